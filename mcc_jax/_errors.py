@@ -1,0 +1,41 @@
+"""The one exception that bad input raises."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class InputError(ValueError):
+    """Input that a person can mend, told in one line.
+
+    The message names the file, the row and the column where they are known, what is wrong there, and what to do.
+    The command line prints it on standard error and exits with status 2; nothing is written.
+
+    Args:
+        problem: what is wrong, in words.
+        file: the file or folder concerned.
+        row: the row as a person counts it in an editor, the header being row 1.
+        column: the column's name as it stands in the file.
+        remedy: what to do about it.
+    """
+
+    def __init__(
+        self,
+        problem: str,
+        *,
+        file: str | Path | None = None,
+        row: int | None = None,
+        column: str | None = None,
+        remedy: str | None = None,
+    ) -> None:
+        self.problem, self.file, self.row, self.column, self.remedy = problem, file, row, column, remedy
+        place = [] if file is None else [str(file)]
+        if row is not None:
+            place.append(f"row {row}")
+        if column is not None:
+            place.append(f"column {column!r}")
+        message = ", ".join(place) + (": " if place else "") + problem
+        if remedy is not None:
+            message = f"{message.rstrip('.')}. {remedy}"
+        # A cell's text may hold line breaks or control characters; the promise is one line.
+        super().__init__("".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in message))

@@ -1,0 +1,25 @@
+"""Array types shared by every module, and the converter that keeps fields scalar."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+from jaxtyping import ScalarLike as ScalarLike
+
+Scalar: TypeAlias = Float[Array, ""]
+Flag: TypeAlias = Bool[Array, ""]
+Path: TypeAlias = Float[Array, " steps"]
+
+
+def scalar(value: ScalarLike) -> Scalar:
+    """Convert a field's value to a floating-point scalar array, keeping the precision of arrays.
+
+    Raises:
+        ValueError: if the value has a batch axis; modules describe one contact and are batched by `vmap`.
+    """
+    array = jnp.asarray(value)
+    if array.ndim:
+        raise ValueError(f"Expected a scalar, got shape {array.shape}; batch with equinox.filter_vmap(Class).")
+    return array if jnp.issubdtype(array.dtype, jnp.inexact) else array.astype(float)
