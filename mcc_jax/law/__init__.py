@@ -1,0 +1,14 @@
+"""The contact law: loading, unloading, reloading, its inverse, its energy, its population, its references."""
+
+from ._base import AbstractContactLaw as AbstractContactLaw
+from ._mcc import Energy as Energy
+from ._mcc import History as History
+from ._mcc import MccLaw as MccLaw
+from ._plastic import Plastic as Plastic
+from ._population import LogNormal as LogNormal
+from ._population import PlasticPopulation as PlasticPopulation
+from ._recovery import energy_ratio as energy_ratio
+from ._recovery import recovery as recovery
+from ._recovery import stress_ratio as stress_ratio
+from ._unloading import StrainScaling as StrainScaling
+from ._unloading import Unloading as Unloading

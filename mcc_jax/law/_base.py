@@ -1,0 +1,43 @@
+"""What every contact law is: a state, one step of it, and the same along a path."""
+
+from __future__ import annotations
+
+import abc
+from typing import Generic, TypeVar
+
+import equinox as eqx
+import jax
+
+from .._types import Path, Scalar
+from ..geometry import Particle
+
+State = TypeVar("State")
+
+
+class AbstractContactLaw(eqx.Module, Generic[State]):
+    """One particle between two platens: `init` gives the virgin state, `step` advances it.
+
+    There is no batch axis; batch laws and particles with `equinox.filter_vmap`. Parameters are the law's own fields, size and
+    shape come as a `Particle`, and history is what `step` returns. No method checks values: entry points such as
+    `simulate.drive` do.
+    """
+
+    @abc.abstractmethod
+    def init(self, particle: Particle) -> State:
+        """State of a particle that was never loaded."""
+
+    @abc.abstractmethod
+    def step(self, particle: Particle, state: State, displacement: Scalar) -> tuple[State, Scalar]:
+        """Force [mN] at the platen displacement [um], and the state after it."""
+
+    @abc.abstractmethod
+    def step_load(self, particle: Particle, state: State, force: Scalar) -> tuple[State, Scalar]:
+        """Platen displacement [um] under the force [mN], and the state after it."""
+
+    def path(self, particle: Particle, state: State, displacement: Path) -> tuple[State, Path]:
+        """Forces [mN] along a path of displacements [um], by `lax.scan` of `step`."""
+        return jax.lax.scan(lambda past, value: self.step(particle, past, value), state, displacement)
+
+    def path_load(self, particle: Particle, state: State, force: Path) -> tuple[State, Path]:
+        """Displacements [um] along a path of forces [mN], by `lax.scan` of `step_load`."""
+        return jax.lax.scan(lambda past, value: self.step_load(particle, past, value), state, force)

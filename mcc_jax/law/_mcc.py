@@ -1,0 +1,240 @@
+"""The loading-unloading contact law of micro-crystalline cellulose particles."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._numerics import running_max
+from .._types import Path, Scalar, scalar
+from ..geometry import Particle, plastic_shape_factor
+from ._base import AbstractContactLaw
+from ._loading_inverse import loading_strain, secant_modulus
+from ._plastic import Plastic
+from ._recovery import energy_ratio, recovery, stress_ratio
+from ._unloading import StrainScaling, Unloading
+
+AnyShape = Float[Array, "..."]
+
+
+class History(eqx.Module):
+    r"""What a particle remembers: the largest platen displacement.
+
+    The paper's two internal variables :math:`\epsilon_P, \sigma_P` are functions of it (`MccLaw.internal_variables`).
+
+    Attributes:
+        displacement_max: largest displacement so far [um]; 0 for a virgin particle, never decreases.
+    """
+
+    displacement_max: Scalar = eqx.field(converter=scalar)
+
+
+class Energy(eqx.Module):
+    """Energy balance of one particle [nJ]; `work = recoverable + dissipated`.
+
+    Attributes:
+        work: work done by the platens up to now.
+        recoverable: what the particle would still give back on full release.
+        dissipated: what is lost for good; it does not change while unloading and reloading.
+    """
+
+    work: Scalar
+    recoverable: Scalar
+    dissipated: Scalar
+
+
+class MccLaw(AbstractContactLaw[History]):
+    r"""Plastic loading along a quintic, elastic unloading and reloading along an arcsine branch.
+
+    With :math:`\epsilon = \gamma/D_e`, :math:`\sigma = F/(\pi R_e^2)`, :math:`\eta_p` from `plastic_shape_factor` and
+    :math:`(\epsilon_P, \sigma_P)` the largest strain so far and its stress,
+
+    .. math::
+        \sigma &= C_1 \eta_p\epsilon - (C_3 \eta_p\epsilon)^3 + (C_5 \eta_p\epsilon)^5
+            && \text{plastic loading},\ \epsilon \ge \epsilon_P \\
+        \sigma &= \tfrac{2}{\pi} \sigma_P \left[\arccos s - s\sqrt{1 - s^2}\right],\quad
+            s = (\epsilon_P - \epsilon)/\delta && \text{elastic unloading and reloading}
+
+    and zero once s >= 1. The recovered strain :math:`\delta` has three forms (`Unloading`) and three ways in which
+    :math:`\eta_p` enters (`StrainScaling`); the defaults are the paper's. Reloading retraces unloading and rejoins the loading
+    curve at :math:`\epsilon_P`. Rate independent, no adhesion.
+
+    Validity: the paper's tests ended at 7 to 16 MPa, :math:`\eta_p\epsilon \le 0.67` on the mean curve. If the quintic is not
+    monotone (`is_monotone`), displacement control follows it down, load control snaps through; nothing becomes NaN.
+
+    At zero displacement, at the onset of unloading, on full release and out of contact, value and first derivatives are finite
+    in both modes. Where branches meet (a kink of the model itself) the derivative is that of loading at the onset, and that of
+    the released particle at full release.
+
+    Attributes:
+        plastic: C1, C3, C5.
+        a: geometric parameter of the shape factor [-].
+        effective_modulus: :math:`\bar E = E/(1-\nu^2)` [MPa], > 0; its value belongs to the chosen `unloading` form.
+        unloading: form of the recovered strain.
+        strain_scaling: how the shape factor enters it.
+
+    References:
+        Bommireddy et al. (2018), eqs. 18, 26 and 27.
+    """
+
+    plastic: Plastic
+    a: Scalar = eqx.field(converter=scalar)
+    effective_modulus: Scalar = eqx.field(converter=scalar)
+    unloading: Unloading = eqx.field(static=True, default=Unloading.PRINTED)
+    strain_scaling: StrainScaling = eqx.field(static=True, default=StrainScaling.RAW)
+
+    @property
+    def is_monotone(self):
+        """Whether the loading curve never falls (`Plastic.is_monotone`)."""
+        return self.plastic.is_monotone
+
+    def shape_factor(self, particle: Particle) -> Scalar:
+        """eta_p of the particle under this law's `a` [-]."""
+        return plastic_shape_factor(particle, self.a)
+
+    # ---- stress and strain -------------------------------------------------------------------------------------------
+
+    def loading_stress(self, particle: Particle, strain: AnyShape) -> AnyShape:
+        """Stress [MPa] of plastic loading at the strain [-]."""
+        return self.plastic.stress(self.shape_factor(particle) * strain)
+
+    def recoverable_strain(self, particle: Particle, strain_max: AnyShape) -> AnyShape:
+        r"""Strain :math:`\delta` [-] recovered on full release from the largest strain :math:`\epsilon_P` [-].
+
+        .. math::
+            \delta^2 = \frac{\sigma_P}{4.12\, \bar E\, \eta_p^p\, \epsilon_P} \ (\text{printed}), \qquad
+            \delta^2 = \frac{\sigma_P^2}{k\, \bar E^2\, \eta_p^p\, \epsilon_P} \ (\text{punch forms})
+
+        with p of the `StrainScaling`. The printed form does not vanish at zero strain: below a peak strain of about 0.01
+        (0.2 MPa) its residual strain is negative, and just below that its unloading creates energy.
+        """
+        eta = self.shape_factor(particle)
+        _, _, recoverable = self._elastic(eta, eta * strain_max)
+        return recoverable
+
+    def unloading_stress(self, particle: Particle, strain: AnyShape, strain_max: AnyShape) -> AnyShape:
+        """Stress [MPa] on the elastic branch that starts at `strain_max`."""
+        eta = self.shape_factor(particle)
+        peak_stress, carries, recoverable = self._elastic(eta, eta * strain_max)
+        return peak_stress * stress_ratio(_recovered(strain_max - strain, carries, recoverable))
+
+    def internal_variables(self, particle: Particle, history: History) -> tuple[Scalar, Scalar]:
+        r"""The paper's :math:`(\epsilon_P, \sigma_P)`: largest strain [-] and its stress [MPa]."""
+        strain_max = particle.strain(history.displacement_max)
+        return strain_max, self.loading_stress(particle, strain_max)
+
+    def residual_displacement(self, particle: Particle, history: History) -> Scalar:
+        """Displacement [um] that stays after full release."""
+        strain_max = particle.strain(history.displacement_max)
+        return history.displacement_max - particle.displacement(self.recoverable_strain(particle, strain_max))
+
+    def _elastic(self, eta: Scalar, x: AnyShape) -> tuple[AnyShape, AnyShape, AnyShape]:
+        """Peak stress, whether it is positive, and the recoverable strain, at the peak scaled strain `x`."""
+        secant = secant_modulus(*self.plastic.polynomial, x)
+        carries = (x > 0) & (secant > 0)
+        k, power = self.unloading.constant, self.strain_scaling.power
+        if self.unloading is Unloading.PRINTED:
+            square = eta ** (1 - power) * secant / (k * self.effective_modulus)
+        else:
+            square = eta ** (1 - power) * x * (secant / self.effective_modulus) ** 2 / k
+        return x * secant, carries, jnp.sqrt(jnp.where(carries, square, 1.0))
+
+    # ---- force and displacement --------------------------------------------------------------------------------------
+
+    def init(self, particle: Particle) -> History:
+        """A virgin particle."""
+        return History(jnp.zeros_like(particle.D3))
+
+    def step(self, particle: Particle, state: History, displacement: Scalar) -> tuple[History, Scalar]:
+        """Force [mN] at the platen displacement [um] (negative: not yet touching), and the history after it."""
+        peak = jnp.where(displacement >= state.displacement_max, displacement, state.displacement_max)
+        return History(peak), self._force(particle, displacement, peak)
+
+    def step_load(self, particle: Particle, state: History, force: Scalar) -> tuple[History, Scalar]:
+        """Platen displacement [um] under the force [mN], and the history after it.
+
+        A force <= 0 means out of contact: the displacement stays where the platen left the particle.
+        """
+        past = self._peak_force(particle, state)
+        loading = force >= past
+        reached = self._loading_displacement(particle, jnp.where(loading, force, past), state.displacement_max)
+        peak = jnp.where(loading & (reached > state.displacement_max), reached, state.displacement_max)
+        return History(peak), self._displacement(particle, force, peak, jnp.where(loading, force, past))
+
+    def path(self, particle: Particle, state: History, displacement: Path) -> tuple[History, Path]:
+        """Forces [mN] along a path of displacements [um], in closed form over the running maximum (no scan)."""
+        highest = running_max(displacement)
+        peak = jnp.where(highest >= state.displacement_max, highest, state.displacement_max)
+        return History(peak[-1]), self._force(particle, displacement, peak)
+
+    def path_load(self, particle: Particle, state: History, force: Path) -> tuple[History, Path]:
+        """Displacements [um] along a path of forces [mN], in closed form over the running maximum (no scan)."""
+        past = self._peak_force(particle, state)
+        highest = running_max(force)
+        peak_force = jnp.where(highest >= past, highest, past)
+        reached = self._loading_displacement(particle, peak_force, state.displacement_max)
+        peak = jnp.where((highest >= past) & (reached > state.displacement_max), reached, state.displacement_max)
+        return History(peak[-1]), self._displacement(particle, force, peak, peak_force)
+
+    def _peak_force(self, particle: Particle, state: History) -> Scalar:
+        return particle.force(self.loading_stress(particle, particle.strain(state.displacement_max)))
+
+    def _force(self, particle: Particle, displacement: AnyShape, peak: AnyShape) -> AnyShape:
+        diameter = particle.effective_diameter
+        eta = self.shape_factor(particle)
+        peak_stress, carries, recoverable = self._elastic(eta, eta * peak / diameter)
+        # The difference is taken in displacement, where it is exact; in strain it would be rounded twice.
+        s = _recovered((peak - displacement) / diameter, carries, recoverable)
+        return particle.force(peak_stress * jnp.where(displacement >= peak, 1.0, stress_ratio(s)))
+
+    def _loading_displacement(self, particle: Particle, force: AnyShape, floor: Scalar) -> AnyShape:
+        scale = particle.effective_diameter / self.shape_factor(particle)
+        return scale * loading_strain(*self.plastic.polynomial, particle.stress(force), floor / scale)
+
+    def _displacement(self, particle: Particle, force: AnyShape, peak: AnyShape, peak_force: AnyShape) -> AnyShape:
+        eta = self.shape_factor(particle)
+        _, carries, recoverable = self._elastic(eta, eta * peak / particle.effective_diameter)
+        loaded = carries & (peak_force > 0)
+        ratio = jnp.where(loaded, force, 0.0) / jnp.where(loaded, peak_force, 1.0)
+        released = particle.displacement(recoverable) * recovery(ratio)
+        return peak - jnp.where(loaded & (force < peak_force), released, 0.0)
+
+    # ---- energy --------------------------------------------------------------------------------------------------------
+
+    def loading_work(self, particle: Particle, displacement: Scalar) -> Scalar:
+        r"""Work [nJ] of plastic loading from zero to the displacement [um].
+
+        .. math:: W = \frac{\pi R_e^2 D_e}{\eta_p}
+            \left(\tfrac12 C_1 x^2 - \tfrac14 C_3^3 x^4 + \tfrac16 C_5^5 x^6\right), \quad x = \eta_p \gamma / D_e
+        """
+        eta = self.shape_factor(particle)
+        density = self.plastic.work(eta * particle.strain(displacement)) / eta
+        return particle.force(density) * particle.effective_diameter
+
+    def energy(self, particle: Particle, history: History, displacement: Scalar) -> Energy:
+        r"""Energy balance [nJ] at a displacement [um] on the branch that starts at the history's peak.
+
+        .. math:: W_{rec} = \pi R_e^2 D_e\, \sigma_P\, \delta\, g(s), \quad g(0) = \tfrac{4}{3\pi}, \qquad
+            W_{diss} = W_{load}(\epsilon_P) - W_{rec}(s = 0)
+
+        Args:
+            particle: the particle.
+            history: its largest displacement; a larger `displacement` counts as further loading.
+            displacement: where it is now [um].
+        """
+        peak = jnp.where(displacement >= history.displacement_max, displacement, history.displacement_max)
+        diameter = particle.effective_diameter
+        eta = self.shape_factor(particle)
+        peak_stress, carries, recoverable = self._elastic(eta, eta * peak / diameter)
+        s = _recovered((peak - displacement) / diameter, carries, recoverable)
+        scale = particle.force(peak_stress) * diameter * jnp.where(carries, recoverable, 0.0)
+        at_peak = scale * energy_ratio(jnp.zeros_like(s))
+        now = jnp.where(displacement >= peak, at_peak, scale * energy_ratio(s))
+        dissipated = self.loading_work(particle, peak) - at_peak
+        return Energy(dissipated + now, now, dissipated)
+
+
+def _recovered(drop: AnyShape, carries: AnyShape, recoverable: AnyShape) -> AnyShape:
+    """Share of the recoverable strain that is recovered after the strain dropped; all of it where no stress was carried."""
+    return jnp.where(carries, drop / recoverable, 1.0)

@@ -1,0 +1,77 @@
+r"""The master loading law, a quintic in the scaled strain :math:`x = \eta_p \epsilon`, and its inverse."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._types import Flag, Scalar, ScalarLike, scalar
+from ._loading_inverse import loading_strain, secant_modulus, tangent_modulus
+
+
+class Plastic(eqx.Module):
+    r"""The three plastic coefficients of the master loading law.
+
+    .. math:: \sigma(x) / \mathrm{MPa} = C_1 x - (C_3 x)^3 + (C_5 x)^5
+
+    Attributes:
+        C1: coefficient of the linear term [-], > 0.
+        C3: coefficient of the softening term [-], >= 0.
+        C5: coefficient of the hardening term [-], > 0.
+
+    References:
+        Bommireddy et al. (2018), eq. 18. Its nomenclature lists them as C1, C2, C3 in MPa, MPa^-3, MPa^-5; the formula makes
+        them pure numbers.
+    """
+
+    C1: Scalar = eqx.field(converter=scalar)
+    C3: Scalar = eqx.field(converter=scalar)
+    C5: Scalar = eqx.field(converter=scalar)
+
+    @classmethod
+    def from_polynomial(cls, K1: ScalarLike, K3: ScalarLike, K5: ScalarLike) -> Plastic:
+        r"""From the factors of :math:`\sigma = K_1 x - K_3 x^3 + K_5 x^5` [MPa], all positive."""
+        return cls(scalar(K1), jnp.cbrt(scalar(K3)), scalar(K5) ** 0.2)
+
+    @property
+    def polynomial(self) -> tuple[Scalar, Scalar, Scalar]:
+        r""":math:`(K_1, K_3, K_5) = (C_1, C_3^3, C_5^5)` [MPa]."""
+        square = self.C5 * self.C5
+        return self.C1, self.C3 * self.C3 * self.C3, square * square * self.C5
+
+    @property
+    def is_monotone(self) -> Flag:
+        r"""Whether stress never falls while strain grows: :math:`9 C_3^6 \le 20 C_1 C_5^5`.
+
+        With equality the curve has one point of zero slope. Beyond it the curve has a peak and a trough: under load control
+        the particle snaps through from the peak to the rising branch behind the trough, and force as a function of
+        displacement has no derivative with respect to load at the peak.
+        """
+        K1, K3, K5 = self.polynomial
+        return 9 * K3 * K3 <= 20 * K1 * K5
+
+    def stress(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Stress [MPa] at the scaled strain `x` = eta_p eps >= 0, never below zero."""
+        K1, K3, K5 = self.polynomial
+        return x * secant_modulus(K1, K3, K5, x)
+
+    def tangent(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
+        r"""Slope :math:`d\sigma/dx = C_1 - 3 C_3^3 x^2 + 5 C_5^5 x^4` [MPa]."""
+        K1, K3, K5 = self.polynomial
+        return tangent_modulus(K1, K3, K5, x)
+
+    def strain(self, stress: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Scaled strain at which the stress [MPa] is first reached from the virgin state; 0 for stress <= 0.
+
+        For a law that is not monotone this is the running maximum turned round: it jumps over peak and trough.
+        Differentiable in stress and coefficients by the implicit-function rule.
+        """
+        stress = jnp.asarray(stress)
+        return loading_strain(*self.polynomial, stress, jnp.zeros_like(stress))
+
+    def work(self, x: Scalar) -> Scalar:
+        r"""Integral of stress over scaled strain, :math:`C_1 x^2/2 - C_3^3 x^4/4 + C_5^5 x^6/6` [MPa]."""
+        K1, K3, K5 = self.polynomial
+        square = x * x
+        return square * (K1 / 2 - square * (K3 / 4 - square * K5 / 6))

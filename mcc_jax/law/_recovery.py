@@ -1,0 +1,100 @@
+r"""The elastic branch in one variable: how stress falls as strain is recovered, its inverse and its energy.
+
+With :math:`s = (\epsilon_P - \epsilon)/\delta = \sqrt{1 - \phi^2}`, which is linear in strain, the arcsine law of unloading
+reads
+
+.. math:: \sigma / \sigma_P = f(s) = \tfrac{2}{\pi}\left[\arccos s - s\sqrt{1 - s^2}\right].
+
+The printed form in :math:`\phi` loses all digits near both ends and has no derivative at the onset; here every function is
+an exact power of the distance to the singular end times a polynomial (square roots and multiply-adds, no arc function, no
+iteration). Accuracy: 4e-16 of the peak in float64, 2e-7 in float32.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from .._numerics import horner
+from .._types import Scalar
+from ._recovery_coefficients import ENERGY_64, RATIO_32, RATIO_64, RECOVERY_32, RECOVERY_64
+
+
+def _is_double(x: Scalar) -> bool:
+    return x.dtype == jnp.float64
+
+
+@jax.custom_jvp
+def stress_ratio(s: Scalar) -> Scalar:
+    r"""Stress over peak stress on the elastic branch.
+
+    Args:
+        s: strain recovered so far over the strain recovered on full release [-].
+
+    Returns:
+        :math:`f(s)` [-]: 1 for s <= 0, 0 for s >= 1, relative accuracy kept towards s = 1. The derivative is the closed form
+        :math:`-\tfrac{4}{\pi}\sqrt{1 - s^2}` on 0 <= s < 1 and 0 outside.
+
+    References:
+        Bommireddy et al. (2018), eq. 26, with phi^2 = 1 - s^2.
+    """
+    u = jnp.clip(1 - s, 0, 1)
+    return u * jnp.sqrt(u) * horner(RATIO_64 if _is_double(u) else RATIO_32, 2 * u - 1)
+
+
+@stress_ratio.defjvp
+def _stress_ratio_jvp(primals, tangents):
+    (s,), (ds,) = primals, tangents
+    inside = (s >= 0) & (s < 1)
+    chord = jnp.where(inside, (1 - s) * (1 + s), 1.0)
+    return stress_ratio(s), jnp.where(inside, -4 / jnp.pi * jnp.sqrt(chord), 0.0) * ds
+
+
+@jax.custom_jvp
+def recovery(ratio: Scalar) -> Scalar:
+    r"""Inverse of `stress_ratio`: the recovered share of strain at a share of the peak stress.
+
+    Solves Kepler's equation of eccentricity 1, :math:`E - \sin E = \pi\,\sigma/\sigma_P` with :math:`s = \cos(E/2)`, in
+    closed form.
+
+    Args:
+        ratio: stress over peak stress [-].
+
+    Returns:
+        s [-], 1 for ratio <= 0 and 0 for ratio >= 1. Its derivative grows as ratio^(-1/3) towards full release and is 0
+        beyond it, where the platen no longer touches.
+    """
+    r = jnp.clip(ratio, 0, 1)
+    w = (r * r) ** (1 / 3)  # faster here and closer than jnp.cbrt
+    return jnp.clip((1 - w) * horner(RECOVERY_64 if _is_double(w) else RECOVERY_32, 2 * w - 1), 0, 1)
+
+
+@recovery.defjvp
+def _recovery_jvp(primals, tangents):
+    (ratio,), (dratio,) = primals, tangents
+    s = recovery(ratio)
+    inside = (ratio > 0) & (ratio <= 1) & (s < 1)
+    chord = jnp.where(inside, (1 - s) * (1 + s), 1.0)
+    return s, jnp.where(inside, -jnp.pi / 4 / jnp.sqrt(chord), 0.0) * dratio
+
+
+@jax.custom_jvp
+def energy_ratio(s: Scalar) -> Scalar:
+    r"""Elastic energy still stored, over :math:`\sigma_P \delta`.
+
+    .. math:: g(s) = \int_s^1 f = \tfrac{2}{\pi}\left[\sqrt{1 - s^2} - s\arccos s - \tfrac13 (1 - s^2)^{3/2}\right]
+
+    Args:
+        s: recovered share of strain [-].
+
+    Returns:
+        g [-], 4/(3 pi) at the onset of unloading, 0 on full release.
+    """
+    u = jnp.clip(1 - s, 0, 1)
+    return u * u * jnp.sqrt(u) * horner(ENERGY_64, 2 * u - 1)
+
+
+@energy_ratio.defjvp
+def _energy_ratio_jvp(primals, tangents):
+    (s,), (ds,) = primals, tangents
+    return energy_ratio(s), jnp.where((s >= 0) & (s < 1), -stress_ratio(s), 0.0) * ds
