@@ -11,6 +11,8 @@ from jaxtyping import ScalarLike as ScalarLike
 Scalar: TypeAlias = Float[Array, ""]
 Flag: TypeAlias = Bool[Array, ""]
 Path: TypeAlias = Float[Array, " steps"]
+Values: TypeAlias = Float[Array, "..."]
+"""One number or many at once, for functions that act on each alone."""
 
 
 def scalar(value: ScalarLike) -> Scalar:

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ._numerics import positive_pow
-from ._types import Scalar, ScalarLike, scalar
+from ._types import Scalar, ScalarLike, Values, scalar
 
 
 class Particle(eqx.Module):
@@ -56,19 +56,19 @@ class Particle(eqx.Module):
         """1 - D3^2 / (D1 D2) [-]: 0 for a sphere, towards 1 for a flake, negative for an upright particle."""
         return 1 - self.D3**2 / (self.D1 * self.D2)
 
-    def strain(self, displacement: Scalar) -> Scalar:
+    def strain(self, displacement: Values) -> Values:
         """Effective strain gamma / D_e [-] of a platen displacement [um] (Bommireddy et al. 2018, eq. 5)."""
         return displacement / self.effective_diameter
 
-    def stress(self, force: Scalar) -> Scalar:
+    def stress(self, force: Values) -> Values:
         """Effective stress F / (pi R_e^2) [MPa] of a force [mN] (Bommireddy et al. 2018, eq. 4)."""
         return force * 1e3 / self.effective_area
 
-    def displacement(self, strain: Scalar) -> Scalar:
+    def displacement(self, strain: Values) -> Values:
         """Platen displacement [um] of an effective strain [-]."""
         return strain * self.effective_diameter
 
-    def force(self, stress: Scalar) -> Scalar:
+    def force(self, stress: Values) -> Values:
         """Force [mN] of an effective stress [MPa]; 1 MPa um^2 = 1e-3 mN."""
         return stress * self.effective_area * 1e-3
 

@@ -10,5 +10,10 @@ from ._population import PlasticPopulation as PlasticPopulation
 from ._recovery import energy_ratio as energy_ratio
 from ._recovery import recovery as recovery
 from ._recovery import stress_ratio as stress_ratio
+from ._reference import hertz_shape_factor as hertz_shape_factor
+from ._reference import hertz_stress as hertz_stress
+from ._reference import ideal_plastic_stress as ideal_plastic_stress
+from ._reference import similarity_strength as similarity_strength
+from ._reference import similarity_stress as similarity_stress
 from ._unloading import StrainScaling as StrainScaling
 from ._unloading import Unloading as Unloading

@@ -3,24 +3,36 @@
 from __future__ import annotations
 
 import abc
-from typing import Generic, TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 
-from .._types import Path, Scalar
+from .._types import Flag, Path, Scalar
 from ..geometry import Particle
 
-State = TypeVar("State")
 
-
-class AbstractContactLaw(eqx.Module, Generic[State]):
+class AbstractContactLaw[State](eqx.Module):
     """One particle between two platens: `init` gives the virgin state, `step` advances it.
 
-    There is no batch axis; batch laws and particles with `equinox.filter_vmap`. Parameters are the law's own fields, size and
-    shape come as a `Particle`, and history is what `step` returns. No method checks values: entry points such as
-    `simulate.drive` do.
+    There is no batch axis; batch laws and particles with `equinox.filter_vmap`. Parameters are the law's own fields,
+    size and shape come as a `Particle`, and history is what `step` returns. No method checks values: entry points such
+    as `simulate.drive` do.
     """
+
+    @property
+    def is_monotone(self) -> Flag:
+        """Whether force never falls while the displacement of a virgin particle grows."""
+        return jnp.asarray(True)
+
+    @property
+    def is_valid(self) -> Flag:
+        """Whether every parameter is in its range."""
+        return jnp.asarray(True)
+
+    def carries_stress(self, particle: Particle) -> Flag:
+        """Whether the law gives this particle any stress at all."""
+        return jnp.asarray(True)
 
     @abc.abstractmethod
     def init(self, particle: Particle) -> State:

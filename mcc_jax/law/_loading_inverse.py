@@ -15,31 +15,29 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
-
-from .._types import Scalar
+from .._types import Scalar, Values
 
 NEWTON_STEPS = 8
 
 
-def secant_modulus(K1: Scalar, K3: Scalar, K5: Scalar, x: Float[Array, "..."]) -> Float[Array, "..."]:
+def secant_modulus(K1: Scalar, K3: Scalar, K5: Scalar, x: Values) -> Values:
     """Stress over scaled strain [MPa], as a polynomial: finite at x = 0, where their quotient is not.
 
     Zero where the quintic would be tensile, which takes K3^2 > 4 K1 K5: pushing a particle together cannot pull.
     """
     square = x * x
     value = K1 - square * (K3 - square * K5)
-    return jnp.where(value > 0, value, 0.0)
+    return jnp.where(value < 0, 0.0, value)  # this way round a parameter that is NaN shows
 
 
-def tangent_modulus(K1: Scalar, K3: Scalar, K5: Scalar, x: Float[Array, "..."]) -> Float[Array, "..."]:
+def tangent_modulus(K1: Scalar, K3: Scalar, K5: Scalar, x: Values) -> Values:
     """Slope of the quintic [MPa]."""
     square = x * x
     return K1 - square * (3 * K3 - 5 * square * K5)
 
 
 @jax.custom_jvp
-def loading_strain(K1: Scalar, K3: Scalar, K5: Scalar, stress: Scalar, floor: Scalar) -> Scalar:
+def loading_strain(K1: Scalar, K3: Scalar, K5: Scalar, stress: Values, floor: Scalar) -> Values:
     """Smallest scaled strain, not on a branch already left behind, at which loading reaches the stress.
 
     Args:
@@ -78,12 +76,12 @@ def _loading_strain_jvp(primals, tangents):
     return x, jnp.where(stress >= 0, change / jnp.where(slope > smallest, slope, smallest), 0.0)
 
 
-def _root(x: Scalar) -> Scalar:
+def _root(x: Values) -> Values:
     """Square root of the positive part, for code that is never differentiated."""
     return jnp.sqrt(jnp.maximum(x, 0.0))
 
 
-def _start(K1: Scalar, K3: Scalar, K5: Scalar, target: Scalar, floor: Scalar) -> Scalar:
+def _start(K1: Scalar, K3: Scalar, K5: Scalar, target: Values, floor: Scalar) -> Values:
     # Written with maxima, and with each costly value used in few places: it then compiles to few loops over the data.
     tiny = jnp.finfo(target.dtype).tiny ** 0.5
     discriminant = 9 * K3 * K3 - 20 * K1 * K5

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .._numerics import running_max
-from .._types import Path, Scalar, scalar
+from .._types import Flag, Path, Scalar, scalar
 from ..geometry import Particle, plastic_shape_factor
 from ._base import AbstractContactLaw
 from ._loading_inverse import loading_strain, secant_modulus
@@ -85,9 +85,19 @@ class MccLaw(AbstractContactLaw[History]):
     strain_scaling: StrainScaling = eqx.field(static=True, default=StrainScaling.RAW)
 
     @property
-    def is_monotone(self):
+    def is_monotone(self) -> Flag:
         """Whether the loading curve never falls (`Plastic.is_monotone`)."""
         return self.plastic.is_monotone
+
+    @property
+    def is_valid(self) -> Flag:
+        """Whether C1, C5 and the modulus are positive, C3 is not negative and nothing is NaN."""
+        C1, C3, C5 = self.plastic.C1, self.plastic.C3, self.plastic.C5
+        return (C1 > 0) & (C3 >= 0) & (C5 > 0) & (self.effective_modulus > 0) & jnp.isfinite(self.a)
+
+    def carries_stress(self, particle: Particle) -> Flag:
+        """Whether the particle's shape factor is positive."""
+        return self.shape_factor(particle) > 0
 
     def shape_factor(self, particle: Particle) -> Scalar:
         """eta_p of the particle under this law's `a` [-]."""
@@ -129,7 +139,7 @@ class MccLaw(AbstractContactLaw[History]):
         strain_max = particle.strain(history.displacement_max)
         return history.displacement_max - particle.displacement(self.recoverable_strain(particle, strain_max))
 
-    def _elastic(self, eta: Scalar, x: AnyShape) -> tuple[AnyShape, AnyShape, AnyShape]:
+    def _elastic(self, eta: Scalar, x: AnyShape) -> tuple[AnyShape, Bool[Array, "..."], AnyShape]:
         """Peak stress, whether it is positive, and the recoverable strain, at the peak scaled strain `x`."""
         secant = secant_modulus(*self.plastic.polynomial, x)
         carries = (x > 0) & (secant > 0)
@@ -148,7 +158,8 @@ class MccLaw(AbstractContactLaw[History]):
 
     def step(self, particle: Particle, state: History, displacement: Scalar) -> tuple[History, Scalar]:
         """Force [mN] at the platen displacement [um] (negative: not yet touching), and the history after it."""
-        peak = jnp.where(displacement >= state.displacement_max, displacement, state.displacement_max)
+        # Asked this way round, a displacement that is NaN shows; so it is below.
+        peak = jnp.where(displacement < state.displacement_max, state.displacement_max, displacement)
         return History(peak), self._force(particle, displacement, peak)
 
     def step_load(self, particle: Particle, state: History, force: Scalar) -> tuple[History, Scalar]:
@@ -157,24 +168,26 @@ class MccLaw(AbstractContactLaw[History]):
         A force <= 0 means out of contact: the displacement stays where the platen left the particle.
         """
         past = self._peak_force(particle, state)
-        loading = force >= past
-        reached = self._loading_displacement(particle, jnp.where(loading, force, past), state.displacement_max)
-        peak = jnp.where(loading & (reached > state.displacement_max), reached, state.displacement_max)
-        return History(peak), self._displacement(particle, force, peak, jnp.where(loading, force, past))
+        peak_force = jnp.where(force < past, past, force)
+        reached = self._loading_displacement(particle, peak_force, state.displacement_max)
+        elastic = (force < past) | (reached < state.displacement_max)
+        peak = jnp.where(elastic, state.displacement_max, reached)
+        return History(peak), self._displacement(particle, force, peak, peak_force)
 
     def path(self, particle: Particle, state: History, displacement: Path) -> tuple[History, Path]:
         """Forces [mN] along a path of displacements [um], in closed form over the running maximum (no scan)."""
         highest = running_max(displacement)
-        peak = jnp.where(highest >= state.displacement_max, highest, state.displacement_max)
+        peak = jnp.where(highest < state.displacement_max, state.displacement_max, highest)
         return History(peak[-1]), self._force(particle, displacement, peak)
 
     def path_load(self, particle: Particle, state: History, force: Path) -> tuple[History, Path]:
         """Displacements [um] along a path of forces [mN], in closed form over the running maximum (no scan)."""
         past = self._peak_force(particle, state)
         highest = running_max(force)
-        peak_force = jnp.where(highest >= past, highest, past)
+        peak_force = jnp.where(highest < past, past, highest)
         reached = self._loading_displacement(particle, peak_force, state.displacement_max)
-        peak = jnp.where((highest >= past) & (reached > state.displacement_max), reached, state.displacement_max)
+        elastic = (highest < past) | (reached < state.displacement_max)
+        peak = jnp.where(elastic, state.displacement_max, reached)
         return History(peak[-1]), self._displacement(particle, force, peak, peak_force)
 
     def _peak_force(self, particle: Particle, state: History) -> Scalar:
@@ -235,6 +248,6 @@ class MccLaw(AbstractContactLaw[History]):
         return Energy(dissipated + now, now, dissipated)
 
 
-def _recovered(drop: AnyShape, carries: AnyShape, recoverable: AnyShape) -> AnyShape:
+def _recovered(drop: AnyShape, carries: Bool[Array, "..."], recoverable: AnyShape) -> AnyShape:
     """Share of the recoverable strain that is recovered after the strain dropped; all of it where no stress was carried."""
     return jnp.where(carries, drop / recoverable, 1.0)

@@ -21,8 +21,8 @@ class Plastic(eqx.Module):
         C5: coefficient of the hardening term [-], > 0.
 
     References:
-        Bommireddy et al. (2018), eq. 18. Its nomenclature lists them as C1, C2, C3 in MPa, MPa^-3, MPa^-5; the formula makes
-        them pure numbers.
+        Bommireddy et al. (2018), eq. 18. Its nomenclature lists them as C1, C2, C3 in MPa, MPa^-3, MPa^-5; the formula
+        makes them pure numbers.
     """
 
     C1: Scalar = eqx.field(converter=scalar)
@@ -44,31 +44,30 @@ class Plastic(eqx.Module):
     def is_monotone(self) -> Flag:
         r"""Whether stress never falls while strain grows: :math:`9 C_3^6 \le 20 C_1 C_5^5`.
 
-        With equality the curve has one point of zero slope. Beyond it the curve has a peak and a trough: under load control
-        the particle snaps through from the peak to the rising branch behind the trough, and force as a function of
-        displacement has no derivative with respect to load at the peak.
+        With equality the curve has one point of zero slope. Beyond it the curve has a peak and a trough: under load
+        control the particle snaps through from the peak to the rising branch behind the trough, and force as a
+        function of displacement has no derivative with respect to load at the peak.
         """
         K1, K3, K5 = self.polynomial
         return 9 * K3 * K3 <= 20 * K1 * K5
 
-    def stress(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
+    def stress(self, x: Float[Array, ...]) -> Float[Array, ...]:
         """Stress [MPa] at the scaled strain `x` = eta_p eps >= 0, never below zero."""
         K1, K3, K5 = self.polynomial
         return x * secant_modulus(K1, K3, K5, x)
 
-    def tangent(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
+    def tangent(self, x: Float[Array, ...]) -> Float[Array, ...]:
         r"""Slope :math:`d\sigma/dx = C_1 - 3 C_3^3 x^2 + 5 C_5^5 x^4` [MPa]."""
         K1, K3, K5 = self.polynomial
         return tangent_modulus(K1, K3, K5, x)
 
-    def strain(self, stress: Float[Array, "..."]) -> Float[Array, "..."]:
+    def strain(self, stress: Float[Array, ...]) -> Float[Array, ...]:
         """Scaled strain at which the stress [MPa] is first reached from the virgin state; 0 for stress <= 0.
 
         For a law that is not monotone this is the running maximum turned round: it jumps over peak and trough.
         Differentiable in stress and coefficients by the implicit-function rule.
         """
-        stress = jnp.asarray(stress)
-        return loading_strain(*self.polynomial, stress, jnp.zeros_like(stress))
+        return loading_strain(*self.polynomial, stress, jnp.zeros_like(self.C1))
 
     def work(self, x: Scalar) -> Scalar:
         r"""Integral of stress over scaled strain, :math:`C_1 x^2/2 - C_3^3 x^4/4 + C_5^5 x^6/6` [MPa]."""

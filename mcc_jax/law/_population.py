@@ -86,7 +86,7 @@ class PlasticPopulation(eqx.Module):
 
     @property
     def probability_not_monotone(self) -> Scalar:
-        r"""Share of particles with :math:`9 C_3^6 > 20 C_1 C_5^5`, a normal tail since the condition is linear in log C."""
+        r"""Share of particles with :math:`9 C_3^6 > 20 C_1 C_5^5`: a normal tail, as log C enters linearly."""
         gap = jnp.log(20 / 9) + self.C1.mean + 5 * self.C5.mean - 6 * self.C3.mean
         spread = jnp.sqrt(self.C1.sd**2 + 25 * self.C5.sd**2 + 36 * self.C3.sd**2)
         return norm.cdf(-gap / spread)
@@ -99,7 +99,7 @@ class PlasticPopulation(eqx.Module):
         return norm.cdf(-gap / spread)
 
     def sample(self, key: PRNGKeyArray, count: int) -> Plastic:
-        """Draws for `count` particles as one batched `Plastic`; draws that are not monotone are kept (and flagged by it)."""
+        """Draws for `count` particles as one batched `Plastic`; those not monotone are kept, and flagged by it."""
         keys = jax.random.split(key, 3)
         draws = [c.sample(k, (count,)) for c, k in zip((self.C1, self.C3, self.C5), keys, strict=True)]
         return eqx.filter_vmap(Plastic)(*draws)

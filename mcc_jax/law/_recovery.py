@@ -16,16 +16,16 @@ import jax
 import jax.numpy as jnp
 
 from .._numerics import horner
-from .._types import Scalar
+from .._types import Values
 from ._recovery_coefficients import ENERGY_64, RATIO_32, RATIO_64, RECOVERY_32, RECOVERY_64
 
 
-def _is_double(x: Scalar) -> bool:
+def _is_double(x: Values) -> bool:
     return x.dtype == jnp.float64
 
 
 @jax.custom_jvp
-def stress_ratio(s: Scalar) -> Scalar:
+def stress_ratio(s: Values) -> Values:
     r"""Stress over peak stress on the elastic branch.
 
     Args:
@@ -51,7 +51,7 @@ def _stress_ratio_jvp(primals, tangents):
 
 
 @jax.custom_jvp
-def recovery(ratio: Scalar) -> Scalar:
+def recovery(ratio: Values) -> Values:
     r"""Inverse of `stress_ratio`: the recovered share of strain at a share of the peak stress.
 
     Solves Kepler's equation of eccentricity 1, :math:`E - \sin E = \pi\,\sigma/\sigma_P` with :math:`s = \cos(E/2)`, in
@@ -79,7 +79,7 @@ def _recovery_jvp(primals, tangents):
 
 
 @jax.custom_jvp
-def energy_ratio(s: Scalar) -> Scalar:
+def energy_ratio(s: Values) -> Values:
     r"""Elastic energy still stored, over :math:`\sigma_P \delta`.
 
     .. math:: g(s) = \int_s^1 f = \tfrac{2}{\pi}\left[\sqrt{1 - s^2} - s\arccos s - \tfrac13 (1 - s^2)^{3/2}\right]

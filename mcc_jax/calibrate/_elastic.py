@@ -1,0 +1,199 @@
+"""The effective modulus from the unloading branches."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float, Int
+
+from .._types import Scalar
+from ..campaign import Curve, find_segments, stress_and_strain
+from ..law import StrainScaling, Unloading, recovery
+
+LEAST_RATIO = 0.05
+"""Points below this share of the peak stress are left out: strain there depends on stress with an infinite slope."""
+
+
+@dataclass(frozen=True)
+class ElasticBranch:
+    r"""One elastic branch: unloading from a peak and, if any, the reloading that follows, up to further virgin loading.
+
+    Attributes:
+        particle: position of the particle in the campaign.
+        strain_max: :math:`\epsilon_P` [-], with the offset step applied.
+        stress_max_MPa: :math:`\sigma_P` [MPa].
+        strain: strains along the branch [-], shape (n,).
+        stress_MPa: stresses along it [MPa], shape (n,).
+    """
+
+    particle: int
+    strain_max: float
+    stress_max_MPa: float
+    strain: np.ndarray
+    stress_MPa: np.ndarray
+
+
+@dataclass(frozen=True)
+class ElasticFit:
+    """A fitted effective modulus.
+
+    Attributes:
+        effective_modulus_MPa: the modulus shared by all particles [MPa]; None if no branch could be used.
+        rms_strain: root mean square residual [-].
+        per_branch_MPa: the modulus that each branch alone would give [MPa].
+        branches: the branches used.
+        converged: whether the optimiser met its tolerances.
+        reason: why there is no modulus or no convergence, in words; empty if all is well.
+    """
+
+    effective_modulus_MPa: float | None
+    rms_strain: float
+    per_branch_MPa: np.ndarray
+    branches: tuple[ElasticBranch, ...]
+    converged: bool
+    reason: str
+
+
+def elastic_branches(particle: int, curve: Curve, diameters_um: np.ndarray, shift: float = 0.0) -> list[ElasticBranch]:
+    """Collect a test's elastic branches.
+
+    Args:
+        particle: position in the campaign, kept in the result.
+        curve: the test.
+        diameters_um: D1, D2, D3 [um].
+        shift: offset of strain from the offset step [-].
+
+    Returns:
+        Branches with at least five points between `LEAST_RATIO` and the peak.
+    """
+    stress, strain = stress_and_strain(curve, diameters_um)
+    strain = strain + shift
+    branches: list[ElasticBranch] = []
+    rows: list[np.ndarray] = []
+    peak: int | None = None
+
+    def close() -> None:
+        if peak is None or not rows:
+            return
+        # The samples on both sides of the turning point: noise would make their maximum alone too large.
+        around = slice(max(peak - 1, 0), peak + 1)
+        top, deepest = float(stress[around].mean()), float(strain[around].max())
+        points = np.concatenate(rows)
+        points = points[(stress[points] > LEAST_RATIO * top) & (stress[points] <= top)]
+        if len(points) >= 5 and deepest > 0 and top > 0:
+            branches.append(ElasticBranch(particle, deepest, top, strain[points], stress[points]))
+
+    loaded = False
+    for segment in find_segments(curve):
+        if segment.kind == "load":
+            close()
+            rows, peak, loaded = [], None, True
+        elif segment.kind in ("unload", "reload") and loaded:
+            if peak is None:
+                peak = segment.start
+            rows.append(np.arange(segment.start, segment.stop))
+    close()
+    return branches
+
+
+def _recoverable(
+    log_modulus: Scalar,
+    stress_max: Float[Array, " branches"],
+    strain_max: Float[Array, " branches"],
+    shape_power: Float[Array, " branches"],
+    unloading: Unloading,
+) -> Float[Array, " branches"]:
+    """Recoverable strain from the *measured* peak of each branch, whatever the loading law."""
+    modulus = jnp.exp(log_modulus)
+    if unloading is Unloading.PRINTED:
+        return jnp.sqrt(stress_max / (unloading.constant * modulus * shape_power * strain_max))
+    return stress_max / (modulus * jnp.sqrt(unloading.constant * shape_power * strain_max))
+
+
+@partial(jax.jit, static_argnames=("unloading", "count"))
+def _fit(
+    start: Scalar,
+    stress_max: Float[Array, " branches"],
+    strain_max: Float[Array, " branches"],
+    shape_power: Float[Array, " branches"],
+    strain: Float[Array, " points"],
+    ratio: Float[Array, " points"],
+    branch: Int[Array, " points"],
+    *,
+    unloading: Unloading,
+    count: int,
+):
+    released = recovery(ratio)
+    points = jnp.maximum(jax.ops.segment_sum(jnp.ones_like(strain), branch, count), 1.0)
+
+    def residuals(log_modulus, _):
+        delta = _recoverable(log_modulus, stress_max, strain_max, shape_power, unloading)
+        deviation = strain - (strain_max[branch] - delta[branch] * released)
+        # The zero of every branch is free; least squares over it is the branch's mean.
+        return deviation - (jax.ops.segment_sum(deviation, branch, count) / points)[branch]
+
+    # Each branch alone, from the slope of strain over the recovery curve: linear, so in closed form.
+    centred = released - (jax.ops.segment_sum(released, branch, count) / points)[branch]
+    slope = -jax.ops.segment_sum(strain * centred, branch, count) / jax.ops.segment_sum(centred**2, branch, count)
+    unit = _recoverable(jnp.zeros_like(start), stress_max, strain_max, shape_power, unloading)
+    exponent = 2 if unloading is Unloading.PRINTED else 1
+    alone = (unit / jnp.where(slope > 0, slope, jnp.nan)) ** exponent
+    solver = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-12)
+    first = jnp.where(jnp.isfinite(jnp.nanmedian(alone)), jnp.log(jnp.nanmedian(alone)), start)
+    solution = optx.least_squares(residuals, solver, first, max_steps=200, throw=False)
+    final = residuals(solution.value, None)
+    return solution.value, jnp.sqrt(jnp.mean(final**2)), alone, solution.result == optx.RESULTS.successful
+
+
+def fit_effective_modulus(
+    branches: Sequence[ElasticBranch],
+    shape_factor: np.ndarray,
+    unloading: Unloading = Unloading.PRINTED,
+    strain_scaling: StrainScaling = StrainScaling.RAW,
+) -> ElasticFit:
+    r"""Least squares for one modulus over all elastic branches, in strain at measured stress.
+
+    .. math:: \min_{\bar E,\, o_b} \sum_{b, k} \left[\epsilon_{bk} - o_b - \epsilon_{P,b}
+        + \delta_b(\bar E)\, s(\sigma_{bk}/\sigma_{P,b})\right]^2
+
+    with the recoverable strain :math:`\delta_b` of the chosen form at the measured peak, and a free zero :math:`o_b`
+    per branch, so that neither the loading law nor the contact point enters.
+
+    Args:
+        branches: elastic branches of all particles.
+        shape_factor: eta_p of every particle of the campaign, shape (N,); it enters unless the scaling is raw.
+        unloading: form of the recoverable strain; the modulus belongs to it.
+        strain_scaling: how the shape factor enters.
+
+    References:
+        Bommireddy et al. (2018), section 6, eqs. 26 and 27.
+    """
+    branches = tuple(branches)
+    if not branches:
+        return ElasticFit(None, np.nan, np.empty(0), (), False, "no unloading branch was measured")
+    index = np.concatenate([np.full(len(b.strain), i) for i, b in enumerate(branches)])
+    top = np.array([b.stress_max_MPa for b in branches])
+    stress = np.concatenate([b.stress_MPa for b in branches])
+    eta = np.asarray(shape_factor)[[b.particle for b in branches]]
+    value, rms, alone, converged = _fit(
+        jnp.log(jnp.asarray(1e4)),
+        jnp.asarray(top),
+        jnp.asarray([b.strain_max for b in branches]),
+        jnp.asarray(eta**strain_scaling.power),
+        jnp.asarray(np.concatenate([b.strain for b in branches])),
+        jnp.asarray(stress / top[index]),
+        jnp.asarray(index),
+        unloading=unloading,
+        count=len(branches),
+    )
+    modulus = float(jnp.exp(value))
+    if not (np.isfinite(modulus) and modulus > 0):
+        return ElasticFit(None, np.nan, np.asarray(alone), branches, False, "strain does not fall on unloading")
+    reason = "" if converged else "the optimiser did not meet its tolerances within 200 steps"
+    return ElasticFit(modulus, float(rms), np.asarray(alone), branches, bool(converged), reason)

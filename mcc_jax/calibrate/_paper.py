@@ -1,0 +1,371 @@
+"""The paper's whole calibration, step after step, for any campaign."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from .._errors import InputError
+from ..campaign import (
+    THRESHOLD_MPA,
+    Adjustment,
+    Campaign,
+    Curve,
+    adjust,
+    effective_diameter_um,
+    find_segments,
+    particle_batch,
+    stress_and_strain,
+)
+from ..law import MccLaw, Plastic, StrainScaling, Unloading
+from ..simulate import simulate_batch
+from ._elastic import ElasticFit, elastic_branches, fit_effective_modulus
+from ._master import MasterCurve, StrainTable, master_curve, strain_table
+from ._plastic import PlasticFit, fit_polynomial, fit_population
+from ._result import estimate
+from ._shape import Objective, ShapeFit, fit_shape_parameter
+
+BAD_MISFIT = 0.05
+"""Share of the range of displacement; with the law's own data and a tester's noise it stays below 0.01."""
+
+
+@dataclass(frozen=True)
+class ParticleFit:
+    """One particle against the calibrated law.
+
+    Attributes:
+        plastic: C1, C3, C5 of this particle's own adjusted loading curve, under the common `a`.
+        zero_um: what the offset step, and the contact point, take off its displacement [um].
+        measured_um: measured displacement less `zero_um` [um], at every point.
+        predicted_um: displacement under the measured force by the mean law, scaled by this particle's size and shape
+            [um].
+        own_um: the same with the particle's own C1, C3, C5.
+        used: which points enter `rms_um`: those after contact and above the threshold.
+        rms_um: root mean square of measured less predicted [um].
+        own_rms_um: the same with its own coefficients [um].
+    """
+
+    plastic: tuple[float, float, float]
+    zero_um: float
+    measured_um: np.ndarray
+    predicted_um: np.ndarray
+    own_um: np.ndarray
+    used: np.ndarray
+    rms_um: float
+    own_rms_um: float
+
+
+@dataclass(frozen=True)
+class PaperCalibration:
+    """Everything that the paper's calibration finds, with what it was made from.
+
+    Attributes:
+        campaign: the tests.
+        adjustment: the offset step.
+        table: strain over stress of the kept particles.
+        shape: `a` by the full objective; the one in `law`, unless the reference objective was asked for.
+        shape_reference: `a` by the reference-particle objective, None if it could not be fitted.
+        objective: which of the two is in `law`.
+        master: the master curve under that `a`.
+        plastic: log-normal C1, C3, C5.
+        elastic: the effective modulus.
+        law: the mean law.
+        particles: one entry per particle of the campaign, None where it was not kept.
+        displacement_noise_um: standard deviation of displacement from point to point [um], for comparison with the
+            residuals.
+        seed: kept for the record; nothing here is random.
+        runtime_s: time taken.
+    """
+
+    campaign: Campaign
+    adjustment: Adjustment
+    table: StrainTable
+    shape: ShapeFit
+    shape_reference: ShapeFit | None
+    objective: Objective
+    master: MasterCurve
+    plastic: PlasticFit
+    elastic: ElasticFit
+    law: MccLaw
+    particles: tuple[ParticleFit | None, ...]
+    displacement_noise_um: float
+    seed: int
+    runtime_s: float
+
+    @property
+    def a(self) -> float:
+        """The shape parameter in use [-]."""
+        return float(self.law.a)
+
+    @property
+    def converged(self) -> bool:
+        """Whether shape parameter and modulus both converged."""
+        return self._chosen.converged and self.elastic.converged
+
+    @property
+    def _chosen(self) -> ShapeFit:
+        return self.shape if self.objective == "full" or self.shape_reference is None else self.shape_reference
+
+    def warnings(self) -> list[str]:
+        """What a reader of the numbers must know, one sentence each."""
+        notes = [reason for reason in (self._chosen.reason, self.elastic.reason) if reason]
+        if self.plastic.at_bound:
+            notes.append(
+                f"{', '.join(self.plastic.at_bound)} ended at the lower bound: a collapsed estimate, not a measurement"
+            )
+        if not bool(self.law.is_monotone):
+            notes.append("the mean law is not monotone: under load control it snaps through")
+        share = float(self.plastic.population.probability_not_monotone)
+        if share > 0.05:
+            notes.append(
+                f"{100 * share:.0f} % of particles drawn from this population would have a law that is not monotone"
+            )
+        dropped = int((~self.adjustment.kept).sum())
+        if dropped:
+            notes.append(f"{dropped} of {len(self.campaign)} particles could not be used")
+        if self.own_misfit > BAD_MISFIT:
+            notes.append(
+                f"even with its own C1, C3, C5 the law misses a test's displacements by {100 * self.own_misfit:.0f} % of their "
+                "range (median): it describes these tests badly, or they are no compressions of single particles"
+            )
+        return notes
+
+    @property
+    def relative_misfit(self) -> float:
+        """Median over the kept particles of `rms_um` over the range of displacement [-]."""
+        fits = [p for p in self.particles if p is not None and p.used.any()]
+        return (
+            float(np.median([p.rms_um / max(np.ptp(p.measured_um[p.used]), 1e-300) for p in fits])) if fits else np.nan
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """The contents of `calibration.json`."""
+        population = self.plastic.population
+        eta = np.asarray(eqx.filter_vmap(self.law.shape_factor)(particle_batch(self.campaign.diameters_um)))
+        entries = []
+        for i, name in enumerate(self.campaign.particles):
+            fit = self.particles[i]
+            C1, C3, C5 = fit.plastic if fit else (None, None, None)
+            entries.append(
+                {
+                    "particle": name,
+                    "eta_p": estimate(float(eta[i])),
+                    "C1": estimate(C1),
+                    "C3": estimate(C3),
+                    "C5": estimate(C5),
+                    "zero_um": estimate(fit.zero_um if fit else None),
+                    "rms_um": fit.rms_um if fit else None,
+                    "own_rms_um": fit.own_rms_um if fit else None,
+                    "kept": fit is not None,
+                    "why_not": self.adjustment.why_not[i],
+                }
+            )
+        reference = self.shape_reference
+        return {
+            "schema": 1,
+            "method": "paper",
+            "converged": self.converged,
+            "runtime_s": self.runtime_s,
+            "seed": self.seed,
+            "law": {"unloading": self.law.unloading.value, "strain_scaling": self.law.strain_scaling.value},
+            "a": estimate(self.a),
+            "a_objective": self.objective,
+            "a_full": estimate(self.shape.a),
+            "a_reference": estimate(reference.a if reference else None),
+            "reference_particle": None
+            if reference is None or reference.reference is None
+            else self.campaign.particles[reference.reference],
+            "effective_modulus_MPa": estimate(self.elastic.effective_modulus_MPa),
+            **{
+                f"log_{name}": {"mean": estimate(float(c.mean)), "sd": estimate(float(c.sd))}
+                for name, c in (("C1", population.C1), ("C3", population.C3), ("C5", population.C5))
+            },
+            "yield_stress_MPa": estimate(float(population.yield_stress)),
+            "probability_not_monotone": estimate(float(population.probability_not_monotone)),
+            "noise": {"displacement_um": estimate(self.displacement_noise_um)},
+            "adjustment": {"threshold_MPa": self.adjustment.threshold_MPa, "strain": self.adjustment.strain},
+            "particles": entries,
+            "warnings": self.warnings(),
+            "diagnostics": {
+                "rhat_max": None,
+                "ess_bulk_min": None,
+                "divergences": None,
+                "pareto_k_max": None,
+                "a_objective_value": self._chosen.objective,
+                "a_objective_value_at_zero": self._chosen.objective_at_zero,
+                "master_rms_MPa": self.plastic.rms_MPa,
+                "elastic_rms_strain": self.elastic.rms_strain if self.elastic.branches else None,
+                "elastic_branches": len(self.elastic.branches),
+                "relative_misfit": self.relative_misfit,
+                "own_misfit": self.own_misfit,
+            },
+        }
+
+
+def calibrate_paper(
+    campaign: Campaign,
+    *,
+    threshold_MPa: float = THRESHOLD_MPA,
+    objective: Objective = "full",
+    reference: str | None = None,
+    unloading: Unloading = Unloading.PRINTED,
+    strain_scaling: StrainScaling = StrainScaling.RAW,
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> PaperCalibration:
+    """The paper's calibration: offset step, shape parameter, master curve, plastic coefficients, effective modulus.
+
+    Args:
+        campaign: the tests.
+        threshold_MPa: stress of the offset step [MPa]; 0 leaves it out (and removes its bias on `a`).
+        objective: "full" or "reference", which objective's `a` the rest is built on; both are fitted and reported.
+        reference: name of the reference particle; by the paper's rule if None.
+        unloading: form of unloading that the modulus belongs to.
+        strain_scaling: how the shape factor enters unloading.
+        seed: kept for the record.
+        progress: called with the name of each step.
+
+    Raises:
+        InputError: if no two particles can be used, or the reference particle is unknown or unusable.
+
+    References:
+        Bommireddy et al. (2018), sections 3 to 6.
+    """
+    started = time.perf_counter()
+    tell = progress or (lambda _: None)
+    tell("adjusting the curves")
+    adjustment = adjust(campaign, threshold_MPa)
+    if adjustment.kept.sum() < 2:
+        reasons = "; ".join(
+            f"particle {n!r} {r}" for n, r in zip(campaign.particles, adjustment.why_not, strict=True) if r is not None
+        )
+        raise InputError(
+            f"the calibration needs two usable particles or more, {int(adjustment.kept.sum())} can be used ({reasons})",
+            file=campaign.source or None,
+            remedy="Check the diameters (they turn force into stress), or lower the threshold.",
+        )
+    table = strain_table(adjustment, campaign.diameters_um)
+    tell("fitting the shape parameter")
+    shape = fit_shape_parameter(table)
+    shape_reference = _reference_fit(campaign, table, objective, reference)
+    chosen = shape_reference if objective == "reference" and shape_reference is not None else shape
+    tell("fitting the plastic coefficients")
+    master = master_curve(table, chosen.a)
+    plastic = fit_population(master, adjustment.threshold_MPa)
+    tell("fitting the effective modulus")
+    D1, D2, D3 = campaign.diameters_um.T
+    eta = 1 + chosen.a * (1 - D3**2 / (D1 * D2))
+    branches = [
+        b
+        for i in np.flatnonzero(adjustment.kept)
+        for b in elastic_branches(int(i), campaign.curves[i], campaign.diameters_um[i], float(adjustment.shift[i]))
+    ]
+    elastic = fit_effective_modulus(branches, eta, unloading, strain_scaling)
+    # Without any unloading the modulus cannot matter to a prediction; a stiff one keeps the law defined.
+    modulus = elastic.effective_modulus_MPa if elastic.effective_modulus_MPa is not None else 1e9
+    law = MccLaw(plastic.population.mean_law, chosen.a, modulus, unloading, strain_scaling)
+    tell("predicting every particle")
+    particles = _predict(campaign, adjustment, law, eta)
+    noise = float(np.median([_point_noise(curve) for curve in campaign.curves]))
+    return PaperCalibration(
+        campaign,
+        adjustment,
+        table,
+        shape,
+        shape_reference,
+        objective,
+        master,
+        plastic,
+        elastic,
+        law,
+        particles,
+        noise,
+        seed,
+        time.perf_counter() - started,
+    )
+
+
+def _reference_fit(campaign: Campaign, table: StrainTable, objective: Objective, name: str | None) -> ShapeFit | None:
+    index = None
+    if name is not None:
+        if name not in campaign.particles:
+            raise InputError(
+                f"there is no particle {name!r} to serve as reference",
+                file=campaign.source or None,
+                remedy=f"Name one of: {', '.join(campaign.particles)}.",
+            )
+        index = campaign.index(name)
+        if index not in table.index:
+            raise InputError(
+                f"the reference particle {name!r} cannot be used",
+                file=campaign.source or None,
+                remedy="Name another one, or leave the choice to the paper's rule.",
+            )
+    elif len(table.index) < 3 and objective == "full":
+        return None
+    return fit_shape_parameter(table, "reference", index)
+
+
+def _point_noise(curve: Curve) -> float:
+    """Standard deviation of displacement from point to point: second differences cancel any smooth course."""
+    if len(curve) < 4:
+        return 0.0
+    second = np.diff(curve.displacement_um, 2)
+    return float(np.median(np.abs(second - np.median(second))) / 0.6745 / np.sqrt(6))
+
+
+def _predict(
+    campaign: Campaign, adjustment: Adjustment, law: MccLaw, eta: np.ndarray
+) -> tuple[ParticleFit | None, ...]:
+    kept = np.flatnonzero(adjustment.kept)
+    own = []
+    for i in kept:
+        curve = adjustment.curves[i]
+        assert curve is not None
+        # Residuals are relative: below a fiftieth of the peak they would be those of the force read-out.
+        use = curve.stress_MPa >= max(adjustment.threshold_MPa, 0.02 * curve.stress_max_MPa)
+        own.append(fit_polynomial(eta[i] * curve.strain[use], curve.stress_MPa[use]))
+    plastic = eqx.filter_vmap(Plastic.from_polynomial)(*jnp.asarray(own).T)
+    longest = max(len(campaign.curves[i]) for i in kept)
+    # Lengths in steps of 64: campaigns of similar length then share one compilation.
+    longest += -longest % 64
+    forces = jnp.asarray(
+        [np.pad(campaign.curves[i].force_mN, (0, longest - len(campaign.curves[i])), mode="edge") for i in kept]
+    )
+    sizes = particle_batch(campaign.diameters_um[kept])
+    same = eqx.filter_vmap(lambda one: eqx.tree_at(lambda each: each.plastic, law, one))(plastic)
+    mean = eqx.filter_vmap(lambda _: law)(plastic.C1)
+    by_mean = np.asarray(simulate_batch(mean, sizes, forces, control="load").displacement)
+    by_own = np.asarray(simulate_batch(same, sizes, forces, control="load").displacement)
+    fits: list[ParticleFit | None] = [None] * len(campaign)
+    for row, i in enumerate(kept):
+        curve = campaign.curves[i]
+        stress, strain = stress_and_strain(curve, campaign.diameters_um[i])
+        measured = (strain + adjustment.shift[i]) * effective_diameter_um(campaign.diameters_um[i])
+        touching = np.ones(len(curve), bool)
+        for segment in find_segments(curve):
+            if segment.kind == "approach":
+                touching[segment.start : segment.stop] = False
+        used = touching & (stress > max(adjustment.threshold_MPa, 0.02 * stress.max()))
+        predicted, with_own = by_mean[row, : len(curve)], by_own[row, : len(curve)]
+        fits[i] = ParticleFit(
+            (float(plastic.C1[row]), float(plastic.C3[row]), float(plastic.C5[row])),
+            float(curve.displacement_um[0] - measured[0]),
+            measured,
+            predicted,
+            with_own,
+            used,
+            _rms(measured - predicted, used),
+            _rms(measured - with_own, used),
+        )
+    return tuple(fits)
+
+
+def _rms(deviation: np.ndarray, used: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(deviation[used] ** 2))) if used.any() else float("nan")

@@ -1,0 +1,29 @@
+"""Measured (or simulated) tests on single particles: reading, checking, converting and segmenting them."""
+
+from ._adjustment import THRESHOLD_MPA as THRESHOLD_MPA
+from ._adjustment import Adjustment as Adjustment
+from ._adjustment import LoadingCurve as LoadingCurve
+from ._adjustment import adjust as adjust
+from ._adjustment import effective_diameter_um as effective_diameter_um
+from ._adjustment import loading_curve as loading_curve
+from ._adjustment import stress_and_strain as stress_and_strain
+from ._batch import Batch as Batch
+from ._batch import batch as batch
+from ._batch import particle_batch as particle_batch
+from ._csv import read_campaign as read_campaign
+from ._paper import PAPER_DIAMETERS_UM as PAPER_DIAMETERS_UM
+from ._paper import PAPER_EFFECTIVE_MODULUS_MPA as PAPER_EFFECTIVE_MODULUS_MPA
+from ._paper import PAPER_LOAD_RATE_MN_PER_S as PAPER_LOAD_RATE_MN_PER_S
+from ._paper import PAPER_LOG_C as PAPER_LOG_C
+from ._paper import PAPER_SHAPE_PARAMETER as PAPER_SHAPE_PARAMETER
+from ._schema import Campaign as Campaign
+from ._schema import Control as Control
+from ._schema import Curve as Curve
+from ._schema import Metadata as Metadata
+from ._segments import Segment as Segment
+from ._segments import SegmentKind as SegmentKind
+from ._segments import find_segments as find_segments
+from ._segments import summarise_segments as summarise_segments
+from ._write import write_campaign as write_campaign
+from .readers import read_diameters as read_diameters
+from .readers import read_tester_file as read_tester_file

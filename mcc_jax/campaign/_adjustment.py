@@ -1,0 +1,166 @@
+"""Loading curves as strain over stress, and the paper's removal of the first, uncharacterised contact."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ._schema import Campaign, Curve
+from ._segments import find_segments
+
+THRESHOLD_MPA = 0.2
+"""Stress [MPa] below which surface irregularities, not the particle, deform (Bommireddy et al. 2018, section 3)."""
+
+
+@dataclass(frozen=True)
+class LoadingCurve:
+    r"""Strain at which virgin loading first reached a stress, :math:`\epsilon_i(\sigma)`.
+
+    Attributes:
+        stress_MPa: increasing stresses [MPa], shape (n,), n >= 2.
+        strain: the strains there [-], from the test's zero of displacement.
+    """
+
+    stress_MPa: np.ndarray
+    strain: np.ndarray
+
+    @property
+    def stress_max_MPa(self) -> float:
+        """The largest stress that was reached [MPa]."""
+        return float(self.stress_MPa[-1])
+
+    def at(self, stress_MPa: np.ndarray | float) -> np.ndarray:
+        """Strain at the stresses, linear between measured points; NaN beyond the largest stress that was measured."""
+        return np.asarray(np.interp(stress_MPa, self.stress_MPa, self.strain, right=np.nan), dtype=float)
+
+
+def effective_diameter_um(diameters_um: np.ndarray) -> float:
+    """D_e = D1 D2 / D3 [um] of one particle's three diameters [um]."""
+    D1, D2, D3 = diameters_um
+    return float(D1 * D2 / D3)
+
+
+def stress_and_strain(curve: Curve, diameters_um: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    r"""Effective stress [MPa] and strain [-] of every point of a test.
+
+    .. math:: \sigma = F / (\pi R_e^2), \qquad \epsilon = (\gamma - \gamma_0) / D_e
+
+    Strain counts from :math:`\gamma_0`, the platen's position at first contact: where the approach ends if the record
+    has one, the tester's own zero otherwise.
+
+    References:
+        Bommireddy et al. (2018), eqs. 4 and 5.
+    """
+    diameter = effective_diameter_um(diameters_um)
+    segments = find_segments(curve)
+    zero = curve.displacement_um[segments[0].stop] if segments[0].kind == "approach" and len(segments) > 1 else 0.0
+    return 1e3 * curve.force_mN / (np.pi * diameter**2 / 4), (curve.displacement_um - zero) / diameter
+
+
+def loading_curve(curve: Curve, diameters_um: np.ndarray) -> LoadingCurve | None:
+    """The virgin loading of a test, over all its cycles, as strain over stress.
+
+    Force is made monotone by isotonic regression, which, unlike a running maximum, is not lifted by noise; points that
+    share one force are averaged.
+
+    Returns:
+        The curve, or None if the test never loads.
+    """
+    from scipy.optimize import isotonic_regression  # half a second to import, so only where it is used
+
+    segments = [s for s in find_segments(curve) if s.kind == "load"]
+    if not segments:
+        return None
+    rows = np.concatenate([np.arange(s.start, s.stop) for s in segments])
+    stress, strain = stress_and_strain(curve, diameters_um)
+    fit = isotonic_regression(stress[rows])
+    starts = fit.blocks[:-1]
+    level = np.asarray(fit.x)[starts]
+    mean_strain = np.add.reduceat(strain[rows], starts) / np.diff(fit.blocks)
+    positive = level > 0
+    level, mean_strain = level[positive], mean_strain[positive]
+    if len(level) < 2:
+        return None
+    return LoadingCurve(np.concatenate([[0.0], level]), np.concatenate([[min(0.0, mean_strain[0])], mean_strain]))
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """The paper's offset step for a whole campaign.
+
+    Attributes:
+        curves: adjusted loading curve of every particle that is kept, None for the others.
+        shift: what was added to each particle's strain [-], shape (N,); 0 where not kept.
+        threshold_MPa: the stress at which all adjusted curves meet; 0 if no offset step was made.
+        strain: their common strain there, the mean over the particles.
+        why_not: for each particle, None if kept, else the reason.
+    """
+
+    curves: tuple[LoadingCurve | None, ...]
+    shift: np.ndarray
+    threshold_MPa: float
+    strain: float
+    why_not: tuple[str | None, ...]
+
+    @property
+    def kept(self) -> np.ndarray:
+        """Which particles are kept, booleans of shape (N,)."""
+        return np.array([reason is None for reason in self.why_not])
+
+
+def adjust(campaign: Campaign, threshold_MPa: float = THRESHOLD_MPA) -> Adjustment:
+    r"""Shift every curve so that at the threshold stress all share the mean strain; below it, a straight line.
+
+    .. math:: \epsilon_i \leftarrow \epsilon_i - \epsilon_i(\sigma_t) + \bar\epsilon_t, \qquad
+        \bar\epsilon_t = \tfrac1N \sum_j \epsilon_j(\sigma_t)
+
+    The step also removes true differences in shape below the threshold, which biases `a`; see `calibrate`'s
+    documentation for how much. `threshold_MPa = 0` leaves every curve as measured.
+
+    Args:
+        campaign: the tests; its raw data are not touched.
+        threshold_MPa: stress [MPa], 0.2 in the paper.
+
+    Raises:
+        ValueError: if the threshold is negative or not finite.
+
+    References:
+        Bommireddy et al. (2018), section 3.
+    """
+    if not (np.isfinite(threshold_MPa) and threshold_MPa >= 0):
+        raise ValueError(f"the threshold must be a stress >= 0 MPa, got {threshold_MPa}")
+    raw = [loading_curve(curve, d) for curve, d in zip(campaign.curves, campaign.diameters_um, strict=True)]
+    why_not: list[str | None] = []
+    for curve in raw:
+        if curve is None:
+            why_not.append("no loading found")
+        elif curve.stress_max_MPa <= threshold_MPa:
+            why_not.append(f"reaches {curve.stress_max_MPa:.3g} MPa only, not the threshold of {threshold_MPa:g} MPa")
+        else:
+            why_not.append(None)
+    if threshold_MPa == 0:
+        return Adjustment(tuple(raw), np.zeros(len(raw)), 0.0, 0.0, tuple(why_not))
+    at_threshold = np.array(
+        [
+            float(c.at(threshold_MPa)) if c is not None and r is None else np.nan
+            for c, r in zip(raw, why_not, strict=True)
+        ]
+    )
+    if np.isnan(at_threshold).all():
+        return Adjustment((None,) * len(raw), np.zeros(len(raw)), threshold_MPa, 0.0, tuple(why_not))
+    mean = float(np.nanmean(at_threshold))
+    shift = np.where(np.isnan(at_threshold), 0.0, mean - at_threshold)
+    adjusted: list[LoadingCurve | None] = []
+    for curve, reason, offset in zip(raw, why_not, shift, strict=True):
+        if curve is None or reason is not None:
+            adjusted.append(None)
+            continue
+        above = curve.stress_MPa > threshold_MPa
+        adjusted.append(
+            LoadingCurve(
+                np.concatenate([[0.0, threshold_MPa], curve.stress_MPa[above]]),
+                np.concatenate([[0.0, mean], curve.strain[above] + offset]),
+            )
+        )
+    return Adjustment(tuple(adjusted), shift, threshold_MPa, mean, tuple(why_not))

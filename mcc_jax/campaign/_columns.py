@@ -1,0 +1,126 @@
+"""Column names that carry their unit: `force_mN`, `displacement_um`, `time_s`, `D1_um`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from difflib import get_close_matches
+from fractions import Fraction
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .._errors import InputError
+
+FORCE, LENGTH, TIME = "force", "length", "time"
+CANONICAL = {FORCE: "mN", LENGTH: "um", TIME: "s"}
+EXAMPLES = {FORCE: "mN, N, uN, kN, gf", LENGTH: "um, nm, mm, m", TIME: "s, ms, min"}
+# A larger magnitude (in mN, um or s) is a wrong unit or a damaged cell, and its powers would overflow further on.
+LARGEST_MAGNITUDE = 1e15
+_UNIT = re.compile(r"[A-Za-zµμ]{1,24}")
+
+
+@cache
+def _registry() -> Any:
+    from pint import UnitRegistry  # slow to import, and needed for other than the usual units only
+
+    # Fractions keep nm -> um at exactly 1/1000.
+    registry: Any = UnitRegistry
+    return registry(non_int_type=Fraction)
+
+
+@cache
+def unit_factor(unit: str, dimension: str) -> Fraction:
+    """How many canonical units (mN, um, s) one `unit` is.
+
+    Args:
+        unit: a unit's symbol or name, letters only.
+        dimension: "force", "length" or "time".
+
+    Raises:
+        ValueError: if the unit is unknown or measures something else; the text says which.
+    """
+    canonical = CANONICAL[dimension]
+    if unit == canonical:
+        return Fraction(1)
+    if _UNIT.fullmatch(unit) is None:
+        raise ValueError(f"{unit!r} is not a unit")
+    registry = _registry()
+    try:
+        quantity = registry.Quantity(Fraction(1), registry.Unit(unit))
+    # Pint reports an unknown name through many exception types, some of them from Python's tokenizer.
+    except Exception:
+        raise ValueError(f"the unit {unit!r} is unknown") from None
+    if quantity.dimensionality != registry.Unit(canonical).dimensionality:
+        raise ValueError(f"{unit!r} is no unit of {dimension}")
+    return Fraction(quantity.to(canonical).magnitude)
+
+
+def convert(values: np.ndarray, factor: Fraction) -> np.ndarray:
+    """`values * factor`, rounded once where the factor is a whole number or the inverse of one."""
+    if factor == 1:
+        return values
+    with np.errstate(over="ignore"):  # the caller checks the size and names the row
+        if factor.numerator == 1:
+            return values / float(factor.denominator)
+        return values * float(factor)
+
+
+def find_column(
+    header: Sequence[str], quantity: str, dimension: str, file: str | Path, *, what: str = "column"
+) -> tuple[int, Fraction]:
+    """Where `quantity` stands in a header, and the factor that turns its unit into the canonical one.
+
+    Args:
+        header: the names, already stripped of blanks.
+        quantity: the name without its unit, e.g. "force".
+        dimension: "force", "length" or "time".
+        file: for messages.
+        what: what the names are called in messages.
+
+    Raises:
+        InputError: if the quantity is missing, stands there twice, or has no unit or a wrong one.
+    """
+    expected = f"{quantity}_{CANONICAL[dimension]}"
+    allowed = f"accepted units, as a suffix: {EXAMPLES[dimension]} (for example {expected})"
+    found = [i for i, name in enumerate(header) if name.rpartition("_")[0] == quantity]
+    if len(found) > 1:
+        both = " and ".join(header[i] for i in found)
+        raise InputError(
+            f"{quantity} is given {len(found)} times", file=file, row=_row(what), column=both, remedy="Keep one of them"
+        )
+    if found:
+        name = header[found[0]]
+        try:
+            return found[0], unit_factor(name.rpartition("_")[2], dimension)
+        except ValueError as error:
+            raise InputError(
+                str(error), file=file, row=_row(what), column=name, remedy=allowed[0].upper() + allowed[1:]
+            ) from None
+    if quantity in header:
+        raise InputError(
+            "the unit is missing", file=file, row=_row(what), column=quantity, remedy=f"Name it {expected}; {allowed}"
+        )
+    raise missing_column(header, expected, file, what=what, hint=allowed)
+
+
+def missing_column(
+    header: Sequence[str], expected: str, file: str | Path, *, what: str = "column", hint: str | None = None
+) -> InputError:
+    """The error for a column that is not there, with the nearest name that is."""
+    lower = {name.lower(): name for name in reversed(header)}
+    close = get_close_matches(expected.lower(), list(lower), n=1, cutoff=0.6)
+    there = ", ".join(header[:12]) + (", ..." if len(header) > 12 else "")
+    remedy = f"Did you mean {expected!r} by {lower[close[0]]!r}? Rename it" if close else f"Add it; there are: {there}"
+    return InputError(
+        f"the {what} {expected!r} is missing",
+        file=file,
+        row=_row(what),
+        remedy=remedy + (f"; {hint}" if hint else ""),
+    )
+
+
+def _row(what: str) -> int | None:
+    return 1 if what == "column" else None

@@ -1,0 +1,148 @@
+"""Reading a campaign: a folder with `particles.csv`, `curves.csv` and, optionally, `campaign.toml`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from difflib import get_close_matches
+from pathlib import Path
+
+import numpy as np
+
+from .._errors import InputError
+from ._columns import LENGTH, convert, find_column
+from ._curves import PARTICLES, CurveRows, name_column, read_curves
+from ._metadata import parse_metadata
+from ._schema import Campaign
+from ._table import Table, decode, read_bytes, read_table
+from ._validate import check_magnitudes
+
+CURVES, METADATA = "curves.csv", "campaign.toml"
+
+
+def read_campaign(folder: str | os.PathLike[str]) -> Campaign:
+    """Read a campaign folder and check all of it.
+
+    Lengths become um, forces mN, times s, whatever units the columns are named with. Rows of different particles
+    may be mixed; within a particle they must be in the order of time. Particles keep the order of `particles.csv`.
+
+    Args:
+        folder: the folder that holds `particles.csv`, `curves.csv` and perhaps `campaign.toml`.
+
+    Returns:
+        The campaign, with every value finite, every diameter positive and every curve at least two rows long.
+
+    Raises:
+        InputError: if anything is missing, damaged or contradictory; it names file, row and column.
+    """
+    path = Path(folder)
+    _check_folder(path)
+    table = read_table(path / PARTICLES)
+    names, diameters, columns = _read_particles(table)
+    curves = read_curves(path / CURVES)
+    _check_match(table, names, curves, path)
+    metadata_file = path / METADATA
+    toml = decode(read_bytes(metadata_file), metadata_file) if _has_content(metadata_file) else ""
+    campaign = Campaign(
+        particles=names,
+        diameters_um=diameters,
+        curves=tuple(curves.curve(name) for name in names),
+        columns=columns,
+        metadata=parse_metadata(toml, metadata_file),
+        source=str(path),
+    )
+    for name, curve in zip(names, campaign.curves, strict=True):
+        curves.check(name, curve)
+    return campaign
+
+
+def _check_folder(path: Path) -> None:
+    expected = f"a campaign is a folder with {PARTICLES} and {CURVES}"
+    try:
+        if not path.exists():
+            raise InputError("there is no such folder", file=path, remedy=f"Check the path; {expected}")
+        if not path.is_dir():
+            raise InputError(
+                "is a file, not a campaign folder",
+                file=path,
+                remedy=f"{expected.capitalize()}; mcc-jax convert makes one of a tester's file",
+            )
+        there = sorted(entry.name for entry in path.iterdir())
+    except OSError as error:
+        raise InputError(
+            f"cannot be read: {error.strerror or error}", file=path, remedy="Check the permissions"
+        ) from None
+    for name in (PARTICLES, CURVES):
+        if name not in there:
+            lower = {entry.lower(): entry for entry in there}
+            close = get_close_matches(name, list(lower), n=1, cutoff=0.8)
+            found = ", ".join(there[:8]) + (", ..." if len(there) > 8 else "") if there else "nothing"
+            remedy = f"Rename {lower[close[0]]!r} to it" if close else f"Expected: {expected}; found: {found}"
+            raise InputError(f"{name} is missing", file=path, remedy=remedy)
+
+
+def _has_content(file: Path) -> bool:
+    return file.is_file() and file.stat().st_size > 0 if file.exists() else False
+
+
+def _read_particles(table: Table) -> tuple[tuple[str, ...], np.ndarray, dict[str, tuple[str, ...]]]:
+    where = name_column(table.header, table.file)
+    names = _checked_names(table.text(where), table)
+    used, diameters = [where], []
+    for quantity in ("D1", "D2", "D3"):
+        column, factor = find_column(table.header, quantity, LENGTH, table.file)
+        values = convert(table.numbers(column), factor)
+        check_magnitudes(values, table.file, table.rows, table.header[column], diameter=True)
+        used.append(column)
+        diameters.append(values)
+    columns = {name: tuple(table.text(i)) for i, name in enumerate(table.header) if i not in used}
+    return names, np.stack(diameters, axis=-1), columns
+
+
+def _checked_names(names: list[str], table: Table) -> tuple[str, ...]:
+    seen: dict[str, int] = {}
+    for i, name in enumerate(names):
+        row = table.rows[i]
+        if not name.strip():
+            raise InputError(
+                "the name is empty", file=table.file, row=row, column="particle", remedy="Name the particle"
+            )
+        if name in seen:
+            raise InputError(
+                f"the particle {name!r} is already in row {seen[name]}",
+                file=table.file,
+                row=row,
+                column="particle",
+                remedy="Give every particle one row",
+            )
+        seen[name] = row
+    return tuple(names)
+
+
+def _check_match(table: Table, names: tuple[str, ...], curves: CurveRows, path: Path) -> None:
+    for i, name in enumerate(names):
+        if name not in curves.groups:
+            raise InputError(
+                f"the particle {name!r} has no curve in {CURVES}",
+                file=table.file,
+                row=table.rows[i],
+                column="particle",
+                remedy=_similar(name, curves.groups) or f"Add its rows to {CURVES} or remove it here",
+            )
+    known = set(names)
+    for name, records in curves.groups.items():
+        if name not in known:
+            raise InputError(
+                f"the particle {name!r} is not in {PARTICLES}",
+                file=path / CURVES,
+                row=curves.row(int(records[0])),
+                column="particle",
+                remedy=_similar(name, names) or f"Add its diameters to {PARTICLES} or remove its rows here",
+            )
+
+
+def _similar(name: str, others: Sequence[str] | dict[str, np.ndarray]) -> str | None:
+    for other in others:
+        if other.strip() == name.strip():
+            return f"The other file has {other!r}; mind the blanks"
+    return None

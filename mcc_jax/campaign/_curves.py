@@ -1,0 +1,199 @@
+"""`curves.csv`: rows of many particles, checked and grouped."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .._errors import InputError
+from ._columns import FORCE, LARGEST_MAGNITUDE, LENGTH, TIME, convert, find_column, missing_column
+from ._schema import Curve
+from ._table import decode, parse_table, read_bytes
+from ._validate import check_magnitudes
+
+PARTICLES = "particles.csv"
+_QUANTITIES = (("time", TIME), ("force", FORCE), ("displacement", LENGTH))
+
+
+@dataclass(frozen=True)
+class CurveRows:
+    """The rows of `curves.csv`, grouped by particle; the table itself is parsed for messages only."""
+
+    file: Path
+    header: tuple[str, ...]
+    columns: tuple[int, ...]  # of time, force and displacement
+    values: np.ndarray  # (3, rows of data), canonical units
+    groups: dict[str, np.ndarray]  # name -> indices of its records, in the order of the file
+    text: str
+
+    def curve(self, name: str) -> Curve:
+        return Curve(*(np.ascontiguousarray(column[self.groups[name]]) for column in self.values))
+
+    def row(self, record: int) -> int:
+        return parse_table(self.text, self.file).rows[record]
+
+    def check(self, name: str, curve: Curve) -> None:
+        records = self.groups[name]
+        if len(curve) < 2:
+            raise InputError(
+                f"the particle {name!r} has one row only",
+                file=self.file,
+                row=self.row(int(records[0])),
+                column="particle",
+                remedy="A curve needs at least two rows; add them or remove the particle",
+            )
+        back = np.flatnonzero(np.diff(curve.time_s) < 0)
+        if len(back):
+            i = int(back[0])
+            raise InputError(
+                f"the time of {name!r} goes back, from {curve.time_s[i]:.10g} s to {curve.time_s[i + 1]:.10g} s",
+                file=self.file,
+                row=self.row(int(records[i + 1])),
+                column=self.header[self.columns[0]],
+                remedy="Keep each particle's rows in the order of time; two tests need two names",
+            )
+        for quantity, column, values in (
+            ("force", self.columns[1], curve.force_mN),
+            ("displacement", self.columns[2], curve.displacement_um),
+        ):
+            if not values.any():
+                raise InputError(
+                    f"every {quantity} of particle {name!r} is zero, so the test holds no data",
+                    file=self.file,
+                    row=self.row(int(records[0])),
+                    column=self.header[column],
+                    remedy="Export the test again or remove the particle",
+                )
+
+
+def read_curves(file: Path) -> CurveRows:
+    data = read_bytes(file)
+    text = decode(data, file)
+    first = re.split(r"[\r\n]", text, maxsplit=1)[0]
+    layout = _curve_layout(parse_table(f"{first}\n{first}", file).header, file) if first else None
+    fast = _split_fast(text, layout) if layout is not None else None
+    if layout is None or fast is None:
+        table = parse_table(text, file)
+        layout = _curve_layout(table.header, file)
+        names = table.text(layout.name)
+        raw = [table.numbers(column) for column in layout.columns]
+        groups = _group(names)
+    else:
+        raw, groups = fast
+    values = np.stack([convert(column, factor) for column, factor in zip(raw, layout.factors, strict=True)])
+    curves = CurveRows(file, layout.header, layout.columns, values, groups, text)
+    if np.abs(values).max() > LARGEST_MAGNITUDE:
+        rows = parse_table(text, file).rows
+        for column, of in zip(values, layout.columns, strict=True):
+            check_magnitudes(column, file, rows, layout.header[of])
+    for name, records in groups.items():
+        if not name.strip():
+            raise InputError(
+                "the name is empty",
+                file=file,
+                row=curves.row(int(records[0])),
+                column="particle",
+                remedy="Name the particle",
+            )
+    return curves
+
+
+@dataclass(frozen=True)
+class _Layout:
+    header: tuple[str, ...]
+    name: int
+    columns: tuple[int, ...]
+    factors: tuple[Fraction, ...]
+
+
+def _curve_layout(header: tuple[str, ...], file: Path) -> _Layout:
+    name = name_column(header, file)
+    found = [find_column(header, quantity, dimension, file) for quantity, dimension in _QUANTITIES]
+    columns = tuple(column for column, _ in found)
+    for i, other in enumerate(header):
+        if i != name and i not in columns:
+            raise InputError(
+                "is no column of curves",
+                file=file,
+                row=1,
+                column=other,
+                remedy=f"Keep particle, time, force and displacement; facts about a particle belong in {PARTICLES}",
+            )
+    return _Layout(header, name, columns, tuple(factor for _, factor in found))
+
+
+def _split_fast(text: str, layout: _Layout) -> tuple[list[np.ndarray], dict[str, np.ndarray]] | None:
+    """The same as the strict parser gives, by pandas' C parser, or None where that one could be lenient."""
+    import pandas as pd
+
+    data = text.encode()
+    count = _count_records(text, data, len(layout.header))
+    if count is None:
+        return None
+        # From pandas 3.1 on numbers are always rounded correctly, and the option is gone.
+    modern = tuple(int(part) for part in pd.__version__.split(".")[:2]) >= (3, 1)
+    exact: dict[str, Any] = {} if modern else {"float_precision": "round_trip"}
+    names = [str(i) for i in range(len(layout.header))]
+    types: dict[Hashable, Any] = {names[column]: "float64" for column in layout.columns}
+    types[names[layout.name]] = "category"
+    try:
+        frame = pd.read_csv(
+            io.BytesIO(data),
+            header=None,
+            skiprows=1,
+            names=names,
+            dtype=types,
+            index_col=False,
+            na_filter=False,
+            **exact,
+            engine="c",
+        )
+    except (ValueError, OverflowError):
+        return None
+    raw = [frame[names[column]].to_numpy() for column in layout.columns]
+    if len(frame) != count or not all(np.isfinite(column).all() for column in raw):
+        return None
+    particles = frame[names[layout.name]].cat
+    codes = particles.codes.to_numpy()
+    order = np.argsort(codes, kind="stable")
+    parts = np.split(order, np.flatnonzero(np.diff(codes[order])) + 1)
+    parts.sort(key=lambda part: int(part[0]))  # particles in the order in which they appear
+    categories = particles.categories.tolist()
+    return raw, {str(categories[codes[part[0]]]): part for part in parts}
+
+
+def _count_records(text: str, data: bytes, width: int) -> int | None:
+    """The number of records behind the header, or None unless every line is one record of `width` cells."""
+    if '"' in text:
+        try:
+            widths = [len(record) for record in csv.reader(io.StringIO(text, newline=""), strict=True) if record]
+        except csv.Error:
+            return None
+        return len(widths) - 1 if set(widths) == {width} else None
+    if b"\r" in data:
+        data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    cells = np.frombuffer(data.strip(b"\n"), np.uint8)
+    ends = np.append(np.flatnonzero(cells == ord("\n")), len(cells))
+    commas = np.diff(np.searchsorted(np.flatnonzero(cells == ord(",")), ends), prepend=0)
+    return len(ends) - 1 if len(ends) > 1 and (commas == width - 1).all() else None
+
+
+def _group(names: list[str]) -> dict[str, np.ndarray]:
+    members: dict[str, list[int]] = {}
+    for i, name in enumerate(names):
+        members.setdefault(name, []).append(i)
+    return {name: np.array(indices) for name, indices in members.items()}
+
+
+def name_column(header: Sequence[str], file: Path) -> int:
+    if "particle" not in header:
+        raise missing_column(header, "particle", file)
+    return list(header).index("particle")

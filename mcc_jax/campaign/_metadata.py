@@ -1,0 +1,191 @@
+"""`campaign.toml`: how the tests were made. Reading it strictly and writing it back."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import math
+import re
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+
+from .._errors import InputError
+from ._columns import FORCE, LENGTH, convert, find_column
+from ._schema import Control, Metadata
+
+_QUANTITIES = {"force_resolution": FORCE, "displacement_resolution": LENGTH, "punch_diameter": LENGTH}
+_WORDS = ("control", "provenance", "corrections")
+_BARE = re.compile(r"[A-Za-z0-9_-]+")
+
+
+def load_toml(text: str, file: Path) -> dict[str, Any]:
+    """Parse TOML.
+
+    Raises:
+        InputError: naming the line with the mistake.
+    """
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        place = re.search(r" \(at line (\d+), column \d+\)", str(error))
+        problem = str(error)[: place.start()] if place else str(error).removesuffix(" (at end of document)")
+        raise InputError(
+            f"this is not TOML: {problem}",
+            file=file,
+            row=int(place[1]) if place else text.rstrip().count("\n") + 1,
+            remedy='Write key = value lines, text in double quotes, for example control = "load"',
+        ) from None
+
+
+def parse_metadata(text: str, file: Path) -> Metadata:
+    """The metadata that a `campaign.toml` holds; keys it does not know go to `other`.
+
+    Args:
+        text: the file's text.
+        file: for messages.
+
+    Raises:
+        InputError: if it is not TOML, or a known key has a wrong type, value or unit.
+    """
+    entries = load_toml(text, file)
+    for key in entries:
+        for known in (*_WORDS, *_QUANTITIES):
+            if key != known and key.lower() == known:
+                raise InputError("is misspelt", file=file, column=key, remedy=f"Did you mean {known!r}?")
+    control = entries.pop("control", None)
+    if control is not None and control not in get_args(Control):
+        raise InputError(
+            f"{control!r} is no way of control", file=file, column="control", remedy='Write "load" or "displacement"'
+        )
+    provenance = entries.pop("provenance", None)
+    if provenance is not None and not isinstance(provenance, str):
+        raise InputError(
+            "must be text", file=file, column="provenance", remedy='Write it in quotes, provenance = "..."'
+        )
+    corrections = entries.pop("corrections", [])
+    if not isinstance(corrections, list) or not all(isinstance(name, str) for name in corrections):
+        raise InputError(
+            "must be a list of names",
+            file=file,
+            column="corrections",
+            remedy='Write corrections = ["frame_compliance"]',
+        )
+    return Metadata(
+        control=control,
+        force_resolution_mN=_positive(entries, "force_resolution", file),
+        displacement_resolution_um=_positive(entries, "displacement_resolution", file),
+        punch_diameter_um=_positive(entries, "punch_diameter", file),
+        provenance=provenance,
+        corrections=tuple(corrections),
+        other=entries,
+    )
+
+
+def _positive(entries: dict[str, Any], quantity: str, file: Path) -> float | None:
+    keys = list(entries)
+    if not any(key == quantity or key.rpartition("_")[0] == quantity for key in keys):
+        return None
+    where, factor = find_column(keys, quantity, _QUANTITIES[quantity], file, what="key")
+    key = keys[where]
+    value = entries.pop(key)
+    number = float("nan")
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        try:
+            number = float(convert(np.array([float(value)]), factor)[0])
+        except OverflowError:
+            number = math.inf
+    if not (0 < number < math.inf):
+        raise InputError(
+            f"{str(value)[:40]!r} is not a positive number",
+            file=file,
+            column=key,
+            remedy="Write the number alone, without quotes and unit, or remove the key",
+        )
+    return number
+
+
+def format_metadata(metadata: Metadata, file: Path) -> str:
+    """The text of a `campaign.toml` that reads back as the same metadata.
+
+    Args:
+        metadata: what to write.
+        file: for messages.
+
+    Raises:
+        InputError: if `other` holds what TOML cannot, or a key that has a meaning of its own.
+    """
+    known = {
+        "control": metadata.control,
+        "force_resolution_mN": metadata.force_resolution_mN,
+        "displacement_resolution_um": metadata.displacement_resolution_um,
+        "punch_diameter_um": metadata.punch_diameter_um,
+        "provenance": metadata.provenance,
+        "corrections": list(metadata.corrections) or None,
+    }
+    plain = {key: value for key, value in known.items() if value is not None}
+    tables: dict[str, Any] = {}
+    for key, value in metadata.other.items():
+        if not isinstance(key, str) or key in known:
+            raise InputError(f"{key!r} cannot be a key of its own", file=file, remedy="Rename it in Metadata.other")
+        (tables if isinstance(value, Mapping) else plain)[key] = value
+    try:
+        lines = [f"{_key(key)} = {_value(value)}" for key, value in plain.items()]
+        for key, table in tables.items():
+            lines += ["", f"[{_key(key)}]", *(f"{_key(k)} = {_value(v)}" for k, v in table.items())]
+        text = "".join(line + "\n" for line in lines)
+        text.encode("utf-8")
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"cannot be written as TOML: {error}", file=file, remedy="Keep text, numbers, dates, lists and tables"
+        ) from None
+    if parse_metadata(text, file).other != _plain(metadata.other) and not _has_nan(metadata.other):
+        raise InputError("would not read back the same", file=file, remedy="Rename the keys of Metadata.other")
+    return text
+
+
+def _key(key: Any) -> str:
+    if not isinstance(key, str):
+        raise TypeError(f"the key {key!r} is not text")
+    return key if _BARE.fullmatch(key) else _string(key)
+
+
+def _string(text: str) -> str:
+    # JSON escapes all that TOML wants escaped, but for DEL.
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _value(value: Any) -> str:
+    match value:
+        case bool():
+            return "true" if value else "false"
+        case str():
+            return _string(value)
+        case int():
+            return str(value)
+        case float():
+            return repr(float(value)) if math.isfinite(value) else str(float(value))
+        case datetime.datetime() | datetime.date() | datetime.time():
+            return value.isoformat()
+        case Mapping():
+            return "{" + ", ".join(f"{_key(k)} = {_value(v)}" for k, v in value.items()) + "}"
+        case list() | tuple():
+            return "[" + ", ".join(_value(v) for v in value) + "]"
+    raise TypeError(f"{type(value).__name__} {value!r} has no form in TOML")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def _has_nan(value: Any) -> bool:
+    if isinstance(value, Mapping):
+        return any(_has_nan(item) for item in value.values())
+    if isinstance(value, list | tuple):
+        return any(_has_nan(item) for item in value)
+    return isinstance(value, float) and math.isnan(value)

@@ -1,0 +1,122 @@
+"""Noise, turning points and monotone envelopes of a measured signal."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def noise_level(values: np.ndarray, span: float) -> float:
+    """Standard deviation of the noise, from differences that a smooth course does not show, plus rounding.
+
+    Args:
+        values: the signal, shape (n,).
+        span: its range.
+    """
+    scatter = 0.0
+    if len(values) >= 8:
+        # White noise of deviation 1 gives third differences of variance 1 + 9 + 9 + 1.
+        third = np.diff(values, 3)
+        scatter = 1.4826 * float(np.median(np.abs(third))) / np.sqrt(20.0)
+    return float(np.hypot(scatter, _resolution(values, span) / 2))
+
+
+def _resolution(values: np.ndarray, span: float) -> float:
+    """The step of a read-out that is rounded so coarsely that it stays and jumps; else 0."""
+    steps = np.abs(np.diff(values))
+    moves = steps > 1e-9 * span
+    if not moves.any():
+        return 0.0
+    smallest = float(steps[moves].min())
+    multiples = steps[moves] / smallest
+    whole = np.round(multiples)
+    if np.mean(np.abs(multiples - whole) < 0.01) <= 0.95:
+        return 0.0
+    # Even ramps also have few steps; but one that starts out of a hold jumps once, a rounded one again and again.
+    jumps = np.count_nonzero(moves[1:] & ~moves[:-1])
+    return smallest if jumps > 0.1 * len(multiples) or len(np.unique(whole)) > 2 else 0.0
+
+
+def steady_clock(time: np.ndarray) -> np.ndarray:
+    """Time with gaps shortened and repeats spread, so that dwelling is judged by samples that are there.
+
+    Args:
+        time: never decreasing, shape (n,).
+
+    Returns:
+        A strictly increasing clock in units of the typical interval.
+    """
+    steps = np.diff(time)
+    positive = steps[steps > 0]
+    if not len(positive):
+        return np.arange(len(time), dtype=float)
+    typical = float(np.median(positive))
+    intervals = np.maximum(np.minimum(steps, 5 * typical) / typical, 0.2)
+    return np.concatenate(([0.0], np.cumsum(intervals)))
+
+
+def turning_points(values: np.ndarray, depth: float) -> list[int]:
+    """Indices of the first sample, the turning points deeper than `depth`, and the last sample.
+
+    Of the local extremes, the pair with the smallest difference goes first, until every difference left is at
+    least `depth`; pairs that are smaller than both their neighbours go together.
+    """
+    count = len(values)
+    steps = np.diff(values)
+    moving = np.flatnonzero(steps)
+    turns = moving[1:][np.signbit(steps[moving[1:]]) != np.signbit(steps[moving[:-1]])]
+    index = np.concatenate(([0], turns, [count - 1]))
+    while len(index) > 2:
+        ranges = np.abs(np.diff(values[index]))
+        if ranges.min() >= depth:
+            break
+        left = np.concatenate(([np.inf], ranges[:-1]))
+        right = np.concatenate((ranges[1:], [np.inf]))
+        smallest = np.flatnonzero((ranges < depth) & (ranges <= left) & (ranges < right))
+        if not len(smallest):
+            smallest = np.array([int(np.argmin(ranges))])
+        drop = np.zeros(len(index), bool)
+        # At the ends only the end itself goes: what remains begins (or ends) with the other one's turn.
+        drop[smallest] = True
+        drop[smallest + 1] = True
+        if smallest[0] == 0:
+            drop[1] = len(ranges) == 1
+        if smallest[-1] == len(ranges) - 1:
+            drop[-2] = False
+        index = index[~drop]
+    inner = [int(i) for i in index if 0 < i < count - 1]
+    # A turn left at the very first or last samples bounds a stretch that is itself no deeper than noise.
+    while inner and abs(values[inner[0]] - values[0]) < depth:
+        inner.pop(0)
+    while inner and abs(values[inner[-1]] - values[-1]) < depth:
+        inner.pop()
+    return [0, *inner, count - 1]
+
+
+def branch_envelope(values: np.ndarray) -> np.ndarray:
+    """A never falling signal through the middle of a rising, noisy one, shape (n,)."""
+    highest = np.maximum.accumulate(values)
+    lowest = np.minimum.accumulate(values[::-1])[::-1]
+    return (highest + lowest) / 2
+
+
+def two_lines(x: np.ndarray, y: np.ndarray) -> int:
+    """The index at which a second straight line best takes over from a first, by least squares.
+
+    Args:
+        x: abscissa, shape (n,), n >= 8.
+        y: ordinate, shape (n,).
+    """
+    x, y = x - x.mean(), y - y.mean()
+    count = np.arange(1, len(x) + 1)
+    sums = np.cumsum(np.stack([x, y, x * x, x * y, y * y]), axis=1)
+    cuts = slice(2, len(x) - 3)
+    left = _misfit(count[cuts], sums[:, cuts])
+    right = _misfit(len(x) - count[cuts], sums[:, -1:] - sums[:, cuts])
+    return 3 + int(np.argmin(left + right))
+
+
+def _misfit(count: np.ndarray, sums: np.ndarray) -> np.ndarray:
+    sx, sy, sxx, sxy, syy = sums
+    xx, xy, yy = sxx - sx * sx / count, sxy - sx * sy / count, syy - sy * sy / count
+    flat = xx <= 1e-12 * np.abs(sxx)
+    return np.maximum(yy - np.where(flat, 0.0, xy * xy / np.where(flat, 1.0, xx)), 0.0)

@@ -1,0 +1,119 @@
+"""What every campaign must satisfy, whether read from files or made in memory."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from .._errors import InputError
+from ._columns import LARGEST_MAGNITUDE
+from ._schema import Campaign
+
+SMALLEST_DIAMETER_UM = 1e-6
+_TAKEN = ("particle", "D1_um", "D2_um", "D3_um")
+
+
+def check_magnitudes(
+    values: np.ndarray, file: str | Path, rows: Sequence[int], column: str, *, diameter: bool = False
+) -> None:
+    """Refuse values that are too large to be measured, and diameters that are not positive.
+
+    Args:
+        values: in canonical units, shape (n,).
+        file: for messages.
+        rows: the row each value stands in.
+        column: for messages.
+        diameter: whether the values are diameters.
+
+    Raises:
+        InputError: at the first such value.
+    """
+    bad = ~(np.abs(values) <= LARGEST_MAGNITUDE)
+    if diameter:
+        bad |= ~(values >= SMALLEST_DIAMETER_UM)
+    if not bad.any():
+        return
+    i = int(np.argmax(bad))
+    value = float(values[i])
+    if diameter and value <= 0:
+        problem, remedy = f"the diameter {value:.10g} um is not positive", "Enter the measured diameter"
+    else:
+        problem = f"{value:.4g} (in mN, um or s) is " + ("too small" if abs(value) < 1 else "too large") + " to be real"
+        remedy = "Check the number and the column's unit"
+    raise InputError(problem, file=file, row=rows[i], column=column, remedy=remedy)
+
+
+def check_campaign(campaign: Campaign, *, file: str | Path) -> None:
+    """Check a campaign made in memory as strictly as one from files.
+
+    Args:
+        campaign: what to check.
+        file: what messages name as the place, for instance the tester's file.
+
+    Raises:
+        InputError: if names, shapes or values are unfit.
+    """
+
+    def fail(problem: str, remedy: str = "Mend the campaign before it is used") -> InputError:
+        return InputError(problem, file=file, remedy=remedy)
+
+    count = len(campaign.particles)
+    if count == 0:
+        raise fail("there is no particle")
+    diameters = np.asarray(campaign.diameters_um, float)
+    if diameters.shape != (count, 3):
+        raise fail(f"diameters have the shape {diameters.shape} where ({count}, 3) is expected")
+    if len(campaign.curves) != count:
+        raise fail(f"{count} particles have {len(campaign.curves)} curves")
+    name, times = Counter(campaign.particles).most_common(1)[0]
+    if times > 1:
+        raise fail(f"the particle {name!r} stands there {times} times")
+    for name, triple in zip(campaign.particles, diameters, strict=True):
+        _check_text(name, f"the particle's name {name!r}", fail)
+        if not name.strip():
+            raise fail("a particle's name is empty")
+        if not ((triple >= SMALLEST_DIAMETER_UM) & (triple <= LARGEST_MAGNITUDE)).all():
+            raise fail(f"the diameters {triple.tolist()} um of particle {name!r} are not all positive and finite")
+    for name, curve in zip(campaign.particles, campaign.curves, strict=True):
+        _check_curve(name, curve.time_s, curve.force_mN, curve.displacement_um, fail)
+    for column, cells in campaign.columns.items():
+        if not column or column != column.strip() or "\ufeff" in column or column in _TAKEN or column[:3] in _DIAMETER:
+            raise fail(f"{column!r} cannot be the name of a further column")
+        if len(cells) != count:
+            raise fail(f"the column {column!r} has {len(cells)} cells for {count} particles")
+        for text in (column, *cells):
+            _check_text(text, f"the text {text!r} of column {column!r}", fail)
+
+
+_DIAMETER = ("D1_", "D2_", "D3_")
+
+
+def _check_text(text: str, what: str, fail: Callable[[str], InputError]) -> None:
+    try:
+        text.encode("utf-8")
+    except UnicodeEncodeError:
+        raise fail(f"{what} is no valid Unicode text") from None
+    if "\0" in text:
+        raise fail(f"{what} holds a NUL character")
+
+
+def _check_curve(
+    name: str, time: np.ndarray, force: np.ndarray, displacement: np.ndarray, fail: Callable[[str], InputError]
+) -> None:
+    parts = {"time": np.asarray(time), "force": np.asarray(force), "displacement": np.asarray(displacement)}
+    for what, values in parts.items():
+        if values.ndim != 1 or len(values) != len(time):
+            raise fail(f"the {what} of particle {name!r} has the shape {values.shape}")
+        if not (np.abs(values) <= LARGEST_MAGNITUDE).all():
+            first = int(np.argmax(~(np.abs(values) <= LARGEST_MAGNITUDE)))
+            raise fail(f"the {what} of particle {name!r} is {values[first]} at sample {first + 1}")
+        if what != "time" and not values.any():
+            raise fail(f"every {what} of particle {name!r} is zero, so the test holds no data")
+    if len(time) < 2:
+        raise fail(f"the particle {name!r} has one row only; a curve needs at least two")
+    back = np.flatnonzero(np.diff(parts["time"]) < 0)
+    if len(back):
+        raise fail(f"the time of particle {name!r} goes back at sample {int(back[0]) + 2}")

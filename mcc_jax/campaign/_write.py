@@ -1,0 +1,103 @@
+"""Writing a campaign folder: all of it or nothing."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+from .._errors import InputError
+from ._csv import CURVES, METADATA
+from ._curves import PARTICLES
+from ._metadata import format_metadata
+from ._schema import Campaign
+from ._validate import check_campaign
+
+
+def write_campaign(campaign: Campaign, folder: str | os.PathLike[str]) -> None:
+    """Write a campaign so that `read_campaign` gives back exactly the same numbers and texts.
+
+    The three files appear in `folder` together or not at all; other files there are left alone.
+
+    Args:
+        campaign: what to write; it is checked first.
+        folder: the folder to make or to replace the campaign in.
+
+    Raises:
+        InputError: if the campaign could not be read back, or the folder cannot be written.
+    """
+    path = Path(folder)
+    check_campaign(campaign, file=path)
+    texts = {
+        PARTICLES: _format_particles(campaign),
+        CURVES: _format_curves(campaign),
+        METADATA: format_metadata(campaign.metadata, path / METADATA),
+    }
+    if path.exists() and not path.is_dir():
+        raise InputError("is a file, not a folder", file=path, remedy="Choose another folder")
+    try:
+        _place({name: text.encode("utf-8") for name, text in texts.items()}, path)
+    except OSError as error:
+        raise InputError(
+            f"the folder cannot be written: {error.strerror or error}",
+            file=path,
+            remedy="Choose a folder you may write to",
+        ) from None
+
+
+def _cell(text: str) -> str:
+    if any(mark in text for mark in ',"\r\n'):
+        return '"' + text.replace('"', '""') + '"'
+    return text
+
+
+def _format_particles(campaign: Campaign) -> str:
+    lines = [",".join(["particle", "D1_um", "D2_um", "D3_um", *map(_cell, campaign.columns)])]
+    further = list(campaign.columns.values())
+    for i, (name, diameters) in enumerate(zip(campaign.particles, campaign.diameters_um.tolist(), strict=True)):
+        lines.append(",".join([_cell(name), *map(repr, diameters), *(_cell(values[i]) for values in further)]))
+    return "\n".join(lines) + "\n"
+
+
+def _format_curves(campaign: Campaign) -> str:
+    lines = ["particle,time_s,force_mN,displacement_um"]
+    for name, curve in zip(campaign.particles, campaign.curves, strict=True):
+        cell = _cell(name)
+        columns = (np.asarray(c, float).tolist() for c in (curve.time_s, curve.force_mN, curve.displacement_um))
+        lines.extend(f"{cell},{t!r},{f!r},{d!r}" for t, f, d in zip(*columns, strict=True))
+    return "\n".join(lines) + "\n"
+
+
+def _place(files: dict[str, bytes], folder: Path) -> None:
+    """Put all files into the folder, or leave it as it was."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    new = folder.parent / f".{folder.name or 'campaign'}-{secrets.token_hex(6)}"
+    new.mkdir()
+    try:
+        for name, data in files.items():
+            (new / name).write_bytes(data)
+        if not folder.exists():
+            new.rename(folder)
+            return
+        _replace_each(files, new, folder)
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
+
+
+def _replace_each(names: dict[str, bytes], new: Path, folder: Path) -> None:
+    moved: list[str] = []
+    try:
+        for name in names:
+            if (folder / name).exists():
+                (folder / name).replace(new / f"{name}.old")
+            moved.append(name)
+            (new / name).replace(folder / name)
+    except OSError:
+        for name in moved:
+            (folder / name).unlink(missing_ok=True)
+            if (new / f"{name}.old").exists():
+                (new / f"{name}.old").replace(folder / name)
+        raise

@@ -1,0 +1,111 @@
+"""Diameters of the particles, which testers' files do not hold."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..._errors import InputError
+from .._columns import LENGTH, convert, find_column, missing_column
+from .._table import Table, parse_number, read_table
+from .._validate import SMALLEST_DIAMETER_UM, check_magnitudes
+
+Triple = Sequence[float | int] | np.ndarray
+Diameters = Mapping[str, Triple] | Triple
+_HOW = "Give --diameters D1,D2,D3 in um for all, or --diameters FILE, a CSV table with particle,D1_um,D2_um,D3_um"
+
+
+def read_diameters(text: str | os.PathLike[str]) -> Diameters:
+    """Diameters from the command line: three numbers for all particles, or a table with one row for each.
+
+    Args:
+        text: `D1,D2,D3` in um, or the path of a CSV table with the columns `particle`, `D1_um`, `D2_um`, `D3_um`
+            (or other units of length).
+
+    Returns:
+        Three numbers [um], or a mapping from names to three numbers [um].
+
+    Raises:
+        InputError: if it is neither, or a diameter is not positive.
+    """
+    parts = str(text).split(",")
+    if len(parts) == 3 and not Path(text).is_file():
+        try:
+            values = [parse_number(part) for part in parts]
+        except ValueError as error:
+            raise InputError(f"--diameters: {error}", remedy=_HOW) from None
+        check_triple(values, "all particles", "--diameters")
+        return values
+    table = read_table(Path(text))
+    if "particle" not in table.header:
+        raise missing_column(table.header, "particle", table.file)
+    names = table.text(table.header.index("particle"))
+    columns = [_lengths(table, quantity) for quantity in ("D1", "D2", "D3")]
+    triples: dict[str, Triple] = {}
+    for row, name, *triple in zip(table.rows, names, *columns, strict=True):
+        if name in triples:
+            raise InputError(
+                f"the particle {name!r} is already there",
+                file=table.file,
+                row=row,
+                column="particle",
+                remedy="Keep one row",
+            )
+        triples[name] = triple
+    return triples
+
+
+def _lengths(table: Table, quantity: str) -> list[float]:
+    column, factor = find_column(table.header, quantity, LENGTH, table.file)
+    values = convert(table.numbers(column), factor)
+    check_magnitudes(values, table.file, table.rows, table.header[column], diameter=True)
+    return values.tolist()
+
+
+def check_triple(triple: Triple, what: str, file: str | Path) -> None:
+    """Refuse anything but three positive, finite lengths [um].
+
+    Raises:
+        InputError: saying which.
+    """
+    try:
+        values = np.asarray(triple, float)
+    except (OverflowError, TypeError, ValueError):
+        values = np.empty(0)
+    if values.shape != (3,) or not ((values >= SMALLEST_DIAMETER_UM) & (values < 1e15)).all():
+        raise InputError(
+            f"the diameters of {what} are {list(triple)}, where three positive lengths in um are expected",
+            file=file,
+            remedy="Give D1, D2 and D3",
+        )
+
+
+def diameters_for(names: Sequence[str], diameters: Diameters | None, file: Path) -> np.ndarray:
+    """Diameters in the order of the names, shape (N, 3) [um].
+
+    Raises:
+        InputError: if they are missing, or the mapping has another set of names.
+    """
+    if diameters is None:
+        raise InputError("a tester's file knows no particle diameters", file=file, remedy=_HOW)
+    if not isinstance(diameters, Mapping):
+        check_triple(diameters, "all particles", file)
+        return np.tile(np.asarray(diameters, float), (len(names), 1))
+    shown = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
+    for name in names:
+        if name not in diameters:
+            raise InputError(
+                f"the test {name!r} has no diameters", file=file, remedy=f"Add a row for it; the tests are: {shown}"
+            )
+        check_triple(diameters[name], f"particle {name!r}", file)
+    for name in diameters:
+        if name not in names:
+            raise InputError(
+                f"diameters are given for {name!r}, which is no test of the file",
+                file=file,
+                remedy=f"Rename or remove it; the tests are: {shown}",
+            )
+    return np.array([np.asarray(diameters[name], float) for name in names])

@@ -1,0 +1,184 @@
+"""Simulated campaigns: the law in place of the particles, everything else as in a measurement."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._results import RESULTS
+from ..campaign import (
+    PAPER_DIAMETERS_UM,
+    PAPER_EFFECTIVE_MODULUS_MPA,
+    PAPER_LOAD_RATE_MN_PER_S,
+    PAPER_LOG_C,
+    PAPER_SHAPE_PARAMETER,
+    Campaign,
+    Curve,
+    Metadata,
+    particle_batch,
+)
+from ..geometry import Particle
+from ..law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainScaling, Unloading
+from ._drive import simulate_batch
+from ._instrument import Instrument
+from ._programme import Programme
+
+PAPER_PEAK_STRESS_MPA = (7.0, 16.0)
+"""Range of the maximum stress of the paper's tests [MPa]; the value of each particle is not published."""
+
+
+def paper_population() -> PlasticPopulation:
+    """C1, C3, C5 of the paper's Table 2."""
+    return PlasticPopulation(*(LogNormal(*PAPER_LOG_C[name]) for name in ("C1", "C3", "C5")))
+
+
+def paper_law(unloading: Unloading = Unloading.PRINTED, strain_scaling: StrainScaling = StrainScaling.RAW) -> MccLaw:
+    """The paper's mean law: a = 1.43, effective modulus 16 GPa (which belongs to the printed form)."""
+    return MccLaw(
+        paper_population().mean_law, PAPER_SHAPE_PARAMETER, PAPER_EFFECTIVE_MODULUS_MPA, unloading, strain_scaling
+    )
+
+
+def law_for_each(
+    plastic: Plastic,
+    a: float,
+    effective_modulus_MPa: float,
+    unloading: Unloading = Unloading.PRINTED,
+    strain_scaling: StrainScaling = StrainScaling.RAW,
+) -> MccLaw:
+    """One law per particle: its own plastic coefficients (leading axis N), a and modulus shared."""
+    return eqx.filter_vmap(lambda one: MccLaw(one, a, effective_modulus_MPa, unloading, strain_scaling))(plastic)
+
+
+def simulate_campaign(
+    laws: MccLaw,
+    diameters_um: np.ndarray,
+    peaks: np.ndarray,
+    programme: Programme,
+    *,
+    instrument: Instrument | None = None,
+    particles: Sequence[str] | None = None,
+    seed: int = 0,
+    provenance: str = "simulated",
+) -> Campaign:
+    """Test N particles in the computer.
+
+    Args:
+        laws: one law per particle, every array field with a leading axis N (`law_for_each`).
+        diameters_um: D1, D2, D3 [um], shape (N, 3).
+        peaks: each particle's peak, force [mN] under load control or displacement [um], shape (N,), > 0.
+        programme: what the tester does, relative to the peak.
+        instrument: how it reads; perfect if None.
+        particles: names; "1" to "N" if None.
+        seed: seed of the read-out's noise. Each particle has a stream of its own: adding one leaves the others as they
+            were.
+        provenance: for the campaign's metadata.
+
+    Returns:
+        A campaign; the true coefficients, and whether each law is monotone, are in its `columns`.
+
+    Raises:
+        ValueError: if lengths disagree or the law refuses a particle (`RESULTS` says why).
+    """
+    count = len(diameters_um)
+    names = tuple(str(i + 1) for i in range(count)) if particles is None else tuple(particles)
+    if not (len(names) == len(peaks) == count == laws.plastic.C1.shape[0]):
+        raise ValueError(
+            f"{count} particles need as many names ({len(names)}), peaks ({len(peaks)}) "
+            f"and laws ({laws.plastic.C1.shape[0]})"
+        )
+    instrument = instrument or Instrument()
+    samples = [programme.sample(float(peak)) for peak in peaks]
+    longest = max(len(time) for time, _ in samples)
+    # Padding repeats the last value: a valid path whose further points change nothing.
+    paths = np.stack([np.pad(target, (0, longest - len(target)), mode="edge") for _, target in samples])
+    response = simulate_batch(laws, particle_batch(diameters_um), jnp.asarray(paths), control=programme.control)
+    force, displacement = np.asarray(response.force, float), np.asarray(response.displacement, float)
+    bad = np.flatnonzero(np.asarray(response.result != RESULTS.successful))
+    if len(bad):
+        reason = RESULTS[jax.tree.map(lambda x: x[bad[0]], response.result)]
+        raise ValueError(f"particle {names[bad[0]]!r}: {reason}")
+    streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(count)]
+    curves = []
+    for i, (time, _) in enumerate(samples):
+        read = instrument.read(streams[i], force[i, : len(time)], displacement[i, : len(time)])
+        curves.append(Curve(time, *read))
+    truth = {name: np.asarray(getattr(laws.plastic, name), float) for name in ("C1", "C3", "C5")}
+    columns = {f"true_{name}": tuple(repr(float(v)) for v in values) for name, values in truth.items()}
+    columns["true_monotone"] = tuple("yes" if m else "no" for m in np.asarray(response.monotone))
+    metadata = Metadata(
+        control=programme.control,
+        force_resolution_mN=instrument.force_resolution_mN or None,
+        displacement_resolution_um=instrument.displacement_resolution_um or None,
+        provenance=provenance,
+        other={
+            "simulation": {
+                "seed": seed,
+                "a": float(np.asarray(laws.a).ravel()[0]),
+                "effective_modulus_MPa": float(np.asarray(laws.effective_modulus).ravel()[0]),
+                "unloading": laws.unloading.value,
+                "strain_scaling": laws.strain_scaling.value,
+                "displacement_noise_um": instrument.displacement_noise_um,
+                "force_noise_mN": instrument.force_noise_mN,
+                "zero_um": instrument.zero_um,
+            }
+        },
+    )
+    return Campaign(names, np.asarray(diameters_um, float), tuple(curves), columns, metadata)
+
+
+def paper_campaign(
+    seed: int = 0,
+    *,
+    shared_material: bool = False,
+    instrument: Instrument | None = None,
+    programme: Programme | None = None,
+    unloading: Unloading = Unloading.PRINTED,
+    strain_scaling: StrainScaling = StrainScaling.RAW,
+    peak_stress_MPa: tuple[float, float] = PAPER_PEAK_STRESS_MPA,
+) -> Campaign:
+    """A campaign drawn from the paper: Table 1's particles, Table 2's coefficients, its protocol.
+
+    The paper publishes no measured curve as numbers; this is what its law says such a campaign looks like. Maximum
+    stresses are drawn evenly from the published range. Of draws from Table 2, 2.4 % are not monotone; they are kept,
+    snap through under load control and are marked in the column `true_monotone`.
+
+    Args:
+        seed: seed of coefficients, peaks and noise.
+        shared_material: give every particle the mean law instead of a draw.
+        instrument: read-out; 0.02 um and 0.05 mN of noise if None.
+        programme: what the tester does; one cycle at 2 mN/s if None.
+        unloading: form of the unloading law (16 GPa belongs to the printed one).
+        strain_scaling: how the shape factor enters unloading.
+        peak_stress_MPa: range of the maximum stress [MPa].
+    """
+    count = len(PAPER_DIAMETERS_UM)
+    population = paper_population()
+    if shared_material:
+        plastic = jax.tree.map(lambda x: jnp.broadcast_to(x, (count,)), population.mean_law)
+    else:
+        plastic = population.sample(jax.random.key(seed), count)
+    laws = law_for_each(plastic, PAPER_SHAPE_PARAMETER, PAPER_EFFECTIVE_MODULUS_MPA, unloading, strain_scaling)
+    programme = programme or Programme.cycles(rate=PAPER_LOAD_RATE_MN_PER_S)
+    rng = np.random.default_rng(np.random.SeedSequence(seed).generate_state(4))
+    stress = rng.uniform(*peak_stress_MPa, count)
+    particles = particle_batch(PAPER_DIAMETERS_UM)
+    peaks = np.asarray(eqx.filter_vmap(Particle.force)(particles, jnp.asarray(stress)))
+    if programme.control == "displacement":
+        strain = eqx.filter_vmap(lambda law, particle, s: law.plastic.strain(s) / law.shape_factor(particle))(
+            laws, particles, jnp.asarray(stress)
+        )
+        peaks = np.asarray(eqx.filter_vmap(Particle.displacement)(particles, strain))
+    return simulate_campaign(
+        laws,
+        PAPER_DIAMETERS_UM,
+        peaks,
+        programme,
+        instrument=instrument or Instrument(displacement_noise_um=0.02, force_noise_mN=0.05),
+        seed=seed,
+        provenance=f"simulated from Tables 1 and 2 of Bommireddy et al. (2018), seed {seed}; not a measurement",
+    )

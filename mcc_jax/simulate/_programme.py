@@ -1,0 +1,215 @@
+"""What the tester is told to do: ramps, holds and cycles, sampled into paths."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .._errors import InputError
+from ..campaign import Control
+
+
+@dataclass(frozen=True)
+class Ramp:
+    """Go to a level at a constant rate.
+
+    Attributes:
+        to: level as a share of the particle's peak; 1 is the peak, 0 full release.
+        rate: magnitude of the rate, mN/s under load control, um/s under displacement control, > 0.
+    """
+
+    to: float
+    rate: float
+
+
+@dataclass(frozen=True)
+class Hold:
+    """Stay where you are.
+
+    Attributes:
+        seconds: how long [s], > 0.
+    """
+
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Programme:
+    """A sequence of ramps and holds, starting from zero.
+
+    Exactly one of `interval_s` and `points` says how densely it is sampled. Turning points are always sampled.
+
+    Attributes:
+        control: the controlled quantity, "load" or "displacement".
+        steps: the ramps and holds.
+        interval_s: time between two samples [s]; particles then get curves of unequal length.
+        points: number of samples, evenly spread over the time of the test (the turning points come on top).
+
+    Raises:
+        ValueError: for a rate or duration that is not positive, a negative level, or no steps.
+    """
+
+    control: Control
+    steps: tuple[Ramp | Hold, ...]
+    interval_s: float | None = None
+    points: int | None = None
+
+    def __post_init__(self) -> None:
+        if (self.interval_s is None) == (self.points is None):
+            raise ValueError("give exactly one of interval_s and points")
+        if self.interval_s is not None and not self.interval_s > 0:
+            raise ValueError(f"interval_s must be positive, got {self.interval_s}")
+        if self.points is not None and self.points < 2:
+            raise ValueError(f"points must be at least 2, got {self.points}")
+        if self.control not in ("load", "displacement"):
+            raise ValueError(f"control must be 'load' or 'displacement', got {self.control!r}")
+        if not self.steps:
+            raise ValueError("a programme needs at least one step")
+        for step in self.steps:
+            if isinstance(step, Ramp):
+                if not (step.rate > 0 and np.isfinite(step.rate)):
+                    raise ValueError(f"the rate of a ramp must be positive, got {step.rate}")
+                if not (step.to >= 0 and np.isfinite(step.to)):
+                    raise ValueError(f"a ramp goes to a level >= 0, a share of the peak, got {step.to}")
+            elif not (step.seconds > 0 and np.isfinite(step.seconds)):
+                raise ValueError(f"a hold lasts longer than 0 s, got {step.seconds}")
+
+    @classmethod
+    def cycles(
+        cls,
+        *,
+        control: Control = "load",
+        rate: float = 2.0,
+        levels: Sequence[float] = (1.0,),
+        unload_to: float = 0.0,
+        hold_s: float = 0.0,
+        unload_rate: float | None = None,
+        interval_s: float | None = None,
+        points: int | None = None,
+    ) -> Programme:
+        """Load to each level in turn and unload after each; the last unloading is complete.
+
+        Args:
+            control: controlled quantity.
+            rate: loading rate [mN/s or um/s]; the paper's tests ran at 2 mN/s.
+            levels: shares of the particle's peak, one per cycle.
+            unload_to: share of the peak at which reloading starts.
+            hold_s: hold at every level [s].
+            unload_rate: rate of unloading; `rate` if None.
+            interval_s: time between two samples [s].
+            points: number of samples; 300 if neither is given.
+        """
+        back = rate if unload_rate is None else unload_rate
+        steps: list[Ramp | Hold] = []
+        for i, level in enumerate(levels):
+            steps.append(Ramp(level, rate))
+            if hold_s:
+                steps.append(Hold(hold_s))
+            steps.append(Ramp(unload_to if i + 1 < len(levels) else 0.0, back))
+        if interval_s is None and points is None:
+            points = 300
+        return cls(control, tuple(steps), interval_s, points)
+
+    def sample(self, peak: float) -> tuple[np.ndarray, np.ndarray]:
+        """Times [s] and target values (mN or um) for a particle whose peak is `peak`.
+
+        Returns:
+            Two arrays of one length; times increase strictly.
+        """
+        times, values = [0.0], [0.0]
+        for step in self.steps:
+            if isinstance(step, Hold):
+                duration, value = step.seconds, values[-1]
+            else:
+                value = step.to * peak
+                duration = abs(value - values[-1]) / step.rate
+            if times[-1] + duration > times[-1]:
+                times.append(times[-1] + duration)
+                values.append(value)
+        if len(times) < 2:
+            raise ValueError("the programme never leaves zero")
+        interval = self.interval_s if self.interval_s is not None else times[-1] / ((self.points or 2) - 1)
+        grid = np.arange(0.0, times[-1], interval)
+        # A grid point that falls onto a turning point but for rounding would make two samples of one.
+        near = np.abs(grid[:, None] - np.asarray(times)[None, :]).min(axis=1) < 1e-6 * interval
+        time = np.sort(np.concatenate([grid[~near], times]))
+        return time, np.interp(time, times, values)
+
+
+def read_programme(file: str | Path) -> Programme:
+    """Read a programme from a TOML file.
+
+    ::
+
+        control = "load"            # or "displacement"
+        rate = 2.0                  # mN/s or um/s, for every ramp that names none
+        points = 300                # or: interval_s = 0.5
+        [[step]]
+        ramp_to = 1.0               # share of the particle's peak
+        [[step]]
+        hold_s = 60
+        [[step]]
+        ramp_to = 0.0
+        rate = 4.0
+
+    Raises:
+        InputError: naming the file and the entry.
+    """
+    file = Path(file)
+    try:
+        content = tomllib.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(
+            f"cannot be read ({error.strerror})", file=file, remedy="Give a TOML file with the programme."
+        ) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(
+            f"is no valid TOML: {error}", file=file, remedy="See the example in `mcc-jax simulate --help`."
+        ) from error
+    unknown = set(content) - {"control", "rate", "points", "interval_s", "step"}
+    if unknown:
+        raise InputError(
+            f"unknown entry {sorted(unknown)[0]!r}", file=file, remedy="Known: control, rate, points, interval_s, step."
+        )
+    if not isinstance(content.get("step"), list) or not content["step"]:
+        raise InputError("has no [[step]]", file=file, remedy="Add steps with ramp_to or hold_s.")
+
+    def number(entry: dict, key: str, where: str) -> float:
+        value = entry.get(key)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise InputError(f"{where}: {key} must be a number, got {value!r}", file=file)
+        return float(value)
+
+    steps: list[Ramp | Hold] = []
+    for i, entry in enumerate(content["step"], start=1):
+        where = f"step {i}"
+        if not isinstance(entry, dict) or ("ramp_to" in entry) == ("hold_s" in entry):
+            raise InputError(f"{where} needs exactly one of ramp_to and hold_s", file=file)
+        extra = set(entry) - {"ramp_to", "rate", "hold_s"}
+        if extra:
+            raise InputError(f"{where}: unknown entry {sorted(extra)[0]!r}", file=file)
+        if "hold_s" in entry:
+            steps.append(Hold(number(entry, "hold_s", where)))
+        elif "rate" in entry or "rate" in content:
+            steps.append(
+                Ramp(number(entry, "ramp_to", where), number(entry if "rate" in entry else content, "rate", where))
+            )
+        else:
+            raise InputError(f"{where} has no rate", file=file, remedy="Give it one, or one for all at the top.")
+    control = content.get("control", "load")
+    if control not in ("load", "displacement"):
+        raise InputError(f"control must be 'load' or 'displacement', got {control!r}", file=file)
+    points = content.get("points")
+    interval = number(content, "interval_s", "the programme") if "interval_s" in content else None
+    if points is not None and (isinstance(points, bool) or not isinstance(points, int)):
+        raise InputError(f"points must be a whole number, got {points!r}", file=file)
+    if points is None and interval is None:
+        points = 300
+    try:
+        return Programme(control, tuple(steps), interval, points)
+    except ValueError as error:
+        raise InputError(str(error), file=file) from error

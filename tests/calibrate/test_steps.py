@@ -1,0 +1,356 @@
+"""Each step of the paper's calibration against what it must give in closed form or on exact data."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import trapezoid
+
+from mcc_jax import Instrument, LogNormal, Plastic, Programme, StrainScaling, Unloading, paper_campaign, paper_law
+from mcc_jax.calibrate import (
+    choose_reference,
+    elastic_branches,
+    fit_effective_modulus,
+    fit_polynomial,
+    fit_population,
+    fit_shape_parameter,
+    master_curve,
+    strain_table,
+)
+from mcc_jax.calibrate._master import MasterCurve, StrainTable
+from mcc_jax.calibrate._shape import _weights, full_residuals, reference_residuals
+from mcc_jax.campaign import adjust, loading_curve
+
+
+@pytest.fixture(scope="module")
+def exact():
+    """The paper's particles of one material, without noise."""
+    return paper_campaign(0, shared_material=True, instrument=Instrument())
+
+
+@pytest.fixture(scope="module")
+def scattered():
+    return paper_campaign(0)
+
+
+# ---- adjustment ----
+
+
+def test_loading_curve_is_the_law_at_the_measured_points(exact):
+    law = paper_law()
+    for i in (0, 5, 15):
+        curve = loading_curve(exact.curves[i], exact.diameters_um[i])
+        D1, D2, D3 = exact.diameters_um[i]
+        eta = 1 + 1.43 * (1 - D3**2 / (D1 * D2))
+        expected = np.asarray(law.plastic.strain(jnp.asarray(curve.stress_MPa[1:]))) / eta
+        np.testing.assert_allclose(curve.strain[1:], expected, rtol=1e-9)
+
+
+def test_adjusted_curves_meet_at_the_threshold_in_the_mean_of_the_raw_strains(scattered):
+    raw, adjusted = adjust(scattered, 0.0), adjust(scattered, 0.2)
+    at = np.array([float(c.at(0.2)) for c in raw.curves])
+    assert adjusted.strain == pytest.approx(at.mean(), rel=1e-12)
+    for curve in adjusted.curves:
+        assert float(curve.at(0.2)) == pytest.approx(at.mean(), rel=1e-12)
+        # Straight below the threshold, from the origin.
+        assert float(curve.at(0.1)) == pytest.approx(at.mean() / 2, rel=1e-12)
+    np.testing.assert_allclose(adjusted.shift, at.mean() - at, rtol=1e-9, atol=1e-12)
+
+
+def test_adjusted_curves_do_not_depend_on_each_test_s_zero():
+    plain = paper_campaign(3, instrument=Instrument())
+    shifted = paper_campaign(3, instrument=Instrument(zero_um=2.0))
+    a, b = adjust(plain), adjust(shifted)
+    # The common strain at the threshold moves with the mean zero; the curves' shapes above it do not move at all.
+    for one, two in zip(a.curves, b.curves, strict=True):
+        np.testing.assert_allclose(one.at(5.0) - a.strain, two.at(5.0) - b.strain, rtol=1e-6)
+
+
+def test_raw_data_stay_as_they_were(scattered):
+    before = [c.displacement_um.copy() for c in scattered.curves]
+    adjust(scattered)
+    for curve, copy in zip(scattered.curves, before, strict=True):
+        np.testing.assert_array_equal(curve.displacement_um, copy)
+
+
+def test_particles_below_the_threshold_are_left_out_with_the_reason():
+    weak = paper_campaign(0, peak_stress_MPa=(0.05, 0.4), instrument=Instrument())
+    adjustment = adjust(weak)
+    assert 0 < adjustment.kept.sum() < 20
+    for reason, curve in zip(adjustment.why_not, adjustment.curves, strict=True):
+        assert (reason is None) == (curve is not None)
+        assert reason is None or "not the threshold of 0.2 MPa" in reason
+
+
+def test_cycles_give_the_same_loading_curve_as_one_ramp():
+    programme = Programme.cycles(levels=(0.3, 0.6, 1.0), unload_to=0.05, points=900)
+    ramp, cycles = (
+        paper_campaign(1, shared_material=True, instrument=Instrument(), programme=p) for p in (None, programme)
+    )
+    for i in range(0, 20, 5):
+        one = loading_curve(ramp.curves[i], ramp.diameters_um[i])
+        many = loading_curve(cycles.curves[i], cycles.diameters_um[i])
+        grid = np.linspace(0.5, 0.98 * one.stress_max_MPa, 50)
+        np.testing.assert_allclose(many.at(grid), one.at(grid), rtol=2e-3)
+
+
+def test_a_negative_threshold_is_refused(exact):
+    with pytest.raises(ValueError, match="threshold"):
+        adjust(exact, -0.1)
+
+
+# ---- master curve ----
+
+
+def test_master_mean_and_spread_are_the_sample_s_own(scattered):
+    table = strain_table(adjust(scattered), scattered.diameters_um)
+    master = master_curve(table, 1.43)
+    k = int(np.searchsorted(master.stress_MPa, 5.0))
+    values = [
+        eta * float(c.at(master.stress_MPa[k]))
+        for eta, c in zip(table.shape_factor(1.43), adjust(scattered).curves, strict=True)
+    ]
+    assert master.mean[k] == pytest.approx(np.mean(values), rel=1e-12)
+    assert master.sd[k] == pytest.approx(np.std(values, ddof=1), rel=1e-12)
+    assert master.count[k] == 20
+
+
+def test_master_curve_ends_where_a_fifth_of_the_particles_is_left(scattered):
+    table = strain_table(adjust(scattered), scattered.diameters_um)
+    master = master_curve(table, 1.43)
+    tops = np.sort([c.stress_max_MPa for c in adjust(scattered).curves])
+    assert master.count.min() > 4
+    # The fifth largest of twenty maxima is the last stress that more than four particles reach.
+    assert master.stress_MPa[-1] == pytest.approx(tops[-5], abs=table.stress_MPa[1])
+
+
+def test_master_mean_is_within_three_percent_of_the_true_curves():
+    for seed in range(3):
+        campaign = paper_campaign(seed)
+        table = strain_table(adjust(campaign, 0.0), campaign.diameters_um)
+        master = master_curve(table, 1.43)
+        use = (master.stress_MPa > 0.5) & (master.count == 20)
+        truth = []
+        for i in range(20):
+            plastic = Plastic(*(float(campaign.columns[f"true_C{k}"][i]) for k in (1, 3, 5)))
+            truth.append(np.asarray(plastic.strain(jnp.asarray(master.stress_MPa[use]))))
+        np.testing.assert_allclose(master.mean[use], np.mean(truth, axis=0), rtol=0.03)
+
+
+@pytest.mark.parametrize("threshold", [0.0, 0.2])
+def test_master_mean_of_one_material_holds_with_a_fitted_shape_parameter_too(threshold):
+    campaign = paper_campaign(1, shared_material=True)
+    table = strain_table(adjust(campaign, threshold), campaign.diameters_um)
+    master = master_curve(table, fit_shape_parameter(table).a)
+    use = master.stress_MPa > 0.5
+    truth = np.asarray(paper_law().plastic.strain(jnp.asarray(master.stress_MPa[use])))
+    np.testing.assert_allclose(master.mean[use], truth, rtol=0.03)
+
+
+# ---- shape parameter ----
+
+
+@pytest.mark.parametrize("objective", ["full", "reference"])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_shape_parameter_of_one_material_is_recovered(objective, seed):
+    campaign = paper_campaign(seed, shared_material=True)  # 0.02 um and 0.05 mN of noise
+    table = strain_table(adjust(campaign, 0.0), campaign.diameters_um)
+    fit = fit_shape_parameter(table, objective)
+    assert fit.converged
+    assert fit.a == pytest.approx(1.43, abs=0.02)
+    assert fit.objective < 1e-3 * fit.objective_at_zero
+
+
+def test_full_objective_is_the_paper_s_integral(scattered):
+    table = strain_table(adjust(scattered), scattered.diameters_um, points=4001)
+    a, total = 0.9, 0.0
+    eta = table.shape_factor(a)
+    use = table.reached.sum(axis=0) > 4
+    grid = table.stress_MPa[use]
+    scaled = eta[:, None] * table.strain[:, use]
+    reached = table.reached[:, use]
+    mean = scaled.sum(axis=0, where=reached) / reached.sum(axis=0)
+    for i in range(20):
+        r = reached[i]
+        total += trapezoid((mean[r] - scaled[i, r]) ** 2, grid[r]) / trapezoid(mean[r] ** 2, grid[r])
+    residuals = full_residuals(
+        jnp.asarray(a),
+        *(jnp.asarray(x) for x in (table.strain[:, use], _weights(grid, reached), reached, table.flatness)),
+    )
+    assert float(jnp.sum(residuals**2)) == pytest.approx(total, rel=1e-10)
+
+
+def test_reference_objective_is_the_paper_s_integral(scattered):
+    table = strain_table(adjust(scattered), scattered.diameters_um)
+    row, a = choose_reference(table), 0.7
+    eta, total = table.shape_factor(a), 0.0
+    use = table.reached.sum(axis=0) > 4
+    grid, strain, reached = table.stress_MPa[use], table.strain[:, use], table.reached[:, use]
+    others = [i for i in range(20) if i != row]
+    for i in others:
+        r = reached[i] & reached[row]
+        deviation = strain[row, r] - eta[i] / eta[row] * strain[i, r]
+        total += trapezoid(deviation**2, grid[r]) / trapezoid(strain[row, r] ** 2, grid[r])
+    both = reached[others] & reached[row]
+    residuals = reference_residuals(
+        jnp.asarray(a),
+        jnp.asarray(strain[others]),
+        jnp.asarray(_weights(grid, both)),
+        jnp.asarray(strain[row]),
+        jnp.asarray(table.flatness[others]),
+        jnp.asarray(table.flatness[row]),
+    )
+    assert float(jnp.sum(residuals**2)) == pytest.approx(total, rel=1e-10)
+
+
+def test_the_minimum_is_one(scattered):
+    table = strain_table(adjust(scattered), scattered.diameters_um)
+    for objective in ("full", "reference"):
+        fit = fit_shape_parameter(table, objective)
+        use = table.reached.sum(axis=0) > 4
+        grid, strain, reached = table.stress_MPa[use], table.strain[:, use], table.reached[:, use]
+
+        def cost(a, objective=objective, grid=grid, strain=strain, reached=reached):
+            if objective == "full":
+                data = (strain, _weights(grid, reached), reached, table.flatness)
+                return jnp.sum(full_residuals(a, *(jnp.asarray(x) for x in data)) ** 2)
+            row = choose_reference(table)
+            others = np.arange(20) != row
+            both = reached[others] & reached[row]
+            data = (strain[others], _weights(grid, both), strain[row], table.flatness[others], table.flatness[row])
+            return jnp.sum(reference_residuals(a, *(jnp.asarray(x) for x in data)) ** 2)
+
+        slope, curvature = jax.grad(cost)(jnp.asarray(fit.a)), jax.grad(jax.grad(cost))(jnp.asarray(fit.a))
+        assert abs(float(slope)) < 1e-5
+        assert float(curvature) > 0
+        scan = [float(cost(jnp.asarray(a))) for a in np.linspace(-0.9, 6, 70)]
+        assert fit.objective <= min(scan) + 1e-12
+
+
+def test_reference_follows_the_paper_s_rule(exact):
+    table = strain_table(adjust(exact), exact.diameters_um)
+    row = choose_reference(table)
+    top = np.array([c.stress_max_MPa for c in adjust(exact).curves])
+    assert top[row] >= np.median(top) - 0.1
+    high = top >= np.median(top)
+    assert abs(table.flatness[row]) <= np.abs(table.flatness[high]).min() + 1e-12
+
+
+def test_equal_particles_cannot_tell_the_shape_parameter():
+    grid = np.linspace(0, 5, 50)
+    strain = np.sqrt(grid) * np.array([[1.0], [1.1], [0.9]])
+    table = StrainTable(grid, strain, np.ones((3, 50), bool), np.full(3, 0.3), np.arange(3))
+    fit = fit_shape_parameter(table)
+    assert not fit.identifiable
+    assert not fit.converged
+    assert "same D3^2" in fit.reason
+
+
+def test_negative_shape_parameters_are_found():
+    flatness = np.linspace(0.0, 0.6, 8)
+    grid = np.linspace(0, 5, 200)
+    strain = np.sqrt(grid) / (1 - 0.85 * flatness)[:, None]
+    table = StrainTable(grid, strain, np.ones((8, 200), bool), flatness, np.arange(8))
+    for objective in ("full", "reference"):
+        assert fit_shape_parameter(table, objective).a == pytest.approx(-0.85, abs=1e-6)
+
+
+# ---- plastic coefficients ----
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(st.floats(1, 50), st.floats(0.1, 60), st.floats(20, 500), st.floats(0.3, 1.0))
+def test_polynomial_of_exact_points_is_recovered(K1, K3, K5, reach):
+    if 9 * K3**2 > 20 * K1 * K5:
+        K3 = np.sqrt(20 * K1 * K5 / 9) * 0.99
+    x = np.linspace(0.02, reach, 60)
+    got = fit_polynomial(x, K1 * x - K3 * x**3 + K5 * x**5)
+    np.testing.assert_allclose(got, [K1, K3, K5], rtol=1e-5)
+
+
+def test_moments_give_back_the_log_normal_distributions():
+    truth = {"C1": (1.9027, 0.2985), "C3": (1.1015, 0.02), "C5": (0.9784, 0.0797)}
+    laws = {name: LogNormal(*v) for name, v in truth.items()}
+    x = np.linspace(0.03, 0.65, 300)
+    K1, K3, K5 = (float(laws[n].moment(k)) for n, k in (("C1", 1), ("C3", 3), ("C5", 5)))
+    stress = K1 * x - K3 * x**3 + K5 * x**5
+    variance = sum(float(laws[n].variance_of_power(k)) * x ** (2 * k) for n, k in (("C1", 1), ("C3", 3), ("C5", 5)))
+    slope = K1 - 3 * K3 * x**2 + 5 * K5 * x**4
+    fit = fit_population(MasterCurve(stress, x, np.sqrt(variance) / slope, np.full(300, 20)))
+    for name, (mean, sd) in truth.items():
+        got = getattr(fit.population, name)
+        assert float(got.mean) == pytest.approx(mean, rel=1e-6)
+        assert float(got.sd) == pytest.approx(sd, rel=1e-4)
+    assert fit.at_bound == ()
+
+
+def test_a_spread_that_leaves_nothing_for_a_term_collapses_and_is_named():
+    # Spread as of C1 alone, and less than that in the middle: what the paper's own table looks like.
+    x = np.linspace(0.03, 0.65, 300)
+    stress = 7.0 * x - 27.0 * x**3 + 144.0 * x**5
+    slope = 7.0 - 81.0 * x**2 + 720.0 * x**4
+    fit = fit_population(MasterCurve(stress, x, 2.0 * x / slope, np.full(300, 20)))
+    assert "spread of C3" in fit.at_bound
+    assert float(fit.population.C3.sd) == 0.0
+    assert float(fit.population.C1.sd) == pytest.approx(np.sqrt(np.log1p((2 / 7) ** 2)), rel=1e-4)
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(st.floats(-2, 3), st.floats(0, 0.5), st.sampled_from([1, 3, 5]))
+def test_log_normal_moments_round_trip(mean, sd, order):
+    c = LogNormal(mean, sd)
+    back = LogNormal.from_power_moments(order, c.moment(order), c.variance_of_power(order))
+    assert float(back.mean) == pytest.approx(mean, abs=1e-9)
+    assert float(back.sd) == pytest.approx(sd, abs=1e-7)
+
+
+# ---- effective modulus ----
+
+
+def _branches(campaign, threshold):
+    adjustment = adjust(campaign, threshold)
+    return [
+        b
+        for i in range(len(campaign))
+        for b in elastic_branches(i, campaign.curves[i], campaign.diameters_um[i], float(adjustment.shift[i]))
+    ]
+
+
+def _eta(campaign):
+    D1, D2, D3 = campaign.diameters_um.T
+    return 1 + 1.43 * (1 - D3**2 / (D1 * D2))
+
+
+@pytest.mark.parametrize("unloading", list(Unloading))
+@pytest.mark.parametrize("scaling", list(StrainScaling))
+def test_modulus_of_exact_branches_is_recovered_in_every_form(unloading, scaling):
+    campaign = paper_campaign(
+        2, shared_material=True, instrument=Instrument(), unloading=unloading, strain_scaling=scaling
+    )
+    fit = fit_effective_modulus(_branches(campaign, 0.0), _eta(campaign), unloading, scaling)
+    assert fit.converged
+    assert fit.effective_modulus_MPa == pytest.approx(16e3, rel=2e-3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_modulus_under_noise_and_offset_step_is_within_three_percent(seed):
+    campaign = paper_campaign(seed)
+    fit = fit_effective_modulus(_branches(campaign, 0.2), _eta(campaign))
+    assert fit.effective_modulus_MPa == pytest.approx(16e3, rel=0.03)
+
+
+def test_every_cycle_is_a_branch_and_reloading_belongs_to_it():
+    programme = Programme.cycles(levels=(0.4, 0.7, 1.0), unload_to=0.3, points=900)
+    campaign = paper_campaign(0, shared_material=True, programme=programme)
+    branches = _branches(campaign, 0.2)
+    assert len(branches) == 60
+    fit = fit_effective_modulus(branches, _eta(campaign))
+    assert fit.effective_modulus_MPa == pytest.approx(16e3, rel=0.03)
+
+
+def test_no_unloading_is_told():
+    fit = fit_effective_modulus([], np.ones(3))
+    assert fit.effective_modulus_MPa is None
+    assert "no unloading" in fit.reason

@@ -1,0 +1,126 @@
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mcc_jax import Curve, Instrument, MccLaw, Particle, Plastic, Programme, batch, paper_campaign, simulate_campaign
+from mcc_jax.simulate import PAPER_PEAK_STRESS_MPA, law_for_each, paper_population
+
+
+def quiet(**arguments):
+    return paper_campaign(instrument=Instrument(), **arguments)
+
+
+def test_paper_campaign_follows_the_paper():
+    campaign = quiet(seed=5)
+    assert len(campaign) == 20
+    assert campaign.metadata.control == "load"
+    assert "not a measurement" in campaign.metadata.provenance
+    for curve, (D1, D2, D3) in zip(campaign.curves, campaign.diameters_um, strict=True):
+        radius = D1 * D2 / D3 / 2
+        stress = 1e3 * curve.force_mN.max() / (np.pi * radius**2)
+        assert PAPER_PEAK_STRESS_MPA[0] <= stress <= PAPER_PEAK_STRESS_MPA[1]
+        rate = np.abs(np.diff(curve.force_mN) / np.diff(curve.time_s))
+        np.testing.assert_allclose(rate, 2.0, rtol=1e-9)
+
+
+def test_same_seed_same_campaign_and_another_seed_another():
+    one, two, other = paper_campaign(7), paper_campaign(7), paper_campaign(8)
+    for a, b in zip(one.curves, two.curves, strict=True):
+        np.testing.assert_array_equal(a.displacement_um, b.displacement_um)
+        np.testing.assert_array_equal(a.force_mN, b.force_mN)
+    assert one.columns == two.columns
+    assert not np.array_equal(one.curves[0].displacement_um, other.curves[0].displacement_um)
+
+
+def test_noise_has_the_asked_size_and_the_truth_stays():
+    truth, noisy = (
+        quiet(seed=2),
+        paper_campaign(2, instrument=Instrument(displacement_noise_um=0.02, force_noise_mN=0.05)),
+    )
+    gamma = np.concatenate(
+        [n.displacement_um - t.displacement_um for n, t in zip(noisy.curves, truth.curves, strict=True)]
+    )
+    force = np.concatenate([n.force_mN - t.force_mN for n, t in zip(noisy.curves, truth.curves, strict=True)])
+    assert gamma.std() == pytest.approx(0.02, rel=0.05)
+    assert force.std() == pytest.approx(0.05, rel=0.05)
+    assert abs(np.corrcoef(gamma, force)[0, 1]) < 0.05
+
+
+def test_resolution_and_zero():
+    read = paper_campaign(
+        2, instrument=Instrument(displacement_resolution_um=0.01, force_resolution_mN=0.5, zero_um=3.0)
+    )
+    for curve in read.curves:
+        np.testing.assert_allclose(curve.displacement_um / 0.01, np.round(curve.displacement_um / 0.01), atol=1e-6)
+        np.testing.assert_allclose(curve.force_mN / 0.5, np.round(curve.force_mN / 0.5), atol=1e-9)
+    zeros = [curve.displacement_um[0] for curve in read.curves]
+    assert 1.0 < np.std(zeros) < 6.0
+
+
+def test_switching_one_read_out_effect_on_leaves_the_others_draws_alone():
+    plain = paper_campaign(4, instrument=Instrument(displacement_noise_um=0.02))
+    both = paper_campaign(4, instrument=Instrument(displacement_noise_um=0.02, force_noise_mN=0.05))
+    np.testing.assert_array_equal(plain.curves[3].displacement_um, both.curves[3].displacement_um)
+
+
+def test_displacement_control_reaches_the_asked_stress():
+    campaign = quiet(seed=1, programme=Programme.cycles(control="displacement", rate=1.0, points=200))
+    for curve, (D1, D2, D3) in zip(campaign.curves, campaign.diameters_um, strict=True):
+        stress = 1e3 * curve.force_mN.max() / (np.pi * (D1 * D2 / D3 / 2) ** 2)
+        assert PAPER_PEAK_STRESS_MPA[0] * 0.999 <= stress <= PAPER_PEAK_STRESS_MPA[1] * 1.001
+
+
+def test_unequal_lengths_are_padded_with_valid_values_and_masked():
+    campaign = quiet(seed=1, programme=Programme.cycles(interval_s=3.0))
+    lengths = [len(c) for c in campaign.curves]
+    assert len(set(lengths)) > 5
+    padded = batch(campaign, multiple=16)
+    assert padded.force.shape[1] % 16 == 0
+    assert np.isfinite(np.asarray(padded.displacement)).all()
+    np.testing.assert_array_equal(np.asarray(padded.mask).sum(axis=1), lengths)
+    for i, curve in enumerate(campaign.curves):
+        np.testing.assert_array_equal(np.asarray(padded.force)[i, : len(curve)], curve.force_mN)
+        assert (np.asarray(padded.force)[i, len(curve) :] == curve.force_mN[-1]).all()
+
+
+def test_padding_changes_no_particle():
+    # The same particle alone, and beside one whose test is ten times as long.
+    plastic = eqx.filter_vmap(Plastic)(jnp.array([7.0, 7.0]), jnp.array([3.0, 3.0]), jnp.array([2.7, 2.7]))
+    laws = law_for_each(plastic, 1.43, 16e3)
+    sizes = np.array([[200.0, 190, 160], [200.0, 190, 160]])
+    programme = Programme.cycles(interval_s=1.0)
+    two = simulate_campaign(laws, sizes, np.array([50.0, 500.0]), programme)
+    one = simulate_campaign(
+        law_for_each(eqx.filter_vmap(Plastic)(*jnp.array([[7.0], [3.0], [2.7]])), 1.43, 16e3),
+        sizes[:1],
+        np.array([50.0]),
+        programme,
+    )
+    np.testing.assert_allclose(two.curves[0].displacement_um, one.curves[0].displacement_um, rtol=1e-14)
+    assert len(two.curves[1]) > 5 * len(two.curves[0])
+
+
+def test_particles_whose_law_is_not_monotone_are_marked():
+    plastic = eqx.filter_vmap(Plastic)(jnp.array([4.0, 7.0]), jnp.array([3.0, 3.0]), jnp.array([2.4, 2.7]))
+    campaign = simulate_campaign(
+        law_for_each(plastic, 1.43, 16e3), np.full((2, 3), 150.0), np.array([60.0, 60.0]), Programme.cycles()
+    )
+    assert campaign.columns["true_monotone"] == ("no", "yes")
+    assert isinstance(campaign.curves[0], Curve)
+
+
+def test_mismatched_lengths_are_told():
+    laws = law_for_each(paper_population().sample(__import__("jax").random.key(0), 2), 1.43, 16e3)
+    with pytest.raises(ValueError, match="3 particles need as many"):
+        simulate_campaign(laws, np.full((3, 3), 100.0), np.ones(3), Programme.cycles())
+
+
+def test_parameters_without_sense_are_told():
+    laws = eqx.filter_vmap(lambda p: MccLaw(p, 1.43, -5.0))(eqx.filter_vmap(Plastic)(*jnp.array([[7.0], [3.0], [2.7]])))
+    with pytest.raises(ValueError, match="must be positive"):
+        simulate_campaign(laws, np.full((1, 3), 100.0), np.ones(1) * 20, Programme.cycles())
+
+
+def test_particle_of_the_table_is_a_particle():
+    assert float(Particle(1, 2, 3).effective_diameter) == pytest.approx(2 / 3)

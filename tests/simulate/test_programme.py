@@ -1,0 +1,113 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mcc_jax import Hold, InputError, Programme, Ramp
+from mcc_jax.simulate import read_programme
+
+
+def test_paper_cycle_takes_twice_peak_over_rate():
+    time, force = Programme.cycles(rate=2.0, points=300).sample(200.0)
+    assert time[-1] == pytest.approx(200.0)
+    assert force.max() == 200.0
+    assert force[0] == force[-1] == 0.0
+
+
+def test_levels_holds_and_partial_unloads_are_all_reached():
+    programme = Programme.cycles(
+        rate=4.0, levels=(0.5, 1.0), unload_to=0.1, hold_s=10.0, unload_rate=8.0, interval_s=1.0
+    )
+    time, force = programme.sample(80.0)
+    turning = {0.0: 0.0, 10.0: 40.0, 20.0: 40.0, 24.0: 8.0, 42.0: 80.0, 52.0: 80.0, 62.0: 0.0}
+    for t, f in turning.items():
+        assert force[np.argmin(np.abs(time - t))] == pytest.approx(f)
+    assert time[-1] == pytest.approx(62.0)
+
+
+steps = st.lists(
+    st.one_of(
+        st.builds(Ramp, st.floats(0, 2), st.floats(0.01, 100)),
+        st.builds(Hold, st.floats(0.01, 100)),
+    ),
+    min_size=1,
+    max_size=8,
+)
+
+
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(steps, st.floats(1, 1e3), st.integers(2, 500))
+def test_sampled_paths_increase_in_time_and_stay_within_the_levels(steps, peak, points):
+    programme = Programme("load", tuple(steps), points=points)
+    moves = any(isinstance(s, Hold) or s.to > 0 for s in steps)
+    if not moves:
+        with pytest.raises(ValueError, match="never leaves zero"):
+            programme.sample(peak)
+        return
+    time, value = programme.sample(peak)
+    highest = max([0.0] + [s.to * peak for s in steps if isinstance(s, Ramp)])
+    assert (np.diff(time) > 0).all()
+    assert value.min() >= 0
+    assert value.max() == pytest.approx(highest)
+    # No ramp is faster than it was told to be.
+    fastest = max([0.0] + [s.rate for s in steps if isinstance(s, Ramp)])
+    assert np.abs(np.diff(value) / np.diff(time)).max() <= fastest * (1 + 1e-6) + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"steps": (Ramp(1.0, 1.0),)}, "exactly one of"),
+        ({"steps": (Ramp(1.0, 1.0),), "points": 10, "interval_s": 1.0}, "exactly one of"),
+        ({"steps": (), "points": 10}, "at least one step"),
+        ({"steps": (Ramp(1.0, 0.0),), "points": 10}, "rate"),
+        ({"steps": (Ramp(-1.0, 1.0),), "points": 10}, "level"),
+        ({"steps": (Hold(0.0),), "points": 10}, "hold"),
+        ({"steps": (Ramp(1.0, 1.0),), "points": 1}, "points"),
+        ({"steps": (Ramp(1.0, 1.0),), "interval_s": -1.0}, "interval_s"),
+    ],
+)
+def test_impossible_programmes_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Programme("load", **arguments)
+
+
+def test_programme_file_round_trip(tmp_path):
+    file = tmp_path / "programme.toml"
+    file.write_text(
+        'control = "load"\nrate = 2\ninterval_s = 0.5\n[[step]]\nramp_to = 1\n[[step]]\nhold_s = 60\n'
+        "[[step]]\nramp_to = 0\nrate = 4.0\n"
+    )
+    assert read_programme(file) == Programme("load", (Ramp(1.0, 2.0), Hold(60.0), Ramp(0.0, 4.0)), interval_s=0.5)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("control = ", "valid TOML"),
+        ("rate = 2", "no [[step]]"),
+        ("speed = 2\n[[step]]\nramp_to=1", "unknown entry 'speed'"),
+        ("[[step]]\nramp_to = 1", "no rate"),
+        ("rate=1\n[[step]]\nramp_to = 'full'", "must be a number"),
+        ("rate=1\n[[step]]\nramp_to = 1\nhold_s = 2", "exactly one of"),
+        ("rate=1\n[[step]]\nramp_to = 1\nfast = true", "unknown entry 'fast'"),
+        ("rate=-1\n[[step]]\nramp_to = 1", "rate"),
+        ("rate=1\npoints=2.5\n[[step]]\nramp_to = 1", "whole number"),
+        ("control='torque'\nrate=1\n[[step]]\nramp_to = 1", "control"),
+        ("step = 3", "no [[step]]"),
+        ("rate=true\n[[step]]\nramp_to = 1", "must be a number"),
+    ],
+)
+def test_bad_programme_files_are_told_in_one_line(tmp_path, text, message):
+    file = tmp_path / "programme.toml"
+    file.write_text(text)
+    with pytest.raises(InputError) as error:
+        read_programme(file)
+    assert message in str(error.value)
+    assert "programme.toml" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_missing_programme_file_is_told(tmp_path):
+    with pytest.raises(InputError, match="cannot be read"):
+        read_programme(tmp_path / "none.toml")
