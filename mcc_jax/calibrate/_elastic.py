@@ -13,7 +13,7 @@ import optimistix as optx
 from jaxtyping import Array, Float, Int
 
 from .._types import Scalar
-from ..campaign import Curve, find_segments, stress_and_strain
+from ..campaign import Curve, Segment, stress_and_strain
 from ..law import StrainScaling, Unloading, recovery
 
 LEAST_RATIO = 0.05
@@ -60,19 +60,22 @@ class ElasticFit:
     reason: str
 
 
-def elastic_branches(particle: int, curve: Curve, diameters_um: np.ndarray, shift: float = 0.0) -> list[ElasticBranch]:
+def elastic_branches(
+    particle: int, curve: Curve, diameters_um: np.ndarray, segments: tuple[Segment, ...], shift: float = 0.0
+) -> list[ElasticBranch]:
     """Collect a test's elastic branches.
 
     Args:
         particle: position in the campaign, kept in the result.
         curve: the test.
         diameters_um: D1, D2, D3 [um].
+        segments: the test's segments.
         shift: offset of strain from the offset step [-].
 
     Returns:
         Branches with at least five points between `LEAST_RATIO` and the peak.
     """
-    stress, strain = stress_and_strain(curve, diameters_um)
+    stress, strain = stress_and_strain(curve, diameters_um, segments)
     strain = strain + shift
     branches: list[ElasticBranch] = []
     rows: list[np.ndarray] = []
@@ -90,7 +93,7 @@ def elastic_branches(particle: int, curve: Curve, diameters_um: np.ndarray, shif
             branches.append(ElasticBranch(particle, deepest, top, strain[points], stress[points]))
 
     loaded = False
-    for segment in find_segments(curve):
+    for segment in segments:
         if segment.kind == "load":
             close()
             rows, peak, loaded = [], None, True

@@ -19,7 +19,6 @@ from ..campaign import (
     Curve,
     adjust,
     effective_diameter_um,
-    find_segments,
     particle_batch,
     stress_and_strain,
 )
@@ -131,18 +130,25 @@ class PaperCalibration:
             notes.append(f"{dropped} of {len(self.campaign)} particles could not be used")
         if self.own_misfit > BAD_MISFIT:
             notes.append(
-                f"even with its own C1, C3, C5 the law misses a test's displacements by {100 * self.own_misfit:.0f} % of their "
-                "range (median): it describes these tests badly, or they are no compressions of single particles"
+                "even with its own C1, C3, C5 the law misses a test's displacements by "
+                f"{100 * self.own_misfit:.0f} % of their range (median): "
+                "it describes these tests badly, or they are no compressions of single particles"
             )
         return notes
 
     @property
     def relative_misfit(self) -> float:
-        """Median over the kept particles of `rms_um` over the range of displacement [-]."""
+        """Median over the particles of `rms_um` over the range of displacement [-], with their scatter."""
+        return self._misfit("rms_um")
+
+    @property
+    def own_misfit(self) -> float:
+        """The same with every particle's own coefficients: what the form of the law leaves."""
+        return self._misfit("own_rms_um")
+
+    def _misfit(self, name: str) -> float:
         fits = [p for p in self.particles if p is not None and p.used.any()]
-        return (
-            float(np.median([p.rms_um / max(np.ptp(p.measured_um[p.used]), 1e-300) for p in fits])) if fits else np.nan
-        )
+        return float(np.median([getattr(p, name) / max(np.ptp(p.measured_um[p.used]), 1e-300) for p in fits]))
 
     def to_json(self) -> dict[str, Any]:
         """The contents of `calibration.json`."""
@@ -264,7 +270,9 @@ def calibrate_paper(
     branches = [
         b
         for i in np.flatnonzero(adjustment.kept)
-        for b in elastic_branches(int(i), campaign.curves[i], campaign.diameters_um[i], float(adjustment.shift[i]))
+        for b in elastic_branches(
+            int(i), campaign.curves[i], campaign.diameters_um[i], adjustment.segments[i], float(adjustment.shift[i])
+        )
     ]
     elastic = fit_effective_modulus(branches, eta, unloading, strain_scaling)
     # Without any unloading the modulus cannot matter to a prediction; a stiff one keeps the law defined.
@@ -346,10 +354,10 @@ def _predict(
     fits: list[ParticleFit | None] = [None] * len(campaign)
     for row, i in enumerate(kept):
         curve = campaign.curves[i]
-        stress, strain = stress_and_strain(curve, campaign.diameters_um[i])
+        stress, strain = stress_and_strain(curve, campaign.diameters_um[i], adjustment.segments[i])
         measured = (strain + adjustment.shift[i]) * effective_diameter_um(campaign.diameters_um[i])
         touching = np.ones(len(curve), bool)
-        for segment in find_segments(curve):
+        for segment in adjustment.segments[i]:
             if segment.kind == "approach":
                 touching[segment.start : segment.stop] = False
         used = touching & (stress > max(adjustment.threshold_MPa, 0.02 * stress.max()))

@@ -4,6 +4,7 @@ from ._adjustment import THRESHOLD_MPA as THRESHOLD_MPA
 from ._adjustment import Adjustment as Adjustment
 from ._adjustment import LoadingCurve as LoadingCurve
 from ._adjustment import adjust as adjust
+from ._adjustment import campaign_segments as campaign_segments
 from ._adjustment import effective_diameter_um as effective_diameter_um
 from ._adjustment import loading_curve as loading_curve
 from ._adjustment import stress_and_strain as stress_and_strain

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ._schema import Campaign, Curve
-from ._segments import find_segments
+from ._segments import Segment, find_segments
 
 THRESHOLD_MPA = 0.2
 """Stress [MPa] below which surface irregularities, not the particle, deform (Bommireddy et al. 2018, section 3)."""
@@ -41,7 +41,14 @@ def effective_diameter_um(diameters_um: np.ndarray) -> float:
     return float(D1 * D2 / D3)
 
 
-def stress_and_strain(curve: Curve, diameters_um: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def campaign_segments(campaign: Campaign) -> tuple[tuple[Segment, ...], ...]:
+    """The segments of every test, found with the campaign's own control if it is known."""
+    return tuple(find_segments(curve, control=campaign.metadata.control) for curve in campaign.curves)
+
+
+def stress_and_strain(
+    curve: Curve, diameters_um: np.ndarray, segments: tuple[Segment, ...]
+) -> tuple[np.ndarray, np.ndarray]:
     r"""Effective stress [MPa] and strain [-] of every point of a test.
 
     .. math:: \sigma = F / (\pi R_e^2), \qquad \epsilon = (\gamma - \gamma_0) / D_e
@@ -53,12 +60,11 @@ def stress_and_strain(curve: Curve, diameters_um: np.ndarray) -> tuple[np.ndarra
         Bommireddy et al. (2018), eqs. 4 and 5.
     """
     diameter = effective_diameter_um(diameters_um)
-    segments = find_segments(curve)
     zero = curve.displacement_um[segments[0].stop] if segments[0].kind == "approach" and len(segments) > 1 else 0.0
     return 1e3 * curve.force_mN / (np.pi * diameter**2 / 4), (curve.displacement_um - zero) / diameter
 
 
-def loading_curve(curve: Curve, diameters_um: np.ndarray) -> LoadingCurve | None:
+def loading_curve(curve: Curve, diameters_um: np.ndarray, segments: tuple[Segment, ...]) -> LoadingCurve | None:
     """The virgin loading of a test, over all its cycles, as strain over stress.
 
     Force is made monotone by isotonic regression, which, unlike a running maximum, is not lifted by noise; points that
@@ -69,11 +75,11 @@ def loading_curve(curve: Curve, diameters_um: np.ndarray) -> LoadingCurve | None
     """
     from scipy.optimize import isotonic_regression  # half a second to import, so only where it is used
 
-    segments = [s for s in find_segments(curve) if s.kind == "load"]
-    if not segments:
+    virgin = [np.arange(s.start, s.stop) for s in segments if s.kind == "load"]
+    if not virgin:
         return None
-    rows = np.concatenate([np.arange(s.start, s.stop) for s in segments])
-    stress, strain = stress_and_strain(curve, diameters_um)
+    rows = np.concatenate(virgin)
+    stress, strain = stress_and_strain(curve, diameters_um, segments)
     fit = isotonic_regression(stress[rows])
     starts = fit.blocks[:-1]
     level = np.asarray(fit.x)[starts]
@@ -95,6 +101,7 @@ class Adjustment:
         threshold_MPa: the stress at which all adjusted curves meet; 0 if no offset step was made.
         strain: their common strain there, the mean over the particles.
         why_not: for each particle, None if kept, else the reason.
+        segments: the segments of every test, for whoever needs them next.
     """
 
     curves: tuple[LoadingCurve | None, ...]
@@ -102,6 +109,7 @@ class Adjustment:
     threshold_MPa: float
     strain: float
     why_not: tuple[str | None, ...]
+    segments: tuple[tuple[Segment, ...], ...]
 
     @property
     def kept(self) -> np.ndarray:
@@ -130,7 +138,8 @@ def adjust(campaign: Campaign, threshold_MPa: float = THRESHOLD_MPA) -> Adjustme
     """
     if not (np.isfinite(threshold_MPa) and threshold_MPa >= 0):
         raise ValueError(f"the threshold must be a stress >= 0 MPa, got {threshold_MPa}")
-    raw = [loading_curve(curve, d) for curve, d in zip(campaign.curves, campaign.diameters_um, strict=True)]
+    segments = campaign_segments(campaign)
+    raw = [loading_curve(*one) for one in zip(campaign.curves, campaign.diameters_um, segments, strict=True)]
     why_not: list[str | None] = []
     for curve in raw:
         if curve is None:
@@ -140,7 +149,7 @@ def adjust(campaign: Campaign, threshold_MPa: float = THRESHOLD_MPA) -> Adjustme
         else:
             why_not.append(None)
     if threshold_MPa == 0:
-        return Adjustment(tuple(raw), np.zeros(len(raw)), 0.0, 0.0, tuple(why_not))
+        return Adjustment(tuple(raw), np.zeros(len(raw)), 0.0, 0.0, tuple(why_not), segments)
     at_threshold = np.array(
         [
             float(c.at(threshold_MPa)) if c is not None and r is None else np.nan
@@ -148,7 +157,7 @@ def adjust(campaign: Campaign, threshold_MPa: float = THRESHOLD_MPA) -> Adjustme
         ]
     )
     if np.isnan(at_threshold).all():
-        return Adjustment((None,) * len(raw), np.zeros(len(raw)), threshold_MPa, 0.0, tuple(why_not))
+        return Adjustment((None,) * len(raw), np.zeros(len(raw)), threshold_MPa, 0.0, tuple(why_not), segments)
     mean = float(np.nanmean(at_threshold))
     shift = np.where(np.isnan(at_threshold), 0.0, mean - at_threshold)
     adjusted: list[LoadingCurve | None] = []
@@ -163,4 +172,4 @@ def adjust(campaign: Campaign, threshold_MPa: float = THRESHOLD_MPA) -> Adjustme
                 np.concatenate([[0.0, mean], curve.strain[above] + offset]),
             )
         )
-    return Adjustment(tuple(adjusted), shift, threshold_MPa, mean, tuple(why_not))
+    return Adjustment(tuple(adjusted), shift, threshold_MPa, mean, tuple(why_not), segments)

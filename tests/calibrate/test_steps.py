@@ -21,7 +21,7 @@ from mcc_jax.calibrate import (
 )
 from mcc_jax.calibrate._master import MasterCurve, StrainTable
 from mcc_jax.calibrate._shape import _weights, full_residuals, reference_residuals
-from mcc_jax.campaign import adjust, loading_curve
+from mcc_jax.campaign import adjust, find_segments, loading_curve
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def scattered():
 def test_loading_curve_is_the_law_at_the_measured_points(exact):
     law = paper_law()
     for i in (0, 5, 15):
-        curve = loading_curve(exact.curves[i], exact.diameters_um[i])
+        curve = loading_curve(exact.curves[i], exact.diameters_um[i], find_segments(exact.curves[i]))
         D1, D2, D3 = exact.diameters_um[i]
         eta = 1 + 1.43 * (1 - D3**2 / (D1 * D2))
         expected = np.asarray(law.plastic.strain(jnp.asarray(curve.stress_MPa[1:]))) / eta
@@ -90,8 +90,8 @@ def test_cycles_give_the_same_loading_curve_as_one_ramp():
         paper_campaign(1, shared_material=True, instrument=Instrument(), programme=p) for p in (None, programme)
     )
     for i in range(0, 20, 5):
-        one = loading_curve(ramp.curves[i], ramp.diameters_um[i])
-        many = loading_curve(cycles.curves[i], cycles.diameters_um[i])
+        one = loading_curve(ramp.curves[i], ramp.diameters_um[i], find_segments(ramp.curves[i]))
+        many = loading_curve(cycles.curves[i], cycles.diameters_um[i], find_segments(cycles.curves[i]))
         grid = np.linspace(0.5, 0.98 * one.stress_max_MPa, 50)
         np.testing.assert_allclose(many.at(grid), one.at(grid), rtol=2e-3)
 
@@ -314,7 +314,9 @@ def _branches(campaign, threshold):
     return [
         b
         for i in range(len(campaign))
-        for b in elastic_branches(i, campaign.curves[i], campaign.diameters_um[i], float(adjustment.shift[i]))
+        for b in elastic_branches(
+            i, campaign.curves[i], campaign.diameters_um[i], adjustment.segments[i], float(adjustment.shift[i])
+        )
     ]
 
 

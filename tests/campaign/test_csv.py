@@ -1,0 +1,426 @@
+from __future__ import annotations
+
+import datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mcc_jax._errors import InputError
+from mcc_jax.campaign import Campaign, Curve, Metadata, read_campaign, write_campaign
+from mcc_jax.campaign import _curves as curves_module
+
+PARTICLES = "particle,D1_um,D2_um,D3_um,batch\nA,200,190,180,x\n01,150,140,130,\n"
+CURVES = (
+    "particle,time_s,force_mN,displacement_um\n"
+    "A,0,0,0\nA,1,2.5,0.1\nA,2,5,0.2\n01,0,0,0\n01,0.5,1,0.05\n01,0.5,2,0.07\n"
+)
+
+
+def make(folder: Path, particles: str | bytes | None = PARTICLES, curves: str | bytes | None = CURVES, toml=None):
+    folder.mkdir(exist_ok=True)
+    for name, content in (("particles.csv", particles), ("curves.csv", curves), ("campaign.toml", toml)):
+        if content is not None:
+            (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
+    return folder
+
+
+def assert_same(a: Campaign, b: Campaign) -> None:
+    assert a.particles == b.particles
+    assert np.array_equal(a.diameters_um, b.diameters_um)
+    assert a.columns == b.columns
+    assert a.metadata == b.metadata
+    for one, two in zip(a.curves, b.curves, strict=True):
+        for name in ("time_s", "force_mN", "displacement_um"):
+            x, y = getattr(one, name), getattr(two, name)
+            assert np.array_equal(x, y)
+            assert np.array_equal(np.signbit(x), np.signbit(y))
+
+
+def message(folder: Path) -> str:
+    with pytest.raises(InputError) as caught:
+        read_campaign(folder)
+    return str(caught.value)
+
+
+def test_reads_plain_campaign(tmp_path):
+    campaign = read_campaign(make(tmp_path / "c"))
+    assert campaign.particles == ("A", "01")
+    assert campaign.diameters_um.tolist() == [[200, 190, 180], [150, 140, 130]]
+    assert campaign.columns == {"batch": ("x", "")}
+    assert campaign.curves[1].force_mN.tolist() == [0, 1, 2]
+    assert campaign.source == str(tmp_path / "c")
+    assert campaign.metadata == Metadata()
+
+
+def test_converts_units(tmp_path):
+    curves = "displacement_nm,time_ms,particle,force_N\n1000,0,A,0\n2000,500,A,0.001\n3,1,01,0\n4,2,01,1e-6\n"
+    particles = "D3_m,D1_mm,D2_nm,particle\n0.00018,0.2,190000,A\n1e-4,1e-1,1e5,01\n"
+    campaign = read_campaign(make(tmp_path / "c", particles, curves))
+    assert campaign.diameters_um.tolist() == [[200, 190, 180], [100, 100, 100]]
+    assert campaign.curves[0].displacement_um.tolist() == [1, 2]
+    assert campaign.curves[0].time_s.tolist() == [0, 0.5]
+    assert campaign.curves[0].force_mN.tolist() == [0, 1]
+    assert campaign.curves[1].displacement_um.tolist() == [0.003, 0.004]
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor"),
+    [("N", 1e3), ("uN", 1e-3), ("µN", 1e-3), ("nN", 1e-6), ("kN", 1e6), ("gf", 9.80665), ("newton", 1e3)],
+)
+def test_accepts_units_of_force(tmp_path, unit, factor):
+    curves = CURVES.replace("force_mN", f"force_{unit}")
+    force = read_campaign(make(tmp_path / "c", curves=curves)).curves[0].force_mN
+    assert force == pytest.approx([0, 2.5 * factor, 5 * factor], rel=1e-14)
+
+
+def test_accepts_byte_order_mark_crlf_blanks_and_empty_rows(tmp_path):
+    windows = "\ufeff" + CURVES.replace(",force", " , force").replace("\n", "\r\n") + "\r\n\r\n"
+    assert_same(read_campaign(make(tmp_path / "a", curves=windows)), read_campaign(make(tmp_path / "b")))
+
+
+def test_rows_of_particles_may_be_mixed(tmp_path):
+    header, *rows = CURVES.splitlines()
+    mixed = "\n".join([header, *(rows[i] for i in (3, 0, 4, 1, 5, 2))])
+    assert_same(read_campaign(make(tmp_path / "a", curves=mixed)), read_campaign(make(tmp_path / "b")))
+
+
+def test_metadata(tmp_path):
+    toml = (
+        'control = "load"\nforce_resolution_uN = 100\npunch_diameter_mm = 0.5\ncorrections = ["frame_compliance"]\n'
+        'provenance = "made up"\nlab = "L"\n[tester]\ncompliance_um_per_mN = 0.1\n'
+    )
+    metadata = read_campaign(make(tmp_path / "c", toml=toml)).metadata
+    assert metadata == Metadata(
+        "load",
+        0.1,
+        None,
+        500.0,
+        "made up",
+        ("frame_compliance",),
+        {"lab": "L", "tester": {"compliance_um_per_mN": 0.1}},
+    )
+
+
+P, C, T = "particles.csv", "curves.csv", "campaign.toml"
+HEAD = "particle,time_s,force_mN,displacement_um\n"
+DIAMETERS = "particle,D1_um,D2_um,D3_um\n"
+
+# Which file, its content, and pieces that the message must hold.
+BAD = {
+    "particles empty": (P, "", ["empty", "Export"]),
+    "curves empty": (C, "", ["empty", "Export"]),
+    "curves blank": (C, " \n\n", ["empty"]),
+    "particles header only": (P, DIAMETERS, ["row 1", "no row of data"]),
+    "curves header only": (C, HEAD, ["row 1", "no row of data"]),
+    "particle column missing": (
+        C,
+        CURVES.replace("particle,", "sample,"),
+        ["row 1", "'particle' is missing", "Add it"],
+    ),
+    "particle column misspelt": (
+        P,
+        PARTICLES.replace("particle,", "Particle,"),
+        ["Did you mean 'particle' by 'Particle'"],
+    ),
+    "diameter missing": (P, "particle,D1_um,D2_um\nA,1,1\n01,1,1\n", ["'D3_um' is missing"]),
+    "diameter misspelt": (P, PARTICLES.replace("D3_um", "d3_um"), ["Did you mean 'D3_um' by 'd3_um'"]),
+    "force missing": (C, "particle,time_s,displacement_um\nA,0,0\n", ["'force_mN' is missing"]),
+    "force misspelt": (C, CURVES.replace("force_mN", "forse_mN"), ["Did you mean 'force_mN' by 'forse_mN'"]),
+    "force wrong case": (C, CURVES.replace("force_mN", "Force_mN"), ["Did you mean 'force_mN' by 'Force_mN'"]),
+    "unit missing": (C, CURVES.replace("force_mN", "force"), ["column 'force'", "unit is missing", "force_mN"]),
+    "unit missing time": (C, CURVES.replace("time_s", "time"), ["column 'time'", "unit is missing", "ms"]),
+    "unit unknown": (C, CURVES.replace("force_mN", "force_bananas"), ["'force_bananas'", "unknown", "mN, N, uN"]),
+    "unit of other kind": (C, CURVES.replace("force_mN", "force_um"), ["'force_um'", "no unit of force", "mN"]),
+    "unit of mass": (C, CURVES.replace("force_mN", "force_g"), ["'force_g'", "no unit of force", "gf"]),
+    "unit an expression": (C, CURVES.replace("force_mN", "force_N*2"), ["'force_N*2'", "not a unit"]),
+    "unit empty": (C, CURVES.replace("force_mN", "force_"), ["'force_'", "not a unit"]),
+    "force twice": (C, "particle,time_s,force_mN,force_N,displacement_um\nA,0,0,0,0\n", ["given 2 times", "Keep one"]),
+    "same name twice": (C, "particle,time_s,time_s,force_mN,displacement_um\n", ["'time_s'", "2 times", "Rename"]),
+    "name of column empty": (P, PARTICLES.replace("batch", " "), ["column 5 is empty", "Name or delete"]),
+    "unknown column of curves": (
+        C,
+        HEAD.strip() + ",temp\nA,0,0,0,1\n",
+        ["'temp'", "no column of curves", "particles.csv"],
+    ),
+    "text for a number": (C, CURVES.replace("A,1,2.5", "A,1,abc"), ["row 3", "'force_mN'", "'abc' is not a number"]),
+    "text for a diameter": (P, PARTICLES.replace("190", "big"), ["row 2", "'D2_um'", "'big' is not a number"]),
+    "decimal comma": (C, CURVES.replace("A,1,2.5", 'A,1,"2,5"'), ["row 3", "'2,5'", "decimal comma", "decimal point"]),
+    "decimal comma unquoted": (
+        C,
+        CURVES.replace("A,1,2.5", "A,1,2,5"),
+        ["row 3", "5 cells", "header has 4", "decimal point"],
+    ),
+    "underscore": (C, CURVES.replace("2.5", "2_5"), ["row 3", "'2_5' is not a number"]),
+    "NaN": (C, CURVES.replace("2.5", "nan"), ["row 3", "'force_mN'", "not a finite number"]),
+    "NA": (C, CURVES.replace("2.5", "NA"), ["row 3", "'force_mN'", "not a number"]),
+    "infinite": (C, CURVES.replace("2.5", "-inf"), ["row 3", "'force_mN'", "not a finite number"]),
+    "empty cell": (C, CURVES.replace("2.5", ""), ["row 3", "'force_mN'", "empty"]),
+    "blank cell": (C, CURVES.replace("2.5", "  "), ["row 3", "'force_mN'", "empty"]),
+    "NaN diameter": (P, PARTICLES.replace("190", "NaN"), ["row 2", "'D2_um'", "not a finite number"]),
+    "number overflows": (C, CURVES.replace("2.5", "1e999"), ["row 3", "'force_mN'", "too large"]),
+    "number huge": (C, CURVES.replace("2.5", "1e200"), ["row 3", "'force_mN'", "too large"]),
+    "number huge in its unit": (C, CURVES.replace("2.5", "1e14").replace("mN", "N"), ["row 3", "too large", "unit"]),
+    "diameter negative": (P, PARTICLES.replace("140", "-140"), ["row 3", "'D2_um'", "not positive"]),
+    "diameter zero": (P, PARTICLES.replace("140", "0"), ["row 3", "'D2_um'", "not positive"]),
+    "diameter tiny": (P, PARTICLES.replace("140", "1e-300"), ["row 3", "'D2_um'", "too small", "unit"]),
+    "particle twice": (P, PARTICLES.replace("01,", "A,"), ["row 3", "'A' is already in row 2", "one row"]),
+    "particle without curve": (P, PARTICLES + "B,1,1,1,\n", ["row 4", "'B' has no curve", "remove it"]),
+    "curve without particle": (C, CURVES + "B,0,0,0\nB,1,1,1\n", ["row 8", "'B' is not in particles.csv", "Add its"]),
+    "blank before a name": (P, PARTICLES.replace("\n01", "\n 01"), ["row 3", "' 01' has no curve", "'01'", "blanks"]),
+    "name empty": (P, PARTICLES.replace("01,", ","), ["row 3", "'particle'", "name is empty"]),
+    "name empty in curves": (C, CURVES + ",0,0,0\n", ["row 8", "'particle'", "name is empty"]),
+    "time goes back": (C, CURVES.replace("A,2,", "A,0.5,"), ["row 4", "'time_s'", "goes back", "order of time"]),
+    "one row": (C, HEAD + "A,0,0,0\nA,1,1,1\n01,0,1,1\n", ["row 4", "'01' has one row only", "two rows"]),
+    "too many cells": (C, CURVES.replace("A,2,5,0.2", "A,2,5,0.2,7"), ["row 4", "5 cells", "header has 4"]),
+    "too few cells": (C, CURVES.replace("A,2,5,0.2", "A,2,5"), ["row 4", "'displacement_um'", "3 cells", "Fill"]),
+    "quotes open": (C, CURVES.replace("A,2", '"A,2'), ["row 4", "quotes", "Close"]),
+    "quotes with a tail": (C, CURVES.replace("A,2", '"A"b,2'), ["row 4", "quotes"]),
+    "semicolons": (C, CURVES.replace(",", ";"), ["row 1", "';'", "mcc-jax convert", "mapping file"]),
+    "tabs": (P, PARTICLES.replace(",", "\t"), ["row 1", "tabs", "mcc-jax convert"]),
+    "semicolons and commas": (C, CURVES.replace(",", ";").replace(".", ","), ["row 1", "';'", "convert"]),
+    "Latin-1": (P, PARTICLES.replace("A,", "\xb5,").encode("latin-1"), ["row 2", "0xb5", "UTF-8"]),
+    "Latin-1 behind a mark": (
+        P,
+        b"\xef\xbb\xbf" + PARTICLES.replace("01,", "\xb5,").encode("latin-1"),
+        ["row 3", "0xb5"],
+    ),
+    "UTF-16": (C, CURVES.encode("utf-16"), ["UTF-16", "UTF-8"]),
+    "gzip": (C, b"\x1f\x8b\x08\x00junk", ["gzip", "plain CSV"]),
+    "Excel": (C, b"PK\x03\x04junk", ["Excel", "plain CSV"]),
+    "old Excel": (P, b"\xd0\xcf\x11\xe0junk", ["Excel", "plain CSV"]),
+    "NUL bytes": (C, CURVES.replace("A", "\0"), ["NUL", "plain CSV"]),
+    "forces all zero": (C, HEAD + "A,0,0,0\nA,1,0,1\n01,0,1,1\n01,1,1,1\n", ["row 2", "'force_mN'", "holds no data"]),
+    "displacements all zero": (C, HEAD + "A,0,1,0\nA,1,0,0\n01,0,1,1\n01,1,1,1\n", ["'displacement_um'", "no data"]),
+    "TOML broken": (T, 'control = "load"\nx = = 1\n', ["row 2", "not TOML", "double quotes"]),
+    "TOML cut off": (T, 'control = "load"\nx = ', ["row 2", "not TOML"]),
+    "TOML deep": (T, "x = " + "[" * 20_000, ["not TOML"]),
+    "control unknown": (T, 'control = "force"', ["'control'", "'force'", '"displacement"']),
+    "control no text": (T, "control = [1]", ["'control'", "Write"]),
+    "key in wrong case": (T, 'Control = "load"', ["'Control'", "Did you mean 'control'"]),
+    "resolution text": (T, 'force_resolution_mN = "0.1"', ["'force_resolution_mN'", "not a positive number", "quotes"]),
+    "resolution negative": (T, "force_resolution_mN = -1", ["'force_resolution_mN'", "not a positive number"]),
+    "resolution NaN": (T, "displacement_resolution_um = nan", ["'displacement_resolution_um'", "not a positive"]),
+    "resolution true": (T, "force_resolution_mN = true", ["'force_resolution_mN'", "not a positive number"]),
+    "punch zero": (T, "punch_diameter_um = 0", ["'punch_diameter_um'", "not a positive number"]),
+    "punch huge": (T, "punch_diameter_um = 1" + "0" * 400, ["'punch_diameter_um'", "not a positive number"]),
+    "punch without unit": (T, "punch_diameter = 500", ["'punch_diameter'", "unit is missing", "punch_diameter_um"]),
+    "punch in bananas": (T, "punch_diameter_bananas = 500", ["'punch_diameter_bananas'", "unknown"]),
+    "punch twice": (T, "punch_diameter_um = 500\npunch_diameter_mm = 0.5", ["2 times", "Keep one"]),
+    "provenance no text": (T, "provenance = 3", ["'provenance'", "must be text"]),
+    "corrections no list": (T, 'corrections = "creep"', ["'corrections'", "list of names"]),
+    "corrections of numbers": (T, "corrections = [1]", ["'corrections'", "list of names"]),
+    "TOML in Latin-1": (T, 'x = 1\nprovenance = "\xb5"'.encode("latin-1"), ["row 2", "UTF-8"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_file_is_one_line_with_place_and_remedy(tmp_path, case):
+    file, content, pieces = BAD[case]
+    folder = make(tmp_path / "c")
+    (folder / file).write_bytes(content.encode() if isinstance(content, str) else content)
+    text = message(folder)
+    assert text.startswith(str(folder / file))
+    assert text.isprintable()
+    assert len(text) < 420 + len(str(folder))
+    for piece in pieces:
+        assert piece in text
+    # What to do stands behind a full stop.
+    assert ". " in text.removeprefix(str(folder / file))
+
+
+def test_bad_folders(tmp_path):
+    assert "no such folder" in message(tmp_path / "none")
+    folder = make(tmp_path / "c")
+    assert "is a file" in message(folder / "curves.csv")
+    (folder / "curves.csv").rename(folder / "Curves.CSV")
+    assert "Rename 'Curves.CSV'" in message(folder)
+    (folder / "Curves.CSV").unlink()
+    assert "curves.csv is missing" in message(folder)
+    assert "found: particles.csv" in message(folder)
+    (tmp_path / "empty").mkdir()
+    assert "found: nothing" in message(tmp_path / "empty")
+    (folder / "curves.csv").mkdir()
+    assert "folder where a file is expected" in message(folder)
+
+
+def test_unreadable_file(tmp_path, monkeypatch):
+    folder = make(tmp_path / "c")
+
+    def refuse(self):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "read_bytes", refuse)
+    text = message(folder)
+    assert "particles.csv: cannot be read: Permission denied" in text
+    assert "Check the permissions" in text
+
+
+def test_row_counts_lines_within_quotes_and_empty_lines(tmp_path):
+    particles = DIAMETERS + '"A\nB",1,1,1\n'
+    curves = HEAD + '"A\nB",0,0,0\n\n"A\nB",1,x,0\n'
+    assert "row 5, column 'force_mN'" in message(make(tmp_path / "c", particles, curves))
+
+
+NAMES = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), min_size=1, max_size=12).filter(
+    str.strip
+)
+NASTY = st.sampled_from(
+    ["01", "1", "1.0", "NA", "null", "nan", "None", "True", "a,b", 'say "so"', " lead", "trail ", "ü µ 粒子", "a\nb",
+     "a\r\nb", "a\rb", "'", "-", "1e5", "#", "=1+1", "\ufeffx", "x\x85y", "\u2028z", "a;b", "\t tab"]
+)  # fmt: skip
+VALUES = st.floats(-1e15, 1e15, allow_nan=False)
+LENGTHS = st.floats(1e-6, 1e15)
+
+
+@st.composite
+def campaign_parts(draw):
+    # The run-time type checks draw random numbers, which Hypothesis forbids in here; the test puts it together.
+    names = draw(st.lists(st.one_of(NAMES, NASTY), min_size=1, max_size=4, unique=True))
+    curves = []
+    for _ in names:
+        n = draw(st.integers(2, 6))
+        time = np.sort(draw(st.lists(VALUES, min_size=n, max_size=n)))
+        force, displacement = (np.array(draw(st.lists(VALUES, min_size=n, max_size=n).filter(any))) for _ in range(2))
+        curves.append((time, force, displacement))
+    columns = {
+        name: tuple(draw(st.one_of(NASTY, st.just(""))) for _ in names)
+        for name in draw(st.lists(NASTY.map(str.strip), max_size=2, unique=True))
+        if "\ufeff" not in name
+    }
+    leaves = st.one_of(
+        st.text(st.characters(exclude_categories=["Cs"])), st.integers(-(2**63), 2**63), st.booleans(),
+        st.floats(allow_nan=False), st.just(datetime.date(2020, 2, 29)), st.datetimes(), st.times(),
+    )  # fmt: skip
+    trees = st.recursive(
+        leaves, lambda t: st.lists(t, max_size=3) | st.dictionaries(st.text(max_size=3), t, max_size=3)
+    )
+    other = draw(st.dictionaries(st.text(st.characters(exclude_categories=["Cs"]), max_size=5), trees, max_size=3))
+    metadata = {
+        "control": draw(st.sampled_from([None, "load", "displacement"])),
+        "punch_diameter_um": draw(st.none() | st.floats(1e-3, 1e9)),
+        "provenance": draw(st.none() | NASTY),
+        "corrections": tuple(draw(st.lists(NASTY, max_size=2))),
+        "other": other,
+    }
+    diameters = np.array([[draw(LENGTHS) for _ in range(3)] for _ in names])
+    return tuple(names), diameters, curves, columns, metadata
+
+
+@settings(max_examples=120, deadline=None)
+@given(parts=campaign_parts())
+def test_round_trip_is_exact(tmp_path_factory, parts):
+    names, diameters, curves, columns, metadata = parts
+    campaign = Campaign(names, diameters, tuple(Curve(*c) for c in curves), columns, Metadata(**metadata))
+    folder = tmp_path_factory.mktemp("round") / "c"
+    refused = None
+    try:
+        write_campaign(campaign, folder)
+    except InputError as error:
+        refused = str(error)
+    if refused is None:
+        assert_same(read_campaign(folder), campaign)
+        return
+    # Only what TOML cannot hold, or would read as something else, is refused, and with nothing written.
+    assert "campaign.toml" in refused
+    assert not folder.exists()
+
+
+@pytest.mark.parametrize("name", ["01", "NA", "a,b", 'q"q', "a\nb", "粒子", " x ", "1e5", "a\rb"])
+def test_names_stay_as_they_are(tmp_path, name):
+    curve = Curve(np.array([0.0, 1]), np.array([0.0, 1]), np.array([-0.0, 1 / 3]))
+    campaign = Campaign((name, "other"), np.full((2, 3), 100.1), (curve, curve), {"x y": (name, "")})
+    write_campaign(campaign, tmp_path / "c")
+    assert_same(read_campaign(tmp_path / "c"), campaign)
+
+
+def test_fast_and_strict_parser_agree(tmp_path, monkeypatch):
+    rng = np.random.default_rng(0)
+    names = ("a", "NA", "01", 'x"y', "p,q")
+    curves = tuple(Curve(np.sort(rng.normal(size=50)), *rng.normal(size=(2, 50)) * 1e-3) for _ in names)
+    campaign = Campaign(names, np.full((5, 3), 100.0), curves)
+    write_campaign(campaign, tmp_path / "c")
+    fast = read_campaign(tmp_path / "c")
+    monkeypatch.setattr(curves_module, "_split_fast", lambda *_: None)
+    assert_same(read_campaign(tmp_path / "c"), fast)
+    assert_same(fast, campaign)
+
+
+def simple(**changes) -> Campaign:
+    curve = Curve(np.array([0.0, 1]), np.array([0.0, 1]), np.array([0.0, 1]))
+    parts = {"particles": ("A",), "diameters_um": np.full((1, 3), 100.0), "curves": (curve,)}
+    return Campaign(**parts | changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "piece"),
+    [
+        ({"particles": (), "diameters_um": np.empty((0, 3)), "curves": ()}, "no particle"),
+        ({"particles": ("A", "A")}, "shape"),
+        ({"diameters_um": np.full((1, 3), np.nan)}, "not all positive"),
+        ({"diameters_um": np.full((1, 2), 1.0)}, "shape"),
+        ({"curves": ()}, "0 curves"),
+        ({"particles": ("\0",)}, "NUL"),
+        ({"particles": ("\ud800",)}, "Unicode"),
+        ({"particles": ("  ",)}, "empty"),
+        ({"curves": (Curve(np.array([0.0, 1]), np.array([0.0, np.nan]), np.ones(2)),)}, "force of particle 'A' is nan"),
+        ({"curves": (Curve(np.array([1.0, 0]), np.ones(2), np.ones(2)),)}, "goes back at sample 2"),
+        ({"curves": (Curve(np.zeros(1), np.ones(1), np.ones(1)),)}, "one row only"),
+        ({"curves": (Curve(np.zeros(2), np.zeros(2), np.ones(2)),)}, "every force"),
+        ({"curves": (Curve(np.zeros(2), np.ones(3), np.ones(2)),)}, "shape"),
+        ({"columns": {"D1_um": ("x",)}}, "name of a further column"),
+        ({"columns": {"x": ("x", "y")}}, "2 cells"),
+        ({"metadata": Metadata(other={"control": 1})}, "cannot be a key"),
+        ({"metadata": Metadata(other={"x": None})}, "no form in TOML"),
+        ({"metadata": Metadata(other={"force_resolution_N": 1})}, "would not read back"),
+    ],
+)
+def test_unfit_campaign_is_not_written(tmp_path, changes, piece):
+    with pytest.raises(InputError, match=piece):
+        write_campaign(simple(**changes), tmp_path / "c")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_write_replaces_whole_and_keeps_other_files(tmp_path):
+    folder = make(tmp_path / "c", toml='control = "load"')
+    (folder / "notes.txt").write_text("mine")
+    write_campaign(simple(), folder)
+    assert_same(read_campaign(folder), simple())
+    assert sorted(p.name for p in folder.iterdir()) == ["campaign.toml", "curves.csv", "notes.txt", "particles.csv"]
+    assert [p.name for p in tmp_path.iterdir()] == ["c"]
+
+
+@pytest.mark.parametrize("failing", range(6))
+def test_failure_half_way_leaves_everything_as_it_was(tmp_path, monkeypatch, failing):
+    folder = make(tmp_path / "c", toml='control = "load"')
+    before = read_campaign(folder)
+    real, calls = Path.replace, []
+
+    def replace(self, target):
+        calls.append(target)
+        if len(calls) == failing + 1:
+            raise OSError(28, "No space left on device")
+        return real(self, target)
+
+    monkeypatch.setattr(Path, "replace", replace)
+    with pytest.raises(InputError, match="No space left"):
+        write_campaign(simple(), folder)
+    assert_same(read_campaign(folder), before)
+    assert [p.name for p in tmp_path.iterdir()] == ["c"]
+
+
+def test_folder_that_cannot_be_written(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(InputError, match="is a file, not a folder"):
+        write_campaign(simple(), tmp_path / "file")
+    with pytest.raises(InputError, match="cannot be written"):
+        write_campaign(simple(), tmp_path / "file" / "below")
+
+    def refuse(self, **_):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    with pytest.raises(InputError, match="Permission denied"):
+        write_campaign(simple(), tmp_path / "new")

@@ -1,0 +1,84 @@
+"""Whatever the files hold, reading gives a campaign or an `InputError`, and both parsers agree on which."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_csv import CURVES, PARTICLES, assert_same, make
+
+from mcc_jax._errors import InputError
+from mcc_jax.campaign import Campaign, read_campaign
+from mcc_jax.campaign import _curves as curves_module
+
+TOML = 'control = "load"\nforce_resolution_mN = 0.1\n[other]\nx = [1, 2]\n'
+PIECES = st.sampled_from(
+    [",", "\n", "\r", '"', '""', ";", "\t", " ", "\0", "nan", "inf", "-", ".", "e", "1e400", "A", "01", "\ufeff", "µ",
+     "_", "'", "force_mN", "time_s", "particle", "0x1", "1_0", "１", "True", "\x1a", "\u2028", "\x0b"]
+)  # fmt: skip
+
+
+def outcome(folder) -> Campaign | str:
+    try:
+        campaign = read_campaign(folder)
+    except InputError as error:
+        text = str(error)
+        assert text.isprintable()
+        assert text.startswith(str(folder))
+        return text
+    for curve in campaign.curves:
+        for values in (curve.time_s, curve.force_mN, curve.displacement_um):
+            assert len(values) >= 2
+            assert np.isfinite(values).all()
+        assert (np.diff(curve.time_s) >= 0).all()
+    assert (campaign.diameters_um > 0).all()
+    return campaign
+
+
+def check_both_parsers(folder) -> None:
+    fast = outcome(folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(curves_module, "_split_fast", lambda *_: None)
+        strict = outcome(folder)
+    if isinstance(fast, Campaign):
+        assert isinstance(strict, Campaign)
+        assert_same(fast, strict)
+    else:
+        assert fast == strict
+
+
+@st.composite
+def mutated(draw, text: str) -> str:
+    for _ in range(draw(st.integers(1, 4))):
+        at = draw(st.integers(0, len(text)))
+        length = draw(st.sampled_from([0, 1, 1, 2, 8]))
+        text = text[:at] + draw(st.one_of(PIECES, st.text(max_size=2), st.just(""))) + text[at + length :]
+    return text
+
+
+@settings(max_examples=400, deadline=None)
+@given(curves=mutated(CURVES))
+def test_mutated_curves(tmp_path_factory, curves):
+    folder = make(tmp_path_factory.getbasetemp() / "curves", curves=curves.encode("utf-8", "surrogatepass"))
+    check_both_parsers(folder)
+
+
+@settings(max_examples=200, deadline=None)
+@given(particles=mutated(PARTICLES))
+def test_mutated_particles(tmp_path_factory, particles):
+    outcome(make(tmp_path_factory.getbasetemp() / "particles", particles=particles.encode("utf-8", "surrogatepass")))
+
+
+@settings(max_examples=200, deadline=None)
+@given(toml=mutated(TOML))
+def test_mutated_metadata(tmp_path_factory, toml):
+    outcome(make(tmp_path_factory.getbasetemp() / "toml", toml=toml.encode("utf-8", "surrogatepass")))
+
+
+@settings(max_examples=150, deadline=None)
+@given(data=st.binary(max_size=200) | st.lists(PIECES, max_size=40).map(lambda p: "".join(p).encode()))
+def test_anything_at_all(tmp_path_factory, data):
+    folder = make(tmp_path_factory.getbasetemp() / "any", curves=data)
+    check_both_parsers(folder)
+    outcome(make(folder, particles=data, curves=CURVES))

@@ -1,0 +1,224 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mcc_jax._errors import InputError
+from mcc_jax.campaign import read_tester_file
+
+MAPPING = """
+[columns.time]
+column = "Time (s)"
+unit = "s"
+[columns.force]
+column = "Load"
+unit = "N"
+[columns.displacement]
+column = "Depth"
+unit = "nm"
+[diameters_um]
+all = [200, 190, 180]
+"""
+TABLE = "Time (s),Load,Depth\n0,0,0\n1,0.001,500\n2,0.002,1000\n"
+
+
+def convert(tmp_path, table: str | bytes = TABLE, mapping: str = MAPPING, **kwargs):
+    (tmp_path / "t.dat").write_bytes(table.encode() if isinstance(table, str) else table)
+    (tmp_path / "m.toml").write_text(mapping, encoding="utf-8")
+    return read_tester_file(tmp_path / "t.dat", mapping=tmp_path / "m.toml", **kwargs)
+
+
+def message(*args, **kwargs) -> str:
+    with pytest.raises(InputError) as caught:
+        convert(*args, **kwargs)
+    assert str(caught.value).isprintable()
+    return str(caught.value)
+
+
+def test_plain(tmp_path):
+    campaign = convert(tmp_path)
+    assert campaign.particles == ("t",)
+    assert campaign.diameters_um.tolist() == [[200, 190, 180]]
+    assert campaign.curves[0].force_mN.tolist() == [0, 1, 2]
+    assert campaign.curves[0].displacement_um.tolist() == [0, 0.5, 1]
+    assert "t.dat, mapped by m.toml" in (campaign.metadata.provenance or "")
+
+
+def test_everything_unusual_at_once(tmp_path):
+    table = (
+        "Prüfer 7\nirgendwas\nZeit;Kraft;Weg;Probe\nms;mN;µm;-\n% Bemerkung\n"
+        "0;-0,5;0;01\n500;-1,5;-0,25;01\n\n0;-1;0;b\n1;-2;-1e-1;b\n"
+    )
+    mapping = """
+encoding = "latin-1"
+delimiter = "semicolon"
+decimal_mark = ","
+comment_prefix = "%"
+skip_rows = 2
+header_rows = 2
+tests = "column"
+control = "displacement"
+provenance = "Labor 7"
+[columns]
+time = { column = "Zeit", unit = "ms" }
+force = { column = 2, unit = "mN", sign = -1 }
+displacement = { column = "Weg", unit = "µm", sign = -1 }
+test = { column = "Probe" }
+[diameters_um]
+01 = [1.0, 2.0, 3.0]
+b = [4.0, 5.0, 6.0]
+"""
+    campaign = convert(tmp_path, table.encode("latin-1"), mapping)
+    assert campaign.particles == ("01", "b")
+    assert campaign.diameters_um.tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert campaign.curves[0].time_s.tolist() == [0, 0.5]
+    assert campaign.curves[0].force_mN.tolist() == [0.5, 1.5]
+    assert campaign.curves[1].displacement_um.tolist() == [0, 0.1]
+    assert campaign.metadata.control == "displacement"
+    assert campaign.metadata.other == {"mapping_provenance": "Labor 7"}
+
+
+def test_blank_lines_part_tests_without_header(tmp_path):
+    mapping = """
+delimiter = "space"
+header_rows = 0
+tests = "blank line"
+columns.time = { column = 1, unit = "s" }
+columns.force = { column = 2, unit = "gf" }
+columns.displacement = { column = 3, unit = "um" }
+"""
+    table = "\n  0 0   0\n1 1 1\n\n\n0 0 0\n 2 3 4\n5 6 7\n\n"
+    campaign = convert(tmp_path, table, mapping, diameters_um=[1.0, 1.0, 1.0])
+    assert campaign.particles == ("1", "2")
+    assert [len(curve) for curve in campaign.curves] == [2, 3]
+    assert campaign.curves[0].force_mN[1] == pytest.approx(9.80665)
+
+
+@pytest.mark.parametrize(("delimiter", "mark"), [("tab", "\t"), ("|", "|"), ("comma", ","), ("semicolon", ";")])
+def test_delimiters(tmp_path, delimiter, mark):
+    campaign = convert(tmp_path, TABLE.replace(",", mark), f'delimiter = "{delimiter}"\n' + MAPPING)
+    assert len(campaign.curves[0]) == 3
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-8-sig", "cp1252", "gb18030"])
+def test_encodings(tmp_path, encoding):
+    campaign = convert(tmp_path, TABLE.encode(encoding), f'encoding = "{encoding}"\n' + MAPPING)
+    assert len(campaign.curves[0]) == 3
+
+
+def test_quotes_and_names(tmp_path):
+    table = TABLE.replace("Load", '"Load"').replace("0.001", '"0.001"')
+    campaign = convert(tmp_path, table, 'test_name = "A, 1"\n' + MAPPING, diameters_um={"A, 1": [1.0, 2.0, 3.0]})
+    assert campaign.particles == ("A, 1",)
+    assert campaign.diameters_um.tolist() == [[1, 2, 3]]
+
+
+def test_fischer_through_a_mapping_equals_its_reader(tmp_path):
+    from test_readers import TESTERS, lines_of
+
+    rows = "\n".join(lines_of("FS1.txt")[84:1285])
+    mapping = """
+encoding = "latin-1"
+delimiter = "tab"
+decimal_mark = ","
+columns.time = { column = "t", unit = "s" }
+columns.force = { column = "F", unit = "mN" }
+columns.displacement = { column = "h", unit = "um" }
+"""
+    mapped = convert(tmp_path, rows.encode("latin-1"), mapping, diameters_um=[1.0, 1.0, 1.0]).curves[0]
+    known = read_tester_file(TESTERS / "FS1.txt", diameters_um=[1.0, 1.0, 1.0]).curves[0]
+    assert np.array_equal(mapped.force_mN, known.force_mN)
+    assert np.array_equal(mapped.time_s, known.time_s)
+    assert np.array_equal(mapped.displacement_um, known.displacement_um)
+
+
+def without(table: str) -> str:
+    kept, skip = [], False
+    for line in MAPPING.splitlines():
+        skip = line == f"[{table}]" if line.startswith("[") else skip
+        if not skip:
+            kept.append(line)
+    return "\n".join(kept)
+
+
+BAD_MAPPING = {
+    "not TOML": ("x", ["row 1", "not TOML"]),
+    "empty": (" ", ["empty"]),
+    "unknown key": ('delimeter = ","\n' + MAPPING, ["'delimeter'", "Did you mean 'delimiter'?"]),
+    "unknown key far off": ("zzz = 1\n" + MAPPING, ["'zzz'", "Known keys"]),
+    "unknown key of columns": (MAPPING + "[columns.temperature]\ncolumn = 4\n", ["'columns.temperature'"]),
+    "unknown key of a column": (MAPPING.replace("unit", "units"), ["'columns.time.units'", "Did you mean"]),
+    "no columns": ("skip_rows = 1", ["'columns' is missing"]),
+    "no time": (without("columns.time"), ["'columns.time' is missing"]),
+    "no unit": (MAPPING.replace('unit = "N"', ""), ["'columns.force.unit'", "missing", "mN"]),
+    "unit no text": (MAPPING.replace('unit = "N"', "unit = 3"), ["'columns.force.unit'", "not a unit"]),
+    "unknown unit": (MAPPING.replace('"N"', '"bananas"'), ["'columns.force.unit'", "unknown"]),
+    "unit of other kind": (MAPPING.replace('"N"', '"um"'), ["'columns.force.unit'", "no unit of force"]),
+    "sign": (MAPPING.replace('"N"', '"N"\nsign = 2'), ["'columns.force.sign'", "1 or -1"]),
+    "column zero": (MAPPING.replace('"Load"', "0"), ["'columns.force.column'"]),
+    "column negative": (MAPPING.replace('"Load"', "-2"), ["'columns.force.column'", "from 1"]),
+    "column no name": (MAPPING.replace('"Load"', "1.5"), ["'columns.force.column'"]),
+    "name without header": ("header_rows = 0\n" + MAPPING, ["'columns.time.column'", "header_rows"]),
+    "test column missing": ('tests = "column"\n' + MAPPING, ["'columns.test' is missing"]),
+    "tests unknown": ('tests = "row"\n' + MAPPING, ["'tests'", '"blank line"']),
+    "rows negative": ("skip_rows = -1\n" + MAPPING, ["'skip_rows'", "0 or more"]),
+    "rows true": ("skip_rows = true\n" + MAPPING, ["'skip_rows'"]),
+    "rows text": ('skip_rows = "2"\n' + MAPPING, ["'skip_rows'"]),
+    "encoding unknown": ('encoding = "klingon"\n' + MAPPING, ["'encoding'", "'klingon'"]),
+    "encoding no text codec": ('encoding = "zlib"\n' + MAPPING, ["'encoding'"]),
+    "delimiter long": ('delimiter = "ab"\n' + MAPPING, ["'delimiter'", '"semicolon"']),
+    "decimal mark": ('decimal_mark = ";"\n' + MAPPING, ["'decimal_mark'"]),
+    "both commas": ('decimal_mark = ","\n' + MAPPING, ["'delimiter'", "also the decimal mark"]),
+    "control": ('control = "force"\n' + MAPPING, ["'control'", '"displacement"']),
+    "name for many": ('tests = "blank line"\ntest_name = "A"\n' + MAPPING, ["'test_name'", "Remove"]),
+    "diameters no table": ("diameters_um = 3\n" + without("diameters_um"), ["'diameters_um'", "all = "]),
+    "diameters two": (MAPPING.replace(", 180", ""), ["three positive lengths"]),
+    "diameters text": (MAPPING.replace("180", '"180"'), ["'diameters_um.all'", "three numbers"]),
+    "diameters huge": (MAPPING.replace("180", "1" + "0" * 400), ["three positive lengths"]),
+    "diameters zero": (MAPPING.replace("180", "0"), ["three positive lengths"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD_MAPPING)
+def test_bad_mapping(tmp_path, case):
+    mapping, pieces = BAD_MAPPING[case]
+    text = message(tmp_path, TABLE, mapping)
+    assert text.startswith(str(tmp_path / "m.toml"))
+    for piece in pieces:
+        assert piece in text
+
+
+BAD_TABLE = {
+    "no such column": (TABLE.replace("Load", "Laod"), "", ["row 1", "no column 'Load'", "Did you mean 'Laod'"]),
+    "column twice": (TABLE.replace("Depth", "Load"), "", ["row 1", "2 columns called 'Load'", "number"]),
+    "text": (TABLE.replace("0.001", "abc"), "", ["row 3", "'Load'", "'abc' is not a number"]),
+    "empty cell": (TABLE.replace("0.001", ""), "", ["row 3", "'Load'", "empty"]),
+    "NaN": (TABLE.replace("0.001", "nan"), "", ["row 3", "'Load'", "not a finite"]),
+    "overflow in its unit": (TABLE.replace("0.001", "1e14"), "", ["row 3", "'Load'", "too large"]),
+    "cells too few": (TABLE.replace(",500", ""), "", ["row 3", "2 cells where 3"]),
+    "cells too many": (TABLE.replace(",500", ",5,00"), "", ["row 3", "4 cells where 3"]),
+    "time goes back": (TABLE + "1.5,1,1\n", "", ["row 5", "goes back"]),
+    "quotes": (TABLE.replace("0.001", '"0.001'), "", ["row 3", "quotes"]),
+    "no rows": (TABLE, "skip_rows = 50\n", ["no column"]),
+    "header only": ("Time (s),Load,Depth\n", "", ["no rows of data", "m.toml"]),
+    "encoding": (TABLE.replace("Load", "L\xf6ad").encode("latin-1"), "", ["cannot be decoded as 'utf-8'"]),
+    "gzip": (b"\x1f\x8b\x08", "", ["gzip"]),
+    "empty": ("", "", ["empty"]),
+    "one row": ("Time (s),Load,Depth\n0,1,1\n", "", ["row 2", "fewer than two samples"]),
+    "all zero": ("Time (s),Load,Depth\n0,0,1\n1,0,2\n", "", ["every force", "no data"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD_TABLE)
+def test_bad_table(tmp_path, case):
+    table, extra, pieces = BAD_TABLE[case]
+    text = message(tmp_path, table, extra + MAPPING)
+    assert text.startswith(str(tmp_path / "t.dat"))
+    for piece in pieces:
+        assert piece in text
+
+
+def test_missing_mapping(tmp_path):
+    (tmp_path / "t.dat").write_text(TABLE)
+    with pytest.raises(InputError, match="no such file"):
+        read_tester_file(tmp_path / "t.dat", mapping=tmp_path / "m.toml")

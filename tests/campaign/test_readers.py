@@ -1,0 +1,307 @@
+from __future__ import annotations
+
+import io
+import re
+import struct
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mcc_jax._errors import InputError
+from mcc_jax.campaign import read_campaign, read_diameters, read_tester_file, write_campaign
+from mcc_jax.campaign.readers import _micromaterials
+
+TESTERS = Path(__file__).parents[3] / "shared" / "data" / "testers"
+FILES = ("FS1.txt", "Exp-50mN_0000.hld", "RobinSteel0000LC.txt", "multipleIndentations.zip")
+SIZES = [200.0, 190.0, 180.0]
+
+
+def read(path, **kwargs):
+    return read_tester_file(path, **{"diameters_um": SIZES} | kwargs)
+
+
+def message(path, **kwargs) -> str:
+    with pytest.raises(InputError) as caught:
+        read(path, **kwargs)
+    text = str(caught.value)
+    assert text.isprintable()
+    assert ". " in text or "? " in text
+    return text
+
+
+def test_fischer():
+    campaign = read(TESTERS / "FS1.txt")
+    assert campaign.particles == tuple(str(i) for i in range(1, 11))
+    assert campaign.diameters_um.shape == (10, 3)
+    assert campaign.metadata.control == "load"
+    first = campaign.curves[0]
+    # The first and the last row of the first test, as they stand in the file.
+    assert (first.force_mN[0], first.displacement_um[0], first.time_s[0]) == (0.416459, 0.031365, 0.1)
+    assert (first.force_mN[-1], first.displacement_um[-1], first.time_s[-1]) == (29.9928, 0.89375, 120.0)
+    assert [len(curve) for curve in campaign.curves] == [1200] * 10
+    for curve in campaign.curves:
+        assert curve.force_mN.max() == pytest.approx(300, abs=0.01)
+    assert "R = 10% 8 Cycles" in campaign.metadata.other["test_parameters"]
+    assert "Compliance\t[µm/N]\t      1.9" in campaign.metadata.other["tester_results"]["1"]
+
+
+def test_hysitron_hld():
+    campaign = read(TESTERS / "Exp-50mN_0000.hld")
+    assert campaign.particles == ("Exp-50mN_0000",)
+    curve, other = campaign.curves[0], campaign.metadata.other
+    assert len(curve) == 1068
+    assert curve.displacement_um[0] == 5.800346 / 1e3
+    assert curve.force_mN[0] == 204.644060 / 1e3
+    assert curve.force_mN.max() == pytest.approx(50, rel=0.01)
+    assert campaign.metadata.control == "load"
+    assert other["machine_compliance_um_per_mN"] == 0.00663947
+    assert other["drift_rate_um_per_s"] == pytest.approx(3.648e-5)
+    assert [segment["End Demand"] for segment in other["programmed_segments"]] == ["0 µN", "0 µN", "50000 µN", "0 µN"]
+    assert len(other["approach_block"]["MotorDisp_mm"]) == 312
+    assert len(other["drift_block"]["Disp_nm"]) == 913
+    assert len(other["test_block_further_columns"]["LoadCell_nm"]) == 1068
+    assert other["tester_header"]["Drift Monitor Time"] == "40 s"
+
+
+def test_hysitron_lc():
+    campaign = read(TESTERS / "RobinSteel0000LC.txt")
+    curve, other = campaign.curves[0], campaign.metadata.other
+    assert len(curve) == 5304
+    assert other["block_lengths"] == [201, 104, 2000, 1000, 1999]
+    assert curve.displacement_um.min() < -0.049  # the approach is there
+    assert curve.force_mN[0] == 1.836146 / 1e3
+    assert len(other["further_columns"]["Depth (V)"]) == 5304
+
+
+def test_micromaterials():
+    campaign = read(TESTERS / "multipleIndentations.zip")
+    assert len(campaign) == 39
+    assert campaign.particles[0] == "1000nmXX 1 6958 -4555"
+    assert campaign.metadata.control is None
+    curve = campaign.curves[0]
+    assert (curve.displacement_um[0], curve.force_mN[0]) == (-367.982536 / 1e3, -0.010298)
+    assert len({len(curve) for curve in campaign.curves}) > 10
+
+
+def test_single_micromaterials_text(tmp_path):
+    with zipfile.ZipFile(TESTERS / "multipleIndentations.zip") as archive:
+        name = archive.namelist()[0]
+        (tmp_path / "one.dat").write_bytes(archive.read(name))
+    assert read(tmp_path / "one.dat").particles == ("one",)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_format_is_told_by_content_and_campaign_survives_files(tmp_path, name):
+    disguised = tmp_path / "data.bin"
+    disguised.write_bytes((TESTERS / name).read_bytes())
+    campaign = read(disguised)
+    write_campaign(campaign, tmp_path / "c")
+    again = read_campaign(tmp_path / "c")
+    assert again.metadata == campaign.metadata
+    assert again.particles == campaign.particles
+    for one, two in zip(campaign.curves, again.curves, strict=True):
+        assert np.array_equal(one.force_mN, two.force_mN)
+        assert np.array_equal(one.displacement_um, two.displacement_um)
+        assert np.array_equal(one.time_s, two.time_s)
+    assert "data.bin" in (again.metadata.provenance or "")
+
+
+def test_diameters(tmp_path):
+    table = tmp_path / "d.csv"
+    table.write_text("particle,D1_mm,D2_um,D3_um\nRobinSteel0000LC,0.2,190,180\n")
+    diameters = read_diameters(table)
+    campaign = read(TESTERS / "RobinSteel0000LC.txt", diameters_um=diameters)
+    assert campaign.diameters_um.tolist() == [SIZES]
+    assert read_diameters("200,190, 180") == SIZES
+
+
+@pytest.mark.parametrize(
+    ("diameters", "piece"),
+    [
+        (None, "--diameters"),
+        ([1.0, 2.0], "three positive lengths"),
+        ([1.0, 2.0, -3.0], "three positive lengths"),
+        ([1.0, 2.0, float("nan")], "three positive lengths"),
+        ({}, "has no diameters"),
+        ({"RobinSteel0000LC": SIZES, "x": SIZES}, "is no test of the file"),
+        ({"RobinSteel0000LC": [1.0]}, "three positive lengths"),
+    ],
+)
+def test_bad_diameters(diameters, piece):
+    assert piece in message(TESTERS / "RobinSteel0000LC.txt", diameters_um=diameters)
+
+
+@pytest.mark.parametrize(
+    ("text", "piece"),
+    [
+        ("particle,D1_um,D2_um,D3_um\nA,1,1,1\nA,1,1,1\n", "row 3, column 'particle': the particle 'A' is already"),
+        ("particle,D1_um,D2_um\nA,1,1\n", "'D3_um' is missing"),
+        ("name,D1_um,D2_um,D3_um\nA,1,1,1\n", "'particle' is missing"),
+        ("particle,D1_um,D2_um,D3_um\nA,1,0,1\n", "row 2, column 'D2_um'"),
+        ("particle,D1_um,D2_um,D3_um\nA,1,x,1\n", "row 2, column 'D2_um'"),
+    ],
+)
+def test_bad_table_of_diameters(tmp_path, text, piece):
+    (tmp_path / "d.csv").write_text(text)
+    with pytest.raises(InputError, match=re.escape(piece)):
+        read_diameters(tmp_path / "d.csv")
+
+
+@pytest.mark.parametrize("text", ["1,2,x", "1,2,-3", "1,2,nan", "1,2", "nowhere.csv", ""])
+def test_bad_diameters_on_the_command_line(text):
+    with pytest.raises(InputError):
+        read_diameters(text)
+
+
+def lines_of(name: str) -> list[str]:
+    return (TESTERS / name).read_bytes().decode("latin-1").split("\n")
+
+
+DAMAGE = {
+    # name of the file, what is done to its lines, what the message holds
+    "fs cut between tests": ("FS1.txt", lambda x: x[:7415], ["announces 10 tests, the file holds 6"]),
+    "fs cut in a test": ("FS1.txt", lambda x: x[:12000], ["'10'", "before its greatest force", "export it again"]),
+    "fs cut in a row": ("FS1.txt", lambda x: [*x[:500], "1,5\t0,2"], ["row 501", "2 cells where 3"]),
+    "fs text": ("FS1.txt", lambda x: [*x[:99], "a\t0,2\t1,4", *x[100:]], ["row 100", "'F'", "'a' is not a number"]),
+    "fs point": (
+        "FS1.txt",
+        lambda x: [*x[:99], "1.5\t0,2\t1,4", *x[100:]],
+        ["row 100", "'F'", "'1.5' is not a number"],
+    ),
+    "fs NaN": ("FS1.txt", lambda x: [*x[:99], "1,5\tnan\t1,4", *x[100:]], ["row 100", "'h'", "not a finite number"]),
+    "fs time": ("FS1.txt", lambda x: [*x[:99], "1,5\t0,2\t0,1", *x[100:]], ["row 100", "goes back"]),
+    "fs no samples": ("FS1.txt", lambda x: x[:11110], ["'10' has no samples"]),
+    "hld cut": ("Exp-50mN_0000.hld", lambda x: x[:2000], ["row 1422", "Test announces 1068 rows"]),
+    "hld no test": ("Exp-50mN_0000.hld", lambda x: x[:1421], ["'Test Data Points' is missing"]),
+    "hld text": (
+        "Exp-50mN_0000.hld",
+        lambda x: [*x[:1500], x[1500].replace("\t", "\tx", 1), *x[1501:]],
+        ["row 1501", "'Disp_nm'", "is not a number"],
+    ),
+    "hld row short": ("Exp-50mN_0000.hld", lambda x: [*x[:1500], "1\t2", *x[1501:]], ["row 1501", "2 cells where 8"]),
+    "hld row more": ("Exp-50mN_0000.hld", lambda x: [*x[:1500], x[1500], *x[1500:]], ["row 2492", "neither"]),
+    "hld row less": ("Exp-50mN_0000.hld", lambda x: x[:1500] + x[1501:], ["row 1422", "Test announces 1068 rows"]),
+    "hld column": (
+        "Exp-50mN_0000.hld",
+        lambda x: [s.replace("Disp_nm\tForce", "Disp\tForce") for s in x],
+        ["'Disp_nm'"],
+    ),
+    "lc cut": ("RobinSteel0000LC.txt", lambda x: x[:3000], ["row 3", "5304 points are announced"]),
+    "lc text": ("RobinSteel0000LC.txt", lambda x: [*x[:99], "x" + x[99], *x[100:]], ["row 100", "'Depth (nm)'", "x"]),
+    "lc time": (
+        "RobinSteel0000LC.txt",
+        lambda x: [*x[:999], "1\t1\t0\t1\t1", *x[1000:]],
+        ["row 1000", "goes back"],
+    ),
+    "lc column": (
+        "RobinSteel0000LC.txt",
+        lambda x: [s.replace("Time (s)", "Zeit") for s in x],
+        ["row 4", "'Time (s)'"],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", DAMAGE)
+def test_damaged_files(tmp_path, case):
+    name, change, pieces = DAMAGE[case]
+    path = tmp_path / name
+    path.write_bytes("\n".join(change(lines_of(name))).encode("latin-1"))
+    text = message(path)
+    assert text.startswith(str(path))
+    for piece in pieces:
+        assert piece in text
+
+
+def zipped(**files: bytes) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in files.items():
+            archive.writestr(name.replace("__", "/"), content)
+    return buffer.getvalue()
+
+
+ROWS = b"0.000000\t-1.000000\t0.000000\n1.000000\t2.000000\t0.100000\n2.000000\t3.000000\t0.200000\n"
+
+
+def test_names_in_archives_are_names_only(tmp_path):
+    (tmp_path / "a.zip").write_bytes(zipped(**{"..__..__evil.txt": ROWS, "deep__b.txt": ROWS}))
+    assert read(tmp_path / "a.zip").particles == ("evil", "b")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.zip"]
+
+
+def bomb() -> bytes:
+    """An archive whose directory claims that an entry is far smaller than it is."""
+    data = bytearray(zipped(**{"a.txt": ROWS * 100_000}))
+    directory = data.rindex(b"PK\x01\x02")
+    data[directory + 24 : directory + 28] = struct.pack("<I", 50)
+    return bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("data", "piece"),
+    [
+        (zipped(), "holds no file"),
+        (zipped(**{"a.txt": ROWS, "x__a.txt": ROWS}), "two tests are called 'a'"),
+        (zipped(**{"a.txt": zipped(**{"b.txt": ROWS})}), "itself an archive"),
+        (zipped(**{"a.txt": b"hello\n"}), "no Micro Materials text"),
+        (zipped(**{"a.txt": ROWS + b"3.000000\tx\t1.000000\n"}), "row 4, column 'h'"),
+        (zipped(**{"a.txt": ROWS + b"3.000000\t1.000000"}), "row 4: 2 cells"),
+        (zipped(**{"a.txt": ROWS + b"0.500000\t1.000000\t1.000000\n"}), "row 4: the time of test 'a' goes back"),
+        (zipped(**{"a.txt": ROWS})[:-30], "damaged"),
+        (zipped(**{"a.txt": ROWS})[:30], "damaged"),
+        (zipped(**{"a.txt": ROWS}).replace(b"\x14\0\0\0\x08", b"\x14\0\1\0\x08"), "encrypted"),
+        (bomb(), "damaged"),
+    ],
+)
+def test_bad_archives(tmp_path, data, piece):
+    (tmp_path / "a.zip").write_bytes(data)
+    assert piece in message(tmp_path / "a.zip")
+
+
+def test_too_large_archive(tmp_path, monkeypatch):
+    (tmp_path / "a.zip").write_bytes(zipped(**{"a.txt": ROWS}))
+    monkeypatch.setattr(_micromaterials, "LARGEST_TOTAL", 50)
+    assert "too large" in message(tmp_path / "a.zip")
+
+
+@pytest.mark.parametrize(
+    ("data", "piece"),
+    [
+        (b"", "empty"),
+        (b"hello\nworld\n", "format is not known (known: Fischer HM export"),
+        (b"time,force\n1,2\n", "--mapping"),
+        (b"1.0\t2.0\t3.0\n1.0\t2.0\t3.0\n", "mapping file"),
+        (b"\x1f\x8b\x08junk", "gzip"),
+        (b"\x89HDF\r\n", "HDF5"),
+        (b"abc\0def", "NUL"),
+    ],
+)
+def test_unknown_files(tmp_path, data, piece):
+    (tmp_path / "x").write_bytes(data)
+    assert piece in message(tmp_path / "x")
+
+
+def test_missing_file(tmp_path):
+    assert "no such file" in message(tmp_path / "none")
+    assert "a folder" in message(tmp_path)
+
+
+@settings(max_examples=60, deadline=None)
+@given(name=st.sampled_from(FILES), data=st.data())
+def test_broken_bytes_never_crash(tmp_path_factory, name, data):
+    content = bytearray((TESTERS / name).read_bytes())
+    for _ in range(data.draw(st.integers(1, 3))):
+        at = data.draw(st.integers(0, len(content) - 1))
+        content[at : at + data.draw(st.sampled_from([0, 1, 5, 100_000]))] = data.draw(st.binary(max_size=4))
+    path = tmp_path_factory.getbasetemp() / "broken"
+    path.write_bytes(content)
+    text = ""
+    try:
+        read(path)
+    except InputError as error:
+        text = str(error)
+    assert text.isprintable()
