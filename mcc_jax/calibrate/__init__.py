@@ -9,11 +9,13 @@ from ._master import StrainTable as StrainTable
 from ._master import master_curve as master_curve
 from ._master import strain_table as strain_table
 from ._paper import PaperCalibration as PaperCalibration
-from ._paper import ParticleFit as ParticleFit
 from ._paper import calibrate_paper as calibrate_paper
 from ._plastic import PlasticFit as PlasticFit
 from ._plastic import fit_polynomial as fit_polynomial
 from ._plastic import fit_population as fit_population
+from ._predict import ParticleFit as ParticleFit
+from ._predict import point_noise_um as point_noise_um
+from ._predict import predict_particles as predict_particles
 from ._result import estimate as estimate
 from ._shape import Objective as Objective
 from ._shape import ShapeFit as ShapeFit

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 from .._errors import InputError
@@ -16,48 +15,19 @@ from ..campaign import (
     THRESHOLD_MPA,
     Adjustment,
     Campaign,
-    Curve,
     adjust,
-    effective_diameter_um,
     particle_batch,
-    stress_and_strain,
 )
-from ..law import MccLaw, Plastic, StrainScaling, Unloading
-from ..simulate import simulate_batch
+from ..law import MccLaw, StrainScaling, Unloading
 from ._elastic import ElasticFit, elastic_branches, fit_effective_modulus
 from ._master import MasterCurve, StrainTable, master_curve, strain_table
-from ._plastic import PlasticFit, fit_polynomial, fit_population
+from ._plastic import PlasticFit, fit_population
+from ._predict import ParticleFit, point_noise_um, predict_particles
 from ._result import estimate
 from ._shape import Objective, ShapeFit, fit_shape_parameter
 
 BAD_MISFIT = 0.05
 """Share of the range of displacement; with the law's own data and a tester's noise it stays below 0.01."""
-
-
-@dataclass(frozen=True)
-class ParticleFit:
-    """One particle against the calibrated law.
-
-    Attributes:
-        plastic: C1, C3, C5 of this particle's own adjusted loading curve, under the common `a`.
-        zero_um: what the offset step, and the contact point, take off its displacement [um].
-        measured_um: measured displacement less `zero_um` [um], at every point.
-        predicted_um: displacement under the measured force by the mean law, scaled by this particle's size and shape
-            [um].
-        own_um: the same with the particle's own C1, C3, C5.
-        used: which points enter `rms_um`: those after contact and above the threshold.
-        rms_um: root mean square of measured less predicted [um].
-        own_rms_um: the same with its own coefficients [um].
-    """
-
-    plastic: tuple[float, float, float]
-    zero_um: float
-    measured_um: np.ndarray
-    predicted_um: np.ndarray
-    own_um: np.ndarray
-    used: np.ndarray
-    rms_um: float
-    own_rms_um: float
 
 
 @dataclass(frozen=True)
@@ -279,8 +249,8 @@ def calibrate_paper(
     modulus = elastic.effective_modulus_MPa if elastic.effective_modulus_MPa is not None else 1e9
     law = MccLaw(plastic.population.mean_law, chosen.a, modulus, unloading, strain_scaling)
     tell("predicting every particle")
-    particles = _predict(campaign, adjustment, law, eta)
-    noise = float(np.median([_point_noise(curve) for curve in campaign.curves]))
+    particles = predict_particles(campaign, adjustment, law, eta)
+    noise = float(np.median([point_noise_um(curve) for curve in campaign.curves]))
     return PaperCalibration(
         campaign,
         adjustment,
@@ -318,62 +288,3 @@ def _reference_fit(campaign: Campaign, table: StrainTable, objective: Objective,
     elif len(table.index) < 3 and objective == "full":
         return None
     return fit_shape_parameter(table, "reference", index)
-
-
-def _point_noise(curve: Curve) -> float:
-    """Standard deviation of displacement from point to point: second differences cancel any smooth course."""
-    if len(curve) < 4:
-        return 0.0
-    second = np.diff(curve.displacement_um, 2)
-    return float(np.median(np.abs(second - np.median(second))) / 0.6745 / np.sqrt(6))
-
-
-def _predict(
-    campaign: Campaign, adjustment: Adjustment, law: MccLaw, eta: np.ndarray
-) -> tuple[ParticleFit | None, ...]:
-    kept = np.flatnonzero(adjustment.kept)
-    own = []
-    for i in kept:
-        curve = adjustment.curves[i]
-        assert curve is not None
-        # Residuals are relative: below a fiftieth of the peak they would be those of the force read-out.
-        use = curve.stress_MPa >= max(adjustment.threshold_MPa, 0.02 * curve.stress_max_MPa)
-        own.append(fit_polynomial(eta[i] * curve.strain[use], curve.stress_MPa[use]))
-    plastic = eqx.filter_vmap(Plastic.from_polynomial)(*jnp.asarray(own).T)
-    longest = max(len(campaign.curves[i]) for i in kept)
-    # Lengths in steps of 64: campaigns of similar length then share one compilation.
-    longest += -longest % 64
-    forces = jnp.asarray(
-        [np.pad(campaign.curves[i].force_mN, (0, longest - len(campaign.curves[i])), mode="edge") for i in kept]
-    )
-    sizes = particle_batch(campaign.diameters_um[kept])
-    same = eqx.filter_vmap(lambda one: eqx.tree_at(lambda each: each.plastic, law, one))(plastic)
-    mean = eqx.filter_vmap(lambda _: law)(plastic.C1)
-    by_mean = np.asarray(simulate_batch(mean, sizes, forces, control="load").displacement)
-    by_own = np.asarray(simulate_batch(same, sizes, forces, control="load").displacement)
-    fits: list[ParticleFit | None] = [None] * len(campaign)
-    for row, i in enumerate(kept):
-        curve = campaign.curves[i]
-        stress, strain = stress_and_strain(curve, campaign.diameters_um[i], adjustment.segments[i])
-        measured = (strain + adjustment.shift[i]) * effective_diameter_um(campaign.diameters_um[i])
-        touching = np.ones(len(curve), bool)
-        for segment in adjustment.segments[i]:
-            if segment.kind == "approach":
-                touching[segment.start : segment.stop] = False
-        used = touching & (stress > max(adjustment.threshold_MPa, 0.02 * stress.max()))
-        predicted, with_own = by_mean[row, : len(curve)], by_own[row, : len(curve)]
-        fits[i] = ParticleFit(
-            (float(plastic.C1[row]), float(plastic.C3[row]), float(plastic.C5[row])),
-            float(curve.displacement_um[0] - measured[0]),
-            measured,
-            predicted,
-            with_own,
-            used,
-            _rms(measured - predicted, used),
-            _rms(measured - with_own, used),
-        )
-    return tuple(fits)
-
-
-def _rms(deviation: np.ndarray, used: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(deviation[used] ** 2))) if used.any() else float("nan")
