@@ -56,7 +56,7 @@ def _running_max(path: Shaped[Array, " steps"], width: int = 10) -> Shaped[Array
     return jnp.concatenate([jax.lax.cummax(path[:width]), functools.reduce(jnp.maximum, recent, earlier)])
 
 
-def horner(coefficients: tuple[float, ...], x: Float[Array, "..."]) -> Float[Array, "..."]:
+def horner(coefficients: tuple[float, ...], x: Float[Array, ...]) -> Float[Array, ...]:
     """Polynomial in `x`, coefficients from the highest power down."""
     value = jnp.full_like(x, coefficients[0])
     for c in coefficients[1:]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import optimistix as optx
 
 
-class RESULTS(optx.RESULTS):
+class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # an Enumeration of Equinox, no enum
     """Results of the entry points, next to those of Optimistix."""
 
     successful = ""

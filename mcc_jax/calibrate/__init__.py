@@ -1,9 +1,11 @@
 """From a campaign to the law's parameters."""
 
+from ._elastic import LEAST_RATIO as LEAST_RATIO
 from ._elastic import ElasticBranch as ElasticBranch
 from ._elastic import ElasticFit as ElasticFit
 from ._elastic import elastic_branches as elastic_branches
 from ._elastic import fit_effective_modulus as fit_effective_modulus
+from ._elastic import recoverable_strain as recoverable_strain
 from ._master import MasterCurve as MasterCurve
 from ._master import StrainTable as StrainTable
 from ._master import master_curve as master_curve

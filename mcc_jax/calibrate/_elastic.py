@@ -105,7 +105,7 @@ def elastic_branches(
     return branches
 
 
-def _recoverable(
+def recoverable_strain(
     log_modulus: Scalar,
     stress_max: Float[Array, " branches"],
     strain_max: Float[Array, " branches"],
@@ -136,7 +136,7 @@ def _fit(
     points = jnp.maximum(jax.ops.segment_sum(jnp.ones_like(strain), branch, count), 1.0)
 
     def residuals(log_modulus, _):
-        delta = _recoverable(log_modulus, stress_max, strain_max, shape_power, unloading)
+        delta = recoverable_strain(log_modulus, stress_max, strain_max, shape_power, unloading)
         deviation = strain - (strain_max[branch] - delta[branch] * released)
         # The zero of every branch is free; least squares over it is the branch's mean.
         return deviation - (jax.ops.segment_sum(deviation, branch, count) / points)[branch]
@@ -144,7 +144,7 @@ def _fit(
     # Each branch alone, from the slope of strain over the recovery curve: linear, so in closed form.
     centred = released - (jax.ops.segment_sum(released, branch, count) / points)[branch]
     slope = -jax.ops.segment_sum(strain * centred, branch, count) / jax.ops.segment_sum(centred**2, branch, count)
-    unit = _recoverable(jnp.zeros_like(start), stress_max, strain_max, shape_power, unloading)
+    unit = recoverable_strain(jnp.zeros_like(start), stress_max, strain_max, shape_power, unloading)
     exponent = 2 if unloading is Unloading.PRINTED else 1
     alone = (unit / jnp.where(slope > 0, slope, jnp.nan)) ** exponent
     solver = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-12)

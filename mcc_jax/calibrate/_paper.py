@@ -23,8 +23,11 @@ from ._elastic import ElasticFit, elastic_branches, fit_effective_modulus
 from ._master import MasterCurve, StrainTable, master_curve, strain_table
 from ._plastic import PlasticFit, fit_population
 from ._predict import ParticleFit, point_noise_um, predict_particles
-from ._result import estimate
+from ._result import estimate, finite
 from ._shape import Objective, ShapeFit, fit_shape_parameter
+
+PLAUSIBLE_SHAPE_FACTOR = 4.0
+"""Shape factors beyond this, twice the paper's largest, come from curves that do not collapse, not from shape."""
 
 BAD_MISFIT = 0.05
 """Share of the range of displacement; with the law's own data and a tester's noise it stays below 0.01."""
@@ -98,13 +101,30 @@ class PaperCalibration:
         dropped = int((~self.adjustment.kept).sum())
         if dropped:
             notes.append(f"{dropped} of {len(self.campaign)} particles could not be used")
-        if self.own_misfit > BAD_MISFIT:
+        if self.shape_factor_max > PLAUSIBLE_SHAPE_FACTOR:
             notes.append(
-                "even with its own C1, C3, C5 the law misses a test's displacements by "
-                f"{100 * self.own_misfit:.0f} % of their range (median): "
-                "it describes these tests badly, or they are no compressions of single particles"
+                f"a = {self.a:.3g} makes shape factors of up to {self.shape_factor_max:.3g}: "
+                "the shape factor does not bring these curves together"
             )
+        if self.misfit_note is not None:
+            notes.append(self.misfit_note)
         return notes
+
+    @property
+    def shape_factor_max(self) -> float:
+        """Largest shape factor of the particles used [-]; 1.87 in the paper."""
+        return float(self.table.shape_factor(self.a).max())
+
+    @property
+    def misfit_note(self) -> str | None:
+        """A sentence if the law describes the tests badly even with each particle's own coefficients, else None."""
+        if not self.own_misfit > BAD_MISFIT:
+            return None
+        return (
+            "even with its own C1, C3, C5 the law misses a test's displacements by "
+            f"{100 * self.own_misfit:.0f} % of their range (median): "
+            "it describes these tests badly, or they are no compressions of single particles"
+        )
 
     @property
     def relative_misfit(self) -> float:
@@ -136,8 +156,8 @@ class PaperCalibration:
                     "C3": estimate(C3),
                     "C5": estimate(C5),
                     "zero_um": estimate(fit.zero_um if fit else None),
-                    "rms_um": fit.rms_um if fit else None,
-                    "own_rms_um": fit.own_rms_um if fit else None,
+                    "rms_um": finite(fit.rms_um) if fit else None,
+                    "own_rms_um": finite(fit.own_rms_um) if fit else None,
                     "kept": fit is not None,
                     "why_not": self.adjustment.why_not[i],
                 }
@@ -173,13 +193,13 @@ class PaperCalibration:
                 "ess_bulk_min": None,
                 "divergences": None,
                 "pareto_k_max": None,
-                "a_objective_value": self._chosen.objective,
+                "a_objective_value": finite(self._chosen.objective),
                 "a_objective_value_at_zero": self._chosen.objective_at_zero,
                 "master_rms_MPa": self.plastic.rms_MPa,
-                "elastic_rms_strain": self.elastic.rms_strain if self.elastic.branches else None,
+                "elastic_rms_strain": finite(self.elastic.rms_strain),
                 "elastic_branches": len(self.elastic.branches),
-                "relative_misfit": self.relative_misfit,
-                "own_misfit": self.own_misfit,
+                "relative_misfit": finite(self.relative_misfit),
+                "own_misfit": finite(self.own_misfit),
             },
         }
 

@@ -12,6 +12,8 @@ from ._batch import Batch as Batch
 from ._batch import batch as batch
 from ._batch import particle_batch as particle_batch
 from ._csv import read_campaign as read_campaign
+from ._csv import read_particles as read_particles
+from ._metadata import load_toml as load_toml
 from ._paper import PAPER_DIAMETERS_UM as PAPER_DIAMETERS_UM
 from ._paper import PAPER_EFFECTIVE_MODULUS_MPA as PAPER_EFFECTIVE_MODULUS_MPA
 from ._paper import PAPER_LOAD_RATE_MN_PER_S as PAPER_LOAD_RATE_MN_PER_S
@@ -25,6 +27,7 @@ from ._segments import Segment as Segment
 from ._segments import SegmentKind as SegmentKind
 from ._segments import find_segments as find_segments
 from ._segments import summarise_segments as summarise_segments
+from ._validate import check_campaign as check_campaign
 from ._write import write_campaign as write_campaign
 from .readers import read_diameters as read_diameters
 from .readers import read_tester_file as read_tester_file

@@ -38,7 +38,7 @@ def read_campaign(folder: str | os.PathLike[str]) -> Campaign:
     path = Path(folder)
     _check_folder(path)
     table = read_table(path / PARTICLES)
-    names, diameters, columns = _read_particles(table)
+    names, diameters, columns = _parse_particles(table)
     curves = read_curves(path / CURVES)
     _check_match(table, names, curves, path)
     metadata_file = path / METADATA
@@ -85,7 +85,19 @@ def _has_content(file: Path) -> bool:
     return file.is_file() and file.stat().st_size > 0 if file.exists() else False
 
 
-def _read_particles(table: Table) -> tuple[tuple[str, ...], np.ndarray, dict[str, tuple[str, ...]]]:
+def read_particles(file: str | Path) -> tuple[tuple[str, ...], np.ndarray, dict[str, tuple[str, ...]]]:
+    """Read a table of particles alone: `particle,D1_um,D2_um,D3_um` and any further columns.
+
+    Returns:
+        Names, diameters [um] of shape (N, 3), and the further columns as text.
+
+    Raises:
+        InputError: naming file, row and column.
+    """
+    return _parse_particles(read_table(Path(file)))
+
+
+def _parse_particles(table: Table) -> tuple[tuple[str, ...], np.ndarray, dict[str, tuple[str, ...]]]:
     where = name_column(table.header, table.file)
     names = _checked_names(table.text(where), table)
     used, diameters = [where], []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -10,6 +11,7 @@ from .._numerics import running_max
 from .._types import Flag, Path, Scalar, scalar
 from ..geometry import Particle, plastic_shape_factor
 from ._base import AbstractContactLaw
+from ._branch import branch_force
 from ._loading_inverse import loading_strain, secant_modulus
 from ._plastic import Plastic
 from ._recovery import energy_ratio, recovery, stress_ratio
@@ -139,7 +141,7 @@ class MccLaw(AbstractContactLaw[History]):
         strain_max = particle.strain(history.displacement_max)
         return history.displacement_max - particle.displacement(self.recoverable_strain(particle, strain_max))
 
-    def _elastic(self, eta: Scalar, x: AnyShape) -> tuple[AnyShape, Bool[Array, "..."], AnyShape]:
+    def _elastic(self, eta: Scalar, x: AnyShape) -> tuple[AnyShape, Bool[Array, ...], AnyShape]:
         """Peak stress, whether it is positive, and the recoverable strain, at the peak scaled strain `x`."""
         secant = secant_modulus(*self.plastic.polynomial, x)
         carries = (x > 0) & (secant > 0)
@@ -167,12 +169,8 @@ class MccLaw(AbstractContactLaw[History]):
 
         A force <= 0 means out of contact: the displacement stays where the platen left the particle.
         """
-        past = self._peak_force(particle, state)
-        peak_force = jnp.where(force < past, past, force)
-        reached = self._loading_displacement(particle, peak_force, state.displacement_max)
-        elastic = (force < past) | (reached < state.displacement_max)
-        peak = jnp.where(elastic, state.displacement_max, reached)
-        return History(peak), self._displacement(particle, force, peak, peak_force)
+        peak, displacement = self._displacement(particle, state, force, force)
+        return History(peak), displacement
 
     def path(self, particle: Particle, state: History, displacement: Path) -> tuple[History, Path]:
         """Forces [mN] along a path of displacements [um], in closed form over the running maximum (no scan)."""
@@ -182,36 +180,42 @@ class MccLaw(AbstractContactLaw[History]):
 
     def path_load(self, particle: Particle, state: History, force: Path) -> tuple[History, Path]:
         """Displacements [um] along a path of forces [mN], in closed form over the running maximum (no scan)."""
-        past = self._peak_force(particle, state)
-        highest = running_max(force)
-        peak_force = jnp.where(highest < past, past, highest)
-        reached = self._loading_displacement(particle, peak_force, state.displacement_max)
-        elastic = (highest < past) | (reached < state.displacement_max)
-        peak = jnp.where(elastic, state.displacement_max, reached)
-        return History(peak[-1]), self._displacement(particle, force, peak, peak_force)
-
-    def _peak_force(self, particle: Particle, state: History) -> Scalar:
-        return particle.force(self.loading_stress(particle, particle.strain(state.displacement_max)))
+        peak, displacement = self._displacement(particle, state, force, running_max(force))
+        return History(peak[-1]), displacement
 
     def _force(self, particle: Particle, displacement: AnyShape, peak: AnyShape) -> AnyShape:
-        diameter = particle.effective_diameter
+        # The quintic of force against displacement: a whole path then depends on its particle through four numbers only.
+        diameter, area = particle.effective_diameter, 1e-3 * particle.effective_area
         eta = self.shape_factor(particle)
-        peak_stress, carries, recoverable = self._elastic(eta, eta * peak / diameter)
-        # The difference is taken in displacement, where it is exact; in strain it would be rounded twice.
-        s = _recovered((peak - displacement) / diameter, carries, recoverable)
-        return particle.force(peak_stress * jnp.where(displacement >= peak, 1.0, stress_ratio(s)))
+        scale = eta / diameter
+        square = scale * scale
+        K1, K3, K5 = (K * (scale * area) for K in self.plastic.polynomial)
+        power = 1 if self.unloading is Unloading.PRINTED else 2
+        stiffness = self.unloading.constant * eta**self.strain_scaling.power * (self.effective_modulus * area) ** power
+        compliance = diameter * diameter * diameter / stiffness
+        return branch_force(power, K1, K3 * square, K5 * (square * square), compliance, peak, peak - displacement)
 
-    def _loading_displacement(self, particle: Particle, force: AnyShape, floor: Scalar) -> AnyShape:
-        scale = particle.effective_diameter / self.shape_factor(particle)
-        return scale * loading_strain(*self.plastic.polynomial, particle.stress(force), floor / scale)
+    def _displacement(self, particle: Particle, state: History, force: AnyShape, highest: AnyShape) -> tuple[AnyShape, AnyShape]:
+        """Peak displacement and displacement under a force, of which `highest` is the largest so far."""
+        # The barriers make three stages that share nothing but what they are given. Where they share intermediate values, XLA
+        # stores those and cuts the loop over the data of the inverse in many pieces: twice the time.
+        past = jax.lax.optimization_barrier(particle.force(self.loading_stress(particle, particle.strain(state.displacement_max))))
 
-    def _displacement(self, particle: Particle, force: AnyShape, peak: AnyShape, peak_force: AnyShape) -> AnyShape:
-        eta = self.shape_factor(particle)
-        _, carries, recoverable = self._elastic(eta, eta * peak / particle.effective_diameter)
+        law, p, state, highest = jax.lax.optimization_barrier((self, particle, state, highest))
+        scale = p.effective_diameter / law.shape_factor(p)
+        stress = p.stress(jnp.where(highest < past, past, highest))
+        reached = scale * loading_strain(*law.plastic.polynomial, stress, state.displacement_max / scale)
+        elastic = (highest < past) | (reached < state.displacement_max)
+        peak = jax.lax.optimization_barrier(jnp.where(elastic, state.displacement_max, reached))
+
+        law, p, force, highest = jax.lax.optimization_barrier((self, particle, force, highest))
+        peak_force = jnp.where(highest < past, past, highest)
+        eta = law.shape_factor(p)
+        _, carries, recoverable = law._elastic(eta, eta * peak / p.effective_diameter)
         loaded = carries & (peak_force > 0)
         ratio = jnp.where(loaded, force, 0.0) / jnp.where(loaded, peak_force, 1.0)
-        released = particle.displacement(recoverable) * recovery(ratio)
-        return peak - jnp.where(loaded & (force < peak_force), released, 0.0)
+        released = p.displacement(recoverable) * recovery(ratio)
+        return peak, peak - jnp.where(loaded & (force < peak_force), released, 0.0)
 
     # ---- energy --------------------------------------------------------------------------------------------------------
 
@@ -248,6 +252,6 @@ class MccLaw(AbstractContactLaw[History]):
         return Energy(dissipated + now, now, dissipated)
 
 
-def _recovered(drop: AnyShape, carries: Bool[Array, "..."], recoverable: AnyShape) -> AnyShape:
+def _recovered(drop: AnyShape, carries: Bool[Array, ...], recoverable: AnyShape) -> AnyShape:
     """Share of the recoverable strain that is recovered after the strain dropped; all of it where no stress was carried."""
     return jnp.where(carries, drop / recoverable, 1.0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from .._errors import InputError
-from ..campaign import Control
+from ..campaign import Control, load_toml
 
 
 @dataclass(frozen=True)
@@ -161,15 +160,13 @@ def read_programme(file: str | Path) -> Programme:
     """
     file = Path(file)
     try:
-        content = tomllib.loads(file.read_text(encoding="utf-8"))
+        content = load_toml(file.read_text(encoding="utf-8"), file)
     except OSError as error:
         raise InputError(
             f"cannot be read ({error.strerror})", file=file, remedy="Give a TOML file with the programme."
         ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"is no valid TOML: {error}", file=file, remedy="See the example in `mcc-jax simulate --help`."
-        ) from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"is no text in UTF-8: {error}", file=file, remedy="Save it as UTF-8.") from error
     unknown = set(content) - {"control", "rate", "points", "interval_s", "step"}
     if unknown:
         raise InputError(
@@ -181,17 +178,25 @@ def read_programme(file: str | Path) -> Programme:
     def number(entry: dict, key: str, where: str) -> float:
         value = entry.get(key)
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise InputError(f"{where}: {key} must be a number, got {value!r}", file=file)
+            raise InputError(
+                f"{where}: {key} must be a number, got {value!r}", file=file, remedy=f"Write it as {key} = 2.0."
+            )
         return float(value)
 
     steps: list[Ramp | Hold] = []
     for i, entry in enumerate(content["step"], start=1):
         where = f"step {i}"
         if not isinstance(entry, dict) or ("ramp_to" in entry) == ("hold_s" in entry):
-            raise InputError(f"{where} needs exactly one of ramp_to and hold_s", file=file)
+            raise InputError(
+                f"{where} needs exactly one of ramp_to and hold_s",
+                file=file,
+                remedy="Make two steps of it.",
+            )
         extra = set(entry) - {"ramp_to", "rate", "hold_s"}
         if extra:
-            raise InputError(f"{where}: unknown entry {sorted(extra)[0]!r}", file=file)
+            raise InputError(
+                f"{where}: unknown entry {sorted(extra)[0]!r}", file=file, remedy="Known: ramp_to, rate, hold_s."
+            )
         if "hold_s" in entry:
             steps.append(Hold(number(entry, "hold_s", where)))
         elif "rate" in entry or "rate" in content:
@@ -202,14 +207,16 @@ def read_programme(file: str | Path) -> Programme:
             raise InputError(f"{where} has no rate", file=file, remedy="Give it one, or one for all at the top.")
     control = content.get("control", "load")
     if control not in ("load", "displacement"):
-        raise InputError(f"control must be 'load' or 'displacement', got {control!r}", file=file)
+        raise InputError(
+            f"control must be 'load' or 'displacement', got {control!r}", file=file, remedy='Write control = "load".'
+        )
     points = content.get("points")
     interval = number(content, "interval_s", "the programme") if "interval_s" in content else None
     if points is not None and (isinstance(points, bool) or not isinstance(points, int)):
-        raise InputError(f"points must be a whole number, got {points!r}", file=file)
+        raise InputError(f"points must be a whole number, got {points!r}", file=file, remedy="Write points = 300.")
     if points is None and interval is None:
         points = 300
     try:
         return Programme(control, tuple(steps), interval, points)
     except ValueError as error:
-        raise InputError(str(error), file=file) from error
+        raise InputError(str(error), file=file, remedy="See the example in `mcc-jax simulate --help`.") from error

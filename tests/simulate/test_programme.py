@@ -84,7 +84,7 @@ def test_programme_file_round_trip(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("control = ", "valid TOML"),
+        ("control = ", "not TOML"),
         ("rate = 2", "no [[step]]"),
         ("speed = 2\n[[step]]\nramp_to=1", "unknown entry 'speed'"),
         ("[[step]]\nramp_to = 1", "no rate"),

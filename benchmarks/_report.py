@@ -1,0 +1,44 @@
+"""What every benchmark records: versions and device, never a machine's name or path."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from importlib.metadata import version
+from pathlib import Path
+
+RESULTS = Path(__file__).parent / "results"
+
+
+def environment(*packages):
+    """Versions, number of cores and the C allocator's settings, for the record."""
+    return {
+        "python": platform.python_version(),
+        **{name: version(name) for name in packages},
+        "cores": len(os.sched_getaffinity(0)),
+        "GLIBC_TUNABLES": os.environ.get("GLIBC_TUNABLES", ""),
+    }
+
+
+def table(rows):
+    """A markdown table of dictionaries with the same keys."""
+    keys = list(rows[0])
+    cells = [keys, ["---"] * len(keys)] + [[_text(row[key]) for key in keys] for row in rows]
+    return "\n".join("| " + " | ".join(row) + " |" for row in cells)
+
+
+def _text(value):
+    if isinstance(value, bool):
+        return "PASS" if value else "FAIL"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def write(name, title, tables, record):
+    """Print the tables and, if `record` holds, keep them in `results/name.md` and `.json`."""
+    text = f"# {title}\n\n" + "\n\n".join(f"## {heading}\n\n{table(rows)}" for heading, rows in tables.items()) + "\n"
+    print(text)
+    if record:
+        RESULTS.mkdir(exist_ok=True)
+        (RESULTS / f"{name}.md").write_text(text)
+        (RESULTS / f"{name}.json").write_text(json.dumps(tables, indent=1) + "\n")

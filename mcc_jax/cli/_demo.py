@@ -1,0 +1,77 @@
+"""`mcc-jax demo`."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from pathlib import Path
+
+import click
+
+from ._output import results
+from ._session import say, say_table, session
+from ._types import out_option, seed_option
+
+CAMPAIGN_FILES = ("particles.csv", "curves.csv", "campaign.toml")
+
+
+@click.command(short_help="The whole job on an embedded campaign.")
+@out_option(default="mcc-jax-demo", show_default=True)
+@seed_option()
+def demo(out: Path, seed: int) -> None:
+    """Simulate the paper's 20 particles, calibrate the law on them, draw the figures.
+
+    The tests are simulated from the paper's tables (Bommireddy et al. 2018): it publishes its measured curves as
+    pictures only, not as numbers. DIR gets campaign/, calibration.json and figures/.
+
+    \b
+    Example:
+      mcc-jax demo --out try --seed 1
+    """
+    with session(9) as tell:
+        from ..calibrate import calibrate_paper
+        from ..campaign import write_campaign
+        from ..simulate import paper_campaign
+        from ._calibration import main_numbers, say_files, say_state, say_warnings, write_calibration
+
+        with results(out) as stage:
+            tell("simulating the campaign")
+            campaign = paper_campaign(seed)
+            write_campaign(campaign, stage.folder / "campaign")
+            calibration = calibrate_paper(campaign, seed=seed, progress=tell)
+            content = write_calibration(calibration, stage, figures=True, tell=tell)
+    points = sum(len(curve) for curve in campaign.curves)
+    say(f"The tests are SIMULATED from the paper's tables, not measured: {len(campaign)} particles, {points} points,")
+    say("each with C1, C3 and C5 of its own drawn from Table 2, with noise of 0.02 um and 0.05 mN.")
+    say()
+    say_state(content)
+    rows = [(*row, paper) for row, paper in zip(main_numbers(content), _paper_values(), strict=True)]
+    say_table(("quantity", "this run", "the paper"), rows)
+    say("With 20 particles that differ this much, a and the spreads scatter from seed to seed.")
+    say_warnings(content)
+    say()
+    say_files(out, [*(f"campaign/{name}" for name in CAMPAIGN_FILES), *content["figures"], "calibration.json"])
+    say()
+    say("Next, for example:")
+    folder = shlex.quote(str(out / "campaign"))
+    for comment, command in (
+        (
+            "the same particles, a by the paper's reference objective",
+            f"calibrate {folder} --out fit --objective reference",
+        ),
+        (
+            "one shared material, two cycles with holds",
+            "simulate --out sim --shared-material --levels 0.5,1 --hold-s 30",
+        ),
+        ("your own tests, from a tester's file", "convert FILE --out tests --diameters 200,190,180"),
+    ):
+        say(f"  mcc-jax {command}", nl=False)
+        say(f"   # {comment}", dim=True)
+
+
+def _paper_values() -> list[str]:
+    """The paper's own numbers, in the order of `main_numbers`."""
+    from ..campaign import PAPER_EFFECTIVE_MODULUS_MPA, PAPER_LOG_C, PAPER_SHAPE_PARAMETER
+
+    spreads = [text for mean, sd in PAPER_LOG_C.values() for text in (f"{math.exp(mean):.4g}", f"{sd:.4g}")]
+    return [f"{PAPER_SHAPE_PARAMETER:g}", f"{PAPER_EFFECTIVE_MODULUS_MPA / 1e3:g} GPa", *spreads, "0.4085 MPa"]

@@ -1,0 +1,60 @@
+"""All figures of a calibration, and writing them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from ..calibrate import PaperCalibration
+from ._collapse import plot_collapse
+from ._curves import plot_curves
+from ._dimensions import plot_dimensions
+from ._elastic import plot_elastic
+from ._law import plot_law
+from ._master import plot_master
+from ._particles import particle_pages, plot_particles
+from ._residuals import plot_residuals
+from ._style import styled
+
+
+def paper_figures(calibration: PaperCalibration) -> dict[str, Figure]:
+    """Every figure of the calibration, by the stem of its file's name.
+
+    Returns:
+        `curves`, `dimensions`, `collapse`, `master`, `law`, `particles` (then `particles_2`, ... with more than 20
+        particles), `elastic`, `residuals`.
+    """
+    figures = {
+        "curves": plot_curves(calibration),
+        "dimensions": plot_dimensions(calibration.campaign),
+        "collapse": plot_collapse(calibration),
+        "master": plot_master(calibration),
+        "law": plot_law(calibration),
+    }
+    for page in range(1, particle_pages(calibration) + 1):
+        figures["particles" if page == 1 else f"particles_{page}"] = plot_particles(calibration, page)
+    figures["elastic"] = plot_elastic(calibration)
+    figures["residuals"] = plot_residuals(calibration)
+    return figures
+
+
+@styled
+def save_figures(figures: Mapping[str, Figure], directory: str | Path, *, dpi: int = 150) -> list[Path]:
+    """Write figures as `<stem>.png` into a directory that exists.
+
+    Args:
+        figures: figures by stem, as `paper_figures` gives them.
+        directory: where to; files of these names are overwritten.
+        dpi: resolution [dots per inch].
+
+    Returns:
+        The files, in the order of the figures.
+    """
+    files = []
+    for stem, figure in figures.items():
+        file = Path(directory) / f"{stem}.png"
+        figure.savefig(file, format="png", dpi=dpi)
+        files.append(file)
+    return files

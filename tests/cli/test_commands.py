@@ -1,0 +1,237 @@
+import dataclasses
+import json
+import math
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from asserting import snapshot
+
+from mcc_jax.campaign import PAPER_DIAMETERS_UM, find_segments, read_campaign
+from mcc_jax.cli._main import cli
+from mcc_jax.cli._types import STRAIN_SCALING, UNLOADING
+from mcc_jax.law import StrainScaling, Unloading
+from mcc_jax.simulate import Instrument, paper_campaign
+
+TESTERS = Path(__file__).parents[3] / "shared" / "data" / "testers"
+# What the contract promises; more may be there.
+KEYS = {
+    *("schema", "method", "converged", "runtime_s", "law", "a", "effective_modulus_MPa"),
+    *("log_C1", "log_C3", "log_C5", "noise", "particles", "diagnostics"),
+}
+PARTICLE_KEYS = {"particle", "eta_p", "C1", "C3", "C5", "zero_um", "rms_um", "kept", "why_not"}
+DIAGNOSTICS = {"rhat_max", "ess_bulk_min", "divergences", "pareto_k_max"}
+
+
+def done(result):
+    assert result.exit_code == 0, (result.stdout, result.stderr, result.exception)
+    assert result.stderr == ""
+    return result.stdout
+
+
+def is_estimate(entry):
+    return set(entry) == {"value", "sd", "interval_95"}
+
+
+def check_contract(content):
+    assert set(content) >= KEYS
+    assert content["schema"] == 1
+    assert content["law"].keys() == {"unloading", "strain_scaling"}
+    assert is_estimate(content["a"])
+    assert is_estimate(content["effective_modulus_MPa"])
+    for name in ("log_C1", "log_C3", "log_C5"):
+        assert is_estimate(content[name]["mean"])
+        assert is_estimate(content[name]["sd"])
+    for particle in content["particles"]:
+        assert set(particle) >= PARTICLE_KEYS
+        assert all(is_estimate(particle[name]) for name in ("eta_p", "C1", "C3", "C5", "zero_um"))
+    assert set(content["diagnostics"]) >= DIAGNOSTICS
+
+
+def test_names_of_the_options_are_those_of_the_law():
+    assert tuple(form.value for form in Unloading) == UNLOADING
+    assert tuple(form.value for form in StrainScaling) == STRAIN_SCALING
+
+
+def test_without_arguments_help_with_examples(run):
+    text = done(run())
+    assert text == done(run("--help"))
+    for word in ("demo", "simulate", "convert", "calibrate", "Examples:", "_MCC_JAX_COMPLETE"):
+        assert word in text
+    assert set(cli.commands) == {"demo", "simulate", "convert", "calibrate"}
+    assert "0.1.0" in done(run("--version"))
+
+
+@pytest.mark.parametrize("command", ["demo", "simulate", "convert", "calibrate"])
+def test_every_command_has_help_with_an_example(run, command):
+    text = done(run(command, "--help"))
+    assert "xample" in text
+    assert "--out DIR" in text
+
+
+def test_demo_does_the_whole_job(run, tmp_path):
+    out = tmp_path / "new" / "demo"
+    text = done(run("demo", "--out", out))
+    assert "SIMULATED" in text
+    for number in ("1.43", "16 GPa", "6.704", "3.009", "2.66", "0.4085 MPa"):
+        assert number in text
+    content = json.loads((out / "calibration.json").read_text(encoding="utf-8"))
+    check_contract(content)
+    assert content["converged"] is True
+    assert len(content["figures"]) >= 8
+    expected = {"calibration.json", "campaign", "figures", *content["figures"]}
+    expected |= {f"campaign/{name}" for name in ("particles.csv", "curves.csv", "campaign.toml")}
+    assert set(snapshot(out)) == expected
+    for name in content["figures"]:
+        assert (out / name).read_bytes().startswith(b"\x89PNG")
+    for warning in content["warnings"]:
+        assert warning[1:20] in text
+    assert read_campaign(out / "campaign").particles == tuple(str(i) for i in range(1, 21))
+
+
+def test_simulate_then_calibrate_twice_gives_the_same(run, simulated, tmp_path):
+    out = tmp_path / "fit"
+    (out / "figures").mkdir(parents=True)
+    (out / "figures" / "mine.png").write_text("a file of the user's")
+    first = done(run("calibrate", simulated, "--out", out))
+    assert "converged" in first
+    assert str(out) in first
+    one = json.loads((out / "calibration.json").read_text())
+    check_contract(one)
+    assert all((out / name).is_file() for name in one["figures"])
+    assert [p["particle"] for p in one["particles"]] == ["A", "B", "C"]
+    text = done(run("calibrate", simulated, "--out", out, "--no-figures", "--json"))
+    assert text.endswith("}\n")
+    two = json.loads(text)
+    assert text == (out / "calibration.json").read_text(encoding="utf-8")
+    # The figures of the first run would contradict what lies beside them now; the user's own file stays.
+    assert set(snapshot(out)) == {"calibration.json", "figures", "figures/mine.png"}
+    assert two["figures"] == []
+    assert one["runtime_s"] > 0
+    for content in (one, two):
+        del content["runtime_s"], content["figures"]
+    assert one == two
+
+
+def test_calibrate_into_the_campaigns_own_folder(run, campaign):
+    before = snapshot(campaign)
+    done(run("calibrate", campaign, "--out", campaign, "--no-figures", "--objective", "reference", "--reference", "B"))
+    after = snapshot(campaign)
+    content = json.loads(after.pop("calibration.json"))
+    assert after == before
+    assert (content["a_objective"], content["reference_particle"]) == ("reference", "B")
+
+
+def test_calibrate_recovers_what_simulate_put_in(run, tmp_path):
+    coefficients = {"C1": 7.0, "C3": 2.5, "C5": 2.7}
+    fixed = [word for name, value in coefficients.items() for word in (f"--{name}", value)]
+    sim, fit = tmp_path / "sim", tmp_path / "fit"
+    done(run("simulate", "--out", sim, *fixed, "--a", "0.9", "--effective-modulus", "9000", "--points", "200"))
+    for column, value in coefficients.items():
+        assert set(read_campaign(sim).columns[f"true_{column}"]) == {str(value)}
+    done(run("calibrate", sim, "--out", fit, "--no-figures", "--threshold-MPa", "0"))
+    content = json.loads((fit / "calibration.json").read_text())
+    assert content["adjustment"]["threshold_MPa"] == 0
+    assert content["a"]["value"] == pytest.approx(0.9, abs=2e-3)
+    assert content["effective_modulus_MPa"]["value"] == pytest.approx(9000, rel=5e-3)
+    for name, value in coefficients.items():
+        assert content[f"log_{name}"]["mean"]["value"] == pytest.approx(math.log(value), abs=5e-3)
+
+
+def test_simulate_by_default_is_the_paper_campaign_with_a_perfect_tester(run, tmp_path):
+    text = done(run("simulate", "--out", tmp_path / "sim", "--seed", "4"))
+    assert "20 particles" in text
+    mine, papers = read_campaign(tmp_path / "sim"), paper_campaign(4, instrument=Instrument())
+    np.testing.assert_array_equal(mine.diameters_um, PAPER_DIAMETERS_UM)
+    assert mine.columns == papers.columns
+    for a, b in zip(mine.curves, papers.curves, strict=True):
+        np.testing.assert_array_equal(a.force_mN, b.force_mN)
+        np.testing.assert_array_equal(a.displacement_um, b.displacement_um)
+
+
+def test_simulate_keeps_columns_and_forgets_older_truth(run, simulated, tmp_path):
+    again = ["simulate", "--particles", simulated / "particles.csv", "--points", "20", "--shared-material"]
+    done(run(*again, "--out", tmp_path / "sim"))
+    campaign = read_campaign(tmp_path / "sim")
+    assert campaign.particles == ("A", "B", "C")
+    assert campaign.columns["batch"] == ("x", "y", "y")
+    assert len(set(campaign.columns["true_C1"])) == 1
+    assert set(campaign.columns) == {"batch", "true_C1", "true_C3", "true_C5", "true_monotone"}
+
+
+def test_simulate_options_do_what_they_say(run, simulated, tmp_path):
+    base = ["simulate", "--particles", simulated / "particles.csv", "--out", tmp_path / "sim"]
+    done(run(*base, "--peak-stress", "10", "--levels", "0.5,1", "--unload-to", "0.1", "--hold-s", "20", "--rate", "4"))
+    campaign = read_campaign(tmp_path / "sim")
+    kinds = [part.kind for part in find_segments(campaign.curves[0])]
+    assert kinds == ["load", "hold", "unload", "reload", "load", "hold", "unload"]
+    for curve, (D1, D2, D3) in zip(campaign.curves, campaign.diameters_um, strict=True):
+        peak = 10e-3 * math.pi * (D1 * D2 / D3 / 2) ** 2
+        assert curve.force_mN.max() == pytest.approx(peak, rel=1e-12)
+        assert curve.time_s[-1] == pytest.approx((0.5 + 0.4 + 0.9 + 1) * peak / 4 + 40)
+    displacement = ["--control", "displacement", "--rate", "0.5", "--peak-strain", "0.2:0.3", "--interval-s", "2"]
+    done(run(*base, *displacement, "--resolution-um", "0.5", "--resolution-mN", "0.25", "--zero-um", "3"))
+    campaign = read_campaign(tmp_path / "sim")
+    assert campaign.metadata.control == "displacement"
+    assert campaign.metadata.displacement_resolution_um == 0.5
+    assert len({len(curve) for curve in campaign.curves}) == 3
+    for curve, (D1, D2, D3) in zip(campaign.curves, campaign.diameters_um, strict=True):
+        assert (np.ptp(curve.displacement_um) + 0.5) / (D1 * D2 / D3) >= 0.2
+        assert np.ptp(curve.displacement_um) - 0.5 <= 0.3 * (D1 * D2 / D3)
+        np.testing.assert_array_equal(curve.displacement_um % 0.5, 0)
+        np.testing.assert_array_equal(curve.force_mN % 0.25, 0)
+        assert curve.time_s[1] == 2
+
+
+def test_simulate_by_a_programme_file(run, simulated, tmp_path):
+    programme = tmp_path / "steps.toml"
+    programme.write_text("rate = 3\npoints = 50\n[[step]]\nramp_to = 1\n[[step]]\nhold_s = 9\n[[step]]\nramp_to = 0\n")
+    base = ["simulate", "--particles", simulated / "particles.csv", "--out", tmp_path / "sim"]
+    done(run(*base, "--programme", programme, "--noise-um", "0.1", "--noise-mN", "0.1", "--unloading", "punch"))
+    campaign = read_campaign(tmp_path / "sim")
+    simulation = campaign.metadata.other["simulation"]
+    assert simulation["unloading"] == "punch"
+    assert simulation["displacement_noise_um"] == 0.1
+    assert campaign.curves[0].force_mN[:1] != 0
+    assert "not a measurement" in campaign.metadata.provenance
+
+
+def test_convert_then_calibrate_says_that_the_law_does_not_fit(run, tmp_path):
+    tests, fit = tmp_path / "tests", tmp_path / "fit"
+    text = done(run("convert", TESTERS / "FS1.txt", "--out", tests, "--diameters", "200,190,180"))
+    campaign = read_campaign(tests)
+    counts = Counter(part.kind for curve in campaign.curves for part in find_segments(curve))
+    assert "10 tests, 12000 points" in text
+    for kind in ("load", "hold", "unload", "reload"):
+        assert f"{counts[kind]} {kind}" in text
+    assert counts["unload"] == 80  # 8 cycles each
+    text = done(run("calibrate", tests, "--out", fit, "--no-figures"))
+    assert "describes these tests badly" in text
+    assert snapshot(fit).keys() == {"calibration.json"}
+
+
+def test_convert_by_a_mapping_file_with_diameters_from_a_table(run, tmp_path):
+    tests, table, mapping = tmp_path / "lab.txt", tmp_path / "sizes.csv", tmp_path / "map.toml"
+    tests.write_text("made by hand\nt;F;d;who\n0;0;0;é 1\n1;0,5;-1;é 1\n0;0;0;2\n1;1;-2;2\n", encoding="latin-1")
+    table.write_text("particle,D1_mm,D2_mm,D3_mm\n2,0.2,0.2,0.1\né 1,0.3,0.3,0.2\n", encoding="utf-8")
+    mapping.write_text(
+        'encoding = "latin-1"\ndelimiter = "semicolon"\ndecimal_mark = ","\nskip_rows = 1\ntests = "column"\n'
+        '[columns]\ntime = { column = "t", unit = "s" }\nforce = { column = "F", unit = "N" }\n'
+        'displacement = { column = "d", unit = "um", sign = -1 }\ntest = { column = "who" }\n'
+    )
+    done(run("convert", tests, "--out", tmp_path / "out", "--mapping", mapping, "--diameters", table))
+    campaign = read_campaign(tmp_path / "out")
+    assert campaign.particles == ("é 1", "2")
+    np.testing.assert_allclose(campaign.diameters_um, [[300, 300, 200], [200, 200, 100]])
+    np.testing.assert_array_equal(campaign.curves[0].force_mN, [0, 500])
+    assert dataclasses.asdict(campaign.metadata)["control"] is None
+
+
+def test_json_of_odd_names_is_utf8(run, campaign):
+    for name in ("particles.csv", "curves.csv"):
+        file = campaign / name
+        file.write_text(file.read_text().replace("\nA,", "\nπ [bold],"), encoding="utf-8")
+    text = done(run("calibrate", campaign, "--out", campaign / "fit", "--no-figures", "--json"))
+    assert json.loads(text)["particles"][0]["particle"] == "π [bold]"
+    assert "π [bold]" in text

@@ -1,0 +1,157 @@
+import errno
+import os
+from pathlib import Path
+
+import pytest
+from asserting import snapshot
+
+from mcc_jax import InputError
+from mcc_jax.cli._lock import LOCK, locked
+from mcc_jax.cli._output import WORK, json_text, results
+
+
+def test_results_appear_together(tmp_path):
+    out = tmp_path / "a" / "b"
+    with results(out) as stage:
+        (stage.folder / "sub").mkdir()
+        (stage.folder / "one.txt").write_text("1")
+        (stage.folder / "sub" / "two.txt").write_text("2")
+        assert not (out / "one.txt").exists()
+    assert snapshot(out) == {"one.txt": b"1", "sub": None, "sub/two.txt": b"2"}
+
+
+def test_only_files_named_stale_go(tmp_path):
+    for name in ("old.png", "kept.png", "one.txt"):
+        (tmp_path / name).write_text("old")
+    with results(tmp_path) as stage:
+        (stage.folder / "one.txt").write_text("1")
+        stage.stale += ["old.png", "never there.png", "one.txt"]
+    assert snapshot(tmp_path) == {"one.txt": b"1", "kept.png": b"old"}
+
+
+@pytest.mark.parametrize("at", [1, 2, 3])
+def test_a_move_that_fails_is_undone(tmp_path, monkeypatch, at):
+    for name in ("a", "b", "stale"):
+        (tmp_path / name).write_text("old")
+    replace, calls = Path.replace, []
+
+    def failing(self, target):
+        calls.append(target)
+        if len(calls) == at:
+            raise OSError(errno.EIO, "planted", str(target))
+        return replace(self, target)
+
+    def write():
+        with results(tmp_path) as stage:
+            stage.stale.append("stale")
+            (stage.folder / "sub").mkdir()
+            for name in ("a", "b", "sub/new"):
+                (stage.folder / name).write_text("new")
+            monkeypatch.setattr(Path, "replace", failing)
+
+    before = snapshot(tmp_path)
+    with pytest.raises(InputError, match="planted"):
+        write()
+    assert snapshot(tmp_path) == before
+
+
+def test_a_folder_where_a_file_belongs(tmp_path):
+    (tmp_path / "one.txt").mkdir()
+    (tmp_path / "a.txt").write_text("old")
+    before = snapshot(tmp_path)
+
+    def write():
+        with results(tmp_path) as stage:
+            (stage.folder / "a.txt").write_text("new")
+            (stage.folder / "one.txt").write_text("1")
+
+    with pytest.raises(InputError, match=r"one\.txt there is a folder"):
+        write()
+    assert snapshot(tmp_path) == before
+
+
+def test_without_hard_links(tmp_path, monkeypatch):
+    def no_links(*_):
+        raise OSError(errno.EPERM, "no hard links here")
+
+    (tmp_path / "a").write_text("old")
+    monkeypatch.setattr(Path, "hardlink_to", no_links)
+    with results(tmp_path) as stage:
+        (stage.folder / "a").write_text("new")
+    assert snapshot(tmp_path) == {"a": b"new"}
+
+
+def test_the_users_folder_is_named_not_the_stage(tmp_path):
+    def write():
+        with results(tmp_path / "out") as stage:
+            raise InputError("cannot be written", file=stage.folder / "campaign", remedy="Make room")
+
+    with pytest.raises(InputError) as caught:
+        write()
+    assert str(caught.value) == f"{tmp_path / 'out'}: cannot be written. Make room"
+    assert snapshot(tmp_path) == {}
+
+
+def test_a_full_disk_is_bad_luck_not_a_defect(tmp_path):
+    def write():
+        with results(tmp_path):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with pytest.raises(InputError, match=r"No space left on device\. Make room"):
+        write()
+
+
+def test_an_error_of_another_file_is_not_ours(tmp_path):
+    def read():
+        with results(tmp_path):
+            raise FileNotFoundError(errno.ENOENT, "no such file", "/somewhere/else")
+
+    with pytest.raises(FileNotFoundError):
+        read()
+
+
+def test_one_run_at_a_time(tmp_path):
+    def second():
+        with results(tmp_path):
+            raise AssertionError
+
+    with results(tmp_path) as stage:
+        with pytest.raises(InputError, match=rf"another mcc-jax run \(process {os.getpid()}\) is writing there"):
+            second()
+        (stage.folder / "a").write_text("first")  # undisturbed by the refusal
+    assert snapshot(tmp_path) == {"a": b"first"}
+    with results(tmp_path):
+        pass
+
+
+def test_left_overs_of_a_killed_run_are_cleared(tmp_path):
+    (tmp_path / LOCK).write_text("1\n")
+    (tmp_path / f"{WORK}x" / "new").mkdir(parents=True)
+    (tmp_path / f"{WORK}x" / "new" / "half").write_text("half")
+    with results(tmp_path) as stage:
+        (stage.folder / "a").write_text("a")
+    assert snapshot(tmp_path) == {"a": b"a"}
+
+
+def test_a_lock_that_vanishes_is_taken_anew(tmp_path, monkeypatch):
+    from mcc_jax.cli import _lock
+
+    attempts, try_lock = [], _lock._try_lock
+
+    def racing(handle: int) -> bool:
+        if not attempts:  # the run before removes its file just now
+            (tmp_path / LOCK).unlink()
+        attempts.append(handle)
+        return try_lock(handle)
+
+    monkeypatch.setattr(_lock, "_try_lock", racing)
+    with locked(tmp_path):
+        assert len(attempts) == 2
+        assert (tmp_path / LOCK).exists()
+    assert not (tmp_path / LOCK).exists()
+
+
+def test_json_is_strict():
+    assert json_text({"a": float("nan"), "b": [1.5, float("inf")], "c": "µ"}) == (
+        '{\n  "a": null,\n  "b": [\n    1.5,\n    null\n  ],\n  "c": "µ"\n}\n'
+    )

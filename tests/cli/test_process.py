@@ -1,0 +1,136 @@
+"""As a user runs it: a process of its own, with pipes, signals and limits."""
+
+import os
+import pty
+import select
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from asserting import snapshot
+
+COMMAND = [sys.executable, "-m", "mcc_jax"]
+posix = pytest.mark.skipif(os.name != "posix", reason="signals")
+
+
+def call(*arguments, **settings):
+    settings = {"capture_output": True, "text": True, "timeout": 100} | settings
+    return subprocess.run([*COMMAND, *map(str, arguments)], **settings)
+
+
+def test_help_loads_nothing_heavy():
+    code = (
+        "import sys, time; start = time.process_time()\n"
+        "from mcc_jax.cli._main import cli\n"
+        "try: cli.main([], prog_name='mcc-jax')\n"
+        "except SystemExit as end: status = end.code\n"
+        "took = time.process_time() - start  # of this process, whatever else runs\n"
+        "heavy = [m for m in ('jax', 'equinox', 'numpy', 'pandas', 'matplotlib', 'rich') if m in sys.modules]\n"
+        "print(status, heavy, took < 0.5)"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert result.stdout.splitlines()[-1] == "0 [] True"
+    assert result.stderr == ""
+
+
+def test_bad_input_is_one_line(tmp_path):
+    result = call("calibrate", tmp_path / "nothing", "--out", tmp_path / "fit")
+    assert (result.returncode, result.stdout) == (2, "")
+    assert result.stderr.startswith("mcc-jax: error: ")
+    assert result.stderr.count("\n") == 1
+
+
+def test_shell_completion():
+    source = call(env=os.environ | {"_MCC_JAX_COMPLETE": "bash_source"})
+    assert "mcc-jax" in source.stdout
+    asked = {"_MCC_JAX_COMPLETE": "bash_complete", "COMP_WORDS": "mcc-jax cal", "COMP_CWORD": "1"}
+    assert "calibrate" in call(env=os.environ | asked).stdout
+
+
+@posix
+def test_full_disk(tmp_path):
+    (tmp_path / "curves.csv").write_text("old")
+    before = snapshot(tmp_path)
+    limited = ["sh", "-c", 'ulimit -f 4; exec "$@"', "sh", *COMMAND, "simulate", "--out", tmp_path, "--points", "20"]
+    result = subprocess.run(limited, capture_output=True, text=True, timeout=100)
+    assert result.returncode == 2
+    assert result.stderr.count("\n") == 1
+    assert str(tmp_path) in result.stderr
+    assert "work-" not in result.stderr
+    assert snapshot(tmp_path) == before
+
+
+@posix
+def test_broken_pipe_is_quiet():
+    with subprocess.Popen([*COMMAND, "simulate", "--help"], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.close()
+        assert process.stderr.read() == b""
+
+
+@posix
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)])
+def test_killed_in_the_middle(tmp_path, number, status):
+    out = tmp_path / "out"
+    (out / "campaign").mkdir(parents=True)
+    (out / "campaign" / "curves.csv").write_text("old")
+    (out / "calibration.json").write_text("old")
+    before = snapshot(out)
+    with subprocess.Popen([*COMMAND, "demo", "--out", out], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        deadline = time.monotonic() + 60
+        while not list(out.glob(".mcc-jax-work-*/new")) and time.monotonic() < deadline:
+            time.sleep(0.02)
+        process.send_signal(number)
+        stdout, stderr = process.communicate(timeout=60)
+    assert process.returncode == status
+    assert stdout == b""
+    assert stderr == (b"mcc-jax: interrupted\n" if number == signal.SIGINT else b"")
+    visible = {name: data for name, data in snapshot(out).items() if not name.startswith(".mcc-jax")}
+    assert visible == before
+    if number != signal.SIGKILL:
+        assert snapshot(out) == before
+
+
+@posix
+def test_two_at_once_and_the_lock_of_a_dead_one(tmp_path):
+    holder = (
+        "import sys, time; from pathlib import Path; from mcc_jax.cli._output import results\n"
+        "with results(Path(sys.argv[1])): print('in', flush=True); time.sleep(60)"
+    )
+    with subprocess.Popen([sys.executable, "-c", holder, str(tmp_path)], stdout=subprocess.PIPE) as process:
+        assert process.stdout.readline() == b"in\n"
+        result = call("simulate", "--out", tmp_path, "--points", "20")
+        assert result.returncode == 2
+        assert f"another mcc-jax run (process {process.pid}) is writing there" in result.stderr
+        process.kill()
+        process.wait()
+    assert any(name.startswith(".mcc-jax") for name in snapshot(tmp_path))
+    result = call("simulate", "--out", tmp_path, "--points", "20")
+    assert (result.returncode, result.stderr) == (0, "")
+    assert "\x1b" not in result.stdout
+    assert set(snapshot(tmp_path)) == {"particles.csv", "curves.csv", "campaign.toml"}
+
+
+@posix
+def test_progress_on_a_terminal_only(tmp_path):
+    ours, theirs = pty.openpty()
+    environment = os.environ | {"TERM": "xterm", "COLUMNS": "100"}
+    arguments = [*COMMAND, "simulate", "--out", str(tmp_path / "sim"), "--points", "20"]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=theirs, env=environment) as process:
+        os.close(theirs)
+        seen = b""
+        while select.select([ours], [], [], 60)[0]:
+            try:
+                part = os.read(ours, 4096)
+            except OSError:  # the other end is closed
+                break
+            if not part:
+                break
+            seen += part
+        stdout = process.stdout.read()
+    os.close(ours)
+    assert process.returncode == 0
+    assert b"simulating" in seen
+    assert b"Simulated 20 particles" in stdout
+    assert b"\x1b" not in stdout

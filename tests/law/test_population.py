@@ -1,0 +1,193 @@
+"""The log-normal population of plastic coefficients: Table 2 of the paper and what follows from it."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import K1, K3, K5, check, close, paper_population
+from scipy.stats import norm
+
+from mcc_jax.campaign._paper import PAPER_LOG_C
+from mcc_jax.law import LogNormal, Plastic, PlasticPopulation, ideal_plastic_stress
+
+POPULATION = paper_population()
+DRAWS = 200_000
+
+
+@pytest.fixture(scope="module")
+def draws():
+    return POPULATION.sample(jax.random.key(20181206), DRAWS)
+
+
+@pytest.fixture(scope="module")
+def kept(draws):
+    return np.asarray(jax.vmap(lambda p: p.is_monotone)(draws))
+
+
+@pytest.mark.parametrize(
+    ("index", "exact", "printed"),
+    [(0, "7.0093931281847", "7.0094"), (1, "27.234920723507", "27.235"), (2, "144.22882848282", "144.23")],
+)
+def test_mean_law(index, exact, printed):
+    value = POPULATION.mean_law.polynomial[index]
+    check(value, exact)
+    close(value, float(printed), rel=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "order", "low", "high", "printed"),
+    [("C1", 1, "7.00894", "7.00985", K1), ("C3", 3, "27.2308", "27.2390", K3), ("C5", 5, "144.178", "144.279", K5)],
+)
+def test_rounding_of_the_papers_table_allows_its_coefficients(name, order, low, high, printed):
+    mean, sd = PAPER_LOG_C[name]
+    half_mean, half_sd = 5e-5, (5e-5 if name != "C3" else 5e-14)
+    smallest = LogNormal(mean - half_mean, sd - half_sd).moment(order)
+    largest = LogNormal(mean + half_mean, sd + half_sd).moment(order)
+    assert smallest < printed < largest
+    check(smallest, low, slack=2)
+    check(largest, high, slack=2)
+    close(POPULATION.mean_law.polynomial[(order - 1) // 2], printed, rel=4e-4)
+
+
+def test_medians():
+    for value, printed in zip(
+        (POPULATION.median_law.C1, POPULATION.median_law.C3, POPULATION.median_law.C5),
+        ("6.7039707493066", "3.0086756543596", "2.6601965206281"),
+        strict=True,
+    ):
+        check(value, printed)
+    check(POPULATION.median_law.polynomial[2], "133.21974728389", rel=1e-14)
+
+
+def test_power_of_the_mean_is_not_the_mean_of_the_power():
+    check(POPULATION.C5.moment(1) ** 5, "135.35219389777", rel=1e-14)
+
+
+def test_yield_stress():
+    """17.16 sigma_y = C1: 0.4085 MPa, twice that when two contacts share the displacement."""
+    unit = jnp.array(1.0)
+    prefactor = ideal_plastic_stress(unit, 1.0)
+    close(prefactor, 17.16, rel=1e-15)
+    check(K1 / prefactor, "0.40847319347")
+    check(POPULATION.yield_stress, "0.4085")
+    close(POPULATION.yield_stress, 0.40847319347, rel=2e-6)
+    check(POPULATION.median_law.C1 / prefactor, "0.39067428609")
+    check(K1 / ideal_plastic_stress(unit, 1.0, contacts=2), "0.816946386946")
+
+
+def test_moments():
+    check(jnp.sqrt(POPULATION.C1.variance_of_power(1)) / POPULATION.C1.moment(1), "0.3052743513")
+    check(jnp.sqrt(POPULATION.C5.variance_of_power(5)) / POPULATION.C5.moment(5), "0.4148567702")
+    check(jnp.sqrt(POPULATION.C1.variance_of_power(1)), "2.13978793994")
+    check(jnp.sqrt(POPULATION.C5.variance_of_power(5)), "59.8343059527")
+    check(jnp.sqrt(POPULATION.C3.variance_of_power(3)), "4e-7")
+
+
+@pytest.mark.parametrize(
+    ("x", "mean", "sd", "median"),
+    [
+        (0.1, "0.67514668", "0.21397963", "0.64449435"),
+        (0.3, "1.71795113", "0.65819656", "1.59957235"),
+        (0.5, "4.60748236", "2.15427659", "4.11073739"),
+        (0.6, "9.53812670", "4.82660253", "8.49880712"),
+    ],
+)
+def test_mean_spread_and_median_curve(x, mean, sd, median):
+    x = jnp.array(x)
+    check(POPULATION.mean_law.stress(x), mean)
+    check(POPULATION.stress_sd(x), sd)
+    check(POPULATION.median_law.stress(x), median)
+    close(POPULATION.stress_sd(jnp.stack([x, x])), np.full(2, float(sd)), scale=1e-8)
+
+
+def test_probability_of_a_curve_that_falls():
+    mu, tau = zip(*(PAPER_LOG_C[c] for c in ("C1", "C3", "C5")), strict=True)
+    gap = np.log(20 / 9) + mu[0] + 5 * mu[2] - 6 * mu[1]
+    spread = np.sqrt(tau[0] ** 2 + 25 * tau[2] ** 2 + 36 * tau[1] ** 2)
+    check(gap, "0.984207696218")
+    check(spread, "0.49790009038")
+    check(gap / spread, "1.97671724757")
+    check(POPULATION.probability_not_monotone, "0.0240368000563", rel=1e-10)
+    check(POPULATION.probability_tensile, "7.96327523577e-4", rel=1e-10)
+    check(1 - (1 - POPULATION.probability_not_monotone) ** 20, "0.38529203")
+    close(POPULATION.probability_not_monotone, norm.cdf(-gap / spread), rel=1e-12)
+
+
+def test_probability_against_draws(draws, kept):
+    """Monte Carlo with a fixed seed, within four standard errors."""
+    p = float(POPULATION.probability_not_monotone)
+    close(np.mean(~kept), p, scale=4 * np.sqrt(p * (1 - p) / DRAWS))
+    _, K3, K5 = (np.asarray(k) for k in jax.vmap(lambda p: p.polynomial)(draws))
+    p = float(POPULATION.probability_tensile)
+    tensile = 4 * np.asarray(draws.C1) * K5 < K3**2
+    close(np.mean(tensile), p, scale=4 * np.sqrt(p / DRAWS))
+
+
+def test_every_curve_that_falls_does_so_within_the_tested_range(draws, kept):
+    """First peak at x = 0.15 to 0.50 and 0.14 to 3.4 MPa, median 0.75 MPa."""
+    violators = jax.tree.map(lambda c: c[np.flatnonzero(~kept)], draws)
+    K1, K3, K5 = jax.vmap(lambda p: p.polynomial)(violators)
+    x = jnp.sqrt((3 * K3 - jnp.sqrt(9 * K3**2 - 20 * K1 * K5)) / (10 * K5))
+    peak = eqx.filter_vmap(lambda p, x: p.stress(x))(violators, x)
+    assert np.all(np.abs(eqx.filter_vmap(lambda p, x: p.tangent(x))(violators, x)) < 1e-12 * K1)
+    assert x.min() > 0.14
+    assert x.max() < 0.51
+    assert peak.min() > 0.13
+    assert peak.max() < 3.4
+    close(np.median(peak), 0.75, scale=0.01)
+
+
+def test_sample_moments(draws):
+    for C, order, field in (
+        (draws.C1, 1, POPULATION.C1),
+        (draws.C3, 3, POPULATION.C3),
+        (draws.C5, 5, POPULATION.C5),
+    ):
+        power = np.asarray(C) ** order
+        sd = float(jnp.sqrt(field.variance_of_power(order)))
+        close(power.mean(), field.moment(order), scale=5 * sd / np.sqrt(DRAWS) + 1e-9)
+        close(power.std(), sd, rel=0.02, scale=1e-7)
+        close(np.std(np.log(C)), field.sd, rel=0.01)
+    assert abs(np.corrcoef(np.log(draws.C1), np.log(draws.C5))[0, 1]) < 5 / np.sqrt(DRAWS)
+
+
+def test_rejecting_the_curves_that_fall_shifts_the_moments(draws, kept):
+    C1, C5 = np.asarray(draws.C1)[kept], np.asarray(draws.C5)[kept]
+    close(C1.mean(), 7.068, scale=0.02)
+    close((C5**5).mean(), 146.2, scale=0.5)
+    close(np.corrcoef(np.log(C1), np.log(C5))[0, 1], -0.060, scale=0.008)
+
+
+def test_mean_of_the_inverse_is_not_the_inverse_of_the_mean(draws, kept):
+    """Strain at 10 MPa over the draws that are monotone: 0.62078 +- 0.066 in an independent sample, not 0.60635."""
+    some = jax.tree.map(lambda c: c[np.flatnonzero(kept)], draws)
+    x = jax.jit(jax.vmap(lambda p: p.strain(jnp.array(10.0))))(some)
+    check(Plastic.from_polynomial(K1, K3, K5).strain(jnp.array(10.0)), "0.60635")
+    close(np.mean(x), 0.62078, scale=0.001)
+    close(np.std(x), 0.066, scale=0.001)
+
+
+def test_samples_are_reproducible_and_differ():
+    one, again = (POPULATION.sample(jax.random.key(1), 4) for _ in range(2))
+    other = POPULATION.sample(jax.random.key(2), 4)
+    np.testing.assert_array_equal(one.C1, again.C1)
+    assert not np.any(one.C1 == other.C1)
+    assert one.C1.shape == (4,)
+    # The three coefficients must not share their random numbers.
+    z1, z5 = (jnp.log(one.C1) - 1.9027) / 0.2985, (jnp.log(one.C5) - 0.9784) / 0.0797
+    assert not np.any(np.isclose(z1, z5))
+
+
+@pytest.mark.parametrize("order", [1, 3, 5])
+def test_lognormal_from_the_moments_of_a_power(order):
+    true = LogNormal(0.9, 0.12)
+    again = LogNormal.from_power_moments(order, true.moment(order), true.variance_of_power(order))
+    close(np.array([again.mean, again.sd]), np.array([0.9, 0.12]), rel=1e-13)
+
+
+def test_population_without_spread_is_its_median():
+    sure = PlasticPopulation(*(LogNormal(jnp.log(c), 0.0) for c in (7.0, 3.0, 2.7)))
+    close(np.array(sure.mean_law.polynomial), np.array(sure.median_law.polynomial), rel=1e-14)
+    assert sure.stress_sd(jnp.array(0.5)) == 0
+    close(np.asarray(sure.sample(jax.random.key(0), 3).C5), np.full(3, 2.7), rel=1e-14)

@@ -1,0 +1,208 @@
+"""Sizes, shape factors and the conversion between curves and force-displacement."""
+
+import equinox as eqx
+import hypothesis.strategies as st
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import A, between, check, close, paper_particle, sphere
+from hypothesis import given, settings
+
+from mcc_jax.campaign._paper import PAPER_DIAMETERS_UM
+from mcc_jax.geometry import Particle, elastic_shape_factor, plastic_shape_factor
+from mcc_jax.law import hertz_shape_factor
+
+DIAMETERS = between(1, 1000)
+
+
+@pytest.fixture(scope="module")
+def particles():
+    return eqx.filter_vmap(Particle)(*jnp.asarray(PAPER_DIAMETERS_UM.T))
+
+
+@eqx.filter_jit
+def sizes_and_shapes(particle, a):
+    return (
+        particle.effective_diameter,
+        plastic_shape_factor(particle, a),
+        elastic_shape_factor(particle),
+        hertz_shape_factor(particle),
+        particle.flatness,
+        particle.mean_diameter,
+    )
+
+
+@pytest.mark.parametrize(
+    ("number", "diameter", "eta_p"),
+    [
+        (1, "224.702344228", "1.24420062209"),
+        (6, "135.70384106", "1.87308503422"),
+        (12, "187.299122332", "1.41395466231"),
+        (16, "361.033753754", "1.55948471789"),
+    ],
+)
+def test_paper_particles(number, diameter, eta_p):
+    particle = paper_particle(number)
+    check(particle.effective_diameter, diameter)
+    check(2 * particle.effective_radius, diameter)
+    check(plastic_shape_factor(particle, A), eta_p)
+
+
+def test_elastic_shape_factor_of_a_particle_with_D1_below_D2():
+    check(elastic_shape_factor(paper_particle(12)), "1.01948420441")
+
+
+def test_sphere():
+    for size in (1e-3, 1.0, 100.0, 1e4):
+        for a in (-0.85, 0.0, A):
+            assert plastic_shape_factor(sphere(size), a) == 1
+        assert elastic_shape_factor(sphere(size)) == 1
+        assert hertz_shape_factor(sphere(size)) == 1
+        assert sphere(size).flatness == 0
+        close(sphere(size).effective_diameter, size, rel=1e-15)
+        close(sphere(size).mean_diameter, size, rel=1e-15)
+        close(sphere(size).effective_area, np.pi * size**2 / 4, rel=1e-15)
+
+
+def test_definitions_as_the_paper_words_them():
+    """eta_p = 1 + a (1 - D3^2/(D1 D2)) = 1 + a (1 - D3/D_e)."""
+    p = Particle(120.0, 90.0, 75.0)
+    close(p.effective_diameter, 120 * 90 / 75, rel=1e-15)
+    close(p.flatness, 1 - 75 / p.effective_diameter, rel=1e-15)
+    close(plastic_shape_factor(p, 0.7), 1 + 0.7 * (1 - 75**2 / (120 * 90)), rel=1e-15)
+    assert plastic_shape_factor(p, -0.85) < 1 < plastic_shape_factor(p, 0.1)
+
+
+def test_the_paper_calls_D1_major_although_it_is_often_the_smaller(particles):
+    smaller = np.flatnonzero(particles.D1 < particles.D2) + 1
+    assert list(smaller) == [2, 3, 4, 5, 7, 8, 11, 12, 13, 17, 19, 20]
+    assert list(np.flatnonzero(np.minimum(particles.D1, particles.D2) < particles.D3) + 1) == [12, 17, 20]
+
+
+def test_effective_and_mean_diameter_are_not_proportional(particles):
+    effective, _, _, _, _, mean = eqx.filter_vmap(sizes_and_shapes, in_axes=(0, None))(particles, A)
+    effective, mean = np.asarray(effective), np.asarray(mean)
+    check(np.mean(mean / effective), "0.77864")
+    check(np.std(mean / effective, ddof=1), "0.1164")
+    check(np.min(mean / effective), "0.548")
+    check(np.max(mean / effective), "0.989")
+    check(np.mean(effective / mean), "1.31315")
+    check(np.std(effective / mean, ddof=1), "0.2064")
+    check(np.min(effective / mean), "1.011")
+    check(np.max(effective / mean), "1.825")
+    check(effective @ mean / (mean @ mean), "1.25555")
+    check(np.corrcoef(effective, mean)[0, 1], "0.8928")
+    check(mean.min(), "74.4")
+    check(mean.max(), "261.3")
+
+
+def test_effective_diameter_exceeds_every_diameter_of_a_flat_particle():
+    p = paper_particle(6)
+    check(p.effective_diameter, "135.7")
+    assert max(p.D1, p.D2, p.D3) == 93.8
+
+
+def test_printed_elastic_shape_factor_is_no_number_when_D1_is_the_smaller(particles):
+    """(D1/D2)^0.1368 - 1 < 0 has no power 1.531; the library takes the larger over the smaller and agrees elsewhere."""
+    with np.errstate(invalid="ignore"):
+        ratio = np.asarray(particles.D1 / particles.D2)
+        printed = 1 / (1 - (ratio**0.1368 - 1) ** 1.531)
+    symmetric = eqx.filter_vmap(elastic_shape_factor)(particles)
+    assert np.isnan(printed).sum() == 12
+    np.testing.assert_array_equal(np.isnan(printed), ratio < 1)
+    close(symmetric[ratio >= 1], printed[ratio >= 1], rel=1e-14)
+    assert np.all(np.isfinite(symmetric))
+
+
+@pytest.mark.parametrize(
+    ("ratio", "percent"),
+    [
+        (213.54 / 196.07, "0.07"),
+        (217.51 / 155.32, "0.31"),
+        (205.93 / 121.04, "0.39"),
+        (2.0, "0.36"),
+        (3.0, "0.06"),
+        (5.0, "-0.37"),
+    ],
+)
+def test_elastic_shape_factor_against_the_exact_contact(ratio, percent):
+    particle = Particle(ratio, 1.0, 1.0)
+    check(100 * (elastic_shape_factor(particle) / hertz_shape_factor(particle) - 1), percent)
+
+
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(D1=DIAMETERS, D2=DIAMETERS, D3=DIAMETERS, a=between(-2, 2))
+def test_exchange_of_D1_and_D2_changes_no_bit(D1, D2, D3, a):
+    a = jnp.asarray(a)
+    for one, other in zip(
+        sizes_and_shapes(Particle(D1, D2, D3), a), sizes_and_shapes(Particle(D2, D1, D3), a), strict=True
+    ):
+        assert one == other
+
+
+@settings(max_examples=50, deadline=None, derandomize=True)
+@given(D=st.tuples(DIAMETERS, DIAMETERS, DIAMETERS), factor=between(0.01, 100))
+def test_shape_does_not_depend_on_size(D, factor):
+    small, large = (sizes_and_shapes(Particle(*d), jnp.asarray(A)) for d in (D, tuple(factor * d for d in D)))
+    close(large[0], factor * small[0], rel=1e-14)
+    for i in (1, 4):
+        close(large[i], small[i], scale=1e-14 * max(1, D[2] ** 2 / (D[0] * D[1])))
+    for i in (2, 3):
+        close(large[i], small[i], rel=1e-13)
+
+
+@settings(max_examples=50, deadline=None, derandomize=True)
+@given(D=st.tuples(DIAMETERS, DIAMETERS, DIAMETERS), value=between(1e-6, 1e6))
+def test_conversions_and_their_inverses(D, value):
+    p, value = Particle(*D), jnp.asarray(value)
+    close(p.strain(p.displacement(value)), value, rel=4e-16)
+    close(p.stress(p.force(value)), value, rel=1e-15)
+
+
+def test_units():
+    """1 MPa on 1 um^2 is 1 uN = 1e-3 mN; strain is displacement over 2 R_e."""
+    p = sphere(100.0)
+    close(p.force(jnp.array(10.0)), 10e6 * np.pi * (50e-6) ** 2 * 1e3, rel=1e-15)
+    check(p.force(jnp.array(10.0)), "78.5398163397")
+    close(p.strain(jnp.array(25.0)), 0.25)
+    q = paper_particle(12)
+    close(q.stress(jnp.array(275.525225175)), 10.0, rel=1e-11)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("diameters", [(100.0, 100.0, 100.0), (80.0, 100.0, 60.0), (100.0, 80.0, 60.0)])
+def test_derivatives_of_the_shape_factors(dtype, mode, diameters):
+    D = jnp.array(diameters, dtype)
+    for factor in (lambda p: plastic_shape_factor(p, jnp.asarray(A, dtype)), elastic_shape_factor, hertz_shape_factor):
+        slope = mode(lambda D, factor=factor: factor(Particle(*D)))(D)
+        assert slope.dtype == dtype
+        assert np.all(np.isfinite(slope))
+        # A shape is the same at every size (Euler's theorem).
+        close(slope @ D, 0.0, scale=20 * float(jnp.finfo(dtype).eps))
+        if dtype == jnp.float64:
+            step = 1e-4
+            ahead = [factor(Particle(*(D + step * e))) - factor(Particle(*(D - step * e))) for e in jnp.eye(3)]
+            # Beside D1 = D2 the closed form grows as |D1 - D2|^1.531.
+            close(slope, np.array(ahead) / (2 * step), scale=1e-8)
+    if diameters[0] == diameters[1]:
+        for factor in (elastic_shape_factor, hertz_shape_factor):
+            np.testing.assert_array_equal(mode(lambda D, factor=factor: factor(Particle(*D)))(D), 0)
+
+
+def test_batch_by_vmap_only(particles):
+    assert particles.D1.shape == (20,)
+    alone = [sizes_and_shapes(paper_particle(i + 1), A)[1] for i in range(20)]
+    together = eqx.filter_vmap(sizes_and_shapes, in_axes=(0, None))(particles, A)[1]
+    close(together, np.array(alone), rel=2e-16)
+    with pytest.raises((ValueError, TypeError)):  # TypeError from the run-time type checker of the tests
+        Particle(jnp.ones(2), 1.0, 1.0)
+
+
+def test_precision_is_that_of_the_input():
+    p = Particle(*(jnp.float32(d) for d in (213.54, 196.07, 186.33)))
+    for value in (p.effective_diameter, p.effective_area, plastic_shape_factor(p, 1.43), elastic_shape_factor(p)):
+        assert value.dtype == jnp.float32
+    close(plastic_shape_factor(p, 1.43), 1.24420062209, rel=3e-7)
+    close(hertz_shape_factor(p), 1.0004046425, rel=3e-7)

@@ -1,0 +1,113 @@
+import inspect
+
+import equinox as eqx
+import hypothesis.extra.numpy as hnp
+import hypothesis.strategies as st
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+from mcc_jax._numerics import horner, positive_pow, running_max, safe_sqrt
+from mcc_jax._types import scalar
+
+DTYPES = [jnp.float32, jnp.float64]
+MODES = [jax.jacfwd, jax.jacrev]
+largest_so_far = eqx.filter_jit(running_max)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("power", [1.5, 2.0, 3.0])
+@pytest.mark.parametrize("x", [-2.0, -1e-30, 0.0])
+def test_positive_pow_vanishes_with_its_derivatives(dtype, mode, power, x):
+    x = jnp.array(x, dtype)
+    function = lambda x: positive_pow(x, power)  # noqa: E731
+    for order in (function, mode(function), mode(mode(function))):
+        assert order(x) == 0
+        assert order(x).dtype == dtype
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_positive_pow_is_the_power_above_zero(mode):
+    x, p = jnp.array(0.7), jnp.array(1.531)
+    np.testing.assert_allclose(positive_pow(x, p), 0.7**1.531, rtol=1e-15)
+    np.testing.assert_allclose(mode(positive_pow)(x, p), 1.531 * 0.7**0.531, rtol=1e-15)
+    np.testing.assert_allclose(mode(positive_pow, 1)(x, p), 0.7**1.531 * np.log(0.7), rtol=1e-15)
+    np.testing.assert_array_equal(mode(positive_pow, 1)(jnp.array(0.0), p), 0)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_safe_sqrt(mode, dtype):
+    points = jnp.array([-1.0, 0.0, 4.0], dtype)
+    np.testing.assert_array_equal(jax.vmap(safe_sqrt)(points), [0, 0, 2])
+    np.testing.assert_array_equal(jax.vmap(mode(safe_sqrt))(points), [0, 0, 0.25])
+
+
+PATHS = hnp.arrays(np.float64, st.just(12), elements=st.integers(-3, 3).map(float))
+
+
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(path=PATHS)
+def test_running_max_is_the_running_maximum(path):
+    np.testing.assert_array_equal(largest_so_far(jnp.asarray(path)), np.maximum.accumulate(path))
+
+
+jacobians = [jax.jit(mode(running_max)) for mode in MODES]
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(path=PATHS)
+def test_running_max_passes_a_tie_to_the_earliest_whole(path):
+    expected = np.zeros((12, 12))
+    for i in range(12):
+        expected[i, np.argmax(path[: i + 1])] = 1
+    for jacobian in jacobians:
+        np.testing.assert_array_equal(jacobian(jnp.asarray(path)), expected)
+
+
+@pytest.mark.parametrize("steps", [1, 9, 10, 11, 20, 25, 101, 234])
+def test_running_max_of_every_length(steps):
+    """Values, and the derivative at ties, on both sides of the block lengths that the implementation uses."""
+    path = np.random.default_rng(steps).integers(-9, 9, steps) + 0.3 * np.arange(steps) // 4
+    np.testing.assert_array_equal(largest_so_far(jnp.asarray(path)), np.maximum.accumulate(path))
+    earliest = np.array([np.argmax(path[: i + 1]) for i in range(steps)])
+    np.testing.assert_array_equal(jacobians[0](jnp.asarray(path)), np.eye(steps)[earliest])
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("path", [[0.3], [1.0, 1.0], [-2.0, -3.0, -1.0], [0.0, -0.0, 0.0]])
+def test_running_max_of_short_paths(path, dtype):
+    path = jnp.array(path, dtype)
+    assert running_max(path).dtype == dtype
+    np.testing.assert_array_equal(running_max(path), np.maximum.accumulate(path))
+    for mode in MODES:
+        np.testing.assert_array_equal(mode(running_max)(path)[0], jnp.eye(len(path), dtype=dtype)[0])
+
+
+def test_running_max_in_a_batch():
+    paths = jnp.array([[0.0, 2.0, 1.0], [3.0, 2.0, 4.0]])
+    np.testing.assert_array_equal(jax.vmap(running_max)(paths), [[0, 2, 2], [3, 3, 4]])
+    tangents = jax.jvp(jax.vmap(running_max), (paths,), (jnp.arange(6.0).reshape(2, 3),))[1]
+    np.testing.assert_array_equal(tangents, [[0, 1, 1], [3, 3, 5]])
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_horner(dtype):
+    coefficients = (2.0, -1.0, 0.5, 3.0)
+    x = jnp.linspace(-1, 1, 9, dtype=dtype)
+    assert horner(coefficients, x).dtype == dtype
+    np.testing.assert_allclose(horner(coefficients, x), np.polyval(coefficients, x), rtol=1e-6)
+    np.testing.assert_allclose(horner(coefficients, jnp.array(0.5)), np.polyval(coefficients, 0.5), rtol=1e-15)
+    np.testing.assert_array_equal(horner((4.0,), x), 4)
+
+
+def test_scalar_converter():
+    assert scalar(1).dtype == jnp.float64
+    assert scalar(jnp.float32(1)).dtype == jnp.float32
+    assert scalar(np.array(2)).dtype == jnp.float64
+    # Unwrapped: the run-time type checker of the tests would speak first.
+    with pytest.raises(ValueError, match=r"Expected a scalar, got shape \(2,\).*filter_vmap"):
+        inspect.unwrap(scalar)(jnp.zeros(2))
