@@ -1,4 +1,6 @@
-"""Write `mcc_jax/law/_recovery_coefficients.py`: run `uv run --group test python benchmarks/make_recovery_coefficients.py`.
+"""Write `mcc_jax/law/_recovery_coefficients.py`.
+
+Run `uv run --group test python benchmarks/make_recovery_coefficients.py`.
 
 Chebyshev interpolation with 50 digits of
   P(u) = f / u^(3/2),  f = (2/pi)(acos s - s sqrt(1 - s^2)),  u = 1 - s,
@@ -46,11 +48,12 @@ def S(w):
 
 
 def interpolate(function, degree):
-    """Coefficients in powers of z on [-1, 1], highest first, of the Chebyshev interpolant of `function((1 + z) / 2)`."""
+    """Coefficients in powers of z on [-1, 1], highest first, of the interpolant of `function((1 + z) / 2)`."""
     n = degree + 1
     nodes = [mp.cos(mp.pi * (2 * k + 1) / (2 * n)) for k in range(n)]
     values = [function((1 + z) / 2) for z in nodes]
-    cheb = [2 / mpf(n) * sum(v * mp.cos(j * mp.pi * (2 * k + 1) / (2 * n)) for k, v in enumerate(values)) for j in range(n)]
+    angles = [mp.pi * (2 * k + 1) / (2 * n) for k in range(n)]
+    cheb = [2 / mpf(n) * sum(v * mp.cos(j * t) for v, t in zip(values, angles, strict=True)) for j in range(n)]
     cheb[0] /= 2
     # Clenshaw on polynomials: T_j expanded in powers of z.
     previous, current = [mpf(1)], [mpf(0), mpf(1)]
@@ -89,8 +92,16 @@ def block(name, function, degree):
 
 
 def main():
-    text = '"""Coefficients of the recovery curve; written by `benchmarks/make_recovery_coefficients.py`, not by hand."""\n\n'
-    text += block("RATIO_64", P, 17) + block("RATIO_32", P, 7) + block("ENERGY_64", R, 17) + block("RECOVERY_64", S, 23) + block("RECOVERY_32", S, 9)
+    script = "benchmarks/make_recovery_coefficients.py"
+    head = f'"""Coefficients of the recovery curve; written by `{script}`, not by hand."""\n\n'
+    blocks = [
+        block("RATIO_64", P, 17),
+        block("RATIO_32", P, 7),
+        block("ENERGY_64", R, 17),
+        block("RECOVERY_64", S, 23),
+        block("RECOVERY_32", S, 9),
+    ]
+    text = head + "".join(blocks)
     TARGET.write_text(text, encoding="utf-8")
 
 

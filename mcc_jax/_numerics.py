@@ -27,11 +27,11 @@ def safe_sqrt(x: Values) -> Values:
 
 @jax.custom_jvp
 def running_max(path: Path) -> Path:
-    """Largest value so far. A tie passes the derivative to the earliest of the equal values, whole and not in halves."""
+    """Largest value so far. A tie passes the derivative to the earliest of the equal values, whole, not in halves."""
     return _running_max(path)
 
 
-@functools.partial(running_max.defjvp, symbolic_zeros=True)
+@functools.partial(running_max.defjvp, symbolic_zeros=True)  # pyright: ignore[reportArgumentType]  # a zero is a tangent
 def _running_max_jvp(primals, tangents):
     (path,), (tangent,) = primals, tangents
     highest = running_max(path)
@@ -43,7 +43,7 @@ def _running_max_jvp(primals, tangents):
 
 
 def _running_max(path: Shaped[Array, " steps"], width: int = 10) -> Shaped[Array, " steps"]:
-    """The larger of the last `width` values and of the blocks of as many before them: one loop over the data, and vectorised.
+    """The larger of the last `width` values and of the blocks of as many before them: one loop over the data.
 
     `lax.cummax` makes a logarithmic number of strided copies instead and takes five times as long on a CPU.
     """

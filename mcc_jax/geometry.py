@@ -57,11 +57,11 @@ class Particle(eqx.Module):
         return 1 - self.D3**2 / (self.D1 * self.D2)
 
     def strain(self, displacement: Values) -> Values:
-        """Effective strain gamma / D_e [-] of a platen displacement [um] (Bommireddy et al. 2018, eq. 5)."""
+        """Effective strain gamma / D_e [-] of a platen displacement [um] (Bommireddy et al. 2018, eq. 4)."""
         return displacement / self.effective_diameter
 
     def stress(self, force: Values) -> Values:
-        """Effective stress F / (pi R_e^2) [MPa] of a force [mN] (Bommireddy et al. 2018, eq. 4)."""
+        """Effective stress F / (pi R_e^2) [MPa] of a force [mN] (Bommireddy et al. 2018, eq. 3)."""
         return force * 1e3 / self.effective_area
 
     def displacement(self, strain: Values) -> Values:
@@ -87,7 +87,7 @@ def plastic_shape_factor(particle: Particle, a: ScalarLike) -> Scalar:
         The shape factor [-].
 
     References:
-        Bommireddy et al. (2018), eq. 14.
+        Bommireddy et al. (2018), eq. 13.
     """
     return 1 + scalar(a) * particle.flatness
 

@@ -175,7 +175,7 @@ def fit_effective_modulus(
         strain_scaling: how the shape factor enters.
 
     References:
-        Bommireddy et al. (2018), section 6, eqs. 26 and 27.
+        Bommireddy et al. (2018), section 6, eqs. 23 and 24.
     """
     branches = tuple(branches)
     if not branches:

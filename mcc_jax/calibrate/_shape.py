@@ -67,7 +67,7 @@ def full_residuals(
         \eta_{p,j}\epsilon_j
 
     References:
-        Bommireddy et al. (2018), eq. 15.
+        Bommireddy et al. (2018), eq. 14.
     """
     scaled = (1 + a * flatness)[:, None] * strain
     count = jnp.sum(reached, axis=0)
@@ -91,7 +91,7 @@ def reference_residuals(
         {\int \epsilon_N(\sigma)^2 d\sigma}
 
     References:
-        Bommireddy et al. (2018), eq. 17.
+        Bommireddy et al. (2018), eq. 15.
     """
     ratio = (1 + a * flatness) / (1 + a * reference_flatness)
     norm = jnp.sum(weights * reference_strain[None, :] ** 2, axis=1)
@@ -133,7 +133,7 @@ def fit_shape_parameter(table: StrainTable, objective: Objective = "full", refer
 
     Args:
         table: strains on a common grid of stresses.
-        objective: "full" (eq. 15) or "reference" (eq. 17, the paper's own simplification).
+        objective: "full" (eq. 14) or "reference" (eq. 15, the paper's own simplification).
         reference: position in the campaign of the reference particle; by the paper's rule (`choose_reference`) if None.
 
     Returns:
@@ -143,7 +143,7 @@ def fit_shape_parameter(table: StrainTable, objective: Objective = "full", refer
         ValueError: for fewer than two particles, or a reference that was not kept.
 
     References:
-        Bommireddy et al. (2018), eqs. 14 to 17.
+        Bommireddy et al. (2018), eqs. 13 to 15.
     """
     if len(table.index) < 2:
         raise ValueError("the shape parameter needs at least two particles")

@@ -57,7 +57,7 @@ def stress_and_strain(
     has one, the tester's own zero otherwise.
 
     References:
-        Bommireddy et al. (2018), eqs. 4 and 5.
+        Bommireddy et al. (2018), eqs. 3 and 4.
     """
     diameter = effective_diameter_um(diameters_um)
     zero = curve.displacement_um[segments[0].stop] if segments[0].kind == "approach" and len(segments) > 1 else 0.0

@@ -138,12 +138,12 @@ def _split_fast(text: str, layout: _Layout) -> tuple[list[np.ndarray], dict[str,
     count = _count_records(text, data, len(layout.header))
     if count is None:
         return None
-        # From pandas 3.1 on numbers are always rounded correctly, and the option is gone.
+    # From pandas 3.1 on numbers are always rounded correctly, and the option is gone.
     modern = tuple(int(part) for part in pd.__version__.split(".")[:2]) >= (3, 1)
     exact: dict[str, Any] = {} if modern else {"float_precision": "round_trip"}
     names = [str(i) for i in range(len(layout.header))]
     types: dict[Hashable, Any] = {names[column]: "float64" for column in layout.columns}
-    types[names[layout.name]] = "category"
+    types[names[layout.name]] = str  # not "category", which makes numbers of names such as 007
     try:
         frame = pd.read_csv(
             io.BytesIO(data),
@@ -161,13 +161,11 @@ def _split_fast(text: str, layout: _Layout) -> tuple[list[np.ndarray], dict[str,
     raw = [frame[names[column]].to_numpy() for column in layout.columns]
     if len(frame) != count or not all(np.isfinite(column).all() for column in raw):
         return None
-    particles = frame[names[layout.name]].cat
-    codes = particles.codes.to_numpy()
+    codes, particles = pd.factorize(frame[names[layout.name]])
     order = np.argsort(codes, kind="stable")
     parts = np.split(order, np.flatnonzero(np.diff(codes[order])) + 1)
     parts.sort(key=lambda part: int(part[0]))  # particles in the order in which they appear
-    categories = particles.categories.tolist()
-    return raw, {str(categories[codes[part[0]]]): part for part in parts}
+    return raw, {str(particles[codes[part[0]]]): part for part in parts}
 
 
 def _count_records(text: str, data: bytes, width: int) -> int | None:

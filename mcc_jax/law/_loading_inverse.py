@@ -1,14 +1,14 @@
 r"""Strain of plastic loading under a given stress: the inverse of the quintic, without a data-dependent loop.
 
-An iteration needs a good start where the curve is nearly flat: at its bend when monotonicity is about to be lost, and at
-its peak when it is lost. Around the bend b the quintic is *exactly*
+An iteration needs a good start where the curve is nearly flat: at its bend when monotonicity is about to be lost, and
+at its peak when it is lost. Around the bend b the quintic is *exactly*
 
 .. math:: \sigma(b + d) = \sigma_b + m d + 2 K_3 d^3 + 5 K_5 b\, d^4 + K_5 d^5,
 
-so the root of its cubic part is such a start, and an upper bound to the right of the bend. Around a peak p the curve falls by
-:math:`H_0 e^2 + H_1 e^3 + \dots` with :math:`e = p - x`, again a cubic. From these starts four steps of Halley's
-method (Newton's, with the curvature) reach the last digit in every case tried: K3 = 0, the exact loss of monotonicity, peaks
-approached to 1e-14, stresses over 13 decades. The error is then the rounding of the curve itself.
+so the root of its cubic part is such a start, and an upper bound to the right of the bend. Around a peak p the curve
+falls by :math:`H_0 e^2 + H_1 e^3 + \dots` with :math:`e = p - x`, again a cubic. From these starts four steps of
+Halley's method (Newton's, with the curvature) reach the last digit in every case tried: K3 = 0, the exact loss of
+monotonicity, peaks approached to 1e-14, stresses over 13 decades. The error is then the rounding of the curve itself.
 """
 
 from __future__ import annotations
@@ -46,16 +46,18 @@ def loading_strain(K1: Scalar, K3: Scalar, K5: Scalar, stress: Values, floor: Sc
         K3: factor of -x^3 [MPa], >= 0.
         K5: factor of x^5 [MPa], > 0.
         stress: stress [MPa]; 0 is returned for stress <= 0.
-        floor: scaled strain that the particle has already seen. It matters only where the curve is not monotone: behind the
-            peak there is no way back to the first branch.
+        floor: scaled strain that the particle has already seen. It matters only where the curve is not monotone:
+            behind the peak there is no way back to the first branch.
 
     Returns:
         Scaled strain [-]. Derivatives follow from the implicit-function rule, 0 out of contact.
     """
     target = jnp.maximum(stress, 0.0)
     x = _start(K1, K3, K5, target, floor)
-    # The slope vanishes only where the curve just stops being monotone, and there at the root itself: stay there.
+    # The slope vanishes only where the curve just stops being monotone, and there at the root itself: stay there. Stay,
+    # too, once the stress is met but for rounding, which over a small slope would be a large step.
     noise = 8 * jnp.finfo(x.dtype).eps * K1
+    rounding = 2 * jnp.finfo(x.dtype).eps * target
     for _ in range(HALLEY_STEPS):
         square = x * x
         slope = tangent_modulus(K1, K3, K5, x)
@@ -63,7 +65,8 @@ def loading_strain(K1: Scalar, K3: Scalar, K5: Scalar, stress: Values, floor: Sc
         half_curvature = x * (10 * square * K5 - 3 * K3)
         squared = slope * slope
         divisor = jnp.maximum(squared - excess * half_curvature, 0.5 * squared)
-        x = x - excess * slope / jnp.where(slope > noise, divisor, jnp.inf)
+        moves = (slope > noise) & (jnp.abs(excess) > rounding)
+        x = x - excess * slope / jnp.where(moves, divisor, jnp.inf)
     return x
 
 
@@ -96,8 +99,8 @@ def _start(K1: Scalar, K3: Scalar, K5: Scalar, target: Values, floor: Scalar) ->
     drop = peak * (K1 - y * (K3 - y * K5)) - target
     first_branch = falls & (drop >= 0) & (floor <= peak)
 
-    # Below a peak, H0 e^2 + H1 e^3 = drop: e = E g(H1 E / H0) with E = sqrt(drop / H0) and g(z) = (1 + 3z/2)^(-1/3), right at
-    # both ends and 13 % off at worst between them.
+    # Below a peak, H0 e^2 + H1 e^3 = drop: e = E g(H1 E / H0) with E = sqrt(drop / H0) and g(z) = (1 + 3z/2)^(-1/3),
+    # right at both ends and 13 % off at worst between them.
     H0 = jnp.maximum(peak * (3 * K3 - 10 * K5 * y), tiny)
     E = _root(drop / H0)
     widening = 1 + jnp.maximum(15 * K5 * y - 1.5 * K3, 0.0) * E / H0
@@ -107,20 +110,23 @@ def _start(K1: Scalar, K3: Scalar, K5: Scalar, target: Values, floor: Scalar) ->
     bend = _root(bend_squared)
     factor = 1 / jnp.maximum(2 * K3, _root(K1 * K5))
     p = (K1 - 1.5 * bend_squared * K3) * factor / 3
-    q = (target - bend * (K1 - 0.7 * bend_squared * K3)) * factor / 2
+    secant = K1 - 0.7 * bend_squared * K3
+    q = (target - bend * secant) * factor / 2
+    concave = (q < 0) & ~falls
     half = jnp.abs(q)
     # One cube root for both; that of a start need not be exact.
     root_cubed = jnp.where(first_branch, widening, half + _root(half * half + p * p * p))
     root = jnp.maximum(jnp.exp(jnp.log(jnp.maximum(root_cubed, tiny)) / 3), jnp.where(first_branch, 1.0, _root(-p)))
-    around_bend = bend + jnp.where((q < 0) & ~falls, -1.0, 1.0) * (root - p / root)
+    around_bend = bend + jnp.where(concave, -1.0, 1.0) * (root - p / root)
 
-    # An upper bound: K5 x^5 is at most 9/4 of the stress (monotone), or else half of stress + K3 x^3. The 7/32th power of
-    # what exceeds the place where K1 x = K5 x^5 is above its fifth root, and cheaper.
+    # An upper bound: K5 x^5 is at most 9/4 of the stress (monotone), or else half of stress + K3 x^3. The 7/32th power
+    # of what exceeds the place where K1 x = K5 x^5 is above its fifth root, and cheaper.
     balance = _root(_root(K1 / K5))
     eighth = _root(_root(_root(jnp.maximum(2.25 * target / (K1 * balance), 1.0))))
     sixteenth = _root(eighth)
     bound = balance * eighth * sixteenth * _root(sixteenth)
     bound = jnp.maximum(bound, jnp.where(falls, 2.6, 0.0) * bend)
+    bound = jnp.where(concave, target / secant, bound)  # left of the bend, the chord
     x = jnp.where(first_branch, peak - E / root, jnp.minimum(around_bend, bound))
     # At or left of the root of a concave piece.
     return jnp.maximum(x, jnp.where((q < 0) | first_branch, target / K1, 0.0))

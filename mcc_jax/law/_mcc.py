@@ -59,15 +59,16 @@ class MccLaw(AbstractContactLaw[History]):
             s = (\epsilon_P - \epsilon)/\delta && \text{elastic unloading and reloading}
 
     and zero once s >= 1. The recovered strain :math:`\delta` has three forms (`Unloading`) and three ways in which
-    :math:`\eta_p` enters (`StrainScaling`); the defaults are the paper's. Reloading retraces unloading and rejoins the loading
-    curve at :math:`\epsilon_P`. Rate independent, no adhesion.
+    :math:`\eta_p` enters (`StrainScaling`); the defaults are the paper's. Reloading retraces unloading and rejoins the
+    loading curve at :math:`\epsilon_P`. Rate independent, no adhesion.
 
-    Validity: the paper's tests ended at 7 to 16 MPa, :math:`\eta_p\epsilon \le 0.67` on the mean curve. If the quintic is not
-    monotone (`is_monotone`), displacement control follows it down, load control snaps through; nothing becomes NaN.
+    Validity: the paper's tests ended at 7 to 16 MPa, :math:`\eta_p\epsilon \le 0.67` on the mean curve. If the quintic
+    is not monotone (`is_monotone`), displacement control follows it down, load control snaps through; nothing becomes
+    NaN.
 
-    At zero displacement, at the onset of unloading, on full release and out of contact, value and first derivatives are finite
-    in both modes. Where branches meet (a kink of the model itself) the derivative is that of loading at the onset, and that of
-    the released particle at full release.
+    At zero displacement, at the onset of unloading, on full release and out of contact, value and first derivatives are
+    finite in both modes. Where branches meet (a kink of the model itself) the derivative is that of loading at the
+    onset, and that of the released particle at full release.
 
     Attributes:
         plastic: C1, C3, C5.
@@ -77,7 +78,7 @@ class MccLaw(AbstractContactLaw[History]):
         strain_scaling: how the shape factor enters it.
 
     References:
-        Bommireddy et al. (2018), eqs. 18, 26 and 27.
+        Bommireddy et al. (2018), eqs. 16, 23 and 24.
     """
 
     plastic: Plastic
@@ -118,8 +119,8 @@ class MccLaw(AbstractContactLaw[History]):
             \delta^2 = \frac{\sigma_P}{4.12\, \bar E\, \eta_p^p\, \epsilon_P} \ (\text{printed}), \qquad
             \delta^2 = \frac{\sigma_P^2}{k\, \bar E^2\, \eta_p^p\, \epsilon_P} \ (\text{punch forms})
 
-        with p of the `StrainScaling`. The printed form does not vanish at zero strain: below a peak strain of about 0.01
-        (0.2 MPa) its residual strain is negative, and just below that its unloading creates energy.
+        with p of the `StrainScaling`. The printed form does not vanish at zero strain: below a peak strain of about
+        0.01 (0.2 MPa) its residual strain is negative, and just below that its unloading creates energy.
         """
         eta = self.shape_factor(particle)
         _, _, recoverable = self._elastic(eta, eta * strain_max)
@@ -144,12 +145,12 @@ class MccLaw(AbstractContactLaw[History]):
     def _elastic(self, eta: Scalar, x: AnyShape) -> tuple[AnyShape, Bool[Array, ...], AnyShape]:
         """Peak stress, whether it is positive, and the recoverable strain, at the peak scaled strain `x`."""
         secant = secant_modulus(*self.plastic.polynomial, x)
-        carries = (x > 0) & (secant > 0)
         k, power = self.unloading.constant, self.strain_scaling.power
         if self.unloading is Unloading.PRINTED:
             square = eta ** (1 - power) * secant / (k * self.effective_modulus)
         else:
             square = eta ** (1 - power) * x * (secant / self.effective_modulus) ** 2 / k
+        carries = (x > 0) & (square > jnp.finfo(square.dtype).tiny)  # down to where the root still has a derivative
         return x * secant, carries, jnp.sqrt(jnp.where(carries, square, 1.0))
 
     # ---- force and displacement --------------------------------------------------------------------------------------
@@ -184,7 +185,7 @@ class MccLaw(AbstractContactLaw[History]):
         return History(peak[-1]), displacement
 
     def _force(self, particle: Particle, displacement: AnyShape, peak: AnyShape) -> AnyShape:
-        # The quintic of force against displacement: a whole path then depends on its particle through four numbers only.
+        # The quintic of force against displacement: a path then depends on its particle through four numbers only.
         diameter, area = particle.effective_diameter, 1e-3 * particle.effective_area
         eta = self.shape_factor(particle)
         scale = eta / diameter
@@ -195,11 +196,15 @@ class MccLaw(AbstractContactLaw[History]):
         compliance = diameter * diameter * diameter / stiffness
         return branch_force(power, K1, K3 * square, K5 * (square * square), compliance, peak, peak - displacement)
 
-    def _displacement(self, particle: Particle, state: History, force: AnyShape, highest: AnyShape) -> tuple[AnyShape, AnyShape]:
+    def _displacement(
+        self, particle: Particle, state: History, force: AnyShape, highest: AnyShape
+    ) -> tuple[AnyShape, AnyShape]:
         """Peak displacement and displacement under a force, of which `highest` is the largest so far."""
-        # The barriers make three stages that share nothing but what they are given. Where they share intermediate values, XLA
-        # stores those and cuts the loop over the data of the inverse in many pieces: twice the time.
-        past = jax.lax.optimization_barrier(particle.force(self.loading_stress(particle, particle.strain(state.displacement_max))))
+        # The barriers make three stages that share nothing but what they are given. Where they share intermediate
+        # values, XLA stores those and cuts the loop over the data of the inverse in many pieces.
+        past = jax.lax.optimization_barrier(
+            particle.force(self.loading_stress(particle, particle.strain(state.displacement_max)))
+        )
 
         law, p, state, highest = jax.lax.optimization_barrier((self, particle, state, highest))
         scale = p.effective_diameter / law.shape_factor(p)
@@ -212,12 +217,13 @@ class MccLaw(AbstractContactLaw[History]):
         peak_force = jnp.where(highest < past, past, highest)
         eta = law.shape_factor(p)
         _, carries, recoverable = law._elastic(eta, eta * peak / p.effective_diameter)
-        loaded = carries & (peak_force > 0)
+        # Below that, the quotient's derivatives overflow.
+        loaded = carries & (peak_force > jnp.finfo(peak_force.dtype).tiny ** 0.5)
         ratio = jnp.where(loaded, force, 0.0) / jnp.where(loaded, peak_force, 1.0)
         released = p.displacement(recoverable) * recovery(ratio)
         return peak, peak - jnp.where(loaded & (force < peak_force), released, 0.0)
 
-    # ---- energy --------------------------------------------------------------------------------------------------------
+    # ---- energy ------------------------------------------------------------------------------------------------------
 
     def loading_work(self, particle: Particle, displacement: Scalar) -> Scalar:
         r"""Work [nJ] of plastic loading from zero to the displacement [um].
@@ -253,5 +259,5 @@ class MccLaw(AbstractContactLaw[History]):
 
 
 def _recovered(drop: AnyShape, carries: Bool[Array, ...], recoverable: AnyShape) -> AnyShape:
-    """Share of the recoverable strain that is recovered after the strain dropped; all of it where no stress was carried."""
+    """Share of the recoverable strain recovered after the strain dropped; all of it where no stress was carried."""
     return jnp.where(carries, drop / recoverable, 1.0)

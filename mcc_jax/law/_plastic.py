@@ -21,7 +21,7 @@ class Plastic(eqx.Module):
         C5: coefficient of the hardening term [-], > 0.
 
     References:
-        Bommireddy et al. (2018), eq. 18. Its nomenclature lists them as C1, C2, C3 in MPa, MPa^-3, MPa^-5; the formula
+        Bommireddy et al. (2018), eq. 16. Its nomenclature lists them as C1, C2, C3 in MPa, MPa^-3, MPa^-5; the formula
         makes them pure numbers.
     """
 

@@ -51,7 +51,7 @@ class PlasticPopulation(eqx.Module):
         C1, C3, C5: their distributions.
 
     References:
-        Bommireddy et al. (2018), Table 2 and eq. 19.
+        Bommireddy et al. (2018), Table 2 and eq. 17.
     """
 
     C1: LogNormal
@@ -60,7 +60,7 @@ class PlasticPopulation(eqx.Module):
 
     @property
     def mean_law(self) -> Plastic:
-        r"""The law of the expected stress: :math:`E[C_1] x - E[C_3^3] x^3 + E[C_5^5] x^5` (eq. 19)."""
+        r"""The law of the expected stress: :math:`E[C_1] x - E[C_3^3] x^3 + E[C_5^5] x^5` (eq. 17)."""
         return Plastic.from_polynomial(self.C1.moment(1), self.C3.moment(3), self.C5.moment(5))
 
     @property
@@ -78,7 +78,7 @@ class PlasticPopulation(eqx.Module):
 
     @property
     def yield_stress(self) -> Scalar:
-        r""":math:`\sigma_y = E[C_1] / 17.16` [MPa] from the ideal plastic contact (eq. 23).
+        r""":math:`\sigma_y = E[C_1] / 17.16` [MPa] from the ideal plastic contact (eq. 22).
 
         It takes the whole platen displacement as the deformation of one contact; shared by two contacts it doubles.
         """

@@ -26,7 +26,7 @@ class Unloading(enum.Enum):
     same curves as the printed one with a modulus of 0.3 to 0.6 GPa. Independent finite elements favour the punch forms.
 
     References:
-        Bommireddy et al. (2018), eq. 27; Mesarovic and Johnson (2000); Hill and Storakers (1990).
+        Bommireddy et al. (2018), eq. 24; Mesarovic and Johnson (2000); Hill and Storakers (1990).
     """
 
     PRINTED = "printed"

@@ -126,7 +126,8 @@ class Programme:
             else:
                 value = step.to * peak
                 duration = abs(value - values[-1]) / step.rate
-            if times[-1] + duration > times[-1]:
+            # A billionth of the time so far is no step: rounding of the times alone would change its rate.
+            if duration > 1e-9 * times[-1]:
                 times.append(times[-1] + duration)
                 values.append(value)
         if len(times) < 2:

@@ -424,3 +424,11 @@ def test_folder_that_cannot_be_written(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "mkdir", refuse)
     with pytest.raises(InputError, match="Permission denied"):
         write_campaign(simple(), tmp_path / "new")
+
+
+@pytest.mark.parametrize("names", [("00", "000"), ("01", "1"), ("1e3", "1000.0"), ("True", "nan"), ("0x1", "1_0")])
+def test_names_that_look_like_numbers_stay_text(tmp_path, names):
+    (tmp_path / "particles.csv").write_text("particle,D1_um,D2_um,D3_um\n" + "".join(f"{n},100,90,80\n" for n in names))
+    rows = "".join(f"{n},0,0,0\n{n},1,2,3\n" for n in names)
+    (tmp_path / "curves.csv").write_text("particle,time_s,force_mN,displacement_um\n" + rows)
+    assert read_campaign(tmp_path).particles == names

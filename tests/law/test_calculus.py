@@ -173,9 +173,8 @@ def test_value_and_derivatives_are_finite_in_single_precision(unloading, scaling
     finite_everywhere(unloading, scaling, jnp.float32, along_a_path)
 
 
-@SOME_CASES
-def test_value_and_derivatives_of_one_step_are_finite(unloading, scaling):
-    finite_everywhere(unloading, scaling, jnp.float64, one_step)
+def test_value_and_derivatives_of_one_step_are_finite():
+    finite_everywhere(*SOME[0], jnp.float64, one_step)
 
 
 def along_a_path(law, particle, state, value, load):
@@ -201,12 +200,12 @@ def test_a_tie_has_the_loading_tangent(mode):
     state, slope = law.init(p), jnp.array([0.0, 1.0])
     close(mode(lambda d: law.step(p, History(PEAK), d)[1])(d), tangent, rel=1e-13)
     for path in (law.path, functools.partial(AbstractContactLaw.path, law)):
-        jacobian = mode(lambda v, path=path: path(p, state, v)[1])(jnp.stack([d, d]))
+        jacobian = jax.jit(mode(lambda v, path=path: path(p, state, v)[1]))(jnp.stack([d, d]))
         close(jnp.sum(jacobian, axis=1), jnp.stack([tangent, tangent]), rel=1e-13)
         assert jnp.all(jnp.isin(jnp.round(jacobian / tangent, 12), slope))
     force = law.step(p, state, d)[1]
     for path in (law.path_load, functools.partial(AbstractContactLaw.path_load, law)):
-        jacobian = mode(lambda v, path=path: path(p, state, v)[1])(jnp.stack([force, force]))
+        jacobian = jax.jit(mode(lambda v, path=path: path(p, state, v)[1]))(jnp.stack([force, force]))
         close(jnp.sum(jacobian, axis=1), jnp.stack([1 / tangent, 1 / tangent]), rel=1e-12)
     # A law's parameters do not care how a tie is shared.
     hold = jnp.stack([d, d, d - 1e-3, d])
@@ -215,7 +214,7 @@ def test_a_tie_has_the_loading_tangent(mode):
         law, p = unpack(theta)
         return route(law, p, law.init(p), hold)[1]
 
-    one, other = (mode(lambda t, r=r: forces(t, r))(theta) for r in (type(law).path, AbstractContactLaw.path))
+    one, other = (jax.jit(mode(lambda t, r=r: forces(t, r)))(theta) for r in (type(law).path, AbstractContactLaw.path))
     close(one, other, rel=1e-11)
 
 

@@ -193,6 +193,38 @@ def test_inverse_on_the_hard_domain(numbers, softening, exponent, place, on_bend
     close(stress(plastic, x), target, scale=4e-16 * rounding + 1e-14 * target)
 
 
+NEAR = 10.0 ** np.arange(-15.0, 0.0)
+SWEPT = np.concatenate([[0.0, 1e-12, 1e-6, 0.1, 0.4, 0.7], 1 - NEAR, [1.0], 1 + NEAR, [1.3, 1.79, 2.0, 3.0]])
+
+
+@pytest.mark.parametrize("K5", [1.0, 144.0, 4000.0])
+def test_inverse_over_a_dense_sweep(K5):
+    """Every degree of softening, 13 decades of stress, and stresses that close in on bend and peak from both sides."""
+    K1 = 7.0
+
+    @jax.jit
+    @jax.vmap
+    def residuals(softening, shares):
+        plastic = Plastic.from_polynomial(K1, jnp.sqrt(softening * 20 / 9 * K1 * K5), K5)
+        _, K3, _ = plastic.polynomial
+        root = jnp.sqrt(jnp.maximum(9 * K3**2 - 20 * K1 * K5, 0.0))
+        # The peak where there is one, else the bend, where the slope is least.
+        place = jnp.where(softening > 1, jnp.sqrt(2 * K1 / (3 * K3 + root)), jnp.sqrt(0.3 * K3 / K5))
+        level = plastic.stress(jnp.where(softening > 0, place, 0.3))
+        targets = jnp.concatenate([level * shares, jnp.logspace(-10, 3, 400)])
+        x = plastic.strain(targets)
+        terms = K1 * x + K3 * x**3 + K5 * x**5
+        return x, plastic.stress(x) - targets, 4e-16 * terms + 1e-14 * targets
+
+    shares = np.concatenate([1 - NEAR, [1.0], 1 + NEAR])
+    x, residual, tolerance = residuals(jnp.asarray(SWEPT), jnp.asarray(np.tile(shares, (SWEPT.size, 1))))
+    assert jnp.all(jnp.isfinite(x))
+    assert jnp.all(x >= 0)
+    off = np.abs(residual) / tolerance
+    worst = np.unravel_index(np.argmax(off), off.shape)
+    assert off.max() <= 1, f"softening {SWEPT[worst[0]]!r}, stress number {worst[1]}: {off.max()} times the tolerance"
+
+
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(x=between(0.0, 1.2), numbers=PLASTIC_NUMBERS, ratio=between(0.0, 0.8))
 def test_inverse_round_trip_of_strain(x, numbers, ratio):
