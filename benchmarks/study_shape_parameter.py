@@ -15,7 +15,7 @@ jax.config.update("jax_enable_x64", True)
 
 from mcc_jax import Instrument, adjust, paper_campaign  # noqa: E402
 from mcc_jax.calibrate import (  # noqa: E402
-    elastic_branches,
+    campaign_branches,
     fit_effective_modulus,
     fit_population,
     fit_shape_parameter,
@@ -35,13 +35,7 @@ def one(seed, shared_material, threshold, noise):
     table = strain_table(adjustment, campaign.diameters_um)
     full, reference = fit_shape_parameter(table, "full"), fit_shape_parameter(table, "reference")
     plastic = fit_population(master_curve(table, full.a), threshold)
-    branches = [
-        b
-        for i in range(len(campaign))
-        for b in elastic_branches(
-            i, campaign.curves[i], campaign.diameters_um[i], adjustment.segments[i], float(adjustment.shift[i])
-        )
-    ]
+    branches = campaign_branches(campaign, adjustment)
     modulus = fit_effective_modulus(branches, table.shape_factor(full.a)).effective_modulus_MPa
     return (full.a, reference.a, modulus, *plastic.polynomial, float(plastic.population.C3.sd == 0))
 

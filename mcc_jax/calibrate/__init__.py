@@ -3,6 +3,7 @@
 from ._elastic import LEAST_RATIO as LEAST_RATIO
 from ._elastic import ElasticBranch as ElasticBranch
 from ._elastic import ElasticFit as ElasticFit
+from ._elastic import campaign_branches as campaign_branches
 from ._elastic import elastic_branches as elastic_branches
 from ._elastic import fit_effective_modulus as fit_effective_modulus
 from ._elastic import recoverable_strain as recoverable_strain

@@ -13,7 +13,7 @@ import optimistix as optx
 from jaxtyping import Array, Float, Int
 
 from .._types import Scalar
-from ..campaign import Curve, Segment, stress_and_strain
+from ..campaign import Adjustment, Campaign, Curve, Segment, stress_and_strain
 from ..law import StrainScaling, Unloading, recovery
 
 LEAST_RATIO = 0.05
@@ -103,6 +103,17 @@ def elastic_branches(
             rows.append(np.arange(segment.start, segment.stop))
     close()
     return branches
+
+
+def campaign_branches(campaign: Campaign, adjustment: Adjustment) -> list[ElasticBranch]:
+    """The elastic branches of every particle that the offset step kept, in its adjusted strain."""
+    return [
+        branch
+        for i in np.flatnonzero(adjustment.kept)
+        for branch in elastic_branches(
+            int(i), campaign.curves[i], campaign.diameters_um[i], adjustment.segments[i], float(adjustment.shift[i])
+        )
+    ]
 
 
 def recoverable_strain(

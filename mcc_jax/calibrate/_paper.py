@@ -19,7 +19,7 @@ from ..campaign import (
     particle_batch,
 )
 from ..law import MccLaw, StrainScaling, Unloading
-from ._elastic import ElasticFit, elastic_branches, fit_effective_modulus
+from ._elastic import ElasticFit, campaign_branches, fit_effective_modulus
 from ._master import MasterCurve, StrainTable, master_curve, strain_table
 from ._plastic import PlasticFit, fit_population
 from ._predict import ParticleFit, point_noise_um, predict_particles
@@ -257,14 +257,7 @@ def calibrate_paper(
     tell("fitting the effective modulus")
     D1, D2, D3 = campaign.diameters_um.T
     eta = 1 + chosen.a * (1 - D3**2 / (D1 * D2))
-    branches = [
-        b
-        for i in np.flatnonzero(adjustment.kept)
-        for b in elastic_branches(
-            int(i), campaign.curves[i], campaign.diameters_um[i], adjustment.segments[i], float(adjustment.shift[i])
-        )
-    ]
-    elastic = fit_effective_modulus(branches, eta, unloading, strain_scaling)
+    elastic = fit_effective_modulus(campaign_branches(campaign, adjustment), eta, unloading, strain_scaling)
     # Without any unloading the modulus cannot matter to a prediction; a stiff one keeps the law defined.
     modulus = elastic.effective_modulus_MPa if elastic.effective_modulus_MPa is not None else 1e9
     law = MccLaw(plastic.population.mean_law, chosen.a, modulus, unloading, strain_scaling)

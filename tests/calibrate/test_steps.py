@@ -10,8 +10,8 @@ from scipy.integrate import trapezoid
 
 from mcc_jax import Instrument, LogNormal, Plastic, Programme, StrainScaling, Unloading, paper_campaign, paper_law
 from mcc_jax.calibrate import (
+    campaign_branches,
     choose_reference,
-    elastic_branches,
     fit_effective_modulus,
     fit_polynomial,
     fit_population,
@@ -310,14 +310,7 @@ def test_log_normal_moments_round_trip(mean, sd, order):
 
 
 def _branches(campaign, threshold):
-    adjustment = adjust(campaign, threshold)
-    return [
-        b
-        for i in range(len(campaign))
-        for b in elastic_branches(
-            i, campaign.curves[i], campaign.diameters_um[i], adjustment.segments[i], float(adjustment.shift[i])
-        )
-    ]
+    return campaign_branches(campaign, adjust(campaign, threshold))
 
 
 def _eta(campaign):
