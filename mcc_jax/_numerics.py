@@ -19,12 +19,6 @@ def positive_pow(x: Values, p: float | Values) -> Values:
     return jnp.where(positive, inside**p, 0.0)
 
 
-def safe_sqrt(x: Values) -> Values:
-    """`sqrt(max(x, 0))` with the derivative 0, instead of infinity, at and below zero."""
-    positive = x > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
-
-
 @jax.custom_jvp
 def running_max(path: Path) -> Path:
     """Largest value so far. A tie passes the derivative to the earliest of the equal values, whole, not in halves."""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from mcc_jax._numerics import horner, positive_pow, running_max, safe_sqrt
+from mcc_jax._numerics import horner, positive_pow, running_max
 from mcc_jax._types import scalar
 
 DTYPES = [jnp.float32, jnp.float64]
@@ -36,14 +36,6 @@ def test_positive_pow_is_the_power_above_zero(mode):
     np.testing.assert_allclose(mode(positive_pow)(x, p), 1.531 * 0.7**0.531, rtol=1e-15)
     np.testing.assert_allclose(mode(positive_pow, 1)(x, p), 0.7**1.531 * np.log(0.7), rtol=1e-15)
     np.testing.assert_array_equal(mode(positive_pow, 1)(jnp.array(0.0), p), 0)
-
-
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_safe_sqrt(mode, dtype):
-    points = jnp.array([-1.0, 0.0, 4.0], dtype)
-    np.testing.assert_array_equal(jax.vmap(safe_sqrt)(points), [0, 0, 2])
-    np.testing.assert_array_equal(jax.vmap(mode(safe_sqrt))(points), [0, 0, 0.25])
 
 
 PATHS = hnp.arrays(np.float64, st.just(12), elements=st.integers(-3, 3).map(float))
