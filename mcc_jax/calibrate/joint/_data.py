@@ -1,0 +1,191 @@
+"""A campaign as the joint calibration sees it: rectangular arrays, and which points and particles take part."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ..._errors import InputError
+from ...campaign import THRESHOLD_MPA, Campaign, Curve, Segment, campaign_segments, particle_batch, stress_and_strain
+from ...geometry import Particle
+from .._elastic import LEAST_RATIO
+from .._predict import point_noise_um
+
+LEAST_POINTS = 12
+"""Fewer usable points than this cannot carry three coefficients, a zero and their noise."""
+
+LEAST_CLIMB = 8.0
+"""Displacement must grow over loading by this many times its noise, or there is no curve to fit."""
+
+
+class Tests(eqx.Module):
+    """N tests as rectangular arrays; shorter ones are padded with their last point, which is masked.
+
+    Attributes:
+        particle: sizes and shapes, leading axis N.
+        force: measured force [mN].
+        displacement: measured displacement [um], raw.
+        mask: which points are compared with the law.
+        loading: which of them lie on virgin loading.
+        contact: displacement at which the record says that the platen touches [um].
+        step: share of the peak force passed since the point before [-], the path length of correlated residuals.
+    """
+
+    __test__ = False  # no test of ours, whatever pytest thinks of the name
+
+    particle: Particle
+    force: Float[Array, "particles points"]
+    displacement: Float[Array, "particles points"]
+    mask: Bool[Array, "particles points"]
+    loading: Bool[Array, "particles points"]
+    contact: Float[Array, " particles"]
+    step: Float[Array, "particles points"]
+
+    def __len__(self) -> int:
+        return self.force.shape[0]
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Which particles take part, and which points of each.
+
+    Attributes:
+        tests: the arrays of those that do.
+        kept: their positions in the campaign.
+        why_not: for each particle of the campaign, None if kept, else the reason.
+        rows: for each kept particle, the rows of its curve that stand in `tests`.
+        notes: what a reader must know about particles that are kept.
+    """
+
+    tests: Tests
+    kept: tuple[int, ...]
+    why_not: tuple[str | None, ...]
+    rows: tuple[np.ndarray, ...]
+    notes: tuple[str, ...]
+
+
+def select_tests(
+    campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_points: int = 400, multiple: int = 64
+) -> Selection:
+    """Choose what the joint calibration uses.
+
+    Points count from the threshold stress on, below which surface asperities and not the particle deform. On unloading
+    and reloading they count from `LEAST_RATIO` of the peak, below which displacement depends on force with an infinite
+    slope. The approach never counts. Of longer records every n-th row is used, turning points always.
+
+    Args:
+        campaign: the tests.
+        threshold_MPa: stress of the threshold [MPa].
+        most_points: thin records longer than this.
+        multiple: round the common length up to this, so that campaigns of similar length share one compilation.
+
+    Raises:
+        InputError: if no particle can be used.
+        ValueError: for a threshold that is negative or not finite.
+    """
+    if not (np.isfinite(threshold_MPa) and threshold_MPa >= 0):
+        raise ValueError(f"the threshold must be a stress >= 0 MPa, got {threshold_MPa}")
+    segments = campaign_segments(campaign)
+    prepared = [
+        _prepare(curve, diameters, parts, threshold_MPa, most_points)
+        for curve, diameters, parts in zip(campaign.curves, campaign.diameters_um, segments, strict=True)
+    ]
+    why_not = tuple(one if isinstance(one, str) else None for one in prepared)
+    kept = tuple(i for i, one in enumerate(prepared) if not isinstance(one, str))
+    if not kept:
+        reasons = "; ".join(f"particle {n!r} {r}" for n, r in zip(campaign.particles[:5], why_not, strict=False))
+        raise InputError(
+            f"no particle can be used ({reasons}{'; ...' if len(why_not) > 5 else ''})",
+            file=campaign.source or None,
+            remedy="Check the diameters (they turn force into stress), or lower the threshold.",
+        )
+    used = [one for one in prepared if not isinstance(one, str)]
+    longest = max(len(one.rows) for one in used)
+    longest += -longest % multiple
+
+    def padded(values: list[np.ndarray], fill: str) -> np.ndarray:
+        options = {"mode": "edge"} if fill == "edge" else {"mode": "constant", "constant_values": False}
+        return np.stack([np.pad(v, (0, longest - len(v)), **options) for v in values])  # pyright: ignore[reportCallIssue, reportArgumentType]
+
+    curves = [campaign.curves[i] for i in kept]
+    force = padded([c.force_mN[one.rows] for c, one in zip(curves, used, strict=True)], "edge").astype(float)
+    largest = force.max(axis=1, keepdims=True)
+    tests = Tests(
+        particle_batch(campaign.diameters_um[list(kept)]),
+        jnp.asarray(force),
+        jnp.asarray(padded([c.displacement_um[one.rows] for c, one in zip(curves, used, strict=True)], "edge"), float),
+        jnp.asarray(padded([one.mask for one in used], "false")),
+        jnp.asarray(padded([one.loading for one in used], "false")),
+        jnp.asarray([one.contact for one in used]),
+        jnp.asarray(np.abs(np.diff(force, axis=1, prepend=force[:, :1])) / largest),
+    )
+    return Selection(
+        tests, kept, why_not, tuple(one.rows for one in used), tuple(_notes(campaign, kept, used, most_points))
+    )
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    rows: np.ndarray
+    mask: np.ndarray
+    loading: np.ndarray
+    contact: float
+
+
+def _prepare(
+    curve: Curve, diameters: np.ndarray, segments: tuple[Segment, ...], threshold: float, most_points: int
+) -> _Prepared | str:
+    """The rows of one test that are used, or why there are none."""
+    stress, _ = stress_and_strain(curve, diameters, segments)
+    kind = np.empty(len(curve), dtype="<U8")
+    for part in segments:
+        kind[part.start : part.stop] = part.kind
+    if not (kind == "load").any():
+        return "has no loading: force never rises above its noise"
+    contact = curve.displacement_um[segments[0].stop] if segments[0].kind == "approach" and len(segments) > 1 else None
+    start = 0 if contact is None else segments[0].stop
+    rows = np.arange(start, len(curve))
+    stride = -(-len(rows) // most_points)
+    if stride > 1:
+        turns = [part.start for part in segments] + [part.stop - 1 for part in segments]
+        turns.append(int(np.argmax(curve.force_mN)))
+        rows = np.unique(np.concatenate([rows[::stride], [t for t in turns if t >= start]]))
+    peak = np.maximum.accumulate(stress[rows])
+    loading = (kind[rows] == "load") & (stress[rows] >= threshold) & (stress[rows] > 0)
+    elastic = np.isin(kind[rows], ("hold", "unload", "reload")) & (stress[rows] >= LEAST_RATIO * peak)
+    mask = loading | (elastic & (stress[rows] >= threshold) & (peak > 0))
+    if stress.max() <= threshold:
+        return f"reaches {stress.max():.3g} MPa only, not the threshold of {threshold:g} MPa"
+    if loading.sum() < LEAST_POINTS:
+        return f"has {int(loading.sum())} usable points on loading, fewer than {LEAST_POINTS}"
+    climb = curve.displacement_um[rows[loading]]
+    third = max(len(climb) // 3, 1)
+    rise, noise = climb[-third:].mean() - climb[:third].mean(), point_noise_um(curve)
+    if rise <= LEAST_CLIMB * noise / np.sqrt(third):
+        return "shows no loading curve: displacement does not grow with force beyond its noise"
+    return _Prepared(rows, mask, loading, float(curve.displacement_um[0] if contact is None else contact))
+
+
+def _notes(campaign: Campaign, kept: tuple[int, ...], used: Sequence[_Prepared], most_points: int):
+    thinned = sum(len(one.rows) < len(campaign.curves[i]) - 1 for i, one in zip(kept, used, strict=True))
+    if any(len(campaign.curves[i]) > most_points for i in kept):
+        yield f"{thinned} records were thinned to about {most_points} rows"
+    for i, one in zip(kept, used, strict=True):
+        if not (one.mask & ~one.loading).any():
+            yield f"particle {campaign.particles[i]!r} was never unloaded: it says nothing about the modulus"
+    seen: dict[bytes, int] = {}
+    for i in kept:
+        curve = campaign.curves[i]
+        fingerprint = curve.force_mN.tobytes() + curve.displacement_um.tobytes()
+        if fingerprint in seen:
+            first = campaign.particles[seen[fingerprint]]
+            yield (
+                f"particles {first!r} and {campaign.particles[i]!r} have the same curve to the last digit: "
+                "one test counted twice makes everything look too certain"
+            )
+        seen.setdefault(fingerprint, i)

@@ -1,0 +1,197 @@
+"""The joint fit that both methods share: particles, noise, population, and their best compromise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ...law import StrainScaling, Unloading
+from ._data import Tests
+from ._individual import Individual, fit_individuals
+from ._linearised import expected_latent, linear_data, summarise
+from ._mode import PriorNumbers, from_free, most_probable, to_free
+from ._noise import Noise, Whitening, estimate_noise, particle_scales
+from ._population import Population, Scatter, Summary
+from ._priors import Priors
+
+ROUNDS = 2
+"""Noise, population and particles depend on each other a little: how often they are taken in turn."""
+
+ALMOST = 0.98
+"""Share of the way to the value of a at which a particle's shape factor would vanish."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """What is assumed about a campaign.
+
+    Attributes:
+        unloading: form of unloading, to which the modulus belongs.
+        strain_scaling: how the shape factor enters unloading.
+        modulus_scatter: let the modulus differ from particle to particle.
+        shape_scatter: let `a` differ from particle to particle.
+        priors: what is believed beforehand.
+    """
+
+    unloading: Unloading = Unloading.PRINTED
+    strain_scaling: StrainScaling = StrainScaling.RAW
+    modulus_scatter: bool = False
+    shape_scatter: bool = False
+    priors: Priors | None = None
+
+    @property
+    def scatter(self) -> Scatter:
+        """What scatters, and the power of the strain scaling."""
+        return Scatter(self.modulus_scatter, self.shape_scatter, self.strain_scaling.power)
+
+    @property
+    def beliefs(self) -> Priors:
+        """The priors given, or the defaults for the form of unloading."""
+        return self.priors or Priors.default(self.unloading)
+
+    @property
+    def zero_sd(self) -> Array:
+        """Standard deviation of the zeros [um]."""
+        return jnp.asarray(self.beliefs.zero_um.sd)
+
+
+class JointFit(eqx.Module):
+    """Particles, noise and population in agreement: the common starting point of least squares and posterior.
+
+    Attributes:
+        individual: every particle on its own.
+        noise: the campaign's noise.
+        noise_log_sd: standard deviations of the logarithms of its four numbers.
+        filters: its filters at the latent vectors.
+        latent, zero: most probable latent vectors and zeros [um].
+        residual: measured less predicted displacement there [um], 0 where masked.
+        summary: quadratic summaries there.
+        mode, covariance: of the population in unbounded coordinates, given the summaries.
+        numbers: its priors.
+        converged: for particles, noise and population in turn.
+    """
+
+    individual: Individual
+    noise: Noise
+    noise_log_sd: Float[Array, 4]
+    filters: Whitening
+    latent: Float[Array, "particles 4"]
+    zero: Float[Array, " particles"]
+    residual: Float[Array, "particles points"]
+    summary: Summary
+    mode: Float[Array, " d"]
+    covariance: Float[Array, "d d"]
+    numbers: PriorNumbers
+    converged: Bool[Array, 3]
+
+
+def prior_numbers(priors: Priors, flatness: Float[Array, " particles"]) -> PriorNumbers:
+    """Priors as arrays; `a` is bounded to where every particle's shape factor is positive."""
+    flat = np.asarray(flatness)
+    most, least = max(flat.max(), 1e-3), min(flat.min(), -1e-3)
+    wide = priors.a.mean + np.array([-8, 8]) * priors.a.sd
+    low, high = max(-ALMOST / most, wide[0]), min(-ALMOST / least, wide[1])
+
+    def log_pair(prior):
+        return jnp.asarray([np.log(prior.median), prior.log_sd])
+
+    spreads = (priors.tau_C1, priors.tau_C3, priors.tau_C5, priors.modulus_scatter, priors.shape_scatter)
+    return PriorNumbers(
+        a=jnp.asarray([priors.a.mean, priors.a.sd, low, high]),
+        log_modulus=log_pair(priors.effective_modulus_MPa),
+        mu_1=log_pair(priors.C1),
+        mu_5=log_pair(priors.C5),
+        softening=log_pair(priors.softening),
+        spread=jnp.asarray([p.sd for p in spreads]),
+        log_noise=log_pair(priors.noise_factor),
+    )
+
+
+def fit_joint(
+    tests: Tests,
+    model: Model,
+    read_out_um: float,
+    *,
+    correlated: bool = True,
+    tell: Callable[[str], None] = lambda _: None,
+) -> JointFit:
+    """Fit particles, noise and population.
+
+    Particles come first, each on its own. Then, in turns: the noise from residuals linear in the particles' parameters,
+    the most probable population under the quadratic summaries, the most probable particles under that population.
+
+    Args:
+        tests: the measurements.
+        model: what is assumed.
+        read_out_um: noise of displacement from point to point, a first guess [um].
+        correlated: estimate the whole noise; if False, white noise of the residuals' median modulus, which outliers do
+            not move.
+        tell: called with the name of each step.
+    """
+    scatter, zero_sd, priors = model.scatter, model.zero_sd, model.beliefs
+    flatness = tests.particle.flatness
+    numbers = prior_numbers(priors, flatness)
+    read_out = max(read_out_um, 1e-4)
+    tell("fitting every particle")
+    individual = fit_individuals(tests, jnp.asarray(read_out), _centre(priors), zero_sd, model.unloading)
+    latent, zero = individual.latent, individual.zero
+    four = [read_out, *np.asarray(priors.noise.median)[1:]]
+    noise = Noise(*(jnp.asarray(v) for v in four), jnp.asarray(np.ones(len(tests))))
+    log_sd, noise_converged = jnp.asarray(np.full(4, np.nan)), True
+    free = _start(np.asarray(latent), np.asarray(flatness), model, numbers)
+    for turn in range(ROUNDS + 1):
+        data = linear_data(latent, zero, tests, zero_sd, model.unloading)
+        if not correlated:
+            width = 1.4826 * np.median(np.abs(np.asarray(data.residual)[np.asarray(tests.mask)]))
+            noise = Noise(*(jnp.asarray(v) for v in (max(width, 1e-9), 0.0, 0.0, 1.0)), jnp.ones(len(tests)))
+        elif turn < ROUNDS:
+            tell("estimating the noise")
+            noise, log_sd, noise_converged = estimate_noise(data, priors.noise, noise)
+        summary, filtered = summarise(latent, zero, tests.contact, data, noise, zero_sd)
+        if correlated and turn < ROUNDS:
+            old = np.asarray(noise.scale)
+            scale = particle_scales(old, np.asarray(summary.squares), np.asarray(summary.count) - 4)
+            if np.any(scale != old):
+                noise = eqx.tree_at(lambda n: n.scale, noise, jnp.asarray(scale))
+                summary, filtered = summarise(latent, zero, tests.contact, data, noise, zero_sd)
+        tell("fitting the population")
+        free, covariance, mode_converged = most_probable(free, numbers, summary, flatness, scatter)
+        if turn < ROUNDS:
+            latent, zero = expected_latent(free, numbers, summary, flatness, scatter)
+    converged = np.asarray([bool(np.all(np.asarray(individual.converged))), noise_converged, mode_converged])
+    return JointFit(
+        individual, noise, log_sd, filtered, latent, zero, data.residual, summary, free, covariance, numbers, converged
+    )
+
+
+def _centre(priors: Priors) -> Float[Array, 4]:
+    """Centre of b1, b3, b5, e for what a curve alone does not say: the prior's, at the paper's typical shape factor."""
+    C1, C5 = np.log(priors.C1.median), np.log(priors.C5.median)
+    C3 = (np.log(20 / 9) + C1 + 5 * C5 + np.log(priors.softening.median)) / 6
+    log_eta = np.log(1.4)
+    return jnp.asarray([C1 + log_eta, C3 + log_eta, C5 + log_eta, np.log(priors.effective_modulus_MPa.median)])
+
+
+@eqx.filter_jit
+def populations(free: Float[Array, "draws d"], numbers: PriorNumbers, scatter: Scatter) -> Population:
+    """Populations of many unbounded coordinates, every field with a leading axis."""
+    return jax.vmap(lambda f: from_free(f, numbers, scatter)[0])(free)
+
+
+def _start(latent: np.ndarray, flatness: np.ndarray, model: Model, numbers: PriorNumbers) -> Float[Array, " d"]:
+    """Where to look for the population: the prior's a, and the particles' own median and scatter under it."""
+    priors = model.beliefs
+    low, high = np.asarray(numbers.a)[2:]
+    a = float(np.clip(priors.a.mean, 0.9 * low, 0.9 * high))
+    log_eta = np.log(1 + a * flatness)
+    b = latent[:, :3] - log_eta[:, None]
+    log_modulus = float(np.median(latent[:, 3] - model.strain_scaling.power * log_eta))
+    scales = np.array([priors.tau_C1.sd, priors.tau_C3.sd, priors.tau_C5.sd])
+    tau = np.clip(np.std(b, axis=0), 0.05 * scales, 2 * scales)
+    return to_free(a, log_modulus, np.median(b, axis=0), tau, numbers, model.scatter)

@@ -1,0 +1,157 @@
+"""Every particle on its own: starts without iteration, then its own least squares from several of them."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..._types import Path, Scalar
+from ...geometry import Particle
+from ...law import Unloading
+from ._data import Tests
+from ._forward import linearise
+from ._small import Cholesky
+
+SHIFTS = 21
+SPREAD = 0.04
+"""Zeros tried lie within this share of the effective diameter around the recorded contact."""
+
+VARIATIONS = ((0.0, 0.0, 0.0), (0.05, -0.1, 0.03), (-0.05, 0.06, -0.02))
+"""What is added to the linear start's b1, b3, b5 for further starts."""
+
+MOST_STEPS = 60
+
+WIDE = 1.5
+"""Standard deviation of the logarithms that a particle on its own is allowed, around the prior's centre: no more than
+what keeps a coefficient finite about which its curve says nothing."""
+
+
+class Individual(eqx.Module):
+    """Fits of single particles.
+
+    Attributes:
+        latent: b1, b3, b5, e, shape (N, 4).
+        zero: zero of displacement [um].
+        rms: root mean square residual [um].
+        converged: whether the best start's fit met its tolerances.
+    """
+
+    latent: Float[Array, "particles 4"]
+    zero: Float[Array, " particles"]
+    rms: Float[Array, " particles"]
+    converged: Bool[Array, " particles"]
+
+
+def _polynomial(x: Path, stress: Path, weight: Path) -> Float[Array, 3]:
+    """K1, K3, K5 by linear least squares."""
+    design = jnp.stack([x, -(x**3), x**5], 1) * weight[:, None]
+    scale = jnp.sqrt(jnp.sum(design**2, axis=0)) + 1e-30
+    scaled = design / scale
+    ridge = jnp.eye(3) * 1e-9
+    return Cholesky(scaled.T @ scaled + ridge).solve(scaled.T @ (stress * weight)) / scale
+
+
+def linear_start(
+    particle: Particle, force: Path, measured: Path, loading: Bool[Array, " steps"], contact: Scalar
+) -> tuple[Float[Array, 3], Scalar]:
+    """Coefficients (as b) and zero of one particle from its loading, without iteration.
+
+    Stress is linear in the three coefficients at a given zero, so zeros are tried on a grid; deviations of stress are
+    divided by the slope, which makes them deviations of strain.
+    """
+    stress = particle.stress(force)
+    reach = particle.effective_diameter
+    top = jnp.max(jnp.where(loading, stress, 0.0))
+
+    def at(shift):
+        x = jnp.where(loading, (measured - contact) / reach - shift, 0.0)
+        possible = jnp.all(jnp.where(loading, x > 1e-4, True))
+        x = jnp.maximum(x, 1e-4)
+        used = jnp.where(loading, 1.0, 0.0)
+        K = _polynomial(x, stress, used)
+
+        def slope(K):
+            return jnp.maximum(K[0] - 3 * K[1] * x**2 + 5 * K[2] * x**4, 0.05 * top / jnp.max(x))
+
+        for _ in range(2):
+            K = _polynomial(x, stress, used / slope(K))
+        # Each term carries at least a hundredth of the largest stress: logarithms follow.
+        far = jnp.max(x)
+        K = jnp.maximum(K, 0.01 * top / jnp.stack([far, far**3, far**5]))
+        deviation = (K[0] * x - K[1] * x**3 + K[2] * x**5 - stress) / slope(K)
+        return jnp.where(possible, jnp.sum(used * deviation**2), jnp.inf), K
+
+    shifts = jnp.linspace(-SPREAD, SPREAD, SHIFTS)
+    losses, coefficients = jax.vmap(at)(shifts)
+    best = jnp.argmin(losses)
+    K = jnp.where(jnp.isfinite(losses[best]), coefficients[best], jnp.array([6.0, 27.0, 144.0]))
+    return jnp.log(K) / jnp.array([1.0, 3.0, 5.0]), contact + shifts[best] * reach
+
+
+@eqx.filter_jit
+def fit_individuals(
+    tests: Tests, noise: Scalar, centre: Float[Array, 4], zero_sd: Scalar, unloading: Unloading
+) -> Individual:
+    """Fit every particle on its own, its modulus included, from several starts.
+
+    Levenberg-Marquardt for all particles and starts in step, each with a damping of its own: one that has converged
+    waits for the others, so there is one loop whatever their number.
+
+    Args:
+        tests: the measurements.
+        noise: scale of the residuals [um].
+        centre: centre of b1, b3, b5 and e for what a curve does not say.
+        zero_sd: how far the zero may lie from the recorded contact [um].
+        unloading: form of unloading.
+    """
+    b, zero = jax.vmap(linear_start)(tests.particle, tests.force, tests.displacement, tests.loading, tests.contact)
+    starts = len(VARIATIONS)
+    first = jnp.concatenate([b, jnp.broadcast_to(centre[3:], (len(tests), 1)), zero[:, None]], 1)
+    varied = first[None] + jnp.pad(jnp.asarray(VARIATIONS), ((0, 0), (0, 2)))[:, None]
+    many: Tests = jax.tree.map(lambda x: jnp.tile(x, (starts, *[1] * (x.ndim - 1))), tests)
+    middle = jnp.append(jnp.broadcast_to(centre, (starts * len(tests), 4)).T, many.contact[None], axis=0).T
+    width = jnp.append(jnp.full(4, WIDE), zero_sd)
+
+    def normal_equations(y):
+        r, J = linearise(y[:, :4], y[:, 4], many, unloading)
+        r, J, away = r / noise, J / noise, (y - middle) / width
+        H = jnp.einsum("nkp,nkq->npq", J, J) + jnp.diag(1 / width**2)
+        g = jnp.einsum("nkp,nk->np", J, r) + away / width
+        loss = 0.5 * (jnp.sum(r**2, 1) + jnp.sum(away**2, 1))
+        return jnp.where(jnp.isfinite(loss), loss, jnp.inf), g, H
+
+    def step(carry):
+        y, loss, g, H, damping, count, _ = carry
+        diagonal = jnp.diagonal(H, axis1=1, axis2=2)
+        move = -Cholesky(H + jnp.eye(5) * (damping[:, None] * diagonal)[:, None, :]).solve(g)
+        # No logarithm moves by more than a factor of e, no zero by more than a tenth of its prior's reach, at a time.
+        most = jnp.max(jnp.abs(move) / jnp.append(jnp.ones(4), zero_sd), 1)
+        tried = y + move / jnp.maximum(most, 1.0)[:, None]
+        new_loss, new_g, new_H = normal_equations(tried)
+        better = new_loss < loss
+        done = (jnp.abs(jnp.einsum("np,np->n", move, g)) < 1e-6) | (damping > 1e8)
+
+        def choose(new, old):
+            return jnp.where(better.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+
+        damping = jnp.where(done, damping, jnp.where(better, jnp.maximum(damping / 8, 1e-9), damping * 4))
+        return (*map(choose, (tried, new_loss, new_g, new_H), (y, loss, g, H)), damping, count + 1, done)
+
+    y = varied.reshape(-1, 5)
+    unfinished = jnp.zeros(len(y), bool)
+    # The first pass through the loop evaluates the start: an infinite loss accepts whatever comes, and no force moves it.
+    carry = (y, jnp.full(len(y), jnp.inf), jnp.zeros((len(y), 5)), jnp.broadcast_to(jnp.eye(5), (len(y), 5, 5)))
+    carry = (*carry, jnp.full(len(y), 1e-3), 0, unfinished)
+    going = lambda c: (c[5] < 2) | ((c[5] < MOST_STEPS) & ~jnp.all(c[6]))  # noqa: E731  # a condition, no function
+    y, loss, _, _, _, _, done = jax.lax.while_loop(going, step, carry)
+    y, loss, done = (v.reshape(starts, len(tests), *v.shape[1:]) for v in (y, loss, done))
+    best = jnp.argmin(loss, axis=0)
+
+    def take(values):
+        return jnp.take_along_axis(values, best.reshape(1, -1, *[1] * (values.ndim - 2)), axis=0)[0]
+
+    found = take(y)
+    points = jnp.maximum(jnp.sum(tests.mask, 1), 1)
+    return Individual(found[:, :4], found[:, 4], noise * jnp.sqrt(2 * take(loss) / points), take(done))

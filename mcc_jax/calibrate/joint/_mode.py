@@ -1,0 +1,170 @@
+"""The population's prior in coordinates without bounds, and its most probable value given the summaries."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import log_ndtr
+from jaxtyping import Array, Float
+
+from ..._types import Scalar
+from ._population import Population, Scatter, Summary, marginal_likelihood
+
+
+class PriorNumbers(eqx.Module):
+    """The population's priors as arrays, so that other numbers need no new compilation.
+
+    Attributes:
+        a: mean, sd, lower and upper bound of the shape parameter.
+        log_modulus, mu_1, mu_5: mean and sd.
+        softening: mean and sd of its logarithm.
+        spread: scales of the half-normal priors of tau 1, 3, 5, of the modulus' and of a's scatter.
+        log_noise: standard deviation.
+    """
+
+    a: Float[Array, 4]
+    log_modulus: Float[Array, 2]
+    mu_1: Float[Array, 2]
+    mu_5: Float[Array, 2]
+    softening: Float[Array, 2]
+    spread: Float[Array, 5]
+    log_noise: Float[Array, 2]
+
+
+def given_mu_3(mu_1: Scalar, mu_5: Scalar, softening: Float[Array, 2]) -> tuple[Scalar, Scalar]:
+    r"""Mean and standard deviation of :math:`\mu_3` given the other two, by the prior of the softening.
+
+    .. math:: 6 \mu_3 = \log\tfrac{20}{9} + \mu_1 + 5\mu_5 + \log(\text{softening})
+    """
+    return (jnp.log(20 / 9) + mu_1 + 5 * mu_5 + softening[0]) / 6, softening[1] / 6
+
+
+def from_free(free: Float[Array, " d"], numbers: PriorNumbers, scatter: Scatter) -> tuple[Population, Scalar]:
+    """The population at unbounded coordinates, and the log density of its prior in those coordinates."""
+    mean, sd, low, high = numbers.a
+    unit = jax.nn.sigmoid(free[0])
+    a = low + (high - low) * unit
+    # log of a truncated normal's density, and of da/dfree
+    inside = jnp.log(jnp.exp(log_ndtr((high - mean) / sd)) - jnp.exp(log_ndtr((low - mean) / sd)))
+    density = -0.5 * ((a - mean) / sd) ** 2 - jnp.log(sd) - inside
+    density += jnp.log(high - low) + jax.nn.log_sigmoid(free[0]) + jax.nn.log_sigmoid(-free[0])
+    log_modulus, mu1, mu3, mu5, log_noise = free[1:6]
+    normal = (
+        (log_modulus, numbers.log_modulus),
+        (mu1, numbers.mu_1),
+        (mu3, given_mu_3(mu1, mu5, numbers.softening)),
+        (mu5, numbers.mu_5),
+        (log_noise, numbers.log_noise),
+    )
+    for value, (centre, width) in normal:
+        density += -0.5 * ((value - centre) / width) ** 2 - jnp.log(width)
+    count = scatter.size
+    signed = free[6 : 6 + count]
+    chosen = [0, 1, 2] + ([3] if scatter.modulus else []) + ([4] if scatter.shape else [])
+    scales = numbers.spread[jnp.asarray(chosen)]
+    # A spread is the modulus of a coordinate that may have either sign: the density is even and smooth there, so that
+    # a spread that is 0 is no boundary and has no tail towards minus infinity.
+    spread = jnp.abs(signed)
+    density += jnp.sum(-0.5 * (spread / scales) ** 2 - jnp.log(scales))
+    zero = jnp.zeros(())
+    population = Population(
+        a,
+        log_modulus,
+        jnp.stack([mu1, mu3, mu5]),
+        spread[:3],
+        spread[3] if scatter.modulus else zero,
+        spread[-1] if scatter.shape else zero,
+        log_noise,
+    )
+    return population, density
+
+
+def to_free(
+    a: float, log_modulus: float, mu: np.ndarray, tau: np.ndarray, numbers: PriorNumbers, scatter: Scatter
+) -> Float[Array, " d"]:
+    """Unbounded coordinates of a population, kept away from the bounds of `a`; further scatter begins at a tenth."""
+    low, high = np.asarray(numbers.a)[2:]
+    unit = np.clip((a - low) / (high - low), 1e-3, 1 - 1e-3)
+    further = np.full(scatter.size - 3, 0.1)
+    return jnp.asarray(np.concatenate([[np.log(unit / (1 - unit)), log_modulus, *mu, 0.0], tau, further]))
+
+
+def log_posterior(
+    free: Float[Array, " d"],
+    numbers: PriorNumbers,
+    summary: Summary,
+    flatness: Float[Array, " particles"],
+    scatter: Scatter,
+) -> Scalar:
+    """Log density of the population given all tests, up to a constant."""
+    population, prior = from_free(free, numbers, scatter)
+    return prior + jnp.sum(marginal_likelihood(population, summary, flatness, scatter))
+
+
+@eqx.filter_jit
+def _gradients(
+    free: Float[Array, "many d"],
+    numbers: PriorNumbers,
+    summary: Summary,
+    flatness: Float[Array, " particles"],
+    scatter: Scatter,
+) -> tuple[Float[Array, " many"], Float[Array, "many d"]]:
+    def loss(free):
+        return -log_posterior(free, numbers, summary, flatness, scatter)
+
+    return jax.lax.map(jax.value_and_grad(loss), free)
+
+
+def most_probable(
+    start: Float[Array, " d"],
+    numbers: PriorNumbers,
+    summary: Summary,
+    flatness: Float[Array, " particles"],
+    scatter: Scatter,
+) -> tuple[Float[Array, " d"], Float[Array, "d d"], bool]:
+    """Mode of the population in unbounded coordinates, covariance there, and whether the optimiser converged.
+
+    Newton's method in a trust region (SciPy), in coordinates scaled by the curvature at the start. The curvature comes
+    from differences of exact gradients, which are quicker than second derivatives are to compile.
+    """
+    from scipy.optimize import minimize
+
+    origin = np.asarray(start)
+    d = len(origin)
+    width = np.full(d, 1e-5)
+
+    def expand(free: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        steps = np.diag(width)
+        points = free + np.concatenate([np.zeros((1, d)), steps, -steps])
+        value, slope = (np.asarray(v) for v in _gradients(jnp.asarray(points), numbers, summary, flatness, scatter))
+        curvature = (slope[1 : d + 1] - slope[d + 1 :]) / (2 * width[:, None])
+        return float(value[0]), slope[0], (curvature + curvature.T) / 2
+
+    unit = 1 / np.sqrt(np.maximum(np.abs(np.diagonal(expand(origin)[2])), 1e-8))
+    width = 1e-3 * np.minimum(unit, 1.0)
+    memory: dict[bytes, tuple[float, np.ndarray, np.ndarray]] = {}
+
+    def at(z: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        key = z.tobytes()
+        if key not in memory:
+            memory.clear()
+            memory[key] = expand(origin + unit * z)
+        return memory[key]
+
+    found = minimize(
+        lambda z: at(z)[0] if np.isfinite(at(z)[0]) else np.inf,
+        np.zeros_like(origin),
+        jac=lambda z: at(z)[1] * unit,
+        hess=lambda z: at(z)[2] * unit * unit[:, None],
+        method="trust-exact",
+        options={"gtol": 1e-4, "maxiter": 200},
+    )
+    free = origin + unit * found.x
+    curvature = expand(free)[2]
+    # Curvatures differ by many powers of ten: on the scale of each coordinate, what is not convex is taken as wide.
+    scale = 1 / np.sqrt(np.maximum(np.abs(np.diagonal(curvature)), 1e-8))
+    values, vectors = np.linalg.eigh(curvature * scale * scale[:, None])
+    covariance = (vectors / np.maximum(values, 0.01)) @ vectors.T * scale * scale[:, None]
+    return jnp.asarray(free), jnp.asarray(covariance), bool(found.success)

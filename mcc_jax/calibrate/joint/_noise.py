@@ -1,0 +1,218 @@
+r"""Noise of a test: white read-out noise, noise of force, and residuals that are correlated along the load path.
+
+.. math:: d_k - z - \gamma_k = o_k + w_k, \qquad
+    w_k \sim N(0,\, s_i^2 (\sigma_w^2 + \sigma_F^2 \gamma'^2_k)), \qquad
+    \mathrm{Cov}(o_k, o_l) = s_i^2 \sigma_o^2 \exp(-|p_k - p_l| / \ell)
+
+with p the path length of force in shares of the peak (an Ornstein-Uhlenbeck process along it), and a scale s_i of each
+particle's own. The covariance is never formed: a Kalman filter turns residuals into independent ones in linear time.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ..._types import Path, Scalar
+from ._small import Cholesky
+
+
+class Noise(eqx.Module):
+    """Standard deviations of a campaign's noise.
+
+    Attributes:
+        displacement: white noise of displacement [um].
+        force: white noise of force [mN].
+        correlated: standard deviation of the correlated residual [um].
+        length: its correlation length, in shares of the peak force passed [-].
+        scale: each particle's own factor on all of them [-], shape (N,).
+    """
+
+    displacement: Scalar
+    force: Scalar
+    correlated: Scalar
+    length: Scalar
+    scale: Float[Array, " particles"]
+
+    @property
+    def logs(self) -> Float[Array, 4]:
+        """Logarithms of the four numbers."""
+        return jnp.log(jnp.stack([self.displacement, self.force, self.correlated, self.length]))
+
+    @classmethod
+    def from_logs(cls, logs: Float[Array, 4], scale: Float[Array, " particles"]) -> Noise:
+        """From the logarithms of the four numbers."""
+        displacement, force, correlated, length = jnp.exp(logs)
+        return cls(displacement, force, correlated, length, scale)
+
+
+class Whitening(eqx.Module):
+    """The Kalman filter of one test, ready to whiten any residuals of it; linear.
+
+    Attributes:
+        decay: correlation with the point before.
+        gain: share of a surprise that the correlated part takes.
+        weight: one over the standard deviation of a surprise, 0 where the point is masked.
+    """
+
+    decay: Path
+    gain: Path
+    weight: Path
+
+    def __call__(self, residual: Path) -> Path:
+        """Independent residuals of standard deviation 1 (0 where masked)."""
+
+        def advance(expected, point):
+            r, decay, gain = point
+            surprise = r - decay * expected
+            return decay * expected + gain * surprise, surprise
+
+        _, surprise = jax.lax.scan(advance, jnp.zeros_like(residual[0]), (residual, self.decay, self.gain))
+        return surprise * self.weight
+
+    @property
+    def log_det(self) -> Scalar:
+        """Logarithm of the covariance's determinant, over the points that are not masked."""
+        used = self.weight > 0
+        return -2 * jnp.sum(jnp.where(used, jnp.log(jnp.where(used, self.weight, 1.0)), 0.0))
+
+
+def whitening(noise: Noise, scale: Scalar, step: Path, mask: Bool[Array, " steps"], compliance: Path) -> Whitening:
+    """The filter of one test.
+
+    Args:
+        noise: the campaign's noise; `noise.scale` is not used.
+        scale: this particle's scale.
+        step: path length since the point before [-].
+        mask: which points count.
+        compliance: how far noise of force moves the predicted displacement [um/mN].
+    """
+    decay = jnp.exp(-step / noise.length)
+    stationary = noise.correlated**2
+    read_out = noise.displacement**2 + (noise.force * compliance) ** 2
+
+    def advance(variance, point):
+        decay, used, own = point
+        variance = decay**2 * variance + (1 - decay**2) * stationary
+        total = variance + own
+        gain = jnp.where(used, variance / total, 0.0)
+        return (1 - gain) * variance, (gain, total)
+
+    _, (gain, total) = jax.lax.scan(advance, stationary, (decay, mask, read_out))
+    return Whitening(decay, gain, jnp.where(mask, 1 / (scale * jnp.sqrt(total)), 0.0))
+
+
+def white(mask: Bool[Array, "particles steps"], scale: Scalar) -> Whitening:
+    """Filters that only divide by one standard deviation [um]."""
+    zeros = jnp.zeros(mask.shape)
+    return Whitening(zeros, zeros, jnp.where(mask, 1 / scale, 0.0))
+
+
+class Linear(eqx.Module):
+    """Residuals of N tests, linear in each particle's own parameters around a point.
+
+    Attributes:
+        residual: at the point [um].
+        jacobian: derivative with respect to the particle's P parameters.
+        prior: precision that keeps directions without data in place, shape (P,).
+        step, mask, compliance: as in `whitening`.
+    """
+
+    residual: Float[Array, "particles points"]
+    jacobian: Float[Array, "particles points P"]
+    prior: Float[Array, " P"]
+    step: Float[Array, "particles points"]
+    mask: Bool[Array, "particles points"]
+    compliance: Float[Array, "particles points"]
+
+
+def restricted_likelihood(noise: Noise, data: Linear) -> Float[Array, " particles"]:
+    """Log likelihood of each test under the noise, with the particle's own parameters integrated out."""
+
+    def one(scale, residual, jacobian, step, mask, compliance):
+        filtered = whitening(noise, scale, step, mask, compliance)
+        r = filtered(residual)
+        J = jax.vmap(filtered, in_axes=1, out_axes=1)(jacobian)
+        factor = Cholesky(J.T @ J + jnp.diag(data.prior))
+        explained = factor.forward(J.T @ r)
+        return -0.5 * (filtered.log_det + r @ r - explained @ explained + factor.log_det())
+
+    return jax.vmap(one)(noise.scale, data.residual, data.jacobian, data.step, data.mask, data.compliance)
+
+
+class NoisePrior(eqx.Module):
+    """Log-normal priors of the four numbers of the noise: medians and standard deviations of the logarithm."""
+
+    median: Float[Array, 4]
+    log_sd: Float[Array, 4]
+
+    def log_density(self, logs: Float[Array, 4]) -> Scalar:
+        """Log density of the logarithms, up to a constant."""
+        return -0.5 * jnp.sum(((logs - jnp.log(self.median)) / self.log_sd) ** 2)
+
+
+@eqx.filter_jit
+def _losses(logs: Float[Array, "many 4"], scale: Float[Array, " particles"], data: Linear, prior: NoisePrior):
+    def loss(one):
+        noise = Noise.from_logs(one, scale)
+        return -(jnp.sum(restricted_likelihood(noise, data)) + prior.log_density(one))
+
+    return jax.vmap(loss)(logs)
+
+
+STEP = 1e-3
+"""Step of the differences in the logarithms; the loss is smooth on the scale of 1 and exact to 1e-12 of its size."""
+
+
+def estimate_noise(data: Linear, prior: NoisePrior, start: Noise) -> tuple[Noise, Float[Array, 4], bool]:
+    """Noise by restricted maximum likelihood with its prior.
+
+    The particles' scales stay as they are (`particle_scales`). Derivatives with respect to four numbers are cheaper as
+    differences, all of them in one batch, than to compile.
+
+    Returns:
+        The noise, standard deviations of the logarithms of its four numbers, and whether the optimiser converged.
+    """
+    from scipy.optimize import minimize
+
+    steps = STEP * np.concatenate([np.zeros((1, 4)), np.eye(4), -np.eye(4)])
+
+    def value_and_gradient(logs: np.ndarray) -> tuple[float, np.ndarray]:
+        values = np.asarray(_losses(jnp.asarray(logs + steps), start.scale, data, prior))
+        return float(values[0]), (values[1:5] - values[5:]) / (2 * STEP)
+
+    # Further than this from the prior nothing is distinguishable from zero, or from any data.
+    bounds = [(m - 6 * s, m + 6 * s) for m, s in zip(np.log(prior.median), np.asarray(prior.log_sd), strict=True)]
+    inside = np.clip(np.asarray(start.logs), *np.transpose(bounds))
+    found = minimize(value_and_gradient, inside, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-10})
+    width = 0.02
+    columns = [
+        (value_and_gradient(found.x + width * e)[1] - value_and_gradient(found.x - width * e)[1]) / (2 * width)
+        for e in np.eye(4)
+    ]
+    values, vectors = np.linalg.eigh((np.array(columns) + np.array(columns).T) / 2)
+    sd = np.sqrt(np.sum(vectors**2 / np.maximum(values, 1e-6), axis=1))
+    four = (jnp.asarray(v) for v in np.exp(found.x))
+    return Noise(*four, start.scale), jnp.asarray(sd), bool(found.success)
+
+
+def particle_scales(scale: np.ndarray, squares: np.ndarray, freedom: np.ndarray) -> np.ndarray:
+    """Every particle's scale from its whitened sum of squares, pulled towards 1 unless they scatter by more than chance.
+
+    Args:
+        scale: scales that the sums were whitened with, shape (N,).
+        squares: sums of squares of whitened residuals, shape (N,).
+        freedom: degrees of freedom, shape (N,).
+    """
+    freedom = np.maximum(freedom, 1)
+    log_scale = np.log(scale) + 0.5 * np.log(np.maximum(squares / freedom, 1e-12))
+    chance = 0.5 / freedom
+    centre = np.sum(log_scale / chance) / np.sum(1 / chance)
+    scatter = np.mean((log_scale - centre) ** 2) - np.mean(chance)
+    # Up to twice the uncertainty of this estimate itself, all particles share one scale.
+    if scatter <= 2 * np.mean(chance) * np.sqrt(2 / len(log_scale)):
+        return np.ones_like(log_scale)
+    return np.exp(scatter / (scatter + chance) * (log_scale - centre))

@@ -1,0 +1,151 @@
+"""What is believed before the data: weakly informative, in physical units, and open to change from a file."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+
+from ..._errors import InputError
+from ...campaign import load_toml
+from ...law import Unloading
+from ._noise import NoisePrior
+
+
+@dataclass(frozen=True)
+class NormalPrior:
+    """A normal distribution."""
+
+    mean: float
+    sd: float
+
+
+@dataclass(frozen=True)
+class LogNormalPrior:
+    """A log-normal distribution: its median, and the standard deviation of the logarithm."""
+
+    median: float
+    log_sd: float
+
+
+@dataclass(frozen=True)
+class HalfNormalPrior:
+    """A normal distribution cut off below 0."""
+
+    sd: float
+
+
+@dataclass(frozen=True)
+class Priors:
+    r"""Priors of the joint calibration.
+
+    Attributes:
+        a: shape parameter [-], cut off where any particle's shape factor would not be positive. Dense bodies want
+            negative values, porous irregular ones 1 to 2.
+        effective_modulus_MPa: Ebar [MPa]; its default depends on the form of unloading, to which it belongs.
+        C1: median of C1 over the particles [-], the initial slope of the master curve in MPa.
+        C5: median of C5 over the particles [-].
+        softening: :math:`9 C_3^6 / (20 C_1 C_5^5)` of the median particle [-], 0.33 in the paper: the share of the
+            initial slope that is lost at the curve's bend. It stands in for C3, whose median follows. At 1 the curve is
+            flat there, beyond 1 its stress falls; most powders stay well below, single particles need not.
+        tau_C1, tau_C3, tau_C5: standard deviation of log C over the particles.
+        modulus_scatter: standard deviation of the logarithm of the modulus over the particles, if it may scatter.
+        shape_scatter: standard deviation of a over the particles, if it may scatter.
+        zero_um: how far the true zero of displacement may lie from the recorded contact [um].
+        noise_displacement_um, noise_force_mN, noise_correlated_um, noise_length: see `Noise`.
+        noise_factor: common factor on the noise as estimated beforehand.
+    """
+
+    a: NormalPrior = NormalPrior(1.0, 1.0)
+    effective_modulus_MPa: LogNormalPrior = LogNormalPrior(10_000.0, 1.0)
+    C1: LogNormalPrior = LogNormalPrior(6.0, 0.7)
+    C5: LogNormalPrior = LogNormalPrior(2.7, 0.3)
+    softening: LogNormalPrior = LogNormalPrior(0.33, 0.6)
+    tau_C1: HalfNormalPrior = HalfNormalPrior(0.5)
+    tau_C3: HalfNormalPrior = HalfNormalPrior(0.1)
+    tau_C5: HalfNormalPrior = HalfNormalPrior(0.2)
+    modulus_scatter: HalfNormalPrior = HalfNormalPrior(0.3)
+    shape_scatter: HalfNormalPrior = HalfNormalPrior(0.3)
+    zero_um: NormalPrior = NormalPrior(0.0, 5.0)
+    noise_displacement_um: LogNormalPrior = LogNormalPrior(0.02, 1.5)
+    noise_force_mN: LogNormalPrior = LogNormalPrior(0.05, 1.0)
+    noise_correlated_um: LogNormalPrior = LogNormalPrior(0.01, 1.5)
+    noise_length: LogNormalPrior = LogNormalPrior(0.2, 1.0)
+    noise_factor: LogNormalPrior = LogNormalPrior(1.0, 0.5)
+    changed: tuple[str, ...] = field(default=(), compare=False)
+
+    @classmethod
+    def default(cls, unloading: Unloading = Unloading.PRINTED) -> Priors:
+        """The defaults; the modulus of a punch form is some twenty times smaller than that of the printed one."""
+        if unloading is Unloading.PRINTED:
+            return cls()
+        return cls(effective_modulus_MPa=LogNormalPrior(500.0, 1.0))
+
+    @property
+    def noise(self) -> NoisePrior:
+        """The four priors of the noise together."""
+        four = (self.noise_displacement_um, self.noise_force_mN, self.noise_correlated_um, self.noise_length)
+        return NoisePrior(jnp.asarray([p.median for p in four]), jnp.asarray([p.log_sd for p in four]))
+
+    def to_json(self) -> dict[str, Any]:
+        """Every prior with its numbers."""
+        content = {}
+        for name, prior in self._entries():
+            content[name] = {"distribution": _NAMES[type(prior)], **dataclasses.asdict(prior)}
+        return content
+
+    def _entries(self) -> list[tuple[str, Any]]:
+        return [(f.name, getattr(self, f.name)) for f in dataclasses.fields(self) if f.name != "changed"]
+
+
+_NAMES = {
+    NormalPrior: "normal",
+    LogNormalPrior: "log-normal",
+    HalfNormalPrior: "half-normal",
+}
+_POSITIVE = {"sd", "log_sd", "median"}
+
+
+def read_priors(file: str | Path, unloading: Unloading = Unloading.PRINTED) -> Priors:
+    """Read priors from a TOML file; what it does not name keeps its default.
+
+    The file holds one table per prior, with the fields of its distribution::
+
+        [a]
+        mean = 1.4
+        sd = 0.3
+
+    Raises:
+        InputError: naming table, entry and what is allowed.
+    """
+    file = Path(file)
+    priors = Priors.default(unloading)
+    known = dict(priors._entries())
+    changes: dict[str, Any] = {}
+    for name, entry in load_toml(file).items():
+        if name not in known:
+            raise InputError(
+                f"there is no prior {name!r}", file=str(file), remedy=f"Known priors: {', '.join(sorted(known))}."
+            )
+        fields = [f.name for f in dataclasses.fields(known[name])]
+        if not isinstance(entry, dict):
+            raise InputError(
+                f"prior {name!r} must be a table", file=str(file), remedy=f"Write [{name}] and its {', '.join(fields)}."
+            )
+        for key, value in entry.items():
+            if key not in fields:
+                raise InputError(
+                    f"prior {name!r} has no entry {key!r}", file=str(file), remedy=f"Its entries: {', '.join(fields)}."
+                )
+            number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+            if not number or (key in _POSITIVE and value <= 0):
+                allowed = "a positive number" if key in _POSITIVE else "a number"
+                raise InputError(
+                    f"{name}.{key} must be {allowed}, not {value!r}", file=str(file), remedy="Correct the entry."
+                )
+        changes[name] = dataclasses.replace(known[name], **{k: float(v) for k, v in entry.items()})
+    return dataclasses.replace(priors, **changes, changed=tuple(changes))

@@ -1,0 +1,224 @@
+"""The posterior: the population sampled with all particles integrated out, the particles drawn back, and exact weights.
+
+1. Given the summaries (`_population`), nothing but the population is left to sample: seven to eleven numbers.
+2. Given a draw of the population, every particle's parameters are normal and independent: drawn directly.
+3. A summary is a quadratic; the true likelihood of a test is not. Their ratio at the drawn parameters is the draw's
+   importance weight, which makes the result exact whatever the summary's quality, and shows that quality (Pareto k).
+   Particles whose ratio scatters (a curve that snaps through, say) get several candidates per draw of the population, of
+   which one is kept in proportion to its ratio, and the mean ratio becomes the weight: the same exact posterior,
+   with less scatter.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from ...law import Unloading
+from ._data import Tests
+from ._fit import JointFit
+from ._forward import displacement
+from ._mode import PriorNumbers, from_free, log_posterior
+from ._noise import Whitening
+from ._nuts import Chains, sample
+from ._population import Population, Scatter, Summary, draw_latent, log_jacobian, marginal_likelihood
+
+
+class ParticleDraws(NamedTuple):
+    """Draws of the particles' parameters, one for each draw of the population.
+
+    Attributes:
+        latent: b1, b3, b5, e.
+        zero: zero of displacement [um].
+        log_likelihood: of every test given the population, the particle integrated out.
+        log_ratio: log of exact over quadratic likelihood; 0 where the exact one was not looked at.
+    """
+
+    latent: Float[Array, "draws particles 4"]
+    zero: Float[Array, "draws particles"]
+    log_likelihood: Float[Array, "draws particles"]
+    log_ratio: Float[Array, "draws particles"]
+
+
+@eqx.filter_jit
+def sample_population(
+    key: PRNGKeyArray,
+    mode: Float[Array, " d"],
+    covariance: Float[Array, "d d"],
+    numbers: PriorNumbers,
+    summary: Summary,
+    flatness: Float[Array, " particles"],
+    scatter: Scatter,
+    *,
+    chains: int,
+    warmup: int,
+    draws: int,
+) -> tuple[Chains, Population]:
+    """NUTS over the population, all particles integrated out; populations of all chains in one row."""
+
+    def log_density(free):
+        return log_posterior(free, numbers, summary, flatness, scatter)
+
+    factor = jnp.linalg.cholesky(covariance)
+    together = jax.default_backend() != "cpu"
+    run = sample(key, log_density, mode, factor, chains=chains, warmup=warmup, draws=draws, together=together)
+    return run, jax.vmap(lambda f: from_free(f, numbers, scatter)[0])(run.position.reshape(-1, mode.shape[0]))
+
+
+class Exact(eqx.Module):
+    """What the exact likelihood of a test needs."""
+
+    tests: Tests
+    filters: Whitening
+    summary: Summary
+    zero_sd: Float[Array, ""]
+    unloading: Unloading = eqx.field(static=True)
+
+
+def log_ratio(
+    exact: Exact, latent: Float[Array, "particles 4"], zero: Float[Array, " particles"], log_noise: Float[Array, ""]
+) -> Float[Array, " particles"]:
+    """Log of the exact over the quadratic likelihood of each test at the given parameters."""
+    share = jnp.exp(-2 * log_noise)
+    tests, summary = exact.tests, exact.summary
+
+    def squares(w, z, particle, force, measured, mask, filtered):
+        predicted = displacement(w, particle, force, exact.unloading)
+        return jnp.sum(filtered(jnp.where(mask, measured - predicted - z, 0.0)) ** 2)
+
+    total = jax.vmap(squares)(latent, zero, tests.particle, tests.force, tests.displacement, tests.mask, exact.filters)
+    at_zero = ((zero - tests.contact) / exact.zero_sd) ** 2
+    away = latent - summary.point
+    quadratic = (
+        summary.squares
+        + jnp.einsum("np,npq,nq->n", away, summary.precision, away)
+        - 2 * jnp.einsum("np,np->n", summary.score, away)
+        + ((zero - summary.zero - jnp.einsum("np,np->n", summary.zero_slope, away)) / summary.zero_sd) ** 2
+    )
+    ratio = -0.5 * (share * total + at_zero) + 0.5 * share * quadratic
+    return jnp.where(jnp.isfinite(ratio), ratio, -jnp.inf)
+
+
+@eqx.filter_jit
+def draw_particles(
+    key: PRNGKeyArray,
+    population: Population,
+    exact: Exact,
+    flatness: Float[Array, " particles"],
+    scatter: Scatter,
+    candidates: int = 1,
+) -> ParticleDraws:
+    """Draw the particles' parameters given each draw of the population, and compare with the exact likelihood.
+
+    Args:
+        key: random key.
+        population: draws, every field with a leading axis.
+        exact: the tests.
+        flatness: of the particles.
+        scatter: what scatters.
+        candidates: how many to draw and choose from; 0 draws one and does not look at the exact likelihood.
+    """
+    draws = population.a.shape[0]
+    count = flatness.shape[0]
+
+    def one(arguments):
+        key, at = arguments
+        deviate, zeros, pick = jax.random.split(key, 3)
+
+        def candidate(normal, normal_zero):
+            latent, zero, _ = draw_latent(at, exact.summary, flatness, scatter, normal, normal_zero)
+            ratio = log_ratio(exact, latent, zero, at.log_noise) if candidates else jnp.zeros(count)
+            return latent, zero, ratio
+
+        shape = (max(candidates, 1), count)
+        latent, zero, ratio = jax.vmap(candidate)(
+            jax.random.normal(deviate, (*shape, scatter.size)), jax.random.normal(zeros, shape)
+        )
+        likelihood = marginal_likelihood(at, exact.summary, flatness, scatter)
+        if candidates <= 1:
+            return ParticleDraws(latent[0], zero[0], likelihood, ratio[0])
+        chosen: Int[Array, " particles"] = jax.random.categorical(pick, jnp.maximum(ratio, -1e30), axis=0)
+        mean = jax.scipy.special.logsumexp(ratio, axis=0) - jnp.log(candidates)
+
+        def take(values):
+            return jnp.take_along_axis(values, chosen.reshape(1, count, *[1] * (values.ndim - 2)), axis=0)[0]
+
+        return ParticleDraws(take(latent), take(zero), likelihood, mean)
+
+    batch = max(1, min(draws, 40_000 // (count * max(candidates, 1))))
+    return jax.lax.map(one, (jax.random.split(key, draws), population), batch_size=batch)
+
+
+def exact_of(fit: JointFit, tests: Tests, zero_sd: Float[Array, ""], unloading: Unloading) -> Exact:
+    """The exact likelihood that belongs to a fit."""
+    return Exact(tests, fit.filters, fit.summary, zero_sd, unloading)
+
+
+@eqx.filter_jit
+def sample_joint(
+    key: PRNGKeyArray,
+    mode: Float[Array, " d"],
+    covariance: Float[Array, "d d"],
+    numbers: PriorNumbers,
+    exact: Exact,
+    flatness: Float[Array, " particles"],
+    scatter: Scatter,
+    *,
+    chains: int,
+    warmup: int,
+    draws: int,
+) -> tuple[
+    Chains,
+    Float[Array, "chains draws d"],
+    Float[Array, "chains draws n 4"],
+    Float[Array, "chains draws n"],
+    Float[Array, "chains draws n"],
+]:
+    r"""NUTS over population and all particles at once, under the exact likelihood: the plain joint model.
+
+    .. math:: p(\text{population}) \prod_i N(\xi_i; 0, 1)\, N(z_i; z_{i0}, s_z^2)\, p(y_i | w_i, z_i)
+
+    The sampler's coordinates of a particle are standard normal numbers that `draw_latent` maps to its deviations and
+    zero; the volume of that map is part of the density, which is therefore the plain one, whatever the summaries are.
+    """
+    d, count, k = mode.shape[0], flatness.shape[0], scatter.size
+
+    def place(position):
+        free, rest = position[:d], position[d:].reshape(count, k + 1)
+        population, prior = from_free(free, numbers, scatter)
+        latent, zero, deviations = draw_latent(population, exact.summary, flatness, scatter, rest[:, :k], rest[:, k])
+        return population, prior, latent, zero, deviations
+
+    def log_density(position):
+        population, prior, latent, zero, deviations = place(position)
+        share = jnp.exp(-2 * population.log_noise)
+        tests = exact.tests
+
+        def squares(w, z, particle, force, measured, mask, filtered):
+            predicted = displacement(w, particle, force, exact.unloading)
+            return jnp.sum(filtered(jnp.where(mask, measured - predicted - z, 0.0)) ** 2)
+
+        total = jax.vmap(squares)(
+            latent, zero, tests.particle, tests.force, tests.displacement, tests.mask, exact.filters
+        )
+        points = jnp.sum(tests.mask)
+        likelihood = -0.5 * share * jnp.sum(total) - points * population.log_noise
+        at_zero = -0.5 * jnp.sum(((zero - tests.contact) / exact.zero_sd) ** 2)
+        volume = log_jacobian(population, exact.summary, flatness, scatter)
+        return prior + likelihood + at_zero - 0.5 * jnp.sum(deviations**2) + volume
+
+    size = d + count * (k + 1)
+    factor = jnp.eye(size).at[:d, :d].set(jnp.linalg.cholesky(covariance))
+    centre = jnp.zeros(size).at[:d].set(mode)
+    run = sample(key, log_density, centre, factor, chains=chains, warmup=warmup, draws=draws)
+
+    def latents(position):
+        population, _, latent, zero, _ = place(position)
+        return latent, zero, marginal_likelihood(population, exact.summary, flatness, scatter)
+
+    particles = jax.lax.map(lambda chain: jax.vmap(latents)(chain), run.position)
+    return run, run.position[..., :d], *particles
