@@ -59,13 +59,14 @@ class Normal(eqx.Module):
         shared = -Cholesky(complement).solve(right)
         return Parameters(-forward - jnp.einsum("npq,q->np", inner, shared), shared)
 
-    def covariance(self) -> tuple[Float[Array, "particles P P"], Float[Array, "Q Q"]]:
-        """Blocks of the inverse: each particle's own, and that of the shared parameters."""
+    def covariance(
+        self,
+    ) -> tuple[Float[Array, "particles P P"], Float[Array, "particles P Q"], Float[Array, "Q Q"]]:
+        """Blocks of the inverse: each particle's own, between it and the shared parameters, and of the shared ones."""
         factor, inner, complement = self.schur()
-        if self.shared.shape[0] == 0:
-            return factor.inverse(), self.shared
         shared = Cholesky(_damped(complement, 0.0)).inverse()
-        return factor.inverse() + jnp.einsum("npq,qr,nor->npo", inner, shared, inner), shared
+        between = -jnp.einsum("npq,qr->npr", inner, shared)
+        return factor.inverse() - jnp.einsum("npq,noq->npo", between, inner), between, shared
 
 
 def _damped(A: Float[Array, "*batch p p"], damping: Any) -> Float[Array, "*batch p p"]:

@@ -19,7 +19,7 @@ from ...campaign import THRESHOLD_MPA, Campaign
 from .._predict import point_noise_um
 from .._result import estimate, finite
 from ._data import Selection, Tests, select_tests
-from ._fit import JointFit, Model, fit_joint, populations, prior_numbers
+from ._fit import JointFit, JointModel, fit_joint, populations, prior_numbers
 from ._noise import Whitening
 from ._population import Population, Summary
 from ._sampling import (
@@ -82,7 +82,7 @@ class BayesCalibration:
 
     campaign: Campaign
     selection: Selection
-    model: Model
+    model: JointModel
     fit: JointFit
     population: Population
     C: np.ndarray
@@ -283,7 +283,7 @@ def _argmax(values: dict[str, float]) -> str:
 def calibrate_bayes(
     campaign: Campaign,
     *,
-    model: Model | None = None,
+    model: JointModel | None = None,
     threshold_MPa: float = THRESHOLD_MPA,
     mode: Mode = "fast",
     chains: int = 4,
@@ -309,7 +309,7 @@ def calibrate_bayes(
     """
     started = time.perf_counter()
     tell = progress or (lambda _: None)
-    model = model or Model()
+    model = model or JointModel()
     tell("selecting points")
     selection = select_tests(campaign, threshold_MPa=threshold_MPa)
     tests = selection.tests
@@ -318,9 +318,11 @@ def calibrate_bayes(
     if mode == "fast":
         compiling = threading.Thread(target=_compile, args=(tests, model, chains, warmup, draws), daemon=True)
         compiling.start()
-    fit = fit_joint(tests, model, read_out, tell=tell)
-    if compiling is not None:
-        compiling.join()
+    try:
+        fit = fit_joint(tests, model, read_out, tell=tell)
+    finally:
+        if compiling is not None:
+            compiling.join()  # also on an error: a compiler must not outlive the interpreter
     key = jax.random.key(seed)
     tell("sampling the population" if mode == "fast" else "sampling everything")
     found = _fast if mode == "fast" else _joint
@@ -338,7 +340,7 @@ def calibrate_bayes(
     )
 
 
-def _compile(tests: Tests, model: Model, chains: int, warmup: int, draws: int) -> None:
+def _compile(tests: Tests, model: JointModel, chains: int, warmup: int, draws: int) -> None:
     """Compile what is needed last while the first steps run: the same functions, for arrays of the same shapes."""
     count, points = tests.force.shape
     d = 6 + model.scatter.size
@@ -368,7 +370,7 @@ def _stride(count: int, total: int) -> int:
 
 
 def _fast(
-    key: Array, tests: Tests, model: Model, fit: JointFit, chains: int, warmup: int, draws: int
+    key: Array, tests: Tests, model: JointModel, fit: JointFit, chains: int, warmup: int, draws: int
 ) -> dict[str, Any]:
     flat, scatter = tests.particle.flatness, model.scatter
     population_key, particle_key, check_key, pick_key = jax.random.split(key, 4)
@@ -437,7 +439,7 @@ def _fast(
 
 
 def _joint(
-    key: Array, tests: Tests, model: Model, fit: JointFit, chains: int, warmup: int, draws: int
+    key: Array, tests: Tests, model: JointModel, fit: JointFit, chains: int, warmup: int, draws: int
 ) -> dict[str, Any]:
     flat, scatter = tests.particle.flatness, model.scatter
     exact = exact_of(fit, tests, model.zero_sd, model.unloading)
@@ -472,7 +474,7 @@ def _joint(
 
 
 def _particles(
-    latent: np.ndarray, zero: np.ndarray, population: Population, flatness: np.ndarray, model: Model, chains: int
+    latent: np.ndarray, zero: np.ndarray, population: Population, flatness: np.ndarray, model: JointModel, chains: int
 ) -> dict[str, np.ndarray]:
     """C, modulus, zero and shape factor of the particles from their latent vectors."""
     count = len(flatness)

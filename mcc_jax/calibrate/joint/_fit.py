@@ -28,7 +28,7 @@ ALMOST = 0.98
 
 
 @dataclass(frozen=True)
-class Model:
+class JointModel:
     """What is assumed about a campaign.
 
     Attributes:
@@ -79,7 +79,7 @@ class JointFit(eqx.Module):
 
     individual: Individual
     noise: Noise
-    noise_log_sd: Float[Array, 4]
+    noise_log_sd: Float[Array, " 4"]
     filters: Whitening
     latent: Float[Array, "particles 4"]
     zero: Float[Array, " particles"]
@@ -88,7 +88,7 @@ class JointFit(eqx.Module):
     mode: Float[Array, " d"]
     covariance: Float[Array, "d d"]
     numbers: PriorNumbers
-    converged: Bool[Array, 3]
+    converged: Bool[Array, " 3"]
 
 
 def prior_numbers(priors: Priors, flatness: Float[Array, " particles"]) -> PriorNumbers:
@@ -115,10 +115,11 @@ def prior_numbers(priors: Priors, flatness: Float[Array, " particles"]) -> Prior
 
 def fit_joint(
     tests: Tests,
-    model: Model,
+    model: JointModel,
     read_out_um: float,
     *,
     correlated: bool = True,
+    rounds: int = ROUNDS,
     tell: Callable[[str], None] = lambda _: None,
 ) -> JointFit:
     """Fit particles, noise and population.
@@ -132,6 +133,7 @@ def fit_joint(
         read_out_um: noise of displacement from point to point, a first guess [um].
         correlated: estimate the whole noise; if False, white noise of the residuals' median modulus, which outliers do
             not move.
+        rounds: how often noise, population and particles take turns.
         tell: called with the name of each step.
     """
     scatter, zero_sd, priors = model.scatter, model.zero_sd, model.beliefs
@@ -145,16 +147,16 @@ def fit_joint(
     noise = Noise(*(jnp.asarray(v) for v in four), jnp.asarray(np.ones(len(tests))))
     log_sd, noise_converged = jnp.asarray(np.full(4, np.nan)), True
     free = _start(np.asarray(latent), np.asarray(flatness), model, numbers)
-    for turn in range(ROUNDS + 1):
+    for turn in range(rounds + 1):
         data = linear_data(latent, zero, tests, zero_sd, model.unloading)
         if not correlated:
             width = 1.4826 * np.median(np.abs(np.asarray(data.residual)[np.asarray(tests.mask)]))
             noise = Noise(*(jnp.asarray(v) for v in (max(width, 1e-9), 0.0, 0.0, 1.0)), jnp.ones(len(tests)))
-        elif turn < ROUNDS:
+        elif turn < rounds:
             tell("estimating the noise")
-            noise, log_sd, noise_converged = estimate_noise(data, priors.noise, noise)
+            noise, log_sd, noise_converged = estimate_noise(data, priors.noise, noise, uncertainty=turn == rounds - 1)
         summary, filtered = summarise(latent, zero, tests.contact, data, noise, zero_sd)
-        if correlated and turn < ROUNDS:
+        if correlated and turn < rounds:
             old = np.asarray(noise.scale)
             scale = particle_scales(old, np.asarray(summary.squares), np.asarray(summary.count) - 4)
             if np.any(scale != old):
@@ -162,7 +164,7 @@ def fit_joint(
                 summary, filtered = summarise(latent, zero, tests.contact, data, noise, zero_sd)
         tell("fitting the population")
         free, covariance, mode_converged = most_probable(free, numbers, summary, flatness, scatter)
-        if turn < ROUNDS:
+        if turn < rounds:
             latent, zero = expected_latent(free, numbers, summary, flatness, scatter)
     converged = np.asarray([bool(np.all(np.asarray(individual.converged))), noise_converged, mode_converged])
     return JointFit(
@@ -170,7 +172,7 @@ def fit_joint(
     )
 
 
-def _centre(priors: Priors) -> Float[Array, 4]:
+def _centre(priors: Priors) -> Float[Array, " 4"]:
     """Centre of b1, b3, b5, e for what a curve alone does not say: the prior's, at the paper's typical shape factor."""
     C1, C5 = np.log(priors.C1.median), np.log(priors.C5.median)
     C3 = (np.log(20 / 9) + C1 + 5 * C5 + np.log(priors.softening.median)) / 6
@@ -179,12 +181,18 @@ def _centre(priors: Priors) -> Float[Array, 4]:
 
 
 @eqx.filter_jit
+def population_at(free: Float[Array, " d"], numbers: PriorNumbers, scatter: Scatter) -> Population:
+    """The population at unbounded coordinates."""
+    return from_free(free, numbers, scatter)[0]
+
+
+@eqx.filter_jit
 def populations(free: Float[Array, "draws d"], numbers: PriorNumbers, scatter: Scatter) -> Population:
     """Populations of many unbounded coordinates, every field with a leading axis."""
     return jax.vmap(lambda f: from_free(f, numbers, scatter)[0])(free)
 
 
-def _start(latent: np.ndarray, flatness: np.ndarray, model: Model, numbers: PriorNumbers) -> Float[Array, " d"]:
+def _start(latent: np.ndarray, flatness: np.ndarray, model: JointModel, numbers: PriorNumbers) -> Float[Array, " d"]:
     """Where to look for the population: the prior's a, and the particles' own median and scatter under it."""
     priors = model.beliefs
     low, high = np.asarray(numbers.a)[2:]

@@ -44,7 +44,7 @@ class Individual(eqx.Module):
     converged: Bool[Array, " particles"]
 
 
-def _polynomial(x: Path, stress: Path, weight: Path) -> Float[Array, 3]:
+def _polynomial(x: Path, stress: Path, weight: Path) -> Float[Array, " 3"]:
     """K1, K3, K5 by linear least squares."""
     design = jnp.stack([x, -(x**3), x**5], 1) * weight[:, None]
     scale = jnp.sqrt(jnp.sum(design**2, axis=0)) + 1e-30
@@ -55,7 +55,7 @@ def _polynomial(x: Path, stress: Path, weight: Path) -> Float[Array, 3]:
 
 def linear_start(
     particle: Particle, force: Path, measured: Path, loading: Bool[Array, " steps"], contact: Scalar
-) -> tuple[Float[Array, 3], Scalar]:
+) -> tuple[Float[Array, " 3"], Scalar]:
     """Coefficients (as b) and zero of one particle from its loading, without iteration.
 
     Stress is linear in the three coefficients at a given zero, so zeros are tried on a grid; deviations of stress are
@@ -92,7 +92,7 @@ def linear_start(
 
 @eqx.filter_jit
 def fit_individuals(
-    tests: Tests, noise: Scalar, centre: Float[Array, 4], zero_sd: Scalar, unloading: Unloading
+    tests: Tests, noise: Scalar, centre: Float[Array, " 4"], zero_sd: Scalar, unloading: Unloading
 ) -> Individual:
     """Fit every particle on its own, its modulus included, from several starts.
 

@@ -24,16 +24,16 @@ class PriorNumbers(eqx.Module):
         log_noise: standard deviation.
     """
 
-    a: Float[Array, 4]
-    log_modulus: Float[Array, 2]
-    mu_1: Float[Array, 2]
-    mu_5: Float[Array, 2]
-    softening: Float[Array, 2]
-    spread: Float[Array, 5]
-    log_noise: Float[Array, 2]
+    a: Float[Array, " 4"]
+    log_modulus: Float[Array, " 2"]
+    mu_1: Float[Array, " 2"]
+    mu_5: Float[Array, " 2"]
+    softening: Float[Array, " 2"]
+    spread: Float[Array, " 5"]
+    log_noise: Float[Array, " 2"]
 
 
-def given_mu_3(mu_1: Scalar, mu_5: Scalar, softening: Float[Array, 2]) -> tuple[Scalar, Scalar]:
+def given_mu_3(mu_1: Scalar, mu_5: Scalar, softening: Float[Array, " 2"]) -> tuple[Scalar, Scalar]:
     r"""Mean and standard deviation of :math:`\mu_3` given the other two, by the prior of the softening.
 
     .. math:: 6 \mu_3 = \log\tfrac{20}{9} + \mu_1 + 5\mu_5 + \log(\text{softening})

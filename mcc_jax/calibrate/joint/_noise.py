@@ -38,12 +38,12 @@ class Noise(eqx.Module):
     scale: Float[Array, " particles"]
 
     @property
-    def logs(self) -> Float[Array, 4]:
+    def logs(self) -> Float[Array, " 4"]:
         """Logarithms of the four numbers."""
         return jnp.log(jnp.stack([self.displacement, self.force, self.correlated, self.length]))
 
     @classmethod
-    def from_logs(cls, logs: Float[Array, 4], scale: Float[Array, " particles"]) -> Noise:
+    def from_logs(cls, logs: Float[Array, " 4"], scale: Float[Array, " particles"]) -> Noise:
         """From the logarithms of the four numbers."""
         displacement, force, correlated, length = jnp.exp(logs)
         return cls(displacement, force, correlated, length, scale)
@@ -146,10 +146,10 @@ def restricted_likelihood(noise: Noise, data: Linear) -> Float[Array, " particle
 class NoisePrior(eqx.Module):
     """Log-normal priors of the four numbers of the noise: medians and standard deviations of the logarithm."""
 
-    median: Float[Array, 4]
-    log_sd: Float[Array, 4]
+    median: Float[Array, " 4"]
+    log_sd: Float[Array, " 4"]
 
-    def log_density(self, logs: Float[Array, 4]) -> Scalar:
+    def log_density(self, logs: Float[Array, " 4"]) -> Scalar:
         """Log density of the logarithms, up to a constant."""
         return -0.5 * jnp.sum(((logs - jnp.log(self.median)) / self.log_sd) ** 2)
 
@@ -167,14 +167,22 @@ STEP = 1e-3
 """Step of the differences in the logarithms; the loss is smooth on the scale of 1 and exact to 1e-12 of its size."""
 
 
-def estimate_noise(data: Linear, prior: NoisePrior, start: Noise) -> tuple[Noise, Float[Array, 4], bool]:
+def estimate_noise(
+    data: Linear, prior: NoisePrior, start: Noise, *, uncertainty: bool = True
+) -> tuple[Noise, Float[Array, " 4"], bool]:
     """Noise by restricted maximum likelihood with its prior.
 
     The particles' scales stay as they are (`particle_scales`). Derivatives with respect to four numbers are cheaper as
     differences, all of them in one batch, than to compile.
 
+    Args:
+        data: linear residuals.
+        prior: prior of the four numbers.
+        start: where to begin, and the particles' scales.
+        uncertainty: whether to work out standard deviations.
+
     Returns:
-        The noise, standard deviations of the logarithms of its four numbers, and whether the optimiser converged.
+        The noise, standard deviations of the logarithms of its four numbers (or NaN), and whether the optimiser converged.
     """
     from scipy.optimize import minimize
 
@@ -187,7 +195,11 @@ def estimate_noise(data: Linear, prior: NoisePrior, start: Noise) -> tuple[Noise
     # Further than this from the prior nothing is distinguishable from zero, or from any data.
     bounds = [(m - 6 * s, m + 6 * s) for m, s in zip(np.log(prior.median), np.asarray(prior.log_sd), strict=True)]
     inside = np.clip(np.asarray(start.logs), *np.transpose(bounds))
-    found = minimize(value_and_gradient, inside, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-10})
+    found = minimize(value_and_gradient, inside, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-9})
+    four = (jnp.asarray(v) for v in np.exp(found.x))
+    noise = Noise(*four, start.scale)
+    if not uncertainty:
+        return noise, jnp.asarray(np.full(4, np.nan)), bool(found.success)
     width = 0.02
     columns = [
         (value_and_gradient(found.x + width * e)[1] - value_and_gradient(found.x - width * e)[1]) / (2 * width)
@@ -195,8 +207,7 @@ def estimate_noise(data: Linear, prior: NoisePrior, start: Noise) -> tuple[Noise
     ]
     values, vectors = np.linalg.eigh((np.array(columns) + np.array(columns).T) / 2)
     sd = np.sqrt(np.sum(vectors**2 / np.maximum(values, 1e-6), axis=1))
-    four = (jnp.asarray(v) for v in np.exp(found.x))
-    return Noise(*four, start.scale), jnp.asarray(sd), bool(found.success)
+    return noise, jnp.asarray(sd), bool(found.success)
 
 
 def particle_scales(scale: np.ndarray, squares: np.ndarray, freedom: np.ndarray) -> np.ndarray:

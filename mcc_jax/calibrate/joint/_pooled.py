@@ -52,7 +52,7 @@ class Pooled(eqx.Module):
     """
 
     whitening: Whitening
-    tau: Float[Array, 3]
+    tau: Float[Array, " 3"]
     modulus_scatter: Scalar
     shape_scatter: Scalar
     zero_sd: Scalar
@@ -102,7 +102,7 @@ def pooled_residual(settings: Pooled, tests: Tests) -> Callable[[Parameters], tu
 
 @eqx.filter_jit
 def fit_pooled(
-    tests: Tests, settings: Pooled, start: Parameters, *, max_steps: int = 60, tolerance: float = 1e-7
+    tests: Tests, settings: Pooled, start: Parameters, *, max_steps: int = 300, tolerance: float = 1e-7
 ) -> Solution:
     """Minimise the pooled residuals."""
     return minimise(pooled_residual(settings, tests), start, max_steps=max_steps, tolerance=tolerance)

@@ -35,8 +35,8 @@ class Population(eqx.Module):
 
     a: Scalar
     log_modulus: Scalar
-    mu: Float[Array, 3]
-    tau: Float[Array, 3]
+    mu: Float[Array, " 3"]
+    tau: Float[Array, " 3"]
     modulus_scatter: Scalar
     shape_scatter: Scalar
     log_noise: Scalar

@@ -1,0 +1,328 @@
+"""Joint least squares: everything at once, by gradients, with covariance and what the data leave open."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ...campaign import THRESHOLD_MPA, Campaign
+from .._predict import point_noise_um
+from .._result import estimate, finite
+from ._arrow import Parameters, Solution
+from ._bayes import COEFFICIENTS, log_estimate
+from ._data import Selection, select_tests
+from ._fit import JointFit, JointModel, fit_joint, population_at
+from ._pooled import Pooled, fit_pooled, unpack
+
+Loss = Literal["linear", "soft_l1", "cauchy"]
+SHARED = ("a", "log effective modulus", "mu_C1", "mu_C3", "mu_C5")
+STARTS = (0.0, 2.5)
+"""Values of a to start from besides the population's mode."""
+
+OPEN = 1e-3
+"""A combination of shared parameters counts as open if its curvature, each parameter scaled to its own, is smaller."""
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """What the data say of combinations of the shared parameters.
+
+    Attributes:
+        singular_values: of the curvature, every parameter on the scale of its own curvature, largest first; all would be
+            1 if the parameters did not interact, and 0 marks a combination that the data leave open.
+        directions: the combinations, one row each, in the order of `SHARED`.
+    """
+
+    singular_values: np.ndarray
+    directions: np.ndarray
+
+    @property
+    def open(self) -> list[str]:
+        """Combinations that the data leave open, in words."""
+        found = []
+        for value, row in zip(self.singular_values, self.directions, strict=True):
+            if value < OPEN:
+                terms = [f"{w:+.2f} {n}" for w, n in zip(row, SHARED, strict=True) if abs(w) > 0.1]
+                found.append(" ".join(terms))
+        return found
+
+
+@dataclass(frozen=True)
+class LeastSquaresCalibration:
+    """The joint least-squares fit of a campaign.
+
+    Attributes:
+        campaign: the tests.
+        selection: which particles and points took part.
+        model: what was assumed.
+        loss: the loss of the residuals.
+        fit: noise and spread that set the weights.
+        settings: the pooled problem.
+        solution: its solution.
+        identifiability: what the data leave open.
+        agreeing_starts: how many starts ended at the same optimum, of how many.
+        seed, runtime_s: for the record; nothing here is random.
+    """
+
+    campaign: Campaign
+    selection: Selection
+    model: JointModel
+    loss: Loss
+    fit: JointFit
+    settings: Pooled
+    solution: Solution
+    identifiability: Identifiability
+    agreeing_starts: tuple[int, int]
+    seed: int
+    runtime_s: float
+
+    @property
+    def particles(self) -> tuple[str, ...]:
+        """Names of the particles that took part."""
+        return tuple(self.campaign.particles[i] for i in self.selection.kept)
+
+    @property
+    def reason(self) -> str:
+        """Why the fit must not be called converged; empty if it is."""
+        if not bool(self.solution.converged):
+            return f"the optimiser did not meet its tolerances within {int(self.solution.steps)} steps"
+        for name, fine in zip(("the noise", "the spread of the particles"), self.fit.converged[1:], strict=True):
+            if not fine:
+                return f"the optimiser for {name} did not meet its tolerances"
+        return ""
+
+    @property
+    def converged(self) -> bool:
+        """Whether every optimiser met its tolerances."""
+        return not self.reason
+
+    def warnings(self) -> list[str]:
+        """What a reader of the numbers must know, one sentence each."""
+        notes = [self.reason] if self.reason else []
+        notes += [f"the data leave this combination open: {text}" for text in self.identifiability.open]
+        agree, count = self.agreeing_starts
+        if agree < count:
+            notes.append(f"{count - agree} of {count} starts ended at a worse optimum")
+        notes += self.selection.notes
+        dropped = sum(reason is not None for reason in self.selection.why_not)
+        if dropped:
+            notes.append(f"{dropped} of {len(self.campaign)} particles could not be used")
+        if np.any(np.asarray(self.settings.tau) < 1e-3):
+            small = [n for n, t in zip(COEFFICIENTS, np.asarray(self.settings.tau), strict=True) if t < 1e-3]
+            notes.append(f"the spread of {', '.join(small)} cannot be told from zero")
+        return notes
+
+    def to_json(self) -> dict[str, Any]:
+        """The contents of `calibration.json`."""
+        tests = self.selection.tests
+        latent, zero = (np.asarray(v) for v in unpack(self.solution.value, self.settings, tests))
+        own, between, shared = (np.asarray(v) for v in self.solution.normal.covariance())
+        values = np.asarray(self.solution.value.shared)
+        free = bool(self.identifiability.open)
+        sds = np.sqrt(np.diagonal(shared))
+        known = [not (free and self._open_share(q) > 0.1) for q in range(5)]
+        a = float(values[0])
+        flat = np.asarray(tests.particle.flatness)
+        eta = 1 + a * flat
+        slope = flat / eta
+        mask = np.asarray(tests.mask)
+        count = np.maximum(mask.sum(1), 1)
+        rms = np.sqrt((np.asarray(self.residual()) ** 2).sum(1) / count)
+        position = {i: row for row, i in enumerate(self.selection.kept)}
+        entries = []
+        for i, name in enumerate(self.campaign.particles):
+            row = position.get(i)
+            found: dict[str, Any] = dict.fromkeys(("eta_p", *COEFFICIENTS, "zero_um"), estimate(None))
+            if row is not None:
+                spread = abs(flat[row]) * sds[0]
+                found["eta_p"] = _normal(float(eta[row]), float(spread)) if known[0] else estimate(float(eta[row]))
+                for j, coefficient in enumerate(COEFFICIENTS):
+                    variance = own[row, j, j] - 2 * slope[row] * between[row, j, 0] + slope[row] ** 2 * shared[0, 0]
+                    log = float(latent[row, j] - np.log(eta[row]))
+                    found[coefficient] = log_estimate(log, float(np.sqrt(max(variance, 0.0))) if known[0] else np.nan)
+                found["zero_um"] = _normal(float(zero[row]), float(np.sqrt(own[row, 3, 3])))
+            entries.append(
+                {
+                    "particle": name,
+                    **found,
+                    "rms_um": finite(float(rms[row])) if row is not None else None,
+                    "noise_scale": finite(float(self.fit.noise.scale[row])) if row is not None else None,
+                    "kept": row is not None,
+                    "why_not": self.selection.why_not[i],
+                }
+            )
+        spread_sd = np.sqrt(np.diagonal(np.asarray(self.fit.covariance)))[6:9]
+        tau = np.asarray(self.settings.tau)
+        logs, log_sds = np.asarray(self.fit.noise.logs), np.asarray(self.fit.noise_log_sd)
+        numbers = ("displacement_um", "force_mN", "correlated_um", "correlation_length")
+        steps = int(self.solution.steps)
+        return {
+            "schema": 1,
+            "method": "least-squares",
+            "converged": self.converged,
+            "reason": self.reason or f"the tolerances were met after {steps} steps",
+            "runtime_s": self.runtime_s,
+            "seed": self.seed,
+            "law": {"unloading": self.model.unloading.value, "strain_scaling": self.model.strain_scaling.value},
+            "loss": self.loss,
+            "a": _normal(a, float(sds[0])) if known[0] else estimate(a),
+            "effective_modulus_MPa": log_estimate(float(values[1]), float(sds[1]) if known[1] else np.nan),
+            **{
+                f"log_{name}": {
+                    "mean": _normal(float(values[2 + j]), float(sds[2 + j]))
+                    if known[2 + j]
+                    else estimate(values[2 + j]),
+                    "sd": _spread(float(tau[j]), float(spread_sd[j])),
+                }
+                for j, name in enumerate(COEFFICIENTS)
+            },
+            "yield_stress_MPa": estimate(float(np.exp(values[2] + tau[0] ** 2 / 2) / 17.16)),
+            "noise": {
+                name: log_estimate(m, s) if np.isfinite(m) else estimate(0.0)
+                for name, m, s in zip(numbers, logs, log_sds, strict=True)
+            },
+            "priors": self.model.beliefs.to_json(),
+            "particles": entries,
+            "warnings": self.warnings(),
+            "diagnostics": {
+                "rhat_max": None,
+                "ess_bulk_min": None,
+                "divergences": None,
+                "pareto_k_max": None,
+                "steps": steps,
+                "loss": finite(float(self.solution.loss)),
+                "chi2_per_dof": finite(self._chi2()),
+                "singular_values": [float(v) for v in self.identifiability.singular_values],
+                "open_combinations": self.identifiability.open,
+                "agreeing_starts": list(self.agreeing_starts),
+            },
+        }
+
+    def residual(self) -> np.ndarray:
+        """Measured less predicted displacement [um], shape (N, points), 0 where masked."""
+        from ._forward import raw_residual
+
+        latent, zero = unpack(self.solution.value, self.settings, self.selection.tests)
+        return np.asarray(
+            jax.jit(raw_residual, static_argnums=3)(latent, zero, self.selection.tests, self.model.unloading)
+        )
+
+    def _chi2(self) -> float:
+        used = int(np.asarray(self.selection.tests.mask).sum())
+        freedom = max(used - 4 * len(self.selection.kept) - 5, 1)
+        return float(np.sum(np.asarray(self.solution.residual[0]) ** 2) / freedom)
+
+    def _open_share(self, parameter: int) -> float:
+        rows = self.identifiability.directions[self.identifiability.singular_values < OPEN]
+        return float(np.sum(rows[:, parameter] ** 2)) if len(rows) else 0.0
+
+
+def _normal(value: float, sd: float) -> dict[str, Any]:
+    return estimate(value, sd, (value - 1.96 * sd, value + 1.96 * sd))
+
+
+def _spread(value: float, sd: float) -> dict[str, Any]:
+    return estimate(value, sd, (max(value - 1.96 * sd, 0.0), value + 1.96 * sd))
+
+
+def identifiability(solution: Solution) -> Identifiability:
+    """Singular values and directions of the shared parameters' curvature, all particles' own parameters eliminated."""
+    complement = np.asarray(solution.normal.schur()[2])
+    raw = np.diagonal(np.asarray(solution.normal.shared))
+    scale = 1 / np.sqrt(np.where(raw > 0, raw, 1.0))
+    scaled = complement * scale * scale[:, None]
+    # On the scale of what is left of each parameter's curvature when the particles are eliminated.
+    left = np.sqrt(np.maximum(np.diagonal(scaled), 1e-300))
+    values, vectors = np.linalg.eigh(scaled / left / left[:, None])
+    order = np.argsort(values)[::-1]
+    return Identifiability(np.maximum(values[order], 0.0), vectors.T[order])
+
+
+def calibrate_least_squares(
+    campaign: Campaign,
+    *,
+    model: JointModel | None = None,
+    threshold_MPa: float = THRESHOLD_MPA,
+    loss: Loss = "linear",
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> LeastSquaresCalibration:
+    r"""Least squares for a, modulus, and every particle's C1, C3, C5 and zero at once.
+
+    .. math:: \min \sum_i \left\| L^{-1} (d_i - z_i - \gamma_i) \right\|^2
+        + \sum_{ij} \left(\frac{\log C_{ij} - \mu_j}{\tau_j}\right)^2 + \sum_i \left(\frac{z_i - z_{i0}}{s_z}\right)^2
+
+    The first term alone does not contain `a` (see `joint._forward`): the second one does, which says that particles of
+    different shapes are of one material. The noise in L and the spreads tau are estimated first, by restricted maximum
+    likelihood and as the mode of their posterior.
+
+    Args:
+        campaign: the tests.
+        model: form of unloading, what scatters, and priors for what the data leave open.
+        threshold_MPa: points below this stress on loading do not count [MPa].
+        loss: "linear", or a robust one of the whitened residuals, "soft_l1" or "cauchy".
+        seed: kept for the record.
+        progress: called with the name of each step.
+
+    Raises:
+        InputError: if no particle can be used.
+    """
+    started = time.perf_counter()
+    tell = progress or (lambda _: None)
+    model = model or JointModel()
+    tell("selecting points")
+    selection = select_tests(campaign, threshold_MPa=threshold_MPa)
+    tests = selection.tests
+    read_out = float(np.median([point_noise_um(campaign.curves[i]) for i in selection.kept]))
+    fit = fit_joint(tests, model, read_out, correlated=loss == "linear", rounds=1, tell=tell)
+    population = population_at(fit.mode, fit.numbers, model.scatter)
+    settings = Pooled(
+        fit.filters,
+        population.tau,
+        population.modulus_scatter,
+        population.shape_scatter,
+        model.zero_sd,
+        model.unloading,
+        model.scatter,
+        loss,
+    )
+    tell("fitting all particles together")
+    best = solve(
+        fit, settings, selection, float(population.a), np.asarray(population.mu), float(population.log_modulus)
+    )
+    low, high = np.asarray(fit.numbers.a)[2:]
+    agree = 1
+    others = [replaced for replaced in STARTS if 0.9 * low < replaced < 0.9 * high]
+    for a in others:
+        found = solve(fit, settings, selection, a, np.asarray(population.mu), float(population.log_modulus))
+        agree += bool(abs(float(found.loss) - float(best.loss)) <= 1e-5 * float(best.loss) + 1e-6)
+        if float(found.loss) < float(best.loss) * (1 - 1e-9):
+            best = found
+    return LeastSquaresCalibration(
+        campaign,
+        selection,
+        model,
+        loss,
+        fit,
+        settings,
+        best,
+        identifiability(best),
+        (agree, 1 + len(others)),
+        seed,
+        time.perf_counter() - started,
+    )
+
+
+def solve(
+    fit: JointFit, settings: Pooled, selection: Selection, a: float, mu: np.ndarray, log_modulus: float
+) -> Solution:
+    """The pooled least squares from the fitted particles and the given shared parameters."""
+    local = [fit.latent[:, :3], fit.zero[:, None]] + ([fit.latent[:, 3:]] if settings.scatter.modulus else [])
+    shared = jnp.asarray(np.concatenate([[a, log_modulus], mu]))
+    return fit_pooled(selection.tests, settings, Parameters(jnp.concatenate(local, 1), shared))
