@@ -3,45 +3,94 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from ._output import json_text, results
 from ._session import say, say_table, session
 from ._types import Location, Number, law_options, out_option, seed_option
 
+METHODS = ("paper", "least-squares", "bayes")
+# Which methods an option belongs to; given with another one it would be ignored, so it is refused.
+BELONGS = {
+    "objective": ("paper",),
+    "reference": ("paper",),
+    "loss": ("least-squares",),
+    "mode": ("bayes",),
+    "chains": ("bayes",),
+    "draws": ("bayes",),
+    "priors": ("least-squares", "bayes"),
+    "modulus_scatter": ("least-squares", "bayes"),
+    "shape_scatter": ("least-squares", "bayes"),
+}
+
 
 @click.command(short_help="Fit the law to a campaign.")
 @click.argument("campaign", type=Location(), metavar="CAMPAIGN")
 @out_option(required=True)
-@click.option("--method", type=click.Choice(["paper"]), default="paper", show_default=True, help="How to calibrate.")
+@click.option("--method", type=click.Choice(METHODS), default="bayes", show_default=True, help="How to calibrate.")
 @click.option(
     "--threshold-MPa",
     "threshold_MPa",
     type=Number(0, metavar="MPa"),
     default=0.2,
     show_default=True,
-    help="Stress of the offset step, below which only surface asperities deform; 0 leaves the step out.",
+    help="Stress below which only surface asperities deform. paper: of the offset step, which 0 leaves out; "
+    "otherwise: points below it do not count.",
+)
+@click.option("--priors", type=Location(), metavar="FILE", help="TOML file of priors.  [least-squares, bayes]")
+@click.option(
+    "--modulus-scatter", is_flag=True, help="Let every particle have its own modulus.  [least-squares, bayes]"
+)
+@click.option("--shape-scatter", is_flag=True, help="Let a differ from particle to particle.  [least-squares, bayes]")
+@click.option(
+    "--mode",
+    type=click.Choice(["fast", "joint"]),
+    default="fast",
+    show_default=True,
+    help="Integrate the particles out, or sample everything at once (minutes).  [bayes]",
+)
+@click.option("--chains", type=click.IntRange(1, 64), default=4, show_default=True, help="Chains.  [bayes]")
+@click.option(
+    "--draws", type=click.IntRange(20, 100_000), default=1000, show_default=True, help="Draws per chain.  [bayes]"
+)
+@click.option(
+    "--loss",
+    type=click.Choice(["linear", "soft_l1", "cauchy"]),
+    default="linear",
+    show_default=True,
+    help="Loss of the residuals; all but linear bear outliers.  [least-squares]",
 )
 @click.option(
     "--objective",
     type=click.Choice(["full", "reference"]),
     default="full",
     show_default=True,
-    help="Which objective's a the rest is built on; both are reported.",
+    help="Which objective's a the rest is built on; both are reported.  [paper]",
 )
 @click.option(
-    "--reference", metavar="NAME", help="Reference particle of that objective.  [default: by the paper's rule]"
+    "--reference", metavar="NAME", help="Reference particle of that objective; by the paper's rule if absent.  [paper]"
 )
 @law_options
-@click.option("--no-figures", is_flag=True, help="Write calibration.json only.")
+@click.option("--no-figures", is_flag=True, help="Draw no figures.")
 @seed_option()
 @click.option("--json", "as_json", is_flag=True, help="Print calibration.json instead of a summary.")
+@click.pass_context
 def calibrate(
+    context: click.Context,
     campaign: Path,
     out: Path,
     method: str,
     threshold_MPa: float,
+    priors: Path | None,
+    modulus_scatter: bool,
+    shape_scatter: bool,
+    mode: str,
+    chains: int,
+    draws: int,
+    loss: str,
     objective: str,
     reference: str | None,
     unloading: str,
@@ -52,41 +101,64 @@ def calibrate(
 ) -> None:
     """Fit the law to the tests in the folder CAMPAIGN.
 
-    Writes calibration.json and figures/ into DIR, which may be the campaign's own folder. The paper's method gives
-    values without uncertainties; nothing in it is random, so the seed is only recorded.
+    Writes calibration.json and figures/ into DIR, which may be the campaign's own folder; with bayes also posterior.nc,
+    the posterior as ArviZ data.
 
     \b
-    Example:
-      mcc-jax calibrate my-tests --out my-fit --threshold-MPa 0.1
+    Methods:
+      bayes          everything at once, with honest uncertainty (the default)
+      least-squares  everything at once, the best fit and its covariance
+      paper          the paper's own steps one after the other, values only
+
+    \b
+    Examples:
+      mcc-jax calibrate my-tests --out my-fit
+      mcc-jax calibrate my-tests --out my-fit --priors priors.toml --draws 4000
+      mcc-jax calibrate my-tests --out my-fit --method paper --threshold-MPa 0.1
     """
-    with session(8) as tell:
-        from ..calibrate import calibrate_paper
+    for name, methods in BELONGS.items():
+        given = context.get_parameter_source(name) not in (ParameterSource.DEFAULT, None)
+        if given and method not in methods:
+            option = "--" + name.replace("_", "-")
+            raise click.UsageError(f"{option} belongs to --method {' or '.join(methods)}, not to {method}.")
+    with session(12) as tell:
         from ..campaign import read_campaign
-        from ..law import StrainScaling, Unloading
         from ._calibration import main_numbers, require_particle, say_files, say_state, say_warnings, write_calibration
 
         tell("reading the campaign")
         data = read_campaign(campaign)
         require_particle(reference, data.particles, data.source)
+        settings: dict[str, Any] = {"threshold_MPa": threshold_MPa, "seed": seed, "progress": tell}
         with results(out) as stage:
-            calibration = calibrate_paper(
-                data,
-                threshold_MPa=threshold_MPa,
-                objective="reference" if objective == "reference" else "full",
-                reference=reference,
-                unloading=Unloading(unloading),
-                strain_scaling=StrainScaling(strain_scaling),
-                seed=seed,
-                progress=tell,
-            )
+            if method == "paper":
+                from ..calibrate import calibrate_paper
+                from ..law import StrainScaling, Unloading
+
+                calibration = calibrate_paper(
+                    data,
+                    objective="reference" if objective == "reference" else "full",
+                    reference=reference,
+                    unloading=Unloading(unloading),
+                    strain_scaling=StrainScaling(strain_scaling),
+                    **settings,
+                )
+            else:
+                from ..calibrate import calibrate_bayes, calibrate_least_squares
+                from ._calibration import joint_model
+
+                model = joint_model(unloading, strain_scaling, modulus_scatter, shape_scatter, priors)
+                if method == "bayes":
+                    calibration = calibrate_bayes(data, model=model, mode=mode, chains=chains, draws=draws, **settings)  # pyright: ignore[reportArgumentType]  # click has checked the words
+                else:
+                    calibration = calibrate_least_squares(data, model=model, loss=loss, **settings)  # pyright: ignore[reportArgumentType]
             content = write_calibration(calibration, stage, figures=not no_figures, tell=tell)
     if as_json:
         click.echo(json_text(content).encode(), nl=False)  # JSON is UTF-8, whatever the terminal speaks
         return
     say_state(content)
     say_table(("quantity", "value"), main_numbers(content))
-    misfit = content["diagnostics"]["relative_misfit"]
+    misfit = content["diagnostics"].get("relative_misfit")
     if misfit is not None:
         say(f"The mean law misses the displacements by {100 * misfit:.1f} % of their range (median over particles).")
     say_warnings(content)
-    say_files(out, [*content["figures"], "calibration.json"])
+    say_files(out, [*content["figures"], *content["files"], "calibration.json"])

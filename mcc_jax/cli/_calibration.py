@@ -9,16 +9,17 @@ from pathlib import Path
 from typing import Any
 
 from .._errors import InputError
-from ..calibrate import PaperCalibration
+from ..calibrate import BayesCalibration, JointModel, LeastSquaresCalibration, PaperCalibration
 from ._output import Stage, json_text
 from ._session import Tell, say
 
-RESULT, FIGURES = "calibration.json", "figures"
+RESULT, FIGURES, POSTERIOR = "calibration.json", "figures", "posterior.nc"
+Calibration = PaperCalibration | LeastSquaresCalibration | BayesCalibration
 _FIGURE = re.compile(rf"{FIGURES}/[A-Za-z0-9_-]+\.png")
 
 
-def write_calibration(calibration: PaperCalibration, stage: Stage, *, figures: bool, tell: Tell) -> dict[str, Any]:
-    """Write `calibration.json` and the figures into the stage.
+def write_calibration(calibration: Calibration, stage: Stage, *, figures: bool, tell: Tell) -> dict[str, Any]:
+    """Write `calibration.json`, the figures and, if there is one, the posterior into the stage.
 
     Figures that an earlier calibration lists as its own, and this one does not draw, become stale.
 
@@ -34,15 +35,56 @@ def write_calibration(calibration: PaperCalibration, stage: Stage, *, figures: b
     names: list[str] = []
     tell("drawing the figures" if figures else "writing")
     if figures:
-        from ..plots import paper_figures, save_figures
-
         (stage.folder / FIGURES).mkdir()
-        saved = save_figures(paper_figures(calibration), stage.folder / FIGURES)
+        saved = _save(calibration, stage.folder / FIGURES)
         names = sorted(f"{FIGURES}/{path.name}" for path in saved)
     stage.stale += [name for name in _listed(stage.directory / RESULT) if name not in names]
-    content = calibration.to_json() | {"figures": names}
+    files = []
+    if isinstance(calibration, BayesCalibration):
+        from ..calibrate import write_posterior
+
+        tell("writing the posterior")
+        write_posterior(calibration, stage.folder / POSTERIOR)
+        files = [POSTERIOR]
+    elif _is_ours(stage.directory / RESULT):
+        stage.stale.append(POSTERIOR)  # of an earlier run: it would contradict what lies beside it now
+    content = calibration.to_json() | {"figures": names, "files": files}
     (stage.folder / RESULT).write_text(json_text(content), encoding="utf-8")
     return content
+
+
+def _save(calibration: Calibration, folder: Path) -> list[Path]:
+    from ..plots import least_squares_figures, paper_figures, posterior_figures, save_figures
+
+    if isinstance(calibration, BayesCalibration):
+        return save_figures(posterior_figures(calibration), folder)
+    if isinstance(calibration, LeastSquaresCalibration):
+        return save_figures(least_squares_figures(calibration), folder)
+    return save_figures(paper_figures(calibration), folder)
+
+
+def joint_model(
+    unloading: str, strain_scaling: str, modulus_scatter: bool, shape_scatter: bool, priors: Path | None
+) -> JointModel:
+    """The model that the options describe.
+
+    Raises:
+        InputError: for a file of priors that cannot be used.
+    """
+    from ..calibrate import read_priors
+    from ..law import StrainScaling, Unloading
+
+    form = Unloading(unloading)
+    beliefs = None if priors is None else read_priors(priors, form)
+    return JointModel(form, StrainScaling(strain_scaling), modulus_scatter, shape_scatter, beliefs)
+
+
+def _is_ours(file: Path) -> bool:
+    """Whether an earlier result says that it wrote a posterior beside it."""
+    try:
+        return POSTERIOR in json.loads(file.read_text(encoding="utf-8"))["files"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return False
 
 
 def _listed(file: Path) -> list[str]:
@@ -57,16 +99,34 @@ def _listed(file: Path) -> list[str]:
 
 def main_numbers(content: dict[str, Any]) -> list[tuple[str, str]]:
     """Name and value of what matters most in a `calibration.json`."""
-    modulus = content["effective_modulus_MPa"]["value"]
+    modulus = content["effective_modulus_MPa"]
     rows = [
-        ("shape parameter a", _number(content["a"]["value"])),
-        ("effective modulus", "unknown (no unloading)" if modulus is None else f"{_number(modulus / 1e3)} GPa"),
+        ("shape parameter a", _estimate(content["a"])),
+        (
+            "effective modulus",
+            "unknown (no unloading)" if modulus["value"] is None else f"{_estimate(modulus, 1e-3)} GPa",
+        ),
     ]
     for name in ("C1", "C3", "C5"):
-        rows.append((f"{name}, median", _number(_exp(content[f"log_{name}"]["mean"]["value"]))))
-        rows.append((f"{name}, sd of its logarithm", _number(content[f"log_{name}"]["sd"]["value"])))
-    rows.append(("yield stress sigma_y", f"{_number(content['yield_stress_MPa']['value'])} MPa"))
+        mean = content[f"log_{name}"]["mean"]
+        median = _exp(mean["value"])
+        spread = None if mean["sd"] is None or median is None else median * mean["sd"]
+        rows.append((f"{name}, median", _estimate({"value": median, "sd": spread})))
+        rows.append((f"{name}, sd of its logarithm", _estimate(content[f"log_{name}"]["sd"])))
+    rows.append(("yield stress sigma_y", f"{_estimate(content['yield_stress_MPa'])} MPa"))
     return rows
+
+
+def _estimate(estimate: dict[str, Any], factor: float = 1.0) -> str:
+    """A value with its standard deviation, which decides the digits of both."""
+    value, sd = estimate["value"], estimate["sd"]
+    if value is None or sd is None or not sd > 0:
+        return _number(None if value is None else value * factor)
+    value, sd = value * factor, sd * factor
+    digits = max(0, 1 - math.floor(math.log10(sd)))
+    if digits > 6 or abs(value) >= 1e6:
+        return f"{value:.4g} +- {sd:.2g}"
+    return f"{value:.{digits}f} +- {sd:.{digits}f}"
 
 
 def _exp(value: float | None) -> float | None:
@@ -82,8 +142,9 @@ def say_state(content: dict[str, Any]) -> None:
     used = sum(entry["kept"] for entry in content["particles"])
     law = content["law"]
     say(
-        f"Method {content['method']}: {used} of {len(content['particles'])} particles, a by the "
-        f"{content['a_objective']} objective, unloading {law['unloading']}, strain scaling {law['strain_scaling']}; "
+        f"Method {content['method']}: {used} of {len(content['particles'])} particles, "
+        + (f"a by the {content['a_objective']} objective, " if "a_objective" in content else "")
+        + f"unloading {law['unloading']}, strain scaling {law['strain_scaling']}; "
         + ("converged." if content["converged"] else "NOT converged.")
     )
 

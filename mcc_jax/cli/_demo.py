@@ -22,14 +22,15 @@ def demo(out: Path, seed: int) -> None:
     """Simulate the paper's 20 particles, calibrate the law on them, draw the figures.
 
     The tests are simulated from the paper's tables (Bommireddy et al. 2018): it publishes its measured curves as
-    pictures only, not as numbers. DIR gets campaign/, calibration.json and figures/.
+    pictures only, not as numbers. DIR gets campaign/, calibration.json, posterior.nc and
+    figures/.
 
     \b
     Example:
       mcc-jax demo --out try --seed 1
     """
-    with session(9) as tell:
-        from ..calibrate import calibrate_paper
+    with session(14) as tell:
+        from ..calibrate import calibrate_bayes
         from ..campaign import write_campaign
         from ..simulate import paper_campaign
         from ._calibration import main_numbers, say_files, say_state, say_warnings, write_calibration
@@ -38,7 +39,7 @@ def demo(out: Path, seed: int) -> None:
             tell("simulating the campaign")
             campaign = paper_campaign(seed)
             write_campaign(campaign, stage.folder / "campaign")
-            calibration = calibrate_paper(campaign, seed=seed, progress=tell)
+            calibration = calibrate_bayes(campaign, seed=seed, progress=tell)
             content = write_calibration(calibration, stage, figures=True, tell=tell)
     points = sum(len(curve) for curve in campaign.curves)
     say(f"The tests are SIMULATED from the paper's tables, not measured: {len(campaign)} particles, {points} points,")
@@ -47,17 +48,20 @@ def demo(out: Path, seed: int) -> None:
     say_state(content)
     rows = [(*row, paper) for row, paper in zip(main_numbers(content), _paper_values(), strict=True)]
     say_table(("quantity", "this run", "the paper"), rows)
-    say("With 20 particles that differ this much, a and the spreads scatter from seed to seed.")
+    say("After +-: the standard deviation of the posterior. Spreads of 20 particles differ from seed to seed.")
     say_warnings(content)
     say()
-    say_files(out, [*(f"campaign/{name}" for name in CAMPAIGN_FILES), *content["figures"], "calibration.json"])
+    say_files(
+        out,
+        [*(f"campaign/{name}" for name in CAMPAIGN_FILES), *content["figures"], *content["files"], "calibration.json"],
+    )
     say()
     say("Next, for example:")
     folder = shlex.quote(str(out / "campaign"))
     for comment, command in (
         (
-            "the same particles, a by the paper's reference objective",
-            f"calibrate {folder} --out fit --objective reference",
+            "the same particles by the paper's own steps",
+            f"calibrate {folder} --out paper --method paper",
         ),
         (
             "one shared material, two cycles with holds",

@@ -6,10 +6,11 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,9 +20,9 @@ from ...campaign import THRESHOLD_MPA, Campaign
 from .._predict import point_noise_um
 from .._result import estimate, finite
 from ._data import Selection, Tests, select_tests
-from ._fit import JointFit, JointModel, fit_joint, populations, prior_numbers
+from ._fit import JointFit, JointModel, fit_joint, population_at, populations, prior_numbers
 from ._noise import Whitening
-from ._population import Population, Summary
+from ._population import Population, Summary, laplace
 from ._sampling import (
     Exact,
     ParticleDraws,
@@ -42,9 +43,11 @@ MOST_CHECKED = 400_000
 of larger campaigns some draws are compared, to know how good each particle's summary is."""
 
 RESTLESS = 0.3
-"""A particle whose log weight scatters by more gets several candidates per draw."""
+"""A particle whose weight scatters by more than this share of its mean gets several candidates per draw."""
 
-CANDIDATES = 16
+CANDIDATES = (16, 128)
+"""How many: first, and for those that still scatter."""
+
 MOST_PARTICLE_DRAWS = 4_000_000
 """At most as many draws of single particles are kept; of very large campaigns every n-th draw."""
 
@@ -351,7 +354,8 @@ def _compile(tests: Tests, model: JointModel, chains: int, warmup: int, draws: i
     one, four = dummy(count), dummy(count, 4)
     quadratic = Summary(four, dummy(count, 4, 4), four, one, one, one, four, one)
     numbers = prior_numbers(model.beliefs, tests.particle.flatness)
-    key, flat, scatter = jax.random.key(0), tests.particle.flatness, model.scatter
+    # Almost all campaigns pin their coefficients down; the others compile again.
+    key, flat, scatter = jax.random.key(0), tests.particle.flatness, replace(model.scatter, newton=0)
     settings = {"chains": chains, "warmup": warmup, "draws": draws}
     sample_population.lower(key, dummy(d), dummy(d, d), numbers, quadratic, flat, scatter, **settings).compile()
     exact = Exact(
@@ -364,6 +368,19 @@ def _compile(tests: Tests, model: JointModel, chains: int, warmup: int, draws: i
     import arviz_stats.base  # noqa: F401  # seconds on a cold machine, so here too
 
 
+SHARP = 0.03
+"""Posterior standard deviation of the logarithm of a polynomial's coefficient below which one Newton step is enough."""
+
+
+def newton_steps(fit: JointFit, tests: Tests, model: JointModel) -> int:
+    """How many Newton steps the integration over the particles needs: none if every coefficient is known sharply."""
+    population = population_at(fit.mode, fit.numbers, model.scatter)
+    at = eqx.filter_jit(laplace)(population, fit.summary, tests.particle.flatness, model.scatter)
+    variance = np.diagonal(np.linalg.inv(np.asarray(at.hessian)), axis1=1, axis2=2)
+    widest = float(np.max(np.sqrt(variance) * np.asarray(at.stretch)))
+    return 0 if widest < SHARP else 4
+
+
 def _stride(count: int, total: int) -> int:
     """Every how many-th draw is compared with the exact likelihood: all of them for few particles."""
     return max(1, -(-total * count // MOST_CHECKED))
@@ -372,7 +389,7 @@ def _stride(count: int, total: int) -> int:
 def _fast(
     key: Array, tests: Tests, model: JointModel, fit: JointFit, chains: int, warmup: int, draws: int
 ) -> dict[str, Any]:
-    flat, scatter = tests.particle.flatness, model.scatter
+    flat, scatter = tests.particle.flatness, replace(model.scatter, newton=newton_steps(fit, tests, model))
     population_key, particle_key, check_key, pick_key = jax.random.split(key, 4)
     run, population = sample_population(
         population_key,
@@ -394,17 +411,24 @@ def _fast(
     )
     ratio = checked.log_ratio
     k = pareto_k(ratio)
-    restless = np.flatnonzero(np.std(np.where(np.isfinite(ratio), ratio, -1e3), axis=0) > RESTLESS)
+    restless = np.flatnonzero(_restless(ratio))
     applied = stride == 1
     notes: list[str] = []
     names, stacked = _stack(population, scatter, (chains, draws))
     if applied:
         latent, zero, likelihood, ratio = checked
-        if len(restless):
-            some = _take(exact, restless, flat)
-            more = draw_particles(pick_key, population, *some, scatter, CANDIDATES)
-            latent[:, restless], zero[:, restless], _, ratio[:, restless] = (np.asarray(v) for v in more)
+        for candidates in CANDIDATES:
+            if not len(restless):
+                break
+            # Always of one of a few sizes, the first one repeated: every size would be compiled anew.
+            size = min(count, 4 ** int(np.ceil(np.log(max(len(restless), 2)) / np.log(4))))
+            padded = np.concatenate([restless, np.full(size - len(restless), restless[0])])
+            some = _take(exact, padded, flat)
+            more = draw_particles(jax.random.fold_in(pick_key, candidates), population, *some, scatter, candidates)
+            better = [np.asarray(v)[:, : len(restless)] for v in more]
+            latent[:, restless], zero[:, restless], ratio[:, restless] = better[0], better[1], better[3]
             k[restless] = pareto_k(ratio[:, restless])
+            restless = restless[_restless(ratio[:, restless])]
         weight, joint = smoothed_weights(ratio.sum(1))
         rows = (slice(c * draws, (c + 1) * draws) for c in range(chains))
         chosen = np.concatenate([row.start + ordered_resample(weight[row], draws) for row in rows])
@@ -441,7 +465,7 @@ def _fast(
 def _joint(
     key: Array, tests: Tests, model: JointModel, fit: JointFit, chains: int, warmup: int, draws: int
 ) -> dict[str, Any]:
-    flat, scatter = tests.particle.flatness, model.scatter
+    flat, scatter = tests.particle.flatness, replace(model.scatter, newton=newton_steps(fit, tests, model))
     exact = exact_of(fit, tests, model.zero_sd, model.unloading)
     run, free, latent, zero, likelihood = sample_joint(
         key, fit.mode, fit.covariance, fit.numbers, exact, flat, scatter, chains=chains, warmup=warmup, draws=draws
@@ -528,6 +552,12 @@ def diagnostics(names: list[str], draws: np.ndarray) -> tuple[dict[str, float], 
     return named(rhat), named(bulk), named(tail)
 
 
+def _restless(log_weight: np.ndarray) -> np.ndarray:
+    """Which particles' weights scatter too much, draws along the first axis."""
+    relative = np.exp(log_weight - log_weight.max(0))
+    return relative.std(0) > RESTLESS * relative.mean(0)
+
+
 def pareto_k(log_weight: np.ndarray) -> np.ndarray:
     """Pareto k of importance weights, draws along the first axis."""
     from arviz_stats.base import array_stats
@@ -537,8 +567,9 @@ def pareto_k(log_weight: np.ndarray) -> np.ndarray:
     # Weights that are all equal have no tail to fit.
     varied = np.std(columns, axis=1) > 1e-9
     if varied.any():
-        result[varied] = array_stats.psislw(columns[varied], axis=-1)[1]
-    return result
+        with np.errstate(all="ignore"):
+            result[varied] = array_stats.psislw(columns[varied], axis=-1)[1]
+    return np.where(np.isnan(result), np.inf, result)
 
 
 def smoothed_weights(log_weight: np.ndarray) -> tuple[np.ndarray, float]:
@@ -546,9 +577,14 @@ def smoothed_weights(log_weight: np.ndarray) -> tuple[np.ndarray, float]:
     from arviz_stats.base import array_stats
 
     finite_weight = np.where(np.isfinite(log_weight), log_weight, -1e10)
-    smooth, k = array_stats.psislw(finite_weight, axis=-1)
+    if np.std(finite_weight) <= 1e-9:
+        return np.full(len(finite_weight), 1 / len(finite_weight)), 0.0
+    with np.errstate(all="ignore"):
+        smooth, k = array_stats.psislw(finite_weight, axis=-1)
+    if not np.isfinite(smooth).all():  # one weight holds all: nothing to smooth
+        smooth, k = finite_weight, np.inf
     weight = np.exp(np.asarray(smooth) - np.max(smooth))
-    return weight / weight.sum(), float(k)
+    return weight / weight.sum(), float(k) if np.isfinite(k) else float("inf")
 
 
 def ordered_resample(weight: np.ndarray, count: int) -> np.ndarray:

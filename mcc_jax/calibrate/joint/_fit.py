@@ -13,12 +13,19 @@ from jaxtyping import Array, Bool, Float
 
 from ...law import StrainScaling, Unloading
 from ._data import Tests
-from ._individual import Individual, fit_individuals
+from ._individual import Particles, fit_particles, linear_starts
 from ._linearised import expected_latent, linear_data, summarise
 from ._mode import PriorNumbers, from_free, most_probable, to_free
 from ._noise import Noise, Whitening, estimate_noise, particle_scales
 from ._population import Population, Scatter, Summary
 from ._priors import Priors
+
+WIDE = 1.5
+"""Standard deviation of the logarithms that a particle by itself is allowed, around the prior's centre: no more than
+what keeps a coefficient finite about which its curve says nothing."""
+
+LEAST_WIDTH = 1e-3
+"""Least such standard deviation under the population: any smaller and the problem is badly scaled."""
 
 ROUNDS = 2
 """Noise, population and particles depend on each other a little: how often they are taken in turn."""
@@ -77,7 +84,7 @@ class JointFit(eqx.Module):
         converged: for particles, noise and population in turn.
     """
 
-    individual: Individual
+    individual: Particles
     noise: Noise
     noise_log_sd: Float[Array, " 4"]
     filters: Whitening
@@ -141,7 +148,13 @@ def fit_joint(
     numbers = prior_numbers(priors, flatness)
     read_out = max(read_out_um, 1e-4)
     tell("fitting every particle")
-    individual = fit_individuals(tests, jnp.asarray(read_out), _centre(priors), zero_sd, model.unloading)
+    N = len(tests)
+    centre = np.broadcast_to(_centre(priors), (N, 4))
+    starts = linear_starts(tests, jnp.asarray(centre[0, 3]))
+    wide = jnp.asarray(np.full((N, 4), WIDE))
+    individual = fit_particles(
+        tests, jnp.asarray(np.full(N, read_out)), jnp.asarray(centre), wide, zero_sd, starts, model.unloading
+    )
     latent, zero = individual.latent, individual.zero
     four = [read_out, *np.asarray(priors.noise.median)[1:]]
     noise = Noise(*(jnp.asarray(v) for v in four), jnp.asarray(np.ones(len(tests))))
@@ -155,29 +168,47 @@ def fit_joint(
         elif turn < rounds:
             tell("estimating the noise")
             noise, log_sd, noise_converged = estimate_noise(data, priors.noise, noise, uncertainty=turn == rounds - 1)
-        summary, filtered = summarise(latent, zero, tests.contact, data, noise, zero_sd)
+        summary, filtered = summarise(latent, zero, tests, data, noise, zero_sd)
         if correlated and turn < rounds:
             old = np.asarray(noise.scale)
             scale = particle_scales(old, np.asarray(summary.squares), np.asarray(summary.count) - 4)
             if np.any(scale != old):
                 noise = eqx.tree_at(lambda n: n.scale, noise, jnp.asarray(scale))
-                summary, filtered = summarise(latent, zero, tests.contact, data, noise, zero_sd)
+                summary, filtered = summarise(latent, zero, tests, data, noise, zero_sd)
         tell("fitting the population")
         free, covariance, mode_converged = most_probable(free, numbers, summary, flatness, scatter)
         if turn < rounds:
-            latent, zero = expected_latent(free, numbers, summary, flatness, scatter)
+            tell("fitting every particle")
+            mean, spread, moved, shifted = expected_latent(free, numbers, summary, flatness, scatter)
+            starts = jnp.stack(
+                [
+                    jnp.concatenate([latent, zero[:, None]], 1),
+                    jnp.concatenate([moved, shifted[:, None]], 1),
+                    jnp.concatenate([mean, zero[:, None]], 1),
+                ]
+            )
+            sizes = _white_equivalent(filtered, tests)
+            within = jnp.maximum(spread, LEAST_WIDTH)
+            found = fit_particles(tests, sizes, mean, within, zero_sd, starts, model.unloading)
+            latent, zero = found.latent, found.zero
     converged = np.asarray([bool(np.all(np.asarray(individual.converged))), noise_converged, mode_converged])
     return JointFit(
         individual, noise, log_sd, filtered, latent, zero, data.residual, summary, free, covariance, numbers, converged
     )
 
 
-def _centre(priors: Priors) -> Float[Array, " 4"]:
+def _centre(priors: Priors) -> np.ndarray:
     """Centre of b1, b3, b5, e for what a curve alone does not say: the prior's, at the paper's typical shape factor."""
     C1, C5 = np.log(priors.C1.median), np.log(priors.C5.median)
     C3 = (np.log(20 / 9) + C1 + 5 * C5 + np.log(priors.softening.median)) / 6
     log_eta = np.log(1.4)
-    return jnp.asarray([C1 + log_eta, C3 + log_eta, C5 + log_eta, np.log(priors.effective_modulus_MPa.median)])
+    return np.array([C1 + log_eta, C3 + log_eta, C5 + log_eta, np.log(priors.effective_modulus_MPa.median)])
+
+
+@eqx.filter_jit
+def _white_equivalent(filters: Whitening, tests: Tests) -> Float[Array, " particles"]:
+    """Standard deviation of white noise that weighs a test as much as its filter does [um]."""
+    return jnp.sqrt(jnp.sum(tests.mask, 1) / jnp.maximum(jnp.sum(filters.weight**2, 1), 1e-30))
 
 
 @eqx.filter_jit

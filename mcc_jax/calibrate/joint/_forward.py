@@ -84,3 +84,14 @@ def _linearise(latent, zero, tests, unloading, with_force):
     residual = jnp.where(used, tests.displacement - value - zero[:, None], 0.0)
     moved = jnp.where(record, columns[4], columns[4] - columns[5]) if with_force else still
     return residual, jnp.concatenate([J, own], -1), moved
+
+
+def snap(latent: Latent, particle: Particle) -> Scalar:
+    """Logarithm of the force [mN] at which loading snaps through; infinite if the law is monotone."""
+    law = law_of(latent, Unloading.PRINTED)
+    K1, K3, K5 = law.plastic.polynomial
+    falls = 9 * K3 * K3 > 20 * K1 * K5
+    root = jnp.sqrt(jnp.where(falls, 9 * K3 * K3 - 20 * K1 * K5, 1.0))
+    square = 2 * K1 / (3 * K3 + root)  # of the scaled strain at the peak
+    force = particle.force(jnp.sqrt(square) * (K1 - square * (K3 - square * K5)))
+    return jnp.where(falls, jnp.log(jnp.where(falls, force, 1.0)), jnp.inf)

@@ -1,4 +1,4 @@
-"""Every particle on its own: starts without iteration, then its own least squares from several of them."""
+"""Every particle by itself: starts without iteration, then its own least squares from several of them."""
 
 from __future__ import annotations
 
@@ -23,12 +23,8 @@ VARIATIONS = ((0.0, 0.0, 0.0), (0.05, -0.1, 0.03), (-0.05, 0.06, -0.02))
 
 MOST_STEPS = 60
 
-WIDE = 1.5
-"""Standard deviation of the logarithms that a particle on its own is allowed, around the prior's centre: no more than
-what keeps a coefficient finite about which its curve says nothing."""
 
-
-class Individual(eqx.Module):
+class Particles(eqx.Module):
     """Fits of single particles.
 
     Attributes:
@@ -91,33 +87,50 @@ def linear_start(
 
 
 @eqx.filter_jit
-def fit_individuals(
-    tests: Tests, noise: Scalar, centre: Float[Array, " 4"], zero_sd: Scalar, unloading: Unloading
-) -> Individual:
-    """Fit every particle on its own, its modulus included, from several starts.
+def linear_starts(tests: Tests, log_modulus: Scalar) -> Float[Array, "starts particles 5"]:
+    """Several starts for every particle: the linear one and variations of it."""
+    b, zero = jax.vmap(linear_start)(tests.particle, tests.force, tests.displacement, tests.loading, tests.contact)
+    first = jnp.concatenate([b, jnp.full((len(tests), 1), log_modulus), zero[:, None]], 1)
+    return first[None] + jnp.pad(jnp.asarray(VARIATIONS), ((0, 0), (0, 2)))[:, None]
+
+
+@eqx.filter_jit
+def fit_particles(
+    tests: Tests,
+    noise: Float[Array, " particles"],
+    centre: Float[Array, "particles 4"],
+    width: Float[Array, "particles 4"],
+    zero_sd: Scalar,
+    starts: Float[Array, "starts particles 5"],
+    unloading: Unloading,
+) -> Particles:
+    """Fit every particle by itself, its modulus included, from several starts.
 
     Levenberg-Marquardt for all particles and starts in step, each with a damping of its own: one that has converged
     waits for the others, so there is one loop whatever their number.
 
     Args:
         tests: the measurements.
-        noise: scale of the residuals [um].
-        centre: centre of b1, b3, b5 and e for what a curve does not say.
+        noise: scale of each particle's residuals [um].
+        centre, width: normal prior of each particle's b1, b3, b5, e.
         zero_sd: how far the zero may lie from the recorded contact [um].
+        starts: b1, b3, b5, e and zero to start from.
         unloading: form of unloading.
     """
-    b, zero = jax.vmap(linear_start)(tests.particle, tests.force, tests.displacement, tests.loading, tests.contact)
-    starts = len(VARIATIONS)
-    first = jnp.concatenate([b, jnp.broadcast_to(centre[3:], (len(tests), 1)), zero[:, None]], 1)
-    varied = first[None] + jnp.pad(jnp.asarray(VARIATIONS), ((0, 0), (0, 2)))[:, None]
-    many: Tests = jax.tree.map(lambda x: jnp.tile(x, (starts, *[1] * (x.ndim - 1))), tests)
-    middle = jnp.append(jnp.broadcast_to(centre, (starts * len(tests), 4)).T, many.contact[None], axis=0).T
-    width = jnp.append(jnp.full(4, WIDE), zero_sd)
+    count = len(starts)
+
+    def tile(x: Array) -> Array:
+        return jnp.tile(x, (count, *[1] * (x.ndim - 1)))
+
+    many: Tests = jax.tree.map(tile, tests)
+    scale = tile(noise)[:, None]
+    middle = jnp.concatenate([tile(centre), many.contact[:, None]], 1)
+    width = jnp.concatenate([tile(width), jnp.full((len(middle), 1), zero_sd)], 1)
 
     def normal_equations(y):
         r, J = linearise(y[:, :4], y[:, 4], many, unloading)
-        r, J, away = r / noise, J / noise, (y - middle) / width
-        H = jnp.einsum("nkp,nkq->npq", J, J) + jnp.diag(1 / width**2)
+        r, J, away = r / scale, J / scale[..., None], (y - middle) / width
+        H = jnp.einsum("nkp,nkq->npq", J, J) + jnp.eye(5) / width[..., None] ** 2
         g = jnp.einsum("nkp,nk->np", J, r) + away / width
         loss = 0.5 * (jnp.sum(r**2, 1) + jnp.sum(away**2, 1))
         return jnp.where(jnp.isfinite(loss), loss, jnp.inf), g, H
@@ -139,14 +152,14 @@ def fit_individuals(
         damping = jnp.where(done, damping, jnp.where(better, jnp.maximum(damping / 8, 1e-9), damping * 4))
         return (*map(choose, (tried, new_loss, new_g, new_H), (y, loss, g, H)), damping, count + 1, done)
 
-    y = varied.reshape(-1, 5)
+    y = starts.reshape(-1, 5)
     unfinished = jnp.zeros(len(y), bool)
     # The first pass through the loop evaluates the start: an infinite loss accepts whatever comes, and no force moves it.
     carry = (y, jnp.full(len(y), jnp.inf), jnp.zeros((len(y), 5)), jnp.broadcast_to(jnp.eye(5), (len(y), 5, 5)))
     carry = (*carry, jnp.full(len(y), 1e-3), 0, unfinished)
     going = lambda c: (c[5] < 2) | ((c[5] < MOST_STEPS) & ~jnp.all(c[6]))  # noqa: E731  # a condition, no function
     y, loss, _, _, _, _, done = jax.lax.while_loop(going, step, carry)
-    y, loss, done = (v.reshape(starts, len(tests), *v.shape[1:]) for v in (y, loss, done))
+    y, loss, done = (v.reshape(count, len(tests), *v.shape[1:]) for v in (y, loss, done))
     best = jnp.argmin(loss, axis=0)
 
     def take(values):
@@ -154,4 +167,4 @@ def fit_individuals(
 
     found = take(y)
     points = jnp.maximum(jnp.sum(tests.mask, 1), 1)
-    return Individual(found[:, :4], found[:, 4], noise * jnp.sqrt(2 * take(loss) / points), take(done))
+    return Particles(found[:, :4], found[:, 4], noise * jnp.sqrt(2 * take(loss) / points), take(done))

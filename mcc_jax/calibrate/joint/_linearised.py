@@ -10,10 +10,10 @@ from jaxtyping import Array, Float
 from ..._types import Scalar
 from ...law import Unloading
 from ._data import Tests
-from ._forward import linearise_with_force
+from ._forward import linearise_with_force, snap
 from ._mode import PriorNumbers, from_free
 from ._noise import Linear, Noise, Whitening, whitening
-from ._population import Scatter, Summary, draw_latent
+from ._population import Scatter, Summary, draw_latent, moments
 
 
 @eqx.filter_jit
@@ -34,7 +34,7 @@ def linear_data(
 def summarise(
     latent: Float[Array, "particles 4"],
     zero: Float[Array, " particles"],
-    contact: Float[Array, " particles"],
+    tests: Tests,
     data: Linear,
     noise: Noise,
     zero_sd: Scalar,
@@ -51,7 +51,10 @@ def summarise(
     J = jax.vmap(lambda f, x: jax.vmap(f, in_axes=1, out_axes=1)(x))(noise_filters, data.jacobian)
     H = jnp.einsum("nkp,nkq->npq", J, J)
     g = -jnp.einsum("nkp,nk->np", J, r)
-    away = zero - contact
+    slope, offset, weight = jax.vmap(_snap_evidence)(latent, tests.particle, tests.force, tests.mask & tests.loading)
+    H = H.at[:, :4, :4].add(weight[:, None, None] * slope[:, :, None] * slope[:, None, :])
+    g = g.at[:, :4].add(weight[:, None] * slope * offset[:, None])
+    away = zero - tests.contact
     width = 1 / (H[:, 4, 4] + 1 / zero_sd**2)
     pull = g[:, 4] - away / zero_sd**2
     border = H[:, :4, 4]
@@ -68,6 +71,27 @@ def summarise(
     return summary, noise_filters
 
 
+def _snap_evidence(latent, particle, force, used):
+    """What a jump says that no residual does: that the curve's peak lies between the two forces around it.
+
+    The likelihood of a particle that snaps through falls off a cliff where the jump would move to another point of the
+    record. A normal distribution of the logarithm of the force at the peak, as wide as the interval, stands in for it.
+
+    Returns:
+        Derivative of that logarithm by the latent vector, distance of the interval's middle from it, and its precision:
+        zero unless the test shows a jump.
+    """
+    value, slope = jax.value_and_grad(snap)(latent, particle)
+    at = jnp.where(jnp.isfinite(value), jnp.exp(jnp.where(jnp.isfinite(value), value, 0.0)), jnp.inf)
+    below = jnp.max(jnp.where(used & (force <= at), force, 0.0))
+    above = jnp.min(jnp.where(used & (force > at), force, jnp.inf))
+    seen = jnp.isfinite(above) & (below > 0)
+    low, high = jnp.log(jnp.where(seen, below, 1.0)), jnp.log(jnp.where(seen, above, 2.0))
+    width = jnp.maximum(high - low, 1e-6)
+    middle = jnp.where(seen, (low + high) / 2 - jnp.where(seen, value, 0.0), 0.0)
+    return jnp.where(seen, slope, 0.0), middle, jnp.where(seen, 12 / width**2, 0.0)
+
+
 @eqx.filter_jit
 def expected_latent(
     free: Float[Array, " d"],
@@ -75,7 +99,13 @@ def expected_latent(
     summary: Summary,
     flatness: Float[Array, " particles"],
     scatter: Scatter,
-) -> tuple[Float[Array, "particles 4"], Float[Array, " particles"]]:
-    """Most probable latent vectors and zeros of the particles given the population."""
+) -> tuple[
+    Float[Array, "particles 4"], Float[Array, "particles 4"], Float[Array, "particles 4"], Float[Array, " particles"]
+]:
+    """Mean and standard deviation of the particles' latent vectors under the population, then the most probable latent
+    vectors and zeros given the tests, too."""
+    population = from_free(free, numbers, scatter)[0]
+    mean, factor = moments(population, flatness, scatter)
     still = jnp.zeros((flatness.shape[0], scatter.size))
-    return draw_latent(from_free(free, numbers, scatter)[0], summary, flatness, scatter, still, still[:, 0])[:2]
+    found = draw_latent(population, summary, flatness, scatter, still, still[:, 0])
+    return mean, jnp.sqrt(jnp.sum(factor**2, -1)), found.latent, found.zero

@@ -210,6 +210,10 @@ def estimate_noise(
     return noise, jnp.asarray(sd), bool(found.success)
 
 
+OUTLYING = 5.0
+"""A particle whose noise differs by this many standard deviations keeps its own scale whatever the others do."""
+
+
 def particle_scales(scale: np.ndarray, squares: np.ndarray, freedom: np.ndarray) -> np.ndarray:
     """Every particle's scale from its whitened sum of squares, pulled towards 1 unless they scatter by more than chance.
 
@@ -221,9 +225,11 @@ def particle_scales(scale: np.ndarray, squares: np.ndarray, freedom: np.ndarray)
     freedom = np.maximum(freedom, 1)
     log_scale = np.log(scale) + 0.5 * np.log(np.maximum(squares / freedom, 1e-12))
     chance = 0.5 / freedom
-    centre = np.sum(log_scale / chance) / np.sum(1 / chance)
-    scatter = np.mean((log_scale - centre) ** 2) - np.mean(chance)
-    # Up to twice the uncertainty of this estimate itself, all particles share one scale.
-    if scatter <= 2 * np.mean(chance) * np.sqrt(2 / len(log_scale)):
-        return np.ones_like(log_scale)
-    return np.exp(scatter / (scatter + chance) * (log_scale - centre))
+    away = log_scale - np.median(log_scale)
+    spread = 1.4826 * np.median(np.abs(away))
+    scatter = spread**2 - np.median(chance)
+    # Up to twice the uncertainty of this estimate itself, all particles share one scale, but for outliers.
+    if scatter <= 2 * np.median(chance) * np.sqrt(2 / len(log_scale)):
+        scatter = 0.0
+    outlier = np.abs(away) > OUTLYING * np.sqrt(scatter + chance)
+    return np.exp(np.where(outlier, away, scatter / (scatter + chance) * away))

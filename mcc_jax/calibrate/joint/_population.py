@@ -5,14 +5,18 @@ Particle i's latent vector :math:`w = (b_1, b_3, b_5, e)` (see `_forward`) has, 
 .. math:: w_i = m_i + S_i \xi_i, \quad \xi_i \sim N(0, 1), \qquad
     m_i = (\mu_1 + \log\eta_i,\ \mu_3 + \log\eta_i,\ \mu_5 + \log\eta_i,\ \log\bar E + p \log\eta_i)
 
-with :math:`\eta_i = \eta_p(a)`. The likelihood of its test is summarised by a quadratic around its best fit
-(`Summary`). Their product is normal in :math:`\xi`, which integrates out in closed form, in a way that stays regular
-when a spread is exactly 0: there is no funnel left.
+with :math:`\eta_i = \eta_p(a)`. The likelihood of its test is summarised by a quadratic (`Summary`): not in w, but in
+the coefficients of the stress's polynomial, :math:`\kappa_j = (e^{j (b_j - \hat b_j)} - 1)/j`, because stress is linear
+in these and the ridges of the likelihood are straight. What is left to integrate is three-dimensional and smooth, and
+is done by Laplace's method around the most probable deviations, in coordinates in which the summary is exactly
+quadratic. Deviations, not coefficients, are the variables, so everything stays regular when a spread is exactly 0:
+there is no funnel.
 """
 
 from __future__ import annotations
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -43,11 +47,20 @@ class Population(eqx.Module):
 
 
 class Scatter(eqx.Module):
-    """Which further quantities differ from particle to particle, and the power with which shape enters unloading."""
+    """How particles differ, and how carefully they are integrated out.
+
+    Attributes:
+        modulus: whether the modulus scatters, too.
+        shape: whether `a` does.
+        power: power with which the shape factor enters unloading.
+        newton: Newton steps from the linear solution to the most probable deviations, besides a last one; 0 is enough
+            where the tests pin all coefficients down (`JointFit.newton`).
+    """
 
     modulus: bool = eqx.field(static=True, default=False)
     shape: bool = eqx.field(static=True, default=False)
     power: int = eqx.field(static=True, default=0)
+    newton: int = eqx.field(static=True, default=4)
 
     @property
     def size(self) -> int:
@@ -58,11 +71,11 @@ class Scatter(eqx.Module):
 class Summary(eqx.Module):
     r"""A quadratic for the log likelihood of each test, its zero integrated out.
 
-    .. math:: -n\lambda - \tfrac12 e^{-2\lambda}\left[R + (w - \hat w)^T \Lambda (w - \hat w)\right]
-        + e^{-2\lambda} g^T (w - \hat w)
+    .. math:: -n\lambda - \tfrac12 e^{-2\lambda}\left[R + \kappa^T \Lambda \kappa - 2 g^T \kappa\right], \qquad
+        \kappa_j = \frac{e^{j (b_j - \hat b_j)} - 1}{j},\ j = 1, 3, 5, \quad \kappa_e = e - \hat e
 
-    with :math:`\lambda` the `log_noise`. The zero given w is normal around
-    `zero + zero_slope (w - point)` with standard deviation `zero_sd` (times the noise factor).
+    with :math:`\lambda` the `log_noise`. The zero given kappa is normal around `zero + zero_slope kappa` with standard
+    deviation `zero_sd` (times the noise factor).
 
     Attributes:
         point: :math:`\hat w`, shape (N, 4).
@@ -101,26 +114,116 @@ def moments(
     return mean, factor
 
 
-def _posterior(population: Population, summary: Summary, flatness: Float[Array, " particles"], scatter: Scatter):
+class Laplace(eqx.Module):
+    """Deviations of all particles given the population, around the most probable ones.
+
+    Attributes:
+        deviations: most probable xi, shape (N, k).
+        hessian: curvature there in the straightened coordinates nu.
+        stretch: :math:`j \\tau_j` by which :math:`\\xi_j = \\hat\\xi_j + \\log(1 + j\\tau_j\\nu_j)/(j\\tau_j)`.
+        log_likelihood: of each test, integrated.
+        mean, factor: m and S.
+    """
+
+    deviations: Float[Array, "particles k"]
+    hessian: Float[Array, "particles k k"]
+    stretch: Float[Array, " k"]
+    log_likelihood: Float[Array, " particles"]
+    mean: Float[Array, "particles 4"]
+    factor: Float[Array, "particles 4 k"]
+
+
+FARTHEST = 4.0
+"""Exponents are cut here: a coefficient e^4 times its fitted value is nowhere near any test."""
+
+
+def straighten(away: Float[Array, "*batch 4"]) -> tuple[Float[Array, "*batch 4"], Float[Array, "*batch 4"]]:
+    """kappa, in which stress is linear, and its derivative, from w less the summary's point."""
+    powers = jnp.array([1.0, 3.0, 5.0])
+    exponent = jnp.clip(powers * away[..., :3], -FARTHEST, FARTHEST)
+    kappa = jnp.concatenate([jnp.expm1(exponent) / powers, away[..., 3:]], -1)
+    return kappa, jnp.concatenate([jnp.exp(exponent), jnp.ones_like(away[..., 3:])], -1)
+
+
+def laplace(
+    population: Population, summary: Summary, flatness: Float[Array, " particles"], scatter: Scatter
+) -> Laplace:
+    """Integrate every particle out by Laplace's method."""
     share = jnp.exp(-2 * population.log_noise)
     mean, factor = moments(population, flatness, scatter)
-    away = mean - summary.point
-    pull = summary.score - jnp.einsum("npq,nq->np", summary.precision, away)
-    right = share * jnp.einsum("npk,np->nk", factor, pull)
-    inner = share * jnp.einsum("npk,npq,nql->nkl", factor, summary.precision, factor) + jnp.eye(scatter.size)
-    return share, mean, factor, away, right, Cholesky(inner)
+    eye = jnp.eye(scatter.size)
+
+    def curvature(slope, factor, precision):
+        bent = slope[..., None] * factor
+        return share * jnp.einsum("npk,npq,nql->nkl", bent, precision, bent)
+
+    def newton(xi, mean, factor, quadratic):
+        away = mean + jnp.einsum("npk,nk->np", factor, xi) - quadratic.point
+        kappa, slope = straighten(away)
+        pull = jnp.einsum("npq,nq->np", quadratic.precision, kappa) - quadratic.score
+        gradient = xi + share * jnp.einsum("npk,np->nk", factor, slope * pull)
+        return xi - Cholesky(curvature(slope, factor, quadratic.precision) + eye).solve(gradient)
+
+    def linear(mean, factor, quadratic):
+        away = mean - quadratic.point
+        pull = quadratic.score - jnp.einsum("npq,nq->np", quadratic.precision, away)
+        ones = jnp.ones_like(mean)
+        right = share * jnp.einsum("npk,np->nk", factor, pull)
+        return Cholesky(curvature(ones, factor, quadratic.precision) + eye).solve(right)
+
+    # Found without derivatives; one last step with them carries the derivative of the whole iteration.
+    fixed = jax.lax.stop_gradient((mean, factor, summary))
+    share_fixed = share
+    share = jax.lax.stop_gradient(share)
+    start = linear(*fixed)
+    xi = jax.lax.fori_loop(0, scatter.newton, lambda _, xi: newton(xi, *fixed), start) if scatter.newton else start
+    share = share_fixed
+    xi = newton(jax.lax.stop_gradient(xi), mean, factor, summary)
+
+    away = mean + jnp.einsum("npk,nk->np", factor, xi) - summary.point
+    kappa, slope = straighten(away)
+    quadratic = jnp.einsum("np,npq,nq->n", kappa, summary.precision, kappa) - 2 * jnp.einsum(
+        "np,np->n", summary.score, kappa
+    )
+    at_mode = -0.5 * share * (quadratic + summary.squares) - 0.5 * jnp.sum(xi**2, -1)
+    stretch = jnp.concatenate([jnp.array([1.0, 3.0, 5.0]) * population.tau, jnp.zeros(scatter.size - 3)])
+    # In nu the summary is quadratic; what bends is the prior: xi^2/2 has the curvature 1 - j tau xi.
+    bend = jnp.maximum(1 - stretch * xi, 0.25)
+    hessian = curvature(slope, factor, summary.precision) + eye * bend[..., None, :]
+    inner = Cholesky(hessian)
+    tilt = 0.5 * jnp.sum(inner.forward(jnp.broadcast_to(stretch, xi.shape)) ** 2, -1)
+    value = at_mode - 0.5 * inner.log_det() + tilt - summary.count * population.log_noise
+    return Laplace(xi, hessian, stretch, value, mean, factor)
 
 
 def marginal_likelihood(
     population: Population, summary: Summary, flatness: Float[Array, " particles"], scatter: Scatter
 ) -> Float[Array, " particles"]:
     """Log likelihood of each test, the particle's own parameters integrated out, up to a constant."""
-    share, _, _, away, right, inner = _posterior(population, summary, flatness, scatter)
-    at_mean = jnp.einsum("np,np->n", summary.score, away) - 0.5 * jnp.einsum(
-        "np,npq,nq->n", away, summary.precision, away
-    )
-    gained = 0.5 * jnp.sum(inner.forward(right) ** 2, -1) - 0.5 * inner.log_det()
-    return share * (at_mean - 0.5 * summary.squares) + gained - summary.count * population.log_noise
+    return laplace(population, summary, flatness, scatter).log_likelihood
+
+
+class Draw(eqx.Module):
+    """One draw of all particles given the population.
+
+    Attributes:
+        latent: w, shape (N, 4).
+        zero: zero of displacement [um].
+        deviations: xi, shape (N, k).
+        log_volume: log of the volume by which the map from standard normal numbers to xi and zero stretches; minus
+            infinity outside its range.
+        log_likelihood: of each test, integrated.
+    """
+
+    latent: Float[Array, "particles 4"]
+    zero: Float[Array, " particles"]
+    deviations: Float[Array, "particles k"]
+    log_volume: Float[Array, " particles"]
+    log_likelihood: Float[Array, " particles"]
+
+
+LEAST_SHARE = 0.05
+"""A coefficient of the polynomial is not drawn below this share of its most probable value."""
 
 
 def draw_latent(
@@ -130,19 +233,22 @@ def draw_latent(
     scatter: Scatter,
     normal: Float[Array, "particles k"],
     normal_zero: Float[Array, " particles"],
-) -> tuple[Float[Array, "particles 4"], Float[Array, " particles"], Float[Array, "particles k"]]:
+) -> Draw:
     """Latent vectors, zeros and deviations of the particles given the population, from standard normal numbers."""
-    _, mean, factor, _, right, inner = _posterior(population, summary, flatness, scatter)
-    deviations = inner.solve(right) + inner.backward(normal)
-    latent = mean + jnp.einsum("npk,nk->np", factor, deviations)
-    slope = jnp.einsum("np,np->n", summary.zero_slope, latent - summary.point)
-    zero = summary.zero + slope + summary.zero_sd * jnp.exp(population.log_noise) * normal_zero
-    return latent, zero, deviations
-
-
-def log_jacobian(
-    population: Population, summary: Summary, flatness: Float[Array, " particles"], scatter: Scatter
-) -> Scalar:
-    """Log of the volume by which `draw_latent` stretches its standard normal numbers into deviations and zeros."""
-    *_, inner = _posterior(population, summary, flatness, scatter)
-    return jnp.sum(-0.5 * inner.log_det() + jnp.log(summary.zero_sd) + population.log_noise)
+    at = laplace(population, summary, flatness, scatter)
+    inner = Cholesky(at.hessian)
+    nu = inner.backward(normal)
+    y = at.stretch * nu
+    inside = y > LEAST_SHARE - 1
+    y = jnp.where(inside, y, 0.0)
+    small = jnp.abs(y) < 1e-5
+    safe = jnp.where(small, 1.0, y)
+    quotient = jnp.where(small, 1 - y / 2 + y * y / 3, jnp.log1p(safe) / safe)
+    deviations = at.deviations + nu * quotient
+    latent = at.mean + jnp.einsum("npk,nk->np", at.factor, deviations)
+    kappa, _ = straighten(latent - summary.point)
+    sd = summary.zero_sd * jnp.exp(population.log_noise)
+    zero = summary.zero + jnp.einsum("np,np->n", summary.zero_slope, kappa) + sd * normal_zero
+    volume = -0.5 * inner.log_det() - jnp.sum(jnp.log1p(y), -1) + jnp.log(sd)
+    volume = jnp.where(jnp.all(inside, -1), volume, -jnp.inf)
+    return Draw(latent, zero, deviations, volume, at.log_likelihood)

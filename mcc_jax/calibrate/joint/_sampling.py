@@ -25,7 +25,7 @@ from ._forward import displacement
 from ._mode import PriorNumbers, from_free, log_posterior
 from ._noise import Whitening
 from ._nuts import Chains, sample
-from ._population import Population, Scatter, Summary, draw_latent, log_jacobian, marginal_likelihood
+from ._population import Population, Scatter, Summary, draw_latent, marginal_likelihood
 
 
 class ParticleDraws(NamedTuple):
@@ -79,12 +79,11 @@ class Exact(eqx.Module):
     unloading: Unloading = eqx.field(static=True)
 
 
-def log_ratio(
+def exact_log_likelihood(
     exact: Exact, latent: Float[Array, "particles 4"], zero: Float[Array, " particles"], log_noise: Float[Array, ""]
 ) -> Float[Array, " particles"]:
-    """Log of the exact over the quadratic likelihood of each test at the given parameters."""
-    share = jnp.exp(-2 * log_noise)
-    tests, summary = exact.tests, exact.summary
+    """Log likelihood of each test at given parameters, and log prior of its zero, up to a constant."""
+    tests = exact.tests
 
     def squares(w, z, particle, force, measured, mask, filtered):
         predicted = displacement(w, particle, force, exact.unloading)
@@ -92,15 +91,8 @@ def log_ratio(
 
     total = jax.vmap(squares)(latent, zero, tests.particle, tests.force, tests.displacement, tests.mask, exact.filters)
     at_zero = ((zero - tests.contact) / exact.zero_sd) ** 2
-    away = latent - summary.point
-    quadratic = (
-        summary.squares
-        + jnp.einsum("np,npq,nq->n", away, summary.precision, away)
-        - 2 * jnp.einsum("np,np->n", summary.score, away)
-        + ((zero - summary.zero - jnp.einsum("np,np->n", summary.zero_slope, away)) / summary.zero_sd) ** 2
-    )
-    ratio = -0.5 * (share * total + at_zero) + 0.5 * share * quadratic
-    return jnp.where(jnp.isfinite(ratio), ratio, -jnp.inf)
+    points = jnp.sum(tests.mask, 1)
+    return -0.5 * (jnp.exp(-2 * log_noise) * total + at_zero) - points * log_noise
 
 
 @eqx.filter_jit
@@ -130,9 +122,15 @@ def draw_particles(
         deviate, zeros, pick = jax.random.split(key, 3)
 
         def candidate(normal, normal_zero):
-            latent, zero, _ = draw_latent(at, exact.summary, flatness, scatter, normal, normal_zero)
-            ratio = log_ratio(exact, latent, zero, at.log_noise) if candidates else jnp.zeros(count)
-            return latent, zero, ratio
+            drawn = draw_latent(at, exact.summary, flatness, scatter, normal, normal_zero)
+            ratio = jnp.zeros(count)
+            if candidates:
+                truth = exact_log_likelihood(exact, drawn.latent, drawn.zero, at.log_noise)
+                prior = -0.5 * jnp.sum(drawn.deviations**2, -1)
+                proposal = -0.5 * (jnp.sum(normal**2, -1) + normal_zero**2) - drawn.log_volume
+                ratio = truth + prior - proposal - drawn.log_likelihood - jnp.log(exact.summary.zero_sd)
+                ratio = jnp.where(jnp.isfinite(ratio), ratio, -jnp.inf)
+            return drawn.latent, drawn.zero, ratio
 
         shape = (max(candidates, 1), count)
         latent, zero, ratio = jax.vmap(candidate)(
@@ -190,26 +188,12 @@ def sample_joint(
     def place(position):
         free, rest = position[:d], position[d:].reshape(count, k + 1)
         population, prior = from_free(free, numbers, scatter)
-        latent, zero, deviations = draw_latent(population, exact.summary, flatness, scatter, rest[:, :k], rest[:, k])
-        return population, prior, latent, zero, deviations
+        return population, prior, draw_latent(population, exact.summary, flatness, scatter, rest[:, :k], rest[:, k])
 
     def log_density(position):
-        population, prior, latent, zero, deviations = place(position)
-        share = jnp.exp(-2 * population.log_noise)
-        tests = exact.tests
-
-        def squares(w, z, particle, force, measured, mask, filtered):
-            predicted = displacement(w, particle, force, exact.unloading)
-            return jnp.sum(filtered(jnp.where(mask, measured - predicted - z, 0.0)) ** 2)
-
-        total = jax.vmap(squares)(
-            latent, zero, tests.particle, tests.force, tests.displacement, tests.mask, exact.filters
-        )
-        points = jnp.sum(tests.mask)
-        likelihood = -0.5 * share * jnp.sum(total) - points * population.log_noise
-        at_zero = -0.5 * jnp.sum(((zero - tests.contact) / exact.zero_sd) ** 2)
-        volume = log_jacobian(population, exact.summary, flatness, scatter)
-        return prior + likelihood + at_zero - 0.5 * jnp.sum(deviations**2) + volume
+        population, prior, drawn = place(position)
+        likelihood = jnp.sum(exact_log_likelihood(exact, drawn.latent, drawn.zero, population.log_noise))
+        return prior + likelihood - 0.5 * jnp.sum(drawn.deviations**2) + jnp.sum(drawn.log_volume)
 
     size = d + count * (k + 1)
     factor = jnp.eye(size).at[:d, :d].set(jnp.linalg.cholesky(covariance))
@@ -217,8 +201,8 @@ def sample_joint(
     run = sample(key, log_density, centre, factor, chains=chains, warmup=warmup, draws=draws)
 
     def latents(position):
-        population, _, latent, zero, _ = place(position)
-        return latent, zero, marginal_likelihood(population, exact.summary, flatness, scatter)
+        _, _, drawn = place(position)
+        return drawn.latent, drawn.zero, drawn.log_likelihood
 
     particles = jax.lax.map(lambda chain: jax.vmap(latents)(chain), run.position)
     return run, run.position[..., :d], *particles

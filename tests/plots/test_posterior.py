@@ -1,0 +1,288 @@
+"""The figures of the joint calibrations: they draw for campaigns of every size, and show what the calibration holds."""
+
+import dataclasses
+import itertools
+import re
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.collections import LineCollection
+from matplotlib.quiver import Quiver
+
+from mcc_jax.calibrate import calibrate_bayes, calibrate_least_squares
+from mcc_jax.campaign import Metadata
+from mcc_jax.plots import (
+    least_squares_figures,
+    plot_bands,
+    plot_fits,
+    plot_new_particle,
+    plot_pairs,
+    plot_shrinkage,
+    plot_whitened,
+    posterior_figures,
+    save_figures,
+)
+from mcc_jax.plots._forest import CoefficientTable, draw_forest, posterior_table, shrinkage
+from mcc_jax.plots._joint import density, spread_over, with_sd
+from mcc_jax.simulate import paper_campaign
+
+KINDS = ("paper", "one", "odd")
+STEMS = ["pairs", "prior_posterior", "forest", "shrinkage", "bands", "new_particle", "whitened", "fits", "estimates"]
+UNIT = re.compile(r"\[(GPa|mN|µm|-)\]$")
+
+
+@pytest.fixture(scope="module")
+def calibrations():
+    """Posterior and least squares of 20 particles, of one, and of 20 of which some have odd names."""
+    campaign = paper_campaign(0)
+    found = {}
+    for name, tested in (("paper", campaign), ("one", campaign.select(np.arange(20) == 3))):
+        found[name] = calibrate_bayes(tested, draws=200, chains=2), calibrate_least_squares(tested)
+    odd = (
+        "$x_1$ <b>",
+        "a_b^c",
+        "a very long name of a particle of the second batch",
+        "中文",
+        *campaign.particles[4:],
+    )
+    renamed = dataclasses.replace(campaign, particles=(*odd, *campaign.particles[4:]))
+    found["odd"] = tuple(dataclasses.replace(c, campaign=renamed) for c in found["paper"])
+    return found
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def kind(request):
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def figures(calibrations, kind, tmp_path_factory):
+    """Every figure, drawn and written."""
+    posterior, squares = calibrations[kind]
+    settings = dict(mpl.rcParams)
+    found = posterior_figures(posterior) | least_squares_figures(squares)
+    files = save_figures(found, tmp_path_factory.mktemp(kind), dpi=80)
+    assert all(5000 < file.stat().st_size < 1_000_000 for file in files)
+    assert dict(mpl.rcParams) == settings
+    return found
+
+
+def texts(figure):
+    return [t.get_text() for t in figure.findobj(mpl.text.Text) if t.get_text()]
+
+
+def panels(figure):
+    """Axes with data, without colour bars and panels left blank."""
+    return [ax for ax in figure.axes if ax.get_label() != "<colorbar>" and ax.axison]
+
+
+def within(box, page):
+    return page.x0 <= box.x0 and box.x1 <= page.x1 and page.y0 <= box.y0 and box.y1 <= page.y1
+
+
+# ---- all figures -----------------------------------------------------------------------------------------------------
+
+
+def test_every_figure_has_its_panels(figures, kind):
+    assert list(figures) == STEMS
+    cells = 1 if kind == "one" else 12
+    expected = {
+        "pairs": 8 * 9 // 2,
+        "prior_posterior": 2 * 9,
+        "forest": 3,
+        "shrinkage": 3,
+        "bands": 2 * cells,
+        "new_particle": 2,
+        "whitened": 3,
+        "fits": 2 * cells,
+        "estimates": 3,
+    }
+    assert {stem: len(panels(figure)) for stem, figure in figures.items()} == expected
+
+
+def test_every_axis_has_its_unit_and_simulated_data_are_called_so(figures):
+    for stem, figure in figures.items():
+        assert texts(figure).count("simulated data") == 1
+        for ax in panels(figure):
+            shown = [label for label in (ax.get_xlabel(), ax.get_ylabel()) if label]
+            assert all(UNIT.search(label) for label in shown), (stem, shown)
+
+
+def test_nothing_is_clipped_and_no_panels_overlap(figures):
+    for stem, figure in figures.items():
+        page = figure.bbox.padded(1)
+        for text in [*figure.texts, *(t for one in figure.legends for t in one.get_texts())]:
+            assert within(text.get_window_extent(), page), (stem, text)
+        for ax in panels(figure):
+            ticks = [t for axis in (ax.xaxis, ax.yaxis) for t in axis.get_ticklabels() if t.get_visible()]
+            titles = [t for t in (ax.xaxis.label, ax.yaxis.label, ax.title, ax._left_title) if t.get_text()]
+            for text in [*ticks, *titles]:
+                assert within(text.get_window_extent(), page), (stem, text)
+            for text in titles:
+                box = text.get_window_extent()
+                assert not any(box.overlaps(other.bbox) for other in figure.axes if other.axison), (stem, text)
+            boxes = [t.get_window_extent() for t in ax.xaxis.get_ticklabels() if t.get_visible() and t.get_text()]
+            boxes = sorted((b for b in boxes if b.width), key=lambda b: b.x0)
+            assert all(a.x1 <= b.x0 for a, b in itertools.pairwise(boxes)), (stem, ax.get_xlabel())
+
+
+def test_names_are_drawn_as_they_stand(calibrations):
+    posterior, squares = calibrations["odd"]
+    for figure in (plot_bands(posterior), plot_fits(squares)):
+        shown = texts(figure)
+        assert any(t.startswith("\\$x_1\\$ <b>\n") for t in shown)
+        assert any(t.startswith("\N{REPLACEMENT CHARACTER}\N{REPLACEMENT CHARACTER} (no. 4)\n") for t in shown)
+
+
+def test_a_measured_campaign_is_not_called_simulated(calibrations):
+    for calibration, plot in zip(calibrations["one"], (plot_bands, plot_fits), strict=True):
+        measured = dataclasses.replace(calibration.campaign, metadata=Metadata(provenance="tester file x.tri"))
+        assert "simulated data" not in texts(plot(dataclasses.replace(calibration, campaign=measured)))
+
+
+def test_what_must_not_be_relied_on_is_said(calibrations):
+    posterior, squares = calibrations["one"]
+    assert not posterior.converged
+    assert any(t.startswith("Not converged: ") for t in texts(plot_pairs(posterior)))
+    assert any(t.startswith("The data leave this combination open: ") for t in texts(plot_whitened(squares)))
+    good = dataclasses.replace(
+        posterior, rhat={"a": 1.0}, ess_bulk={"a": 1e3}, divergences=0, pareto_k=np.zeros(1), pareto_k_joint=None
+    )
+    assert good.converged
+    assert not any("converged" in t for t in texts(plot_pairs(good)))
+
+
+# ---- coefficients ----------------------------------------------------------------------------------------------------
+
+
+def test_forest_has_a_row_for_every_particle(figures, calibrations, kind):
+    posterior, squares = calibrations[kind]
+    for stem, calibration in (("forest", posterior), ("estimates", squares)):
+        count = len(calibration.particles)
+        first = panels(figures[stem])[0]
+        assert len(first.get_yticklabels()) == count
+        for j, ax in enumerate(panels(figures[stem])):
+            (dots,) = [one for one in ax.lines if one.get_marker() == "o"]
+            assert len(dots.get_xdata()) == count
+            if stem == "forest":
+                np.testing.assert_allclose(dots.get_xdata(), np.median(posterior.C[..., j], axis=(0, 1)))
+            else:
+                entries = squares.to_json()["particles"]
+                np.testing.assert_allclose(dots.get_xdata(), [e[("C1", "C3", "C5")[j]]["value"] for e in entries])
+
+
+def test_intervals_hold_their_share_of_the_draws(calibrations):
+    posterior = calibrations["paper"][0]
+    table = posterior_table(posterior)
+    for ends, share in ((table.wide, 0.95), (table.narrow, 0.5)):
+        held = np.mean((ends[0] <= posterior.C) & (ends[1] >= posterior.C), axis=(0, 1))
+        np.testing.assert_allclose(held, share, atol=0.01)
+    assert np.all((table.spread[0] < table.median) & (table.median < table.spread[1]))
+
+
+@pytest.mark.parametrize(("count", "rows"), [(40, 40), (41, 41), (120, 120), (5000, 200)])
+def test_many_particles_stand_in_order_without_labels(count, rows):
+    rng = np.random.default_rng(0)
+    centre = rng.lognormal(size=(count, 3))
+    table = CoefficientTable(centre, centre * np.array([0.9, 1.1])[:, None, None], None, np.ones(3), np.ones((2, 3)))
+    figure, _ = draw_forest(table, [f"particle {i}" for i in range(count)])
+    for j, ax in enumerate(panels(figure)):
+        (dots,) = [one for one in ax.lines if one.get_marker() == "o"]
+        (intervals,) = [c for c in ax.collections if isinstance(c, LineCollection)]
+        assert len(dots.get_xdata()) == len(intervals.get_segments()) == rows
+        if count > 40:
+            x = dots.get_xdata()
+            assert np.all(np.diff(x) >= 0)
+            assert (x[0], x[-1]) == (centre[:, j].min(), centre[:, j].max())
+    assert figure.get_size_inches()[1] < 9
+    assert (f"particle {count - 1}" in texts(figure)) == (count <= 40)
+
+
+def test_arrows_lead_from_each_particle_alone_to_its_posterior_mean(calibrations):
+    posterior = calibrations["paper"][0]
+    alone, together = shrinkage(posterior)
+    for ax, (i, j) in zip(panels(plot_shrinkage(posterior)), ((0, 1), (2, 1), (0, 2)), strict=True):
+        (arrows,) = [c for c in ax.collections if isinstance(c, Quiver)]
+        np.testing.assert_allclose(arrows.get_offsets(), alone[:, [i, j]])
+        np.testing.assert_allclose(arrows.U + alone[:, i], together[:, i])
+    # All of one C3, as the paper has it: alone they scatter, together hardly.
+    assert np.std(together[:, 1]) < np.std(alone[:, 1])
+
+
+# ---- curves ----------------------------------------------------------------------------------------------------------
+
+
+def test_grids_show_every_used_point(calibrations):
+    posterior, squares = calibrations["paper"]
+    for plot, calibration in ((plot_bands, posterior), (plot_fits, squares)):
+        strips = panels(plot(calibration))[1::2]
+        tests = calibration.selection.tests
+        for strip, row in zip(strips, spread_over(20, 12), strict=True):
+            dots = [one for one in strip.lines if one.get_marker() == "."]
+            assert sum(len(one.get_xdata()) for one in dots) == int(tests.mask[row].sum())
+            forces = np.sort(np.concatenate([one.get_ydata() for one in dots]))
+            np.testing.assert_array_equal(forces, np.sort(np.asarray(tests.force[row])[np.asarray(tests.mask[row])]))
+
+
+def test_the_band_holds_the_measured_points(calibrations):
+    titles = [ax.get_title(loc="left") for ax in panels(plot_bands(calibrations["paper"][0]))[::2]]
+    inside = [float(re.search(r"(\d+) % inside", title).group(1)) for title in titles]
+    assert 92 < np.mean(inside) < 98
+
+
+def test_new_particle(calibrations):
+    posterior = calibrations["paper"][0]
+    up, down = panels(plot_new_particle(posterior, (150.0, 140.0, 120.0)))
+    loading, unloading = up.lines[-1], down.lines[-1]
+    assert loading.get_xdata()[-1] == unloading.get_xdata()[0]
+    assert np.all(np.diff(loading.get_xdata()) > 0)
+    assert np.all(np.diff(unloading.get_xdata()) < 0)
+    for bad in ((150.0, 140.0), (150.0, 140.0, 0.0)):
+        with pytest.raises(ValueError, match="three positive diameters"):
+            plot_new_particle(posterior, bad)
+
+
+def test_whitened_residuals_are_standard(calibrations):
+    squares = calibrations["paper"][1]
+    figure = plot_whitened(squares)
+    drawn = sum(len(ax.collections[0].get_offsets()) for ax in panels(figure)[:2])
+    assert drawn == int(squares.selection.tests.mask.sum())
+    (title,) = [t for t in texts(figure) if t.startswith("Residuals of 20 particles: rms ")]
+    assert float(title.split()[-1]) == pytest.approx(1, abs=0.1)
+    robust = dataclasses.replace(squares, loss="cauchy")
+    assert any("cauchy loss" in t for t in texts(plot_whitened(robust)))
+
+
+# ---- helpers ---------------------------------------------------------------------------------------------------------
+
+
+def test_density_is_reflected_at_zero_and_even_in_the_logarithm():
+    rng = np.random.default_rng(0)
+    x = np.linspace(-1, 4, 501)
+    half = density(np.abs(rng.standard_normal(4000)), x, positive=True)
+    assert np.all(half[x < 0] == 0)
+    np.testing.assert_allclose(half[x >= 0], np.exp(-(x[x >= 0] ** 2) / 2), atol=0.15)
+    log = density(np.exp(rng.standard_normal(4000)), x, log=True)
+    assert np.all(log[x <= 0] == 0)
+    assert x[np.argmax(log)] == pytest.approx(np.exp(-1), abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("value", "sd", "text"),
+    [
+        (1.42934, 0.0017, "1.4293 ± 0.0017"),
+        (16011.5, 10.3, "16012 ± 10"),
+        (2.5e-9, 3e-9, "2.5e-09 ± 3e-09"),
+        (1.25, 0.0, "1.25"),
+    ],
+)
+def test_numbers_have_two_digits_of_their_uncertainty(value, sd, text):
+    assert with_sd(value, sd) == text
+
+
+def test_positions_are_spread_from_first_to_last():
+    assert spread_over(3, 12).tolist() == [0, 1, 2]
+    assert spread_over(1, 12).tolist() == [0]
+    many = spread_over(1000, 12)
+    assert (len(many), many[0], many[-1]) == (12, 0, 999)
