@@ -45,7 +45,7 @@ def draw_truth(seed: int, count: int, collapsed: bool):
     chosen = np.sort(rng.choice(len(PAPER_DIAMETERS_UM), size=count, replace=False))
     diameters = PAPER_DIAMETERS_UM[chosen]
     particles = particle_batch(diameters)
-    low, high = np.asarray(prior_numbers(JointModel().beliefs, particles.flatness).a)[2:]
+    low, high = np.asarray(prior_numbers(JointModel().beliefs, eqx.filter_vmap(lambda p: p.flatness)(particles)).a)[2:]
     truth = {k: v[0, 0] for k, v in prior_draws(JointModel().beliefs, low, high, (1, 1), seed).items()}
     if collapsed:
         truth["tau"] = np.array([truth["tau"][0], COLLAPSED, truth["tau"][2]])

@@ -23,14 +23,11 @@ from ._elastic import ElasticFit, campaign_branches, fit_effective_modulus
 from ._master import MasterCurve, StrainTable, master_curve, strain_table
 from ._plastic import PlasticFit, fit_population
 from ._predict import ParticleFit, point_noise_um, predict_particles
-from ._result import estimate, finite
+from ._result import estimate, finite, misfit_note
 from ._shape import Objective, ShapeFit, fit_shape_parameter
 
 PLAUSIBLE_SHAPE_FACTOR = 4.0
 """Shape factors beyond this, twice the paper's largest, come from curves that do not collapse, not from shape."""
-
-BAD_MISFIT = 0.05
-"""Share of the range of displacement; with the law's own data and a tester's noise it stays below 0.01."""
 
 
 @dataclass(frozen=True)
@@ -118,13 +115,7 @@ class PaperCalibration:
     @property
     def misfit_note(self) -> str | None:
         """A sentence if the law describes the tests badly even with each particle's own coefficients, else None."""
-        if not self.own_misfit > BAD_MISFIT:
-            return None
-        return (
-            "even with its own C1, C3, C5 the law misses a test's displacements by "
-            f"{100 * self.own_misfit:.0f} % of their range (median): "
-            "it describes these tests badly, or they are no compressions of single particles"
-        )
+        return misfit_note(self.own_misfit)
 
     @property
     def relative_misfit(self) -> float:

@@ -5,6 +5,20 @@ from __future__ import annotations
 import math
 from typing import Any
 
+BAD_MISFIT = 0.05
+"""Share of the range of displacement; with the law's own data and a tester's noise it stays below 0.01."""
+
+
+def misfit_note(own_misfit: float) -> str | None:
+    """A sentence if the law describes the tests badly even with each particle's own coefficients, else None."""
+    if not own_misfit > BAD_MISFIT:
+        return None
+    return (
+        "even with its own C1, C3, C5 the law misses a test's displacements by "
+        f"{100 * own_misfit:.0f} % of their range (median): "
+        "it describes these tests badly, or they are no compressions of single particles"
+    )
+
 
 def finite(value: float) -> float | None:
     """The number, or None if it is not finite: JSON knows neither NaN nor infinity."""

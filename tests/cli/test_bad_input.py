@@ -94,11 +94,18 @@ COMMAND_LINES = {
     "calibrate {c} --out {f}": "is a file, not a folder",
     "calibrate {c} --out {f}/below/it --no-figures": "cannot be written",
     "calibrate {c} --out /proc/nothing/here --no-figures": "cannot be written",
-    "calibrate {c} --out {o} --reference Z": "'Z'",
+    "calibrate {c} --out {o} --method paper --reference Z": "'Z'",
+    "calibrate {c} --out {o} --reference A": "belongs to --method paper",
+    "calibrate {c} --out {o} --method paper --draws 100": "belongs to --method bayes",
+    "calibrate {c} --out {o} --loss cauchy": "belongs to --method least-squares",
+    "calibrate {c} --out {o} --draws 3": "--draws",
+    "calibrate {c} --out {o} --priors {n}": "cannot be read",
+    "calibrate {c} --out {o} --priors {c}/particles.csv": "particles.csv",
     "calibrate {c} --out {o} --threshold-MPa -1": "-1 is not at least 0",
     "calibrate {c} --out {o} --threshold-MPa nan": "'nan'",
-    "calibrate {c} --out {o} --threshold-MPa 1000": "usable particles",
-    "calibrate {c} --out {o} --method bayes": "'bayes'",
+    "calibrate {c} --out {o} --method paper --threshold-MPa 1000": "usable particles",
+    "calibrate {c} --out {o} --threshold-MPa 1000": "no particle can be used",
+    "calibrate {c} --out {o} --method mcmc": "'mcmc'",
     "calibrate {c} --out {o} --seed -1": "--seed",
     "calibrate {c} --out {o} --seed 1.5": "--seed",
     "calibrate {c} --out ": "--out",
@@ -195,7 +202,7 @@ def test_whatever_is_raised_leaves_old_results(run, simulated, tmp_path, monkeyp
         (stage.folder / "calibration.json").write_text("half")
         raise error
 
-    monkeypatch.setattr(calibrate, "calibrate_paper", lambda *_, **__: None)
+    monkeypatch.setattr(calibrate, "calibrate_bayes", lambda *_, **__: None)
     monkeypatch.setattr(_calibration, "write_calibration", fail)
     monkeypatch.delenv("MCC_JAX_DEBUG", raising=False)
     before = snapshot(tmp_path)
@@ -213,7 +220,7 @@ def test_debug_shows_the_traceback_of_a_defect_only(run, simulated, tmp_path, mo
         raise RuntimeError("planted")
 
     monkeypatch.setattr(_calibration, "write_calibration", fail)
-    arguments = ["calibrate", simulated, "--out", tmp_path / "fit"]
+    arguments = ["calibrate", simulated, "--out", tmp_path / "fit", "--method", "paper"]
     result = run("--debug", *arguments)
     assert (result.exit_code, "Traceback" in result.stderr) == (1, True)
     monkeypatch.setenv("MCC_JAX_DEBUG", "1")

@@ -94,14 +94,14 @@ def test_simulate_then_calibrate_twice_gives_the_same(run, simulated, tmp_path):
     out = tmp_path / "fit"
     (out / "figures").mkdir(parents=True)
     (out / "figures" / "mine.png").write_text("a file of the user's")
-    first = done(run("calibrate", simulated, "--out", out))
+    first = done(run("calibrate", simulated, "--out", out, "--method", "paper"))
     assert "converged" in first
     assert str(out) in first
     one = json.loads((out / "calibration.json").read_text())
     check_contract(one)
     assert all((out / name).is_file() for name in one["figures"])
     assert [p["particle"] for p in one["particles"]] == ["A", "B", "C"]
-    text = done(run("calibrate", simulated, "--out", out, "--no-figures", "--json"))
+    text = done(run("calibrate", simulated, "--out", out, "--method", "paper", "--no-figures", "--json"))
     assert text.endswith("}\n")
     two = json.loads(text)
     assert text == (out / "calibration.json").read_text(encoding="utf-8")
@@ -116,7 +116,8 @@ def test_simulate_then_calibrate_twice_gives_the_same(run, simulated, tmp_path):
 
 def test_calibrate_into_the_campaigns_own_folder(run, campaign):
     before = snapshot(campaign)
-    done(run("calibrate", campaign, "--out", campaign, "--no-figures", "--objective", "reference", "--reference", "B"))
+    reference = ["--method", "paper", "--objective", "reference", "--reference", "B"]
+    done(run("calibrate", campaign, "--out", campaign, "--no-figures", *reference))
     after = snapshot(campaign)
     content = json.loads(after.pop("calibration.json"))
     assert after == before
@@ -130,7 +131,7 @@ def test_calibrate_recovers_what_simulate_put_in(run, tmp_path):
     done(run("simulate", "--out", sim, *fixed, "--a", "0.9", "--effective-modulus", "9000", "--points", "200"))
     for column, value in coefficients.items():
         assert set(read_campaign(sim).columns[f"true_{column}"]) == {str(value)}
-    done(run("calibrate", sim, "--out", fit, "--no-figures", "--threshold-MPa", "0"))
+    done(run("calibrate", sim, "--out", fit, "--method", "paper", "--no-figures", "--threshold-MPa", "0"))
     content = json.loads((fit / "calibration.json").read_text())
     assert content["adjustment"]["threshold_MPa"] == 0
     assert content["a"]["value"] == pytest.approx(0.9, abs=2e-3)

@@ -18,8 +18,8 @@ from jaxtyping import Array, Float
 
 from ...campaign import THRESHOLD_MPA, Campaign
 from .._predict import point_noise_um
-from .._result import estimate, finite
-from ._data import Selection, Tests, select_tests
+from .._result import estimate, finite, misfit_note
+from ._data import Selection, Tests, own_misfit, select_tests
 from ._fit import JointFit, JointModel, fit_joint, population_at, populations, prior_numbers
 from ._noise import Whitening
 from ._population import Population, Summary, laplace
@@ -127,8 +127,8 @@ class BayesCalibration:
         if len(bad):
             names = ", ".join(self.particles[i] for i in bad[:5]) + (", ..." if len(bad) > 5 else "")
             found.append(
-                f"Pareto k is above {PARETO_K_MOST} for particle {names}: its likelihood is far from the quadratic that "
-                "the fast mode takes it for; use --mode joint, or leave the particle out"
+                f"Pareto k is above {PARETO_K_MOST} for particle {names}: its likelihood is far from the quadratic "
+                "that the fast mode takes it for; use --mode joint, or leave the particle out"
             )
         if self.pareto_k_joint is not None and not self.pareto_k_joint <= PARETO_K_MOST:
             found.append(
@@ -164,6 +164,9 @@ class BayesCalibration:
     def warnings(self) -> list[str]:
         """What a reader of the numbers must know, one sentence each."""
         notes = [*self.failures(), *self.selection.notes, *self.notes]
+        misfit = misfit_note(own_misfit(self.selection.tests, self.fit.residual))
+        if misfit is not None:
+            notes.append(misfit)
         dropped = sum(reason is not None for reason in self.selection.why_not)
         if dropped:
             notes.append(f"{dropped} of {len(self.campaign)} particles could not be used")
@@ -171,7 +174,7 @@ class BayesCalibration:
             notes.append(
                 f"{len(self.particles)} particles say little about a population: its spread is mostly the prior"
             )
-        flat = np.asarray(self.selection.tests.particle.flatness)
+        flat = np.asarray(self.selection.tests.flatness)
         if np.ptp(flat) < 0.02:
             notes.append("all particles have the same shape: nothing here tells a from C1, C3, C5; a is its prior")
         share = float(np.mean(self.probability_not_monotone()))
@@ -259,6 +262,7 @@ class BayesCalibration:
                 "pareto_k_joint": None if self.pareto_k_joint is None else finite(self.pareto_k_joint),
                 "weights_applied": self.weights_applied,
                 "leapfrogs_mean": finite(self.leapfrogs),
+                "own_misfit": finite(own_misfit(self.selection.tests, self.fit.residual)),
                 "failures": self.failures(),
             },
         }
@@ -353,17 +357,21 @@ def _compile(tests: Tests, model: JointModel, chains: int, warmup: int, draws: i
 
     one, four = dummy(count), dummy(count, 4)
     quadratic = Summary(four, dummy(count, 4, 4), four, one, one, one, four, one)
-    numbers = prior_numbers(model.beliefs, tests.particle.flatness)
+    numbers = prior_numbers(model.beliefs, tests.flatness)
     # Almost all campaigns pin their coefficients down; the others compile again.
-    key, flat, scatter = jax.random.key(0), tests.particle.flatness, replace(model.scatter, newton=0)
+    key, flat, scatter = jax.random.key(0), tests.flatness, replace(model.scatter, newton=0)
     settings = {"chains": chains, "warmup": warmup, "draws": draws}
     sample_population.lower(key, dummy(d), dummy(d, d), numbers, quadratic, flat, scatter, **settings).compile()
     exact = Exact(
-        tests, Whitening(*(dummy(count, points) for _ in range(3))), quadratic, model.zero_sd, model.unloading
+        tests,
+        eqx.filter_vmap(Whitening)(*(dummy(count, points) for _ in range(3))),
+        quadratic,
+        model.zero_sd,
+        model.unloading,
     )
     several = dummy(len(range(0, chains * draws, _stride(count, chains * draws))))
     triple = dummy(*several.shape, 3)
-    some = Population(several, several, triple, triple, several, several, several)
+    some = eqx.filter_vmap(Population)(several, several, triple, triple, several, several, several)
     draw_particles.lower(key, some, exact, flat, scatter).compile()
     import arviz_stats.base  # noqa: F401  # seconds on a cold machine, so here too
 
@@ -375,7 +383,7 @@ SHARP = 0.03
 def newton_steps(fit: JointFit, tests: Tests, model: JointModel) -> int:
     """How many Newton steps the integration over the particles needs: none if every coefficient is known sharply."""
     population = population_at(fit.mode, fit.numbers, model.scatter)
-    at = eqx.filter_jit(laplace)(population, fit.summary, tests.particle.flatness, model.scatter)
+    at = eqx.filter_jit(laplace)(population, fit.summary, tests.flatness, model.scatter)
     variance = np.diagonal(np.linalg.inv(np.asarray(at.hessian)), axis1=1, axis2=2)
     widest = float(np.max(np.sqrt(variance) * np.asarray(at.stretch)))
     return 0 if widest < SHARP else 4
@@ -389,7 +397,7 @@ def _stride(count: int, total: int) -> int:
 def _fast(
     key: Array, tests: Tests, model: JointModel, fit: JointFit, chains: int, warmup: int, draws: int
 ) -> dict[str, Any]:
-    flat, scatter = tests.particle.flatness, replace(model.scatter, newton=newton_steps(fit, tests, model))
+    flat, scatter = tests.flatness, replace(model.scatter, newton=newton_steps(fit, tests, model))
     population_key, particle_key, check_key, pick_key = jax.random.split(key, 4)
     run, population = sample_population(
         population_key,
@@ -465,7 +473,7 @@ def _fast(
 def _joint(
     key: Array, tests: Tests, model: JointModel, fit: JointFit, chains: int, warmup: int, draws: int
 ) -> dict[str, Any]:
-    flat, scatter = tests.particle.flatness, replace(model.scatter, newton=newton_steps(fit, tests, model))
+    flat, scatter = tests.flatness, replace(model.scatter, newton=newton_steps(fit, tests, model))
     exact = exact_of(fit, tests, model.zero_sd, model.unloading)
     run, free, latent, zero, likelihood = sample_joint(
         key, fit.mode, fit.covariance, fit.numbers, exact, flat, scatter, chains=chains, warmup=warmup, draws=draws

@@ -49,6 +49,11 @@ class Tests(eqx.Module):
     def __len__(self) -> int:
         return self.force.shape[0]
 
+    @property
+    def flatness(self) -> Float[Array, " particles"]:
+        """1 - D3^2/(D1 D2) of every particle [-], through which `a` acts."""
+        return eqx.filter_vmap(lambda particle: particle.flatness)(self.particle)
+
 
 @dataclass(frozen=True)
 class Selection:
@@ -169,6 +174,14 @@ def _prepare(
     if rise <= LEAST_CLIMB * noise / np.sqrt(third):
         return "shows no loading curve: displacement does not grow with force beyond its noise"
     return _Prepared(rows, mask, loading, float(curve.displacement_um[0] if contact is None else contact))
+
+
+def own_misfit(tests: Tests, residual: Float[Array, "particles points"]) -> float:
+    """Median over the particles of the root mean square residual, in shares of the range of displacement [-]."""
+    mask, measured = np.asarray(tests.mask), np.asarray(tests.displacement)
+    rms = np.sqrt((np.asarray(residual) ** 2).sum(1) / np.maximum(mask.sum(1), 1))
+    high, low = np.where(mask, measured, -np.inf).max(1), np.where(mask, measured, np.inf).min(1)
+    return float(np.median(rms / np.maximum(high - low, 1e-300)))
 
 
 def _notes(campaign: Campaign, kept: tuple[int, ...], used: Sequence[_Prepared], most_points: int):

@@ -95,7 +95,7 @@ class JointFit(eqx.Module):
     mode: Float[Array, " d"]
     covariance: Float[Array, "d d"]
     numbers: PriorNumbers
-    converged: Bool[Array, " 3"]
+    converged: Bool[np.ndarray, " 3"]
 
 
 def prior_numbers(priors: Priors, flatness: Float[Array, " particles"]) -> PriorNumbers:
@@ -144,7 +144,7 @@ def fit_joint(
         tell: called with the name of each step.
     """
     scatter, zero_sd, priors = model.scatter, model.zero_sd, model.beliefs
-    flatness = tests.particle.flatness
+    flatness = tests.flatness
     numbers = prior_numbers(priors, flatness)
     read_out = max(read_out_um, 1e-4)
     tell("fitting every particle")

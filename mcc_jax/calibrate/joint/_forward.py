@@ -5,9 +5,9 @@ The tester controls force and noise lives in displacement, so a test of particle
 .. math:: d_{ik} = z_i + \gamma(F_{i1} \dots F_{ik};\, b_i, e_i) + \text{noise}
 
 with its zero z, and the law's displacement under load control. The law knows the coefficients only through products
-with the shape factor: :math:`b_j = \log(C_j \eta_p)`, and the modulus through :math:`e = \log(\bar E \eta_p^p)` with the
-power p of the strain scaling. So the data of one particle never contain the shape parameter `a`: it enters through what
-particles of different shapes have in common (`_population`).
+with the shape factor: :math:`b_j = \log(C_j \eta_p)`, and the modulus through :math:`e = \log(\bar E \eta_p^p)` with
+the power p of the strain scaling. So the data of one particle never contain the shape parameter `a`: it enters through
+what particles of different shapes have in common (`_population`).
 """
 
 from __future__ import annotations

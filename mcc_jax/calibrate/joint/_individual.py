@@ -154,7 +154,7 @@ def fit_particles(
 
     y = starts.reshape(-1, 5)
     unfinished = jnp.zeros(len(y), bool)
-    # The first pass through the loop evaluates the start: an infinite loss accepts whatever comes, and no force moves it.
+    # The first pass evaluates the start: an infinite loss accepts whatever comes, and no force moves it.
     carry = (y, jnp.full(len(y), jnp.inf), jnp.zeros((len(y), 5)), jnp.broadcast_to(jnp.eye(5), (len(y), 5, 5)))
     carry = (*carry, jnp.full(len(y), 1e-3), 0, unfinished)
     going = lambda c: (c[5] < 2) | ((c[5] < MOST_STEPS) & ~jnp.all(c[6]))  # noqa: E731  # a condition, no function

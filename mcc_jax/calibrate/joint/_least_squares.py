@@ -13,10 +13,10 @@ import numpy as np
 
 from ...campaign import THRESHOLD_MPA, Campaign
 from .._predict import point_noise_um
-from .._result import estimate, finite
+from .._result import estimate, finite, misfit_note
 from ._arrow import Parameters, Solution
 from ._bayes import COEFFICIENTS, log_estimate
-from ._data import Selection, select_tests
+from ._data import Selection, own_misfit, select_tests
 from ._fit import JointFit, JointModel, fit_joint, population_at
 from ._pooled import Pooled, fit_pooled, unpack
 
@@ -34,8 +34,8 @@ class Identifiability:
     """What the data say of combinations of the shared parameters.
 
     Attributes:
-        singular_values: of the curvature, every parameter on the scale of its own curvature, largest first; all would be
-            1 if the parameters did not interact, and 0 marks a combination that the data leave open.
+        singular_values: of the curvature, every parameter on the scale of its own, largest first; all
+            would be 1 if the parameters did not interact, and 0 marks a combination that the data leave open.
         directions: the combinations, one row each, in the order of `SHARED`.
     """
 
@@ -110,6 +110,9 @@ class LeastSquaresCalibration:
         if agree < count:
             notes.append(f"{count - agree} of {count} starts ended at a worse optimum")
         notes += self.selection.notes
+        misfit = misfit_note(own_misfit(self.selection.tests, jnp.asarray(self.residual())))
+        if misfit is not None:
+            notes.append(misfit)
         dropped = sum(reason is not None for reason in self.selection.why_not)
         if dropped:
             notes.append(f"{dropped} of {len(self.campaign)} particles could not be used")
@@ -128,7 +131,7 @@ class LeastSquaresCalibration:
         sds = np.sqrt(np.diagonal(shared))
         known = [not (free and self._open_share(q) > 0.1) for q in range(5)]
         a = float(values[0])
-        flat = np.asarray(tests.particle.flatness)
+        flat = np.asarray(tests.flatness)
         eta = 1 + a * flat
         slope = flat / eta
         mask = np.asarray(tests.mask)

@@ -1,4 +1,4 @@
-"""Tests linear in their particle's own parameters: what the noise is estimated from and what the summaries are made of."""
+"""Tests linear in their particle's own parameters: what noise is estimated from and summaries are made of."""
 
 from __future__ import annotations
 

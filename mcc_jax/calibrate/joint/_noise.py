@@ -105,12 +105,6 @@ def whitening(noise: Noise, scale: Scalar, step: Path, mask: Bool[Array, " steps
     return Whitening(decay, gain, jnp.where(mask, 1 / (scale * jnp.sqrt(total)), 0.0))
 
 
-def white(mask: Bool[Array, "particles steps"], scale: Scalar) -> Whitening:
-    """Filters that only divide by one standard deviation [um]."""
-    zeros = jnp.zeros(mask.shape)
-    return Whitening(zeros, zeros, jnp.where(mask, 1 / scale, 0.0))
-
-
 class Linear(eqx.Module):
     """Residuals of N tests, linear in each particle's own parameters around a point.
 
@@ -182,7 +176,8 @@ def estimate_noise(
         uncertainty: whether to work out standard deviations.
 
     Returns:
-        The noise, standard deviations of the logarithms of its four numbers (or NaN), and whether the optimiser converged.
+        The noise, standard deviations of the logarithms of its four numbers (or NaN), and whether the optimiser
+        converged.
     """
     from scipy.optimize import minimize
 
@@ -215,7 +210,7 @@ OUTLYING = 5.0
 
 
 def particle_scales(scale: np.ndarray, squares: np.ndarray, freedom: np.ndarray) -> np.ndarray:
-    """Every particle's scale from its whitened sum of squares, pulled towards 1 unless they scatter by more than chance.
+    """Every particle's scale from its whitened sum of squares, pulled towards 1 unless they scatter beyond chance.
 
     Args:
         scale: scales that the sums were whitened with, shape (N,).

@@ -65,7 +65,7 @@ def unpack(y: Parameters, settings: Pooled, tests: Tests) -> tuple[Float[Array, 
     """Latent vectors and zeros: local are b1, b3, b5, zero and, if it scatters, e."""
     if settings.scatter.modulus:
         return jnp.concatenate([y.local[:, :3], y.local[:, 4:]], 1), y.local[:, 3]
-    log_eta = jnp.log(jnp.maximum(1 + y.shared[0] * tests.particle.flatness, 1e-3))
+    log_eta = jnp.log(jnp.maximum(1 + y.shared[0] * tests.flatness, 1e-3))
     e = y.shared[1] + settings.scatter.power * log_eta
     return jnp.concatenate([y.local[:, :3], e[:, None]], 1), y.local[:, 3]
 
@@ -92,7 +92,7 @@ def pooled_residual(settings: Pooled, tests: Tests) -> Callable[[Parameters], tu
             settings.shape_scatter,
             jnp.zeros(()),
         )
-        mean, factor = moments(population, tests.particle.flatness, settings.scatter)
+        mean, factor = moments(population, tests.flatness, settings.scatter)
         covariance = jnp.einsum("npk,nqk->npq", factor, factor)[:, :size, :size]
         pooled = Cholesky(covariance).forward((latent - mean)[:, :size])
         return robust(settings.loss, data), pooled, ((zero - tests.contact) / settings.zero_sd)[:, None]

@@ -126,7 +126,15 @@ def read_priors(file: str | Path, unloading: Unloading = Unloading.PRINTED) -> P
     priors = Priors.default(unloading)
     known = dict(priors._entries())
     changes: dict[str, Any] = {}
-    for name, entry in load_toml(file).items():
+    try:
+        content = load_toml(file.read_text(encoding="utf-8"), file)
+    except OSError as error:
+        raise InputError(
+            f"cannot be read ({error.strerror})", file=file, remedy="Give a TOML file of priors."
+        ) from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"is no text in UTF-8: {error}", file=file, remedy="Save it as UTF-8.") from error
+    for name, entry in content.items():
         if name not in known:
             raise InputError(
                 f"there is no prior {name!r}", file=str(file), remedy=f"Known priors: {', '.join(sorted(known))}."
