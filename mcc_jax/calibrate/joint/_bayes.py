@@ -45,8 +45,10 @@ of larger campaigns some draws are compared, to know how good each particle's su
 RESTLESS = 0.3
 """A particle whose weight scatters by more than this share of its mean gets several candidates per draw."""
 
-CANDIDATES = (16, 128)
-"""How many: first, and for those that still scatter."""
+CANDIDATES = (16, 64)
+"""How many: first, and for the few that scatter most even then."""
+
+FEW = 4
 
 MOST_PARTICLE_DRAWS = 4_000_000
 """At most as many draws of single particles are kept; of very large campaigns every n-th draw."""
@@ -419,7 +421,7 @@ def _fast(
     )
     ratio = checked.log_ratio
     k = pareto_k(ratio)
-    restless = np.flatnonzero(_restless(ratio))
+    restless = np.flatnonzero(_unrest(ratio) > RESTLESS)
     applied = stride == 1
     notes: list[str] = []
     names, stacked = _stack(population, scatter, (chains, draws))
@@ -436,7 +438,8 @@ def _fast(
             better = [np.asarray(v)[:, : len(restless)] for v in more]
             latent[:, restless], zero[:, restless], ratio[:, restless] = better[0], better[1], better[3]
             k[restless] = pareto_k(ratio[:, restless])
-            restless = restless[_restless(ratio[:, restless])]
+            restless = restless[np.argsort(-_unrest(ratio[:, restless]))][:FEW]
+            restless = restless[_unrest(ratio[:, restless]) > RESTLESS]
         weight, joint = smoothed_weights(ratio.sum(1))
         rows = (slice(c * draws, (c + 1) * draws) for c in range(chains))
         chosen = np.concatenate([row.start + ordered_resample(weight[row], draws) for row in rows])
@@ -560,10 +563,10 @@ def diagnostics(names: list[str], draws: np.ndarray) -> tuple[dict[str, float], 
     return named(rhat), named(bulk), named(tail)
 
 
-def _restless(log_weight: np.ndarray) -> np.ndarray:
-    """Which particles' weights scatter too much, draws along the first axis."""
-    relative = np.exp(log_weight - log_weight.max(0))
-    return relative.std(0) > RESTLESS * relative.mean(0)
+def _unrest(log_weight: np.ndarray) -> np.ndarray:
+    """Standard deviation of each particle's weights over their mean, draws along the first axis."""
+    relative = np.exp(log_weight - np.maximum(log_weight.max(0), -1e300))
+    return relative.std(0) / np.maximum(relative.mean(0), 1e-300)
 
 
 def pareto_k(log_weight: np.ndarray) -> np.ndarray:

@@ -5,8 +5,8 @@
 3. A summary is a quadratic; the true likelihood of a test is not. Their ratio at the drawn parameters is the draw's
    importance weight, which makes the result exact whatever the summary's quality, and shows that quality (Pareto k).
    Particles whose ratio scatters (a curve that snaps through, say) get several candidates per draw of the population,
-   of which one is kept in proportion to its ratio, and the mean ratio becomes the weight: the same exact posterior, with
-   less scatter.
+   of which one is kept in proportion to its ratio, and the mean ratio becomes the weight: the same exact posterior,
+   with less scatter.
 """
 
 from __future__ import annotations

@@ -1,0 +1,69 @@
+"""The residual function of the joint least squares, written by hand in NumPy: what SciPy and lmfit are fed with."""
+
+from __future__ import annotations
+
+import numpy as np
+
+FIELDS = ("D1", "D2", "D3")
+
+
+def numpy_residual(tests, settings):
+    """The pooled residuals as a function of one flat vector: every particle's b1, b3, b5, zero, then the shared five.
+
+    For monotone laws, the printed form and raw scaling, without further scatter.
+    """
+    D1, D2, D3 = (np.asarray(getattr(tests.particle, name)) for name in FIELDS)
+    diameter = (D1 * D2 / D3)[:, None]
+    flatness = 1 - D3**2 / (D1 * D2)
+    force = np.asarray(tests.force)
+    stress = np.maximum(force * 1e3 / (np.pi * diameter**2 / 4), 0)
+    highest = np.maximum.accumulate(stress, axis=1)
+    ratio = np.minimum(stress / np.maximum(highest, 1e-300), 1)
+    recovered = kepler(ratio)
+    measured, mask, contact = (np.asarray(v) for v in (tests.displacement, tests.mask, tests.contact))
+    decay, gain, weight = (np.asarray(getattr(settings.whitening, n)) for n in ("decay", "gain", "weight"))
+    tau, zero_sd = np.maximum(np.asarray(settings.tau), 1e-4), float(settings.zero_sd)
+    count = len(force)
+
+    def residual(flat):
+        local, (a, e, *mu) = flat[: 4 * count].reshape(count, 4), flat[4 * count :]
+        b, zero = local[:, :3], local[:, 3]
+        K1, K3, K5 = (np.exp(k * b[:, j])[:, None] for j, k in enumerate((1, 3, 5)))
+        x = loading_strain(K1, K3, K5, highest)
+        secant = K1 - x**2 * (K3 - x**2 * K5)
+        predicted = diameter * (x - np.sqrt(secant / (4.12 * np.exp(e))) * recovered)
+        r = np.where(mask, measured - predicted - zero[:, None], 0.0)
+        white = np.empty_like(r)
+        expected = np.zeros(count)
+        for k in range(r.shape[1]):
+            expected *= decay[:, k]
+            surprise = r[:, k] - expected
+            expected = expected + gain[:, k] * surprise
+            white[:, k] = surprise * weight[:, k]
+        pooled = (b - np.array(mu) - np.log(1 + a * flatness)[:, None]) / tau
+        return np.concatenate([white[mask], pooled.ravel(), (zero - contact) / zero_sd])
+
+    return residual
+
+
+def loading_strain(K1, K3, K5, stress):
+    """Newton from an upper bound on the convex part, from below on the concave one."""
+    bend = np.sqrt(0.3 * K3 / K5)
+    at_bend = bend * (K1 - bend**2 * (K3 - bend**2 * K5))
+    above = np.minimum(9 * stress / (4 * K1), (9 * stress / (4 * K5)) ** 0.2)
+    x = np.where(stress <= at_bend, stress / K1, above)
+    for _ in range(14):
+        square = x * x
+        x = x - (x * (K1 - square * (K3 - square * K5)) - stress) / (K1 - square * (3 * K3 - 5 * square * K5))
+    return x
+
+
+def kepler(ratio):
+    """Recovered share of strain at a share of the peak stress: E - sin E = pi ratio, s = cos(E/2)."""
+    z = np.cbrt(6 * np.pi * ratio)
+    E = z + z**3 / 60 + z**5 / 1400 + z**7 / 25200 + 43 * z**9 / 17248000
+    for _ in range(4):
+        slope = np.where(E > 1e-3, 1 - np.cos(E), 1.0)
+        excess = np.where(E > 0.1, E - np.sin(E), E**3 / 6 - E**5 / 120 + E**7 / 5040) - np.pi * ratio
+        E = np.where(E > 1e-3, E - excess / slope, E)
+    return np.cos(E / 2)

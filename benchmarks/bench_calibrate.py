@@ -1,0 +1,212 @@
+"""How fast is the joint calibration, against SciPy and lmfit, and against the textbook model in NumPyro and PyMC?
+
+Run `uv run --group bench python benchmarks/bench_calibrate.py --write` (ten minutes); `--budget 60` for a look.
+
+All rows see the same campaign: the paper's 20 particles. The textbook samplers get the time budget and are ended then.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import time
+
+import _report
+import _textbook
+import _textbook_numpyro
+import _textbook_pymc
+import jax
+import numpy as np
+from _numpy_residual import numpy_residual
+
+from mcc_jax.calibrate import calibrate_bayes, calibrate_least_squares
+from mcc_jax.calibrate.joint._least_squares import solve
+from mcc_jax.simulate import paper_campaign
+
+COLD = """
+import jax, time
+jax.config.update("jax_enable_x64", True)
+from mcc_jax import calibrate_bayes, paper_campaign
+calibrate_bayes(paper_campaign(0))
+"""
+
+
+def least_squares(repeats: int) -> tuple[list[dict], list[dict]]:
+    """Ours, SciPy's and lmfit's, from the same start to the same optimum."""
+    import lmfit
+    from scipy.optimize import least_squares as scipy_least_squares
+
+    campaign = paper_campaign(0)
+    whole = calibrate_least_squares(campaign)
+    seconds = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        calibrate_least_squares(campaign)
+        seconds.append(time.perf_counter() - start)
+    shared = np.asarray(whole.solution.value.shared)
+    first = np.concatenate([[1.0], shared[1:2] + 0.05, shared[2:]])
+    alone = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        found = solve(whole.fit, whole.settings, whole.selection, float(first[0]), first[2:], float(first[1]))
+        jax.block_until_ready(found.value)
+        alone.append(time.perf_counter() - start)
+    ours = np.concatenate([np.asarray(found.value.local).ravel(), np.asarray(found.value.shared)])
+    residual = numpy_residual(whole.selection.tests, whole.settings)
+    ours_loss, ours_here = float(found.loss), float(0.5 * np.sum(residual(ours) ** 2))
+    assert abs(ours_loss - ours_here) < 1e-6 * ours_loss, (ours_loss, ours_here)
+    local = np.concatenate([np.asarray(whole.fit.latent)[:, :3], np.asarray(whole.fit.zero)[:, None]], 1)
+    x0 = np.concatenate([local.ravel(), first])
+    rows = [
+        {
+            "row": "mcc_jax, everything (starts, noise, spread, fit)",
+            "seconds": float(np.median(seconds)),
+            "loss": ours_loss,
+            "largest difference": 0.0,
+        },
+        {
+            "row": "mcc_jax, the least squares alone",
+            "seconds": float(np.median(alone)),
+            "loss": ours_loss,
+            "largest difference": 0.0,
+        },
+    ]
+    start = time.perf_counter()
+    scipy_found = scipy_least_squares(residual, x0, x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    rows.append(
+        _row("scipy.optimize.least_squares", time.perf_counter() - start, scipy_found.x, scipy_found.cost, ours)
+    )
+    parameters = lmfit.Parameters()
+    for i, value in enumerate(x0):
+        parameters.add(f"p{i}", value=float(value))
+    start = time.perf_counter()
+    fitted = lmfit.minimize(
+        lambda p: residual(np.array(list(p.valuesdict().values()))), parameters, xtol=1e-12, ftol=1e-12
+    )
+    x = np.array(list(fitted.params.valuesdict().values()))
+    rows.append(_row("lmfit.minimize", time.perf_counter() - start, x, 0.5 * fitted.chisqr, ours))
+    best = min(row["seconds"] for row in rows[2:])
+    verdicts = [
+        {
+            "target": "least squares, warm [s]",
+            "value": rows[1]["seconds"],
+            "limit": 0.1,
+            "verdict": rows[1]["seconds"] <= 0.1,
+        },
+        {
+            "target": "everything, warm [s]",
+            "value": rows[0]["seconds"],
+            "limit": 0.1,
+            "verdict": rows[0]["seconds"] <= 0.1,
+        },
+        {
+            "target": "least squares / faster of SciPy and lmfit",
+            "value": rows[1]["seconds"] / best,
+            "limit": 0.1,
+            "verdict": rows[1]["seconds"] <= 0.1 * best,
+        },
+        {
+            "target": "same optimum (SciPy), relative",
+            "value": rows[2]["largest difference"],
+            "limit": 1e-6,
+            "verdict": rows[2]["largest difference"] <= 1e-6,
+        },
+    ]
+    return rows, verdicts
+
+
+def _row(name: str, seconds: float, x: np.ndarray, loss: float, ours: np.ndarray) -> dict:
+    difference = np.max(np.abs(x - ours) / np.maximum(np.abs(ours), 1.0))
+    return {"row": name, "seconds": seconds, "loss": float(loss), "largest difference": float(difference)}
+
+
+def posterior(repeats: int, budget: float) -> tuple[list[dict], list[dict]]:
+    """Ours, cold and warm, and the textbook model's."""
+    start = time.perf_counter()
+    subprocess.run([sys.executable, "-c", COLD], check=True)
+    cold = time.perf_counter() - start
+    campaign = paper_campaign(0)
+    calibrate_bayes(campaign)
+    seconds = []
+    for seed in range(repeats):
+        start = time.perf_counter()
+        result = calibrate_bayes(campaign, seed=seed)
+        seconds.append(time.perf_counter() - start)
+    warm = float(np.median(seconds))
+    least = min(result.ess_bulk.values())
+    rows = [_sampler("mcc_jax, warm", warm, least, max(result.rhat.values()), result.divergences, result.converged)]
+    data = _textbook.data_from_campaign(campaign)
+    settings = {"draws": 1000, "warmup": 1000, "chains": 2, "seed": 0, "timeout_s": budget}
+    for name, module, centred in (
+        ("textbook, NumPyro, centred", _textbook_numpyro, True),
+        ("textbook, NumPyro, not centred", _textbook_numpyro, False),
+        ("textbook, PyMC and nutpie, centred", _textbook_pymc, True),
+    ):
+        run = module.sample(data, centred=centred, **settings)
+        if run["posterior"] is None:
+            rows.append({**_sampler(name, budget, 0.0, float("inf"), 0, False), "note": run["why_not"]})
+            continue
+        table = _textbook.summary(run["posterior"])
+        ess, rhat = min(r["ess_bulk"] for r in table), max(r["rhat"] for r in table)
+        rows.append(
+            _sampler(name, run["seconds"], ess, rhat, int(run["divergences"]), all(r["converged"] for r in table))
+        )
+    ours = least / warm
+    verdicts = [
+        {"target": "posterior from a cold process [s]", "value": cold, "limit": 15.0, "verdict": cold <= 15},
+        {"target": "posterior, warm [s]", "value": warm, "limit": 2.0, "verdict": warm <= 2},
+        {"target": "smallest bulk ESS, at least", "value": float(least), "limit": 2000, "verdict": least >= 2000},
+        {"target": "divergences", "value": result.divergences, "limit": 0, "verdict": result.divergences == 0},
+    ]
+    for row in rows[1:]:
+        ratio = ours / row["ESS per s"] if row["ESS per s"] > 0 else float("inf")
+        verdicts.append(
+            {
+                "target": f"ESS per second over {row['row']}, at least",
+                "value": ratio,
+                "limit": 100,
+                "verdict": ratio >= 100,
+            }
+        )
+    return rows, verdicts
+
+
+def _sampler(name: str, seconds: float, ess: float, rhat: float, divergences: int, converged: bool) -> dict:
+    return {
+        "row": name,
+        "seconds": float(seconds),
+        "smallest bulk ESS": float(ess),
+        "ESS per s": float(ess / seconds),
+        "R-hat": float(rhat),
+        "divergences": divergences,
+        "converged": converged,
+        "note": "",
+    }
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--budget", type=float, default=200.0, help="seconds for each textbook sampler")
+    parser.add_argument("--write", action="store_true", help="keep the tables in benchmarks/results/")
+    arguments = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    fits, fit_verdicts = least_squares(arguments.repeats)
+    samplers, sampler_verdicts = posterior(arguments.repeats, arguments.budget)
+    settings = {
+        "campaign": "paper_campaign(0): 20 particles, 301 points each",
+        "budget of the textbook samplers": f"{arguments.budget:g} s, 2 chains, 1000 + 1000",
+        **_report.environment("jax", "numpyro", "optimistix", "scipy", "lmfit", "pymc", "nutpie"),
+    }
+    tables = {
+        "Targets": fit_verdicts + sampler_verdicts,
+        "Least squares": fits,
+        "Posterior": samplers,
+        "Settings": [{"setting": key, "value": str(value)} for key, value in settings.items()],
+    }
+    _report.write("calibrate", "Speed of the joint calibration", tables, arguments.write)
+
+
+if __name__ == "__main__":
+    main()

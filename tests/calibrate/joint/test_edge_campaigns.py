@@ -1,0 +1,224 @@
+"""Campaigns as they come: ragged, weak, noisy, without unloading, doubled, tiny. Nothing becomes NaN or silent."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from joint_cases import COEFFICIENTS, DIAMETERS, NOISE, simulated, true_coefficients
+
+from mcc_jax import Campaign, Curve, InputError, Programme, Ramp, calibrate_bayes, calibrate_least_squares
+from mcc_jax.calibrate.joint._data import select_tests
+
+METHODS = {
+    "bayes": lambda campaign: calibrate_bayes(campaign, draws=200, chains=2),
+    "least-squares": calibrate_least_squares,
+}
+methods = pytest.mark.parametrize("method", list(METHODS))
+
+
+def one(name, which, **options):
+    return simulated(
+        COEFFICIENTS[which : which + 1],
+        DIAMETERS[which : which + 1],
+        instrument=NOISE,
+        particles=[name],
+        seed=which,
+        **options,
+    )
+
+
+def joined(*campaigns):
+    first = campaigns[0]
+    return Campaign(
+        tuple(c.particles[0] for c in campaigns),
+        np.concatenate([c.diameters_um for c in campaigns]),
+        tuple(c.curves[0] for c in campaigns),
+        {name: tuple(c.columns[name][0] for c in campaigns) for name in first.columns},
+        first.metadata,
+    )
+
+
+def with_displacement(campaign, displacement, force=None):
+    (curve,) = campaign.curves
+    curve = Curve(curve.time_s, curve.force_mN if force is None else force, displacement)
+    return replace(campaign, curves=(curve,))
+
+
+def renamed(campaign, name):
+    return replace(campaign, particles=(name,))
+
+
+def ragged():
+    plain = one("plain", 0, programme=Programme.cycles(points=220))
+    rng = np.random.default_rng(9)
+    noise = one("noise", 3, programme=Programme.cycles(points=120))
+    n = len(noise.curves[0])
+    return joined(
+        plain,
+        one("cycles", 1, programme=Programme.cycles(levels=(0.3, 0.6, 1.0), unload_to=0.2, points=250)),
+        one("hold", 2, programme=Programme.cycles(hold_s=20.0, points=90)),
+        one("weak", 3, peak_MPa=0.15),
+        one("loading", 3, programme=Programme("load", (Ramp(1.0, 2.0),), points=80)),
+        with_displacement(noise, 3 * rng.standard_normal(n)),
+        with_displacement(renamed(noise, "nothing"), 0.02 * rng.standard_normal(n), 0.05 * rng.standard_normal(n)),
+        renamed(plain, "twin"),
+    )
+
+
+KEPT = ("plain", "cycles", "hold", "loading", "twin")
+
+
+def check_contract(content, campaign):
+    """No NaN anywhere, every particle listed, and each either has numbers or a reason."""
+    text = json.dumps(content, allow_nan=False)
+    assert json.loads(text) == content
+    assert [p["particle"] for p in content["particles"]] == list(campaign.particles)
+    for particle in content["particles"]:
+        assert particle["kept"] is (particle["why_not"] is None)
+        for name in ("C1", "C3", "C5", "zero_um", "eta_p"):
+            value = particle[name]["value"]
+            if particle["kept"]:
+                assert value is not None, (particle["particle"], name)
+                assert math.isfinite(value)
+                assert name == "zero_um" or value > 0
+            else:
+                assert value is None
+    assert content["a"]["value"] is not None
+    assert content["effective_modulus_MPa"]["value"] > 0
+
+
+@pytest.fixture(scope="module")
+def campaign():
+    return ragged()
+
+
+@pytest.fixture(scope="module")
+def contents(campaign):
+    return {name: method(campaign).to_json() for name, method in METHODS.items()}
+
+
+def test_the_campaign_is_ragged(campaign):
+    assert len({len(curve) for curve in campaign.curves}) >= 5
+
+
+@methods
+def test_every_particle_has_numbers_or_a_reason(campaign, contents, method):
+    content = contents[method]
+    check_contract(content, campaign)
+    kept = tuple(p["particle"] for p in content["particles"] if p["kept"])
+    assert kept == KEPT
+    why = {p["particle"]: p["why_not"] for p in content["particles"]}
+    assert "MPa" in why["weak"]
+    assert "threshold of 0.2 MPa" in why["weak"]
+    assert why["noise"]
+    assert why["nothing"]
+    assert any("3 of 8 particles could not be used" in note for note in content["warnings"])
+
+
+@methods
+def test_notes_name_the_particles_they_are_about(contents, method):
+    notes = contents[method]["warnings"]
+    assert any("'loading'" in note and "never unloaded" in note for note in notes)
+    assert any("'plain'" in note and "'twin'" in note for note in notes)
+    assert not any("'hold'" in note and "never unloaded" in note for note in notes)
+
+
+@methods
+def test_the_good_particles_are_recovered_all_the_same(campaign, contents, method):
+    truth = true_coefficients(campaign)
+    for particle, C in zip(contents[method]["particles"], truth, strict=True):
+        if particle["kept"]:
+            for j, name in enumerate(("C1", "C3", "C5")):
+                assert abs(particle[name]["value"] - C[j]) < 0.25 * C[j], (particle["particle"], name)
+    modulus = contents[method]["effective_modulus_MPa"]
+    assert abs(modulus["value"] - 16_000) < 5 * modulus["sd"]
+    assert abs(contents[method]["a"]["value"] - 1.43) < 1.0
+
+
+def test_selected_points_are_those_of_the_record(campaign):
+    selection = select_tests(campaign)
+    tests = selection.tests
+    assert tests.force.shape == (5, 256)
+    assert tuple(campaign.particles[i] for i in selection.kept) == KEPT
+    for row, i in enumerate(selection.kept):
+        rows = selection.rows[row]
+        np.testing.assert_array_equal(np.asarray(tests.force[row])[: len(rows)], campaign.curves[i].force_mN[rows])
+        mask, loading = np.asarray(tests.mask[row]), np.asarray(tests.loading[row])
+        assert not mask[len(rows) :].any()
+        assert np.all(mask[loading])
+        stress = np.asarray(tests.particle.D3[row] ** 2 / (tests.particle.D1[row] * tests.particle.D2[row]) ** 2)
+        stress = stress * 4e3 / np.pi * np.asarray(tests.force[row])
+        assert np.all(stress[mask] >= 0.2)
+    cycles = KEPT.index("cycles")
+    # All three loadings count as virgin only beyond what was reached before.
+    loading = np.asarray(tests.loading[cycles])
+    force = np.asarray(tests.force[cycles])
+    highest = np.maximum.accumulate(force)
+    assert np.all(force[loading] > highest[loading] - 0.05 * highest.max())
+
+
+def test_a_threshold_must_be_a_stress(campaign):
+    for threshold in (-0.1, math.nan, math.inf):
+        with pytest.raises(ValueError, match="threshold"):
+            select_tests(campaign, threshold_MPa=threshold)
+
+
+@methods
+def test_one_particle_alone(method):
+    campaign = one("alone", 1)
+    content = METHODS[method](campaign).to_json()
+    check_contract(content, campaign)
+    eta = content["particles"][0]["eta_p"]["value"]
+    b = np.array([content["particles"][0][name]["value"] for name in ("C1", "C3", "C5")]) * eta
+    true_eta = 1 + 1.43 * (1 - 137.0**2 / (155.0 * 217.0))
+    # The curve says what C eta is, whatever a may be.
+    np.testing.assert_allclose(b, COEFFICIENTS[1] * true_eta, rtol=0.15)
+    assert content["effective_modulus_MPa"]["value"] == pytest.approx(16_000, rel=0.1)
+    if method == "least-squares":
+        assert content["diagnostics"]["open_combinations"]
+        assert content["a"]["sd"] is None
+        assert content["particles"][0]["C1"]["sd"] is None
+    else:
+        assert any("spread is mostly the prior" in note for note in content["warnings"])
+        assert any("a is its prior" in note for note in content["warnings"])
+        assert content["a"]["sd"] > 0.5  # the prior's is 1
+
+
+@methods
+def test_two_particles_of_one_shape(method):
+    C, diameters = COEFFICIENTS[:2], np.array([[150.0, 160.0, 120.0], [180.0, 192.0, 144.0]])
+    campaign = simulated(C, diameters, instrument=NOISE)
+    content = METHODS[method](campaign).to_json()
+    check_contract(content, campaign)
+    if method == "least-squares":
+        assert any("open" in note and " a" in note for note in content["warnings"])
+        assert content["a"]["sd"] is None
+    else:
+        assert any("2 particles say little" in note for note in content["warnings"])
+        assert any("same shape" in note and "a is its prior" in note for note in content["warnings"])
+        assert content["a"]["sd"] > 0.5
+
+
+@methods
+def test_two_spheres(method):
+    """Flatness is exactly zero: a is in no equation at all."""
+    campaign = simulated(COEFFICIENTS[:2], np.array([[150.0] * 3, [180.0] * 3]), instrument=NOISE)
+    content = METHODS[method](campaign).to_json()
+    check_contract(content, campaign)
+    for particle in content["particles"]:
+        assert particle["eta_p"]["value"] == 1.0
+    for particle, C in zip(content["particles"], COEFFICIENTS[:2], strict=True):
+        np.testing.assert_allclose([particle[n]["value"] for n in ("C1", "C3", "C5")], C, rtol=0.15)
+
+
+@methods
+def test_no_usable_particle_is_told_by_name(method):
+    weak = joined(one("feather", 0, peak_MPa=0.1), one("dust", 1, peak_MPa=0.15))
+    with pytest.raises(InputError) as error:
+        METHODS[method](weak)
+    told = str(error.value)
+    assert "'feather'" in told
+    assert "'dust'" in told
+    assert "0.2 MPa" in told

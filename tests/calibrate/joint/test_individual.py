@@ -1,0 +1,101 @@
+"""Particles fitted each on its own: known coefficients from noise-free curves, and curves that snap through."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from joint_cases import COEFFICIENTS, DIAMETERS, NOISE, SNAPPING, modulus_of, simulated, true_latent
+
+from mcc_jax import Instrument, StrainScaling, Unloading
+from mcc_jax.calibrate.joint import JointModel
+from mcc_jax.calibrate.joint._data import select_tests
+from mcc_jax.calibrate.joint._fit import WIDE, _centre
+from mcc_jax.calibrate.joint._forward import raw_residual
+from mcc_jax.calibrate.joint._individual import fit_particles, linear_starts
+
+SNAPS = np.stack([COEFFICIENTS[0], SNAPPING, COEFFICIENTS[2], SNAPPING * np.array([1.0, 1.01, 0.99])])
+
+
+def fitted(campaign, noise, unloading=Unloading.PRINTED, zero_sd=5.0):
+    tests = select_tests(campaign).tests
+    return tests, fit(tests, noise, unloading, zero_sd)
+
+
+def fit(tests, noise, unloading=Unloading.PRINTED, zero_sd=5.0):
+    centre = np.broadcast_to(_centre(JointModel(unloading).beliefs), (len(tests), 4))
+    return fit_particles(
+        tests,
+        jnp.full(len(tests), noise),
+        jnp.asarray(centre),
+        jnp.full((len(tests), 4), WIDE),
+        jnp.asarray(zero_sd),
+        linear_starts(tests, jnp.asarray(centre[0, 3])),
+        unloading,
+    )
+
+
+@pytest.mark.parametrize("unloading", [Unloading.PRINTED, Unloading.PUNCH_EXACT], ids=lambda u: u.value)
+def test_noise_free_particles_are_recovered(unloading):
+    form = {"unloading": unloading, "scaling": StrainScaling.CONTACT}
+    _, found = fitted(simulated(**form), 1e-6, unloading)
+    assert np.all(np.asarray(found.converged))
+    np.testing.assert_allclose(found.latent, true_latent(**form), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(found.zero, 0.0, rtol=0, atol=1e-6)
+    assert np.all(np.asarray(found.rms) < 1e-5)
+
+
+def test_an_offset_of_the_record_is_the_zero():
+    campaign = simulated(instrument=Instrument(zero_um=3.0), seed=4)
+    _, found = fitted(campaign, 1e-6)
+    offset = np.array([curve.displacement_um[0] for curve in campaign.curves])
+    assert np.ptp(offset) > 1
+    np.testing.assert_allclose(found.latent, true_latent(), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(found.zero, offset, rtol=0, atol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def snapping():
+    campaign = simulated(SNAPS, instrument=NOISE, seed=2)
+    return campaign, *fitted(campaign, 0.03)
+
+
+def test_the_snapping_particles_do_snap(snapping):
+    campaign, tests, _ = snapping
+    assert campaign.columns["true_monotone"] == ("yes", "no", "yes", "no")
+    largest = np.diff(np.asarray(tests.displacement), axis=1).max(axis=1)
+    assert np.all(largest[[1, 3]] > 5 * largest[[0, 2]])
+
+
+def test_a_curve_that_snaps_is_reproduced_within_noise(snapping):
+    _, tests, found = snapping
+    residual = np.asarray(raw_residual(found.latent, found.zero, tests, Unloading.PRINTED))
+    rms = np.sqrt((residual**2).sum(1) / np.asarray(tests.mask).sum(1))
+    # Read-out noise is 0.02 um; noise of force adds some through the slope, most where a particle snaps.
+    assert np.all(rms[[0, 2]] < 0.03)
+    assert np.all(rms[[1, 3]] < 0.1), rms
+    assert np.all(np.isfinite(np.asarray(found.latent)))
+
+
+def test_coefficients_of_a_curve_that_snaps_are_near_the_truth(snapping):
+    _, _, found = snapping
+    np.testing.assert_allclose(np.asarray(found.latent)[:, :3], true_latent(SNAPS)[:, :3], atol=0.05)
+
+
+def test_coefficients_are_within_their_noise():
+    _, found = fitted(simulated(instrument=NOISE, seed=3), 0.02)
+    assert np.all(np.asarray(found.converged))
+    off = np.asarray(found.latent) - true_latent()
+    assert np.all(np.abs(off) < [0.05, 0.02, 0.02, 0.05]), off
+    assert np.all((np.asarray(found.rms) > 0.015) & (np.asarray(found.rms) < 0.04))
+
+
+def test_without_unloading_the_modulus_stays_at_its_prior():
+    tests = select_tests(simulated(instrument=NOISE)).tests
+    loading_only = replace(tests, mask=tests.loading)
+    centre = _centre(JointModel().beliefs)
+    found = fit(loading_only, 0.02)
+    np.testing.assert_allclose(found.latent[:, 3], centre[3], rtol=1e-6)
+    assert np.all(np.abs(np.asarray(found.latent)[:, :3] - true_latent()[:, :3]) < 0.05)
+    assert abs(float(centre[3]) - np.log(modulus_of(Unloading.PRINTED))) > 0.1
+    assert len(DIAMETERS) == len(found.zero)

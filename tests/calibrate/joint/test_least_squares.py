@@ -1,0 +1,210 @@
+"""Joint least squares: what it recovers, what it calls open, and SciPy on the same residuals."""
+
+import json
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from joint_cases import NOISE, flatness, simulated, true_coefficients
+from scipy.optimize import least_squares
+
+from mcc_jax import Curve, Instrument, Programme, calibrate_least_squares, paper_campaign
+from mcc_jax.calibrate.joint._arrow import Parameters
+from mcc_jax.calibrate.joint._pooled import pooled_residual, robust
+
+# Eight particles in every test: one compilation.
+KEEP = np.arange(20) < 8
+
+
+def campaign_of(instrument=NOISE):
+    return paper_campaign(0, instrument=instrument).select(KEEP)
+
+
+@pytest.fixture(scope="module")
+def result():
+    return calibrate_least_squares(campaign_of())
+
+
+@pytest.fixture(scope="module")
+def content(result):
+    return json.loads(json.dumps(result.to_json(), allow_nan=False))
+
+
+def test_the_truth_is_within_four_standard_deviations(result, content):
+    assert content["converged"], content["reason"]
+    truth = {"a": 1.43, "effective_modulus_MPa": 16_000.0}
+    for name, value in truth.items():
+        found = content[name]
+        assert abs(found["value"] - value) < 4 * found["sd"], found
+        assert found["sd"] < 0.02 * value
+    off = []
+    for particle, C in zip(content["particles"], true_coefficients(result.campaign), strict=True):
+        off += [(particle[f"C{j}"]["value"] - c) / particle[f"C{j}"]["sd"] for j, c in zip((1, 3, 5), C, strict=True)]
+        assert abs(particle["zero_um"]["value"]) < 5 * particle["zero_um"]["sd"]
+    off = np.abs(off)
+    assert np.mean(off < 2) > 0.85
+    assert off.max() < 5
+    for j, name in enumerate(("C1", "C3", "C5")):
+        mean = content[f"log_{name}"]["mean"]
+        expected = np.log(true_coefficients(result.campaign)[:, j]).mean()
+        assert abs(mean["value"] - expected) < 4 * mean["sd"]
+
+
+def test_residuals_are_as_large_as_the_noise(result, content):
+    assert 0.8 < content["diagnostics"]["chi2_per_dof"] < 1.2
+    rms = np.array([p["rms_um"] for p in content["particles"]])
+    assert np.all((rms > 0.015) & (rms < 0.06))
+    np.testing.assert_allclose(content["noise"]["displacement_um"]["value"], 0.02, rtol=0.2)
+    np.testing.assert_allclose(content["noise"]["force_mN"]["value"], 0.05, rtol=0.5)
+
+
+def test_nothing_is_open_and_all_starts_agree(content):
+    assert content["diagnostics"]["open_combinations"] == []
+    agree, count = content["diagnostics"]["agreeing_starts"]
+    assert agree == count >= 3
+    assert content["method"] == "least-squares"
+
+
+def dense(result):
+    """The pooled residuals as a function of one vector."""
+    residual = pooled_residual(result.settings, result.selection.tests)
+    count, own = np.asarray(result.solution.value.local).shape
+
+    @jax.jit
+    def flat(x):
+        parts = residual(Parameters(x[: count * own].reshape(count, own), x[count * own :]))
+        return jnp.concatenate([part.ravel() for part in parts])
+
+    x = np.concatenate([np.ravel(result.solution.value.local), np.asarray(result.solution.value.shared)])
+    return flat, x, (count, own)
+
+
+@pytest.fixture(scope="module")
+def by_scipy(result):
+    flat, x, sizes = dense(result)
+    jacobian = jax.jit(jax.jacfwd(flat))
+    rng = np.random.default_rng(0)
+    start = x + 0.02 * rng.standard_normal(len(x))
+    found = least_squares(
+        lambda v: np.asarray(flat(jnp.asarray(v))),
+        start,
+        jac=lambda v: np.asarray(jacobian(jnp.asarray(v))),
+        x_scale="jac",
+        xtol=1e-14,
+        ftol=1e-14,
+        gtol=1e-12,
+        max_nfev=500,
+    )
+    return found, x, sizes
+
+
+def test_the_optimum_is_scipy_s(result, by_scipy):
+    found, x, _ = by_scipy
+    np.testing.assert_allclose(float(result.solution.loss), found.cost, rtol=1e-6)
+    covariance = np.linalg.inv(found.jac.T @ found.jac)
+    assert np.all(np.abs(x - found.x) < 0.02 * np.sqrt(np.diag(covariance)))
+
+
+def test_the_covariance_is_that_of_scipy_s_jacobian(result, by_scipy):
+    found, _, (count, own) = by_scipy
+    covariance = np.linalg.inv(found.jac.T @ found.jac)
+    blocks = result.solution.normal.covariance()
+    scale = np.sqrt(np.diag(covariance))
+    for n in range(count):
+        rows = slice(n * own, (n + 1) * own)
+        size = scale[rows, None] * scale[rows]
+        np.testing.assert_allclose(np.asarray(blocks[0][n]) / size, covariance[rows, rows] / size, atol=2e-3)
+    shared = slice(count * own, None)
+    size = scale[shared, None] * scale[shared]
+    np.testing.assert_allclose(np.asarray(blocks[2]) / size, covariance[shared, shared] / size, atol=2e-3)
+    sd = result.to_json()["a"]["sd"]
+    np.testing.assert_allclose(sd, scale[count * own], rtol=1e-3)
+
+
+def test_the_same_campaign_gives_the_same_json(result):
+    again = calibrate_least_squares(result.campaign).to_json()
+    first = result.to_json()
+    del again["runtime_s"], first["runtime_s"]
+    assert json.dumps(again) == json.dumps(first)
+
+
+# ---- what the data leave open ----------------------------------------------------------------------------------------
+
+
+def test_particles_of_one_shape_leave_the_shape_parameter_open():
+    """a and the means of log C can then make up for each other."""
+    same = np.array([170.0, 180.0, 140.0]) * np.linspace(0.8, 1.2, 8)[:, None]
+    C = true_coefficients(campaign_of())
+    found = calibrate_least_squares(simulated(C, same, programme=Programme.cycles(points=300), instrument=NOISE))
+    content = json.loads(json.dumps(found.to_json(), allow_nan=False))
+    assert content["diagnostics"]["open_combinations"]
+    assert "a" in content["diagnostics"]["open_combinations"][0]
+    assert content["a"]["sd"] is None
+    assert any("open" in note for note in content["warnings"])
+    # What the curves do say stays: the modulus enters without the shape factor here.
+    modulus = content["effective_modulus_MPa"]
+    assert abs(modulus["value"] - 16_000) < 5 * modulus["sd"]
+
+
+# ---- robust losses ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def with_outliers():
+    campaign = campaign_of()
+    rng = np.random.default_rng(5)
+    curves = []
+    for curve in campaign.curves:
+        bad = rng.random(len(curve)) < 0.05
+        displaced = curve.displacement_um + np.where(bad, 5.0 * rng.choice([-1.0, 1.0], len(curve)), 0.0)
+        curves.append(Curve(curve.time_s, curve.force_mN, displaced))
+    return replace(campaign, curves=tuple(curves))
+
+
+@pytest.mark.parametrize("loss", ["soft_l1", "cauchy"])
+def test_a_robust_loss_resists_outliers(with_outliers, loss):
+    found = calibrate_least_squares(with_outliers, loss=loss)
+    linear = calibrate_least_squares(with_outliers)
+    content = json.loads(json.dumps(found.to_json(), allow_nan=False))
+    assert content["loss"] == loss
+    truth = np.log(true_coefficients(with_outliers))
+
+    def error(result):
+        return np.abs(
+            np.log([[p[f"C{j}"]["value"] for j in (1, 3, 5)] for p in result.to_json()["particles"]]) - truth
+        ).max()
+
+    assert abs(content["a"]["value"] - 1.43) < 0.05
+    assert error(found) < 0.05
+    assert error(linear) > 2 * error(found)
+
+
+@pytest.mark.parametrize("loss", ["linear", "soft_l1", "cauchy"])
+def test_robust_residuals_are_the_losses_in_words(loss):
+    r = np.concatenate([-np.geomspace(1e-9, 1e6, 40), [0.0], np.geomspace(1e-9, 1e6, 40)])
+    expected = {
+        "linear": r**2,
+        "soft_l1": 2 * r**2 / (np.sqrt(1 + r**2) + 1),
+        "cauchy": np.log1p(r**2),
+    }[loss]
+    actual = np.asarray(robust(loss, jnp.asarray(r)))
+    np.testing.assert_allclose(actual**2, expected, rtol=1e-10)
+    np.testing.assert_array_equal(np.sign(actual), np.sign(r))
+    slope = np.asarray(jax.vmap(jax.grad(lambda x: robust(loss, x)))(jnp.asarray(r)))
+    assert np.all(np.isfinite(slope))
+    assert np.all(slope > -1e-12)
+    assert slope[40] == 1.0
+
+
+def test_without_noise_every_particle_is_known_exactly():
+    """Only a is not: how the particles' own coefficients scatter limits it, however good the tests are."""
+    campaign = campaign_of(Instrument())
+    content = json.loads(json.dumps(calibrate_least_squares(campaign).to_json(), allow_nan=False))
+    assert abs(content["a"]["value"] - 1.43) < 4 * content["a"]["sd"]
+    true_eta = 1 + 1.43 * flatness(campaign.diameters_um)
+    for particle, C, eta in zip(content["particles"], true_coefficients(campaign), true_eta, strict=True):
+        b = np.array([particle[f"C{j}"]["value"] for j in (1, 3, 5)]) * particle["eta_p"]["value"]
+        np.testing.assert_allclose(b, C * eta, rtol=1e-3)
+    np.testing.assert_allclose(content["effective_modulus_MPa"]["value"], 16_000, rtol=1e-3)

@@ -1,0 +1,384 @@
+"""The joint posterior of a simulated campaign against its truth, against the plain joint sampler, and as it is kept."""
+
+import json
+import warnings
+
+import equinox as eqx
+import numpy as np
+import pytest
+from joint_cases import NOISE, Programme, flatness, simulated, true_coefficients
+
+from mcc_jax import (
+    beside_paper,
+    calibrate_bayes,
+    new_laws,
+    paper_campaign,
+    predict_measured,
+    predict_new_particle,
+    to_arviz,
+    write_posterior,
+)
+from mcc_jax.calibrate.joint._bayes import ordered_resample, pareto_k, smoothed_weights
+
+
+@pytest.fixture(scope="module")
+def result():
+    return calibrate_bayes(paper_campaign(0))
+
+
+@pytest.fixture(scope="module")
+def content(result):
+    return json.loads(json.dumps(result.to_json(), allow_nan=False))
+
+
+def inside(draws, truth, share):
+    low, high = np.quantile(draws, [(1 - share) / 2, (1 + share) / 2], axis=(0, 1))
+    return (low <= truth) & (truth <= high)
+
+
+# ---- the truth -------------------------------------------------------------------------------------------------------
+
+
+def test_it_converges(result):
+    assert result.converged, result.failures()
+    assert result.divergences == 0
+    assert max(result.rhat.values()) <= 1.01
+    assert min(result.ess_bulk.values()) >= 400
+
+
+def test_what_all_particles_share_is_recovered(result):
+    named = result.named_population()
+    assert inside(named["a"], 1.43, 0.99)
+    assert inside(named["effective_modulus_MPa"], 16_000.0, 0.99)
+    assert inside(named["noise_factor"], 1.0, 0.99)
+    log_C = np.log(true_coefficients(result.campaign))
+    for j, name in enumerate(("C1", "C3", "C5")):
+        # This campaign's own particles are what the population is inferred from.
+        assert inside(named[f"mu_{name}"], log_C[:, j].mean(), 0.99)
+    assert inside(named["tau_C1"], 0.2985, 0.99)
+    assert inside(named["tau_C5"], 0.0797, 0.99)
+    assert np.quantile(named["tau_C3"], 0.95) < 0.02  # the truth is zero
+
+
+def test_particles_are_recovered(result):
+    truth = true_coefficients(result.campaign)
+    covered = inside(result.C, truth, 0.95)
+    assert covered.mean() >= 0.9
+    assert inside(result.C, truth, 0.9999).all()
+    # The data are good: not by wide intervals.
+    assert np.all(result.C.std((0, 1)) < 0.1 * truth)
+    assert inside(result.zero_um, np.zeros(20), 0.95).mean() >= 0.8
+    assert inside(result.shape_factor, 1 + 1.43 * flatness(result.campaign.diameters_um), 0.99).all()
+
+
+def test_residuals_are_as_large_as_the_noise(result, content):
+    assert np.all((result.rms_um() > 0.015) & (result.rms_um() < 0.06))
+    low, high = content["noise"]["displacement_um"]["interval_95"]
+    assert low < 0.02 < high
+    low, high = content["noise"]["force_mN"]["interval_95"]
+    assert 0.5 * low < 0.05 < 2 * high
+
+
+# ---- what is written -------------------------------------------------------------------------------------------------
+
+
+def test_json_keeps_the_contract(result, content):
+    keys = "schema method mode converged runtime_s seed law a effective_modulus_MPa log_C1 log_C3 log_C5 noise priors"
+    for key in [*keys.split(), "yield_stress_MPa", "probability_not_monotone", "particles", "warnings", "diagnostics"]:
+        assert key in content, key
+    assert content["schema"] == 1
+    assert content["method"] == "bayes"
+    assert content["law"] == {"unloading": "printed", "strain_scaling": "raw"}
+    assert content["modulus_scatter"] is None
+    estimate = {"value", "sd", "interval_95"}
+    for found in (content["a"], content["effective_modulus_MPa"], content["log_C1"]["mean"], content["log_C5"]["sd"]):
+        assert set(found) == estimate
+        low, high = found["interval_95"]
+        assert low < found["value"] < high
+    assert [p["particle"] for p in content["particles"]] == [str(i + 1) for i in range(20)]
+    for particle in content["particles"]:
+        names = {"eta_p", "C1", "C3", "C5", "zero_um", "rms_um", "noise_scale", "pareto_k", "kept", "why_not"}
+        assert names <= set(particle)
+        assert particle["kept"] is True
+        assert particle["why_not"] is None
+    diagnostics = content["diagnostics"]
+    assert diagnostics["failures"] == []
+    assert diagnostics["rhat_max"] == pytest.approx(max(result.rhat.values()))
+    assert {"ess_bulk_min", "divergences", "pareto_k_max"} <= set(diagnostics)
+
+
+def test_numbers_are_those_of_the_draws(result, content):
+    a = np.asarray(result.population.a)
+    assert content["a"]["value"] == pytest.approx(a.mean())
+    assert content["a"]["sd"] == pytest.approx(a.std())
+    np.testing.assert_allclose(content["a"]["interval_95"], np.quantile(a, [0.025, 0.975]))
+    assert content["particles"][3]["C5"]["value"] == pytest.approx(result.C[:, :, 3, 2].mean())
+    tau, mu = np.asarray(result.population.tau)[..., 0], np.asarray(result.population.mu)[..., 0]
+    expected = np.exp(mu + tau**2 / 2).mean() / 17.16
+    assert content["yield_stress_MPa"]["value"] == pytest.approx(expected)
+
+
+def without_time(result):
+    content = result.to_json()
+    del content["runtime_s"]
+    return json.dumps(content)
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_seed_nearly_the_same_numbers(result):
+    assert without_time(calibrate_bayes(paper_campaign(0))) == without_time(result)
+    other = calibrate_bayes(paper_campaign(0), seed=1)
+    assert without_time(other) != without_time(result)
+    one, two = result.named_population(), other.named_population()
+    for name in one:
+        assert abs(one[name].mean() - two[name].mean()) < 0.15 * one[name].std(), name
+        assert one[name].std() == pytest.approx(two[name].std(), rel=0.2), name
+
+
+def test_probability_not_monotone_is_that_of_draws_from_the_population(result):
+    laws = new_laws(result, 4000, seed=3)
+    share = 1 - np.mean(np.asarray(eqx.filter_vmap(lambda law: law.is_monotone)(laws)))
+    expected = result.probability_not_monotone().mean()
+    assert share == pytest.approx(expected, abs=4 * np.sqrt(expected * (1 - expected) / 4000) + 0.002)
+
+
+# ---- predictions -----------------------------------------------------------------------------------------------------
+
+
+def test_measured_points_lie_in_the_predicted_band(result):
+    shares = []
+    for row, name in enumerate(result.particles[:4]):
+        curves = predict_measured(result, name, count=200)
+        low, high = curves.band(0.95, observed=True)
+        mask = np.asarray(result.selection.tests.mask[row])[: len(low)]
+        measured = np.asarray(result.selection.tests.displacement[row])[: len(low)]
+        shares.append(np.mean((low <= measured)[mask] & (measured <= high)[mask]))
+    assert 0.9 < np.mean(shares) < 0.99
+
+
+def test_a_particle_never_measured_is_predicted_with_the_scatter_of_the_population(result):
+    force = np.concatenate([np.linspace(0, 200, 40), np.linspace(200, 0, 20)])
+    curves = predict_new_particle(result, (200.0, 200.0, 160.0), force, count=400, seed=1)
+    assert curves.displacement_um.shape == (400, 60)
+    low, high = curves.band(0.95)
+    assert np.all(low <= high)
+    assert curves.observed_um is None
+    # tau of log C1 is 0.3, so the spread of displacement is tens of percent.
+    assert 0.1 < (high[30] - low[30]) / np.median(curves.displacement_um[:, 30]) < 1.5
+    with pytest.raises(ValueError, match="positive diameters"):
+        predict_new_particle(result, (200.0, 0.0, 160.0), force)
+    with pytest.raises(ValueError, match="without noise"):
+        curves.band(0.95, observed=True)
+    with pytest.raises(KeyError, match="99"):
+        predict_measured(result, "99")
+
+
+def test_the_paper_s_table_stands_beside_ours(result):
+    rows = {row["quantity"]: row for row in beside_paper(result)}
+    assert rows["a"]["paper"] == 1.43
+    assert rows["effective_modulus_MPa"]["paper"] == 16_000.0
+    assert rows["mu_C1"]["paper"] == 1.9027
+    assert rows["a"]["value"] == pytest.approx(1.43, abs=0.02)
+
+
+# ---- ArviZ -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def tree(result):
+    return to_arviz(result)
+
+
+def test_groups_dimensions_and_units(tree):
+    groups = "posterior log_likelihood sample_stats prior prior_predictive posterior_predictive"
+    groups += " observed_data constant_data"
+    for group in groups.split():
+        assert group in tree.children, group
+    assert tree["posterior"]["C"].dims == ("chain", "draw", "particle", "coefficient")
+    assert tree["posterior"]["mu"].dims == ("chain", "draw", "coefficient")
+    assert tree["posterior"]["zero_um"].dims == ("chain", "draw", "particle")
+    assert tree["log_likelihood"]["test"].dims == ("chain", "draw", "particle")
+    assert tree["observed_data"]["displacement_um"].dims == ("particle", "point")
+    assert tree["posterior_predictive"]["displacement_um"].dims == ("chain", "draw", "particle", "point")
+    assert list(tree["posterior"]["coefficient"].values) == ["C1", "C3", "C5"]
+    assert list(tree["posterior"]["particle"].values) == [str(i + 1) for i in range(20)]
+    for group, dataset in tree.children.items():
+        for name, variable in dataset.data_vars.items():
+            assert "units" in variable.attrs, f"{group}/{name} has no unit"
+    assert tree["posterior"]["effective_modulus_MPa"].attrs["units"] == "MPa"
+
+
+def test_padded_points_are_nan_and_no_others(result, tree):
+    mask = np.asarray(result.selection.tests.mask)
+    for group in ("observed_data", "posterior_predictive", "prior_predictive"):
+        values = tree[group]["displacement_um"].values
+        np.testing.assert_array_equal(np.isfinite(values), np.broadcast_to(mask, values.shape), err_msg=group)
+    assert np.all(np.isfinite(tree["posterior"]["C"].values))
+    assert np.all(np.isfinite(tree["log_likelihood"]["test"].values))
+
+
+def test_prior_draws_have_the_prior_s_quantiles(result, tree):
+    prior = result.model.beliefs
+    a = tree["prior"]["a"].values.ravel()
+    assert abs(a.mean() - prior.a.mean) < 5 * prior.a.sd / np.sqrt(len(a)) + 0.1
+    modulus = np.log(tree["prior"]["effective_modulus_MPa"].values)
+    assert np.median(modulus) == pytest.approx(np.log(prior.effective_modulus_MPa.median), abs=0.3)
+    assert np.all(tree["prior"]["tau"].values >= 0)
+
+
+def test_leave_one_particle_out_runs(tree):
+    import arviz as az
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        loo = az.loo(tree, var_name="test")
+    assert np.isfinite(loo.elpd)
+    assert loo.n_data_points == 20
+
+
+def test_the_file_comes_back_as_it_was_and_twice_the_same(result, tree, tmp_path):
+    import xarray
+
+    one, two = tmp_path / "one.nc", tmp_path / "two.nc"
+    write_posterior(result, one)
+    write_posterior(result, two)
+    assert one.read_bytes() == two.read_bytes()
+    with xarray.open_datatree(one, engine="h5netcdf") as back:
+        assert set(tree.children) <= set(back.children)
+        for group in tree.children:
+            for name, variable in tree[group].data_vars.items():
+                np.testing.assert_array_equal(back[group][name].values, variable.values)
+                assert back[group][name].attrs == variable.attrs
+        assert back.attrs["seed"] == 0
+        assert back.attrs["method"] == "bayes"
+
+
+# ---- against the plain joint sampler, and the gate -------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def small():
+    return simulated(instrument=NOISE, programme=Programme.cycles(points=60))
+
+
+@pytest.fixture(scope="module")
+def both(small):
+    return [calibrate_bayes(small, mode=mode, draws=2000) for mode in ("fast", "joint")]
+
+
+def gap(one, two):
+    """Differences of mean and of log sd of two sets of draws, in sds, and the standard errors of these."""
+    from arviz_stats.base import array_stats
+
+    sd = two.std()
+    axes = {"chain_axis": 0, "draw_axis": 1}
+    error = [float(array_stats.mcse(d, method="mean", **axes)) / sd for d in (one, two)]
+    of_sd = [float(array_stats.mcse(d, method="sd", **axes)) / sd for d in (one, two)]
+    return (
+        abs(one.mean() - two.mean()) / sd,
+        abs(np.log(one.std() / sd)),
+        float(np.hypot(*error)),
+        float(np.hypot(*of_sd)),
+    )
+
+
+def test_the_fast_mode_gives_the_joint_posterior(both):
+    fast, joint = both
+    assert (fast.mode, joint.mode) == ("fast", "joint")
+    pairs = [(name, fast.named_population()[name], draws) for name, draws in joint.named_population().items()]
+    for row, particle in enumerate(joint.particles):
+        pairs.append((f"zero of {particle}", fast.zero_um[:, :, row], joint.zero_um[:, :, row]))
+        for j in range(3):
+            pairs.append((f"C of {particle}, {j}", fast.C[:, :, row, j], joint.C[:, :, row, j]))
+            # What the curve itself says, without the uncertainty of the shape factor in front.
+            b = [np.log(r.C[:, :, row, j] * r.shape_factor[:, :, row]) for r in both]
+            pairs.append((f"b of {particle}, {j}", *b))
+    for name, one, two in pairs:
+        mean, width, error, error_of_sd = gap(one, two)
+        assert mean < 0.15 + 3 * error, (name, mean, error)
+        assert width < 0.15 + 3 * error_of_sd, (name, width, error_of_sd)
+
+
+def test_the_joint_mode_says_nothing_of_weights(both):
+    _, joint = both
+    assert joint.pareto_k_joint is None
+    assert not joint.weights_applied
+    assert json.dumps(joint.to_json(), allow_nan=False)
+
+
+def test_too_few_draws_are_not_called_converged(small):
+    short = calibrate_bayes(small, draws=20, warmup=20)
+    assert not short.converged
+    content = json.loads(json.dumps(short.to_json(), allow_nan=False))
+    assert content["converged"] is False
+    told = " ".join(content["diagnostics"]["failures"])
+    assert "ESS" in told
+    assert "draw longer" in told
+    assert "--draws" in told
+    assert set(content["diagnostics"]["failures"]) <= set(content["warnings"])
+
+
+# ---- weights ---------------------------------------------------------------------------------------------------------
+
+
+def test_resampling_by_equal_weights_changes_nothing():
+    np.testing.assert_array_equal(ordered_resample(np.full(50, 0.02), 50), np.arange(50))
+
+
+def test_resampling_keeps_the_order_and_the_shares():
+    rng = np.random.default_rng(0)
+    weight = rng.gamma(0.5, size=200)
+    chosen = ordered_resample(weight, 1000)
+    assert np.all(np.diff(chosen) >= 0)
+    expected = 1000 * weight / weight.sum()
+    assert np.all(np.abs(np.bincount(chosen, minlength=200) - expected) <= 1)
+
+
+@pytest.mark.parametrize("weight", [np.zeros(10), np.eye(10)[3], np.eye(10)[9], np.full(10, 1e-300)])
+def test_resampling_by_extreme_weights(weight):
+    chosen = ordered_resample(weight, 10)
+    assert chosen.shape == (10,)
+    assert np.all((chosen >= 0) & (chosen < 10))
+    if np.count_nonzero(weight) == 1:
+        assert np.all(chosen == np.argmax(weight))
+
+
+def test_weights_that_are_all_equal_have_no_tail():
+    assert np.all(pareto_k(np.zeros((400, 3))) == 0)
+    weight, k = smoothed_weights(np.zeros(400))
+    np.testing.assert_allclose(weight, 1 / 400)
+    assert k <= 0.7
+
+
+def test_weights_turn_draws_of_one_distribution_into_those_of_another():
+    """N(0, 1) weighted into N(1, 1): the mean tells a weight from its reciprocal."""
+    x = np.random.default_rng(2).standard_normal(20_000)
+    weight, k = smoothed_weights(x - 0.5)
+    assert weight.sum() == pytest.approx(1)
+    assert k < 0.7
+    assert (weight * x).sum() == pytest.approx(1.0, abs=0.1)
+    chosen = ordered_resample(weight, 20_000)
+    assert x[chosen].mean() == pytest.approx(1.0, abs=0.1)
+    assert x[chosen].std() == pytest.approx(1.0, abs=0.1)
+
+
+def test_pareto_k_is_the_index_of_the_upper_tail():
+    rng = np.random.default_rng(1)
+    exponential = rng.standard_exponential((4000, 2))
+    # The exponential of k times an exponential variable is Pareto distributed with index k.
+    k = pareto_k(exponential * np.array([1.2, 0.3]))
+    np.testing.assert_allclose(k, [1.2, 0.3], atol=0.3)
+    # A lower tail, weights that nearly vanish, does no harm.
+    assert pareto_k(-1.5 * exponential)[0] < 0.3
+
+
+def test_a_draw_that_is_impossible_gets_no_weight_and_does_no_other_harm():
+    rng = np.random.default_rng(1)
+    log_weight = 0.1 * rng.standard_normal(4000)
+    before = pareto_k(log_weight[:, None])[0]
+    log_weight[7] = -np.inf
+    assert pareto_k(log_weight[:, None])[0] == pytest.approx(before, abs=0.1)
+    weight, k = smoothed_weights(log_weight)
+    assert k < 0.5
+    assert np.all(np.isfinite(weight))
+    assert weight.sum() == pytest.approx(1)
+    assert weight[7] < 1e-12

@@ -1,0 +1,112 @@
+"""Priors from a file: what it changes, and what it says of a mistake."""
+
+import dataclasses
+import json
+
+import pytest
+
+from mcc_jax import InputError, JointModel, Priors, Unloading, read_priors
+from mcc_jax.calibrate.joint import HalfNormalPrior, LogNormalPrior, NormalPrior
+
+
+@pytest.fixture
+def read(tmp_path):
+    def from_text(text, *arguments):
+        file = tmp_path / "priors.toml"
+        file.write_text(text, encoding="utf-8")
+        return read_priors(file, *arguments)
+
+    return from_text
+
+
+def test_a_file_changes_what_it_names_and_nothing_else(read):
+    found = read("[a]\nsd = 0.3\n")
+    assert found.a == NormalPrior(Priors().a.mean, 0.3)
+    assert found == dataclasses.replace(Priors(), a=found.a)
+    assert found.changed == ("a",)
+
+
+def test_whole_numbers_and_several_tables(read):
+    found = read("[a]\nmean = 2\n[C1]\nmedian = 5\nlog_sd = 0.25\n[tau_C3]\nsd = 1\n")
+    assert found.a == NormalPrior(2.0, Priors().a.sd)
+    assert LogNormalPrior(5.0, 0.25) == found.C1
+    assert found.tau_C3 == HalfNormalPrior(1.0)
+    assert set(found.changed) == {"a", "C1", "tau_C3"}
+    assert isinstance(found.a.mean, float)
+
+
+def test_a_mean_may_be_negative(read):
+    assert read("[a]\nmean = -0.5\n").a.mean == -0.5
+
+
+def test_a_file_without_tables_changes_nothing(read):
+    assert read("# nothing\n") == Priors()
+
+
+def test_the_path_may_be_text(read, tmp_path):
+    read("[a]\nsd = 0.3\n")
+    assert read_priors(str(tmp_path / "priors.toml")).a.sd == 0.3
+
+
+@pytest.mark.parametrize("unloading", [Unloading.PUNCH, Unloading.PUNCH_EXACT])
+def test_what_is_not_named_is_the_default_of_the_form(read, unloading):
+    found = read("[a]\nsd = 0.3\n", unloading)
+    assert found.effective_modulus_MPa == Priors.default(unloading).effective_modulus_MPa
+    assert found.effective_modulus_MPa.median < 0.1 * Priors().effective_modulus_MPa.median
+    assert JointModel(unloading).beliefs == Priors.default(unloading)
+    assert JointModel(unloading, priors=found).beliefs == found
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[aa]\nmean = 1.0\n", ["aa", "Known priors", "effective_modulus_MPa"]),
+        ("[a]\nmedian = 1.0\n", ["'a'", "median", "mean, sd"]),
+        ("[tau_C1]\nmean = 1.0\n", ["tau_C1", "mean", "sd"]),
+        ("[a]\nsd = -0.1\n", ["a.sd", "positive", "-0.1"]),
+        ("[a]\nsd = 0.0\n", ["a.sd", "positive"]),
+        ("[C1]\nmedian = -6.0\n", ["C1.median", "positive"]),
+        ("[C1]\nlog_sd = nan\n", ["C1.log_sd", "positive", "nan"]),
+        ("[a]\nmean = inf\n", ["a.mean", "a number", "inf"]),
+        ('[a]\nmean = "1.4"\n', ["a.mean", "a number", "1.4"]),
+        ("[a]\nsd = true\n", ["a.sd", "positive", "True"]),
+        ("[a]\nmean = [1.0]\n", ["a.mean", "a number"]),
+        ("a = 1.4\n", ["'a'", "table", "[a]"]),
+        ("changed = 1.0\n", ["changed"]),
+        ("[a\nmean = 1.0\n", ["TOML"]),
+    ],
+)
+def test_a_mistake_is_told_with_file_and_entry(read, text, words):
+    with pytest.raises(InputError) as error:
+        read(text)
+    told = str(error.value)
+    for word in ["priors.toml", *words]:
+        assert word in told, told
+
+
+def test_a_missing_file_is_told(tmp_path):
+    with pytest.raises(InputError, match="nowhere.toml"):
+        read_priors(tmp_path / "nowhere.toml")
+
+
+def test_a_file_that_is_no_text_is_told(tmp_path):
+    file = tmp_path / "priors.toml"
+    file.write_bytes(b"[a]\nmean = 1.0 # \xe4\n")
+    with pytest.raises(InputError, match=r"priors\.toml"):
+        read_priors(file)
+
+
+def test_json_holds_every_prior_with_its_numbers():
+    priors = dataclasses.replace(Priors(), a=NormalPrior(1.4, 0.3), changed=("a",))
+    content = json.loads(json.dumps(priors.to_json(), allow_nan=False))
+    assert set(content) == {f.name for f in dataclasses.fields(Priors)} - {"changed"}
+    assert content["a"] == {"distribution": "normal", "mean": 1.4, "sd": 0.3}
+    assert content["C1"]["distribution"] == "log-normal"
+    assert set(content["C1"]) == {"distribution", "median", "log_sd"}
+    assert content["tau_C1"]["distribution"] == "half-normal"
+
+
+def test_the_noise_s_priors_stand_together():
+    noise = Priors().noise
+    assert [float(v) for v in noise.median] == [0.02, 0.05, 0.01, 0.2]
+    assert float(noise.log_density(noise.median * 0 + 0.0)) < 0
