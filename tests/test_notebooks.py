@@ -10,7 +10,12 @@ NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 
 
 def test_there_are_notebooks():
-    assert [n.name for n in NOTEBOOKS][:2] == ["01_law.ipynb", "02_paper_calibration.ipynb"]
+    assert [n.name for n in NOTEBOOKS][:4] == [
+        "01_law.ipynb",
+        "02_paper_calibration.ipynb",
+        "03_least_squares.ipynb",
+        "04_posterior.ipynb",
+    ]
 
 
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda n: n.stem)

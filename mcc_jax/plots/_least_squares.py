@@ -31,7 +31,7 @@ def plot_whitened(calibration: LeastSquaresCalibration) -> Figure:
     share = force / force.max(axis=1, keepdims=True)
     eta = 1 + float(calibration.solution.value.shared[0]) * flatness(calibration)
     colours = sequential(eta)
-    rgba = colours.to_rgba(np.broadcast_to(eta[:, None], force.shape))
+    rgba = colours.to_rgba(eta)
     values = residual[mask]
     reach = max(4.0, 1.1 * float(np.quantile(np.abs(values), 0.999)))
     figure = new_figure(8.6, 4.0)
@@ -46,7 +46,7 @@ def plot_whitened(calibration: LeastSquaresCalibration) -> Figure:
         ax.axhspan(-1.96, 1.96, color=ORANGE, alpha=0.25, linewidth=0, zorder=0)
         ax.axhline(0.0, color=GREY, linewidth=0.8)
         ax.scatter(
-            share.ravel()[picked], residual.ravel()[picked], c=rgba.reshape(-1, 4)[picked], s=4 if few else 2,
+            share.ravel()[picked], residual.ravel()[picked], c=rgba[picked // force.shape[1]], s=4 if few else 2,
             linewidths=0, alpha=0.7 if few else 0.4, rasterized=True,
         )  # fmt: skip
         ax.set_xlim(0, 1.02)

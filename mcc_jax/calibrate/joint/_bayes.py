@@ -366,7 +366,7 @@ def _compile(tests: Tests, model: JointModel, chains: int, warmup: int, draws: i
     sample_population.lower(key, dummy(d), dummy(d, d), numbers, quadratic, flat, scatter, **settings).compile()
     exact = Exact(
         tests,
-        eqx.filter_vmap(Whitening)(*(dummy(count, points) for _ in range(3))),
+        eqx.filter_vmap(Whitening)(*(dummy(count, points) for _ in range(4)), tests.branch),
         quadratic,
         model.zero_sd,
         model.unloading,

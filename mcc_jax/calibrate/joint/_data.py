@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..._errors import InputError
 from ...campaign import THRESHOLD_MPA, Campaign, Curve, Segment, campaign_segments, particle_batch, stress_and_strain
@@ -34,6 +35,8 @@ class Tests(eqx.Module):
         loading: which of them lie on virgin loading.
         contact: displacement at which the record says that the platen touches [um].
         step: share of the peak force passed since the point before [-], the path length of correlated residuals.
+        branch: index of the point at which the largest force so far was reached: shared by the points of an elastic
+            branch.
     """
 
     __test__ = False  # no test of ours, whatever pytest thinks of the name
@@ -45,6 +48,7 @@ class Tests(eqx.Module):
     loading: Bool[Array, "particles points"]
     contact: Float[Array, " particles"]
     step: Float[Array, "particles points"]
+    branch: Int[Array, "particles points"]
 
     def __len__(self) -> int:
         return self.force.shape[0]
@@ -92,9 +96,15 @@ def select_tests(
     Raises:
         InputError: if no particle can be used.
         ValueError: for a threshold that is negative or not finite.
+        RuntimeError: in single precision.
     """
     if not (np.isfinite(threshold_MPa) and threshold_MPa >= 0):
         raise ValueError(f"the threshold must be a stress >= 0 MPa, got {threshold_MPa}")
+    if not jax.config.read("jax_enable_x64"):
+        raise RuntimeError(
+            "the joint calibration needs double precision; "
+            'call jax.config.update("jax_enable_x64", True) before anything else'
+        )
     segments = campaign_segments(campaign)
     prepared = [
         _prepare(curve, diameters, parts, threshold_MPa, most_points)
@@ -128,10 +138,17 @@ def select_tests(
         jnp.asarray(padded([one.loading for one in used], "false")),
         jnp.asarray([one.contact for one in used]),
         jnp.asarray(np.abs(np.diff(force, axis=1, prepend=force[:, :1])) / largest),
+        jnp.asarray(_branches(force)),
     )
     return Selection(
         tests, kept, why_not, tuple(one.rows for one in used), tuple(_notes(campaign, kept, used, most_points))
     )
+
+
+def _branches(force: np.ndarray) -> np.ndarray:
+    """Index of the point at which the largest force so far was reached."""
+    record = force >= np.maximum.accumulate(force, axis=1)
+    return np.maximum.accumulate(np.where(record, np.arange(force.shape[1]), 0), axis=1)
 
 
 @dataclass(frozen=True)

@@ -51,14 +51,19 @@ def linearise(
     latent: Float[Array, "particles 4"], zero: Float[Array, " particles"], tests: Tests, unloading: Unloading
 ) -> tuple[Float[Array, "particles points"], Float[Array, "particles points 5"]]:
     """Residuals [um] and their derivatives with respect to each particle's b1, b3, b5, e and zero."""
-    residual, J, _ = _linearise(latent, zero, tests, unloading, False)
+    residual, J, _, _ = _linearise(latent, zero, tests, unloading, False)
     return residual, J
 
 
 def linearise_with_force(
     latent: Float[Array, "particles 4"], zero: Float[Array, " particles"], tests: Tests, unloading: Unloading
-) -> tuple[Float[Array, "particles points"], Float[Array, "particles points 5"], Float[Array, "particles points"]]:
-    """The same, and the change of each prediction with its own force [um/mN]: how far noise of force moves it."""
+) -> tuple[
+    Float[Array, "particles points"],
+    Float[Array, "particles points 5"],
+    Float[Array, "particles points"],
+    Float[Array, "particles points"],
+]:
+    """The same, and the change of each prediction with its own force and with its branch's peak force [um/mN]."""
     return _linearise(latent, zero, tests, unloading, True)
 
 
@@ -82,8 +87,10 @@ def _linearise(latent, zero, tests, unloading, with_force):
     J = jnp.where(used[..., None], -jnp.moveaxis(columns[:4], 0, -1), 0.0)
     own = jnp.where(used, -1.0, 0.0)[..., None]
     residual = jnp.where(used, tests.displacement - value - zero[:, None], 0.0)
-    moved = jnp.where(record, columns[4], columns[4] - columns[5]) if with_force else still
-    return residual, jnp.concatenate([J, own], -1), moved
+    if not with_force:
+        return residual, jnp.concatenate([J, own], -1), still, still
+    moved = jnp.where(record, columns[4], columns[4] - columns[5])
+    return residual, jnp.concatenate([J, own], -1), moved, jnp.where(record, 0.0, columns[5])
 
 
 def snap(latent: Latent, particle: Particle) -> Scalar:

@@ -25,9 +25,9 @@ def linear_data(
     unloading: Unloading,
 ) -> Linear:
     """Residuals, their derivatives, and how noise of force moves them, around the given latent vectors and zeros."""
-    value, J, moved = linearise_with_force(latent, zero, tests, unloading)
+    value, J, moved, by_peak = linearise_with_force(latent, zero, tests, unloading)
     prior = jnp.concatenate([jnp.ones(4), 1 / zero_sd[None] ** 2])
-    return Linear(value, J, prior, tests.step, tests.mask, moved)
+    return Linear(value, J, prior, tests.step, tests.mask, moved, by_peak, tests.branch)
 
 
 @eqx.filter_jit
@@ -44,8 +44,8 @@ def summarise(
     Returns:
         The summaries, and the noise filters, in which force noise has become noise of displacement.
     """
-    noise_filters = jax.vmap(lambda s, step, mask, moved: whitening(noise, s, step, mask, moved))(
-        noise.scale, data.step, data.mask, data.compliance
+    noise_filters = jax.vmap(lambda s, *path: whitening(noise, s, *path))(
+        noise.scale, data.step, data.mask, data.compliance, data.peak, data.branch
     )
     r = jax.vmap(lambda f, x: f(x))(noise_filters, data.residual)
     J = jax.vmap(lambda f, x: jax.vmap(f, in_axes=1, out_axes=1)(x))(noise_filters, data.jacobian)

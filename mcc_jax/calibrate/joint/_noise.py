@@ -5,7 +5,9 @@ r"""Noise of a test: white read-out noise, noise of force, and residuals that ar
     \mathrm{Cov}(o_k, o_l) = s_i^2 \sigma_o^2 \exp(-|p_k - p_l| / \ell)
 
 with p the path length of force in shares of the peak (an Ornstein-Uhlenbeck process along it), and a scale s_i of each
-particle's own. The covariance is never formed: a Kalman filter turns residuals into independent ones in linear time.
+particle's own. The peak from which an elastic branch starts is one noisy reading, too, and moves the whole branch: a
+variance :math:`s_i^2 \sigma_F^2 c c^T` with c the change of the branch with its peak. The covariance is never formed: a
+Kalman filter turns residuals into independent ones in linear time, and each branch's direction is then shrunk.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..._types import Path, Scalar
 from ._small import Cholesky
@@ -56,11 +58,15 @@ class Whitening(eqx.Module):
         decay: correlation with the point before.
         gain: share of a surprise that the correlated part takes.
         weight: one over the standard deviation of a surprise, 0 where the point is masked.
+        peak: whitened change of every point with the noise of its branch's peak, 0 on loading.
+        branch: which branch a point belongs to.
     """
 
     decay: Path
     gain: Path
     weight: Path
+    peak: Path
+    branch: Int[Array, " steps"]
 
     def __call__(self, residual: Path) -> Path:
         """Independent residuals of standard deviation 1 (0 where masked)."""
@@ -71,16 +77,33 @@ class Whitening(eqx.Module):
             return decay * expected + gain * surprise, surprise
 
         _, surprise = jax.lax.scan(advance, jnp.zeros_like(residual[0]), (residual, self.decay, self.gain))
-        return surprise * self.weight
+        white = surprise * self.weight
+        # 1 + p is the variance along a branch's direction: along it, and only there, divide by its root.
+        power = self._power()
+        shrink = (1 - 1 / jnp.sqrt(1 + power)) / jnp.where(power > 0, power, 1.0)
+        along = jax.ops.segment_sum(self.peak * white, self.branch, len(white))
+        return white - self.peak * (shrink * along)[self.branch]
+
+    def _power(self) -> Path:
+        return jax.ops.segment_sum(self.peak**2, self.branch, len(self.peak))
 
     @property
     def log_det(self) -> Scalar:
         """Logarithm of the covariance's determinant, over the points that are not masked."""
         used = self.weight > 0
-        return -2 * jnp.sum(jnp.where(used, jnp.log(jnp.where(used, self.weight, 1.0)), 0.0))
+        own = -2 * jnp.sum(jnp.where(used, jnp.log(jnp.where(used, self.weight, 1.0)), 0.0))
+        return own + jnp.sum(jnp.log1p(self._power()))
 
 
-def whitening(noise: Noise, scale: Scalar, step: Path, mask: Bool[Array, " steps"], compliance: Path) -> Whitening:
+def whitening(
+    noise: Noise,
+    scale: Scalar,
+    step: Path,
+    mask: Bool[Array, " steps"],
+    compliance: Path,
+    peak: Path,
+    branch: Int[Array, " steps"],
+) -> Whitening:
     """The filter of one test.
 
     Args:
@@ -89,6 +112,8 @@ def whitening(noise: Noise, scale: Scalar, step: Path, mask: Bool[Array, " steps
         step: path length since the point before [-].
         mask: which points count.
         compliance: how far noise of force moves the predicted displacement [um/mN].
+        peak: how far noise of the branch's peak force moves it [um/mN].
+        branch: which branch a point belongs to.
     """
     decay = jnp.exp(-step / noise.length)
     stationary = noise.correlated**2
@@ -102,7 +127,9 @@ def whitening(noise: Noise, scale: Scalar, step: Path, mask: Bool[Array, " steps
         return (1 - gain) * variance, (gain, total)
 
     _, (gain, total) = jax.lax.scan(advance, stationary, (decay, mask, read_out))
-    return Whitening(decay, gain, jnp.where(mask, 1 / (scale * jnp.sqrt(total)), 0.0))
+    weight = jnp.where(mask, 1 / (scale * jnp.sqrt(total)), 0.0)
+    still = Whitening(decay, gain, weight, jnp.zeros_like(step), branch)
+    return Whitening(decay, gain, weight, still(jnp.where(mask, scale * noise.force * peak, 0.0)), branch)
 
 
 class Linear(eqx.Module):
@@ -112,7 +139,7 @@ class Linear(eqx.Module):
         residual: at the point [um].
         jacobian: derivative with respect to the particle's P parameters.
         prior: precision that keeps directions without data in place, shape (P,).
-        step, mask, compliance: as in `whitening`.
+        step, mask, compliance, peak, branch: as in `whitening`.
     """
 
     residual: Float[Array, "particles points"]
@@ -121,20 +148,24 @@ class Linear(eqx.Module):
     step: Float[Array, "particles points"]
     mask: Bool[Array, "particles points"]
     compliance: Float[Array, "particles points"]
+    peak: Float[Array, "particles points"]
+    branch: Int[Array, "particles points"]
 
 
 def restricted_likelihood(noise: Noise, data: Linear) -> Float[Array, " particles"]:
     """Log likelihood of each test under the noise, with the particle's own parameters integrated out."""
 
-    def one(scale, residual, jacobian, step, mask, compliance):
-        filtered = whitening(noise, scale, step, mask, compliance)
+    def one(scale, residual, jacobian, *path):
+        filtered = whitening(noise, scale, *path)
         r = filtered(residual)
         J = jax.vmap(filtered, in_axes=1, out_axes=1)(jacobian)
         factor = Cholesky(J.T @ J + jnp.diag(data.prior))
         explained = factor.forward(J.T @ r)
         return -0.5 * (filtered.log_det + r @ r - explained @ explained + factor.log_det())
 
-    return jax.vmap(one)(noise.scale, data.residual, data.jacobian, data.step, data.mask, data.compliance)
+    return jax.vmap(one)(
+        noise.scale, data.residual, data.jacobian, data.step, data.mask, data.compliance, data.peak, data.branch
+    )
 
 
 class NoisePrior(eqx.Module):

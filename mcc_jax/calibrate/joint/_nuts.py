@@ -41,8 +41,7 @@ def sample(
 ) -> Chains:
     """Sample a density whose mode and covariance are roughly known.
 
-    The sampler works in coordinates in which that covariance is the identity, so only its step size is left to adapt.
-    Call it inside `jit`: MCMC objects of NumPyro compile anew for every data set, this does so once per shape.
+    The sampler works in coordinates in which that covariance is the identity, so little is left to adapt. Call it inside `jit`: MCMC objects of NumPyro compile anew for every data set, this does so once per shape.
 
     Args:
         key: random key.
@@ -63,7 +62,7 @@ def sample(
         return jnp.where(jnp.isnan(value), jnp.inf, value)
 
     def chain(key):
-        kernel = NUTS(potential_fn=potential, adapt_mass_matrix=False, target_accept_prob=0.8)
+        kernel = NUTS(potential_fn=potential, dense_mass=dimension < 40, target_accept_prob=0.8)
         start_key, key = jax.random.split(key)
         start = jax.random.normal(start_key, (dimension,), mode.dtype)
         state = kernel.init(key, warmup, start, (), {})

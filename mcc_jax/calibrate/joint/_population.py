@@ -53,8 +53,8 @@ class Scatter(eqx.Module):
         modulus: whether the modulus scatters, too.
         shape: whether `a` does.
         power: power with which the shape factor enters unloading.
-        newton: Newton steps from the linear solution to the most probable deviations, besides a last one; 0 is enough
-            where the tests pin all coefficients down (`JointFit.newton`).
+        newton: Newton steps from the linear solution to the most probable deviations; none are needed where the tests
+            pin all coefficients down.
     """
 
     modulus: bool = eqx.field(static=True, default=False)
@@ -171,14 +171,14 @@ def laplace(
         right = share * jnp.einsum("npk,np->nk", factor, pull)
         return Cholesky(curvature(ones, factor, quadratic.precision) + eye).solve(right)
 
-    # Found without derivatives; one last step with them carries the derivative of the whole iteration.
-    fixed = jax.lax.stop_gradient((mean, factor, summary))
-    share_fixed = share
-    share = jax.lax.stop_gradient(share)
-    start = linear(*fixed)
-    xi = jax.lax.fori_loop(0, scatter.newton, lambda _, xi: newton(xi, *fixed), start) if scatter.newton else start
-    share = share_fixed
-    xi = newton(jax.lax.stop_gradient(xi), mean, factor, summary)
+    xi = linear(mean, factor, summary)
+    if scatter.newton:
+        # Found without derivatives; one last step with them carries the derivative of the whole iteration.
+        fixed = jax.lax.stop_gradient((mean, factor, summary))
+        with_derivative, share = share, jax.lax.stop_gradient(share)
+        xi = jax.lax.fori_loop(0, scatter.newton, lambda _, at: newton(at, *fixed), jax.lax.stop_gradient(xi))
+        share = with_derivative
+        xi = newton(xi, mean, factor, summary)
 
     away = mean + jnp.einsum("npk,nk->np", factor, xi) - summary.point
     kappa, slope = straighten(away)

@@ -84,8 +84,25 @@ def own_slope(latent, particle, force, unloading, h):
     return jax.vmap(lambda k: (at(k, h) - at(k, -h)) / (2 * h))(index)
 
 
+def peak_slope(latent, particle, force, unloading, h):
+    """Change of the k-th displacement with the largest force before it, by central differences."""
+    index = jnp.arange(len(force))
+
+    def at(k, step):
+        peak = jnp.argmax(jnp.where(index < k, force, -jnp.inf))
+        return displacement(latent, particle, force.at[peak].add(step), unloading)[k]
+
+    return jax.vmap(lambda k: (at(k, h) - at(k, -h)) / (2 * h))(index)
+
+
 slopes = eqx.filter_jit(
     lambda latent, tests, unloading, h: jax.vmap(lambda w, p, f: own_slope(w, p, f, unloading, h))(
+        latent, tests.particle, tests.force
+    )
+)
+
+peak_slopes = eqx.filter_jit(
+    lambda latent, tests, unloading, h: jax.vmap(lambda w, p, f: peak_slope(w, p, f, unloading, h))(
         latent, tests.particle, tests.force
     )
 )
@@ -97,7 +114,7 @@ def test_how_noise_of_force_moves_a_prediction(unloading, hum):
     """On loading, unloading and reloading, and where noise makes loading go back for a point."""
     tests = measured_with(unloading, instrument=Instrument(force_noise_mN=hum), peak_MPa=5.0)
     latent = jnp.asarray(true_latent(unloading=unloading))
-    *_, moved = (np.asarray(v) for v in linearised_with_force(latent, jnp.zeros(4), tests, unloading))
+    *_, moved, by_peak = (np.asarray(v) for v in linearised_with_force(latent, jnp.zeros(4), tests, unloading))
     h = 1e-5
     expected = np.asarray(slopes(latent, tests, unloading, h))
     force = np.asarray(tests.force)
@@ -111,6 +128,11 @@ def test_how_noise_of_force_moves_a_prediction(unloading, hum):
         assert where.sum() > 20
         np.testing.assert_allclose(moved[where], expected[where], rtol=1e-4, atol=1e-7)
     assert np.all(moved[used] > 0)
+    # The whole branch moves with the force at its peak; loading has none.
+    assert np.all(by_peak[used & record] == 0)
+    expected = np.asarray(peak_slopes(latent, tests, unloading, h))
+    where = used & ~record
+    np.testing.assert_allclose(by_peak[where], expected[where], rtol=1e-4, atol=1e-6)
     # Elastic points move less than loading moves: unloading is steeper.
     assert np.median(moved[used & ~record]) < np.median(moved[used & record])
 

@@ -29,12 +29,27 @@ SEEDS = st.integers(0, 2**32 - 1)
 SETTINGS = settings(max_examples=60)
 
 
-def dense_covariance(four, scale, step, compliance):
+# Loading, a branch behind its peak, loading on, and another branch.
+BRANCH = np.repeat([0, 1, 2, 3], POINTS // 4)
+ONE_BRANCH = np.repeat([0, 1], POINTS // 2)
+
+
+def dense_covariance(four, scale, step, compliance, peak=None, branch=None):
     """The covariance in the docstring of `_noise`, written out."""
     white, force, correlated, length = four
     path = np.cumsum(step)
     wander = correlated**2 * np.exp(-np.abs(path[:, None] - path) / length)
-    return scale**2 * (np.diag(white**2 + (force * compliance) ** 2) + wander)
+    total = np.diag(white**2 + (force * compliance) ** 2) + wander
+    if peak is not None:
+        for b in np.unique(branch):
+            c = np.where(branch == b, peak, 0.0)
+            total = total + force**2 * np.outer(c, c)
+    return scale**2 * total
+
+
+def still_branches():
+    """Compliance, and branches whose peaks move nothing."""
+    return jnp.ones(POINTS), jnp.zeros(POINTS), jnp.asarray(BRANCH)
 
 
 def noise_of(four, scale=(1.0,)):
@@ -42,26 +57,27 @@ def noise_of(four, scale=(1.0,)):
 
 
 @jax.jit
-def whitened(four, scale, step, mask, compliance, residual):
+def whitened(four, scale, step, mask, compliance, residual, peak, branch):
     noise = Noise(*four, jnp.ones(1))
-    filtered = whitening(noise, scale, step, mask, compliance)
+    filtered = whitening(noise, scale, step, mask, compliance, peak, branch)
     return filtered(residual), filtered.log_det
 
 
 @SETTINGS
-@given(STEPS, MASKS, SIZES, SIZES, SIZES, SIZES, SIZES, SEEDS)
+@given(STEPS, MASKS, SIZES, SIZES, st.none() | SIZES, SIZES, SIZES, SEEDS)
 def test_whitening_is_the_dense_gaussian(step, mask, white, force, correlated, length, scale, seed):
     rng = np.random.default_rng(seed)
-    compliance, residual = rng.standard_normal(POINTS), rng.standard_normal(POINTS)
-    four = (white, force, correlated, length)
-    independent, log_det = whitened(tuple(map(np.float64, four)), np.float64(scale), step, mask, compliance, residual)
+    compliance, residual, peak = rng.standard_normal((3, POINTS))
+    # Where residuals are correlated, one branch; without correlation, any number.
+    branch = BRANCH if correlated is None else ONE_BRANCH
+    peak = np.where(branch % 2 == 1, peak, 0.0)
+    four = (white, force, correlated or 0.0, length)
+    arguments = (tuple(map(np.float64, four)), np.float64(scale), step, mask, compliance, residual, peak, branch)
+    independent, log_det = whitened(*arguments)
     assert np.all(np.asarray(independent)[~mask] == 0)
-    covariance = dense_covariance(four, scale, step, compliance)[mask][:, mask]
+    covariance = dense_covariance(four, scale, step, compliance, peak, branch)[mask][:, mask]
     used = residual[mask]
-    if mask.any():
-        expected = multivariate_normal(cov=covariance).logpdf(used)
-    else:
-        expected = 0.0
+    expected = multivariate_normal(cov=covariance).logpdf(used) if mask.any() else 0.0
     actual = -0.5 * (np.sum(np.asarray(independent) ** 2) + float(log_det) + mask.sum() * np.log(2 * np.pi))
     np.testing.assert_allclose(actual, expected, rtol=1e-7, atol=1e-8)
 
@@ -70,10 +86,10 @@ def test_whitening_is_the_dense_gaussian(step, mask, white, force, correlated, l
 @given(STEPS, MASKS, SIZES, SIZES, SEEDS)
 def test_masked_points_count_for_nothing(step, mask, correlated, length, seed):
     rng = np.random.default_rng(seed)
-    compliance, one, two = rng.standard_normal((3, POINTS))
+    compliance, peak, one, two = rng.standard_normal((4, POINTS))
     other = np.where(mask, one, two)
     arguments = (tuple(map(np.float64, (0.3, 0.2, correlated, length))), np.float64(1.0), step, mask, compliance)
-    for a, b in zip(whitened(*arguments, one), whitened(*arguments, other), strict=True):
+    for a, b in zip(*(whitened(*arguments, r, peak, BRANCH) for r in (one, other)), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
@@ -81,18 +97,34 @@ def test_whitening_is_linear_and_whitens():
     rng = np.random.default_rng(2)
     step, compliance = np.append(0.0, rng.random(POINTS - 1) / 5), rng.standard_normal(POINTS)
     four = (0.2, 0.3, 0.5, 0.3)
-    filtered = whitening(noise_of(four), jnp.asarray(1.7), *map(jnp.asarray, (step, np.full(POINTS, True), compliance)))
+    peak = np.where(ONE_BRANCH == 1, rng.standard_normal(POINTS), 0.0)
+    path = (step, np.full(POINTS, True), compliance, peak, ONE_BRANCH)
+    filtered = whitening(noise_of(four), jnp.asarray(1.7), *map(jnp.asarray, path))
     L = np.asarray(jax.vmap(filtered, in_axes=1, out_axes=1)(jnp.eye(POINTS)))
-    assert np.all(np.triu(L, 1) == 0)
-    np.testing.assert_allclose(
-        L @ dense_covariance(four, 1.7, step, compliance) @ L.T, np.eye(POINTS), rtol=0, atol=1e-12
-    )
+    covariance = dense_covariance(four, 1.7, step, compliance, peak, ONE_BRANCH)
+    np.testing.assert_allclose(L @ covariance @ L.T, np.eye(POINTS), rtol=0, atol=1e-12)
+
+
+def test_two_branches_of_correlated_residuals_are_nearly_the_dense_gaussian():
+    """The filter carries a little of one branch's direction into what follows; as in tests, correlation is weak."""
+    rng = np.random.default_rng(3)
+    step, mask = np.full(POINTS, 0.05), np.full(POINTS, True)
+    compliance, peak = np.full(POINTS, 0.1), np.where(BRANCH % 2 == 1, 0.3, 0.0)
+    four = (0.02, 0.05, 0.01, 0.2)
+    covariance = dense_covariance(four, 1.0, step, compliance, peak, BRANCH)
+    for _ in range(5):
+        r = np.linalg.cholesky(covariance) @ rng.standard_normal(POINTS)
+        independent, log_det = whitened(
+            tuple(map(np.float64, four)), np.float64(1.0), step, mask, compliance, r, peak, BRANCH
+        )
+        actual = -0.5 * (np.sum(np.asarray(independent) ** 2) + float(log_det) + POINTS * np.log(2 * np.pi))
+        assert abs(actual - multivariate_normal(cov=covariance).logpdf(r)) < 0.3
 
 
 def test_without_correlation_it_only_divides():
     step = jnp.asarray(np.full(POINTS, 0.1))
     mask, residual = jnp.asarray(np.full(POINTS, True)), jnp.arange(POINTS, dtype=float)
-    filtered = whitening(noise_of((0.5, 0.0, 0.0, 1.0)), jnp.asarray(2.0), step, mask, jnp.ones(POINTS))
+    filtered = whitening(noise_of((0.5, 0.0, 0.0, 1.0)), jnp.asarray(2.0), step, mask, *still_branches())
     np.testing.assert_allclose(filtered(residual), residual, rtol=1e-14)
     np.testing.assert_allclose(float(filtered.log_det), 0.0, atol=1e-14)
 
@@ -107,15 +139,18 @@ def linear_problem(four, scale, *, points=POINTS, count=1, seed=0, masked=0.1):
     residual = np.empty((count, points))
     jacobian, compliance = np.empty((count, points, 3)), np.empty((count, points))
     step = np.broadcast_to(np.append(0.0, np.diff(path)), (count, points))
+    branch = np.broadcast_to((path > 1).astype(int), (count, points))
+    peak = np.where(branch == 1, 0.1 + 0.2 * rng.random((count, 1)), 0.0)
     for i in range(count):
         jacobian[i] = np.stack([np.ones(points), path, rng.random() + np.sqrt(path)], 1)
         compliance[i] = 0.05 + rng.random() * np.exp(-2 * path)
-        covariance = dense_covariance(four, scale[i], step[i], compliance[i])
+        covariance = dense_covariance(four, scale[i], step[i], compliance[i], peak[i], branch[i])
         noise = np.linalg.cholesky(covariance) @ rng.standard_normal(points)
         residual[i] = noise + jacobian[i] @ rng.standard_normal(3)
     mask = rng.random((count, points)) >= masked
     prior = np.array([0.5, 1.0, 2.0])
-    return Linear(*(jnp.asarray(v) for v in (residual, jacobian, prior, step, mask, compliance)))
+    arrays = (residual, jacobian, prior, step, mask, compliance, peak, branch)
+    return Linear(*(jnp.asarray(v) for v in arrays))
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.6])
@@ -127,7 +162,8 @@ def test_restricted_likelihood_is_the_dense_gaussian_with_the_parameters_in_the_
     for i in range(2):
         mask, J = np.asarray(data.mask[i]), np.asarray(data.jacobian[i])
         r, prior = np.asarray(data.residual[i])[mask], np.asarray(data.prior)
-        V = dense_covariance(four, (scale, 1.0)[i], np.asarray(data.step[i]), np.asarray(data.compliance[i]))
+        path = (np.asarray(v[i]) for v in (data.step, data.compliance, data.peak, data.branch))
+        V = dense_covariance(four, (scale, 1.0)[i], *path)
         total = (V + J @ np.diag(1 / prior) @ J.T)[mask][:, mask]
         expected = multivariate_normal(cov=total).logpdf(r)
         constant = 0.5 * mask.sum() * np.log(2 * np.pi) - 0.5 * np.log(prior).sum()
@@ -243,14 +279,15 @@ def test_scales_of_extreme_residuals_are_finite_and_positive(squares):
 
 def test_whitening_of_a_batch_is_that_of_each():
     rng = np.random.default_rng(4)
-    step, compliance, r = np.abs(rng.standard_normal((3, 2, POINTS)))
+    step, compliance, r, peak = np.abs(rng.standard_normal((4, 2, POINTS)))
+    branch = np.broadcast_to(BRANCH, (2, POINTS))
     mask = rng.random((2, POINTS)) < 0.8
     scale, noise = np.array([0.5, 2.0]), noise_of((0.2, 0.3, 0.5, 0.3), (0.5, 2.0))
     batch: Whitening = jax.vmap(lambda s, *one: whitening(noise, s, *one))(
-        noise.scale, jnp.asarray(step), jnp.asarray(mask), jnp.asarray(compliance)
+        noise.scale, *map(jnp.asarray, (step, mask, compliance, peak, branch))
     )
     together = jax.vmap(lambda f, x: f(x))(batch, jnp.asarray(r))
     for i in range(2):
         four = tuple(map(np.float64, (0.2, 0.3, 0.5, 0.3)))
-        alone, _ = whitened(four, scale[i], step[i], mask[i], compliance[i], r[i])
+        alone, _ = whitened(four, scale[i], step[i], mask[i], compliance[i], r[i], peak[i], branch[i])
         np.testing.assert_allclose(together[i], alone, rtol=1e-12, atol=1e-14)

@@ -262,7 +262,7 @@ def small():
 
 @pytest.fixture(scope="module")
 def both(small):
-    return [calibrate_bayes(small, mode=mode, draws=2000) for mode in ("fast", "joint")]
+    return [calibrate_bayes(small, mode=mode) for mode in ("fast", "joint")]
 
 
 def gap(one, two):

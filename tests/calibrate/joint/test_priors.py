@@ -85,7 +85,7 @@ def test_a_mistake_is_told_with_file_and_entry(read, text, words):
 
 
 def test_a_missing_file_is_told(tmp_path):
-    with pytest.raises(InputError, match="nowhere.toml"):
+    with pytest.raises(InputError, match=r"nowhere\.toml"):
         read_priors(tmp_path / "nowhere.toml")
 
 
