@@ -102,7 +102,9 @@ def prior_numbers(priors: Priors, flatness: Float[Array, " particles"]) -> Prior
     """Priors as arrays; `a` is bounded to where every particle's shape factor is positive."""
     flat = np.asarray(flatness)
     most, least = max(flat.max(), 1e-3), min(flat.min(), -1e-3)
-    wide = priors.a.mean + np.array([-8, 8]) * priors.a.sd
+    # The bounds scale a coordinate; they are no belief, and stay far from where data or prior could want to go.
+    reach = max(8 * priors.a.sd, 8.0)
+    wide = priors.a.mean + np.array([-reach, reach])
     low, high = max(-ALMOST / most, wide[0]), min(-ALMOST / least, wide[1])
 
     def log_pair(prior):

@@ -166,5 +166,5 @@ def fit_particles(
         return jnp.take_along_axis(values, best.reshape(1, -1, *[1] * (values.ndim - 2)), axis=0)[0]
 
     found = take(y)
-    points = jnp.maximum(jnp.sum(tests.mask, 1), 1)
+    points = jnp.maximum(jnp.sum(tests.mask, 1), 1).astype(noise.dtype)
     return Particles(found[:, :4], found[:, 4], noise * jnp.sqrt(2 * take(loss) / points), take(done))

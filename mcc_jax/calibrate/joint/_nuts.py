@@ -41,7 +41,8 @@ def sample(
 ) -> Chains:
     """Sample a density whose mode and covariance are roughly known.
 
-    The sampler works in coordinates in which that covariance is the identity, so little is left to adapt. Call it inside `jit`: MCMC objects of NumPyro compile anew for every data set, this does so once per shape.
+    The sampler works in coordinates in which that covariance is the identity, so little is left to adapt. Call it
+    inside `jit`: MCMC objects of NumPyro compile anew for every data set, this does so once per shape.
 
     Args:
         key: random key.
