@@ -73,7 +73,8 @@ def _damped(A: Float[Array, "*batch p p"], damping: Any) -> Float[Array, "*batch
     diagonal = jnp.diagonal(A, axis1=-2, axis2=-1)
     # A direction that the data do not know at all gets a curvature of its own, so that it stays where it is.
     floor = jnp.where(diagonal > 1e-12, diagonal * (damping + 1e-14), 1.0)
-    return A + jnp.eye(A.shape[-1]) * floor[..., None, :]
+    eye = jnp.broadcast_to(jnp.eye(A.shape[-1]), A.shape)
+    return A + eye * floor[..., None, :]
 
 
 def normal_equations(push: Callable[[Parameters], Any], residual: Any, y: Parameters) -> Normal:
@@ -133,8 +134,8 @@ class ArrowLevenbergMarquardt(optx.AbstractGaussNewton[Parameters, Any, Any]):
     rtol: float = 1e-9
     atol: float = 1e-9
     norm: Callable[[Any], Float[Array, ""]] = _largest
-    descent: ArrowDescent = ArrowDescent()
-    search: optx.ClassicalTrustRegion[Parameters] = optx.ClassicalTrustRegion(high_constant=10.0)
+    descent: ArrowDescent = ArrowDescent()  # pyright: ignore[reportIncompatibleVariableOverride]
+    search: optx.ClassicalTrustRegion[Parameters] = optx.ClassicalTrustRegion(high_constant=10.0)  # pyright: ignore[reportIncompatibleVariableOverride]
     verbose: Callable[..., None] = eqx.field(static=True, default=lambda **_: None)
 
 

@@ -31,6 +31,9 @@ UNITS = {
     "force_mN": "mN",
     "diameters_um": "um",
     "test": "nat",
+    "mask": "1",
+    "pareto_k": "1",
+    "lp_test": "nat",
 }
 PREDICTIVE_DRAWS = 50
 """Curves per chain and particle kept in the predictive groups."""
@@ -39,7 +42,7 @@ MOST_PREDICTIVE = 2_000_000
 """At most as many predicted points are kept: of large campaigns the first particles only."""
 
 
-def prior_draws(priors: Priors, low: float, high: float, shape: tuple[int, int], seed: int) -> dict[str, np.ndarray]:
+def prior_draws(priors: Priors, low: float, high: float, shape: tuple[int, int], seed: int) -> dict[str, Any]:
     """Draws of the population from its prior, by the names of the posterior."""
     rng = np.random.default_rng(seed)
 
@@ -71,7 +74,8 @@ def to_arviz(calibration: BayesCalibration, *, prior_count: int = 500, seed: int
 
     Groups: `posterior` (population and every particle), `log_likelihood` (variable `test`: each particle's whole test
     given the population, the particle integrated out, so that ArviZ's `loo` leaves one *particle* out),
-    `sample_stats`, `prior`, `prior_predictive` and `posterior_predictive` (displacement at the measured forces),
+    `sample_stats` (`lp_test`: their sum), `prior`, `prior_predictive` and `posterior_predictive` (displacement at the
+    measured forces),
     `observed_data`, `constant_data`. Every variable has its unit in its attributes. Padded points are NaN.
 
     Args:
@@ -147,6 +151,7 @@ def to_arviz(calibration: BayesCalibration, *, prior_count: int = 500, seed: int
         {
             "posterior": posterior,
             "log_likelihood": {"test": c.log_likelihood},
+            "sample_stats": {"lp_test": c.log_likelihood.sum(-1)},
             "prior": prior,
             "observed_data": {"displacement_um": observed},
             "constant_data": {

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import equinox as eqx
 import jax
@@ -25,7 +25,6 @@ from ._noise import Whitening
 from ._population import Population, Summary, laplace
 from ._sampling import (
     Exact,
-    ParticleDraws,
     draw_particles,
     exact_of,
     sample_joint,
@@ -363,7 +362,9 @@ def _compile(tests: Tests, model: JointModel, chains: int, warmup: int, draws: i
     # Almost all campaigns pin their coefficients down; the others compile again.
     key, flat, scatter = jax.random.key(0), tests.flatness, replace(model.scatter, newton=0)
     settings = {"chains": chains, "warmup": warmup, "draws": draws}
-    sample_population.lower(key, dummy(d), dummy(d, d), numbers, quadratic, flat, scatter, **settings).compile()
+    cast(Any, sample_population).lower(
+        key, dummy(d), dummy(d, d), numbers, quadratic, flat, scatter, **settings
+    ).compile()
     exact = Exact(
         tests,
         eqx.filter_vmap(Whitening)(*(dummy(count, points) for _ in range(4)), tests.branch),
@@ -374,7 +375,7 @@ def _compile(tests: Tests, model: JointModel, chains: int, warmup: int, draws: i
     several = dummy(len(range(0, chains * draws, _stride(count, chains * draws))))
     triple = dummy(*several.shape, 3)
     some = eqx.filter_vmap(Population)(several, several, triple, triple, several, several, several)
-    draw_particles.lower(key, some, exact, flat, scatter).compile()
+    cast(Any, draw_particles).lower(key, some, exact, flat, scatter).compile()
     import arviz_stats.base  # noqa: F401  # seconds on a cold machine, so here too
 
 
@@ -416,10 +417,8 @@ def _fast(
     total, count = chains * draws, len(tests)
     exact = exact_of(fit, tests, model.zero_sd, model.unloading)
     stride = _stride(count, total)
-    checked = ParticleDraws(
-        *(np.array(v) for v in draw_particles(check_key, _every(population, stride), exact, flat, scatter))
-    )
-    ratio = checked.log_ratio
+    checked = [np.array(v) for v in draw_particles(check_key, _every(population, stride), exact, flat, scatter)]
+    ratio = checked[3]
     k = pareto_k(ratio)
     restless = np.flatnonzero(_unrest(ratio) > RESTLESS)
     applied = stride == 1
@@ -518,7 +517,7 @@ def _particles(
     log_eta = np.log(eta)
     # What scatter of `a` there is has gone into b alone; a particle's coefficients are those under the common a.
     C = np.exp(latent[..., :3] - log_eta[..., None])
-    modulus = np.exp(latent[..., 3] - model.strain_scaling.power * log_eta)
+    modulus = np.exp(latent[..., 3] - model.shape_power * log_eta)
     return {"C": C, "modulus_MPa": modulus, "zero_um": zero.reshape(chains, -1, count), "shape_factor": eta}
 
 
@@ -550,14 +549,14 @@ def _stack(population: Population, scatter: Any, shape: tuple[int, int]) -> tupl
 
 def diagnostics(names: list[str], draws: np.ndarray) -> tuple[dict[str, float], dict[str, float], dict[str, float]]:
     """R-hat, bulk and tail ESS by name, of draws with the axes (chain, draw, name)."""
-    from arviz_stats.base import array_stats
+    from arviz_stats.base.array import array_stats
 
-    axes = {"chain_axis": 0, "draw_axis": 1}
+    axes: dict[str, Any] = {"chain_axis": 0, "draw_axis": 1}
     rhat = array_stats.rhat(draws, **axes)
     bulk = array_stats.ess(draws, method="bulk", **axes)
     tail = array_stats.ess(draws, method="tail", prob=(0.05, 0.95), **axes)
 
-    def named(values: np.ndarray) -> dict[str, float]:
+    def named(values: Any) -> dict[str, float]:
         return {n: float(v) for n, v in zip(names, np.atleast_1d(values), strict=True)}
 
     return named(rhat), named(bulk), named(tail)
@@ -571,7 +570,7 @@ def _unrest(log_weight: np.ndarray) -> np.ndarray:
 
 def pareto_k(log_weight: np.ndarray) -> np.ndarray:
     """Pareto k of importance weights, draws along the first axis."""
-    from arviz_stats.base import array_stats
+    from arviz_stats.base.array import array_stats
 
     columns = np.where(np.isfinite(log_weight), log_weight, -1e10).T
     result = np.zeros(len(columns))
@@ -579,19 +578,19 @@ def pareto_k(log_weight: np.ndarray) -> np.ndarray:
     varied = np.std(columns, axis=1) > 1e-9
     if varied.any():
         with np.errstate(all="ignore"):
-            result[varied] = array_stats.psislw(columns[varied], axis=-1)[1]
+            result[varied] = array_stats.psislw(-columns[varied], axis=-1)[1]
     return np.where(np.isnan(result), np.inf, result)
 
 
 def smoothed_weights(log_weight: np.ndarray) -> tuple[np.ndarray, float]:
     """Pareto-smoothed importance weights, normalised, and their k."""
-    from arviz_stats.base import array_stats
+    from arviz_stats.base.array import array_stats
 
     finite_weight = np.where(np.isfinite(log_weight), log_weight, -1e10)
     if np.std(finite_weight) <= 1e-9:
         return np.full(len(finite_weight), 1 / len(finite_weight)), 0.0
     with np.errstate(all="ignore"):
-        smooth, k = array_stats.psislw(finite_weight, axis=-1)
+        smooth, k = array_stats.psislw(-finite_weight, axis=-1)
     if not np.isfinite(smooth).all():  # one weight holds all: nothing to smooth
         smooth, k = finite_weight, np.inf
     weight = np.exp(np.asarray(smooth) - np.max(smooth))

@@ -169,8 +169,9 @@ def _prepare(
         kind[part.start : part.stop] = part.kind
     if not (kind == "load").any():
         return "has no loading: force never rises above its noise"
-    contact = curve.displacement_um[segments[0].stop] if segments[0].kind == "approach" and len(segments) > 1 else None
-    start = 0 if contact is None else segments[0].stop
+    first = segments[0]
+    contact = float(curve.displacement_um[first.stop]) if first.kind == "approach" and len(segments) > 1 else None
+    start = 0 if contact is None else first.stop
     rows = np.arange(start, len(curve))
     stride = -(-len(rows) // most_points)
     if stride > 1:

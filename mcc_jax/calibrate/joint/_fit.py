@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ..._errors import InputError
 from ...law import StrainScaling, Unloading
 from ._data import Tests
 from ._individual import Particles, fit_particles, linear_starts
@@ -55,7 +56,12 @@ class JointModel:
     @property
     def scatter(self) -> Scatter:
         """What scatters, and the power of the strain scaling."""
-        return Scatter(self.modulus_scatter, self.shape_scatter, self.strain_scaling.power)
+        return Scatter(self.modulus_scatter, self.shape_scatter, self.shape_power)
+
+    @property
+    def shape_power(self) -> float:
+        """Power of the shape factor in e: the scaling's, or half of it in the forms that square the modulus."""
+        return self.strain_scaling.power / (1 if self.unloading is Unloading.PRINTED else 2)
 
     @property
     def beliefs(self) -> Priors:
@@ -106,6 +112,12 @@ def prior_numbers(priors: Priors, flatness: Float[Array, " particles"]) -> Prior
     reach = max(8 * priors.a.sd, 8.0)
     wide = priors.a.mean + np.array([-reach, reach])
     low, high = max(-ALMOST / most, wide[0]), min(-ALMOST / least, wide[1])
+    if not (low < high and low < priors.a.mean + 6 * priors.a.sd and high > priors.a.mean - 6 * priors.a.sd):
+        raise InputError(
+            f"the prior of a ({priors.a.mean:g} +- {priors.a.sd:g}) leaves no value under which every particle's shape "
+            f"factor is positive ({-ALMOST / most:.3g} < a < {-ALMOST / least:.3g})",
+            remedy="Widen the prior, or check the diameters.",
+        )
 
     def log_pair(prior):
         return jnp.asarray([np.log(prior.median), prior.log_sd])
@@ -159,14 +171,16 @@ def fit_joint(
     )
     latent, zero = individual.latent, individual.zero
     four = [read_out, *np.asarray(priors.noise.median)[1:]]
-    noise = Noise(*(jnp.asarray(v) for v in four), jnp.asarray(np.ones(len(tests))))
+    noise = Noise.from_logs(jnp.asarray(np.log(four)), jnp.asarray(np.ones(len(tests))))
     log_sd, noise_converged = jnp.asarray(np.full(4, np.nan)), True
     free = _start(np.asarray(latent), np.asarray(flatness), model, numbers)
-    for turn in range(rounds + 1):
+    turn = 0
+    while True:
         data = linear_data(latent, zero, tests, zero_sd, model.unloading)
         if not correlated:
             width = 1.4826 * np.median(np.abs(np.asarray(data.residual)[np.asarray(tests.mask)]))
-            noise = Noise(*(jnp.asarray(v) for v in (max(width, 1e-9), 0.0, 0.0, 1.0)), jnp.ones(len(tests)))
+            none = jnp.asarray(0.0)
+            noise = Noise(jnp.asarray(max(width, 1e-9)), none, none, jnp.asarray(1.0), jnp.asarray(np.ones(N)))
         elif turn < rounds:
             tell("estimating the noise")
             noise, log_sd, noise_converged = estimate_noise(data, priors.noise, noise, uncertainty=turn == rounds - 1)
@@ -179,20 +193,22 @@ def fit_joint(
                 summary, filtered = summarise(latent, zero, tests, data, noise, zero_sd)
         tell("fitting the population")
         free, covariance, mode_converged = most_probable(free, numbers, summary, flatness, scatter)
-        if turn < rounds:
-            tell("fitting every particle")
-            mean, spread, moved, shifted = expected_latent(free, numbers, summary, flatness, scatter)
-            starts = jnp.stack(
-                [
-                    jnp.concatenate([latent, zero[:, None]], 1),
-                    jnp.concatenate([moved, shifted[:, None]], 1),
-                    jnp.concatenate([mean, zero[:, None]], 1),
-                ]
-            )
-            sizes = _white_equivalent(filtered, tests)
-            within = jnp.maximum(spread, LEAST_WIDTH)
-            found = fit_particles(tests, sizes, mean, within, zero_sd, starts, model.unloading)
-            latent, zero = found.latent, found.zero
+        if turn == rounds:
+            break
+        turn += 1
+        tell("fitting every particle")
+        mean, spread, moved, shifted = expected_latent(free, numbers, summary, flatness, scatter)
+        starts = jnp.stack(
+            [
+                jnp.concatenate([latent, zero[:, None]], 1),
+                jnp.concatenate([moved, shifted[:, None]], 1),
+                jnp.concatenate([mean, zero[:, None]], 1),
+            ]
+        )
+        sizes = _white_equivalent(filtered, tests)
+        within = jnp.maximum(spread, LEAST_WIDTH)
+        found = fit_particles(tests, sizes, mean, within, zero_sd, starts, model.unloading)
+        latent, zero = found.latent, found.zero
     converged = np.asarray([bool(np.all(np.asarray(individual.converged))), noise_converged, mode_converged])
     return JointFit(
         individual, noise, log_sd, filtered, latent, zero, data.residual, summary, free, covariance, numbers, converged
@@ -210,7 +226,9 @@ def _centre(priors: Priors) -> np.ndarray:
 @eqx.filter_jit
 def _white_equivalent(filters: Whitening, tests: Tests) -> Float[Array, " particles"]:
     """Standard deviation of white noise that weighs a test as much as its filter does [um]."""
-    return jnp.sqrt(jnp.sum(tests.mask, 1) / jnp.maximum(jnp.sum(filters.weight**2, 1), 1e-30))
+    return jnp.sqrt(
+        jnp.sum(tests.mask, 1).astype(filters.weight.dtype) / jnp.maximum(jnp.sum(filters.weight**2, 1), 1e-30)
+    )
 
 
 @eqx.filter_jit
@@ -232,7 +250,7 @@ def _start(latent: np.ndarray, flatness: np.ndarray, model: JointModel, numbers:
     a = float(np.clip(priors.a.mean, 0.9 * low, 0.9 * high))
     log_eta = np.log(1 + a * flatness)
     b = latent[:, :3] - log_eta[:, None]
-    log_modulus = float(np.median(latent[:, 3] - model.strain_scaling.power * log_eta))
+    log_modulus = float(np.median(latent[:, 3] - model.shape_power * log_eta))
     scales = np.array([priors.tau_C1.sd, priors.tau_C3.sd, priors.tau_C5.sd])
     tau = np.clip(np.std(b, axis=0), 0.05 * scales, 2 * scales)
     return to_free(a, log_modulus, np.median(b, axis=0), tau, numbers, model.scatter)

@@ -6,8 +6,9 @@ The tester controls force and noise lives in displacement, so a test of particle
 
 with its zero z, and the law's displacement under load control. The law knows the coefficients only through products
 with the shape factor: :math:`b_j = \log(C_j \eta_p)`, and the modulus through :math:`e = \log(\bar E \eta_p^p)` with
-the power p of the strain scaling. So the data of one particle never contain the shape parameter `a`: it enters through
-what particles of different shapes have in common (`_population`).
+the power p of the strain scaling (half of it in the punch forms, where the modulus is squared). So the data of one
+particle never contain the shape parameter `a`: it enters through what particles of different shapes have in common
+(`_population`).
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..._numerics import running_max
-from ..._types import Path
+from ..._types import Path, Scalar
 from ...geometry import Particle
 from ...law import MccLaw, Plastic, Unloading
 from ._data import Tests
@@ -71,12 +72,12 @@ def _linearise(latent, zero, tests, unloading, with_force):
     count = len(tests)
 
     def predicted(w, force):
-        return jax.vmap(lambda *one: displacement(*one, unloading))(w, tests.particle, force)
+        return jax.vmap(lambda *one: displacement(one[0], one[1], one[2], unloading))(w, tests.particle, force)
 
     value, push = jax.linearize(predicted, latent, tests.force)
     still = jnp.zeros_like(tests.force)
     record = tests.force >= jax.vmap(running_max)(tests.force)
-    directions = jnp.eye(4)[:, None] * jnp.ones((count, 1))
+    directions = jnp.broadcast_to(jnp.eye(4)[:, None], (4, count, 4))
     forces = [still] * 4
     if with_force:
         directions = jnp.concatenate([directions, jnp.zeros((2, count, 4))])

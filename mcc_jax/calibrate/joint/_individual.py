@@ -44,7 +44,7 @@ def _polynomial(x: Path, stress: Path, weight: Path) -> Float[Array, " 3"]:
     """K1, K3, K5 by linear least squares."""
     design = jnp.stack([x, -(x**3), x**5], 1) * weight[:, None]
     scale = jnp.sqrt(jnp.sum(design**2, axis=0)) + 1e-30
-    scaled = design / scale
+    scaled = design / scale[None]
     ridge = jnp.eye(3) * 1e-9
     return Cholesky(scaled.T @ scaled + ridge).solve(scaled.T @ (stress * weight)) / scale
 
@@ -130,7 +130,7 @@ def fit_particles(
     def normal_equations(y):
         r, J = linearise(y[:, :4], y[:, 4], many, unloading)
         r, J, away = r / scale, J / scale[..., None], (y - middle) / width
-        H = jnp.einsum("nkp,nkq->npq", J, J) + jnp.eye(5) / width[..., None] ** 2
+        H = jnp.einsum("nkp,nkq->npq", J, J) + jnp.eye(5)[None] / width[..., None] ** 2
         g = jnp.einsum("nkp,nk->np", J, r) + away / width
         loss = 0.5 * (jnp.sum(r**2, 1) + jnp.sum(away**2, 1))
         return jnp.where(jnp.isfinite(loss), loss, jnp.inf), g, H
@@ -138,9 +138,9 @@ def fit_particles(
     def step(carry):
         y, loss, g, H, damping, count, _ = carry
         diagonal = jnp.diagonal(H, axis1=1, axis2=2)
-        move = -Cholesky(H + jnp.eye(5) * (damping[:, None] * diagonal)[:, None, :]).solve(g)
+        move = -Cholesky(H + jnp.eye(5)[None] * (damping[:, None] * diagonal)[:, None, :]).solve(g)
         # No logarithm moves by more than a factor of e, no zero by more than a tenth of its prior's reach, at a time.
-        most = jnp.max(jnp.abs(move) / jnp.append(jnp.ones(4), zero_sd), 1)
+        most = jnp.max(jnp.abs(move) / jnp.append(jnp.ones(4), zero_sd)[None], 1)
         tried = y + move / jnp.maximum(most, 1.0)[:, None]
         new_loss, new_g, new_H = normal_equations(tried)
         better = new_loss < loss

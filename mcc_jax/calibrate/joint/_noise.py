@@ -222,8 +222,7 @@ def estimate_noise(
     bounds = [(m - 6 * s, m + 6 * s) for m, s in zip(np.log(prior.median), np.asarray(prior.log_sd), strict=True)]
     inside = np.clip(np.asarray(start.logs), *np.transpose(bounds))
     found = minimize(value_and_gradient, inside, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-9})
-    four = (jnp.asarray(v) for v in np.exp(found.x))
-    noise = Noise(*four, start.scale)
+    noise = Noise.from_logs(jnp.asarray(found.x), start.scale)
     if not uncertainty:
         return noise, jnp.asarray(np.full(4, np.nan)), bool(found.success)
     width = 0.02

@@ -77,5 +77,7 @@ def sample(
         return z[warmup:], divergent[warmup:], steps[warmup:], state.adapt_state.step_size
 
     keys = jax.random.split(key, chains)
-    z, divergent, steps, step_size = jax.vmap(chain)(keys) if together else jax.lax.map(chain, keys)
-    return Chains(mode + jnp.einsum("ij,cnj->cni", factor, z), divergent, steps, step_size)
+    # NumPyro counts on JAX's usual promotion of types and ranks, whatever the caller's settings are.
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        z, divergent, steps, step_size = jax.vmap(chain)(keys) if together else jax.lax.map(chain, keys)
+    return Chains(mode[None, None] + jnp.einsum("ij,cnj->cni", factor, z), divergent, steps, step_size)

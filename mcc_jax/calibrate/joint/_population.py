@@ -59,7 +59,7 @@ class Scatter(eqx.Module):
 
     modulus: bool = eqx.field(static=True, default=False)
     shape: bool = eqx.field(static=True, default=False)
-    power: int = eqx.field(static=True, default=0)
+    power: float = eqx.field(static=True, default=0.0)
     newton: int = eqx.field(static=True, default=4)
 
     @property
@@ -103,13 +103,13 @@ def moments(
     eta = 1 + population.a * flatness
     log_eta = jnp.log(jnp.where(eta > 0, eta, 1e-300))
     powers = jnp.array([1.0, 1.0, 1.0, scatter.power])
-    mean = jnp.concatenate([population.mu, population.log_modulus[None]]) + log_eta[:, None] * powers
+    mean = jnp.concatenate([population.mu, population.log_modulus[None]])[None] + log_eta[:, None] * powers[None]
     columns = [jnp.zeros(4).at[j].set(population.tau[j]) for j in range(3)]
     if scatter.modulus:
         columns.append(jnp.zeros(4).at[3].set(population.modulus_scatter))
     factor = jnp.broadcast_to(jnp.stack(columns, 1), (flatness.shape[0], 4, len(columns)))
     if scatter.shape:
-        slope = population.shape_scatter * (flatness / eta)[:, None] * powers
+        slope = population.shape_scatter * (flatness / eta)[:, None] * powers[None]
         factor = jnp.concatenate([factor, slope[..., None]], 2)
     return mean, factor
 
@@ -140,6 +140,7 @@ FARTHEST = 4.0
 def straighten(away: Float[Array, "*batch 4"]) -> tuple[Float[Array, "*batch 4"], Float[Array, "*batch 4"]]:
     """kappa, in which stress is linear, and its derivative, from w less the summary's point."""
     powers = jnp.array([1.0, 3.0, 5.0])
+    powers = jnp.broadcast_to(powers, away[..., :3].shape)
     exponent = jnp.clip(powers * away[..., :3], -FARTHEST, FARTHEST)
     kappa = jnp.concatenate([jnp.expm1(exponent) / powers, away[..., 3:]], -1)
     return kappa, jnp.concatenate([jnp.exp(exponent), jnp.ones_like(away[..., 3:])], -1)
@@ -151,7 +152,7 @@ def laplace(
     """Integrate every particle out by Laplace's method."""
     share = jnp.exp(-2 * population.log_noise)
     mean, factor = moments(population, flatness, scatter)
-    eye = jnp.eye(scatter.size)
+    eye = jnp.eye(scatter.size)[None]
 
     def curvature(slope, factor, precision):
         bent = slope[..., None] * factor
@@ -188,7 +189,7 @@ def laplace(
     at_mode = -0.5 * share * (quadratic + summary.squares) - 0.5 * jnp.sum(xi**2, -1)
     stretch = jnp.concatenate([jnp.array([1.0, 3.0, 5.0]) * population.tau, jnp.zeros(scatter.size - 3)])
     # In nu the summary is quadratic; what bends is the prior: xi^2/2 has the curvature 1 - j tau xi.
-    bend = jnp.maximum(1 - stretch * xi, 0.25)
+    bend = jnp.maximum(1 - stretch[None] * xi, 0.25)
     hessian = curvature(slope, factor, summary.precision) + eye * bend[..., None, :]
     inner = Cholesky(hessian)
     tilt = 0.5 * jnp.sum(inner.forward(jnp.broadcast_to(stretch, xi.shape)) ** 2, -1)
@@ -238,7 +239,7 @@ def draw_latent(
     at = laplace(population, summary, flatness, scatter)
     inner = Cholesky(at.hessian)
     nu = inner.backward(normal)
-    y = at.stretch * nu
+    y = at.stretch[None] * nu
     inside = y > LEAST_SHARE - 1
     y = jnp.where(inside, y, 0.0)
     small = jnp.abs(y) < 1e-5

@@ -91,7 +91,7 @@ def exact_log_likelihood(
 
     total = jax.vmap(squares)(latent, zero, tests.particle, tests.force, tests.displacement, tests.mask, exact.filters)
     at_zero = ((zero - tests.contact) / exact.zero_sd) ** 2
-    points = jnp.sum(tests.mask, 1)
+    points = jnp.sum(tests.mask, 1).astype(total.dtype)
     return -0.5 * (jnp.exp(-2 * log_noise) * total + at_zero) - points * log_noise
 
 
