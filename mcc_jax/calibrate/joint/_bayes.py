@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from ...campaign import THRESHOLD_MPA, Campaign
 from .._predict import point_noise_um
 from .._result import estimate, finite, misfit_note
-from ._data import Selection, Tests, own_misfit, select_tests
+from ._data import Selection, Tests, own_misfit, select_tests, spread
 from ._fit import JointFit, JointModel, fit_joint, population_at, populations, prior_numbers
 from ._noise import Whitening
 from ._population import Population, Summary, laplace
@@ -320,7 +320,7 @@ def calibrate_bayes(
     model = model or JointModel()
     tell("selecting points")
     selection = select_tests(campaign, threshold_MPa=threshold_MPa)
-    tests = selection.tests
+    tests = spread(selection.tests)
     read_out = float(np.median([point_noise_um(campaign.curves[i]) for i in selection.kept]))
     compiling = None
     if mode == "fast":

@@ -59,6 +59,19 @@ class Tests(eqx.Module):
         return eqx.filter_vmap(lambda particle: particle.flatness)(self.particle)
 
 
+def spread(tests: Tests) -> Tests:
+    """The same tests with their particles spread over this process's devices, if their number divides evenly.
+
+    Everything that follows acts on particles one by one and then sums, so the compiler splits it in the same way.
+    """
+    devices = jax.local_devices()
+    if len(devices) < 2 or len(tests) % len(devices):
+        return tests
+    mesh = jax.sharding.Mesh(np.array(devices), ("particles",))
+    place = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("particles"))
+    return jax.tree.map(lambda x: jax.device_put(x, place), tests)
+
+
 @dataclass(frozen=True)
 class Selection:
     """Which particles take part, and which points of each.

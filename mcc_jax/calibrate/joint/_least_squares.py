@@ -16,7 +16,7 @@ from .._predict import point_noise_um
 from .._result import estimate, finite, misfit_note
 from ._arrow import Parameters, Solution
 from ._bayes import COEFFICIENTS, log_estimate
-from ._data import Selection, own_misfit, select_tests
+from ._data import Selection, own_misfit, select_tests, spread
 from ._fit import JointFit, JointModel, fit_joint, population_at
 from ._pooled import Pooled, fit_pooled, unpack
 
@@ -281,7 +281,7 @@ def calibrate_least_squares(
     model = model or JointModel()
     tell("selecting points")
     selection = select_tests(campaign, threshold_MPa=threshold_MPa)
-    tests = selection.tests
+    tests = spread(selection.tests)
     read_out = float(np.median([point_noise_um(campaign.curves[i]) for i in selection.kept]))
     fit = fit_joint(tests, model, read_out, correlated=loss == "linear", rounds=1, tell=tell)
     population = population_at(fit.mode, fit.numbers, model.scatter)
@@ -296,17 +296,14 @@ def calibrate_least_squares(
         loss,
     )
     tell("fitting all particles together")
-    best = solve(
-        fit, settings, selection, float(population.a), np.asarray(population.mu), float(population.log_modulus)
-    )
     low, high = np.asarray(fit.numbers.a)[2:]
-    agree = 1
-    others = [replaced for replaced in STARTS if 0.9 * low < replaced < 0.9 * high]
-    for a in others:
-        found = solve(fit, settings, selection, a, np.asarray(population.mu), float(population.log_modulus))
-        agree += bool(abs(float(found.loss) - float(best.loss)) <= 1e-5 * float(best.loss) + 1e-6)
-        if float(found.loss) < float(best.loss) * (1 - 1e-9):
-            best = found
+    starts = [float(population.a), *(a for a in STARTS if 0.9 * low < a < 0.9 * high)]
+    mu, log_modulus = np.asarray(population.mu), float(population.log_modulus)
+    found = [solve(fit, settings, selection, a, mu, log_modulus) for a in starts]
+    losses = np.array([float(one.loss) for one in found])
+    losses[~np.isfinite(losses)] = np.inf
+    best = found[int(np.argmin(losses))]
+    agree = int(np.sum(losses <= losses.min() * (1 + 1e-5) + 1e-6))
     return LeastSquaresCalibration(
         campaign,
         selection,
@@ -316,7 +313,7 @@ def calibrate_least_squares(
         settings,
         best,
         identifiability(best),
-        (agree, 1 + len(others)),
+        (agree, len(starts)),
         seed,
         time.perf_counter() - started,
     )
