@@ -552,9 +552,11 @@ def diagnostics(names: list[str], draws: np.ndarray) -> tuple[dict[str, float], 
     from arviz_stats.base.array import array_stats
 
     axes: dict[str, Any] = {"chain_axis": 0, "draw_axis": 1}
-    rhat = array_stats.rhat(draws, **axes)
-    bulk = array_stats.ess(draws, method="bulk", **axes)
-    tail = array_stats.ess(draws, method="tail", prob=(0.05, 0.95), **axes)
+    # Chains that never moved have no variance to divide by; their R-hat then is infinite, as it should be.
+    with np.errstate(all="ignore"):
+        rhat = array_stats.rhat(draws, **axes)
+        bulk = array_stats.ess(draws, method="bulk", **axes)
+        tail = array_stats.ess(draws, method="tail", prob=(0.05, 0.95), **axes)
 
     def named(values: Any) -> dict[str, float]:
         return {n: float(v) for n, v in zip(names, np.atleast_1d(values), strict=True)}
@@ -564,7 +566,7 @@ def diagnostics(names: list[str], draws: np.ndarray) -> tuple[dict[str, float], 
 
 def _unrest(log_weight: np.ndarray) -> np.ndarray:
     """Standard deviation of each particle's weights over their mean, draws along the first axis."""
-    relative = np.exp(log_weight - np.maximum(log_weight.max(0), -1e300))
+    relative = np.exp(np.maximum(log_weight - np.maximum(log_weight.max(0), -1e300), -700.0))
     return relative.std(0) / np.maximum(relative.mean(0), 1e-300)
 
 
@@ -593,7 +595,7 @@ def smoothed_weights(log_weight: np.ndarray) -> tuple[np.ndarray, float]:
         smooth, k = array_stats.psislw(-finite_weight, axis=-1)
     if not np.isfinite(smooth).all():  # one weight holds all: nothing to smooth
         smooth, k = finite_weight, np.inf
-    weight = np.exp(np.asarray(smooth) - np.max(smooth))
+    weight = np.exp(np.maximum(np.asarray(smooth) - np.max(smooth), -700.0))
     return weight / weight.sum(), float(k) if np.isfinite(k) else float("inf")
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -103,6 +105,9 @@ def log_posterior(
     return prior + jnp.sum(marginal_likelihood(population, summary, flatness, scatter))
 
 
+ATTEMPTS = 4
+
+
 @eqx.filter_jit
 def _gradients(
     free: Float[Array, "many d"],
@@ -129,8 +134,6 @@ def most_probable(
     Newton's method in a trust region (SciPy), in coordinates scaled by the curvature at the start. The curvature comes
     from differences of exact gradients, which are quicker than second derivatives are to compile.
     """
-    from scipy.optimize import minimize
-
     origin = np.asarray(start)
     d = len(origin)
     width = np.full(d, 1e-5)
@@ -142,8 +145,26 @@ def most_probable(
         curvature = (slope[1 : d + 1] - slope[d + 1 :]) / (2 * width[:, None])
         return float(value[0]), slope[0], (curvature + curvature.T) / 2
 
-    unit = 1 / np.sqrt(np.maximum(np.abs(np.diagonal(expand(origin)[2])), 1e-8))
-    width = 1e-3 * np.minimum(unit, 1.0)
+    # Where data are very exact the scales at the start are far from those at the mode: then once more from there.
+    for _ in range(ATTEMPTS):
+        unit = 1 / np.sqrt(np.maximum(np.abs(np.diagonal(expand(origin)[2])), 1e-8))
+        width = 1e-3 * np.minimum(unit, 1.0)
+        found = _newton(expand, origin, unit)
+        origin = origin + unit * found.x
+        if found.success:
+            break
+    curvature = expand(origin)[2]
+    # Curvatures differ by many powers of ten: on the scale of each coordinate, what is not convex is taken as wide.
+    scale = 1 / np.sqrt(np.maximum(np.abs(np.diagonal(curvature)), 1e-8))
+    values, vectors = np.linalg.eigh(curvature * scale * scale[:, None])
+    values = np.where(values > 1e-7, values, 0.01)
+    covariance = (vectors / values) @ vectors.T * scale * scale[:, None]
+    return jnp.asarray(origin), jnp.asarray(covariance), bool(found.success)
+
+
+def _newton(expand: Callable[[np.ndarray], tuple[float, np.ndarray, np.ndarray]], origin: np.ndarray, unit: np.ndarray):
+    from scipy.optimize import minimize
+
     memory: dict[bytes, tuple[float, np.ndarray, np.ndarray]] = {}
 
     def at(z: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
@@ -153,7 +174,7 @@ def most_probable(
             memory[key] = expand(origin + unit * z)
         return memory[key]
 
-    found = minimize(
+    return minimize(
         lambda z: at(z)[0] if np.isfinite(at(z)[0]) else np.inf,
         np.zeros_like(origin),
         jac=lambda z: at(z)[1] * unit,
@@ -161,10 +182,3 @@ def most_probable(
         method="trust-exact",
         options={"gtol": 1e-4, "maxiter": 200},
     )
-    free = origin + unit * found.x
-    curvature = expand(free)[2]
-    # Curvatures differ by many powers of ten: on the scale of each coordinate, what is not convex is taken as wide.
-    scale = 1 / np.sqrt(np.maximum(np.abs(np.diagonal(curvature)), 1e-8))
-    values, vectors = np.linalg.eigh(curvature * scale * scale[:, None])
-    covariance = (vectors / np.maximum(values, 0.01)) @ vectors.T * scale * scale[:, None]
-    return jnp.asarray(free), jnp.asarray(covariance), bool(found.success)

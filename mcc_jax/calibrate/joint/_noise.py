@@ -218,8 +218,8 @@ def estimate_noise(
         values = np.asarray(_losses(jnp.asarray(logs + steps), start.scale, data, prior))
         return float(values[0]), (values[1:5] - values[5:]) / (2 * STEP)
 
-    # Further than this from the prior nothing is distinguishable from zero, or from any data.
-    bounds = [(m - 6 * s, m + 6 * s) for m, s in zip(np.log(prior.median), np.asarray(prior.log_sd), strict=True)]
+    # No tester reads better than a few tenths of a nanometre: noise-free data, of a simulation say, get that much.
+    bounds = [(m - 3 * s, m + 6 * s) for m, s in zip(np.log(prior.median), np.asarray(prior.log_sd), strict=True)]
     inside = np.clip(np.asarray(start.logs), *np.transpose(bounds))
     found = minimize(value_and_gradient, inside, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-9})
     noise = Noise.from_logs(jnp.asarray(found.x), start.scale)
