@@ -22,6 +22,15 @@ def numpy_residual(tests, settings):
     recovered = kepler(ratio)
     measured, mask, contact = (np.asarray(v) for v in (tests.displacement, tests.mask, tests.contact))
     decay, gain, weight = (np.asarray(getattr(settings.whitening, n)) for n in ("decay", "gain", "weight"))
+    peak, branch = (np.asarray(getattr(settings.whitening, n)) for n in ("peak", "branch"))
+    flat_branch = (np.arange(len(force))[:, None] * force.shape[1] + branch).ravel()
+
+    def by_branch(values):
+        sums = np.bincount(flat_branch, weights=values.ravel(), minlength=force.size)
+        return sums[flat_branch].reshape(force.shape)
+
+    power = by_branch(peak**2)
+    shrink = peak * (1 - 1 / np.sqrt(1 + power)) / np.where(power > 0, power, 1.0)
     tau, zero_sd = np.maximum(np.asarray(settings.tau), 1e-4), float(settings.zero_sd)
     count = len(force)
 
@@ -40,6 +49,7 @@ def numpy_residual(tests, settings):
             surprise = r[:, k] - expected
             expected = expected + gain[:, k] * surprise
             white[:, k] = surprise * weight[:, k]
+        white = white - shrink * by_branch(peak * white)
         pooled = (b - np.array(mu) - np.log(1 + a * flatness)[:, None]) / tau
         return np.concatenate([white[mask], pooled.ravel(), (zero - contact) / zero_sd])
 
