@@ -146,12 +146,14 @@ def most_probable(
         return float(value[0]), slope[0], (curvature + curvature.T) / 2
 
     # Where data are very exact the scales at the start are far from those at the mode: then once more from there.
+    success = False
     for _ in range(ATTEMPTS):
         unit = 1 / np.sqrt(np.maximum(np.abs(np.diagonal(expand(origin)[2])), 1e-8))
         width = 1e-3 * np.minimum(unit, 1.0)
         found = _newton(expand, origin, unit)
         origin = origin + unit * found.x
-        if found.success:
+        success = bool(found.success)
+        if success:
             break
     curvature = expand(origin)[2]
     # Curvatures differ by many powers of ten: on the scale of each coordinate, what is not convex is taken as wide.
@@ -159,7 +161,7 @@ def most_probable(
     values, vectors = np.linalg.eigh(curvature * scale * scale[:, None])
     values = np.where(values > 1e-7, values, 0.01)
     covariance = (vectors / values) @ vectors.T * scale * scale[:, None]
-    return jnp.asarray(origin), jnp.asarray(covariance), bool(found.success)
+    return jnp.asarray(origin), jnp.asarray(covariance), success
 
 
 def _newton(expand: Callable[[np.ndarray], tuple[float, np.ndarray, np.ndarray]], origin: np.ndarray, unit: np.ndarray):
