@@ -31,7 +31,36 @@ def session(steps: int) -> Iterator[Tell]:
         import jax
 
         jax.config.update("jax_enable_x64", True)
+        _keep_compiled(jax.config)
         yield tell
+
+
+CACHE_BYTES = 300 * 2**20
+"""At most so much of the disk is used for compiled functions; the oldest make room."""
+
+
+def _keep_compiled(config: Any) -> None:
+    """Let the next process find what this one compiles, in the user's folder for caches.
+
+    A setting of one's own (JAX_COMPILATION_CACHE_DIR, JAX_ENABLE_COMPILATION_CACHE=0) has precedence. Compiled code
+    belongs to one machine: where several share a home, each has a folder. A folder that cannot be written is left.
+    """
+    if config.jax_compilation_cache_dir is not None or not config.jax_enable_compilation_cache:
+        return
+    import platform
+
+    import platformdirs
+
+    folder = platformdirs.user_cache_path("mcc_jax") / f"{platform.node()}-{platform.machine()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return
+    if os.access(folder, os.W_OK):
+        config.update("jax_compilation_cache_dir", str(folder))
+        config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+        config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+        config.update("jax_compilation_cache_max_size", CACHE_BYTES)
 
 
 @contextlib.contextmanager

@@ -52,6 +52,9 @@ FEW = 4
 MOST_PARTICLE_DRAWS = 4_000_000
 """At most as many draws of single particles are kept; of very large campaigns every n-th draw."""
 
+ACCEPT = (0.8, 0.95, 0.99)
+"""Acceptance that the sampler aims at: after divergences once more, and once more, with smaller steps."""
+
 Mode = Literal["fast", "joint"]
 
 
@@ -363,7 +366,7 @@ def _compile(tests: Tests, model: JointModel, chains: int, warmup: int, draws: i
     key, flat, scatter = jax.random.key(0), tests.flatness, replace(model.scatter, newton=0)
     settings = {"chains": chains, "warmup": warmup, "draws": draws}
     cast(Any, sample_population).lower(
-        key, dummy(d), dummy(d, d), numbers, quadratic, flat, scatter, **settings
+        key, dummy(d), dummy(d, d), numbers, quadratic, flat, scatter, dummy(), **settings
     ).compile()
     exact = Exact(
         tests,
@@ -402,18 +405,22 @@ def _fast(
 ) -> dict[str, Any]:
     flat, scatter = tests.flatness, replace(model.scatter, newton=newton_steps(fit, tests, model))
     population_key, particle_key, check_key, pick_key = jax.random.split(key, 4)
-    run, population = sample_population(
-        population_key,
-        fit.mode,
-        fit.covariance,
-        fit.numbers,
-        fit.summary,
-        flat,
-        scatter,
-        chains=chains,
-        warmup=warmup,
-        draws=draws,
-    )
+    for accept in ACCEPT:
+        run, population = sample_population(
+            population_key,
+            fit.mode,
+            fit.covariance,
+            fit.numbers,
+            fit.summary,
+            flat,
+            scatter,
+            jnp.asarray(accept),
+            chains=chains,
+            warmup=warmup,
+            draws=draws,
+        )
+        if not np.any(np.asarray(run.divergent)):
+            break
     total, count = chains * draws, len(tests)
     exact = exact_of(fit, tests, model.zero_sd, model.unloading)
     stride = _stride(count, total)

@@ -13,10 +13,11 @@ from jaxtyping import Array, Bool, Float
 
 from ..._errors import InputError
 from ...law import StrainScaling, Unloading
+from ._compile import compiled
 from ._data import Tests
 from ._individual import Particles, fit_particles, linear_starts
 from ._linearised import expected_latent, linear_data, summarise
-from ._mode import PriorNumbers, from_free, most_probable, to_free
+from ._mode import PriorNumbers, from_free, most_probable, recentred, to_free
 from ._noise import Noise, Whitening, estimate_noise, particle_scales
 from ._population import Population, Scatter, Summary
 from ._priors import Priors
@@ -27,6 +28,9 @@ what keeps a coefficient finite about which its curve says nothing."""
 
 LEAST_WIDTH = 1e-3
 """Least such standard deviation under the population: any smaller and the problem is badly scaled."""
+
+BLUR = 0.01
+"""Width of a population's mean where nothing scatters, about: only a coordinate's scale."""
 
 ROUNDS = 2
 """Noise, population and particles depend on each other a little: how often they are taken in turn."""
@@ -131,6 +135,9 @@ def prior_numbers(priors: Priors, flatness: Float[Array, " particles"]) -> Prior
         softening=log_pair(priors.softening),
         spread=jnp.asarray([p.sd for p in spreads]),
         log_noise=log_pair(priors.noise_factor),
+        centre=jnp.asarray([np.log(priors.C1.median), _log_C3(priors), np.log(priors.C5.median)]),
+        blur=jnp.asarray(np.full(3, BLUR)),
+        flatness=flatness,
     )
 
 
@@ -173,7 +180,7 @@ def fit_joint(
     four = [read_out, *np.asarray(priors.noise.median)[1:]]
     noise = Noise.from_logs(jnp.asarray(np.log(four)), jnp.asarray(np.ones(len(tests))))
     log_sd, noise_converged = jnp.asarray(np.full(4, np.nan)), True
-    free = _start(np.asarray(latent), np.asarray(flatness), model, numbers)
+    numbers, free = _start(np.asarray(latent), np.asarray(flatness), model, numbers)
     turn = 0
     while True:
         data = linear_data(latent, zero, tests, zero_sd, model.unloading)
@@ -192,6 +199,8 @@ def fit_joint(
                 noise = eqx.tree_at(lambda n: n.scale, noise, jnp.asarray(scale))
                 summary, filtered = summarise(latent, zero, tests, data, noise, zero_sd)
         tell("fitting the population")
+        if turn:
+            numbers, free = recentred(numbers, free)
         free, covariance, mode_converged = most_probable(free, numbers, summary, flatness, scatter)
         if turn == rounds:
             break
@@ -217,13 +226,18 @@ def fit_joint(
 
 def _centre(priors: Priors) -> np.ndarray:
     """Centre of b1, b3, b5, e for what a curve alone does not say: the prior's, at the paper's typical shape factor."""
-    C1, C5 = np.log(priors.C1.median), np.log(priors.C5.median)
-    C3 = (np.log(20 / 9) + C1 + 5 * C5 + np.log(priors.softening.median)) / 6
     log_eta = np.log(1.4)
-    return np.array([C1 + log_eta, C3 + log_eta, C5 + log_eta, np.log(priors.effective_modulus_MPa.median)])
+    C = np.array([np.log(priors.C1.median), _log_C3(priors), np.log(priors.C5.median)])
+    return np.append(C + log_eta, np.log(priors.effective_modulus_MPa.median))
 
 
-@eqx.filter_jit
+def _log_C3(priors: Priors) -> float:
+    """The prior's log C3 at the medians of the others."""
+    log_C1, log_C5 = np.log(priors.C1.median), np.log(priors.C5.median)
+    return float((np.log(20 / 9) + log_C1 + 5 * log_C5 + np.log(priors.softening.median)) / 6)
+
+
+@compiled
 def _white_equivalent(filters: Whitening, tests: Tests) -> Float[Array, " particles"]:
     """Standard deviation of white noise that weighs a test as much as its filter does [um]."""
     return jnp.sqrt(
@@ -231,20 +245,23 @@ def _white_equivalent(filters: Whitening, tests: Tests) -> Float[Array, " partic
     )
 
 
-@eqx.filter_jit
+@compiled
 def population_at(free: Float[Array, " d"], numbers: PriorNumbers, scatter: Scatter) -> Population:
     """The population at unbounded coordinates."""
     return from_free(free, numbers, scatter)[0]
 
 
-@eqx.filter_jit
+@compiled
 def populations(free: Float[Array, "draws d"], numbers: PriorNumbers, scatter: Scatter) -> Population:
     """Populations of many unbounded coordinates, every field with a leading axis."""
     return jax.vmap(lambda f: from_free(f, numbers, scatter)[0])(free)
 
 
-def _start(latent: np.ndarray, flatness: np.ndarray, model: JointModel, numbers: PriorNumbers) -> Float[Array, " d"]:
-    """Where to look for the population: the prior's a, and the particles' own median and scatter under it."""
+def _start(
+    latent: np.ndarray, flatness: np.ndarray, model: JointModel, numbers: PriorNumbers
+) -> tuple[PriorNumbers, Float[Array, " d"]]:
+    """Where to look for the population, the prior's a and the particles' own median and scatter under it; and the
+    coordinates centred there."""
     priors = model.beliefs
     low, high = np.asarray(numbers.a)[2:]
     a = float(np.clip(priors.a.mean, 0.9 * low, 0.9 * high))
@@ -253,4 +270,5 @@ def _start(latent: np.ndarray, flatness: np.ndarray, model: JointModel, numbers:
     log_modulus = float(np.median(latent[:, 3] - model.shape_power * log_eta))
     scales = np.array([priors.tau_C1.sd, priors.tau_C3.sd, priors.tau_C5.sd])
     tau = np.clip(np.std(b, axis=0), 0.05 * scales, 2 * scales)
-    return to_free(a, log_modulus, np.median(b, axis=0), tau, numbers, model.scatter)
+    numbers = eqx.tree_at(lambda n: n.centre, numbers, jnp.asarray(np.median(latent[:, :3], axis=0)))
+    return numbers, to_free(a, log_modulus, np.median(b, axis=0), tau, numbers, model.scatter)

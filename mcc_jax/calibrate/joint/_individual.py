@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 from ..._types import Path, Scalar
 from ...geometry import Particle
 from ...law import Unloading
+from ._compile import compiled
 from ._data import Tests
 from ._forward import linearise
 from ._small import Cholesky
@@ -86,7 +87,7 @@ def linear_start(
     return jnp.log(K) / jnp.array([1.0, 3.0, 5.0]), contact + shifts[best] * reach
 
 
-@eqx.filter_jit
+@compiled
 def linear_starts(tests: Tests, log_modulus: Scalar) -> Float[Array, "starts particles 5"]:
     """Several starts for every particle: the linear one and variations of it."""
     b, zero = jax.vmap(linear_start)(tests.particle, tests.force, tests.displacement, tests.loading, tests.contact)
@@ -94,7 +95,7 @@ def linear_starts(tests: Tests, log_modulus: Scalar) -> Float[Array, "starts par
     return first[None] + jnp.pad(jnp.asarray(VARIATIONS), ((0, 0), (0, 2)))[:, None]
 
 
-@eqx.filter_jit
+@compiled
 def fit_particles(
     tests: Tests,
     noise: Float[Array, " particles"],

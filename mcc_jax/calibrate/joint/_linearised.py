@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..._types import Scalar
 from ...law import Unloading
+from ._compile import compiled
 from ._data import Tests
 from ._forward import linearise_with_force, snap
 from ._mode import PriorNumbers, from_free
@@ -16,7 +16,7 @@ from ._noise import Linear, Noise, Whitening, whitening
 from ._population import Scatter, Summary, draw_latent, moments
 
 
-@eqx.filter_jit
+@compiled
 def linear_data(
     latent: Float[Array, "particles 4"],
     zero: Float[Array, " particles"],
@@ -30,7 +30,7 @@ def linear_data(
     return Linear(value, J, prior, tests.step, tests.mask, moved, by_peak, tests.branch)
 
 
-@eqx.filter_jit
+@compiled
 def summarise(
     latent: Float[Array, "particles 4"],
     zero: Float[Array, " particles"],
@@ -62,7 +62,10 @@ def summarise(
         point=latent,
         precision=H[:, :4, :4] - border[:, :, None] * border[:, None, :] * width[:, None, None],
         score=g[:, :4] - border * (width * pull)[:, None],
-        squares=jnp.sum(r**2, 1) + (away / zero_sd) ** 2 - width * pull**2,
+        squares=jnp.sum(r**2, 1)
+        + jax.vmap(lambda f: f.least_squares)(noise_filters)
+        + (away / zero_sd) ** 2
+        - width * pull**2,
         count=jnp.sum(data.mask, 1).astype(float) - 1,
         zero=zero + width * pull,
         zero_slope=-border * width[:, None],
@@ -92,7 +95,7 @@ def _snap_evidence(latent, particle, force, used):
     return jnp.where(seen, slope, 0.0), middle, jnp.where(seen, 12 / width**2, 0.0)
 
 
-@eqx.filter_jit
+@compiled
 def expected_latent(
     free: Float[Array, " d"],
     numbers: PriorNumbers,

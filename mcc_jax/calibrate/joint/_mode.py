@@ -12,18 +12,27 @@ from jax.scipy.special import log_ndtr
 from jaxtyping import Array, Float
 
 from ..._types import Scalar
+from ._compile import compiled
 from ._population import Population, Scatter, Summary, marginal_likelihood
 
 
 class PriorNumbers(eqx.Module):
-    """The population's priors as arrays, so that other numbers need no new compilation.
+    """The population's priors as arrays, so that other numbers need no new compilation, and where data put its means.
+
+    What data say of a mean is the mean of the particles' b, and how well they say it goes with the spread: a funnel, if
+    a mild one. The coordinate of a mean is therefore the mean b, counted from `centre` in units of
+    sqrt(tau^2/n + blur^2); a spread's coordinate is logarithmic where the spread is large and linear around 0. Both
+    only help the sampler: the density takes the volumes into account.
 
     Attributes:
         a: mean, sd, lower and upper bound of the shape parameter.
         log_modulus, mu_1, mu_5: mean and sd.
         softening: mean and sd of its logarithm.
         spread: scales of the half-normal priors of tau 1, 3, 5, of the modulus' and of a's scatter.
-        log_noise: standard deviation.
+        log_noise: mean and standard deviation.
+        centre: about where the mean b1, b3, b5 of the particles will be found.
+        blur: how wide they are where nothing scatters.
+        flatness: of the particles.
     """
 
     a: Float[Array, " 4"]
@@ -33,6 +42,22 @@ class PriorNumbers(eqx.Module):
     softening: Float[Array, " 2"]
     spread: Float[Array, " 5"]
     log_noise: Float[Array, " 2"]
+    centre: Float[Array, " 3"]
+    blur: Float[Array, " 3"]
+    flatness: Float[Array, " particles"]
+
+    def mean_log_eta(self, a: Scalar) -> Scalar:
+        """Mean logarithm of the particles' shape factors."""
+        return jnp.mean(jnp.log(1 + a * self.flatness))
+
+
+KNEE = 0.1
+"""Share of its prior's scale below which a spread's coordinate is linear in it, above which logarithmic."""
+
+
+def spread_of(coordinate: Float[Array, " k"], scale: Float[Array, " k"]) -> Float[Array, " k"]:
+    """Spreads >= 0 at coordinates that may have either sign, each with its prior's scale."""
+    return KNEE * scale * jnp.sinh(jnp.abs(coordinate))
 
 
 def given_mu_3(mu_1: Scalar, mu_5: Scalar, softening: Float[Array, " 2"]) -> tuple[Scalar, Scalar]:
@@ -52,7 +77,19 @@ def from_free(free: Float[Array, " d"], numbers: PriorNumbers, scatter: Scatter)
     inside = jnp.log(jnp.exp(log_ndtr((high - mean) / sd)) - jnp.exp(log_ndtr((low - mean) / sd)))
     density = -0.5 * ((a - mean) / sd) ** 2 - jnp.log(sd) - inside
     density += jnp.log(high - low) + jax.nn.log_sigmoid(free[0]) + jax.nn.log_sigmoid(-free[0])
-    log_modulus, mu1, mu3, mu5, log_noise = free[1:6]
+    log_modulus, log_noise = free[1], free[5]
+    count = scatter.size
+    chosen = [0, 1, 2] + ([3] if scatter.modulus else []) + ([4] if scatter.shape else [])
+    scales = numbers.spread[jnp.asarray(chosen)]
+    # The coordinate may have either sign: the density is even and smooth at 0, so that a spread that is 0 is no
+    # boundary and has no tail towards minus infinity.
+    signed = free[6 : 6 + count]
+    spread = spread_of(signed, scales)
+    density += jnp.sum(-0.5 * (spread / scales) ** 2 + jnp.log(KNEE * jnp.cosh(signed)))
+    width = jnp.sqrt(spread[:3] ** 2 / len(numbers.flatness) + numbers.blur**2)
+    mu = numbers.centre + width * free[2:5] - numbers.mean_log_eta(a)
+    density += jnp.sum(jnp.log(width))
+    mu1, mu3, mu5 = mu
     normal = (
         (log_modulus, numbers.log_modulus),
         (mu1, numbers.mu_1),
@@ -62,19 +99,11 @@ def from_free(free: Float[Array, " d"], numbers: PriorNumbers, scatter: Scatter)
     )
     for value, (centre, width) in normal:
         density += -0.5 * ((value - centre) / width) ** 2 - jnp.log(width)
-    count = scatter.size
-    signed = free[6 : 6 + count]
-    chosen = [0, 1, 2] + ([3] if scatter.modulus else []) + ([4] if scatter.shape else [])
-    scales = numbers.spread[jnp.asarray(chosen)]
-    # A spread is the modulus of a coordinate that may have either sign: the density is even and smooth there, so that
-    # a spread that is 0 is no boundary and has no tail towards minus infinity.
-    spread = jnp.abs(signed)
-    density += jnp.sum(-0.5 * (spread / scales) ** 2 - jnp.log(scales))
     zero = jnp.zeros(())
     population = Population(
         a,
         log_modulus,
-        jnp.stack([mu1, mu3, mu5]),
+        mu,
         spread[:3],
         spread[3] if scatter.modulus else zero,
         spread[-1] if scatter.shape else zero,
@@ -89,8 +118,20 @@ def to_free(
     """Unbounded coordinates of a population, kept away from the bounds of `a`; further scatter begins at a tenth."""
     low, high = np.asarray(numbers.a)[2:]
     unit = np.clip((a - low) / (high - low), 1e-3, 1 - 1e-3)
-    further = np.full(scatter.size - 3, 0.1)
-    return jnp.asarray(np.concatenate([[np.log(unit / (1 - unit)), log_modulus, *mu, 0.0], tau, further]))
+    chosen = [0, 1, 2] + ([3] if scatter.modulus else []) + ([4] if scatter.shape else [])
+    spread = np.concatenate([tau, np.full(scatter.size - 3, 0.1)])
+    signed = np.arcsinh(spread / (KNEE * np.asarray(numbers.spread)[chosen]))
+    width = np.sqrt(np.asarray(tau) ** 2 / len(numbers.flatness) + np.asarray(numbers.blur) ** 2)
+    means = (mu + float(numbers.mean_log_eta(jnp.asarray(a))) - np.asarray(numbers.centre)) / width
+    return jnp.asarray(np.concatenate([[np.log(unit / (1 - unit)), log_modulus, *means, 0.0], signed]))
+
+
+def recentred(numbers: PriorNumbers, free: Float[Array, " d"]) -> tuple[PriorNumbers, Float[Array, " d"]]:
+    """The same population in coordinates whose centre it is."""
+    tau = spread_of(free[6:9], numbers.spread[:3])
+    width = jnp.sqrt(tau**2 / len(numbers.flatness) + numbers.blur**2)
+    numbers = eqx.tree_at(lambda n: n.centre, numbers, numbers.centre + width * free[2:5])
+    return numbers, free.at[2:5].set(0.0)
 
 
 def log_posterior(
@@ -108,7 +149,7 @@ def log_posterior(
 ATTEMPTS = 4
 
 
-@eqx.filter_jit
+@compiled
 def _gradients(
     free: Float[Array, "many d"],
     numbers: PriorNumbers,

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..._types import Path, Scalar
+from ._compile import compiled
 from ._small import Cholesky
 
 
@@ -49,6 +50,11 @@ class Noise(eqx.Module):
         """From the logarithms of the four numbers."""
         displacement, force, correlated, length = jnp.exp(logs)
         return cls(displacement, force, correlated, length, scale)
+
+
+READING_UM = 2e-4
+"""What no record of displacement is better than [um]: counted as misfit at every point, so that the noise of a record
+without any, of a simulation say, is small but not nothing."""
 
 
 class Whitening(eqx.Module):
@@ -83,6 +89,11 @@ class Whitening(eqx.Module):
         shrink = (1 - 1 / jnp.sqrt(1 + power)) / jnp.where(power > 0, power, 1.0)
         along = jax.ops.segment_sum(self.peak * white, self.branch, len(white))
         return white - self.peak * (shrink * along)[self.branch]
+
+    @property
+    def least_squares(self) -> Scalar:
+        """Sum of squares that reading alone brings about, however well the law fits."""
+        return READING_UM**2 * jnp.sum(self.weight**2)
 
     def _power(self) -> Path:
         return jax.ops.segment_sum(self.peak**2, self.branch, len(self.peak))
@@ -179,7 +190,7 @@ class NoisePrior(eqx.Module):
         return -0.5 * jnp.sum(((logs - jnp.log(self.median)) / self.log_sd) ** 2)
 
 
-@eqx.filter_jit
+@compiled
 def _losses(logs: Float[Array, "many 4"], scale: Float[Array, " particles"], data: Linear, prior: NoisePrior):
     def loss(one):
         noise = Noise.from_logs(one, scale)

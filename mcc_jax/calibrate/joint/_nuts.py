@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from ..._types import Scalar
+from ..._types import Scalar, ScalarLike
 
 
 class Chains(NamedTuple):
@@ -37,6 +37,7 @@ def sample(
     chains: int,
     warmup: int,
     draws: int,
+    accept: ScalarLike = 0.8,
     together: bool = False,
 ) -> Chains:
     """Sample a density whose mode and covariance are roughly known.
@@ -52,6 +53,7 @@ def sample(
         chains: number of chains.
         warmup: draws thrown away while the step size adapts.
         draws: draws kept per chain.
+        accept: mean acceptance that the step size aims at; higher is slower and follows narrower densities.
         together: advance all chains in step (for accelerators), instead of one after the other.
     """
     from numpyro.infer import NUTS
@@ -63,7 +65,7 @@ def sample(
         return jnp.where(jnp.isnan(value), jnp.inf, value)
 
     def chain(key):
-        kernel = NUTS(potential_fn=potential, dense_mass=dimension < 40, target_accept_prob=0.8)
+        kernel = NUTS(potential_fn=potential, dense_mass=dimension < 40, target_accept_prob=accept)
         start_key, key = jax.random.split(key)
         start = jax.random.normal(start_key, (dimension,), mode.dtype)
         state = kernel.init(key, warmup, start, (), {})

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from ..._types import Scalar, Values
 from ...law import Unloading
 from ._arrow import Parameters, Solution, minimise
+from ._compile import compiled
 from ._data import Tests
 from ._forward import raw_residual
 from ._noise import Whitening
@@ -100,7 +101,7 @@ def pooled_residual(settings: Pooled, tests: Tests) -> Callable[[Parameters], tu
     return residual
 
 
-@eqx.filter_jit
+@compiled
 def fit_pooled(
     tests: Tests, settings: Pooled, start: Parameters, *, max_steps: int = 300, tolerance: float = 1e-7
 ) -> Solution:

@@ -14,6 +14,7 @@ import numpy as np
 from ...campaign import PAPER_EFFECTIVE_MODULUS_MPA, PAPER_LOG_C, PAPER_SHAPE_PARAMETER, particle_batch
 from ...law import MccLaw, Plastic
 from ._bayes import COEFFICIENTS, BayesCalibration, summary
+from ._compile import compiled
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class PredictedCurves:
         return low, high
 
 
-@eqx.filter_jit
+@compiled
 def _paths(laws: MccLaw, particles: Any, forces: Any):
     return jax.lax.map(lambda one: one[0].path_load(one[1], one[0].init(one[1]), one[2])[1], (laws, particles, forces))
 

@@ -18,7 +18,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from ..._types import Scalar
 from ...law import Unloading
+from ._compile import compiled
 from ._data import Tests
 from ._fit import JointFit
 from ._forward import displacement
@@ -44,7 +46,7 @@ class ParticleDraws(NamedTuple):
     log_ratio: Float[Array, "draws particles"]
 
 
-@eqx.filter_jit
+@compiled
 def sample_population(
     key: PRNGKeyArray,
     mode: Float[Array, " d"],
@@ -53,6 +55,7 @@ def sample_population(
     summary: Summary,
     flatness: Float[Array, " particles"],
     scatter: Scatter,
+    accept: Scalar,
     *,
     chains: int,
     warmup: int,
@@ -65,7 +68,9 @@ def sample_population(
 
     factor = jnp.linalg.cholesky(covariance)
     together = jax.default_backend() != "cpu"
-    run = sample(key, log_density, mode, factor, chains=chains, warmup=warmup, draws=draws, together=together)
+    run = sample(
+        key, log_density, mode, factor, chains=chains, warmup=warmup, draws=draws, accept=accept, together=together
+    )
     return run, jax.vmap(lambda f: from_free(f, numbers, scatter)[0])(run.position.reshape(-1, mode.shape[0]))
 
 
@@ -87,7 +92,7 @@ def exact_log_likelihood(
 
     def squares(w, z, particle, force, measured, mask, filtered):
         predicted = displacement(w, particle, force, exact.unloading)
-        return jnp.sum(filtered(jnp.where(mask, measured - predicted - z, 0.0)) ** 2)
+        return jnp.sum(filtered(jnp.where(mask, measured - predicted - z, 0.0)) ** 2) + filtered.least_squares
 
     total = jax.vmap(squares)(latent, zero, tests.particle, tests.force, tests.displacement, tests.mask, exact.filters)
     at_zero = ((zero - tests.contact) / exact.zero_sd) ** 2
@@ -95,7 +100,7 @@ def exact_log_likelihood(
     return -0.5 * (jnp.exp(-2 * log_noise) * total + at_zero) - points * log_noise
 
 
-@eqx.filter_jit
+@compiled
 def draw_particles(
     key: PRNGKeyArray,
     population: Population,
@@ -156,7 +161,7 @@ def exact_of(fit: JointFit, tests: Tests, zero_sd: Float[Array, ""], unloading: 
     return Exact(tests, fit.filters, fit.summary, zero_sd, unloading)
 
 
-@eqx.filter_jit
+@compiled
 def sample_joint(
     key: PRNGKeyArray,
     mode: Float[Array, " d"],

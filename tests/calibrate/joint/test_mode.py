@@ -13,12 +13,13 @@ from joint_cases import random_summary
 from mcc_jax import InputError, JointModel
 from mcc_jax.calibrate.joint import NormalPrior, Priors
 from mcc_jax.calibrate.joint._fit import population_at, prior_numbers
-from mcc_jax.calibrate.joint._mode import PriorNumbers, from_free, log_posterior, most_probable, to_free
+from mcc_jax.calibrate.joint._mode import PriorNumbers, from_free, log_posterior, most_probable, recentred, to_free
 from mcc_jax.calibrate.joint._population import Population
 
 PLAIN = JointModel().scatter
 MODULUS, BOTH = JointModel(modulus_scatter=True).scatter, JointModel(modulus_scatter=True, shape_scatter=True).scatter
 SCATTERS = [PLAIN, MODULUS, JointModel(shape_scatter=True).scatter, BOTH]
+FLAT = jnp.asarray(np.random.default_rng(0).uniform(0.0, 0.6, 12))
 NUMBERS = PriorNumbers(
     a=jnp.asarray([1.0, 1.2, -1.5, 4.0]),
     log_modulus=jnp.asarray([9.2, 1.0]),
@@ -27,55 +28,79 @@ NUMBERS = PriorNumbers(
     softening=jnp.asarray([-1.1, 0.6]),
     spread=jnp.asarray([0.5, 0.1, 0.2, 0.3, 0.25]),
     log_noise=jnp.asarray([0.1, 0.5]),
+    centre=jnp.asarray([2.1, 1.3, 1.2]),
+    blur=jnp.asarray([0.02, 0.01, 0.03]),
+    flatness=FLAT,
 )
-FLAT = jnp.asarray(np.random.default_rng(0).uniform(0.0, 0.6, 12))
 
 
-@jax.jit
-def model_log_density(free, spread_scales):
-    """The same prior in NumPyro's words."""
+def as_vector(population, scatter):
+    """a, log modulus, means, log noise and spreads in a row."""
+    p = population
+    further = [p.modulus_scatter] * scatter.modulus + [p.shape_scatter] * scatter.shape
+    return jnp.stack([p.a, p.log_modulus, *p.mu, p.log_noise, *p.tau, *further])
+
+
+def model_log_density(population):
+    """The same prior in NumPyro's words, of the population as `as_vector` gives it."""
     n = NUMBERS
     mean, sd, low, high = n.a
-    to_bounds = dist.biject_to(dist.constraints.interval(low, high))
-    a = to_bounds(free[0])
+    a, log_modulus, mu_1, mu_3, mu_5, log_noise = population[:6]
     total = dist.TruncatedNormal(mean, sd, low=low, high=high).log_prob(a)
-    total += to_bounds.log_abs_det_jacobian(free[0], a)
-    log_modulus, mu_1, mu_3, mu_5, log_noise = free[1:6]
     total += dist.Normal(*n.log_modulus).log_prob(log_modulus)
     total += dist.Normal(*n.mu_1).log_prob(mu_1) + dist.Normal(*n.mu_5).log_prob(mu_5)
     # 6 mu_3 = log(20/9) + mu_1 + 5 mu_5 + log(softening): a change of variables from the softening to mu_3
     softening = 6 * mu_3 - jnp.log(20 / 9) - mu_1 - 5 * mu_5
     total += dist.Normal(*n.softening).log_prob(softening) + jnp.log(6.0)
-    total += dist.Normal(*n.log_noise).log_prob(log_noise)
-    # Each sign of a coordinate carries half of the half-normal's density.
-    return total + jnp.sum(dist.HalfNormal(spread_scales).log_prob(jnp.abs(free[6:])) - jnp.log(2.0))
+    return total + dist.Normal(*n.log_noise).log_prob(log_noise)
 
 
 @pytest.mark.parametrize("scatter", SCATTERS, ids=["plain", "modulus", "shape", "both"])
 def test_the_prior_is_numpyro_s_up_to_a_constant(scatter):
     scales = np.asarray(NUMBERS.spread)[[0, 1, 2] + [3] * scatter.modulus + [4] * scatter.shape]
     rng = np.random.default_rng(1)
-    ours = jax.jit(lambda f: from_free(f, NUMBERS, scatter)[1])
-    centre = np.array([0.0, 9.0, 1.8, 1.1, 1.0, 0.0, *[0.0] * scatter.size])
-    draws = centre + rng.standard_normal((20, 6 + scatter.size)) * np.array([3, 1, 1, 1, 1, 1, *[0.3] * scatter.size])
+
+    @jax.jit
+    def both(free):
+        def place(f):
+            return as_vector(from_free(f, NUMBERS, scatter)[0], scatter)
+
+        population, volume = place(free), jnp.linalg.slogdet(jax.jacfwd(place)(free))[1]
+        # Each sign of a coordinate carries half of the half-normal's density.
+        spreads = jnp.sum(dist.HalfNormal(jnp.asarray(scales)).log_prob(population[6:]) - jnp.log(2.0))
+        return from_free(free, NUMBERS, scatter)[1], model_log_density(population) + spreads + volume
+
+    centre = np.array([0.0, 9.0, 0.0, 0.0, 0.0, 0.0, *[0.0] * scatter.size])
+    draws = centre + rng.standard_normal((20, 6 + scatter.size)) * np.array([3, 1, 2, 2, 2, 1, *[2.0] * scatter.size])
     with jax.numpy_dtype_promotion("standard"):
-        theirs = np.array([float(model_log_density(jnp.asarray(f), jnp.asarray(scales))) for f in draws])
-    gap = theirs - np.array([float(ours(jnp.asarray(f))) for f in draws])
-    np.testing.assert_allclose(gap, -0.5 * np.log(2 * np.pi) * (6 + scatter.size), rtol=0, atol=1e-9)
+        gap = np.array([float(theirs - ours) for ours, theirs in (both(jnp.asarray(f)) for f in draws)])
+    np.testing.assert_allclose(gap, gap[0], rtol=0, atol=1e-9)
 
 
 def test_the_population_at_unbounded_coordinates():
     scatter = BOTH
-    free = jnp.asarray([0.3, 9.0, 1.8, 1.1, 1.0, -0.2, -0.4, 0.1, -0.2, -0.3, 0.2])
+    free = jnp.asarray([0.3, 9.0, 2.0, -1.0, 0.5, -0.2, -0.4, 0.1, -0.2, -0.3, 0.2])
     population: Population = population_at(free, NUMBERS, scatter)
-    np.testing.assert_allclose(float(population.a), -1.5 + 5.5 / (1 + np.exp(-0.3)), rtol=1e-12)
-    np.testing.assert_allclose(population.mu, [1.8, 1.1, 1.0])
-    np.testing.assert_allclose(population.tau, [0.4, 0.1, 0.2])
-    assert float(population.modulus_scatter) == 0.3
-    assert float(population.shape_scatter) == 0.2
+    a = -1.5 + 5.5 / (1 + np.exp(-0.3))
+    tau = 0.1 * np.array([0.5, 0.1, 0.2]) * np.sinh([0.4, 0.1, 0.2])
+    width = np.sqrt(tau**2 / 12 + np.array([0.02, 0.01, 0.03]) ** 2)
+    mu = np.array([2.1, 1.3, 1.2]) + width * np.array([2.0, -1.0, 0.5]) - np.log(1 + a * np.asarray(FLAT)).mean()
+    np.testing.assert_allclose(float(population.a), a, rtol=1e-12)
+    np.testing.assert_allclose(population.mu, mu, rtol=1e-12)
+    np.testing.assert_allclose(population.tau, tau, rtol=1e-12)
+    np.testing.assert_allclose(float(population.modulus_scatter), 0.03 * np.sinh(0.3), rtol=1e-12)
+    np.testing.assert_allclose(float(population.shape_scatter), 0.025 * np.sinh(0.2), rtol=1e-12)
     assert float(population.log_noise) == -0.2
     plain = population_at(free[:9], NUMBERS, PLAIN)
     assert float(plain.modulus_scatter) == float(plain.shape_scatter) == 0.0
+
+
+def test_recentred_coordinates_describe_the_same_population():
+    free = jnp.asarray([0.3, 9.0, 2.0, -1.0, 0.5, -0.2, -0.4, 0.1, -0.2])
+    numbers, moved = recentred(NUMBERS, free)
+    np.testing.assert_array_equal(moved[2:5], 0.0)
+    before, after = (as_vector(from_free(f, n, PLAIN)[0], PLAIN) for f, n in ((free, NUMBERS), (moved, numbers)))
+    np.testing.assert_allclose(after, before, rtol=1e-13)
 
 
 @pytest.mark.parametrize("a", [-1.4, 0.0, 1.43, 3.9])
