@@ -10,6 +10,7 @@ from ._adjustment import loading_curve as loading_curve
 from ._adjustment import stress_and_strain as stress_and_strain
 from ._batch import Batch as Batch
 from ._batch import batch as batch
+from ._batch import of_each_particle as of_each_particle
 from ._batch import particle_batch as particle_batch
 from ._csv import read_campaign as read_campaign
 from ._csv import read_particles as read_particles
