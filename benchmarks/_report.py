@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import platform
@@ -9,6 +10,13 @@ from importlib.metadata import version
 from pathlib import Path
 
 RESULTS = Path(__file__).parent / "results"
+
+
+def parser(description):
+    """A parser of the command line that shows the text as it stands and knows `--write`."""
+    options = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("--write", action="store_true", help="keep the result in benchmarks/results/")
+    return options
 
 
 def environment(*packages):
@@ -19,6 +27,11 @@ def environment(*packages):
         "cores": len(os.sched_getaffinity(0)),
         "GLIBC_TUNABLES": os.environ.get("GLIBC_TUNABLES", ""),
     }
+
+
+def settings(values):
+    """Rows of the table of settings."""
+    return [{"setting": key, "value": str(value)} for key, value in values.items()]
 
 
 def table(rows):

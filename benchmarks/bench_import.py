@@ -7,7 +7,6 @@ row, every public name. Each import runs in a fresh process, in turns; the ratio
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import subprocess
 import sys
@@ -31,9 +30,8 @@ def seconds(statement):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = _report.parser(__doc__)
     parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--write", action="store_true", help="keep the table in benchmarks/results/")
     arguments = parser.parse_args()
     for statement in STATEMENTS.values():
         seconds(statement)  # fills the caches of the disk and of byte code
@@ -47,11 +45,7 @@ def main():
             ratio = statistics.median(one[name] / one["base"] for one in rounds)
             targets.append({"target": f"{name} / base", "ratio": ratio, "at most": TARGET, "verdict": ratio <= TARGET})
     settings = {"rounds": arguments.rounds, **_report.environment("jax", "jaxlib", "equinox", "optimistix")}
-    tables = {
-        "Targets": targets,
-        "Times": times,
-        "Settings": [{"setting": key, "value": str(value)} for key, value in settings.items()],
-    }
+    tables = {"Targets": targets, "Times": times, "Settings": _report.settings(settings)}
     _report.write("import", "Time of import", tables, arguments.write)
 
 

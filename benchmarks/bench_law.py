@@ -11,7 +11,6 @@ Compilation is timed apart. The references are checked to give the same forces.
 
 from __future__ import annotations
 
-import argparse
 import os
 import time
 
@@ -186,12 +185,11 @@ def path_load(law, particle, state, force):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = _report.parser(__doc__)
     parser.add_argument("--contacts", type=int, default=1_000_000)
     parser.add_argument("--particles", type=int, default=10_000)
     parser.add_argument("--points", type=int, default=300, help="per path, a multiple of 3")
     parser.add_argument("--repeats", type=int, default=25)
-    parser.add_argument("--write", action="store_true", help="keep the tables in benchmarks/results/")
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     rng = np.random.default_rng(0)
@@ -218,8 +216,7 @@ def main():
         "device": jax.devices()[0].device_kind,
         **_report.environment("jax", "jaxlib", "equinox", "numba", "numpy"),
     }
-    tables = {"Targets": verdicts, "Times": rows, "Accuracy": accuracy}
-    tables["Settings"] = [{"setting": key, "value": str(value)} for key, value in settings.items()]
+    tables = {"Targets": verdicts, "Times": rows, "Accuracy": accuracy, "Settings": _report.settings(settings)}
     _report.write("law", "Speed of the contact law", tables, arguments.write)
 
 

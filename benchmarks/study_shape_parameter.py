@@ -5,9 +5,7 @@ Run `uv run python benchmarks/study_shape_parameter.py --write` (about five minu
 noise of 0.02 um and 0.05 mN, one load-unload cycle at 2 mN/s and 300 points.
 """
 
-import argparse
-from pathlib import Path
-
+import _report
 import jax
 import numpy as np
 
@@ -23,7 +21,7 @@ from mcc_jax.calibrate import (  # noqa: E402
     strain_table,
 )
 
-RESULT = Path(__file__).parent / "results" / "shape_parameter.md"
+RESULT = _report.RESULTS / "shape_parameter.md"
 TRUE_A, TRUE_MODULUS = 1.43, 16_000.0
 
 
@@ -101,9 +99,8 @@ def text(seeds):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = _report.parser(__doc__)
     parser.add_argument("--campaigns", type=int, default=200, help="campaigns with scattering coefficients")
-    parser.add_argument("--write", action="store_true", help="write the table into benchmarks/results")
     arguments = parser.parse_args()
     result = text(arguments.campaigns)
     print(result)

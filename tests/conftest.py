@@ -1,3 +1,7 @@
+import os
+import shutil
+import tempfile
+
 import hypothesis
 import jax
 import pytest
@@ -10,6 +14,19 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 # The same examples in every run, and no data base written into the tree.
 hypothesis.settings.register_profile("repository", database=None, derandomize=True, deadline=None)
 hypothesis.settings.load_profile("repository")
+
+
+def pytest_configure(config):
+    """What took long to compile is kept for later modules, notebooks and commands, until this run of pytest ends.
+
+    Every worker has a folder of its own: JAX writes entries in place, and another process might read half of one.
+    """
+    folder = tempfile.mkdtemp(prefix="compiled-")
+    config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+    settings = {"jax_compilation_cache_dir": folder, "jax_persistent_cache_min_compile_time_secs": 0.1}
+    for name, value in settings.items():
+        jax.config.update(name, value)
+        os.environ[name.upper()] = str(value)  # for processes that tests start
 
 
 @pytest.fixture(scope="module", autouse=True)

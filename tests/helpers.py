@@ -8,6 +8,7 @@ import hypothesis.strategies as st
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from mcc_jax.campaign._paper import PAPER_DIAMETERS_UM, PAPER_LOG_C
 from mcc_jax.geometry import Particle
@@ -17,6 +18,9 @@ SHARED = Path(__file__).resolve().parents[2] / "shared"
 K1, K3, K5, A, EBAR = 7.0094, 27.235, 144.23, 1.43, 16000.0
 FORMS = [(u, s) for u in Unloading for s in StrainScaling]
 FORM_NAMES = [f"{u.value}-{s.value}" for u, s in FORMS]
+ALL_FORMS = pytest.mark.parametrize(("unloading", "scaling"), FORMS, ids=FORM_NAMES)
+# Each form and each way of the shape factor once.
+SOME_FORMS = pytest.mark.parametrize(("unloading", "scaling"), FORMS[0::4], ids=FORM_NAMES[0::4])
 EPS = {np.dtype("float64"): 2.0**-52, np.dtype("float32"): 2.0**-23}
 
 
@@ -68,6 +72,27 @@ def paper_population():
 
 def with_dtype(tree, dtype):
     return jax.tree.map(lambda x: jnp.asarray(x, dtype) if eqx.is_inexact_array(x) else x, tree)
+
+
+# ---- the law, compiled once for all tests of a file ------------------------------------------------------------------
+
+
+@eqx.filter_jit
+def force_along(law, particle, displacements):
+    """Forces [mN] along a path of displacements [um] that starts on a fresh contact."""
+    return law.path(particle, law.init(particle), displacements)[1]
+
+
+@eqx.filter_jit
+def master_stress(plastic, x):
+    """Stress [MPa] of the master curve at scaled strains."""
+    return plastic.stress(x)
+
+
+@eqx.filter_jit
+def master_strain(plastic, stress):
+    """Scaled strain of the master curve at stresses [MPa]."""
+    return plastic.strain(stress)
 
 
 # ---- a law and a particle as one vector, for derivatives and random trials -------------------------------------------

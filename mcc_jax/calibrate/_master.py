@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..campaign import Adjustment
+from ..campaign import Adjustment, of_each_particle
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,8 @@ def strain_table(adjustment: Adjustment, diameters_um: np.ndarray, points: int =
     grid = np.linspace(0.0, max(c.stress_max_MPa for c in curves), points)
     strain = np.stack([c.at(grid) for c in curves])
     reached = ~np.isnan(strain)
-    D1, D2, D3 = diameters_um[index].T
-    return StrainTable(grid, np.where(reached, strain, 0.0), reached, 1 - D3**2 / (D1 * D2), index)
+    flatness = of_each_particle(diameters_um[index], lambda p: p.flatness)
+    return StrainTable(grid, np.where(reached, strain, 0.0), reached, flatness, index)
 
 
 @dataclass(frozen=True)

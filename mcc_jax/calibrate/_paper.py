@@ -16,8 +16,10 @@ from ..campaign import (
     Adjustment,
     Campaign,
     adjust,
+    of_each_particle,
     particle_batch,
 )
+from ..geometry import plastic_shape_factor
 from ..law import MccLaw, StrainScaling, Unloading
 from ._elastic import ElasticFit, campaign_branches, fit_effective_modulus
 from ._master import MasterCurve, StrainTable, master_curve, strain_table
@@ -246,8 +248,7 @@ def calibrate_paper(
     master = master_curve(table, chosen.a)
     plastic = fit_population(master, adjustment.threshold_MPa)
     tell("fitting the effective modulus")
-    D1, D2, D3 = campaign.diameters_um.T
-    eta = 1 + chosen.a * (1 - D3**2 / (D1 * D2))
+    eta = of_each_particle(campaign.diameters_um, lambda p: plastic_shape_factor(p, chosen.a))
     elastic = fit_effective_modulus(campaign_branches(campaign, adjustment), eta, unloading, strain_scaling)
     # Without any unloading the modulus cannot matter to a prediction; a stiff one keeps the law defined.
     modulus = elastic.effective_modulus_MPa if elastic.effective_modulus_MPa is not None else 1e9

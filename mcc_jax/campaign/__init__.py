@@ -10,10 +10,11 @@ from ._adjustment import loading_curve as loading_curve
 from ._adjustment import stress_and_strain as stress_and_strain
 from ._batch import Batch as Batch
 from ._batch import batch as batch
+from ._batch import of_each_particle as of_each_particle
 from ._batch import particle_batch as particle_batch
 from ._csv import read_campaign as read_campaign
 from ._csv import read_particles as read_particles
-from ._metadata import load_toml as load_toml
+from ._metadata import load_toml_file as load_toml_file
 from ._paper import PAPER_DIAMETERS_UM as PAPER_DIAMETERS_UM
 from ._paper import PAPER_EFFECTIVE_MODULUS_MPA as PAPER_EFFECTIVE_MODULUS_MPA
 from ._paper import PAPER_LOAD_RATE_MN_PER_S as PAPER_LOAD_RATE_MN_PER_S

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from .._types import Scalar
 from ..geometry import Particle
 from ._schema import Campaign
 
@@ -15,6 +19,18 @@ def particle_batch(diameters_um: np.ndarray) -> Particle:
     """One `Particle` whose fields have a leading axis N, from diameters [um] of shape (N, 3)."""
     D1, D2, D3 = jnp.asarray(diameters_um, dtype=float).T
     return eqx.filter_vmap(Particle)(D1, D2, D3)
+
+
+def of_each_particle(diameters_um: np.ndarray, quantity: Callable[[Particle], Scalar]) -> np.ndarray:
+    """A quantity of every particle, shape (N,).
+
+    Args:
+        diameters_um: D1, D2, D3 [um], shape (N, 3).
+        quantity: function of one `Particle`, for instance its flatness or its plastic shape factor.
+    """
+    # What files and figures show is in double precision, whatever precision the caller computes in.
+    with jax.enable_x64(True):
+        return np.array(eqx.filter_vmap(quantity)(particle_batch(diameters_um)))
 
 
 class Batch(eqx.Module):

@@ -41,6 +41,26 @@ def load_toml(text: str, file: Path) -> dict[str, Any]:
         ) from None
 
 
+def load_toml_file(path: str | Path, what: str) -> dict[str, Any]:
+    """Read a TOML file; an empty one holds no entries.
+
+    Args:
+        path: the file.
+        what: what it should be, for the message, for example "a TOML file of priors".
+
+    Raises:
+        InputError: if it cannot be read, is no UTF-8 text, or is not TOML.
+    """
+    file = Path(path)
+    try:
+        text = file.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", file=file, remedy=f"Give {what}.") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"is no text in UTF-8: {error}", file=file, remedy="Save it as UTF-8.") from error
+    return load_toml(text, file)
+
+
 def parse_metadata(text: str, file: Path) -> Metadata:
     """The metadata that a `campaign.toml` holds; keys it does not know go to `other`.
 

@@ -15,8 +15,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._errors import InputError
-from ..campaign import PAPER_DIAMETERS_UM, Campaign, check_campaign, particle_batch, read_particles
-from ..geometry import Particle
+from ..campaign import (
+    PAPER_DIAMETERS_UM,
+    Campaign,
+    check_campaign,
+    of_each_particle,
+    particle_batch,
+    read_particles,
+)
+from ..geometry import Particle, plastic_shape_factor
 from ..law import MccLaw, StrainScaling, Unloading
 from ..simulate import (
     PAPER_PEAK_STRESS_MPA,
@@ -82,8 +89,7 @@ class Material:
         for name, value in self.fixed.items():
             if value is not None:
                 plastic = eqx.tree_at(lambda p, n=name: getattr(p, n), plastic, jnp.full(count, value))
-        D1, D2, D3 = sizes.diameters_um.T
-        eta = 1 + self.a * (1 - D3**2 / (D1 * D2))
+        eta = of_each_particle(sizes.diameters_um, lambda p: plastic_shape_factor(p, self.a))
         if not (eta > 0).all():
             worst = int(np.argmin(eta))
             raise InputError(

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..calibrate import BayesCalibration, LeastSquaresCalibration
+from ..campaign import of_each_particle
 from ._text import particle_labels, plain
 
 COEFFICIENT_SYMBOLS = ("$C_1$", "$C_3$", "$C_5$")
@@ -26,8 +27,8 @@ def kept_labels(calibration: BayesCalibration | LeastSquaresCalibration) -> list
 
 def flatness(calibration: BayesCalibration | LeastSquaresCalibration) -> np.ndarray:
     """1 - D3^2 / (D1 D2) of the particles that took part [-]."""
-    D1, D2, D3 = calibration.campaign.diameters_um[list(calibration.selection.kept)].T
-    return 1 - D3**2 / (D1 * D2)
+    diameters_um = calibration.campaign.diameters_um[list(calibration.selection.kept)]
+    return of_each_particle(diameters_um, lambda p: p.flatness)
 
 
 def spread_over(count: int, most: int) -> np.ndarray:

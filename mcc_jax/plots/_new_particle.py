@@ -10,7 +10,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from ..calibrate import BayesCalibration, predict_new_particle
-from ..campaign import PAPER_DIAMETERS_UM, effective_diameter_um
+from ..campaign import PAPER_DIAMETERS_UM, effective_diameter_um, of_each_particle
+from ..geometry import plastic_shape_factor
 from ._bands import LOADING, UNLOADING
 from ._joint import cautions
 from ._style import BLACK, DISPLACEMENT, FORCE, GREY, finish, new_figure, styled
@@ -64,8 +65,9 @@ def plot_new_particle(calibration: BayesCalibration, diameters_um: Sequence[floa
     panels[0].set_ylabel(FORCE)
     panels[0].set_xlim(left=0)
     panels[0].set_ylim(0, 1.02 * up[-1])
+    a = float(np.median(np.asarray(calibration.population.a)))
+    (eta,) = of_each_particle(sizes[None], lambda p: plastic_shape_factor(p, a))
     D1, D2, D3 = sizes
-    eta = 1 + float(np.median(np.asarray(calibration.population.a))) * (1 - D3**2 / (D1 * D2))
     title = f"A new particle of {D1:.0f} × {D2:.0f} × {D3:.0f} µm, $\\eta_p$ = {eta:.2f}"
     handles = [
         Line2D([], [], color=BLACK, linewidth=1.3, label="median"),

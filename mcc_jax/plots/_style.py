@@ -14,7 +14,8 @@ from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 
 from ..calibrate import PaperCalibration, ShapeFit
-from ..campaign import Metadata
+from ..campaign import Metadata, of_each_particle
+from ..geometry import plastic_shape_factor
 from ._text import FONT, is_simulated
 
 BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILION, PURPLE = (
@@ -139,8 +140,7 @@ def sequential(values: np.ndarray) -> ScalarMappable:
 
 def shape_factors(calibration: PaperCalibration) -> np.ndarray:
     """eta_p of every particle of the campaign under the calibrated `a` [-], shape (N,)."""
-    D1, D2, D3 = calibration.campaign.diameters_um.T
-    return 1 + calibration.a * (1 - D3**2 / (D1 * D2))
+    return of_each_particle(calibration.campaign.diameters_um, lambda p: plastic_shape_factor(p, calibration.a))
 
 
 def shape_fit(calibration: PaperCalibration) -> ShapeFit:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from .._errors import InputError
-from ..campaign import Control, load_toml
+from ..campaign import Control, load_toml_file
 
 
 @dataclass(frozen=True)
@@ -160,14 +160,7 @@ def read_programme(file: str | Path) -> Programme:
         InputError: naming the file and the entry.
     """
     file = Path(file)
-    try:
-        content = load_toml(file.read_text(encoding="utf-8"), file)
-    except OSError as error:
-        raise InputError(
-            f"cannot be read ({error.strerror})", file=file, remedy="Give a TOML file with the programme."
-        ) from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"is no text in UTF-8: {error}", file=file, remedy="Save it as UTF-8.") from error
+    content = load_toml_file(file, "a TOML file with the programme")
     unknown = set(content) - {"control", "rate", "points", "interval_s", "step"}
     if unknown:
         raise InputError(

@@ -143,6 +143,7 @@ def test_bad_diameters(diameters, piece):
         ("name,D1_um,D2_um,D3_um\nA,1,1,1\n", "'particle' is missing"),
         ("particle,D1_um,D2_um,D3_um\nA,1,0,1\n", "row 2, column 'D2_um'"),
         ("particle,D1_um,D2_um,D3_um\nA,1,x,1\n", "row 2, column 'D2_um'"),
+        ("particle,D1_um,D2_um,D3_um\nA,1,1,1\n ,1,1,1\n", "row 3, column 'particle': the name is empty"),
     ],
 )
 def test_bad_table_of_diameters(tmp_path, text, piece):

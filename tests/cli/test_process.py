@@ -15,6 +15,12 @@ COMMAND = [sys.executable, "-m", "mcc_jax"]
 posix = pytest.mark.skipif(os.name != "posix", reason="signals")
 
 
+@pytest.fixture(autouse=True)
+def _nothing_is_kept(monkeypatch):
+    """Of processes that are killed or may not write: they would leave halves of compiled functions to later tests."""
+    monkeypatch.setenv("JAX_ENABLE_COMPILATION_CACHE", "false")
+
+
 def call(*arguments, **settings):
     settings = {"capture_output": True, "text": True, "timeout": 100} | settings
     return subprocess.run([*COMMAND, *map(str, arguments)], **settings)

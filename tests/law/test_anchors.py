@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import (
+    ALL_FORMS,
     EBAR,
-    FORM_NAMES,
-    FORMS,
     K1,
     PAPER_THETA,
     A,
     check,
     close,
+    force_along,
     paper_law,
     paper_particle,
     paper_population,
@@ -26,8 +26,6 @@ from helpers import (
 
 from mcc_jax.geometry import Particle, elastic_shape_factor, plastic_shape_factor
 from mcc_jax.law import History, MccLaw, Plastic, StrainScaling, Unloading, recovery, stress_ratio
-
-forces = eqx.filter_jit(lambda law, particle, path: law.path(particle, law.init(particle), path)[1])
 
 CASES = {
     # stress, eps_P, delta, eps_f, loading tangent, onset tangent, w_load, w_rec, w_diss, F_P, E_diss
@@ -195,7 +193,7 @@ def test_02_rigid_limit():
         close(ratio, factor, rel=1e-14)
 
 
-@pytest.mark.parametrize(("unloading", "scaling"), FORMS, ids=FORM_NAMES)
+@ALL_FORMS
 def test_03_continuity_at_both_ends_of_the_branch(unloading, scaling):
     law, p = paper_law(unloading, scaling), paper_particle(6)
     peak = p.displacement(jnp.array(0.35))
@@ -219,7 +217,7 @@ def test_03_continuity_at_both_ends_of_the_branch(unloading, scaling):
 def test_04_energy_against_the_trapezoidal_rule():
     law, p = PITFALL
     path = jnp.concatenate([jnp.linspace(0.0, 0.45, 4001), jnp.linspace(0.45, 0.43, 4001)])
-    stress = p.stress(forces(law, p, p.displacement(path)))
+    stress = p.stress(force_along(law, p, p.displacement(path)))
     check(jnp.trapezoid(stress, path), "0.8939868", slack=2)
     closed = law.energy(p, History(p.displacement(jnp.array(0.45))), p.displacement(jnp.array(0.43)))
     volume = p.force(jnp.array(1.0)) * p.effective_diameter
@@ -232,7 +230,7 @@ def test_05_scale():
     small = Particle(213.54, 196.07, 186.33)
     large = Particle(2 * 213.54, 2 * 196.07, 2 * 186.33)
     strain = jnp.concatenate([jnp.linspace(0, 0.5, 21), jnp.linspace(0.5, 0.48, 21)])
-    one, other = (forces(law, p, p.displacement(strain)) for p in (small, large))
+    one, other = (force_along(law, p, p.displacement(strain)) for p in (small, large))
     close(other, 4 * one, rel=1e-12)
     close(large.stress(other), small.stress(one), rel=1e-12)
     force = small.force(jnp.array(10.0))
@@ -253,7 +251,7 @@ def test_06_exchange_of_D1_and_D2():
         assert plastic_shape_factor(p, A) == plastic_shape_factor(q, A)
         assert p.effective_diameter == q.effective_diameter
         assert elastic_shape_factor(p) == elastic_shape_factor(q)
-    np.testing.assert_array_equal(forces(law, p, path), forces(law, q, path))
+    np.testing.assert_array_equal(force_along(law, p, path), force_along(law, q, path))
 
 
 def test_07_sphere_has_unit_shape_factors():
@@ -262,20 +260,20 @@ def test_07_sphere_has_unit_shape_factors():
         assert elastic_shape_factor(sphere(size)) == 1
 
 
-@pytest.mark.parametrize(("unloading", "scaling"), FORMS, ids=FORM_NAMES)
+@ALL_FORMS
 def test_08_reload_retraces_and_rejoins(unloading, scaling):
     law, p = paper_law(unloading, scaling, modulus=3000.0), paper_particle(9)
     top, deep, further = (p.displacement(jnp.array(e)) for e in (0.40, 0.37, 0.45))
     up, down = jnp.linspace(0, top, 40), jnp.linspace(top, deep, 40)
     beyond = jnp.linspace(top, further, 40)
     path = jnp.concatenate([up, down, down[::-1], beyond])
-    force = forces(law, p, path)
+    force = force_along(law, p, path)
     close(force[80:120], force[40:80][::-1], scale=2e-14 * float(force.max()))
-    np.testing.assert_array_equal(force[120:], forces(law, p, jnp.concatenate([up, beyond]))[40:])
+    np.testing.assert_array_equal(force[120:], force_along(law, p, jnp.concatenate([up, beyond]))[40:])
 
 
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
-@pytest.mark.parametrize(("unloading", "scaling"), FORMS, ids=FORM_NAMES)
+@ALL_FORMS
 def test_09_sum_rule_at_the_onset(unloading, scaling, mode):
     """Along eps = eps_P the branch is the loading curve: d sigma/d eps + d sigma/d eps_P = loading tangent."""
     law, p = paper_law(unloading, scaling), PITFALL[1]
@@ -326,8 +324,8 @@ def test_11_master_collapse_only_in_the_master_way():
             p = paper_particle(number)
             eta = plastic_shape_factor(p, A)
             x = jnp.asarray(strain) / eta
-            one = p.stress(forces(law, p, p.displacement(x)))
-            master = ball.stress(forces(law, ball, ball.displacement(strain)))
+            one = p.stress(force_along(law, p, p.displacement(x)))
+            master = ball.stress(force_along(law, ball, ball.displacement(strain)))
             collapsed = bool(jnp.max(jnp.abs(one - master)) < 1e-11)
             assert collapsed == (scaling is StrainScaling.MASTER)
 
@@ -352,7 +350,7 @@ def test_13_round_trips():
     close(jax.vmap(plastic.strain)(jax.vmap(plastic.stress)(x)), x, rel=1e-14)
 
 
-@pytest.mark.parametrize(("unloading", "scaling"), FORMS, ids=FORM_NAMES)
+@ALL_FORMS
 def test_14_monotone_and_bounded_on_unloading(unloading, scaling):
     law, p = paper_law(unloading, scaling), paper_particle(18)
     for strain_max in (0.005, 0.05, 0.4, 0.6):

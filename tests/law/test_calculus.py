@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import (
-    FORM_NAMES,
+    ALL_FORMS,
     FORMS,
+    SOME_FORMS,
     all_finite,
     between,
     close,
@@ -23,10 +24,6 @@ from hypothesis import given, settings
 
 from mcc_jax.law import AbstractContactLaw, History, Unloading
 
-CASES = pytest.mark.parametrize(("unloading", "scaling"), FORMS, ids=FORM_NAMES)
-# Each form and each way of the shape factor once.
-SOME = FORMS[0::4]
-SOME_CASES = pytest.mark.parametrize(("unloading", "scaling"), SOME, ids=FORM_NAMES[0::4])
 STEPS = 6
 
 
@@ -90,7 +87,7 @@ def compare(unloading, scaling, theta, seed, by_scan):
     return forward, scale
 
 
-@CASES
+@ALL_FORMS
 @settings(max_examples=6, deadline=None, derandomize=True)
 @given(theta=thetas(softening=between(0.0, 0.8)), seed=st.integers(0, 10**6))
 def test_forward_is_reverse_is_finite_difference(unloading, scaling, theta, seed):
@@ -98,7 +95,7 @@ def test_forward_is_reverse_is_finite_difference(unloading, scaling, theta, seed
     compare(unloading, scaling, theta, seed, by_scan=False)
 
 
-@SOME_CASES
+@SOME_FORMS
 @settings(max_examples=6, deadline=None, derandomize=True)
 @given(theta=thetas(softening=between(0.0, 0.8)), seed=st.integers(0, 10**6))
 def test_forward_is_reverse_is_finite_difference_step_by_step(unloading, scaling, theta, seed):
@@ -163,18 +160,18 @@ def finite_everywhere(unloading, scaling, dtype, function):
             assert jnp.all(jnp.abs(one - other) <= accuracy * scale)
 
 
-@SOME_CASES
+@SOME_FORMS
 def test_value_and_derivatives_are_finite_where_branches_meet(unloading, scaling):
     finite_everywhere(unloading, scaling, jnp.float64, along_a_path)
 
 
-@SOME_CASES
+@SOME_FORMS
 def test_value_and_derivatives_are_finite_in_single_precision(unloading, scaling):
     finite_everywhere(unloading, scaling, jnp.float32, along_a_path)
 
 
 def test_value_and_derivatives_of_one_step_are_finite():
-    finite_everywhere(*SOME[0], jnp.float64, one_step)
+    finite_everywhere(*FORMS[0], jnp.float64, one_step)
 
 
 def along_a_path(law, particle, state, value, load):

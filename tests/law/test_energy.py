@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import (
-    FORM_NAMES,
-    FORMS,
+    ALL_FORMS,
+    SOME_FORMS,
     all_finite,
     between,
     close,
+    force_along,
     paper_law,
     paper_particle,
     shape_factor,
@@ -22,20 +23,13 @@ from hypothesis import given, settings
 
 from mcc_jax.law import Energy, History, Unloading
 
-CASES = pytest.mark.parametrize(("unloading", "scaling"), FORMS, ids=FORM_NAMES)
-
 
 @eqx.filter_jit
 def along(law, particle, peak, displacements):
     return jax.vmap(lambda d: law.energy(particle, History(peak), d))(displacements)
 
 
-@eqx.filter_jit
-def force(law, particle, path):
-    return law.path(particle, law.init(particle), path)[1]
-
-
-@CASES
+@ALL_FORMS
 @settings(max_examples=8, deadline=None, derandomize=True)
 @given(theta=thetas(), x=between(0.1, 0.7), share=between(0.05, 1.2))
 def test_work_is_the_integral_of_force(unloading, scaling, theta, x, share):
@@ -51,7 +45,7 @@ def test_work_is_the_integral_of_force(unloading, scaling, theta, x, share):
     lowest = jnp.maximum(peak - recovered, end)
     t, dt = (nodes + 1) / 2, weights / 2
     down = lowest + jnp.asarray(t**2) * (peak - lowest)
-    F = np.asarray(force(law, p, jnp.concatenate([up, peak[None], down])))
+    F = np.asarray(force_along(law, p, jnp.concatenate([up, peak[None], down])))
     loaded = float(np.sum(weights / 2 * F[:40]) * peak)
     returned = float(np.sum(dt * 2 * t * F[41:]) * (peak - lowest))
     state = along(law, p, peak, jnp.stack([peak, end]))
@@ -60,7 +54,7 @@ def test_work_is_the_integral_of_force(unloading, scaling, theta, x, share):
     close(law.loading_work(p, peak), loaded, rel=1e-12)
 
 
-@CASES
+@ALL_FORMS
 @settings(max_examples=8, deadline=None, derandomize=True)
 @given(theta=thetas(), x=between(0.02, 0.7))
 def test_balance(unloading, scaling, theta, x):
@@ -78,7 +72,7 @@ def test_balance(unloading, scaling, theta, x):
     assert jnp.all(e.recoverable >= 0)
     assert e.recoverable[-1] == 0
     # 4/(3 pi) sigma_P delta, over the volume pi R_e^2 D_e.
-    F = force(law, p, peak[None])[0]
+    F = force_along(law, p, peak[None])[0]
     close(e.recoverable[0], 4 / (3 * np.pi) * F * recovered, rel=1e-13)
 
 
@@ -89,7 +83,7 @@ def test_elastic_loop_dissipates_nothing(form):
     loop = jnp.concatenate(
         [jnp.linspace(0, peak, 50), jnp.linspace(peak, deep, 2001), jnp.linspace(deep, peak, 2001)[1:]]
     )
-    F = force(law, p, loop)
+    F = force_along(law, p, loop)
     area = jnp.trapezoid(F[49:], loop[49:])
     assert abs(area) < 1e-13 * F.max() * (peak - deep)
     assert along(law, p, peak, peak[None]).work[0] == along(law, p, peak, peak[None]).work[0]
@@ -104,7 +98,7 @@ def test_further_loading_counts_from_the_new_peak():
     close(fresh.work, law.loading_work(p, jnp.array(50.0)), rel=1e-15)
 
 
-@pytest.mark.parametrize(("unloading", "scaling"), FORMS[0::4], ids=FORM_NAMES[0::4])
+@SOME_FORMS
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_energy_is_finite_with_its_derivatives_everywhere(unloading, scaling, mode, dtype):
@@ -136,7 +130,7 @@ def test_force_is_the_slope_of_the_stored_energy(x, share):
     peak = p.displacement(jnp.array(x / eta))
     d = peak - share * p.displacement(law.recoverable_strain(p, p.strain(peak)))
     slope = stored_slope(p, peak, d)
-    close(slope, force(law, p, jnp.stack([peak, d]))[1], rel=1e-9)
+    close(slope, force_along(law, p, jnp.stack([peak, d]))[1], rel=1e-9)
 
 
 @eqx.filter_jit

@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import (
-    FORM_NAMES,
-    FORMS,
+    ALL_FORMS,
     PAPER_THETA,
     between,
     close,
+    force_along,
     paper_law,
     paper_particle,
     scaled_paths,
@@ -27,8 +27,6 @@ from hypothesis import given, settings
 
 from mcc_jax.geometry import Particle
 from mcc_jax.law import AbstractContactLaw, History, MccLaw, Plastic, StrainScaling, Unloading
-
-CASES = pytest.mark.parametrize(("unloading", "scaling"), FORMS, ids=FORM_NAMES)
 
 
 @functools.cache
@@ -51,7 +49,7 @@ def routes(unloading, scaling):
     }
 
 
-@CASES
+@ALL_FORMS
 @settings(max_examples=10, deadline=None, derandomize=True)
 @given(theta=thetas(), x=scaled_paths(), start=st.one_of(st.just(0.0), between(0.0, 0.6)))
 def test_closed_form_is_the_scan(unloading, scaling, theta, x, start):
@@ -72,7 +70,7 @@ def test_closed_form_is_the_scan(unloading, scaling, theta, x, start):
     assert jnp.all(d <= peak)
 
 
-@CASES
+@ALL_FORMS
 @settings(max_examples=10, deadline=None, derandomize=True)
 @given(theta=thetas(softening=between(0.0, 0.8)), x=scaled_paths(), start=st.one_of(st.just(0.0), between(0.0, 0.6)))
 def test_load_control_undoes_displacement_control(unloading, scaling, theta, x, start):
@@ -93,7 +91,7 @@ def test_load_control_undoes_displacement_control(unloading, scaling, theta, x, 
     close(again, force, scale=10 * rounding * float(force.max()))
 
 
-@CASES
+@ALL_FORMS
 def test_loading_inverse_meets_the_force(unloading, scaling):
     """Residual of the force under load control: at most 1e-14 of it, from 1e-9 to 1e4 mN."""
     law, p = paper_law(unloading, scaling), paper_particle(4)
@@ -106,7 +104,7 @@ def test_eager_is_jitted():
     law, p = paper_law(), paper_particle(1)
     path = jnp.array([0.0, 40.0, 80.0, 79.5, 79.0, 0.0, 100.0, -3.0])
     eager = law.path(p, law.init(p), path)[1]
-    jitted = eqx.filter_jit(lambda law, p, path: law.path(p, law.init(p), path)[1])(law, p, path)
+    jitted = force_along(law, p, path)
     close(eager, jitted, scale=1e-13 * float(eager.max()))
     state, forces = law.init(p), []
     for d in path:
@@ -210,7 +208,7 @@ def test_single_precision(number):
     close(displacement[loaded], path[loaded], scale=2e-6 * float(path.max()))
 
 
-@CASES
+@ALL_FORMS
 def test_every_form_runs_in_single_precision(unloading, scaling):
     law, p = (with_dtype(t, jnp.float32) for t in (paper_law(unloading, scaling, modulus=1000.0), paper_particle(5)))
     path = jnp.concatenate([jnp.linspace(0, 120, 50), jnp.linspace(120, 90, 50)]).astype(jnp.float32)

@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import (
-    FORM_NAMES,
-    FORMS,
+    SOME_FORMS,
     all_finite,
     between,
     close,
+    master_strain,
+    master_stress,
     paper_particle,
     scaled_paths,
     shape_factor,
@@ -24,17 +25,6 @@ from mcc_jax.law import History, MccLaw, Plastic
 
 EXAMPLE = Plastic(4.0, 3.0, 2.4)
 FALLING = between(1.01, 3.0)  # 9 C3^6 / (20 C1 C5^5); above 1.8 the bare quintic is tensile
-CASES = pytest.mark.parametrize(("unloading", "scaling"), FORMS[0::4], ids=FORM_NAMES[0::4])
-
-
-@eqx.filter_jit
-def curve(plastic, x):
-    return plastic.stress(x)
-
-
-@eqx.filter_jit
-def strains(plastic, stress):
-    return plastic.strain(stress)
 
 
 @eqx.filter_jit
@@ -50,7 +40,7 @@ def under_load(law, p, state, path):
 def envelope(plastic, targets, end):
     """Smallest scaled strain at which the running maximum of the curve reaches each stress, by brute force."""
     x = np.linspace(0, end, 400_001)
-    highest = np.maximum.accumulate(np.asarray(curve(plastic, jnp.asarray(x))))
+    highest = np.maximum.accumulate(np.asarray(master_stress(plastic, jnp.asarray(x))))
     index = np.searchsorted(highest, targets)
     return x[np.maximum(index - 1, 0)], x[index]
 
@@ -64,14 +54,14 @@ def test_load_control_snaps_through(numbers, softening):
     assert not plastic.is_monotone
     K1, K3, K5 = (float(k) for k in plastic.polynomial)
     peak = np.sqrt((3 * K3 - np.sqrt(9 * K3**2 - 20 * K1 * K5)) / (10 * K5))
-    top = float(curve(plastic, jnp.array(peak)))
+    top = float(master_stress(plastic, jnp.array(peak)))
     end = 4 * np.sqrt(K3 / K5)
     targets = top * np.array([1e-6, 0.1, 0.5, 0.9, 0.99, 0.9999, 1.0001, 1.01, 1.5, 3.0])
-    x = np.asarray(strains(plastic, jnp.asarray(targets)))
+    x = np.asarray(master_strain(plastic, jnp.asarray(targets)))
     low, high = envelope(plastic, targets, end)
     assert np.all(x >= low - 1e-9 * end)
     assert np.all(x <= high + 1e-9 * end)
-    close(curve(plastic, jnp.asarray(x)), targets, rel=1e-9)
+    close(master_stress(plastic, jnp.asarray(x)), targets, rel=1e-9)
     assert np.all(x[:6] < peak)
     trough = np.sqrt((3 * K3 + np.sqrt(9 * K3**2 - 20 * K1 * K5)) / (10 * K5))
     assert np.all(x[6:] > trough)
@@ -94,7 +84,7 @@ def test_the_example_under_both_controls():
     assert jumped[1] > 0.345075622969
 
 
-@CASES
+@SOME_FORMS
 @settings(max_examples=10, deadline=None, derandomize=True)
 @given(theta=thetas(softening=FALLING), x=scaled_paths(low=-0.05, high=1.0), start=between(0.0, 0.5))
 def test_nothing_is_ever_nan(unloading, scaling, theta, x, start):
@@ -114,7 +104,7 @@ def test_forces_are_met_under_load_control(theta, fractions):
     law, p = unpack(theta)
     K1, K3, K5 = (float(k) for k in law.plastic.polynomial)
     peak = np.sqrt((3 * K3 - np.sqrt(9 * K3**2 - 20 * K1 * K5)) / (10 * K5))
-    force = p.force(curve(law.plastic, jnp.array(peak))) * jnp.asarray(fractions)
+    force = p.force(master_stress(law.plastic, jnp.array(peak))) * jnp.asarray(fractions)
     _, d = under_load(law, p, law.init(p), force)
     _, back = under_displacement(law, p, law.init(p), d)
     close(back, force, rel=1e-6, scale=1e-9 * float(force.max()))

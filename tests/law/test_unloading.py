@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import EBAR, FORM_NAMES, FORMS, K1, A, check, close, paper_law, paper_particle, particle_of_shape, sphere
+from helpers import ALL_FORMS, EBAR, K1, A, check, close, paper_law, paper_particle, particle_of_shape, sphere
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
@@ -123,7 +123,7 @@ def test_spread_between_the_ways():
     close(spread, plastic_shape_factor(p, A) ** 1.5, rel=1e-14)
 
 
-@pytest.mark.parametrize(("unloading", "scaling"), FORMS, ids=FORM_NAMES)
+@ALL_FORMS
 def test_branch_is_the_printed_equation(unloading, scaling):
     """phi as the paper writes it, evaluated naively away from its singular ends."""
     law, p = paper_law(unloading, scaling), paper_particle(9)
@@ -139,7 +139,7 @@ def test_branch_is_the_printed_equation(unloading, scaling):
     close(law.unloading_stress(p, jnp.asarray(strain), jnp.array(strain_max)), expected, scale=1e-11)
 
 
-@pytest.mark.parametrize(("unloading", "scaling"), FORMS, ids=FORM_NAMES)
+@ALL_FORMS
 def test_half_way_every_form_carries_the_same(unloading, scaling):
     law, p = paper_law(unloading, scaling), paper_particle(6)
     strain_max = jnp.array(0.4)

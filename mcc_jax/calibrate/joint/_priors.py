@@ -11,7 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from ..._errors import InputError
-from ...campaign import load_toml
+from ...campaign import load_toml_file
 from ...law import Unloading
 from ._noise import NoisePrior
 
@@ -126,14 +126,7 @@ def read_priors(file: str | Path, unloading: Unloading = Unloading.PRINTED) -> P
     priors = Priors.default(unloading)
     known = dict(priors._entries())
     changes: dict[str, Any] = {}
-    try:
-        content = load_toml(file.read_text(encoding="utf-8"), file)
-    except OSError as error:
-        raise InputError(
-            f"cannot be read ({error.strerror})", file=file, remedy="Give a TOML file of priors."
-        ) from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"is no text in UTF-8: {error}", file=file, remedy="Save it as UTF-8.") from error
+    content = load_toml_file(file, "a TOML file of priors")
     for name, entry in content.items():
         if name not in known:
             raise InputError(

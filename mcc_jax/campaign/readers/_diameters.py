@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from ..._errors import InputError
-from .._columns import LENGTH, convert, find_column, missing_column
-from .._table import Table, parse_number, read_table
-from .._validate import SMALLEST_DIAMETER_UM, check_magnitudes
+from .._csv import read_particles
+from .._table import parse_number
+from .._validate import SMALLEST_DIAMETER_UM
 
 Triple = Sequence[float | int] | np.ndarray
 Diameters = Mapping[str, Triple] | Triple
@@ -39,30 +39,8 @@ def read_diameters(text: str | os.PathLike[str]) -> Diameters:
             raise InputError(f"--diameters: {error}", remedy=_HOW) from None
         check_triple(values, "all particles", "--diameters")
         return values
-    table = read_table(Path(text))
-    if "particle" not in table.header:
-        raise missing_column(table.header, "particle", table.file)
-    names = table.text(table.header.index("particle"))
-    columns = [_lengths(table, quantity) for quantity in ("D1", "D2", "D3")]
-    triples: dict[str, Triple] = {}
-    for row, name, *triple in zip(table.rows, names, *columns, strict=True):
-        if name in triples:
-            raise InputError(
-                f"the particle {name!r} is already there",
-                file=table.file,
-                row=row,
-                column="particle",
-                remedy="Keep one row",
-            )
-        triples[name] = triple
-    return triples
-
-
-def _lengths(table: Table, quantity: str) -> list[float]:
-    column, factor = find_column(table.header, quantity, LENGTH, table.file)
-    values = convert(table.numbers(column), factor)
-    check_magnitudes(values, table.file, table.rows, table.header[column], diameter=True)
-    return values.tolist()
+    names, diameters, _ = read_particles(Path(text))
+    return dict(zip(names, diameters.tolist(), strict=True))
 
 
 def check_triple(triple: Triple, what: str, file: str | Path) -> None:
