@@ -84,7 +84,7 @@ def one_campaign(seed: int, count: int, collapsed: bool, model: JointModel):
     truth, diameters, laws, peaks = draw_truth(seed, count, collapsed, model)
     programme = Programme.cycles(points=POINTS)
     campaign = simulate_campaign(laws, diameters, peaks, programme, instrument=INSTRUMENT, seed=seed)
-    posterior = calibrate_bayes(campaign, model=model, chains=2, draws=500, warmup=200, seed=seed)
+    posterior = calibrate_bayes(campaign, model=model, chains=2, draws=500, warmup=300, seed=seed)
     named = posterior.named_population()
     values = {"a": truth["a"], "effective_modulus_MPa": truth["effective_modulus_MPa"]}
     for j, name in enumerate(("C1", "C3", "C5")):
