@@ -46,6 +46,7 @@ from .law import Plastic as Plastic
 from .law import PlasticPopulation as PlasticPopulation
 from .law import StrainScaling as StrainScaling
 from .law import Unloading as Unloading
+from .simulate import HiddenEffect as HiddenEffect
 from .simulate import Hold as Hold
 from .simulate import Instrument as Instrument
 from .simulate import Programme as Programme

@@ -9,6 +9,7 @@ from ._library import default_library as default_library
 from ._library import find_variant as find_variant
 from ._library import present as present
 from ._record import HUMIDITY_COLUMN as HUMIDITY_COLUMN
+from ._record import REFERENCE_HUMIDITY_PERCENT as REFERENCE_HUMIDITY_PERCENT
 from ._record import Record as Record
 from ._record import clean_record as clean_record
 from ._record import humidities as humidities

@@ -91,9 +91,9 @@ def present(campaign: Campaign, segments: tuple[tuple[Segment, ...], ...] | None
         loading = np.isin(np.asarray(record.kind), (1, 4))
         rates.extend(np.unique(np.asarray(record.loading_rate)[loading]).tolist())
         area = np.pi * diameter**2 / 4 * 1e-3
-        peaks.append(float(curve.force_mN.max()) / area)
+        peaks.append(float(curve.force_mN.max() / area))
         peaks.extend(
-            float(curve.force_mN[: part.start].max()) / area for part in parts if part.kind == "unload" and part.start
+            float(curve.force_mN[: part.start].max() / area) for part in parts if part.kind == "unload" and part.start
         )
         durations.append(float(curve.time_s[-1] - curve.time_s[0]))
         low += int(np.sum(curve.force_mN < 0.1 * curve.force_mN.max()) >= 5)
@@ -116,4 +116,4 @@ def present(campaign: Campaign, segments: tuple[tuple[Segment, ...], ...] | None
 
 def _apart(values: list[float], ratio: float) -> bool:
     some = [value for value in values if value > 0]
-    return bool(some) and max(some) > ratio * min(some)
+    return bool(some and max(some) > ratio * min(some))

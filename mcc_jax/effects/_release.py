@@ -115,7 +115,7 @@ class AbstractAdhesion(AbstractEffect):
         def excess(value: Values, share: Values, strength: Values) -> Values:
             return value - share - strength * self.attraction(recovery(value))
 
-        def halve(_: int, bracket: tuple[Values, Values]) -> tuple[Values, Values]:
+        def halve(_: Any, bracket: tuple[Values, Values]) -> tuple[Values, Values]:
             low, high = bracket
             middle = 0.5 * (low + high)
             below = excess(middle, frozen, fixed) <= 0

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from .._types import Scalar
+from .._types import Flag, Scalar
 
 MOST_DOUBLINGS = 60
 MOST_STEPS = 100
@@ -45,7 +45,7 @@ def increasing_root(function: Callable[[Scalar], Scalar], start: Scalar) -> Scal
     def width(carry: tuple) -> Scalar:
         return jnp.abs(carry[2] - carry[0])
 
-    def unfinished(carry: tuple) -> Scalar:
+    def unfinished(carry: tuple) -> Flag:
         a, fa, b, fb, *_, steps = carry
         best = jnp.where(jnp.abs(fa) < jnp.abs(fb), a, b)
         exact = (fa == 0) | (fb == 0)

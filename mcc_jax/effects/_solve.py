@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -52,7 +53,7 @@ def _root(effects: Effects, law: MccLaw, particle: Particle, record: Record, tar
     def stress(strain: Values) -> Values:
         return _stress(effects, law, particle, record, strain)
 
-    def newton(_: int, strain: Values) -> Values:
+    def newton(_: Any, strain: Values) -> Values:
         change = (target - stress(strain)) / _slope(stress, strain, law, particle)
         limit = 0.3 * strain
         return strain + jnp.where(change > limit, limit, jnp.where(change < -limit, -limit, change))

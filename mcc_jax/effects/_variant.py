@@ -9,7 +9,9 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from .._types import ScalarLike
+import jax.numpy as jnp
+
+from .._types import ScalarLike, scalar
 from ._effect import AbstractEffect
 
 
@@ -92,7 +94,7 @@ class Variant:
     needs: tuple[Need, ...] = ()
     helps: tuple[Need, ...] = ()
     random_per_test: bool = False
-    fixed: Mapping[str, Any] = field(default_factory=dict)
+    fixed: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         low, high = self.plausible
@@ -130,7 +132,12 @@ class Variant:
                 f"{self.mechanism}:{self.name} has no parameter {unknown[0]!r}; "
                 f"it has: {', '.join([self.parameter, *known])}"
             )
-        return self.make(amplitude, **{**known, **nuisance}, **self.fixed)
+        strength = scalar(amplitude)
+        others = {
+            name: jnp.asarray(value, strength.dtype) if isinstance(value, int | float) else value
+            for name, value in {**known, **nuisance}.items()
+        }
+        return self.make(strength, **others, **self.fixed)
 
     def grid(self) -> list[dict[str, float]]:
         """All combinations of the nuisance parameters' values; one empty dictionary if there are none."""
