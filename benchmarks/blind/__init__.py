@@ -1,0 +1,1 @@
+"""Blind test bench of the discovery workflow: sealed synthetic campaigns, runner, scorer."""
