@@ -22,6 +22,9 @@ PARAMETERS = {"frame_compliance": "compliance_um_per_mN"}
 
 def in_process(folder, *, exclude=(), seed=0, options=None):
     """`mcc_jax.discover.discover` in this process: many campaigns share one compilation."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
     from mcc_jax.campaign import read_campaign
 
     discover = importlib.import_module("mcc_jax.discover").discover

@@ -198,8 +198,8 @@ def main(arguments=None):
     parser.add_argument("--fresh", action="store_true", help="forget an existing run in --out")
     parser.add_argument("--write", action="store_true", help="keep seal, tables and pictures in the repository")
     args = parser.parse_args(arguments)
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
+    if args.jobs > 1:
+        os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
 
     if args.fresh and (args.out / "seal.txt").exists():
         shutil.rmtree(args.out)
