@@ -28,6 +28,9 @@ from benchmarks.blind.generator import tiers
 
 def _worker(pipe, solver, seed):
     """Solve what comes through the pipe until None comes."""
+    with contextlib.suppress(Exception):  # a solver that cannot be found shows in every result
+        adapter.find(solver)
+    pipe.send(None)  # started: from here on time counts
     cold = True
     while (task := pipe.recv()) is not None:
         began = time.perf_counter()
@@ -56,7 +59,7 @@ class _Pool:
         process = self._context.Process(target=_worker, args=(theirs, self._solver, self._seed), daemon=True)
         process.start()
         theirs.close()
-        return {"process": process, "pipe": ours, "task": None, "began": 0.0}
+        return {"process": process, "pipe": ours, "task": None, "began": 0.0, "started": False}
 
     def run(self, tasks):
         """Yield results as they come."""
@@ -64,15 +67,22 @@ class _Pool:
         try:
             while waiting or any(w["task"] for w in self._workers):
                 for worker in self._workers:
-                    if worker["task"] is None and waiting:
+                    if worker["started"] and worker["task"] is None and waiting:
                         worker["task"], worker["began"] = waiting.popleft(), time.monotonic()
                         # A worker that has died meanwhile shows below, as a pipe at its end.
                         with contextlib.suppress(BrokenPipeError):
                             worker["pipe"].send(worker["task"])
-                busy = [w for w in self._workers if w["task"]]
+                busy = [w for w in self._workers if w["task"] or not w["started"]]
                 ready = wait([w["pipe"] for w in busy], timeout=1.0)
                 for worker in busy:
-                    if worker["pipe"] in ready:
+                    if not worker["started"]:
+                        if worker["pipe"] in ready:
+                            try:
+                                worker["pipe"].recv()
+                            except (EOFError, ConnectionResetError):
+                                raise RuntimeError("a worker died while it started: does the solver import?") from None
+                            worker["started"] = True
+                    elif worker["pipe"] in ready:
                         try:
                             yield worker["pipe"].recv()
                             worker["task"] = None
@@ -144,6 +154,8 @@ def solve(folder, *, solver="inprocess", jobs=2, seed=0, timeout=300.0, repeat=0
         for key, base in wanted.items()
         if key not in done
     ]
+    if not queue:
+        return done
     show = _progress("solving")
     with (folder / "results.jsonl").open("a") as record:
         # A cut-off line from an interrupted run must not swallow the next one.
