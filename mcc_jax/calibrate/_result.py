@@ -29,8 +29,9 @@ def estimate(
     value: float | None, sd: float | None = None, interval_95: tuple[float, float] | None = None
 ) -> dict[str, Any]:
     """One estimate; what a method does not give, or what is not finite, is None."""
+    known = interval_95 is not None and all(math.isfinite(end) for end in interval_95)
     return {
         "value": None if value is None else finite(value),
-        "sd": None if sd is None else float(sd),
-        "interval_95": None if interval_95 is None else [float(interval_95[0]), float(interval_95[1])],
+        "sd": None if sd is None else finite(sd),
+        "interval_95": [float(end) for end in interval_95] if interval_95 is not None and known else None,
     }

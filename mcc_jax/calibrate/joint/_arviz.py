@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ._bayes import COEFFICIENTS, BayesCalibration
+from ._bayes import BayesCalibration
+from ._population import COEFFICIENTS
 from ._predictive import predict_measured
 from ._priors import LogNormalPrior, NormalPrior, Priors
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,12 +14,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..._errors import InputError
+from ...campaign import Campaign
 from ...law import StrainScaling, Unloading
+from .._predict import point_noise_um
 from ._compile import compiled
-from ._data import Tests
+from ._data import Selection, Tests, select_tests, spread
 from ._individual import Particles, fit_particles, linear_starts
 from ._linearised import expected_latent, linear_data, summarise
-from ._mode import PriorNumbers, from_free, most_probable, recentred, to_free
+from ._mode import PriorNumbers, Target, from_free, most_probable, recentred, to_free
 from ._noise import Noise, Whitening, estimate_noise, particle_scales
 from ._population import Population, Scatter, Summary
 from ._priors import Priors
@@ -141,6 +145,41 @@ def prior_numbers(priors: Priors, flatness: Float[Array, " particles"]) -> Prior
     )
 
 
+def prepare(
+    campaign: Campaign,
+    model: JointModel,
+    threshold_MPa: float,
+    *,
+    meanwhile: Callable[[Tests], None] | None = None,
+    tell: Callable[[str], None] = lambda _: None,
+    **settings: Any,
+) -> tuple[Selection, Tests, JointFit]:
+    """What every joint calibration begins with: points and particles selected, spread over the devices, and fitted.
+
+    Args:
+        campaign: the tests.
+        model: what is assumed.
+        threshold_MPa: points below this stress on loading do not count [MPa].
+        meanwhile: called with the tests in a thread of its own while the fit runs.
+        tell: called with the name of each step.
+        settings: of `fit_joint`.
+    """
+    tell("selecting points")
+    selection = select_tests(campaign, threshold_MPa=threshold_MPa)
+    tests = spread(selection.tests)
+    read_out = float(np.median([point_noise_um(campaign.curves[i]) for i in selection.kept]))
+    aside = None
+    if meanwhile is not None:
+        aside = threading.Thread(target=meanwhile, args=(tests,), daemon=True)
+        aside.start()
+    try:
+        fit = fit_joint(tests, model, read_out, tell=tell, **settings)
+    finally:
+        if aside is not None:
+            aside.join()  # also on an error: a compiler must not outlive the interpreter
+    return selection, tests, fit
+
+
 def fit_joint(
     tests: Tests,
     model: JointModel,
@@ -201,12 +240,13 @@ def fit_joint(
         tell("fitting the population")
         if turn:
             numbers, free = recentred(numbers, free)
-        free, covariance, mode_converged = most_probable(free, numbers, summary, flatness, scatter)
+        target = Target(numbers, summary, scatter)
+        free, covariance, mode_converged = most_probable(free, target)
         if turn == rounds:
             break
         turn += 1
         tell("fitting every particle")
-        mean, spread, moved, shifted = expected_latent(free, numbers, summary, flatness, scatter)
+        mean, spread, moved, shifted = expected_latent(free, target)
         starts = jnp.stack(
             [
                 jnp.concatenate([latent, zero[:, None]], 1),

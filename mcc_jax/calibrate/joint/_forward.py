@@ -23,7 +23,6 @@ from ...geometry import Particle
 from ...law import MccLaw, Plastic, Unloading
 from ._data import Tests
 
-LATENT = ("log C1", "log C3", "log C5", "log modulus")
 Latent = Float[Array, " 4"]
 """b1, b3, b5 and e of one particle."""
 

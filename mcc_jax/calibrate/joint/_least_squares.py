@@ -12,13 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from ...campaign import THRESHOLD_MPA, Campaign
-from .._predict import point_noise_um
 from .._result import estimate, finite, misfit_note
 from ._arrow import Parameters, Solution
-from ._bayes import COEFFICIENTS, log_estimate
-from ._data import Selection, own_misfit, select_tests, spread
-from ._fit import JointFit, JointModel, fit_joint, population_at
+from ._bayes import log_estimate
+from ._data import Selection, own_misfit
+from ._fit import JointFit, JointModel, population_at, prepare
 from ._pooled import Pooled, fit_pooled, unpack
+from ._population import COEFFICIENTS
 
 Loss = Literal["linear", "soft_l1", "cauchy"]
 SHARED = ("a", "log effective modulus", "mu_C1", "mu_C3", "mu_C5")
@@ -116,7 +116,9 @@ class LeastSquaresCalibration:
         dropped = sum(reason is not None for reason in self.selection.why_not)
         if dropped:
             notes.append(f"{dropped} of {len(self.campaign)} particles could not be used")
-        if np.any(np.asarray(self.settings.tau) < 1e-3):
+        if self._alone:
+            notes.append("one particle says nothing of the scatter between particles: no spread is given")
+        elif np.any(np.asarray(self.settings.tau) < 1e-3):
             small = [n for n, t in zip(COEFFICIENTS, np.asarray(self.settings.tau), strict=True) if t < 1e-3]
             notes.append(f"the spread of {', '.join(small)} cannot be told from zero")
         return notes
@@ -181,11 +183,12 @@ class LeastSquaresCalibration:
                     "mean": _normal(float(values[2 + j]), float(sds[2 + j]))
                     if known[2 + j]
                     else estimate(values[2 + j]),
-                    "sd": _spread(float(tau[j]), float(spread_sd[j])),
+                    "sd": estimate(None) if self._alone else _spread(float(tau[j]), float(spread_sd[j])),
                 }
                 for j, name in enumerate(COEFFICIENTS)
             },
-            "yield_stress_MPa": estimate(float(np.exp(values[2] + tau[0] ** 2 / 2) / 17.16)),
+            # The scatter of C1 is part of its mean.
+            "yield_stress_MPa": estimate(None if self._alone else float(np.exp(values[2] + tau[0] ** 2 / 2) / 17.16)),
             "noise": {
                 name: log_estimate(m, s) if np.isfinite(m) else estimate(0.0)
                 for name, m, s in zip(numbers, logs, log_sds, strict=True)
@@ -215,6 +218,11 @@ class LeastSquaresCalibration:
         return np.asarray(
             jax.jit(raw_residual, static_argnums=3)(latent, zero, self.selection.tests, self.model.unloading)
         )
+
+    @property
+    def _alone(self) -> bool:
+        """Whether one particle is all there is: the mode of a spread of one is 0, and means nothing."""
+        return len(self.selection.kept) == 1
 
     def _chi2(self) -> float:
         used = int(np.asarray(self.selection.tests.mask).sum())
@@ -279,11 +287,7 @@ def calibrate_least_squares(
     started = time.perf_counter()
     tell = progress or (lambda _: None)
     model = model or JointModel()
-    tell("selecting points")
-    selection = select_tests(campaign, threshold_MPa=threshold_MPa)
-    tests = spread(selection.tests)
-    read_out = float(np.median([point_noise_um(campaign.curves[i]) for i in selection.kept]))
-    fit = fit_joint(tests, model, read_out, correlated=loss == "linear", rounds=1, tell=tell)
+    selection, _, fit = prepare(campaign, model, threshold_MPa, tell=tell, correlated=loss == "linear", rounds=1)
     population = population_at(fit.mode, fit.numbers, model.scatter)
     settings = Pooled(
         fit.filters,

@@ -11,9 +11,9 @@ from ...law import Unloading
 from ._compile import compiled
 from ._data import Tests
 from ._forward import linearise_with_force, snap
-from ._mode import PriorNumbers, from_free
+from ._mode import Target
 from ._noise import Linear, Noise, Whitening, whitening
-from ._population import Scatter, Summary, draw_latent, moments
+from ._population import Summary, draw_latent, moments
 
 
 @compiled
@@ -97,18 +97,14 @@ def _snap_evidence(latent, particle, force, used):
 
 @compiled
 def expected_latent(
-    free: Float[Array, " d"],
-    numbers: PriorNumbers,
-    summary: Summary,
-    flatness: Float[Array, " particles"],
-    scatter: Scatter,
+    free: Float[Array, " d"], target: Target
 ) -> tuple[
     Float[Array, "particles 4"], Float[Array, "particles 4"], Float[Array, "particles 4"], Float[Array, " particles"]
 ]:
     """Mean and standard deviation of the particles' latent vectors under the population, then the most probable latent
     vectors and zeros given the tests, too."""
-    population = from_free(free, numbers, scatter)[0]
-    mean, factor = moments(population, flatness, scatter)
-    still = jnp.zeros((flatness.shape[0], scatter.size))
-    found = draw_latent(population, summary, flatness, scatter, still, still[:, 0])
+    population = target.population(free)
+    mean, factor = moments(population, target.flatness, target.scatter)
+    still = jnp.zeros((mean.shape[0], target.scatter.size))
+    found = draw_latent(population, target.summary, target.flatness, target.scatter, still, still[:, 0])
     return mean, jnp.sqrt(jnp.sum(factor**2, -1)), found.latent, found.zero

@@ -134,42 +134,43 @@ def recentred(numbers: PriorNumbers, free: Float[Array, " d"]) -> tuple[PriorNum
     return numbers, free.at[2:5].set(0.0)
 
 
-def log_posterior(
-    free: Float[Array, " d"],
-    numbers: PriorNumbers,
-    summary: Summary,
-    flatness: Float[Array, " particles"],
-    scatter: Scatter,
-) -> Scalar:
-    """Log density of the population given all tests, up to a constant."""
-    population, prior = from_free(free, numbers, scatter)
-    return prior + jnp.sum(marginal_likelihood(population, summary, flatness, scatter))
+class Target(eqx.Module):
+    """The density of the population given all tests, in unbounded coordinates.
+
+    Attributes:
+        numbers: the priors, and the coordinates.
+        summary: the tests.
+        scatter: what scatters.
+    """
+
+    numbers: PriorNumbers
+    summary: Summary
+    scatter: Scatter
+
+    @property
+    def flatness(self) -> Float[Array, " particles"]:
+        """Flatness of the particles."""
+        return self.numbers.flatness
+
+    def population(self, free: Float[Array, " d"]) -> Population:
+        """The population at unbounded coordinates."""
+        return from_free(free, self.numbers, self.scatter)[0]
+
+    def log_density(self, free: Float[Array, " d"]) -> Scalar:
+        """Log density of the population given all tests, up to a constant."""
+        population, prior = from_free(free, self.numbers, self.scatter)
+        return prior + jnp.sum(marginal_likelihood(population, self.summary, self.flatness, self.scatter))
 
 
 ATTEMPTS = 4
 
 
 @compiled
-def _gradients(
-    free: Float[Array, "many d"],
-    numbers: PriorNumbers,
-    summary: Summary,
-    flatness: Float[Array, " particles"],
-    scatter: Scatter,
-) -> tuple[Float[Array, " many"], Float[Array, "many d"]]:
-    def loss(free):
-        return -log_posterior(free, numbers, summary, flatness, scatter)
-
-    return jax.lax.map(jax.value_and_grad(loss), free)
+def _gradients(free: Float[Array, "many d"], target: Target) -> tuple[Float[Array, " many"], Float[Array, "many d"]]:
+    return jax.lax.map(jax.value_and_grad(lambda one: -target.log_density(one)), free)
 
 
-def most_probable(
-    start: Float[Array, " d"],
-    numbers: PriorNumbers,
-    summary: Summary,
-    flatness: Float[Array, " particles"],
-    scatter: Scatter,
-) -> tuple[Float[Array, " d"], Float[Array, "d d"], bool]:
+def most_probable(start: Float[Array, " d"], target: Target) -> tuple[Float[Array, " d"], Float[Array, "d d"], bool]:
     """Mode of the population in unbounded coordinates, covariance there, and whether the optimiser converged.
 
     Newton's method in a trust region (SciPy), in coordinates scaled by the curvature at the start. The curvature comes
@@ -182,7 +183,7 @@ def most_probable(
     def expand(free: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         steps = np.diag(width)
         points = free + np.concatenate([np.zeros((1, d)), steps, -steps])
-        value, slope = (np.asarray(v) for v in _gradients(jnp.asarray(points), numbers, summary, flatness, scatter))
+        value, slope = (np.asarray(v) for v in _gradients(jnp.asarray(points), target))
         curvature = (slope[1 : d + 1] - slope[d + 1 :]) / (2 * width[:, None])
         return float(value[0]), slope[0], (curvature + curvature.T) / 2
 

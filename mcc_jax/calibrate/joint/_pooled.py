@@ -19,7 +19,6 @@ from ._noise import Whitening
 from ._population import Population, Scatter, moments
 from ._small import Cholesky
 
-LOSSES = ("linear", "soft_l1", "cauchy")
 LEAST_SPREAD = 1e-4
 """Least standard deviation of log C in the pooled residuals; any smaller and the problem is badly scaled."""
 

@@ -23,6 +23,8 @@ from jaxtyping import Array, Float
 from ..._types import Scalar
 from ._small import Cholesky
 
+COEFFICIENTS = ("C1", "C3", "C5")
+
 
 class Population(eqx.Module):
     """What all particles share.

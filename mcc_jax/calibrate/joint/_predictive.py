@@ -13,8 +13,9 @@ import numpy as np
 
 from ...campaign import PAPER_EFFECTIVE_MODULUS_MPA, PAPER_LOG_C, PAPER_SHAPE_PARAMETER, particle_batch
 from ...law import MccLaw, Plastic
-from ._bayes import COEFFICIENTS, BayesCalibration, summary
+from ._bayes import BayesCalibration, summary
 from ._compile import compiled
+from ._population import COEFFICIENTS
 
 
 @dataclass(frozen=True)

@@ -22,12 +22,11 @@ from ..._types import Scalar
 from ...law import Unloading
 from ._compile import compiled
 from ._data import Tests
-from ._fit import JointFit
 from ._forward import displacement
-from ._mode import PriorNumbers, from_free, log_posterior
+from ._mode import PriorNumbers, Target, from_free
 from ._noise import Whitening
 from ._nuts import Chains, sample
-from ._population import Population, Scatter, Summary, draw_latent, marginal_likelihood
+from ._population import Draw, Population, Scatter, Summary, draw_latent
 
 
 class ParticleDraws(NamedTuple):
@@ -51,10 +50,7 @@ def sample_population(
     key: PRNGKeyArray,
     mode: Float[Array, " d"],
     covariance: Float[Array, "d d"],
-    numbers: PriorNumbers,
-    summary: Summary,
-    flatness: Float[Array, " particles"],
-    scatter: Scatter,
+    target: Target,
     accept: Scalar,
     *,
     chains: int,
@@ -62,26 +58,46 @@ def sample_population(
     draws: int,
 ) -> tuple[Chains, Population]:
     """NUTS over the population, all particles integrated out; populations of all chains in one row."""
-
-    def log_density(free):
-        return log_posterior(free, numbers, summary, flatness, scatter)
-
     factor = jnp.linalg.cholesky(covariance)
     together = jax.default_backend() != "cpu"
     run = sample(
-        key, log_density, mode, factor, chains=chains, warmup=warmup, draws=draws, accept=accept, together=together
+        key,
+        target.log_density,
+        mode,
+        factor,
+        chains=chains,
+        warmup=warmup,
+        draws=draws,
+        accept=accept,
+        together=together,
     )
-    return run, jax.vmap(lambda f: from_free(f, numbers, scatter)[0])(run.position.reshape(-1, mode.shape[0]))
+    return run, jax.vmap(target.population)(run.position.reshape(-1, mode.shape[0]))
 
 
 class Exact(eqx.Module):
-    """What the exact likelihood of a test needs."""
+    """Tests with their exact likelihood, and what particles are drawn by.
+
+    Attributes:
+        tests: the measurements.
+        filters: their noise.
+        summary: quadratic summaries of the same tests.
+        scatter: what scatters.
+        zero_sd: standard deviation of the zeros [um].
+        unloading: form of unloading.
+    """
 
     tests: Tests
     filters: Whitening
     summary: Summary
+    scatter: Scatter
     zero_sd: Float[Array, ""]
     unloading: Unloading = eqx.field(static=True)
+
+    def draw(
+        self, population: Population, normal: Float[Array, "particles k"], normal_zero: Float[Array, " particles"]
+    ) -> Draw:
+        """Particles given the population, under the summaries, from standard normal numbers."""
+        return draw_latent(population, self.summary, self.tests.flatness, self.scatter, normal, normal_zero)
 
 
 def exact_log_likelihood(
@@ -105,8 +121,6 @@ def draw_particles(
     key: PRNGKeyArray,
     population: Population,
     exact: Exact,
-    flatness: Float[Array, " particles"],
-    scatter: Scatter,
     candidates: int = 1,
 ) -> ParticleDraws:
     """Draw the particles' parameters given each draw of the population, and compare with the exact likelihood.
@@ -115,19 +129,17 @@ def draw_particles(
         key: random key.
         population: draws, every field with a leading axis.
         exact: the tests.
-        flatness: of the particles.
-        scatter: what scatters.
         candidates: how many to draw and choose from; 0 draws one and does not look at the exact likelihood.
     """
     draws = population.a.shape[0]
-    count = flatness.shape[0]
+    count = len(exact.tests)
 
     def one(arguments):
         key, at = arguments
         deviate, zeros, pick = jax.random.split(key, 3)
 
         def candidate(normal, normal_zero):
-            drawn = draw_latent(at, exact.summary, flatness, scatter, normal, normal_zero)
+            drawn = exact.draw(at, normal, normal_zero)
             ratio = jnp.zeros(count)
             if candidates:
                 truth = exact_log_likelihood(exact, drawn.latent, drawn.zero, at.log_noise)
@@ -135,30 +147,24 @@ def draw_particles(
                 proposal = -0.5 * (jnp.sum(normal**2, -1) + normal_zero**2) - drawn.log_volume
                 ratio = truth + prior - proposal - drawn.log_likelihood - jnp.log(exact.summary.zero_sd)
                 ratio = jnp.where(jnp.isfinite(ratio), ratio, -jnp.inf)
-            return drawn.latent, drawn.zero, ratio
+            return drawn.latent, drawn.zero, drawn.log_likelihood, ratio
 
         shape = (max(candidates, 1), count)
-        latent, zero, ratio = jax.vmap(candidate)(
-            jax.random.normal(deviate, (*shape, scatter.size)), jax.random.normal(zeros, shape)
+        latent, zero, likelihood, ratio = jax.vmap(candidate)(
+            jax.random.normal(deviate, (*shape, exact.scatter.size)), jax.random.normal(zeros, shape)
         )
-        likelihood = marginal_likelihood(at, exact.summary, flatness, scatter)
         if candidates <= 1:
-            return ParticleDraws(latent[0], zero[0], likelihood, ratio[0])
+            return ParticleDraws(latent[0], zero[0], likelihood[0], ratio[0])
         chosen: Int[Array, " particles"] = jax.random.categorical(pick, jnp.maximum(ratio, -1e30), axis=0)
         mean = jax.scipy.special.logsumexp(ratio, axis=0) - jnp.log(candidates)
 
         def take(values):
             return jnp.take_along_axis(values, chosen.reshape(1, count, *[1] * (values.ndim - 2)), axis=0)[0]
 
-        return ParticleDraws(take(latent), take(zero), likelihood, mean)
+        return ParticleDraws(take(latent), take(zero), likelihood[0], mean)
 
     batch = max(1, min(draws, 40_000 // (count * max(candidates, 1))))
     return jax.lax.map(one, (jax.random.split(key, draws), population), batch_size=batch)
-
-
-def exact_of(fit: JointFit, tests: Tests, zero_sd: Float[Array, ""], unloading: Unloading) -> Exact:
-    """The exact likelihood that belongs to a fit."""
-    return Exact(tests, fit.filters, fit.summary, zero_sd, unloading)
 
 
 @compiled
@@ -168,8 +174,6 @@ def sample_joint(
     covariance: Float[Array, "d d"],
     numbers: PriorNumbers,
     exact: Exact,
-    flatness: Float[Array, " particles"],
-    scatter: Scatter,
     *,
     chains: int,
     warmup: int,
@@ -188,12 +192,12 @@ def sample_joint(
     The sampler's coordinates of a particle are standard normal numbers that `draw_latent` maps to its deviations and
     zero; the volume of that map is part of the density, which is therefore the plain one, whatever the summaries are.
     """
-    d, count, k = mode.shape[0], flatness.shape[0], scatter.size
+    d, count, k = mode.shape[0], len(exact.tests), exact.scatter.size
 
     def place(position):
         free, rest = position[:d], position[d:].reshape(count, k + 1)
-        population, prior = from_free(free, numbers, scatter)
-        return population, prior, draw_latent(population, exact.summary, flatness, scatter, rest[:, :k], rest[:, k])
+        population, prior = from_free(free, numbers, exact.scatter)
+        return population, prior, exact.draw(population, rest[:, :k], rest[:, k])
 
     def log_density(position):
         population, prior, drawn = place(position)

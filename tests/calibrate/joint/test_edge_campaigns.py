@@ -180,6 +180,8 @@ def test_one_particle_alone(method):
         assert content["diagnostics"]["open_combinations"]
         assert content["a"]["sd"] is None
         assert content["particles"][0]["C1"]["sd"] is None
+        assert content["log_C1"]["sd"] == {"value": None, "sd": None, "interval_95": None}
+        assert any("nothing of the scatter" in note for note in content["warnings"])
     else:
         assert any("spread is mostly the prior" in note for note in content["warnings"])
         assert any("a is its prior" in note for note in content["warnings"])

@@ -13,7 +13,7 @@ from joint_cases import random_summary
 from mcc_jax import InputError, JointModel
 from mcc_jax.calibrate.joint import NormalPrior, Priors
 from mcc_jax.calibrate.joint._fit import population_at, prior_numbers
-from mcc_jax.calibrate.joint._mode import PriorNumbers, from_free, log_posterior, most_probable, recentred, to_free
+from mcc_jax.calibrate.joint._mode import PriorNumbers, Target, from_free, most_probable, recentred, to_free
 from mcc_jax.calibrate.joint._population import Population
 
 PLAIN = JointModel().scatter
@@ -129,7 +129,7 @@ def summary():
 
 @pytest.fixture(scope="module")
 def posterior(summary):
-    return jax.jit(jax.value_and_grad(lambda f: log_posterior(f, NUMBERS, summary, FLAT, PLAIN)))
+    return jax.jit(jax.value_and_grad(Target(NUMBERS, summary, PLAIN).log_density))
 
 
 @settings(max_examples=60)
@@ -169,7 +169,7 @@ def test_a_prior_of_a_that_contradicts_the_shapes_is_told_or_survived(mean, flat
 def mode(summary):
     numbers = NUMBERS
     start = to_free(1.0, 9.2, np.array([1.8, 1.1, 1.0]), np.array([0.3, 0.1, 0.2]), numbers, PLAIN)
-    return start, most_probable(start, numbers, summary, FLAT, PLAIN)
+    return start, most_probable(start, Target(numbers, summary, PLAIN))
 
 
 def test_the_mode_is_one(posterior, mode):
@@ -199,7 +199,7 @@ def test_the_start_does_not_matter(summary, mode):
     _, (free, covariance, _) = mode
     width = np.sqrt(np.diag(np.asarray(covariance)))
     elsewhere = to_free(3.0, 8.0, np.array([1.0, 0.9, 0.7]), np.array([0.6, 0.3, 0.4]), NUMBERS, PLAIN)
-    again, _, converged = most_probable(elsewhere, NUMBERS, summary, FLAT, PLAIN)
+    again, _, converged = most_probable(elsewhere, Target(NUMBERS, summary, PLAIN))
     assert converged
     expected, found = np.asarray(free).copy(), np.asarray(again).copy()
     expected[6:], found[6:] = np.abs(expected[6:]), np.abs(found[6:])
