@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -126,10 +128,8 @@ def test_faster_loading_is_harder():
     """At one force the displacement falls with the rate, or is that of the reference rate."""
     time = jnp.linspace(0.0, 1.0, 60)
     for variant in LIBRARY["rate_dependence"]:
-        ends = []
-        for seconds in (1000.0, 30.0):
-            record = clean_record(200.0 * time, seconds * time)
-            ends.append(float(respond(variant, variant.typical, record=record)[-1]))
+        records = jax.vmap(lambda seconds: clean_record(200.0 * time, seconds * time))(jnp.asarray([1000.0, 30.0]))
+        ends = jax.vmap(lambda record, v=variant: respond(v, v.typical, record=record))(records)[:, -1]
         assert ends[1] < ends[0] - 0.1, variant.name
 
 
@@ -250,13 +250,15 @@ def test_friction_and_hardening_meet_the_stress_they_say():
 def test_dry_air_hardens_and_an_unknown_humidity_does_nothing():
     variants = [v for v in LIBRARY["humidity"] if v.name in ("C1", "flow", "flow_and_modulus", "flow_linear")]
     for variant in variants:
-        ends = []
-        for humidity in (20.0, 45.0, 70.0):
-            record = clean_record(FORCE, TIME, relative_humidity=jnp.asarray(humidity))
-            ends.append(float(respond(variant, variant.typical, record=record).max()))
-        assert ends[0] < ends[1] < ends[2]
-        record = clean_record(FORCE, TIME)
-        np.testing.assert_allclose(respond(variant, variant.typical, record=record), base(record), rtol=1e-12)
+
+        def response(humidity, variant=variant):
+            record = eqx.tree_at(lambda r: r.relative_humidity, RECORD, humidity)
+            return respond(variant, variant.typical, record=record)
+
+        dry, reference, wet = jax.vmap(response)(jnp.asarray([20.0, 45.0, 70.0]))
+        assert dry.max() < reference.max() < wet.max()
+        np.testing.assert_allclose(reference, base(RECORD), rtol=1e-12)
+    assert clean_record(FORCE, TIME).relative_humidity == 45
 
 
 def test_a_stiff_platen_does_not_give_way():
