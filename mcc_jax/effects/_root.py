@@ -34,11 +34,11 @@ def increasing_root(function: Callable[[Scalar], Scalar], start: Scalar) -> Scal
 
     def wider(carry: tuple) -> tuple:
         _, _, high, f_high, steps = carry
-        up = 2 * high
+        up = jnp.where(steps == 0, start, 2 * high)
         return high, f_high, up, function(up), steps + 1
 
     low, f_low, high, f_high, _ = jax.lax.while_loop(
-        lambda c: (c[3] < 0) & (c[4] < MOST_DOUBLINGS), wider, (zero, below, start, function(start), 0)
+        lambda c: (c[3] < 0) & (c[4] < MOST_DOUBLINGS), wider, (zero, below, zero, below, 0)
     )
     eps = jnp.finfo(start.dtype).eps
 
