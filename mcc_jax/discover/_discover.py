@@ -50,7 +50,7 @@ def discover(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> Discovery:
-    """Find where the law and a campaign disagree, name the missing effect, and show on held-out particles that it helps.
+    """Find where law and campaign disagree, name what is missing, and show on held-out particles that it helps.
 
     Args:
         campaign: the tests.
@@ -189,7 +189,7 @@ def _judge(
     further: list[dict[str, Any]] = []
     if experiments and gap:
         tell("next experiments")
-        further = next_experiments(base, system, chosen, sets, missing)
+        further = next_experiments(base, system, chosen, sets)
     with_all = np.concatenate([inside, words]).astype(int)
     found = Discovery(
         verdict=verdict,
@@ -377,6 +377,7 @@ def _notes(base: Base, system: System) -> list[str]:
             notes.append(f"particle {name!r} {reason}")
     if int(system.usable.sum()) < FEWEST:
         notes.append(
-            f"{int(system.usable.sum())} usable particles: their scatter says nothing, significance rests on the noise model"
+            f"{int(system.usable.sum())} usable particles: their scatter says nothing, so significance rests on the "
+            "noise model"
         )
     return notes

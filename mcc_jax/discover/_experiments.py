@@ -34,14 +34,13 @@ MENU = (
 
 
 def next_experiments(
-    base: Base, system: System, chosen: list[int], sets: list[tuple[str, ...]], missing: list[dict[str, str]]
+    base: Base, system: System, chosen: list[int], sets: list[tuple[str, ...]]
 ) -> list[dict[str, Any]]:
     """For every effect with rivals, the tests by the probability that they separate it from the closest one.
 
     The separation of the added effect from a rival is the chi2 that the rival cannot explain if the effect is as large
     as estimated; a rival falls out of the set when it is less probable by the factor that defines the set.
     """
-    del missing
     needed = [
         (k, [n for n in names if n != system.candidates[k].mechanism]) for k, names in zip(chosen, sets, strict=True)
     ]
@@ -82,14 +81,12 @@ def next_experiments(
 
 def _separation(system: System, k: int, rival: str) -> float:
     """chi2 per squared amplitude of a candidate that no formula of the rival explains."""
-    own = np.array([system.column(k)])
     view = project(system, system.candidate_columns)
     both = view.information.sum(0)
     least = both[k, k]
     for j, candidate in enumerate(system.candidates):
         if candidate.mechanism == rival and view.survival[j] > 1e-6:
             least = min(least, both[k, k] - both[k, j] ** 2 / both[j, j])
-    del own
     return max(float(least), 0.0)
 
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..calibrate.joint._linearised import linear_data, summarise
-from ..calibrate.joint._mode import most_probable
+from ..calibrate.joint._mode import Target, most_probable
 from ..calibrate.joint._noise import estimate_noise, particle_scales
 from ._score import project
 from ._system import Base, Signals, System
@@ -57,19 +57,18 @@ def refined(base: Base, system: System, signals: Signals) -> tuple[Base, bool]:
     gap = jnp.einsum("k,nkp->np", jnp.asarray(theta), signals.of(columns))
     data = eqx.tree_at(lambda d: d.residual, data, jnp.where(tests.mask, data.residual + gap, 0.0))
     priors = model.beliefs
-    noise, log_sd, fine = estimate_noise(data, priors.noise, fit.noise, uncertainty=False)
+    noise, _, fine = estimate_noise(data, priors.noise, fit.noise, uncertainty=False)
     summary, filters = summarise(fit.latent, fit.zero, tests, data, noise, zero_sd)
     old = np.asarray(noise.scale)
     scale = particle_scales(old, np.asarray(summary.squares), np.asarray(summary.count) - 4)
     if np.any(scale != old):
         noise = eqx.tree_at(lambda n: n.scale, noise, jnp.asarray(scale))
         summary, filters = summarise(fit.latent, fit.zero, tests, data, noise, zero_sd)
-    mode, covariance, reached = most_probable(fit.mode, fit.numbers, summary, tests.flatness, model.scatter)
+    mode, covariance, reached = most_probable(fit.mode, Target(fit.numbers, summary, model.scatter))
     converged = np.asarray(fit.converged) & np.array([True, fine, reached])
     new = eqx.tree_at(
         lambda f: (f.noise, f.filters, f.summary, f.mode, f.covariance, f.converged),
         fit,
         (noise, filters, summary, mode, covariance, converged),
     )
-    del log_sd
     return replace(base, fit=new), True

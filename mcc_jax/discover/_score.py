@@ -1,7 +1,7 @@
 r"""Score tests on Gram matrices: which effects the residuals ask for, and how surely.
 
-For the candidate's column d, made orthogonal to the population's parameters and the effects already in the law, particle
-i contributes the score :math:`s_i = d_i^T M_i r_i` and the information :math:`h_i = d_i^T M_i d_i`; then
+For the candidate's column d, made orthogonal to the population's parameters and the effects already in the law,
+particle i contributes the score :math:`s_i = d_i^T M_i r_i` and the information :math:`h_i = d_i^T M_i d_i`; then
 
 .. math:: \hat\theta = \sum s_i / \sum h_i, \quad \text{SE} = (\sum h_i)^{-1/2}, \quad
     t = \sum s_i / (\sum s_i^2)^{1/2}.

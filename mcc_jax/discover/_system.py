@@ -23,10 +23,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..calibrate import JointModel
-from ..calibrate._predict import point_noise_um
 from ..calibrate.joint._compile import compiled
-from ..calibrate.joint._data import Selection, Tests, select_tests
-from ..calibrate.joint._fit import JointFit, fit_joint, population_at
+from ..calibrate.joint._data import Selection, Tests
+from ..calibrate.joint._fit import JointFit, population_at, prepare
 from ..calibrate.joint._forward import law_of, snap
 from ..calibrate.joint._linearised import linear_data
 from ..calibrate.joint._population import moments
@@ -122,9 +121,7 @@ def base_fit(
     campaign: Campaign, model: JointModel, *, threshold_MPa: float, tell: Callable[[str], None] = lambda _: None
 ) -> Base:
     """Fit the base law with everything natural free: every particle's coefficients and modulus, and the noise."""
-    selection = select_tests(campaign, threshold_MPa=threshold_MPa)
-    read_out = float(np.median([point_noise_um(campaign.curves[i]) for i in selection.kept]))
-    fit = fit_joint(selection.tests, model, read_out, tell=tell)
+    selection, _, fit = prepare(campaign, model, threshold_MPa, tell=tell)
     return Base(campaign, selection, model, fit, _records(campaign, selection))
 
 
