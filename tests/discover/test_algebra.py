@@ -31,9 +31,7 @@ def test_projection_is_generalised_least_squares(seed, inside, some):
     chosen = np.array([0, 2, 3, 6]) if some else np.arange(7)
     nuisance = [*system.globals, *(system.column(k) for k in inside)]
     looked_at = np.array([system.column(k) for k in range(len(FORMULAS)) if k not in inside])
-    view = project(
-        system, looked_at, inside=np.array(nuisance[G:], int), particles=chosen if some else None
-    )
+    view = project(system, looked_at, inside=np.array(nuisance[G:], int), particles=chosen if some else None)
     B, M = dense.stacked(nuisance, chosen)
     r, _ = dense.stacked([0], chosen)
     D, _ = dense.stacked(looked_at, chosen)
@@ -289,7 +287,7 @@ def test_evidence_is_finite_for_any_amount_of_information():
 
 
 def test_pairs_take_away_what_two_columns_together_do():
-    system, dense = random_campaign(8)
+    system, _ = random_campaign(8)
     view = project(system, system.candidate_columns)
     best = pairs(system, view)
     assert best

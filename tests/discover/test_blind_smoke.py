@@ -19,7 +19,7 @@ FEW = (
     "T2-creep.logarithmic-20-P0-0",
     "T6-reload_hysteresis-P0-0",
 )
-"""Two nulls, three exact formulas, one unlisted, one variant, one untestable; those of one protocol after each other."""
+"""Two nulls, three exact formulas, one unlisted, one variant, one untestable; each protocol in one go."""
 
 
 def answer(case, folder, **options):

@@ -1,4 +1,4 @@
-"""From curves to an answer: a hidden effect is named, nothing hidden is found to be nothing, and the rest is declared."""
+"""From curves to an answer: a hidden effect is named, nothing hidden is nothing found, the rest is declared."""
 
 import json
 

@@ -55,7 +55,7 @@ def test_an_effect_in_three_particles_only():
 
 
 def test_two_effects_that_cancel():
-    """Compliance and reverse plasticity pull in opposite directions: what is left is small, and must not be misnamed."""
+    """Compliance and reverse plasticity pull in opposite directions: what is left is small, not to be misnamed."""
     told = answer(campaign("frame_compliance=0.0004", "reverse_plasticity=0.001", seed=1))
     named = {name for names in told["candidate_set"] for name in names}
     assert told["verdict"] != "NAMED" or named & {"frame_compliance", "platen_sink_in", "reverse_plasticity"}

@@ -1,4 +1,4 @@
-"""The linear system against finite differences of the real forward model; noise estimated without what is systematic."""
+"""The linear system against differences of the real forward model; noise estimated without what is systematic."""
 
 import equinox as eqx
 import jax
@@ -34,7 +34,7 @@ def fitted():
 
 @pytest.fixture(scope="module")
 def whitened(fitted):
-    """Residual, deviations, zero, population and formulas of all particles by differences, whitened: lists of arrays."""
+    """Residual, deviations, zero, population and formulas of all particles by differences, whitened."""
     base, signals, _ = fitted
     fit, tests, scatter = base.fit, base.tests, base.model.scatter
     population = population_at(fit.mode, fit.numbers, scatter)
