@@ -147,7 +147,7 @@ def bent(whole, change):
 WRONG = {
     "negative frame compliance": ("frame_compliance", lambda c: -0.004 * c.force_mN),
     "negative creep in holds": ("creep", lambda c: -0.02 * np.log1p(c.time_s / 10) * c.force_mN / 100),
-    "negative reload lag": ("reload_hysteresis", lambda c: -0.3 * reloading(c)),
+    "a reload that gives back energy": ("reload_hysteresis", lambda c: 0.3 * reloading(c)),
 }
 
 
