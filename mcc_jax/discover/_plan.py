@@ -158,10 +158,9 @@ def power(
     from ..calibrate.joint._fit import population_at
     from ..calibrate.joint._population import moments
     from ..campaign import particle_batch
-    from ..geometry import Particle
 
     particles = particle_batch(diameters_um)
-    flat = eqx.filter_vmap(Particle.flatness.fget)(particles)  # pyright: ignore[reportAttributeAccessIssue]
+    flat = eqx.filter_vmap(lambda particle: particle.flatness)(particles)
     population = population_at(base.fit.mode, base.fit.numbers, base.model.scatter)
     latent, _ = moments(population, flat, base.model.scatter)
     laws = eqx.filter_vmap(lambda w: law_of(w, base.model.unloading))(latent)
