@@ -80,7 +80,7 @@ def discover(
         The answer; "nothing is missing" and "cannot tell" are answers, too.
 
     Raises:
-        InputError: if no particle can be used, or a name to exclude is not known.
+        InputError: if no particle can be used, a name to exclude is not known, or no mechanism is left to look for.
     """
     started = time.perf_counter()
     tell = progress or (lambda _: None)
@@ -93,6 +93,8 @@ def discover(
     assumed = JointModel(assumed.unloading, assumed.strain_scaling, True, assumed.shape_scatter, assumed.priors)
     base = base_fit(campaign, assumed, threshold_MPa=threshold_MPa, tell=tell)
     testable, missing = untestable(without_punch(known, base), present(campaign))
+    if not testable:
+        raise InputError("no mechanism is left to look for", remedy="Exclude fewer, or measure what the others need.")
     if not bool(np.all(np.asarray(base.fit.converged)[1:])) or not _mostly_converged(base):
         return _not_converged(base, missing, seed, started)
     tell("signatures of all effects")

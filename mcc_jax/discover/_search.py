@@ -196,7 +196,7 @@ def pairs(system: System, projection: Projection) -> list[tuple[float, int, int]
         i, j = np.unravel_index(flat, gain.shape)
         if not np.isfinite(gain[i, j]):
             break
-        key = (min(names[i], names[j]), max(names[i], names[j]))
+        key = (str(min(names[i], names[j])), str(max(names[i], names[j])))
         if key not in best:
             best[key] = (float(gain[i, j]), int(i), int(j))
     return sorted(best.values(), reverse=True)
