@@ -18,16 +18,16 @@ ENOUGH = 0.9
 MOST_PARTICLES = 200
 
 MENU = (
-    Plan("a hold of 60 s at the largest load", (Programme.cycles(hold_s=60, points=POINTS),)),
+    Plan("a hold of 60 s at the largest load", (Programme.cycles(hold_s=60.0, points=POINTS),)),
     Plan(
         "a cycle at half load, a hold of 60 s at the largest load, and a reload",
-        (Programme.cycles(levels=(0.5, 1.0, 1.0), unload_to=0.3, hold_s=60, points=POINTS),),
+        (Programme.cycles(levels=(0.5, 1.0, 1.0), unload_to=0.3, hold_s=60.0, points=POINTS),),
     ),
     Plan(
         "two loading rates, every second particle ten times faster, with a cycle and a hold",
         (
-            Programme.cycles(levels=(0.5, 1.0, 1.0), unload_to=0.3, hold_s=60, points=POINTS),
-            Programme.cycles(levels=(0.5, 1.0, 1.0), unload_to=0.3, hold_s=60, rate=20.0, points=POINTS),
+            Programme.cycles(levels=(0.5, 1.0, 1.0), unload_to=0.3, hold_s=60.0, points=POINTS),
+            Programme.cycles(levels=(0.5, 1.0, 1.0), unload_to=0.3, hold_s=60.0, rate=20.0, points=POINTS),
         ),
     ),
 )

@@ -63,7 +63,8 @@ def plot_where(found: Discovery) -> Figure:
     ax.set_xlabel("force over the test's largest force [-]")
     ax.tick_params(axis="y", length=0)
     ax.spines[:].set_visible(False)
-    figure.colorbar(colours, ax=ax, label="share of the systematic gap [-]")
+    what = "share of what noise leaves [-]" if found.verdict == "NO_GAP" else "share of the systematic gap [-]"
+    figure.colorbar(colours, ax=ax, label=what)
     title = "Where law and tests disagree"
     if found.verdict == "NO_GAP":
         title += ": nowhere beyond noise"

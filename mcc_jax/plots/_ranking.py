@@ -33,9 +33,10 @@ def plot_ranking(found: Discovery) -> Figure:
     """Every mechanism's statistic [-]: the estimate of its best formula alone over its standard error.
 
     The dashed line is the detection limit: a mechanism whose true strength reaches it is found with 95 % probability.
-    Beside each bar stand the estimate, the limit in the mechanism's own unit, and its probability among all. Bars of
-    the set (what explains the gap as well as the best) are dark. Mechanisms that these data cannot show stand below,
-    grey, with what they need.
+    Beside each bar stand its probability among all, the estimate, and the limit in the mechanism's own unit. Bars of
+    the set (what explains the gap as well as the best) are blue. An empty bar is an estimate of the physically
+    impossible sign, which explains nothing. Mechanisms that these data cannot show stand below, grey, with what they
+    need.
     """
     assert found.ranking is not None
     assert found.system is not None
@@ -47,21 +48,31 @@ def plot_ranking(found: Discovery) -> Figure:
     figure = new_figure(9.4, 1.3 + 0.235 * rows)
     ax = figure.subplots()
     values = np.array([abs(e["statistic"]) for e in entries])
+    signs = [found.system.candidates[k].variant.sign for k in found.ranking.best]
+    any_impossible = False
     labels = []
     scale = max(float(values.max(initial=0.0)), 1.6 * DETECTABLE)
     for row, entry in enumerate(entries):
         name = entry["mechanism"]
         colour = BLUE if name in named else SKY if name in members else PALE
-        ax.barh(row, values[row], height=0.66, color=colour)
+        impossible = signs[row] * entry["statistic"] < 0
+        ax.barh(
+            row, values[row], height=0.66, color="white" if impossible else colour,
+            edgecolor=PALE if impossible else colour, linewidth=0.9,
+        )  # fmt: skip
+        any_impossible = any_impossible or impossible
         labels.append(plain_name(name))
         unit = entry["unit"]
-        text = f"{_with_unit(entry['estimate'], unit)}  (limit {_with_unit(entry['detection_limit'], unit)})"
-        ax.text(1.02, row, text, transform=ax.get_yaxis_transform(), va="center", fontsize=7.5)
         chance = f"{entry['probability']:.2f}" if entry["probability"] >= 0.005 else "< 0.01"
-        ax.text(1.5, row, chance, transform=ax.get_yaxis_transform(), va="center", ha="right", fontsize=7.5)
+        ax.text(1.1, row, chance, transform=ax.get_yaxis_transform(), va="center", ha="right", fontsize=7.5)
+        text = f"{_with_unit(entry['estimate'], unit)}  (limit {_with_unit(entry['detection_limit'], unit)})"
+        ax.text(1.13, row, text, transform=ax.get_yaxis_transform(), va="center", fontsize=7.5)
+    patch = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
     for row, missing in enumerate(found.untestable, start=len(entries)):
         labels.append(plain_name(missing["mechanism"]))
-        ax.text(0.012 * scale, row, f"needs {missing['needs']}", va="center", fontsize=7.5, color=GREY)
+        ax.text(
+            0.012 * scale, row, f"needs {missing['needs']}", va="center", fontsize=7.5, color=GREY, zorder=5, bbox=patch
+        )
     ax.axvline(DETECTABLE, color=BLACK, linestyle="--", linewidth=1.0)
     ax.set_yticks(range(rows), labels)
     for tick in ax.get_yticklabels()[len(entries) :]:
@@ -71,15 +82,19 @@ def plot_ranking(found: Discovery) -> Figure:
     ax.tick_params(axis="y", length=0)
     ax.set_xlabel("|estimate| / standard error, each mechanism alone [-]")
     header = {"transform": ax.transAxes, "va": "bottom", "fontsize": 8, "color": GREY}
-    ax.text(1.02, 1.0, "estimate and detection limit", **header)
-    ax.text(1.5, 1.0, "probability", ha="right", **header)
+    ax.text(1.1, 1.0, "probability", ha="right", **header)
+    ax.text(1.13, 1.0, "estimate and detection limit", **header)
     handles: list[Line2D | Patch] = []
     if named:
         handles.append(Patch(color=BLUE, label="added to the law"))
     if members - named:
         handles.append(Patch(color=SKY, label="explains it as well"))
-    handles += [Patch(color=PALE, label="others"), Line2D([], [], color=BLACK, linestyle="--", label="detection limit")]
-    return finish(figure, found.base.campaign.metadata, title="What explains the gap", handles=handles)
+    handles.append(Patch(color=PALE, label="others"))
+    if any_impossible:
+        handles.append(Patch(facecolor="white", edgecolor=PALE, label="impossible sign"))
+    handles += [Line2D([], [], color=BLACK, linestyle="--", label="detection limit")]
+    title = "What could be missing: no gap was found" if found.verdict == "NO_GAP" else "What explains the gap"
+    return finish(figure, found.base.campaign.metadata, title=title, handles=handles)
 
 
 def likeness(found: Discovery) -> tuple[list[str], np.ndarray]:
