@@ -115,7 +115,7 @@ def likeness(found: Discovery) -> tuple[list[str], np.ndarray]:
                 best[effect.mechanism] = k
                 break
     index = np.array([best[name] for name in names])
-    view = project(system, np.array([system.column(k) for k in index]))
+    view = project(system, np.array([system.column(int(k)) for k in index]))
     estimate = np.sign(view.estimate)
     sign = np.array([system.candidates[k].variant.sign for k in index])
     sign = np.where(sign == 0, np.where(estimate == 0, 1.0, estimate), sign)
