@@ -61,7 +61,7 @@ def write_discovery(found: Discovery, stage: Stage, *, figures: bool, tell: Tell
 def say_discovery(content: dict[str, Any]) -> None:
     """Print verdict, summary, notes, and the head of the ranking."""
     say(f"Verdict: {content['verdict']}", bold=True)
-    for line in textwrap.wrap(content["summary"], 100):
+    for line in textwrap.wrap(content["summary"], 100, break_on_hyphens=False):
         say(line)
     for text in content["notes"]:
         say(f"Note: {text[:1].upper()}{text[1:].rstrip('.')}.", fg="yellow")
