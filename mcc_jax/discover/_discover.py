@@ -39,6 +39,10 @@ INDEPENDENT = 100
 LEVEL_OF_MORE = 0.01
 """Level at which something is missing besides the whole family of formulas of what was added."""
 
+BETTER, SHARE = 30.0, 0.1
+"""A formula of a few free words takes away this much chi2 more than any listed mechanism by chance and because no
+listed formula is nature's own, in addition this share of what the mechanism takes away. Beyond, it is not listed."""
+
 LIKE_THE_BEST = 0.1
 """A mechanism whose probability is at least this share of the best one's belongs to the set."""
 
@@ -295,11 +299,11 @@ def _name(base: Base, system: System, view: Projection, ranking: Ranking, seed: 
     absorbed = system.absorbing(family_columns(system, (top,))) if ranking.at_random[0] else system
     p_left = _left(absorbed, seed, [first])
     members = tuple(ranking.members(LIKE_THE_BEST))
-    if p_left > LEVEL_OF_MORE:
+    gain_of_words = pursue(system)[1]
+    short = gain_of_words - float(ranking.gain[0])
+    if p_left > LEVEL_OF_MORE and short <= BETTER + SHARE * float(ranking.gain[0]):
         return ("NAMED" if len(members) == 1 else "SET"), [first], [members], [ranking], None
     tell("a second effect")
-    span = _span(base)
-    words, gain_of_words = pursue(system)
     if ranking.at_random[0] and ranking.gain[0] > gain_of_words:
         return ("NAMED" if len(members) == 1 else "SET"), [first], [members], [ranking], None
     best_pairs = pairs(system, view)
@@ -310,14 +314,14 @@ def _name(base: Base, system: System, view: Projection, ranking: Ranking, seed: 
         both = tuple(system.candidates[k].mechanism for k in (i, j))
         p_both = _left(system, seed, [i, j])
         enough = p_both > LEVEL_OF_MORE
-        if enough and gain >= gain_of_words - 10 * len(words):
+        if enough and gain >= gain_of_words - BETTER:
             one = rank(system, project(system, system.candidate_columns, inside=np.array([system.column(j)])))
             two = rank(system, project(system, system.candidate_columns, inside=np.array([system.column(i)])))
             sets = [_with(both[0], one), _with(both[1], two)]
             verdict: Verdict = "NAMED" if all(len(s) == 1 for s in sets) else "SET"
             return verdict, [i, j], sets, [one, two], None
     tell("a formula of its own")
-    closure = find_closure(system, span, seed, tell=tell)
+    closure = find_closure(system, _span(base), seed, tell=tell)
     if closure is None:
         return ("NAMED" if len(members) == 1 else "SET"), [first], [members], [ranking], None
     return "UNLISTED", [], [], [], closure
