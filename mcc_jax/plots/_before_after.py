@@ -27,7 +27,7 @@ def _shade(ax: Axes, time: np.ndarray, kind: np.ndarray) -> set[int]:
         code = int(kind[part[0]])
         if code in SHADES and len(part) > 1:
             begin = max(part[0] - 1, 0)
-            ax.axvspan(time[begin], time[part[-1]], color=SHADES[code], linewidth=0, zorder=0)
+            ax.axvspan(float(time[begin]), float(time[part[-1]]), color=SHADES[code], linewidth=0, zorder=0)
             seen.add(code)
     return seen
 

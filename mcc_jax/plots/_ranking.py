@@ -135,7 +135,7 @@ def plot_similarity(found: Discovery) -> Figure:
     figure = new_figure(3.6 + 0.42 * count, 2.6 + 0.36 * count)
     ax = figure.subplots()
     colours = ScalarMappable(Normalize(-1, 1), colormaps["PuOr_r"])
-    ax.imshow(both, cmap=colours.cmap, norm=colours.norm, aspect="auto")
+    ax.imshow(both, cmap=colours.cmap, vmin=-1, vmax=1, aspect="auto")
     for i in range(count):
         for j in range(count):
             dark = abs(both[i, j]) > 0.65
