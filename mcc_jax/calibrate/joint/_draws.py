@@ -105,12 +105,17 @@ def draw_fast(key: Array, tests: Tests, model: JointModel, fit: JointFit, length
     scatter = replace(model.scatter, newton=newton_steps(fit, tests, model))
     target = Target(fit.numbers, fit.summary, scatter)
     population_key, particle_key, check_key, pick_key = jax.random.split(key, 4)
-    for accept in ACCEPT:
-        run, population = sample_population(
+
+    def sampled(accept: float) -> tuple[Chains, Population]:
+        return sample_population(
             population_key, fit.mode, fit.covariance, target, jnp.asarray(accept), **length._asdict()
         )
+
+    run, population = sampled(ACCEPT[0])
+    for accept in ACCEPT[1:]:
         if not np.any(np.asarray(run.divergent)):
             break
+        run, population = sampled(accept)
     count = len(tests)
     exact = Exact(tests, fit.filters, fit.summary, scatter, model.zero_sd, model.unloading)
     stride = _stride(count, length.total)
