@@ -32,7 +32,7 @@ def found():
     hidden = {"frame": (HiddenEffect(find_variant("frame_compliance"), 0.004),), "null": ()}
     return {
         kind: discover(
-            simulate_campaign(laws, sizes, peaks, programme, instrument=instrument, effects=effects, seed=3),
+            simulate_campaign(laws, sizes, peaks, programme, instrument=instrument, effects=effects, seed=5),
             library=library,
             experiments=False,
         )
