@@ -199,7 +199,10 @@ def _left(system: System, seed: int, chosen: list[int]) -> float:
     keep = view.survival > (1e-6 if not len(inside) else 1e-2)
     if not keep.any():
         return 1.0
-    return _probability(view.scores[:, keep], view.total[keep], sign[keep], seed)
+    scores, total, signs = view.scores[:, keep], view.total[keep], sign[keep]
+    found = _probability(scores, total, signs, seed)
+    # The scatter of few particles cannot be surer than their number of signs allows, however strong a second effect is.
+    return min(found, 2 * _by_noise_model(scores, total, signs)) if chosen else found
 
 
 def _family(system: System, chosen: list[int]) -> tuple[np.ndarray, np.ndarray]:
