@@ -15,7 +15,7 @@ FEW = (
     "T1-thermal_drift.exact-20-P1-0",
     "T1-creep.exact-20-P1-0",
     "T1-reverse_plasticity.exact-20-P1-0",
-    "T4-gauge_interpolation.unlisted-20-P1-1",
+    "T4-mid_unloading_bump.unlisted-20-P1-1",
     "T2-creep.logarithmic-20-P0-0",
     "T6-reload_hysteresis-P0-0",
 )
