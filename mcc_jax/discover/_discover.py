@@ -21,9 +21,9 @@ from ._confirm import held_out
 from ._experiments import next_experiments
 from ._refine import refined
 from ._result import Discovery, Effect, Verdict
-from ._score import Projection, family_wise, flips, project
+from ._score import DETECTABLE, Projection, family_wise, flips, project
 from ._search import Ranking, family_columns, pairs, random_probability, rank
-from ._system import GLOBALS, Base, Signals, System, base_fit, build_system, signals_of
+from ._system import GLOBALS, Base, System, base_fit, build_system, signals_of
 from ._where import where
 from ._words import summary_of
 
@@ -106,7 +106,7 @@ def discover(
         if not changed:
             break
         system = build_system(base, signals)
-    return _judge(base, signals, system, missing, confirm, experiments, seed, started, tell)
+    return _judge(base, system, missing, confirm, experiments, seed, started, tell)
 
 
 def without_punch(library: Mapping[str, Mechanism], base: Base) -> dict[str, Mechanism]:
@@ -208,6 +208,8 @@ def _left(system: System, seed: int, chosen: list[int]) -> float:
 def _family(system: System, chosen: list[int]) -> tuple[np.ndarray, np.ndarray]:
     """Columns of the families of some candidates, and how tightly each is held to zero."""
     own = np.array([system.column(k) for k in chosen], int)
+    if not chosen:
+        return own, np.zeros(0)
     theta = project(system, own[:0], inside=own).theta[len(system.globals) :]
     strength = project(system, system.candidate_columns).total
     columns, precision = list(own), [1e-12] * len(own)
@@ -234,7 +236,7 @@ def _by_noise_model(scores: np.ndarray, total: np.ndarray, sign: np.ndarray) -> 
 
 
 def _judge(
-    base: Base, signals: Signals, system: System, missing, confirm: bool, experiments: bool, seed: int, started, tell
+    base: Base, system: System, missing, confirm: bool, experiments: bool, seed: int, started, tell
 ) -> Discovery:
     tell("is something missing")
     view = project(system, system.candidate_columns)
@@ -312,8 +314,6 @@ def _name(base: Base, system: System, view: Projection, ranking: Ranking, seed: 
     best_pairs = pairs(system, view)
     if best_pairs and not ranking.at_random[0]:
         gain, i, j = best_pairs[0]
-        if view.scores[:, j].sum() ** 2 / view.total[j] > view.scores[:, i].sum() ** 2 / view.total[i]:
-            i, j = j, i
         both = tuple(system.candidates[k].mechanism for k in (i, j))
         p_both = _left(system, seed, [i, j])
         enough = p_both > LEVEL_OF_MORE
@@ -349,8 +349,6 @@ def _chooser(system: System, count: int, formula: bool) -> Callable[[np.ndarray]
         if not found:
             return [empty] * (count + 1)
         _, i, j = found[0]
-        if view.scores[:, j].sum() ** 2 / view.total[j] > view.scores[:, i].sum() ** 2 / view.total[i]:
-            i, j = j, i
         return [empty, np.array([system.column(i)]), np.array([system.column(i), system.column(j)])]
 
     return choose
@@ -383,10 +381,6 @@ def _effects(system: System, chosen: list[int], steps: list[Ranking], p_any: flo
             )
         )
     return tuple(found)
-
-
-DETECTABLE = 4.6
-"""Estimate over standard error that is found with 95 % probability at the family-wise level."""
 
 
 def _limits(system: System, view: Projection, ranking: Ranking) -> dict[str, tuple[float, float, float]]:

@@ -69,7 +69,9 @@ def next_experiments(
             ]
             if not rivals or not same:
                 continue
-            view = views.setdefault(name, project(other, other.candidate_columns))
+            if name not in views:
+                views[name] = project(other, other.candidate_columns)
+            view = views[name]
             least = min(_separation(other, view, same[0], rival) for rival in rivals)
             per_particle = least * amplitude**2 / other.usable.sum()
             count = int(system.usable.sum())

@@ -21,6 +21,9 @@ from ._system import System
 
 FLIPS = 4000
 
+DETECTABLE = 4.6
+"""Estimate over standard error that is found with 95 % probability at the family-wise level."""
+
 
 @dataclass(frozen=True)
 class Projection:

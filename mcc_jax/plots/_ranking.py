@@ -11,11 +11,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from ..discover import Discovery
-from ..discover._score import project
+from ..discover._score import DETECTABLE, project
 from ._style import BLACK, BLUE, GREY, PALE, SKY, finish, new_figure, styled
 
 MOST_ALIKE = 10
-DETECTABLE = 4.6
 """Where the detection limit lies on the axis of statistics; `Discovery.limits` is made with the same number."""
 
 
