@@ -19,20 +19,14 @@ hypothesis.settings.load_profile("repository")
 def pytest_configure(config):
     """What took long to compile is kept for later modules, notebooks and commands, until this run of pytest ends.
 
-    All workers share one folder. With a limit on its size JAX locks it: none reads what another has half written.
+    Every worker has a folder of its own: JAX writes entries in place, and another process might read half of one.
     """
-    if hasattr(config, "workerinput"):
-        return  # the environment says it all
     folder = tempfile.mkdtemp(prefix="compiled-")
     config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
-    settings = {
-        "jax_compilation_cache_dir": folder,
-        "jax_compilation_cache_max_size": 4 * 2**30,
-        "jax_persistent_cache_min_compile_time_secs": 0.1,
-    }
+    settings = {"jax_compilation_cache_dir": folder, "jax_persistent_cache_min_compile_time_secs": 0.1}
     for name, value in settings.items():
         jax.config.update(name, value)
-        os.environ[name.upper()] = str(value)  # for workers, and for processes that tests start
+        os.environ[name.upper()] = str(value)  # for processes that tests start
 
 
 @pytest.fixture(scope="module", autouse=True)
