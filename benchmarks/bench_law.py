@@ -5,12 +5,16 @@ Run `uv run --group bench python benchmarks/bench_law.py`; `--write` keeps the t
 - contacts: many contacts, one step each, every contact with its own law, size and history: what a particle code does.
 - paths: many particles along a path of loading, unloading and reloading: what a calibration does.
 
+The library's rows run as its docs advise for very many contacts (`mcc_jax.in_blocks`): a block that fits the cache at a
+time, on one device for each core. `--plain` times them under `jax.vmap` alone instead.
+
 Rows take turns, so that other work on the machine falls on all of them; a ratio is the median over the rounds.
 Compilation is timed apart. The references are checked to give the same forces.
 """
 
 from __future__ import annotations
 
+import functools
 import os
 import time
 
@@ -22,10 +26,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from mcc_jax import in_blocks
 from mcc_jax.geometry import Particle
 from mcc_jax.law import History, MccLaw, Plastic
 
+BLOCK = 2048
 TARGETS = {"references": 1.5, "gradient": 3.0, "load control": 4.0, "traces": 1}
 
 
@@ -77,23 +84,20 @@ class Row:
 
 
 def compiled(name, function, *arguments):
-    """A row for the batched function, compiled beforehand, and its result."""
+    """A row for the compiled function and its result."""
     start = time.perf_counter()
-    call = jax.jit(jax.vmap(function)).lower(*arguments).compile()
+    call = jax.jit(function).lower(*arguments).compile()
     seconds = time.perf_counter() - start
     return Row(name, lambda: call(*arguments), seconds), call(*arguments)
 
 
-def gradient(name, function, argnums, *arguments):
-    """A row for the reverse-mode gradient of the sum of squared residuals."""
+def squared_residual(function):
+    """What a fit adds up, of one contact or one path."""
 
     def loss(law, particle, state, given, measured):
-        return jnp.sum((jax.vmap(function)(law, particle, state, given)[1] - measured) ** 2)
+        return jnp.sum((function(law, particle, state, given)[1] - measured) ** 2)
 
-    start = time.perf_counter()
-    call = jax.jit(jax.grad(loss, argnums)).lower(*arguments).compile()
-    seconds = time.perf_counter() - start
-    return Row(name, lambda: call(*arguments), seconds)
+    return loss
 
 
 def largest_difference(values, reference):
@@ -116,18 +120,21 @@ def traces(function, *arguments):
     return count
 
 
-def measure(kind, p, peak, given, displacement_control, load_control, numpy_arguments, repeats):
+def measure(kind, p, peak, given, displacement_control, load_control, numpy_arguments, repeats, block):
     """Rows, verdicts and accuracy of one kind of work."""
-    law, particle = modules(p)
+    devices = tuple(jax.devices())
+    many = jax.vmap if block is None else functools.partial(in_blocks, block=block, devices=devices)
     state, displacement = eqx.filter_vmap(History)(jnp.asarray(peak)), jnp.asarray(given)
-    forward, (_, force) = compiled(
-        displacement_control.__name__, displacement_control, law, particle, state, displacement
-    )
-    load, _ = compiled(load_control.__name__, load_control, law, particle, state, force)
-    measured = 1.1 * force
-    everything = (law, particle, state, displacement, measured)
-    by_law = gradient("gradient by law", displacement_control, 0, *everything)
-    by_rest = gradient("gradient by size, history, path", displacement_control, (1, 2, 3), *everything)
+    spread = NamedSharding(Mesh(np.array(devices), ("contacts",)), PartitionSpec("contacts"))
+    everything = (*modules(p), state, displacement)
+    everything = everything if block is None else jax.device_put(everything, spread)
+    law, particle, state, displacement = everything
+    forward, (_, force) = compiled(displacement_control.__name__, many(displacement_control), *everything)
+    load, _ = compiled(load_control.__name__, many(load_control), law, particle, state, force)
+    loss, measured = squared_residual(displacement_control), 1.1 * force
+    by_law, _ = compiled("gradient by law", many(jax.grad(loss, 0)), *everything, measured)
+    rest = many(jax.grad(loss, (1, 2, 3)))
+    by_rest, _ = compiled("gradient by size, history, path", rest, *everything, measured)
 
     arguments = (*p.values(), peak, given)
     references, accuracy = [], []
@@ -190,14 +197,18 @@ def main():
     parser.add_argument("--particles", type=int, default=10_000)
     parser.add_argument("--points", type=int, default=300, help="per path, a multiple of 3")
     parser.add_argument("--repeats", type=int, default=25)
+    parser.add_argument("--plain", action="store_true", help="jax.vmap instead of blocks")
     arguments = parser.parse_args()
+    if not arguments.plain:
+        jax.config.update("jax_num_cpu_devices", os.cpu_count())
     jax.config.update("jax_enable_x64", True)
     rng = np.random.default_rng(0)
 
     p = draw(rng, arguments.contacts)
     peak = reach(p) * rng.uniform(0.2, 0.6, arguments.contacts)
     given = peak * rng.uniform(0.96, 1.02, arguments.contacts)
-    contacts = measure("contacts", p, peak, given, step, step_load, (*p.values(), peak, given), arguments.repeats)
+    size = {"block": None if arguments.plain else BLOCK, "repeats": arguments.repeats}
+    contacts = measure("contacts", p, peak, given, step, step_load, (*p.values(), peak, given), **size)
 
     p = draw(rng, arguments.particles)
     ramp = np.linspace(0, 1, arguments.points // 3)
@@ -205,7 +216,8 @@ def main():
     given = (reach(p) * rng.uniform(0.4, 0.67, arguments.particles))[:, None] * shape
     peak = np.zeros(arguments.particles)
     columns = (*(v[:, None] for v in p.values()), peak[:, None], given)
-    paths = measure("paths", p, peak, given, path, path_load, columns, arguments.repeats)
+    size["block"] = None if arguments.plain else max(8 * BLOCK // arguments.points, 1)
+    paths = measure("paths", p, peak, given, path, path_load, columns, **size)
 
     rows, verdicts, accuracy = (a + b for a, b in zip(contacts, paths, strict=True))
     settings = {

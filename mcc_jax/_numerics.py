@@ -56,3 +56,13 @@ def horner(coefficients: tuple[float, ...], x: Float[Array, ...]) -> Float[Array
     for c in coefficients[1:]:
         value = value * x + c
     return value
+
+
+def shared(x: Values) -> Values:
+    """`x` itself, marked as cheap to use in several places.
+
+    XLA on a CPU keeps a quotient, root or logarithm out of the loop over the data of its users if it has more than one,
+    and passes it on through memory. Behind this identity (rounding to the precision it has) it stays in their loop.
+    """
+    kind = jnp.finfo(x.dtype)
+    return jax.lax.reduce_precision(x, kind.nexp, kind.nmant)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax.numpy as jnp
 
-from ._numerics import positive_pow
+from ._numerics import positive_pow, shared
 from ._types import Scalar, ScalarLike, Values, scalar
 
 
@@ -34,7 +34,7 @@ class Particle(eqx.Module):
     @property
     def effective_diameter(self) -> Scalar:
         """D_e = D1 D2 / D3 [um], the length that turns displacement into strain."""
-        return self.D1 * self.D2 / self.D3
+        return shared(self.D1 * self.D2 / self.D3)
 
     @property
     def effective_radius(self) -> Scalar:
@@ -54,15 +54,15 @@ class Particle(eqx.Module):
     @property
     def flatness(self) -> Scalar:
         """1 - D3^2 / (D1 D2) [-]: 0 for a sphere, towards 1 for a flake, negative for an upright particle."""
-        return 1 - self.D3**2 / (self.D1 * self.D2)
+        return shared(1 - self.D3 * self.D3 / (self.D1 * self.D2))
 
     def strain(self, displacement: Values) -> Values:
         """Effective strain gamma / D_e [-] of a platen displacement [um] (Bommireddy et al. 2018, eq. 4)."""
-        return displacement / self.effective_diameter
+        return shared(displacement / self.effective_diameter)
 
     def stress(self, force: Values) -> Values:
         """Effective stress F / (pi R_e^2) [MPa] of a force [mN] (Bommireddy et al. 2018, eq. 3)."""
-        return force * 1e3 / self.effective_area
+        return shared(force * 1e3 / self.effective_area)
 
     def displacement(self, strain: Values) -> Values:
         """Platen displacement [um] of an effective strain [-]."""

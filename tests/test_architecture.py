@@ -20,6 +20,7 @@ LAYERS = {
     "_numerics": LEAF,
     "_results": LEAF,
     "units": LEAF,
+    "_blocks": 1,
     "geometry": 1,
     "law": 2,
     "campaign": 3,

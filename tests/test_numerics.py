@@ -87,7 +87,7 @@ def test_running_max_in_a_batch():
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_horner(dtype):
+def test_polynomial(dtype):
     coefficients = (2.0, -1.0, 0.5, 3.0)
     x = jnp.linspace(-1, 1, 9, dtype=dtype)
     assert horner(coefficients, x).dtype == dtype

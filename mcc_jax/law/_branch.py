@@ -7,6 +7,7 @@ import functools
 import jax
 import jax.numpy as jnp
 
+from .._numerics import shared
 from .._types import Scalar, Values
 from ._loading_inverse import secant_modulus, tangent_modulus
 from ._recovery import stress_ratio
@@ -45,15 +46,17 @@ def _branch_force_jvp(power, primals, tangents):
     k1, k3, k5, c, peak, _ = primals
     dk1, dk3, dk5, dc, dpeak, ddrop = tangents
     secant, span, s, ratio = _branch(power, *primals)
+    s, ratio = jax.lax.optimization_barrier((s, ratio))
     force = peak * secant
     square = peak * peak
     inside = (s > 0) & (s < 1)
     s = jnp.where(inside, s, 0.0)
-    fall = jnp.where(inside, 4 / jnp.pi * jnp.sqrt((1 - s) * (1 + s)), 0.0)
+    fall = jnp.where(inside, 4 / jnp.pi * shared(jnp.sqrt((1 - s) * (1 + s))), 0.0)
     h = 0.5 * s * fall
     dforce = peak * (dk1 - square * (dk3 - square * dk5)) + tangent_modulus(k1, k3, k5, peak) * dpeak
     factor = jnp.where(secant > 0, ratio + power * h, 0.0)
-    return force * ratio, factor * dforce - h * secant * dpeak + h * force * (dc / c) - force * fall / span * ddrop
+    change = factor * dforce - h * secant * dpeak + shared(h * force / c) * dc - shared(force * fall / span) * ddrop
+    return force * ratio, jax.lax.optimization_barrier(change)
 
 
 def _branch(power, k1, k3, k5, c, peak, drop):
@@ -61,6 +64,6 @@ def _branch(power, k1, k3, k5, c, peak, drop):
     secant = secant_modulus(k1, k3, k5, peak)
     square = c * secant if power == 1 else c * peak * secant * secant
     carries = (peak > 0) & (square > 0)
-    span = jnp.sqrt(jnp.where(carries, square, 1.0))
-    s = jnp.where(carries, drop / span, 1.0)
+    span = shared(jnp.sqrt(jnp.where(carries, square, 1.0)))
+    s = jnp.where(carries, shared(drop / span), 1.0)
     return secant, span, s, jnp.where(drop <= 0, 1.0, stress_ratio(s))

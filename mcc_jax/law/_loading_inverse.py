@@ -16,6 +16,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from .._numerics import shared
 from .._types import Scalar, Values
 
 HALLEY_STEPS = 4
@@ -66,7 +67,7 @@ def loading_strain(K1: Scalar, K3: Scalar, K5: Scalar, stress: Values, floor: Sc
         squared = slope * slope
         divisor = jnp.maximum(squared - excess * half_curvature, 0.5 * squared)
         moves = (slope > noise) & (jnp.abs(excess) > rounding)
-        x = x - excess * slope / jnp.where(moves, divisor, jnp.inf)
+        x = x - shared(excess * slope / jnp.where(moves, divisor, jnp.inf))
     return x
 
 
@@ -80,12 +81,12 @@ def _loading_strain_jvp(primals, tangents):
     # At the peak of a curve that is not monotone the derivative is infinite; a floor keeps it finite.
     smallest = jnp.sqrt(jnp.finfo(x.dtype).eps) * K1
     change = dstress - x * dK1 + cube * dK3 - x * x * cube * dK5
-    return x, jnp.where(stress >= 0, change / jnp.where(slope > smallest, slope, smallest), 0.0)
+    return x, jnp.where(stress >= 0, shared(change / jnp.where(slope > smallest, slope, smallest)), 0.0)
 
 
 def _root(x: Values) -> Values:
     """Square root of the positive part, for code that is never differentiated."""
-    return jnp.sqrt(jnp.maximum(x, 0.0))
+    return shared(jnp.sqrt(jnp.maximum(x, 0.0)))
 
 
 def _start(K1: Scalar, K3: Scalar, K5: Scalar, target: Values, floor: Scalar) -> Values:
@@ -94,7 +95,7 @@ def _start(K1: Scalar, K3: Scalar, K5: Scalar, target: Values, floor: Scalar) ->
     discriminant = 9 * K3 * K3 - 20 * K1 * K5
     falls = discriminant > 0
     # Square of the scaled strain at the peak, the smaller root of the slope, without cancellation and division by K5.
-    y = 2 * K1 / (3 * K3 + _root(discriminant) + tiny)
+    y = shared(2 * K1 / (3 * K3 + _root(discriminant) + tiny))
     peak = _root(y)
     drop = peak * (K1 - y * (K3 - y * K5)) - target
     first_branch = falls & (drop >= 0) & (floor <= peak)
@@ -106,9 +107,9 @@ def _start(K1: Scalar, K3: Scalar, K5: Scalar, target: Values, floor: Scalar) ->
     widening = 1 + jnp.maximum(15 * K5 * y - 1.5 * K3, 0.0) * E / H0
 
     # Around the bend, d^3 + 3 p d = 2 q. With K3 -> 0 there is no bend; the cubic then stands in for K5 x^5.
-    bend_squared = 0.3 * K3 / K5
+    bend_squared = shared(0.3 * K3 / K5)
     bend = _root(bend_squared)
-    factor = 1 / jnp.maximum(2 * K3, _root(K1 * K5))
+    factor = shared(1 / jnp.maximum(2 * K3, _root(K1 * K5)))
     p = (K1 - 1.5 * bend_squared * K3) * factor / 3
     secant = K1 - 0.7 * bend_squared * K3
     q = (target - bend * secant) * factor / 2
@@ -116,7 +117,9 @@ def _start(K1: Scalar, K3: Scalar, K5: Scalar, target: Values, floor: Scalar) ->
     half = jnp.abs(q)
     # One cube root for both; that of a start need not be exact.
     root_cubed = jnp.where(first_branch, widening, half + _root(half * half + p * p * p))
-    root = jnp.maximum(jnp.exp(jnp.log(jnp.maximum(root_cubed, tiny)) / 3), jnp.where(first_branch, 1.0, _root(-p)))
+    root = jnp.maximum(
+        shared(jnp.exp(jnp.log(jnp.maximum(root_cubed, tiny)) / 3)), jnp.where(first_branch, 1.0, _root(-p))
+    )
     around_bend = bend + jnp.where(concave, -1.0, 1.0) * (root - p / root)
 
     # An upper bound: K5 x^5 is at most 9/4 of the stress (monotone), or else half of stress + K3 x^3. The 7/32th power

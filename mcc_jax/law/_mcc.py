@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._numerics import running_max
+from .._numerics import running_max, shared
 from .._types import Flag, Path, Scalar, scalar
 from ..geometry import Particle, plastic_shape_factor
 from ._base import AbstractContactLaw
@@ -147,11 +147,11 @@ class MccLaw(AbstractContactLaw[History]):
         secant = secant_modulus(*self.plastic.polynomial, x)
         k, power = self.unloading.constant, self.strain_scaling.power
         if self.unloading is Unloading.PRINTED:
-            square = eta ** (1 - power) * secant / (k * self.effective_modulus)
+            square = shared(eta ** (1 - power) * secant / (k * self.effective_modulus))
         else:
-            square = eta ** (1 - power) * x * (secant / self.effective_modulus) ** 2 / k
+            square = eta ** (1 - power) * x * shared(secant / self.effective_modulus) ** 2 / k
         carries = (x > 0) & (square > jnp.finfo(square.dtype).tiny)  # down to where the root still has a derivative
-        return x * secant, carries, jnp.sqrt(jnp.where(carries, square, 1.0))
+        return x * secant, carries, shared(jnp.sqrt(jnp.where(carries, square, 1.0)))
 
     # ---- force and displacement --------------------------------------------------------------------------------------
 
@@ -188,12 +188,12 @@ class MccLaw(AbstractContactLaw[History]):
         # The quintic of force against displacement: a path then depends on its particle through four numbers only.
         diameter, area = particle.effective_diameter, 1e-3 * particle.effective_area
         eta = self.shape_factor(particle)
-        scale = eta / diameter
+        scale = shared(eta / diameter)
         square = scale * scale
         K1, K3, K5 = (K * (scale * area) for K in self.plastic.polynomial)
         power = 1 if self.unloading is Unloading.PRINTED else 2
         stiffness = self.unloading.constant * eta**self.strain_scaling.power * (self.effective_modulus * area) ** power
-        compliance = diameter * diameter * diameter / stiffness
+        compliance = shared(diameter * diameter * diameter / stiffness)
         return branch_force(power, K1, K3 * square, K5 * (square * square), compliance, peak, peak - displacement)
 
     def peak_and_displacement(
@@ -214,7 +214,7 @@ class MccLaw(AbstractContactLaw[History]):
         )
 
         law, p, state, highest = jax.lax.optimization_barrier((self, particle, state, highest))
-        scale = p.effective_diameter / law.shape_factor(p)
+        scale = shared(p.effective_diameter / law.shape_factor(p))
         stress = p.stress(jnp.where(highest < past, past, highest))
         reached = scale * loading_strain(*law.plastic.polynomial, stress, state.displacement_max / scale)
         elastic = (highest < past) | (reached < state.displacement_max)
@@ -223,10 +223,10 @@ class MccLaw(AbstractContactLaw[History]):
         law, p, force, highest = jax.lax.optimization_barrier((self, particle, force, highest))
         peak_force = jnp.where(highest < past, past, highest)
         eta = law.shape_factor(p)
-        _, carries, recoverable = law._elastic(eta, eta * peak / p.effective_diameter)
+        _, carries, recoverable = law._elastic(eta, shared(eta * peak / p.effective_diameter))
         # Below that, the quotient's derivatives overflow.
         loaded = carries & (peak_force > jnp.finfo(peak_force.dtype).tiny ** 0.5)
-        ratio = jnp.where(loaded, force, 0.0) / jnp.where(loaded, peak_force, 1.0)
+        ratio = shared(jnp.where(loaded, force, 0.0) / jnp.where(loaded, peak_force, 1.0))
         released = p.displacement(recoverable) * recovery(ratio)
         return peak, peak - jnp.where(loaded & (force < peak_force), released, 0.0)
 

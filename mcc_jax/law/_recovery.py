@@ -15,7 +15,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from .._numerics import horner
+from .._numerics import horner, shared
 from .._types import Values
 from ._recovery_coefficients import ENERGY_64, RATIO_32, RATIO_64, RECOVERY_32, RECOVERY_64
 
@@ -39,7 +39,7 @@ def stress_ratio(s: Values) -> Values:
         Bommireddy et al. (2018), eq. 23, with phi^2 = 1 - s^2.
     """
     u = jnp.clip(1 - s, 0, 1)
-    return u * jnp.sqrt(u) * horner(RATIO_64 if _is_double(u) else RATIO_32, 2 * u - 1)
+    return u * shared(jnp.sqrt(u)) * horner(RATIO_64 if _is_double(u) else RATIO_32, 2 * u - 1)
 
 
 @stress_ratio.defjvp
@@ -47,7 +47,7 @@ def _stress_ratio_jvp(primals, tangents):
     (s,), (ds,) = primals, tangents
     inside = (s >= 0) & (s < 1)
     chord = jnp.where(inside, (1 - s) * (1 + s), 1.0)
-    return stress_ratio(s), jnp.where(inside, -4 / jnp.pi * jnp.sqrt(chord), 0.0) * ds
+    return stress_ratio(s), jnp.where(inside, -4 / jnp.pi * shared(jnp.sqrt(chord)), 0.0) * ds
 
 
 @jax.custom_jvp
@@ -65,7 +65,7 @@ def recovery(ratio: Values) -> Values:
         beyond it, where the platen no longer touches.
     """
     r = jnp.clip(ratio, 0, 1)
-    w = jnp.exp(2 * jnp.log(r) / 3)  # as close as a power, closer than jnp.cbrt, and a third of their cost
+    w = shared(jnp.exp(2 * jnp.log(r) / 3))  # as close as a power, closer than jnp.cbrt, and a third of their cost
     return jnp.clip((1 - w) * horner(RECOVERY_64 if _is_double(w) else RECOVERY_32, 2 * w - 1), 0, 1)
 
 
@@ -75,7 +75,7 @@ def _recovery_jvp(primals, tangents):
     s = recovery(ratio)
     inside = (ratio > 0) & (ratio <= 1) & (s < 1)
     chord = jnp.where(inside, (1 - s) * (1 + s), 1.0)
-    return s, jnp.where(inside, -jnp.pi / 4 / jnp.sqrt(chord), 0.0) * dratio
+    return s, jnp.where(inside, shared(-jnp.pi / 4 / jnp.sqrt(chord)), 0.0) * dratio
 
 
 @jax.custom_jvp

@@ -1,0 +1,86 @@
+"""Many contacts at once, a block that fits a processor's cache at a time, over every device."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+
+from ._errors import InputError
+
+BLOCK = 2048
+
+
+def in_blocks[**P, R](
+    function: Callable[P, R], *, block: int = BLOCK, devices: tuple[Any, ...] | None = None
+) -> Callable[P, R]:
+    r"""Map a function of one contact over many contacts, in blocks.
+
+    The same values as `jax.vmap(function)`, for contacts that do not depend on each other. What a block needs in
+    between stays in a core's cache, so that memory holds the arguments and the results and nothing else; on a CPU
+    gradients are several times faster for it. A CPU works on one block at a time for each device it shows: set
+    ``jax.config.update("jax_num_cpu_devices", cores)`` before the first computation and pass
+    ``devices=tuple(jax.devices())``. On a GPU, `jax.vmap` alone is faster unless memory is short.
+
+    Differentiate inside, ``in_blocks(jax.grad(energy))``, where each contact has its own parameters: outside it works
+    as well, in both modes, and computes each block twice in reverse mode.
+
+    Args:
+        function: of one contact; its positional arguments are trees of arrays without a batch axis.
+        block: contacts in a block, >= 1. The actual one may be smaller, so that blocks come out even.
+        devices: JAX devices over which the contacts are divided, in equal shares; the default device if None.
+
+    Returns:
+        A function of the same arguments with one more axis in front, of the same length in every array.
+
+    Raises:
+        InputError: if the arrays differ in length, have no axis to divide, or cannot be shared out equally.
+    """
+    if block < 1:
+        raise InputError(f"a block of {block} contacts", remedy="Give at least 1.")
+    one = jax.checkpoint(jax.vmap(function))
+
+    def share(*arguments: Any) -> Any:
+        count = jax.tree.leaves(arguments)[0].shape[0]
+        if count <= block:
+            return one(*arguments)
+        size = _even(count, block)
+        whole = count // size * size
+        parts = jax.tree.map(lambda x: x[:whole].reshape(-1, size, *x.shape[1:]), arguments)
+        found = jax.lax.map(lambda part: one(*part), parts)
+        found = jax.tree.map(lambda x: x.reshape(whole, *x.shape[2:]), found)
+        if whole == count:
+            return found
+        rest = one(*jax.tree.map(lambda x: x[whole:], arguments))
+        return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), found, rest)
+
+    def call(*arguments: Any) -> Any:
+        _check(arguments, len(devices or ()) or 1)
+        if devices is None or len(devices) == 1:
+            return share(*arguments)
+        axis = PartitionSpec("contacts")
+        mesh = Mesh(np.array(devices), ("contacts",))
+        return jax.shard_map(share, mesh=mesh, in_specs=axis, out_specs=axis)(*arguments)
+
+    return call  # pyright: ignore[reportReturnType]
+
+
+def _even(count: int, block: int) -> int:
+    """The largest size of a block that leaves nothing over, if one is not much smaller than asked for."""
+    return next((size for size in range(block, block // 2, -1) if count % size == 0), block)
+
+
+def _check(arguments: Any, shares: int) -> None:
+    shapes = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(arguments)}
+    if len(shapes) != 1 or () in shapes:
+        raise InputError(
+            f"arrays of lengths {sorted(s[0] if s else 0 for s in shapes)} are not one batch of contacts",
+            remedy="Give every array one axis in front, of one length.",
+        )
+    (count,) = next(iter(shapes))
+    if count % shares:
+        raise InputError(f"{count} contacts cannot be shared by {shares} devices", remedy="Pad them to a multiple.")
