@@ -34,6 +34,9 @@ from ._types import Location, Number, law_options, out_option, seed_option
     "--no-held-out", is_flag=True, help="Do not repeat the search without each particle: no gap on unseen particles."
 )
 @click.option("--no-experiments", is_flag=True, help="Do not work out which further test would tell more.")
+@click.option(
+    "--no-posterior", is_flag=True, help="Do not sample the extended law: standard errors of its fit instead."
+)
 @click.option("--no-figures", is_flag=True, help="Draw no figures.")
 @seed_option("Seed of the bootstrap.")
 @click.option("--json", "as_json", is_flag=True, help="Print discovery.json instead of a summary.")
@@ -47,6 +50,7 @@ def discover(
     strain_scaling: str,
     no_held_out: bool,
     no_experiments: bool,
+    no_posterior: bool,
     no_figures: bool,
     seed: int,
     as_json: bool,
@@ -86,6 +90,7 @@ def discover(
                 threshold_MPa=threshold_MPa,
                 confirm=not no_held_out,
                 experiments=not no_experiments,
+                posterior=not no_posterior,
                 seed=seed,
                 progress=tell,
             )

@@ -16,6 +16,7 @@ from ._convert import convert
 from ._demo import demo
 from ._discover import discover
 from ._group import PROGRAM, OneLineGroup
+from ._power import power
 from ._simulate import simulate
 
 EPILOG = """\b
@@ -69,7 +70,7 @@ def cli(ctx: click.Context, debug: bool) -> None:
         click.echo(ctx.get_help())
 
 
-for _command in (demo, simulate, convert, calibrate, discover):
+for _command in (demo, simulate, convert, calibrate, discover, power):
     cli.add_command(_command)
 
 

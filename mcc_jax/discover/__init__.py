@@ -6,5 +6,7 @@ from ._plan import Plan as Plan
 from ._plan import Power as Power
 from ._plan import planned_base as planned_base
 from ._plan import power as power
+from ._plan import power_of_campaign as power_of_campaign
+from ._posterior import ExtendedPosterior as ExtendedPosterior
 from ._result import Discovery as Discovery
 from ._result import Effect as Effect

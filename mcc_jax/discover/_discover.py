@@ -12,6 +12,7 @@ from scipy.stats import norm
 
 from .._errors import InputError
 from ..calibrate import JointModel
+from ..calibrate.joint._bayes import summary
 from ..campaign import THRESHOLD_MPA, Campaign
 from ..effects import LIBRARY, Mechanism, Nuisance, Variant, present
 from ..law import PUNCH_AREA
@@ -19,6 +20,7 @@ from ._candidates import untestable
 from ._closure import Closure, find_closure, pursue
 from ._confirm import held_out
 from ._experiments import next_experiments
+from ._posterior import extended_posterior
 from ._refine import refined
 from ._refit import Refit, refit, system_at
 from ._result import Discovery, Effect, Verdict
@@ -71,6 +73,7 @@ def discover(
     threshold_MPa: float = THRESHOLD_MPA,
     confirm: bool = True,
     experiments: bool = True,
+    posterior: bool = True,
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> Discovery:
@@ -84,7 +87,9 @@ def discover(
         threshold_MPa: points below this stress on loading do not count [MPa].
         confirm: repeat the search with each particle left out, and see how far that particle is then from the law.
         experiments: work out which further test would tell the members of a set apart.
-        seed: of the bootstrap.
+        posterior: sample the posterior of the law with what was found; without it, amplitudes and parameters come with
+            the standard errors of the fit.
+        seed: of the bootstrap and the sampler.
         progress: called with the name of each step.
 
     Returns:
@@ -117,7 +122,7 @@ def discover(
         if not changed:
             break
         system = build_system(base, signals)
-    return _judge(base, system, signals, missing, confirm, experiments, seed, started, tell)
+    return _judge(base, system, signals, missing, confirm, experiments, posterior, seed, started, tell)
 
 
 def without_punch(library: Mapping[str, Mechanism], base: Base) -> dict[str, Mechanism]:
@@ -292,7 +297,16 @@ def _serious(system: System, ranking: Ranking) -> list[int]:
 
 
 def _judge(
-    base: Base, system: System, signals: Signals, missing, confirm: bool, experiments: bool, seed: int, started, tell
+    base: Base,
+    system: System,
+    signals: Signals,
+    missing,
+    confirm: bool,
+    experiments: bool,
+    posterior: bool,
+    seed: int,
+    started,
+    tell,
 ) -> Discovery:
     tell("is something missing")
     view = project(system, system.candidate_columns)
@@ -329,6 +343,23 @@ def _judge(
     effects = _effects(extended, last, chosen, steps, p_any)
     inside = np.array([system.column(k) for k in chosen], int)
     words = closure.words if closure is not None else np.array([], int)
+    after = {}
+    if gap:
+        with_all = np.concatenate([inside, words]).astype(int)
+        after = _parameters(base, project(extended, inside[:0], inside=with_all), extended.shift)
+    sampled = None
+    if posterior and chosen and not any(effect.at_random for effect in effects):
+        tell("posterior of the extended law")
+        last = last or _Extensions(base, system, signals).fit(tuple(chosen))
+        sampled = extended_posterior(base, last, seed=seed)
+        if failures := sampled.failures():
+            notes.append(
+                f"the posterior of the extended law has not converged ({'; '.join(failures)}); amplitudes and "
+                "parameters are those of its fit"
+            )
+        else:
+            effects = tuple(_with_draws(effect, sampled.effect_draws(i)) for i, effect in enumerate(effects))
+            after = sampled.parameters()
     ladder, labels = None, (None,)
     if confirm and gap and int(system.usable.sum()) > 2:
         tell("held-out particles")
@@ -338,7 +369,6 @@ def _judge(
     if experiments and gap:
         tell("next experiments")
         further = next_experiments(base, system, chosen, sets)
-    with_all = np.concatenate([inside, words]).astype(int)
     found = Discovery(
         verdict=verdict,
         summary="",
@@ -354,9 +384,10 @@ def _judge(
         labels=labels,
         p_any=p_any,
         before=_parameters(base, project(system, inside[:0])),
-        after=_parameters(base, project(extended, inside[:0], inside=with_all), extended.shift) if gap else {},
+        after=after,
         next_experiments=tuple(further),
         limits=_limits(system, view, ranking),
+        posterior=sampled,
         seed=seed,
         runtime_s=0.0,
         notes=tuple(notes),
@@ -469,6 +500,18 @@ def _effects(
             )
         )
     return tuple(found)
+
+
+def _with_draws(effect: Effect, draws: dict[str, np.ndarray]) -> Effect:
+    """The effect with its numbers from the posterior."""
+    own = draws[effect.variant.parameter]
+    return dataclasses.replace(
+        effect,
+        amplitude=float(own.mean()),
+        sd=float(own.std()),
+        nuisance=effect.nuisance | {name: float(draws[name].mean()) for name in draws if name in effect.nuisance},
+        estimates={name: summary(values) for name, values in draws.items()},
+    )
 
 
 def _limits(system: System, view: Projection, ranking: Ranking) -> dict[str, tuple[float, float, float]]:

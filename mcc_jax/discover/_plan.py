@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from ..calibrate import JointModel
+from ..calibrate._result import finite
 from ..calibrate.joint._data import Tests, select_tests
 from ..calibrate.joint._fit import JointFit
 from ..calibrate.joint._forward import law_of
 from ..calibrate.joint._linearised import linear_data, summarise
 from ..calibrate.joint._noise import Noise
-from ..campaign import Campaign, Curve, Metadata
+from ..campaign import THRESHOLD_MPA, Campaign, Curve, Metadata
 from ..effects import LIBRARY, Mechanism, present
 from ..simulate import Programme, simulate_campaign
 from ._candidates import untestable
 from ._score import DETECTABLE, project
-from ._system import Base, System, _records, build_system, signals_of
+from ._system import Base, System, _records, base_fit, build_system, signals_of
 
 ALIKE = 0.9
 
@@ -99,6 +101,24 @@ class Power:
     inseparable: tuple[tuple[str, str, float], ...]
     untestable: tuple[dict[str, str], ...]
 
+    def to_json(self) -> dict[str, Any]:
+        """The contents of `power.json`."""
+        return {
+            "schema": 1,
+            "mechanisms": [
+                {
+                    "mechanism": name,
+                    "detection_limit": finite(self.limits[name]),
+                    "unit": self.units[name],
+                    "plausible": [float(v) for v in self.plausible[name]],
+                    "visible": bool(self.limits[name] <= self.plausible[name][1]),
+                }
+                for name in self.mechanisms
+            ],
+            "inseparable": [{"pair": [a, b], "similarity": finite(value)} for a, b, value in self.inseparable],
+            "untestable": list(self.untestable),
+        }
+
 
 def power_of(system: System, missing: Sequence[dict[str, str]]) -> Power:
     """Detection limits and inseparable pairs of a linear system; residuals play no part."""
@@ -163,3 +183,31 @@ def power(
     testable, missing = untestable(library, present(campaign))
     system = build_system(planned, signals_of(planned, testable))
     return power_of(replace(system, usable=np.ones(len(system.points), bool)), missing)
+
+
+def power_of_campaign(
+    campaign: Campaign,
+    *,
+    library: Mapping[str, Mechanism] = LIBRARY,
+    model: JointModel | None = None,
+    threshold_MPa: float = THRESHOLD_MPA,
+    progress: Callable[[str], None] | None = None,
+) -> Power:
+    """What a campaign can show: one that was simulated as planned, with the tester's noise, or one that was measured.
+
+    Args:
+        campaign: the tests.
+        library: the mechanisms.
+        model: form of unloading and priors; the modulus may always scatter between particles.
+        threshold_MPa: points below this stress on loading do not count [MPa].
+        progress: called with the name of each step.
+
+    Raises:
+        InputError: if no particle can be used.
+    """
+    tell = progress or (lambda _: None)
+    assumed = replace(model or JointModel(), modulus_scatter=True)
+    base = base_fit(campaign, assumed, threshold_MPa=threshold_MPa, tell=tell)
+    testable, missing = untestable(library, present(campaign))
+    tell("signatures of all effects")
+    return power_of(build_system(base, signals_of(base, testable)), missing)

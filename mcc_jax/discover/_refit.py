@@ -82,9 +82,10 @@ class Formula(eqx.Module):
 
     def nuisance(self, theta: np.ndarray) -> dict[str, float]:
         """Values of all further numbers."""
-        return {name: float(value) for name, value in self._nuisance(jnp.asarray(theta)).items()}
+        return {name: float(value) for name, value in self.nuisances(jnp.asarray(theta)).items()}
 
-    def _nuisance(self, theta: Float[Array, " size"]) -> dict[str, Array]:
+    def nuisances(self, theta: Float[Array, " size"]) -> dict[str, Array]:
+        """Values of all further numbers, traceable."""
         values = dict(self.grid)
         for n, moved in zip(self.free_nuisances, theta[1:], strict=True):
             start, (low, high) = values[n.name], n.plausible
@@ -94,7 +95,7 @@ class Formula(eqx.Module):
 
     def build(self, theta: Float[Array, " size"]) -> AbstractEffect:
         """The effect."""
-        return self.variant.build(theta[0] * self.variant.plausible[1], **self._nuisance(theta))
+        return self.variant.build(theta[0] * self.variant.plausible[1], **self.nuisances(theta))
 
 
 def _by_ratio(nuisance: Nuisance) -> bool:

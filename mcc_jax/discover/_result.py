@@ -11,6 +11,7 @@ from ..calibrate._result import finite
 from ..effects import EQUIVALENCES, AbstractEffect, Variant
 from ._closure import Closure
 from ._confirm import HeldOut
+from ._posterior import ExtendedPosterior
 from ._search import Ranking
 from ._system import Base, System
 
@@ -29,6 +30,7 @@ class Effect:
         p_family_wise: probability of so large a statistic of any mechanism if nothing were missing.
         at_random: whether the amplitude differs from test to test.
         by_particle: each test's own estimate of the amplitude.
+        estimates: amplitude and further parameters with their uncertainty, by name, where the posterior was sampled.
     """
 
     variant: Variant
@@ -39,6 +41,7 @@ class Effect:
     p_family_wise: float
     at_random: bool
     by_particle: np.ndarray
+    estimates: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     @property
     def mechanism(self) -> str:
@@ -63,7 +66,7 @@ class Effect:
             "p_family_wise": float(self.p_family_wise),
             "equation": self.variant.equation,
             "explanation": self.variant.explanation,
-            "parameters": {self.variant.parameter: own, **fixed},
+            "parameters": {self.variant.parameter: own, **fixed} | self.estimates,
             "unit": self.variant.unit,
             "differs_from_test_to_test": self.at_random,
         }
@@ -89,6 +92,7 @@ class Discovery:
         p_any: family-wise probability that anything is missing.
         before, after: the population's parameters without and with the effects.
         next_experiments: what would tell the members of the set apart.
+        posterior: of the extended law; None where nothing was added or it was not asked for.
         notes: what a reader must know.
     """
 
@@ -111,6 +115,7 @@ class Discovery:
     limits: dict[str, tuple[float, float, float]]
     seed: int
     runtime_s: float
+    posterior: ExtendedPosterior | None = None
     notes: tuple[str, ...] = field(default=())
 
     def gap(self) -> dict[str, Any]:
@@ -177,6 +182,7 @@ class Discovery:
             "gap": self.gap(),
             "parameters_before": self.before,
             "parameters_after": self.after,
+            "posterior": None if self.posterior is None else self.posterior.to_json(),
             "next_experiments": list(self.next_experiments),
             "p_anything_missing": finite(self.p_any),
             "equivalent_by_construction": [

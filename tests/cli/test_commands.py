@@ -59,11 +59,11 @@ def test_without_arguments_help_with_examples(run):
     assert text == done(run("--help"))
     for word in ("demo", "simulate", "convert", "calibrate", "discover", "Examples:", "_MCC_JAX_COMPLETE"):
         assert word in text
-    assert set(cli.commands) == {"demo", "simulate", "convert", "calibrate", "discover"}
+    assert set(cli.commands) == {"demo", "simulate", "convert", "calibrate", "discover", "power"}
     assert "0.1.0" in done(run("--version"))
 
 
-@pytest.mark.parametrize("command", ["demo", "simulate", "convert", "calibrate", "discover"])
+@pytest.mark.parametrize("command", ["demo", "simulate", "convert", "calibrate", "discover", "power"])
 def test_every_command_has_help_with_an_example(run, command):
     text = done(run(command, "--help"))
     assert "xample" in text

@@ -62,12 +62,12 @@ def check_contract(content):
 
 @pytest.fixture(scope="module")
 def tests(tmp_path_factory):
-    """Eight particles of the paper's sizes: with a compliant frame, and as the law says."""
+    """Ten particles of the paper's sizes: with a compliant frame, and as the law says."""
     folder = tmp_path_factory.mktemp("tests")
-    rows = (f"{i},{D1},{D2},{D3}" for i, (D1, D2, D3) in enumerate(PAPER_DIAMETERS_UM[:8], 1))
-    (folder / "eight.csv").write_text("\n".join(["particle,D1_um,D2_um,D3_um", *rows, ""]))
-    base = ["simulate", "--particles", folder / "eight.csv", "--points", "120", "--noise-um", "0.02", "--seed", "3"]
-    base += ["--levels", "0.5,1", "--unload-to", "0.1", "--hold-s", "20", "--peak-stress", "8:14"]
+    rows = (f"{i},{D1},{D2},{D3}" for i, (D1, D2, D3) in enumerate(PAPER_DIAMETERS_UM[:10], 1))
+    (folder / "ten.csv").write_text("\n".join(["particle,D1_um,D2_um,D3_um", *rows, ""]))
+    base = ["simulate", "--particles", folder / "ten.csv", "--points", "150", "--noise-um", "0.02", "--seed", "3"]
+    base += ["--levels", "0.5,1,1", "--unload-to", "0.3", "--hold-s", "30", "--peak-stress", "8:14"]
     done(call(*base, "--out", folder / "null"))
     done(call(*base, "--out", folder / "frame", "--effect", f"frame_compliance={HIDDEN}"))
     return folder
@@ -139,6 +139,28 @@ def test_nothing_is_found_where_nothing_is_hidden_and_excluded_names_are_gone(te
     assert content["gap"]["steps"] == []
     names = {entry["mechanism"] for entry in (*content["ranking"], *content["untestable"])}
     assert names == set(LIBRARY) - {"toe_asperity", "pop_in"}
+
+
+def test_power_says_what_the_tests_could_show(tests, tmp_path):
+    excluded = [
+        part
+        for name in set(LIBRARY) - {"frame_compliance", "platen_sink_in", "humidity"}
+        for part in ("--exclude", name)
+    ]
+    text = done(call("power", tests / "null", "--out", tmp_path, *excluded))
+    content = json.loads((tmp_path / "power.json").read_text(encoding="utf-8"))
+    (frame, sink) = content["mechanisms"]
+    assert (frame["mechanism"], frame["unit"], frame["visible"]) == ("frame_compliance", "um/mN", True)
+    # Forty times less than what the command above finds without effort.
+    assert 1e-6 < frame["detection_limit"] < HIDDEN / 4
+    assert sink["detection_limit"] > 0
+    assert [one["mechanism"] for one in content["untestable"]] == ["humidity"]
+    assert "frame_compliance" in text
+    assert "humidity needs" in text
+    assert (
+        done(call("power", tests / "null", "--out", tmp_path, *excluded, "--json"))
+        == json.dumps(content, ensure_ascii=False, indent=2) + "\n"
+    )
 
 
 @pytest.mark.parametrize(

@@ -13,10 +13,8 @@ FEW = (
     "T0-clean-1",
     "T1-reverse_plasticity.exact-20-P1-0",
     "T4-mid_unloading_bump.unlisted-20-P1-1",
-    "T2-creep.logarithmic-20-P0-0",
-    "T6-reload_hysteresis-P0-0",
 )
-"""A null, an exact formula among close relatives, one unlisted, one variant, one untestable."""
+"""A null, an exact formula among close relatives, one unlisted: all of one shape, so that they compile once."""
 
 
 def answer(case, folder, **options):
@@ -26,7 +24,7 @@ def answer(case, folder, **options):
 
 @pytest.mark.parametrize("name", FEW)
 def test_some_blind_cases_get_their_verdict(name, tmp_path):
-    told = answer(CASES[name], tmp_path, confirm=False, experiments=False)
+    told = answer(CASES[name], tmp_path, confirm=False, experiments=False, posterior=False)
     assert adapter.problem(told) is None
     assert smoke.check(CASES[name], told) is None
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
@@ -103,13 +102,19 @@ def _stride(count: int, total: int) -> int:
 def draw_fast(key: Array, tests: Tests, model: JointModel, fit: JointFit, length: Length) -> dict[str, Any]:
     """The population sampled, the particles drawn back and corrected by exact weights: fields of the result."""
     scatter = replace(model.scatter, newton=newton_steps(fit, tests, model))
-    target = Target(fit.numbers, fit.summary, scatter)
+    exact = Exact(tests, fit.filters, fit.summary, scatter, model.zero_sd, model.unloading)
+    return draw_around(key, fit.mode, fit.covariance, Target(fit.numbers, fit.summary, scatter), exact, model, length)
+
+
+def draw_around(
+    key: Array, mode: Array, covariance: Array, target: Target, exact: Exact, model: JointModel, length: Length
+) -> dict[str, Any]:
+    """The same for any density of the population, around its mode, and any exact likelihood of the tests."""
+    tests, scatter = exact.tests, exact.scatter
     population_key, particle_key, check_key, pick_key = jax.random.split(key, 4)
 
     def sampled(accept: float) -> tuple[Chains, Population]:
-        return sample_population(
-            population_key, fit.mode, fit.covariance, target, jnp.asarray(accept), **length._asdict()
-        )
+        return sample_population(population_key, mode, covariance, target, jnp.asarray(accept), **length._asdict())
 
     run, population = sampled(ACCEPT[0])
     for accept in ACCEPT[1:]:
@@ -117,7 +122,6 @@ def draw_fast(key: Array, tests: Tests, model: JointModel, fit: JointFit, length
             break
         run, population = sampled(accept)
     count = len(tests)
-    exact = Exact(tests, fit.filters, fit.summary, scatter, model.zero_sd, model.unloading)
     stride = _stride(count, length.total)
     checked = [np.array(v) for v in draw_particles(check_key, _every(population, stride), exact)]
     ratio = checked[3]
@@ -136,7 +140,7 @@ def draw_fast(key: Array, tests: Tests, model: JointModel, fit: JointFit, length
             size = min(count, 4 ** int(np.ceil(np.log(max(len(restless), 2)) / np.log(4))))
             padded = np.concatenate([restless, np.full(size - len(restless), restless[0])])
             more = draw_particles(
-                jax.random.fold_in(pick_key, candidates), population, _some(exact, padded), candidates
+                jax.random.fold_in(pick_key, candidates), population, exact.some(jnp.asarray(padded)), candidates
             )
             better = [np.asarray(v)[:, : len(restless)] for v in more]
             latent[:, restless], zero[:, restless], ratio[:, restless] = better[0], better[1], better[3]
@@ -229,13 +233,6 @@ def _every(population: Population, stride: int) -> Population:
     return jax.tree.map(lambda x: x[::stride], population)
 
 
-def _some(exact: Exact, which: np.ndarray) -> Exact:
-    """The exact likelihood of some of the particles."""
-    index = jnp.asarray(which)
-    take = partial(jax.tree.map, lambda x: x[index])
-    return replace(exact, tests=take(exact.tests), filters=take(exact.filters), summary=take(exact.summary))
-
-
 def _stack(population: Population, scatter: Scatter, length: Length) -> tuple[list[str], np.ndarray]:
     columns = {"a": population.a, "log_modulus": population.log_modulus}
     columns |= {f"mu_{n}": population.mu[:, j] for j, n in enumerate(COEFFICIENTS)}
@@ -245,4 +242,5 @@ def _stack(population: Population, scatter: Scatter, length: Length) -> tuple[li
     if scatter.shape:
         columns["shape_scatter"] = population.shape_scatter
     columns["noise_factor"] = population.log_noise
+    columns |= population.further()
     return list(columns), np.stack([np.asarray(v).reshape(length.chains, length.draws) for v in columns.values()], -1)

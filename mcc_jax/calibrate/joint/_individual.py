@@ -24,6 +24,9 @@ VARIATIONS = ((0.0, 0.0, 0.0), (0.05, -0.1, 0.03), (-0.05, 0.06, -0.02))
 
 MOST_STEPS = 60
 
+LEFT_TO_GAIN = 1e-6
+"""Log probability still to gain at which a fit is finished, where residuals are as large as the noise."""
+
 
 class Particles(eqx.Module):
     """Fits of single particles.
@@ -125,6 +128,7 @@ def fit_particles(
 
     many: Tests = jax.tree.map(tile, tests)
     scale = tile(noise)[:, None]
+    points = jnp.maximum(jnp.sum(many.mask, 1), 1).astype(noise.dtype)
     middle = jnp.concatenate([tile(centre), many.contact[:, None]], 1)
     width = jnp.concatenate([tile(width), jnp.full((len(middle), 1), zero_sd)], 1)
 
@@ -145,7 +149,10 @@ def fit_particles(
         tried = y + move / jnp.maximum(most, 1.0)[:, None]
         new_loss, new_g, new_H = normal_equations(tried)
         better = new_loss < loss
-        done = (jnp.abs(jnp.einsum("np,np->n", move, g)) < 1e-6) | (damping > 1e8)
+        # What a step would still gain, in units of the scatter that there is: where the law does not describe the
+        # curve, that is many times the noise.
+        scatter = 1 + 2 * jnp.where(jnp.isfinite(loss), loss, 0.0) / points
+        done = (jnp.abs(jnp.einsum("np,np->n", move, g)) < LEFT_TO_GAIN * scatter) | (damping > 1e8)
 
         def choose(new, old):
             return jnp.where(better.reshape(-1, *[1] * (old.ndim - 1)), new, old)
@@ -167,5 +174,5 @@ def fit_particles(
         return jnp.take_along_axis(values, best.reshape(1, -1, *[1] * (values.ndim - 2)), axis=0)[0]
 
     found = take(y)
-    points = jnp.maximum(jnp.sum(tests.mask, 1), 1).astype(noise.dtype)
-    return Particles(found[:, :4], found[:, 4], noise * jnp.sqrt(2 * take(loss) / points), take(done))
+    rms = noise * jnp.sqrt(2 * take(loss) / points[: len(tests)])
+    return Particles(found[:, :4], found[:, 4], rms, take(done))

@@ -47,6 +47,10 @@ class Population(eqx.Module):
     shape_scatter: Scalar
     log_noise: Scalar
 
+    def further(self) -> dict[str, Array]:
+        """Further numbers that all particles share, by name: of effects that were added to the law."""
+        return {}
+
 
 class Scatter(eqx.Module):
     """How particles differ, and how carefully they are integrated out.

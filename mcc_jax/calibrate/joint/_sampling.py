@@ -16,7 +16,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from ..._types import Scalar
 from ...law import Unloading
@@ -97,23 +97,44 @@ class Exact(eqx.Module):
         self, population: Population, normal: Float[Array, "particles k"], normal_zero: Float[Array, " particles"]
     ) -> Draw:
         """Particles given the population, under the summaries, from standard normal numbers."""
-        return draw_latent(population, self.summary, self.tests.flatness, self.scatter, normal, normal_zero)
+        summary = self.summary_at(population)
+        return draw_latent(population, summary, self.tests.flatness, self.scatter, normal, normal_zero)
 
+    def some(self, which: Int[Array, " chosen"]) -> Exact:
+        """Some of the tests."""
+        chosen = [jax.tree.map(lambda x: x[which], part) for part in self.by_test()]
+        return eqx.tree_at(lambda exact: exact.by_test(), self, tuple(chosen))
 
-def exact_log_likelihood(
-    exact: Exact, latent: Float[Array, "particles 4"], zero: Float[Array, " particles"], log_noise: Float[Array, ""]
-) -> Float[Array, " particles"]:
-    """Log likelihood of each test at given parameters, and log prior of its zero, up to a constant."""
-    tests = exact.tests
+    def by_test(self) -> tuple[PyTree, ...]:
+        """The fields with one row per test."""
+        return self.tests, self.filters, self.summary
 
-    def squares(w, z, particle, force, measured, mask, filtered):
-        predicted = displacement(w, particle, force, exact.unloading)
-        return jnp.sum(filtered(jnp.where(mask, measured - predicted - z, 0.0)) ** 2) + filtered.least_squares
+    def summary_at(self, population: Population) -> Summary:
+        """The summaries, which may depend on what all particles share."""
+        return self.summary
 
-    total = jax.vmap(squares)(latent, zero, tests.particle, tests.force, tests.displacement, tests.mask, exact.filters)
-    at_zero = ((zero - tests.contact) / exact.zero_sd) ** 2
-    points = jnp.sum(tests.mask, 1).astype(total.dtype)
-    return -0.5 * (jnp.exp(-2 * log_noise) * total + at_zero) - points * log_noise
+    def predicted(
+        self, population: Population, latent: Float[Array, "particles 4"]
+    ) -> Float[Array, "particles points"]:
+        """Displacement [um] of every particle from its own zero."""
+        return jax.vmap(lambda w, particle, force: displacement(w, particle, force, self.unloading))(
+            latent, self.tests.particle, self.tests.force
+        )
+
+    def log_likelihood(
+        self, population: Population, latent: Float[Array, "particles 4"], zero: Float[Array, " particles"]
+    ) -> Float[Array, " particles"]:
+        """Log likelihood of each test at given parameters, and log prior of its zero, up to a constant."""
+        tests = self.tests
+        residual = tests.displacement - self.predicted(population, latent) - zero[:, None]
+
+        def squares(r, mask, filtered):
+            return jnp.sum(filtered(jnp.where(mask, r, 0.0)) ** 2) + filtered.least_squares
+
+        total = jax.vmap(squares)(residual, tests.mask, self.filters)
+        at_zero = ((zero - tests.contact) / self.zero_sd) ** 2
+        points = jnp.sum(tests.mask, 1).astype(total.dtype)
+        return -0.5 * (jnp.exp(-2 * population.log_noise) * total + at_zero) - points * population.log_noise
 
 
 @compiled
@@ -142,7 +163,7 @@ def draw_particles(
             drawn = exact.draw(at, normal, normal_zero)
             ratio = jnp.zeros(count)
             if candidates:
-                truth = exact_log_likelihood(exact, drawn.latent, drawn.zero, at.log_noise)
+                truth = exact.log_likelihood(at, drawn.latent, drawn.zero)
                 prior = -0.5 * jnp.sum(drawn.deviations**2, -1)
                 proposal = -0.5 * (jnp.sum(normal**2, -1) + normal_zero**2) - drawn.log_volume
                 ratio = truth + prior - proposal - drawn.log_likelihood - jnp.log(exact.summary.zero_sd)
@@ -201,7 +222,7 @@ def sample_joint(
 
     def log_density(position):
         population, prior, drawn = place(position)
-        likelihood = jnp.sum(exact_log_likelihood(exact, drawn.latent, drawn.zero, population.log_noise))
+        likelihood = jnp.sum(exact.log_likelihood(population, drawn.latent, drawn.zero))
         return prior + likelihood - 0.5 * jnp.sum(drawn.deviations**2) + jnp.sum(drawn.log_volume)
 
     size = d + count * (k + 1)

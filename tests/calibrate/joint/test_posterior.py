@@ -22,8 +22,8 @@ from mcc_jax.calibrate.joint._weights import ordered_resample, pareto_k, smoothe
 
 
 @pytest.fixture(scope="module")
-def result():
-    return calibrate_bayes(paper_campaign(0))
+def result(paper_posterior):
+    return paper_posterior
 
 
 @pytest.fixture(scope="module")

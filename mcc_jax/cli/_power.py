@@ -1,0 +1,93 @@
+"""`mcc-jax power`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ._output import json_text, results
+from ._session import say, say_table, session
+from ._types import Location, Number, law_options, out_option, seed_option
+
+POWER = "power.json"
+
+
+@click.command(short_help="Say what a planned campaign could show.")
+@click.argument("campaign", type=Location(), metavar="CAMPAIGN")
+@out_option(required=True)
+@click.option(
+    "--exclude", multiple=True, metavar="NAME", help="A mechanism that cannot be there, on your authority; repeatable."
+)
+@click.option(
+    "--threshold-MPa",
+    "threshold_MPa",
+    type=Number(0, metavar="MPa"),
+    default=0.2,
+    show_default=True,
+    help="Stress below which only surface asperities deform: points below it do not count.",
+)
+@click.option("--priors", type=Location(), metavar="FILE", help="TOML file of priors.")
+@law_options
+@seed_option("For the record: nothing here is random.")
+@click.option("--json", "as_json", is_flag=True, help="Print power.json instead of a table.")
+def power(
+    campaign: Path,
+    out: Path,
+    exclude: tuple[str, ...],
+    threshold_MPa: float,
+    priors: Path | None,
+    unloading: str,
+    strain_scaling: str,
+    seed: int,
+    as_json: bool,
+) -> None:
+    """Say how large each mechanism must be for the tests in the folder CAMPAIGN to show it, and which they cannot tell
+    apart. CAMPAIGN is what `mcc-jax simulate` makes of your plan with your tester's noise, or a measured campaign.
+
+    Writes power.json into DIR.
+
+    \b
+    Example: would twelve particles with a hold and a reload do?
+      mcc-jax simulate --particles twelve.csv --out planned --levels 0.5,1,1 --hold-s 20 --noise-um 0.05 --noise-mN 0.05
+      mcc-jax power planned --out planned
+    """
+    with session(20) as tell:
+        from ..campaign import read_campaign
+        from ..discover import power_of_campaign
+        from ..effects import LIBRARY
+        from ._calibration import joint_model, say_files
+        from ._discovery import require_mechanisms
+
+        require_mechanisms(exclude)
+        tell("reading the campaign")
+        data = read_campaign(campaign)
+        with results(out) as stage:
+            found = power_of_campaign(
+                data,
+                library={name: m for name, m in LIBRARY.items() if name not in exclude},
+                model=joint_model(unloading, strain_scaling, True, False, priors),
+                threshold_MPa=threshold_MPa,
+                progress=tell,
+            )
+            content: dict[str, Any] = found.to_json() | {"seed": seed}
+            (stage.folder / POWER).write_text(json_text(content), encoding="utf-8")
+    if as_json:
+        click.echo(json_text(content).encode(), nl=False)
+        return
+    rows = []
+    for entry in content["mechanisms"]:
+        unit = "" if entry["unit"] == "-" else f" {entry['unit']}"
+        seen = "yes" if entry["visible"] else "no"
+        rows.append(
+            (entry["mechanism"], f"{entry['detection_limit']:.2g}{unit}", f"{entry['plausible'][1]:.2g}{unit}", seen)
+        )
+    say_table(("mechanism", "found from", "largest plausible", "can be seen"), rows)
+    for entry in content["untestable"]:
+        say(f"{entry['mechanism']} needs {entry['needs']}.")
+    for entry in content["inseparable"]:
+        one, other = entry["pair"]
+        say(f"{one} and {other} look alike ({100 * entry['similarity']:.0f} %).")
+    say()
+    say_files(out, [POWER])
