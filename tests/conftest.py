@@ -1,5 +1,4 @@
 import os
-import pathlib
 import shutil
 import tempfile
 
@@ -30,39 +29,15 @@ def pytest_configure(config):
         os.environ[name.upper()] = str(value)  # for processes that tests start
 
 
-# What compiles the same things runs on one worker, one after the other, and shares the folder above.
-TOGETHER = {
-    "discover": ("discover/", "cli/test_discover.py", "plots/test_discovery_figures.py", "[05_discovery]"),
-    "joint": ("calibrate/joint/", "plots/test_joint_figures.py", "cli/test_commands.py", "[04_posterior]"),
-}
-
-
 def pytest_collection_modifyitems(items):
-    """Each file is one group, the long ones together and first."""
-
-    order = {name: i for i, name in enumerate(TOGETHER)}
-    items.sort(key=lambda item: order.get(group_of(item.nodeid), len(order)))
-    for item in items:
-        item.add_marker(pytest.mark.xdist_group(group_of(item.nodeid)))
-
-
-def group_of(place):
-    """Name of the group of a test or file."""
-    return next((name for name, parts in TOGETHER.items() if any(p in place for p in parts)), place.split("::")[0])
-
-
-MOST_MAPS = 30_000
-_current = [""]
+    """The longest file first: begun last, it would keep one worker busy while the other waits."""
+    items.sort(key=lambda item: "test_notebooks" not in item.nodeid)
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _compiled_functions_live_for_one_group(request):
-    """Every compiled function holds memory maps, of which Linux gives a process 65,530 and no more."""
-    group = group_of(request.node.nodeid)
-    maps = pathlib.Path("/proc/self/maps")
-    if group != _current[0] or not maps.exists() or len(maps.read_bytes().splitlines()) > MOST_MAPS:
-        jax.clear_caches()
-    _current[0] = group
+def _compiled_functions_live_for_one_module():
+    yield
+    jax.clear_caches()
 
 
 @pytest.fixture(scope="session")

@@ -187,3 +187,9 @@ def test_importing_loads_nothing_heavy_prints_nothing_and_configures_nothing():
     done = run(code)
     assert done.stdout == ""
     assert done.stderr == ""
+
+
+def test_no_two_test_files_have_one_name():
+    """Helpers stand beside tests, so files are imported by their bare names."""
+    names = [file.name for file in PACKAGE.parent.glob("tests/**/*.py") if file.name != "conftest.py"]
+    assert len(names) == len(set(names)), sorted({n for n in names if names.count(n) > 1})

@@ -251,6 +251,6 @@ def test_json_of_odd_names_is_utf8(run, campaign):
     for name in ("particles.csv", "curves.csv"):
         file = campaign / name
         file.write_text(file.read_text().replace("\nA,", "\nπ [bold],"), encoding="utf-8")
-    text = done(run("calibrate", campaign, "--out", campaign / "fit", "--no-figures", "--json", "--draws", "20"))
+    text = done(run("calibrate", campaign, "--out", campaign / "fit", "--method", "paper", "--no-figures", "--json"))
     assert json.loads(text)["particles"][0]["particle"] == "π [bold]"
     assert "π [bold]" in text

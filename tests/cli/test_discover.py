@@ -114,6 +114,7 @@ def test_the_command_says_what_it_found(found):
         assert (out / name).read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.long
 def test_same_seed_same_file_and_stale_figures_go(found, tests, tmp_path):
     first = json.loads((found[1] / "discovery.json").read_text(encoding="utf-8"))
     out = tmp_path / "again"

@@ -159,7 +159,10 @@ def reloading(curve):
     return np.where(rises & late, 4 * share * (1 - share), 0.0)
 
 
-@pytest.mark.parametrize("kind", WRONG)
+KINDS = [pytest.param(kind, marks=() if i == 0 else pytest.mark.long) for i, kind in enumerate(WRONG)]
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_no_effect_is_ever_named_with_an_impossible_sign(kind):
     mechanism, change = WRONG[kind]
     found = discover(bent(cached(seed=1, programme=FULL), change), **QUICK)

@@ -69,6 +69,7 @@ def test_particles_that_snap_through_take_no_part():
     assert sum("snaps through" in note for note in told["notes"]) == 2
 
 
+@pytest.mark.long
 def test_curves_that_are_nothing_but_noise():
     rng = np.random.default_rng(0)
 
@@ -84,13 +85,15 @@ def test_loading_only():
         top = int(np.argmax(c.force_mN)) + 1
         return c.time_s[:top], c.force_mN[:top], c.displacement_um[:top]
 
-    told = answer(with_curves(cached(programme=SINGLE), rise), library=FEW)
+    library = FEW | {"size_effect": LIBRARY["size_effect"]}  # which loading alone can show
+    told = answer(with_curves(cached(programme=SINGLE), rise), library=library)
     assert told["verdict"] == "NO_GAP"
     silent = {one["mechanism"]: one["needs"] for one in told["untestable"]}
     assert {"frame_compliance", "creep", "adhesion", "unloading_shape", "reload_hysteresis"} <= set(silent)
     assert "unloading" in silent["adhesion"]
 
 
+@pytest.mark.long
 def test_a_gap_twenty_times_larger_than_any_believable_one():
     told = answer(cached("frame_compliance=0.2"))
     assert told["verdict"] != "NO_GAP"
@@ -109,10 +112,12 @@ def indentation():
     return answer(read_tester_file(TESTERS / "FS1.txt", diameters_um=(60.0, 60.0, 60.0)), confirm=True)
 
 
+@pytest.mark.long
 def test_an_indentation_is_not_said_to_agree_with_the_law(indentation):
     assert indentation["verdict"] != "NO_GAP"
 
 
+@pytest.mark.long
 @pytest.mark.xfail(reason="the base fit does not converge: it uses the branch behind a snap-through at first contact")
 def test_an_indentation_s_gap_is_mostly_closed(indentation):
     assert indentation["gap"]["closed_fraction"] > 0.5

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import (
-    ALL_FORMS,
+    ALL_IN_TIME,
     FORMS,
     SOME_FORMS,
     all_finite,
@@ -87,7 +87,7 @@ def compare(unloading, scaling, theta, seed, by_scan):
     return forward, scale
 
 
-@ALL_FORMS
+@ALL_IN_TIME
 @settings(max_examples=6, deadline=None, derandomize=True)
 @given(theta=thetas(softening=between(0.0, 0.8)), seed=st.integers(0, 10**6))
 def test_forward_is_reverse_is_finite_difference(unloading, scaling, theta, seed):

@@ -16,6 +16,8 @@ METHODS = {
     "least-squares": calibrate_least_squares,
 }
 methods = pytest.mark.parametrize("method", list(METHODS))
+few = pytest.mark.parametrize("method", [pytest.param("bayes", marks=pytest.mark.long), "least-squares"])
+"""The posterior compiles for every number of particles."""
 
 
 def one(name, which, **options):
@@ -165,7 +167,7 @@ def test_a_threshold_must_be_a_stress(campaign):
             select_tests(campaign, threshold_MPa=threshold)
 
 
-@methods
+@few
 def test_one_particle_alone(method):
     campaign = one("alone", 1)
     content = METHODS[method](campaign).to_json()
@@ -188,7 +190,7 @@ def test_one_particle_alone(method):
         assert content["a"]["sd"] > 0.5  # the prior's is 1
 
 
-@methods
+@few
 def test_two_particles_of_one_shape(method):
     C, diameters = COEFFICIENTS[:2], np.array([[150.0, 160.0, 120.0], [180.0, 192.0, 144.0]])
     campaign = simulated(C, diameters, instrument=NOISE)
@@ -203,7 +205,7 @@ def test_two_particles_of_one_shape(method):
         assert content["a"]["sd"] > 0.5
 
 
-@methods
+@few
 def test_two_spheres(method):
     """Flatness is exactly zero: a is in no equation at all."""
     campaign = simulated(COEFFICIENTS[:2], np.array([[150.0] * 3, [180.0] * 3]), instrument=NOISE)

@@ -281,6 +281,7 @@ def gap(one, two):
     )
 
 
+@pytest.mark.long
 def test_the_fast_mode_gives_the_joint_posterior(both):
     fast, joint = both
     assert (fast.mode, joint.mode) == ("fast", "joint")
@@ -298,6 +299,7 @@ def test_the_fast_mode_gives_the_joint_posterior(both):
         assert width < 0.15 + 3 * error_of_sd, (name, width, error_of_sd)
 
 
+@pytest.mark.long
 def test_the_joint_mode_says_nothing_of_weights(both):
     _, joint = both
     assert joint.pareto_k_joint is None
@@ -305,8 +307,8 @@ def test_the_joint_mode_says_nothing_of_weights(both):
     assert json.dumps(joint.to_json(), allow_nan=False)
 
 
-def test_too_few_draws_are_not_called_converged(small):
-    short = calibrate_bayes(small, draws=20, warmup=20)
+def test_too_few_draws_are_not_called_converged():
+    short = calibrate_bayes(paper_campaign(0), draws=20, warmup=20)
     assert not short.converged
     content = json.loads(json.dumps(short.to_json(), allow_nan=False))
     assert content["converged"] is False
