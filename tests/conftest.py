@@ -30,8 +30,9 @@ def pytest_configure(config):
 
 
 def pytest_collection_modifyitems(items):
-    """The longest file first: begun last, it would keep one worker busy while the other waits."""
-    items.sort(key=lambda item: "test_notebooks" not in item.nodeid)
+    """The longest files first: begun last, they would keep one worker busy while the other waits."""
+    first = ("test_notebooks", "/discover/", "/joint/", "/cli/", "/plots/")
+    items.sort(key=lambda item: next((i for i, part in enumerate(first) if part in item.nodeid), len(first)))
 
 
 @pytest.fixture(scope="module", autouse=True)
