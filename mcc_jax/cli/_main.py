@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import _thread
 import io
 import os
 import signal
 import sys
+import threading
 import warnings
 from typing import Any
 
@@ -82,10 +84,23 @@ def _terminate(number: int, _: Any) -> None:
     raise _Terminated(128 + number)
 
 
+INSIST_S = 5.0
+
+
+def _interrupt(*_: Any) -> None:
+    """Interrupt, and again unless the process is gone: raised in a library's callback from C, it would be swallowed."""
+    again = threading.Timer(INSIST_S, _thread.interrupt_main)
+    again.daemon = True
+    again.start()
+    raise KeyboardInterrupt
+
+
 def main() -> None:
     """Entry point of `mcc-jax` and `python -m mcc_jax`."""
     if not sys.warnoptions:
         warnings.simplefilter("ignore")
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _interrupt)
     for name in ("SIGTERM", "SIGHUP"):  # so that a run which is told to end clears up behind itself
         if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) is signal.SIG_DFL:
             signal.signal(getattr(signal, name), _terminate)
