@@ -19,6 +19,7 @@ LAYERS = {
     "_types": LEAF,
     "_numerics": LEAF,
     "_results": LEAF,
+    "_version": LEAF,
     "units": LEAF,
     "_blocks": 1,
     "geometry": 1,

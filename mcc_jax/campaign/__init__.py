@@ -12,6 +12,7 @@ from ._batch import Batch as Batch
 from ._batch import batch as batch
 from ._batch import of_each_particle as of_each_particle
 from ._batch import particle_batch as particle_batch
+from ._checksums import file_checksums as file_checksums
 from ._csv import read_campaign as read_campaign
 from ._csv import read_particles as read_particles
 from ._metadata import load_toml_file as load_toml_file

@@ -25,6 +25,12 @@ BELONGS = {
     "modulus_scatter": ("least-squares", "bayes"),
     "shape_scatter": ("least-squares", "bayes"),
 }
+NO_SETTINGS = ("campaign", "out", "no_figures", "as_json")
+
+
+def _applies(name: str, method: str) -> bool:
+    """Whether an option says how a result of this method comes about."""
+    return name not in NO_SETTINGS and method in BELONGS.get(name, METHODS)
 
 
 @click.command(short_help="Fit the law to a campaign.")
@@ -124,11 +130,13 @@ def calibrate(
     with session(12) as tell:
         from ..campaign import read_campaign
         from ._calibration import main_numbers, require_particle, say_files, say_state, say_warnings, write_calibration
+        from ._provenance import provenance
 
         tell("reading the campaign")
         data = read_campaign(campaign)
         require_particle(reference, data.particles, data.source)
         settings: dict[str, Any] = {"threshold_MPa": threshold_MPa, "seed": seed, "progress": tell}
+        origin = provenance(campaign, {n: v for n, v in context.params.items() if _applies(n, method)})
         with results(out) as stage:
             if method == "paper":
                 from ..calibrate import calibrate_paper
@@ -151,7 +159,9 @@ def calibrate(
                     calibration = calibrate_bayes(data, model=model, mode=mode, chains=chains, draws=draws, **settings)  # pyright: ignore[reportArgumentType]  # click has checked the words
                 else:
                     calibration = calibrate_least_squares(data, model=model, loss=loss, **settings)  # pyright: ignore[reportArgumentType]
-            content = write_calibration(calibration, stage, figures=not no_figures, tell=tell)
+            content = write_calibration(
+                calibration, stage, origin=origin, figures=not no_figures, tell=tell
+            )
     if as_json:
         click.echo(json_text(content).encode(), nl=False)  # JSON is UTF-8, whatever the terminal speaks
         return

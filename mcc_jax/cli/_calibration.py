@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,9 @@ Calibration = PaperCalibration | LeastSquaresCalibration | BayesCalibration
 _FIGURE = re.compile(rf"{FIGURES}/[A-Za-z0-9_-]+\.png")
 
 
-def write_calibration(calibration: Calibration, stage: Stage, *, figures: bool, tell: Tell) -> dict[str, Any]:
+def write_calibration(
+    calibration: Calibration, stage: Stage, *, origin: Mapping[str, Any], figures: bool, tell: Tell
+) -> dict[str, Any]:
     """Write `calibration.json`, the figures and, if there is one, the posterior into the stage.
 
     Figures that an earlier calibration lists as its own, and this one does not draw, become stale.
@@ -26,6 +29,7 @@ def write_calibration(calibration: Calibration, stage: Stage, *, figures: bool, 
     Args:
         calibration: what was found.
         stage: where to write.
+        origin: data, settings and versions, as `provenance` gives them.
         figures: whether to draw.
         tell: progress.
 
@@ -48,7 +52,7 @@ def write_calibration(calibration: Calibration, stage: Stage, *, figures: bool, 
         files = [POSTERIOR]
     elif _is_ours(stage.directory / RESULT):
         stage.stale.append(POSTERIOR)  # of an earlier run: it would contradict what lies beside it now
-    content = calibration.to_json() | {"figures": names, "files": files}
+    content = calibration.to_json() | {"figures": names, "files": files, "provenance": dict(origin)}
     (stage.folder / RESULT).write_text(json_text(content), encoding="utf-8")
     return content
 

@@ -78,10 +78,23 @@ def discover(
         from ..discover import discover as find
         from ._calibration import joint_model, say_files
         from ._discovery import require_mechanisms, say_discovery, write_discovery
+        from ._provenance import provenance
 
         require_mechanisms(exclude)
         tell("reading the campaign")
         data = read_campaign(campaign)
+        settings = {
+            "exclude": exclude,
+            "threshold_MPa": threshold_MPa,
+            "priors": priors,
+            "unloading": unloading,
+            "strain_scaling": strain_scaling,
+            "held_out": not no_held_out,
+            "experiments": not no_experiments,
+            "posterior": not no_posterior,
+            "seed": seed,
+        }
+        origin = provenance(campaign, settings)
         with results(out) as stage:
             found = find(
                 data,
@@ -94,7 +107,7 @@ def discover(
                 seed=seed,
                 progress=tell,
             )
-            content = write_discovery(found, stage, figures=not no_figures, tell=tell)
+            content = write_discovery(found, stage, origin=origin, figures=not no_figures, tell=tell)
     if as_json:
         click.echo(json_text(content).encode(), nl=False)  # JSON is UTF-8, whatever the terminal speaks
         return

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Mapping
 from typing import Any
 
 from .._errors import InputError
@@ -30,7 +31,9 @@ def require_mechanisms(names: tuple[str, ...]) -> None:
         raise InputError("every mechanism is excluded", remedy="Leave one to look for")
 
 
-def write_discovery(found: Discovery, stage: Stage, *, figures: bool, tell: Tell) -> dict[str, Any]:
+def write_discovery(
+    found: Discovery, stage: Stage, *, origin: Mapping[str, Any], figures: bool, tell: Tell
+) -> dict[str, Any]:
     """Write `discovery.json` and the figures into the stage.
 
     Figures that an earlier discovery lists as its own, and this one does not draw, become stale.
@@ -38,6 +41,7 @@ def write_discovery(found: Discovery, stage: Stage, *, figures: bool, tell: Tell
     Args:
         found: the answer.
         stage: where to write.
+        origin: data, settings and versions, as `provenance` gives them.
         figures: whether to draw.
         tell: progress.
 
@@ -53,7 +57,7 @@ def write_discovery(found: Discovery, stage: Stage, *, figures: bool, tell: Tell
         saved = save_figures(discovery_figures(found), stage.folder / FIGURES)
         names = sorted(f"{FIGURES}/{path.name}" for path in saved)
     stage.stale += [name for name in earlier_figures(stage.directory / DISCOVERY) if name not in names]
-    content = found.to_json() | {"figures": names}
+    content = found.to_json() | {"figures": names, "provenance": dict(origin)}
     (stage.folder / DISCOVERY).write_text(json_text(content), encoding="utf-8")
     return content
 

@@ -46,13 +46,9 @@ Shell completion (bash; likewise zsh_source, fish_source):
 
 def _version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
     if wanted and not ctx.resilient_parsing:
-        from importlib.metadata import PackageNotFoundError, version
+        from .._version import own_version
 
-        try:
-            number = version(PROGRAM)
-        except PackageNotFoundError:
-            number = "(not installed)"
-        click.echo(f"{PROGRAM} {number}")
+        click.echo(f"{PROGRAM} {own_version()}")
         ctx.exit()
 
 

@@ -189,6 +189,8 @@ class BayesCalibration:
                 for j, coefficient in enumerate(COEFFICIENTS):
                     draws[coefficient] = summary(self.C[..., row, j])
                 draws["zero_um"] = summary(self.zero_um[..., row])
+                if self.model.modulus_scatter:
+                    draws["effective_modulus_MPa"] = summary(self.modulus_MPa[..., row])
             entries.append(
                 {
                     "particle": name,

@@ -172,6 +172,19 @@ class _Prepared:
     contact: float
 
 
+def rows_from_contact(curve: Curve, segments: tuple[Segment, ...], most_points: int) -> np.ndarray:
+    """Rows of a test behind its approach; of longer records every n-th, turning points and the largest force always."""
+    first = segments[0]
+    start = first.stop if first.kind == "approach" and len(segments) > 1 else 0
+    rows = np.arange(start, len(curve))
+    stride = -(-len(rows) // most_points)
+    if stride <= 1:
+        return rows
+    turns = [part.start for part in segments] + [part.stop - 1 for part in segments]
+    turns.append(int(np.argmax(curve.force_mN)))
+    return np.unique(np.concatenate([rows[::stride], [t for t in turns if t >= start]]))
+
+
 def _prepare(
     curve: Curve, diameters: np.ndarray, segments: tuple[Segment, ...], threshold: float, most_points: int
 ) -> _Prepared | str:
@@ -184,13 +197,7 @@ def _prepare(
         return "has no loading: force never rises above its noise"
     first = segments[0]
     contact = float(curve.displacement_um[first.stop]) if first.kind == "approach" and len(segments) > 1 else None
-    start = 0 if contact is None else first.stop
-    rows = np.arange(start, len(curve))
-    stride = -(-len(rows) // most_points)
-    if stride > 1:
-        turns = [part.start for part in segments] + [part.stop - 1 for part in segments]
-        turns.append(int(np.argmax(curve.force_mN)))
-        rows = np.unique(np.concatenate([rows[::stride], [t for t in turns if t >= start]]))
+    rows = rows_from_contact(curve, segments, most_points)
     peak = np.maximum.accumulate(stress[rows])
     loading = (kind[rows] == "load") & (stress[rows] >= threshold) & (stress[rows] > 0)
     elastic = np.isin(kind[rows], ("hold", "unload", "reload")) & (stress[rows] >= LEAST_RATIO * peak)

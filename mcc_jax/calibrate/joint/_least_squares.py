@@ -152,6 +152,9 @@ class LeastSquaresCalibration:
                     log = float(latent[row, j] - np.log(eta[row]))
                     found[coefficient] = log_estimate(log, float(np.sqrt(max(variance, 0.0))) if known[0] else np.nan)
                 found["zero_um"] = _normal(float(zero[row]), float(np.sqrt(own[row, 3, 3])))
+                if self.model.modulus_scatter:
+                    log_modulus = float(latent[row, 3] - self.model.shape_power * np.log(eta[row]))
+                    found["effective_modulus_MPa"] = estimate(float(np.exp(log_modulus)))
             entries.append(
                 {
                     "particle": name,

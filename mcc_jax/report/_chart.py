@@ -1,0 +1,154 @@
+"""The interactive chart: Bokeh's figures without data, which the page's own script fills particle by particle."""
+
+from __future__ import annotations
+
+import json
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+
+from ..plots._style import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION
+from ._compare import KINDS, Shown
+
+ROOTS = ("chart-curve", "chart-residual")
+LOOKS = {
+    "load": ("circle", BLUE, "loading"),
+    "hold": ("diamond", ORANGE, "hold"),
+    "unload": ("triangle", VERMILION, "unloading"),
+    "reload": ("square", GREEN, "reloading"),
+}
+"""Marker, colour (Okabe and Ito) and word of every kind of segment: never told apart by colour alone."""
+
+COLUMNS = ("displacement", "force", "residual", "marker", "colour", "alpha", "particle", "segment", "time", "compared")
+
+
+def chart_scripts() -> str:
+    """Bokeh's own script, to stand in the page."""
+    return files("bokeh").joinpath("server", "static", "js", "bokeh.min.js").read_text(encoding="utf-8")
+
+
+def chart_items() -> dict[str, Any]:
+    """Documents and render items for `Bokeh.embed.embed_items`: the same in every process.
+
+    The data sources `points`, `lines` and `bands`, and the figures `curve` and `residual`, are found by these names.
+    """
+    from bokeh.core.json_encoder import serialize_json
+    from bokeh.document import Document
+    from bokeh.models import ColumnDataSource, HoverTool, Range1d
+
+    points = ColumnDataSource({name: [] for name in COLUMNS}, name="points")
+    lines = ColumnDataSource({name: [] for name in ("force", "own", "typical", "away")}, name="lines")
+    bands = ColumnDataSource({name: [] for name in ("x", "y", "away")}, name="bands")
+    force = Range1d(0, 1)
+    curve = _figure("curve", "displacement [µm]", Range1d(0, 1), force)
+    residual = _figure("residual", "measured − predicted [µm]", Range1d(-1, 1), force)
+    curve.patches("x", "y", source=bands, color=SKY, alpha=0.45, line_width=0)
+    residual.patches("away", "y", source=bands, color=SKY, alpha=0.45, line_width=0)
+    curve.line("typical", "force", source=lines, color=BLACK, line_dash=[6, 4], line_width=1.3)
+    curve.line("own", "force", source=lines, color=BLACK, line_width=1.3)
+    residual.line("away", "force", source=lines, color=BLACK, line_width=1.3)
+    tips = [(word, f"@{column}") for word, column in (("particle", "particle"), ("segment", "segment"))]
+    tips += [("force", "@force{0.000} mN"), ("displacement", "@displacement{0.000} µm")]
+    tips += [("measured − predicted", "@residual{0.0000} µm"), ("time", "@time{0.0} s"), ("compared", "@compared")]
+    for figure, x in ((curve, "displacement"), (residual, "residual")):
+        marks = figure.scatter(
+            x, "force", source=points, marker="marker", color="colour", fill_alpha="alpha", line_alpha="alpha", size=6
+        )
+        figure.add_tools(HoverTool(tooltips=tips, renderers=[marks], description="Show the values of a point"))
+    document = Document()
+    for root in (curve, residual):
+        document.add_root(root)
+    roots = dict(zip((curve.id, residual.id), ROOTS, strict=True))
+    items = [{"docid": "chart", "roots": roots, "root_ids": list(roots)}]
+    return _same_names({"docs": {"chart": json.loads(serialize_json(document.to_json()))}, "items": items})
+
+
+def _figure(name: str, label: str, across: Any, up: Any) -> Any:
+    from bokeh.plotting import figure
+
+    plot = figure(
+        name=name,
+        height=400,
+        sizing_mode="stretch_width",
+        x_range=across,
+        y_range=up,
+        x_axis_label=label,
+        y_axis_label="force [mN]",
+        tools="box_zoom,pan,wheel_zoom,reset,save",
+        active_drag="box_zoom",
+        # A wheel, or a finger, that moves the page must not be caught by a chart on its way.
+        active_scroll=None,
+        toolbar_location="above",
+        min_border_right=12,
+    )
+    plot.toolbar.logo = None
+    for axis in (*plot.xaxis, *plot.yaxis):
+        axis.axis_label_text_font_style = "normal"
+        axis.axis_label_text_font_size = axis.major_label_text_font_size = "13px"
+        axis.axis_label_text_font = axis.major_label_text_font = "system-ui, sans-serif"
+        axis.ticker.desired_num_ticks = 5
+        axis.axis_label_text_color = axis.major_label_text_color = "#222222"
+    return plot
+
+
+def _same_names(item: dict[str, Any]) -> dict[str, Any]:
+    """The item with models named in their order: Bokeh numbers them by what the process drew before."""
+    text = json.dumps(item)
+    names: dict[str, str] = {}
+    for name in _ids(item):
+        names.setdefault(name, f"model-{len(names)}")
+    for name, other in names.items():
+        text = text.replace(f'"{name}"', f'"{other}"')
+    return json.loads(text)
+
+
+def _ids(value: Any):
+    if isinstance(value, dict):
+        if isinstance(value.get("id"), str):
+            yield value["id"]
+        for item in value.values():
+            yield from _ids(item)
+    elif isinstance(value, list):
+        for item in value:
+            yield from _ids(item)
+
+
+def chart_data(shown: list[Shown], labels: list[str], facts: list[str]) -> dict[str, Any]:
+    """What the script shows: every particle's columns, and how kinds of segments look."""
+    return {
+        "kinds": [
+            {"marker": marker, "colour": colour, "word": word}
+            for marker, colour, word in (LOOKS[kind] for kind in KINDS)
+        ],
+        "particles": [
+            {
+                "label": label,
+                "facts": fact,
+                "time": _short(one.time_s),
+                "force": _short(one.force_mN),
+                "displacement": _short(one.displacement_um, one.own_um, one.displacement_um),
+                "own": _short(one.own_um, one.own_um, one.displacement_um),
+                "typical": _short(one.typical_um),
+                "low": _short(one.low_um, one.own_um, one.displacement_um),
+                "high": _short(one.high_um, one.own_um, one.displacement_um),
+                "kind": one.kind.tolist(),
+                "used": one.used.astype(int).tolist(),
+            }
+            for one, label, fact in zip(shown, labels, facts, strict=True)
+        ],
+    }
+
+
+def _short(values: np.ndarray, *beside: np.ndarray) -> list[float | None] | None:
+    """The values with five digits of their range, or of what is left between two columns; None if there are none."""
+    finite = values[np.isfinite(values)]
+    if not len(finite):
+        return None
+    reach = float(np.ptp(finite)) or float(np.abs(finite).max()) or 1.0
+    if beside:
+        away = np.abs(beside[0] - beside[1])
+        away = away[np.isfinite(away) & (away > 0)]
+        reach = min(reach, float(np.median(away)) * 30) if len(away) else reach
+    digits = int(np.clip(5 - np.floor(np.log10(reach)), 0, 12))
+    return [round(v, digits) if np.isfinite(v) else None for v in values.tolist()]

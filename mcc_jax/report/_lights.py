@@ -1,0 +1,196 @@
+"""Diagnostics as traffic lights: a word, a sign and a colour each, what it means, and what to do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from ..calibrate._result import BAD_MISFIT
+from ..calibrate.joint._bayes import ESS_LEAST, PARETO_K_MOST, RHAT_MOST
+from ._numbers import number, percent
+from ._read import Results, checksums_told
+
+Level = Literal["good", "look", "bad", "unknown"]
+RHAT_BAD, ESS_BAD, PARETO_K_BAD = 1.05, 100.0, 1.0
+"""From here on the gate is not just missed: the draws cannot be used."""
+
+GOOD_MISFIT = 0.01
+INSIDE = (0.90, 0.99)
+NOT_MONOTONE = 0.05
+FEW_PARTICLES = 6
+"""Fewer say little of the scatter between particles."""
+
+
+@dataclass(frozen=True)
+class Light:
+    """One check.
+
+    Attributes:
+        level: good, look (use with care), bad, or unknown.
+        check: what is checked.
+        value: what was found.
+        want: what it should be.
+        meaning: what it says, and what to do where it fails.
+    """
+
+    level: Level
+    check: str
+    value: str
+    want: str
+    meaning: str
+
+
+def lights(results: Results) -> list[Light]:
+    """All checks that these results allow, the convergence of the calibration first."""
+    found = []
+    if results.calibration is not None:
+        found += _calibration(results.calibration)
+        if results.calibration["method"] == "bayes":
+            found += _sampler(results.calibration["diagnostics"])
+        found += _fit(results.calibration)
+    if results.posterior is not None and results.posterior.inside is not None:
+        found.append(_coverage(results.posterior.inside))
+    if results.calibration is not None:
+        found.append(_data(results))
+    if results.discovery is not None:
+        found.append(_discovery(results.discovery))
+    return found
+
+
+def _calibration(content: dict[str, Any]) -> list[Light]:
+    count, used = len(content["particles"]), sum(entry["kept"] for entry in content["particles"])
+    share = used / count
+    return [
+        Light(
+            "good" if content["converged"] else "bad",
+            "Calibration converged",
+            "yes" if content["converged"] else "no",
+            "yes",
+            "Every part of the calibration met its own tolerances."
+            if content["converged"]
+            else "The numbers are not to be trusted before the checks below are mended.",
+        ),
+        Light(
+            "good" if share == 1 and used >= FEW_PARTICLES else "look" if share >= 0.5 and used > 1 else "bad",
+            "Particles used",
+            f"{used} of {count}",
+            f"all, and at least {FEW_PARTICLES}",
+            "Few particles say little of how particles differ; the reasons for those left out stand in the table above.",
+        ),
+    ]
+
+
+def _sampler(d: dict[str, Any]) -> list[Light]:
+    rhat, ess, divergences, k = (d.get(n) for n in ("rhat_max", "ess_bulk_min", "divergences", "pareto_k_max"))
+    joint = d.get("pareto_k_joint")
+    worst = None if k is None else max(k, joint or k)
+    return [
+        Light(
+            _below(rhat, RHAT_MOST, RHAT_BAD),
+            "Chains agree (R-hat)",
+            number(rhat),
+            f"at most {RHAT_MOST}",
+            "Chains that started apart must end with one answer. If not: more draws (--draws).",
+        ),
+        Light(
+            _below(None if ess is None else -ess, -ESS_LEAST, -ESS_BAD),
+            "Independent draws (bulk ESS)",
+            number(ess),
+            f"at least {ESS_LEAST:.0f}",
+            "So many independent draws the chains are worth. If too few: more draws (--draws).",
+        ),
+        Light(
+            "unknown" if divergences is None else "good" if divergences == 0 else "bad",
+            "Diverging trajectories",
+            number(divergences),
+            "0",
+            "The sampler could not follow the posterior everywhere. If not 0: more draws, or narrower priors.",
+        ),
+        Light(
+            _below(worst, PARETO_K_MOST, PARETO_K_BAD),
+            "Fast mode is accurate (Pareto k)",
+            number(worst, 2),
+            f"at most {PARETO_K_MOST}",
+            "How well the quadratic summaries of the fast mode stand for the tests themselves. If not: --mode joint.",
+        ),
+    ]
+
+
+def _fit(content: dict[str, Any]) -> list[Light]:
+    d = content["diagnostics"]
+    misfit, share = d.get("own_misfit"), (content.get("probability_not_monotone") or {}).get("value")
+    found = []
+    if misfit is not None:
+        found.append(
+            Light(
+                _below(misfit, GOOD_MISFIT, BAD_MISFIT),
+                "The law's form fits",
+                f"off by {percent(misfit)}",
+                f"at most {percent(GOOD_MISFIT)}",
+                "Median misfit with each particle's own coefficients, as a share of its range of displacement. If large: "
+                "these may be no compressions of single particles, or the diameters are wrong.",
+            )
+        )
+    if share is not None:
+        found.append(
+            Light(
+                "good" if share <= NOT_MONOTONE else "look",
+                "New particles behave",
+                f"{percent(share)} snap through",
+                f"at most {percent(NOT_MONOTONE)}",
+                "Share of particles drawn from this population whose loading curve would fall somewhere.",
+            )
+        )
+    for text in d.get("open_combinations", []):
+        found.append(
+            Light("bad", "Data determine the parameters", "not all", "all", f"The data leave open: {text}.")
+        )
+    return found
+
+
+def _coverage(inside: float) -> Light:
+    low, high = INSIDE
+    return Light(
+        "good" if low <= inside <= high else "look",
+        "Prediction bands hold",
+        f"{percent(inside, 3)} of points inside",
+        f"about 95 %, {percent(low)} to {percent(high)}",
+        "Measured points inside the band that should hold 95 % of them. Fewer: the law misses something, or the noise is "
+        "larger than estimated. More: the noise is smaller.",
+    )
+
+
+def _data(results: Results) -> Light:
+    assert results.calibration is not None
+    told = checksums_told(results.calibration)
+    if not told or not results.checksums:
+        return Light(
+            "unknown", "Same data", "cannot tell", "checksums agree", "Checksums or the campaign's files are missing."
+        )
+    same = all(results.checksums.get(name) == told.get(name) for name in ("particles.csv", "curves.csv"))
+    return Light(
+        "good" if same and not results.cautions else "bad",
+        "Same data",
+        "checksums agree" if same else "checksums differ",
+        "checksums agree",
+        "The data shown here are those that were calibrated. If not: calibrate again.",
+    )
+
+
+def _discovery(content: dict[str, Any]) -> Light:
+    level: dict[str, Level] = {"NO_GAP": "good", "FIT_NOT_CONVERGED": "bad"}
+    meaning = {
+        "NO_GAP": "Nothing is missing in the law that these tests could show.",
+        "NAMED": "The law alone is incomplete: use its parameters together with the effect that was added.",
+        "SET": "The law alone is incomplete, and these tests cannot tell several causes apart.",
+        "UNLISTED": "The law alone is incomplete, and no listed mechanism explains it.",
+        "FIT_NOT_CONVERGED": "The law could not be fitted well enough to ask what it lacks.",
+    }
+    verdict = content["verdict"]
+    return Light(level.get(verdict, "look"), "Law is complete", verdict, "NO_GAP", meaning[verdict])
+
+
+def _below(value: float | None, good: float, bad: float) -> Level:
+    if value is None:
+        return "unknown"
+    return "good" if value <= good else "look" if value <= bad else "bad"

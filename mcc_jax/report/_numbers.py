@@ -1,0 +1,66 @@
+"""Numbers as a person writes them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """So many significant digits, or "unknown"; very large and small ones as powers of ten."""
+    if value is None or not math.isfinite(value):
+        return "unknown"
+    if value and not 1e-4 <= abs(value) < 1e6:
+        mantissa, _, exponent = f"{value:.{max(digits - 2, 0)}e}".partition("e")
+        return f"{mantissa} × 10{_raised(int(exponent))}".replace("-", "−")
+    text = f"{value:.{digits}g}"
+    if "e" in text:
+        text = f"{value:.0f}"
+    return text.replace("-", "−")
+
+
+def _raised(exponent: int) -> str:
+    return str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+
+
+def decimals(value: float, sd: float) -> int | None:
+    """Decimal places that show two digits of the uncertainty; None where a power of ten is called for."""
+    places = max(0, 1 - math.floor(math.log10(sd)))
+    return None if places > 6 or abs(value) >= 1e6 else places
+
+
+def with_sd(estimate: dict[str, Any], factor: float = 1.0) -> str:
+    """Value ± standard deviation, which decides the digits of both."""
+    value, sd = estimate["value"], estimate["sd"]
+    if value is None or sd is None or not sd > 0:
+        return number(None if value is None else value * factor)
+    value, sd = value * factor, sd * factor
+    places = decimals(value, sd)
+    if places is None:
+        return f"{number(value)} ± {number(sd, 2)}"
+    return f"{value:.{places}f} ± {sd:.{places}f}".replace("-", "−")
+
+
+def interval(estimate: dict[str, Any], factor: float = 1.0) -> str | None:
+    """The two ends of the 95 % interval, or None where there is none."""
+    ends = estimate["interval_95"]
+    if ends is None:
+        return None
+    low, high = (end * factor for end in ends)
+    if not high > low:
+        return f"{number(low)} to {number(high)}"
+    places = decimals(max(abs(low), abs(high)), (high - low) / 4)
+    if places is None:
+        return f"{number(low)} to {number(high)}"
+    return f"{low:.{places}f} to {high:.{places}f}".replace("-", "−")
+
+
+def percent(share: float | None, digits: int = 2) -> str:
+    """A share as per cent."""
+    return "unknown" if share is None else f"{number(100 * share, digits)} %"
+
+
+def span(values: Any, unit: str, digits: int = 4) -> str:
+    """Smallest and largest, or the one value."""
+    low, high = number(float(min(values)), digits), number(float(max(values)), digits)
+    return f"{low} {unit}" if low == high else f"{low} to {high} {unit}"

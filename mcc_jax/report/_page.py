@@ -1,0 +1,240 @@
+"""The page: everything that the templates show, gathered and rendered."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from .._version import own_version
+from ..plots._text import particle_labels
+from . import _pictures as pictures
+from ._chart import LOOKS, chart_data, chart_items, chart_scripts
+from ._compare import KINDS, compare
+from ._lights import lights
+from ._numbers import interval, number, percent, with_sd
+from ._read import Results, read_results
+from ._words import (
+    METHODS,
+    calibration_sentences,
+    discovery_sentence,
+    listed,
+    measured,
+    next_steps,
+    parameters,
+    particle_facts,
+    particle_rows,
+    plain,
+    quantity,
+    simulated,
+)
+
+CAPTIONS = {
+    "bands": ("compare", "Measured curves and the central 95 % of what the posterior expects"),
+    "fits": ("compare", "Measured curves and the joint fit"),
+    "particles": ("compare", "Measured curves, the mean law, and each particle's own coefficients"),
+    "residuals": ("compare", "What the law leaves, over strain"),
+    "whitened": ("compare", "Residuals freed of their correlation, which should be noise"),
+    "dimensions": ("measured", "Sizes and shapes of the particles"),
+    "curves": ("measured", "All curves"),
+    "collapse": ("law", "Stress over strain, as measured and scaled by the shape factor"),
+    "master": ("law", "The master curve and its scatter"),
+    "law": ("law", "The mean law"),
+    "elastic": ("law", "Recovered strain on unloading, from which the effective modulus comes"),
+    "pairs": ("posterior", "How the numbers of the population depend on each other"),
+    "prior_posterior": ("posterior", "What the data added to the priors"),
+    "forest": ("posterior", "Coefficients of every particle, and the population behind them"),
+    "estimates": ("posterior", "Coefficients of every particle, and the population behind them"),
+    "shrinkage": ("posterior", "Each particle alone, and among the others"),
+    "new_particle": ("posterior", "What a particle never measured would do"),
+    "discovery_where": ("discovery", "Where law and tests disagree"),
+    "discovery_before_after": ("discovery", "What the law leaves, before and after"),
+    "discovery_ranking": ("discovery", "Every mechanism against the law alone"),
+    "discovery_gap": ("discovery", "The gap on held-out particles"),
+    "discovery_similarity": ("discovery", "How alike the mechanisms look in these tests"),
+    "discovery_shifts": ("discovery", "What the missing effect had done to the parameters"),
+}
+"""Section and caption of every figure, by its stem."""
+
+VERDICTS = {
+    "NO_GAP": ("good", "Nothing missing"),
+    "NAMED": ("look", "Missing and named"),
+    "SET": ("look", "Missing, several candidates"),
+    "UNLISTED": ("look", "Missing, unlisted"),
+    "FIT_NOT_CONVERGED": ("bad", "Cannot ask"),
+}
+
+
+def report_page(folder: str | Path, campaign: str | Path | None = None, *, name: str | None = None) -> str:
+    """One self-contained HTML page from what a folder holds; equal input, equal page.
+
+    Args:
+        folder: what `mcc-jax demo`, `calibrate` or `discover` wrote into.
+        campaign: the folder of the campaign, if it is neither there nor where the results say.
+        name: what to call the folder in the page; its own name if None.
+
+    Raises:
+        InputError: if a file is damaged, of an unknown schema, or there is nothing to report.
+        RuntimeError: in single precision.
+    """
+    _require_double()
+    return render(read_results(folder, campaign, name=name))
+
+
+def _require_double() -> None:
+    import jax
+
+    if not jax.config.read("jax_enable_x64"):
+        raise RuntimeError(
+            'the report needs double precision; call jax.config.update("jax_enable_x64", True) before anything else'
+        )
+
+
+def render(results: Results) -> str:
+    """The page of results that were read."""
+    return _environment().get_template("page.html").render(context(results))
+
+
+@cache
+def _environment() -> Any:
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    # Every text of the data passes through here: autoescape has no exceptions in the templates but our own scripts.
+    found = Environment(
+        loader=PackageLoader("mcc_jax.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    # Bokeh wants a model before what refers to it.
+    found.policies["json.dumps_kwargs"] = {"sort_keys": False, "allow_nan": False, "separators": (",", ":")}
+    found.globals["plain_name"] = quantity
+    found.filters |= {
+        "number": number,
+        "percent": percent,
+        "with_sd": with_sd,
+        "interval": interval,
+        "plain": plain,
+        "listed": listed,
+    }
+    return found
+
+
+def context(results: Results) -> dict[str, Any]:
+    """What the templates show."""
+    from markupsafe import Markup
+
+    shown = compare(results)
+    labels = particle_labels([one.name for one in shown], 40)
+    folder = shlex.quote(results.name)
+    checks = lights(results)
+    return {
+        "results": results,
+        "version": own_version(),
+        "simulated": simulated(results),
+        "cards": _cards(results, checks),
+        "summary": _summary(results),
+        "next_steps": next_steps(results, folder),
+        "facts": [] if results.campaign is None else measured(results.campaign),
+        "rows": particle_rows(results),
+        "parameters": [] if results.calibration is None else parameters(results.calibration),
+        "sentences": [] if results.calibration is None else calibration_sentences(results.calibration),
+        "methods": METHODS,
+        "shown": shown,
+        "labels": labels,
+        "looks": {word: (marker, colour) for marker, colour, word in (LOOKS[kind] for kind in KINDS)},
+        "seen": sorted({LOOKS[KINDS[k]][2] for one in shown for k in set(one.kind.tolist())}),
+        "chart": _chart(results, shown, labels) if shown else None,
+        "bokeh": Markup(_closed(chart_scripts())) if shown else "",
+        "grid": pictures.grid(shown),
+        "marginals": [] if results.posterior is None else pictures.marginals(results.posterior.draws),
+        "lights": checks,
+        "verdicts": VERDICTS,
+        "gap_picture": None if results.discovery is None else pictures.steps(results.discovery["gap"]),
+        "shift_pictures": []
+        if results.discovery is None
+        else pictures.shifts(results.discovery["parameters_before"], results.discovery["parameters_after"]),
+        "figures_of": _figures(results),
+        "folder": folder,
+        "style": Markup(_source("style.css")),
+        "script": Markup(_closed(_source("page.js"))),
+        "versions": next((v for _, c in results.results if (v := c["provenance"]["versions"])), {}),
+    }
+
+
+def _source(name: str) -> str:
+    return (Path(__file__).parent / "templates" / name).read_text(encoding="utf-8")
+
+
+def _closed(script: str) -> str:
+    """A script that cannot end its element early."""
+    return re.sub(r"</(script)", r"<\\/\1", script, flags=re.IGNORECASE)
+
+
+def _chart(results: Results, shown: list[Any], labels: list[str]) -> dict[str, Any]:
+    facts = particle_facts(results, [s.name for s in shown], [s.rms_um for s in shown], [s.why_not for s in shown])
+    return {"bokeh": chart_items(), "data": chart_data(shown, labels, facts)}
+
+
+def _cards(results: Results, checks: list[Any]) -> list[dict[str, str]]:
+    """The answers at the top, each with a level, a heading and a line."""
+    found = []
+    if results.calibration is not None:
+        content = results.calibration
+        used = sum(entry["kept"] for entry in content["particles"])
+        done = content["converged"]
+        found.append(
+            {
+                "level": "good" if done else "bad",
+                "title": "Calibration",
+                "answer": "Converged" if done else "Not converged",
+                "line": f"{used} of {len(content['particles'])} particles, method {content['method']}",
+            }
+        )
+        worst = [c for c in checks if c.level == "bad"] or [c for c in checks if c.level == "look"]
+        good = sum(c.level == "good" for c in checks)
+        found.append(
+            {
+                "level": worst[0].level if worst else "good",
+                "title": "Checks",
+                "answer": f"{good} of {len(checks)} fine",
+                "line": f"look at: {listed([c.check for c in worst[:2]])}" if worst else "nothing stands out",
+            }
+        )
+    if results.discovery is not None:
+        level, answer = VERDICTS[results.discovery["verdict"]]
+        names = [plain(effect["mechanism"]) for effect in results.discovery["effects"]]
+        line = listed(names) if names else f"verdict {results.discovery['verdict']}"
+        found.append({"level": level, "title": "Discovery", "answer": answer, "line": line})
+    return found
+
+
+def _summary(results: Results) -> list[str]:
+    found = []
+    if results.calibration is not None:
+        found += calibration_sentences(results.calibration)
+    if results.discovery is not None:
+        found.append(discovery_sentence(results.discovery))
+    if not found and results.campaign is not None:
+        found.append(f"{len(results.campaign)} tests were measured; nothing has been calibrated on them yet.")
+    return found
+
+
+def _figures(results: Results) -> dict[str, list[tuple[str, str]]]:
+    """Pictures and captions by section."""
+    found: dict[str, list[tuple[str, str]]] = {
+        name: [] for name in ("measured", "law", "compare", "posterior", "discovery")
+    }
+    order = list(CAPTIONS)
+    for stem in sorted(results.figures, key=lambda s: (order.index(_kind(s)) if _kind(s) in order else 99, s)):
+        section, caption = CAPTIONS.get(_kind(stem), ("posterior", stem.replace("_", " ")))
+        found[section].append((pictures.data_uri(results.figures[stem]), caption))
+    return found
+
+
+def _kind(stem: str) -> str:
+    """The stem without the number of a page: `particles_2` is one of `particles`."""
+    return re.sub(r"_\d+$", "", stem)

@@ -1,0 +1,166 @@
+"""Pictures that stand still: every particle at a glance, and the posterior's marginals, as SVG."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ..plots._style import BLACK, BLUE, GREY, ORANGE, PALE, SKY, VERMILION, new_figure, styled
+from ..plots._text import particle_labels
+from ._compare import Shown
+
+GRID = 30
+"""At most so many particles stand in the grid; of more, those with the largest misfit."""
+
+GRID_COLUMNS = 5
+BINS = 40
+PANELS = {
+    "a": ("shape parameter a [-]", 1.0),
+    "effective_modulus_MPa": ("effective modulus [GPa]", 1e-3),
+    "C1_median": ("C₁, median particle [-]", 1.0),
+    "C1_spread": ("sd of log C₁ [-]", 1.0),
+    "C3_median": ("C₃, median particle [-]", 1.0),
+    "C3_spread": ("sd of log C₃ [-]", 1.0),
+    "C5_median": ("C₅, median particle [-]", 1.0),
+    "C5_spread": ("sd of log C₅ [-]", 1.0),
+}
+
+
+def data_uri(picture: bytes, kind: str = "png") -> str:
+    """A picture as part of the page."""
+    return f"data:image/{kind};base64,{base64.b64encode(picture).decode('ascii')}"
+
+
+def _svg(figure: Any) -> str:
+    from matplotlib import rc_context
+
+    stream = io.BytesIO()
+    # The same ids and no date: one input, one page. Text stays text, and small.
+    with rc_context({"svg.hashsalt": "mcc_jax", "svg.fonttype": "none"}):
+        figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
+    return data_uri(stream.getvalue(), "svg+xml")
+
+
+@styled
+def marginals(draws: Mapping[str, np.ndarray]) -> list[tuple[str, str, str]]:
+    """For each number of the population: a picture of its posterior, its name, and what the picture shows in words."""
+    found = []
+    for name, (label, factor) in PANELS.items():
+        values = draws[name] * factor
+        low, middle, high = np.quantile(values, [0.025, 0.5, 0.975])
+        figure = new_figure(3.2, 2.1)
+        ax = figure.subplots()
+        # Outside this range stand a few draws that would squeeze all others.
+        ends = np.quantile(values, [0.001, 0.999])
+        heights, edges, _ = ax.hist(values, bins=BINS, range=tuple(ends), color=SKY, alpha=0.75, linewidth=0)
+        ax.hlines(-0.06 * heights.max(), low, high, color=BLUE, linewidth=2.5)
+        ax.plot(middle, -0.06 * heights.max(), "o", color=BLACK, markersize=4.5)
+        ax.set_ylim(-0.12 * heights.max(), None)
+        ax.set_xlim(edges[0], edges[-1])
+        ax.set_xlabel(label)
+        ax.set_yticks([])
+        ax.spines["left"].set_visible(False)
+        ax.locator_params(axis="x", nbins=4)
+        words = f"Posterior of {label}: median {middle:.4g}, 95 % between {low:.4g} and {high:.4g}"
+        found.append((_svg(figure), label, words))
+    return found
+
+
+@styled
+def grid(shown: list[Shown]) -> tuple[str, int] | None:
+    """Force over displacement of every particle, measured and predicted; and how many stand in it."""
+    if not shown:
+        return None
+    misfit = np.array([one.rms_um or 0.0 for one in shown])
+    chosen = np.sort(np.argsort(-misfit, kind="stable")[:GRID])
+    labels = particle_labels([one.name for one in shown], 18)
+    columns = min(GRID_COLUMNS, len(chosen))
+    rows = -(-len(chosen) // columns)
+    figure = new_figure(2.0 * columns + 0.3, 1.5 * rows + 0.4)
+    panels = figure.subplots(rows, columns, squeeze=False)
+    for ax in panels.flat[len(chosen) :]:
+        ax.set_axis_off()
+    for ax, i in zip(panels.flat, chosen, strict=False):
+        one = shown[i]
+        colour = np.where(one.kind == 0, BLUE, VERMILION)
+        colour = np.where(one.used, colour, PALE)
+        every = max(1, len(colour) // 60)
+        ax.scatter(
+            one.displacement_um[::every], one.force_mN[::every], s=3, c=list(colour[::every]), linewidths=0, zorder=2
+        )
+        ax.plot(one.own_um, one.force_mN, color=BLACK, linewidth=0.7, zorder=3)
+        ax.set_title(labels[i], fontsize=7.5, color=GREY if one.why_not else BLACK)
+        ax.tick_params(labelsize=6.5, length=2, pad=1.5)
+        ax.locator_params(nbins=3)
+        ax.margins(0.04)
+    figure.supxlabel("displacement [µm]", fontsize=8)
+    figure.supylabel("force [mN]", fontsize=8)
+    figure.set_layout_engine("constrained")
+    return _svg(figure), len(chosen)
+
+
+@styled
+def steps(gap: dict[str, Any]) -> tuple[str, str] | None:
+    """The systematic gap on held-out particles at every step, and the same in words; None if nothing was added."""
+    found = [step for step in gap["steps"] if step["systematic_um"] is not None]
+    if len(found) < 2:
+        return None
+    words = [(step["added"] or "law alone").replace("_", " ") for step in found]
+    words = [word if i == 0 else f"+ {word}" for i, word in enumerate(words)]
+    size = [step["systematic_um"] for step in found]
+    figure = new_figure(6.4, 0.55 + 0.42 * len(found))
+    ax = figure.subplots()
+    ax.barh(range(len(found)), size, color=[VERMILION, *[BLUE] * (len(found) - 1)], height=0.6)
+    for i, value in enumerate(size):
+        ax.text(value, i, f" {value:.3g} µm", va="center", ha="left", fontsize=8)
+    ax.axvline(0, color=GREY, linewidth=0.7)
+    ax.set_xlim(0, 1.2 * max(*size, 1e-12))
+    ax.set_yticks(range(len(found)), words)
+    ax.invert_yaxis()
+    ax.set_xlabel("systematic gap on held-out particles [µm]")
+    told = "; ".join(f"{word}: {value:.3g} µm" for word, value in zip(words, size, strict=True))
+    return _svg(figure), f"Systematic gap on held-out particles: {told}"
+
+
+@styled
+def shifts(before: dict[str, Any], after: dict[str, Any]) -> list[tuple[str, str]]:
+    """Each parameter before and after what was added, with 95 % intervals; and the same in words."""
+    names = [
+        ("a", "shape parameter a [-]", 1.0),
+        ("effective_modulus_MPa", "effective modulus [GPa]", 1e-3),
+        *((f"log_C{k}", f"mean log C{'₀₁₂₃₄₅'[k]} [-]", 1.0) for k in (1, 3, 5)),
+    ]
+    found = []
+    for name, label, factor in names:
+        pair = [_estimate(parameters, name) for parameters in (before, after)]
+        if any(e is None or e["value"] is None for e in pair):
+            continue
+        figure = new_figure(3.2, 1.25)
+        ax = figure.subplots()
+        told = []
+        for y, (estimate, colour, marker, word) in enumerate(
+            zip(pair, (VERMILION, BLUE), ("o", "s"), ("before", "after"), strict=True)
+        ):
+            assert estimate is not None
+            value = estimate["value"] * factor
+            ax.plot(value, y, marker, color=colour, markersize=5)
+            if estimate["interval_95"] is not None:
+                ax.hlines(y, *(end * factor for end in estimate["interval_95"]), color=colour, linewidth=2)
+            told.append(f"{word} {value:.4g}")
+        ax.set_yticks([0, 1], ["before", "after"])
+        ax.set_ylim(1.5, -0.5)
+        ax.set_xlabel(label)
+        ax.locator_params(axis="x", nbins=4)
+        ax.margins(x=0.1)
+        ax.grid(axis="x", color=ORANGE, alpha=0.25, linewidth=0.6)
+        found.append((_svg(figure), f"{label}: {', '.join(told)}"))
+    return found
+
+
+def _estimate(parameters: dict[str, Any], name: str) -> dict[str, Any] | None:
+    entry = parameters.get(name)
+    return entry.get("mean") if entry is not None and "mean" in entry else entry

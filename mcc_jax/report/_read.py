@@ -1,0 +1,197 @@
+"""What a folder of results holds, and whether its parts belong together."""
+
+from __future__ import annotations
+
+import datetime
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .._errors import InputError
+from ..campaign import Campaign, file_checksums, read_campaign
+from ._json import read_result
+from ._posterior import Posterior, read_posterior
+
+CALIBRATION, DISCOVERY, POSTERIOR, CAMPAIGN = "calibration.json", "discovery.json", "posterior.nc", "campaign"
+DATA = ("particles.csv", "curves.csv")
+FIGURE = re.compile(r"figures/([A-Za-z0-9_-]+)\.png")
+PNG = b"\x89PNG\r\n\x1a\n"
+LARGEST_FIGURE = 2**21
+"""Bytes; a page must stay small enough to send."""
+
+
+@dataclass(frozen=True)
+class Results:
+    """All that a report is made of; what is not there is None or empty.
+
+    Attributes:
+        name: of the folder.
+        campaign: the tests.
+        checksums: of their files, SHA-256 by name.
+        calibration: contents of `calibration.json`.
+        discovery: contents of `discovery.json`.
+        posterior: draws and bands of `posterior.nc`.
+        figures: files of `figures/` that the two results name as theirs, by stem.
+        written: the day of the newest result.
+        cautions: where parts contradict each other.
+        missing_campaign: why there is no campaign, if there is none.
+    """
+
+    name: str
+    campaign: Campaign | None
+    checksums: Mapping[str, str]
+    calibration: dict[str, Any] | None
+    discovery: dict[str, Any] | None
+    posterior: Posterior | None
+    figures: Mapping[str, bytes]
+    written: datetime.date | None
+    cautions: tuple[str, ...]
+    missing_campaign: str
+
+    @property
+    def results(self) -> list[tuple[str, dict[str, Any]]]:
+        """The two results by the names of their files, those that are there."""
+        both = ((CALIBRATION, self.calibration), (DISCOVERY, self.discovery))
+        return [(name, content) for name, content in both if content is not None]
+
+
+def read_results(folder: str | Path, campaign: str | Path | None = None, *, name: str | None = None) -> Results:
+    """Read what a folder holds of a campaign, a calibration, its posterior and a discovery.
+
+    The campaign is looked for in the folder itself, in its subfolder `campaign`, and where calibration or discovery
+    found it.
+
+    Args:
+        folder: the folder of results.
+        campaign: the folder of the campaign, if it is elsewhere.
+        name: what to call the folder.
+
+    Raises:
+        InputError: if a file is damaged, of another schema, or there is nothing to report.
+    """
+    path = Path(folder)
+    there = _listed(path)
+    calibration = read_result(path / CALIBRATION, "mcc-jax calibrate") if CALIBRATION in there else None
+    discovery = read_result(path / DISCOVERY, "mcc-jax discover") if DISCOVERY in there else None
+    results = [(n, c) for n, c in ((CALIBRATION, calibration), (DISCOVERY, discovery)) if c is not None]
+    where, why = _find(path, there, campaign, [content for _, content in results])
+    data = None if where is None else read_campaign(where)
+    checksums = {} if where is None else file_checksums(where)
+    posterior = read_posterior(path / POSTERIOR) if POSTERIOR in there else None
+    if data is None and posterior is None and not results:
+        found = ", ".join(sorted(there)[:8]) or "nothing"
+        raise InputError(
+            "there is nothing to report",
+            file=path,
+            remedy=f"Give a folder that mcc-jax demo, calibrate or discover wrote into; found there: {found}",
+        )
+    cautions = list(_cautions(data, checksums, calibration, discovery))
+    if posterior is not None and calibration is not None and not _belongs(posterior, calibration):
+        cautions.append(f"{POSTERIOR} is not of the calibration beside it, and is left out")
+        posterior = None
+    return Results(
+        name or path.resolve().name or str(path),
+        data,
+        checksums,
+        calibration,
+        discovery,
+        posterior,
+        _figures(path, [content for _, content in results]),
+        _newest([path / n for n, _ in results]),
+        tuple(cautions),
+        why,
+    )
+
+
+def _listed(path: Path) -> set[str]:
+    try:
+        if not path.exists():
+            raise InputError(
+                "there is no such folder", file=path, remedy="Give a folder of results; mcc-jax demo makes one"
+            )
+        if not path.is_dir():
+            raise InputError(
+                "is a file, not a folder of results", file=path, remedy="Give the folder that calibrate wrote into"
+            )
+        return {entry.name for entry in path.iterdir() if not entry.name.startswith(".")}
+    except OSError as error:
+        raise InputError(
+            f"cannot be read: {error.strerror or error}", file=path, remedy="Check the permissions"
+        ) from None
+
+
+def _find(
+    path: Path, there: set[str], given: str | Path | None, results: list[dict[str, Any]]
+) -> tuple[Path | None, str]:
+    """The campaign's folder, or why there is none."""
+    if given is not None:
+        return Path(given), ""
+    if there & set(DATA):
+        return path, ""
+    if CAMPAIGN in there:
+        return path / CAMPAIGN, ""
+    told = [r["provenance"]["campaign"]["folder"] for r in results if r["provenance"]["campaign"]]
+    for folder in told:
+        try:
+            if all((path / folder / name).is_file() for name in DATA):
+                return path / folder, ""
+        except (OSError, ValueError):  # a text that is no path
+            continue
+    if told:
+        return None, "The campaign's folder is no longer where the results found it."
+    return None, "The results do not say where their campaign is."
+
+
+def _cautions(data: Campaign | None, checksums: Mapping[str, str], *results: dict[str, Any] | None):
+    both = zip((CALIBRATION, DISCOVERY), results, strict=True)
+    told = {n: checksums_told(c) for n, c in both if c is not None}
+    for name, sums in told.items():
+        changed = [f for f in DATA if f in sums and f in checksums and sums[f] != checksums[f]]
+        if changed:
+            yield f"{name} was made from other data: {' and '.join(changed)} of the campaign differ in their checksums"
+    if len(told) == 2 and all(told.values()) and any(told[CALIBRATION].get(f) != told[DISCOVERY].get(f) for f in DATA):
+        yield f"{CALIBRATION} and {DISCOVERY} were made from different data"
+    calibration = results[0]
+    if data is not None and calibration is not None:
+        missing = [e["particle"] for e in calibration["particles"] if e["particle"] not in data.particles]
+        if missing:
+            yield f"{len(missing)} particles of {CALIBRATION} are not in the campaign, {missing[0]!r} first"
+
+
+def checksums_told(content: dict[str, Any]) -> dict[str, str]:
+    """SHA-256 of the campaign's files as a result records them; empty where it does not."""
+    return (content["provenance"]["campaign"] or {}).get("sha256", {})
+
+
+def _belongs(posterior: Posterior, calibration: dict[str, Any]) -> bool:
+    if calibration["method"] != "bayes":
+        return False
+    pairs = [(posterior.draws["a"], calibration["a"]["value"])]
+    pairs.append((posterior.draws["effective_modulus_MPa"], calibration["effective_modulus_MPa"]["value"]))
+    return all(value is not None and np.isclose(np.mean(draws), value, rtol=1e-6) for draws, value in pairs)
+
+
+def _figures(path: Path, results: list[dict[str, Any]]) -> dict[str, bytes]:
+    found = {}
+    for content in results:
+        for name in content["figures"]:
+            match = FIGURE.fullmatch(name)
+            file = path / name
+            try:
+                if match is None or not file.is_file() or file.stat().st_size > LARGEST_FIGURE:
+                    continue
+                picture = file.read_bytes()
+            except OSError:
+                continue
+            if picture.startswith(PNG):
+                found[match[1]] = picture
+    return found
+
+
+def _newest(files: list[Path]) -> datetime.date | None:
+    times = [file.stat().st_mtime for file in files]
+    return datetime.date.fromtimestamp(max(times)) if times else None

@@ -1,0 +1,311 @@
+"""What the numbers say, in plain words."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from ..campaign import (
+    PAPER_EFFECTIVE_MODULUS_MPA,
+    PAPER_LOG_C,
+    PAPER_SHAPE_PARAMETER,
+    Campaign,
+    campaign_segments,
+    effective_diameter_um,
+)
+from ..plots._text import is_simulated
+from ._numbers import interval, number, percent, span, with_sd
+from ._read import Results
+
+KINDS = {"approach": "approach", "load": "loading", "hold": "hold", "unload": "unloading", "reload": "reloading"}
+METHODS = {
+    "bayes": "the joint posterior of all tests at once (NumPyro's NUTS)",
+    "least-squares": "joint least squares of all tests at once (Optimistix)",
+    "paper": "the paper's own steps, one after the other",
+}
+SURE = {
+    "bayes": "with 95 % probability",
+    "least-squares": "as the 95 % confidence interval",
+}
+
+
+def plain(name: str) -> str:
+    """A mechanism's name for a sentence."""
+    return name.replace("_", " ")
+
+
+def quantity(name: str) -> str:
+    """A key with its unit, `compliance_um_per_mN`, for a person."""
+    words = name.split("_")
+    return " ".join({"um": "µm"}.get(word, word) for word in words)
+
+
+def listed(names: list[str], word: str = "and") -> str:
+    """Names in a row, the last after a word."""
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} {word} {names[-1]}"
+
+
+def measured(campaign: Campaign) -> list[tuple[str, str]]:
+    """Facts of a campaign, name and value."""
+    sizes = campaign.diameters_um
+    effective = [effective_diameter_um(one) for one in sizes]
+    peaks = [float(curve.force_mN.max()) for curve in campaign.curves]
+    stress = [1e3 * p / (math.pi * (d / 2) ** 2) for p, d in zip(peaks, effective, strict=True)]
+    flatness = 1 - sizes[:, 2] ** 2 / (sizes[:, 0] * sizes[:, 1])
+    counts = Counter(part.kind for parts in campaign_segments(campaign) for part in parts)
+    segments = ", ".join(f"{counts[kind]} × {word}" for kind, word in KINDS.items() if counts[kind])
+    meta = campaign.metadata
+    facts = [
+        ("Tests", f"{len(campaign)} particles, {sum(len(c) for c in campaign.curves)} points"),
+        ("Diameters", span(sizes.ravel(), "µm")),
+        ("Flatness 1 − D₃²/(D₁D₂)", span(flatness, "", 2)),
+        ("Largest force", span(peaks, "mN")),
+        ("Largest stress", span(stress, "MPa", 3)),
+        ("Segments", segments),
+        ("Duration", span([float(c.time_s[-1] - c.time_s[0]) for c in campaign.curves], "s")),
+        ("Control", {"load": "force", "displacement": "displacement", None: "not recorded"}[meta.control]),
+        ("Resolution", _resolution(campaign)),
+    ]
+    if meta.punch_diameter_um is not None:
+        facts.append(("Punch", f"{number(meta.punch_diameter_um)} µm diameter"))
+    facts.append(("Corrections before", ", ".join(map(plain, meta.corrections)) or "none recorded"))
+    facts.append(("Provenance", meta.provenance or "not recorded"))
+    return facts
+
+
+def _resolution(campaign: Campaign) -> str:
+    meta = campaign.metadata
+    parts = [
+        f"{number(value)} {unit}"
+        for value, unit in ((meta.force_resolution_mN, "mN"), (meta.displacement_resolution_um, "µm"))
+        if value is not None
+    ]
+    return ", ".join(parts) or "not recorded"
+
+
+def simulated(results: Results) -> bool:
+    """Whether these data were computed, not measured."""
+    return results.campaign is not None and is_simulated(results.campaign.metadata)
+
+
+def parameters(content: dict[str, Any]) -> list[dict[str, str]]:
+    """Rows of the table of parameters: symbol, name, meaning, value, interval, and the paper's value."""
+    form = content["law"]["unloading"]
+    rows = [
+        {
+            "symbol": "a",
+            "name": "Shape parameter",
+            "meaning": "How much more a flat particle is strained than a sphere under the same displacement; "
+            "0 would mean that shape does not matter.",
+            **_told(content["a"]),
+            "paper": number(PAPER_SHAPE_PARAMETER),
+        },
+        {
+            "symbol": "Ē",
+            "name": "Effective modulus",
+            "meaning": f"How stiffly a particle springs back on unloading. It belongs to the form “{form}” of the law "
+            "only.",
+            **_told(content["effective_modulus_MPa"], 1e-3, " GPa"),
+            "paper": f"{PAPER_EFFECTIVE_MODULUS_MPA / 1e3:g} GPa" if form == "printed" else "other form",
+        },
+    ]
+    meanings = {
+        "C1": "Initial slope of stress over scaled strain [MPa]: how hard the first squeeze is.",
+        "C3": "Softening in the middle of the curve, entering as a cube.",
+        "C5": "Stiffening at large strain, entering as a fifth power.",
+    }
+    for name, meaning in meanings.items():
+        mean, sd = content[f"log_{name}"]["mean"], content[f"log_{name}"]["sd"]
+        subscript = f"C{'₁' if name == 'C1' else '₃' if name == 'C3' else '₅'}"
+        rows.append(
+            {
+                "symbol": subscript,
+                "name": "Median particle",
+                "meaning": meaning,
+                **_told(_exponential(mean)),
+                "paper": number(math.exp(PAPER_LOG_C[name][0])),
+            }
+        )
+        rows.append(
+            {
+                "symbol": f"τ{subscript[1:]}",
+                "name": f"Spread of log {subscript}",
+                "meaning": _spread(mean["value"], sd["value"]),
+                **_told(sd),
+                "paper": number(PAPER_LOG_C[name][1]),
+            }
+        )
+    if "yield_stress_MPa" in content:
+        rows.append(
+            {
+                "symbol": "σ_y",
+                "name": "Yield stress",
+                "meaning": "Mean of C₁ over 17.16: where a sphere of this material begins to yield.",
+                **_told(content["yield_stress_MPa"], 1.0, " MPa"),
+                "paper": "0.4085 MPa",
+            }
+        )
+    return rows
+
+
+def _told(estimate: dict[str, Any], factor: float = 1.0, unit: str = "") -> dict[str, str]:
+    value = with_sd(estimate, factor)
+    return {
+        "value": value if value == "unknown" else f"{value}{unit}",
+        "interval": f"{interval(estimate, factor)}{unit}" if estimate["interval_95"] is not None else "none given",
+    }
+
+
+def _exponential(estimate: dict[str, Any]) -> dict[str, Any]:
+    """The estimate of exp of what is estimated."""
+
+    def exp(value: float) -> float:
+        return math.exp(min(value, 700.0))
+
+    value, sd, ends = estimate["value"], estimate["sd"], estimate["interval_95"]
+    middle = None if value is None else exp(value)
+    return {
+        "value": middle,
+        "sd": None if middle is None or sd is None else middle * sd,
+        "interval_95": None if ends is None else [exp(end) for end in ends],
+    }
+
+
+def _spread(mean: float | None, sd: float | None) -> str:
+    if mean is None or sd is None or not abs(mean) + abs(sd) < 300:
+        return "How much particles differ; these data do not tell."
+    if sd < 1e-3:
+        return "How much particles differ: hardly at all in these data."
+    low, high = number(math.exp(mean - sd), 3), number(math.exp(mean + sd), 3)
+    return f"How much particles differ: two of three lie between {low} and {high}."
+
+
+def calibration_sentences(content: dict[str, Any]) -> list[str]:
+    """The calibration in a few sentences."""
+    count, used = len(content["particles"]), sum(entry["kept"] for entry in content["particles"])
+    found = [
+        f"The law was calibrated on {used} of {count} particles by {METHODS[content['method']]}"
+        + ("." if content["converged"] else "; it did NOT converge, so nothing below may be relied on.")
+    ]
+    sure = SURE.get(content["method"])
+    if sure is None:
+        found.append("This method gives values without uncertainty; the posterior (mcc-jax calibrate) gives both.")
+    else:
+        known = [
+            f"{name} between {interval(content[key], factor)}{unit}".replace(" to ", " and ")
+            for name, key, factor, unit in (
+                ("a", "a", 1.0, ""),
+                ("the effective modulus", "effective_modulus_MPa", 1e-3, " GPa"),
+            )
+            if content[key]["interval_95"] is not None
+        ]
+        if known:
+            found.append(f"Given the law and these tests, {listed(known)} lies {sure}." if len(known) == 1 else
+                         f"Given the law and these tests, {listed(known)} lie {sure}.")  # fmt: skip
+    misfit = content["diagnostics"].get("own_misfit")
+    if misfit is not None:
+        found.append(
+            f"With its own C₁, C₃, C₅ the law follows a particle's displacement to {percent(misfit)} of its range "
+            "(median over the particles)."
+        )
+    return found
+
+
+def discovery_sentence(content: dict[str, Any]) -> str:
+    """The discovery in one sentence."""
+    verdict = content["verdict"]
+    if verdict == "NO_GAP":
+        return "Nothing is missing in the law that these tests could show."
+    if verdict == "FIT_NOT_CONVERGED":
+        return "The law could not be fitted well enough to ask what it lacks."
+    closed = content["gap"]["closed_fraction"]
+    gap = "" if closed is None else f"; adding it closes {percent(closed)} of the gap on particles that took no part"
+    if verdict == "UNLISTED" or not content["effects"]:
+        return f"Something is missing that no listed mechanism explains{gap}."
+    names = listed([plain(effect["mechanism"]) for effect in content["effects"]])
+    sure = ", or what these tests cannot tell from it" if verdict == "SET" else ""
+    return f"Missing in the law is {names}{sure}{gap}."
+
+
+def next_steps(results: Results, folder: str) -> list[tuple[str, str]]:
+    """What to do next: a sentence and a command (or nothing) each, the most urgent first."""
+    steps: list[tuple[str, str]] = []
+    content, found = results.calibration, results.discovery
+    if results.campaign is None:
+        steps.append(("Show measured against predicted:", f"mcc-jax report {folder} --campaign CAMPAIGN"))
+    if content is None:
+        steps.append(("Calibrate the law on these tests:", f"mcc-jax calibrate CAMPAIGN --out {folder}"))
+    elif not content["converged"]:
+        steps.append(("Mend the checks that failed below before anything else.", ""))
+    elif content["method"] != "bayes":
+        steps.append(("Get the uncertainty of every number:", f"mcc-jax calibrate CAMPAIGN --out {folder}"))
+    if found is None:
+        steps.append(("Ask what the law misses:", f"mcc-jax discover CAMPAIGN --out {folder}"))
+    else:
+        steps += _after(found)
+    if content is not None and content["converged"] and (found is None or found["verdict"] == "NO_GAP"):
+        steps.append(("Predict tests that you plan:", "mcc-jax simulate --out planned"))
+    return steps
+
+
+def _after(found: dict[str, Any]) -> list[tuple[str, str]]:
+    verdict = found["verdict"]
+    if found["next_experiments"]:
+        best = found["next_experiments"][0]
+        text = (
+            f"Measure: {best['experiment']}, {number(best['particles'])} particles. It would separate "
+            f"{listed([plain(n) for n in best['separates']])} with probability {number(best['power'], 2)}."
+        )
+        return [(text, "")]
+    if verdict in ("NAMED", "SET", "UNLISTED"):
+        return [("Use the law together with what was added (parameters “after” below), not alone.", "")]
+    if verdict == "NO_GAP" and found["untestable"]:
+        needs = sorted({entry["needs"] for entry in found["untestable"]})
+        return [(f"To learn about more mechanisms, the tests need {listed(needs)}.", "")]
+    return []
+
+
+def particle_facts(results: Results, names: list[str], rms: list[float | None], whys: list[str | None]) -> list[str]:
+    """One line about each particle, for the line below the chart."""
+    campaign = results.campaign
+    assert campaign is not None
+    entries = {e["particle"]: e for e in results.calibration["particles"]} if results.calibration else {}
+    facts = []
+    for name, misfit, why in zip(names, rms, whys, strict=True):
+        sizes = " × ".join(number(d) for d in campaign.diameters_um[campaign.index(name)])
+        parts = [f"D₁ × D₂ × D₃ = {sizes} µm"]
+        eta = entries.get(name, {}).get("eta_p", {}).get("value")
+        if eta is not None:
+            parts.append(f"shape factor {number(eta, 3)}")
+        if why is not None:
+            parts.append(f"not used: {why}")
+        elif misfit is not None:
+            parts.append(f"root mean square of measured − predicted {number(misfit, 2)} µm")
+        facts.append("; ".join(parts) + ".")
+    return facts
+
+
+def particle_rows(results: Results) -> list[dict[str, Any]]:
+    """The table of particles: sizes, what was measured, what was found, and whether it was used."""
+    campaign, content = results.campaign, results.calibration
+    entries = {e["particle"]: e for e in content["particles"]} if content else {}
+    names = list(campaign.particles) if campaign is not None else list(entries)
+    rows = []
+    for i, name in enumerate(names):
+        entry = entries.get(name)
+        row: dict[str, Any] = {"name": name, "kept": None if entry is None else entry["kept"]}
+        row["why_not"] = None if entry is None else entry["why_not"]
+        if campaign is not None:
+            row["sizes"] = [number(d) for d in campaign.diameters_um[i]]
+            row["peak"] = number(float(np.max(campaign.curves[i].force_mN)))
+            row["points"] = len(campaign.curves[i])
+        if entry is not None:
+            row["eta"] = number(entry["eta_p"]["value"], 3)
+            row["C"] = [with_sd(entry[c]) if entry["kept"] else "–" for c in ("C1", "C3", "C5")]
+            own = entry.get("own_rms_um", entry["rms_um"])
+            row["rms"] = number(own, 2) if entry["kept"] else "–"
+        rows.append(row)
+    return rows
