@@ -159,9 +159,7 @@ def calibrate(
                     calibration = calibrate_bayes(data, model=model, mode=mode, chains=chains, draws=draws, **settings)  # pyright: ignore[reportArgumentType]  # click has checked the words
                 else:
                     calibration = calibrate_least_squares(data, model=model, loss=loss, **settings)  # pyright: ignore[reportArgumentType]
-            content = write_calibration(
-                calibration, stage, origin=origin, figures=not no_figures, tell=tell
-            )
+            content = write_calibration(calibration, stage, origin=origin, figures=not no_figures, tell=tell)
     if as_json:
         click.echo(json_text(content).encode(), nl=False)  # JSON is UTF-8, whatever the terminal speaks
         return

@@ -19,32 +19,38 @@ CAMPAIGN_FILES = ("particles.csv", "curves.csv", "campaign.toml")
 @out_option(default="mcc-jax-demo", show_default=True)
 @seed_option()
 def demo(out: Path, seed: int) -> None:
-    """Simulate the paper's 20 particles, calibrate the law on them, ask what it misses, draw the figures.
+    """Simulate the paper's 20 particles, calibrate the law on them, ask what it misses, and report.
 
     The tests are simulated from the paper's tables (Bommireddy et al. 2018): it publishes its measured curves as
     pictures only, not as numbers. DIR gets campaign/, calibration.json, posterior.nc,
-    discovery.json and figures/.
+    discovery.json, figures/ and report.html, which shows it all in a browser.
 
     \b
     Example:
       mcc-jax demo --out try --seed 1
     """
-    with session(26) as tell:
+    with session(29) as tell:
         from ..calibrate import calibrate_bayes
         from ..campaign import write_campaign
         from ..discover import discover
+        from ..report import read_results, report_page
         from ..simulate import paper_campaign
         from ._calibration import main_numbers, say_files, say_state, say_warnings, write_calibration
         from ._discovery import DISCOVERY, main_finding, write_discovery
+        from ._provenance import provenance
+        from ._report import REPORT
 
         with results(out) as stage:
             tell("simulating the campaign")
             campaign = paper_campaign(seed)
             write_campaign(campaign, stage.folder / "campaign")
+            origin = provenance(stage.folder / "campaign", {"seed": seed}, told="campaign")
             calibration = calibrate_bayes(campaign, seed=seed, progress=tell)
-            content = write_calibration(calibration, stage, figures=True, tell=tell)
+            content = write_calibration(calibration, stage, origin=origin, figures=True, tell=tell)
             found = discover(campaign, experiments=False, seed=seed, progress=tell)
-            missing = write_discovery(found, stage, figures=True, tell=tell)
+            missing = write_discovery(found, stage, origin=origin, figures=True, tell=tell)
+            page = report_page(read_results(stage.folder, name=out.resolve().name), seed=seed, progress=tell)
+            (stage.folder / REPORT).write_text(page, encoding="utf-8")
     points = sum(len(curve) for curve in campaign.curves)
     say(f"The tests are SIMULATED from the paper's tables, not measured: {len(campaign)} particles, {points} points,")
     say("each with C1, C3 and C5 of its own drawn from Table 2, with noise of 0.02 um and 0.05 mN.")
@@ -58,10 +64,10 @@ def demo(out: Path, seed: int) -> None:
     say(f"Discovery ({missing['verdict']}): {main_finding(missing)}.")
     say()
     figures = [*content["figures"], *missing["figures"]]
-    files = [*(f"campaign/{name}" for name in CAMPAIGN_FILES), *content["files"], "calibration.json", DISCOVERY]
+    files = [*(f"campaign/{name}" for name in CAMPAIGN_FILES), *content["files"], "calibration.json", DISCOVERY, REPORT]
     say_files(out, [*figures, *files])
     say()
-    say("Next, for example:")
+    say(f"What next? Open {out / REPORT} in a browser: it shows all of this, and what it means. Then, for example:")
     folder = shlex.quote(str(out / "campaign"))
     for comment, command in (
         (

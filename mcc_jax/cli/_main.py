@@ -19,6 +19,7 @@ from ._demo import demo
 from ._discover import discover
 from ._group import PROGRAM, OneLineGroup
 from ._power import power
+from ._report import report
 from ._simulate import simulate
 
 EPILOG = """\b
@@ -26,7 +27,8 @@ Examples:
   mcc-jax demo
   mcc-jax simulate --out sim --levels 0.5,1 --hold-s 30 --noise-um 0.02
   mcc-jax calibrate sim --out fit
-  mcc-jax discover sim --out found
+  mcc-jax discover sim --out fit
+  mcc-jax report fit
   mcc-jax convert FS1.txt --out tests --diameters 200,190,180
 
 \b
@@ -63,12 +65,12 @@ def _version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
 @click.option("--version", is_flag=True, is_eager=True, expose_value=False, callback=_version, help="Show the version.")
 @click.pass_context
 def cli(ctx: click.Context, debug: bool) -> None:
-    """Loading-unloading contact law of micro-crystalline cellulose particles: simulate, calibrate, discover."""
+    """Loading-unloading contact law of micro-crystalline cellulose particles: simulate, calibrate, discover, report."""
     if ctx.invoked_subcommand is None:
         click.echo(ctx.get_help())
 
 
-for _command in (demo, simulate, convert, calibrate, discover, power):
+for _command in (demo, simulate, convert, calibrate, discover, power, report):
     cli.add_command(_command)
 
 

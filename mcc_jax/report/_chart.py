@@ -35,25 +35,24 @@ def chart_items() -> dict[str, Any]:
     """
     from bokeh.core.json_encoder import serialize_json
     from bokeh.document import Document
-    from bokeh.models import ColumnDataSource, HoverTool, Range1d
+    from bokeh.models import ColumnDataSource, HoverTool, Span
 
     points = ColumnDataSource({name: [] for name in COLUMNS}, name="points")
-    lines = ColumnDataSource({name: [] for name in ("force", "own", "typical", "away")}, name="lines")
-    bands = ColumnDataSource({name: [] for name in ("x", "y", "away")}, name="bands")
-    force = Range1d(0, 1)
-    curve = _figure("curve", "displacement [µm]", Range1d(0, 1), force)
-    residual = _figure("residual", "measured − predicted [µm]", Range1d(-1, 1), force)
-    curve.patches("x", "y", source=bands, color=SKY, alpha=0.45, line_width=0)
-    residual.patches("away", "y", source=bands, color=SKY, alpha=0.45, line_width=0)
+    lines = ColumnDataSource({name: [] for name in ("force", "own", "typical")}, name="lines")
+    bands = ColumnDataSource({name: [] for name in ("displacement", "force", "time", "away")}, name="bands")
+    curve = _figure("curve", "displacement [µm]", "force [mN]")
+    residual = _figure("residual", "time [s]", "measured − predicted [µm]")
+    curve.patches("displacement", "force", source=bands, color=SKY, alpha=0.45, line_width=0)
+    residual.patches("time", "away", source=bands, color=SKY, alpha=0.45, line_width=0)
+    residual.add_layout(Span(location=0, dimension="width", line_color=BLACK, line_width=1.3))
     curve.line("typical", "force", source=lines, color=BLACK, line_dash=[6, 4], line_width=1.3)
     curve.line("own", "force", source=lines, color=BLACK, line_width=1.3)
-    residual.line("away", "force", source=lines, color=BLACK, line_width=1.3)
     tips = [(word, f"@{column}") for word, column in (("particle", "particle"), ("segment", "segment"))]
     tips += [("force", "@force{0.000} mN"), ("displacement", "@displacement{0.000} µm")]
     tips += [("measured − predicted", "@residual{0.0000} µm"), ("time", "@time{0.0} s"), ("compared", "@compared")]
-    for figure, x in ((curve, "displacement"), (residual, "residual")):
+    for figure, x, y in ((curve, "displacement", "force"), (residual, "time", "residual")):
         marks = figure.scatter(
-            x, "force", source=points, marker="marker", color="colour", fill_alpha="alpha", line_alpha="alpha", size=6
+            x, y, source=points, marker="marker", color="colour", fill_alpha="alpha", line_alpha="alpha", size=6
         )
         figure.add_tools(HoverTool(tooltips=tips, renderers=[marks], description="Show the values of a point"))
     document = Document()
@@ -64,17 +63,18 @@ def chart_items() -> dict[str, Any]:
     return _same_names({"docs": {"chart": json.loads(serialize_json(document.to_json()))}, "items": items})
 
 
-def _figure(name: str, label: str, across: Any, up: Any) -> Any:
+def _figure(name: str, across: str, up: str) -> Any:
+    from bokeh.models import Range1d
     from bokeh.plotting import figure
 
     plot = figure(
         name=name,
         height=400,
         sizing_mode="stretch_width",
-        x_range=across,
-        y_range=up,
-        x_axis_label=label,
-        y_axis_label="force [mN]",
+        x_range=Range1d(0, 1),
+        y_range=Range1d(0, 1),
+        x_axis_label=across,
+        y_axis_label=up,
         tools="box_zoom,pan,wheel_zoom,reset,save",
         active_drag="box_zoom",
         # A wheel, or a finger, that moves the page must not be caught by a chart on its way.
@@ -88,6 +88,7 @@ def _figure(name: str, label: str, across: Any, up: Any) -> Any:
         axis.axis_label_text_font_size = axis.major_label_text_font_size = "13px"
         axis.axis_label_text_font = axis.major_label_text_font = "system-ui, sans-serif"
         axis.ticker.desired_num_ticks = 5
+        axis.minor_tick_line_color = None
         axis.axis_label_text_color = axis.major_label_text_color = "#222222"
     return plot
 

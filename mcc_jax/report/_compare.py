@@ -93,9 +93,8 @@ def _measured(campaign: Campaign, i: int, segments: Any, results: Results) -> Sh
     band = None if results.posterior is None else results.posterior.bands.get(name)
     if band is not None and _fits(band, force):
         low, high = band.low_um[: len(rows)], band.high_um[: len(rows)]
-    return Shown(
-        name, None, curve.time_s[rows], force, curve.displacement_um[rows], kind[rows], used, nothing, nothing, low, high
-    )  # fmt: skip
+    measured = (curve.time_s[rows], force, curve.displacement_um[rows])
+    return Shown(name, None, *measured, kind[rows], used, nothing, nothing, low, high)
 
 
 def _fits(band: Band, force: np.ndarray) -> bool:
@@ -206,7 +205,8 @@ def _typical(calibration: dict[str, Any]) -> np.ndarray:
     means = [pair["mean"]["value"] for pair in pairs]
     if any(mean is None for mean in means):
         return np.full(3, np.nan)
-    parts = [LogNormal(_array(np.asarray(m)), _array(np.asarray(p["sd"]["value"] or 0.0))) for m, p in zip(means, pairs, strict=True)]  # fmt: skip
+    sds = [pair["sd"]["value"] or 0.0 for pair in pairs]
+    parts = [LogNormal(_array(np.asarray(m)), _array(np.asarray(sd))) for m, sd in zip(means, sds, strict=True)]
     population = PlasticPopulation(*parts)
     law = population.mean_law if calibration["method"] == "paper" else population.median_law
     return np.array([float(law.C1), float(law.C3), float(law.C5)])

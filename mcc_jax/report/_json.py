@@ -1,4 +1,4 @@
-"""Reading `calibration.json` and `discovery.json`: strict JSON of a known schema, or one line that says what is wrong."""
+"""Reading `calibration.json` and `discovery.json`: strict JSON of a known schema, or one line on what is wrong."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ def _calibration(content: dict[str, Any]) -> list[Light]:
             "Particles used",
             f"{used} of {count}",
             f"all, and at least {FEW_PARTICLES}",
-            "Few particles say little of how particles differ; the reasons for those left out stand in the table above.",
+            "Few particles say little of how particles differ. Why some are left out stands with what was measured.",
         ),
     ]
 
@@ -127,8 +127,8 @@ def _fit(content: dict[str, Any]) -> list[Light]:
                 "The law's form fits",
                 f"off by {percent(misfit)}",
                 f"at most {percent(GOOD_MISFIT)}",
-                "Median misfit with each particle's own coefficients, as a share of its range of displacement. If large: "
-                "these may be no compressions of single particles, or the diameters are wrong.",
+                "Median misfit with each particle's own coefficients, as a share of its range of displacement. If "
+                "large: these may be no compressions of single particles, or the diameters are wrong.",
             )
         )
     if share is not None:
@@ -141,11 +141,9 @@ def _fit(content: dict[str, Any]) -> list[Light]:
                 "Share of particles drawn from this population whose loading curve would fall somewhere.",
             )
         )
-    for text in d.get("open_combinations", []):
-        found.append(
-            Light("bad", "Data determine the parameters", "not all", "all", f"The data leave open: {text}.")
-        )
-    return found
+    gaps = d.get("open_combinations", [])
+    name = "Data determine the parameters"
+    return found + [Light("bad", name, "not all", "all", f"The data leave open: {text}.") for text in gaps]
 
 
 def _coverage(inside: float) -> Light:
@@ -155,8 +153,8 @@ def _coverage(inside: float) -> Light:
         "Prediction bands hold",
         f"{percent(inside, 3)} of points inside",
         f"about 95 %, {percent(low)} to {percent(high)}",
-        "Measured points inside the band that should hold 95 % of them. Fewer: the law misses something, or the noise is "
-        "larger than estimated. More: the noise is smaller.",
+        "Measured points inside the band that should hold 95 % of them. Fewer: the law misses something, or the "
+        "noise is larger than estimated. More: the noise is smaller.",
     )
 
 
@@ -187,7 +185,9 @@ def _discovery(content: dict[str, Any]) -> Light:
         "FIT_NOT_CONVERGED": "The law could not be fitted well enough to ask what it lacks.",
     }
     verdict = content["verdict"]
-    return Light(level.get(verdict, "look"), "Law is complete", verdict, "NO_GAP", meaning[verdict])
+    return Light(
+        level.get(verdict, "look"), "Law is complete", f"verdict {verdict}", "verdict NO_GAP", meaning[verdict]
+    )
 
 
 def _below(value: float | None, good: float, bad: float) -> Level:

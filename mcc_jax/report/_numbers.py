@@ -11,7 +11,7 @@ def number(value: float | None, digits: int = 4) -> str:
     if value is None or not math.isfinite(value):
         return "unknown"
     if value and not 1e-4 <= abs(value) < 1e6:
-        mantissa, _, exponent = f"{value:.{max(digits - 2, 0)}e}".partition("e")
+        mantissa, _, exponent = f"{value:.{digits - 1}e}".partition("e")
         return f"{mantissa} × 10{_raised(int(exponent))}".replace("-", "−")
     text = f"{value:.{digits}g}"
     if "e" in text:
@@ -49,7 +49,7 @@ def interval(estimate: dict[str, Any], factor: float = 1.0) -> str | None:
     low, high = (end * factor for end in ends)
     if not high > low:
         return f"{number(low)} to {number(high)}"
-    places = decimals(max(abs(low), abs(high)), (high - low) / 4)
+    places = decimals(max(abs(low), abs(high)), (high - low) / 2)
     if places is None:
         return f"{number(low)} to {number(high)}"
     return f"{low:.{places}f} to {high:.{places}f}".replace("-", "−")
@@ -58,6 +58,15 @@ def interval(estimate: dict[str, Any], factor: float = 1.0) -> str | None:
 def percent(share: float | None, digits: int = 2) -> str:
     """A share as per cent."""
     return "unknown" if share is None else f"{number(100 * share, digits)} %"
+
+
+def probability(value: float | None) -> str:
+    """A probability to two digits; what is next to 0 or 1 is said so."""
+    if value is None:
+        return "unknown"
+    if value < 0.001:
+        return "below 0.001"
+    return "above 0.99" if value > 0.995 else number(value, 2)
 
 
 def span(values: Any, unit: str, digits: int = 4) -> str:

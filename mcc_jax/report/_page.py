@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,10 @@ from .._version import own_version
 from ..plots._text import particle_labels
 from . import _pictures as pictures
 from ._chart import LOOKS, chart_data, chart_items, chart_scripts
-from ._compare import KINDS, compare
+from ._compare import KINDS, Shown, compare
 from ._lights import lights
-from ._numbers import interval, number, percent, with_sd
-from ._read import Results, read_results
+from ._numbers import interval, number, percent, probability, with_sd
+from ._read import Results
 from ._words import (
     METHODS,
     calibration_sentences,
@@ -67,20 +68,23 @@ VERDICTS = {
 }
 
 
-def report_page(folder: str | Path, campaign: str | Path | None = None, *, name: str | None = None) -> str:
-    """One self-contained HTML page from what a folder holds; equal input, equal page.
+def report_page(results: Results, *, seed: int = 0, progress: Callable[[str], None] | None = None) -> str:
+    """One self-contained HTML page of results; equal input, equal page.
 
     Args:
-        folder: what `mcc-jax demo`, `calibrate` or `discover` wrote into.
-        campaign: the folder of the campaign, if it is neither there nor where the results say.
-        name: what to call the folder in the page; its own name if None.
+        results: what a folder holds, see `read_results`.
+        seed: for the record; nothing here is random.
+        progress: called with the name of each step.
 
     Raises:
-        InputError: if a file is damaged, of an unknown schema, or there is nothing to report.
         RuntimeError: in single precision.
     """
     _require_double()
-    return render(read_results(folder, campaign, name=name))
+    tell = progress or (lambda _: None)
+    tell("predicting every particle")
+    shown = compare(results)
+    tell("drawing the page")
+    return _environment().get_template("page.html").render(context(results, shown), seed=seed)
 
 
 def _require_double() -> None:
@@ -90,11 +94,6 @@ def _require_double() -> None:
         raise RuntimeError(
             'the report needs double precision; call jax.config.update("jax_enable_x64", True) before anything else'
         )
-
-
-def render(results: Results) -> str:
-    """The page of results that were read."""
-    return _environment().get_template("page.html").render(context(results))
 
 
 @cache
@@ -115,6 +114,7 @@ def _environment() -> Any:
     found.filters |= {
         "number": number,
         "percent": percent,
+        "probability": probability,
         "with_sd": with_sd,
         "interval": interval,
         "plain": plain,
@@ -123,11 +123,10 @@ def _environment() -> Any:
     return found
 
 
-def context(results: Results) -> dict[str, Any]:
+def context(results: Results, shown: list[Shown]) -> dict[str, Any]:
     """What the templates show."""
     from markupsafe import Markup
 
-    shown = compare(results)
     labels = particle_labels([one.name for one in shown], 40)
     folder = shlex.quote(results.name)
     checks = lights(results)
@@ -153,10 +152,11 @@ def context(results: Results) -> dict[str, Any]:
         "marginals": [] if results.posterior is None else pictures.marginals(results.posterior.draws),
         "lights": checks,
         "verdicts": VERDICTS,
-        "gap_picture": None if results.discovery is None else pictures.steps(results.discovery["gap"]),
+        "steps": [] if results.discovery is None else _steps(results.discovery["gap"]),
         "shift_pictures": []
         if results.discovery is None
         else pictures.shifts(results.discovery["parameters_before"], results.discovery["parameters_after"]),
+        "before_after": CAPTIONS["discovery_before_after"][1],
         "figures_of": _figures(results),
         "folder": folder,
         "style": Markup(_source("style.css")),
@@ -174,7 +174,7 @@ def _closed(script: str) -> str:
     return re.sub(r"</(script)", r"<\\/\1", script, flags=re.IGNORECASE)
 
 
-def _chart(results: Results, shown: list[Any], labels: list[str]) -> dict[str, Any]:
+def _chart(results: Results, shown: list[Shown], labels: list[str]) -> dict[str, Any]:
     facts = particle_facts(results, [s.name for s in shown], [s.rms_um for s in shown], [s.why_not for s in shown])
     return {"bokeh": chart_items(), "data": chart_data(shown, labels, facts)}
 
@@ -221,6 +221,22 @@ def _summary(results: Results) -> list[str]:
     if not found and results.campaign is not None:
         found.append(f"{len(results.campaign)} tests were measured; nothing has been calibrated on them yet.")
     return found
+
+
+def _steps(gap: dict[str, Any]) -> list[dict[str, Any]]:
+    """The systematic gap on held-out particles at every step, with the length of its bar in per cent."""
+    known = [step for step in gap["steps"] if step["systematic_um"] is not None]
+    if len(known) < 2:
+        return []
+    most = max(step["systematic_um"] for step in known) or 1.0
+    return [
+        {
+            "name": "law alone" if step["added"] is None else f"with {plain(step['added'])}",
+            "value": number(step["systematic_um"], 2),
+            "length": round(100 * step["systematic_um"] / most, 1),
+        }
+        for step in known
+    ]
 
 
 def _figures(results: Results) -> dict[str, list[tuple[str, str]]]:

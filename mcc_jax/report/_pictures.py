@@ -104,29 +104,6 @@ def grid(shown: list[Shown]) -> tuple[str, int] | None:
 
 
 @styled
-def steps(gap: dict[str, Any]) -> tuple[str, str] | None:
-    """The systematic gap on held-out particles at every step, and the same in words; None if nothing was added."""
-    found = [step for step in gap["steps"] if step["systematic_um"] is not None]
-    if len(found) < 2:
-        return None
-    words = [(step["added"] or "law alone").replace("_", " ") for step in found]
-    words = [word if i == 0 else f"+ {word}" for i, word in enumerate(words)]
-    size = [step["systematic_um"] for step in found]
-    figure = new_figure(6.4, 0.55 + 0.42 * len(found))
-    ax = figure.subplots()
-    ax.barh(range(len(found)), size, color=[VERMILION, *[BLUE] * (len(found) - 1)], height=0.6)
-    for i, value in enumerate(size):
-        ax.text(value, i, f" {value:.3g} µm", va="center", ha="left", fontsize=8)
-    ax.axvline(0, color=GREY, linewidth=0.7)
-    ax.set_xlim(0, 1.2 * max(*size, 1e-12))
-    ax.set_yticks(range(len(found)), words)
-    ax.invert_yaxis()
-    ax.set_xlabel("systematic gap on held-out particles [µm]")
-    told = "; ".join(f"{word}: {value:.3g} µm" for word, value in zip(words, size, strict=True))
-    return _svg(figure), f"Systematic gap on held-out particles: {told}"
-
-
-@styled
 def shifts(before: dict[str, Any], after: dict[str, Any]) -> list[tuple[str, str]]:
     """Each parameter before and after what was added, with 95 % intervals; and the same in words."""
     names = [

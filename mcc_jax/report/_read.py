@@ -53,6 +53,17 @@ class Results:
     missing_campaign: str
 
     @property
+    def missing(self) -> tuple[str, ...]:
+        """What is not there, and how to get it."""
+        parts = (
+            (self.campaign, "the tests; name their folder with --campaign"),
+            (self.calibration, "a calibration; mcc-jax calibrate makes one"),
+            (self.posterior, "a posterior; mcc-jax calibrate makes one"),
+            (self.discovery, "a discovery; mcc-jax discover makes one"),
+        )
+        return tuple(text for part, text in parts if part is None)
+
+    @property
     def results(self) -> list[tuple[str, dict[str, Any]]]:
         """The two results by the names of their files, those that are there."""
         both = ((CALIBRATION, self.calibration), (DISCOVERY, self.discovery))

@@ -17,7 +17,7 @@ from ..campaign import (
     effective_diameter_um,
 )
 from ..plots._text import is_simulated
-from ._numbers import interval, number, percent, span, with_sd
+from ._numbers import interval, number, percent, probability, span, with_sd
 from ._read import Results
 
 KINDS = {"approach": "approach", "load": "loading", "hold": "hold", "unload": "unloading", "reload": "reloading"}
@@ -97,6 +97,7 @@ def parameters(content: dict[str, Any]) -> list[dict[str, str]]:
     rows = [
         {
             "symbol": "a",
+            "sub": "",
             "name": "Shape parameter",
             "meaning": "How much more a flat particle is strained than a sphere under the same displacement; "
             "0 would mean that shape does not matter.",
@@ -105,11 +106,12 @@ def parameters(content: dict[str, Any]) -> list[dict[str, str]]:
         },
         {
             "symbol": "Ē",
-            "name": "Effective modulus",
+            "sub": "",
+            "name": "Effective modulus [GPa]",
             "meaning": f"How stiffly a particle springs back on unloading. It belongs to the form “{form}” of the law "
             "only.",
-            **_told(content["effective_modulus_MPa"], 1e-3, " GPa"),
-            "paper": f"{PAPER_EFFECTIVE_MODULUS_MPA / 1e3:g} GPa" if form == "printed" else "other form",
+            **_told(content["effective_modulus_MPa"], 1e-3),
+            "paper": f"{PAPER_EFFECTIVE_MODULUS_MPA / 1e3:g}" if form == "printed" else "other form",
         },
     ]
     meanings = {
@@ -119,10 +121,10 @@ def parameters(content: dict[str, Any]) -> list[dict[str, str]]:
     }
     for name, meaning in meanings.items():
         mean, sd = content[f"log_{name}"]["mean"], content[f"log_{name}"]["sd"]
-        subscript = f"C{'₁' if name == 'C1' else '₃' if name == 'C3' else '₅'}"
         rows.append(
             {
-                "symbol": subscript,
+                "symbol": "C",
+                "sub": name[1],
                 "name": "Median particle",
                 "meaning": meaning,
                 **_told(_exponential(mean)),
@@ -131,8 +133,9 @@ def parameters(content: dict[str, Any]) -> list[dict[str, str]]:
         )
         rows.append(
             {
-                "symbol": f"τ{subscript[1:]}",
-                "name": f"Spread of log {subscript}",
+                "symbol": "τ",
+                "sub": name[1],
+                "name": f"Spread of log C{name[1]}",
                 "meaning": _spread(mean["value"], sd["value"]),
                 **_told(sd),
                 "paper": number(PAPER_LOG_C[name][1]),
@@ -141,22 +144,19 @@ def parameters(content: dict[str, Any]) -> list[dict[str, str]]:
     if "yield_stress_MPa" in content:
         rows.append(
             {
-                "symbol": "σ_y",
-                "name": "Yield stress",
+                "symbol": "σ",
+                "sub": "y",
+                "name": "Yield stress [MPa]",
                 "meaning": "Mean of C₁ over 17.16: where a sphere of this material begins to yield.",
-                **_told(content["yield_stress_MPa"], 1.0, " MPa"),
-                "paper": "0.4085 MPa",
+                **_told(content["yield_stress_MPa"]),
+                "paper": "0.4085",
             }
         )
     return rows
 
 
-def _told(estimate: dict[str, Any], factor: float = 1.0, unit: str = "") -> dict[str, str]:
-    value = with_sd(estimate, factor)
-    return {
-        "value": value if value == "unknown" else f"{value}{unit}",
-        "interval": f"{interval(estimate, factor)}{unit}" if estimate["interval_95"] is not None else "none given",
-    }
+def _told(estimate: dict[str, Any], factor: float = 1.0) -> dict[str, str]:
+    return {"value": with_sd(estimate, factor), "interval": interval(estimate, factor) or "none given"}
 
 
 def _exponential(estimate: dict[str, Any]) -> dict[str, Any]:
@@ -195,7 +195,7 @@ def calibration_sentences(content: dict[str, Any]) -> list[str]:
         found.append("This method gives values without uncertainty; the posterior (mcc-jax calibrate) gives both.")
     else:
         known = [
-            f"{name} between {interval(content[key], factor)}{unit}".replace(" to ", " and ")
+            f"{name} lies between {interval(content[key], factor)}{unit}".replace(" to ", " and ")
             for name, key, factor, unit in (
                 ("a", "a", 1.0, ""),
                 ("the effective modulus", "effective_modulus_MPa", 1e-3, " GPa"),
@@ -203,8 +203,7 @@ def calibration_sentences(content: dict[str, Any]) -> list[str]:
             if content[key]["interval_95"] is not None
         ]
         if known:
-            found.append(f"Given the law and these tests, {listed(known)} lies {sure}." if len(known) == 1 else
-                         f"Given the law and these tests, {listed(known)} lie {sure}.")  # fmt: skip
+            found.append(f"Given the law and these tests, {listed(known)}, each {sure}.")
     misfit = content["diagnostics"].get("own_misfit")
     if misfit is not None:
         found.append(
@@ -239,7 +238,7 @@ def next_steps(results: Results, folder: str) -> list[tuple[str, str]]:
     if content is None:
         steps.append(("Calibrate the law on these tests:", f"mcc-jax calibrate CAMPAIGN --out {folder}"))
     elif not content["converged"]:
-        steps.append(("Mend the checks that failed below before anything else.", ""))
+        steps.append((_mend(found), ""))
     elif content["method"] != "bayes":
         steps.append(("Get the uncertainty of every number:", f"mcc-jax calibrate CAMPAIGN --out {folder}"))
     if found is None:
@@ -251,13 +250,22 @@ def next_steps(results: Results, folder: str) -> list[tuple[str, str]]:
     return steps
 
 
+def _mend(found: dict[str, Any] | None) -> str:
+    if found is not None and found["effects"]:
+        return (
+            "The law alone does not fit these tests, which may be why its calibration did not converge: use the "
+            "parameters “after” under Discovery, and see the failed checks under Diagnostics."
+        )
+    return "Mend the checks that failed under Diagnostics before anything else."
+
+
 def _after(found: dict[str, Any]) -> list[tuple[str, str]]:
     verdict = found["verdict"]
     if found["next_experiments"]:
         best = found["next_experiments"][0]
         text = (
             f"Measure: {best['experiment']}, {number(best['particles'])} particles. It would separate "
-            f"{listed([plain(n) for n in best['separates']])} with probability {number(best['power'], 2)}."
+            f"{listed([plain(n) for n in best['separates']])} with probability {probability(best['power'])}."
         )
         return [(text, "")]
     if verdict in ("NAMED", "SET", "UNLISTED"):
@@ -276,14 +284,14 @@ def particle_facts(results: Results, names: list[str], rms: list[float | None], 
     facts = []
     for name, misfit, why in zip(names, rms, whys, strict=True):
         sizes = " × ".join(number(d) for d in campaign.diameters_um[campaign.index(name)])
-        parts = [f"D₁ × D₂ × D₃ = {sizes} µm"]
+        parts = [f"D₁ × D₂ × D₃ = {sizes} \N{NO-BREAK SPACE}µm"]
         eta = entries.get(name, {}).get("eta_p", {}).get("value")
         if eta is not None:
             parts.append(f"shape factor {number(eta, 3)}")
         if why is not None:
             parts.append(f"not used: {why}")
         elif misfit is not None:
-            parts.append(f"root mean square of measured − predicted {number(misfit, 2)} µm")
+            parts.append(f"root mean square of measured − predicted {number(misfit, 2)}\N{NO-BREAK SPACE}µm")
         facts.append("; ".join(parts) + ".")
     return facts
 

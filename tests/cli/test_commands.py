@@ -59,11 +59,11 @@ def test_without_arguments_help_with_examples(run):
     assert text == done(run("--help"))
     for word in ("demo", "simulate", "convert", "calibrate", "discover", "Examples:", "_MCC_JAX_COMPLETE"):
         assert word in text
-    assert set(cli.commands) == {"demo", "simulate", "convert", "calibrate", "discover", "power"}
+    assert set(cli.commands) == {"demo", "simulate", "convert", "calibrate", "discover", "power", "report"}
     assert "0.1.0" in done(run("--version"))
 
 
-@pytest.mark.parametrize("command", ["demo", "simulate", "convert", "calibrate", "discover", "power"])
+@pytest.mark.parametrize("command", ["demo", "simulate", "convert", "calibrate", "discover", "power", "report"])
 def test_every_command_has_help_with_an_example(run, command):
     text = done(run(command, "--help"))
     assert "xample" in text
@@ -84,7 +84,15 @@ def test_demo_does_the_whole_job(run, tmp_path):
     assert found["verdict"] == "NO_GAP"
     assert "Discovery (NO_GAP): nothing is missing" in text
     assert {"figures/discovery_where.png", "figures/discovery_ranking.png"} <= set(found["figures"])
-    expected = {"calibration.json", "discovery.json", "campaign", "figures", *content["figures"], *found["figures"]}
+    expected = {
+        "report.html",
+        "calibration.json",
+        "discovery.json",
+        "campaign",
+        "figures",
+        *content["figures"],
+        *found["figures"],
+    }
     expected |= {f"campaign/{name}" for name in ("particles.csv", "curves.csv", "campaign.toml")} | {"posterior.nc"}
     assert set(snapshot(out)) == expected
     for name in (*content["figures"], *found["figures"]):

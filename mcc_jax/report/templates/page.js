@@ -30,22 +30,23 @@
     return [low - margin, high + margin];
   }
 
-  // One closed outline for every stretch of one kind: along its lower end up, along its upper end down.
+  // One closed outline for every stretch of one kind: along one end of the band and back along the other.
   function outlines(one) {
-    const found = { x: [], y: [], away: [] };
+    const found = { displacement: [], force: [], time: [], away: [] };
     if (!one.low) return found;
     let stretch = [];
     const close = () => {
       if (stretch.length > 1) {
+        const there = (order, column) => order.map((i) => column[i]);
+        const round = (order, low, high) => [...there(order, low), ...there([...order].reverse(), high)];
         // Noise of force must not fold the band.
         const along = [...stretch].sort((i, j) => one.force[i] - one.force[j]);
-        const back = [...along].reverse();
-        const less = (column, i) => column[i] - one.own[i];
-        found.x.push([...along.map((i) => one.low[i]), ...back.map((i) => one.high[i])]);
-        found.y.push([...along, ...back].map((i) => one.force[i]));
+        found.displacement.push(round(along, one.low, one.high));
+        found.force.push(round(along, one.force, one.force));
+        found.time.push(round(stretch, one.time, one.time));
         found.away.push(one.own
-          ? [...along.map((i) => less(one.low, i)), ...back.map((i) => less(one.high, i))]
-          : [...along, ...back].map(() => NaN));
+          ? round(stretch, difference(one.low, one.own), difference(one.high, one.own))
+          : round(stretch, one.time, one.time).map(() => NaN));
       }
       stretch = [];
     };
@@ -72,29 +73,28 @@
     };
     const own = one.own || missing(one.force);
     const typical = one.typical || missing(one.force);
-    const away = one.own && one.typical ? difference(one.typical, one.own) : missing(one.force);
-    model("lines").data = { force: one.force, own: numbers(own), typical: numbers(typical), away: numbers(away) };
+    model("lines").data = { force: one.force, own: numbers(own), typical: numbers(typical) };
     model("bands").data = outlines(one);
     const counted = residual.filter((_, i) => one.used[i]);
     const reach = Math.max(...ends([counted, [0]]).map(Math.abs));
-    home = { across: ends([one.displacement, own]), up: ends([one.force]), beside: [-reach, reach] };
+    home = [
+      [model("curve"), ends([one.displacement, own]), ends([one.force])],
+      [model("residual"), ends([one.time]), [-reach, reach]],
+    ];
     reset();
     facts.textContent = one.label + ": " + one.facts;
     document.getElementById("previous").disabled = index === 0;
     document.getElementById("next").disabled = index === data.particles.length - 1;
   }
 
-  const ranges = () => [["across", model("curve").x_range], ["up", model("curve").y_range], ["beside", model("residual").x_range]];
+  const ranges = () => home.flatMap(([plot, across, up]) => [[plot.x_range, across], [plot.y_range, up]]);
 
   function reset() {
-    for (const [name, range] of ranges()) {
-      const [start, end] = home[name];
-      range.setv({ start, end, reset_start: start, reset_end: end });
-    }
+    for (const [range, [start, end]] of ranges()) range.setv({ start, end, reset_start: start, reset_end: end });
   }
 
   function zoom(factor) {
-    for (const [, range] of ranges()) {
+    for (const [range] of ranges()) {
       const middle = (range.start + range.end) / 2;
       const half = (factor * (range.end - range.start)) / 2;
       range.setv({ start: middle - half, end: middle + half });
