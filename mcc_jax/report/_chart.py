@@ -64,15 +64,15 @@ def chart_items() -> dict[str, Any]:
 
 
 def _figure(name: str, across: str, up: str) -> Any:
-    from bokeh.models import Range1d
+    from bokeh.models import BasicTicker, Range1d
     from bokeh.plotting import figure
 
     plot = figure(
         name=name,
         height=400,
         sizing_mode="stretch_width",
-        x_range=Range1d(0, 1),
-        y_range=Range1d(0, 1),
+        x_range=Range1d(start=0, end=1),
+        y_range=Range1d(start=0, end=1),
         x_axis_label=across,
         y_axis_label=up,
         tools="box_zoom,pan,wheel_zoom,reset,save",
@@ -87,7 +87,7 @@ def _figure(name: str, across: str, up: str) -> Any:
         axis.axis_label_text_font_style = "normal"
         axis.axis_label_text_font_size = axis.major_label_text_font_size = "13px"
         axis.axis_label_text_font = axis.major_label_text_font = "system-ui, sans-serif"
-        axis.ticker.desired_num_ticks = 5
+        axis.ticker = BasicTicker(desired_num_ticks=5)
         axis.minor_tick_line_color = None
         axis.axis_label_text_color = axis.major_label_text_color = "#222222"
     return plot

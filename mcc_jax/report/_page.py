@@ -17,16 +17,13 @@ from ._compare import KINDS, Shown, compare
 from ._lights import lights
 from ._numbers import interval, number, percent, probability, with_sd
 from ._read import Results
+from ._tables import measured, parameters, particle_facts, particle_rows
 from ._words import (
     METHODS,
     calibration_sentences,
     discovery_sentence,
     listed,
-    measured,
     next_steps,
-    parameters,
-    particle_facts,
-    particle_rows,
     plain,
     quantity,
     simulated,

@@ -1,0 +1,196 @@
+"""The tables of the page: facts of the campaign, parameters, particles."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from ..campaign import (
+    PAPER_EFFECTIVE_MODULUS_MPA,
+    PAPER_LOG_C,
+    PAPER_SHAPE_PARAMETER,
+    Campaign,
+    campaign_segments,
+    effective_diameter_um,
+)
+from ._numbers import interval, number, span, with_sd
+from ._read import Results
+from ._words import plain
+
+KINDS = {"approach": "approach", "load": "loading", "hold": "hold", "unload": "unloading", "reload": "reloading"}
+
+
+def measured(campaign: Campaign) -> list[tuple[str, str]]:
+    """Facts of a campaign, name and value."""
+    sizes = campaign.diameters_um
+    effective = [effective_diameter_um(one) for one in sizes]
+    peaks = [float(curve.force_mN.max()) for curve in campaign.curves]
+    stress = [1e3 * p / (math.pi * (d / 2) ** 2) for p, d in zip(peaks, effective, strict=True)]
+    flatness = 1 - sizes[:, 2] ** 2 / (sizes[:, 0] * sizes[:, 1])
+    counts = Counter(part.kind for parts in campaign_segments(campaign) for part in parts)
+    segments = ", ".join(f"{counts[kind]} × {word}" for kind, word in KINDS.items() if counts[kind])
+    meta = campaign.metadata
+    facts = [
+        ("Tests", f"{len(campaign)} particles, {sum(len(c) for c in campaign.curves)} points"),
+        ("Diameters", span(sizes.ravel(), "µm")),
+        ("Flatness 1 − D₃²/(D₁D₂)", span(flatness, "", 2)),
+        ("Largest force", span(peaks, "mN")),
+        ("Largest stress", span(stress, "MPa", 3)),
+        ("Segments", segments),
+        ("Duration", span([float(c.time_s[-1] - c.time_s[0]) for c in campaign.curves], "s")),
+        ("Control", {"load": "force", "displacement": "displacement", None: "not recorded"}[meta.control]),
+        ("Resolution", _resolution(campaign)),
+    ]
+    if meta.punch_diameter_um is not None:
+        facts.append(("Punch", f"{number(meta.punch_diameter_um)} µm diameter"))
+    facts.append(("Corrections before", ", ".join(map(plain, meta.corrections)) or "none recorded"))
+    facts.append(("Provenance", meta.provenance or "not recorded"))
+    return facts
+
+
+def _resolution(campaign: Campaign) -> str:
+    meta = campaign.metadata
+    parts = [
+        f"{number(value)} {unit}"
+        for value, unit in ((meta.force_resolution_mN, "mN"), (meta.displacement_resolution_um, "µm"))
+        if value is not None
+    ]
+    return ", ".join(parts) or "not recorded"
+
+
+def parameters(content: dict[str, Any]) -> list[dict[str, str]]:
+    """Rows of the table of parameters: symbol, name, meaning, value, interval, and the paper's value."""
+    form = content["law"]["unloading"]
+    rows = [
+        {
+            "symbol": "a",
+            "sub": "",
+            "name": "Shape parameter",
+            "meaning": "How much more a flat particle is strained than a sphere under the same displacement; "
+            "0 would mean that shape does not matter.",
+            **_told(content["a"]),
+            "paper": number(PAPER_SHAPE_PARAMETER),
+        },
+        {
+            "symbol": "Ē",
+            "sub": "",
+            "name": "Effective modulus [GPa]",
+            "meaning": f"How stiffly a particle springs back on unloading. It belongs to the form “{form}” of the law "
+            "only.",
+            **_told(content["effective_modulus_MPa"], 1e-3),
+            "paper": f"{PAPER_EFFECTIVE_MODULUS_MPA / 1e3:g}" if form == "printed" else "other form",
+        },
+    ]
+    meanings = {
+        "C1": "Initial slope of stress over scaled strain [MPa]: how hard the first squeeze is.",
+        "C3": "Softening in the middle of the curve, entering as a cube.",
+        "C5": "Stiffening at large strain, entering as a fifth power.",
+    }
+    for name, meaning in meanings.items():
+        mean, sd = content[f"log_{name}"]["mean"], content[f"log_{name}"]["sd"]
+        rows.append(
+            {
+                "symbol": "C",
+                "sub": name[1],
+                "name": "Median particle",
+                "meaning": meaning,
+                **_told(_exponential(mean)),
+                "paper": number(math.exp(PAPER_LOG_C[name][0])),
+            }
+        )
+        rows.append(
+            {
+                "symbol": "τ",
+                "sub": name[1],
+                "name": f"Spread of log C{name[1]}",
+                "meaning": _spread(mean["value"], sd["value"]),
+                **_told(sd),
+                "paper": number(PAPER_LOG_C[name][1]),
+            }
+        )
+    if "yield_stress_MPa" in content:
+        rows.append(
+            {
+                "symbol": "σ",
+                "sub": "y",
+                "name": "Yield stress [MPa]",
+                "meaning": "Mean of C₁ over 17.16: where a sphere of this material begins to yield.",
+                **_told(content["yield_stress_MPa"]),
+                "paper": "0.4085",
+            }
+        )
+    return rows
+
+
+def _told(estimate: dict[str, Any], factor: float = 1.0) -> dict[str, str]:
+    return {"value": with_sd(estimate, factor), "interval": interval(estimate, factor) or "none given"}
+
+
+def _exponential(estimate: dict[str, Any]) -> dict[str, Any]:
+    """The estimate of exp of what is estimated."""
+
+    def exp(value: float) -> float:
+        return math.exp(min(value, 700.0))
+
+    value, sd, ends = estimate["value"], estimate["sd"], estimate["interval_95"]
+    middle = None if value is None else exp(value)
+    return {
+        "value": middle,
+        "sd": None if middle is None or sd is None else middle * sd,
+        "interval_95": None if ends is None else [exp(end) for end in ends],
+    }
+
+
+def _spread(mean: float | None, sd: float | None) -> str:
+    if mean is None or sd is None or not abs(mean) + abs(sd) < 300:
+        return "How much particles differ; these data do not tell."
+    if sd < 1e-3:
+        return "How much particles differ: hardly at all in these data."
+    low, high = number(math.exp(mean - sd), 3), number(math.exp(mean + sd), 3)
+    return f"How much particles differ: two of three lie between {low} and {high}."
+
+
+def particle_facts(results: Results, names: list[str], rms: list[float | None], whys: list[str | None]) -> list[str]:
+    """One line about each particle, for the line below the chart."""
+    campaign = results.campaign
+    assert campaign is not None
+    entries = {e["particle"]: e for e in results.calibration["particles"]} if results.calibration else {}
+    facts = []
+    for name, misfit, why in zip(names, rms, whys, strict=True):
+        sizes = " × ".join(number(d) for d in campaign.diameters_um[campaign.index(name)])
+        parts = [f"D₁ × D₂ × D₃ = {sizes} \N{NO-BREAK SPACE}µm"]
+        eta = entries.get(name, {}).get("eta_p", {}).get("value")
+        if eta is not None:
+            parts.append(f"shape factor {number(eta, 3)}")
+        if why is not None:
+            parts.append(f"not used: {why}")
+        elif misfit is not None:
+            parts.append(f"root mean square of measured − predicted {number(misfit, 2)}\N{NO-BREAK SPACE}µm")
+        facts.append("; ".join(parts) + ".")
+    return facts
+
+
+def particle_rows(results: Results) -> list[dict[str, Any]]:
+    """The table of particles: sizes, what was measured, what was found, and whether it was used."""
+    campaign, content = results.campaign, results.calibration
+    entries = {e["particle"]: e for e in content["particles"]} if content else {}
+    names = list(campaign.particles) if campaign is not None else list(entries)
+    rows = []
+    for i, name in enumerate(names):
+        entry = entries.get(name)
+        row: dict[str, Any] = {"name": name, "kept": None if entry is None else entry["kept"]}
+        row["why_not"] = None if entry is None else entry["why_not"]
+        if campaign is not None:
+            row["sizes"] = [number(d) for d in campaign.diameters_um[i]]
+            row["peak"] = number(float(np.max(campaign.curves[i].force_mN)))
+            row["points"] = len(campaign.curves[i])
+        if entry is not None:
+            row["eta"] = number(entry["eta_p"]["value"], 3)
+            row["C"] = [with_sd(entry[c]) if entry["kept"] else "–" for c in ("C1", "C3", "C5")]
+            own = entry.get("own_rms_um", entry["rms_um"])
+            row["rms"] = number(own, 2) if entry["kept"] else "–"
+        rows.append(row)
+    return rows

@@ -1,0 +1,37 @@
+import shutil
+
+import pytest
+from click.testing import CliRunner
+from results_folder import write_results
+
+from mcc_jax.cli._main import cli
+
+
+@pytest.fixture(scope="session")
+def complete(tmp_path_factory):
+    """A folder with everything; do not write into it."""
+    return write_results(tmp_path_factory.mktemp("complete"))
+
+
+@pytest.fixture
+def folder(complete, tmp_path):
+    """A copy of it, to be changed."""
+    return shutil.copytree(complete, tmp_path / "results")
+
+
+@pytest.fixture(scope="session")
+def page(complete):
+    """The page of the complete folder."""
+    from mcc_jax.report import read_results, report_page
+
+    return report_page(read_results(complete, name="complete"))
+
+
+@pytest.fixture
+def run():
+    """The command line, in this process."""
+
+    def invoke(*arguments):
+        return CliRunner().invoke(cli, [str(a) for a in arguments], prog_name="mcc-jax")
+
+    return invoke

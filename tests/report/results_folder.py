@@ -1,0 +1,205 @@
+"""A folder of results whose truth is known: tests simulated without noise, and results that state that truth."""
+
+import base64
+import json
+import math
+from dataclasses import replace
+
+import equinox as eqx
+import h5py
+import jax.numpy as jnp
+import numpy as np
+
+from mcc_jax.calibrate.joint._data import rows_from_contact
+from mcc_jax.campaign import campaign_segments, file_checksums, write_campaign
+from mcc_jax.law import MccLaw, Plastic
+from mcc_jax.simulate import Hold, Programme, Ramp, simulate_campaign
+
+SIZES = np.array([[213.54, 196.07, 186.33], [155.32, 217.51, 136.87], [97.56, 100.98, 69.09], [120.0, 110.0, 100.0]])
+C = np.array([[7.0, 3.0, 2.7], [6.0, 2.9, 2.6], [8.0, 3.05, 2.75], [6.5, 2.95, 2.65]])
+A, MODULUS = 1.43, 16000.0
+ZERO = np.array([0.0, 0.5, -0.25, 1.0])
+NOISE = 0.02
+NAMES = ("1", "B 2", "C", "left out")
+STEPS = (Ramp(0.5, 5.0), Hold(10.0), Ramp(0.1, 5.0), Ramp(1.0, 5.0), Ramp(0.0, 5.0))
+PNG = base64.b64decode(
+    "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJggg=="
+)
+
+
+def campaign(names=NAMES, zero=ZERO):
+    one = eqx.filter_vmap(lambda c: MccLaw(Plastic(c[0], c[1], c[2]), A, MODULUS))
+    diameter = SIZES[:, 0] * SIZES[:, 1] / SIZES[:, 2]
+    peaks = 9e-3 * math.pi * (diameter / 2) ** 2
+    plan = Programme("load", STEPS, points=90)
+    made = simulate_campaign(one(jnp.asarray(C)), SIZES, peaks, plan, particles=names)
+    curves = (replace(c, displacement_um=c.displacement_um + z) for c, z in zip(made.curves, zero, strict=True))
+    return replace(made, curves=tuple(curves), columns={})
+
+
+def estimate(value, sd=0.01):
+    return {"value": value, "sd": sd, "interval_95": [value - 1.96 * sd, value + 1.96 * sd]}
+
+
+NOTHING = {"value": None, "sd": None, "interval_95": None}
+
+
+def calibration(names=NAMES, **changes):
+    """`calibration.json` that states the truth; the last particle took no part."""
+    particles = []
+    for i, name in enumerate(names):
+        kept = i < len(names) - 1
+        eta = 1 + A * (1 - SIZES[i, 2] ** 2 / (SIZES[i, 0] * SIZES[i, 1]))
+        values = {"eta_p": eta, "C1": C[i, 0], "C3": C[i, 1], "C5": C[i, 2], "zero_um": ZERO[i]}
+        particles.append(
+            {
+                "particle": name,
+                **{key: estimate(value) if kept else NOTHING for key, value in values.items()},
+                "rms_um": NOISE if kept else None,
+                "kept": kept,
+                "why_not": None if kept else "has 3 usable points on loading, fewer than 12",
+            }
+        )
+    spread = {f"log_C{k}": {"mean": estimate(m), "sd": estimate(0.1)} for k, m in ((1, 1.9), (3, 1.09), (5, 0.98))}
+    return {
+        "schema": 1,
+        "method": "bayes",
+        "converged": True,
+        "runtime_s": 1.0,
+        "seed": 3,
+        "law": {"unloading": "printed", "strain_scaling": "raw"},
+        "a": estimate(A),
+        "effective_modulus_MPa": estimate(MODULUS, 10.0),
+        **spread,
+        "yield_stress_MPa": estimate(0.4),
+        "probability_not_monotone": estimate(0.02),
+        "noise": {"displacement_um": estimate(NOISE, 0.001)},
+        "priors": {"a": {"distribution": "normal", "mean": 1.0, "sd": 1.0}},
+        "particles": particles,
+        "warnings": ["particle 'left out' could not be used"],
+        "diagnostics": {
+            "rhat_max": 1.004,
+            "ess_bulk_min": 900.0,
+            "divergences": 0,
+            "pareto_k_max": 0.3,
+            "own_misfit": 0.001,
+        },
+        "figures": ["figures/forest.png"],
+        "files": ["posterior.nc"],
+    } | changes
+
+
+def discovery(**changes):
+    """`discovery.json` with every part filled."""
+    pair = {"a": estimate(1.2), "effective_modulus_MPa": estimate(9000.0, 50.0)}
+    logs = {f"log_C{k}": {"mean": estimate(m), "sd": NOTHING} for k, m in ((1, 1.9), (3, 1.0), (5, 0.9))}
+    step = {"chi2_per_dof": 2.0, "systematic_um": 0.07, "elpd": 0.0, "elpd_se": 0.0}
+    return {
+        "schema": 1,
+        "verdict": "SET",
+        "summary": "The law and the 3 tests disagree.",
+        "effects": [
+            {
+                "mechanism": "frame_compliance",
+                "variant": "linear",
+                "probability": 0.8,
+                "p_family_wise": 0.0,
+                "equation": "d = C F",
+                "explanation": "A linear spring in series with the particle.",
+                "parameters": {"compliance_um_per_mN": estimate(0.004, 1e-5)},
+            }
+        ],
+        "candidate_set": [["frame_compliance", "platen_sink_in"]],
+        "ranking": [
+            {
+                "mechanism": "frame_compliance",
+                "statistic": 40.0,
+                "estimate": 0.004,
+                "detection_limit": 0.0001,
+                "unit": "um/mN",
+                "probability": 0.8,
+            }
+        ],
+        "untestable": [{"mechanism": "humidity", "needs": "a column relative_humidity_percent"}],
+        "where": [
+            {
+                "segment": "loading",
+                "load_fraction": [0.1, 0.3],
+                "strain": [0.0, 0.4],
+                "share": 0.6,
+                "particles": ["1", "C"],
+                "direction": "more displacement than the law",
+            }
+        ],
+        "closure": None,
+        "gap": {
+            "floor": 1.0,
+            "heldout": "leave-one-particle-out",
+            "steps": [{"added": None, **step}, {"added": "frame_compliance", **step, "systematic_um": 0.001}],
+            "closed_fraction": 0.99,
+        },
+        "parameters_before": pair | logs,
+        "parameters_after": {"a": estimate(A), "effective_modulus_MPa": estimate(MODULUS)} | logs,
+        "next_experiments": [
+            {
+                "experiment": "a hold of 60 s at the largest load",
+                "separates": ["frame_compliance", "platen_sink_in"],
+                "particles": 6,
+                "power": 0.95,
+            }
+        ],
+        "runtime_s": 2.0,
+        "seed": 0,
+        "notes": ["few particles"],
+        "figures": ["figures/discovery_before_after.png"],
+    } | changes
+
+
+def write_posterior(file, tests, names=NAMES, a=A):
+    """A posterior around the truth, with bands of the noise that these tests do not have."""
+    rng = np.random.default_rng(0)
+    kept = len(names) - 1
+    rows = [rows_from_contact(c, s, 400) for c, s in zip(tests.curves, campaign_segments(tests), strict=True)][:kept]
+    points = -(-max(map(len, rows)) // 64) * 64
+
+    def padded(values):
+        return np.stack([np.pad(v[r], (0, points - len(r)), mode="edge") for v, r in zip(values, rows, strict=False)])
+
+    um = padded([c.displacement_um for c in tests.curves])
+    mask = np.stack([np.arange(points) < len(r) for r in rows])
+    with h5py.File(file, "w") as tree:
+        posterior = tree.create_group("posterior")
+        draws = a + 0.01 * rng.standard_normal((4, 100))
+        posterior["a"] = draws - draws.mean() + a
+        draws = 10 * rng.standard_normal((4, 100))
+        posterior["effective_modulus_MPa"] = draws - draws.mean() + MODULUS
+        posterior["mu"] = np.array([1.9, 1.09, 0.98]) + 0.01 * rng.standard_normal((4, 100, 3))
+        posterior["tau"] = np.abs(0.1 + 0.01 * rng.standard_normal((4, 100, 3)))
+        predictive = tree.create_group("posterior_predictive")
+        predictive["particle"] = list(names[:kept])
+        predictive["displacement_um"] = um + NOISE * rng.standard_normal((4, 500, kept, points))
+        constant = tree.create_group("constant_data")
+        constant["force_mN"] = padded([c.force_mN for c in tests.curves])
+        constant["mask"] = mask.astype(np.int8)
+        tree.create_group("observed_data")["displacement_um"] = um
+
+
+def write_results(folder, names=NAMES):
+    """Campaign, calibration, posterior, discovery and figures in one folder."""
+    tests = campaign(names)
+    write_campaign(tests, folder)
+    origin = {
+        "campaign": {"folder": str(folder), "sha256": file_checksums(folder)},
+        "settings": {"threshold_MPa": 0.2, "seed": 3},
+        "versions": {"mcc_jax": "0.1.0", "jax": "0.10"},
+    }
+    for name, content in (
+        ("calibration.json", calibration(names, provenance=origin)),
+        ("discovery.json", discovery(provenance=origin)),
+    ):
+        (folder / name).write_text(json.dumps(content), encoding="utf-8")
+    write_posterior(folder / "posterior.nc", tests, names)
+    (folder / "figures").mkdir()
+    for stem in ("forest", "discovery_before_after"):
+        (folder / "figures" / f"{stem}.png").write_bytes(PNG)
+    return folder

@@ -1,0 +1,344 @@
+"""What stands in the page: predictions that are true, every section filled, nothing loaded from anywhere."""
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from reading_html import Page
+from results_folder import MODULUS, NAMES, NOISE, SIZES, calibration, campaign, write_posterior
+from results_folder import C as COEFFICIENTS
+
+from mcc_jax.campaign import write_campaign
+from mcc_jax.report import _compare as compare_module
+from mcc_jax.report import read_results, report_page
+from mcc_jax.report._chart import chart_data, chart_items
+from mcc_jax.report._compare import KINDS, compare
+from mcc_jax.report._lights import lights
+from mcc_jax.report._numbers import interval, number, with_sd
+from mcc_jax.report._words import calibration_sentences, next_steps
+
+SECTIONS = {"summary", "measured", "law", "compare", "posterior", "diagnostics", "discovery", "settings", "cite"}
+PARTS = {
+    "campaign": ("particles.csv", "curves.csv", "campaign.toml"),
+    "calibration": ("calibration.json",),
+    "posterior": ("posterior.nc",),
+    "discovery": ("discovery.json",),
+}
+
+
+@pytest.fixture(scope="module")
+def results(complete):
+    return read_results(complete)
+
+
+@pytest.fixture(scope="module")
+def shown(results):
+    return compare(results)
+
+
+def changed(folder, name="calibration.json", **changes):
+    """The results of a folder after changing one of its files."""
+    file = folder / name
+    file.write_text(json.dumps(json.loads(file.read_text()) | changes))
+    return read_results(folder)
+
+
+def keep(folder, *parts):
+    """Leave only these parts in the folder, and nothing that points elsewhere."""
+    for part, names in PARTS.items():
+        for name in names:
+            if part not in parts:
+                (folder / name).unlink()
+    for name in ("calibration.json", "discovery.json"):
+        if (folder / name).exists():
+            content = json.loads((folder / name).read_text())
+            content.pop("provenance")
+            (folder / name).write_text(json.dumps(content))
+
+
+def test_prediction_with_the_true_coefficients_is_the_measurement(shown):
+    assert [one.name for one in shown] == list(NAMES)
+    for one in shown[:-1]:
+        np.testing.assert_allclose(one.own_um, one.displacement_um, atol=1e-7)
+        assert one.rms_um < 1e-7
+        assert set(one.kind.tolist()) == {KINDS.index(k) for k in ("load", "hold", "unload", "reload")}
+    assert np.isnan(shown[-1].own_um).all()
+    assert "fewer than 12" in shown[-1].why_not
+    assert shown[-1].rms_um is None
+
+
+def test_a_wrong_coefficient_shows_as_misfit(folder):
+    content = calibration()
+    content["particles"][0]["C1"]["value"] *= 1.05
+    one = compare(changed(folder, particles=content["particles"]))[0]
+    assert one.rms_um > 0.5
+
+
+def test_own_modulus_and_own_shape_are_used_where_they_scatter(folder):
+    content = calibration()["particles"]
+    for entry in content[:-1]:
+        entry["effective_modulus_MPa"] = {"value": MODULUS, "sd": None, "interval_95": None}
+    scatter = {"value": 0.1, "sd": None, "interval_95": None}
+    wrong = {"value": 2000.0, "sd": None, "interval_95": None}
+    found = changed(folder, particles=content, modulus_scatter=scatter, effective_modulus_MPa=wrong)
+    for one in compare(found)[:-1]:
+        np.testing.assert_allclose(one.own_um, one.displacement_um, atol=1e-7)
+        assert np.abs(one.typical_um - one.own_um)[one.kind == KINDS.index("unload")].max() > 0.1
+    found = changed(folder, shape_scatter=scatter, a={"value": 0.5, "sd": None, "interval_95": None})
+    for one in compare(found)[:-1]:
+        np.testing.assert_allclose(one.own_um, one.displacement_um, atol=1e-7)
+
+
+def test_the_typical_particle_is_the_median_or_for_the_papers_method_the_mean(folder):
+    """Where C5 dominates, E[C5^5] of a log-normal is larger than its median: the mean law is stiffer."""
+    median = compare(read_results(folder))[0]
+    mean = compare(changed(folder, method="paper"))[0]
+    top = np.argmax(median.force_mN)
+    assert mean.typical_um[top] < median.typical_um[top]
+    log_C = {f"log_C{k}": {"mean": {"value": math.log(c)} | NO_SD, "sd": {"value": 0.0} | NO_SD} for k, c in zip((1, 3, 5), COEFFICIENTS[0], strict=True)}  # fmt: skip
+    for method in ("paper", "least-squares"):
+        one = compare(changed(folder, method=method, **log_C))[0]
+        np.testing.assert_allclose(one.typical_um, one.own_um, atol=1e-7)
+
+
+NO_SD = {"sd": None, "interval_95": None}
+
+
+def test_bands_hold_what_the_noise_says(results, shown):
+    assert results.posterior.inside == 1.0  # tests without noise, bands with it
+    for one in shown[:-1]:
+        np.testing.assert_allclose(one.high_um - one.low_um, 2 * 1.96 * NOISE, rtol=0.15)
+        np.testing.assert_allclose((one.high_um + one.low_um) / 2, one.displacement_um, atol=NOISE / 3)
+    assert np.isnan(shown[-1].low_um).all()
+
+
+def test_bands_of_other_forces_are_not_drawn(folder):
+    tests = campaign()
+    curves = tuple(dataclasses.replace(c, force_mN=1.01 * c.force_mN) for c in tests.curves)
+    write_campaign(dataclasses.replace(tests, curves=curves), folder)
+    assert all(np.isnan(one.low_um).all() for one in compare(read_results(folder)))
+
+
+def test_points_below_the_threshold_do_not_count(folder, shown):
+    for one, size in zip(shown, SIZES, strict=True):
+        stress = 1e3 * one.force_mN / (math.pi * (size[0] * size[1] / size[2] / 2) ** 2)
+        assert not one.used[stress < 0.2].any()
+        assert one.used[(one.kind == 0) & (stress >= 0.2)].all()
+    origin = json.loads((folder / "calibration.json").read_text())["provenance"]
+    origin["settings"]["threshold_MPa"] = 5.0
+    higher = compare(changed(folder, provenance=origin))
+    assert sum(one.used.sum() for one in higher) < 0.8 * sum(one.used.sum() for one in shown)
+
+
+def test_of_many_points_turns_stay_and_of_many_particles_the_worst(results, shown, monkeypatch):
+    monkeypatch.setattr(compare_module, "POINTS", 80)
+    monkeypatch.setattr(compare_module, "LEAST_POINTS", 20)
+    few = compare(results)
+    for one, all_of_it in zip(few, shown, strict=True):
+        assert len(one.force_mN) < 45 < len(all_of_it.force_mN)
+        assert one.force_mN.max() == all_of_it.force_mN.max()
+        assert one.force_mN[-1] == all_of_it.force_mN[-1]
+    monkeypatch.setattr(compare_module, "MOST_PARTICLES", 1)
+    calibration = {**results.calibration, "particles": [dict(e) for e in results.calibration["particles"]]}
+    calibration["particles"][1]["rms_um"] = 9.0
+    assert [one.name for one in compare(dataclasses.replace(results, calibration=calibration))] == [NAMES[1]]
+
+
+def test_rounding_in_the_page_does_not_show(shown):
+    rng = np.random.default_rng(0)
+    one = shown[0]
+    one = dataclasses.replace(one, displacement_um=one.own_um + 1e-4 * rng.standard_normal(len(one.own_um)))
+    column = chart_data([one], ["1"], [""])["particles"][0]
+    residual = np.array(column["displacement"]) - np.array(column["own"])
+    np.testing.assert_allclose(residual, one.displacement_um - one.own_um, atol=2e-6)
+
+
+def test_sections_are_filled_and_the_page_is_whole(page):
+    read = Page(page)
+    assert set(read.sections) == SECTIONS
+    assert len(read.ids) == len(set(read.ids))
+    assert {link[1:] for link in read.links if link.startswith("#")} <= set(read.ids)
+    assert all(image["alt"].strip() for image in read.images)
+    assert dict(read.tags[0][1]) == {"lang": "en"}
+    for text in ("frame compliance", "platen sink in", "a hold of 60 s", "0.004000 ± 0.000010", "99 %", "1.43"):
+        assert text in read.text
+    for label in NAMES[1:]:
+        assert label in read.text
+    assert "has 3 usable points on loading" in read.sections["measured"]
+    assert "checksums agree" in read.sections["diagnostics"]
+    assert "arXiv:1812.06173" in read.sections["cite"]
+    assert len(page.encode()) < 6e6
+
+
+def test_nothing_is_loaded_from_anywhere(page):
+    read = Page(page)
+    assert all(source.startswith("data:image/") for source in read.sources)
+    assert [link for link in read.links if not link.startswith("#")] == ["https://arxiv.org/abs/1812.06173"]
+    policy = next(a["content"] for tag, a in read.tags if tag == "meta" and "http-equiv" in a)
+    assert "default-src 'none'" in policy
+    assert "url(" not in page[: page.index("</style>")]
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        ("campaign",),
+        ("calibration",),
+        ("posterior",),
+        ("discovery",),
+        ("campaign", "calibration"),
+        ("calibration", "posterior"),
+        ("campaign", "discovery"),
+    ],
+    ids="+".join,
+)
+def test_what_is_missing_is_said_with_the_command_that_makes_it(folder, parts):
+    keep(folder, *parts)
+    found = read_results(folder)
+    assert len(found.missing) == len(PARTS) - len(parts)
+    read = Page(report_page(found))
+    assert set(read.sections) == SECTIONS
+    for name, text in read.sections.items():
+        assert len(text.split()) > 10, (name, text)
+    for part, command in (("campaign", "--campaign CAMPAIGN"), ("discovery", "mcc-jax discover"), ("posterior", "mcc-jax calibrate")):  # fmt: skip
+        assert (command in read.text) == (part not in parts) or part == "posterior"
+    assert ("chart-data" in read.ids) == ("campaign" in parts)
+
+
+@pytest.mark.parametrize(
+    ("verdict", "words"),
+    [
+        ("NO_GAP", "Nothing is missing in the law"),
+        ("NAMED", "Missing in the law is frame compliance"),
+        ("SET", "or what these tests cannot tell from it"),
+        ("UNLISTED", "no listed mechanism explains"),
+        ("FIT_NOT_CONVERGED", "could not be fitted well enough"),
+    ],
+)
+def test_every_verdict_is_told(folder, verdict, words):
+    keep(folder, "discovery")
+    empty = {"effects": [], "candidate_set": [], "where": [], "next_experiments": [], "parameters_after": {}}
+    closure = {"formula": "0.1 * x**2", "resembles": [["creep", 0.7]]}
+    more = {"NO_GAP": empty, "UNLISTED": empty | {"closure": closure}, "FIT_NOT_CONVERGED": empty | {"ranking": []}}
+    text = Page(report_page(changed(folder, "discovery.json", verdict=verdict, **more.get(verdict, {})))).text
+    assert words in text
+    assert verdict in text
+    assert ("0.1 * x**2" in text) == (verdict == "UNLISTED")
+
+
+def test_equal_input_gives_an_equal_page(complete, page):
+    from bokeh.models import ColumnDataSource
+
+    first = chart_items()
+    ColumnDataSource({})  # moves Bokeh's own count
+    assert chart_items() == first
+    assert report_page(read_results(complete, name="complete")) == page
+
+
+def test_the_page_needs_double_precision(results):
+    import jax
+
+    with jax.enable_x64(False), pytest.raises(RuntimeError, match="double precision"):
+        report_page(results)
+
+
+def test_changed_data_are_noticed(folder):
+    assert read_results(folder).cautions == ()
+    with (folder / "curves.csv").open("a") as stream:
+        stream.write("\n")
+    found = read_results(folder)
+    assert [text.split(" was")[0] for text in found.cautions] == ["calibration.json", "discovery.json"]
+    assert "curves.csv" in found.cautions[0]
+    assert next(check.level for check in lights(found) if check.check == "Same data") == "bad"
+
+
+def test_a_posterior_of_another_calibration_is_left_out(folder):
+    write_posterior(folder / "posterior.nc", campaign(), a=1.2)
+    found = read_results(folder)
+    assert found.posterior is None
+    assert "posterior.nc is not of the calibration beside it" in found.cautions[0]
+    assert changed(folder, method="least-squares").posterior is None
+
+
+def test_the_campaign_is_found_where_the_results_say(folder, tmp_path):
+    moved = tmp_path / "elsewhere"
+    moved.mkdir()
+    for name in PARTS["campaign"]:
+        if (folder / name).exists():
+            (folder / name).rename(moved / name)
+    origin = json.loads((folder / "calibration.json").read_text())["provenance"]
+    origin["campaign"]["folder"] = str(moved)
+    assert len(changed(folder, provenance=origin).campaign) == len(NAMES)
+    origin["campaign"]["folder"] = str(tmp_path / "gone")
+    lost = changed(folder, provenance=origin)
+    changed(folder, "discovery.json", provenance=origin)
+    lost = read_results(folder)
+    assert lost.campaign is None
+    assert "no longer where" in lost.missing_campaign
+    assert len(read_results(folder, moved).campaign) == len(NAMES)
+    moved.rename(folder / "campaign")
+    assert len(read_results(folder).campaign) == len(NAMES)
+
+
+def test_figures_are_only_those_that_the_results_name_as_theirs(folder):
+    (folder / "figures" / "mine.png").write_bytes((folder / "figures" / "forest.png").read_bytes())
+    (folder / "secret.png").write_bytes((folder / "figures" / "forest.png").read_bytes())
+    (folder / "figures" / "pairs.png").write_text("no picture")
+    names = ["figures/forest.png", "figures/../secret.png", "/etc/hostname", "figures/pairs.png", "figures/gone.png"]
+    assert set(changed(folder, figures=names).figures) == {"forest", "discovery_before_after"}
+
+
+@pytest.mark.parametrize(
+    ("check", "changes", "level"),
+    [
+        ("Chains agree (R-hat)", {"rhat_max": 1.01}, "good"),
+        ("Chains agree (R-hat)", {"rhat_max": 1.02}, "look"),
+        ("Chains agree (R-hat)", {"rhat_max": 1.2}, "bad"),
+        ("Chains agree (R-hat)", {"rhat_max": None}, "unknown"),
+        ("Independent draws (bulk ESS)", {"ess_bulk_min": 400}, "good"),
+        ("Independent draws (bulk ESS)", {"ess_bulk_min": 399}, "look"),
+        ("Independent draws (bulk ESS)", {"ess_bulk_min": 20}, "bad"),
+        ("Diverging trajectories", {"divergences": 1}, "bad"),
+        ("Fast mode is accurate (Pareto k)", {"pareto_k_max": 0.2, "pareto_k_joint": 0.9}, "look"),
+        ("Fast mode is accurate (Pareto k)", {"pareto_k_max": 1.2}, "bad"),
+        ("The law's form fits", {"own_misfit": 0.03}, "look"),
+        ("The law's form fits", {"own_misfit": 0.2}, "bad"),
+    ],
+)
+def test_lights_change_where_the_gates_are(results, check, changes, level):
+    content = {**results.calibration, "diagnostics": results.calibration["diagnostics"] | changes}
+    found = {one.check: one for one in lights(dataclasses.replace(results, calibration=content))}
+    assert found[check].level == level
+
+
+def test_a_calibration_that_did_not_converge_is_no_green_page(folder):
+    found = changed(folder, converged=False)
+    assert lights(found)[0].level == "bad"
+    assert "NOT converge" in " ".join(calibration_sentences(found.calibration))
+    assert "does not fit these tests" in next_steps(found, "x")[0][0]
+    text = Page(report_page(found)).sections["summary"]
+    assert "Not converged" in text
+    assert "problem" in text
+
+
+@given(st.floats(-1e12, 1e12, allow_subnormal=False), st.integers(1, 6))
+def test_numbers_are_what_they_say(value, digits):
+    text = number(value, digits).replace("−", "-")
+    if "×" in text:
+        mantissa, exponent = text.split(" × 10")
+        exponent = exponent.translate(str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789"))
+        text = f"{mantissa}e{exponent}"
+    assert float(text) == pytest.approx(value, rel=0.51 * 10.0 ** (1 - digits), abs=1e-300)
+
+
+def test_digits_follow_the_uncertainty():
+    assert with_sd({"value": 1.42893, "sd": 0.00153}) == "1.4289 ± 0.0015"
+    assert with_sd({"value": 16012.7, "sd": 10.3}, 1e-3) == "16.013 ± 0.010"
+    assert with_sd({"value": -3.0, "sd": None}) == "−3"
+    assert with_sd({"value": None, "sd": None}) == "unknown"
+    assert interval({"interval_95": [1.42597, 1.43206]}) == "1.4260 to 1.4321"
+    assert interval({"interval_95": None}) is None
