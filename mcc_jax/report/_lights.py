@@ -190,7 +190,7 @@ def _discovery(content: dict[str, Any]) -> Light:
     )
 
 
-def _below(value: float | None, good: float, bad: float) -> Level:
+def _below(value: float | int | None, good: float, bad: float) -> Level:
     if value is None:
         return "unknown"
     return "good" if value <= good else "look" if value <= bad else "bad"

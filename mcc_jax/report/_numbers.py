@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 
-def number(value: float | None, digits: int = 4) -> str:
+def number(value: float | int | None, digits: int = 4) -> str:
     """So many significant digits, or "unknown"; very large and small ones as powers of ten."""
     if value is None or not math.isfinite(value):
         return "unknown"
@@ -23,7 +23,7 @@ def _raised(exponent: int) -> str:
     return str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
 
 
-def decimals(value: float, sd: float) -> int | None:
+def decimals(value: float | int, sd: float | int) -> int | None:
     """Decimal places that show two digits of the uncertainty; None where a power of ten is called for."""
     places = max(0, 1 - math.floor(math.log10(sd)))
     return None if places > 6 or abs(value) >= 1e6 else places
@@ -55,12 +55,12 @@ def interval(estimate: dict[str, Any], factor: float = 1.0) -> str | None:
     return f"{low:.{places}f} to {high:.{places}f}".replace("-", "−")
 
 
-def percent(share: float | None, digits: int = 2) -> str:
+def percent(share: float | int | None, digits: int = 2) -> str:
     """A share as per cent."""
     return "unknown" if share is None else f"{number(100 * share, digits)} %"
 
 
-def probability(value: float | None) -> str:
+def probability(value: float | int | None) -> str:
     """A probability to two digits; what is next to 0 or 1 is said so."""
     if value is None:
         return "unknown"

@@ -132,7 +132,7 @@ def _told(estimate: dict[str, Any], factor: float = 1.0) -> dict[str, str]:
 def _exponential(estimate: dict[str, Any]) -> dict[str, Any]:
     """The estimate of exp of what is estimated."""
 
-    def exp(value: float) -> float:
+    def exp(value: float | int) -> float:
         return math.exp(min(value, 700.0))
 
     value, sd, ends = estimate["value"], estimate["sd"], estimate["interval_95"]
@@ -144,7 +144,7 @@ def _exponential(estimate: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _spread(mean: float | None, sd: float | None) -> str:
+def _spread(mean: float | int | None, sd: float | int | None) -> str:
     if mean is None or sd is None or not abs(mean) + abs(sd) < 300:
         return "How much particles differ; these data do not tell."
     if sd < 1e-3:

@@ -32,7 +32,9 @@ def quantity(name: str) -> str:
 
 def listed(names: list[str], word: str = "and") -> str:
     """Names in a row, the last after a word."""
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} {word} {names[-1]}"
+    if len(names) < 2:
+        return names[0] if names else "nothing"
+    return f"{', '.join(names[:-1])} {word} {names[-1]}"
 
 
 def simulated(results: Results) -> bool:

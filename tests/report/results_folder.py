@@ -41,7 +41,8 @@ def estimate(value, sd=0.01):
     return {"value": value, "sd": sd, "interval_95": [value - 1.96 * sd, value + 1.96 * sd]}
 
 
-NOTHING = {"value": None, "sd": None, "interval_95": None}
+def nothing():
+    return {"value": None, "sd": None, "interval_95": None}
 
 
 def calibration(names=NAMES, **changes):
@@ -54,7 +55,7 @@ def calibration(names=NAMES, **changes):
         particles.append(
             {
                 "particle": name,
-                **{key: estimate(value) if kept else NOTHING for key, value in values.items()},
+                **{key: estimate(value) if kept else nothing() for key, value in values.items()},
                 "rms_um": NOISE if kept else None,
                 "kept": kept,
                 "why_not": None if kept else "has 3 usable points on loading, fewer than 12",
@@ -92,7 +93,7 @@ def calibration(names=NAMES, **changes):
 def discovery(**changes):
     """`discovery.json` with every part filled."""
     pair = {"a": estimate(1.2), "effective_modulus_MPa": estimate(9000.0, 50.0)}
-    logs = {f"log_C{k}": {"mean": estimate(m), "sd": NOTHING} for k, m in ((1, 1.9), (3, 1.0), (5, 0.9))}
+    logs = {f"log_C{k}": {"mean": estimate(m), "sd": nothing()} for k, m in ((1, 1.9), (3, 1.0), (5, 0.9))}
     step = {"chi2_per_dof": 2.0, "systematic_um": 0.07, "elpd": 0.0, "elpd_se": 0.0}
     return {
         "schema": 1,
