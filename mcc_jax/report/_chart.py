@@ -54,7 +54,7 @@ def chart_items() -> dict[str, Any]:
         marks = figure.scatter(
             x, y, source=points, marker="marker", color="colour", fill_alpha="alpha", line_alpha="alpha", size=6
         )
-        figure.add_tools(HoverTool(tooltips=tips, renderers=[marks], description="Show the values of a point"))
+        figure.add_tools(HoverTool(tooltips=tips, renderers=[marks], limit=1, description="Values of a point"))
     document = Document()
     for root in (curve, residual):
         document.add_root(root)

@@ -20,7 +20,7 @@ C = np.array([[7.0, 3.0, 2.7], [6.0, 2.9, 2.6], [8.0, 3.05, 2.75], [6.5, 2.95, 2
 A, MODULUS = 1.43, 16000.0
 ZERO = np.array([0.0, 0.5, -0.25, 1.0])
 NOISE = 0.02
-NAMES = ("1", "B 2", "C", "left out")
+NAMES = ("1", "B 2", "<img src=x onerror=alert(1)>", "left out")
 STEPS = (Ramp(0.5, 5.0), Hold(10.0), Ramp(0.1, 5.0), Ramp(1.0, 5.0), Ramp(0.0, 5.0))
 PNG = base64.b64decode(
     "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJggg=="
