@@ -136,7 +136,7 @@ def calibrate(
         data = read_campaign(campaign)
         require_particle(reference, data.particles, data.source)
         settings: dict[str, Any] = {"threshold_MPa": threshold_MPa, "seed": seed, "progress": tell}
-        origin = provenance(campaign, {n: v for n, v in context.params.items() if _applies(n, method)})
+        origin = provenance("calibrate", campaign, {n: v for n, v in context.params.items() if _applies(n, method)})
         with results(out) as stage:
             if method == "paper":
                 from ..calibrate import calibrate_paper

@@ -44,7 +44,7 @@ def demo(out: Path, seed: int) -> None:
             tell("simulating the campaign")
             campaign = paper_campaign(seed)
             write_campaign(campaign, stage.folder / "campaign")
-            origin = provenance(stage.folder / "campaign", {"seed": seed}, told="campaign")
+            origin = provenance("demo", stage.folder / "campaign", {"seed": seed}, told="campaign")
             calibration = calibrate_bayes(campaign, seed=seed, progress=tell)
             content = write_calibration(calibration, stage, origin=origin, figures=True, tell=tell)
             found = discover(campaign, experiments=False, seed=seed, progress=tell)

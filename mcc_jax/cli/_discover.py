@@ -94,7 +94,7 @@ def discover(
             "posterior": not no_posterior,
             "seed": seed,
         }
-        origin = provenance(campaign, settings)
+        origin = provenance("discover", campaign, settings)
         with results(out) as stage:
             found = find(
                 data,

@@ -14,17 +14,18 @@ from ..campaign import file_checksums
 PACKAGES = ("jax", "jaxlib", "equinox", "optimistix", "numpyro", "arviz", "numpy", "scipy")
 
 
-def provenance(campaign: Path, settings: Mapping[str, Any], *, told: str | None = None) -> dict[str, Any]:
+def provenance(command: str, campaign: Path, settings: Mapping[str, Any], *, told: str | None = None) -> dict[str, Any]:
     """Folder and checksums of the campaign, settings of the command, versions of what computed.
 
     Args:
+        command: the command's name.
         campaign: the folder that was read.
         settings: the options in force, by name.
         told: the folder as the result shall name it; the absolute path if None.
     """
     return {
         "campaign": {"folder": told or str(campaign.resolve()), "sha256": file_checksums(campaign)},
-        "settings": {name: _plain(value) for name, value in settings.items()},
+        "settings": {"command": command} | {name: _plain(value) for name, value in settings.items()},
         "versions": {
             "mcc_jax": own_version(),
             "python": platform.python_version(),

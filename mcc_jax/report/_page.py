@@ -191,14 +191,14 @@ def _cards(results: Results, checks: list[Any]) -> list[dict[str, str]]:
                 "line": f"{used} of {len(content['particles'])} particles, method {content['method']}",
             }
         )
-        worst = [c for c in checks if c.level == "bad"] or [c for c in checks if c.level == "look"]
-        good = sum(c.level == "good" for c in checks)
+        good, look, bad = (sum(c.level == level for c in checks) for level in ("good", "look", "bad"))
+        words = [f"{bad} with a problem"] * (bad > 0) + [f"{look} to look at"] * (look > 0)
         found.append(
             {
-                "level": worst[0].level if worst else "good",
+                "level": "bad" if bad else "look" if look else "good",
                 "title": "Checks",
                 "answer": f"{good} of {len(checks)} fine",
-                "line": f"look at: {listed([c.check for c in worst[:2]])}" if worst else "nothing stands out",
+                "line": f"{listed(words)}, see Diagnostics" if words else "nothing stands out",
             }
         )
     if results.discovery is not None:

@@ -161,7 +161,7 @@ def particle_facts(results: Results, names: list[str], rms: list[float | None], 
     facts = []
     for name, misfit, why in zip(names, rms, whys, strict=True):
         sizes = " × ".join(number(d) for d in campaign.diameters_um[campaign.index(name)])
-        parts = [f"D₁ × D₂ × D₃ = {sizes} \N{NO-BREAK SPACE}µm"]
+        parts = [f"D₁ × D₂ × D₃ = {sizes}\N{NO-BREAK SPACE}µm"]
         eta = entries.get(name, {}).get("eta_p", {}).get("value")
         if eta is not None:
             parts.append(f"shape factor {number(eta, 3)}")

@@ -47,7 +47,7 @@ def calibration_sentences(content: dict[str, Any]) -> list[str]:
     count, used = len(content["particles"]), sum(entry["kept"] for entry in content["particles"])
     found = [
         f"The law was calibrated on {used} of {count} particles by {METHODS[content['method']]}"
-        + ("." if content["converged"] else "; it did NOT converge, so nothing below may be relied on.")
+        + ("." if content["converged"] else "; it did NOT converge, so its numbers may not be relied on.")
     ]
     sure = SURE.get(content["method"])
     if sure is None:
