@@ -13,10 +13,10 @@ from ._posterior import Band
 from ._read import Results
 
 KINDS = ("load", "hold", "unload", "reload")
-POINTS = 60_000
+POINTS = 40_000
 """About so many points stand in the page, shared among its particles."""
 
-MOST_POINTS, LEAST_POINTS = 400, 60
+MOST_POINTS, LEAST_POINTS = 400, 40
 MOST_PARTICLES = POINTS // LEAST_POINTS
 RIGID_MPA = 1e9
 """Where no test was unloaded the modulus cannot matter; a stiff one keeps the law defined."""
@@ -32,7 +32,8 @@ class Shown:
         time_s, force_mN, displacement_um: measured, raw.
         kind: index into `KINDS`.
         used: which points the calibration compared with the law.
-        own_um: displacement by the law with this particle's own coefficients and zero; NaN where there is none.
+        own_um: displacement by the law with this particle's own coefficients and zero, the mean of the posterior's
+            predictions where there are some; NaN where there is none.
         typical_um: with those of the population's middle.
         low_um, high_um: central 95 % of what may be measured; NaN where there is no posterior.
     """
@@ -89,12 +90,12 @@ def _measured(campaign: Campaign, i: int, segments: Any, results: Results) -> Sh
     rows = rows_from_contact(curve, segments, MOST_POINTS)
     used = _compared(curve, campaign.diameters_um[i], segments, kind, results.calibration)[rows]
     force = curve.force_mN[rows]
-    low = high = nothing = np.full(len(rows), np.nan)
+    middle = low = high = nothing = np.full(len(rows), np.nan)
     band = None if results.posterior is None else results.posterior.bands.get(name)
     if band is not None and _fits(band, force):
-        low, high = band.low_um[: len(rows)], band.high_um[: len(rows)]
+        middle, low, high = (ends[: len(rows)] for ends in (band.middle_um, band.low_um, band.high_um))
     measured = (curve.time_s[rows], force, curve.displacement_um[rows])
-    return Shown(name, None, *measured, kind[rows], used, nothing, nothing, low, high)
+    return Shown(name, None, *measured, kind[rows], used, middle, nothing, low, high)
 
 
 def _fits(band: Band, force: np.ndarray) -> bool:
@@ -147,7 +148,9 @@ def _predicted(campaign: Campaign, shown: list[Shown], entries: dict[str, Any], 
     for k, i in enumerate(rows):
         zero = entries[shown[i].name]["zero_um"]["value"] or 0.0
         own, typical = um[:, k, : len(shown[i].force_mN)] + zero
-        done[i] = replace(shown[i], own_um=own, typical_um=typical)
+        # Means of coefficients that hang together are not the coefficients of the mean.
+        middle = shown[i].own_um
+        done[i] = replace(shown[i], own_um=np.where(np.isfinite(middle), middle, own), typical_um=typical)
     return [replace(done[i], why_not=why) for i, why in enumerate(whys)]
 
 

@@ -20,10 +20,12 @@ class Band:
 
     Attributes:
         force_mN: at these forces [mN], shape (n,).
-        low_um, high_um: ends [um]; NaN where no point is compared.
+        middle_um: mean of the predictions [um]; NaN where no point is compared.
+        low_um, high_um: ends [um], likewise.
     """
 
     force_mN: np.ndarray
+    middle_um: np.ndarray
     low_um: np.ndarray
     high_um: np.ndarray
 
@@ -87,17 +89,17 @@ def _bands(tree: Any) -> tuple[dict[str, Band], float | None]:
         force, mask = np.asarray(constant["force_mN"][row], float), np.asarray(constant["mask"][row], bool)
         # Where no point is compared nothing was drawn.
         some = np.flatnonzero(mask)
-        low, high = np.full(len(force), np.nan), np.full(len(force), np.nan)
+        middle, low, high = np.full((3, len(force)), np.nan)
         if len(some):
             # One particle at a time: the whole array may be larger than one wants in memory.
             own = np.asarray(draws[:, :, row, :], float).reshape(-1, len(force))[:, some]
             # Of two hundred draws mean and standard deviation say the ends of a near-normal band better than quantiles.
-            middle, half = own.mean(0), 1.96 * own.std(0)
-            low[some], high[some] = middle - half, middle + half
+            centre, half = own.mean(0), 1.96 * own.std(0)
+            middle[some], low[some], high[some] = centre, centre - half, centre + half
             measured = np.asarray(tree["observed_data"]["displacement_um"][row], float)[some]
             inside += int(((measured >= low[some]) & (measured <= high[some])).sum())
             count += len(some)
-        bands[name] = Band(force, low, high)
+        bands[name] = Band(force, middle, low, high)
     return bands, inside / count if count else None
 
 

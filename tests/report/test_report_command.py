@@ -4,13 +4,16 @@ import json
 import shutil
 
 import h5py
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from results_folder import calibration, discovery
 
 from mcc_jax import InputError
+from mcc_jax.campaign import file_checksums
 from mcc_jax.report import read_results
+from mcc_jax.report._compare import compare
 from mcc_jax.report._lights import lights
 from mcc_jax.report._page import _environment, context
 
@@ -130,3 +133,32 @@ def test_whatever_stands_in_a_result_it_is_refused_or_shown(scratch, data):
         told = _environment().get_template("page.html").render(context(found, []), seed=0)
         assert lights(found)
     assert name in told
+
+
+def test_from_raw_tests_to_the_page_by_the_papers_method(run, folder, tmp_path):
+    """The page recomputes from `calibration.json` what the calibration itself had found."""
+    fit = tmp_path / "fit"
+    result = run("calibrate", folder, "--out", fit, "--method", "paper", "--no-figures", "--threshold-MPa", "0.5")
+    assert result.exit_code == 0, result.output
+    content = json.loads((fit / "calibration.json").read_text(encoding="utf-8"))
+    told = content["provenance"]
+    assert told["settings"] == {
+        "command": "calibrate",
+        "method": "paper",
+        "threshold_MPa": 0.5,
+        "objective": "full",
+        "reference": None,
+        "unloading": "printed",
+        "strain_scaling": "raw",
+        "seed": 0,
+    }
+    assert told["campaign"] == {"folder": str(folder.resolve()), "sha256": file_checksums(folder)}
+    assert set(told["versions"]) >= {"mcc_jax", "jax", "python"}
+    found = read_results(fit)
+    assert found.cautions == ()
+    for one, entry in zip(compare(found), content["particles"], strict=True):
+        typical = (one.displacement_um - one.typical_um)[one.used]
+        assert one.rms_um == pytest.approx(entry["own_rms_um"], rel=1e-9)
+        assert np.sqrt(np.mean(typical**2)) == pytest.approx(entry["rms_um"], rel=1e-9)
+    assert run("report", fit).exit_code == 0
+    assert (fit / "report.html").is_file()

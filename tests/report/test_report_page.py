@@ -60,7 +60,15 @@ def keep(folder, *parts):
             (folder / name).write_text(json.dumps(content))
 
 
-def test_prediction_with_the_true_coefficients_is_the_measurement(shown):
+@pytest.fixture
+def without_posterior(folder):
+    """A folder in which predictions come from `calibration.json` alone."""
+    (folder / "posterior.nc").unlink()
+    return folder
+
+
+def test_prediction_with_the_true_coefficients_is_the_measurement(without_posterior):
+    shown = compare(read_results(without_posterior))
     assert [one.name for one in shown] == list(NAMES)
     for one in shown[:-1]:
         np.testing.assert_allclose(one.own_um, one.displacement_um, atol=1e-7)
@@ -71,24 +79,24 @@ def test_prediction_with_the_true_coefficients_is_the_measurement(shown):
     assert shown[-1].rms_um is None
 
 
-def test_a_wrong_coefficient_shows_as_misfit(folder):
+def test_a_wrong_coefficient_shows_as_misfit(without_posterior):
     content = calibration()
     content["particles"][0]["C1"]["value"] *= 1.05
-    one = compare(changed(folder, particles=content["particles"]))[0]
+    one = compare(changed(without_posterior, particles=content["particles"]))[0]
     assert one.rms_um > 0.5
 
 
-def test_own_modulus_and_own_shape_are_used_where_they_scatter(folder):
+def test_own_modulus_and_own_shape_are_used_where_they_scatter(without_posterior):
     content = calibration()["particles"]
     for entry in content[:-1]:
         entry["effective_modulus_MPa"] = {"value": MODULUS, "sd": None, "interval_95": None}
     scatter = {"value": 0.1, "sd": None, "interval_95": None}
     wrong = {"value": 2000.0, "sd": None, "interval_95": None}
-    found = changed(folder, particles=content, modulus_scatter=scatter, effective_modulus_MPa=wrong)
+    found = changed(without_posterior, particles=content, modulus_scatter=scatter, effective_modulus_MPa=wrong)
     for one in compare(found)[:-1]:
         np.testing.assert_allclose(one.own_um, one.displacement_um, atol=1e-7)
         assert np.abs(one.typical_um - one.own_um)[one.kind == KINDS.index("unload")].max() > 0.1
-    found = changed(folder, shape_scatter=scatter, a={"value": 0.5, "sd": None, "interval_95": None})
+    found = changed(without_posterior, shape_scatter=scatter, a={"value": 0.5, "sd": None, "interval_95": None})
     for one in compare(found)[:-1]:
         np.testing.assert_allclose(one.own_um, one.displacement_um, atol=1e-7)
 
@@ -105,13 +113,14 @@ def test_the_typical_particle_is_the_median_or_for_the_papers_method_the_mean(fo
         for k, c in zip((1, 3, 5), COEFFICIENTS[0], strict=True)
     }
     for method in ("paper", "least-squares"):
-        one = compare(changed(folder, method=method, **log_C))[0]
+        one = compare(changed(folder, method=method, figures=[], **log_C))[0]
         np.testing.assert_allclose(one.typical_um, one.own_um, atol=1e-7)
 
 
 def test_bands_hold_what_the_noise_says(results, shown):
     assert results.posterior.inside == 1.0  # tests without noise, bands with it
     for one in shown[:-1]:
+        np.testing.assert_allclose(one.own_um, one.displacement_um, atol=NOISE / 8)  # of 2000 draws
         np.testing.assert_allclose(one.high_um - one.low_um, 2 * 1.96 * NOISE, rtol=0.15)
         np.testing.assert_allclose((one.high_um + one.low_um) / 2, one.displacement_um, atol=NOISE / 3)
     assert np.isnan(shown[-1].low_um).all()
