@@ -34,7 +34,7 @@ LAYERS = {
     "cli": 10,
 }
 # What importing the package must not load: slow, optional, or for the command line only.
-HEAVY = ("numpyro", "arviz", "pandas", "matplotlib", "pint", "rich", "click")
+HEAVY = ("numpyro", "arviz", "pandas", "matplotlib", "pint", "rich", "click", "bokeh", "jinja2", "jsonschema")
 FILES = sorted(p for p in PACKAGE.rglob("*.py"))
 
 

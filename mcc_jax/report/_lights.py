@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
+
 from ..calibrate._result import BAD_MISFIT
 from ..calibrate.joint._bayes import ESS_LEAST, PARETO_K_MOST, RHAT_MOST
+from ._compare import Shown
 from ._numbers import number, percent
 from ._read import Results, checksums_told
 
@@ -40,14 +44,19 @@ class Light:
     meaning: str
 
 
-def lights(results: Results) -> list[Light]:
-    """All checks that these results allow, the convergence of the calibration first."""
+def lights(results: Results, shown: Sequence[Shown] = ()) -> list[Light]:
+    """All checks that these results allow, the convergence of the calibration first.
+
+    Args:
+        results: what a folder holds.
+        shown: its particles with their predictions, for what the calibration itself does not tell.
+    """
     found = []
     if results.calibration is not None:
         found += _calibration(results.calibration)
         if results.calibration["method"] == "bayes":
             found += _sampler(results.calibration["diagnostics"])
-        found += _fit(results.calibration)
+        found += _fit(results.calibration, shown)
     if results.posterior is not None and results.posterior.inside is not None:
         found.append(_coverage(results.posterior.inside))
     if results.calibration is not None:
@@ -116,11 +125,19 @@ def _sampler(d: dict[str, Any]) -> list[Light]:
     ]
 
 
-def _fit(content: dict[str, Any]) -> list[Light]:
+def _own_misfit(shown: Sequence[Shown]) -> float:
+    """Median over the particles of the root mean square misfit, in shares of the range of displacement."""
+    own = [(one.rms_um, float(np.ptp(one.displacement_um[one.used]))) for one in shown if one.rms_um is not None]
+    return float(np.median([rms / reach for rms, reach in own if rms is not None and reach > 0] or [np.nan]))
+
+
+def _fit(content: dict[str, Any], shown: Sequence[Shown]) -> list[Light]:
     d = content["diagnostics"]
     misfit, share = d.get("own_misfit"), (content.get("probability_not_monotone") or {}).get("value")
+    if misfit is None and shown:
+        misfit = _own_misfit(shown)
     found = []
-    if misfit is not None:
+    if misfit is not None and np.isfinite(misfit):
         found.append(
             Light(
                 _below(misfit, GOOD_MISFIT, BAD_MISFIT),

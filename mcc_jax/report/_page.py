@@ -126,7 +126,7 @@ def context(results: Results, shown: list[Shown]) -> dict[str, Any]:
 
     labels = particle_labels([one.name for one in shown], 40)
     folder = shlex.quote(results.name)
-    checks = lights(results)
+    checks = lights(results, shown)
     return {
         "results": results,
         "version": own_version(),

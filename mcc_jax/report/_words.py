@@ -99,7 +99,10 @@ def next_steps(results: Results, folder: str) -> list[tuple[str, str]]:
     elif not content["converged"]:
         steps.append((_mend(found), ""))
     elif content["method"] != "bayes":
-        steps.append(("Get the uncertainty of every number:", f"mcc-jax calibrate CAMPAIGN --out {folder}"))
+        what = (
+            "the uncertainty of every number" if content["method"] == "paper" else "the posterior, not only a best fit"
+        )
+        steps.append((f"Get {what}:", f"mcc-jax calibrate CAMPAIGN --out {folder}"))
     if found is None:
         steps.append(("Ask what the law misses:", f"mcc-jax discover CAMPAIGN --out {folder}"))
     else:
