@@ -17,7 +17,7 @@ from ._calibrate import calibrate
 from ._convert import convert
 from ._demo import demo
 from ._discover import discover
-from ._group import PROGRAM, OneLineGroup
+from ._group import INTERRUPTED, PROGRAM, OneLineGroup
 from ._power import power
 from ._simulate import simulate
 
@@ -108,8 +108,11 @@ def main() -> None:
         sys.stdout.reconfigure(errors="replace")  # names of particles may be any text, terminals may not
     try:
         cli.main(prog_name=PROGRAM)
-    except _Terminated as end:
-        # All is cleared up by now. What is left, the libraries' own tear-down, once took over a minute.
+    except SystemExit as end:
+        if not isinstance(end, _Terminated) and end.code != INTERRUPTED:
+            raise
+        # All is cleared up by now. What is left, the libraries' own tear-down, once took over a minute: it waits for
+        # compilers that are at work in other threads.
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(int(str(end.code)))
