@@ -36,7 +36,7 @@ from ..calibrate.joint._noise import Whitening
 from ..calibrate.joint._population import COEFFICIENTS, Population, Summary, marginal_likelihood
 from ..calibrate.joint._sampling import Exact
 from ..effects import ExtendedLaw, Record
-from ._refit import Formula, Refit
+from ._refit import Formula, Refit, effects_of, slices
 from ._system import Base
 
 LENGTH = Length(4, 300, 1000)
@@ -146,9 +146,7 @@ class ExtendedExact(Exact):
     ) -> Float[Array, "particles points"]:
         """Displacement [um] of every particle from its own zero."""
         assert isinstance(population, ExtendedPopulation)
-        bounds = np.cumsum([0, *(f.size for f in self.formulas)])
-        parts = zip(self.formulas, bounds[:-1], bounds[1:], strict=True)
-        effects = tuple(f.build(population.theta[a:b]) for f, a, b in parts)
+        effects = effects_of(self.formulas, population.theta)
         return jax.vmap(lambda w, p, r: ExtendedLaw(law_of(w, self.unloading), effects).respond(p, r))(
             latent, self.tests.particle, self.records
         )
@@ -191,9 +189,8 @@ class ExtendedPosterior:
     def effect_draws(self, which: int) -> dict[str, np.ndarray]:
         """Draws of an effect's amplitude and further numbers, by name, each of shape (chains, draws)."""
         formula = self.formulas[which]
-        start = sum(f.size for f in self.formulas[:which])
         assert isinstance(self.population, ExtendedPopulation)
-        theta = np.asarray(self.population.theta)[..., start : start + formula.size]
+        theta = np.asarray(self.population.theta)[..., slices(self.formulas)[which]]
         draws = {formula.variant.parameter: theta[..., 0] * formula.variant.plausible[1]}
         moved = jax.vmap(jax.vmap(lambda t: formula.nuisances(t)))(jnp.asarray(theta))
         return draws | {n.name: np.asarray(moved[n.name]) for n in formula.free_nuisances}
