@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from ..calibrate._result import finite
-from ..calibrate.joint._bayes import ESS_LEAST, PARETO_K_MOST, RHAT_MOST, summary
+from ..calibrate.joint._bayes import ESS_LEAST, PARETO_K_MOST, RHAT_MOST, population_json, unmixed
 from ..calibrate.joint._compile import compiled
 from ..calibrate.joint._draws import Length, draw_around, newton_steps
 from ..calibrate.joint._fit import population_at
@@ -33,7 +33,7 @@ from ..calibrate.joint._forward import law_of
 from ..calibrate.joint._linearised import linear_data, summarise
 from ..calibrate.joint._mode import Target, from_free, most_probable, to_free
 from ..calibrate.joint._noise import Whitening
-from ..calibrate.joint._population import COEFFICIENTS, Population, Summary, marginal_likelihood
+from ..calibrate.joint._population import Population, Summary, marginal_likelihood
 from ..calibrate.joint._sampling import Exact
 from ..effects import ExtendedLaw, Record
 from ._refit import Formula, Refit, effects_of, slices
@@ -197,22 +197,16 @@ class ExtendedPosterior:
 
     def parameters(self) -> dict[str, Any]:
         """The population's parameters as in `discovery.json`."""
-        p = self.population
-        named = {"a": summary(np.asarray(p.a)), "effective_modulus_MPa": summary(np.exp(np.asarray(p.log_modulus)))}
-        mu, tau = np.asarray(p.mu), np.asarray(p.tau)
-        return named | {
-            f"log_{name}": {"mean": summary(mu[..., j]), "sd": summary(tau[..., j])}
-            for j, name in enumerate(COEFFICIENTS)
-        }
+        return population_json(self.population)
 
     def failures(self) -> list[str]:
         """Why it must not be called converged; empty if all gates of the joint calibration are passed."""
         found = []
-        worst, least = max(self.rhat.values()), min(self.ess_bulk.values())
-        if not worst <= RHAT_MOST:
-            found.append(f"R-hat is {worst:.3f}, above {RHAT_MOST}")
-        if not least >= ESS_LEAST:
-            found.append(f"bulk ESS is {least:.0f}, below {ESS_LEAST:.0f}")
+        rhat, ess = unmixed(self.rhat, self.ess_bulk)
+        if rhat is not None:
+            found.append(f"R-hat is {rhat.value:.3f}, above {RHAT_MOST}")
+        if ess is not None:
+            found.append(f"bulk ESS is {ess.value:.0f}, below {ESS_LEAST:.0f}")
         if self.divergences:
             found.append(f"{self.divergences} trajectories diverged")
         k = float(np.max(self.pareto_k)) if self.pareto_k_joint is None else self.pareto_k_joint
