@@ -324,18 +324,21 @@ def _judge(
     closure: Closure | None = None
     steps: list[Ranking] = []
     places: list[dict[str, Any]] = []
+    extensions = _Extensions(base, system, signals)
     extended, last, around = system, None, {}
     if gap:
         tell("where")
         places = where(base, system)
         tell("what")
-        extensions = _Extensions(base, system, signals) if ranking.gain[0] >= LARGE else None
-        if extensions is not None:
+        large = ranking.gain[0] >= LARGE
+        if large:
             tell("the serious names, fitted as they are")
             drops = {k: extensions.drop((k,)) for k in _serious(system, ranking)}
             ranking = rank(system, view, refitted=drops)
-        verdict, chosen, sets, steps, closure = _name(base, system, view, ranking, extensions, seed, tell)
-        if extensions is not None and chosen and not any(step.at_random[0] for step in steps):
+        verdict, chosen, sets, steps, closure = _name(
+            base, system, view, ranking, extensions if large else None, seed, tell
+        )
+        if large and chosen and not any(step.at_random[0] for step in steps):
             last = extensions.fit(tuple(chosen))
             if last.physical:
                 extended = extensions.system_of(tuple(chosen))
@@ -350,9 +353,14 @@ def _judge(
     sampled = None
     if posterior and chosen and not any(effect.at_random for effect in effects):
         tell("posterior of the extended law")
-        last = last or _Extensions(base, system, signals).fit(tuple(chosen))
-        sampled = extended_posterior(base, last, seed=seed)
-        if failures := sampled.failures():
+        last = extensions.fit(tuple(chosen))
+        sampled = extended_posterior(base, last, seed=seed) if last.physical else None
+        if sampled is None:
+            notes.append(
+                "the posterior of the extended law is not sampled: fitted as it is, an amplitude has a sign that it "
+                "cannot have; amplitudes and parameters are those of the linear system"
+            )
+        elif failures := sampled.failures():
             notes.append(
                 f"the posterior of the extended law has not converged ({'; '.join(failures)}); amplitudes and "
                 "parameters are those of its fit"
