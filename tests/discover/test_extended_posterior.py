@@ -14,7 +14,7 @@ from mcc_jax.calibrate.joint._draws import Length
 from mcc_jax.calibrate.joint._linearised import linear_data, summarise
 from mcc_jax.campaign import THRESHOLD_MPA
 from mcc_jax.discover import _discover, discover
-from mcc_jax.discover._discover import _Extensions
+from mcc_jax.discover._extensions import Extensions
 from mcc_jax.discover._posterior import _movable, extended_posterior
 from mcc_jax.discover._refine import refined
 from mcc_jax.discover._system import base_fit, build_system, signals_of
@@ -32,7 +32,7 @@ def extended():
     system = build_system(base, signals)
     base, _ = refined(base, system, signals)
     system = build_system(base, signals)
-    return base, _Extensions(base, system, signals).fit((0,))
+    return base, Extensions(base, system, signals).fit((0,))
 
 
 @pytest.fixture(scope="module")
@@ -90,14 +90,14 @@ def test_the_same_seed_gives_the_same_draws_and_few_draws_are_told(extended, pos
 
 
 def test_an_impossible_sign_is_not_sampled_but_told(monkeypatch):
-    fit = _Extensions.fit
+    fit = Extensions.fit
 
     def turned(self, chosen):
         found = fit(self, chosen)
         return replace(found, state=eqx.tree_at(lambda s: s.theta, found.state, -found.state.theta))
 
     monkeypatch.setattr(_discover, "LARGE", np.inf)  # named to first order; the fit as it is comes with the posterior
-    monkeypatch.setattr(_Extensions, "fit", turned)
+    monkeypatch.setattr(Extensions, "fit", turned)
     frame = {"frame_compliance": LIBRARY["frame_compliance"]}
     found = discover(cached(f"frame_compliance={HIDDEN}"), library=frame, confirm=False, experiments=False)
     assert [effect.mechanism for effect in found.effects] == ["frame_compliance"]
