@@ -7,31 +7,23 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from campaigns import cached
+from campaigns import cached, refined_system
 
-from mcc_jax.calibrate import JointModel
 from mcc_jax.calibrate.joint._draws import Length
 from mcc_jax.calibrate.joint._linearised import linear_data, summarise
-from mcc_jax.campaign import THRESHOLD_MPA
 from mcc_jax.discover import _discover, discover
 from mcc_jax.discover._extensions import Extensions
 from mcc_jax.discover._posterior import _movable, extended_posterior
-from mcc_jax.discover._refine import refined
-from mcc_jax.discover._system import base_fit, build_system, signals_of
 from mcc_jax.effects import LIBRARY
 
 HIDDEN = 0.004
+FRAME = {"frame_compliance": LIBRARY["frame_compliance"]}
 
 
 @pytest.fixture(scope="module")
 def extended():
     """Base fit and fit of the extended law of tests with a compliant frame."""
-    model = JointModel(modulus_scatter=True)
-    base = base_fit(cached(f"frame_compliance={HIDDEN}"), model, threshold_MPa=THRESHOLD_MPA, tell=lambda _: None)
-    signals = signals_of(base, {"frame_compliance": LIBRARY["frame_compliance"]})
-    system = build_system(base, signals)
-    base, _ = refined(base, system, signals)
-    system = build_system(base, signals)
+    base, signals, system = refined_system(cached(f"frame_compliance={HIDDEN}"), FRAME)
     return base, Extensions(base, system, signals).fit((0,))
 
 
@@ -98,8 +90,7 @@ def test_an_impossible_sign_is_not_sampled_but_told(monkeypatch):
 
     monkeypatch.setattr(_discover, "LARGE", np.inf)  # named to first order; the fit as it is comes with the posterior
     monkeypatch.setattr(Extensions, "fit", turned)
-    frame = {"frame_compliance": LIBRARY["frame_compliance"]}
-    found = discover(cached(f"frame_compliance={HIDDEN}"), library=frame, confirm=False, experiments=False)
+    found = discover(cached(f"frame_compliance={HIDDEN}"), library=FRAME, confirm=False, experiments=False)
     assert [effect.mechanism for effect in found.effects] == ["frame_compliance"]
     assert found.effects[0].amplitude > 0
     assert found.posterior is None
