@@ -62,17 +62,21 @@ def name_missing(
             with_both, gain = extensions.system_of((i, j)), max(gain, extensions.drop((i, j)))
         p_both = p_nothing_left(with_both, seed, [i, j])
         if p_both > LEVEL_OF_MORE and gain >= gain_of_words - BETTER:
-            one = rank(system, project(system, system.candidate_columns, inside=np.array([system.column(j)])))
-            two = rank(system, project(system, system.candidate_columns, inside=np.array([system.column(i)])))
-            sets = [_with(both[0], one), _with(both[1], two)]
+            steps = [_beside(system, other) for other in (j, i)]  # each is judged with the other one in the law
+            sets = [_with(name, step) for name, step in zip(both, steps, strict=True)]
             verdict: Verdict = "NAMED" if all(len(s) == 1 for s in sets) else "SET"
-            return verdict, [i, j], sets, [one, two], None
+            return verdict, [i, j], sets, steps, None
     tell("a formula of its own")
     closure = find_closure(system, _span(base), seed, tell=tell)
     unexplained = most_left <= LEVEL_OF_UNLISTED or gain_of_words > ranking.gain[0] * (1 + SHARE) + BETTER
     if closure is None or not unexplained:
         return ("NAMED" if len(members) == 1 else "SET"), [first], [members], [ranking], None
     return "UNLISTED", [], [], [], closure
+
+
+def _beside(system: System, other: int) -> Ranking:
+    """The ranking beside a candidate that is in the law already."""
+    return rank(system, project(system, system.candidate_columns, inside=np.array([system.column(other)])))
 
 
 def _with(name: str, ranking: Ranking) -> tuple[str, ...]:
@@ -102,7 +106,7 @@ def chooser(system: System, count: int, formula: bool) -> Callable[[np.ndarray],
 def _span(base: Base) -> dict[str, tuple[float, float]]:
     tests = base.tests
     force = np.where(np.asarray(tests.mask), np.asarray(tests.force), np.nan)
-    diameter = np.asarray(tests.particle.D1 * tests.particle.D2 / tests.particle.D3)
+    diameter = np.asarray(tests.effective_diameter)
     stress = force / (np.pi * diameter[:, None] ** 2 / 4) * 1e3
     return {
         "stress_MPa": (float(np.nanmin(stress)), float(np.nanmax(stress))),

@@ -21,7 +21,7 @@ def without_punch(library: Mapping[str, Mechanism], base: Base) -> dict[str, Mec
     """
     diameter = base.campaign.metadata.punch_diameter_um
     tests = base.tests
-    size = np.asarray(tests.particle.D1 * tests.particle.D2 / tests.particle.D3)
+    size = np.asarray(tests.effective_diameter)
     travel = np.where(np.asarray(tests.mask), np.asarray(tests.displacement), -np.inf).max(1) - np.asarray(
         base.fit.zero
     )
