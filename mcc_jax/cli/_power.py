@@ -50,6 +50,7 @@ def power(
         from ..effects import LIBRARY
         from ._calibration import joint_model, say_files
         from ._discovery import require_mechanisms
+        from ._figures import write_result
 
         require_mechanisms(exclude)
         tell("reading the campaign")
@@ -63,7 +64,7 @@ def power(
                 progress=tell,
             )
             content: dict[str, Any] = found.to_json() | {"seed": seed}
-            (stage.folder / POWER).write_text(json_text(content), encoding="utf-8")
+            write_result(stage, POWER, content)
     if as_json:
         click.echo(json_text(content).encode(), nl=False)
         return
