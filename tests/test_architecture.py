@@ -28,12 +28,13 @@ LAYERS = {
     "simulate": 5,
     "calibrate": 6,
     "discover": 7,
+    "export": 7,
     "plots": 8,
     "report": 9,
     "cli": 10,
 }
 # What importing the package must not load: slow, optional, or for the command line only.
-HEAVY = ("numpyro", "arviz", "pandas", "matplotlib", "pint", "rich", "click")
+HEAVY = ("numpyro", "arviz", "pandas", "matplotlib", "pint", "rich", "click", "jinja2")
 FILES = sorted(p for p in PACKAGE.rglob("*.py"))
 
 

@@ -17,6 +17,7 @@ from ._calibrate import calibrate
 from ._convert import convert
 from ._demo import demo
 from ._discover import discover
+from ._export import export
 from ._group import INTERRUPTED, PROGRAM, OneLineGroup
 from ._power import power
 from ._simulate import simulate
@@ -27,6 +28,7 @@ Examples:
   mcc-jax simulate --out sim --levels 0.5,1 --hold-s 30 --noise-um 0.02
   mcc-jax calibrate sim --out fit
   mcc-jax discover sim --out found
+  mcc-jax export fit --format c --out law
   mcc-jax convert FS1.txt --out tests --diameters 200,190,180
 
 \b
@@ -72,7 +74,7 @@ def cli(ctx: click.Context, debug: bool) -> None:
         click.echo(ctx.get_help())
 
 
-for _command in (demo, simulate, convert, calibrate, discover, power):
+for _command in (demo, simulate, convert, calibrate, discover, power, export):
     cli.add_command(_command)
 
 
