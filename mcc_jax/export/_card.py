@@ -65,6 +65,7 @@ def card(law: MccLaw, particle: Particle | None = None, *, origin: Origin | None
         "coefficients_of": "the population: exp(mean of log C)" if origin.particle is None else origin.particle,
         "law": form,
         "parameters": parameters,
+        "uncertainty": "sd and interval_95 are those of the estimate; scatter between particles is in population.sd",
         "polynomial_MPa": {"K1": K1, "K3": K3, "K5": K5, "formula": "sigma = K1 x - K3 x^3 + K5 x^5"},
         "population": None if origin.population is None else dict(origin.population),
         "is_monotone": bool(law.is_monotone),

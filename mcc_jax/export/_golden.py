@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Literal
 
 import equinox as eqx
@@ -50,8 +51,8 @@ def golden_table(
     """
     scale = STRAIN_MAX * float(particle.effective_diameter / law.shape_factor(particle))
 
-    def recovered(peak: float) -> float:
-        return float(particle.displacement(law.recoverable_strain(particle, particle.strain(jnp.asarray(peak)))))
+    def recovered(peak: np.ndarray) -> np.ndarray:
+        return np.asarray(particle.displacement(law.recoverable_strain(particle, particle.strain(jnp.asarray(peak)))))
 
     paths = _paths(scale, recovered, seed)
     step = eqx.filter_jit(eqx.filter_vmap(respond, in_axes=(None, None, 0, 0)))
@@ -77,30 +78,31 @@ def golden_pair_table(
         sides = [particle] if other is None else [particle, other]
         valid = [STRAIN_MAX * float(p.effective_diameter / law.shape_factor(p)) / 2 for p in sides]
         scale = len(valid) * min(valid)
-        for number, path in enumerate(
-            _paths(scale, lambda peak, other=other: pair_force(law, particle, law, other, peak, peak)[2], seed)
-        ):
+
+        def recovered(peak: np.ndarray, other: Particle | None = other) -> np.ndarray:
+            return pair_force(law, particle, law, other, peak, peak)[2]
+
+        for number, path in enumerate(_paths(scale, recovered, seed)):
             past = np.maximum.accumulate(np.maximum(path, 0.0))
-            rows = [pair_force(law, particle, law, other, x, peak) for x, peak in zip(path, past, strict=True)]
-            force, tangent, _ = (np.asarray(v) for v in zip(*rows, strict=True))
+            force, tangent, _ = pair_force(law, particle, law, other, path, past)
             tables.append(_rows(number, path, past, force, tangent).assign(partner=partner))
     return _in_units(tables, units)
 
 
-def _paths(scale, recovered, seed: int) -> list[np.ndarray]:
+def _paths(scale: float, recovered: Callable[[np.ndarray], np.ndarray], seed: int) -> list[np.ndarray]:
     """One path that meets every branch and some at random, the largest displacement being `scale`."""
     loading = np.linspace(0.0, 0.6 * scale, 13)
     peak = loading[-1]
-    down = peak - recovered(peak) * SHARES
+    down = peak - recovered(np.asarray(peak)) * SHARES
     further = np.linspace(peak, scale, 9)
-    end = scale - recovered(scale) * SHARES
+    end = scale - recovered(np.asarray(scale)) * SHARES
     first = np.concatenate([[-0.01 * scale], loading, down, [-0.01 * scale], down[::-1], further, end, end[::-1]])
     rng = np.random.default_rng(seed)
     walks = []
     for _ in range(RANDOM_PATHS):
         peaks = np.maximum.accumulate(scale * rng.uniform(0.0, 1.0, STEPS) ** 2)
         depth = np.where(rng.uniform(size=STEPS) < 0.5, 0.0, rng.uniform(0.0, 1.2, STEPS))
-        walks.append(peaks - depth * np.array([recovered(p) for p in peaks]))
+        walks.append(peaks - depth * recovered(peaks))
     return [first, *walks]
 
 

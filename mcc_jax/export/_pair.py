@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from ..geometry import Particle
 from ..law import MccLaw
 from ._card import stress_power
 
+Numbers = np.ndarray | float
 HALVINGS = 1100  # down to the smallest floating-point number
 
 
@@ -44,8 +47,13 @@ class _Half:
 
 
 def pair_force(
-    law_i: MccLaw, particle_i: Particle, law_j: MccLaw, particle_j: Particle | None, overlap: float, overlap_max: float
-) -> tuple[float, float, float]:
+    law_i: MccLaw,
+    particle_i: Particle,
+    law_j: MccLaw,
+    particle_j: Particle | None,
+    overlap: Numbers,
+    overlap_max: Numbers,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     r"""Force, tangent and recoverable overlap of two half contacts in series.
 
     Each side is half a platen test, :math:`F_s(d) = F_{plates}(2d)`. On loading the overlap is shared so that both
@@ -59,7 +67,7 @@ def pair_force(
         particle_i: its size; D3 along the contact's normal.
         law_j: law of the other.
         particle_j: its size; None for a rigid wall.
-        overlap: overlap now [um].
+        overlap: overlap now [um], one or many.
         overlap_max: the largest so far [um], not below `overlap`.
 
     Returns:
@@ -67,6 +75,13 @@ def pair_force(
     """
     i = _Half(law_i, particle_i)
     j = None if particle_j is None else _Half(law_j, particle_j)
+    x, peak = np.broadcast_arrays(np.asarray(overlap, float), np.asarray(overlap_max, float))
+    rows = [_respond(i, j, one, most) for one, most in zip(x.ravel().tolist(), peak.ravel().tolist(), strict=True)]
+    force, tangent, width = np.array(rows).reshape(-1, 3).T
+    return force.reshape(x.shape), tangent.reshape(x.shape), width.reshape(x.shape)
+
+
+def _respond(i: _Half, j: _Half | None, overlap: float, overlap_max: float) -> tuple[float, float, float]:
     d = overlap_max if j is None else _share(i, j, overlap_max)
     peak, width = i.force(d), i.recovered(d)
     slope = i.slope(d)
