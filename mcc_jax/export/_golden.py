@@ -31,9 +31,7 @@ OTHER_SIZE = 0.6
 _SI = {"displacement": ("um", "m", 1e-6), "force": ("mN", "N", 1e-3), "tangent": ("mN_per_um", "N_per_m", 1e3)}
 
 
-def golden_table(
-    law: MccLaw, particle: Particle, *, seed: int = 0, units: Literal["um_mN", "SI"] = "um_mN"
-) -> Table:
+def golden_table(law: MccLaw, particle: Particle, *, seed: int = 0, units: Literal["um_mN", "SI"] = "um_mN") -> Table:
     """Paths of one particle between two platens with the law's force and tangent.
 
     The first path loads, releases, reloads and overtakes its peak, up to a scaled strain of 0.67, with points close to
@@ -55,13 +53,14 @@ def golden_table(
         return np.asarray(particle.displacement(law.recoverable_strain(particle, particle.strain(jnp.asarray(peak)))))
 
     paths = _paths(scale, recovered, seed)
+    pasts = [np.concatenate([[0.0], np.maximum.accumulate(np.maximum(path, 0.0))[:-1]]) for path in paths]
     step = eqx.filter_jit(eqx.filter_vmap(respond, in_axes=(None, None, 0, 0)))
-    tables = []
-    for number, path in enumerate(paths):
-        past = np.concatenate([[0.0], np.maximum.accumulate(np.maximum(path, 0.0))[:-1]])
-        force, tangent, peak = (np.asarray(v) for v in step(law, particle, jnp.asarray(path), jnp.asarray(past)))
-        tables.append(_rows(number, path, peak, force, tangent))
-    return _in_units(tables, units)
+    x = np.concatenate(paths)  # in one call, which compiles once
+    force, tangent, peak = (
+        np.asarray(v) for v in step(law, particle, jnp.asarray(x), jnp.asarray(np.concatenate(pasts)))
+    )
+    number = np.repeat(np.arange(len(paths)), [len(path) for path in paths])
+    return _in_units(_rows(number, x, peak, force, tangent), units)
 
 
 def golden_pair_table(
@@ -72,6 +71,8 @@ def golden_pair_table(
     Both sides carry one force; see `pair_force`. Columns as of `golden_table`, and `partner`: `equal`, `smaller`,
     `wall`.
     """
+    import pandas as pd
+
     smaller = jax.tree.map(lambda d: d * OTHER_SIZE, particle)
     tables = []
     for partner, other in (("equal", particle), ("smaller", smaller), ("wall", None)):
@@ -86,7 +87,7 @@ def golden_pair_table(
             past = np.maximum.accumulate(np.maximum(path, 0.0))
             force, tangent, _ = pair_force(law, particle, law, other, path, past)
             tables.append(_rows(number, path, past, force, tangent).assign(partner=partner))
-    return _in_units(tables, units)
+    return _in_units(pd.concat(tables, ignore_index=True), units)
 
 
 def _paths(scale: float, recovered: Callable[[np.ndarray], np.ndarray], seed: int) -> list[np.ndarray]:
@@ -106,7 +107,9 @@ def _paths(scale: float, recovered: Callable[[np.ndarray], np.ndarray], seed: in
     return [first, *walks]
 
 
-def _rows(number: int, path: np.ndarray, peak: np.ndarray, force: np.ndarray, tangent: np.ndarray) -> Table:
+def _rows(
+    number: int | np.ndarray, path: np.ndarray, peak: np.ndarray, force: np.ndarray, tangent: np.ndarray
+) -> Table:
     import pandas as pd
 
     return pd.DataFrame(
@@ -114,10 +117,7 @@ def _rows(number: int, path: np.ndarray, peak: np.ndarray, force: np.ndarray, ta
     )
 
 
-def _in_units(tables: list, units: str) -> Table:
-    import pandas as pd
-
-    table = pd.concat(tables, ignore_index=True)
+def _in_units(table: Table, units: str) -> Table:
     columns = {}
     for name in table.columns:
         if name.removesuffix("_max") not in _SI:

@@ -84,6 +84,7 @@ def check(law: MccLaw, particle: Particle, *, allow_not_monotone: bool = False) 
     problem = "the loading curve is not monotone (9 C3^6 > 20 C1 C5^5): stress falls over part of the loading"
     if not allow_not_monotone:
         raise InputError(
-            problem, remedy="Take the population or another particle, or give --allow-not-monotone to export it as it is"
+            problem,
+            remedy="Take the population or another particle, or give --allow-not-monotone to export it as it is",
         )
     return (f"{problem}; under load control it snaps through, and a pair of such contacts has several solutions",)

@@ -24,7 +24,7 @@ def program(tmp_path_factory):
 
 
 def random_laws(rng, count, unloading, scaling, monotone=False):
-    """Laws and diameters [um] far around the paper's; some are not monotone, some even tensile, unless excluded."""
+    """Laws and diameters [um] far around the paper's; unless excluded, some are not monotone."""
     C1, C5 = rng.uniform(3, 15, count), rng.uniform(1.8, 3.5, count)
     C3 = rng.uniform(0, 1 if monotone else 1.05, count) * (20 / 9 * C1 * C5**5) ** (1 / 6)
     plastic = eqx.filter_vmap(Plastic)(*map(jnp.asarray, (C1, C3, C5)))
@@ -169,9 +169,7 @@ def test_finite_whatever_the_displacement(program):
     for law in laws:
         for kind in (PLATES, WALL, PAIR):
             sizes = np.tile([200.0, 180.0, 150.0], (len(paths), 1))
-            force, tangent, peak = run_driver(
-                program, head(kind, paths.shape[1], law, sizes, law, 0.3 * sizes), paths
-            )
+            force, tangent, peak = run_driver(program, head(kind, paths.shape[1], law, sizes, law, 0.3 * sizes), paths)
             assert np.isfinite(force).all()
             assert np.isfinite(tangent).all()
             assert (force >= 0).all()
@@ -203,7 +201,7 @@ def test_compiles_without_a_warning_and_holds_the_values(tmp_path, language):
               map(float, values), strict=True)),
             f"l.k != {form.unloading.constant.hex()}", f"l.n != {n}", f"l.p != {form.strain_scaling.power}",
         ]  # fmt: skip
-        tests = [t.split(" != ")[0] + f" != strtod(\"{t.split(' != ')[1]}\", NULL)" for t in tests]
+        tests = [t.split(" != ")[0] + f' != strtod("{t.split(" != ")[1]}", NULL)' for t in tests]
         source = tmp_path / f"main_{number}.c"
         source.write_text(
             f'#include <stdlib.h>\n#include "law_{number}.h"\n#include "law_{number}.h"\n'
