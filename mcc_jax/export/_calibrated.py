@@ -7,7 +7,7 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -38,7 +38,7 @@ def read_calibration(
         folder: holds `calibration.json`, of any method.
         particle: take this particle's coefficients.
         diameters: `D1,D2,D3` [um], or a table of particles (its row of that particle, or its mean). If None, the
-            `particles.csv` beside the calibration; without one, a sphere of 200 um.
+            `particles.csv` beside the calibration or in its folder `campaign`; without one, a sphere of 200 um.
         allow_not_monotone: warn of a loading curve that falls, instead of refusing it.
 
     Returns:
@@ -50,6 +50,7 @@ def read_calibration(
     file = Path(folder) / CALIBRATION
     content, checksum = _read(file)
     form, scaling = _forms(content, file)
+    entry = None if particle is None else _entry(content, particle, file)
     sizes, geometry = _sizes(Path(folder), particle, diameters)
     estimates = {
         "a": _estimate(content, ("a",), file),
@@ -58,10 +59,9 @@ def read_calibration(
     logs = {f"log_{name}": _log(content, name, file) for name in COEFFICIENTS}
     notes = [f"the calibration of {file.name} did not converge"] if not content.get("converged") else []
     notes += [str(w) for w in content.get("warnings") or () if isinstance(w, str)]
-    if particle is None:
+    if entry is None:
         estimates |= {name: _median(logs[f"log_{name}"]["mean"]) for name in COEFFICIENTS}
     else:
-        entry = _entry(content, particle, file)
         estimates |= {name: _estimate(entry, (name,), file) for name in COEFFICIENTS}
         if content.get("shape_scatter") is not None:
             estimates["a"] = _own_shape(entry, sizes, estimates["a"], file)
@@ -133,7 +133,7 @@ def _estimate(content: Mapping[str, Any], keys: tuple[str, ...], file: Path) -> 
     return {"value": float(value), "sd": float(sd) if _is_number(sd) else None, "interval_95": ends}
 
 
-def _is_number(value: Any) -> bool:
+def _is_number(value: Any) -> TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
@@ -184,8 +184,8 @@ def _own_shape(entry: Mapping[str, Any], sizes: Particle, shared: dict[str, Any]
 
 
 def _sizes(folder: Path, particle: str | None, diameters: str | None) -> tuple[Particle, str]:
-    table = folder / PARTICLES
-    if diameters is None and not table.is_file():
+    table = next((t for t in (folder / PARTICLES, folder / "campaign" / PARTICLES) if t.is_file()), None)
+    if diameters is None and table is None:
         if particle is not None:
             raise InputError(
                 f"the size of particle {particle!r} is not known",
@@ -193,19 +193,19 @@ def _sizes(folder: Path, particle: str | None, diameters: str | None) -> tuple[P
                 remedy="Give --diameters D1,D2,D3 in um, or the campaign's particles.csv",
             )
         return Particle(SPHERE_UM, SPHERE_UM, SPHERE_UM), f"a sphere of {SPHERE_UM:g} um: no diameters were given"
-    found = read_diameters(table if diameters is None else diameters)
+    source = str(table) if diameters is None else diameters
+    found = read_diameters(source)
     if not isinstance(found, Mapping):
         D1, D2, D3 = found
         return Particle(D1, D2, D3), "given"
-    source = table.name if diameters is None else Path(diameters).name
     if particle is None:
-        D1, D2, D3 = np.mean(list(found.values()), axis=0).tolist()
-        return Particle(D1, D2, D3), f"mean diameters of the {len(found)} particles of {source}"
+        D1, D2, D3 = np.array([list(triple) for triple in found.values()]).mean(axis=0).tolist()
+        return Particle(D1, D2, D3), f"mean diameters of the {len(found)} particles of {Path(source).name}"
     if particle not in found:
         raise InputError(
             f"there is no particle {particle!r}",
-            file=table if diameters is None else diameters,
+            file=source,
             remedy="Give --diameters D1,D2,D3 in um",
         )
     D1, D2, D3 = found[particle]
-    return Particle(D1, D2, D3), f"particle {particle} of {source}"
+    return Particle(D1, D2, D3), f"particle {particle} of {Path(source).name}"

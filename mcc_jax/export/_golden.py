@@ -127,4 +127,4 @@ def _in_units(table: Table, units: str) -> Table:
         if units == "SI":
             table[name] *= factor
     front = ["path"] if "partner" not in table else ["partner", "path"]
-    return table.rename(columns=columns)[front + list(columns.values())]
+    return table.rename(columns=columns).reindex(columns=front + list(columns.values()))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from ..geometry import Particle
@@ -15,7 +13,7 @@ HALVINGS = 1100  # down to the smallest floating-point number
 
 
 class _Half:
-    """One side: F = F_plates(2 d), in mN and um, with Python floats."""
+    """One side: F = F_plates(2 d), in mN and um."""
 
     def __init__(self, law: MccLaw, particle: Particle) -> None:
         self.eta = float(law.shape_factor(particle))
@@ -25,25 +23,23 @@ class _Half:
         self.modulus = float(law.effective_modulus)
         self.k, self.n, self.p = law.unloading.constant, stress_power(law), law.strain_scaling.power
 
-    def stress(self, d: float) -> float:
+    def stress(self, d: np.ndarray) -> np.ndarray:
         x = 2 * self.eta * d / self.diameter
         K1, K3, K5 = self.K
-        return max(K1 * x - K3 * x**3 + K5 * x**5, 0.0)
+        return np.maximum(K1 * x - K3 * x**3 + K5 * x**5, 0.0)
 
-    def force(self, d: float) -> float:
+    def force(self, d: np.ndarray) -> np.ndarray:
         return self.area * self.stress(d)
 
-    def slope(self, d: float) -> float:
+    def slope(self, d: np.ndarray) -> np.ndarray:
         x = 2 * self.eta * d / self.diameter
         K1, K3, K5 = self.K
         return self.area * (K1 - 3 * K3 * x**2 + 5 * K5 * x**4) * 2 * self.eta / self.diameter
 
-    def recovered(self, d: float) -> float:
-        strain = 2 * d / self.diameter
-        if not strain > 0:
-            return 0.0
+    def recovered(self, d: np.ndarray) -> np.ndarray:
+        strain = np.where(d > 0, 2 * d / self.diameter, 1.0)
         square = (self.stress(d) / self.modulus) ** self.n / (self.k * self.eta**self.p * strain)
-        return self.diameter * math.sqrt(square) / 2
+        return np.where(d > 0, self.diameter * np.sqrt(square) / 2, 0.0)
 
 
 def pair_force(
@@ -75,40 +71,31 @@ def pair_force(
     """
     i = _Half(law_i, particle_i)
     j = None if particle_j is None else _Half(law_j, particle_j)
-    x, peak = np.broadcast_arrays(np.asarray(overlap, float), np.asarray(overlap_max, float))
-    rows = [_respond(i, j, one, most) for one, most in zip(x.ravel().tolist(), peak.ravel().tolist(), strict=True)]
-    force, tangent, width = np.array(rows).reshape(-1, 3).T
-    return force.reshape(x.shape), tangent.reshape(x.shape), width.reshape(x.shape)
-
-
-def _respond(i: _Half, j: _Half | None, overlap: float, overlap_max: float) -> tuple[float, float, float]:
-    d = overlap_max if j is None else _share(i, j, overlap_max)
-    peak, width = i.force(d), i.recovered(d)
-    slope = i.slope(d)
+    shape = np.broadcast_shapes(np.shape(overlap), np.shape(overlap_max))
+    x, x_max = (np.broadcast_to(np.asarray(v, float), shape).ravel() for v in (overlap, overlap_max))
+    d = x_max if j is None else _share(i, j, x_max)
+    peak, width, slope = i.force(d), i.recovered(d), i.slope(d)
     if j is not None:
-        rest = overlap_max - d
+        rest = x_max - d
         slope_j = j.slope(rest)
         # A stiff side alone would carry the rounding of its share.
         peak = (peak * slope_j + j.force(rest) * slope) / (slope + slope_j)
         slope = slope * slope_j / (slope + slope_j)
-        width += j.recovered(rest)
-    if overlap >= overlap_max:
-        return peak, slope, width
-    q = (overlap_max - overlap) / width if width > 0 else 1.0
-    if q >= 1:
-        return 0.0, 0.0, width
-    root = math.sqrt((1 - q) * (1 + q))
-    return peak * 2 / math.pi * (math.acos(q) - q * root), 4 / math.pi * peak * root / width, width
+        width = width + j.recovered(rest)
+    q = np.where(width > 0, (x_max - x) / np.where(width > 0, width, 1.0), 1.0).clip(0.0, 1.0)
+    root = np.sqrt((1 - q) * (1 + q))
+    loading = x >= x_max
+    force = np.where(loading, peak, peak * 2 / np.pi * (np.arccos(q) - q * root))
+    tangent = np.where(loading, slope, 4 / np.pi * peak * root / np.where(width > 0, width, 1.0))
+    return force.reshape(shape), tangent.reshape(shape), width.reshape(shape)
 
 
-def _share(i: _Half, j: _Half, overlap: float) -> float:
-    low, high = 0.0, overlap
+def _share(i: _Half, j: _Half, overlap: np.ndarray) -> np.ndarray:
+    low, high = np.zeros_like(overlap), overlap
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
-        if not low < middle < high:
+        if not ((low < middle) & (middle < high)).any():
             break
-        if i.force(middle) > j.force(overlap - middle):
-            high = middle
-        else:
-            low = middle
+        too_far = i.force(middle) > j.force(overlap - middle)
+        low, high = np.where(too_far, low, middle), np.where(too_far, middle, high)
     return 0.5 * (low + high)

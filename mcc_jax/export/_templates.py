@@ -16,7 +16,7 @@ def render(name: str, **values: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
-        autoescape=False,  # noqa: S701  # C and Markdown, not HTML
+        autoescape=False,  # C and Markdown, not HTML
     )
     return environment.get_template(name).render(**values)
 

@@ -8,7 +8,6 @@ from calibrations import content, estimate, write
 from click.testing import CliRunner
 from compiling import PAIR, PLATES, WALL, build_driver, head, run_driver
 
-from mcc_jax import Particle
 from mcc_jax.cli._export import FORMATS as OFFERED
 from mcc_jax.cli._main import cli
 from mcc_jax.export import FORMATS, read_calibration
@@ -153,7 +152,7 @@ BAD = {
         ("--particle", "A"),
         "particles.csv: there is no particle 'A'",
     ),
-    "two diameters": (None, ("--diameters", "1,2"), "--diameters"),
+    "two diameters": (None, ("--diameters", "1,2"), "1,2: there is no such file"),
     "zero diameter": (None, ("--diameters", "1,0,2"), "--diameters"),
     "empty diameters": (None, ("--diameters", " "), "--diameters"),
     "seed": (None, ("--seed", "-1"), "--seed"),
@@ -180,22 +179,13 @@ def test_format_is_required_and_checked(run, tmp_path):
     assert "'matlab'" in one_line(run(tmp_path / "fit", "--format", "matlab", "--out", tmp_path / "out"))
 
 
-def test_a_calibration_of_the_library_is_understood(run, tmp_path):
-    """The real file, not only ours: the paper's method on its simulated campaign."""
-    from mcc_jax import calibrate_paper, paper_campaign, write_campaign
-
-    folder, campaign = tmp_path / "fit", paper_campaign(0)
-    found = calibrate_paper(campaign)
-    write_campaign(campaign, folder)
-    (folder / "calibration.json").write_text(json.dumps(found.to_json()))
-    law, particle, origin = read_calibration(folder, particle="3")
-    assert float(law.a) == float(found.a)
-    assert [float(v) for v in (law.plastic.C1, law.plastic.C3, law.plastic.C5)] == pytest.approx(
-        list(found.particles[2].plastic), rel=1e-15
-    )
-    assert isinstance(particle, Particle)
-    assert origin.estimates["C1"]["sd"] is None
-    assert run(folder, "--format", "json", "--out", tmp_path / "out").exit_code == 0
+def test_sizes_are_also_found_where_the_demo_puts_its_campaign(tmp_path):
+    folder = write(tmp_path / "fit")
+    (folder / "campaign").mkdir()
+    (folder / "particles.csv").rename(folder / "campaign" / "particles.csv")
+    _, particle, origin = read_calibration(folder, particle="A")
+    assert float(particle.D1) == 200.0
+    assert origin.geometry == "particle A of particles.csv"
 
 
 def test_help_does_not_import_jax():
