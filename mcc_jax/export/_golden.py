@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._types import Values
 from ..geometry import Particle
 from ..law import MccLaw
 from ._origin import STRAIN_MAX
@@ -31,6 +32,15 @@ OTHER_SIZE = 0.6
 _SI = {"displacement": ("um", "m", 1e-6), "force": ("mN", "N", 1e-3), "tangent": ("mN_per_um", "N_per_m", 1e3)}
 
 
+@eqx.filter_jit
+def _recovered(law: MccLaw, particle: Particle, peak: Values) -> Values:
+    """Displacement recovered on full release [um]."""
+    return particle.displacement(law.recoverable_strain(particle, particle.strain(peak)))
+
+
+_each = eqx.filter_jit(eqx.filter_vmap(respond, in_axes=(None, None, 0, 0)))
+
+
 def golden_table(law: MccLaw, particle: Particle, *, seed: int = 0, units: Literal["um_mN", "SI"] = "um_mN") -> Table:
     """Paths of one particle between two platens with the law's force and tangent.
 
@@ -50,14 +60,13 @@ def golden_table(law: MccLaw, particle: Particle, *, seed: int = 0, units: Liter
     scale = STRAIN_MAX * float(particle.effective_diameter / law.shape_factor(particle))
 
     def recovered(peak: np.ndarray) -> np.ndarray:
-        return np.asarray(particle.displacement(law.recoverable_strain(particle, particle.strain(jnp.asarray(peak)))))
+        return np.asarray(_recovered(law, particle, jnp.asarray(peak)))
 
     paths = _paths(scale, recovered, seed)
     pasts = [np.concatenate([[0.0], np.maximum.accumulate(np.maximum(path, 0.0))[:-1]]) for path in paths]
-    step = eqx.filter_jit(eqx.filter_vmap(respond, in_axes=(None, None, 0, 0)))
     x = np.concatenate(paths)  # in one call, which compiles once
     force, tangent, peak = (
-        np.asarray(v) for v in step(law, particle, jnp.asarray(x), jnp.asarray(np.concatenate(pasts)))
+        np.asarray(v) for v in _each(law, particle, jnp.asarray(x), jnp.asarray(np.concatenate(pasts)))
     )
     number = np.repeat(np.arange(len(paths)), [len(path) for path in paths])
     return _in_units(_rows(number, x, peak, force, tangent), units)

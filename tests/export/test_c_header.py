@@ -52,7 +52,7 @@ def along(law, diameters, path, past):
     def force(x, before):
         return law.step(particle, History(before), x)[1]
 
-    return jax.vmap(force)(path, past), jax.vmap(jax.grad(force))(path, past)
+    return jax.vmap(jax.value_and_grad(force))(path, past)
 
 
 def random_paths(rng, reach, recovered, steps=STEPS):
@@ -91,8 +91,8 @@ def test_equals_the_library_over_random_paths(program, kind):
 
 def test_pair_of_unlike_particles_equals_bisection(program):
     rng = np.random.default_rng(3)
-    count, steps = 12, 20
-    for unloading, scaling in FORMS:
+    count, steps = 8, 20
+    for unloading, scaling in FORMS[::2]:
         one, sizes = random_laws(rng, count, unloading, scaling, monotone=True)
         two, others = random_laws(rng, count, unloading, scaling, monotone=True)
         others *= np.geomspace(0.05, 20, count)[:, None]  # up to a wall nearly, and down to a grain
