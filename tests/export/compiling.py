@@ -34,7 +34,7 @@ def build_driver(folder, header, language="c"):
 
 
 def run_driver(program, heads, paths):
-    """Force, tangent and history of shape (paths, steps) for heads (paths, 24) and paths (paths, steps) in SI units."""
+    """Force, tangent and history of shape (paths, steps) for heads (paths, 25) and paths (paths, steps) in SI units."""
     done = subprocess.run([program], input=np.hstack([heads, paths]).tobytes(), capture_output=True, check=True)
     return np.moveaxis(np.frombuffer(done.stdout).reshape(*paths.shape, 3), -1, 0)
 
@@ -47,10 +47,10 @@ def law_numbers(law):
     return np.stack(np.broadcast_arrays(*map(np.asarray, [*own, *same])), axis=-1)
 
 
-def head(kind, steps, law_i, diameters_i, law_j=None, diameters_j=None):
+def head(kind, steps, law_i, diameters_i, law_j=None, diameters_j=None, x_max=0.0):
     """Records of the driver but for their paths; diameters in um, shape (paths, 3)."""
     law_j, diameters_j = (law_i, diameters_i) if law_j is None else (law_j, diameters_j)
     count = len(diameters_i)
     front = np.tile([kind, float(steps)], (count, 1))
     i, j = (np.broadcast_to(law_numbers(law), (count, 8)) for law in (law_i, law_j))
-    return np.hstack([front, i, 1e-6 * diameters_i, j, 1e-6 * diameters_j])
+    return np.hstack([front, i, 1e-6 * diameters_i, j, 1e-6 * diameters_j, np.full((count, 1), x_max)])

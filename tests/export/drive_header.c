@@ -1,5 +1,6 @@
 /* Runs mcc_law.h over paths: records of doubles on standard input, {force, tangent, x_max} for every point on output.
- * A record: kind (0 plates, 1 wall, 2 pair), steps, law of i (C1 C3 C5 a E k n p), D1 D2 D3 of i, the same of j, path. */
+ * A record: kind (0 plates, 1 wall, 2 pair), steps, law of i (C1 C3 C5 a E k n p), D1 D2 D3 of i, the same of j,
+ * history at the start, path. */
 #include <stdio.h>
 #include <stdlib.h>
 
@@ -21,14 +22,14 @@ static mcc_law law_of(const double *v)
 
 int main(void)
 {
-    double head[24];
-    while (fread(head, sizeof(double), 24, stdin) == 24) {
+    double head[25];
+    while (fread(head, sizeof(double), 25, stdin) == 25) {
         const int kind = (int)head[0], steps = (int)head[1];
         const mcc_law law_i = law_of(head + 2), law_j = law_of(head + 13);
         const mcc_contact plates = mcc_plates(&law_i, head[10], head[11], head[12]);
         const mcc_contact i = mcc_half_contact(&law_i, head[10], head[11], head[12]);
         const mcc_contact j = mcc_half_contact(&law_j, head[21], head[22], head[23]);
-        double x_max = 0.0;
+        double x_max = head[24];
         int k;
         for (k = 0; k < steps; ++k) {
             double x, out[3];

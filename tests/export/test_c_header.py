@@ -95,7 +95,7 @@ def test_pair_of_unlike_particles_equals_bisection(program):
     for unloading, scaling in FORMS[::2]:
         one, sizes = random_laws(rng, count, unloading, scaling, monotone=True)
         two, others = random_laws(rng, count, unloading, scaling, monotone=True)
-        others *= np.geomspace(0.05, 20, count)[:, None]  # up to a wall nearly, and down to a grain
+        others *= np.geomspace(1e-5, 1e5, count)[:, None]  # down to dust, and up to what is a wall
         reach = np.minimum(*(np.asarray(scales(law, jnp.asarray(d))[0]) for law, d in ((one, sizes), (two, others))))
         laws = [[jax.tree.map(lambda v, k=k: v[k], law) for k in range(count)] for law in (one, two)]
         sides = [(a, Particle(*d), b, Particle(*e)) for a, d, b, e in zip(laws[0], sizes, laws[1], others, strict=True)]
@@ -176,6 +176,14 @@ def test_finite_whatever_the_displacement(program):
             np.testing.assert_array_equal(peak, np.maximum.accumulate(np.maximum(paths, 0), axis=1))
             if float(law.a) == -300.0:  # the shape factor is negative: nothing is carried
                 assert not force.any()
+
+
+@pytest.mark.parametrize("kind", [PLATES, WALL, PAIR])
+def test_a_history_below_zero_is_that_of_a_virgin_particle(program, kind):
+    paths, sizes = np.array([[-2e-6, -5e-7, 0.0, 1e-5, 9.9e-6]]), np.full((1, 3), 200.0)
+    virgin, odd = (run_driver(program, head(kind, 5, paper_law(), sizes, x_max=x), paths) for x in (0.0, -1e-6))
+    np.testing.assert_array_equal(virgin, odd)
+    assert not virgin[0, 0, :3].any()
 
 
 def test_what_is_not_a_number_shows(program):
