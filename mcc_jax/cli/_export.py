@@ -46,7 +46,7 @@ def export(
     Formats:
       json    parameter card: values, units, uncertainty, formulae, validity, provenance
       csv     master curve and unloading curve as tables for linear interpolation
-      jax     functions of many contacts that need JAX only, for cpu, cuda, rocm and tpu
+      jax     functions of many contacts that need jax and flatbuffers only
       c       a C99 header, also C++: one particle between platens, and pairs
       lammps  a normal model for LAMMPS around that header
       yade    material and functors for Yade around that header

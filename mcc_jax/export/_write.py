@@ -51,7 +51,7 @@ def _jax(law: MccLaw, particle: Particle, origin: Origin, folder: Path, seed: in
             (folder / name).write_bytes(artefact.content)
             signatures[name] = artefact.signature
             names.append(name)
-    use = "jax.export.deserialize(bytearray(Path(file).read_bytes())).call(...)"
+    use = "jax.export.deserialize(bytearray(Path(file).read_bytes())).call(...), with the packages jax and flatbuffers"
     _dump(
         folder / "mcc_jax_export.json",
         {**card(law, particle, origin=origin), "artefacts": {"use": use, "files": signatures}},
