@@ -66,7 +66,7 @@ def jax_artefact(
 ) -> Artefact:
     """A function of many contacts at once, serialised by `jax.export` with its reverse-mode derivative.
 
-    The number of contacts b is symbolic: one artefact serves every batch size. To use it, with jax and flatbuffers alone:
+    The number of contacts b is symbolic: one artefact serves every batch size. To use it, with jax and flatbuffers:
 
         step = jax.export.deserialize(bytearray(Path(file).read_bytes())).call
         force, tangent, displacement_max = step(displacement, displacement_max)
