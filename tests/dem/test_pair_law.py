@@ -1,6 +1,7 @@
 """The pair rule: the plate test again, equal force, symmetry, limits, one history scalar, derivatives."""
 
 import functools
+import itertools
 
 import equinox as eqx
 import jax
@@ -38,7 +39,7 @@ def law_of(unloading=Unloading.PRINTED, scaling=StrainScaling.RAW, C1=16.0, C3=3
 def cycle(largest):
     """Load, unload, reload further, release, reload: overlaps, starting out of contact."""
     turns = np.array([-0.02, 0.6, 0.45, 0.8, 0.3, 1.0, -0.02, 0.9]) * largest
-    return np.concatenate([np.linspace(a, b, 15) for a, b in zip(turns[:-1], turns[1:], strict=True)])
+    return np.concatenate([np.linspace(a, b, 15) for a, b in itertools.pairwise(turns)])
 
 
 def driven(force, overlaps):
@@ -179,7 +180,7 @@ def test_ellipsoid_turns_continuously():
 
 
 def summed(vector):
-    """Force of one pair from a vector: both sides' numbers, largest overlap, overlap, each relative to its own scale."""
+    """Force of one pair from a vector: both sides' numbers, largest overlap, overlap."""
     i = HalfContact(vector[0], vector[1], vector[2], vector[3], jnp.ones(()))
     j = HalfContact(vector[4], vector[5], vector[6], vector[7], jnp.ones(()))
     return pair_force(i, j, vector[8], vector[9])
@@ -226,7 +227,7 @@ VALUE_AND_GRADIENT = jax.jit(jax.value_and_grad(summed))
 
 @pytest.mark.parametrize("unloading", list(Unloading))
 def test_onset_and_release_are_finite(unloading):
-    """Pitfall: at the onset the arc-function form has a derivative that is NaN, and just behind it one that is wrong."""
+    """Pitfall: at the onset the arc-function form gives a derivative that is NaN, just behind it a wrong one."""
     side = half_contact(law_of(unloading), PARTICLE)
     peak = jnp.asarray(20e-6)
     slope = jax.jit(jax.grad(lambda overlap: pair_force(side, side, peak, overlap)))
@@ -281,7 +282,7 @@ def test_energy_is_the_area_under_the_curve(unloading):
         assert energy.recoverable >= 0
 
 
-# ---- what is refused, what is flagged ------------------------------------------------------------------------------------
+# ---- what is refused, what is flagged --------------------------------------------------------------------------------
 
 
 def test_forms_do_not_mix():

@@ -14,7 +14,7 @@ def _load(numbers, d):
 
 
 def _force(numbers, power, d, d_max):
-    """Force of one side at its own compression, from its own peak: strain and stress of the paper's internal variables."""
+    """Force of one side at its own compression d, from its own peak."""
     if d >= d_max:
         return _load(numbers, max(d, 0.0))
     peak = _load(numbers, d_max)
@@ -36,7 +36,7 @@ def bisected_path(i, j, overlaps):
     forces = []
     for overlap in overlaps:
 
-        def excess(d, overlap=overlap):
+        def excess(d, overlap=overlap, max_i=max_i, max_j=max_j):
             return _force(ni, power, d, max_i) - _force(nj, power, overlap - d, max_j)
 
         low, high = min(0.0, overlap) - 1e-6, max(overlap, 0.0) + 1e-6
