@@ -145,7 +145,9 @@ def contact_forces(
     mass = shared(packing.mass[i] * packing.mass[j] / (packing.mass[i] + packing.mass[j]))
     arm = packing.radius[i][:, None] * spin[i] + packing.radius[j][:, None] * spin[j]
     relative = velocity[j] - velocity[i] - jnp.cross(arm, normal)
-    elastic = jax.vmap(pair_force)(side_i, side_j, edges.overlap_max, overlap)
+    # Without the barriers XLA computes the law again for every use of its force.
+    overlap, normal, relative = jax.lax.optimization_barrier((overlap, normal, relative))
+    elastic = jax.lax.optimization_barrier(jax.vmap(pair_force)(side_i, side_j, edges.overlap_max, overlap))
     pairs = jax.vmap(_contact, (None, None, 0, 0, 0, 0, 0, 0, 0, 0, None))(
         interaction,
         interaction.friction,
@@ -173,7 +175,7 @@ def contact_forces(
         contacts = jax.vmap(_contact, (None, None, 0, 0, 0, 0, 0, 0, 0, 0, None))(
             interaction,
             interaction.wall_friction,
-            jax.vmap(wall_force)(packing.sides, history.overlap_max[:, w], overlap),
+            jax.lax.optimization_barrier(jax.vmap(wall_force)(packing.sides, history.overlap_max[:, w], overlap)),
             packing.sides.k1,
             packing.mass,
             -inward,
@@ -216,14 +218,17 @@ def _contact(
     # The contact plane turned since the last step: keep the slip's length and put it into the new plane.
     sliding = relative - opening * normal
     in_plane = slip - jnp.sum(slip * normal) * normal
+    sliding, push, in_plane = jax.lax.optimization_barrier((sliding, push, in_plane))
     slip = in_plane * shared(_norm(slip) / (_norm(in_plane) + jnp.finfo(slip.dtype).tiny ** 0.5))
     slip = slip + time_step * sliding
     stiffness = interaction.tangential_ratio * k
     trial = stiffness * slip + damping * shared(jnp.sqrt(mass * stiffness)) * sliding
+    slip, trial = jax.lax.optimization_barrier((slip, trial))
     limit = friction * push
     size = _norm(trial)
     slips = size > limit
     tangential = trial * jnp.where(slips, shared(limit / jnp.where(slips, size, 1.0)), 1.0)[None]
+    tangential = jax.lax.optimization_barrier(tangential)
     held = jnp.where(slips, tangential * shared(1 / jnp.where(stiffness > 0, stiffness, 1.0)), slip)
     return _Contact(
         tangential - push * normal,
