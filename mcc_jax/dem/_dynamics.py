@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -14,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._errors import InputError
 from .._numerics import shared
 from .._types import Scalar
-from ._edges import Edges, carry_history, list_edges
+from ._edges import PADDING, Edges, carry_history, list_edges, widened
 from ._forces import Forces, Interaction, Packing, Vectors, WallHistory, contact_forces, pair_geometry
 from ._neighbours import close_pairs
 from ._pair import pair_split
@@ -154,7 +155,7 @@ def start(packing: Packing, walls: Walls, position: Vectors, skin: float, capaci
         position,
         jnp.zeros((), dtype),
     )
-    check_state(packing, state)
+    check_state(state)
     return listed(packing, state, skin, capacity)
 
 
@@ -293,15 +294,63 @@ def advance(
             if tape is not None and int(done):
                 tape.append(Segment(state.edges.key, state.edges.i, state.edges.j, done))
             if left:
-                check_state(packing, state)
+                check_state(state)
                 state = listed(packing, state, skin)
                 made += 1
-        check_state(packing, state)
+        check_state(state)
         table.append(_sample(packing, state, on_wall / steps))
         lists.append(made)
         capacity.append(state.edges.capacity)
     columns = jax.tree.map(lambda *x: np.stack(x), *table)
     return state, Trajectory(*columns, np.asarray(lists), np.asarray(capacity))
+
+
+def replay(packing: Packing, motion: Motion, state: State, tape: Sequence[Segment]) -> State:
+    """The same motion again over the lists of edges that `advance` recorded, differentiable in both modes.
+
+    Neighbour lists have no derivative and are made on the host; the contacts on them have. In reverse mode each list's
+    steps are computed twice and only the states between lists are kept. A gradient through thousands of steps is exact
+    for that trajectory and says little about compaction: rearrangements are chaotic (see the quasi-static compaction).
+
+    Args:
+        packing: the spheres.
+        motion: as in `advance`.
+        state: the state `advance` started from, with the walls' velocities set (`set_velocity`).
+        tape: of one call of `advance`.
+    """
+    if not tape:
+        return state
+    room = max(segment.key.shape[0] for segment in tape)
+    longest = max(int(segment.steps) for segment in tape)
+    segments = jax.tree.map(lambda *x: jnp.stack(x), *(_widened(segment, room) for segment in tape))
+
+    @jax.checkpoint
+    def one(state: State, segment: Segment) -> tuple[State, None]:
+        empty = jnp.zeros(room, state.edges.overlap_max.dtype)
+        fresh = Edges(
+            segment.key,
+            segment.i,
+            segment.j,
+            empty,
+            jnp.zeros((room, 3), empty.dtype),
+            state.edges.wanted,
+            state.edges.particles,
+        )
+        state = eqx.tree_at(lambda s: s.edges, state, carry_history(state.edges, fresh))
+        return run(packing, motion, state, longest, segment.steps), None
+
+    state = eqx.tree_at(lambda s: s.edges, state, widened(state.edges, room))
+    return jax.lax.scan(one, state, segments)[0]
+
+
+def _widened(segment: Segment, room: int) -> Segment:
+    spare = room - segment.key.shape[0]
+    return Segment(
+        jnp.pad(segment.key, (0, spare), constant_values=PADDING),
+        jnp.pad(segment.i, (0, spare)),
+        jnp.pad(segment.j, (0, spare)),
+        segment.steps,
+    )
 
 
 def stable_time_step(packing: Packing, safety: float = 0.3) -> float:
@@ -346,26 +395,33 @@ def not_monotone(packing: Packing) -> Bool[np.ndarray, " particles"]:
     return ~np.asarray(jax.vmap(lambda side: side.is_monotone)(packing.sides))
 
 
-def check_state(packing: Packing, state: State) -> None:
+def check_state(state: State) -> None:
     """Refuse a state that has gone astray.
 
     Raises:
         InputError: if a position is not finite or a particle's centre is behind a wall; it names particle and wall.
     """
-    lost = np.flatnonzero(~np.isfinite(np.asarray(state.position)).all(axis=1))
-    if lost.size:
+    lost, behind = (np.asarray(x) for x in _astray(state))
+    if lost.any():
         raise InputError(
-            f"the position of particle {lost[0]} is not finite at {float(state.time):.6g} s",
+            f"the position of particle {np.flatnonzero(lost)[0]} is not finite at {float(state.time):.6g} s",
             remedy="A smaller time step, or look at how the packing was made.",
         )
     for w, wall in enumerate(state.walls):
-        behind = np.flatnonzero(np.asarray(jax.vmap(wall.distance)(state.position)) < 0)
-        if behind.size:
+        if behind[w].any():
             raise InputError(
-                f"particle {behind[0]} is outside wall {w} ({type(wall).__name__}) at {float(state.time):.6g} s",
+                f"particle {np.flatnonzero(behind[w])[0]} is outside wall {w} ({type(wall).__name__}) "
+                f"at {float(state.time):.6g} s",
                 remedy="Place particles inside; if it was pushed through, a smaller time step or a slower punch.",
             )
-    del packing
+
+
+@jax.jit
+def _astray(state: State) -> tuple[Bool[Array, " particles"], Bool[Array, "walls particles"]]:
+    """Which particles are nowhere, and which are behind which wall."""
+    behind = [jax.vmap(wall.distance)(state.position) < 0 for wall in state.walls]
+    lost = ~jnp.all(jnp.isfinite(state.position), axis=1)
+    return lost, jnp.stack(behind) if behind else jnp.zeros((0, len(lost)), bool)
 
 
 @jax.jit

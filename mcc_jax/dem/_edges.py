@@ -125,6 +125,20 @@ def carry_history(old: Edges, new: Edges) -> Edges:
     )
 
 
+def widened(edges: Edges, capacity: int) -> Edges:
+    """The same list with room for more."""
+    spare = capacity - edges.capacity
+    return Edges(
+        jnp.pad(edges.key, (0, spare), constant_values=PADDING),
+        jnp.pad(edges.i, (0, spare)),
+        jnp.pad(edges.j, (0, spare)),
+        jnp.pad(edges.overlap_max, (0, spare)),
+        jnp.pad(edges.slip, ((0, spare), (0, 0))),
+        edges.wanted,
+        edges.particles,
+    )
+
+
 @jax.jit
 def relabel(edges: Edges, label: Int[Array, " particles"]) -> Edges:
     """The same contacts after particle k became particle `label[k]`, a permutation.

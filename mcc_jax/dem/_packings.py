@@ -80,4 +80,3 @@ def scattered(
 def relative_density(packing: Packing, radius: float, bottom: float, top: float) -> float:
     """Volume of the spheres over that of the die between the punches [-]."""
     return float(packing.volume) / (math.pi * radius**2 * (top - bottom))
-
