@@ -1,5 +1,32 @@
 """The law between particles: half contacts in series, history that survives neighbour lists, walls. SI units."""
 
+from ._dynamics import Motion as Motion
+from ._dynamics import Segment as Segment
+from ._dynamics import State as State
+from ._dynamics import Trajectory as Trajectory
+from ._dynamics import advance as advance
+from ._dynamics import check_state as check_state
+from ._dynamics import listed as listed
+from ._dynamics import not_monotone as not_monotone
+from ._dynamics import replay as replay
+from ._dynamics import run as run
+from ._dynamics import stable_time_step as stable_time_step
+from ._dynamics import start as start
+from ._dynamics import step as step
+from ._edges import Edges as Edges
+from ._edges import carry_history as carry_history
+from ._edges import list_edges as list_edges
+from ._edges import relabel as relabel
+from ._forces import Forces as Forces
+from ._forces import Interaction as Interaction
+from ._forces import Packing as Packing
+from ._forces import WallHistory as WallHistory
+from ._forces import contact_forces as contact_forces
+from ._neighbours import close_pairs as close_pairs
+from ._packings import MCC_DENSITY as MCC_DENSITY
+from ._packings import relative_density as relative_density
+from ._packings import scattered as scattered
+from ._packings import spheres as spheres
 from ._pair import ContactEnergy as ContactEnergy
 from ._pair import largest_overlap as largest_overlap
 from ._pair import pair_energy as pair_energy
@@ -7,7 +34,14 @@ from ._pair import pair_force as pair_force
 from ._pair import pair_split as pair_split
 from ._pair import wall_energy as wall_energy
 from ._pair import wall_force as wall_force
+from ._restart import load_state as load_state
+from ._restart import save_state as save_state
 from ._side import TESTED_STRAIN as TESTED_STRAIN
 from ._side import HalfContact as HalfContact
 from ._side import half_contact as half_contact
 from ._side import sides_of as sides_of
+from ._walls import Cylinder as Cylinder
+from ._walls import Plane as Plane
+from ._walls import Walls as Walls
+from ._walls import die as die
+from ._walls import set_velocity as set_velocity

@@ -16,7 +16,7 @@ from .._errors import InputError
 from .._numerics import shared
 from .._types import Scalar
 from ._edges import PADDING, Edges, carry_history, list_edges, widened
-from ._forces import Forces, Interaction, Packing, Vectors, WallHistory, contact_forces, pair_geometry
+from ._forces import Forces, Interaction, Packing, Vector, Vectors, WallHistory, contact_forces, overlap_and_normal
 from ._neighbours import close_pairs
 from ._pair import pair_split
 from ._side import sides_of
@@ -199,10 +199,9 @@ def step(packing: Packing, motion: Motion, state: State) -> tuple[State, Forces]
         motion.time_step,
     )
     dt = motion.time_step
-    decay = shared(1 / (1 + dt * motion.drag))
-    inertia = 0.4 * packing.mass * packing.radius**2
-    velocity = decay * (state.velocity + dt * (forces.force * shared(1 / packing.mass)[:, None] + motion.gravity))
-    spin = decay * (state.spin + dt * forces.torque * shared(1 / inertia)[:, None])
+    velocity, spin = jax.vmap(_kicked, (None, 0, 0, 0, 0, 0, 0))(
+        motion, packing.mass, packing.radius, state.velocity, state.spin, forces.force, forces.torque
+    )
     moved = State(
         state.position + dt * velocity,
         velocity,
@@ -214,6 +213,19 @@ def step(packing: Packing, motion: Motion, state: State) -> tuple[State, Forces]
         state.time + dt,
     )
     return moved, forces
+
+
+def _kicked(
+    motion: Motion, mass: Scalar, radius: Scalar, velocity: Vector, spin: Vector, force: Vector, torque: Vector
+) -> tuple[Vector, Vector]:
+    """Velocity and spin of one sphere after a step."""
+    dt = motion.time_step
+    decay = shared(1 / (1 + dt * motion.drag))
+    inertia = 0.4 * mass * radius * radius
+    return (
+        decay * (velocity + dt * (force * shared(1 / mass) + motion.gravity)),
+        decay * (spin + dt * torque * shared(1 / inertia)),
+    )
 
 
 def run(packing: Packing, motion: Motion, state: State, steps: int, wanted: Int[Array, ""] | int) -> State:
@@ -428,9 +440,11 @@ def _astray(state: State) -> tuple[Bool[Array, " particles"], Bool[Array, "walls
 def _sample(packing: Packing, state: State, on_wall: Float[Array, "walls 3"]) -> Sample:
     edges, history = state.edges, state.wall_history
     i, j = sides_of(packing.sides, edges.i), sides_of(packing.sides, edges.j)
-    overlap, _ = pair_geometry(packing.radius, state.position, edges)
+    reach = packing.radius[edges.i] + packing.radius[edges.j]
+    overlap, _ = jax.vmap(overlap_and_normal)(state.position[edges.i], state.position[edges.j], reach, edges.active)
     d_i, d_j = jax.vmap(pair_split)(i, j, edges.overlap_max)
     beyond = edges.active & ((d_i > i.tested) | (d_j > j.tested))
+    beyond_at_walls = history.overlap_max > jnp.broadcast_to(packing.sides.tested[:, None], history.overlap_max.shape)
     wall_overlap = [packing.radius - jax.vmap(wall.distance)(state.position) for wall in state.walls]
     touching = jnp.sum(overlap > 0) + sum(jnp.sum(x > 0) for x in wall_overlap)
     kinetic = 0.5 * jnp.sum(packing.mass * jnp.sum(state.velocity**2, axis=1)) + 0.2 * jnp.sum(
@@ -441,6 +455,6 @@ def _sample(packing: Packing, state: State, on_wall: Float[Array, "walls 3"]) ->
         state.walls,
         on_wall,
         touching,
-        jnp.sum(beyond) + jnp.sum(history.overlap_max > packing.sides.tested[:, None]),
+        jnp.sum(beyond) + jnp.sum(beyond_at_walls),
         kinetic,
     )

@@ -120,7 +120,7 @@ def carry_history(old: Edges, new: Edges) -> Edges:
         new,
         (
             jnp.where(known, old.overlap_max[place], 0.0),
-            jnp.where(known[:, None], old.slip[place], 0.0),
+            jax.vmap(lambda known, slip: jnp.where(known, slip, 0.0))(known, old.slip[place]),
         ),
     )
 
@@ -160,7 +160,7 @@ def relabel(edges: Edges, label: Int[Array, " particles"]) -> Edges:
         sorted_index(jnp.minimum(i, j)),
         sorted_index(jnp.maximum(i, j)),
         edges.overlap_max[order],
-        (turned[:, None] * edges.slip)[order],
+        jax.vmap(jnp.multiply)(edges.slip, turned)[order],
         edges.wanted,
         edges.particles,
     )

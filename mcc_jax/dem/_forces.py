@@ -8,11 +8,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._numerics import shared
-from .._types import Scalar, scalar
+from .._types import Flag, Scalar, scalar
 from ._edges import Edges
 from ._pair import largest_overlap, pair_force, wall_force
-from ._side import HalfContact, sides_of
-from ._walls import Walls
+from ._side import HalfContact
+from ._walls import Wall, Walls
 
 Vectors = Float[Array, "particles 3"]
 Vector = Float[Array, " 3"]
@@ -91,27 +91,43 @@ class Forces(eqx.Module):
     on_wall: Float[Array, "walls 3"]
 
 
+class _Body(eqx.Module):
+    """One sphere, as its contacts see it."""
+
+    radius: Scalar
+    mass: Scalar
+    side: HalfContact
+    position: Vector
+    velocity: Vector
+    spin: Vector
+
+
 class _Contact(eqx.Module):
-    """One contact: what acts on the first body, and what the contact remembers."""
+    """One contact: force on the first body, its couple per radius of either body, and what the contact remembers."""
 
     force: Vector
-    tangential: Vector
+    couple: Vector
     overlap_max: Scalar
     slip: Vector
 
 
-def pair_geometry(radius: Float[Array, " particles"], position: Vectors, edges: Edges) -> tuple[Array, Array]:
-    """Overlap [m] and unit normal from i to j of every edge; the overlap is -1 m where the list is padded.
+def overlap_and_normal(i: Vector, j: Vector, reach: Scalar, listed: Flag) -> tuple[Scalar, Vector]:
+    """Overlap [m] of two spheres and unit vector from i to j.
 
-    Two centres in one place have no normal: they get none, and so no force.
+    Two centres in one place have no normal: they get none, and so no force. A place in the list that no pair uses
+    overlaps by -1 m. A position that is NaN shows.
+
+    Args:
+        i, j: centres [m].
+        reach: sum of the radii [m].
+        listed: whether this is a pair at all.
     """
-    between = position[edges.j] - position[edges.i]
-    square = jnp.sum(between * between, axis=1)
-    apart = edges.active & (square > 0)
+    between = j - i
+    square = jnp.sum(between * between)
+    apart = listed & (square > 0)
     distance = shared(jnp.sqrt(jnp.where(apart, square, 1.0)))
-    overlap = jnp.where(apart, radius[edges.i] + radius[edges.j] - distance, -1.0)
-    overlap = jnp.where(edges.active & jnp.isnan(square), square, overlap)
-    return overlap, jnp.where(apart[:, None], between * shared(1 / distance)[:, None], 0.0)
+    overlap = jnp.where(apart, reach - distance, jnp.where(listed & jnp.isnan(square), square, -1.0))
+    return overlap, jnp.where(apart, between * shared(1 / distance), 0.0)
 
 
 def contact_forces(
@@ -138,61 +154,68 @@ def contact_forces(
         history: of the contacts with walls.
         time_step: over which slip adds up [s].
     """
-    i, j = edges.i, edges.j
-    side_i, side_j = sides_of(packing.sides, i), sides_of(packing.sides, j)
-    overlap, normal = pair_geometry(packing.radius, position, edges)
-    k = shared(side_i.k1 * side_j.k1 / (side_i.k1 + side_j.k1))
-    mass = shared(packing.mass[i] * packing.mass[j] / (packing.mass[i] + packing.mass[j]))
-    arm = packing.radius[i][:, None] * spin[i] + packing.radius[j][:, None] * spin[j]
-    relative = velocity[j] - velocity[i] - jnp.cross(arm, normal)
-    # Without the barriers XLA computes the law again for every use of its force.
-    overlap, normal, relative = jax.lax.optimization_barrier((overlap, normal, relative))
-    elastic = jax.lax.optimization_barrier(jax.vmap(pair_force)(side_i, side_j, edges.overlap_max, overlap))
-    pairs = jax.vmap(_contact, (None, None, 0, 0, 0, 0, 0, 0, 0, 0, None))(
-        interaction,
-        interaction.friction,
-        elastic,
-        k,
-        mass,
-        normal,
-        relative,
-        edges.overlap_max,
-        overlap,
-        edges.slip,
-        time_step,
-    )
-    couple = jnp.cross(normal, pairs.tangential)
-    load = jnp.concatenate([pairs.force, packing.radius[i][:, None] * couple], axis=1)
-    load_j = jnp.concatenate([-pairs.force, packing.radius[j][:, None] * couple], axis=1)
-    total = jnp.zeros((position.shape[0], 6), position.dtype).at[i].add(load).at[j].add(load_j)
+    bodies = jax.vmap(_Body)(packing.radius, packing.mass, packing.sides, position, velocity, spin)
+    pairs, load = pair_loads(interaction, bodies, edges, time_step)
     edges = eqx.tree_at(lambda e: (e.overlap_max, e.slip), edges, (pairs.overlap_max, pairs.slip))
-
     on_wall, columns = [], []
     for w, wall in enumerate(walls):
-        inward = jax.vmap(wall.normal_at)(position)
-        overlap = packing.radius - jax.vmap(wall.distance)(position)
-        relative = wall.velocity - velocity + jnp.cross(packing.radius[:, None] * spin, inward)
-        contacts = jax.vmap(_contact, (None, None, 0, 0, 0, 0, 0, 0, 0, 0, None))(
-            interaction,
-            interaction.wall_friction,
-            jax.lax.optimization_barrier(jax.vmap(wall_force)(packing.sides, history.overlap_max[:, w], overlap)),
-            packing.sides.k1,
-            packing.mass,
-            -inward,
-            relative,
-            history.overlap_max[:, w],
-            overlap,
-            history.slip[:, w],
-            time_step,
-        )
-        torque = packing.radius[:, None] * jnp.cross(-inward, contacts.tangential)
-        total = total + jnp.concatenate([contacts.force, torque], axis=1)
+        against = jax.vmap(_against, (None, None, 0, 0, 0, None))
+        contacts = against(interaction, wall, bodies, history.overlap_max[:, w], history.slip[:, w], time_step)
+        load = load + _load(contacts.force, packing.radius, contacts.couple)
         on_wall.append(-jnp.sum(contacts.force, axis=0))
         columns.append((contacts.overlap_max, contacts.slip))
     if walls:
         history = WallHistory(*(jnp.stack(x, axis=1) for x in zip(*columns, strict=True)))
-    forces = Forces(total[:, :3], total[:, 3:], jnp.stack(on_wall) if walls else jnp.zeros((0, 3), position.dtype))
+    forces = Forces(load[:, :3], load[:, 3:], jnp.stack(on_wall) if walls else jnp.zeros((0, 3), position.dtype))
     return forces, edges, history
+
+
+def pair_loads(
+    interaction: Interaction, bodies: _Body, edges: Edges, time_step: Scalar
+) -> tuple[_Contact, Float[Array, "particles 6"]]:
+    """Contacts of all edges, and their force and torque summed over the particles."""
+    i, j = (jax.tree.map(lambda x, at=at: x[at], bodies) for at in (edges.i, edges.j))
+    between = jax.vmap(_between, (None, 0, 0, 0, 0, 0, None))
+    pairs = between(interaction, i, j, edges.active, edges.overlap_max, edges.slip, time_step)
+    total = jnp.zeros((bodies.radius.shape[0], 6), bodies.position.dtype)
+    total = total.at[edges.i].add(_load(pairs.force, i.radius, pairs.couple))
+    return pairs, total.at[edges.j].add(_load(-pairs.force, j.radius, pairs.couple))
+
+
+@jax.vmap
+def _load(force: Vector, radius: Scalar, couple: Vector) -> Float[Array, " 6"]:
+    return jnp.concatenate([force, radius * couple])
+
+
+def _between(
+    interaction: Interaction,
+    i: _Body,
+    j: _Body,
+    listed: Flag,
+    overlap_max: Scalar,
+    slip: Vector,
+    time_step: Scalar,
+) -> _Contact:
+    overlap, normal = overlap_and_normal(i.position, j.position, i.radius + j.radius, listed)
+    relative = j.velocity - i.velocity - jnp.cross(i.radius * i.spin + j.radius * j.spin, normal)
+    # Without the barriers XLA computes the law again for every use of its force.
+    overlap, normal, relative = jax.lax.optimization_barrier((overlap, normal, relative))
+    elastic = jax.lax.optimization_barrier(pair_force(i.side, j.side, overlap_max, overlap))
+    k = shared(i.side.k1 * j.side.k1 / (i.side.k1 + j.side.k1))
+    mass = shared(i.mass * j.mass / (i.mass + j.mass))
+    friction = interaction.friction
+    return _contact(interaction, friction, elastic, k, mass, normal, relative, overlap_max, overlap, slip, time_step)
+
+
+def _against(
+    interaction: Interaction, wall: Wall, body: _Body, overlap_max: Scalar, slip: Vector, time_step: Scalar
+) -> _Contact:
+    outward = -wall.normal_at(body.position)
+    overlap = body.radius - wall.distance(body.position)
+    relative = wall.velocity - body.velocity - jnp.cross(body.radius * body.spin, outward)
+    elastic = jax.lax.optimization_barrier(wall_force(body.side, overlap_max, overlap))
+    friction, k, mass = interaction.wall_friction, body.side.k1, body.mass
+    return _contact(interaction, friction, elastic, k, mass, outward, relative, overlap_max, overlap, slip, time_step)
 
 
 def _contact(
@@ -227,12 +250,12 @@ def _contact(
     limit = friction * push
     size = _norm(trial)
     slips = size > limit
-    tangential = trial * jnp.where(slips, shared(limit / jnp.where(slips, size, 1.0)), 1.0)[None]
+    tangential = trial * jnp.where(slips, shared(limit / jnp.where(slips, size, 1.0)), 1.0)
     tangential = jax.lax.optimization_barrier(tangential)
     held = jnp.where(slips, tangential * shared(1 / jnp.where(stiffness > 0, stiffness, 1.0)), slip)
     return _Contact(
         tangential - push * normal,
-        tangential,
+        jnp.cross(normal, tangential),
         largest_overlap(overlap_max, overlap),
         jnp.where(touching, held, 0.0),
     )

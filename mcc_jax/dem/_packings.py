@@ -74,7 +74,8 @@ def scattered(
     place = jnp.asarray(centres)[jax.random.permutation(order, len(centres))[: len(radius)]]
     # A sphere may move by half of what is left between it and the largest there could be beside it.
     room = jnp.maximum(0.5 * pitch - radius - 0.5 * gap * largest, 0.0) / math.sqrt(3)
-    return place + room[:, None] * jax.random.uniform(shake, place.shape, minval=-1.0), layers * pitch
+    shift = jax.random.uniform(shake, place.shape, minval=-1.0)
+    return place + jax.vmap(jnp.multiply)(shift, room), layers * pitch
 
 
 def relative_density(packing: Packing, radius: float, bottom: float, top: float) -> float:

@@ -92,13 +92,13 @@ def die(radius: float, height: float, dtype: type = jnp.float64) -> Walls:
     if not (radius > 0 and height > 0):
         raise InputError(f"a die of radius {radius} m and height {height} m", remedy="Both must be positive.")
 
-    def vector(x: float, y: float, z: float) -> Array:
-        return jnp.asarray([x, y, z], dtype)
+    def along_z(z: float) -> Array:
+        return jnp.asarray([0.0, 0.0, z], dtype)
 
-    rest = vector(0, 0, 0)
+    rest = along_z(0.0)
     return (
-        Plane(rest, vector(0, 0, 1), rest),
-        Plane(vector(0, 0, height), vector(0, 0, -1), rest),
+        Plane(rest, along_z(1.0), rest),
+        Plane(along_z(height), along_z(-1.0), rest),
         Cylinder(jnp.asarray(radius, dtype), jnp.asarray(height, dtype), jnp.asarray(0.05, dtype), rest),
     )
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from two_scalars import bisected_path
 
 from mcc_jax import InputError, MccLaw, Particle, Plastic, StrainScaling, Unloading, paper_law, paper_population
 from mcc_jax.dem import (
@@ -22,8 +23,6 @@ from mcc_jax.dem import (
     wall_energy,
     wall_force,
 )
-
-from two_scalars import bisected_path
 
 UM, MN = 1e-6, 1e-3
 FORMS = [(u, s) for u in Unloading for s in (StrainScaling.RAW, StrainScaling.MASTER)]
