@@ -236,27 +236,9 @@ def _series_jvp(primals, tangents):
 
 
 def _solve(i: _Numbers, j: _Numbers, overlap: Scalar) -> _Series:
-    """Equal-force split by Newton's method with the curvature (Halley), kept between bounds.
-
-    A split that meets the force but for rounding stays where it is: asked again, the bounds would throw it out.
-    """
     whole = jnp.where(overlap > 0, overlap, 0.0)
-    share = shared(j.k1 / (i.k1 + j.k1))
-    d = share * whole
-    low, high = jnp.zeros_like(d), whole
-    for _ in range(SPLIT_STEPS):
-        rest = whole - d
-        force_i, slope_i, bend_i = _polynomial(i, d)
-        force_j, slope_j, bend_j = _polynomial(j, rest)
-        excess, slope, bend = force_i - force_j, slope_i + slope_j, bend_i - bend_j
-        low = jnp.where(excess < 0, d, low)
-        high = jnp.where(excess > 0, d, high)
-        settled = jnp.abs(excess) <= 4 * jnp.finfo(d.dtype).eps * (jnp.abs(force_i) + jnp.abs(force_j))
-        square = slope * slope
-        divisor = jnp.maximum(square - excess * bend, 0.5 * square)
-        new = d - shared(excess * slope / jnp.where(divisor > 0, divisor, 1.0))
-        new = jnp.where((new < low) | (new > high) | (divisor <= 0), 0.5 * (low + high), new)
-        d = jnp.where(settled, d, new)
+    # One number leaves the iteration and a barrier closes it: with more, or without, XLA iterates again for each use.
+    d = jax.lax.optimization_barrier(_split(i, j, whole))
     # One more step, on both sides separately: beside a side much stiffer, what is left of the overlap has no digits.
     rest = whole - d
     force_i, force_j = (x * secant_modulus(s.k1, s.k3, s.k5, x) for s, x in ((i, d), (j, rest)))
@@ -266,8 +248,30 @@ def _solve(i: _Numbers, j: _Numbers, overlap: Scalar) -> _Series:
     return _Series(d - change, rest + change, flexibility * (t_j * force_i + t_i * force_j))
 
 
+def _split(i: _Numbers, j: _Numbers, whole: Scalar) -> Scalar:
+    """Compression of i at equal force, by Newton's method with the curvature (Halley), kept between bounds.
+
+    A split that meets the force but for rounding stays where it is: asked again, the bounds would throw it out.
+    """
+    d = shared(j.k1 / (i.k1 + j.k1)) * whole
+    low, high = jnp.zeros_like(d), whole
+    for _ in range(SPLIT_STEPS):
+        force_i, slope_i, bend_i = _polynomial(i, d)
+        force_j, slope_j, bend_j = _polynomial(j, whole - d)
+        excess, slope, bend = force_i - force_j, slope_i + slope_j, bend_i - bend_j
+        low = jnp.where(excess < 0, d, low)
+        high = jnp.where(excess > 0, d, high)
+        settled = jnp.abs(excess) <= 4 * jnp.finfo(d.dtype).eps * (jnp.abs(force_i) + jnp.abs(force_j))
+        square = slope * slope
+        divisor = jnp.maximum(square - excess * bend, 0.5 * square)
+        new = d - shared(excess * slope / jnp.where(divisor > 0, divisor, 1.0))
+        new = jnp.where((new < low) | (new > high) | (divisor <= 0), 0.5 * (low + high), new)
+        d = jnp.where(settled, d, new)
+    return d
+
+
 def _polynomial(side: _Numbers, d: Scalar) -> tuple[Scalar, Scalar, Scalar]:
     """Force, slope and half the curvature of a side."""
     square = d * d
-    k3, k5 = square * side.k3, square * square * side.k5
-    return d * (side.k1 - k3 + k5), side.k1 - 3 * k3 + 5 * k5, shared((10 * k5 - 3 * k3) / jnp.where(d > 0, d, 1.0))
+    k3, k5 = square * side.k3, square * side.k5
+    return d * (side.k1 - k3 + square * k5), side.k1 - 3 * k3 + 5 * square * k5, d * (10 * k5 - 3 * side.k3)
