@@ -10,6 +10,8 @@ from mcc_jax.dem import Interaction, Motion, die, scattered, spheres, stable_tim
 
 DIE_RADIUS = 2.2e-4
 SKIN = 2e-5
+CAPACITY = 320
+"""Room for all pairs of 24 spheres: with one length of list everything compiles once."""
 PRESSING = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 0.0]])
 
 
@@ -30,16 +32,22 @@ def dense(count=24):
     spheres_ = packing(count)
     position, height = scattered(jax.random.key(0), spheres_.radius, DIE_RADIUS)
     squeeze = 0.72
-    return start(spheres_, die(DIE_RADIUS, squeeze * height), squeezed(position, squeeze), SKIN)
+    return start(spheres_, die(DIE_RADIUS, squeeze * height), squeezed(position, squeeze), SKIN, CAPACITY)
 
 
 @functools.cache
 def loose(count=24):
     spheres_ = packing(count)
     position, height = scattered(jax.random.key(0), spheres_.radius, DIE_RADIUS)
-    return start(spheres_, die(DIE_RADIUS, height), position, SKIN)
+    return start(spheres_, die(DIE_RADIUS, height), position, SKIN, CAPACITY)
+
+
+@functools.cache
+def resolved():
+    """Time step of the packing [s]."""
+    return stable_time_step(packing())
 
 
 def motion(friction=0.3, damping=0.1, share=1.0, **further):
     interaction = Interaction(damping=damping, friction=friction, wall_friction=friction)
-    return Motion.of(share * stable_time_step(packing()), interaction, **further)
+    return Motion.of(share * resolved(), interaction, **further)

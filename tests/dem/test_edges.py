@@ -25,6 +25,7 @@ from mcc_jax.dem import (
 )
 
 PARTICLES = 30
+FORCES = jax.jit(contact_forces)
 
 
 def with_history(edges, seed=0):
@@ -137,7 +138,7 @@ def unloading():
 
 def forces_of(state, edges):
     pack, move = packing(), motion()
-    return jax.jit(contact_forces)(
+    return FORCES(
         pack,
         move.interaction,
         state.walls,
@@ -155,7 +156,7 @@ def test_a_new_list_in_the_middle_of_unloading_changes_nothing():
     state = unloading()
     pairs = close_pairs(np.asarray(state.position), np.asarray(packing().radius), SKIN)
     shuffled = np.random.default_rng(0).permutation(pairs)[:, ::-1]
-    other = carry_history(state.edges, list_edges(shuffled, len(state.position), 3 * state.edges.capacity))
+    other = carry_history(state.edges, list_edges(shuffled, len(state.position), 2 * state.edges.capacity))
     kept = {p: v for p, v in remembered(state.edges).items() if p in remembered(other)}
     assert kept
     assert {p: remembered(other)[p] for p in kept} == kept
