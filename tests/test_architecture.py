@@ -27,6 +27,7 @@ LAYERS = {
     "effects": 4,
     "simulate": 5,
     "calibrate": 6,
+    "dem": 7,
     "discover": 7,
     "export": 7,
     "plots": 8,
