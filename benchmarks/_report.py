@@ -29,6 +29,13 @@ def environment(*packages):
     }
 
 
+def verdict(target, value, limit, *, at_least=False):
+    """Row of the table of targets."""
+    passed = value >= limit if at_least else value <= limit
+    text = f"at {'least' if at_least else 'most'} {limit:g}"
+    return {"target": target, "value": value, "limit": text, "verdict": bool(passed)}
+
+
 def settings(values):
     """Rows of the table of settings."""
     return [{"setting": key, "value": str(value)} for key, value in values.items()]

@@ -7,7 +7,6 @@ All rows see the same campaign: the paper's 20 particles. The textbook samplers 
 
 from __future__ import annotations
 
-import argparse
 import subprocess
 import sys
 import time
@@ -88,30 +87,10 @@ def least_squares(repeats: int) -> tuple[list[dict], list[dict]]:
     rows.append(_row("lmfit.minimize", time.perf_counter() - start, x, 0.5 * fitted.chisqr, ours))
     best = min(row["seconds"] for row in rows[2:])
     verdicts = [
-        {
-            "target": "least squares, warm [s]",
-            "value": rows[1]["seconds"],
-            "limit": 0.1,
-            "verdict": rows[1]["seconds"] <= 0.1,
-        },
-        {
-            "target": "everything, warm [s]",
-            "value": rows[0]["seconds"],
-            "limit": 0.1,
-            "verdict": rows[0]["seconds"] <= 0.1,
-        },
-        {
-            "target": "least squares / faster of SciPy and lmfit",
-            "value": rows[1]["seconds"] / best,
-            "limit": 0.1,
-            "verdict": rows[1]["seconds"] <= 0.1 * best,
-        },
-        {
-            "target": "same optimum (SciPy), relative",
-            "value": rows[2]["largest difference"],
-            "limit": 1e-6,
-            "verdict": rows[2]["largest difference"] <= 1e-6,
-        },
+        _report.verdict("least squares, warm [s]", rows[1]["seconds"], 0.1),
+        _report.verdict("everything, warm [s]", rows[0]["seconds"], 0.1),
+        _report.verdict("least squares / faster of SciPy and lmfit", rows[1]["seconds"] / best, 0.1),
+        _report.verdict("same optimum (SciPy), relative", rows[2]["largest difference"], 1e-6),
     ]
     return rows, verdicts
 
@@ -154,21 +133,14 @@ def posterior(repeats: int, budget: float) -> tuple[list[dict], list[dict]]:
         )
     ours = least / warm
     verdicts = [
-        {"target": "posterior from a cold process [s]", "value": cold, "limit": 15.0, "verdict": cold <= 15},
-        {"target": "posterior, warm [s]", "value": warm, "limit": 2.0, "verdict": warm <= 2},
-        {"target": "smallest bulk ESS, at least", "value": float(least), "limit": 2000, "verdict": least >= 2000},
-        {"target": "divergences", "value": result.divergences, "limit": 0, "verdict": result.divergences == 0},
+        _report.verdict("posterior from a cold process [s]", cold, 15.0),
+        _report.verdict("posterior, warm [s]", warm, 2.0),
+        _report.verdict("smallest bulk ESS", float(least), 2000, at_least=True),
+        _report.verdict("divergences", result.divergences, 0),
     ]
     for row in rows[1:]:
         ratio = ours / row["ESS per s"] if row["ESS per s"] > 0 else float("inf")
-        verdicts.append(
-            {
-                "target": f"ESS per second over {row['row']}, at least",
-                "value": ratio,
-                "limit": 100,
-                "verdict": ratio >= 100,
-            }
-        )
+        verdicts.append(_report.verdict(f"ESS per second over {row['row']}", ratio, 100, at_least=True))
     return rows, verdicts
 
 
@@ -186,10 +158,9 @@ def _sampler(name: str, seconds: float, ess: float, rhat: float, divergences: in
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = _report.parser(__doc__)
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--budget", type=float, default=200.0, help="seconds for each textbook sampler")
-    parser.add_argument("--write", action="store_true", help="keep the tables in benchmarks/results/")
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     fits, fit_verdicts = least_squares(arguments.repeats)
@@ -203,7 +174,7 @@ def main():
         "Targets": fit_verdicts + sampler_verdicts,
         "Least squares": fits,
         "Posterior": samplers,
-        "Settings": [{"setting": key, "value": str(value)} for key, value in settings.items()],
+        "Settings": _report.settings(settings),
     }
     _report.write("calibrate", "Speed of the joint calibration", tables, arguments.write)
 

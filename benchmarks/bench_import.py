@@ -43,7 +43,7 @@ def main():
         times.append({"statement": f"`{statement}`", "median [s]": statistics.median(column), "min [s]": min(column)})
         if name != "base":
             ratio = statistics.median(one[name] / one["base"] for one in rounds)
-            targets.append({"target": f"{name} / base", "ratio": ratio, "at most": TARGET, "verdict": ratio <= TARGET})
+            targets.append(_report.verdict(f"{name} / base", ratio, TARGET))
     settings = {"rounds": arguments.rounds, **_report.environment("jax", "jaxlib", "equinox", "optimistix")}
     tables = {"Targets": targets, "Times": times, "Settings": _report.settings(settings)}
     _report.write("import", "Time of import", tables, arguments.write)

@@ -28,11 +28,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from mcc_jax import in_blocks
+from mcc_jax._blocks import BLOCK, in_blocks
 from mcc_jax.geometry import Particle
 from mcc_jax.law import History, MccLaw, Plastic
 
-BLOCK = 2048
 TARGETS = {"references": 1.5, "gradient": 3.0, "load control": 4.0, "traces": 1}
 
 
@@ -158,7 +157,7 @@ def measure(kind, p, peak, given, displacement_control, load_control, numpy_argu
 
     def verdict(name, row, reference, limit):
         ratio = float(np.median(np.array(row.seconds) / np.array(reference.seconds)))
-        return {"target": f"{kind}: {name}", "ratio": ratio, "at most": limit, "verdict": ratio <= limit}
+        return _report.verdict(f"{kind}: {name}", ratio, limit)
 
     best = min(references, key=lambda row: row.best)
     verdicts = [
@@ -169,9 +168,7 @@ def measure(kind, p, peak, given, displacement_control, load_control, numpy_argu
         verdict("load control / displacement control", load, forward, TARGETS["load control"]),
     ]
     count = traces(displacement_control, law, particle, state, displacement)
-    verdicts.append(
-        {"target": f"{kind}: traces while numbers change", "ratio": count, "at most": 1, "verdict": count == 1}
-    )
+    verdicts.append(_report.verdict(f"{kind}: traces while numbers change", count, TARGETS["traces"]))
     return [{"work": kind, **row.record()} for row in rows], verdicts, accuracy
 
 

@@ -6,7 +6,6 @@ twice: the second run shows the time without compilation. Memory is the process'
 
 from __future__ import annotations
 
-import argparse
 import json
 import subprocess
 import sys
@@ -66,11 +65,10 @@ def one_size(count: int, points: int) -> dict:
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = _report.parser(__doc__)
     parser.add_argument("--sizes", type=int, nargs="+", default=[100, 1000, 10_000])
     parser.add_argument("--points", type=int, default=300)
     parser.add_argument("--one", type=int, help="run this size here and print its row as JSON")
-    parser.add_argument("--write", action="store_true", help="keep the tables in benchmarks/results/")
     arguments = parser.parse_args()
     if arguments.one:
         print(json.dumps(one_size(arguments.one, arguments.points)))
@@ -83,36 +81,17 @@ def main():
         print(rows[-1], flush=True)
     largest = rows[-1]
     verdicts = [
-        {
-            "target": f"{largest['particles']} particles, first run [s]",
-            "value": largest["first run [s]"],
-            "at most": TARGETS["seconds"],
-            "verdict": largest["first run [s]"] <= TARGETS["seconds"],
-        },
-        {
-            "target": "peak memory [GiB]",
-            "value": largest["peak memory [GiB]"],
-            "at most": TARGETS["GiB"],
-            "verdict": largest["peak memory [GiB]"] <= TARGETS["GiB"],
-        },
+        _report.verdict(
+            f"{largest['particles']} particles, first run [s]", largest["first run [s]"], TARGETS["seconds"]
+        ),
+        _report.verdict("peak memory [GiB]", largest["peak memory [GiB]"], TARGETS["GiB"]),
     ]
     if len(rows) > 1:
         growth = largest["second run [s]"] / rows[0]["second run [s]"]
         ratio = largest["particles"] / rows[0]["particles"]
-        verdicts.append(
-            {
-                "target": f"time for {ratio:.0f} times the particles",
-                "value": growth,
-                "at most": ratio,
-                "verdict": growth <= ratio,
-            }
-        )
-    settings = _report.environment("jax", "numpyro", "numpy")
-    tables = {
-        "Targets": verdicts,
-        "Runs": rows,
-        "Settings": [{"setting": k, "value": str(v)} for k, v in settings.items()],
-    }
+        verdicts.append(_report.verdict(f"time for {ratio:.0f} times the particles", growth, ratio))
+    settings = _report.settings(_report.environment("jax", "numpyro", "numpy"))
+    tables = {"Targets": verdicts, "Runs": rows, "Settings": settings}
     _report.write("scale", "The posterior of many particles", tables, arguments.write)
 
 

@@ -15,7 +15,6 @@ Run `uv run --group bench python benchmarks/study_posterior.py --write` (an hour
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from pathlib import Path
@@ -173,10 +172,9 @@ def plot(results: dict[str, list[dict]], file: Path) -> None:
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = _report.parser(__doc__)
     parser.add_argument("--campaigns", type=int, default=300)
     parser.add_argument("--settings", nargs="+", default=["prior", "collapsed", "five"])
-    parser.add_argument("--write", action="store_true", help="keep tables and picture in benchmarks/results/")
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     results: dict[str, list[dict]] = {}
@@ -221,7 +219,7 @@ def main():
         "instrument": str(INSTRUMENT),
         **_report.environment("jax", "numpyro", "numpy"),
     }
-    tables["Settings"] = [{"setting": k, "value": str(v)} for k, v in settings.items()]
+    tables["Settings"] = _report.settings(settings)
     _report.write("posterior", "Simulation-based calibration of the joint posterior", tables, arguments.write)
     folder = Path(__file__).parent / "results" if arguments.write else Path(tempfile.gettempdir())
     plot(results, folder / "posterior_ranks.png")

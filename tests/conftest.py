@@ -31,7 +31,7 @@ def pytest_configure(config):
 
 def pytest_collection_modifyitems(items):
     """The longest files first: begun last, they would keep one worker busy while the other waits."""
-    first = ("test_notebooks", "/discover/", "/joint/", "/cli/", "/plots/")
+    first = ("/discover/", "/joint/", "/cli/", "/plots/")
     items.sort(key=lambda item: next((i for i, part in enumerate(first) if part in item.nodeid), len(first)))
 
 

@@ -19,6 +19,7 @@ def test_there_are_notebooks():
     ]
 
 
+@pytest.mark.notebook
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda n: n.stem)
 @pytest.mark.filterwarnings("default")
 def test_notebook_runs(notebook):

@@ -10,7 +10,7 @@ from click.core import ParameterSource
 
 from ._output import json_text, results
 from ._session import say, say_table, session
-from ._types import Location, Number, law_options, out_option, seed_option
+from ._types import Location, law_options, out_option, priors_option, seed_option, threshold_option
 
 METHODS = ("paper", "least-squares", "bayes")
 # Which methods an option belongs to; given with another one it would be ignored, so it is refused.
@@ -37,16 +37,8 @@ def _applies(name: str, method: str) -> bool:
 @click.argument("campaign", type=Location(), metavar="CAMPAIGN")
 @out_option(required=True)
 @click.option("--method", type=click.Choice(METHODS), default="bayes", show_default=True, help="How to calibrate.")
-@click.option(
-    "--threshold-MPa",
-    "threshold_MPa",
-    type=Number(0, metavar="MPa"),
-    default=0.2,
-    show_default=True,
-    help="Stress below which only surface asperities deform. paper: of the offset step, which 0 leaves out; "
-    "otherwise: points below it do not count.",
-)
-@click.option("--priors", type=Location(), metavar="FILE", help="TOML file of priors.  [least-squares, bayes]")
+@threshold_option(". paper: of the offset step, which 0 leaves out; otherwise: points below it do not count.")
+@priors_option("  [least-squares, bayes]")
 @click.option(
     "--modulus-scatter", is_flag=True, help="Let every particle have its own modulus.  [least-squares, bayes]"
 )

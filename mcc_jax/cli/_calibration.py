@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from .._errors import InputError
 from ..calibrate import BayesCalibration, JointModel, LeastSquaresCalibration, PaperCalibration
-from ._output import Stage, json_text
+from ._figures import FIGURES, write_figures, write_result
+from ._output import Stage
 from ._session import Tell, say
 
-RESULT, FIGURES, POSTERIOR = "calibration.json", "figures", "posterior.nc"
+RESULT, POSTERIOR = "calibration.json", "posterior.nc"
 Calibration = PaperCalibration | LeastSquaresCalibration | BayesCalibration
-_FIGURE = re.compile(rf"{FIGURES}/[A-Za-z0-9_-]+\.png")
 
 
 def write_calibration(
@@ -36,13 +36,8 @@ def write_calibration(
     Returns:
         The contents of the file.
     """
-    names: list[str] = []
-    tell("drawing the figures" if figures else "writing")
-    if figures:
-        (stage.folder / FIGURES).mkdir()
-        saved = _save(calibration, stage.folder / FIGURES)
-        names = sorted(f"{FIGURES}/{path.name}" for path in saved)
-    stage.stale += [name for name in earlier_figures(stage.directory / RESULT) if name not in names]
+    draw = functools.partial(_save, calibration) if figures else None
+    names = write_figures(stage, RESULT, draw, tell)
     files = []
     if isinstance(calibration, BayesCalibration):
         from ..calibrate import write_posterior
@@ -53,7 +48,7 @@ def write_calibration(
     elif _is_ours(stage.directory / RESULT):
         stage.stale.append(POSTERIOR)  # of an earlier run: it would contradict what lies beside it now
     content = calibration.to_json() | {"figures": names, "files": files, "provenance": dict(origin)}
-    (stage.folder / RESULT).write_text(json_text(content), encoding="utf-8")
+    write_result(stage, RESULT, content)
     return content
 
 
@@ -89,16 +84,6 @@ def _is_ours(file: Path) -> bool:
         return POSTERIOR in json.loads(file.read_text(encoding="utf-8"))["files"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return False
-
-
-def earlier_figures(file: Path) -> list[str]:
-    """Figures that an earlier result names; what is no such result names none."""
-    try:
-        listed = json.loads(file.read_text(encoding="utf-8"))["figures"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return []
-    names = listed if isinstance(listed, list) else []
-    return [name for name in names if isinstance(name, str) and _FIGURE.fullmatch(name)]
 
 
 def main_numbers(content: dict[str, Any]) -> list[tuple[str, str]]:

@@ -8,27 +8,15 @@ import click
 
 from ._output import json_text, results
 from ._session import say, session
-from ._types import Location, Number, law_options, out_option, seed_option
+from ._types import Location, exclude_option, law_options, out_option, priors_option, seed_option, threshold_option
 
 
 @click.command(short_help="Find, name and add what the law misses.")
 @click.argument("campaign", type=Location(), metavar="CAMPAIGN")
 @out_option(required=True)
-@click.option(
-    "--exclude",
-    multiple=True,
-    metavar="NAME",
-    help="A mechanism that cannot be there, on your authority; repeatable.",
-)
-@click.option(
-    "--threshold-MPa",
-    "threshold_MPa",
-    type=Number(0, metavar="MPa"),
-    default=0.2,
-    show_default=True,
-    help="Stress below which only surface asperities deform: points below it do not count.",
-)
-@click.option("--priors", type=Location(), metavar="FILE", help="TOML file of priors.")
+@exclude_option
+@threshold_option()
+@priors_option()
 @law_options
 @click.option(
     "--no-held-out", is_flag=True, help="Do not repeat the search without each particle: no gap on unseen particles."

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import functools
 import textwrap
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from .._errors import InputError
 from ..discover import Discovery
 from ..effects import LIBRARY
-from ._calibration import FIGURES, earlier_figures
-from ._output import Stage, json_text
+from ._figures import write_figures, write_result
+from ._output import Stage
 from ._session import Tell, say, say_table
 
 DISCOVERY = "discovery.json"
@@ -48,18 +50,17 @@ def write_discovery(
     Returns:
         The contents of the file.
     """
-    names: list[str] = []
-    tell("drawing the figures" if figures else "writing")
-    if figures:
-        from ..plots import discovery_figures, save_figures
-
-        (stage.folder / FIGURES).mkdir(exist_ok=True)
-        saved = save_figures(discovery_figures(found), stage.folder / FIGURES)
-        names = sorted(f"{FIGURES}/{path.name}" for path in saved)
-    stage.stale += [name for name in earlier_figures(stage.directory / DISCOVERY) if name not in names]
-    content = found.to_json() | {"figures": names, "provenance": dict(origin)}
-    (stage.folder / DISCOVERY).write_text(json_text(content), encoding="utf-8")
+    draw = functools.partial(_save, found) if figures else None
+    figures_drawn = write_figures(stage, DISCOVERY, draw, tell)
+    content = found.to_json() | {"figures": figures_drawn, "provenance": dict(origin)}
+    write_result(stage, DISCOVERY, content)
     return content
+
+
+def _save(found: Discovery, folder: Path) -> list[Path]:
+    from ..plots import discovery_figures, save_figures
+
+    return save_figures(discovery_figures(found), folder)
 
 
 def say_discovery(content: dict[str, Any]) -> None:

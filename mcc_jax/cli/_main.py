@@ -17,7 +17,8 @@ from ._calibrate import calibrate
 from ._convert import convert
 from ._demo import demo
 from ._discover import discover
-from ._group import PROGRAM, OneLineGroup
+from ._export import export
+from ._group import INTERRUPTED, PROGRAM, OneLineGroup
 from ._power import power
 from ._report import report
 from ._simulate import simulate
@@ -29,6 +30,7 @@ Examples:
   mcc-jax calibrate sim --out fit
   mcc-jax discover sim --out fit
   mcc-jax report fit
+  mcc-jax export fit --format c --out law
   mcc-jax convert FS1.txt --out tests --diameters 200,190,180
 
 \b
@@ -70,7 +72,7 @@ def cli(ctx: click.Context, debug: bool) -> None:
         click.echo(ctx.get_help())
 
 
-for _command in (demo, simulate, convert, calibrate, discover, power, report):
+for _command in (demo, simulate, convert, calibrate, discover, power, report, export):
     cli.add_command(_command)
 
 
@@ -106,8 +108,11 @@ def main() -> None:
         sys.stdout.reconfigure(errors="replace")  # names of particles may be any text, terminals may not
     try:
         cli.main(prog_name=PROGRAM)
-    except _Terminated as end:
-        # All is cleared up by now. What is left, the libraries' own tear-down, once took over a minute.
+    except SystemExit as end:
+        if not isinstance(end, _Terminated) and end.code != INTERRUPTED:
+            raise
+        # All is cleared up by now. What is left, the libraries' own tear-down, once took over a minute: it waits for
+        # compilers that are at work in other threads.
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(int(str(end.code)))

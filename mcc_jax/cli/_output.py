@@ -73,7 +73,8 @@ def results(directory: Path) -> Iterator[Stage]:
                     yield stage
                     _place(stage, work / "old")
                 finally:
-                    shutil.rmtree(work, ignore_errors=True)
+                    with _undisturbed():  # by the second Ctrl-C of somebody impatient
+                        shutil.rmtree(work, ignore_errors=True)
         except OSError as error:
             # Making the folder can fail at a parent of it, writing at anything inside.
             place = "" if error.filename is None else str(error.filename)

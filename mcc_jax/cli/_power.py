@@ -9,7 +9,7 @@ import click
 
 from ._output import json_text, results
 from ._session import say, say_table, session
-from ._types import Location, Number, law_options, out_option, seed_option
+from ._types import Location, exclude_option, law_options, out_option, priors_option, seed_option, threshold_option
 
 POWER = "power.json"
 
@@ -17,18 +17,9 @@ POWER = "power.json"
 @click.command(short_help="Say what a planned campaign could show.")
 @click.argument("campaign", type=Location(), metavar="CAMPAIGN")
 @out_option(required=True)
-@click.option(
-    "--exclude", multiple=True, metavar="NAME", help="A mechanism that cannot be there, on your authority; repeatable."
-)
-@click.option(
-    "--threshold-MPa",
-    "threshold_MPa",
-    type=Number(0, metavar="MPa"),
-    default=0.2,
-    show_default=True,
-    help="Stress below which only surface asperities deform: points below it do not count.",
-)
-@click.option("--priors", type=Location(), metavar="FILE", help="TOML file of priors.")
+@exclude_option
+@threshold_option()
+@priors_option()
 @law_options
 @seed_option("For the record: nothing here is random.")
 @click.option("--json", "as_json", is_flag=True, help="Print power.json instead of a table.")
@@ -59,6 +50,7 @@ def power(
         from ..effects import LIBRARY
         from ._calibration import joint_model, say_files
         from ._discovery import require_mechanisms
+        from ._figures import write_result
 
         require_mechanisms(exclude)
         tell("reading the campaign")
@@ -72,7 +64,7 @@ def power(
                 progress=tell,
             )
             content: dict[str, Any] = found.to_json() | {"seed": seed}
-            (stage.folder / POWER).write_text(json_text(content), encoding="utf-8")
+            write_result(stage, POWER, content)
     if as_json:
         click.echo(json_text(content).encode(), nl=False)
         return

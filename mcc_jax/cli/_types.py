@@ -127,6 +127,28 @@ def seed_option(help: str = "Seed of all draws.") -> Any:
     )
 
 
+def threshold_option(use: str = ": points below it do not count.") -> Any:
+    """`--threshold-MPa`; `use` says what it does."""
+    return click.option(
+        "--threshold-MPa",
+        "threshold_MPa",
+        type=Number(0, metavar="MPa"),
+        default=0.2,
+        show_default=True,
+        help=f"Stress below which only surface asperities deform{use}",
+    )
+
+
+def priors_option(where: str = "") -> Any:
+    """`--priors FILE`; `where` says with which methods."""
+    return click.option("--priors", type=Location(), metavar="FILE", help=f"TOML file of priors.{where}")
+
+
+exclude_option = click.option(
+    "--exclude", multiple=True, metavar="NAME", help="A mechanism that cannot be there, on your authority; repeatable."
+)
+
+
 def law_options(command: Any) -> Any:
     """`--unloading` and `--strain-scaling`."""
     scaling = click.option(

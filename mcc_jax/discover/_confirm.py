@@ -48,7 +48,7 @@ def held_out(system: System, choose: Choose, extended: Mapping[frozenset[int], S
         extended: for some sets of columns, the system around the law with these effects: a fold that chooses one fits
             and is judged there. The other particles alone fit its amplitudes; the system is only where lines are drawn.
     """
-    around = dict(extended or {})
+    around = extended or {}
     usable = np.flatnonzero(system.usable)
     basis = np.concatenate([system.place_columns, system.word_columns])
     whole = project(system, basis)

@@ -8,25 +8,26 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm
 
 from .._errors import InputError
 from ..calibrate import JointModel
-from ..calibrate.joint._bayes import summary
 from ..campaign import THRESHOLD_MPA, Campaign
-from ..effects import LIBRARY, Mechanism, Nuisance, Variant, present
-from ..law import PUNCH_AREA
+from ..effects import LIBRARY, Mechanism, present
 from ._candidates import untestable
-from ._closure import Closure, find_closure, pursue
+from ._closure import Closure
 from ._confirm import held_out
+from ._estimates import detection_limits, estimated_effects, population_parameters, with_draws
 from ._experiments import next_experiments
+from ._extensions import Extensions, serious
+from ._naming import chooser, name_missing
 from ._posterior import extended_posterior
+from ._punch import without_punch
 from ._refine import refined
-from ._refit import Refit, refit, system_at
-from ._result import Discovery, Effect, Verdict
-from ._score import DETECTABLE, Projection, family_wise, flips, project
-from ._search import Ranking, family_columns, pairs, random_probability, rank
-from ._system import GLOBALS, Base, Signals, System, base_fit, build_system, signals_of
+from ._result import Discovery, Verdict
+from ._score import project
+from ._search import Ranking, random_probability, rank
+from ._significance import FEWEST, by_noise_model, p_nothing_left, signs_of
+from ._system import Base, Signals, System, base_fit, build_system, signals_of
 from ._where import where
 from ._words import summary_of
 
@@ -36,32 +37,10 @@ LEVEL_OF_NOISE_MODEL = 0.005
 """Family-wise levels of the three tests for a gap: common to all particles, by their scatter; different from test to
 test; common, by the noise model, for effects of which few particles carry most of the information. Together 5 %."""
 
-INDEPENDENT = 100
-"""So many independent columns are counted where no bootstrap does it."""
-
-LEVEL_OF_MORE = 0.01
-"""Level at which something is missing besides the whole family of formulas of what was added."""
-
-LEVEL_OF_UNLISTED = 0.001
-"""Level at which something is missing besides every name, for saying that no name is right: no listed formula is
-nature's own, so that a little is always left, and this is the stronger claim."""
-
-BETTER, SHARE = 30.0, 0.1
-"""A formula of a few free words takes away this much chi2 more than any listed mechanism by chance and because no
-listed formula is nature's own, in addition this share of what the mechanism takes away. Beyond, it is not listed."""
-
-LIKE_THE_BEST = 0.1
-"""A mechanism whose probability is at least this share of the best one's belongs to the set."""
-
 LARGE = 40.0
 """Drop of chi2 by the best mechanism from which on the serious ones are fitted as they are: below, first order does."""
 
-SERIOUS, MOST_REFITS = 0.5, 8
-"""Mechanisms whose log evidence is at least this share of the best one's are serious; so many formulas at most."""
-
 REFINEMENTS = 2
-FEWEST = 4
-"""Below so many particles their scatter says nothing; the noise model has to do."""
 
 
 def discover(
@@ -125,40 +104,6 @@ def discover(
     return _judge(base, system, signals, missing, confirm, experiments, posterior, seed, started, tell)
 
 
-def without_punch(library: Mapping[str, Mechanism], base: Base) -> dict[str, Mechanism]:
-    """The library without the finite width of the punch, unless a contact grows wider than the punch is known to be.
-
-    A formula that knows neither would be nothing but another name for the compliance of the frame.
-    """
-    diameter = base.campaign.metadata.punch_diameter_um
-    tests = base.tests
-    size = np.asarray(tests.particle.D1 * tests.particle.D2 / tests.particle.D3)
-    travel = np.where(np.asarray(tests.mask), np.asarray(tests.displacement), -np.inf).max(1) - np.asarray(
-        base.fit.zero
-    )
-    widest = float(np.max(np.sqrt(PUNCH_AREA * size * np.maximum(travel, 0.0))))
-    outgrown = diameter is not None and 2 * widest > diameter
-
-    def known(variant: Variant) -> Variant | None:
-        if not any(n.name == PUNCH for n in variant.nuisances):
-            return variant
-        if not outgrown or diameter is None:
-            return None
-        radius = Nuisance(PUNCH, (diameter / 2,), (diameter / 2, diameter / 2), "radius of the flat punch, as recorded")
-        others = tuple(n for n in variant.nuisances if n.name != PUNCH)
-        return dataclasses.replace(variant, nuisances=(*others, radius))
-
-    kept = {}
-    for name, mechanism in library.items():
-        variants = tuple(v for v in map(known, mechanism.variants) if v is not None)
-        if variants:
-            kept[name] = Mechanism(name, mechanism.explanation, variants, mechanism.equivalences)
-    return kept
-
-
-PUNCH = "punch_radius_um"
-
-
 def _mostly_converged(base: Base) -> bool:
     return float(np.mean(np.asarray(base.fit.individual.converged))) >= 0.7
 
@@ -186,114 +131,13 @@ def _not_converged(base: Base, missing, seed: int, started: float) -> Discovery:
         held_out=None,
         labels=(),
         p_any=float("nan"),
-        before=_parameters(base, None),
+        before=population_parameters(base, None),
         after={},
         next_experiments=(),
         limits={},
         seed=seed,
         runtime_s=time.perf_counter() - started,
     )
-
-
-def _signs(system: System) -> np.ndarray:
-    return np.array([c.variant.sign for c in system.candidates])
-
-
-FREEDOM = 0.3
-"""How far nature's formula may differ from the best one of its family: by so much of it in every other one."""
-
-
-def _left(system: System, seed: int, chosen: list[int]) -> float:
-    """Family-wise probability that nothing is left beside some candidates, over candidates, map and words.
-
-    The candidates are fitted; the other formulas of their families are let in within `FREEDOM`.
-    """
-    inside, precision = _family(system, chosen)
-    columns = np.concatenate([system.candidate_columns, system.place_columns, system.word_columns])
-    sign = np.concatenate([_signs(system), np.zeros(len(columns) - len(system.candidates))])
-    view = project(system, columns, inside=inside, precision=precision)
-    keep = view.survival > (1e-6 if not len(inside) else 1e-2)
-    if not keep.any():
-        return 1.0
-    scores, total, signs = view.scores[:, keep], view.total[keep], sign[keep]
-    found = _probability(scores, total, signs, seed)
-    # The scatter of few particles cannot be surer than their number of signs allows, however strong a second effect is.
-    return min(found, 2 * _by_noise_model(scores, total, signs)) if chosen else found
-
-
-def _family(system: System, chosen: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Columns of the families of some candidates, and how tightly each is held to zero."""
-    own = np.array([system.column(k) for k in chosen], int)
-    if not chosen:
-        return own, np.zeros(0)
-    theta = system.at[chosen] + project(system, own[:0], inside=own).theta[len(system.globals) :]
-    strength = project(system, system.candidate_columns).total
-    columns, precision = list(own), [1e-12] * len(own)
-    for k, amplitude in zip(chosen, theta, strict=True):
-        effect = FREEDOM**2 * amplitude**2 * strength[k]
-        for j, candidate in enumerate(system.candidates):
-            if candidate.mechanism == system.candidates[k].mechanism and j not in chosen and strength[j] > 0:
-                columns.append(system.column(j))
-                precision.append(float(strength[j] / max(effect, 1e-300)))
-    return np.array(columns, int), np.array(precision)
-
-
-def _probability(scores: np.ndarray, total: np.ndarray, sign: np.ndarray, seed: int) -> float:
-    if len(scores) < FEWEST:
-        return _by_noise_model(scores, total, sign)
-    return float(family_wise(scores, sign, flips(len(scores), seed))[0].min())
-
-
-def _by_noise_model(scores: np.ndarray, total: np.ndarray, sign: np.ndarray) -> float:
-    """Bonferroni's bound for the largest estimate over its standard error; a sign that is NaN does not count."""
-    t = scores.sum(0) / np.sqrt(np.maximum(total, 1e-300))
-    sided = np.where(np.isnan(sign), -np.inf, np.where(sign == 0, np.abs(t), t * np.nan_to_num(sign)))
-    return float(min(1.0, INDEPENDENT * norm.sf(float(np.max(sided)))))
-
-
-class _Extensions:
-    """The law extended by effects, fitted as it is: once each, and only where first order may not do."""
-
-    def __init__(self, base: Base, system: System, signals: Signals) -> None:
-        self.base, self.system, self.signals = base, system, signals
-        self.known: dict[tuple[int, ...], Refit] = {}
-
-    def fit(self, chosen: tuple[int, ...]) -> Refit:
-        """The base law with some candidates."""
-        if chosen not in self.known:
-            inside = np.array([self.system.column(k) for k in chosen], int)
-            start = project(self.system, inside[:0], inside=inside).theta[len(GLOBALS) :]
-            candidates = tuple(self.system.candidates[k] for k in chosen)
-            self.known[chosen] = refit(self.base, candidates, start, self.system.prior)
-        return self.known[chosen]
-
-    def drop(self, chosen: tuple[int, ...]) -> float:
-        """By how much -2 log likelihood falls; not at all where an amplitude has a sign that it cannot have."""
-        found = self.fit(chosen)
-        return max(self.fit(()).deviance - found.deviance, 0.0) if found.physical else 0.0
-
-    def system_of(self, chosen: tuple[int, ...]) -> System:
-        """The linear system around the extended law."""
-        return system_at(self.base, self.system, self.signals, list(chosen), self.fit(chosen))
-
-
-def _serious(system: System, ranking: Ranking) -> list[int]:
-    """Candidates worth a fit of their own: of the mechanisms that may be true the best two formulas."""
-    chosen: list[int] = []
-    best = ranking.log_evidence[0]
-    for name, value, at_random in zip(ranking.names, ranking.log_evidence, ranking.at_random, strict=True):
-        if value < SERIOUS * best or len(chosen) >= MOST_REFITS:
-            break
-        if at_random:
-            continue
-        members = [k for k, c in enumerate(system.candidates) if c.mechanism == name]
-        members.sort(key=lambda k: -ranking.evidence[k])
-        formulas: dict[str, int] = {}
-        for k in members:
-            if np.isfinite(ranking.evidence[k]):
-                formulas.setdefault(system.candidates[k].variant.name, k)
-        chosen.extend(list(formulas.values())[:2])
-    return chosen[:MOST_REFITS]
 
 
 def _judge(
@@ -311,9 +155,9 @@ def _judge(
     tell("is something missing")
     view = project(system, system.candidate_columns)
     ranking = rank(system, view)
-    p_common = _left(system, seed, [])
+    p_common = p_nothing_left(system, seed, [])
     p_random = random_probability(system, view, seed)
-    p_model = _by_noise_model(view.scores, view.total, np.where(view.survival > 1e-6, _signs(system), np.nan))
+    p_model = by_noise_model(view.scores, view.total, np.where(view.survival > 1e-6, signs_of(system), np.nan))
     tests = ((p_common, LEVEL), (p_random, LEVEL_AT_RANDOM), (p_model, LEVEL_OF_NOISE_MODEL))
     p_any = min(1.0, *(p * 0.05 / level for p, level in tests))
     gap = p_any <= 0.05
@@ -324,46 +168,54 @@ def _judge(
     closure: Closure | None = None
     steps: list[Ranking] = []
     places: list[dict[str, Any]] = []
+    extensions = Extensions(base, system, signals)
     extended, last, around = system, None, {}
     if gap:
         tell("where")
         places = where(base, system)
         tell("what")
-        extensions = _Extensions(base, system, signals) if ranking.gain[0] >= LARGE else None
-        if extensions is not None:
+        large = ranking.gain[0] >= LARGE
+        if large:
             tell("the serious names, fitted as they are")
-            drops = {k: extensions.drop((k,)) for k in _serious(system, ranking)}
+            drops = {k: extensions.drop((k,)) for k in serious(system, ranking)}
             ranking = rank(system, view, refitted=drops)
-        verdict, chosen, sets, steps, closure = _name(base, system, view, ranking, extensions, seed, tell)
-        if extensions is not None and chosen and not any(step.at_random[0] for step in steps):
+        verdict, chosen, sets, steps, closure = name_missing(
+            base, system, view, ranking, extensions if large else None, seed, tell
+        )
+        if large and chosen and not any(step.at_random[0] for step in steps):
             last = extensions.fit(tuple(chosen))
             if last.physical:
                 extended = extensions.system_of(tuple(chosen))
                 around[frozenset(system.column(k) for k in chosen)] = extended
-    effects = _effects(extended, last, chosen, steps, p_any)
+    effects = estimated_effects(extended, last, chosen, steps, p_any)
     inside = np.array([system.column(k) for k in chosen], int)
     words = closure.words if closure is not None else np.array([], int)
     after = {}
     if gap:
         with_all = np.concatenate([inside, words]).astype(int)
-        after = _parameters(base, project(extended, inside[:0], inside=with_all), extended.shift)
+        after = population_parameters(base, project(extended, inside[:0], inside=with_all), extended.shift)
     sampled = None
     if posterior and chosen and not any(effect.at_random for effect in effects):
         tell("posterior of the extended law")
-        last = last or _Extensions(base, system, signals).fit(tuple(chosen))
-        sampled = extended_posterior(base, last, seed=seed)
-        if failures := sampled.failures():
+        last = extensions.fit(tuple(chosen))
+        sampled = extended_posterior(base, last, seed=seed) if last.physical else None
+        if sampled is None:
+            notes.append(
+                "the posterior of the extended law is not sampled: fitted as it is, an amplitude has a sign that it "
+                "cannot have; amplitudes and parameters are those of the linear system"
+            )
+        elif failures := sampled.failures():
             notes.append(
                 f"the posterior of the extended law has not converged ({'; '.join(failures)}); amplitudes and "
                 "parameters are those of its fit"
             )
         else:
-            effects = tuple(_with_draws(effect, sampled.effect_draws(i)) for i, effect in enumerate(effects))
+            effects = tuple(with_draws(effect, sampled.effect_draws(i)) for i, effect in enumerate(effects))
             after = sampled.parameters()
     ladder, labels = None, (None,)
     if confirm and gap and int(system.usable.sum()) > 2:
         tell("held-out particles")
-        ladder = held_out(system, _chooser(system, len(chosen), closure is not None), around)
+        ladder = held_out(system, chooser(system, len(chosen), closure is not None), around)
         labels = (None, *(e.mechanism for e in effects), *(("formula",) if closure is not None else ()))
     further: list[dict[str, Any]] = []
     if experiments and gap:
@@ -383,191 +235,16 @@ def _judge(
         held_out=ladder,
         labels=labels,
         p_any=p_any,
-        before=_parameters(base, project(system, inside[:0])),
+        before=population_parameters(base, project(system, inside[:0])),
         after=after,
         next_experiments=tuple(further),
-        limits=_limits(system, view, ranking),
+        limits=detection_limits(system, view, ranking),
         posterior=sampled,
         seed=seed,
         runtime_s=0.0,
         notes=tuple(notes),
     )
     return dataclasses.replace(found, summary=summary_of(found), runtime_s=time.perf_counter() - started)
-
-
-def _name(
-    base: Base, system: System, view: Projection, ranking: Ranking, extensions: _Extensions | None, seed: int, tell
-):
-    """Verdict, chosen candidates, their sets, rankings of each step, and the formula if nothing listed will do."""
-    members = tuple(ranking.members(LIKE_THE_BEST))
-    gain_of_words = pursue(system)[1]
-    # Any member of the set may be the one beside which nothing is left; the most probable is asked first.
-    most_left = 0.0
-    for name in members:
-        position = ranking.names.index(name)
-        first, gain = ranking.best[position], float(ranking.gain[position])
-        if ranking.at_random[position]:
-            around = system.absorbing(family_columns(system, (name,)))
-        else:
-            around = system if extensions is None else extensions.system_of((first,))
-        left = _left(around, seed, [first])
-        most_left = max(most_left, left)
-        if gain_of_words <= gain + BETTER + SHARE * gain and left > LEVEL_OF_MORE:
-            own = (name, *(m for m in members if m != name))
-            return ("NAMED" if len(members) == 1 else "SET"), [first], [own], [ranking], None
-    first = ranking.best[0]
-    tell("a second effect")
-    if ranking.at_random[0] and ranking.gain[0] > gain_of_words:
-        return ("NAMED" if len(members) == 1 else "SET"), [first], [members], [ranking], None
-    best_pairs = pairs(system, view)
-    if best_pairs and not ranking.at_random[0]:
-        gain, i, j = best_pairs[0]
-        both = tuple(system.candidates[k].mechanism for k in (i, j))
-        with_both = system
-        if extensions is not None:
-            with_both, gain = extensions.system_of((i, j)), max(gain, extensions.drop((i, j)))
-        p_both = _left(with_both, seed, [i, j])
-        if p_both > LEVEL_OF_MORE and gain >= gain_of_words - BETTER:
-            one = rank(system, project(system, system.candidate_columns, inside=np.array([system.column(j)])))
-            two = rank(system, project(system, system.candidate_columns, inside=np.array([system.column(i)])))
-            sets = [_with(both[0], one), _with(both[1], two)]
-            verdict: Verdict = "NAMED" if all(len(s) == 1 for s in sets) else "SET"
-            return verdict, [i, j], sets, [one, two], None
-    tell("a formula of its own")
-    closure = find_closure(system, _span(base), seed, tell=tell)
-    unexplained = most_left <= LEVEL_OF_UNLISTED or gain_of_words > ranking.gain[0] * (1 + SHARE) + BETTER
-    if closure is None or not unexplained:
-        return ("NAMED" if len(members) == 1 else "SET"), [first], [members], [ranking], None
-    return "UNLISTED", [], [], [], closure
-
-
-def _with(name: str, ranking: Ranking) -> tuple[str, ...]:
-    members = ranking.members(LIKE_THE_BEST)
-    return (name, *(m for m in members if m != name))
-
-
-def _chooser(system: System, count: int, formula: bool) -> Callable[[np.ndarray], list[np.ndarray]]:
-    """The search as it is repeated within a fold."""
-    empty = np.array([], int)
-
-    def choose(particles: np.ndarray) -> list[np.ndarray]:
-        if formula:
-            return [empty, np.array(pursue(system, particles=particles)[0], int)]
-        view = project(system, system.candidate_columns, particles=particles)
-        if count == 1:
-            return [empty, np.array([system.column(rank(system, view).best[0])])]
-        found = pairs(system, view)
-        if not found:
-            return [empty] * (count + 1)
-        _, i, j = found[0]
-        return [empty, np.array([system.column(i)]), np.array([system.column(i), system.column(j)])]
-
-    return choose
-
-
-def _effects(
-    system: System, fit: Refit | None, chosen: list[int], steps: list[Ranking], p_any: float
-) -> tuple[Effect, ...]:
-    """The chosen effects, in the linear system around the law with them, if they were fitted as they are."""
-    if not chosen:
-        return ()
-    inside = np.array([system.column(k) for k in chosen])
-    fitted = project(system, inside[:0], inside=inside)
-    start = len(system.globals)
-    found = []
-    for row, (k, step) in enumerate(zip(chosen, steps, strict=True)):
-        candidate = system.candidates[k]
-        unit = candidate.unit_amplitude
-        position = step.names.index(candidate.mechanism)
-        others = inside[inside != inside[row]]
-        alone = project(system, inside[row : row + 1], inside=others)
-        own = alone.scores[:, 0] / np.maximum(alone.information[:, 0, 0], 1e-300)
-        own = own + system.at[k]
-        variance = fitted.covariance[start + row, start + row]
-        if fit is not None:
-            # With the further numbers free, an amplitude is less certain.
-            variance = max(variance, fit.spread(row)[0] ** 2)
-        found.append(
-            Effect(
-                candidate.variant,
-                dict(candidate.nuisance),
-                float((fitted.theta[start + row] + system.at[k]) * unit),
-                float(np.sqrt(variance) * unit),
-                float(step.probability[position]),
-                p_any,
-                step.at_random[position],
-                own * unit,
-            )
-        )
-    return tuple(found)
-
-
-def _with_draws(effect: Effect, draws: dict[str, np.ndarray]) -> Effect:
-    """The effect with its numbers from the posterior."""
-    own = draws[effect.variant.parameter]
-    return dataclasses.replace(
-        effect,
-        amplitude=float(own.mean()),
-        sd=float(own.std()),
-        nuisance=effect.nuisance | {name: float(draws[name].mean()) for name in draws if name in effect.nuisance},
-        estimates={name: summary(values) for name, values in draws.items()},
-    )
-
-
-def _limits(system: System, view: Projection, ranking: Ranking) -> dict[str, tuple[float, float, float]]:
-    """Statistic, estimate and detection limit of every mechanism's best formula, in its unit."""
-    found = {}
-    for name, k in zip(ranking.names, ranking.best, strict=True):
-        unit = system.candidates[k].unit_amplitude
-        information = max(float(view.total[k]), 1e-300)
-        found[name] = (
-            float(view.gaussian[k]),
-            float(view.estimate[k] * unit),
-            DETECTABLE / np.sqrt(information) * unit,
-        )
-    return found
-
-
-def _parameters(base: Base, view: Projection | None, shift: np.ndarray | None = None) -> dict[str, Any]:
-    """The population's parameters, moved as a linear system says, which itself may stand a shift away."""
-    from ..calibrate.joint._fit import population_at
-
-    population = population_at(base.fit.mode, base.fit.numbers, base.model.scatter)
-    values = np.array([float(population.a), float(population.log_modulus), *np.asarray(population.mu)])
-    sd = np.full(len(GLOBALS), np.nan)
-    if shift is not None:
-        values = values + shift
-    if view is not None:
-        values = values + view.theta[: len(GLOBALS)]
-        sd = np.sqrt(np.diagonal(view.covariance)[: len(GLOBALS)])
-
-    def entry(value: float, width: float) -> dict[str, Any]:
-        if not np.isfinite(width):
-            return {"value": float(value), "sd": None, "interval_95": None}
-        return {"value": float(value), "sd": float(width), "interval_95": [value - 1.96 * width, value + 1.96 * width]}
-
-    modulus = float(np.exp(values[1]))
-    tau = np.asarray(population.tau)
-    return {
-        "a": entry(values[0], sd[0]),
-        "effective_modulus_MPa": entry(modulus, modulus * sd[1]),
-        **{
-            f"log_{name}": {"mean": entry(values[2 + j], sd[2 + j]), "sd": entry(float(tau[j]), float("nan"))}
-            for j, name in enumerate(("C1", "C3", "C5"))
-        },
-    }
-
-
-def _span(base: Base) -> dict[str, tuple[float, float]]:
-    tests = base.tests
-    force = np.where(np.asarray(tests.mask), np.asarray(tests.force), np.nan)
-    diameter = np.asarray(tests.particle.D1 * tests.particle.D2 / tests.particle.D3)
-    stress = force / (np.pi * diameter[:, None] ** 2 / 4) * 1e3
-    return {
-        "stress_MPa": (float(np.nanmin(stress)), float(np.nanmax(stress))),
-        "effective_diameter_um": (float(diameter.min()), float(diameter.max())),
-        "time_s": (0.0, float(np.asarray(base.records.time).max())),
-    }
 
 
 def _notes(base: Base, system: System) -> list[str]:

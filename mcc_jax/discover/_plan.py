@@ -22,7 +22,7 @@ from ..effects import LIBRARY, Mechanism, present
 from ..simulate import Programme, simulate_campaign
 from ._candidates import untestable
 from ._score import DETECTABLE, project
-from ._system import Base, System, _records, base_fit, build_system, signals_of
+from ._system import Base, System, base_fit, build_system, records_of, signals_of
 
 ALIKE = 0.9
 
@@ -73,7 +73,7 @@ def _expected(campaign: Campaign, fit: JointFit, model: JointModel, latent, nois
         fit,
         (noise, filters, latent, zero, data.residual, summary, numbers),
     )
-    return Base(campaign, selection, model, new, _records(campaign, selection))
+    return Base(campaign, selection, model, new, records_of(campaign, selection))
 
 
 def planned_system(base: Base, plan: Plan, library: Mapping[str, Mechanism]) -> System:
@@ -180,8 +180,7 @@ def power(
     campaign = planned_campaign(laws, np.asarray(diameters_um, float), np.asarray(peaks_mN, float), plan)
     noise = eqx.tree_at(lambda n: n.scale, base.fit.noise, jnp.ones(len(diameters_um)))
     planned = _expected(campaign, base.fit, base.model, latent, noise)
-    testable, missing = untestable(library, present(campaign))
-    system = build_system(planned, signals_of(planned, testable))
+    system, missing = _testable(planned, library)
     return power_of(replace(system, usable=np.ones(len(system.points), bool)), missing)
 
 
@@ -208,6 +207,11 @@ def power_of_campaign(
     tell = progress or (lambda _: None)
     assumed = replace(model or JointModel(), modulus_scatter=True)
     base = base_fit(campaign, assumed, threshold_MPa=threshold_MPa, tell=tell)
-    testable, missing = untestable(library, present(campaign))
     tell("signatures of all effects")
-    return power_of(build_system(base, signals_of(base, testable)), missing)
+    return power_of(*_testable(base, library))
+
+
+def _testable(base: Base, library: Mapping[str, Mechanism]) -> tuple[System, Sequence[dict[str, str]]]:
+    """The linear system with all formulas that the campaign can be searched for, and what the others need."""
+    testable, missing = untestable(library, present(base.campaign))
+    return build_system(base, signals_of(base, testable)), missing

@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from ..calibrate._result import finite
-from ..calibrate.joint._bayes import ESS_LEAST, PARETO_K_MOST, RHAT_MOST, summary
+from ..calibrate.joint._bayes import ESS_LEAST, PARETO_K_MOST, RHAT_MOST, population_json, unmixed
 from ..calibrate.joint._compile import compiled
 from ..calibrate.joint._draws import Length, draw_around, newton_steps
 from ..calibrate.joint._fit import population_at
@@ -33,10 +33,10 @@ from ..calibrate.joint._forward import law_of
 from ..calibrate.joint._linearised import linear_data, summarise
 from ..calibrate.joint._mode import Target, from_free, most_probable, to_free
 from ..calibrate.joint._noise import Whitening
-from ..calibrate.joint._population import COEFFICIENTS, Population, Summary, marginal_likelihood
+from ..calibrate.joint._population import Population, Summary, marginal_likelihood
 from ..calibrate.joint._sampling import Exact
 from ..effects import ExtendedLaw, Record
-from ._refit import Formula, Refit
+from ._refit import Formula, Refit, effects_of, slices
 from ._system import Base
 
 LENGTH = Length(4, 300, 1000)
@@ -146,9 +146,7 @@ class ExtendedExact(Exact):
     ) -> Float[Array, "particles points"]:
         """Displacement [um] of every particle from its own zero."""
         assert isinstance(population, ExtendedPopulation)
-        bounds = np.cumsum([0, *(f.size for f in self.formulas)])
-        parts = zip(self.formulas, bounds[:-1], bounds[1:], strict=True)
-        effects = tuple(f.build(population.theta[a:b]) for f, a, b in parts)
+        effects = effects_of(self.formulas, population.theta)
         return jax.vmap(lambda w, p, r: ExtendedLaw(law_of(w, self.unloading), effects).respond(p, r))(
             latent, self.tests.particle, self.records
         )
@@ -191,31 +189,24 @@ class ExtendedPosterior:
     def effect_draws(self, which: int) -> dict[str, np.ndarray]:
         """Draws of an effect's amplitude and further numbers, by name, each of shape (chains, draws)."""
         formula = self.formulas[which]
-        start = sum(f.size for f in self.formulas[:which])
         assert isinstance(self.population, ExtendedPopulation)
-        theta = np.asarray(self.population.theta)[..., start : start + formula.size]
+        theta = np.asarray(self.population.theta)[..., slices(self.formulas)[which]]
         draws = {formula.variant.parameter: theta[..., 0] * formula.variant.plausible[1]}
         moved = jax.vmap(jax.vmap(lambda t: formula.nuisances(t)))(jnp.asarray(theta))
         return draws | {n.name: np.asarray(moved[n.name]) for n in formula.free_nuisances}
 
     def parameters(self) -> dict[str, Any]:
         """The population's parameters as in `discovery.json`."""
-        p = self.population
-        named = {"a": summary(np.asarray(p.a)), "effective_modulus_MPa": summary(np.exp(np.asarray(p.log_modulus)))}
-        mu, tau = np.asarray(p.mu), np.asarray(p.tau)
-        return named | {
-            f"log_{name}": {"mean": summary(mu[..., j]), "sd": summary(tau[..., j])}
-            for j, name in enumerate(COEFFICIENTS)
-        }
+        return population_json(self.population)
 
     def failures(self) -> list[str]:
         """Why it must not be called converged; empty if all gates of the joint calibration are passed."""
         found = []
-        worst, least = max(self.rhat.values()), min(self.ess_bulk.values())
-        if not worst <= RHAT_MOST:
-            found.append(f"R-hat is {worst:.3f}, above {RHAT_MOST}")
-        if not least >= ESS_LEAST:
-            found.append(f"bulk ESS is {least:.0f}, below {ESS_LEAST:.0f}")
+        rhat, ess = unmixed(self.rhat, self.ess_bulk)
+        if rhat is not None:
+            found.append(f"R-hat is {rhat.value:.3f}, above {RHAT_MOST}")
+        if ess is not None:
+            found.append(f"bulk ESS is {ess.value:.0f}, below {ESS_LEAST:.0f}")
         if self.divergences:
             found.append(f"{self.divergences} trajectories diverged")
         k = float(np.max(self.pareto_k)) if self.pareto_k_joint is None else self.pareto_k_joint

@@ -13,6 +13,8 @@ with the noise filters W of the refined fit. Every step is the linear system onc
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import equinox as eqx
@@ -102,6 +104,17 @@ def _by_ratio(nuisance: Nuisance) -> bool:
     return nuisance.plausible[0] > 0
 
 
+def slices(formulas: Sequence[Formula]) -> tuple[slice, ...]:
+    """Where each formula's own numbers stand among the free numbers of all."""
+    ends = list(itertools.accumulate((f.size for f in formulas), initial=0))
+    return tuple(itertools.starmap(slice, itertools.pairwise(ends)))
+
+
+def effects_of(formulas: Sequence[Formula], theta: Float[Array, " size"]) -> tuple[AbstractEffect, ...]:
+    """The effects at the free numbers of all formulas."""
+    return tuple(f.build(theta[own]) for f, own in zip(formulas, slices(formulas), strict=True))
+
+
 class State(eqx.Module):
     """Where the law stands.
 
@@ -148,21 +161,13 @@ class Refit:
     covariance: np.ndarray
     converged: bool
 
-    @property
-    def starts(self) -> list[int]:
-        """Position of each formula's amplitude among the free numbers."""
-        sizes = [f.size for f in self.formulas]
-        return [sum(sizes[:i]) for i in range(len(sizes))]
-
     def own(self, which: int) -> np.ndarray:
         """Free numbers of one of the formulas."""
-        start = self.starts[which]
-        return np.asarray(self.state.theta)[start : start + self.formulas[which].size]
+        return np.asarray(self.state.theta)[slices(self.formulas)[which]]
 
     def spread(self, which: int) -> np.ndarray:
         """Standard deviations of the free numbers of one of the formulas."""
-        start = self.starts[which]
-        return np.sqrt(np.diagonal(self.covariance)[start : start + self.formulas[which].size])
+        return np.sqrt(np.diagonal(self.covariance)[slices(self.formulas)[which]])
 
     @property
     def physical(self) -> bool:
@@ -224,8 +229,8 @@ def refit(base: Base, candidates: tuple[Candidate, ...], amplitudes: np.ndarray,
 
 def system_at(base: Base, system: System, signals: Signals, chosen: list[int], found: Refit) -> System:
     """The linear system around an extended law: its residuals, its derivatives, its effects' further numbers."""
-    starts = np.array(found.starts, int)
-    added = signals.added.at[:, np.array(chosen)].set(found.columns[:, starts])
+    amplitudes = np.array([own.start for own in slices(found.formulas)], int)
+    added = signals.added.at[:, np.array(chosen)].set(found.columns[:, amplitudes])
     tests, state = base.tests, found.state
     gram = gram_matrices(
         found.residual,
@@ -354,12 +359,9 @@ def _linearise(
     records: Record,
     unloading: Unloading,
 ) -> tuple[Array, Array, Array]:
-    bounds = np.cumsum([0, *(f.size for f in formulas)])
-
     def one(w, z, particle, record, measured, mask):
         def predicted(w, theta):
-            effects = tuple(f.build(theta[a:b]) for f, a, b in zip(formulas, bounds[:-1], bounds[1:], strict=True))
-            return ExtendedLaw(law_of(w, unloading), effects).respond(particle, record)
+            return ExtendedLaw(law_of(w, unloading), effects_of(formulas, theta)).respond(particle, record)
 
         value, push = jax.linearize(predicted, w, theta)
         by_latent = jax.vmap(lambda d: push(d, jnp.zeros_like(theta)))(jnp.eye(4))

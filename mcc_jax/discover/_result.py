@@ -92,7 +92,8 @@ class Discovery:
         p_any: family-wise probability that anything is missing.
         before, after: the population's parameters without and with the effects.
         next_experiments: what would tell the members of the set apart.
-        posterior: of the extended law; None where nothing was added or it was not asked for.
+        posterior: of the extended law; None where nothing was added, its fit has an impossible sign, or it was not
+            asked for.
         notes: what a reader must know.
     """
 

@@ -128,10 +128,11 @@ def base_fit(
 ) -> Base:
     """Fit the base law with everything natural free: every particle's coefficients and modulus, and the noise."""
     selection, _, fit = prepare(campaign, model, threshold_MPa, tell=tell)
-    return Base(campaign, selection, model, fit, _records(campaign, selection))
+    return Base(campaign, selection, model, fit, records_of(campaign, selection))
 
 
-def _records(campaign: Campaign, selection: Selection) -> Record:
+def records_of(campaign: Campaign, selection: Selection) -> Record:
+    """What the tester did, by particle, at the rows of the selection."""
     whole = record_batch(campaign, campaign_segments(campaign))
     length = selection.tests.force.shape[1]
     index = np.stack([np.pad(rows, (0, length - len(rows)), mode="edge") for rows in selection.rows])

@@ -53,7 +53,7 @@ def _strains(base: Base) -> np.ndarray:
     tests = base.tests
     mask = np.asarray(tests.mask)
     d = np.asarray(tests.displacement) - np.asarray(base.fit.zero)[:, None]
-    diameter = np.asarray(tests.particle.D1 * tests.particle.D2 / tests.particle.D3)
+    diameter = np.asarray(tests.effective_diameter)
     low = np.where(mask, d, np.inf).min(1) / diameter
     high = np.where(mask, d, -np.inf).max(1) / diameter
     return np.stack([low, high], 1)

@@ -46,6 +46,7 @@ def _branch_force_jvp(power, primals, tangents):
     k1, k3, k5, c, peak, _ = primals
     dk1, dk3, dk5, dc, dpeak, ddrop = tangents
     secant, span, s, ratio = _branch(power, *primals)
+    # The force and all derivatives need these: without a barrier XLA computes them again in the loop of each output.
     s, ratio = jax.lax.optimization_barrier((s, ratio))
     force = peak * secant
     square = peak * peak
@@ -56,6 +57,7 @@ def _branch_force_jvp(power, primals, tangents):
     dforce = peak * (dk1 - square * (dk3 - square * dk5)) + tangent_modulus(k1, k3, k5, peak) * dpeak
     factor = jnp.where(secant > 0, ratio + power * h, 0.0)
     change = factor * dforce - h * secant * dpeak + shared(h * force / c) * dc - shared(force * fall / span) * ddrop
+    # Transposed, this is a barrier for the cotangent, which otherwise would be computed again for each input.
     return force * ratio, jax.lax.optimization_barrier(change)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks import _report
-from benchmarks.blind import score, sealing, smoke
+from benchmarks.blind import scoring, sealing, smoke
 from benchmarks.blind.generator import effects, tiers
 
 
@@ -115,14 +115,14 @@ def perfect_run():
     for number, case in enumerate(tiers.plan(seeds=2)):
         answer = answer_to(case)
         result = {"status": "ok", "wall_s": 3.0, "cold": number == 0, "discovery": perfect(answer, number)}
-        found.append(score.Outcome(f"c{number:05d}", answer, result))
+        found.append(scoring.Outcome(f"c{number:05d}", answer, result))
     results = {o.key: o.result for o in found}
     results["c00000#repeat"] = {**found[0].result, "discovery": {**found[0].found, "runtime_s": 9.0}}
     return found, results
 
 
 def rows(found, results=None, folder=None):
-    return {row["metric"]: row for row in score.acceptance(found, results or {}, folder)}
+    return {row["metric"]: row for row in scoring.acceptance(found, results or {}, folder)}
 
 
 def changed(found, which, **discovery):
@@ -130,7 +130,7 @@ def changed(found, which, **discovery):
     out = []
     for o in found:
         altered = {**o.result, "discovery": {**o.found, **discovery}}
-        out.append(score.Outcome(o.key, o.answer, altered) if which(o) else o)
+        out.append(scoring.Outcome(o.key, o.answer, altered) if which(o) else o)
     return out
 
 
@@ -170,7 +170,7 @@ def test_false_alarms_are_counted_with_their_interval(perfect_run):
 def test_no_answer_is_a_failure_everywhere(perfect_run, status, verdict):
     found, _ = perfect_run
     lost = [
-        score.Outcome(
+        scoring.Outcome(
             o.key,
             o.answer,
             {
@@ -196,7 +196,7 @@ def test_no_answer_is_a_failure_everywhere(perfect_run, status, verdict):
         "held-out gap closed, lambda>=20 (mean share)",
     ):
         assert metric in failed
-    assert sum(row["campaigns"] for row in score.failures(lost)) == len(lost)
+    assert sum(row["campaigns"] for row in scoring.failures(lost)) == len(lost)
     assert not any(
         row["result"] is True for name, row in table.items() if name.startswith(("false", "top", "true", "two", "UN"))
     )
@@ -216,7 +216,7 @@ def test_a_solver_that_always_names_the_same_is_found_out(perfect_run):
     assert table["calibration of the stated probability, ECE"]["result"] is False
     assert table["two effects, false discoveries among names"]["result"] is False
     assert table["mean size of the set, lambda=10"]["result"] is True
-    counts = score.confusion(stuck)
+    counts = scoring.confusion(stuck)
     assert all(set(row) == {"creep"} for row in counts.values())
 
 
@@ -235,8 +235,8 @@ def test_campaigns_off_their_strength_do_not_count_for_it(perfect_run):
     o = next(o for o in found if o.tier == "T1" and o.strength == 10.0)
     weak = json.loads(json.dumps(o.answer))
     weak["effects"][0]["lambda"] = 7.0
-    assert score.Outcome("c", weak, o.result).strength is None
-    assert score.by_mechanism([score.Outcome("c", weak, o.result)])[0]["off strength"] == 1
+    assert scoring.Outcome("c", weak, o.result).strength is None
+    assert scoring.by_mechanism([scoring.Outcome("c", weak, o.result)])[0]["off strength"] == 1
 
 
 def test_biased_parameters_fail(perfect_run):
@@ -254,19 +254,19 @@ def test_biased_parameters_fail(perfect_run):
 
 
 def test_clopper_pearson():
-    assert score.interval(0, 500) == pytest.approx((0.0, 1 - 0.025 ** (1 / 500)))
-    assert score.interval(20, 20) == pytest.approx((0.025 ** (1 / 20), 1.0))
-    assert score.interval(5, 10) == pytest.approx((0.1870860, 0.8129140), abs=1e-6)
-    assert score.interval(0, 0) == (0.0, 1.0)
+    assert scoring.interval(0, 500) == pytest.approx((0.0, 1 - 0.025 ** (1 / 500)))
+    assert scoring.interval(20, 20) == pytest.approx((0.025 ** (1 / 20), 1.0))
+    assert scoring.interval(5, 10) == pytest.approx((0.1870860, 0.8129140), abs=1e-6)
+    assert scoring.interval(0, 0) == (0.0, 1.0)
 
 
 def test_reliability():
     pairs = [(0.9, True)] * 9 + [(0.9, False)] + [(0.3, True)] * 5 + [(0.3, False)] * 5
-    table, error = score.reliability(pairs)
+    table, error = scoring.reliability(pairs)
     assert table == [(pytest.approx(0.3), 0.5, 10), (pytest.approx(0.9), pytest.approx(0.9), 10)]
     assert error == pytest.approx(0.1)
-    assert score.reliability([(1.0, True)]) == ([(1.0, 1.0, 1)], 0.0)
-    assert score.reliability([]) == ([], None)
+    assert scoring.reliability([(1.0, True)]) == ([(1.0, 1.0, 1)], 0.0)
+    assert scoring.reliability([]) == ([], None)
 
 
 def test_determinism_ignores_the_time_only(perfect_run):
@@ -313,7 +313,7 @@ def test_closure_error_sees_only_what_the_base_law_cannot_take_up():
     change = law.simulate(drawn.particles, drawn.path, hidden) - base
 
     def error(curves):
-        return score.closure_error(answer, {str(i + 1): row.tolist() for i, row in enumerate(curves)})
+        return scoring.closure_error(answer, {str(i + 1): row.tolist() for i, row in enumerate(curves)})
 
     assert error(change) == pytest.approx(0.0, abs=1e-9)
     stiffer = law.simulate(drawn.particles.with_(modulus=drawn.particles.modulus * 1.05), drawn.path) - base
@@ -324,14 +324,14 @@ def test_closure_error_sees_only_what_the_base_law_cannot_take_up():
 
 def test_tables_and_pictures(perfect_run, tmp_path):
     found, results = perfect_run
-    made = score.pictures(found, tmp_path)
+    made = scoring.pictures(found, tmp_path)
     assert made == ["blind_confusion.png", "blind_reliability.png", "blind_power.png"]
     assert all((tmp_path / name).stat().st_size > 10_000 for name in made)
     for table in (
-        score.acceptance(found, results),
-        score.by_mechanism(found),
-        score.by_noise(found),
-        score.gaps(found),
+        scoring.acceptance(found, results),
+        scoring.by_mechanism(found),
+        scoring.by_noise(found),
+        scoring.gaps(found),
     ):
         lines = _report.table(table).splitlines()
         assert len({line.count("|") for line in lines}) == 1

@@ -59,11 +59,13 @@ def test_without_arguments_help_with_examples(run):
     assert text == done(run("--help"))
     for word in ("demo", "simulate", "convert", "calibrate", "discover", "Examples:", "_MCC_JAX_COMPLETE"):
         assert word in text
-    assert set(cli.commands) == {"demo", "simulate", "convert", "calibrate", "discover", "power", "report"}
+    assert set(cli.commands) == {"demo", "simulate", "convert", "calibrate", "discover", "power", "report", "export"}
     assert "0.1.0" in done(run("--version"))
 
 
-@pytest.mark.parametrize("command", ["demo", "simulate", "convert", "calibrate", "discover", "power", "report"])
+@pytest.mark.parametrize(
+    "command", ["demo", "simulate", "convert", "calibrate", "discover", "power", "report", "export"]
+)
 def test_every_command_has_help_with_an_example(run, command):
     text = done(run(command, "--help"))
     assert "xample" in text
@@ -100,6 +102,9 @@ def test_demo_does_the_whole_job(run, tmp_path):
     for warning in content["warnings"]:
         assert warning[1:20] in text
     assert read_campaign(out / "campaign").particles == tuple(str(i) for i in range(1, 21))
+    assert "of the 20 particles of particles.csv" in done(run("export", out, "--format", "json", "--out", out / "law"))
+    card = json.loads((out / "law" / "parameters.json").read_text())
+    assert card["parameters"]["effective_modulus_MPa"].items() >= content["effective_modulus_MPa"].items()
 
 
 def test_simulate_then_calibrate_twice_gives_the_same(run, simulated, tmp_path):
@@ -134,6 +139,13 @@ def test_calibrate_into_the_campaigns_own_folder(run, campaign):
     content = json.loads(after.pop("calibration.json"))
     assert after == before
     assert (content["a_objective"], content["reference_particle"]) == ("reference", "B")
+    done(run("export", campaign, "--format", "json", "--out", campaign / "law", "--particle", "B"))
+    card = json.loads((campaign / "law" / "parameters.json").read_text())
+    assert {name: card["parameters"][name]["value"] for name in ("C1", "C3", "C5", "a")} == {
+        **{name: content["particles"][1][name]["value"] for name in ("C1", "C3", "C5")},
+        "a": content["a"]["value"],
+    }
+    assert card["particle"]["eta_p"] == pytest.approx(content["particles"][1]["eta_p"]["value"], rel=1e-14)
 
 
 def test_calibrate_recovers_what_simulate_put_in(run, tmp_path):

@@ -99,6 +99,19 @@ def test_killed_in_the_middle(tmp_path, number, status):
 
 
 @posix
+def test_who_interrupts_does_not_wait_for_other_threads():
+    code = (
+        "import threading, time, click; from mcc_jax.cli import _main\n"
+        "threading.Thread(target=time.sleep, args=(60,)).start()\n"
+        "@_main.cli.command()\n"
+        "def halt(): raise KeyboardInterrupt\n"
+        "_main.main()"
+    )
+    result = subprocess.run([sys.executable, "-c", code, "halt"], capture_output=True, text=True, timeout=30)
+    assert (result.returncode, result.stdout, result.stderr) == (130, "", "mcc-jax: interrupted\n")
+
+
+@posix
 def test_two_at_once_and_the_lock_of_a_dead_one(tmp_path):
     holder = (
         "import sys, time; from pathlib import Path; from mcc_jax.cli._output import results\n"

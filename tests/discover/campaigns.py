@@ -5,7 +5,10 @@ import functools
 import jax
 import numpy as np
 
-from mcc_jax.campaign import PAPER_DIAMETERS_UM, Campaign
+from mcc_jax.calibrate import JointModel
+from mcc_jax.campaign import PAPER_DIAMETERS_UM, THRESHOLD_MPA, Campaign
+from mcc_jax.discover._refine import refined
+from mcc_jax.discover._system import base_fit, build_system, signals_of
 from mcc_jax.simulate import Instrument, Programme, law_for_each, paper_population, read_effect, simulate_campaign
 
 N, POINTS = 10, 150
@@ -58,3 +61,14 @@ def mixed(one, other, from_other):
 
 
 cached = functools.cache(campaign)
+
+MODEL = JointModel(modulus_scatter=True)
+
+
+def refined_system(whole, library):
+    """Base fit of a campaign, its noise without what is systematic; what the formulas add; the linear system."""
+    base = base_fit(whole, MODEL, threshold_MPa=THRESHOLD_MPA)
+    signals = signals_of(base, library)
+    base, changed = refined(base, build_system(base, signals), signals)
+    assert changed
+    return base, signals, build_system(base, signals)

@@ -1,36 +1,30 @@
 """The posterior of the extended law: its summaries are those of the shifted tests, and it holds the truth."""
 
 import json
+from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from campaigns import cached
+from campaigns import cached, refined_system
 
-from mcc_jax.calibrate import JointModel
 from mcc_jax.calibrate.joint._draws import Length
 from mcc_jax.calibrate.joint._linearised import linear_data, summarise
-from mcc_jax.campaign import THRESHOLD_MPA
-from mcc_jax.discover._discover import _Extensions
+from mcc_jax.discover import _discover, discover
+from mcc_jax.discover._extensions import Extensions
 from mcc_jax.discover._posterior import _movable, extended_posterior
-from mcc_jax.discover._refine import refined
-from mcc_jax.discover._system import base_fit, build_system, signals_of
 from mcc_jax.effects import LIBRARY
 
 HIDDEN = 0.004
+FRAME = {"frame_compliance": LIBRARY["frame_compliance"]}
 
 
 @pytest.fixture(scope="module")
 def extended():
     """Base fit and fit of the extended law of tests with a compliant frame."""
-    model = JointModel(modulus_scatter=True)
-    base = base_fit(cached(f"frame_compliance={HIDDEN}"), model, threshold_MPa=THRESHOLD_MPA, tell=lambda _: None)
-    signals = signals_of(base, {"frame_compliance": LIBRARY["frame_compliance"]})
-    system = build_system(base, signals)
-    base, _ = refined(base, system, signals)
-    system = build_system(base, signals)
-    return base, _Extensions(base, system, signals).fit((0,))
+    base, signals, system = refined_system(cached(f"frame_compliance={HIDDEN}"), FRAME)
+    return base, Extensions(base, system, signals).fit((0,))
 
 
 @pytest.fixture(scope="module")
@@ -85,3 +79,19 @@ def test_the_same_seed_gives_the_same_draws_and_few_draws_are_told(extended, pos
     np.testing.assert_array_equal(again.population.theta, posterior.population.theta)
     short = extended_posterior(*extended, length=Length(4, 20, 20), seed=1)
     assert any("ESS" in failure for failure in short.failures())
+
+
+def test_an_impossible_sign_is_not_sampled_but_told(monkeypatch):
+    fit = Extensions.fit
+
+    def turned(self, chosen):
+        found = fit(self, chosen)
+        return replace(found, state=eqx.tree_at(lambda s: s.theta, found.state, -found.state.theta))
+
+    monkeypatch.setattr(_discover, "LARGE", np.inf)  # named to first order; the fit as it is comes with the posterior
+    monkeypatch.setattr(Extensions, "fit", turned)
+    found = discover(cached(f"frame_compliance={HIDDEN}"), library=FRAME, confirm=False, experiments=False)
+    assert [effect.mechanism for effect in found.effects] == ["frame_compliance"]
+    assert found.effects[0].amplitude > 0
+    assert found.posterior is None
+    assert any("not sampled" in note for note in found.notes)

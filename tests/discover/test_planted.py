@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from linear_systems import FORMULAS, planted, random_campaign
 
-from mcc_jax.discover._discover import _left
 from mcc_jax.discover._refine import systematic
 from mcc_jax.discover._score import project
 from mcc_jax.discover._search import pairs, rank
+from mcc_jax.discover._significance import p_nothing_left
 
 NOTHING = np.array([], int)
 
@@ -15,7 +15,7 @@ NOTHING = np.array([], int)
 @pytest.mark.parametrize("name", [mechanism for mechanism, _ in FORMULAS])
 def test_a_planted_effect_is_named(name):
     system = planted(1, {name: 8.0})
-    assert _left(system, 0, []) < 0.01
+    assert p_nothing_left(system, 0, []) < 0.01
     ranking = rank(system, project(system, system.candidate_columns))
     assert ranking.names[0] == name
     assert ranking.probability[0] > 0.9
@@ -43,7 +43,7 @@ def test_an_amplitude_comes_back_within_its_error():
 
 def test_nothing_planted_nothing_found():
     """Forty campaigns: p is not small more often than by chance (P(more than 6 of 40 below 5 %) = 0.3 %)."""
-    p = [_left(random_campaign(100 + seed, particles=12)[0], seed, []) for seed in range(40)]
+    p = [p_nothing_left(random_campaign(100 + seed, particles=12)[0], seed, []) for seed in range(40)]
     assert np.sum(np.array(p) < 0.05) <= 6
     assert np.median(p) > 0.25
 

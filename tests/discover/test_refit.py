@@ -2,18 +2,13 @@
 
 import numpy as np
 import pytest
-from campaigns import campaign
+from campaigns import campaign, refined_system
 
-from mcc_jax.calibrate import JointModel
-from mcc_jax.campaign import THRESHOLD_MPA
-from mcc_jax.discover._refine import refined
 from mcc_jax.discover._refit import refit, system_at
 from mcc_jax.discover._score import project
 from mcc_jax.discover._search import rank
-from mcc_jax.discover._system import base_fit, build_system, signals_of
 from mcc_jax.effects import LIBRARY, Mechanism
 
-MODEL = JointModel(modulus_scatter=True)
 COMPLIANCE, CREEP, TAU = 0.02, 0.001, 11.0
 """A frame softer than any first-order formula bears, and a creep whose time lies between the grid's values."""
 
@@ -21,15 +16,6 @@ SMALL = {
     name: Mechanism(name, LIBRARY[name].explanation, (LIBRARY[name][variant],))
     for name, variant in {"frame_compliance": "linear", "creep": "kelvin_voigt"}.items()
 }
-
-
-def prepared(effect):
-    base = base_fit(campaign(effect), MODEL, threshold_MPa=THRESHOLD_MPA)
-    signals = signals_of(base, SMALL)
-    system = build_system(base, signals)
-    base, changed = refined(base, system, signals)
-    assert changed
-    return base, signals, build_system(base, signals)
 
 
 def candidate(system, name):
@@ -40,7 +26,7 @@ def candidate(system, name):
 
 @pytest.fixture(scope="module")
 def soft():
-    base, signals, system = prepared(f"frame_compliance={COMPLIANCE}")
+    base, signals, system = refined_system(campaign(f"frame_compliance={COMPLIANCE}"), SMALL)
     k = candidate(system, "frame_compliance")
     inside = np.array([system.column(k)])
     linear = float(project(system, inside[:0], inside=inside).theta[-1])
@@ -49,7 +35,7 @@ def soft():
 
 @pytest.fixture(scope="module")
 def creeping():
-    base, _, system = prepared(f"creep:kelvin_voigt={CREEP},tau_s={TAU}")
+    base, _, system = refined_system(campaign(f"creep:kelvin_voigt={CREEP},tau_s={TAU}"), SMALL)
     k = candidate(system, "creep")
     return base, system, k, refit(base, (system.candidates[k],), np.array([0.1]), system.prior)
 

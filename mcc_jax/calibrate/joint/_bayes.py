@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -24,6 +24,13 @@ PARETO_K_MOST = 0.7
 """The gate: R-hat at most, bulk ESS at least, no divergence, Pareto k at most (Vehtari et al. 2021, 2024)."""
 
 Mode = Literal["fast", "joint"]
+
+
+class Worst(NamedTuple):
+    """The parameter that a diagnostic is worst for, and its value."""
+
+    name: str
+    value: float
 
 
 @dataclass(frozen=True)
@@ -86,13 +93,11 @@ class BayesCalibration:
     def failures(self) -> list[str]:
         """Why the result must not be called converged, and what to do; empty if all gates are passed."""
         found = []
-        worst = max(self.rhat.values())
-        if not worst <= RHAT_MOST:
-            found.append(f"R-hat of {_argmax(self.rhat)} is {worst:.3f}, above {RHAT_MOST}: draw longer (--draws)")
-        least = min(self.ess_bulk.values())
-        if not least >= ESS_LEAST:
-            name = min(self.ess_bulk, key=lambda k: self.ess_bulk[k])
-            found.append(f"bulk ESS of {name} is {least:.0f}, below {ESS_LEAST:.0f}: draw longer (--draws)")
+        rhat, ess = unmixed(self.rhat, self.ess_bulk)
+        if rhat is not None:
+            found.append(f"R-hat of {rhat.name} is {rhat.value:.3f}, above {RHAT_MOST}: draw longer (--draws)")
+        if ess is not None:
+            found.append(f"bulk ESS of {ess.name} is {ess.value:.0f}, below {ESS_LEAST:.0f}: draw longer (--draws)")
         if self.divergences:
             found.append(f"{self.divergences} trajectories diverged: draw longer, or narrow the priors")
         bad = np.flatnonzero(~(self.pareto_k <= PARETO_K_MOST))
@@ -210,12 +215,7 @@ class BayesCalibration:
             "runtime_s": self.runtime_s,
             "seed": self.seed,
             "law": {"unloading": self.model.unloading.value, "strain_scaling": self.model.strain_scaling.value},
-            "a": summary(named["a"]),
-            "effective_modulus_MPa": summary(named["effective_modulus_MPa"]),
-            **{
-                f"log_{name}": {"mean": summary(named[f"mu_{name}"]), "sd": summary(named[f"tau_{name}"])}
-                for name in COEFFICIENTS
-            },
+            **population_json(self.population),
             "modulus_scatter": summary(named["modulus_scatter"]) if self.model.modulus_scatter else None,
             "shape_scatter": summary(named["shape_scatter"]) if self.model.shape_scatter else None,
             "yield_stress_MPa": summary(self.yield_stress_MPa()),
@@ -242,6 +242,29 @@ class BayesCalibration:
         }
 
 
+def population_json(draws: Population) -> dict[str, Any]:
+    """a, modulus, means and spreads of log C1, log C3, log C5, as they stand in result files."""
+    mu, tau = np.asarray(draws.mu), np.asarray(draws.tau)
+    return {
+        "a": summary(np.asarray(draws.a)),
+        "effective_modulus_MPa": summary(np.exp(np.asarray(draws.log_modulus))),
+        **{
+            f"log_{name}": {"mean": summary(mu[..., j]), "sd": summary(tau[..., j])}
+            for j, name in enumerate(COEFFICIENTS)
+        },
+    }
+
+
+def unmixed(rhat: Mapping[str, float], ess_bulk: Mapping[str, float]) -> tuple[Worst | None, Worst | None]:
+    """The largest R-hat and the smallest bulk ESS; None for what passes the gate."""
+    slowest = max(rhat, key=lambda name: rhat[name])
+    fewest = min(ess_bulk, key=lambda name: ess_bulk[name])
+    return (
+        None if rhat[slowest] <= RHAT_MOST else Worst(slowest, rhat[slowest]),
+        None if ess_bulk[fewest] >= ESS_LEAST else Worst(fewest, ess_bulk[fewest]),
+    )
+
+
 def summary(draws: np.ndarray) -> dict[str, Any]:
     """Mean, standard deviation and central 95 % interval of draws."""
     low, high = np.quantile(draws, [0.025, 0.975])
@@ -255,10 +278,6 @@ def log_estimate(log: float, sd: float) -> dict[str, Any]:
         return estimate(value)
     sd = min(sd, 5.0)
     return estimate(value, value * sd, (value * math.exp(-1.96 * sd), value * math.exp(1.96 * sd)))
-
-
-def _argmax(values: dict[str, float]) -> str:
-    return max(values, key=lambda k: values[k])
 
 
 def calibrate_bayes(

@@ -58,6 +58,11 @@ class Tests(eqx.Module):
         """1 - D3^2/(D1 D2) of every particle [-], through which `a` acts."""
         return eqx.filter_vmap(lambda particle: particle.flatness)(self.particle)
 
+    @property
+    def effective_diameter(self) -> Float[Array, " particles"]:
+        """D1 D2/D3 of every particle [um]."""
+        return eqx.filter_vmap(lambda particle: particle.effective_diameter)(self.particle)
+
 
 def spread(tests: Tests) -> Tests:
     """The same tests with their particles spread over this process's devices, if their number divides evenly.

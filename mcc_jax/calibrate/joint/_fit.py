@@ -170,13 +170,12 @@ def prepare(
     read_out = float(np.median([point_noise_um(campaign.curves[i]) for i in selection.kept]))
     aside = None
     if meanwhile is not None:
-        aside = threading.Thread(target=meanwhile, args=(tests,), daemon=True)
+        # No daemon: a compiler must not outlive the interpreter. Who interrupts the fit need not wait for it here.
+        aside = threading.Thread(target=meanwhile, args=(tests,))
         aside.start()
-    try:
-        fit = fit_joint(tests, model, read_out, tell=tell, **settings)
-    finally:
-        if aside is not None:
-            aside.join()  # also on an error: a compiler must not outlive the interpreter
+    fit = fit_joint(tests, model, read_out, tell=tell, **settings)
+    if aside is not None:
+        aside.join()
     return selection, tests, fit
 
 

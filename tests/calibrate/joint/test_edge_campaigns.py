@@ -2,6 +2,7 @@
 
 import json
 import math
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from joint_cases import COEFFICIENTS, DIAMETERS, NOISE, simulated, true_coefficients
 
 from mcc_jax import Campaign, Curve, InputError, Programme, Ramp, calibrate_bayes, calibrate_least_squares
+from mcc_jax.calibrate.joint import _fit
 from mcc_jax.calibrate.joint._data import select_tests
 
 METHODS = {
@@ -226,3 +228,26 @@ def test_no_usable_particle_is_told_by_name(method):
     assert "'feather'" in told
     assert "'dust'" in told
     assert "0.2 MPa" in told
+
+
+def test_an_interrupted_fit_does_not_wait_for_what_runs_meanwhile(monkeypatch):
+    begun, end = threading.Event(), threading.Event()
+
+    def meanwhile(_):
+        begun.set()
+        assert end.wait(60)
+
+    def interrupted(*_, **__):
+        assert begun.wait(60)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(_fit, "fit_joint", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        _fit.prepare(one("A", 0), _fit.JointModel(), 0.2, meanwhile=meanwhile)
+    assert not end.is_set()
+    aside = [thread for thread in threading.enumerate() if meanwhile.__name__ in thread.name]
+    end.set()
+    for thread in aside:
+        thread.join(60)
+        assert not thread.is_alive()
+    assert len(aside) == 1

@@ -1,0 +1,83 @@
+"""`mcc-jax export`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from ._output import results
+from ._session import say, session
+from ._types import Location, out_option, seed_option
+
+FORMATS = ("json", "csv", "jax", "c", "lammps", "yade")
+
+
+@click.command(short_help="Hand the calibrated law to other engines.")
+@click.argument("directory", type=Location(), metavar="DIR")
+@click.option("--format", "form", type=click.Choice(FORMATS), required=True, help="What to write; see below.")
+@out_option(required=True)
+@click.option("--particle", metavar="NAME", help="Take this particle's coefficients instead of the population's.")
+@click.option(
+    "--diameters",
+    metavar="D1,D2,D3|FILE",
+    help="Diameters in um of the particle that the golden table shows, or a table of particles (its row of that "
+    "particle, or its mean).  [default: particles.csv in DIR or DIR/campaign, else a sphere of 200 um]",
+)
+@click.option(
+    "--allow-not-monotone", is_flag=True, help="Export a law whose stress falls on loading, instead of refusing it."
+)
+@seed_option("Seed of the random paths in the golden table.")
+def export(
+    directory: Path,
+    form: str,
+    out: Path,
+    particle: str | None,
+    diameters: str | None,
+    allow_not_monotone: bool,
+    seed: int,
+) -> None:
+    """Write the law in DIR/calibration.json, of any method, for use in other engines.
+
+    Takes the population's law, each coefficient at its median exp(mean of log C), or one particle's. Beside every
+    artefact lies a golden table: paths with force and tangent to check an implementation against.
+
+    \b
+    Formats:
+      json    parameter card: values, units, uncertainty, formulae, validity, provenance
+      csv     master curve and unloading curve as tables for linear interpolation
+      jax     functions of many contacts that need jax and flatbuffers only
+      c       a C99 header, also C++: one particle between platens, and pairs
+      lammps  a normal model for LAMMPS around that header
+      yade    material and functors for Yade around that header
+
+    \b
+    Examples:
+      mcc-jax export fit --format c --out law
+      mcc-jax export fit --format json --out law --particle 7 --diameters tests/particles.csv
+    """
+    if diameters is not None and not diameters.strip():
+        raise click.BadParameter("it is empty.", param_hint="--diameters")
+    with session(3) as tell:
+        from ..export import read_calibration, write_export
+
+        tell("reading the calibration")
+        law, shown, origin = read_calibration(
+            directory, particle=particle, diameters=diameters, allow_not_monotone=allow_not_monotone
+        )
+        tell("writing")
+        with results(out) as stage:
+            files = write_export(form, law, shown, stage.folder, origin=origin, seed=seed)
+    whose = "the population" if particle is None else f"particle {particle}"
+    say(
+        f"Law of {whose}: unloading {law.unloading.value}, strain scaling {law.strain_scaling.value}, "
+        f"C1 {float(law.plastic.C1):.4g}, C3 {float(law.plastic.C3):.4g}, C5 {float(law.plastic.C5):.4g}, "
+        f"a {float(law.a):.4g}, effective modulus {float(law.effective_modulus) / 1e3:.4g} GPa."
+    )
+    sizes = " x ".join(f"{float(d):.4g}" for d in (shown.D1, shown.D2, shown.D3))
+    say(f"Golden table of a particle of {sizes} um ({origin.geometry}).")
+    for warning in origin.warnings:
+        say(f"Warning: {warning[:1].upper()}{warning[1:].rstrip('.')}.", fg="yellow")
+    say(f"Written into {out}:")
+    for name in files:
+        say(f"  {name}")

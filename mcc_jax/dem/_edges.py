@@ -1,0 +1,166 @@
+"""Contacts between particles as a list of fixed length, and what each remembers across lists."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from .._errors import InputError
+from .._types import Flag
+
+PADDING = np.iinfo(np.int64).max
+"""Key of a place in the list that no pair uses; sorts behind all others."""
+
+
+class Edges(eqx.Module):
+    r"""Pairs of particles that touch or may soon, sorted by key, in a list of fixed length.
+
+    The key of a pair is :math:`\min(i, j)\,N + \max(i, j)` and its sides are ordered by index, whatever order a
+    neighbour list names them in. History follows the key. A pair that leaves the list loses its history: should it come
+    back, it is a virgin contact.
+
+    Attributes:
+        key: keys, ascending, then padding. 8 B an edge; needs double precision switched on, the rest does not.
+        i, j: particles of the pair, i < j; 0 in padding.
+        overlap_max: largest overlap so far [m].
+        slip: elastic tangential displacement of j's surface against i's [m].
+        wanted: number of pairs asked for; larger than the capacity if the list overflowed.
+        particles: N.
+    """
+
+    key: Int[Array, " edges"]
+    i: Int[Array, " edges"]
+    j: Int[Array, " edges"]
+    overlap_max: Float[Array, " edges"]
+    slip: Float[Array, "edges 3"]
+    wanted: Int[Array, ""]
+    particles: int = eqx.field(static=True)
+
+    @property
+    def capacity(self) -> int:
+        """Length of the list."""
+        return self.key.shape[0]
+
+    @property
+    def active(self) -> Bool[Array, " edges"]:
+        """Which places hold a pair."""
+        return self.key != PADDING
+
+    @property
+    def overflow(self) -> Flag:
+        """Whether pairs were left out for want of room."""
+        return self.wanted > self.capacity
+
+    def require_room(self) -> None:
+        """Refuse to go on with a list from which pairs are missing.
+
+        Raises:
+            InputError: if the list overflowed.
+        """
+        if bool(self.overflow):
+            raise InputError(
+                f"{int(self.wanted)} pairs do not fit into a list of {self.capacity} edges",
+                remedy="Make the list with a larger `capacity`; nothing was computed with this one.",
+            )
+
+
+def list_edges(
+    pairs: Int[np.ndarray, "pairs 2"], particles: int, capacity: int, dtype: np.dtype | type = np.float64
+) -> Edges:
+    """Edges of virgin contacts from pairs in any order.
+
+    Args:
+        pairs: indices of particles; the order of pairs and within a pair does not matter, repetitions are dropped.
+        particles: number of particles N.
+        capacity: length of the list. If the pairs do not fit, `Edges.overflow` says so.
+        dtype: precision of the history.
+
+    Raises:
+        InputError: if an index is not of a particle, if a particle is paired with itself, or without double precision,
+            which 64-bit keys need.
+    """
+    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        raise InputError(
+            "keys of contacts need 64 bits",
+            remedy='jax.config.update("jax_enable_x64", True) first; positions and forces may still be float32.',
+        )
+    pairs = np.asarray(pairs, np.int64).reshape(-1, 2)
+    low, high = pairs.min(axis=1), pairs.max(axis=1)
+    wrong = np.flatnonzero((low < 0) | (high >= particles) | (low == high))
+    if wrong.size:
+        raise InputError(f"pair {wrong[0]} joins {pairs[wrong[0]].tolist()}", remedy=f"Name two of {particles}.")
+    key = np.unique(low * particles + high)
+    kept = np.full(capacity, PADDING)
+    kept[: min(key.size, capacity)] = key[:capacity]
+    first, second = np.divmod(np.where(kept == PADDING, 0, kept), particles)
+    return Edges(
+        jnp.asarray(kept),
+        jnp.asarray(first, jnp.int32),
+        jnp.asarray(second, jnp.int32),
+        jnp.zeros(capacity, dtype),
+        jnp.zeros((capacity, 3), dtype),
+        jnp.asarray(key.size),
+        particles,
+    )
+
+
+@jax.jit
+def carry_history(old: Edges, new: Edges) -> Edges:
+    """The new list with the history of the pairs that were in the old one, bit for bit; others start virgin.
+
+    Both lists are of the same particles, their capacities may differ.
+    """
+    place = jnp.searchsorted(old.key, new.key).clip(0, old.capacity - 1)
+    known = (old.key[place] == new.key) & new.active
+    return eqx.tree_at(
+        lambda e: (e.overlap_max, e.slip),
+        new,
+        (
+            jnp.where(known, old.overlap_max[place], 0.0),
+            jax.vmap(lambda known, slip: jnp.where(known, slip, 0.0))(known, old.slip[place]),
+        ),
+    )
+
+
+def widened(edges: Edges, capacity: int) -> Edges:
+    """The same list with room for more."""
+    spare = capacity - edges.capacity
+    return Edges(
+        jnp.pad(edges.key, (0, spare), constant_values=PADDING),
+        jnp.pad(edges.i, (0, spare)),
+        jnp.pad(edges.j, (0, spare)),
+        jnp.pad(edges.overlap_max, (0, spare)),
+        jnp.pad(edges.slip, ((0, spare), (0, 0))),
+        edges.wanted,
+        edges.particles,
+    )
+
+
+@jax.jit
+def relabel(edges: Edges, label: Int[Array, " particles"]) -> Edges:
+    """The same contacts after particle k became particle `label[k]`, a permutation.
+
+    A pair whose order turns over sees its slip, which is of j against i, from the other side.
+    """
+    i, j = label[edges.i], label[edges.j]
+    key = jnp.minimum(i, j).astype(edges.key.dtype) * edges.particles + jnp.maximum(i, j)
+    key = jnp.where(edges.active, key, PADDING)
+    order = jnp.argsort(key)
+    turned = jnp.where(i > j, -1.0, 1.0).astype(edges.slip.dtype)
+    padding = ~edges.active
+
+    def sorted_index(values: Array) -> Array:
+        return jnp.where(padding, 0, values).astype(edges.i.dtype)[order]
+
+    return Edges(
+        key[order],
+        sorted_index(jnp.minimum(i, j)),
+        sorted_index(jnp.maximum(i, j)),
+        edges.overlap_max[order],
+        jax.vmap(jnp.multiply)(edges.slip, turned)[order],
+        edges.wanted,
+        edges.particles,
+    )

@@ -1,0 +1,277 @@
+"""Two half contacts in series: equal force, one history scalar, derivatives in closed form."""
+
+from __future__ import annotations
+
+import functools
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from .._errors import InputError
+from .._numerics import shared
+from .._types import Scalar
+from ..law import energy_ratio, stress_ratio
+from ..law._branch import branch_force
+from ..law._loading_inverse import secant_modulus, tangent_modulus
+from ._side import HalfContact
+
+SPLIT_STEPS = 8
+"""Enough for radii from 20 to 150 um and the paper's scatter, to the last digit (with one more step on both sides)."""
+
+
+class ContactEnergy(eqx.Module):
+    """Energy balance of a contact [J]: work done on it = recoverable + dissipated.
+
+    Attributes:
+        recoverable: what it gives back on full release.
+        dissipated: what is lost for good; does not change while unloading and reloading.
+    """
+
+    recoverable: Scalar
+    dissipated: Scalar
+
+
+def largest_overlap(overlap_max: Scalar, overlap: Scalar) -> Scalar:
+    """The history after this overlap [m]: the larger of both; an overlap that is NaN shows."""
+    return jnp.where(overlap < overlap_max, overlap_max, overlap)
+
+
+def pair_force(i: HalfContact, j: HalfContact, overlap_max: Scalar, overlap: Scalar) -> Scalar:
+    r"""Repulsive force between two particles.
+
+    .. math::
+        \delta_P = d_i + d_j, \quad F_i(d_i) = F_j(d_j) = F_P, \qquad
+        F = F_P\, f(q), \quad q = (\delta_P - \delta) / (\Delta_i + \Delta_j)
+
+    with f of `law.stress_ratio`. The equal-force split is unique where both sides are monotone. Both sides peaked at
+    the same force, so they unload by the same share of it, and the largest overlap is all there is to remember.
+    Particles that are alike share the overlap in halves. Beside a side whose stiffness and modulus over stiffness are
+    both without bound the other behaves as against a wall; a side that is only large does not give way on loading, but
+    its recovery stays.
+
+    Args:
+        i, j: the half contacts; exchanging them changes nothing but rounding.
+        overlap_max: largest overlap before this one [m], 0 for a virgin contact.
+        overlap: overlap now [m]; negative where the particles do not touch.
+
+    Returns:
+        Force [N], never negative. Scalar and first derivatives, in both modes, are finite everywhere; at the onset of
+        unloading the derivative is that of loading.
+
+    Raises:
+        InputError: if one side unloads by the printed form and the other by a punch form.
+    """
+    if i.power != j.power:
+        raise InputError(
+            "a pair whose sides unload by different forms shares no unloading curve",
+            remedy="Give both particles the same `unloading` form.",
+        )
+    peak = largest_overlap(overlap_max, overlap)
+    return _series_force(i.power, _numbers(i), _numbers(j), peak, peak - overlap)
+
+
+def wall_force(side: HalfContact, overlap_max: Scalar, overlap: Scalar) -> Scalar:
+    r"""Force [N] of a rigid wall on a particle: the half contact alone, :math:`F = F_P f((d_P - d) / \Delta)`.
+
+    Args:
+        side: the particle's half contact.
+        overlap_max: largest overlap before this one [m].
+        overlap: overlap with the wall now [m].
+    """
+    peak = largest_overlap(overlap_max, overlap)
+    return branch_force(side.power, side.k1, side.k3, side.k5, side.c, peak, peak - overlap)
+
+
+def pair_split(i: HalfContact, j: HalfContact, overlap: Scalar) -> tuple[Scalar, Scalar]:
+    """Compressions [m] of the two sides while loading at an overlap [m], and so of the peak of any unloading."""
+    series = _series(_numbers(i), _numbers(j), overlap)
+    return series.d_i, series.d_j
+
+
+def pair_energy(i: HalfContact, j: HalfContact, overlap_max: Scalar, overlap: Scalar) -> ContactEnergy:
+    r"""Energy of a contact [J].
+
+    .. math:: W = \sum_s \left(\tfrac12 k_1 d^2 - \tfrac14 k_3 d^4 + \tfrac16 k_5 d^6\right)_s, \quad
+        W_{rec} = F_P (\Delta_i + \Delta_j)\, g(q), \quad W_{diss} = W - W_{rec}(q = 0)
+
+    with g of `law.energy_ratio`. Arguments as in `pair_force`.
+    """
+    peak = largest_overlap(overlap_max, overlap)
+    series = _series(_numbers(i), _numbers(j), peak)
+    span = _span(i.power, i.c, series.force, series.d_i) + _span(j.power, j.c, series.force, series.d_j)
+    return _energy(_work(i, series.d_i) + _work(j, series.d_j), series.force, span, peak - overlap)
+
+
+def wall_energy(side: HalfContact, overlap_max: Scalar, overlap: Scalar) -> ContactEnergy:
+    """Energy [J] of a contact with a rigid wall; see `pair_energy`."""
+    peak = largest_overlap(overlap_max, overlap)
+    force = peak * secant_modulus(side.k1, side.k3, side.k5, peak)
+    return _energy(_work(side, peak), force, _span(side.power, side.c, force, peak), peak - overlap)
+
+
+# ---- inside ----------------------------------------------------------------------------------------------------------
+
+
+class _Numbers(NamedTuple):
+    """The numbers of one side that its force depends on."""
+
+    k1: Scalar
+    k3: Scalar
+    k5: Scalar
+    c: Scalar
+
+
+class _Series(NamedTuple):
+    """Loading of the two sides: compressions, common force."""
+
+    d_i: Scalar
+    d_j: Scalar
+    force: Scalar
+
+
+def _numbers(side: HalfContact) -> _Numbers:
+    return _Numbers(side.k1, side.k3, side.k5, side.c)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _series_force(power: int, i: _Numbers, j: _Numbers, peak: Scalar, drop: Scalar) -> Scalar:
+    series = _solve(i, j, peak)
+    span = _span(power, i.c, series.force, series.d_i) + _span(power, j.c, series.force, series.d_j)
+    return series.force * _ratio(span, drop)[1]
+
+
+@_series_force.defjvp
+def _series_force_jvp(power, primals, tangents):
+    # With the tangents t of the sides and their explicit changes dF_s at fixed compression,
+    #   dF_P = (t_i t_j dpeak + t_j dF_i + t_i dF_j) / (t_i + t_j),   d(d_s) = (dF_P - dF_s) / t_s,
+    #   dF = (f + n h) dF_P + F_P f' d(drop) / W + (h / W) sum_s span_s (F_P dc_s / c_s - k_s d(d_s)),  h = -q f' / 2.
+    i, j, peak, drop = primals
+    di, dj, dpeak, ddrop = tangents
+    series = _solve(i, j, peak)
+    span_i, span_j = (_span(power, s.c, series.force, d) for s, d in ((i, series.d_i), (j, series.d_j)))
+    span = span_i + span_j
+    q, ratio = _ratio(span, drop)
+    inside = (q > 0) & (q < 1)
+    q = jnp.where(inside, q, 0.0)
+    fall = jnp.where(inside, 4 / jnp.pi * shared(jnp.sqrt((1 - q) * (1 + q))), 0.0)  # -f'
+    h = 0.5 * q * fall
+    t_i, t_j = _tangent(i, series.d_i), _tangent(j, series.d_j)
+    change_i, change_j = _explicit(di, series.d_i), _explicit(dj, series.d_j)
+    flexibility = shared(1 / (t_i + t_j))
+    dforce = flexibility * (t_i * t_j * dpeak + t_j * change_i + t_i * change_j)
+    # d(d_i) + d(d_j) = d(peak); written without a division by a tangent that may be small.
+    dd_i = flexibility * (t_j * dpeak + change_j - change_i)
+    dd_j = flexibility * (t_i * dpeak + change_i - change_j)
+    widths = _widening(i, di, series.force, series.d_i, dd_i, span_i) + _widening(
+        j, dj, series.force, series.d_j, dd_j, span_j
+    )
+    carried = series.force > 0
+    per_span = shared(1 / jnp.where(carried, span, 1.0))
+    change = (ratio + power * h) * dforce + per_span * (h * widths - series.force * fall * ddrop)
+    return series.force * ratio, jnp.where(carried | (drop <= 0), change, 0.0)
+
+
+def _widening(side, dside, force, d, dd, span):
+    """Twice the force times the change of a side's recovered compression, less the part that goes with the force."""
+    return span * (shared(force / side.c) * dside.c - secant_modulus(side.k1, side.k3, side.k5, d) * dd)
+
+
+def _explicit(change: _Numbers, d: Scalar) -> Scalar:
+    square = d * d
+    return d * (change.k1 - square * (change.k3 - square * change.k5))
+
+
+def _tangent(side: _Numbers, d: Scalar) -> Scalar:
+    """Slope of a side; where it vanishes (on the verge of not being monotone) a small positive number."""
+    floor = jnp.sqrt(jnp.finfo(d.dtype).eps) * side.k1
+    slope = tangent_modulus(side.k1, side.k3, side.k5, d)
+    return jnp.where(slope < floor, floor, slope)
+
+
+def _span(power: int, c: Scalar, force: Scalar, d: Scalar) -> Scalar:
+    """Compression recovered on full release, 1 where no force was carried."""
+    carries = (d > 0) & (force > 0)
+    per_compression = shared(jnp.where(carries, force, 1.0) / jnp.where(carries, d, 1.0))
+    square = c * per_compression if power == 1 else c * force * per_compression
+    return shared(jnp.sqrt(jnp.where(carries & (square > 0), square, 1.0)))
+
+
+def _ratio(span: Scalar, drop: Scalar) -> tuple[Scalar, Scalar]:
+    q = shared(drop / span)
+    return q, jnp.where(drop <= 0, 1.0, stress_ratio(q))
+
+
+def _work(side: HalfContact, d: Scalar) -> Scalar:
+    square = d * d
+    return square * (side.k1 / 2 - square * (side.k3 / 4 - square * side.k5 / 6))
+
+
+def _energy(work: Scalar, force: Scalar, span: Scalar, drop: Scalar) -> ContactEnergy:
+    q, _ = _ratio(span, drop)
+    carried = force > 0
+    scale = jnp.where(carried, force * span, 0.0)
+    at_peak = scale * energy_ratio(jnp.zeros_like(q))
+    now = jnp.where(drop <= 0, at_peak, scale * energy_ratio(q))
+    return ContactEnergy(now, work - at_peak)
+
+
+@jax.custom_jvp
+def _series(i: _Numbers, j: _Numbers, overlap: Scalar) -> _Series:
+    return _solve(i, j, overlap)
+
+
+@_series.defjvp
+def _series_jvp(primals, tangents):
+    i, j, overlap = primals
+    di, dj, doverlap = tangents
+    series = _solve(i, j, overlap)
+    t_i, t_j = _tangent(i, series.d_i), _tangent(j, series.d_j)
+    change_i, change_j = _explicit(di, series.d_i), _explicit(dj, series.d_j)
+    flexibility = shared(1 / (t_i + t_j))
+    dd_i = flexibility * (t_j * doverlap + change_j - change_i)
+    dd_j = flexibility * (t_i * doverlap + change_i - change_j)
+    return series, _Series(dd_i, dd_j, flexibility * (t_i * t_j * doverlap + t_j * change_i + t_i * change_j))
+
+
+def _solve(i: _Numbers, j: _Numbers, overlap: Scalar) -> _Series:
+    whole = jnp.where(overlap > 0, overlap, 0.0)
+    # One number leaves the iteration and a barrier closes it: with more, or without, XLA iterates again for each use.
+    d = jax.lax.optimization_barrier(_split(i, j, whole))
+    # One more step, on both sides separately: beside a side much stiffer, what is left of the overlap has no digits.
+    rest = whole - d
+    force_i, force_j = (x * secant_modulus(s.k1, s.k3, s.k5, x) for s, x in ((i, d), (j, rest)))
+    t_i, t_j = _tangent(i, d), _tangent(j, rest)
+    flexibility = shared(1 / (t_i + t_j))
+    change = flexibility * (force_i - force_j)
+    return _Series(d - change, rest + change, flexibility * (t_j * force_i + t_i * force_j))
+
+
+def _split(i: _Numbers, j: _Numbers, whole: Scalar) -> Scalar:
+    """Compression of i at equal force, by Newton's method with the curvature (Halley), kept between bounds.
+
+    A split that meets the force but for rounding stays where it is: asked again, the bounds would throw it out.
+    """
+    d = shared(j.k1 / (i.k1 + j.k1)) * whole
+    low, high = jnp.zeros_like(d), whole
+    for _ in range(SPLIT_STEPS):
+        force_i, slope_i, bend_i = _polynomial(i, d)
+        force_j, slope_j, bend_j = _polynomial(j, whole - d)
+        excess, slope, bend = force_i - force_j, slope_i + slope_j, bend_i - bend_j
+        low = jnp.where(excess < 0, d, low)
+        high = jnp.where(excess > 0, d, high)
+        settled = jnp.abs(excess) <= 4 * jnp.finfo(d.dtype).eps * (jnp.abs(force_i) + jnp.abs(force_j))
+        square = slope * slope
+        divisor = jnp.maximum(square - excess * bend, 0.5 * square)
+        new = d - shared(excess * slope / jnp.where(divisor > 0, divisor, 1.0))
+        new = jnp.where((new < low) | (new > high) | (divisor <= 0), 0.5 * (low + high), new)
+        d = jnp.where(settled, d, new)
+    return d
+
+
+def _polynomial(side: _Numbers, d: Scalar) -> tuple[Scalar, Scalar, Scalar]:
+    """Force, slope and half the curvature of a side."""
+    square = d * d
+    k3, k5 = square * side.k3, square * side.k5
+    return d * (side.k1 - k3 + square * k5), side.k1 - 3 * k3 + 5 * square * k5, d * (10 * k5 - 3 * side.k3)

@@ -1,0 +1,117 @@
+"""Rigid walls that particles press against: planes, and a cylinder open at its rim."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._errors import InputError
+from .._numerics import shared
+from .._types import Scalar, scalar
+
+Vector = Float[Array, " 3"]
+
+
+class Plane(eqx.Module):
+    """A plane; particles are on the side to which its normal points.
+
+    Attributes:
+        point: any point of it [m].
+        normal: unit vector into the space of the particles.
+        velocity: how fast it moves [m/s].
+    """
+
+    point: Vector = eqx.field(converter=jnp.asarray)
+    normal: Vector = eqx.field(converter=jnp.asarray)
+    velocity: Vector = eqx.field(converter=jnp.asarray)
+
+    def distance(self, position: Vector) -> Scalar:
+        """Distance [m] of a point from the wall, negative behind it."""
+        return jnp.sum((position - self.point) * self.normal)
+
+    def normal_at(self, position: Vector) -> Vector:
+        """Direction in which the wall pushes a particle there."""
+        del position
+        return self.normal
+
+    def moved(self, time: Scalar) -> Plane:
+        """The wall after that time [s]."""
+        return eqx.tree_at(lambda w: w.point, self, self.point + time * self.velocity)
+
+
+class Cylinder(eqx.Module):
+    r"""The inside of a cylinder about the z axis, widening above its rim so that a tablet can leave.
+
+    .. math:: \text{distance} = R + t \max(z - z_{rim}, 0) - \sqrt{x^2 + y^2}
+
+    Attributes:
+        radius: R [m].
+        rim: height above which the chamfer starts [m]; infinite for none.
+        chamfer: t, widening per height above the rim [-].
+        velocity: how fast it moves along z (third component) and, for friction, as a body [m/s].
+    """
+
+    radius: Scalar = eqx.field(converter=scalar)
+    rim: Scalar = eqx.field(converter=scalar)
+    chamfer: Scalar = eqx.field(converter=scalar)
+    velocity: Vector = eqx.field(converter=jnp.asarray)
+
+    def distance(self, position: Vector) -> Scalar:
+        """Distance [m] of a point from the wall, negative outside."""
+        above = jnp.maximum(position[2] - self.rim, 0.0)
+        opening = jnp.where(above > 0, self.chamfer * above, 0.0)
+        return self.radius + opening - _length(position[:2])
+
+    def normal_at(self, position: Vector) -> Vector:
+        """Direction in which the wall pushes a particle there: towards the axis."""
+        flat = jnp.stack([position[0], position[1], jnp.zeros_like(position[2])])
+        length = _length(position[:2])
+        return -flat * shared(1 / jnp.where(length > 0, length, 1.0))
+
+    def moved(self, time: Scalar) -> Cylinder:
+        """The wall after that time [s]."""
+        return eqx.tree_at(lambda w: w.rim, self, self.rim + time * self.velocity[2])
+
+
+Wall: TypeAlias = Plane | Cylinder
+Walls: TypeAlias = tuple[Wall, ...]
+
+
+def die(radius: float, height: float, dtype: type = jnp.float64) -> Walls:
+    """A closed die: bottom punch at z = 0, top punch at the height, cylinder between them with its rim at the height.
+
+    Returns:
+        (bottom, top, cylinder), at rest; give them velocities with `set_velocity`.
+
+    Raises:
+        InputError: if a size is not positive.
+    """
+    if not (radius > 0 and height > 0):
+        raise InputError(f"a die of radius {radius} m and height {height} m", remedy="Both must be positive.")
+
+    def along_z(z: float) -> Array:
+        return jnp.asarray([0.0, 0.0, z], dtype)
+
+    rest = along_z(0.0)
+    return (
+        Plane(rest, along_z(1.0), rest),
+        Plane(along_z(height), along_z(-1.0), rest),
+        Cylinder(jnp.asarray(radius, dtype), jnp.asarray(height, dtype), jnp.asarray(0.05, dtype), rest),
+    )
+
+
+def set_velocity(walls: Walls, velocity: Float[Array, "walls 3"]) -> Walls:
+    """The walls with these velocities [m/s]."""
+    return tuple(
+        eqx.tree_at(lambda w: w.velocity, wall, v.astype(wall.velocity.dtype))
+        for wall, v in zip(walls, velocity, strict=True)
+    )
+
+
+def _length(vector: Float[Array, " 2"]) -> Scalar:
+    """Length with a finite derivative at zero."""
+    square = jnp.sum(vector * vector)
+    return jnp.where(square > 0, shared(jnp.sqrt(jnp.where(square > 0, square, 1.0))), 0.0)

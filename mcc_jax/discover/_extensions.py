@@ -1,0 +1,58 @@
+"""Extended laws fitted as they are, each once, and which of them are worth it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ._refit import Refit, refit, system_at
+from ._score import project
+from ._search import Ranking
+from ._system import GLOBALS, Base, Signals, System
+
+SERIOUS, MOST_REFITS = 0.5, 8
+"""Mechanisms whose log evidence is at least this share of the best one's are serious; so many formulas at most."""
+
+
+class Extensions:
+    """The law extended by effects, fitted as it is: once each, and only where first order may not do."""
+
+    def __init__(self, base: Base, system: System, signals: Signals) -> None:
+        self.base, self.system, self.signals = base, system, signals
+        self.known: dict[tuple[int, ...], Refit] = {}
+
+    def fit(self, chosen: tuple[int, ...]) -> Refit:
+        """The base law with some candidates."""
+        if chosen not in self.known:
+            inside = np.array([self.system.column(k) for k in chosen], int)
+            start = project(self.system, inside[:0], inside=inside).theta[len(GLOBALS) :]
+            candidates = tuple(self.system.candidates[k] for k in chosen)
+            self.known[chosen] = refit(self.base, candidates, start, self.system.prior)
+        return self.known[chosen]
+
+    def drop(self, chosen: tuple[int, ...]) -> float:
+        """By how much -2 log likelihood falls; not at all where an amplitude has a sign that it cannot have."""
+        found = self.fit(chosen)
+        return max(self.fit(()).deviance - found.deviance, 0.0) if found.physical else 0.0
+
+    def system_of(self, chosen: tuple[int, ...]) -> System:
+        """The linear system around the extended law."""
+        return system_at(self.base, self.system, self.signals, list(chosen), self.fit(chosen))
+
+
+def serious(system: System, ranking: Ranking) -> list[int]:
+    """Candidates worth a fit of their own: of the mechanisms that may be true the best two formulas."""
+    chosen: list[int] = []
+    best = ranking.log_evidence[0]
+    for name, value, at_random in zip(ranking.names, ranking.log_evidence, ranking.at_random, strict=True):
+        if value < SERIOUS * best or len(chosen) >= MOST_REFITS:
+            break
+        if at_random:
+            continue
+        members = [k for k, c in enumerate(system.candidates) if c.mechanism == name]
+        members.sort(key=lambda k: -ranking.evidence[k])
+        formulas: dict[str, int] = {}
+        for k in members:
+            if np.isfinite(ranking.evidence[k]):
+                formulas.setdefault(system.candidates[k].variant.name, k)
+        chosen.extend(list(formulas.values())[:2])
+    return chosen[:MOST_REFITS]

@@ -1,0 +1,115 @@
+"""What is missing: one mechanism, several that cannot be told apart, two together, or a formula of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ._closure import find_closure, pursue
+from ._extensions import Extensions
+from ._result import Verdict
+from ._score import Projection, project
+from ._search import Ranking, family_columns, pairs, rank
+from ._significance import p_nothing_left
+from ._system import Base, System
+
+LEVEL_OF_MORE = 0.01
+"""Level at which something is missing besides the whole family of formulas of what was added."""
+
+LEVEL_OF_UNLISTED = 0.001
+"""Level at which something is missing besides every name, for saying that no name is right: no listed formula is
+nature's own, so that a little is always left, and this is the stronger claim."""
+
+BETTER, SHARE = 30.0, 0.1
+"""A formula of a few free words takes away this much chi2 more than any listed mechanism by chance and because no
+listed formula is nature's own, in addition this share of what the mechanism takes away. Beyond, it is not listed."""
+
+LIKE_THE_BEST = 0.1
+"""A mechanism whose probability is at least this share of the best one's belongs to the set."""
+
+
+def name_missing(
+    base: Base, system: System, view: Projection, ranking: Ranking, extensions: Extensions | None, seed: int, tell
+):
+    """Verdict, chosen candidates, their sets, rankings of each step, and the formula if nothing listed will do."""
+    members = tuple(ranking.members(LIKE_THE_BEST))
+    gain_of_words = pursue(system)[1]
+    # Any member of the set may be the one beside which nothing is left; the most probable is asked first.
+    most_left = 0.0
+    for name in members:
+        position = ranking.names.index(name)
+        first, gain = ranking.best[position], float(ranking.gain[position])
+        if ranking.at_random[position]:
+            around = system.absorbing(family_columns(system, (name,)))
+        else:
+            around = system if extensions is None else extensions.system_of((first,))
+        left = p_nothing_left(around, seed, [first])
+        most_left = max(most_left, left)
+        if gain_of_words <= gain + BETTER + SHARE * gain and left > LEVEL_OF_MORE:
+            own = (name, *(m for m in members if m != name))
+            return ("NAMED" if len(members) == 1 else "SET"), [first], [own], [ranking], None
+    first = ranking.best[0]
+    tell("a second effect")
+    if ranking.at_random[0] and ranking.gain[0] > gain_of_words:
+        return ("NAMED" if len(members) == 1 else "SET"), [first], [members], [ranking], None
+    best_pairs = pairs(system, view)
+    if best_pairs and not ranking.at_random[0]:
+        gain, i, j = best_pairs[0]
+        both = tuple(system.candidates[k].mechanism for k in (i, j))
+        with_both = system
+        if extensions is not None:
+            with_both, gain = extensions.system_of((i, j)), max(gain, extensions.drop((i, j)))
+        p_both = p_nothing_left(with_both, seed, [i, j])
+        if p_both > LEVEL_OF_MORE and gain >= gain_of_words - BETTER:
+            steps = [_beside(system, other) for other in (j, i)]  # each is judged with the other one in the law
+            sets = [_with(name, step) for name, step in zip(both, steps, strict=True)]
+            verdict: Verdict = "NAMED" if all(len(s) == 1 for s in sets) else "SET"
+            return verdict, [i, j], sets, steps, None
+    tell("a formula of its own")
+    closure = find_closure(system, _span(base), seed, tell=tell)
+    unexplained = most_left <= LEVEL_OF_UNLISTED or gain_of_words > ranking.gain[0] * (1 + SHARE) + BETTER
+    if closure is None or not unexplained:
+        return ("NAMED" if len(members) == 1 else "SET"), [first], [members], [ranking], None
+    return "UNLISTED", [], [], [], closure
+
+
+def _beside(system: System, other: int) -> Ranking:
+    """The ranking beside a candidate that is in the law already."""
+    return rank(system, project(system, system.candidate_columns, inside=np.array([system.column(other)])))
+
+
+def _with(name: str, ranking: Ranking) -> tuple[str, ...]:
+    members = ranking.members(LIKE_THE_BEST)
+    return (name, *(m for m in members if m != name))
+
+
+def chooser(system: System, count: int, formula: bool) -> Callable[[np.ndarray], list[np.ndarray]]:
+    """The search as it is repeated within a fold."""
+    empty = np.array([], int)
+
+    def choose(particles: np.ndarray) -> list[np.ndarray]:
+        if formula:
+            return [empty, np.array(pursue(system, particles=particles)[0], int)]
+        view = project(system, system.candidate_columns, particles=particles)
+        if count == 1:
+            return [empty, np.array([system.column(rank(system, view).best[0])])]
+        found = pairs(system, view)
+        if not found:
+            return [empty] * (count + 1)
+        _, i, j = found[0]
+        return [empty, np.array([system.column(i)]), np.array([system.column(i), system.column(j)])]
+
+    return choose
+
+
+def _span(base: Base) -> dict[str, tuple[float, float]]:
+    tests = base.tests
+    force = np.where(np.asarray(tests.mask), np.asarray(tests.force), np.nan)
+    diameter = np.asarray(tests.effective_diameter)
+    stress = force / (np.pi * diameter[:, None] ** 2 / 4) * 1e3
+    return {
+        "stress_MPa": (float(np.nanmin(stress)), float(np.nanmax(stress))),
+        "effective_diameter_um": (float(diameter.min()), float(diameter.max())),
+        "time_s": (0.0, float(np.asarray(base.records.time).max())),
+    }

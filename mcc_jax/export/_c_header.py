@@ -1,0 +1,68 @@
+"""The law as a C99 header."""
+
+from __future__ import annotations
+
+from ..geometry import Particle
+from ..law import MccLaw, StrainScaling, Unloading
+from ._origin import STRAIN_MAX, Origin, check, numbers, version
+from ._templates import quoted, render
+
+
+def c_header(law: MccLaw, particle: Particle | None = None, *, origin: Origin | None = None) -> str:
+    """A C99 header, valid as C++, in SI units, with the law's numbers as an initialiser.
+
+    It holds force, tangent and history of one particle between platens, and of a pair of half contacts, for all forms
+    of unloading and strain scaling. Coefficients are passed as a struct, so that every particle can have its own.
+
+    Args:
+        law: the law.
+        particle: if given, the law is checked to carry it, and a comment names its size.
+        origin: where the law comes from, for the comment on top.
+
+    Raises:
+        InputError: if a parameter is out of its range or the particle carries no stress. A law that is not monotone is
+            passed on; `read_calibration` refuses it, and so should you unless you know what a pair of them means.
+    """
+    origin = origin or Origin()
+    if particle is not None:
+        check(law, particle, allow_not_monotone=True)
+    values = numbers(law)
+    return render(
+        "mcc_law.h.j2",
+        version=version(),
+        origin=origin_lines(law, particle, origin),
+        strain_max=STRAIN_MAX,
+        forms=[
+            {
+                "name": form.name,
+                "constant": repr(form.constant),
+                "power": 1 if form is Unloading.PRINTED else 2,
+            }
+            for form in Unloading
+        ],
+        scalings=[{"name": scaling.name, "power": scaling.power} for scaling in StrainScaling],
+        form=law.unloading.name,
+        scaling=law.strain_scaling.name,
+        modulus=repr(values["effective_modulus_MPa"] * 1e6),
+        **{name: repr(values[name]) for name in ("C1", "C3", "C5", "a")},
+    )
+
+
+def origin_lines(law: MccLaw, particle: Particle | None, origin: Origin) -> list[str]:
+    """Where the values come from, a fact a line."""
+    lines = [f"Unloading {law.unloading.value}, strain scaling {law.strain_scaling.value}."]
+    if origin.calibration is not None:
+        c = origin.calibration
+        lines.append(
+            f"From {quoted(str(c['file']))}, method {quoted(str(c['method']))}, sha256 {str(c['sha256'])[:16]}..."
+        )
+        if not c["converged"]:
+            lines.append("WARNING: that calibration did not converge.")
+    whose = "the population (medians)" if origin.particle is None else f"particle {quoted(origin.particle)}"
+    lines.append(f"Coefficients of {whose}.")
+    if particle is not None:
+        sizes = ", ".join(f"{float(d):.6g}" for d in (particle.D1, particle.D2, particle.D3))
+        lines.append(f"Particle of the golden table: D1, D2, D3 = {sizes} um ({quoted(origin.geometry)}).")
+    if not bool(law.is_monotone):
+        lines.append("WARNING: the loading curve is not monotone; a pair of such contacts has several solutions.")
+    return lines

@@ -1,0 +1,112 @@
+"""The parameter card: everything that a person needs to code the law anew, as JSON."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import Any
+
+from ..geometry import Particle
+from ..law import MccLaw, Unloading
+from ._origin import STRAIN_MAX, Origin, numbers, version
+
+UNITS = {"C1": "1", "C3": "1", "C5": "1", "a": "1", "effective_modulus_MPa": "MPa"}
+FORMULAE = {
+    "effective_diameter": "D_e = D1 D2 / D3, D3 along the compression",
+    "strain": "eps = displacement / D_e",
+    "stress": "sigma = force / (pi D_e^2 / 4); 1 MPa um^2 = 1e-3 mN",
+    "shape_factor": "eta_p = 1 + a (1 - D3^2 / (D1 D2))",
+    "loading": "sigma / MPa = C1 x - (C3 x)^3 + (C5 x)^5 with x = eta_p eps, for eps >= eps_P",
+    "history": "eps_P is the largest strain so far, sigma_P the loading stress there",
+    "recovered_strain": "delta^2 = (sigma_P / E)^n / (k eta_p^p eps_P)",
+    "unloading": "sigma = sigma_P g(s), g(s) = (2/pi) (acos s - s sqrt(1 - s^2)), s = (eps_P - eps) / delta, "
+    "for eps < eps_P; 0 for s >= 1; reloading retraces it",
+    "unloading_slope": "dg/ds = -(4/pi) sqrt(1 - s^2)",
+    "monotone": "stress never falls on loading if 9 C3^6 <= 20 C1 C5^5",
+    "pair_of_particles": "each of two half contacts takes a share d_i of the overlap, F_i = force of a platen test at "
+    "displacement 2 d_i; F_1 = F_2 on loading; F = F_P g(q), q = (overlap_P - overlap) / (recovered_1 + recovered_2) "
+    "on unloading, recovered_i half that of the platen test",
+}
+
+
+def card(law: MccLaw, particle: Particle | None = None, *, origin: Origin | None = None) -> dict[str, Any]:
+    """The parameter card of a law.
+
+    Args:
+        law: the law.
+        particle: if given, its size and shape factor are part of the card.
+        origin: estimates with their uncertainty, and where they are from; nothing is claimed without.
+
+    Returns:
+        Parameters with unit and uncertainty, form of the law, validity, formulae in words, provenance, warnings and
+        a checksum (SHA-256) over the law and its numbers; ready for `json.dump`.
+
+    References:
+        Bommireddy et al. (2018), eqs. 13, 16, 23, 24.
+    """
+    origin = origin or Origin()
+    values = numbers(law)
+    form = {
+        "unloading": law.unloading.value,
+        "strain_scaling": law.strain_scaling.value,
+        "k": law.unloading.constant,
+        "n": stress_power(law),
+        "p": law.strain_scaling.power,
+    }
+    unknown = {"sd": None, "interval_95": None}
+    parameters = {
+        name: {**unknown, **origin.estimates.get(name, {}), "value": value, "unit": UNITS[name]}
+        for name, value in values.items()
+    }
+    K1, K3, K5 = (float(K) for K in law.plastic.polynomial)
+    return {
+        "schema": 1,
+        "what": "loading-unloading contact law of micro-crystalline cellulose particles",
+        "coefficients_of": "the population: exp(mean of log C)" if origin.particle is None else origin.particle,
+        "law": form,
+        "parameters": parameters,
+        "uncertainty": "sd and interval_95 are those of the estimate; scatter between particles is in population.sd",
+        "polynomial_MPa": {"K1": K1, "K3": K3, "K5": K5, "formula": "sigma = K1 x - K3 x^3 + K5 x^5"},
+        "population": None if origin.population is None else dict(origin.population),
+        "is_monotone": bool(law.is_monotone),
+        "particle": None if particle is None else _geometry(law, particle, origin),
+        "validity": {
+            "scaled_strain_max": STRAIN_MAX,
+            "stress_there_MPa": STRAIN_MAX * (K1 - STRAIN_MAX**2 * (K3 - STRAIN_MAX**2 * K5)),
+            "words": f"single particles between platens, along D3, eta_p eps up to {STRAIN_MAX}; rate independent, "
+            "no adhesion, no friction; contacts of one particle do not know of each other",
+        },
+        "formulae": FORMULAE,
+        "units": {"stress": "MPa", "length": "um", "force": "mN"},
+        "provenance": {
+            "software": "mcc_jax",
+            "version": version(),
+            "calibration": None if origin.calibration is None else dict(origin.calibration),
+            "reference": "Bommireddy, Agarwal, Yettella, Tomar, Gonzalez (2018), arXiv:1812.06173",
+        },
+        "warnings": list(origin.warnings),
+        "sha256": checksum({"law": form, "values": values}),
+    }
+
+
+def checksum(content: Any) -> str:
+    """SHA-256 of the canonical JSON of some content: sorted keys, no spaces."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def stress_power(law: MccLaw) -> int:
+    """The power n of stress over modulus in the recovered strain squared."""
+    return 1 if law.unloading is Unloading.PRINTED else 2
+
+
+def _geometry(law: MccLaw, particle: Particle, origin: Origin) -> dict[str, Any]:
+    return {
+        "D1_um": float(particle.D1),
+        "D2_um": float(particle.D2),
+        "D3_um": float(particle.D3),
+        "effective_diameter_um": float(particle.effective_diameter),
+        "effective_area_um2": float(particle.effective_area),
+        "eta_p": float(law.shape_factor(particle)),
+        "displacement_valid_um": STRAIN_MAX * float(particle.effective_diameter / law.shape_factor(particle)),
+        "from": origin.geometry,
+    }

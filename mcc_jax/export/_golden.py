@@ -1,0 +1,139 @@
+"""Golden tables: paths with force and tangent, against which an implementation in any engine is checked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._types import Values
+from ..geometry import Particle
+from ..law import MccLaw
+from ._origin import STRAIN_MAX
+from ._pair import pair_force
+from ._respond import respond
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    Table = pd.DataFrame
+else:
+    Table = object
+
+RANDOM_PATHS = 8
+STEPS = 40
+# Shares of the recoverable displacement on the way down; 1 itself is left out, where a tangent is all rounding.
+SHARES = np.array([1e-9, 1e-3, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.99, 0.9999, 1.001, 1.5])
+OTHER_SIZE = 0.6
+_SI = {"displacement": ("um", "m", 1e-6), "force": ("mN", "N", 1e-3), "tangent": ("mN_per_um", "N_per_m", 1e3)}
+
+
+@eqx.filter_jit
+def _recovered(law: MccLaw, particle: Particle, peak: Values) -> Values:
+    """Displacement recovered on full release [um]."""
+    return particle.displacement(law.recoverable_strain(particle, particle.strain(peak)))
+
+
+_each = eqx.filter_jit(eqx.filter_vmap(respond, in_axes=(None, None, 0, 0)))
+
+
+def golden_table(law: MccLaw, particle: Particle, *, seed: int = 0, units: Literal["um_mN", "SI"] = "um_mN") -> Table:
+    """Paths of one particle between two platens with the law's force and tangent.
+
+    The first path loads, releases, reloads and overtakes its peak, up to a scaled strain of 0.67, with points close to
+    every place where branches meet; the others are random.
+
+    Args:
+        law: the law.
+        particle: the particle.
+        seed: of the random paths.
+        units: `um_mN` or `SI`.
+
+    Returns:
+        A pandas table with a column `path`, 0 for the first, and displacement, largest displacement so far, force and
+        tangent, the unit in the column's name. Every path starts from a virgin particle.
+    """
+    scale = STRAIN_MAX * float(particle.effective_diameter / law.shape_factor(particle))
+
+    def recovered(peak: np.ndarray) -> np.ndarray:
+        return np.asarray(_recovered(law, particle, jnp.asarray(peak)))
+
+    paths = _paths(scale, recovered, seed)
+    pasts = [np.concatenate([[0.0], np.maximum.accumulate(np.maximum(path, 0.0))[:-1]]) for path in paths]
+    x = np.concatenate(paths)  # in one call, which compiles once
+    force, tangent, peak = (
+        np.asarray(v) for v in _each(law, particle, jnp.asarray(x), jnp.asarray(np.concatenate(pasts)))
+    )
+    number = np.repeat(np.arange(len(paths)), [len(path) for path in paths])
+    return _in_units(_rows(number, x, peak, force, tangent), units)
+
+
+def golden_pair_table(
+    law: MccLaw, particle: Particle, *, seed: int = 0, units: Literal["um_mN", "SI"] = "um_mN"
+) -> Table:
+    """Paths of the overlap of two half contacts: with itself, with one of 0.6 times the size, and with a rigid wall.
+
+    Both sides carry one force; see `pair_force`. Columns as of `golden_table`, and `partner`: `equal`, `smaller`,
+    `wall`.
+    """
+    import pandas as pd
+
+    smaller = jax.tree.map(lambda d: d * OTHER_SIZE, particle)
+    tables = []
+    for partner, other in (("equal", particle), ("smaller", smaller), ("wall", None)):
+        sides = [particle] if other is None else [particle, other]
+        valid = [STRAIN_MAX * float(p.effective_diameter / law.shape_factor(p)) / 2 for p in sides]
+        scale = len(valid) * min(valid)
+
+        def recovered(peak: np.ndarray, other: Particle | None = other) -> np.ndarray:
+            return pair_force(law, particle, law, other, peak, peak)[2]
+
+        for number, path in enumerate(_paths(scale, recovered, seed)):
+            past = np.maximum.accumulate(np.maximum(path, 0.0))
+            force, tangent, _ = pair_force(law, particle, law, other, path, past)
+            tables.append(_rows(number, path, past, force, tangent).assign(partner=partner))
+    return _in_units(pd.concat(tables, ignore_index=True), units)
+
+
+def _paths(scale: float, recovered: Callable[[np.ndarray], np.ndarray], seed: int) -> list[np.ndarray]:
+    """One path that meets every branch and some at random, the largest displacement being `scale`."""
+    loading = np.linspace(0.0, 0.6 * scale, 13)
+    peak = loading[-1]
+    down = peak - recovered(np.asarray(peak)) * SHARES
+    further = np.linspace(peak, scale, 9)
+    end = scale - recovered(np.asarray(scale)) * SHARES
+    first = np.concatenate([[-0.01 * scale], loading, down, [-0.01 * scale], down[::-1], further, end, end[::-1]])
+    rng = np.random.default_rng(seed)
+    walks = []
+    for _ in range(RANDOM_PATHS):
+        peaks = np.maximum.accumulate(scale * rng.uniform(0.0, 1.0, STEPS) ** 2)
+        depth = np.where(rng.uniform(size=STEPS) < 0.5, 0.0, rng.uniform(0.0, 1.2, STEPS))
+        walks.append(peaks - depth * recovered(peaks))
+    return [first, *walks]
+
+
+def _rows(
+    number: int | np.ndarray, path: np.ndarray, peak: np.ndarray, force: np.ndarray, tangent: np.ndarray
+) -> Table:
+    import pandas as pd
+
+    return pd.DataFrame(
+        {"path": number, "displacement": path, "displacement_max": peak, "force": force, "tangent": tangent}
+    )
+
+
+def _in_units(table: Table, units: str) -> Table:
+    columns = {}
+    for name in table.columns:
+        if name.removesuffix("_max") not in _SI:
+            continue
+        ours, si, factor = _SI[name.removesuffix("_max")]
+        columns[name] = f"{name}_{si if units == 'SI' else ours}"
+        if units == "SI":
+            table[name] *= factor
+    front = ["path"] if "partner" not in table else ["partner", "path"]
+    return table.rename(columns=columns).reindex(columns=front + list(columns.values()))

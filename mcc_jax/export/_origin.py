@@ -1,0 +1,90 @@
+"""Where exported values come from: estimates, calibration, what a user of them must know."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError
+from importlib.metadata import version as installed_version
+from typing import Any
+
+from .._errors import InputError
+from ..geometry import Particle
+from ..law import MccLaw
+
+STRAIN_MAX = 0.67
+"""Largest scaled strain eta_p eps of the paper's tests: 16 MPa on its mean curve."""
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where a law comes from; everything is optional, and what is not known is not claimed.
+
+    Attributes:
+        estimates: `{"value", "sd", "interval_95"}` of C1, C3, C5, a, effective_modulus_MPa, by name.
+        population: `{"mean", "sd"}` of log_C1, log_C3, log_C5, each again an estimate.
+        calibration: file, checksum, method, seed and state of the calibration.
+        particle: the particle whose coefficients these are; None for those of the population.
+        geometry: where the diameters are from, in words.
+        warnings: what a user of the values must know.
+    """
+
+    estimates: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    population: Mapping[str, Mapping[str, Any]] | None = None
+    calibration: Mapping[str, Any] | None = None
+    particle: str | None = None
+    geometry: str = "given"
+    warnings: tuple[str, ...] = ()
+
+
+def version() -> str:
+    """Version of this library."""
+    try:
+        return installed_version("mcc-jax")
+    except PackageNotFoundError:
+        return "(not installed)"
+
+
+def numbers(law: MccLaw) -> dict[str, float]:
+    """The five numbers of a law by name, as Python floats."""
+    return {
+        "C1": float(law.plastic.C1),
+        "C3": float(law.plastic.C3),
+        "C5": float(law.plastic.C5),
+        "a": float(law.a),
+        "effective_modulus_MPa": float(law.effective_modulus),
+    }
+
+
+def check(law: MccLaw, particle: Particle, *, allow_not_monotone: bool = False) -> tuple[str, ...]:
+    """Refuse a law that other engines could not use.
+
+    Args:
+        law: the law.
+        particle: a particle that it must carry.
+        allow_not_monotone: warn of a loading curve that falls, instead of refusing it.
+
+    Returns:
+        Warnings.
+
+    Raises:
+        InputError: if a parameter is out of its range, the particle carries no stress, or the curve falls.
+    """
+    if not bool(law.is_valid):
+        raise InputError(f"the law is not usable: {numbers(law)}", remedy="C1, C5 and the modulus must be positive")
+    if not bool(law.carries_stress(particle)):
+        sizes = ", ".join(f"{float(d):g}" for d in (particle.D1, particle.D2, particle.D3))
+        raise InputError(
+            f"the shape factor of a particle of {sizes} um is {float(law.shape_factor(particle)):.4g} "
+            f"with a = {float(law.a):.4g}",
+            remedy="Give --diameters of a rounder particle: shape factors must be positive",
+        )
+    if bool(law.is_monotone):
+        return ()
+    problem = "the loading curve is not monotone (9 C3^6 > 20 C1 C5^5): stress falls over part of the loading"
+    if not allow_not_monotone:
+        raise InputError(
+            problem,
+            remedy="Take the population or another particle, or give --allow-not-monotone to export it as it is",
+        )
+    return (f"{problem}; under load control it snaps through, and a pair of such contacts has several solutions",)

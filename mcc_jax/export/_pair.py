@@ -1,0 +1,101 @@
+"""The pair of half contacts, by bisection: slow and plain, the reference of what other engines get."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..geometry import Particle
+from ..law import MccLaw
+from ._card import stress_power
+
+Numbers = np.ndarray | float
+HALVINGS = 1100  # down to the smallest floating-point number
+
+
+class _Half:
+    """One side: F = F_plates(2 d), in mN and um."""
+
+    def __init__(self, law: MccLaw, particle: Particle) -> None:
+        self.eta = float(law.shape_factor(particle))
+        self.diameter = float(particle.effective_diameter)
+        self.area = 1e-3 * float(particle.effective_area)
+        self.K = [float(K) for K in law.plastic.polynomial]
+        self.modulus = float(law.effective_modulus)
+        self.k, self.n, self.p = law.unloading.constant, stress_power(law), law.strain_scaling.power
+
+    def stress(self, d: np.ndarray) -> np.ndarray:
+        x = 2 * self.eta * d / self.diameter
+        K1, K3, K5 = self.K
+        return np.maximum(K1 * x - K3 * x**3 + K5 * x**5, 0.0)
+
+    def force(self, d: np.ndarray) -> np.ndarray:
+        return self.area * self.stress(d)
+
+    def slope(self, d: np.ndarray) -> np.ndarray:
+        x = 2 * self.eta * d / self.diameter
+        K1, K3, K5 = self.K
+        return self.area * (K1 - 3 * K3 * x**2 + 5 * K5 * x**4) * 2 * self.eta / self.diameter
+
+    def recovered(self, d: np.ndarray) -> np.ndarray:
+        strain = np.where(d > 0, 2 * d / self.diameter, 1.0)
+        square = (self.stress(d) / self.modulus) ** self.n / (self.k * self.eta**self.p * strain)
+        return np.where(d > 0, self.diameter * np.sqrt(square) / 2, 0.0)
+
+
+def pair_force(
+    law_i: MccLaw,
+    particle_i: Particle,
+    law_j: MccLaw,
+    particle_j: Particle | None,
+    overlap: Numbers,
+    overlap_max: Numbers,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    r"""Force, tangent and recoverable overlap of two half contacts in series.
+
+    Each side is half a platen test, :math:`F_s(d) = F_{plates}(2d)`. On loading the overlap is shared so that both
+    carry one force, :math:`d_i + d_j = \delta, F_i(d_i) = F_j(d_j)`. Both unload along one curve of
+    :math:`\sigma/\sigma_P`, so that
+
+    .. math:: F = F_P g(q), \quad q = (\delta_P - \delta)/W, \quad W = W_i + W_j
+
+    Args:
+        law_i: law of one particle; monotone, or the share is not unique.
+        particle_i: its size; D3 along the contact's normal.
+        law_j: law of the other.
+        particle_j: its size; None for a rigid wall.
+        overlap: overlap now [um], one or many.
+        overlap_max: the largest so far [um], not below `overlap`.
+
+    Returns:
+        Force [mN], dF/d overlap [mN/um] (that of loading at the peak), and W [um].
+    """
+    i = _Half(law_i, particle_i)
+    j = None if particle_j is None else _Half(law_j, particle_j)
+    shape = np.broadcast_shapes(np.shape(overlap), np.shape(overlap_max))
+    x, x_max = (np.broadcast_to(np.asarray(v, float), shape).ravel() for v in (overlap, overlap_max))
+    d = x_max if j is None else _share(i, j, x_max)
+    peak, width, slope = i.force(d), i.recovered(d), i.slope(d)
+    if j is not None:
+        rest = x_max - d
+        slope_j = j.slope(rest)
+        # A stiff side alone would carry the rounding of its share.
+        peak = (peak * slope_j + j.force(rest) * slope) / (slope + slope_j)
+        slope = slope * slope_j / (slope + slope_j)
+        width = width + j.recovered(rest)
+    q = np.where(width > 0, (x_max - x) / np.where(width > 0, width, 1.0), 1.0).clip(0.0, 1.0)
+    root = np.sqrt((1 - q) * (1 + q))
+    loading = x >= x_max
+    force = np.where(loading, peak, peak * 2 / np.pi * (np.arccos(q) - q * root))
+    tangent = np.where(loading, slope, 4 / np.pi * peak * root / np.where(width > 0, width, 1.0))
+    return force.reshape(shape), tangent.reshape(shape), width.reshape(shape)
+
+
+def _share(i: _Half, j: _Half, overlap: np.ndarray) -> np.ndarray:
+    low, high = np.zeros_like(overlap), overlap
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        if not ((low < middle) & (middle < high)).any():
+            break
+        too_far = i.force(middle) > j.force(overlap - middle)
+        low, high = np.where(too_far, low, middle), np.where(too_far, middle, high)
+    return 0.5 * (low + high)

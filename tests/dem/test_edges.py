@@ -1,0 +1,230 @@
+"""Lists of contacts: history follows the pair through new lists, other orders, more room, other names, the disk."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from packed import PRESSING, SKIN, dense, loose, motion, packing
+
+from mcc_jax import InputError
+from mcc_jax.dem import (
+    Edges,
+    WallHistory,
+    advance,
+    carry_history,
+    close_pairs,
+    contact_forces,
+    list_edges,
+    listed,
+    load_state,
+    relabel,
+    save_state,
+)
+
+PARTICLES = 30
+FORCES = jax.jit(contact_forces)
+
+
+def with_history(edges, seed=0):
+    """The list with numbers to remember in every used place."""
+    rng = np.random.default_rng(seed)
+    return eqx.tree_at(
+        lambda e: (e.overlap_max, e.slip),
+        edges,
+        (
+            jnp.asarray(np.where(edges.active, rng.uniform(1e-7, 1e-5, edges.capacity), 0.0)),
+            jnp.asarray(np.where(np.asarray(edges.active)[:, None], rng.normal(0, 1e-7, (edges.capacity, 3)), 0.0)),
+        ),
+    )
+
+
+def remembered(edges):
+    """What each pair remembers, by pair."""
+    return {
+        (int(i), int(j)): (float(d), tuple(map(float, s)))
+        for i, j, d, s, used in zip(edges.i, edges.j, edges.overlap_max, edges.slip, edges.active, strict=True)
+        if used
+    }
+
+
+pairs_strategy = st.lists(
+    st.tuples(st.integers(0, PARTICLES - 1), st.integers(0, PARTICLES - 1)).filter(lambda p: p[0] != p[1]), max_size=40
+)
+
+
+@settings(max_examples=25, deadline=None)
+@given(old=pairs_strategy, new=pairs_strategy, seed=st.integers(0, 3))
+def test_history_follows_the_pair(old, new, seed):
+    """T5: bitwise through a new list in any order, with repetitions, turned round; what was absent is virgin."""
+    first = with_history(list_edges(np.array(old, int).reshape(-1, 2), PARTICLES, 48), seed)
+    second = carry_history(first, list_edges(np.array(new, int).reshape(-1, 2), PARTICLES, 64))
+    before, after = remembered(first), remembered(second)
+    assert set(after) == {(min(p), max(p)) for p in new}
+    for pair, value in after.items():
+        assert value == before.get(pair, (0.0, (0.0, 0.0, 0.0)))
+    assert np.all(np.diff(second.key) >= 0)
+    assert not second.overlap_max[~np.asarray(second.active)].any()
+
+
+@settings(max_examples=15, deadline=None)
+@given(pairs=pairs_strategy, seed=st.integers(0, 1000))
+def test_other_names_for_the_particles(pairs, seed):
+    """T5: a permutation and back is bitwise the same; slip is seen from the other side when a pair turns over."""
+    edges = with_history(list_edges(np.array(pairs, int).reshape(-1, 2), PARTICLES, 48))
+    label = np.random.default_rng(seed).permutation(PARTICLES)
+    turned = relabel(edges, jnp.asarray(label))
+    for (i, j), (overlap, slip) in remembered(edges).items():
+        a, b = int(label[i]), int(label[j])
+        sign = 1.0 if a < b else -1.0
+        assert remembered(turned)[min(a, b), max(a, b)] == (overlap, tuple(sign * s for s in slip))
+    back = relabel(turned, jnp.asarray(np.argsort(label)))
+    assert eqx.tree_equal(back, edges)
+
+
+def test_overflow_is_reported():
+    edges = list_edges(np.array([[0, 1], [1, 2], [3, 2]]), 4, 2)
+    assert bool(edges.overflow)
+    assert int(edges.wanted) == 3
+    with pytest.raises(InputError, match="3 pairs do not fit into a list of 2 edges"):
+        edges.require_room()
+    with pytest.raises(InputError, match="do not fit"):
+        listed(packing(), dense(), SKIN, capacity=10)
+    list_edges(np.array([[0, 1]]), 4, 2).require_room()
+
+
+def test_bad_pairs_are_named():
+    for pair in ([0, 0], [0, 4], [-1, 2]):
+        with pytest.raises(InputError, match="pair 1 joins"):
+            list_edges(np.array([[0, 1], pair]), 4, 8)
+
+
+def test_keys_hold_many_particles():
+    """N^2 of a million particles does not fit 32 bits."""
+    edges = list_edges(np.array([[999_998, 999_999], [0, 999_999]]), 1_000_000, 2)
+    assert edges.key.tolist() == [999_999, 999_998 * 1_000_000 + 999_999]
+    assert (edges.i.tolist(), edges.j.tolist()) == ([0, 999_998], [999_999, 999_999])
+
+
+def test_persistent_state_is_small():
+    edges = list_edges(np.array([[0, 1]]), 4, 1000)
+    held = sum(leaf.nbytes for leaf in (edges.key, edges.i, edges.j, edges.overlap_max, edges.slip))
+    assert held / edges.capacity <= 48
+
+
+def test_neighbours_equal_all_pairs():
+    rng = np.random.default_rng(2)
+    position, radius = rng.uniform(0, 1e-3, (200, 3)), rng.uniform(2e-5, 8e-5, 200)
+    gap = np.linalg.norm(position[:, None] - position[None], axis=2) - radius[:, None] - radius[None]
+    expected = {(i, j) for i, j in zip(*np.nonzero(gap < 1e-5), strict=True) if i < j}
+    found = close_pairs(position, radius, 1e-5)
+    assert {(min(p), max(p)) for p in found.tolist()} == expected
+    assert len(found) == len(expected)
+
+
+def test_neighbours_of_few_and_of_nowhere():
+    assert close_pairs(np.zeros((1, 3)), np.ones(1), 0.1).shape == (0, 2)
+    with pytest.raises(InputError, match="particle 1 is not finite"):
+        close_pairs(np.array([[0.0, 0, 0], [np.nan, 0, 0]]), np.ones(2), 0.1)
+
+
+def unloading():
+    """A packing pressed and then let go a little, so that most contacts are on their elastic branch."""
+    state, _ = advance(packing(), motion(), dense(), PRESSING, 1, 60, SKIN)
+    return advance(packing(), motion(), state, -PRESSING, 1, 30, SKIN)[0]
+
+
+def forces_of(state, edges):
+    pack, move = packing(), motion()
+    return FORCES(
+        pack,
+        move.interaction,
+        state.walls,
+        state.position,
+        state.velocity,
+        state.spin,
+        edges,
+        state.wall_history,
+        move.time_step,
+    )
+
+
+def test_a_new_list_in_the_middle_of_unloading_changes_nothing():
+    """T5: rebuilt, permuted and with more room; history bitwise, forces of edges and sums over particles."""
+    state = unloading()
+    pairs = close_pairs(np.asarray(state.position), np.asarray(packing().radius), SKIN)
+    shuffled = np.random.default_rng(0).permutation(pairs)[:, ::-1]
+    other = carry_history(state.edges, list_edges(shuffled, len(state.position), 2 * state.edges.capacity))
+    kept = {p: v for p, v in remembered(state.edges).items() if p in remembered(other)}
+    assert kept
+    assert {p: remembered(other)[p] for p in kept} == kept
+    forces, edges, _ = forces_of(state, state.edges)
+    again, edges_again, _ = forces_of(state, other)
+    size = np.max(np.abs(forces.force))
+    assert np.max(np.abs(again.force - forces.force)) <= 1e-13 * size
+    np.testing.assert_allclose(again.on_wall, forces.on_wall, atol=1e-13 * np.max(np.abs(forces.on_wall)))
+    both = set(remembered(edges)) & set(remembered(edges_again))
+    assert all(remembered(edges)[p][0] == remembered(edges_again)[p][0] for p in both)
+
+
+def test_a_pair_that_left_the_list_is_virgin():
+    """Documented: history does not outlive the skin."""
+    edges = with_history(list_edges(np.array([[0, 1], [1, 2]]), 3, 4))
+    without = carry_history(edges, list_edges(np.array([[1, 2]]), 3, 4))
+    back = carry_history(without, list_edges(np.array([[0, 1], [1, 2]]), 3, 4))
+    assert remembered(back)[0, 1] == (0.0, (0.0, 0.0, 0.0))
+    assert remembered(back)[1, 2] == remembered(edges)[1, 2]
+
+
+def test_resumed_run_is_bitwise_the_same(tmp_path):
+    state = dense()
+    half, _ = advance(packing(), motion(), state, PRESSING, 2, 40, SKIN)
+    save_state(tmp_path / "half.npz", packing(), half)
+    whole, rows = advance(packing(), motion(), half, PRESSING, 2, 40, SKIN)
+    again_packing, again = load_state(tmp_path / "half.npz")
+    assert eqx.tree_equal((again_packing, again), (packing(), half))
+    resumed, rows_again = advance(again_packing, motion(), again, PRESSING, 2, 40, SKIN)
+    assert eqx.tree_equal(resumed, whole)
+    assert np.array_equal(rows.on_wall, rows_again.on_wall)
+    assert list(tmp_path.iterdir()) == [tmp_path / "half.npz"]
+
+
+@pytest.mark.parametrize("damage", ["missing", "empty", "cut", "text", "other"])
+def test_damaged_states_are_refused(tmp_path, damage):
+    file = tmp_path / "state.npz"
+    save_state(file, packing(), loose())
+    if damage == "missing":
+        file.unlink()
+    elif damage == "empty":
+        file.write_bytes(b"")
+    elif damage == "cut":
+        file.write_bytes(file.read_bytes()[:-900])
+    elif damage == "text":
+        file.write_text("not a state")
+    else:
+        np.savez(file, x=np.zeros(3))
+    with pytest.raises(InputError, match=r"state\.npz"):
+        load_state(file)
+
+
+def test_interrupted_save_leaves_the_old_file(tmp_path, monkeypatch):
+    file = tmp_path / "state.npz"
+    save_state(file, packing(), loose())
+    before = file.read_bytes()
+
+    def fails(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", fails)
+    with pytest.raises(OSError, match="No space"):
+        save_state(file, packing(), dense())
+    assert file.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_types():
+    assert isinstance(loose().edges, Edges)
+    assert isinstance(loose().wall_history, WallHistory)
+    assert jax.tree.leaves(loose().edges)[0].dtype == jnp.int64

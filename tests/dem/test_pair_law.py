@@ -1,0 +1,327 @@
+"""The pair rule: the plate test again, equal force, symmetry, limits, one history scalar, derivatives."""
+
+import functools
+import itertools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from two_scalars import bisected_path
+
+from mcc_jax import InputError, MccLaw, Particle, Plastic, StrainScaling, Unloading, paper_law, paper_population
+from mcc_jax.dem import (
+    HalfContact,
+    half_contact,
+    pair_energy,
+    pair_force,
+    pair_split,
+    sides_of,
+    wall_energy,
+    wall_force,
+)
+
+UM, MN = 1e-6, 1e-3
+FORMS = [(u, s) for u in Unloading for s in (StrainScaling.RAW, StrainScaling.MASTER)]
+MODULUS = {Unloading.PRINTED: 16000.0, Unloading.PUNCH: 450.0, Unloading.PUNCH_EXACT: 380.0}
+PARTICLE = Particle(105.0, 92.0, 85.0)
+
+
+def law_of(unloading=Unloading.PRINTED, scaling=StrainScaling.RAW, C1=16.0, C3=3.4, C5=2.7, a=1.43, modulus=None):
+    modulus = MODULUS[unloading] if modulus is None else modulus
+    return MccLaw(Plastic(C1, C3, C5), a, modulus, unloading, scaling)
+
+
+def cycle(largest):
+    """Load, unload, reload further, release, reload: overlaps, starting out of contact."""
+    turns = np.array([-0.02, 0.6, 0.45, 0.8, 0.3, 1.0, -0.02, 0.9]) * largest
+    return np.concatenate([np.linspace(a, b, 15) for a, b in itertools.pairwise(turns)])
+
+
+def driven(force, overlaps):
+    """Forces along a path of overlaps of one contact, the history being the running maximum before each."""
+    before = np.maximum.accumulate(np.concatenate([[0.0], overlaps[:-1]]))
+    return force(jnp.asarray(np.maximum(before, 0.0)), jnp.asarray(overlaps))
+
+
+PAIRS, SPLITS, WALLS = jax.vmap(pair_force), jax.vmap(pair_split), jax.vmap(wall_force)
+ON_PATH = jax.jit(jax.vmap(pair_force, (None, None, 0, 0)))
+WALL_PATH = jax.jit(jax.vmap(wall_force, (None, 0, 0)))
+
+
+def on_wall(side):
+    return functools.partial(WALL_PATH, side)
+
+
+def on_pair(i, j):
+    return functools.partial(ON_PATH, i, j)
+
+
+def drawn(seed, count):
+    """Sides of particles drawn from the paper's population, those monotone, with sizes and shapes that differ."""
+    keys = jax.random.split(jax.random.key(seed), 4)
+    plastic = paper_population().sample(keys[0], count)
+    size = jax.random.uniform(keys[1], (count,), minval=40.0, maxval=150.0)
+    shape = jax.random.uniform(keys[2], (count, 2), minval=0.9, maxval=1.2)
+    modulus = jax.random.uniform(keys[3], (count,), minval=8000.0, maxval=20000.0)
+
+    def one(plastic, size, shape, modulus):
+        return half_contact(MccLaw(plastic, 1.43, modulus), Particle(size * shape[0], size * shape[1], size))
+
+    sides = jax.jit(jax.vmap(one))(plastic, size, shape, modulus)
+    return sides_of(sides, np.flatnonzero(jax.vmap(lambda side: side.is_monotone)(sides)))
+
+
+@pytest.mark.parametrize(("unloading", "scaling"), FORMS)
+def test_two_walls_are_the_plate_test(unloading, scaling):
+    """T1: a particle between plates is two half contacts, each compressed by half the platen displacement."""
+    law = law_of(unloading, scaling)
+    displacement = cycle(45.0)
+    _, expected = law.path(PARTICLE, law.init(PARTICLE), jnp.asarray(displacement))
+    force = driven(on_wall(half_contact(law, PARTICLE)), 0.5 * displacement * UM)
+    assert np.max(np.abs(force - expected * MN)) <= 1e-12 * np.max(expected * MN)
+
+
+@pytest.mark.parametrize(("unloading", "scaling"), FORMS)
+def test_identical_pair_is_the_plate_test(unloading, scaling):
+    """T2: two equal particles share the overlap in halves; a chain of any length carries the force of one."""
+    law = law_of(unloading, scaling)
+    displacement = cycle(45.0)
+    _, expected = law.path(PARTICLE, law.init(PARTICLE), jnp.asarray(displacement))
+    side = half_contact(law, PARTICLE)
+    # Two half contacts of gamma / 2 each: the overlap of the pair is the platen displacement of the single particle.
+    force = driven(on_pair(side, side), displacement * UM)
+    assert np.max(np.abs(force - expected * MN)) <= 1e-12 * np.max(expected * MN)
+
+
+def test_equal_force_symmetry_and_order():
+    """T3: both sides carry the same force; exchanging them changes nothing."""
+    sides = drawn(0, 2000)
+    half = sides.k1.shape[0] // 2
+    i, j = sides_of(sides, np.arange(half)), sides_of(sides, np.arange(half, 2 * half))
+    overlap = (i.tested + j.tested) * np.random.default_rng(1).uniform(0.0, 1.3, half)
+    d_i, d_j = SPLITS(i, j, overlap)
+    force_i, force_j = WALLS(i, jnp.zeros_like(overlap), d_i), WALLS(j, jnp.zeros_like(overlap), d_j)
+    np.testing.assert_allclose(force_i, force_j, rtol=2e-14, atol=0)
+    np.testing.assert_allclose(d_i + d_j, overlap, rtol=1e-15)
+    peak = 1.02 * overlap
+    np.testing.assert_allclose(PAIRS(i, j, peak, overlap), PAIRS(j, i, peak, overlap), rtol=1e-12)
+
+
+def test_beside_a_stiff_side_the_pair_is_the_wall():
+    """T3: stiffness and modulus of j without bound. Recovery goes as the root of C / E, so E must win."""
+    side = half_contact(law_of(), PARTICLE)
+    rigid = half_contact(law_of(C1=16e14, C3=0.0, C5=2.7e3, modulus=1.6e50), PARTICLE)
+    overlaps = cycle(20.0) * UM
+    alone = driven(on_wall(side), overlaps)
+    assert np.max(np.abs(driven(on_pair(side, rigid), overlaps) - alone)) <= 1e-12 * np.max(alone)
+
+
+def test_beside_a_large_side_the_pair_loads_as_against_the_wall():
+    """T3: a body without curvature does not give way on loading; its recovery does not vanish with its curvature."""
+    side = half_contact(law_of(), PARTICLE)
+    large = half_contact(law_of(modulus=1.6e60), Particle(1e17, 1e17, 1e17))
+    overlaps = cycle(20.0) * UM
+    alone = driven(on_wall(side), overlaps)
+    assert np.max(np.abs(driven(on_pair(side, large), overlaps) - alone)) <= 1e-12 * np.max(alone)
+
+
+def test_small_overlaps_add_stiffness_in_series():
+    sides = drawn(1, 40)
+    i, j = sides_of(sides, np.arange(10)), sides_of(sides, np.arange(10, 20))
+    overlap = jnp.full(10, 1e-12)
+    force = PAIRS(i, j, jnp.zeros(10), overlap)
+    np.testing.assert_allclose(force / overlap, i.k1 * j.k1 / (i.k1 + j.k1), rtol=1e-9)
+
+
+@pytest.mark.parametrize("unloading", list(Unloading))
+def test_one_history_scalar_is_enough(unloading):
+    """T4: the closed form against bisection with the two internal variables of each side."""
+    i = half_contact(law_of(unloading), PARTICLE)
+    j = half_contact(
+        law_of(unloading, C1=11.0, C3=3.0, C5=2.6, modulus=0.7 * MODULUS[unloading]), Particle(60.0, 62.0, 50.0)
+    )
+    overlaps = cycle(34.0) * UM
+    force = driven(on_pair(i, j), overlaps)
+    expected = bisected_path(i, j, overlaps)
+    assert np.max(np.abs(force - expected)) <= 1e-12 * np.max(expected)
+
+
+def test_ellipsoid_along_its_axes_is_the_paper():
+    """T6: along e3 radius and shape factor are the paper's, along e1 those of the particle laid on its side."""
+    law = law_of()
+    for normal, turned in (
+        ([0.0, 0.0, 1.0], PARTICLE),
+        ([1.0, 0.0, 0.0], Particle(PARTICLE.D2, PARTICLE.D3, PARTICLE.D1)),
+        ([0.0, -1.0, 0.0], Particle(PARTICLE.D1, PARTICLE.D3, PARTICLE.D2)),
+    ):
+        side, expected = half_contact(law, PARTICLE, jnp.asarray(normal)), half_contact(law, turned)
+        for found, wanted in zip(jax.tree.leaves(side), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_allclose(found, wanted, rtol=1e-13)
+    sphere = half_contact(law, Particle(80.0, 80.0, 80.0), jnp.asarray([0.6, 0.0, 0.8]))
+    np.testing.assert_allclose(sphere.k1, np.pi * 40e-6 * 16e6, rtol=1e-13)
+
+
+def test_ellipsoid_turns_continuously():
+    law = law_of()
+    angles = jnp.linspace(0.0, np.pi / 2, 181)
+    normals = jnp.stack([jnp.sin(angles), jnp.zeros_like(angles), jnp.cos(angles)], axis=1)
+    sides = jax.vmap(lambda n: half_contact(law, PARTICLE, n))(normals)
+    assert np.max(np.abs(np.diff(np.log(sides.k1)))) < 0.02
+    slope = jax.jacfwd(lambda n: half_contact(law, PARTICLE, n).k1)(normals[40])
+    assert np.all(np.isfinite(slope))
+
+
+# ---- derivatives -----------------------------------------------------------------------------------------------------
+
+
+def summed(vector):
+    """Force of one pair from a vector: both sides' numbers, largest overlap, overlap."""
+    i = HalfContact(vector[0], vector[1], vector[2], vector[3], jnp.ones(()))
+    j = HalfContact(vector[4], vector[5], vector[6], vector[7], jnp.ones(()))
+    return pair_force(i, j, vector[8], vector[9])
+
+
+def vector_of(peak, overlap):
+    i = half_contact(law_of(), PARTICLE)
+    j = half_contact(law_of(C1=11.0, C3=3.0, C5=2.6, modulus=12000.0), Particle(60.0, 62.0, 50.0))
+    return jnp.asarray([i.k1, i.k3, i.k5, i.c, j.k1, j.k3, j.k5, j.c, peak * UM, overlap * UM])
+
+
+@pytest.mark.parametrize(("peak", "overlap"), [(0.0, 8.0), (0.0, 25.0), (25.0, 24.9), (25.0, 24.0), (30.0, 29.5)])
+def test_derivatives_equal_differences(peak, overlap):
+    """T7: every parameter, on loading and unloading, both modes."""
+    at = vector_of(peak, overlap)
+    value = summed(at)
+    assert value > 0
+    forward, reverse = jax.jacfwd(summed)(at), jax.jacrev(summed)(at)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-12)
+    for k in range(at.shape[0]):
+        step = 1e-5 * at[k] if at[k] else 0.0
+        if not step:
+            assert forward[k] == 0
+            continue
+        difference = (
+            8 * (summed(at.at[k].add(step)) - summed(at.at[k].add(-step)))
+            - (summed(at.at[k].add(2 * step)) - summed(at.at[k].add(-2 * step)))
+        ) / (12 * step)
+        assert abs(forward[k] - difference) * at[k] <= 1e-6 * value, k
+
+
+@settings(max_examples=60, deadline=None)
+@given(peak=st.sampled_from([0.0, 1e-300, 1e-14, 1e-6, 1.0, 25.0, 60.0]), share=st.floats(-0.5, 1.2))
+def test_finite_everywhere(peak, share):
+    at = vector_of(peak, share * peak)
+    value, gradient = VALUE_AND_GRADIENT(at)
+    assert np.isfinite(value)
+    assert value >= 0
+    assert np.all(np.isfinite(gradient))
+
+
+VALUE_AND_GRADIENT = jax.jit(jax.value_and_grad(summed))
+
+
+@pytest.mark.parametrize("unloading", list(Unloading))
+def test_onset_and_release_are_finite(unloading):
+    """Pitfall: at the onset the arc-function form gives a derivative that is NaN, just behind it a wrong one."""
+    side = half_contact(law_of(unloading), PARTICLE)
+    peak = jnp.asarray(20e-6)
+    slope = jax.jit(jax.grad(lambda overlap: pair_force(side, side, peak, overlap)))
+    expected = jax.grad(lambda overlap: pair_force(side, side, jnp.zeros(()), overlap))(peak)
+    np.testing.assert_allclose(slope(peak), expected, rtol=1e-12)  # the exact peak: loading
+    unloading_slope = float(slope(peak * (1 - 1e-6)))
+    assert unloading_slope > 5 * expected
+    for below in (1e-9, 1e-11, 1e-13):
+        np.testing.assert_allclose(slope(peak * (1 - below)), unloading_slope, rtol=2e-3)
+    span = 2 * np.sqrt(float(side.c) * (wall_force(side, peak * 0, peak / 2) / (peak / 2)))
+    if unloading is Unloading.PRINTED:
+        for overlap in (peak - span, peak - span * (1 + 1e-12), -peak):
+            assert pair_force(side, side, peak, jnp.asarray(overlap)) == pytest.approx(0.0, abs=1e-20)
+            assert np.isfinite(slope(jnp.asarray(overlap)))
+
+
+def test_first_touch_has_finite_gradient():
+    """Pitfall: strain over stress of a contact that barely touches is 0/0 unless the factor is cancelled."""
+    at = vector_of(0.0, 0.0).at[9].set(1e-300)
+    assert np.all(np.isfinite(VALUE_AND_GRADIENT(at)[1]))
+
+
+@pytest.mark.parametrize("spread_of_sizes", [(40.0, 110.0), (20.0, 150.0)])
+def test_compiled_split_converges(spread_of_sizes):
+    """Pitfall: compiled code that tests its bounds strictly bisects again after it has converged."""
+    low, high = spread_of_sizes
+    plastic = law_of().plastic
+    radii = jnp.geomspace(low, high, 60)
+    sides = jax.vmap(lambda R: half_contact(MccLaw(plastic, 1.43, 16000.0), Particle(2 * R, 2 * R, 2 * R)))(radii)
+    i, j = (jax.tree.map(lambda x, k=k: jnp.ravel(jnp.meshgrid(x, x)[k]), sides) for k in (0, 1))
+    for share in (1e-6, 0.3, 1.0, 1.6):
+        d_i, d_j = jax.jit(SPLITS)(i, j, share * (i.tested + j.tested))
+        zero = jnp.zeros_like(d_i)
+        np.testing.assert_allclose(WALLS(i, zero, d_i), WALLS(j, zero, d_j), rtol=2e-14)
+
+
+# ---- energy ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("unloading", list(Unloading))
+def test_energy_is_the_area_under_the_curve(unloading):
+    i = half_contact(law_of(unloading), PARTICLE)
+    j = half_contact(law_of(unloading, C1=11.0, C3=3.0, C5=2.6), Particle(60.0, 62.0, 50.0))
+    overlaps = np.concatenate([np.linspace(0, 30e-6, 4001), np.linspace(30e-6, 28e-6, 4001)])
+    for force, energy in (
+        (on_pair(i, j), pair_energy(i, j, jnp.asarray(30e-6), jnp.asarray(28e-6))),
+        (on_wall(i), wall_energy(i, jnp.asarray(30e-6), jnp.asarray(28e-6))),
+    ):
+        forces = np.asarray(driven(force, overlaps))
+        work = np.sum(0.5 * (forces[1:] + forces[:-1]) * np.diff(overlaps))
+        np.testing.assert_allclose(energy.recoverable + energy.dissipated, work, rtol=2e-5)
+        assert energy.recoverable >= 0
+
+
+# ---- what is refused, what is flagged --------------------------------------------------------------------------------
+
+
+def test_forms_do_not_mix():
+    i = half_contact(law_of(Unloading.PRINTED), PARTICLE)
+    j = half_contact(law_of(Unloading.PUNCH), PARTICLE)
+    with pytest.raises(InputError, match="different forms"):
+        pair_force(i, j, jnp.zeros(()), jnp.asarray(1e-6))
+
+
+def test_not_monotone_is_flagged_and_not_nan():
+    """Pitfall: 2.4 % of the paper's draws have no unique split."""
+    plastic = paper_population().sample(jax.random.key(3), 4000)
+    sides = jax.vmap(lambda p: half_contact(MccLaw(p, 1.43, 16000.0), PARTICLE))(plastic)
+    flagged = ~np.asarray(jax.vmap(lambda side: side.is_monotone)(sides))
+    assert 0.01 < flagged.mean() < 0.05
+    assert np.array_equal(flagged, ~np.asarray(jax.vmap(lambda p: p.is_monotone)(plastic)))
+    i, j = sides_of(sides, np.flatnonzero(flagged)), sides_of(sides, np.arange(flagged.sum()))
+    force = PAIRS(i, j, jnp.zeros(flagged.sum()), i.tested + j.tested)
+    assert np.all(np.isfinite(force))
+
+
+def test_nan_shows():
+    side = half_contact(law_of(), PARTICLE)
+    assert np.isnan(pair_force(side, side, jnp.zeros(()), jnp.asarray(jnp.nan)))
+    assert np.isnan(wall_force(side, jnp.zeros(()), jnp.asarray(jnp.nan)))
+
+
+def test_single_precision():
+    side = half_contact(law_of(), PARTICLE)
+    small = jax.tree.map(lambda x: x.astype(jnp.float32), side)
+    overlaps = cycle(40.0) * UM
+    double = np.asarray(driven(on_pair(side, side), overlaps))
+    before = jnp.asarray(np.maximum.accumulate(np.concatenate([[0.0], overlaps[:-1]])).clip(0), jnp.float32)
+    single = on_pair(small, small)(before, jnp.asarray(overlaps, jnp.float32))
+    assert single.dtype == jnp.float32
+    # Unloading turns a rounding of the overlap, 3e-12 m, into a force through a stiffness of 5e4 N/m.
+    assert np.max(np.abs(np.asarray(single) - double)) <= 2e-4 * np.max(double)
+
+
+def test_paper_law_makes_a_side():
+    side = half_contact(paper_law(), PARTICLE)
+    assert eqx.tree_equal(jax.tree.map(jnp.shape, side), jax.tree.map(lambda _: (), side))
+    np.testing.assert_allclose(side.tested, 0.67 * PARTICLE.effective_radius * UM / paper_law().shape_factor(PARTICLE))

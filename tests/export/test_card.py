@@ -1,0 +1,99 @@
+import json
+import math
+
+import equinox as eqx
+import jax.numpy as jnp
+import pytest
+from calibrations import write
+
+from mcc_jax import InputError, Particle, StrainScaling, Unloading, paper_law
+from mcc_jax.export import card, read_calibration
+
+PARTICLE = Particle(213.54, 196.07, 186.33)
+
+
+@pytest.mark.parametrize("unloading", Unloading)
+@pytest.mark.parametrize("scaling", StrainScaling)
+def test_the_formulae_in_words_are_the_law(unloading, scaling):
+    """Coded anew from the card's numbers and sentences alone, on loading and unloading."""
+    law = paper_law(unloading, scaling)
+    told = json.loads(json.dumps(card(law, PARTICLE)))
+    C1, C3, C5, a, E = (told["parameters"][k]["value"] for k in ("C1", "C3", "C5", "a", "effective_modulus_MPa"))
+    k, n, p = (told["law"][key] for key in "knp")
+    size = told["particle"]
+    D1, D2, D3 = (size[f"D{i}_um"] for i in (1, 2, 3))
+    diameter, eta = D1 * D2 / D3, 1 + a * (1 - D3**2 / (D1 * D2))
+    assert size["effective_diameter_um"] == pytest.approx(diameter, rel=1e-14)
+    assert size["eta_p"] == pytest.approx(eta, rel=1e-14)
+
+    def loading(displacement):
+        x = eta * displacement / diameter
+        return C1 * x - (C3 * x) ** 3 + (C5 * x) ** 5
+
+    peak = 0.8 * size["displacement_valid_um"]
+    strain, stress = peak / diameter, loading(peak)
+    delta = math.sqrt((stress / E) ** n / (k * eta**p * strain))
+    s = 0.3
+    unloaded = stress * 2 / math.pi * (math.acos(s) - s * math.sqrt(1 - s * s))
+    want = [float(law.loading_stress(PARTICLE, jnp.asarray(strain)))]
+    want.append(float(law.unloading_stress(PARTICLE, jnp.asarray(strain - s * delta), jnp.asarray(strain))))
+    assert [stress, unloaded] == pytest.approx(want, rel=1e-12)
+    assert told["validity"]["stress_there_MPa"] == pytest.approx(loading(size["displacement_valid_um"]), rel=1e-12)
+
+
+def test_checksum_is_that_of_the_numbers():
+    base = card(paper_law())["sha256"]
+    assert card(paper_law(), PARTICLE)["sha256"] == base
+    other = eqx.tree_at(lambda law: law.a, paper_law(), jnp.nextafter(paper_law().a, 2.0))
+    assert card(other)["sha256"] != base
+    assert card(paper_law(Unloading.PUNCH))["sha256"] != base
+
+
+def test_population_has_the_medians_and_their_uncertainty(tmp_path):
+    law, particle, origin = read_calibration(write(tmp_path / "fit"))
+    told = card(law, particle, origin=origin)
+    assert told["parameters"]["C1"]["value"] == pytest.approx(6.7, rel=1e-12)
+    assert told["parameters"]["C1"]["sd"] == pytest.approx(6.7 * 0.05, rel=1e-12)
+    low, high = told["parameters"]["C1"]["interval_95"]
+    assert (low * high, high / low) == pytest.approx((6.7**2, math.exp(2 * 1.96 * 0.05)), rel=1e-12)
+    assert told["population"]["log_C1"]["sd"]["value"] == 0.3
+    assert told["law"]["unloading"] == "punch"
+    assert told["provenance"]["calibration"]["method"] == "bayes"
+    assert told["particle"]["D1_um"] == 150.0  # the mean of the table
+    assert told["warnings"] == []
+
+
+def test_a_particle_has_its_own_coefficients_and_size(tmp_path):
+    law, particle, origin = read_calibration(write(tmp_path / "fit"), particle="b c")
+    assert [float(v) for v in (law.plastic.C1, law.plastic.C3, law.plastic.C5)] == [9.0, 3.1, 2.5]
+    assert float(particle.D3) == 130.0
+    assert card(law, particle, origin=origin)["coefficients_of"] == "b c"
+
+
+def test_where_shapes_scatter_a_particle_has_its_own_shape_factor(tmp_path):
+    folder = write(tmp_path / "fit", shape_scatter={"value": 0.1, "sd": None, "interval_95": None})
+    law, particle, _ = read_calibration(folder, particle="A")
+    assert float(law.shape_factor(particle)) == pytest.approx(1.3, rel=1e-12)
+    law, *_ = read_calibration(folder)
+    assert float(law.a) == 1.4
+
+
+def test_without_sizes_the_population_is_shown_on_a_sphere_and_says_so(tmp_path):
+    _, particle, origin = read_calibration(write(tmp_path / "fit", sizes=False))
+    assert [float(d) for d in (particle.D1, particle.D2, particle.D3)] == [200.0] * 3
+    assert "sphere" in origin.geometry
+
+
+def test_a_falling_curve_is_refused_or_flagged(tmp_path):
+    folder = write(tmp_path / "fit")
+    with pytest.raises(InputError, match="not monotone"):
+        read_calibration(folder, particle="falling")
+    law, particle, origin = read_calibration(folder, particle="falling", allow_not_monotone=True)
+    told = card(law, particle, origin=origin)
+    assert told["is_monotone"] is False
+    assert "not monotone" in told["warnings"][0]
+
+
+def test_what_did_not_converge_is_flagged(tmp_path):
+    _, _, origin = read_calibration(write(tmp_path / "fit", converged=False, warnings=["few particles"]))
+    assert origin.warnings == ("the calibration of calibration.json did not converge", "few particles")

@@ -1,0 +1,195 @@
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from calibrations import content, estimate, write
+from click.testing import CliRunner
+from compiling import PAIR, PLATES, WALL, build_driver, head, run_driver
+
+from mcc_jax.cli._export import FORMATS as OFFERED
+from mcc_jax.cli._main import cli
+from mcc_jax.export import FORMATS, read_calibration
+
+FILES = {
+    "json": {"parameters.json", "parameters_golden.csv"},
+    "csv": {"master_curve.csv", "unloading_curve.csv", "master_curve.json", "master_curve_golden.csv"},
+    "c": {"mcc_law.h", "mcc_law_golden.csv", "mcc_law_pair_golden.csv"},
+    "lammps": {"lammps.md", "mcc_law.h", "mcc_law_golden.csv", "mcc_law_pair_golden.csv"},
+    "yade": {"yade.md", "mcc_law.h", "mcc_law_golden.csv", "mcc_law_pair_golden.csv"},
+}
+
+
+@pytest.fixture
+def run():
+    def invoke(*arguments):
+        return CliRunner().invoke(cli, ["export", *map(str, arguments)], prog_name="mcc-jax")
+
+    return invoke
+
+
+def one_line(result):
+    """Assert exit status 2 and one clear line on standard error; the line."""
+    assert result.exit_code == 2, (result.stdout, result.stderr, result.exception)
+    assert result.stdout == ""
+    assert result.stderr.count("\n") == 1
+    assert result.stderr.startswith("mcc-jax: error: ")
+    return result.stderr.strip()
+
+
+def test_the_command_offers_what_there_is():
+    assert OFFERED == FORMATS
+
+
+@pytest.mark.parametrize("form", FILES)
+def test_writes_the_artefact_and_its_golden_table(run, tmp_path, form):
+    folder = write(tmp_path / "fit")
+    result = run(folder, "--format", form, "--out", tmp_path / "out")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert {p.name for p in (tmp_path / "out").iterdir()} == FILES[form]
+    for name in FILES[form]:
+        assert f"  {name}\n" in result.stdout
+    again = run(folder, "--format", form, "--out", tmp_path / "again")
+    assert again.exit_code == 0
+    for name in FILES[form]:
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
+
+
+def golden(file):
+    return np.genfromtxt(file, delimiter=",", names=True, dtype=None, encoding="utf-8")
+
+
+def test_the_header_passes_its_own_golden_tables(run, tmp_path):
+    """As a user would: the files alone, whatever the calibration was."""
+    folder, out = write(tmp_path / "fit"), tmp_path / "out"
+    assert run(folder, "--format", "c", "--out", out, "--particle", "b c", "--seed", 7).exit_code == 0
+    program = build_driver(tmp_path, (out / "mcc_law.h").read_text())
+    law, particle, _ = read_calibration(folder, particle="b c")
+    size = np.array([[float(d) for d in (particle.D1, particle.D2, particle.D3)]])
+    single, pair = golden(out / "mcc_law_golden.csv"), golden(out / "mcc_law_pair_golden.csv")
+    cases = [(PLATES, single, size)]
+    cases += [
+        (kind, pair[pair["partner"] == name], other)
+        for name, kind, other in (("equal", PAIR, size), ("smaller", PAIR, 0.6 * size), ("wall", WALL, size))
+    ]
+    for kind, table, other in cases:
+        assert len(np.unique(table["path"])) == 9
+        for number in np.unique(table["path"]):
+            rows = table[table["path"] == number]
+            x = rows["displacement_m"][None]
+            force, tangent, peak = run_driver(program, head(kind, x.shape[1], law, size, law, other), x)
+            assert np.abs(force[0] - rows["force_N"]).max() <= 1e-12 * table["force_N"].max()
+            assert np.abs(tangent[0] - rows["tangent_N_per_m"]).max() <= 1e-9 * table["tangent_N_per_m"].max()
+            np.testing.assert_allclose(peak[0], rows["displacement_max_m"], rtol=1e-15)
+
+
+def test_options_arrive(run, tmp_path):
+    folder, out = write(tmp_path / "fit"), tmp_path / "out"
+    arguments = (folder, "--format", "json", "--out", out)
+    assert run(*arguments, "--diameters", "120,110,100", "--particle", "A", "--seed", 3).exit_code == 0
+    told = json.loads((out / "parameters.json").read_text())
+    assert told["coefficients_of"] == "A"
+    assert told["particle"]["D2_um"] == 110.0
+    first = (out / "parameters_golden.csv").read_text()
+    assert run(*arguments, "--diameters", folder / "particles.csv", "--particle", "A").exit_code == 0
+    told = json.loads((out / "parameters.json").read_text())
+    assert told["particle"]["D2_um"] == 190.0
+    assert (out / "parameters_golden.csv").read_text() != first
+
+
+def test_what_is_not_monotone_is_exported_only_on_demand_and_said(run, tmp_path):
+    folder, out = write(tmp_path / "fit"), tmp_path / "out"
+    arguments = (folder, "--format", "c", "--out", out, "--particle", "falling")
+    assert "--allow-not-monotone" in one_line(run(*arguments))
+    assert not out.exists()
+    result = run(*arguments, "--allow-not-monotone")
+    assert result.exit_code == 0
+    assert "Warning: The loading curve is not monotone" in result.stdout
+    assert "WARNING" in (out / "mcc_law.h").read_text()
+
+
+def test_what_did_not_converge_is_exported_and_said(run, tmp_path):
+    folder = write(tmp_path / "fit", converged=False, warnings=["the chains disagree"])
+    result = run(folder, "--format", "c", "--out", tmp_path / "out")
+    assert result.exit_code == 0
+    assert "Warning: The calibration of calibration.json did not converge." in result.stdout
+    assert "Warning: The chains disagree." in result.stdout
+    assert "did not converge" in (tmp_path / "out" / "mcc_law.h").read_text()
+
+
+def broken(text):
+    return lambda folder: (folder / "calibration.json").write_text(text)
+
+
+def changed(**changes):
+    return lambda folder: (folder / "calibration.json").write_text(json.dumps(content(**changes)))
+
+
+BAD = {
+    "no folder": (lambda f: [p.unlink() for p in f.iterdir()] and f.rmdir(), (), "no such folder"),
+    "no calibration": (lambda f: (f / "calibration.json").unlink(), (), "calibration.json is missing"),
+    "not JSON": (broken('{"schema": 1,\n"law"'), (), "row 2: is not JSON"),
+    "not UTF-8": (lambda f: (f / "calibration.json").write_bytes(b'{"a": "\xff"}'), (), "is not JSON"),
+    "nested": (broken("[" * 100_000), (), "is not JSON"),
+    "a list": (broken("[]"), (), "schema 1"),
+    "schema": (changed(schema=2), (), "schema 1"),
+    "form": (changed(law={"unloading": "elastic", "strain_scaling": "raw"}), (), "'elastic'"),
+    "law a list": (changed(law=[1]), (), "None is not a valid Unloading"),
+    "no modulus": (changed(effective_modulus_MPa=estimate(None)), (), "no effective modulus"),
+    "text for a": (changed(a=estimate("large")), (), "a has no value"),
+    "infinite a": (broken(json.dumps(content(a=estimate(float("inf"))))), (), "a has no value"),
+    "negative modulus": (changed(effective_modulus_MPa=estimate(-1.0)), (), "must be positive"),
+    "huge mean": (changed(log_C1={"mean": estimate(1e6), "sd": estimate(0.1)}), (), "no sensible value"),
+    "no mean": (changed(log_C1=None), (), "log_C1.mean has no value"),
+    "steep shape": (changed(a=estimate(-20.0)), (), "the shape factor"),
+    "unknown particle": (None, ("--particle", "Z"), "--particle takes one of: A, b c, falling, out"),
+    "no particles": (changed(particles=None), ("--particle", "A"), "there is no particle 'A'"),
+    "particle left out": (None, ("--particle", "out"), "took no part in the calibration: burst at 3 mN"),
+    "particle without size": (lambda f: (f / "particles.csv").unlink(), ("--particle", "A"), "--diameters"),
+    "particle not in table": (
+        lambda f: (f / "particles.csv").write_text("particle,D1_um,D2_um,D3_um\nB,1,1,1\n"),
+        ("--particle", "A"),
+        "particles.csv: there is no particle 'A'",
+    ),
+    "two diameters": (None, ("--diameters", "1,2"), "1,2: there is no such file"),
+    "zero diameter": (None, ("--diameters", "1,0,2"), "--diameters"),
+    "empty diameters": (None, ("--diameters", " "), "--diameters"),
+    "seed": (None, ("--seed", "-1"), "--seed"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_bad_input_is_one_line_and_writes_nothing(run, tmp_path, kind):
+    damage, options, words = BAD[kind]
+    folder, out = write(tmp_path / "fit"), tmp_path / "out"
+    if damage is not None:
+        damage(folder)
+    line = one_line(run(folder, "--format", "c", "--out", out, *options))
+    assert words in line
+    assert not out.exists()
+    out.mkdir()
+    (out / "mcc_law.h").write_text("old")
+    one_line(run(folder, "--format", "c", "--out", out, *options))
+    assert [p.read_text() for p in out.iterdir()] == ["old"]
+
+
+def test_format_is_required_and_checked(run, tmp_path):
+    assert "--format" in one_line(run(write(tmp_path / "fit"), "--out", tmp_path / "out"))
+    assert "'matlab'" in one_line(run(tmp_path / "fit", "--format", "matlab", "--out", tmp_path / "out"))
+
+
+def test_sizes_are_also_found_where_the_demo_puts_its_campaign(tmp_path):
+    folder = write(tmp_path / "fit")
+    (folder / "campaign").mkdir()
+    (folder / "particles.csv").rename(folder / "campaign" / "particles.csv")
+    _, particle, origin = read_calibration(folder, particle="A")
+    assert float(particle.D1) == 200.0
+    assert origin.geometry == "particle A of particles.csv"
+
+
+def test_help_does_not_import_jax():
+    code = "import sys; sys.argv = ['mcc-jax', 'export', '--help']; from mcc_jax.cli import main\n"
+    code += "try:\n    main()\nexcept SystemExit:\n    assert 'jax' not in sys.modules\n"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "--allow-not-monotone" in done.stdout

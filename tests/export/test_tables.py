@@ -1,0 +1,124 @@
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mcc_jax import InputError, MccLaw, Particle, Plastic, StrainScaling, Unloading, drive, paper_law
+from mcc_jax.export import curve_tables, golden_table
+
+TOLERANCE = 1e-5
+FORMS = list(itertools.product(Unloading, StrainScaling))
+numbers = st.tuples(
+    st.floats(2, 20), st.floats(0, 0.99), st.floats(1.5, 4), st.floats(100, 1e5), st.sampled_from(FORMS)
+)
+
+
+@settings(max_examples=20)
+@given(numbers)
+def test_linear_interpolation_is_within_the_stated_error(drawn):
+    C1, share, C5, modulus, form = drawn
+    law = MccLaw(Plastic(C1, share * (20 / 9 * C1 * C5**5) ** (1 / 6), C5), 1.43, modulus, *form)
+    tables = curve_tables(law)
+    assert tables.error <= TOLERANCE
+    x = np.random.default_rng(0).uniform(0, 0.67, 4000)
+    at = tables.loading.set_index("scaled_strain")
+    for column, want in (
+        ("stress_MPa", law.plastic.stress(jnp.asarray(x))),
+        ("tangent_MPa", law.plastic.tangent(jnp.asarray(x))),
+    ):
+        miss = np.abs(np.interp(x, at.index, at[column]) - np.asarray(want))
+        assert miss.max() <= TOLERANCE * at[column].abs().max()
+    # A sphere has eta_p = 1.
+    sphere = Particle(200.0, 200.0, 200.0)
+    column = "recovered_strain_at_eta_1"
+    want = np.asarray(law.recoverable_strain(sphere, jnp.asarray(x)))
+    assert np.abs(np.interp(x, at.index, at[column]) - want).max() <= TOLERANCE * at[column].max()
+
+
+def test_the_unloading_curve_is_the_arcsine_law():
+    table = curve_tables(paper_law()).unloading
+    s = np.random.default_rng(1).uniform(0, 1, 5000)
+    want = 2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s**2))
+    assert np.abs(np.interp(s, table["recovered_share"], table["stress_share"]) - want).max() <= TOLERANCE
+
+
+@pytest.mark.parametrize("form", [FORMS[0], FORMS[4], FORMS[8]], ids=str)
+def test_the_law_rebuilt_from_the_tables_alone(form):
+    """An engine that interpolates gets the golden table's forces, of a particle that is no sphere."""
+    law, particle = paper_law(*form), Particle(213.54, 196.07, 150.0)
+    tables, golden = curve_tables(law), golden_table(law, particle)
+    eta, diameter = float(law.shape_factor(particle)), float(particle.effective_diameter)
+    x, peak = eta * golden["displacement_um"] / diameter, eta * golden["displacement_max_um"] / diameter
+    loading, unloading = tables.loading, tables.unloading
+
+    def at(column, where):
+        return np.interp(where, loading["scaled_strain"], loading[column])
+
+    delta = eta * eta ** ((1 - form[1].power) / 2) * at("recovered_strain_at_eta_1", peak)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.where(x < peak, (peak - x) / delta, 0.0)
+    stress = at("stress_MPa", peak) * np.interp(share, unloading["recovered_share"], unloading["stress_share"])
+    force = stress * float(particle.effective_area) * 1e-3
+    assert np.abs(force - golden["force_mN"]).max() <= 2e-4 * golden["force_mN"].max()
+
+
+def test_a_curve_with_a_corner_is_refused():
+    with pytest.raises(InputError, match="corner"):
+        curve_tables(MccLaw(Plastic(1.0, 4.0, 2.0), 1.43, 16000.0))
+
+
+def test_golden_table_is_the_law_driven_along_its_paths():
+    law, particle = paper_law(), Particle(213.54, 196.07, 186.33)
+    table = golden_table(law, particle, seed=3)
+    for _, path in table.groupby("path"):
+        force = drive(law, particle, jnp.asarray(path["displacement_um"].to_numpy())).force
+        np.testing.assert_allclose(path["force_mN"], force, rtol=0, atol=1e-12 * float(force.max()))
+        assert path["displacement_max_um"].is_monotonic_increasing
+    first = table[table["path"] == 0]
+    assert (first["displacement_um"] < 0).any()
+    assert ((first["force_mN"] == 0) & (first["displacement_um"] > 0)).any()  # released
+    assert first["displacement_um"].max() == pytest.approx(
+        float(0.67 * particle.effective_diameter / law.shape_factor(particle)), rel=1e-12
+    )
+
+
+def test_golden_tangents_are_difference_quotients_away_from_the_kinks():
+    law, particle = paper_law(), Particle(213.54, 196.07, 186.33)
+    table = golden_table(law, particle)
+    down = table[(table["displacement_um"] < table["displacement_max_um"] - 1e-3) & (table["force_mN"] > 1e-3)]
+    h = 1e-5
+
+    def force(x):
+        step = jax.vmap(lambda x, past: law.step(particle, type(law.init(particle))(past), x)[1])
+        return np.asarray(step(jnp.asarray(x.to_numpy()), jnp.asarray(down["displacement_max_um"].to_numpy())))
+
+    slope = (force(down["displacement_um"] + h) - force(down["displacement_um"] - h)) / (2 * h)
+    np.testing.assert_allclose(down["tangent_mN_per_um"], slope, rtol=1e-4)
+
+
+def test_seed_and_units():
+    law, particle = paper_law(), Particle(213.54, 196.07, 186.33)
+    ours, si, other = (golden_table(law, particle, **kind) for kind in ({}, {"units": "SI"}, {"seed": 1}))
+    assert ours.equals(golden_table(law, particle))
+    assert not ours.equals(other)
+    for one, two, factor in (
+        ("displacement_um", "displacement_m", 1e-6),
+        ("force_mN", "force_N", 1e-3),
+        ("tangent_mN_per_um", "tangent_N_per_m", 1e3),
+    ):
+        np.testing.assert_allclose(ours[one] * factor, si[two], rtol=1e-15)
+
+
+def test_every_digit_survives_the_file(tmp_path):
+    from mcc_jax.export import write_export
+
+    law, particle = paper_law(), Particle(213.54, 196.07, 186.33)
+    write_export("json", law, particle, tmp_path)
+    text = (tmp_path / "parameters_golden.csv").read_text().splitlines()
+    table = golden_table(law, particle)
+    assert text[0].split(",") == list(table.columns)
+    np.testing.assert_array_equal([[float(v) for v in line.split(",")] for line in text[1:]], table.to_numpy(float))
