@@ -1,8 +1,8 @@
 """Loading-unloading contact law of micro-crystalline cellulose particles: simulate, calibrate, discover, embed.
 
 Everything public is here or in `mcc_jax.law`, `mcc_jax.campaign`, `mcc_jax.effects`, `mcc_jax.simulate`,
-`mcc_jax.calibrate`, `mcc_jax.discover`, `mcc_jax.dem`, `mcc_jax.export`, `mcc_jax.plots` and `mcc_jax.report`. Units: MPa, um, mN, s, nJ;
-only `mcc_jax.dem` talks SI.
+`mcc_jax.calibrate`, `mcc_jax.discover`, `mcc_jax.dem`, `mcc_jax.export`, `mcc_jax.plots` and `mcc_jax.report`.
+Units: MPa, um, mN, s, nJ; only `mcc_jax.dem` talks SI.
 Switch JAX to double precision first, unless you mean single:
 `jax.config.update("jax_enable_x64", True)`.
 """
