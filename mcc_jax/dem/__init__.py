@@ -34,6 +34,7 @@ from ._pair import pair_force as pair_force
 from ._pair import pair_split as pair_split
 from ._pair import wall_energy as wall_energy
 from ._pair import wall_force as wall_force
+from ._precision import in_single as in_single
 from ._restart import load_state as load_state
 from ._restart import save_state as save_state
 from ._side import TESTED_STRAIN as TESTED_STRAIN

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -19,6 +20,7 @@ from ._edges import PADDING, Edges, carry_history, list_edges, widened
 from ._forces import Forces, Interaction, Packing, Vector, Vectors, WallHistory, contact_forces, overlap_and_normal
 from ._neighbours import close_pairs
 from ._pair import pair_split
+from ._sharded import Contacts, Devices, at_home, divided
 from ._side import sides_of
 from ._walls import Walls, set_velocity
 
@@ -182,12 +184,12 @@ def listed(packing: Packing, state: State, skin: float, capacity: int | None = N
     return eqx.tree_at(lambda s: (s.edges, s.listed_at), state, (fresh, state.position))
 
 
-def step(packing: Packing, motion: Motion, state: State) -> tuple[State, Forces]:
+def step(packing: Packing, motion: Motion, state: State, contacts: Contacts = contact_forces) -> tuple[State, Forces]:
     """One step of the symplectic Euler rule (leapfrog): forces, then velocities, then positions and walls.
 
-    The list of edges is taken as it is; `advance` makes it anew in time.
+    The list of edges is taken as it is; `advance` makes it anew in time. `contacts` computes the forces.
     """
-    forces, edges, history = contact_forces(
+    forces, edges, history = contacts(
         packing,
         motion.interaction,
         state.walls,
@@ -203,14 +205,14 @@ def step(packing: Packing, motion: Motion, state: State) -> tuple[State, Forces]
         motion, packing.mass, packing.radius, state.velocity, state.spin, forces.force, forces.torque
     )
     moved = State(
-        state.position + dt * velocity,
+        state.position + (dt * velocity).astype(state.position.dtype),
         velocity,
         spin,
         edges,
         history,
-        tuple(wall.moved(dt) for wall in state.walls),
+        tuple(wall.moved(motion.time_step.astype(state.time.dtype)) for wall in state.walls),
         state.listed_at,
-        state.time + dt,
+        state.time + dt.astype(state.time.dtype),
     )
     return moved, forces
 
@@ -228,7 +230,14 @@ def _kicked(
     )
 
 
-def run(packing: Packing, motion: Motion, state: State, steps: int, wanted: Int[Array, ""] | int) -> State:
+def run(
+    packing: Packing,
+    motion: Motion,
+    state: State,
+    steps: int,
+    wanted: Int[Array, ""] | int,
+    devices: Devices | None = None,
+) -> State:
     """Steps on one list of edges, as one compiled loop, differentiable in both modes.
 
     Args:
@@ -237,18 +246,28 @@ def run(packing: Packing, motion: Motion, state: State, steps: int, wanted: Int[
         state: where to start.
         steps: length of the loop.
         wanted: how many of these steps are taken.
+        devices: over which the contacts are divided (`jax.devices()`); not divided if None.
     """
 
-    def one(state: State, k: Array) -> tuple[State, None]:
-        return jax.lax.cond(k < wanted, lambda s: step(packing, motion, s)[0], lambda s: s, state), None
+    def loop(contacts: Contacts, packing: Packing, motion: Motion, state: State, wanted: Array) -> tuple[State, tuple]:
+        def one(state: State, k: Array) -> tuple[State, None]:
+            return jax.lax.cond(k < wanted, lambda s: step(packing, motion, s, contacts)[0], lambda s: s, state), None
 
-    return jax.lax.scan(one, state, jnp.arange(steps))[0]
+        return jax.lax.scan(one, state, jnp.arange(steps))[0], ()
+
+    return divided(loop, devices, packing, motion, state, jnp.asarray(wanted))[0]
 
 
-@jax.jit
+@functools.partial(jax.jit, static_argnums=0)
 def _run_while_listed(
-    packing: Packing, motion: Motion, state: State, steps: Int[Array, ""], skin: Scalar
-) -> tuple[State, Int[Array, ""], Float[Array, "walls 3"]]:
+    devices: Devices | None, packing: Packing, motion: Motion, state: State, steps: Int[Array, ""], skin: Scalar
+) -> tuple[State, tuple[Int[Array, ""], Float[Array, "walls 3"]]]:
+    return divided(_while_listed, devices, packing, motion, state, steps, skin)
+
+
+def _while_listed(
+    contacts: Contacts, packing: Packing, motion: Motion, state: State, steps: Int[Array, ""], skin: Scalar
+) -> tuple[State, tuple[Int[Array, ""], Float[Array, "walls 3"]]]:
     """Steps for as long as the list is complete: no particle further than half the skin from where it was listed."""
 
     def goes_on(carry):
@@ -258,11 +277,12 @@ def _run_while_listed(
 
     def one(carry):
         state, done, on_wall = carry
-        state, forces = step(packing, motion, state)
+        state, forces = step(packing, motion, state, contacts)
         return state, done + 1, on_wall + forces.on_wall
 
-    walls = jnp.zeros((len(state.walls), 3), state.position.dtype)
-    return jax.lax.while_loop(goes_on, one, (state, jnp.zeros_like(steps), walls))
+    walls = jnp.zeros((len(state.walls), 3), state.velocity.dtype)
+    state, done, on_wall = jax.lax.while_loop(goes_on, one, (state, jnp.zeros_like(steps), walls))
+    return state, (done, on_wall)
 
 
 def advance(
@@ -274,6 +294,7 @@ def advance(
     steps: int,
     skin: float,
     tape: list[Segment] | None = None,
+    devices: Devices | None = None,
 ) -> tuple[State, Trajectory]:
     """Move on for a time, with a new list of edges whenever a particle has moved by half the skin.
 
@@ -287,6 +308,8 @@ def advance(
         skin: extra distance up to which pairs are listed [m]; as large as a particle moves in a few tens of steps or
             more, so that lists are made rarely.
         tape: a list to which the lists of edges are appended, for `replay`.
+        devices: over which the contacts are divided, for example `jax.devices()`, those of all processes after
+            `jax.distributed.initialize`; every process calls this with the same arguments. Not divided if None.
 
     Returns:
         The state at the end, with the walls still moving, and the rows.
@@ -300,7 +323,7 @@ def advance(
     for _ in range(rows):
         left, on_wall = steps, 0.0
         while left:
-            state, done, force = _run_while_listed(packing, motion, state, jnp.asarray(left), limit)
+            state, (done, force) = at_home(_run_while_listed, devices, packing, motion, state, jnp.asarray(left), limit)
             on_wall = on_wall + force
             left -= int(done)
             if tape is not None and int(done):
@@ -317,7 +340,9 @@ def advance(
     return state, Trajectory(*columns, np.asarray(lists), np.asarray(capacity))
 
 
-def replay(packing: Packing, motion: Motion, state: State, tape: Sequence[Segment]) -> State:
+def replay(
+    packing: Packing, motion: Motion, state: State, tape: Sequence[Segment], devices: Devices | None = None
+) -> State:
     """The same motion again over the lists of edges that `advance` recorded, differentiable in both modes.
 
     Neighbour lists have no derivative and are made on the host; the contacts on them have. In reverse mode each list's
@@ -329,6 +354,7 @@ def replay(packing: Packing, motion: Motion, state: State, tape: Sequence[Segmen
         motion: as in `advance`.
         state: the state `advance` started from, with the walls' velocities set (`set_velocity`).
         tape: of one call of `advance`.
+        devices: as in `run`.
     """
     if not tape:
         return state
@@ -349,7 +375,7 @@ def replay(packing: Packing, motion: Motion, state: State, tape: Sequence[Segmen
             state.edges.particles,
         )
         state = eqx.tree_at(lambda s: s.edges, state, carry_history(state.edges, fresh))
-        return run(packing, motion, state, longest, segment.steps), None
+        return run(packing, motion, state, longest, segment.steps, devices), None
 
     state = eqx.tree_at(lambda s: s.edges, state, widened(state.edges, room))
     return jax.lax.scan(one, state, segments)[0]
@@ -445,7 +471,8 @@ def _sample(packing: Packing, state: State, on_wall: Float[Array, "walls 3"]) ->
     d_i, d_j = jax.vmap(pair_split)(i, j, edges.overlap_max)
     beyond = edges.active & ((d_i > i.tested) | (d_j > j.tested))
     beyond_at_walls = history.overlap_max > jnp.broadcast_to(packing.sides.tested[:, None], history.overlap_max.shape)
-    wall_overlap = [packing.radius - jax.vmap(wall.distance)(state.position) for wall in state.walls]
+    extent = packing.radius.astype(state.position.dtype)
+    wall_overlap = [extent - jax.vmap(wall.distance)(state.position) for wall in state.walls]
     touching = jnp.sum(overlap > 0) + sum(jnp.sum(x > 0) for x in wall_overlap)
     kinetic = 0.5 * jnp.sum(packing.mass * jnp.sum(state.velocity**2, axis=1)) + 0.2 * jnp.sum(
         packing.mass * packing.radius**2 * jnp.sum(state.spin**2, axis=1)

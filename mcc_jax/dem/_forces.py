@@ -115,7 +115,8 @@ def overlap_and_normal(i: Vector, j: Vector, reach: Scalar, listed: Flag) -> tup
     """Overlap [m] of two spheres and unit vector from i to j.
 
     Two centres in one place have no normal: they get none, and so no force. A place in the list that no pair uses
-    overlaps by -1 m. A position that is NaN shows.
+    overlaps by -1 m. A position that is NaN shows. The overlap, a small difference of large numbers, is taken in the
+    precision of the positions and then rounded to that of the radii.
 
     Args:
         i, j: centres [m].
@@ -126,8 +127,10 @@ def overlap_and_normal(i: Vector, j: Vector, reach: Scalar, listed: Flag) -> tup
     square = jnp.sum(between * between)
     apart = listed & (square > 0)
     distance = shared(jnp.sqrt(jnp.where(apart, square, 1.0)))
-    overlap = jnp.where(apart, reach - distance, jnp.where(listed & jnp.isnan(square), square, -1.0))
-    return overlap, jnp.where(apart, between * shared(1 / distance), 0.0)
+    separation = reach.astype(distance.dtype) - distance
+    overlap = jnp.where(apart, separation, jnp.where(listed & jnp.isnan(square), square, -1.0))
+    normal = jnp.where(apart, between * shared(1 / distance), 0.0)
+    return overlap.astype(reach.dtype), normal.astype(reach.dtype)
 
 
 def contact_forces(
@@ -154,32 +157,46 @@ def contact_forces(
         history: of the contacts with walls.
         time_step: over which slip adds up [s].
     """
-    bodies = jax.vmap(_Body)(packing.radius, packing.mass, packing.sides, position, velocity, spin)
-    pairs, load = pair_loads(interaction, bodies, edges, time_step)
-    edges = eqx.tree_at(lambda e: (e.overlap_max, e.slip), edges, (pairs.overlap_max, pairs.slip))
-    on_wall, columns = [], []
-    for w, wall in enumerate(walls):
-        against = jax.vmap(_against, (None, None, 0, 0, 0, None))
-        contacts = against(interaction, wall, bodies, history.overlap_max[:, w], history.slip[:, w], time_step)
-        load = load + _load(contacts.force, packing.radius, contacts.couple)
-        on_wall.append(-jnp.sum(contacts.force, axis=0))
-        columns.append((contacts.overlap_max, contacts.slip))
-    if walls:
-        history = WallHistory(*(jnp.stack(x, axis=1) for x in zip(*columns, strict=True)))
-    forces = Forces(load[:, :3], load[:, 3:], jnp.stack(on_wall) if walls else jnp.zeros((0, 3), position.dtype))
-    return forces, edges, history
+    bodies = bodies_of(packing, position, velocity, spin)
+    load, edges = pair_loads(interaction, bodies, edges, time_step)
+    at_walls, on_wall, history = wall_loads(interaction, walls, bodies, history, time_step)
+    load = load + at_walls
+    return Forces(load[:, :3], load[:, 3:], on_wall), edges, history
+
+
+def bodies_of(packing: Packing, position: Vectors, velocity: Vectors, spin: Vectors) -> _Body:
+    """The spheres as their contacts see them, in a batch."""
+    return jax.vmap(_Body)(packing.radius, packing.mass, packing.sides, position, velocity, spin)
 
 
 def pair_loads(
     interaction: Interaction, bodies: _Body, edges: Edges, time_step: Scalar
-) -> tuple[_Contact, Float[Array, "particles 6"]]:
-    """Contacts of all edges, and their force and torque summed over the particles."""
+) -> tuple[Float[Array, "particles 6"], Edges]:
+    """Force and torque of all edges, or any part of them, summed over the particles, and what the edges remember."""
     i, j = (jax.tree.map(lambda x, at=at: x[at], bodies) for at in (edges.i, edges.j))
     between = jax.vmap(_between, (None, 0, 0, 0, 0, 0, None))
     pairs = between(interaction, i, j, edges.active, edges.overlap_max, edges.slip, time_step)
-    total = jnp.zeros((bodies.radius.shape[0], 6), bodies.position.dtype)
+    total = jnp.zeros((bodies.radius.shape[0], 6), bodies.radius.dtype)
     total = total.at[edges.i].add(_load(pairs.force, i.radius, pairs.couple))
-    return pairs, total.at[edges.j].add(_load(-pairs.force, j.radius, pairs.couple))
+    total = total.at[edges.j].add(_load(-pairs.force, j.radius, pairs.couple))
+    return total, eqx.tree_at(lambda e: (e.overlap_max, e.slip), edges, (pairs.overlap_max, pairs.slip))
+
+
+def wall_loads(
+    interaction: Interaction, walls: Walls, bodies: _Body, history: WallHistory, time_step: Scalar
+) -> tuple[Float[Array, "particles 6"], Float[Array, "walls 3"], WallHistory]:
+    """Force and torque of the walls on all particles, or any part of them, forces on the walls, and the memory."""
+    load = jnp.zeros((bodies.radius.shape[0], 6), bodies.radius.dtype)
+    on_wall, columns = [], []
+    for w, wall in enumerate(walls):
+        against = jax.vmap(_against, (None, None, 0, 0, 0, None))
+        contacts = against(interaction, wall, bodies, history.overlap_max[:, w], history.slip[:, w], time_step)
+        load = load + _load(contacts.force, bodies.radius, contacts.couple)
+        on_wall.append(-jnp.sum(contacts.force, axis=0))
+        columns.append((contacts.overlap_max, contacts.slip))
+    if not walls:
+        return load, jnp.zeros((0, 3), load.dtype), history
+    return load, jnp.stack(on_wall), WallHistory(*(jnp.stack(x, axis=1) for x in zip(*columns, strict=True)))
 
 
 @jax.vmap
@@ -210,9 +227,10 @@ def _between(
 def _against(
     interaction: Interaction, wall: Wall, body: _Body, overlap_max: Scalar, slip: Vector, time_step: Scalar
 ) -> _Contact:
-    outward = -wall.normal_at(body.position)
-    overlap = body.radius - wall.distance(body.position)
-    relative = wall.velocity - body.velocity - jnp.cross(body.radius * body.spin, outward)
+    dtype = body.radius.dtype
+    outward = -wall.normal_at(body.position).astype(dtype)
+    overlap = (body.radius.astype(body.position.dtype) - wall.distance(body.position)).astype(dtype)
+    relative = wall.velocity.astype(dtype) - body.velocity - jnp.cross(body.radius * body.spin, outward)
     elastic = jax.lax.optimization_barrier(wall_force(body.side, overlap_max, overlap))
     friction, k, mass = interaction.wall_friction, body.side.k1, body.mass
     return _contact(interaction, friction, elastic, k, mass, outward, relative, overlap_max, overlap, slip, time_step)
