@@ -44,7 +44,7 @@ class ContactNewton(optx.AbstractMinimiser[Vectors, Balance, _State]):
         reach: a particle moves at most so far in one step [m].
     """
 
-    rtol: float
+    rtol: Scalar | float
     atol: Scalar
     reach: Scalar
 
@@ -123,7 +123,7 @@ class Settled(NamedTuple):
     steps: Int[Array, ""]
 
 
-def settle(held: Held, guess: Vectors, rtol: float, max_steps: int) -> Settled:
+def settle(held: Held, guess: Vectors, rtol: Scalar | float, max_steps: int) -> Settled:
     r"""Centres at which the net force vanishes, a minimum of the energy of contacts and proximal springs.
 
     .. math:: f(x; \theta) - \mu (x - x_{prev}) = 0, \qquad K\, dx = \partial_\theta f\, d\theta + \mu\, dx_{prev}

@@ -70,7 +70,7 @@ class LoadStep(NamedTuple):
     height: Scalar
     spring: Scalar
     position: Vectors
-    last: bool
+    last: bool | Bool[Array, " steps"]
 
 
 class Compaction(NamedTuple):
@@ -164,7 +164,7 @@ def relaxed(packing: Packing, walls: Walls, position: Vectors, solver: Solver | 
     state = start(packing, walls, position, skin)
     for _ in range(passes):
         held = Held(packing, walls, state.edges, state.wall_history, state.position, jnp.asarray(0.3 * k))
-        settled = _settle(held, state.position, solver.rtol, solver.max_steps)
+        settled = _settle(held, state.position, jnp.asarray(1e-3), solver.max_steps)
         state = eqx.tree_at(lambda s: s.position, state, settled.position)
         if _moved(state) > skin / 2:
             state = listed(packing, state, skin)
@@ -243,13 +243,35 @@ def replay_compaction(
     Raises:
         InputError: if the tape is empty.
     """
+    return _replay(packing, state, stacked(tape), solver or Solver())
+
+
+def stacked(tape: Sequence[LoadStep]) -> LoadStep:
+    """All load steps as one, every field with a leading axis.
+
+    Raises:
+        InputError: if there are none.
+    """
     if not tape:
         raise InputError("a compaction without load steps", remedy="Give `compact` a list as its `tape`.")
-    return _replay(packing, state, *_stacked(tape), solver or Solver())
+    room = max(step.key.shape[0] for step in tape)
+
+    def padded(step: LoadStep) -> LoadStep:
+        spare = (0, room - step.key.shape[0])
+        key = np.pad(step.key, spare, constant_values=PADDING)
+        return step._replace(key=key, i=np.pad(step.i, spare), j=np.pad(step.j, spare))
+
+    return LoadStep(*(jnp.asarray(np.stack(column)) for column in zip(*map(padded, tape), strict=True)))
 
 
 @eqx.filter_jit
-def _replay(packing: Packing, state: State, steps: LoadStep, room: int, solver: Solver) -> Replayed:
+def _replay(packing: Packing, state: State, steps: LoadStep, solver: Solver) -> Replayed:
+    return replay_stacked(packing, state, steps, solver)
+
+
+def replay_stacked(packing: Packing, state: State, steps: LoadStep, solver: Solver) -> Replayed:
+    """`replay_compaction` of load steps that are `stacked`, to be traced."""
+    room = steps.key.shape[1]
     empty = jnp.zeros(room, state.edges.overlap_max.dtype)
     slip = jnp.zeros((room, 3), empty.dtype)
 
@@ -271,18 +293,6 @@ def _replay(packing: Packing, state: State, steps: LoadStep, room: int, solver: 
     carry = (state.position, state.position, before, state.wall_history)
     (_, _, edges, wall_history), (on_wall, position, residual, proximal, converged) = jax.lax.scan(one, carry, steps)
     return Replayed(on_wall, position, edges, wall_history, residual, proximal, converged)
-
-
-def _stacked(tape: Sequence[LoadStep]) -> tuple[LoadStep, int]:
-    room = max(step.key.shape[0] for step in tape)
-
-    def padded(step: LoadStep) -> LoadStep:
-        spare = room - step.key.shape[0]
-        key = jnp.pad(step.key, (0, spare), constant_values=PADDING)
-        i, j = jnp.pad(step.i, (0, spare)), jnp.pad(step.j, (0, spare))
-        return step._replace(key=key, i=i, j=j, last=jnp.asarray(step.last))
-
-    return jax.tree.map(lambda *x: jnp.stack(x), *(padded(step) for step in tape)), room
 
 
 def _reach(packing: Packing, state: State, height: float, solver: Solver, halvings: int) -> list[_Attempt]:
@@ -309,7 +319,7 @@ def _attempt(packing: Packing, state: State, height: float, solver: Solver) -> _
     evaluations, reached, best = 0, 0.0, None
     for spring in solver.springs:
         held = Held(packing, walls, state.edges, state.wall_history, state.position, jnp.asarray(spring * k))
-        settled = _settle(held, guess, solver.rtol, solver.max_steps)
+        settled = _settle(held, guess, jnp.asarray(solver.rtol), solver.max_steps)
         evaluations += int(settled.steps)
         end = eqx.tree_at(lambda s: s.position, state, settled.position)
         if _moved(end) > skin / 2 and np.isfinite(settled.position).all():
@@ -317,7 +327,7 @@ def _attempt(packing: Packing, state: State, height: float, solver: Solver) -> _
             if _unlisted(packing, state.edges, fresh):
                 state = eqx.tree_at(lambda s: (s.edges, s.listed_at), state, (fresh.edges, fresh.listed_at))
                 held = eqx.tree_at(lambda h: h.edges, held, fresh.edges)
-                settled = _settle(held, settled.position, solver.rtol, solver.max_steps)
+                settled = _settle(held, settled.position, jnp.asarray(solver.rtol), solver.max_steps)
                 evaluations += int(settled.steps)
         if not bool(settled.converged):
             best = best or (held, settled)
@@ -340,7 +350,7 @@ def _attempt(packing: Packing, state: State, height: float, solver: Solver) -> _
 
 
 @eqx.filter_jit
-def _settle(held: Held, guess: Vectors, rtol: float, max_steps: int) -> Settled:
+def _settle(held: Held, guess: Vectors, rtol: Scalar, max_steps: int) -> Settled:
     return settle(held, guess, rtol, max_steps)
 
 

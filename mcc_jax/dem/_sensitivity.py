@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from ._dynamics import State
 from ._forces import Packing
-from ._quasistatic import TOP, LoadStep, Replayed, Solver, replay_compaction
+from ._quasistatic import TOP, LoadStep, Replayed, Solver, replay_stacked, stacked
 
 STRESSES = ("K1", "K3", "K5", "Ebar", "springs")
 """What has the dimension of a stress: K1 = C1, K3 = C3^3, K5 = C5^5, the effective modulus, the proximal springs."""
@@ -87,7 +87,7 @@ def punch_sensitivity(
     # Outside the compiled function: that one then is the same for all parametrisations.
     direction = jax.jacfwd(packing_of)(values)
     packing = packing_of(values)
-    jacobian, (force, replayed) = _jacobian(packing, direction, state, list(tape), solver or Solver())
+    jacobian, (force, replayed) = _jacobian(packing, direction, state, stacked(tape), solver or Solver())
     force, jacobian, worst = np.asarray(force), np.asarray(jacobian), np.asarray(replayed.residual)
     row = np.concatenate([[0], np.cumsum(last)[:-1]])
     by_stress = jacobian[last, len(values) :]
@@ -107,14 +107,14 @@ def punch_sensitivity(
 
 @eqx.filter_jit
 def _jacobian(
-    packing: Packing, direction: Packing, state: State, tape: list[LoadStep], solver: Solver
+    packing: Packing, direction: Packing, state: State, steps: LoadStep, solver: Solver
 ) -> tuple[Array, tuple[Array, Replayed]]:
     count = direction.radius.shape[-1]
 
     def force(parameters: Array) -> tuple[Array, tuple[Array, Replayed]]:
         along = jax.tree.map(lambda x, dx: x + dx @ parameters[:count], packing, direction)
-        steps = [step._replace(spring=step.spring * jnp.exp(parameters[-1])) for step in tape]
-        replayed = replay_compaction(rescaled(along, parameters[count : count + 4]), state, steps, solver)
+        springs = steps._replace(spring=steps.spring * jnp.exp(parameters[-1]))
+        replayed = replay_stacked(rescaled(along, parameters[count : count + 4]), state, springs, solver)
         return replayed.on_wall[:, TOP], (replayed.on_wall[:, TOP], replayed)
 
     return jax.jacfwd(force, has_aux=True)(jnp.zeros(count + len(STRESSES)))
