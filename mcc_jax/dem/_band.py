@@ -45,7 +45,7 @@ class Band(NamedTuple):
         height, density: of the rows.
         probability: of the quantiles.
         quantiles: force on the top punch [N], (probabilities, rows).
-        standard_deviation: of that force [N].
+        standard_deviation: of that force [N]; infinite where a single draw converged.
         used: draws that converged in a row; in the first-order band 1 where the one compaction did, else 0.
         not_monotone: the most particles whose force falls on loading, over all draws used.
         compaction: rows of the compaction at the mean of the draws (first order only).
@@ -204,11 +204,18 @@ def band_by_draws(
         rows.density,
         np.asarray(probability, float),
         np.nanquantile(forces, np.asarray(probability, float), axis=0),
-        np.nanstd(forces, axis=0),
+        _deviation(forces),
         used,
         wrong,
         forces=forces,
     )
+
+
+def _deviation(forces: np.ndarray) -> np.ndarray:
+    """Standard deviation of the draws that converged; nothing is known of it from one."""
+    used = np.isfinite(forces).sum(axis=0)
+    spread = np.nansum((forces - np.nanmean(forces, axis=0)) ** 2, axis=0)
+    return np.where(used > 1, np.sqrt(spread / np.maximum(used - 1, 1)), np.inf)
 
 
 def _checked(draws: np.ndarray, probability: Sequence[float]) -> np.ndarray:

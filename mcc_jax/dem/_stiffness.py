@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,8 +16,8 @@ from .._types import Scalar
 from ._edges import Edges
 from ._forces import Packing, Vectors, WallHistory, pair_geometry
 from ._pair import largest_overlap, pair_energy, pair_force, wall_energy, wall_force
-from ._side import sides_of
-from ._walls import Wall, Walls
+from ._side import HalfContact, sides_of
+from ._walls import Walls
 
 DENSE = 1200
 """Unknowns up to which stiffness matrices are factorised; above, conjugate gradients."""
@@ -123,90 +126,91 @@ def net_force(held: Held, position: Vectors) -> Vectors:
     Contacts load where the overlap is above the largest so far and unload below: backward Euler in the history.
     Differentiable in everything.
     """
-    edges, packing = held.edges, held.packing
-    overlap, normal = pair_geometry(packing.radius, position, edges)
-    overlap, normal = jax.lax.optimization_barrier((overlap, normal))
-    i, j = sides_of(packing.sides, edges.i), sides_of(packing.sides, edges.j)
-    push = jax.vmap(pair_force)(i, j, edges.overlap_max, overlap)[:, None] * normal
-    total = -held.proximal * (position - held.previous)
-    total = total.at[edges.j].add(push).at[edges.i].add(-push)
-    for w, wall in enumerate(held.walls):
-        inward, overlap = _wall_geometry(wall, packing.radius, position)
-        total = total + jax.vmap(wall_force)(packing.sides, held.wall_history.overlap_max[:, w], overlap)[:, None] * inward
-    return total
+    edges = held.edges
+    i, j, overlap, normal = _pairs(held, position)
+    force = jax.lax.optimization_barrier(jax.vmap(pair_force)(i, j, edges.overlap_max, overlap))
+    push = force[:, None] * normal
+    against, inward = _on_walls(held, position)
+    total = -held.proximal * (position - held.previous) + jnp.sum(against[:, :, None] * inward, axis=0)
+    return total.at[edges.j].add(push).at[edges.i].add(-push)
 
 
 def balance(held: Held, position: Vectors) -> Balance:
     """Energy, net force and stiffness; not meant to be differentiated."""
-    packing, edges = held.packing, held.edges
-    i, j = sides_of(packing.sides, edges.i), sides_of(packing.sides, edges.j)
-    overlap, normal = jax.lax.optimization_barrier(pair_geometry(packing.radius, position, edges))
-    force, slope = jax.lax.optimization_barrier(
-        _with_slope(lambda x: jax.vmap(pair_force)(i, j, edges.overlap_max, x), overlap)
-    )
-    stored = jax.vmap(pair_energy)(i, j, edges.overlap_max, overlap)
+    packing, edges, peak = held.packing, held.edges, held.wall_history.overlap_max.T
+    i, j, overlap, normal = _pairs(held, position)
+    force, slope = _with_slope(lambda x: jax.vmap(pair_force)(i, j, edges.overlap_max, x), overlap)
     moved = position - held.previous
-    energy = 0.5 * held.proximal * jnp.sum(moved**2) + _work(stored)
+    energy = 0.5 * held.proximal * jnp.sum(moved**2) + _work(jax.vmap(pair_energy)(i, j, edges.overlap_max, overlap))
     push = force[:, None] * normal
-    net = (-held.proximal * moved).at[edges.j].add(push).at[edges.i].add(-push)
     distance = packing.radius[edges.i] + packing.radius[edges.j] - overlap
     along = normal[:, :, None] * normal[:, None, :]
-    turning = shared(force / distance)[:, None, None] * (jnp.eye(3) - along)
-    pairs, soft_pairs = slope[:, None, None] * along - turning, jnp.maximum(slope, 0.0)[:, None, None] * along
-    alone = held.proximal * jnp.broadcast_to(jnp.eye(3), (len(position), 3, 3))
-    soft = alone
-    count, total, on_wall = jnp.sum(force > 0), jnp.sum(force), []
-    for w, wall in enumerate(held.walls):
-        peak = held.wall_history.overlap_max[:, w]
-        inward, overlap = _wall_geometry(wall, packing.radius, position)
-        force, slope = _with_slope(lambda x, p=peak: jax.vmap(wall_force)(packing.sides, p, x), overlap)
-        energy = energy + _work(jax.vmap(wall_energy)(packing.sides, peak, overlap))
-        net = net + force[:, None] * inward
-        along = inward[:, :, None] * inward[:, None, :]
-        bend = jax.vmap(jax.hessian(wall.distance))(position)
-        alone = alone + slope[:, None, None] * along - force[:, None, None] * bend
-        soft = soft + jnp.maximum(slope, 0.0)[:, None, None] * along
-        count, total = count + jnp.sum(force > 0), total + jnp.sum(force)
-        on_wall.append(jnp.sum(force))
-    scale = shared(total / jnp.maximum(count, 1))
+    turning = shared(force / distance)[:, None, None] * (jnp.eye(3)[None] - along)
+
+    inward, wall_overlap = _wall_geometry(held, position)
+    against, steepness = _with_slope(lambda x: _each_wall(wall_force)(packing.sides, peak, x), wall_overlap)
+    energy = energy + _work(_each_wall(wall_energy)(packing.sides, peak, wall_overlap))
+    bend = jnp.stack([jax.vmap(jax.hessian(wall.distance))(position) for wall in held.walls])
+    facing = inward[:, :, :, None] * inward[:, :, None, :]
+    springs = held.proximal * jnp.eye(3)[None]
+
+    def pressing(slope: Array, steepness: Array) -> tuple[Blocks, Blocks]:
+        return slope[:, None, None] * along, springs + jnp.sum(steepness[:, :, None, None] * facing, axis=0)
+
+    pairs, alone = pressing(slope, steepness)
+    soft_pairs, soft_alone = pressing(jnp.maximum(slope, 0.0), jnp.maximum(steepness, 0.0))
+    net = -held.proximal * moved + jnp.sum(against[:, :, None] * inward, axis=0)
     return Balance(
         energy,
-        net,
-        scale,
-        Stiffness(pairs, alone, edges.i, edges.j),
-        Stiffness(soft_pairs, soft, edges.i, edges.j),
-        jnp.stack(on_wall) if on_wall else jnp.zeros(0, position.dtype),
+        net.at[edges.j].add(push).at[edges.i].add(-push),
+        shared((jnp.sum(force) + jnp.sum(against)) / jnp.maximum(jnp.sum(force > 0) + jnp.sum(against > 0), 1)),
+        Stiffness(pairs - turning, alone - jnp.sum(against[:, :, None, None] * bend, axis=0), edges.i, edges.j),
+        Stiffness(soft_pairs, soft_alone, edges.i, edges.j),
+        jnp.sum(against, axis=1),
     )
 
 
 def remembered(held: Held, position: Vectors) -> tuple[Edges, WallHistory]:
     """The largest overlaps after a load step that ended at these centres."""
     overlap, _ = pair_geometry(held.packing.radius, position, held.edges)
+    _, wall_overlap = _wall_geometry(held, position)
     edges = eqx.tree_at(lambda e: e.overlap_max, held.edges, largest_overlap(held.edges.overlap_max, overlap))
-    walls = [held.packing.radius - jax.vmap(wall.distance)(position) for wall in held.walls]
-    if not walls:
-        return edges, held.wall_history
-    peak = largest_overlap(held.wall_history.overlap_max, jnp.stack(walls, axis=1))
+    peak = largest_overlap(held.wall_history.overlap_max, wall_overlap.T)
     return edges, eqx.tree_at(lambda h: h.overlap_max, held.wall_history, peak)
 
 
 def force_on_walls(held: Held, position: Vectors) -> Float[Array, " walls"]:
     """Force on each wall along its normal [N], all particles added up; differentiable."""
-    forces = []
-    for w, wall in enumerate(held.walls):
-        _, overlap = _wall_geometry(wall, held.packing.radius, position)
-        forces.append(jnp.sum(jax.vmap(wall_force)(held.packing.sides, held.wall_history.overlap_max[:, w], overlap)))
-    return jnp.stack(forces)
+    return jnp.sum(_on_walls(held, position)[0], axis=1)
 
 
-def _wall_geometry(wall: Wall, radius: Array, position: Vectors) -> tuple[Vectors, Array]:
-    distance, inward = jax.vmap(jax.value_and_grad(wall.distance))(position)
-    return jax.lax.optimization_barrier((inward, radius - distance))
+def _pairs(held: Held, position: Vectors) -> tuple[HalfContact, HalfContact, Array, Array]:
+    """Both sides, overlap and normal of every edge."""
+    sides = (sides_of(held.packing.sides, k) for k in (held.edges.i, held.edges.j))
+    return jax.lax.optimization_barrier((*sides, *pair_geometry(held.packing.radius, position, held.edges)))
+
+
+def _on_walls(held: Held, position: Vectors) -> tuple[Float[Array, "walls particles"], Float[Array, "walls particles 3"]]:
+    inward, overlap = _wall_geometry(held, position)
+    force = _each_wall(wall_force)(held.packing.sides, held.wall_history.overlap_max.T, overlap)
+    return jax.lax.optimization_barrier(force), inward
+
+
+def _wall_geometry(held: Held, position: Vectors) -> tuple[Array, Array]:
+    """Inward normals (walls, particles, 3) and overlaps (walls, particles)."""
+    found = [jax.vmap(jax.value_and_grad(wall.distance))(position) for wall in held.walls]
+    distance, inward = (jnp.stack(x) for x in zip(*found, strict=True))
+    return jax.lax.optimization_barrier((inward, held.packing.radius - distance))
+
+
+def _each_wall(function: Callable[..., Any]) -> Callable[..., Any]:
+    return jax.vmap(jax.vmap(function), (None, 0, 0))
 
 
 def _with_slope(force, overlap: Array) -> tuple[Array, Array]:
-    return jax.jvp(force, (overlap,), (jnp.ones_like(overlap),))
+    return jax.lax.optimization_barrier(jax.jvp(force, (overlap,), (jnp.ones_like(overlap),)))
 
 
 def _work(stored) -> Scalar:
+    stored = jax.lax.optimization_barrier(stored)
     return jnp.sum(stored.recoverable) + jnp.sum(stored.dissipated)
