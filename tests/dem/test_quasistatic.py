@@ -65,7 +65,7 @@ def test_chain_between_punches_is_the_plate_test():
     n, diameter = len(DIAMETERS), 100.0
     packing = spheres(LAW, jnp.full(n, diameter))
     radius = 0.5e-6 * diameter
-    position = jnp.zeros((n, 3)).at[:, 2].set((2 * jnp.arange(n) + 1) * radius)
+    position = jnp.zeros((n, 3)).at[:, 2].set(jnp.asarray((2 * np.arange(n) + 1) * radius))
     state = start(packing, die(radius, 2 * n * radius), position, 0.5 * radius)
     strain = np.concatenate([np.linspace(0.02, 0.3, 5), np.linspace(0.295, 0.28, 3), np.linspace(0.3, 0.4, 2)])
     _, rows = compact(packing, state, 2 * n * radius * (1 - strain), SOLVER)
