@@ -107,7 +107,9 @@ def population_packing(
     rng = np.random.default_rng(seed)
     z = rng.standard_normal((len(size), 5))
     for _ in range(REDRAWS):
-        wrong = ~np.asarray(eqx.filter_vmap(lambda law: law.is_monotone)(laws(jnp.asarray(draws.mean(0)), jnp.asarray(z))))
+        wrong = ~np.asarray(
+            eqx.filter_vmap(lambda law: law.is_monotone)(laws(jnp.asarray(draws.mean(0)), jnp.asarray(z)))
+        )
         if not wrong.any():
             break
         z[wrong] = rng.standard_normal((int(wrong.sum()), 5))

@@ -42,7 +42,7 @@ def fit_compaction(
     start: Parameters,
     state: State,
     heights: Float[np.ndarray, " rows"] | Sequence[float],
-    force: Float[np.ndarray, " rows"] | Sequence[float],
+    force: Float[np.ndarray, " measured"] | Sequence[float],
     *,
     solver: Solver | None = None,
     tolerance: float = 1e-7,

@@ -17,8 +17,8 @@ from .._types import Scalar
 from ._dynamics import State, _sample, check_packing, check_state, listed, start
 from ._edges import PADDING, Edges, carry_history
 from ._equilibrium import Settled, settle
-from ._forces import Packing, Vectors, WallHistory, pair_geometry
-from ._stiffness import Held, force_on_walls, net_force, remembered
+from ._forces import Packing, Vectors, WallHistory
+from ._stiffness import Held, force_on_walls, net_force, pair_geometry, remembered
 from ._walls import Cylinder, Plane, Walls
 
 BOTTOM, TOP, BARREL = 0, 1, 2
@@ -34,7 +34,8 @@ class Solver(eqx.Module):
         rtol: largest net force over the mean contact force.
         max_steps: evaluations before an equilibrium is given up.
         halvings: how often a load step that did not converge is halved.
-        skin: extra distance up to which pairs are listed, as a share of the mean radius.
+        skin: extra distance up to which pairs are listed, as a share of the mean radius. Ample: a load step that ends
+            with unlisted particles touching is solved again from there, and may so end elsewhere.
     """
 
     springs: tuple[float, ...] = eqx.field(static=True, default=(1e-1, 1e-2, 1e-3, 1e-4))

@@ -14,15 +14,13 @@ from jaxtyping import Array, Float, Int
 from .._numerics import shared
 from .._types import Scalar
 from ._edges import Edges
-from ._forces import Packing, Vectors, WallHistory, pair_geometry
+from ._forces import Packing, Vectors, WallHistory, overlap_and_normal
 from ._pair import largest_overlap, pair_energy, pair_force, wall_energy, wall_force
 from ._side import HalfContact, sides_of
 from ._walls import Walls
 
 DENSE = 1200
 """Unknowns up to which stiffness matrices are factorised; above, conjugate gradients."""
-
-Blocks = Float[Array, "some 3 3"]
 
 
 class Held(eqx.Module):
@@ -54,8 +52,8 @@ class Stiffness(eqx.Module):
         i, j: particles of the edges.
     """
 
-    pairs: Blocks
-    alone: Blocks
+    pairs: Float[Array, "edges 3 3"]
+    alone: Float[Array, "particles 3 3"]
     i: Int[Array, " edges"]
     j: Int[Array, " edges"]
 
@@ -70,11 +68,16 @@ class Stiffness(eqx.Module):
         n = self.alone.shape[0]
         each = jnp.arange(n)
         blocks = jnp.zeros((n, n, 3, 3), self.alone.dtype).at[each, each].add(self.alone)
-        for a, b, sign in ((self.i, self.i, 1.0), (self.j, self.j, 1.0), (self.i, self.j, -1.0), (self.j, self.i, -1.0)):
+        for a, b, sign in (
+            (self.i, self.i, 1.0),
+            (self.j, self.j, 1.0),
+            (self.i, self.j, -1.0),
+            (self.j, self.i, -1.0),
+        ):
             blocks = blocks.at[a, b].add(sign * self.pairs)
         return blocks.transpose(0, 2, 1, 3).reshape(3 * n, 3 * n)
 
-    def diagonal(self) -> Blocks:
+    def diagonal(self) -> Float[Array, "particles 3 3"]:
         """Its 3 x 3 blocks on the diagonal."""
         return self.alone.at[self.i].add(self.pairs).at[self.j].add(self.pairs)
 
@@ -145,25 +148,27 @@ def balance(held: Held, position: Vectors) -> Balance:
     push = force[:, None] * normal
     distance = packing.radius[edges.i] + packing.radius[edges.j] - overlap
     along = normal[:, :, None] * normal[:, None, :]
-    turning = shared(force / distance)[:, None, None] * (jnp.eye(3)[None] - along)
 
     inward, wall_overlap = _wall_geometry(held, position)
     against, steepness = _with_slope(lambda x: _each_wall(wall_force)(packing.sides, peak, x), wall_overlap)
     energy = energy + _work(_each_wall(wall_energy)(packing.sides, peak, wall_overlap))
     bend = jnp.stack([jax.vmap(jax.hessian(wall.distance))(position) for wall in held.walls])
     facing = inward[:, :, :, None] * inward[:, :, None, :]
-    springs = held.proximal * jnp.eye(3)[None]
+    identity = jnp.eye(3, dtype=position.dtype)[None]
+    springs = held.proximal * identity
+    turning = shared(force / distance)[:, None, None] * (identity - along)
 
-    def pressing(slope: Array, steepness: Array) -> tuple[Blocks, Blocks]:
+    def pressing(slope: Array, steepness: Array) -> tuple[Array, Array]:
         return slope[:, None, None] * along, springs + jnp.sum(steepness[:, :, None, None] * facing, axis=0)
 
+    carrying = (jnp.sum(force > 0) + jnp.sum(against > 0)).astype(force.dtype)
     pairs, alone = pressing(slope, steepness)
     soft_pairs, soft_alone = pressing(jnp.maximum(slope, 0.0), jnp.maximum(steepness, 0.0))
     net = -held.proximal * moved + jnp.sum(against[:, :, None] * inward, axis=0)
     return Balance(
         energy,
         net.at[edges.j].add(push).at[edges.i].add(-push),
-        shared((jnp.sum(force) + jnp.sum(against)) / jnp.maximum(jnp.sum(force > 0) + jnp.sum(against > 0), 1)),
+        shared((jnp.sum(force) + jnp.sum(against)) / jnp.maximum(carrying, 1.0)),
         Stiffness(pairs - turning, alone - jnp.sum(against[:, :, None, None] * bend, axis=0), edges.i, edges.j),
         Stiffness(soft_pairs, soft_alone, edges.i, edges.j),
         jnp.sum(against, axis=1),
@@ -174,9 +179,15 @@ def remembered(held: Held, position: Vectors) -> tuple[Edges, WallHistory]:
     """The largest overlaps after a load step that ended at these centres."""
     overlap, _ = pair_geometry(held.packing.radius, position, held.edges)
     _, wall_overlap = _wall_geometry(held, position)
-    edges = eqx.tree_at(lambda e: e.overlap_max, held.edges, largest_overlap(held.edges.overlap_max, overlap))
-    peak = largest_overlap(held.wall_history.overlap_max, wall_overlap.T)
+    edges = eqx.tree_at(lambda e: e.overlap_max, held.edges, jax.vmap(largest_overlap)(held.edges.overlap_max, overlap))
+    peak = jax.vmap(jax.vmap(largest_overlap))(held.wall_history.overlap_max, wall_overlap.T)
     return edges, eqx.tree_at(lambda h: h.overlap_max, held.wall_history, peak)
+
+
+def pair_geometry(radius: Float[Array, " particles"], position: Vectors, edges: Edges) -> tuple[Array, Array]:
+    """Overlap [m] and unit normal from i to j of every edge."""
+    i, j = edges.i, edges.j
+    return jax.vmap(overlap_and_normal)(position[i], position[j], radius[i] + radius[j], edges.active)
 
 
 def force_on_walls(held: Held, position: Vectors) -> Float[Array, " walls"]:
@@ -190,7 +201,9 @@ def _pairs(held: Held, position: Vectors) -> tuple[HalfContact, HalfContact, Arr
     return jax.lax.optimization_barrier((*sides, *pair_geometry(held.packing.radius, position, held.edges)))
 
 
-def _on_walls(held: Held, position: Vectors) -> tuple[Float[Array, "walls particles"], Float[Array, "walls particles 3"]]:
+def _on_walls(
+    held: Held, position: Vectors
+) -> tuple[Float[Array, "walls particles"], Float[Array, "walls particles 3"]]:
     inward, overlap = _wall_geometry(held, position)
     force = _each_wall(wall_force)(held.packing.sides, held.wall_history.overlap_max.T, overlap)
     return jax.lax.optimization_barrier(force), inward
@@ -200,7 +213,7 @@ def _wall_geometry(held: Held, position: Vectors) -> tuple[Array, Array]:
     """Inward normals (walls, particles, 3) and overlaps (walls, particles)."""
     found = [jax.vmap(jax.value_and_grad(wall.distance))(position) for wall in held.walls]
     distance, inward = (jnp.stack(x) for x in zip(*found, strict=True))
-    return jax.lax.optimization_barrier((inward, held.packing.radius - distance))
+    return jax.lax.optimization_barrier((inward, held.packing.radius[None] - distance))
 
 
 def _each_wall(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -111,9 +111,9 @@ def test_every_row_is_an_equilibrium_and_punches_differ_by_the_springs(pressed):
 
 def test_lists_do_not_change_the_compaction(pressed):
     packing, state, heights, _, rows, _ = pressed
-    again = start(packing, state.walls, state.position, 0.02 * float(packing.radius.mean()))
-    _, short = compact(packing, again, heights, Solver(skin=0.02))
-    np.testing.assert_allclose(short.top, rows.top, rtol=1e-7)
+    again = start(packing, state.walls, state.position, 1.2 * float(packing.radius.mean()))
+    _, longer = compact(packing, again, heights, Solver(skin=1.2))
+    np.testing.assert_allclose(longer.top, rows.top, rtol=1e-7)
 
 
 def test_a_step_that_does_not_settle_is_halved_and_marked(pressed, monkeypatch):
