@@ -72,7 +72,7 @@ def population_packing(
     seed: int = 0,
     density: float = MCC_DENSITY,
 ) -> PopulationPacking:
-    r"""Spheres whose laws follow the calibrated population, :math:`\ln C_i = \mu + \tau z_i`, and alike for the modulus.
+    r"""Spheres whose laws follow the population, :math:`\ln C_i = \mu + \tau z_i`, and alike for the modulus.
 
     The z of every particle are drawn once and kept, so that a draw of the population moves all particles together:
     the band is about the population, not about which particles one happened to take. Particles not monotone at the

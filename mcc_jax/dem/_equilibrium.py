@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
 from .._types import Flag, Scalar
 from ._forces import Vectors
@@ -48,7 +47,7 @@ class ContactNewton(optx.AbstractMinimiser[Vectors, Balance, _State]):
     atol: Scalar
     reach: Scalar
 
-    def norm(self, y: Any) -> Scalar:  # noqa: D102  # an attribute that Optimistix asks for
+    def norm(self, y: Any) -> Scalar:  # an attribute that Optimistix asks for
         return jnp.max(jnp.abs(y))
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:

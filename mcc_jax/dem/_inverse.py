@@ -53,8 +53,8 @@ def fit_compaction(
 
     with the sensitivities of the load steps. Within a round the load steps are those of a compaction at the round's
     start (`replay_compaction`); then the compaction is made anew, because contacts may snap elsewhere, until the
-    parameters stay. Take logarithms of positive parameters. What a curve does not show it cannot give: the modulus needs
-    rows of unloading.
+    parameters stay. Take logarithms of positive parameters. What a curve does not show it cannot give: the modulus
+    needs rows of unloading.
 
     Args:
         packing_of: the packing as a function of the parameters; traced by JAX.

@@ -183,7 +183,8 @@ def compact(
 ) -> tuple[State, Compaction]:
     r"""Move the top punch from height to height, down or up, without friction and without inertia.
 
-    .. math:: f(x; \max(\delta_P, \delta(x))) - \mu (x - x_{prev}) = 0, \qquad \delta_P \leftarrow \max(\delta_P, \delta(x))
+    .. math:: f(x; \max(\delta_P, \delta(x))) - \mu (x - x_{prev}) = 0, \qquad
+        \delta_P \leftarrow \max(\delta_P, \delta(x))
 
     In every load step the centres settle where the contact forces f balance but for the proximal springs mu, which are
     made weaker in turn (`Solver.springs`); contacts remember only what they are at the end of the step (backward
@@ -232,8 +233,8 @@ def replay_compaction(
 
     Lists of edges, heights and springs are those of the tape; the equilibria are found anew, each from where the tape
     has it, and differentiated by the implicit function theorem, history included: the derivatives of positions, largest
-    overlaps and forces go on from load step to load step. With the packing of the tape this is the same compaction. With
-    one so different that particles meet that the tape does not list, contacts are missing: compact anew.
+    overlaps and forces go on from load step to load step. With the packing of the tape this is the same compaction.
+    With one so different that particles meet that the tape does not list, contacts are missing: compact anew.
 
     Args:
         packing: the spheres, for example as a function of the law's parameters under `jax.jvp`.

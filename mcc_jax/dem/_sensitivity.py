@@ -64,8 +64,9 @@ def punch_sensitivity(
 ) -> Sensitivity:
     r"""Derivatives of the punch force with respect to any parameters of the packing, through all load steps.
 
-    .. math:: K_n\, dx_n = \partial_\theta f\, d\theta + \partial_{\delta_P} f\, d\delta_{P,n-1} + \mu\, dx_{n-1}, \qquad
-        d\delta_{P,n} = [\delta > \delta_P]\; d\delta(x_n) + [\delta \le \delta_P]\; d\delta_{P,n-1}
+    .. math:: K_n\, dx_n = \partial_\theta f\, d\theta + \partial_{\delta_P} f\, d\delta_{P,n-1} + \mu\, dx_{n-1},
+
+    .. math:: d\delta_{P,n} = [\delta > \delta_P]\; d\delta(x_n) + [\delta \le \delta_P]\; d\delta_{P,n-1}
 
     in forward mode: one factorisation of the stiffness K a load step, whatever the number of parameters. The derivative
     is that of the branch the compaction took. Where contacts snap from one equilibrium to another

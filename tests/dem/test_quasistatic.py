@@ -1,4 +1,4 @@
-"""Quasi-static compaction: a chain is the plate test, equilibrium, lists, Euler's identity, gradients, band, inverse."""
+"""Quasi-static compaction: the plate test, equilibrium, lists, Euler's identity, gradients, band, inverse."""
 
 import equinox as eqx
 import jax
@@ -68,15 +68,14 @@ def test_chain_between_punches_is_the_plate_test():
     position = jnp.zeros((n, 3)).at[:, 2].set(jnp.asarray((2 * np.arange(n) + 1) * radius))
     state = start(packing, die(radius, 2 * n * radius), position, 0.5 * radius)
     strain = np.concatenate([np.linspace(0.02, 0.3, 5), np.linspace(0.295, 0.28, 3), np.linspace(0.3, 0.4, 2)])
-    _, rows = compact(packing, state, 2 * n * radius * (1 - strain), SOLVER)
+    _, rows = compact(packing, state, 2 * n * radius * (1 - strain), Solver(springs=(1e-2, 1e-4, 1e-6)))
     side, before = half_contact(LAW, Particle(diameter, diameter, diameter)), np.maximum.accumulate(strain * radius)
     expected = jax.vmap(wall_force, (None, 0, 0))(side, jnp.asarray(before), jnp.asarray(strain * radius))
     assert rows.converged.all()
     # The weakest springs hold a share of the force; the rest is the law.
     slack = 2 * rows.proximal_share * np.maximum(rows.top, rows.bottom)
     assert np.all(np.abs(0.5 * (rows.top + rows.bottom) - expected) <= slack + 1e-9 * np.max(expected))
-    assert np.all(rows.proximal_share < 0.05)
-    np.testing.assert_allclose(rows.top[4:], expected[4:], rtol=0.02)
+    assert np.all(rows.proximal_share < 2e-3)
 
 
 def test_net_force_is_minus_the_gradient_of_the_energy_and_has_its_stiffness(pressed):
