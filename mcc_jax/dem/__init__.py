@@ -29,6 +29,10 @@ from ._forces import WallHistory as WallHistory
 from ._forces import contact_forces as contact_forces
 from ._inverse import CompactionFit as CompactionFit
 from ._inverse import fit_compaction as fit_compaction
+from ._load_steps import LoadStep as LoadStep
+from ._load_steps import Replayed as Replayed
+from ._load_steps import Solver as Solver
+from ._load_steps import replay_compaction as replay_compaction
 from ._neighbours import close_pairs as close_pairs
 from ._packings import MCC_DENSITY as MCC_DENSITY
 from ._packings import relative_density as relative_density
@@ -42,12 +46,8 @@ from ._pair import pair_split as pair_split
 from ._pair import wall_energy as wall_energy
 from ._pair import wall_force as wall_force
 from ._quasistatic import Compaction as Compaction
-from ._quasistatic import LoadStep as LoadStep
-from ._quasistatic import Replayed as Replayed
-from ._quasistatic import Solver as Solver
 from ._quasistatic import compact as compact
 from ._quasistatic import relaxed as relaxed
-from ._quasistatic import replay_compaction as replay_compaction
 from ._restart import load_state as load_state
 from ._restart import save_state as save_state
 from ._sensitivity import STRESSES as STRESSES

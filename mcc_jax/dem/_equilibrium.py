@@ -43,8 +43,8 @@ class ContactNewton(optx.AbstractMinimiser[Vectors, Balance, _State]):
         reach: a particle moves at most so far in one step [m].
     """
 
-    rtol: Scalar | float
-    atol: Scalar
+    rtol: Scalar | float  # pyright: ignore[reportIncompatibleVariableOverride]
+    atol: Scalar  # pyright: ignore[reportIncompatibleVariableOverride]
     reach: Scalar
 
     def norm(self, y: Any) -> Scalar:  # an attribute that Optimistix asks for
@@ -139,7 +139,8 @@ def settle(held: Held, guess: Vectors, rtol: Scalar | float, max_steps: int) -> 
     """
     fixed = jax.lax.stop_gradient(held)
     sides, radius = fixed.packing.sides, fixed.packing.radius
-    solver = ContactNewton(rtol, 1e-12 * jnp.mean(sides.k1 * radius), 0.3 * jnp.min(radius))
+    atol, reach = 1e-12 * jnp.mean(sides.k1 * radius), 0.3 * jnp.min(radius)
+    solver = ContactNewton(rtol, atol, reach)  # pyright: ignore[reportCallIssue]  # `norm` is a method here
 
     def energy(position: Vectors, held: Held) -> tuple[Scalar, Balance]:
         at = balance(held, position)

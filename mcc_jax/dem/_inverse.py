@@ -13,7 +13,8 @@ from jaxtyping import Array, Float
 
 from .._errors import InputError
 from ._dynamics import State
-from ._quasistatic import TOP, Compaction, LoadStep, Solver, compact, replay_stacked, stacked
+from ._load_steps import TOP, LoadStep, Solver, replay_stacked, stacked
+from ._quasistatic import Compaction, compact
 from ._sensitivity import PackingOf, Parameters
 
 ROUNDS = 5

@@ -7,6 +7,7 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._errors import InputError
@@ -30,7 +31,7 @@ def spheres(law: MccLaw, diameter: Float[Array, " particles"], density: float = 
     Raises:
         InputError: if a diameter or the density is not positive.
     """
-    known = not isinstance(diameter, jax.core.Tracer)  # under `jax.jit` diameters of the caller still are, laws are not
+    known = not isinstance(diameter, Tracer)  # under `jax.jit` diameters of the caller still are, laws are not
     if not (density > 0 and (not known or np.all(np.asarray(diameter) > 0))):
         raise InputError("a diameter or density that is not positive", remedy="Diameters are in um.")
     batched = law.a.ndim == 1 or law.plastic.C1.ndim == 1

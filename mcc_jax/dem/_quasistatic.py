@@ -1,4 +1,4 @@
-"""Quasi-static compaction in a die: load steps in equilibrium, and the same steps again, differentiable."""
+"""Quasi-static compaction in a die: as many load steps as it takes, each in equilibrium."""
 
 from __future__ import annotations
 
@@ -7,71 +7,19 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Float
 
 from .._errors import InputError
 from .._types import Scalar
 from ._dynamics import State, _sample, check_packing, check_state, listed, start
-from ._edges import PADDING, Edges, carry_history
+from ._edges import Edges
 from ._equilibrium import Settled, settle
 from ._forces import Packing, Vectors, WallHistory
-from ._stiffness import Held, force_on_walls, net_force, pair_geometry, remembered
-from ._walls import Cylinder, Plane, Walls
-
-BOTTOM, TOP, BARREL = 0, 1, 2
-
-
-class Solver(eqx.Module):
-    """How a load step is solved. The defaults suit from ten to a few thousand spheres.
-
-    Attributes:
-        springs: stiffnesses of the proximal springs, in turn, as shares of the mean initial stiffness; each
-            equilibrium is where the search for the next begins. Without the last, small one, particles that touch
-            nothing would have no place.
-        rtol: largest net force over the mean contact force.
-        max_steps: evaluations before an equilibrium is given up.
-        halvings: how often a load step that did not converge is halved.
-        skin: extra distance up to which pairs are listed, as a share of the mean radius. Ample: a load step that ends
-            with unlisted particles touching is solved again from there, and may so end elsewhere.
-    """
-
-    springs: tuple[float, ...] = eqx.field(static=True, default=(1e-1, 1e-2, 1e-3, 1e-4))
-    rtol: float = eqx.field(static=True, default=1e-10)
-    max_steps: int = eqx.field(static=True, default=150)
-    halvings: int = eqx.field(static=True, default=4)
-    skin: float = eqx.field(static=True, default=0.5)
-
-    def __check_init__(self) -> None:
-        positive = all(x > 0 for x in (*self.springs, self.rtol, self.max_steps, self.skin))
-        if not (self.springs and positive and self.halvings >= 0):
-            raise InputError(
-                f"a solver with springs {self.springs}, rtol {self.rtol}, {self.max_steps} steps, "
-                f"{self.halvings} halvings, skin {self.skin}",
-                remedy="All but the halvings must be positive.",
-            )
-
-
-class LoadStep(NamedTuple):
-    """What `replay_compaction` needs of a load step.
-
-    Attributes:
-        key, i, j: the list of edges.
-        height: of the top punch [m].
-        spring: stiffness of the proximal springs [N/m].
-        position: centres at its end [m].
-        last: whether a row of the table ends with it.
-    """
-
-    key: Int[Array, " edges"]
-    i: Int[Array, " edges"]
-    j: Int[Array, " edges"]
-    height: Scalar
-    spring: Scalar
-    position: Vectors
-    last: bool | Bool[Array, " steps"]
+from ._load_steps import BOTTOM, TOP, LoadStep, Solver, die_walls, lowered
+from ._stiffness import Held, pair_geometry, remembered
+from ._walls import Walls
 
 
 class Compaction(NamedTuple):
@@ -83,7 +31,8 @@ class Compaction(NamedTuple):
         top, bottom: force on the punches [N].
         converged: whether every load step of the row ended in equilibrium. Do not use a row that did not.
         residual: largest net force on a particle over the mean contact force [-].
-        proximal_share: sum of the proximal springs' axial forces, without sign, over the force on the top punch [-].
+        proximal_share: sum of the proximal springs' axial forces, without sign, over the force on the top punch;
+            infinite where there is none [-].
         spring: the proximal springs' stiffness over the mean initial stiffness [-].
         load_steps: into how many steps the row was divided.
         evaluations: of forces and stiffness.
@@ -105,28 +54,6 @@ class Compaction(NamedTuple):
     largest_move: np.ndarray
     contacts: np.ndarray
     beyond_tested: np.ndarray
-
-
-class Replayed(NamedTuple):
-    """The load steps again, all of it differentiable but `converged`.
-
-    Attributes:
-        on_wall: force on bottom, top and barrel along their normals, summed over particles [N].
-        position: centres at the end of every load step [m].
-        edges: the pairs at the very end, with their largest overlaps.
-        wall_history: the same of the walls.
-        residual: largest net force over the mean contact force [-].
-        proximal: sum of the proximal springs' axial forces, without sign [N].
-        converged: whether the step ended in equilibrium.
-    """
-
-    on_wall: Float[Array, "steps walls"]
-    position: Float[Array, "steps particles 3"]
-    edges: Edges
-    wall_history: WallHistory
-    residual: Float[Array, " steps"]
-    proximal: Float[Array, " steps"]
-    converged: Bool[Array, " steps"]
 
 
 class _Attempt(NamedTuple):
@@ -209,7 +136,7 @@ def compact(
     """
     solver = solver or Solver()
     check_packing(packing)
-    _check_die(state.walls)
+    die_walls(state.walls)
     heights = np.asarray(heights, float)
     if heights.ndim != 1 or not (np.isfinite(heights).all() and (heights > 0).all()):
         raise InputError("a height of the top punch that is not positive", remedy="Give the heights in metres.")
@@ -224,77 +151,6 @@ def compact(
         if tape is not None:
             tape.extend(_load_step(a, a is attempts[-1]) for a in attempts)
     return state, Compaction(*(np.asarray(column) for column in zip(*rows, strict=True)))
-
-
-def replay_compaction(
-    packing: Packing, state: State, tape: Sequence[LoadStep], solver: Solver | None = None
-) -> Replayed:
-    """The load steps that `compact` recorded, for this packing or one like it, differentiable in both modes.
-
-    Lists of edges, heights and springs are those of the tape; the equilibria are found anew, each from where the tape
-    has it, and differentiated by the implicit function theorem, history included: the derivatives of positions, largest
-    overlaps and forces go on from load step to load step. With the packing of the tape this is the same compaction.
-    With one so different that particles meet that the tape does not list, contacts are missing: compact anew.
-
-    Args:
-        packing: the spheres, for example as a function of the law's parameters under `jax.jvp`.
-        state: where `compact` started.
-        tape: its load steps.
-        solver: as given to `compact`.
-
-    Raises:
-        InputError: if the tape is empty.
-    """
-    return _replay(packing, state, stacked(tape), solver or Solver())
-
-
-def stacked(tape: Sequence[LoadStep]) -> LoadStep:
-    """All load steps as one, every field with a leading axis.
-
-    Raises:
-        InputError: if there are none.
-    """
-    if not tape:
-        raise InputError("a compaction without load steps", remedy="Give `compact` a list as its `tape`.")
-    room = max(step.key.shape[0] for step in tape)
-
-    def padded(step: LoadStep) -> LoadStep:
-        spare = (0, room - step.key.shape[0])
-        key = np.pad(step.key, spare, constant_values=PADDING)
-        return step._replace(key=key, i=np.pad(step.i, spare), j=np.pad(step.j, spare))
-
-    return LoadStep(*(jnp.asarray(np.stack(column)) for column in zip(*map(padded, tape), strict=True)))
-
-
-@eqx.filter_jit
-def _replay(packing: Packing, state: State, steps: LoadStep, solver: Solver) -> Replayed:
-    return replay_stacked(packing, state, steps, solver)
-
-
-def replay_stacked(packing: Packing, state: State, steps: LoadStep, solver: Solver) -> Replayed:
-    """`replay_compaction` of load steps that are `stacked`, to be traced."""
-    room = steps.key.shape[1]
-    empty = jnp.zeros(room, state.edges.overlap_max.dtype)
-    slip = jnp.zeros((room, 3), empty.dtype)
-
-    def one(carry, step):
-        previous, recorded, edges, wall_history = carry
-        fresh = Edges(step.key, step.i, step.j, empty, slip, edges.wanted, edges.particles)
-        walls = _lowered(state.walls, step.height)
-        held = Held(packing, walls, carry_history(edges, fresh), wall_history, previous, step.spring)
-        settled = settle(held, previous + (step.position - recorded), solver.rtol, solver.max_steps)
-        edges, wall_history = remembered(held, settled.position)
-        springs = step.spring * jnp.sum(jnp.abs(settled.position[:, 2] - previous[:, 2]))
-        net = jnp.max(jnp.abs(net_force(held, settled.position)))
-        row = (force_on_walls(held, settled.position), settled.position, net / settled.balance.scale, springs)
-        return (settled.position, step.position, edges, wall_history), (*row, settled.converged)
-
-    before = carry_history(
-        state.edges, Edges(steps.key[0], steps.i[0], steps.j[0], empty, slip, state.edges.wanted, state.edges.particles)
-    )
-    carry = (state.position, state.position, before, state.wall_history)
-    (_, _, edges, wall_history), (on_wall, position, residual, proximal, converged) = jax.lax.scan(one, carry, steps)
-    return Replayed(on_wall, position, edges, wall_history, residual, proximal, converged)
 
 
 def _reach(packing: Packing, state: State, height: float, solver: Solver, halvings: int) -> list[_Attempt]:
@@ -314,11 +170,12 @@ def _attempt(packing: Packing, state: State, height: float, solver: Solver) -> _
     skin = solver.skin * float(jnp.mean(packing.radius))
     if _moved(state) > skin / 2:
         state = listed(packing, state, skin)
-    walls = _lowered(state.walls, jnp.asarray(height, state.position.dtype))
+    walls = lowered(state.walls, jnp.asarray(height, state.position.dtype))
     squeeze = min(height / _height(state.walls), 1.0)
     guess = state.position.at[:, 2].multiply(squeeze)
     k = float(jnp.mean(packing.sides.k1))
-    evaluations, reached, best = 0, 0.0, None
+    evaluations, reached = 0, 0.0
+    best: tuple[Held, Settled] | None = None
     for spring in solver.springs:
         held = Held(packing, walls, state.edges, state.wall_history, state.position, jnp.asarray(spring * k))
         settled = _settle(held, guess, jnp.asarray(solver.rtol), solver.max_steps)
@@ -335,6 +192,7 @@ def _attempt(packing: Packing, state: State, height: float, solver: Solver) -> _
             best = best or (held, settled)
             break
         guess, reached, best = settled.position, spring, (held, settled)
+    assert best is not None  # there is at least one spring
     held, settled = best
     edges, wall_history = _remembered(held, settled.position)
     end = eqx.tree_at(
@@ -343,7 +201,8 @@ def _attempt(packing: Packing, state: State, height: float, solver: Solver) -> _
         (settled.position, edges, wall_history, walls),
     )
     moved = np.asarray(settled.position - state.position)
-    share = float(held.proximal) * np.abs(moved[:, 2]).sum() / max(float(settled.balance.on_wall[TOP]), 1e-300)
+    springs, top = float(held.proximal) * np.abs(moved[:, 2]).sum(), float(settled.balance.on_wall[TOP])
+    share = float(springs / top) if top > 0 else math.inf
     stroke = max(abs(height - _height(state.walls)), 1e-300)
     move = float(np.linalg.norm(moved, axis=1).max()) / stroke
     complete = reached == solver.springs[-1]
@@ -372,7 +231,7 @@ def _row(packing: Packing, state: State, attempts: list[_Attempt]) -> tuple:
     balance = attempts[-1].settled.balance
     sample = _sample(packing, state, jnp.zeros((len(state.walls), 3), state.position.dtype))
     height = _height(state.walls)
-    barrel = state.walls[BARREL]
+    _, _, barrel = die_walls(state.walls)
     top, bottom = float(balance.on_wall[TOP]), float(balance.on_wall[BOTTOM])
     return (
         height,
@@ -393,27 +252,15 @@ def _row(packing: Packing, state: State, attempts: list[_Attempt]) -> tuple:
 
 def _load_step(attempt: _Attempt, last: bool) -> LoadStep:
     state, edges = attempt.state, attempt.state.edges
-    height = state.walls[TOP].point[2] - state.walls[BOTTOM].point[2]
+    height = jnp.asarray(_height(state.walls), state.position.dtype)
     return LoadStep(edges.key, edges.i, edges.j, height, attempt.stiffness, state.position, last)
 
 
-def _lowered(walls: Walls, height: Scalar) -> Walls:
-    """The walls with the top punch at a height over the bottom one."""
-    bottom, top, barrel = walls
-    return bottom, eqx.tree_at(lambda w: w.point, top, bottom.point + height * bottom.normal), barrel
-
-
 def _height(walls: Walls) -> float:
-    return float(walls[TOP].point[2] - walls[BOTTOM].point[2])
+    bottom, top, _ = die_walls(walls)
+    return float(top.point[2] - bottom.point[2])
 
 
 def _moved(state: State) -> float:
     """Furthest that a particle is from where it was when the edges were listed [m]."""
     return float(jnp.sqrt(jnp.max(jnp.sum((state.position - state.listed_at) ** 2, axis=1))))
-
-
-def _check_die(walls: Walls) -> None:
-    kinds = tuple(type(wall) for wall in walls)
-    up = jnp.asarray([0.0, 0.0, 1.0])
-    if kinds != (Plane, Plane, Cylinder) or not bool(jnp.all((walls[0].normal == up) & (walls[1].normal == -up))):
-        raise InputError("walls that are not bottom punch, top punch and barrel", remedy="Make them with `die`.")

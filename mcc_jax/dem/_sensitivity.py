@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from ._dynamics import State
 from ._forces import Packing
-from ._quasistatic import TOP, LoadStep, Replayed, Solver, replay_stacked, stacked
+from ._load_steps import TOP, LoadStep, Replayed, Solver, replay_stacked, stacked
 
 STRESSES = ("K1", "K3", "K5", "Ebar", "springs")
 """What has the dimension of a stress: K1 = C1, K3 = C3^3, K5 = C5^5, the effective modulus, the proximal springs."""
@@ -31,7 +31,7 @@ class Sensitivity(NamedTuple):
         by_stress: p dF/dp for p in `STRESSES`, each scaled in all particles alike, (rows, 5) [N]. So dF/dln C1 is the
             first column, dF/dln C3 three times the second, dF/dln C5 five times the third.
         euler_defect: :math:`|\sum_p p\,\partial F/\partial p - F| / F`, zero in exact arithmetic: F is homogeneous of
-            degree one in all stresses (Euler's identity).
+            degree one in all stresses (Euler's identity). In newtons where F = 0.
         residual: largest net force over the mean contact force, the worst of the row's load steps.
         proximal_share: the springs' axial forces, without sign, over F, the largest of the row's load steps.
         converged: whether this row and all before it, whose history it carries, are in equilibrium.
@@ -92,14 +92,15 @@ def punch_sensitivity(
     force, jacobian, worst = np.asarray(force), np.asarray(jacobian), np.asarray(replayed.residual)
     row = np.concatenate([[0], np.cumsum(last)[:-1]])
     by_stress = jacobian[last, len(values) :]
-    share = np.asarray(replayed.proximal) / np.maximum(force, 1e-300)
+    pressed = force > 0
+    share = np.where(pressed, np.asarray(replayed.proximal) / np.where(pressed, force, 1.0), np.inf)
     reached = np.logical_and.accumulate(np.asarray(replayed.converged))
     rows = range(int(last.sum()))
     return Sensitivity(
         force[last],
         jacobian[last, : len(values)],
         by_stress,
-        np.abs(by_stress.sum(axis=1) - force[last]) / np.maximum(np.abs(force[last]), 1e-300),
+        np.abs(by_stress.sum(axis=1) - force[last]) / np.where(pressed, force, 1.0)[last],
         np.array([worst[row == r].max() for r in rows]),
         np.array([share[row == r].max() for r in rows]),
         reached[last],
