@@ -2,8 +2,9 @@
 
 Run `uv run python benchmarks/bench_dem_quasistatic.py`; `--write` keeps the tables in `benchmarks/results/`.
 
-Spheres of 80 to 120 um with the paper's mean law are scattered in a die, relaxed without overlap (`relaxed`) at a
-relative density of 0.5, pressed in equal load steps to the density asked for and then released. Reported are
+Spheres of 80 to 120 um with the paper's mean law are scattered in a die, relaxed (`relaxed`) at the density to start
+from, pressed in equal load steps to the density asked for and then released. Started below random close packing
+(`--loose 0.5`) they first rearrange: all steps converge there too, but contacts snap from row to row. Reported are
 
 - the share of rows whose load steps all converged,
 - the defect of Euler's identity (the force is homogeneous of degree one in all stresses),
@@ -28,11 +29,11 @@ import numpy as np
 from mcc_jax import paper_law
 from mcc_jax.dem import Solver, compact, die, punch_sensitivity, relaxed, replay_compaction, scattered, spheres
 
-STEP = 1e-6
+STEP = 1e-7
 TARGETS = {"converged": 0.95, "Euler identity": 1e-8, "finite differences": 1e-5}
 
 
-def made(count, seed):
+def made(count, seed, loose):
     """The packing as a function of ln C1 and ln Ebar beside the paper's, its start, and the die's height."""
     law, diameter = paper_law(), jax.random.uniform(jax.random.key(seed), (count,), minval=80.0, maxval=120.0)
 
@@ -42,7 +43,7 @@ def made(count, seed):
 
     packing = packing_of(jnp.zeros(2))
     barrel = 0.8 * float(packing.radius.mean()) * count ** (1 / 3)
-    height = float(packing.volume) / (np.pi * barrel**2 * 0.5)
+    height = float(packing.volume) / (np.pi * barrel**2 * loose)
     position, tall = scattered(jax.random.key(seed + 1), packing.radius, barrel)
     state = relaxed(packing, die(barrel, height), position.at[:, 2].multiply(height / tall))
     return packing_of, packing, state, height
@@ -61,14 +62,14 @@ def states(packing, state, tape, replayed):
     return np.where(overlap <= 0, 0, np.where(overlap >= peak, 1, 2))
 
 
-def study(count, density, down, up, seed):
+def study(count, loose, density, down, up, seed):
     """One packing: rows of the table of rows, and the summary."""
-    packing_of, packing, state, height = made(count, seed)
-    lowest = height * 0.5 / density
+    packing_of, packing, state, height = made(count, seed, loose)
+    lowest = height * loose / density
     heights = np.concatenate(
         [height + (lowest - height) * np.arange(1, down + 1) / down, lowest * (1 + 0.02 * np.arange(1, up + 1) / up)]
     )
-    tape, solver = [], Solver()
+    tape, solver = [], Solver(rtol=1e-11)
     begun = time.perf_counter()
     _, rows = compact(packing, state, heights, solver, tape)
     pressed = time.perf_counter() - begun
@@ -124,13 +125,14 @@ def main():
     """Run the study."""
     options = _report.parser(__doc__)
     options.add_argument("--count", type=int, default=200, help="spheres")
+    options.add_argument("--loose", type=float, default=0.62, help="relative density to start from")
     options.add_argument("--density", type=float, default=0.85, help="to press to")
-    options.add_argument("--rows", type=int, nargs=2, default=(24, 6), help="rows down and up")
+    options.add_argument("--rows", type=int, nargs=2, default=(20, 5), help="rows down and up")
     options.add_argument("--seed", type=int, default=0)
     given = options.parse_args()
     jax.config.update("jax_enable_x64", True)
-    table, verdict, note = study(given.count, given.density, *given.rows, given.seed)
-    settings = {"spheres": given.count, "seed": given.seed, "step of differences": STEP, **note}
+    table, verdict, note = study(given.count, given.loose, given.density, *given.rows, given.seed)
+    settings = {"spheres": given.count, "start": given.loose, "seed": given.seed, "step of differences": STEP, **note}
     settings |= _report.environment("jax", "optimistix", "lineax")
     _report.write(
         "bench_dem_quasistatic",

@@ -188,14 +188,12 @@ def band_by_draws(
         InputError: as `first_order_band`, and if no draw converged in a row.
     """
     draws = _checked(draws, probability)
-    forces, wrong = [], 0
-    for values in draws:
-        packing = packing_of(jnp.asarray(values))
-        wrong = max(wrong, int(not_monotone(packing).sum()))
-        _, rows = compact(packing, state, heights, solver)
-        # A row that did not settle hands its history on.
-        forces.append(np.where(np.logical_and.accumulate(rows.converged), rows.top, np.nan))
-    forces = np.stack(forces)
+    packings = [packing_of(jnp.asarray(values)) for values in draws]
+    every = [compact(packing, state, heights, solver)[1] for packing in packings]
+    wrong = max(int(not_monotone(packing).sum()) for packing in packings)
+    # A row that did not settle hands its history on.
+    forces = np.stack([np.where(np.logical_and.accumulate(rows.converged), rows.top, np.nan) for rows in every])
+    rows = every[0]
     used = np.isfinite(forces).sum(axis=0)
     if (used == 0).any():
         raise InputError(
