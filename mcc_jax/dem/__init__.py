@@ -1,5 +1,10 @@
 """The law between particles: half contacts in series, history that survives neighbour lists, walls. SI units."""
 
+from ._band import Band as Band
+from ._band import PopulationPacking as PopulationPacking
+from ._band import band_by_draws as band_by_draws
+from ._band import first_order_band as first_order_band
+from ._band import population_packing as population_packing
 from ._dynamics import Motion as Motion
 from ._dynamics import Segment as Segment
 from ._dynamics import State as State
@@ -22,6 +27,12 @@ from ._forces import Interaction as Interaction
 from ._forces import Packing as Packing
 from ._forces import WallHistory as WallHistory
 from ._forces import contact_forces as contact_forces
+from ._inverse import CompactionFit as CompactionFit
+from ._inverse import fit_compaction as fit_compaction
+from ._load_steps import LoadStep as LoadStep
+from ._load_steps import Replayed as Replayed
+from ._load_steps import Solver as Solver
+from ._load_steps import replay_compaction as replay_compaction
 from ._neighbours import close_pairs as close_pairs
 from ._packings import MCC_DENSITY as MCC_DENSITY
 from ._packings import relative_density as relative_density
@@ -35,8 +46,15 @@ from ._pair import pair_split as pair_split
 from ._pair import wall_energy as wall_energy
 from ._pair import wall_force as wall_force
 from ._precision import in_single as in_single
+from ._quasistatic import Compaction as Compaction
+from ._quasistatic import compact as compact
+from ._quasistatic import relaxed as relaxed
 from ._restart import load_state as load_state
 from ._restart import save_state as save_state
+from ._sensitivity import STRESSES as STRESSES
+from ._sensitivity import Sensitivity as Sensitivity
+from ._sensitivity import punch_sensitivity as punch_sensitivity
+from ._sensitivity import rescaled as rescaled
 from ._side import TESTED_STRAIN as TESTED_STRAIN
 from ._side import HalfContact as HalfContact
 from ._side import half_contact as half_contact
