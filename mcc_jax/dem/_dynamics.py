@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
 from .._errors import InputError
@@ -74,7 +75,7 @@ class Motion(eqx.Module):
         interaction: Interaction | None = None,
         drag: float = 0.0,
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        dtype: type = jnp.float64,
+        dtype: DTypeLike = jnp.float64,
     ) -> Motion:
         """From plain numbers.
 
@@ -336,8 +337,8 @@ def advance(
         table.append(_sample(packing, state, on_wall / steps))
         lists.append(made)
         capacity.append(state.edges.capacity)
-    columns = jax.tree.map(lambda *x: np.stack(x), *table)
-    return state, Trajectory(*columns, np.asarray(lists), np.asarray(capacity))
+    columns: Sample = jax.tree.map(lambda *x: np.stack(x), *table)
+    return state, Trajectory(**columns._asdict(), lists=np.asarray(lists), capacity=np.asarray(capacity))
 
 
 def replay(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from .._numerics import shared
@@ -72,7 +73,7 @@ class WallHistory(eqx.Module):
     slip: Float[Array, "particles walls 3"]
 
     @classmethod
-    def virgin(cls, particles: int, walls: int, dtype: jnp.dtype | type = jnp.float64) -> WallHistory:
+    def virgin(cls, particles: int, walls: int, dtype: DTypeLike = jnp.float64) -> WallHistory:
         """Nothing has touched yet."""
         return cls(jnp.zeros((particles, walls), dtype), jnp.zeros((particles, walls, 3), dtype))
 
