@@ -1,12 +1,16 @@
 """Quasi-static compaction: the plate test, equilibrium, lists, Euler's identity, gradients, band, inverse."""
 
+from types import SimpleNamespace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mcc_jax import InputError, paper_law
+from mcc_jax import InputError, MccLaw, Plastic, paper_law
+from mcc_jax.calibrate import BayesCalibration
+from mcc_jax.calibrate.joint import Population
 from mcc_jax.dem import (
     Solver,
     band_by_draws,
@@ -15,6 +19,7 @@ from mcc_jax.dem import (
     first_order_band,
     fit_compaction,
     half_contact,
+    population_packing,
     punch_sensitivity,
     relaxed,
     replay_compaction,
@@ -179,6 +184,48 @@ def test_reverse_mode_gives_the_same_sensitivities(sensitivity, pressed):
 
     expected = sensitivity.by_stress[:, :4].sum(axis=0)
     np.testing.assert_allclose(jax.grad(total)(jnp.zeros(4)), expected, rtol=1e-8)
+
+
+def posterior(scatter):
+    """A calibration of which only the population's draws, one chain of five, and the form of unloading are known."""
+
+    def drawn(k):
+        at = 0.01 * k
+        return Population(
+            a=1.43 + at,
+            log_modulus=jnp.log(16000.0) + at,
+            mu=jnp.log(jnp.asarray([7.0, 3.0, 2.7])) + at,
+            tau=jnp.full(3, scatter),
+            modulus_scatter=jnp.asarray(scatter),
+            shape_scatter=jnp.asarray(0.0),
+            log_noise=jnp.asarray(0.0),
+        )
+
+    found = object.__new__(BayesCalibration)
+    model = SimpleNamespace(unloading=LAW.unloading, strain_scaling=LAW.strain_scaling)
+    for name, value in (("model", model), ("population", jax.vmap(jax.vmap(drawn))(jnp.arange(5.0)[None]))):
+        object.__setattr__(found, name, value)
+    return found
+
+
+def test_packing_of_a_population_without_scatter_is_one_law():
+    made = population_packing(posterior(0.0), np.asarray(DIAMETERS))
+    assert made.draws.shape == (5, len(made.names))
+    values = jnp.asarray(made.draws[3])
+    law = MccLaw(Plastic(*(x * jnp.exp(0.03) for x in (7.0, 3.0, 2.7))), 1.46, 16000 * jnp.exp(0.03))
+    for got, expected in zip(
+        jax.tree.leaves(made.packing_of(values)), jax.tree.leaves(spheres(law, DIAMETERS)), strict=True
+    ):
+        np.testing.assert_allclose(got, expected, rtol=1e-12)
+
+
+def test_packing_of_a_population_scatters_the_same_particles_in_every_draw():
+    made = population_packing(posterior(0.2), np.asarray(DIAMETERS), seed=1)
+    first, second = (np.asarray(made.packing_of(jnp.asarray(made.draws[k])).sides.k1) for k in (0, 4))
+    np.testing.assert_allclose(second / first, np.exp(0.04), rtol=1e-12)
+    assert np.log(first / np.asarray(DIAMETERS)).std() > 0.1
+    slope = jax.jacfwd(made.packing_of)(jnp.asarray(made.draws[0])).sides.k1[:, made.names.index("mu1")]
+    np.testing.assert_allclose(slope, first, rtol=1e-12)
 
 
 def test_bands_agree_for_small_scatter(pressed):
