@@ -7,16 +7,10 @@ from ._band import first_order_band as first_order_band
 from ._band import population_packing as population_packing
 from ._dynamics import Motion as Motion
 from ._dynamics import Segment as Segment
-from ._dynamics import State as State
-from ._dynamics import Trajectory as Trajectory
 from ._dynamics import advance as advance
-from ._dynamics import check_state as check_state
-from ._dynamics import listed as listed
-from ._dynamics import not_monotone as not_monotone
 from ._dynamics import replay as replay
 from ._dynamics import run as run
 from ._dynamics import stable_time_step as stable_time_step
-from ._dynamics import start as start
 from ._dynamics import step as step
 from ._edges import Edges as Edges
 from ._edges import carry_history as carry_history
@@ -33,6 +27,7 @@ from ._load_steps import LoadStep as LoadStep
 from ._load_steps import Replayed as Replayed
 from ._load_steps import Solver as Solver
 from ._load_steps import replay_compaction as replay_compaction
+from ._measured import Trajectory as Trajectory
 from ._neighbours import close_pairs as close_pairs
 from ._packings import MCC_DENSITY as MCC_DENSITY
 from ._packings import relative_density as relative_density
@@ -59,6 +54,11 @@ from ._side import TESTED_STRAIN as TESTED_STRAIN
 from ._side import HalfContact as HalfContact
 from ._side import half_contact as half_contact
 from ._side import sides_of as sides_of
+from ._state import State as State
+from ._state import check_state as check_state
+from ._state import listed as listed
+from ._state import not_monotone as not_monotone
+from ._state import start as start
 from ._walls import Cylinder as Cylinder
 from ._walls import Plane as Plane
 from ._walls import Walls as Walls

@@ -12,10 +12,10 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from .._errors import InputError
-from ._dynamics import State
 from ._load_steps import TOP, LoadStep, Solver, replay_stacked, stacked
 from ._quasistatic import Compaction, compact
 from ._sensitivity import PackingOf, Parameters
+from ._state import State
 
 ROUNDS = 5
 

@@ -13,10 +13,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._errors import InputError
 from .._types import Scalar
-from ._dynamics import State
 from ._edges import PADDING, Edges, carry_history
 from ._equilibrium import settle
 from ._forces import Packing, Vectors, WallHistory
+from ._state import State
 from ._stiffness import Held, force_on_walls, net_force, remembered
 from ._walls import Cylinder, Plane, Walls
 

@@ -8,8 +8,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ._dynamics import Motion, State
+from ._dynamics import Motion
 from ._forces import Packing
+from ._state import State
 
 
 def in_single(packing: Packing, motion: Motion, state: State) -> tuple[Packing, Motion, State]:

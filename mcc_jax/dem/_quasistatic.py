@@ -13,11 +13,12 @@ from jaxtyping import Float
 
 from .._errors import InputError
 from .._types import Scalar
-from ._dynamics import State, _sample, check_packing, check_state, listed, start
 from ._edges import Edges
 from ._equilibrium import Settled, settle
 from ._forces import Packing, Vectors, WallHistory
 from ._load_steps import BOTTOM, TOP, LoadStep, Solver, die_walls, lowered
+from ._measured import measured
+from ._state import State, check_packing, check_state, listed, start
 from ._stiffness import Held, pair_geometry, remembered
 from ._walls import Walls
 
@@ -229,7 +230,7 @@ def _unlisted(packing: Packing, old: Edges, fresh: State) -> bool:
 
 def _row(packing: Packing, state: State, attempts: list[_Attempt]) -> tuple:
     balance = attempts[-1].settled.balance
-    sample = _sample(packing, state, jnp.zeros((len(state.walls), 3), state.position.dtype))
+    sample = measured(packing, state, jnp.zeros((len(state.walls), 3), state.position.dtype))
     height = _height(state.walls)
     _, _, barrel = die_walls(state.walls)
     top, bottom = float(balance.on_wall[TOP]), float(balance.on_wall[BOTTOM])

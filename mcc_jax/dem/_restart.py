@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._errors import InputError
-from ._dynamics import State
 from ._edges import Edges
 from ._forces import Packing, WallHistory
 from ._side import HalfContact
+from ._state import State
 from ._walls import Cylinder, Plane
 
 SCHEMA = 1
@@ -94,4 +94,4 @@ def _skeleton(header: dict) -> tuple[Packing, State]:
     edges = Edges(index, index, index, one, vector, empty(kind=int), header["particles"])
     history = WallHistory.virgin(1, len(walls))
     packing = Packing(one, one, side)
-    return packing, State(vector, vector, vector, edges, history, walls, vector, number)
+    return packing, State(vector, vector, vector, edges, history, walls, vector, number, number)

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ._dynamics import State
 from ._forces import Packing
 from ._load_steps import TOP, LoadStep, Replayed, Solver, replay_stacked, stacked
+from ._state import State
 
 STRESSES = ("K1", "K3", "K5", "Ebar", "springs")
 """What has the dimension of a stress: K1 = C1, K3 = C3^3, K5 = C5^5, the effective modulus, the proximal springs."""

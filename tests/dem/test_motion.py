@@ -173,6 +173,16 @@ def test_lists_made_anew_miss_nothing():
     np.testing.assert_allclose(rows.on_wall, rows_all.on_wall, rtol=1e-6, atol=1e-9)
 
 
+def test_a_larger_skin_makes_a_new_list_first():
+    """A list made with a small skin lacks pairs on which a larger one relies."""
+    near = start(packing(), dense().walls, dense().position, 1e-8, CAPACITY)
+    assert int(near.edges.wanted) < int(dense().edges.wanted)
+    end, rows = advance(packing(), motion(), near, PRESSING, 1, 60, SKIN)
+    expected, _ = advance(packing(), motion(), dense(), PRESSING, 1, 60, SKIN)
+    assert rows.lists[0] >= 1
+    np.testing.assert_allclose(end.position, expected.position, rtol=0, atol=1e-15)
+
+
 def test_list_grows_when_full():
     """A list made for fewer pairs gets more room, by itself where none was asked for, and never loses a pair."""
     pairs = close_pairs(np.asarray(dense().position), np.asarray(packing().radius), SKIN)
