@@ -272,8 +272,9 @@ def harder(pack, log_c1):
 @functools.cache
 def recorded():
     """A short motion with lists made anew on the way: its start with moving walls, end and tape."""
-    move, tape, begin = motion(), [], dense()
-    end, rows = advance(packing(), move, begin, PRESSING, 2, 40, 4e-6, tape=tape)
+    fine, tape = 4e-6, []
+    begin = start(packing(), dense().walls, dense().position, fine, CAPACITY)
+    end, rows = advance(packing(), motion(), begin, PRESSING, 2, 40, fine, tape=tape)
     assert rows.lists[-1] >= 2
     moving = eqx.tree_at(lambda s: s.walls, begin, set_velocity(begin.walls, jnp.asarray(PRESSING)))
     return moving, end, tape
