@@ -9,7 +9,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from .._numerics import shared
-from .._types import Flag, Scalar, scalar
+from .._types import Flag, Scalar, ScalarLike, scalar
 from ._edges import Edges
 from ._pair import largest_overlap, pair_force, wall_force
 from ._side import HalfContact
@@ -38,6 +38,10 @@ class Packing(eqx.Module):
         return 4 / 3 * jnp.pi * jnp.sum(self.radius**3)
 
 
+def _maybe(value: ScalarLike | None) -> Scalar | None:
+    return None if value is None else scalar(value)
+
+
 class Interaction(eqx.Module):
     r"""What a contact does besides the law, all of it off by default.
 
@@ -50,14 +54,14 @@ class Interaction(eqx.Module):
 
     Attributes:
         damping: beta, share of critical damping [-].
-        friction: mu between particles [-].
-        wall_friction: mu against walls [-].
+        friction: mu between particles [-]; None, not 0, leaves the tangential part out of what is computed.
+        wall_friction: mu against walls [-]; None likewise.
         tangential_ratio: r_t, tangential over initial normal stiffness [-].
     """
 
     damping: Scalar = eqx.field(converter=scalar, default=0.0)
-    friction: Scalar = eqx.field(converter=scalar, default=0.0)
-    wall_friction: Scalar = eqx.field(converter=scalar, default=0.0)
+    friction: Scalar | None = eqx.field(converter=_maybe, default=None)
+    wall_friction: Scalar | None = eqx.field(converter=_maybe, default=None)
     tangential_ratio: Scalar = eqx.field(converter=scalar, default=0.8)
 
 
@@ -215,7 +219,9 @@ def _between(
     time_step: Scalar,
 ) -> _Contact:
     overlap, normal = overlap_and_normal(i.position, j.position, i.radius + j.radius, listed)
-    relative = j.velocity - i.velocity - jnp.cross(i.radius * i.spin + j.radius * j.spin, normal)
+    relative = j.velocity - i.velocity
+    if interaction.friction is not None:
+        relative = relative - jnp.cross(i.radius * i.spin + j.radius * j.spin, normal)
     # Without the barriers XLA computes the law again for every use of its force.
     overlap, normal, relative = jax.lax.optimization_barrier((overlap, normal, relative))
     elastic = jax.lax.optimization_barrier(pair_force(i.side, j.side, overlap_max, overlap))
@@ -231,7 +237,9 @@ def _against(
     dtype = body.radius.dtype
     outward = -wall.normal_at(body.position).astype(dtype)
     overlap = (body.radius.astype(body.position.dtype) - wall.distance(body.position)).astype(dtype)
-    relative = wall.velocity.astype(dtype) - body.velocity - jnp.cross(body.radius * body.spin, outward)
+    relative = wall.velocity.astype(dtype) - body.velocity
+    if interaction.wall_friction is not None:
+        relative = relative - jnp.cross(body.radius * body.spin, outward)
     elastic = jax.lax.optimization_barrier(wall_force(body.side, overlap_max, overlap))
     friction, k, mass = interaction.wall_friction, body.side.k1, body.mass
     return _contact(interaction, friction, elastic, k, mass, outward, relative, overlap_max, overlap, slip, time_step)
@@ -239,7 +247,7 @@ def _against(
 
 def _contact(
     interaction: Interaction,
-    friction: Scalar,
+    friction: Scalar | None,
     elastic: Scalar,
     k: Scalar,
     mass: Scalar,
@@ -256,6 +264,9 @@ def _contact(
     damping = 2 * interaction.damping
     push = elastic - damping * shared(jnp.sqrt(mass * k)) * opening
     push = jnp.where(touching & (push > 0), push, jnp.where(jnp.isnan(elastic), elastic, 0.0))
+    overlap_max = largest_overlap(overlap_max, overlap)
+    if friction is None:
+        return _Contact(-push * normal, jnp.zeros_like(normal), overlap_max, slip)
 
     # The contact plane turned since the last step: keep the slip's length and put it into the new plane.
     sliding = relative - opening * normal
@@ -275,7 +286,7 @@ def _contact(
     return _Contact(
         tangential - push * normal,
         jnp.cross(normal, tangential),
-        largest_overlap(overlap_max, overlap),
+        overlap_max,
         jnp.where(touching, held, 0.0),
     )
 

@@ -140,6 +140,17 @@ def test_rolling_without_slip_needs_no_friction():
     assert np.abs(forces.force[:, 1]).max() > 0
 
 
+def test_no_friction_is_friction_of_zero():
+    """None leaves the tangential part out; the forces are those of a coefficient of zero."""
+    state = stirred(dense())
+    zero, none = (Motion.of(1e-9, Interaction(damping=0.1, friction=f, wall_friction=f)) for f in (0.0, None))
+    (with_zero, forces), (without, plain) = STEP(packing(), zero, state), STEP(packing(), none, state)
+    np.testing.assert_allclose(plain.force, forces.force, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(plain.on_wall, forces.on_wall, rtol=1e-12, atol=1e-15)
+    assert np.abs(plain.torque).max() == 0
+    np.testing.assert_array_equal(without.edges.overlap_max, with_zero.edges.overlap_max)
+
+
 def test_damping_never_pulls():
     pack, _, state = two_spheres(friction=0.0, normal_overlap=1e-8)
     parting = eqx.tree_at(lambda s: s.velocity, state, jnp.asarray([[0.0, 0, 0], [5.0, 0, 0]]))
