@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -135,6 +135,8 @@ def run(
     """
 
     def loop(contacts: Contacts, packing: Packing, motion: Motion, state: State, wanted: Array) -> tuple[State, tuple]:
+        # Reverse mode keeps the state of each step and computes the step again: what is in between costs more to keep.
+        @jax.checkpoint
         def one(state: State, k: Array) -> tuple[State, None]:
             return jax.lax.cond(k < wanted, lambda s: step(packing, motion, s, contacts)[0], lambda s: s, state), None
 
@@ -228,13 +230,17 @@ def advance(
 
 
 def replay(
-    packing: Packing, motion: Motion, state: State, tape: Sequence[Segment], devices: Devices | None = None
+    packing: Packing,
+    motion: Motion,
+    state: State,
+    tape: Sequence[Segment],
+    devices: Devices | None = None,
+    keep: Literal["steps", "lists"] = "steps",
 ) -> State:
     """The same motion again over the lists of edges that `advance` recorded, differentiable in both modes.
 
-    Neighbour lists have no derivative and are made on the host; the contacts on them have. In reverse mode each list's
-    steps are computed twice and only the states between lists are kept. A gradient through thousands of steps is exact
-    for that trajectory and says little about compaction: rearrangements are chaotic (see the quasi-static compaction).
+    Neighbour lists have no derivative and are made on the host; the contacts on them have. A gradient through thousands
+    of steps is exact for that trajectory and says little about compaction: rearrangements are chaotic (see `compact`).
 
     Args:
         packing: the spheres.
@@ -242,6 +248,8 @@ def replay(
         state: the state `advance` started from, with the walls' velocities set (`set_velocity`).
         tape: of one call of `advance`.
         devices: as in `run`.
+        keep: what reverse mode keeps on its way: the states of all steps, or, for long motions, those between lists
+            only; each step is then computed once more.
     """
     if not tape:
         return state
@@ -249,7 +257,6 @@ def replay(
     longest = max(int(segment.steps) for segment in tape)
     segments = jax.tree.map(lambda *x: jnp.stack(x), *(_widened(segment, room) for segment in tape))
 
-    @jax.checkpoint
     def one(state: State, segment: Segment) -> tuple[State, None]:
         empty = jnp.zeros(room, state.edges.overlap_max.dtype)
         fresh = Edges(
@@ -265,7 +272,7 @@ def replay(
         return run(packing, motion, state, longest, segment.steps, devices), None
 
     state = eqx.tree_at(lambda s: s.edges, state, widened(state.edges, room))
-    return jax.lax.scan(one, state, segments)[0]
+    return jax.lax.scan(jax.checkpoint(one) if keep == "lists" else one, state, segments)[0]
 
 
 def _widened(segment: Segment, room: int) -> Segment:

@@ -291,10 +291,10 @@ def recorded():
     return moving, end, tape
 
 
-def mean_height(log_c1):
+def mean_height(log_c1, keep="steps"):
     """Mean height [um] at the end of the recorded motion, replayed with other particles."""
     moving, _, tape = recorded()
-    return jnp.mean(replay(harder(packing(), log_c1), motion(), moving, tape).position[:, 2] * 1e6)
+    return jnp.mean(replay(harder(packing(), log_c1), motion(), moving, tape, keep=keep).position[:, 2] * 1e6)
 
 
 def test_replay_is_the_motion_and_has_its_derivative():
@@ -306,6 +306,15 @@ def test_replay_is_the_motion_and_has_its_derivative():
     np.testing.assert_allclose(value, 1e6 * jnp.mean(end.position[:, 2]), rtol=1e-12)
     difference = (compiled(jnp.asarray(1e-4))[0] - compiled(jnp.asarray(-1e-4))[0]) / 2e-4
     np.testing.assert_allclose(slope, difference, rtol=1e-4)
+
+
+@pytest.mark.long
+def test_replay_that_keeps_less_has_the_same_gradient():
+    recorded()
+    every, lists = (
+        jax.jit(jax.grad(functools.partial(mean_height, keep=k)))(jnp.zeros(())) for k in ("steps", "lists")
+    )
+    np.testing.assert_allclose(lists, every, rtol=1e-12)
 
 
 @pytest.mark.long
