@@ -1,0 +1,40 @@
+"""What the build of the pages adds to MkDocs: the lists of public names, and formulae as MathML."""
+
+import ast
+import html
+import re
+from pathlib import Path
+
+from latex2mathml.converter import convert
+
+PACKAGE = Path(__file__).parents[1] / "mcc_jax"
+_API = re.compile(r"^!api (\S+)$", re.M)
+_FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.S)
+
+
+def public_names(module: str) -> list[tuple[str, str]]:
+    """Every name that a module exports, in the order of the text, and the module that defines it."""
+    folder = PACKAGE.joinpath(*module.split(".")[1:])
+    file = next(f for f in (folder / "__init__.pyi", folder / "__init__.py", folder.with_suffix(".py")) if f.exists())
+    body = ast.parse(file.read_text(encoding="utf-8")).body
+    return [(a.name, f"{module}.{n.module}") for n in body if isinstance(n, ast.ImportFrom) for a in n.names]
+
+
+def on_page_markdown(markdown, **_):
+    """`!api mcc_jax.law` stands for everything that module exports, one entry for each name."""
+
+    def entries(match):
+        module = match[1]
+        return "\n\n".join(f"::: {module}.{name}" for name, _ in public_names(module))
+
+    return _API.sub(entries, markdown)
+
+
+def on_page_content(content, **_):
+    """MathML instead of TeX: browsers draw it themselves, so that no page needs a script for its formulae."""
+
+    def mathml(match):
+        display = "block" if match[2] == "[" else "inline"
+        return convert(html.unescape(match[3]), display=display)
+
+    return _FORMULA.sub(mathml, content)
