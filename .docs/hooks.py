@@ -9,25 +9,29 @@ from latex2mathml.converter import convert
 
 PACKAGE = Path(__file__).parents[1] / "mcc_jax"
 _API = re.compile(r"^!api (\S+)$", re.M)
+_NAMES = re.compile(r"^!names (\S+)$", re.M)
 _FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.S)
 
 
 def public_names(module: str) -> list[tuple[str, str]]:
-    """Every name that a module exports, in the order of the text, and the module that defines it."""
+    """Every name that a module exports, in the order of the text, and the part of the module it is from."""
     folder = PACKAGE.joinpath(*module.split(".")[1:])
     file = next(f for f in (folder / "__init__.pyi", folder / "__init__.py", folder.with_suffix(".py")) if f.exists())
     body = ast.parse(file.read_text(encoding="utf-8")).body
-    return [(a.name, f"{module}.{n.module}") for n in body if isinstance(n, ast.ImportFrom) for a in n.names]
+    return [(a.name, str(n.module)) for n in body if isinstance(n, ast.ImportFrom) for a in n.names]
 
 
 def on_page_markdown(markdown, **_):
-    """`!api mcc_jax.law` stands for everything that module exports, one entry for each name."""
+    """`!api mcc_jax.law` stands for an entry for each name of the module, `!names mcc_jax` for links to them."""
 
     def entries(match):
-        module = match[1]
-        return "\n\n".join(f"::: {module}.{name}" for name, _ in public_names(module))
+        return "\n\n".join(f"::: {match[1]}.{name}" for name, _ in public_names(match[1]))
 
-    return _API.sub(entries, markdown)
+    def links(match):
+        homes = {name: match[1] if part.startswith("_") else f"{match[1]}.{part}" for name, part in public_names(match[1])}
+        return "\n".join(f"- [`{name}`][{home}.{name}]" for name, home in sorted(homes.items(), key=lambda i: i[1]))
+
+    return _NAMES.sub(links, _API.sub(entries, markdown))
 
 
 def on_page_content(content, **_):
