@@ -28,7 +28,9 @@ def on_page_markdown(markdown, **_):
         return "\n\n".join(f"::: {match[1]}.{name}" for name, _ in public_names(match[1]))
 
     def links(match):
-        homes = {name: match[1] if part.startswith("_") else f"{match[1]}.{part}" for name, part in public_names(match[1])}
+        homes = {
+            name: match[1] if part.startswith("_") else f"{match[1]}.{part}" for name, part in public_names(match[1])
+        }
         return "\n".join(f"- [`{name}`][{home}.{name}]" for name, home in sorted(homes.items(), key=lambda i: i[1]))
 
     return _NAMES.sub(links, _API.sub(entries, markdown))

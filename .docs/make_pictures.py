@@ -5,6 +5,7 @@
 The tests are simulated from the paper's tables; nobody measured them. Takes about three minutes.
 """
 
+from itertools import pairwise
 from pathlib import Path
 
 import jax
@@ -37,7 +38,7 @@ def panel(title, xlabel, ylabel):
 def law():
     """One particle, loaded further and further, with a little unloading between."""
     turns = [0.0, 65.0, 62.0, 85.0, 81.5, 105.0, 100.5]
-    legs = [np.linspace(a, b, 150) for a, b in zip(turns[:-1], turns[1:], strict=True)]
+    legs = [np.linspace(a, b, 150) for a, b in pairwise(turns)]
     curve = mcc.drive(mcc.paper_law(), mcc.Particle(213.54, 196.07, 186.33), jnp.asarray(np.concatenate(legs)))
     figure, ax = panel("The law", "displacement of the platen / µm", "force / mN")
     ax.plot(curve.displacement, curve.force, color=BLUE, lw=1.6)
