@@ -62,7 +62,7 @@ def added_columns(found: Discovery) -> np.ndarray:
 def _apart(one: Mapping[str, float], other: Mapping[str, float]) -> float:
     """Relative distance of two sets of further numbers; 0 only where they are equal."""
     pairs = [(float(one[name]), float(value)) for name, value in other.items() if name in one]
-    return sum(abs(a - b) / (abs(a) + abs(b)) for a, b in pairs if a != b)
+    return sum((abs(a - b) / (abs(a) + abs(b)) for a, b in pairs if a != b), 0.0)
 
 
 def leftover(found: Discovery) -> Leftover:
@@ -109,7 +109,8 @@ def _as_found(base: Base, system: System, found: Discovery) -> tuple[System, np.
     moved = len(signals.candidates) - len(system.candidates)
     columns = np.array([*(system.column(i) for i in range(len(formulas))), *(inside[len(formulas) :] + moved)], int)
     if all(
-        _apart(_candidate(system, c).nuisance, e.nuisance) == 0 for c, e in zip(inside, found.effects, strict=False)
+        _apart(_candidate(system, int(c)).nuisance, e.nuisance) == 0
+        for c, e in zip(inside, found.effects, strict=False)
     ):
         return system, inside, signals.of(columns)
     return replace(build_system(base, signals), usable=system.usable), columns, signals.of(columns)
