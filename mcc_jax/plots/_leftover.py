@@ -49,12 +49,13 @@ def added_columns(found: Discovery) -> np.ndarray:
 
     An effect whose further numbers were fitted has moved away from its column; then it is the nearest one.
     """
-    if found.system is None:
+    system = found.system
+    if system is None:
         return np.array([], int)
     index = []
     for effect in found.effects:
-        alike = [found.system.column(k) for k, c in enumerate(found.system.candidates) if c.variant == effect.variant]
-        index.append(min(alike, key=lambda column: _apart(_candidate(found.system, column).nuisance, effect.nuisance)))
+        alike = [system.column(k) for k, c in enumerate(system.candidates) if c.variant == effect.variant]
+        index.append(min(alike, key=lambda column: _apart(_candidate(system, column).nuisance, effect.nuisance)))
     words = found.closure.words if found.closure is not None else []
     return np.array([*index, *words], int)
 
