@@ -1,13 +1,19 @@
-"""What the build of the pages adds to MkDocs: the lists of public names, and formulae as MathML."""
+"""What the build of the pages adds to MkDocs: lists of public names, formulae as MathML, and a look at the result."""
 
 import ast
 import html
+import logging
 import re
 from pathlib import Path
 
 from latex2mathml.converter import convert
 
 PACKAGE = Path(__file__).parents[1] / "mcc_jax"
+LOG = logging.getLogger("mkdocs.hooks.mcc_jax")
+_ELSEWHERE = re.compile(
+    r'<(?:script|img|iframe|source)\b[^>]*\bsrc="(?:https?:)?//|<link\b[^>]*\bhref="(?:https?:)?//', re.I
+)
+_LEFT_OVER = re.compile(r'class="arithmatex"|:math:|\.\. math::|^!(?:api|names) ', re.M)
 _API = re.compile(r"^!api (\S+)$", re.M)
 _NAMES = re.compile(r"^!names (\S+)$", re.M)
 _FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.S)
@@ -44,3 +50,11 @@ def on_page_content(content, **_):
         return convert(html.unescape(match[3]), display=display)
 
     return _FORMULA.sub(mathml, content)
+
+
+def on_post_page(output, page, **_):
+    """Warn, which fails a strict build, if a page loads something from elsewhere or a formula or list was not made."""
+    for what, pattern in (("loads from elsewhere", _ELSEWHERE), ("was not turned into HTML", _LEFT_OVER)):
+        if found := pattern.search(output):
+            LOG.warning("%s: %r %s", page.file.src_uri, found[0], what)
+    return output
