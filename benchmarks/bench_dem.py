@@ -31,6 +31,7 @@ from mcc_jax.dem import (
     die,
     half_contact,
     list_edges,
+    listed,
     pair_force,
     relative_density,
     replay,
@@ -157,7 +158,7 @@ def reverse(count=1000, steps=200):
     packing, state = pressed(count)
     motion = motion_of(packing)
     velocity = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -SPEED], [0.0, 0.0, 0.0]])
-    tape = []
+    tape, state = [], listed(packing, state, 4e-6)
     advance(packing, motion, state, velocity, 1, steps, 4e-6, tape=tape)
     state = eqx.tree_at(lambda s: s.walls, state, set_velocity(state.walls, jnp.asarray(velocity)))
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from .._numerics import shared
-from .._types import Flag, Scalar, scalar
+from .._types import Flag, Scalar, ScalarLike, scalar
 from ._edges import Edges
 from ._pair import largest_overlap, pair_force, wall_force
 from ._side import HalfContact
@@ -37,6 +38,10 @@ class Packing(eqx.Module):
         return 4 / 3 * jnp.pi * jnp.sum(self.radius**3)
 
 
+def _maybe(value: ScalarLike | None) -> Scalar | None:
+    return None if value is None else scalar(value)
+
+
 class Interaction(eqx.Module):
     r"""What a contact does besides the law, all of it off by default.
 
@@ -49,14 +54,14 @@ class Interaction(eqx.Module):
 
     Attributes:
         damping: beta, share of critical damping [-].
-        friction: mu between particles [-].
-        wall_friction: mu against walls [-].
+        friction: mu between particles [-]; None, not 0, leaves the tangential part out of what is computed.
+        wall_friction: mu against walls [-]; None likewise.
         tangential_ratio: r_t, tangential over initial normal stiffness [-].
     """
 
     damping: Scalar = eqx.field(converter=scalar, default=0.0)
-    friction: Scalar = eqx.field(converter=scalar, default=0.0)
-    wall_friction: Scalar = eqx.field(converter=scalar, default=0.0)
+    friction: Scalar | None = eqx.field(converter=_maybe, default=None)
+    wall_friction: Scalar | None = eqx.field(converter=_maybe, default=None)
     tangential_ratio: Scalar = eqx.field(converter=scalar, default=0.8)
 
 
@@ -72,7 +77,7 @@ class WallHistory(eqx.Module):
     slip: Float[Array, "particles walls 3"]
 
     @classmethod
-    def virgin(cls, particles: int, walls: int, dtype: jnp.dtype | type = jnp.float64) -> WallHistory:
+    def virgin(cls, particles: int, walls: int, dtype: DTypeLike = jnp.float64) -> WallHistory:
         """Nothing has touched yet."""
         return cls(jnp.zeros((particles, walls), dtype), jnp.zeros((particles, walls, 3), dtype))
 
@@ -115,7 +120,8 @@ def overlap_and_normal(i: Vector, j: Vector, reach: Scalar, listed: Flag) -> tup
     """Overlap [m] of two spheres and unit vector from i to j.
 
     Two centres in one place have no normal: they get none, and so no force. A place in the list that no pair uses
-    overlaps by -1 m. A position that is NaN shows.
+    overlaps by -1 m. A position that is NaN shows. The overlap, a small difference of large numbers, is taken in the
+    precision of the positions and then rounded to that of the radii.
 
     Args:
         i, j: centres [m].
@@ -126,8 +132,10 @@ def overlap_and_normal(i: Vector, j: Vector, reach: Scalar, listed: Flag) -> tup
     square = jnp.sum(between * between)
     apart = listed & (square > 0)
     distance = shared(jnp.sqrt(jnp.where(apart, square, 1.0)))
-    overlap = jnp.where(apart, reach - distance, jnp.where(listed & jnp.isnan(square), square, -1.0))
-    return overlap, jnp.where(apart, between * shared(1 / distance), 0.0)
+    separation = reach.astype(distance.dtype) - distance
+    overlap = jnp.where(apart, separation, jnp.where(listed & jnp.isnan(square), square, -1.0))
+    normal = jnp.where(apart, between * shared(1 / distance), 0.0)
+    return overlap.astype(reach.dtype), normal.astype(reach.dtype)
 
 
 def contact_forces(
@@ -154,32 +162,46 @@ def contact_forces(
         history: of the contacts with walls.
         time_step: over which slip adds up [s].
     """
-    bodies = jax.vmap(_Body)(packing.radius, packing.mass, packing.sides, position, velocity, spin)
-    pairs, load = pair_loads(interaction, bodies, edges, time_step)
-    edges = eqx.tree_at(lambda e: (e.overlap_max, e.slip), edges, (pairs.overlap_max, pairs.slip))
-    on_wall, columns = [], []
-    for w, wall in enumerate(walls):
-        against = jax.vmap(_against, (None, None, 0, 0, 0, None))
-        contacts = against(interaction, wall, bodies, history.overlap_max[:, w], history.slip[:, w], time_step)
-        load = load + _load(contacts.force, packing.radius, contacts.couple)
-        on_wall.append(-jnp.sum(contacts.force, axis=0))
-        columns.append((contacts.overlap_max, contacts.slip))
-    if walls:
-        history = WallHistory(*(jnp.stack(x, axis=1) for x in zip(*columns, strict=True)))
-    forces = Forces(load[:, :3], load[:, 3:], jnp.stack(on_wall) if walls else jnp.zeros((0, 3), position.dtype))
-    return forces, edges, history
+    bodies = bodies_of(packing, position, velocity, spin)
+    load, edges = pair_loads(interaction, bodies, edges, time_step)
+    at_walls, on_wall, history = wall_loads(interaction, walls, bodies, history, time_step)
+    load = load + at_walls
+    return Forces(load[:, :3], load[:, 3:], on_wall), edges, history
+
+
+def bodies_of(packing: Packing, position: Vectors, velocity: Vectors, spin: Vectors) -> _Body:
+    """The spheres as their contacts see them, in a batch."""
+    return jax.vmap(_Body)(packing.radius, packing.mass, packing.sides, position, velocity, spin)
 
 
 def pair_loads(
     interaction: Interaction, bodies: _Body, edges: Edges, time_step: Scalar
-) -> tuple[_Contact, Float[Array, "particles 6"]]:
-    """Contacts of all edges, and their force and torque summed over the particles."""
+) -> tuple[Float[Array, "particles 6"], Edges]:
+    """Force and torque of all edges, or any part of them, summed over the particles, and what the edges remember."""
     i, j = (jax.tree.map(lambda x, at=at: x[at], bodies) for at in (edges.i, edges.j))
     between = jax.vmap(_between, (None, 0, 0, 0, 0, 0, None))
     pairs = between(interaction, i, j, edges.active, edges.overlap_max, edges.slip, time_step)
-    total = jnp.zeros((bodies.radius.shape[0], 6), bodies.position.dtype)
+    total = jnp.zeros((bodies.radius.shape[0], 6), bodies.radius.dtype)
     total = total.at[edges.i].add(_load(pairs.force, i.radius, pairs.couple))
-    return pairs, total.at[edges.j].add(_load(-pairs.force, j.radius, pairs.couple))
+    total = total.at[edges.j].add(_load(-pairs.force, j.radius, pairs.couple))
+    return total, eqx.tree_at(lambda e: (e.overlap_max, e.slip), edges, (pairs.overlap_max, pairs.slip))
+
+
+def wall_loads(
+    interaction: Interaction, walls: Walls, bodies: _Body, history: WallHistory, time_step: Scalar
+) -> tuple[Float[Array, "particles 6"], Float[Array, "walls 3"], WallHistory]:
+    """Force and torque of the walls on all particles, or any part of them, forces on the walls, and the memory."""
+    load = jnp.zeros((bodies.radius.shape[0], 6), bodies.radius.dtype)
+    on_wall, columns = [], []
+    for w, wall in enumerate(walls):
+        against = jax.vmap(_against, (None, None, 0, 0, 0, None))
+        contacts = against(interaction, wall, bodies, history.overlap_max[:, w], history.slip[:, w], time_step)
+        load = load + _load(contacts.force, bodies.radius, contacts.couple)
+        on_wall.append(-jnp.sum(contacts.force, axis=0))
+        columns.append((contacts.overlap_max, contacts.slip))
+    if not walls:
+        return load, jnp.zeros((0, 3), load.dtype), history
+    return load, jnp.stack(on_wall), WallHistory(*(jnp.stack(x, axis=1) for x in zip(*columns, strict=True)))
 
 
 @jax.vmap
@@ -197,7 +219,9 @@ def _between(
     time_step: Scalar,
 ) -> _Contact:
     overlap, normal = overlap_and_normal(i.position, j.position, i.radius + j.radius, listed)
-    relative = j.velocity - i.velocity - jnp.cross(i.radius * i.spin + j.radius * j.spin, normal)
+    relative = j.velocity - i.velocity
+    if interaction.friction is not None:
+        relative = relative - jnp.cross(i.radius * i.spin + j.radius * j.spin, normal)
     # Without the barriers XLA computes the law again for every use of its force.
     overlap, normal, relative = jax.lax.optimization_barrier((overlap, normal, relative))
     elastic = jax.lax.optimization_barrier(pair_force(i.side, j.side, overlap_max, overlap))
@@ -210,9 +234,12 @@ def _between(
 def _against(
     interaction: Interaction, wall: Wall, body: _Body, overlap_max: Scalar, slip: Vector, time_step: Scalar
 ) -> _Contact:
-    outward = -wall.normal_at(body.position)
-    overlap = body.radius - wall.distance(body.position)
-    relative = wall.velocity - body.velocity - jnp.cross(body.radius * body.spin, outward)
+    dtype = body.radius.dtype
+    outward = -wall.normal_at(body.position).astype(dtype)
+    overlap = (body.radius.astype(body.position.dtype) - wall.distance(body.position)).astype(dtype)
+    relative = wall.velocity.astype(dtype) - body.velocity
+    if interaction.wall_friction is not None:
+        relative = relative - jnp.cross(body.radius * body.spin, outward)
     elastic = jax.lax.optimization_barrier(wall_force(body.side, overlap_max, overlap))
     friction, k, mass = interaction.wall_friction, body.side.k1, body.mass
     return _contact(interaction, friction, elastic, k, mass, outward, relative, overlap_max, overlap, slip, time_step)
@@ -220,7 +247,7 @@ def _against(
 
 def _contact(
     interaction: Interaction,
-    friction: Scalar,
+    friction: Scalar | None,
     elastic: Scalar,
     k: Scalar,
     mass: Scalar,
@@ -237,6 +264,9 @@ def _contact(
     damping = 2 * interaction.damping
     push = elastic - damping * shared(jnp.sqrt(mass * k)) * opening
     push = jnp.where(touching & (push > 0), push, jnp.where(jnp.isnan(elastic), elastic, 0.0))
+    overlap_max = largest_overlap(overlap_max, overlap)
+    if friction is None:
+        return _Contact(-push * normal, jnp.zeros_like(normal), overlap_max, slip)
 
     # The contact plane turned since the last step: keep the slip's length and put it into the new plane.
     sliding = relative - opening * normal
@@ -256,7 +286,7 @@ def _contact(
     return _Contact(
         tangential - push * normal,
         jnp.cross(normal, tangential),
-        largest_overlap(overlap_max, overlap),
+        overlap_max,
         jnp.where(touching, held, 0.0),
     )
 

@@ -40,11 +40,11 @@ def close_pairs(
 
 def _pairs_within(position: np.ndarray, cutoff: float) -> np.ndarray:
     try:
-        from vesin import NeighborList
+        from vesin import NeighborList  # pyright: ignore[reportMissingImports]  # optional
     except ImportError:
-        from scipy.spatial import cKDTree
+        from scipy.spatial import KDTree
 
-        return cKDTree(position).query_pairs(cutoff, output_type="ndarray").astype(np.int64)
+        return KDTree(position).query_pairs(cutoff, output_type="ndarray").astype(np.int64)
     # vesin's cell grid is made for lengths of the order of one: in units of the cut-off they are.
     found = NeighborList(cutoff=1.0, full_list=False).compute(
         points=position / cutoff, box=np.zeros((3, 3)), periodic=False, quantities="ij"

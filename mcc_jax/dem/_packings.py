@@ -7,6 +7,7 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._errors import InputError
@@ -30,7 +31,8 @@ def spheres(law: MccLaw, diameter: Float[Array, " particles"], density: float = 
     Raises:
         InputError: if a diameter or the density is not positive.
     """
-    if not (bool(jnp.all(diameter > 0)) and density > 0):
+    known = not isinstance(diameter, Tracer)  # under `jax.jit` diameters of the caller still are, laws are not
+    if not (density > 0 and (not known or np.all(np.asarray(diameter) > 0))):
         raise InputError("a diameter or density that is not positive", remedy="Diameters are in um.")
     batched = law.a.ndim == 1 or law.plastic.C1.ndim == 1
     axes = jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, law) if batched else None

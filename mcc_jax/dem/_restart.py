@@ -7,16 +7,17 @@ import os
 import tempfile
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from .._errors import InputError
-from ._dynamics import State
 from ._edges import Edges
 from ._forces import Packing, WallHistory
 from ._side import HalfContact
+from ._state import State
 from ._walls import Cylinder, Plane
 
 SCHEMA = 1
@@ -37,7 +38,7 @@ def save_state(path: str | Path, packing: Packing, state: State) -> None:
         "particles": state.edges.particles,
         "power": packing.sides.power,
     }
-    arrays = {f"leaf_{k}": np.asarray(leaf) for k, leaf in enumerate(jax.tree.leaves((packing, state)))}
+    arrays: dict[str, Any] = {f"leaf_{k}": np.asarray(leaf) for k, leaf in enumerate(jax.tree.leaves((packing, state)))}
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
     try:
         with os.fdopen(handle, "wb") as stream:
@@ -93,4 +94,4 @@ def _skeleton(header: dict) -> tuple[Packing, State]:
     edges = Edges(index, index, index, one, vector, empty(kind=int), header["particles"])
     history = WallHistory.virgin(1, len(walls))
     packing = Packing(one, one, side)
-    return packing, State(vector, vector, vector, edges, history, walls, vector, number)
+    return packing, State(vector, vector, vector, edges, history, walls, vector, number, number)

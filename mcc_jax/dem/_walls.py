@@ -6,6 +6,7 @@ from typing import TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from .._errors import InputError
@@ -80,7 +81,7 @@ Wall: TypeAlias = Plane | Cylinder
 Walls: TypeAlias = tuple[Wall, ...]
 
 
-def die(radius: float, height: float, dtype: type = jnp.float64) -> Walls:
+def die(radius: float, height: float, dtype: DTypeLike = jnp.float64) -> Walls:
     """A closed die: bottom punch at z = 0, top punch at the height, cylinder between them with its rim at the height.
 
     Returns:

@@ -140,6 +140,17 @@ def test_rolling_without_slip_needs_no_friction():
     assert np.abs(forces.force[:, 1]).max() > 0
 
 
+def test_no_friction_is_friction_of_zero():
+    """None leaves the tangential part out; the forces are those of a coefficient of zero."""
+    state = stirred(dense())
+    zero, none = (Motion.of(1e-9, Interaction(damping=0.1, friction=f, wall_friction=f)) for f in (0.0, None))
+    (with_zero, forces), (without, plain) = STEP(packing(), zero, state), STEP(packing(), none, state)
+    np.testing.assert_allclose(plain.force, forces.force, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(plain.on_wall, forces.on_wall, rtol=1e-12, atol=1e-15)
+    assert np.abs(plain.torque).max() == 0
+    np.testing.assert_array_equal(without.edges.overlap_max, with_zero.edges.overlap_max)
+
+
 def test_damping_never_pulls():
     pack, _, state = two_spheres(friction=0.0, normal_overlap=1e-8)
     parting = eqx.tree_at(lambda s: s.velocity, state, jnp.asarray([[0.0, 0, 0], [5.0, 0, 0]]))
@@ -171,6 +182,16 @@ def test_lists_made_anew_miss_nothing():
     assert rows.contacts[-1] > 5
     np.testing.assert_allclose(end.position, expected.position, rtol=0, atol=1e-13)
     np.testing.assert_allclose(rows.on_wall, rows_all.on_wall, rtol=1e-6, atol=1e-9)
+
+
+def test_a_larger_skin_makes_a_new_list_first():
+    """A list made with a small skin lacks pairs on which a larger one relies."""
+    near = start(packing(), dense().walls, dense().position, 1e-8, CAPACITY)
+    assert int(near.edges.wanted) < int(dense().edges.wanted)
+    end, rows = advance(packing(), motion(), near, PRESSING, 1, 60, SKIN)
+    expected, _ = advance(packing(), motion(), dense(), PRESSING, 1, 60, SKIN)
+    assert rows.lists[0] >= 1
+    np.testing.assert_allclose(end.position, expected.position, rtol=0, atol=1e-15)
 
 
 def test_list_grows_when_full():
@@ -262,8 +283,9 @@ def harder(pack, log_c1):
 @functools.cache
 def recorded():
     """A short motion with lists made anew on the way: its start with moving walls, end and tape."""
-    move, tape, begin = motion(), [], dense()
-    end, rows = advance(packing(), move, begin, PRESSING, 2, 40, 4e-6, tape=tape)
+    fine, tape = 4e-6, []
+    begin = start(packing(), dense().walls, dense().position, fine, CAPACITY)
+    end, rows = advance(packing(), motion(), begin, PRESSING, 2, 40, fine, tape=tape)
     assert rows.lists[-1] >= 2
     moving = eqx.tree_at(lambda s: s.walls, begin, set_velocity(begin.walls, jnp.asarray(PRESSING)))
     return moving, end, tape

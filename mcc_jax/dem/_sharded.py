@@ -1,0 +1,141 @@
+"""Contacts divided over devices and processes: each computes its share, one sum a step brings them together."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from .._types import Scalar
+from ._edges import Edges, widened
+from ._forces import (
+    Forces,
+    Interaction,
+    Packing,
+    Vectors,
+    WallHistory,
+    bodies_of,
+    contact_forces,
+    pair_loads,
+    wall_loads,
+)
+from ._walls import Walls
+
+AXIS = "shares"
+
+Devices: TypeAlias = Sequence[jax.Device]  # pyright: ignore[reportInvalidTypeForm]  # JAX names it by assignment
+Contacts: TypeAlias = Callable[..., tuple[Forces, Edges, WallHistory]]
+"""What computes all contact forces, with the arguments of `contact_forces`."""
+
+
+def divided[Moving: eqx.Module](
+    loop: Callable[..., tuple[Moving, Any]],
+    devices: Devices | None,
+    packing: Packing,
+    motion: eqx.Module,
+    state: Moving,
+    *further: jax.Array,
+) -> tuple[Moving, Any]:
+    """A loop over time steps with its contacts divided over devices; differentiable like the loop itself.
+
+    Edges, sorted by key, are dealt out in contiguous shares of equal length, and contacts with walls by particle. What
+    belongs to particles (positions, velocities, the packing) is on every device, and every device moves all of them.
+    A step needs one reduction, of one array of forces, torques and forces on walls.
+
+    Args:
+        loop: called with what computes the contact forces, then the packing, motion, state, and what is further. It
+            returns the state, and anything that is the same on all devices.
+        devices: those of one process or, after `jax.distributed.initialize`, of all. None: no division.
+        packing: the spheres.
+        motion: how they move.
+        state: holds `edges` and `wall_history`.
+        further: numbers for the loop.
+    """
+    if devices is None:
+        return loop(contact_forces, packing, motion, state, *further)
+    mesh = Mesh(np.asarray(devices), (AXIS,))
+    lengths = [x.shape[0] for x in _remembered(state)]
+    whole, share = PartitionSpec(), PartitionSpec(AXIS)
+    padded = _padded(state, len(devices))
+    specs = eqx.tree_at(_dealt, jax.tree.map(lambda _: whole, padded), (share,) * len(_dealt(padded)))
+
+    def one_share(packing: Packing, motion: eqx.Module, state: Moving, *further: jax.Array) -> tuple[Moving, Any]:
+        # Marked once, outside the loop: its derivative is then summed over devices once, not in every step.
+        own = jax.lax.pcast(packing, AXIS, to="varying")
+        return loop(functools.partial(_share_of_contacts, own), packing, motion, state, *further)
+
+    moved, rest = jax.shard_map(
+        one_share, mesh=mesh, in_specs=(whole, whole, specs, *(whole for _ in further)), out_specs=(specs, whole)
+    )(packing, motion, padded, *further)
+    everywhere = NamedSharding(mesh, whole)
+    kept = [
+        jax.lax.with_sharding_constraint(x[:n], everywhere) for x, n in zip(_remembered(moved), lengths, strict=True)
+    ]
+    return eqx.tree_at(_dealt, moved, (*_dealt(state)[:3], *kept)), rest
+
+
+def at_home[Moving: eqx.Module](
+    run: Callable[..., tuple[Moving, Any]], devices: Devices | None, *arguments: Any
+) -> tuple[Moving, Any]:
+    """Call a compiled `divided` loop with values of this process and bring what it returns back to this process.
+
+    Neighbour lists are made on the host, by every process for itself and all alike.
+    """
+    if devices is None:
+        return run(None, *arguments)
+    given = jax.tree.map(np.asarray, arguments)
+    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), run(tuple(devices), *given))
+
+
+def _dealt(state: Any) -> tuple[jax.Array, ...]:
+    """What is dealt out, one row an edge or a particle."""
+    return (state.edges.key, state.edges.i, state.edges.j, *_remembered(state))
+
+
+def _remembered(state: Any) -> tuple[jax.Array, ...]:
+    edges, history = state.edges, state.wall_history
+    return edges.overlap_max, edges.slip, history.overlap_max, history.slip
+
+
+def _padded(state: Any, parts: int) -> Any:
+    """The state with as many edges, and rows of contacts with walls, as divide among the parts."""
+    edges, history = state.edges, state.wall_history
+    room, rows = (parts * math.ceil(n / parts) for n in (edges.capacity, history.slip.shape[0]))
+    spare = jax.tree.map(lambda x: jnp.pad(x, [(0, rows - len(x))] + [(0, 0)] * (x.ndim - 1)), history)
+    return eqx.tree_at(lambda s: (s.edges, s.wall_history), state, (widened(edges, room), spare))
+
+
+def _share_of_contacts(
+    packing: Packing,
+    _: Packing,
+    interaction: Interaction,
+    walls: Walls,
+    position: Vectors,
+    velocity: Vectors,
+    spin: Vectors,
+    edges: Edges,
+    history: WallHistory,
+    time_step: Scalar,
+) -> tuple[Forces, Edges, WallHistory]:
+    """`contact_forces` on one device of several, which holds a share of the edges and of the contacts with walls."""
+    motion = jax.lax.pcast((position, velocity, spin), AXIS, to="varying")
+    bodies = bodies_of(packing, *motion)
+    loads, edges = pair_loads(interaction, bodies, edges, time_step)
+    particles, rows = loads.shape[0], history.slip.shape[0]
+    own = jax.lax.axis_index(AXIS) * rows + jnp.arange(rows)
+    index = jnp.minimum(own, particles - 1)
+    # The last share may be short: a radius below zero touches nothing.
+    some = jax.tree.map(lambda x: x[index], bodies)
+    some = eqx.tree_at(lambda b: b.radius, some, jnp.where(own < particles, some.radius, -1.0))
+    at_walls, on_wall, history = wall_loads(interaction, walls, some, history, time_step)
+    loads = loads.at[index].add(at_walls)
+    loads = jax.lax.psum(jnp.concatenate([loads, jnp.pad(on_wall, ((0, 0), (0, 3)))]), AXIS)
+    forces = Forces(loads[:particles, :3], loads[:particles, 3:], loads[particles:, :3])
+    return forces, edges, history

@@ -1,0 +1,151 @@
+"""What a packing is at one moment: places, velocities, contacts with their history, walls; how it starts."""
+
+from __future__ import annotations
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
+
+from .._errors import InputError
+from .._types import Scalar
+from ._edges import Edges, carry_history, list_edges
+from ._forces import Packing, Vectors, WallHistory
+from ._neighbours import close_pairs
+from ._walls import Walls
+
+SPARE = 1.25
+"""Room in the list of edges beyond the pairs found when it was made."""
+
+
+class State(eqx.Module):
+    """Everything that moves or remembers. Saved and loaded whole (`save_state`), it goes on bit for bit.
+
+    Attributes:
+        position: centres [m].
+        velocity: of the centres [m/s].
+        spin: angular velocities [rad/s].
+        edges: pairs and their history.
+        wall_history: history of contacts with walls.
+        walls: the walls, where they are now.
+        listed_at: positions when the list of edges was made [m].
+        skin: extra distance up to which pairs were listed then [m].
+        time: [s].
+    """
+
+    position: Vectors
+    velocity: Vectors
+    spin: Vectors
+    edges: Edges
+    wall_history: WallHistory
+    walls: Walls
+    listed_at: Vectors
+    skin: Scalar
+    time: Scalar
+
+
+def start(packing: Packing, walls: Walls, position: Vectors, skin: float, capacity: int | None = None) -> State:
+    """A state at rest: virgin contacts, a fresh list of edges.
+
+    Args:
+        packing: the spheres.
+        walls: the walls.
+        position: centres [m].
+        skin: extra distance up to which pairs are listed [m], for example a fifth of a radius.
+        capacity: room for edges; a quarter more than there are pairs if None.
+
+    Raises:
+        InputError: if a position is not finite, a particle is outside the walls, a half contact resists nothing, or
+            the pairs do not fit the capacity.
+    """
+    check_packing(packing)
+    dtype = position.dtype
+    state = State(
+        position,
+        jnp.zeros_like(position),
+        jnp.zeros_like(position),
+        list_edges(np.zeros((0, 2), np.int64), len(position), 0, dtype),
+        WallHistory.virgin(len(position), len(walls), dtype),
+        walls,
+        position,
+        jnp.asarray(skin, dtype),
+        jnp.zeros((), dtype),
+    )
+    check_state(state)
+    return listed(packing, state, skin, capacity)
+
+
+def listed(packing: Packing, state: State, skin: float, capacity: int | None = None) -> State:
+    """The state with a fresh list of edges; contacts keep their history.
+
+    Args:
+        packing: the spheres.
+        state: any state, also one whose list is stale.
+        skin: as in `start`.
+        capacity: room for edges; if None that of the present list, or a quarter more than the pairs if they do not fit.
+
+    Raises:
+        InputError: as `close_pairs`, and if the pairs do not fit a capacity that was asked for.
+    """
+    pairs = close_pairs(np.asarray(state.position, float), np.asarray(packing.radius, float), skin)
+    room = state.edges.capacity if capacity is None else capacity
+    if capacity is None and len(pairs) > room:
+        room = 64 * math.ceil(SPARE * len(pairs) / 64 + 1)
+    fresh = list_edges(pairs, len(state.position), room, state.edges.overlap_max.dtype)
+    fresh.require_room()
+    if state.edges.capacity:
+        fresh = carry_history(state.edges, fresh)
+    reach = jnp.asarray(skin, state.skin.dtype)
+    return eqx.tree_at(lambda s: (s.edges, s.listed_at, s.skin), state, (fresh, state.position, reach))
+
+
+def check_packing(packing: Packing) -> None:
+    """Refuse half contacts that resist nothing.
+
+    Raises:
+        InputError: naming the first such particle.
+    """
+    valid = np.asarray(jax.vmap(lambda side: side.is_valid)(packing.sides))
+    valid = valid & np.asarray((packing.radius > 0) & (packing.mass > 0))
+    if not valid.all():
+        raise InputError(
+            f"particle {np.flatnonzero(~valid)[0]} has no positive radius, mass or stiffness, or a shape factor <= 0",
+            remedy="Check its coefficients and diameters.",
+        )
+
+
+def not_monotone(packing: Packing) -> Bool[np.ndarray, " particles"]:
+    """Which particles soften until their force falls; the split of their contacts is not unique. Draw them anew."""
+    return ~np.asarray(jax.vmap(lambda side: side.is_monotone)(packing.sides))
+
+
+def check_state(state: State) -> None:
+    """Refuse a state that has gone astray.
+
+    Raises:
+        InputError: if a position is not finite or a particle's centre is behind a wall; it names particle and wall.
+    """
+    lost, behind = (np.asarray(x) for x in _astray(state))
+    if lost.any():
+        raise InputError(
+            f"the position of particle {np.flatnonzero(lost)[0]} is not finite at {float(state.time):.6g} s",
+            remedy="A smaller time step, or look at how the packing was made.",
+        )
+    for w, wall in enumerate(state.walls):
+        if behind[w].any():
+            raise InputError(
+                f"particle {np.flatnonzero(behind[w])[0]} is outside wall {w} ({type(wall).__name__}) "
+                f"at {float(state.time):.6g} s",
+                remedy="Place particles inside; if it was pushed through, a smaller time step or a slower punch.",
+            )
+
+
+@jax.jit
+def _astray(state: State) -> tuple[Bool[Array, " particles"], Bool[Array, "walls particles"]]:
+    """Which particles are nowhere, and which are behind which wall."""
+    behind = [jax.vmap(wall.distance)(state.position) < 0 for wall in state.walls]
+    lost = ~jnp.all(jnp.isfinite(state.position), axis=1)
+    return lost, jnp.stack(behind) if behind else jnp.zeros((0, len(lost)), bool)

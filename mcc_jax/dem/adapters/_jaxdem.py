@@ -1,0 +1,107 @@
+"""The pair law as a force model of JaxDEM."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ..._errors import InputError
+from ..._numerics import shared
+from .._pair import largest_overlap, pair_energy, pair_force
+from .._side import HalfContact, sides_of
+
+
+def jaxdem_force_model(sides: HalfContact) -> Any:
+    """A JaxDEM force model (`jaxdem.ForceModel`) that remembers the largest overlap of every contact.
+
+    Use it with JaxDEM's `NeighborList` collider, the one that carries history and keeps the order of particles:
+    ``jaxdem.System.create(..., force_model=jaxdem_force_model(sides), collider_type="NeighborList", ...)``. Every
+    contact is computed from both sides, and both come to the same force. It exerts no torque. Units are those of the
+    half contacts: metres and newtons.
+
+    Written for the interface of JaxDEM in mid 2026 (`requires_history`, `init_history`, `force_and_history`). JaxDEM
+    is not on the package index: install it from its source.
+
+    Args:
+        sides: half contacts, one a particle in the order of the JaxDEM state, as `Packing.sides`.
+
+    Raises:
+        InputError: if JaxDEM is not installed; later, if a collider asks for a force without history.
+    """
+    try:
+        from jaxdem import ForceModel  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        raise InputError("JaxDEM is not installed", remedy="Install it from its source (cdelv/JaxDEM).") from None
+
+    @jax.tree_util.register_dataclass
+    @dataclasses.dataclass
+    class MccForce(ForceModel):
+        """Loading and unloading of micro-crystalline cellulose, one half contact a particle."""
+
+        sides: HalfContact | None = None
+
+        @property
+        def requires_history(self) -> bool:
+            """Unloading depends on the largest overlap."""
+            return True
+
+        def init_history(self, shape: tuple[int, ...]) -> Array:
+            """Virgin contacts."""
+            return jnp.zeros(shape, _require(self.sides).k1.dtype)
+
+        @staticmethod
+        def force_and_history(i: Any, j: Any, pos: Array, state: Any, system: Any, history: Array) -> tuple:
+            """Force on i from each j, no torque, and the largest overlaps after this one."""
+            overlap, away, pair = _geometry(i, j, pos, state, system)
+            push = _each(pair_force, *pair, history, overlap)
+            torque = jnp.zeros((*jnp.shape(overlap), *state.torque.shape[1:]), push.dtype)
+            return push[..., None] * away, torque, _each(largest_overlap, history, overlap)
+
+        @staticmethod
+        def force(i: Any, j: Any, pos: Array, state: Any, system: Any) -> tuple:
+            """Refused: without history there is no unloading."""
+            raise InputError(
+                "this collider of JaxDEM carries no history, and the law needs it",
+                remedy='Take `collider_type="NeighborList"`.',
+            )
+
+        @staticmethod
+        def energy(i: Any, j: Any, pos: Array, state: Any, system: Any) -> Array:
+            """Energy that a contact loaded for the first time gives back; JaxDEM hands over no history here."""
+            overlap, _, pair = _geometry(i, j, pos, state, system)
+            return _each(pair_energy, *pair, jnp.zeros_like(overlap), overlap).recoverable
+
+    return MccForce(sides=sides)
+
+
+def _geometry(
+    i: Any, j: Any, pos: Array, state: Any, system: Any
+) -> tuple[Array, Array, tuple[HalfContact, HalfContact]]:
+    """Overlaps, unit vectors from j to i, and the half contacts, those of the lower index first."""
+    i, j = jnp.broadcast_arrays(i, j)
+    between = system.domain.displacement(pos[i], pos[j], system)
+    square = jnp.sum(between * between, axis=-1)
+    apart = (i != j) & (square > 0)
+    distance = shared(jnp.sqrt(jnp.where(apart, square, 1.0)))
+    overlap = jnp.where(apart, state.rad[i] + state.rad[j] - distance, -1.0)
+    away = jnp.where(apart[..., None], between * shared(1 / distance)[..., None], 0.0)
+    sides = _require(system.force_model.sides)
+    return overlap, away, (sides_of(sides, jnp.minimum(i, j)), sides_of(sides, jnp.maximum(i, j)))
+
+
+def _each(law: Any, *arguments: Any) -> Any:
+    """The law for every contact of arrays of any shape, that of the last argument."""
+    for _ in range(arguments[-1].ndim):
+        law = jax.vmap(law)
+    return law(*arguments)
+
+
+def _require(sides: HalfContact | None) -> HalfContact:
+    """JaxDEM rebuilds force models by their fields, which must have defaults."""
+    if sides is None:
+        raise InputError("a force model without half contacts", remedy="Make it with `jaxdem_force_model(sides)`.")
+    return sides
