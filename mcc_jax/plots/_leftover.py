@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax
@@ -14,8 +15,8 @@ from ..calibrate.joint._linearised import linear_data
 from ..calibrate.joint._population import moments
 from ..discover import Discovery
 from ..discover._score import project
-from ..discover._system import Base, System, signals_of
-from ..effects import Mechanism
+from ..discover._system import Base, Candidate, System, build_system, signals_of
+from ..effects import Mechanism, Variant
 
 
 @dataclass(frozen=True)
@@ -44,17 +45,25 @@ class Leftover:
 
 
 def added_columns(found: Discovery) -> np.ndarray:
-    """Columns of the system that a discovery put into the law: those of its effects, or the words of its formula."""
-    if found.system is None:
+    """Columns of the system that a discovery put into the law: those of its effects, or the words of its formula.
+
+    An effect whose further numbers were fitted has moved away from its column; then it is the nearest one.
+    """
+    system = found.system
+    if system is None:
         return np.array([], int)
     index = []
     for effect in found.effects:
-        for k, candidate in enumerate(found.system.candidates):
-            if candidate.variant == effect.variant and dict(candidate.nuisance) == effect.nuisance:
-                index.append(found.system.column(k))
-                break
+        alike = [system.column(k) for k, c in enumerate(system.candidates) if c.variant == effect.variant]
+        index.append(min(alike, key=lambda column: _apart(_candidate(system, column).nuisance, effect.nuisance)))
     words = found.closure.words if found.closure is not None else []
     return np.array([*index, *words], int)
+
+
+def _apart(one: Mapping[str, float], other: Mapping[str, float]) -> float:
+    """Relative distance of two sets of further numbers; 0 only where they are equal."""
+    pairs = [(float(one[name]), float(value)) for name, value in other.items() if name in one]
+    return sum((abs(a - b) / (abs(a) + abs(b)) for a, b in pairs if a != b), 0.0)
 
 
 def leftover(found: Discovery) -> Leftover:
@@ -66,14 +75,12 @@ def leftover(found: Discovery) -> Leftover:
     base, system = found.base, found.system
     if base is None or system is None:
         raise ValueError("the base law was not fitted well enough; there is nothing to compare")
-    none = np.array([], int)
-    inside = added_columns(found)
-    before = project(system, none)
-    after = project(system, none, inside=inside)
-    signals = _signals(base, system, inside)
+    system, inside, changes = _as_found(base, system, found)
+    before = project(system, np.array([], int))
+    after = project(system, np.array([], int), inside=inside)
     count = len(system.globals)
-    one, white_one = _remain(base, before.theta[:count], jnp.zeros_like(signals))
-    two, white_two = _remain(base, after.theta[:count], signals * after.theta[count:][None, :, None])
+    one, white_one = _remain(base, before.theta[:count], jnp.zeros_like(changes))
+    two, white_two = _remain(base, after.theta[:count], changes * after.theta[count:][None, :, None])
     weight = np.asarray(base.fit.filters.weight)
     return Leftover(
         np.asarray(base.records.time),
@@ -88,32 +95,42 @@ def leftover(found: Discovery) -> Leftover:
     )
 
 
-def _signals(base: Base, system: System, columns: np.ndarray) -> jax.Array:
-    """Change of the residual per unit of some columns, shape (N, columns, points)."""
-    if not len(columns):
-        return jnp.zeros((len(system.points), 0, base.tests.force.shape[1]))
-    # Only what was added is computed again; the columns of features come after all candidates.
-    total = len(system.candidates)
-    listed = [int(c) - system.column(0) for c in columns]
-    chosen = [k for k in listed if k < total]
-    library = {
-        str(n): Mechanism(c.variant.mechanism, "", (c.variant,))
-        for n, c in enumerate(system.candidates[k] for k in dict.fromkeys(chosen))
-    }
-    signals = signals_of(base, library)
-    at = []
-    for k in listed:
-        if k >= total:
-            at.append(k - total + len(signals.candidates))
-            continue
-        wanted = system.candidates[k]
-        same = [
-            j
-            for j, c in enumerate(signals.candidates)
-            if c.variant == wanted.variant and dict(c.nuisance) == dict(wanted.nuisance)
-        ]
-        at.append(same[0])
-    return signals.of(np.array(at) + system.column(0))
+def _as_found(base: Base, system: System, found: Discovery) -> tuple[System, np.ndarray, jax.Array]:
+    """A linear system that holds what was added with the further numbers it was found with, and where.
+
+    Returns:
+        The system, the columns of the additions, and their change of the residual per unit, shape (N, columns, points).
+    """
+    inside = added_columns(found)
+    if not len(inside):
+        return system, inside, jnp.zeros((len(system.points), 0, base.tests.force.shape[1]))
+    formulas = [_fixed_at(effect.variant, effect.nuisance) for effect in found.effects]
+    signals = signals_of(base, {str(i): Mechanism(v.mechanism, "", (v,)) for i, v in enumerate(formulas)})
+    # Columns of features stand behind those of all candidates, so they move with the number of these.
+    moved = len(signals.candidates) - len(system.candidates)
+    columns = np.array([*(system.column(i) for i in range(len(formulas))), *(inside[len(formulas) :] + moved)], int)
+    if all(
+        _apart(_candidate(system, int(c)).nuisance, e.nuisance) == 0
+        for c, e in zip(inside, found.effects, strict=False)
+    ):
+        return system, inside, signals.of(columns)
+    return replace(build_system(base, signals), usable=system.usable), columns, signals.of(columns)
+
+
+def _candidate(system: System, column: int) -> Candidate:
+    return system.candidates[column - system.column(0)]
+
+
+def _fixed_at(variant: Variant, numbers: Mapping[str, float]) -> Variant:
+    """The formula with its further numbers where they were found, and nowhere else."""
+    fixed = [(n, float(numbers.get(n.name, n.middle))) for n in variant.nuisances]
+    return replace(
+        variant,
+        nuisances=tuple(
+            replace(n, grid=(value,), plausible=(min(n.plausible[0], value), max(n.plausible[1], value)))
+            for n, value in fixed
+        ),
+    )
 
 
 def _remain(base: Base, theta: np.ndarray, extra: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -80,6 +80,21 @@ def test_what_is_left_is_less_with_the_effect_and_the_same_without(found):
     assert np.sum(nothing.white_before**2) / nothing.used.sum() == pytest.approx(1.0, abs=0.15)
 
 
+def test_an_effect_whose_time_was_fitted_counts_with_that_time(found):
+    """What a refit moved off the grid is no column of the system; the residuals must not leave it out for that."""
+    frame = found["frame"]
+    variant = find_variant("creep")
+    name, middle = variant.nuisances[0].name, variant.nuisances[0].middle
+    numbers = {n.name: n.middle for n in variant.nuisances}
+    creep = dataclasses.replace(frame.effects[0], variant=variant, nuisance=numbers)
+    moved = dataclasses.replace(creep, nuisance=numbers | {name: middle * (1 + 1e-9)})
+    on, off = (leftover(dataclasses.replace(frame, effects=(effect,))) for effect in (creep, moved))
+    assert np.abs(on.after - on.before).max() > 0.01
+    np.testing.assert_allclose(off.after, on.after, atol=1e-6)
+    far = dataclasses.replace(creep, nuisance=numbers | {name: 2.7 * middle})
+    assert np.abs(leftover(dataclasses.replace(frame, effects=(far,))).after - on.after).max() > 1e-4
+
+
 def test_map_has_every_kind_of_segment(found):
     values = where_map(found["frame"])
     assert set(values) == {"loading", "hold", "unloading", "reloading"}

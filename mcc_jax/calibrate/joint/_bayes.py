@@ -300,7 +300,9 @@ def calibrate_bayes(
         threshold_MPa: points below this stress on loading do not count [MPa].
         mode: "fast" integrates the particles out through quadratic summaries of their tests and corrects by exact
             importance weights; "joint" samples everything at once under the exact likelihood, the reference.
-        chains, warmup, draws: of the sampler, per chain.
+        chains: how many of the sampler run side by side.
+        warmup: steps of each that tune the sampler and are thrown away.
+        draws: of each that are kept.
         seed: random seed.
         progress: called with the name of each step.
 

@@ -1,0 +1,32 @@
+"""Docstrings write formulae in the way of Sphinx; Markdown wants them between dollars."""
+
+import re
+import textwrap
+
+import griffe
+
+_BLOCK = re.compile(r"^(?P<indent>[ ]*)\.\. math::[ ]*(?P<first>.*)\n(?P<rest>(?:(?P=indent)[ ]+\S.*\n|[ ]*\n)*)", re.M)
+_INLINE = re.compile(r":math:`([^`]+)`")
+_LITERAL = re.compile(r"(?<=\w)::$", re.M)
+
+
+def in_markdown(text: str) -> str:
+    """A docstring with its formulae between dollars, each block a paragraph."""
+
+    def block(match):
+        indent = match["indent"]
+        lines = textwrap.dedent(match["rest"]).strip()
+        formula = " ".join(f"{match['first']} {lines}".split())
+        return f"\n{indent}$$\n{indent}{formula}\n{indent}$$\n\n"
+
+    text = _BLOCK.sub(block, text + "\n")
+    return _LITERAL.sub(":", _INLINE.sub(lambda m: f"${' '.join(m[1].split())}$", text)).rstrip()
+
+
+class Formulae(griffe.Extension):
+    """Rewrites every docstring before it is parsed."""
+
+    def on_object(self, *, obj, **_):
+        """Called for every module, class, function and attribute."""
+        if obj.docstring:
+            obj.docstring.value = in_markdown(obj.docstring.value)

@@ -1,0 +1,60 @@
+"""What the build of the pages adds to MkDocs: lists of public names, formulae as MathML, and a look at the result."""
+
+import ast
+import html
+import logging
+import re
+from pathlib import Path
+
+from latex2mathml.converter import convert
+
+PACKAGE = Path(__file__).parents[1] / "mcc_jax"
+LOG = logging.getLogger("mkdocs.hooks.mcc_jax")
+_ELSEWHERE = re.compile(
+    r'<(?:script|img|iframe|source)\b[^>]*\bsrc="(?:https?:)?//|<link\b[^>]*\bhref="(?:https?:)?//', re.I
+)
+_LEFT_OVER = re.compile(r'class="arithmatex"|:math:|\.\. math::|^!(?:api|names) ', re.M)
+_API = re.compile(r"^!api (\S+)$", re.M)
+_NAMES = re.compile(r"^!names (\S+)$", re.M)
+_FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.S)
+
+
+def public_names(module: str) -> list[tuple[str, str]]:
+    """Every name that a module exports, in the order of the text, and the part of the module it is from."""
+    folder = PACKAGE.joinpath(*module.split(".")[1:])
+    file = next(f for f in (folder / "__init__.pyi", folder / "__init__.py", folder.with_suffix(".py")) if f.exists())
+    body = ast.parse(file.read_text(encoding="utf-8")).body
+    return [(a.name, str(n.module)) for n in body if isinstance(n, ast.ImportFrom) for a in n.names]
+
+
+def on_page_markdown(markdown, **_):
+    """`!api mcc_jax.law` stands for an entry for each name of the module, `!names mcc_jax` for links to them."""
+
+    def entries(match):
+        return "\n\n".join(f"::: {match[1]}.{name}" for name, _ in public_names(match[1]))
+
+    def links(match):
+        homes = {
+            name: match[1] if part.startswith("_") else f"{match[1]}.{part}" for name, part in public_names(match[1])
+        }
+        return "\n".join(f"- [`{name}`][{home}.{name}]" for name, home in sorted(homes.items(), key=lambda i: i[1]))
+
+    return _NAMES.sub(links, _API.sub(entries, markdown))
+
+
+def on_page_content(content, **_):
+    """MathML instead of TeX: browsers draw it themselves, so that no page needs a script for its formulae."""
+
+    def mathml(match):
+        display = "block" if match[2] == "[" else "inline"
+        return convert(html.unescape(match[3]), display=display)
+
+    return _FORMULA.sub(mathml, content)
+
+
+def on_post_page(output, page, **_):
+    """Warn, which fails a strict build, if a page loads something from elsewhere or a formula or list was not made."""
+    for what, pattern in (("loads from elsewhere", _ELSEWHERE), ("was not turned into HTML", _LEFT_OVER)):
+        if found := pattern.search(output):
+            LOG.warning("%s: %r %s", page.file.src_uri, found[0], what)
+    return output

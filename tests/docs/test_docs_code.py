@@ -1,0 +1,126 @@
+"""Every page of the documentation does what it shows: files are written, Python runs, commands run, in their order."""
+
+import re
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from mcc_jax.cli._main import cli
+
+PAGES = Path(__file__).parents[2] / ".docs" / "pages"
+EXPENSIVE = re.compile(r"\A---\n(?:.*\n)*?expensive: true\n(?:.*\n)*?---\n")
+FENCE = re.compile(r'^```(\w+)(?: title="([^"]+)")?\n(.*?)^```$', re.M | re.S)
+COMMAND = re.compile(r"(?:\w+=\S+ )*(?:uv run )?mcc-jax (.*)")
+ALL = {str(page.relative_to(PAGES)): page.read_text(encoding="utf-8") for page in sorted(PAGES.rglob("*.md"))}
+# Languages: files where a title names one; `sh` is run, `console` speaks of the reader's files and is only parsed.
+KNOWN = {"python", "sh", "console", "toml", "csv", "text", "c"}
+
+
+@dataclass(frozen=True)
+class Block:
+    language: str
+    title: str
+    text: str
+
+    @property
+    def commands(self):
+        """Each line that calls mcc-jax, as its arguments."""
+        found = [COMMAND.match(line) for line in self.text.splitlines()]
+        return [shlex.split(match[1], comments=True) for match in found if match]
+
+
+def blocks(text):
+    return [Block(*match.groups(default="")) for match in FENCE.finditer(text)]
+
+
+def runnable(page):
+    marks = [pytest.mark.notebook] if EXPENSIVE.match(ALL[page]) else []
+    return pytest.param(page, marks=marks, id=page)
+
+
+def write(block, folder):
+    name = Path(block.title)
+    assert not name.is_absolute()
+    (folder / name).write_text(block.text, encoding="utf-8")
+
+
+def run_command(arguments):
+    result = CliRunner().invoke(cli, arguments)
+    assert result.exit_code == 0, f"mcc-jax {shlex.join(arguments)}\n{result.output}\n{result.exception!r}"
+
+
+RUN = [page for page, text in ALL.items() if any(b.language in ("python", "sh") for b in blocks(text))]
+
+
+@pytest.mark.parametrize("page", [runnable(page) for page in RUN])
+@pytest.mark.filterwarnings("default")
+def test_page_does_what_it_shows(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = {"__name__": "page"}
+    for number, block in enumerate(blocks(ALL[page]), start=1):
+        if block.language == "python":
+            exec(compile(block.text, f"{page}, block {number}", "exec"), names)
+        elif block.language == "sh":
+            for arguments in block.commands:
+                run_command(arguments)
+        elif block.title:
+            write(block, tmp_path)
+
+
+def parse(arguments):
+    """The command's own parser, without running anything: options that do not exist and bad choices raise."""
+    command = cli.commands[arguments[0]]
+    context = click.Context(command, info_name=arguments[0])
+    options, rest, _ = command.make_parser(context).parse_args(list(arguments[1:]))
+    wanted = [p for p in command.params if isinstance(p, click.Argument)]
+    given = len([p for p in wanted if isinstance(options.get(p.name), str)])
+    if rest or given != len(wanted):
+        raise click.UsageError(f"{len(wanted)} arguments are expected")
+    for parameter in command.params:
+        value = options.get(parameter.name)
+        if parameter.required and value is None:
+            raise click.UsageError(f"{parameter.name} is missing")
+        if value is not None and isinstance(parameter.type, click.Choice | click.types.IntParamType):
+            parameter.type_cast_value(context, value)
+
+
+COMMANDS = [(page, c) for page, text in ALL.items() for b in blocks(text) for c in b.commands]
+
+
+@pytest.mark.parametrize(("page", "arguments"), COMMANDS, ids=lambda x: x if isinstance(x, str) else x[0])
+def test_command_parses(page, arguments):
+    parse(arguments)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    ["calibrate tests --out a --no-such-option", "calibrate tests", "report", "calibrate a b --out c",
+     "calibrate tests --out a --method best", "calibrate tests --out a --draws many"],
+)  # fmt: skip
+def test_the_check_of_commands_finds_mistakes(wrong):
+    with pytest.raises(click.UsageError):
+        parse(shlex.split(wrong))
+
+
+@pytest.mark.parametrize("page", list(ALL))
+def test_every_block_is_of_a_language_that_is_checked(page):
+    languages = {b.language for b in blocks(ALL[page])}
+    assert languages <= KNOWN, languages - KNOWN
+    assert len(re.findall(r"^ *```", ALL[page], flags=re.M)) == 2 * len(blocks(ALL[page])), "a block is not closed"
+
+
+@pytest.mark.parametrize("page", list(ALL))
+def test_pages_load_nothing_from_elsewhere(page):
+    assert not re.search(r"!\[[^\]]*\]\(https?:|<(?:script|link|img|iframe)\b", ALL[page])
+
+
+def test_every_public_module_has_its_page():
+    import mcc_jax
+
+    documented = set(re.findall(r"mcc_jax\.([a-z]+)", mcc_jax.__doc__))
+    shown = {match for text in ALL.values() for match in re.findall(r"^!api mcc_jax\.([a-z]+)$", text, flags=re.M)}
+    assert documented <= shown, documented - shown
