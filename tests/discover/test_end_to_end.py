@@ -115,6 +115,7 @@ def test_nothing_hidden_nothing_found(seed):
     assert "agree" in told["summary"]
 
 
+@pytest.mark.long
 def test_an_excluded_name_is_not_named():
     told = content(discover(cached(f"frame_compliance={COMPLIANCE}"), exclude=("frame_compliance",), **QUICK))
     assert told["verdict"] != "NO_GAP"
@@ -128,6 +129,7 @@ def test_an_unknown_name_to_exclude_is_an_error():
         discover(campaign(), exclude=("wobble",))
 
 
+@pytest.mark.long
 def test_one_loading_and_unloading_cannot_show_what_needs_more():
     told = content(discover(campaign(seed=1, programme=SINGLE), **QUICK))
     needs = {one["mechanism"]: one["needs"] for one in told["untestable"]}

@@ -48,6 +48,7 @@ def test_one_particle():
     assert nothing["verdict"] == "NO_GAP"
 
 
+@pytest.mark.long
 def test_an_effect_in_three_particles_only():
     told = answer(mixed(cached(), cached("frame_compliance=0.004"), {0, 3, 6}), library=FEW, confirm=True)
     assert told["verdict"] != "FIT_NOT_CONVERGED"
@@ -80,6 +81,7 @@ def test_curves_that_are_nothing_but_noise():
     assert told["verdict"] != "NO_GAP"
 
 
+@pytest.mark.long
 def test_loading_only():
     def rise(c):
         top = int(np.argmax(c.force_mN)) + 1
