@@ -75,7 +75,16 @@ def test_broken_pipe_is_quiet():
         assert process.stderr.read() == b""
 
 
+@pytest.fixture
+def interruptible():
+    """A process begun in the background inherits that interrupts are ignored, and so would what the tests start."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @posix
+@pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)])
 def test_killed_in_the_middle(tmp_path, number, status):
     out = tmp_path / "out"

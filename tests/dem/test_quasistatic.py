@@ -240,6 +240,7 @@ def test_bands_agree_for_small_scatter(pressed):
     assert np.all(np.diff(first.quantiles, axis=0) > 0)
 
 
+@pytest.mark.long
 def test_fit_recovers_the_mean_C1_and_modulus(pressed):
     _, state, heights, _, rows, _ = pressed
     fit = fit_compaction(packing_of, np.array([0.05, -0.1]), state, heights, rows.top, solver=SOLVER)

@@ -10,7 +10,7 @@ from benchmarks.blind.generator import campaigns
 
 CASES = {case.id: case for case in smoke.cases()}
 FEW = (
-    "T0-clean-1",
+    pytest.param("T0-clean-1", marks=pytest.mark.long),
     pytest.param("T1-reverse_plasticity.exact-20-P1-0", marks=pytest.mark.long),
     pytest.param("T4-mid_unloading_bump.unlisted-20-P1-1", marks=pytest.mark.long),
 )

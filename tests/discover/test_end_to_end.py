@@ -164,6 +164,7 @@ def reloading(curve):
 KINDS = [pytest.param(kind, marks=() if i == 0 else pytest.mark.long) for i, kind in enumerate(WRONG)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_effect_is_ever_named_with_an_impossible_sign(kind):
     mechanism, change = WRONG[kind]

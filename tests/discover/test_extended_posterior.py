@@ -74,6 +74,7 @@ def test_it_agrees_with_the_fit_it_started_from(extended, posterior):
     assert 0.5 < amplitude.std() / spread < 2
 
 
+@pytest.mark.long
 def test_the_same_seed_gives_the_same_draws_and_few_draws_are_told(extended, posterior):
     again = extended_posterior(*extended)
     np.testing.assert_array_equal(again.population.theta, posterior.population.theta)

@@ -39,6 +39,7 @@ def with_curves(whole, change):
     return Campaign(whole.particles, whole.diameters_um, curves, whole.columns, whole.metadata)
 
 
+@pytest.mark.long
 def test_one_particle():
     hidden = subset(cached("frame_compliance=0.004"), [0])
     told = answer(hidden, library=FEW, confirm=True, experiments=True)
@@ -56,6 +57,7 @@ def test_an_effect_in_three_particles_only():
         assert {name for place in told["where"][:1] for name in place["particles"]} & {"1", "4", "7"}
 
 
+@pytest.mark.long
 def test_two_effects_that_cancel():
     """Compliance and reverse plasticity pull in opposite directions: what is left is small, not to be misnamed."""
     told = answer(campaign("frame_compliance=0.0004", "reverse_plasticity=0.001", seed=1))

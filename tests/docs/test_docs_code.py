@@ -38,7 +38,7 @@ def blocks(text):
 
 
 def runnable(page):
-    marks = [pytest.mark.notebook if "tutorial" in page else pytest.mark.long] if EXPENSIVE.match(ALL[page]) else []
+    marks = [pytest.mark.long] if EXPENSIVE.match(ALL[page]) else []
     return pytest.param(page, marks=marks, id=page)
 
 

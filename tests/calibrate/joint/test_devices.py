@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import numpy as np
+import pytest
 
 SCRIPT = """
 import json
@@ -30,6 +31,7 @@ def run(devices):
     return json.loads(done.stdout.splitlines()[-1])
 
 
+@pytest.mark.long
 def test_two_devices_give_the_numbers_of_one():
     one, two, three = run(1), run(2), run(3)
     # Four particles do not divide among three devices: then one does it all.

@@ -192,6 +192,7 @@ def test_one_particle_alone(method):
         assert content["a"]["sd"] > 0.5  # the prior's is 1
 
 
+@pytest.mark.long
 @few
 def test_two_particles_of_one_shape(method):
     C, diameters = COEFFICIENTS[:2], np.array([[150.0, 160.0, 120.0], [180.0, 192.0, 144.0]])

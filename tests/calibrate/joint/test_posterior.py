@@ -307,6 +307,7 @@ def test_the_joint_mode_says_nothing_of_weights(both):
     assert json.dumps(joint.to_json(), allow_nan=False)
 
 
+@pytest.mark.long
 def test_too_few_draws_are_not_called_converged():
     short = calibrate_bayes(paper_campaign(0), draws=20, warmup=20)
     assert not short.converged
