@@ -50,7 +50,6 @@ from ._sensitivity import STRESSES as STRESSES
 from ._sensitivity import Sensitivity as Sensitivity
 from ._sensitivity import punch_sensitivity as punch_sensitivity
 from ._sensitivity import rescaled as rescaled
-from ._side import TESTED_STRAIN as TESTED_STRAIN
 from ._side import HalfContact as HalfContact
 from ._side import half_contact as half_contact
 from ._side import sides_of as sides_of

@@ -11,10 +11,7 @@ from jaxtyping import Array, Float, Int
 from .._numerics import shared
 from .._types import Flag, Scalar
 from ..geometry import Particle
-from ..law import MccLaw, Unloading
-
-TESTED_STRAIN = 0.67
-"""Scaled strain eta_p eps at which the paper's tests ended, on its mean curve (peaks of 7 to 16 MPa)."""
+from ..law import TESTED_STRAIN, MccLaw
 
 Normal = Float[Array, " 3"]
 
@@ -101,7 +98,7 @@ def _side(law: MccLaw, eta: Scalar, radius: Scalar) -> HalfContact:
     area = jnp.pi * radius * radius
     scale = shared(eta / radius)
     K1, K3, K5 = (1e6 * K for K in law.plastic.polynomial)  # Pa
-    power = 1 if law.unloading is Unloading.PRINTED else 2
+    power = law.unloading.stress_power
     stiffness = law.unloading.constant * eta**law.strain_scaling.power * (1e6 * law.effective_modulus * area) ** power
     return HalfContact(
         k1=K1 * area * scale,

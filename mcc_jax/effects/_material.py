@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from .._types import Scalar, Values, scalar
 from ..geometry import Particle
-from ..law import MccLaw, Plastic, Unloading
+from ..law import MccLaw, Plastic
 from ._context import Context, positive
 from ._effect import AbstractEffect, at_least
 from ._record import REFERENCE_HUMIDITY_PERCENT, Record
@@ -128,7 +128,7 @@ class AbstractShape(AbstractEffect):
     def modify(self, law: MccLaw, particle: Particle, record: Record) -> MccLaw:
         """Coefficients and modulus with the factor."""
         g = at_least(self.factor(particle), LEAST_FACTOR)
-        power = law.strain_scaling.power * (1.0 if law.unloading is Unloading.PRINTED else 0.5)
+        power = law.strain_scaling.power / law.unloading.stress_power
         plastic = Plastic(law.plastic.C1 * g, law.plastic.C3 * g, law.plastic.C5 * g)
         return MccLaw(plastic, law.a, law.effective_modulus * g**power, law.unloading, law.strain_scaling)
 

@@ -7,7 +7,6 @@ from ._golden import golden_pair_table as golden_pair_table
 from ._golden import golden_table as golden_table
 from ._jax_artefact import Artefact as Artefact
 from ._jax_artefact import jax_artefact as jax_artefact
-from ._origin import STRAIN_MAX as STRAIN_MAX
 from ._origin import Origin as Origin
 from ._pair import pair_force as pair_force
 from ._recipes import lammps_recipe as lammps_recipe

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from .._version import own_version
 from ..geometry import Particle
-from ..law import MccLaw, StrainScaling, Unloading
-from ._origin import STRAIN_MAX, Origin, check, numbers, version
+from ..law import TESTED_STRAIN, MccLaw, StrainScaling, Unloading
+from ._origin import Origin, check, numbers
 from ._templates import quoted, render
 
 
@@ -29,14 +30,14 @@ def c_header(law: MccLaw, particle: Particle | None = None, *, origin: Origin | 
     values = numbers(law)
     return render(
         "mcc_law.h.j2",
-        version=version(),
+        version=own_version(),
         origin=origin_lines(law, particle, origin),
-        strain_max=STRAIN_MAX,
+        strain_max=TESTED_STRAIN,
         forms=[
             {
                 "name": form.name,
                 "constant": repr(form.constant),
-                "power": 1 if form is Unloading.PRINTED else 2,
+                "power": form.stress_power,
             }
             for form in Unloading
         ],

@@ -6,9 +6,10 @@ import hashlib
 import json
 from typing import Any
 
+from .._version import own_version
 from ..geometry import Particle
-from ..law import MccLaw, Unloading
-from ._origin import STRAIN_MAX, Origin, numbers, version
+from ..law import TESTED_STRAIN, MccLaw
+from ._origin import Origin, numbers
 
 UNITS = {"C1": "1", "C3": "1", "C5": "1", "a": "1", "effective_modulus_MPa": "MPa"}
 FORMULAE = {
@@ -50,7 +51,7 @@ def card(law: MccLaw, particle: Particle | None = None, *, origin: Origin | None
         "unloading": law.unloading.value,
         "strain_scaling": law.strain_scaling.value,
         "k": law.unloading.constant,
-        "n": stress_power(law),
+        "n": law.unloading.stress_power,
         "p": law.strain_scaling.power,
     }
     unknown = {"sd": None, "interval_95": None}
@@ -71,16 +72,16 @@ def card(law: MccLaw, particle: Particle | None = None, *, origin: Origin | None
         "is_monotone": bool(law.is_monotone),
         "particle": None if particle is None else _geometry(law, particle, origin),
         "validity": {
-            "scaled_strain_max": STRAIN_MAX,
-            "stress_there_MPa": STRAIN_MAX * (K1 - STRAIN_MAX**2 * (K3 - STRAIN_MAX**2 * K5)),
-            "words": f"single particles between platens, along D3, eta_p eps up to {STRAIN_MAX}; rate independent, "
+            "scaled_strain_max": TESTED_STRAIN,
+            "stress_there_MPa": TESTED_STRAIN * (K1 - TESTED_STRAIN**2 * (K3 - TESTED_STRAIN**2 * K5)),
+            "words": f"single particles between platens, along D3, eta_p eps up to {TESTED_STRAIN}; rate independent, "
             "no adhesion, no friction; contacts of one particle do not know of each other",
         },
         "formulae": FORMULAE,
         "units": {"stress": "MPa", "length": "um", "force": "mN"},
         "provenance": {
             "software": "mcc_jax",
-            "version": version(),
+            "version": own_version(),
             "calibration": None if origin.calibration is None else dict(origin.calibration),
             "reference": "Bommireddy, Agarwal, Yettella, Tomar, Gonzalez (2018), arXiv:1812.06173",
         },
@@ -94,11 +95,6 @@ def checksum(content: Any) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
-def stress_power(law: MccLaw) -> int:
-    """The power n of stress over modulus in the recovered strain squared."""
-    return 1 if law.unloading is Unloading.PRINTED else 2
-
-
 def _geometry(law: MccLaw, particle: Particle, origin: Origin) -> dict[str, Any]:
     return {
         "D1_um": float(particle.D1),
@@ -107,6 +103,6 @@ def _geometry(law: MccLaw, particle: Particle, origin: Origin) -> dict[str, Any]
         "effective_diameter_um": float(particle.effective_diameter),
         "effective_area_um2": float(particle.effective_area),
         "eta_p": float(law.shape_factor(particle)),
-        "displacement_valid_um": STRAIN_MAX * float(particle.effective_diameter / law.shape_factor(particle)),
+        "displacement_valid_um": TESTED_STRAIN * float(particle.effective_diameter / law.shape_factor(particle)),
         "from": origin.geometry,
     }

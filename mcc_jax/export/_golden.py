@@ -12,8 +12,7 @@ import numpy as np
 
 from .._types import Values
 from ..geometry import Particle
-from ..law import MccLaw
-from ._origin import STRAIN_MAX
+from ..law import TESTED_STRAIN, MccLaw
 from ._pair import pair_force
 from ._respond import respond
 
@@ -57,7 +56,7 @@ def golden_table(law: MccLaw, particle: Particle, *, seed: int = 0, units: Liter
         A pandas table with a column `path`, 0 for the first, and displacement, largest displacement so far, force and
         tangent, the unit in the column's name. Every path starts from a virgin particle.
     """
-    scale = STRAIN_MAX * float(particle.effective_diameter / law.shape_factor(particle))
+    scale = TESTED_STRAIN * float(particle.effective_diameter / law.shape_factor(particle))
 
     def recovered(peak: np.ndarray) -> np.ndarray:
         return np.asarray(_recovered(law, particle, jnp.asarray(peak)))
@@ -86,7 +85,7 @@ def golden_pair_table(
     tables = []
     for partner, other in (("equal", particle), ("smaller", smaller), ("wall", None)):
         sides = [particle] if other is None else [particle, other]
-        valid = [STRAIN_MAX * float(p.effective_diameter / law.shape_factor(p)) / 2 for p in sides]
+        valid = [TESTED_STRAIN * float(p.effective_diameter / law.shape_factor(p)) / 2 for p in sides]
         scale = len(valid) * min(valid)
 
         def recovered(peak: np.ndarray, other: Particle | None = other) -> np.ndarray:

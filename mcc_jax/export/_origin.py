@@ -4,16 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import PackageNotFoundError
-from importlib.metadata import version as installed_version
 from typing import Any
 
 from .._errors import InputError
 from ..geometry import Particle
 from ..law import MccLaw
-
-STRAIN_MAX = 0.67
-"""Largest scaled strain eta_p eps of the paper's tests: 16 MPa on its mean curve."""
 
 
 @dataclass(frozen=True)
@@ -35,14 +30,6 @@ class Origin:
     particle: str | None = None
     geometry: str = "given"
     warnings: tuple[str, ...] = ()
-
-
-def version() -> str:
-    """Version of this library."""
-    try:
-        return installed_version("mcc-jax")
-    except PackageNotFoundError:
-        return "(not installed)"
 
 
 def numbers(law: MccLaw) -> dict[str, float]:

@@ -6,7 +6,6 @@ import numpy as np
 
 from ..geometry import Particle
 from ..law import MccLaw
-from ._card import stress_power
 
 Numbers = np.ndarray | float
 HALVINGS = 1100  # down to the smallest floating-point number
@@ -21,7 +20,7 @@ class _Half:
         self.area = 1e-3 * float(particle.effective_area)
         self.K = [float(K) for K in law.plastic.polynomial]
         self.modulus = float(law.effective_modulus)
-        self.k, self.n, self.p = law.unloading.constant, stress_power(law), law.strain_scaling.power
+        self.k, self.n, self.p = law.unloading.constant, law.unloading.stress_power, law.strain_scaling.power
 
     def stress(self, d: np.ndarray) -> np.ndarray:
         x = 2 * self.eta * d / self.diameter

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from .._version import own_version
 from ..geometry import Particle
 from ..law import MccLaw
 from ._c_header import origin_lines
-from ._origin import Origin, check, numbers, version
+from ._origin import Origin, check, numbers
 from ._templates import render
 
 
@@ -36,7 +37,7 @@ def _recipe(name: str, law: MccLaw, particle: Particle, origin: Origin) -> str:
     values = numbers(law)
     return render(
         name,
-        version=version(),
+        version=own_version(),
         origin=[f"- {line}" for line in origin_lines(law, particle, origin)],
         modulus=repr(values["effective_modulus_MPa"] * 1e6),
         **{key: repr(values[key]) for key in ("C1", "C3", "C5", "a")},

@@ -10,9 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._errors import InputError
-from ..law import MccLaw, stress_ratio
-from ._card import stress_power
-from ._origin import STRAIN_MAX
+from ..law import TESTED_STRAIN, MccLaw, stress_ratio
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -41,7 +39,7 @@ class CurveTables:
     error: float
 
 
-def curve_tables(law: MccLaw, *, strain_max: float = STRAIN_MAX, tolerance: float = 1e-5) -> CurveTables:
+def curve_tables(law: MccLaw, *, strain_max: float = TESTED_STRAIN, tolerance: float = 1e-5) -> CurveTables:
     """Tables of the master curves of a law; sizes and shapes come in through the scaled strain.
 
     Args:
@@ -62,7 +60,7 @@ def curve_tables(law: MccLaw, *, strain_max: float = STRAIN_MAX, tolerance: floa
 def _loading(law: MccLaw, x: np.ndarray) -> dict[str, np.ndarray]:
     K1, K3, K5 = (float(K) for K in law.plastic.polynomial)
     secant = np.maximum(K1 - x**2 * (K3 - x**2 * K5), 0.0)
-    n, k, modulus = stress_power(law), law.unloading.constant, float(law.effective_modulus)
+    n, k, modulus = law.unloading.stress_power, law.unloading.constant, float(law.effective_modulus)
     return {
         "scaled_strain": x,
         "stress_MPa": x * secant,

@@ -3,6 +3,7 @@
 from ._base import AbstractContactLaw as AbstractContactLaw
 from ._loading_inverse import loading_strain as loading_strain
 from ._loading_inverse import tangent_modulus as tangent_modulus
+from ._mcc import TESTED_STRAIN as TESTED_STRAIN
 from ._mcc import Energy as Energy
 from ._mcc import History as History
 from ._mcc import MccLaw as MccLaw

@@ -18,6 +18,8 @@ from ._recovery import energy_ratio, recovery, stress_ratio
 from ._unloading import StrainScaling, Unloading
 
 AnyShape = Float[Array, "..."]
+TESTED_STRAIN = 0.67
+"""Scaled strain eta_p eps at which the paper's tests ended, on its mean curve (peaks of 7 to 16 MPa)."""
 
 
 class History(eqx.Module):
@@ -191,7 +193,7 @@ class MccLaw(AbstractContactLaw[History]):
         scale = shared(eta / diameter)
         square = scale * scale
         K1, K3, K5 = (K * (scale * area) for K in self.plastic.polynomial)
-        power = 1 if self.unloading is Unloading.PRINTED else 2
+        power = self.unloading.stress_power
         stiffness = self.unloading.constant * eta**self.strain_scaling.power * (self.effective_modulus * area) ** power
         compliance = shared(diameter * diameter * diameter / stiffness)
         return branch_force(power, K1, K3 * square, K5 * (square * square), compliance, peak, peak - displacement)

@@ -43,6 +43,11 @@ class Unloading(enum.Enum):
         }
         return constants[self]
 
+    @property
+    def stress_power(self) -> int:
+        r"""The power n of :math:`\sigma_P/\bar E` in :math:`\delta^2`: 1 as printed, 2 in the punch forms."""
+        return 1 if self is Unloading.PRINTED else 2
+
 
 class StrainScaling(enum.Enum):
     r"""How the shape factor enters unloading, as its power p in the arcsine law's argument.

@@ -69,7 +69,7 @@ class JointModel:
     @property
     def shape_power(self) -> float:
         """Power of the shape factor in e: the scaling's, or half of it in the forms that square the modulus."""
-        return self.strain_scaling.power / (1 if self.unloading is Unloading.PRINTED else 2)
+        return self.strain_scaling.power / self.unloading.stress_power
 
     @property
     def beliefs(self) -> Priors:
