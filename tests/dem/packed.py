@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from mcc_jax import paper_law
-from mcc_jax.dem import Interaction, Motion, die, scattered, spheres, stable_time_step, start
+from mcc_jax.dem import Interaction, Motion, contact_forces, die, scattered, spheres, stable_time_step, start
 
 DIE_RADIUS = 2.2e-4
 SKIN = 2e-5
@@ -51,3 +51,21 @@ def resolved():
 def motion(friction=0.3, damping=0.1, share=1.0, **further):
     interaction = Interaction(damping=damping, friction=friction, wall_friction=friction)
     return Motion.of(share * resolved(), interaction, **further)
+
+
+FORCES = jax.jit(contact_forces)
+
+
+def forces_of(pack, move, state, edges=None, time_step=None):
+    """Forces of a state's contacts, on other edges or over another time step if given, and what they remember."""
+    return FORCES(
+        pack,
+        move.interaction,
+        state.walls,
+        state.position,
+        state.velocity,
+        state.spin,
+        state.edges if edges is None else edges,
+        state.wall_history,
+        move.time_step if time_step is None else time_step,
+    )

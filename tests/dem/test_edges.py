@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from packed import PRESSING, SKIN, dense, loose, motion, packing
+from packed import PRESSING, SKIN, dense, forces_of, loose, motion, packing
 
 from mcc_jax import InputError
 from mcc_jax.dem import (
@@ -16,7 +16,6 @@ from mcc_jax.dem import (
     advance,
     carry_history,
     close_pairs,
-    contact_forces,
     list_edges,
     listed,
     load_state,
@@ -25,7 +24,6 @@ from mcc_jax.dem import (
 )
 
 PARTICLES = 30
-FORCES = jax.jit(contact_forces)
 
 
 def with_history(edges, seed=0):
@@ -136,21 +134,6 @@ def unloading():
     return advance(packing(), motion(), state, -PRESSING, 1, 30, SKIN)[0]
 
 
-def forces_of(state, edges):
-    pack, move = packing(), motion()
-    return FORCES(
-        pack,
-        move.interaction,
-        state.walls,
-        state.position,
-        state.velocity,
-        state.spin,
-        edges,
-        state.wall_history,
-        move.time_step,
-    )
-
-
 def test_a_new_list_in_the_middle_of_unloading_changes_nothing():
     """T5: rebuilt, permuted and with more room; history bitwise, forces of edges and sums over particles."""
     state = unloading()
@@ -160,8 +143,8 @@ def test_a_new_list_in_the_middle_of_unloading_changes_nothing():
     kept = {p: v for p, v in remembered(state.edges).items() if p in remembered(other)}
     assert kept
     assert {p: remembered(other)[p] for p in kept} == kept
-    forces, edges, _ = forces_of(state, state.edges)
-    again, edges_again, _ = forces_of(state, other)
+    forces, edges, _ = forces_of(packing(), motion(), state)
+    again, edges_again, _ = forces_of(packing(), motion(), state, other)
     size = np.max(np.abs(forces.force))
     assert np.max(np.abs(again.force - forces.force)) <= 1e-13 * size
     np.testing.assert_allclose(again.on_wall, forces.on_wall, atol=1e-13 * np.max(np.abs(forces.on_wall)))

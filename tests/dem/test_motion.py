@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from packed import CAPACITY, DIE_RADIUS, PRESSING, SKIN, dense, loose, motion, packing, squeezed
+from packed import CAPACITY, DIE_RADIUS, PRESSING, SKIN, dense, forces_of, loose, motion, packing, squeezed
 
 from mcc_jax import InputError, MccLaw, Plastic, paper_law, paper_population
 from mcc_jax.dem import (
@@ -18,7 +18,6 @@ from mcc_jax.dem import (
     Plane,
     advance,
     close_pairs,
-    contact_forces,
     die,
     list_edges,
     listed,
@@ -35,7 +34,6 @@ from mcc_jax.dem import (
 
 REST = np.zeros((3, 3))
 STEP = jax.jit(step)
-FORCES = jax.jit(contact_forces)
 
 
 def stirred(state, seed=0):
@@ -104,17 +102,7 @@ def test_friction_sticks_then_slides():
         """Driven at constant velocity, the centres kept where they are: only the contact's memory moves on."""
         ratio = []
         for _ in range(steps):
-            forces, edges, history = FORCES(
-                pack,
-                move.interaction,
-                state.walls,
-                state.position,
-                state.velocity,
-                state.spin,
-                state.edges,
-                state.wall_history,
-                jnp.asarray(1e-6),
-            )
+            forces, edges, history = forces_of(pack, move, state, time_step=jnp.asarray(1e-6))
             state = eqx.tree_at(lambda s: (s.edges, s.wall_history), state, (edges, history))
             ratio.append(float(forces.force[0, 1] / -forces.force[0, 0]))
         return state, ratio
