@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
+from ._devices import local
 from ._small import Cholesky
 
 
@@ -157,6 +158,24 @@ class Solution(eqx.Module):
     loss: Float[Array, ""]
     converged: Bool[Array, ""]
     steps: Any
+
+    def here(self, count: int) -> Solution:
+        """The same on this process's own device, of the first `count` particles."""
+        value, normal = self.value, self.normal
+        return Solution(
+            Parameters(local(value.local, count), local(value.shared)),
+            local(self.residual, count),
+            Normal(
+                local(normal.local, count),
+                local(normal.border, count),
+                local(normal.shared),
+                local(normal.gradient_local, count),
+                local(normal.gradient_shared),
+            ),
+            local(self.loss),
+            local(self.converged),
+            local(self.steps),
+        )
 
 
 def minimise(

@@ -286,12 +286,39 @@ def calibrate_bayes(
     Raises:
         InputError: if no particle can be used.
     """
+    return posterior(
+        campaign,
+        model=model,
+        threshold_MPa=threshold_MPa,
+        mode=mode,
+        chains=chains,
+        warmup=warmup,
+        draws=draws,
+        seed=seed,
+        progress=progress,
+    )
+
+
+def posterior(
+    campaign: Campaign,
+    *,
+    model: JointModel | None = None,
+    threshold_MPa: float = THRESHOLD_MPA,
+    mode: Mode = "fast",
+    chains: int = 4,
+    warmup: int = 300,
+    draws: int = 1000,
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+    size: tuple[int, int] = (0, 0),
+) -> BayesCalibration:
+    """`calibrate_bayes` with the arrays filled up to at least `size`: particles and points."""
     started = time.perf_counter()
     tell = progress or (lambda _: None)
     model = model or JointModel()
     length = Length(chains, warmup, draws)
     ahead = (lambda tests: compile_ahead(tests, model, length)) if mode == "fast" else None
-    selection, tests, fit = prepare(campaign, model, threshold_MPa, meanwhile=ahead, tell=tell)
+    selection, tests, fit = prepare(campaign, model, threshold_MPa, size=size, meanwhile=ahead, tell=tell)
     tell("sampling the population" if mode == "fast" else "sampling everything")
     found = draw_fast if mode == "fast" else draw_joint
     parts = found(jax.random.key(seed), tests, model, fit, length)
@@ -300,7 +327,7 @@ def calibrate_bayes(
         campaign=campaign,
         selection=selection,
         model=model,
-        fit=fit,
+        fit=fit if tests is selection.tests else fit.here(len(selection.kept)),
         mode=mode,
         seed=seed,
         runtime_s=time.perf_counter() - started,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -37,6 +38,7 @@ class Tests(eqx.Module):
         step: share of the peak force passed since the point before [-], the path length of correlated residuals.
         branch: index of the point at which the largest force so far was reached: shared by the points of an elastic
             branch.
+        weight: 1 for particles, 0 for copies that only fill up; None where all are particles.
     """
 
     __test__ = False  # no test of ours, whatever pytest thinks of the name
@@ -49,6 +51,7 @@ class Tests(eqx.Module):
     contact: Float[Array, " particles"]
     step: Float[Array, "particles points"]
     branch: Int[Array, "particles points"]
+    weight: Float[Array, " particles"] | None = None
 
     def __len__(self) -> int:
         return self.force.shape[0]
@@ -59,17 +62,24 @@ class Tests(eqx.Module):
         return eqx.filter_vmap(lambda particle: particle.flatness)(self.particle)
 
 
-def spread(tests: Tests) -> Tests:
-    """The same tests with their particles spread over this process's devices, if their number divides evenly.
-
-    Everything that follows acts on particles one by one and then sums, so the compiler splits it in the same way.
-    """
-    devices = jax.local_devices()
-    if len(devices) < 2 or len(tests) % len(devices):
+def enlarged(tests: Tests, particles: int, points: int = 0) -> Tests:
+    """The same tests among more, and longer: copies of the last particle that count for nothing, masked last points."""
+    count, length = tests.force.shape
+    more, longer = max(particles - count, 0), max(points - length, 0)
+    if not (more or longer):
         return tests
-    mesh = jax.sharding.Mesh(np.array(devices), ("particles",))
-    place = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("particles"))
-    return jax.tree.map(lambda x: jax.device_put(x, place), tests)
+
+    def wider(x: Any) -> np.ndarray:
+        x = np.asarray(x)
+        last = "constant" if x.dtype == bool else "edge"
+        x = np.pad(x, [(0, 0), (0, longer)], mode=last) if x.ndim == 2 else x
+        return np.pad(x, [(0, more)] + [(0, 0)] * (x.ndim - 1), mode="edge")
+
+    weight = np.ones(count) if tests.weight is None else np.asarray(tests.weight)
+    step = np.pad(np.asarray(tests.step), [(0, 0), (0, longer)])
+    wide = jax.tree.map(lambda x: jnp.asarray(wider(x)), eqx.tree_at(lambda t: t.step, tests, jnp.asarray(step)))
+    none = {"is_leaf": lambda x: x is None}
+    return eqx.tree_at(lambda t: t.weight, wide, jnp.asarray(np.pad(weight, (0, more))), **none) if more else wide
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from jaxtyping import Array
 
 from ._compile import compiled
 from ._data import Tests
+from ._devices import count_of, host, mesh_of
 from ._fit import JointFit, JointModel, population_at, populations, prior_numbers
 from ._mode import Target
 from ._noise import Whitening
@@ -57,6 +58,8 @@ class Length(NamedTuple):
 
 def compile_ahead(tests: Tests, model: JointModel, length: Length) -> None:
     """Compile what is needed last while the first steps run: the same functions, for arrays of the same shapes."""
+    if mesh_of(tests.force) is not None:
+        return  # the same shapes in other places: another compilation
     count, points = tests.force.shape
     d = 6 + model.scatter.size
 
@@ -67,13 +70,13 @@ def compile_ahead(tests: Tests, model: JointModel, length: Length) -> None:
     quadratic = Summary(four, dummy(count, 4, 4), four, one, one, one, four, one)
     # Almost all campaigns pin their coefficients down; the others compile again.
     scatter = replace(model.scatter, newton=0)
-    target = Target(prior_numbers(model.beliefs, tests.flatness), quadratic, scatter)
+    target = Target(prior_numbers(model.beliefs, tests.flatness, tests.weight), quadratic, scatter)
     cast(Any, sample_population).lower(
         jax.random.key(0), dummy(d), dummy(d, d), target, dummy(), **length._asdict()
     ).compile()
     filters = eqx.filter_vmap(Whitening)(*(dummy(count, points) for _ in range(4)), tests.branch)
     exact = Exact(tests, filters, quadratic, scatter, model.zero_sd, model.unloading)
-    several = dummy(len(range(0, length.total, _stride(count, length.total))))
+    several = dummy(len(range(0, length.total, _stride(count_of(tests), length.total))))
     triple = dummy(*several.shape, 3)
     some = eqx.filter_vmap(Population)(several, several, triple, triple, several, several, several)
     cast(Any, draw_particles).lower(jax.random.key(0), some, exact).compile()
@@ -90,8 +93,8 @@ def newton_steps(fit: JointFit, tests: Tests, model: JointModel) -> int:
     """How many Newton steps the integration over the particles needs: none if every coefficient is known sharply."""
     population = population_at(fit.mode, fit.numbers, model.scatter)
     at = _laplace(population, fit.summary, tests.flatness, model.scatter)
-    variance = np.diagonal(np.linalg.inv(np.asarray(at.hessian)), axis1=1, axis2=2)
-    widest = float(np.max(np.sqrt(variance) * np.asarray(at.stretch)))
+    variance = np.diagonal(np.linalg.inv(host(at.hessian)[: count_of(tests)]), axis1=1, axis2=2)
+    widest = float(np.max(np.sqrt(variance) * host(at.stretch)))
     return 0 if widest < SHARP else 4
 
 
@@ -105,16 +108,11 @@ def draw_fast(key: Array, tests: Tests, model: JointModel, fit: JointFit, length
     scatter = replace(model.scatter, newton=newton_steps(fit, tests, model))
     target = Target(fit.numbers, fit.summary, scatter)
     population_key, particle_key, check_key, pick_key = jax.random.split(key, 4)
-    for accept in ACCEPT:
-        run, population = sample_population(
-            population_key, fit.mode, fit.covariance, target, jnp.asarray(accept), **length._asdict()
-        )
-        if not np.any(np.asarray(run.divergent)):
-            break
-    count = len(tests)
+    run, population = _settled(population_key, fit, target, length)
+    count = count_of(tests)
     exact = Exact(tests, fit.filters, fit.summary, scatter, model.zero_sd, model.unloading)
     stride = _stride(count, length.total)
-    checked = [np.array(v) for v in draw_particles(check_key, _every(population, stride), exact)]
+    checked = [np.array(host(v)[:, :count]) for v in draw_particles(check_key, _every(population, stride), exact)]
     ratio = checked[3]
     k = pareto_k(ratio)
     restless = np.flatnonzero(unrest(ratio) > RESTLESS)
@@ -133,7 +131,7 @@ def draw_fast(key: Array, tests: Tests, model: JointModel, fit: JointFit, length
             more = draw_particles(
                 jax.random.fold_in(pick_key, candidates), population, _some(exact, padded), candidates
             )
-            better = [np.asarray(v)[:, : len(restless)] for v in more]
+            better = [host(v)[:, : len(restless)] for v in more]
             latent[:, restless], zero[:, restless], ratio[:, restless] = better[0], better[1], better[3]
             k[restless] = pareto_k(ratio[:, restless])
             restless = restless[np.argsort(-unrest(ratio[:, restless]))][:FEW]
@@ -149,7 +147,8 @@ def draw_fast(key: Array, tests: Tests, model: JointModel, fit: JointFit, length
             affected = ", ".join(str(i) for i in restless[:5])
             notes.append(f"{len(restless)} particles are far from their quadratic summary (positions {affected}, ...)")
         keep = max(1, -(-length.total * count // MOST_PARTICLE_DRAWS))
-        latent, zero, likelihood, _ = draw_particles(particle_key, _every(population, keep), exact, 0)
+        found = draw_particles(particle_key, _every(population, keep), exact, 0)
+        latent, zero, likelihood = (host(v)[:, :count] for v in found[:3])
     return {
         **_fields(run, population, names, stacked, (latent, zero, likelihood), tests, model, length, keep),
         "pareto_k": k,
@@ -159,16 +158,34 @@ def draw_fast(key: Array, tests: Tests, model: JointModel, fit: JointFit, length
     }
 
 
+def _settled(key: Array, fit: JointFit, target: Target, length: Length) -> tuple[Chains, Population]:
+    """The sampler's run and its populations, with smaller steps if any trajectory diverged."""
+
+    def run(accept: float) -> tuple[Chains, Population]:
+        found = sample_population(key, fit.mode, fit.covariance, target, jnp.asarray(accept), **length._asdict())
+        return cast(Any, jax.tree.map(host, found))
+
+    chains, population = run(ACCEPT[0])
+    for accept in ACCEPT[1:]:
+        if not np.any(np.asarray(chains.divergent)):
+            break
+        chains, population = run(accept)
+    return chains, population
+
+
 def draw_joint(key: Array, tests: Tests, model: JointModel, fit: JointFit, length: Length) -> dict[str, Any]:
     """Population and particles sampled together under the exact likelihood: fields of the result."""
     scatter = replace(model.scatter, newton=newton_steps(fit, tests, model))
     exact = Exact(tests, fit.filters, fit.summary, scatter, model.zero_sd, model.unloading)
-    run, free, *particles = sample_joint(key, fit.mode, fit.covariance, fit.numbers, exact, **length._asdict())
+    found = sample_joint(key, fit.mode, fit.covariance, fit.numbers, exact, **length._asdict())
+    run, free, *particles = jax.tree.map(host, found)
+    count = count_of(tests)
+    particles = [v[:, :, :count] for v in particles]
     population = populations(free.reshape(-1, free.shape[-1]), fit.numbers, scatter)
     names, stacked = _stack(population, scatter, length)
     return {
         **_fields(run, population, names, stacked, particles, tests, model, length),
-        "pareto_k": np.zeros(len(tests)),
+        "pareto_k": np.zeros(count),
         "pareto_k_joint": None,
         "weights_applied": False,
     }
@@ -192,11 +209,11 @@ def _fields(
 
     population = jax.tree.map(shaped, population)
     rhat, bulk, tail = diagnostics(names, stacked)
+    count = count_of(tests)
     latent, zero, likelihood = (np.asarray(v) for v in particles)
-    count = len(tests)
     return {
         "population": population,
-        **_particles(latent, zero, population, np.asarray(tests.flatness), model, length.chains),
+        **_particles(latent, zero, population, host(tests.flatness)[:count], model, length.chains),
         "log_likelihood": likelihood.reshape(length.chains, -1, count),
         "divergences": int(np.sum(np.asarray(run.divergent))),
         "rhat": rhat,
@@ -227,7 +244,7 @@ def _every(population: Population, stride: int) -> Population:
 def _some(exact: Exact, which: np.ndarray) -> Exact:
     """The exact likelihood of some of the particles."""
     index = jnp.asarray(which)
-    take = partial(jax.tree.map, lambda x: x[index])
+    take = partial(jax.tree.map, lambda x: jnp.asarray(host(x)[which]) if mesh_of(x) else x[index])
     return replace(exact, tests=take(exact.tests), filters=take(exact.filters), summary=take(exact.summary))
 
 

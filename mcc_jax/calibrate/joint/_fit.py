@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import equinox as eqx
@@ -18,7 +18,8 @@ from ...campaign import Campaign
 from ...law import StrainScaling, Unloading
 from .._predict import point_noise_um
 from ._compile import compiled
-from ._data import Selection, Tests, select_tests, spread
+from ._data import Selection, Tests, enlarged, select_tests
+from ._devices import count_of, host, local, spread
 from ._individual import Particles, fit_particles, linear_starts
 from ._linearised import expected_latent, linear_data, summarise
 from ._mode import PriorNumbers, Target, from_free, most_probable, recentred, to_free
@@ -111,10 +112,30 @@ class JointFit(eqx.Module):
     numbers: PriorNumbers
     converged: Bool[np.ndarray, " 3"]
 
+    def here(self, count: int) -> JointFit:
+        """The same on this process's own device, of the first `count` particles."""
+        noise, numbers = local(self.noise), local(self.numbers)
+        return JointFit(
+            local(self.individual, count),
+            replace(noise, scale=noise.scale[:count]),
+            local(self.noise_log_sd),
+            local(self.filters, count),
+            local(self.latent, count),
+            local(self.zero, count),
+            local(self.residual, count),
+            local(self.summary, count),
+            local(self.mode),
+            local(self.covariance),
+            replace(numbers, flatness=numbers.flatness[:count], weight=None),
+            self.converged,
+        )
 
-def prior_numbers(priors: Priors, flatness: Float[Array, " particles"]) -> PriorNumbers:
+
+def prior_numbers(
+    priors: Priors, flatness: Float[Array, " particles"], weight: Float[Array, " particles"] | None = None
+) -> PriorNumbers:
     """Priors as arrays; `a` is bounded to where every particle's shape factor is positive."""
-    flat = np.asarray(flatness)
+    flat = host(flatness)
     most, least = max(flat.max(), 1e-3), min(flat.min(), -1e-3)
     # The bounds scale a coordinate; they are no belief, and stay far from where data or prior could want to go.
     reach = max(8 * priors.a.sd, 8.0)
@@ -142,6 +163,7 @@ def prior_numbers(priors: Priors, flatness: Float[Array, " particles"]) -> Prior
         centre=jnp.asarray([np.log(priors.C1.median), _log_C3(priors), np.log(priors.C5.median)]),
         blur=jnp.asarray(np.full(3, BLUR)),
         flatness=flatness,
+        weight=weight,
     )
 
 
@@ -150,6 +172,7 @@ def prepare(
     model: JointModel,
     threshold_MPa: float,
     *,
+    size: tuple[int, int] = (0, 0),
     meanwhile: Callable[[Tests], None] | None = None,
     tell: Callable[[str], None] = lambda _: None,
     **settings: Any,
@@ -160,13 +183,14 @@ def prepare(
         campaign: the tests.
         model: what is assumed.
         threshold_MPa: points below this stress on loading do not count [MPa].
+        size: particles and points to fill up to, at least, so that campaigns of about that size share compilations.
         meanwhile: called with the tests in a thread of its own while the fit runs.
         tell: called with the name of each step.
         settings: of `fit_joint`.
     """
     tell("selecting points")
     selection = select_tests(campaign, threshold_MPa=threshold_MPa)
-    tests = spread(selection.tests)
+    tests = spread(enlarged(selection.tests, *size))
     read_out = float(np.median([point_noise_um(campaign.curves[i]) for i in selection.kept]))
     aside = None
     if meanwhile is not None:
@@ -205,10 +229,11 @@ def fit_joint(
     """
     scatter, zero_sd, priors = model.scatter, model.zero_sd, model.beliefs
     flatness = tests.flatness
-    numbers = prior_numbers(priors, flatness)
+    numbers = prior_numbers(priors, flatness, tests.weight)
     read_out = max(read_out_um, 1e-4)
     tell("fitting every particle")
     N = len(tests)
+    count = count_of(tests)
     centre = np.broadcast_to(_centre(priors), (N, 4))
     starts = linear_starts(tests, jnp.asarray(centre[0, 3]))
     wide = jnp.asarray(np.full((N, 4), WIDE))
@@ -219,12 +244,12 @@ def fit_joint(
     four = [read_out, *np.asarray(priors.noise.median)[1:]]
     noise = Noise.from_logs(jnp.asarray(np.log(four)), jnp.asarray(np.ones(len(tests))))
     log_sd, noise_converged = jnp.asarray(np.full(4, np.nan)), True
-    numbers, free = _start(np.asarray(latent), np.asarray(flatness), model, numbers)
+    numbers, free = _start(host(latent)[:count], host(flatness)[:count], model, numbers)
     turn = 0
     while True:
         data = linear_data(latent, zero, tests, zero_sd, model.unloading)
         if not correlated:
-            width = 1.4826 * np.median(np.abs(np.asarray(data.residual)[np.asarray(tests.mask)]))
+            width = 1.4826 * np.median(np.abs(host(data.residual)[:count][host(tests.mask)[:count]]))
             none = jnp.asarray(0.0)
             noise = Noise(jnp.asarray(max(width, 1e-9)), none, none, jnp.asarray(1.0), jnp.asarray(np.ones(N)))
         elif turn < rounds:
@@ -232,8 +257,9 @@ def fit_joint(
             noise, log_sd, noise_converged = estimate_noise(data, priors.noise, noise, uncertainty=turn == rounds - 1)
         summary, filtered = summarise(latent, zero, tests, data, noise, zero_sd)
         if correlated and turn < rounds:
-            old = np.asarray(noise.scale)
-            scale = particle_scales(old, np.asarray(summary.squares), np.asarray(summary.count) - 4)
+            old = host(noise.scale)
+            parts = (old, host(summary.squares), host(summary.count) - 4)
+            scale = np.pad(particle_scales(*(part[:count] for part in parts)), (0, N - count), mode="edge")
             if np.any(scale != old):
                 noise = eqx.tree_at(lambda n: n.scale, noise, jnp.asarray(scale))
                 summary, filtered = summarise(latent, zero, tests, data, noise, zero_sd)
@@ -258,7 +284,7 @@ def fit_joint(
         within = jnp.maximum(spread, LEAST_WIDTH)
         found = fit_particles(tests, sizes, mean, within, zero_sd, starts, model.unloading)
         latent, zero = found.latent, found.zero
-    converged = np.asarray([bool(np.all(np.asarray(individual.converged))), noise_converged, mode_converged])
+    converged = np.asarray([bool(np.all(host(individual.converged)[:count])), noise_converged, mode_converged])
     return JointFit(
         individual, noise, log_sd, filtered, latent, zero, data.residual, summary, free, covariance, numbers, converged
     )
@@ -303,7 +329,7 @@ def _start(
     """Where to look for the population, the prior's a and the particles' own median and scatter under it; and the
     coordinates centred there."""
     priors = model.beliefs
-    low, high = np.asarray(numbers.a)[2:]
+    low, high = host(numbers.a)[2:]
     a = float(np.clip(priors.a.mean, 0.9 * low, 0.9 * high))
     log_eta = np.log(1 + a * flatness)
     b = latent[:, :3] - log_eta[:, None]

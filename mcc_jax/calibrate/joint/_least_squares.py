@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import jax
@@ -15,7 +15,8 @@ from ...campaign import THRESHOLD_MPA, Campaign
 from .._result import estimate, finite, misfit_note
 from ._arrow import Parameters, Solution
 from ._bayes import log_estimate
-from ._data import Selection, own_misfit
+from ._data import Selection, Tests, own_misfit
+from ._devices import host, local
 from ._fit import JointFit, JointModel, population_at, prepare
 from ._pooled import Pooled, fit_pooled, unpack
 from ._population import COEFFICIENTS
@@ -284,10 +285,26 @@ def calibrate_least_squares(
     Raises:
         InputError: if no particle can be used.
     """
+    return least_squares(campaign, model=model, threshold_MPa=threshold_MPa, loss=loss, seed=seed, progress=progress)
+
+
+def least_squares(
+    campaign: Campaign,
+    *,
+    model: JointModel | None = None,
+    threshold_MPa: float = THRESHOLD_MPA,
+    loss: Loss = "linear",
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+    size: tuple[int, int] = (0, 0),
+) -> LeastSquaresCalibration:
+    """`calibrate_least_squares` with the arrays filled up to at least `size`: particles and points."""
     started = time.perf_counter()
     tell = progress or (lambda _: None)
     model = model or JointModel()
-    selection, _, fit = prepare(campaign, model, threshold_MPa, tell=tell, correlated=loss == "linear", rounds=1)
+    selection, tests, fit = prepare(
+        campaign, model, threshold_MPa, size=size, tell=tell, correlated=loss == "linear", rounds=1
+    )
     population = population_at(fit.mode, fit.numbers, model.scatter)
     settings = Pooled(
         fit.filters,
@@ -300,13 +317,17 @@ def calibrate_least_squares(
         loss,
     )
     tell("fitting all particles together")
-    low, high = np.asarray(fit.numbers.a)[2:]
+    low, high = host(fit.numbers.a)[2:]
     starts = [float(population.a), *(a for a in STARTS if 0.9 * low < a < 0.9 * high)]
     mu, log_modulus = np.asarray(population.mu), float(population.log_modulus)
-    found = [solve(fit, settings, selection, a, mu, log_modulus) for a in starts]
+    found = [solve(fit, settings, tests, a, mu, log_modulus) for a in starts]
     losses = np.array([float(one.loss) for one in found])
     losses[~np.isfinite(losses)] = np.inf
     best = found[int(np.argmin(losses))]
+    if tests is not selection.tests:
+        count = len(selection.kept)
+        fit, best = fit.here(count), best.here(count)
+        settings = replace(local(settings), whitening=fit.filters)
     agree = int(np.sum(losses <= losses.min() * (1 + 1e-5) + 1e-6))
     return LeastSquaresCalibration(
         campaign,
@@ -323,10 +344,8 @@ def calibrate_least_squares(
     )
 
 
-def solve(
-    fit: JointFit, settings: Pooled, selection: Selection, a: float, mu: np.ndarray, log_modulus: float
-) -> Solution:
+def solve(fit: JointFit, settings: Pooled, tests: Tests, a: float, mu: np.ndarray, log_modulus: float) -> Solution:
     """The pooled least squares from the fitted particles and the given shared parameters."""
     local = [fit.latent[:, :3], fit.zero[:, None]] + ([fit.latent[:, 3:]] if settings.scatter.modulus else [])
     shared = jnp.asarray(np.concatenate([[a, log_modulus], mu]))
-    return fit_pooled(selection.tests, settings, Parameters(jnp.concatenate(local, 1), shared))
+    return fit_pooled(tests, settings, Parameters(jnp.concatenate(local, 1), shared))

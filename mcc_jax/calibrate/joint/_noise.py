@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..._types import Path, Scalar
 from ._compile import compiled
+from ._devices import host
 from ._small import Cholesky
 
 
@@ -151,6 +152,7 @@ class Linear(eqx.Module):
         jacobian: derivative with respect to the particle's P parameters.
         prior: precision that keeps directions without data in place, shape (P,).
         step, mask, compliance, peak, branch: as in `whitening`.
+        weight: 1 for particles, 0 for copies that only fill up; None where all are particles.
     """
 
     residual: Float[Array, "particles points"]
@@ -161,6 +163,7 @@ class Linear(eqx.Module):
     compliance: Float[Array, "particles points"]
     peak: Float[Array, "particles points"]
     branch: Int[Array, "particles points"]
+    weight: Float[Array, " particles"] | None = None
 
 
 def restricted_likelihood(noise: Noise, data: Linear) -> Float[Array, " particles"]:
@@ -194,7 +197,9 @@ class NoisePrior(eqx.Module):
 def _losses(logs: Float[Array, "many 4"], scale: Float[Array, " particles"], data: Linear, prior: NoisePrior):
     def loss(one):
         noise = Noise.from_logs(one, scale)
-        return -(jnp.sum(restricted_likelihood(noise, data)) + prior.log_density(one))
+        each = restricted_likelihood(noise, data)
+        total = jnp.sum(each if data.weight is None else data.weight * each)
+        return -(total + prior.log_density(one))
 
     return jax.vmap(loss)(logs)
 
@@ -226,7 +231,7 @@ def estimate_noise(
     steps = STEP * np.concatenate([np.zeros((1, 4)), np.eye(4), -np.eye(4)])
 
     def value_and_gradient(logs: np.ndarray) -> tuple[float, np.ndarray]:
-        values = np.asarray(_losses(jnp.asarray(logs + steps), start.scale, data, prior))
+        values = host(_losses(jnp.asarray(logs + steps), start.scale, data, prior))
         return float(values[0]), (values[1:5] - values[5:]) / (2 * STEP)
 
     # No tester reads better than a few tenths of a nanometre: noise-free data, of a simulation say, get that much.

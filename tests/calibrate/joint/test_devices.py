@@ -13,14 +13,15 @@ import jax
 jax.config.update("jax_enable_x64", True)
 import numpy as np
 from mcc_jax.calibrate.joint import JointModel
-from mcc_jax.calibrate.joint._data import select_tests, spread
+from mcc_jax.calibrate.joint._data import select_tests
+from mcc_jax.calibrate.joint._devices import host, spread
 from mcc_jax.calibrate.joint._fit import fit_joint
 from mcc_jax.simulate import Programme, paper_campaign
 campaign = paper_campaign(0, programme=Programme.cycles(points=60)).select(np.arange(20) < 4)
 tests = spread(select_tests(campaign).tests)
 fit = fit_joint(tests, JointModel(), 0.02)
-print(json.dumps({"devices": len(tests.force.sharding.device_set), "mode": np.asarray(fit.mode).tolist(),
-                  "latent": np.asarray(fit.latent).tolist()}))
+print(json.dumps({"devices": len(tests.force.sharding.device_set), "mode": host(fit.mode).tolist(),
+                  "latent": host(fit.latent).tolist()}))
 """
 
 
