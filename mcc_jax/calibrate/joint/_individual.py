@@ -131,7 +131,11 @@ def _fit_spread(tests, noise, centre, width, zero_sd, starts, unloading, mesh):
     own, all_ = PartitionSpec(AXIS), PartitionSpec()
     parts = (own, own, own, own, all_, PartitionSpec(None, AXIS))
     fit = jax.shard_map(
-        lambda *arrays: _steps(*arrays, unloading=unloading, axis=AXIS), mesh=mesh, in_specs=parts, out_specs=own, check_vma=False
+        lambda *arrays: _steps(*arrays, unloading=unloading, axis=AXIS),
+        mesh=mesh,
+        in_specs=parts,
+        out_specs=own,
+        check_vma=False,
     )
     return fit(tests, noise, centre, width, zero_sd, starts)
 

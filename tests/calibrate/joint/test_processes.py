@@ -26,7 +26,7 @@ def together(count, folder):
     """What `count` processes print, started at once; all are ended if one fails or none comes to an end in time."""
     address = f"127.0.0.1:{free_port()}"
     environment = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"} | {"JAX_PLATFORMS": "cpu"}
-    files = [(open(folder / f"{count}-{i}.out", "w+"), open(folder / f"{count}-{i}.err", "w+")) for i in range(count)]  # noqa: SIM115
+    files = [[(folder / f"{count}-{i}.{kind}").open("w+") for kind in ("out", "err")] for i in range(count)]
     arguments = [[address, str(count), str(i)] if count > 1 else [] for i in range(count)]
     running = [
         subprocess.Popen([sys.executable, str(PART), *a], env=environment, stdout=out, stderr=err)
