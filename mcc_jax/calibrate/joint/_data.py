@@ -63,10 +63,14 @@ class Tests(eqx.Module):
 
 
 def enlarged(tests: Tests, particles: int, points: int = 0) -> Tests:
-    """The same tests among more, and longer: copies of the last particle that count for nothing, masked last points."""
+    """The same tests among more, and longer: copies of the last particle that count for nothing, masked last points.
+
+    With `particles` given, every particle gets a weight, whether copies are needed or not: one kind of arrays, one
+    compilation. With 0 their number stays.
+    """
     count, length = tests.force.shape
     more, longer = max(particles - count, 0), max(points - length, 0)
-    if not (more or longer):
+    if not (particles or longer):
         return tests
 
     def wider(x: Any) -> np.ndarray:
@@ -79,7 +83,7 @@ def enlarged(tests: Tests, particles: int, points: int = 0) -> Tests:
     step = np.pad(np.asarray(tests.step), [(0, 0), (0, longer)])
     wide = jax.tree.map(lambda x: jnp.asarray(wider(x)), eqx.tree_at(lambda t: t.step, tests, jnp.asarray(step)))
     none = {"is_leaf": lambda x: x is None}
-    return eqx.tree_at(lambda t: t.weight, wide, jnp.asarray(np.pad(weight, (0, more))), **none) if more else wide
+    return eqx.tree_at(lambda t: t.weight, wide, jnp.asarray(np.pad(weight, (0, more))), **none) if particles else wide
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,8 @@ def spread(tests: Tests) -> Tests:
     devices = jax.devices()
     if len(devices) < 2 or (len(tests) < len(devices) and jax.process_count() == 1):
         return tests
-    tests = enlarged(tests, len(tests) + -len(tests) % len(devices))
+    missing = -len(tests) % len(devices)
+    tests = enlarged(tests, len(tests) + missing if missing else 0)
     place = NamedSharding(Mesh(np.array(devices), (AXIS,)), PartitionSpec(AXIS))
 
     def put(x: Any) -> Any:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Literal
+from typing import Any
 
 import jax
 
@@ -24,7 +25,7 @@ Calibration = BayesCalibration | LeastSquaresCalibration
 def calibrate_many(
     campaigns: Iterable[Campaign],
     *,
-    method: Literal["bayes", "least-squares"] = "bayes",
+    method: str = "bayes",
     threshold_MPa: float = THRESHOLD_MPA,
     workers: int = 1,
     progress: Callable[[int, str], None] | None = None,
@@ -59,7 +60,7 @@ def calibrate_many(
         raise ValueError(f"the method must be one of {', '.join(methods)}, got {method!r}")
     if workers < 1:
         raise ValueError(f"there must be at least one worker, got {workers}")
-    names = set(methods[method].__kwdefaults__ or {}) - {"size", "progress", "threshold_MPa"}
+    names = set(inspect.signature(methods[method]).parameters) - {"campaign", "size", "progress", "threshold_MPa"}
     unknown = sorted(set(settings) - names)
     if unknown:
         raise TypeError(f"{method} has no setting {', '.join(unknown)}; it has: {', '.join(sorted(names))}")
@@ -104,7 +105,10 @@ def calibrate_many(
 
 
 def _groups(sizes: dict[int, Size], *, particles: bool) -> Sequence[tuple[Size, list[int]]]:
-    """Sizes to fill up to, and the positions of the campaigns that share each; the largest first."""
+    """Sizes to fill up to, and the positions of the campaigns that share each; the largest first.
+
+    The number of particles is 0 where all have the same, and nothing has to be filled up.
+    """
     groups: list[tuple[Size, list[int]]] = []
     for i, size in sorted(sizes.items(), key=lambda item: (-item[1][0], -item[1][1])):
         for g, (common, members) in enumerate(groups):
@@ -115,4 +119,5 @@ def _groups(sizes: dict[int, Size], *, particles: bool) -> Sequence[tuple[Size, 
                 break
         else:
             groups.append((size, [i]))
-    return groups
+    mixed = [len({sizes[i][0] for i in members}) > 1 for _, members in groups]
+    return [((n if fill else 0, points), own) for fill, ((n, points), own) in zip(mixed, groups, strict=True)]

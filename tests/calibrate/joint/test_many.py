@@ -56,7 +56,7 @@ def test_progress_names_the_campaign(queued, told):
 
 def test_campaigns_of_similar_size_share_their_compilations(queued):
     _, compiled = queued
-    # One of the sampler, and two of the particles' fit: from three starts each time, of one shape.
+    # The particles are fitted from three starts each time: one shape.
     assert compiled[0] == 1
     assert compiled[1] == 1
 
@@ -90,13 +90,14 @@ def test_what_is_filled_up_counts_for_nothing(campaigns):
     assert not np.asarray(more.mask)[:, points:].any()
     np.testing.assert_array_equal(more.step[:, points:], 0.0)
     np.testing.assert_array_equal(more.force[:count, :points], tests.force)
-    assert enlarged(tests, count, points) is tests
+    assert enlarged(tests, 0, points) is tests
+    np.testing.assert_array_equal(enlarged(tests, count).weight, np.ones(count))
 
 
 def test_groups_have_similar_sizes():
     sizes = {0: (20, 192), 1: (5, 192), 2: (14, 256), 3: (20, 640), 4: (4, 128)}
-    assert _groups(sizes, particles=True) == [((20, 640), [3]), ((20, 256), [0, 2]), ((5, 192), [1, 4])]
-    assert _groups({0: (5, 128), 1: (4, 128), 2: (5, 192)}, particles=False) == [((5, 192), [2, 0]), ((4, 128), [1])]
+    assert _groups(sizes, particles=True) == [((0, 640), [3]), ((20, 256), [0, 2]), ((5, 192), [1, 4])]
+    assert _groups({0: (5, 128), 1: (4, 128), 2: (5, 192)}, particles=False) == [((0, 192), [2, 0]), ((0, 128), [1])]
 
 
 def test_wrong_arguments_are_told(campaigns):
