@@ -31,6 +31,10 @@ from .campaign import find_segments as find_segments
 from .campaign import read_campaign as read_campaign
 from .campaign import read_tester_file as read_tester_file
 from .campaign import write_campaign as write_campaign
+from .effects import LIBRARY as LIBRARY
+from .effects import ExtendedLaw as ExtendedLaw
+from .effects import Record as Record
+from .effects import Variant as Variant
 from .geometry import Particle as Particle
 from .geometry import elastic_shape_factor as elastic_shape_factor
 from .geometry import plastic_shape_factor as plastic_shape_factor
@@ -43,6 +47,7 @@ from .law import Plastic as Plastic
 from .law import PlasticPopulation as PlasticPopulation
 from .law import StrainScaling as StrainScaling
 from .law import Unloading as Unloading
+from .simulate import HiddenEffect as HiddenEffect
 from .simulate import Hold as Hold
 from .simulate import Instrument as Instrument
 from .simulate import Programme as Programme

@@ -23,12 +23,13 @@ LAYERS = {
     "geometry": 1,
     "law": 2,
     "campaign": 3,
-    "simulate": 4,
-    "calibrate": 5,
-    "discover": 6,
-    "plots": 7,
-    "report": 8,
-    "cli": 9,
+    "effects": 4,
+    "simulate": 5,
+    "calibrate": 6,
+    "discover": 7,
+    "plots": 8,
+    "report": 9,
+    "cli": 10,
 }
 # What importing the package must not load: slow, optional, or for the command line only.
 HEAVY = ("numpyro", "arviz", "pandas", "matplotlib", "pint", "rich", "click")

@@ -60,6 +60,13 @@ def _zero(name: str, unit: str, text: str) -> Any:
 @_number("--a", "A", {}, "Shape parameter.", default=1.43, show_default=True)
 @_number("--effective-modulus", "MPa", POSITIVE, "Effective modulus.", default=16000.0, show_default=True)
 @law_options
+@click.option(
+    "--effect",
+    "effects",
+    multiple=True,
+    metavar="NAME[:VARIANT][=X][,P=V]",
+    help="An effect that the law does not contain; repeatable.  [default amplitude: the middle of what is plausible]",
+)
 @_zero("--noise-um", "um", "Standard deviation of noise on displacement.")
 @_zero("--noise-mN", "mN", "Standard deviation of noise on force.")
 @_zero("--resolution-um", "um", "Smallest step of displacement.")
@@ -69,13 +76,14 @@ def _zero(name: str, unit: str, text: str) -> Any:
 def simulate(out: Path, particles: Path | None, unloading: str, strain_scaling: str, seed: int, **options: Any) -> None:
     """Put particles through a test programme in the computer and write the campaign into DIR.
 
-    True coefficients go into the columns true_C1, true_C3, true_C5 of particles.csv.
+    True coefficients go into the columns true_C1, true_C3, true_C5 of particles.csv, effects into campaign.toml.
 
     \b
     Examples:
       mcc-jax simulate --out sim --levels 0.5,1 --unload-to 0.1 --hold-s 30
       mcc-jax simulate --out sim --control displacement --rate 1 --peak-strain 0.4
       mcc-jax simulate --out sim --programme steps.toml --noise-um 0.02
+      mcc-jax simulate --out sim --hold-s 60 --effect frame_compliance=0.002 --effect creep:logarithmic,tau_s=5
 
     \b
     Example of a programme file (levels are shares of each particle's peak):
@@ -94,10 +102,11 @@ def simulate(out: Path, particles: Path | None, unloading: str, strain_scaling: 
     with session(3) as tell:
         from ..campaign import write_campaign
         from ..law import StrainScaling, Unloading
-        from ._simulation import Material, particle_sizes, peaks_and_programme, simulate_particles
+        from ._simulation import Material, hidden_effects, particle_sizes, peaks_and_programme, simulate_particles
 
         tell("reading the input")
         sizes = particle_sizes(particles)
+        hidden = hidden_effects(options["effects"], sizes)
         material = Material(
             {name: options[name] for name in ("C1", "C3", "C5")},
             options["shared_material"],
@@ -110,13 +119,18 @@ def simulate(out: Path, particles: Path | None, unloading: str, strain_scaling: 
         laws = material.laws(sizes, seed)
         peaks, programme = peaks_and_programme(options, laws, sizes, seed)
         with results(out) as stage:
-            campaign = simulate_particles(laws, sizes, peaks, programme, options, seed)
+            campaign = simulate_particles(laws, sizes, peaks, programme, options, hidden, seed)
             tell("writing")
             write_campaign(campaign, stage.folder)
     points = [len(curve) for curve in campaign.curves]
     forces = [curve.force_mN.max() for curve in campaign.curves]
     say(f"Simulated {len(campaign)} particles, {sum(points)} points, {programme.control} control, seed {seed}.")
     say(f"Peak forces {min(forces):.4g} to {max(forces):.4g} mN; the tests take up to {_duration(campaign):.4g} s.")
+    for effect in hidden:
+        variant = effect.variant
+        drawn = " (drawn for each test)" if variant.parameter in effect.random else ""
+        amplitude = f"{variant.parameter} {effect.strength:.4g}{drawn}"
+        say(f"Hidden effect: {variant.mechanism}, {variant.name}, {amplitude}.")
     falling = [
         name for name, flag in zip(campaign.particles, campaign.columns["true_monotone"], strict=True) if flag == "no"
     ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,15 +23,18 @@ from ..campaign import (
     particle_batch,
     read_particles,
 )
+from ..effects import HUMIDITY_COLUMN, Need, humidities
 from ..geometry import Particle, plastic_shape_factor
 from ..law import MccLaw, StrainScaling, Unloading
 from ..simulate import (
     PAPER_PEAK_STRESS_MPA,
+    HiddenEffect,
     Instrument,
     Programme,
     Ramp,
     law_for_each,
     paper_population,
+    read_effect,
     read_programme,
     simulate_campaign,
 )
@@ -178,8 +181,41 @@ def _check_size(programme: Programme, peaks: np.ndarray, file: Path | None) -> N
             )
 
 
+def hidden_effects(texts: Sequence[str], sizes: Sizes) -> tuple[HiddenEffect, ...]:
+    """The effects of the option --effect.
+
+    Raises:
+        InputError: naming the valid choices, or what an effect needs of the table of particles.
+    """
+    hidden = []
+    for text in texts:
+        try:
+            hidden.append(read_effect(text))
+        except ValueError as error:
+            raise InputError(f"--effect {text}: {error}") from error
+    wet = [effect for effect in hidden if Need.HUMIDITY_COLUMN in effect.variant.needs]
+    if wet and HUMIDITY_COLUMN not in sizes.columns:
+        raise InputError(
+            f"--effect {wet[0].variant.mechanism}: needs a column {HUMIDITY_COLUMN} in the table of particles",
+            file=sizes.file,
+            remedy="Give --particles FILE with that column",
+        )
+    return tuple(hidden)
+
+
+def _humidity(sizes: Sizes) -> np.ndarray | None:
+    table = Campaign(sizes.names, sizes.diameters_um, (), sizes.columns, source=str(sizes.file or ""))
+    return humidities(table)
+
+
 def simulate_particles(
-    laws: MccLaw, sizes: Sizes, peaks: np.ndarray, programme: Programme, options: Mapping[str, Any], seed: int
+    laws: MccLaw,
+    sizes: Sizes,
+    peaks: np.ndarray,
+    programme: Programme,
+    options: Mapping[str, Any],
+    effects: Sequence[HiddenEffect],
+    seed: int,
 ) -> Campaign:
     """The campaign, with the further columns of the particles' table.
 
@@ -201,6 +237,8 @@ def simulate_particles(
             programme,
             instrument=instrument,
             particles=sizes.names,
+            effects=effects,
+            relative_humidity_percent=_humidity(sizes) if effects else None,
             seed=seed,
             provenance=f"simulated by mcc-jax simulate, seed {seed}; not a measurement",
         )

@@ -1,6 +1,8 @@
 """The contact law: loading, unloading, reloading, its inverse, its energy, its population, its references."""
 
 from ._base import AbstractContactLaw as AbstractContactLaw
+from ._loading_inverse import loading_strain as loading_strain
+from ._loading_inverse import tangent_modulus as tangent_modulus
 from ._mcc import Energy as Energy
 from ._mcc import History as History
 from ._mcc import MccLaw as MccLaw
@@ -15,5 +17,6 @@ from ._reference import hertz_stress as hertz_stress
 from ._reference import ideal_plastic_stress as ideal_plastic_stress
 from ._reference import similarity_strength as similarity_strength
 from ._reference import similarity_stress as similarity_stress
+from ._unloading import PUNCH_AREA as PUNCH_AREA
 from ._unloading import StrainScaling as StrainScaling
 from ._unloading import Unloading as Unloading

@@ -170,7 +170,7 @@ class MccLaw(AbstractContactLaw[History]):
 
         A force <= 0 means out of contact: the displacement stays where the platen left the particle.
         """
-        peak, displacement = self._displacement(particle, state, force, force)
+        peak, displacement = self.peak_and_displacement(particle, state, force, force)
         return History(peak), displacement
 
     def path(self, particle: Particle, state: History, displacement: Path) -> tuple[History, Path]:
@@ -181,7 +181,7 @@ class MccLaw(AbstractContactLaw[History]):
 
     def path_load(self, particle: Particle, state: History, force: Path) -> tuple[History, Path]:
         """Displacements [um] along a path of forces [mN], in closed form over the running maximum (no scan)."""
-        peak, displacement = self._displacement(particle, state, force, running_max(force))
+        peak, displacement = self.peak_and_displacement(particle, state, force, running_max(force))
         return History(peak[-1]), displacement
 
     def _force(self, particle: Particle, displacement: AnyShape, peak: AnyShape) -> AnyShape:
@@ -196,10 +196,17 @@ class MccLaw(AbstractContactLaw[History]):
         compliance = diameter * diameter * diameter / stiffness
         return branch_force(power, K1, K3 * square, K5 * (square * square), compliance, peak, peak - displacement)
 
-    def _displacement(
+    def peak_and_displacement(
         self, particle: Particle, state: History, force: AnyShape, highest: AnyShape
     ) -> tuple[AnyShape, AnyShape]:
-        """Peak displacement and displacement under a force, of which `highest` is the largest so far."""
+        """Largest displacement so far and displacement [um] under forces [mN], one or many.
+
+        Args:
+            particle: the particle.
+            state: its history before the first of the forces.
+            force: forces [mN].
+            highest: the largest force up to each of them [mN].
+        """
         # The barriers make three stages that share nothing but what they are given. Where they share intermediate
         # values, XLA stores those and cuts the loop over the data of the inverse in many pieces.
         past = jax.lax.optimization_barrier(

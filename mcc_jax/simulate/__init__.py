@@ -9,6 +9,8 @@ from ._campaign import simulate_campaign as simulate_campaign
 from ._drive import Response as Response
 from ._drive import drive as drive
 from ._drive import simulate_batch as simulate_batch
+from ._effects import HiddenEffect as HiddenEffect
+from ._effects import read_effect as read_effect
 from ._instrument import Instrument as Instrument
 from ._programme import Hold as Hold
 from ._programme import Programme as Programme

@@ -21,9 +21,11 @@ from ..campaign import (
     Metadata,
     particle_batch,
 )
+from ..effects import HUMIDITY_COLUMN, REFERENCE_HUMIDITY_PERCENT, AbstractEffect, ExtendedLaw, Need
 from ..geometry import Particle
 from ..law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainScaling, Unloading
-from ._drive import simulate_batch
+from ._drive import Response, simulate_batch
+from ._effects import HiddenEffect, batched_humidity
 from ._instrument import Instrument
 from ._programme import Programme
 
@@ -62,6 +64,8 @@ def simulate_campaign(
     *,
     instrument: Instrument | None = None,
     particles: Sequence[str] | None = None,
+    effects: Sequence[HiddenEffect] = (),
+    relative_humidity_percent: np.ndarray | None = None,
     seed: int = 0,
     provenance: str = "simulated",
 ) -> Campaign:
@@ -74,15 +78,19 @@ def simulate_campaign(
         programme: what the tester does, relative to the peak.
         instrument: how it reads; perfect if None.
         particles: names; "1" to "N" if None.
-        seed: seed of the read-out's noise. Each particle has a stream of its own: adding one leaves the others as they
-            were.
+        effects: what else acts, besides the law; strengths that differ from test to test are drawn with the seed,
+            and stand in `columns`.
+        relative_humidity_percent: of the room during each test, shape (N,); it becomes a column.
+        seed: seed of the read-out's noise and of the effects. Each particle has a stream of its own: adding one leaves
+            the others as they were.
         provenance: for the campaign's metadata.
 
     Returns:
         A campaign; the true coefficients, and whether each law is monotone, are in its `columns`.
 
     Raises:
-        ValueError: if lengths disagree or the law refuses a particle (`RESULTS` says why).
+        ValueError: if lengths disagree, an effect of humidity gets no humidities, or the law refuses a particle
+            (`RESULTS` says why).
     """
     count = len(diameters_um)
     names = tuple(str(i + 1) for i in range(count)) if particles is None else tuple(particles)
@@ -96,7 +104,12 @@ def simulate_campaign(
     longest = max(len(time) for time, _ in samples)
     # Padding repeats the last value: a valid path whose further points change nothing.
     paths = np.stack([np.pad(target, (0, longest - len(target)), mode="edge") for _, target in samples])
-    response = simulate_batch(laws, particle_batch(diameters_um), jnp.asarray(paths), control=programme.control)
+    drawn = [effect.draw(seed, i, count) for i, effect in enumerate(effects)]
+    if drawn:
+        times = np.stack([np.pad(time, (0, longest - len(time)), mode="edge") for time, _ in samples])
+        response = _with_effects(laws, diameters_um, paths, times, effects, drawn, relative_humidity_percent, programme)
+    else:
+        response = simulate_batch(laws, particle_batch(diameters_um), jnp.asarray(paths), control=programme.control)
     force, displacement = np.asarray(response.force, float), np.asarray(response.displacement, float)
     bad = np.flatnonzero(np.asarray(response.result != RESULTS.successful))
     if len(bad):
@@ -109,6 +122,12 @@ def simulate_campaign(
         curves.append(Curve(time, *read))
     truth = {name: np.asarray(getattr(laws.plastic, name), float) for name in ("C1", "C3", "C5")}
     columns = {f"true_{name}": tuple(repr(float(v)) for v in values) for name, values in truth.items()}
+    for i, (effect, (_, values)) in enumerate(zip(effects, drawn, strict=True)):
+        mark = "" if [e.variant.mechanism for e in effects].count(effect.variant.mechanism) == 1 else f"_{i + 1}"
+        for name in effect.random:
+            columns[f"true_{effect.variant.mechanism}{mark}_{name}"] = tuple(repr(float(v)) for v in values[name])
+    if relative_humidity_percent is not None:
+        columns[HUMIDITY_COLUMN] = tuple(repr(float(v)) for v in relative_humidity_percent)
     columns["true_monotone"] = tuple("yes" if m else "no" for m in np.asarray(response.monotone))
     metadata = Metadata(
         control=programme.control,
@@ -125,10 +144,34 @@ def simulate_campaign(
                 "displacement_noise_um": instrument.displacement_noise_um,
                 "force_noise_mN": instrument.force_noise_mN,
                 "zero_um": instrument.zero_um,
+                **({"effects": [effect.describe() for effect in effects]} if effects else {}),
             }
         },
     )
     return Campaign(names, np.asarray(diameters_um, float), tuple(curves), columns, metadata)
+
+
+def _with_effects(
+    laws: MccLaw,
+    diameters_um: np.ndarray,
+    paths: np.ndarray,
+    times: np.ndarray,
+    effects: Sequence[HiddenEffect],
+    drawn: Sequence[tuple[AbstractEffect, dict[str, np.ndarray]]],
+    humidity: np.ndarray | None,
+    programme: Programme,
+) -> Response:
+    wet = [e.variant.mechanism for e in effects if Need.HUMIDITY_COLUMN in e.variant.needs]
+    if wet and humidity is None:
+        raise ValueError(f"the effect {wet[0]} needs the relative humidity of every test ({HUMIDITY_COLUMN})")
+    return simulate_batch(
+        ExtendedLaw(laws, tuple(effect for effect, _ in drawn)),
+        particle_batch(diameters_um),
+        jnp.asarray(paths),
+        times=jnp.asarray(times),
+        relative_humidity=batched_humidity(humidity, len(diameters_um), REFERENCE_HUMIDITY_PERCENT),
+        control=programme.control,
+    )
 
 
 def paper_campaign(
@@ -140,6 +183,8 @@ def paper_campaign(
     unloading: Unloading = Unloading.PRINTED,
     strain_scaling: StrainScaling = StrainScaling.RAW,
     peak_stress_MPa: tuple[float, float] = PAPER_PEAK_STRESS_MPA,
+    effects: Sequence[HiddenEffect] = (),
+    relative_humidity_percent: np.ndarray | None = None,
 ) -> Campaign:
     """A campaign drawn from the paper: Table 1's particles, Table 2's coefficients, its protocol.
 
@@ -155,6 +200,8 @@ def paper_campaign(
         unloading: form of the unloading law (16 GPa belongs to the printed one).
         strain_scaling: how the shape factor enters unloading.
         peak_stress_MPa: range of the maximum stress [MPa].
+        effects: what else acts, besides the law.
+        relative_humidity_percent: of the room during each test [%], shape (20,).
     """
     count = len(PAPER_DIAMETERS_UM)
     population = paper_population()
@@ -179,6 +226,8 @@ def paper_campaign(
         peaks,
         programme,
         instrument=instrument or Instrument(displacement_noise_um=0.02, force_noise_mN=0.05),
+        effects=effects,
+        relative_humidity_percent=relative_humidity_percent,
         seed=seed,
         provenance=f"simulated from Tables 1 and 2 of Bommireddy et al. (2018), seed {seed}; not a measurement",
     )

@@ -185,6 +185,20 @@ def test_simulate_options_do_what_they_say(run, simulated, tmp_path):
         assert curve.time_s[1] == 2
 
 
+def test_simulate_hides_effects(run, simulated, tmp_path):
+    base = ["simulate", "--particles", simulated / "particles.csv", "--points", "30"]
+    done(run(*base, "--out", tmp_path / "plain"))
+    effects = ["--effect", "frame_compliance=0.002", "--effect", "creep:logarithmic,tau_s=5"]
+    text = done(run(*base, "--out", tmp_path / "sim", *effects))
+    assert "Hidden effect: frame_compliance, linear, compliance_um_per_mN 0.002." in text
+    plain, hidden = (read_campaign(tmp_path / name) for name in ("plain", "sim"))
+    for one, other in zip(plain.curves, hidden.curves, strict=True):
+        assert (other.displacement_um[1:] > one.displacement_um[1:] + 0.0019 * one.force_mN[1:]).all()
+    told = hidden.metadata.other["simulation"]["effects"]
+    assert [effect["variant"] for effect in told] == ["linear", "logarithmic"]
+    assert told[1]["tau_s"] == 5
+
+
 def test_simulate_by_a_programme_file(run, simulated, tmp_path):
     programme = tmp_path / "steps.toml"
     programme.write_text("rate = 3\npoints = 50\n[[step]]\nramp_to = 1\n[[step]]\nhold_s = 9\n[[step]]\nramp_to = 0\n")

@@ -1,0 +1,1 @@
+"""Synthetic campaigns with hidden effects, in NumPy alone: nothing here knows the library under test."""

@@ -1,0 +1,79 @@
+"""The gap on particles that took no part in finding and fitting what should close it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ._score import project
+from ._system import System
+
+DIRECTIONS = 12
+"""Most informative directions of the smooth features in which a systematic gap is looked for."""
+
+Choose = Callable[[np.ndarray], list[np.ndarray]]
+"""From the particles of a fold, the columns inside the law at each step, the base law first."""
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Held-out results of every step.
+
+    Attributes:
+        chi2: of every particle at every step, shape (steps, N).
+        points: of every particle.
+        energy: systematic chi2 that is left, noise taken off, at every step.
+        elpd: log predictive density of every particle at every step, up to a constant of its own.
+    """
+
+    chi2: np.ndarray
+    points: np.ndarray
+    energy: np.ndarray
+    elpd: np.ndarray
+
+    @property
+    def chi2_per_dof(self) -> np.ndarray:
+        """Mean chi2 per point of every step."""
+        return self.chi2.sum(1) / self.points.sum()
+
+
+def held_out(system: System, choose: Choose) -> HeldOut:
+    """Leave out one particle after the other; search and fit with the others; see how far it is then from the law."""
+    usable = np.flatnonzero(system.usable)
+    basis = np.concatenate([system.place_columns, system.word_columns])
+    whole = project(system, basis)
+    values, vectors = np.linalg.eigh(whole.information.sum(0))
+    order = np.argsort(-values)[:DIRECTIONS]
+    order = order[values[order] > 1e-9 * values[order[0]]]
+    directions = vectors[:, order] / np.sqrt(values[order])
+    nuisance = system.globals
+    # The basis with the population projected off, as in the whole campaign.
+    shift = _shift(system, basis, usable)
+    steps = len(choose(usable))
+    chi2, elpd = np.zeros((steps, len(usable))), np.zeros((steps, len(usable)))
+    pattern = np.zeros((steps, len(usable), directions.shape[1]))
+    for row, i in enumerate(usable):
+        others = usable[usable != i] if len(usable) > 1 else usable
+        for step, inside in enumerate(choose(others)):
+            fitted = project(system, basis[:0], inside=inside, particles=others)
+            at = np.concatenate([nuisance, inside]).astype(int)
+            gram = system.gram[i]
+            left = gram[:, 0] + gram[:, at] @ fitted.theta
+            chi2[step, row] = left[0] + fitted.theta @ left[at]
+            inner = gram[np.ix_(at, at)]
+            # The fitted parameters are uncertain themselves: their covariance widens the prediction.
+            widened = np.eye(len(at)) + fitted.covariance @ inner
+            explained = left[at] @ np.linalg.solve(widened, fitted.covariance @ left[at])
+            elpd[step, row] = -0.5 * (chi2[step, row] - explained + np.linalg.slogdet(widened)[1])
+            scores = -(left[basis] + left[nuisance] @ shift)
+            pattern[step, row] = scores @ directions
+    total = (pattern.sum(1) ** 2).sum(1) - (pattern**2).sum((1, 2))
+    return HeldOut(chi2, system.points[usable].astype(float), total, elpd)
+
+
+def _shift(system: System, basis: np.ndarray, usable: np.ndarray) -> np.ndarray:
+    total = system.gram[usable].sum(0)
+    inner = total[np.ix_(system.globals, system.globals)] + np.diag(system.prior)
+    return -np.linalg.solve(inner, total[np.ix_(system.globals, basis)])

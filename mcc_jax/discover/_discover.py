@@ -1,0 +1,383 @@
+"""The workflow: fit, is something missing, where, what, how sure, does it close the gap, what next."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from .._errors import InputError
+from ..calibrate import JointModel
+from ..campaign import THRESHOLD_MPA, Campaign
+from ..effects import LIBRARY, Mechanism, present
+from ._candidates import untestable
+from ._closure import Closure, find_closure, pursue
+from ._confirm import held_out
+from ._experiments import next_experiments
+from ._refine import refined
+from ._result import Discovery, Effect, Verdict
+from ._score import Projection, family_wise, flips, project
+from ._search import Ranking, family_columns, pairs, random_probability, rank
+from ._system import GLOBALS, Base, Signals, System, base_fit, build_system, signals_of
+from ._where import where
+
+LEVEL = 0.04
+LEVEL_AT_RANDOM = 0.01
+"""Family-wise levels of the two tests for a gap: common to all particles, different from test to test. Together 5 %."""
+
+LEVEL_OF_MORE = 0.01
+"""Level at which something is missing besides the whole family of formulas of what was added."""
+
+LIKE_THE_BEST = 0.1
+"""A mechanism whose probability is at least this share of the best one's belongs to the set."""
+
+REFINEMENTS = 2
+FEWEST = 4
+"""Below so many particles their scatter says nothing; the noise model has to do."""
+
+
+def discover(
+    campaign: Campaign,
+    *,
+    library: Mapping[str, Mechanism] | None = None,
+    exclude: tuple[str, ...] = (),
+    model: JointModel | None = None,
+    threshold_MPa: float = THRESHOLD_MPA,
+    confirm: bool = True,
+    experiments: bool = True,
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> Discovery:
+    """Find where law and campaign disagree, name what is missing, and show on held-out particles that it helps.
+
+    Args:
+        campaign: the tests.
+        library: mechanisms to look for; the whole `mcc_jax.effects.LIBRARY` if None.
+        exclude: names of mechanisms to leave out.
+        model: form of unloading and priors; the modulus may always scatter between particles.
+        threshold_MPa: points below this stress on loading do not count [MPa].
+        confirm: repeat the search with each particle left out, and see how far that particle is then from the law.
+        experiments: work out which further test would tell the members of a set apart.
+        seed: of the bootstrap.
+        progress: called with the name of each step.
+
+    Returns:
+        The answer; "nothing is missing" and "cannot tell" are answers, too.
+
+    Raises:
+        InputError: if no particle can be used, or a name to exclude is not known.
+    """
+    started = time.perf_counter()
+    tell = progress or (lambda _: None)
+    known = dict(LIBRARY if library is None else library)
+    for name in exclude:
+        if name not in known:
+            raise InputError(f"there is no mechanism {name!r}", remedy=f"Known: {', '.join(known)}.")
+        known.pop(name)
+    assumed = model or JointModel()
+    assumed = JointModel(assumed.unloading, assumed.strain_scaling, True, assumed.shape_scatter, assumed.priors)
+    base = base_fit(campaign, assumed, threshold_MPa=threshold_MPa, tell=tell)
+    testable, missing = untestable(known, present(campaign))
+    if not bool(np.all(np.asarray(base.fit.converged)[1:])) or not _mostly_converged(base):
+        return _not_converged(base, missing, seed, started)
+    tell("signatures of all effects")
+    signals = signals_of(base, testable)
+    system = build_system(base, signals)
+    for _ in range(REFINEMENTS):
+        tell("noise without what is systematic")
+        base, changed = refined(base, system, signals)
+        if not changed:
+            break
+        system = build_system(base, signals)
+    return _judge(base, signals, system, missing, confirm, experiments, seed, started, tell)
+
+
+def _mostly_converged(base: Base) -> bool:
+    return float(np.mean(np.asarray(base.fit.individual.converged))) >= 0.7
+
+
+def _not_converged(base: Base, missing, seed: int, started: float) -> Discovery:
+    reasons = [
+        name
+        for name, fine in zip(("particles", "noise", "population"), np.asarray(base.fit.converged), strict=True)
+        if not fine
+    ]
+    return Discovery(
+        verdict="FIT_NOT_CONVERGED",
+        summary=(
+            f"The base law could not be fitted well enough to ask what it lacks (not converged: {', '.join(reasons)}). "
+            "Nothing is named. Look at the curves and the diameters, leave out damaged tests, and try again."
+        ),
+        base=base,
+        system=None,
+        effects=(),
+        candidate_set=(),
+        ranking=None,
+        untestable=tuple(missing),
+        where=(),
+        closure=None,
+        held_out=None,
+        labels=(),
+        p_any=float("nan"),
+        before=_parameters(base, None),
+        after={},
+        next_experiments=(),
+        limits={},
+        seed=seed,
+        runtime_s=time.perf_counter() - started,
+    )
+
+
+def _signs(system: System) -> np.ndarray:
+    return np.array([c.variant.sign for c in system.candidates])
+
+
+def _left(system: System, seed: int, inside: np.ndarray) -> float:
+    """Family-wise probability that nothing is left beside some columns, over candidates, map and words."""
+    columns = np.concatenate([system.candidate_columns, system.place_columns, system.word_columns])
+    sign = np.concatenate([_signs(system), np.zeros(len(columns) - len(system.candidates))])
+    view = project(system, columns, inside=inside)
+    keep = view.survival > (1e-6 if not len(inside) else 1e-2)
+    if not keep.any():
+        return 1.0
+    return _probability(view.scores[:, keep], view.total[keep], sign[keep], seed)
+
+
+def _probability(scores: np.ndarray, total: np.ndarray, sign: np.ndarray, seed: int) -> float:
+    if len(scores) < FEWEST:
+        from scipy.stats import norm
+
+        t = scores.sum(0) / np.sqrt(np.maximum(total, 1e-300))
+        largest = float(np.max(np.where(sign == 0, np.abs(t), t * sign)))
+        # Some thirty of the columns are independent of each other.
+        return float(min(1.0, 60 * norm.sf(largest)))
+    return float(family_wise(scores, sign, flips(len(scores), seed))[0].min())
+
+
+def _judge(
+    base: Base, signals: Signals, system: System, missing, confirm: bool, experiments: bool, seed: int, started, tell
+) -> Discovery:
+    tell("is something missing")
+    view = project(system, system.candidate_columns)
+    ranking = rank(system, view)
+    p_common = _left(system, seed, np.array([], int))
+    p_random = random_probability(system, view, seed)
+    gap = p_common <= LEVEL or p_random <= LEVEL_AT_RANDOM
+    p_any = min(1.0, p_common * 0.05 / LEVEL, p_random * 0.05 / LEVEL_AT_RANDOM)
+    notes = _notes(base, system)
+    verdict: Verdict = "NO_GAP"
+    chosen: list[int] = []
+    sets: list[tuple[str, ...]] = []
+    closure: Closure | None = None
+    steps: list[Ranking] = []
+    places: list[dict[str, Any]] = []
+    if gap:
+        tell("where")
+        places = where(base, system)
+        tell("what")
+        verdict, chosen, sets, steps, closure = _name(base, system, view, ranking, seed, tell)
+    effects = _effects(system, chosen, steps, p_any)
+    inside = np.array([system.column(k) for k in chosen], int)
+    words = closure.words if closure is not None else np.array([], int)
+    ladder, labels = None, (None,)
+    if confirm and gap and int(system.usable.sum()) > 2:
+        tell("held-out particles")
+        ladder = held_out(system, _chooser(system, len(chosen), closure is not None))
+        labels = (None, *(e.mechanism for e in effects), *(("formula",) if closure is not None else ()))
+    further: list[dict[str, Any]] = []
+    if experiments and gap:
+        tell("next experiments")
+        further = next_experiments(base, system, chosen, sets)
+    with_all = np.concatenate([inside, words]).astype(int)
+    found = Discovery(
+        verdict=verdict,
+        summary="",
+        base=base,
+        system=system,
+        effects=effects,
+        candidate_set=tuple(sets),
+        ranking=ranking,
+        untestable=tuple(missing),
+        where=tuple(places),
+        closure=closure,
+        held_out=ladder,
+        labels=labels,
+        p_any=p_any,
+        before=_parameters(base, project(system, inside[:0])),
+        after=_parameters(base, project(system, inside[:0], inside=with_all)) if gap else {},
+        next_experiments=tuple(further),
+        limits=_limits(system, view, ranking),
+        seed=seed,
+        runtime_s=0.0,
+        notes=tuple(notes),
+    )
+    from dataclasses import replace
+
+    from ._words import summary_of
+
+    return replace(found, summary=summary_of(found), runtime_s=time.perf_counter() - started)
+
+
+def _name(base: Base, system: System, view: Projection, ranking: Ranking, seed: int, tell):
+    """Verdict, chosen candidates, their sets, rankings of each step, and the formula if nothing listed will do."""
+    first = ranking.best[0]
+    top = ranking.names[0]
+    absorbed = system.absorbing(family_columns(system, (top,))) if ranking.at_random[0] else system
+    family = family_columns(system, (top,))
+    p_left = _left(absorbed, seed, family)
+    members = tuple(ranking.members(LIKE_THE_BEST))
+    if p_left > LEVEL_OF_MORE:
+        return ("NAMED" if len(members) == 1 else "SET"), [first], [members], [ranking], None
+    tell("a second effect")
+    span = _span(base)
+    words, gain_of_words = pursue(system)
+    best_pairs = pairs(system, view)
+    if best_pairs and not ranking.at_random[0]:
+        gain, i, j = best_pairs[0]
+        if view.scores[:, j].sum() ** 2 / view.total[j] > view.scores[:, i].sum() ** 2 / view.total[i]:
+            i, j = j, i
+        both = tuple(system.candidates[k].mechanism for k in (i, j))
+        p_both = _left(system, seed, family_columns(system, both))
+        enough = p_both > LEVEL_OF_MORE
+        if enough and gain >= gain_of_words - 10 * len(words):
+            one = rank(system, project(system, system.candidate_columns, inside=np.array([system.column(j)])))
+            two = rank(system, project(system, system.candidate_columns, inside=np.array([system.column(i)])))
+            sets = [_with(both[0], one), _with(both[1], two)]
+            verdict: Verdict = "NAMED" if all(len(s) == 1 for s in sets) else "SET"
+            return verdict, [i, j], sets, [one, two], None
+    tell("a formula of its own")
+    closure = find_closure(system, span, seed, tell=tell)
+    if closure is None:
+        return ("NAMED" if len(members) == 1 else "SET"), [first], [members], [ranking], None
+    return "UNLISTED", [], [], [], closure
+
+
+def _with(name: str, ranking: Ranking) -> tuple[str, ...]:
+    members = ranking.members(LIKE_THE_BEST)
+    return (name, *(m for m in members if m != name))
+
+
+def _chooser(system: System, count: int, formula: bool) -> Callable[[np.ndarray], list[np.ndarray]]:
+    """The search as it is repeated within a fold."""
+    empty = np.array([], int)
+
+    def choose(particles: np.ndarray) -> list[np.ndarray]:
+        if formula:
+            return [empty, np.array(pursue(system, particles=particles)[0], int)]
+        view = project(system, system.candidate_columns, particles=particles)
+        if count == 1:
+            return [empty, np.array([system.column(rank(system, view).best[0])])]
+        found = pairs(system, view)
+        if not found:
+            return [empty] * (count + 1)
+        _, i, j = found[0]
+        if view.scores[:, j].sum() ** 2 / view.total[j] > view.scores[:, i].sum() ** 2 / view.total[i]:
+            i, j = j, i
+        return [empty, np.array([system.column(i)]), np.array([system.column(i), system.column(j)])]
+
+    return choose
+
+
+def _effects(system: System, chosen: list[int], steps: list[Ranking], p_any: float) -> tuple[Effect, ...]:
+    if not chosen:
+        return ()
+    inside = np.array([system.column(k) for k in chosen])
+    fitted = project(system, inside[:0], inside=inside)
+    start = len(system.globals)
+    found = []
+    for row, (k, step) in enumerate(zip(chosen, steps, strict=True)):
+        candidate = system.candidates[k]
+        unit = candidate.unit_amplitude
+        position = step.names.index(candidate.mechanism)
+        others = inside[inside != inside[row]]
+        alone = project(system, inside[row : row + 1], inside=others)
+        own = alone.scores[:, 0] / np.maximum(alone.information[:, 0, 0], 1e-300)
+        found.append(
+            Effect(
+                candidate.variant,
+                dict(candidate.nuisance),
+                float(fitted.theta[start + row] * unit),
+                float(np.sqrt(fitted.covariance[start + row, start + row]) * unit),
+                float(step.probability[position]),
+                p_any,
+                step.at_random[position],
+                own * unit,
+            )
+        )
+    return tuple(found)
+
+
+DETECTABLE = 4.6
+"""Estimate over standard error that is found with 95 % probability at the family-wise level."""
+
+
+def _limits(system: System, view: Projection, ranking: Ranking) -> dict[str, tuple[float, float, float]]:
+    """Statistic, estimate and detection limit of every mechanism's best formula, in its unit."""
+    found = {}
+    for name, k in zip(ranking.names, ranking.best, strict=True):
+        unit = system.candidates[k].unit_amplitude
+        information = max(float(view.total[k]), 1e-300)
+        found[name] = (
+            float(view.gaussian[k]),
+            float(view.estimate[k] * unit),
+            DETECTABLE / np.sqrt(information) * unit,
+        )
+    return found
+
+
+def _parameters(base: Base, view: Projection | None) -> dict[str, Any]:
+    """The population's parameters, moved as the linear system says."""
+    from ..calibrate.joint._fit import population_at
+
+    population = population_at(base.fit.mode, base.fit.numbers, base.model.scatter)
+    values = np.array([float(population.a), float(population.log_modulus), *np.asarray(population.mu)])
+    sd = np.full(len(GLOBALS), np.nan)
+    if view is not None:
+        values = values + view.theta[: len(GLOBALS)]
+        sd = np.sqrt(np.diagonal(view.covariance)[: len(GLOBALS)])
+
+    def entry(value: float, width: float) -> dict[str, Any]:
+        if not np.isfinite(width):
+            return {"value": float(value), "sd": None, "interval_95": None}
+        return {"value": float(value), "sd": float(width), "interval_95": [value - 1.96 * width, value + 1.96 * width]}
+
+    modulus = float(np.exp(values[1]))
+    tau = np.asarray(population.tau)
+    return {
+        "a": entry(values[0], sd[0]),
+        "effective_modulus_MPa": entry(modulus, modulus * sd[1]),
+        **{
+            f"log_{name}": {"mean": entry(values[2 + j], sd[2 + j]), "sd": entry(float(tau[j]), float("nan"))}
+            for j, name in enumerate(("C1", "C3", "C5"))
+        },
+    }
+
+
+def _span(base: Base) -> dict[str, tuple[float, float]]:
+    tests = base.tests
+    force = np.where(np.asarray(tests.mask), np.asarray(tests.force), np.nan)
+    diameter = np.asarray(tests.particle.D1 * tests.particle.D2 / tests.particle.D3)
+    stress = force / (np.pi * diameter[:, None] ** 2 / 4) * 1e3
+    return {
+        "stress_MPa": (float(np.nanmin(stress)), float(np.nanmax(stress))),
+        "effective_diameter_um": (float(diameter.min()), float(diameter.max())),
+        "time_s": (0.0, float(np.asarray(base.records.time).max())),
+    }
+
+
+def _notes(base: Base, system: System) -> list[str]:
+    notes = list(base.selection.notes)
+    for i in np.flatnonzero(~system.usable):
+        name = base.campaign.particles[base.selection.kept[i]]
+        notes.append(f"particle {name!r} snaps through in its loading; it is fitted, but takes no part in the search")
+    for name, reason in zip(base.campaign.particles, base.selection.why_not, strict=True):
+        if reason is not None:
+            notes.append(f"particle {name!r} {reason}")
+    if int(system.usable.sum()) < FEWEST:
+        notes.append(
+            f"{int(system.usable.sum())} usable particles: their scatter says nothing, so significance rests on the "
+            "noise model"
+        )
+    return notes

@@ -1,0 +1,174 @@
+"""What a planned campaign could show, before it is measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..calibrate import JointModel
+from ..calibrate.joint._data import Tests, select_tests
+from ..calibrate.joint._fit import JointFit
+from ..calibrate.joint._forward import law_of
+from ..calibrate.joint._linearised import linear_data, summarise
+from ..calibrate.joint._noise import Noise
+from ..campaign import Campaign, Curve, Metadata
+from ..effects import LIBRARY, Mechanism, present
+from ..simulate import Programme, simulate_campaign
+from ._candidates import untestable
+from ._score import project
+from ._system import Base, System, _records, build_system, signals_of
+
+DETECTABLE = 4.6
+"""Estimate over standard error that is found with 95 % probability at the family-wise level."""
+
+ALIKE = 0.9
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A test programme, perhaps another one for every second particle.
+
+    Attributes:
+        name: what to do, in words.
+        programmes: taken in turn by the particles.
+    """
+
+    name: str
+    programmes: tuple[Programme, ...]
+
+
+def planned_campaign(laws, diameters_um: np.ndarray, peaks_mN: np.ndarray, plan: Plan) -> Campaign:
+    """The campaign that a plan would give without noise and without any missing effect."""
+    parts = [simulate_campaign(laws, diameters_um, peaks_mN, programme) for programme in plan.programmes]
+    curves: list[Curve] = [parts[i % len(parts)].curves[i] for i in range(len(diameters_um))]
+    return Campaign(parts[0].particles, parts[0].diameters_um, tuple(curves), {}, Metadata(control="load"))
+
+
+def planned_base(base: Base, plan: Plan) -> Base:
+    """A base fit as it would be if the same particles were tested by a plan, with the same noise."""
+    fit = base.fit
+    kept = list(base.selection.kept)
+    laws = eqx.filter_vmap(lambda w: law_of(w, base.model.unloading))(fit.latent)
+    peaks = np.asarray(jnp.max(base.tests.force, axis=1))
+    campaign = planned_campaign(laws, base.campaign.diameters_um[kept], peaks, plan)
+    return _expected(campaign, fit, base.model, fit.latent, fit.noise)
+
+
+def _expected(campaign: Campaign, fit: JointFit, model: JointModel, latent, noise: Noise) -> Base:
+    selection = select_tests(campaign)
+    kept = np.asarray(selection.kept)
+    tests: Tests = selection.tests
+    latent = latent[kept]
+    zero = jnp.zeros(len(kept))
+    noise = eqx.tree_at(lambda n: n.scale, noise, noise.scale[kept])
+    data = linear_data(latent, zero, tests, model.zero_sd, model.unloading)
+    data = eqx.tree_at(lambda d: d.residual, data, jnp.zeros_like(data.residual))
+    summary, filters = summarise(latent, zero, tests, data, noise, model.zero_sd)
+    numbers = eqx.tree_at(lambda n: n.flatness, fit.numbers, tests.flatness)
+    new = eqx.tree_at(
+        lambda f: (f.noise, f.filters, f.latent, f.zero, f.residual, f.summary, f.numbers),
+        fit,
+        (noise, filters, latent, zero, data.residual, summary, numbers),
+    )
+    return Base(campaign, selection, model, new, _records(campaign, selection))
+
+
+def planned_system(base: Base, plan: Plan, library: Mapping[str, Mechanism]) -> System:
+    """The linear system of the same particles under another plan."""
+    planned = planned_base(base, plan)
+    return build_system(planned, signals_of(planned, library))
+
+
+@dataclass(frozen=True)
+class Power:
+    """What a planned campaign can show.
+
+    Attributes:
+        mechanisms: names.
+        limits: smallest amplitude of each mechanism's most visible formula that is found with 95 % probability.
+        units, plausible: its unit and the range one would believe.
+        inseparable: pairs whose projected signatures are so alike that these data cannot tell them apart.
+        untestable: mechanisms that need what the campaign does not hold.
+    """
+
+    mechanisms: tuple[str, ...]
+    limits: dict[str, float]
+    units: dict[str, str]
+    plausible: dict[str, tuple[float, float]]
+    inseparable: tuple[tuple[str, str, float], ...]
+    untestable: tuple[dict[str, str], ...]
+
+
+def power_of(system: System, missing: Sequence[dict[str, str]]) -> Power:
+    """Detection limits and inseparable pairs of a linear system; residuals play no part."""
+    view = project(system, system.candidate_columns)
+    both = view.similarity()
+    first: dict[str, int] = {}
+    limits, units, plausible = {}, {}, {}
+    strength = view.total * (view.survival > 1e-6)
+    for k, candidate in enumerate(system.candidates):
+        first.setdefault(candidate.mechanism, k)
+    members: dict[str, list[int]] = {}
+    for k, candidate in enumerate(system.candidates):
+        if strength[k] > 0:
+            members.setdefault(candidate.mechanism, []).append(k)
+    for name, ks in members.items():
+        # The first formula is the common one; the limit is that of the family's first formula that leaves a trace.
+        k = ks[0]
+        unit = system.candidates[k].unit_amplitude
+        limits[name] = float(DETECTABLE / np.sqrt(strength[k]) * unit)
+        units[name] = system.candidates[k].variant.unit
+        plausible[name] = system.candidates[k].variant.plausible
+    alike = []
+    names = list(members)
+    signs = np.array([c.variant.sign for c in system.candidates])
+    for a, one in enumerate(names):
+        for other in names[a + 1 :]:
+            block = both[np.ix_(members[one], members[other])]
+            product = signs[members[one]][:, None] * signs[members[other]][None]
+            value = float(np.max(np.where(product == 0, np.abs(block), block * product)))
+            if value >= ALIKE:
+                alike.append((one, other, value))
+    alike.sort(key=lambda item: -item[2])
+    return Power(tuple(names), limits, units, plausible, tuple(alike), tuple(missing))
+
+
+def power(
+    diameters_um: np.ndarray,
+    peaks_mN: np.ndarray,
+    plan: Plan,
+    *,
+    base: Base,
+    library: Mapping[str, Mechanism] = LIBRARY,
+) -> Power:
+    """Power of a planned campaign of particles of given sizes, with material and noise as in a fitted one.
+
+    Args:
+        diameters_um: D1, D2, D3 of the particles to be tested, shape (N, 3).
+        peaks_mN: their largest forces.
+        plan: what is done to them.
+        base: a fitted campaign, of which material and noise are taken.
+        library: the mechanisms.
+    """
+    from ..calibrate.joint._fit import population_at
+    from ..calibrate.joint._population import moments
+    from ..campaign import particle_batch
+    from ..geometry import Particle
+
+    particles = particle_batch(diameters_um)
+    flat = eqx.filter_vmap(Particle.flatness.fget)(particles)  # pyright: ignore[reportAttributeAccessIssue]
+    population = population_at(base.fit.mode, base.fit.numbers, base.model.scatter)
+    latent, _ = moments(population, flat, base.model.scatter)
+    laws = eqx.filter_vmap(lambda w: law_of(w, base.model.unloading))(latent)
+    campaign = planned_campaign(laws, np.asarray(diameters_um, float), np.asarray(peaks_mN, float), plan)
+    noise = eqx.tree_at(lambda n: n.scale, base.fit.noise, jnp.ones(len(diameters_um)))
+    planned = _expected(campaign, base.fit, base.model, latent, noise)
+    testable, missing = untestable(library, present(campaign))
+    system = build_system(planned, signals_of(planned, testable))
+    jax.block_until_ready(planned.fit.latent)
+    return power_of(replace(system, usable=np.ones(len(system.points), bool)), missing)

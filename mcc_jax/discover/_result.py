@@ -1,0 +1,188 @@
+"""The answer of a discovery."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from ..calibrate._result import finite
+from ..effects import EQUIVALENCES, AbstractEffect, Variant
+from ._closure import Closure
+from ._confirm import HeldOut
+from ._search import Ranking
+from ._system import Base, System
+
+Verdict = Literal["NO_GAP", "NAMED", "SET", "UNLISTED", "FIT_NOT_CONVERGED"]
+
+
+@dataclass(frozen=True)
+class Effect:
+    """A mechanism that was added.
+
+    Attributes:
+        variant: the formula.
+        nuisance: its further parameters.
+        amplitude, sd: estimate of the amplitude in the variant's unit.
+        probability: of the mechanism among all, tempered.
+        p_family_wise: probability of so large a statistic of any mechanism if nothing were missing.
+        at_random: whether the amplitude differs from test to test.
+        by_particle: each test's own estimate of the amplitude.
+    """
+
+    variant: Variant
+    nuisance: dict[str, float]
+    amplitude: float
+    sd: float
+    probability: float
+    p_family_wise: float
+    at_random: bool
+    by_particle: np.ndarray
+
+    @property
+    def mechanism(self) -> str:
+        """Name of the mechanism."""
+        return self.variant.mechanism
+
+    def build(self) -> AbstractEffect:
+        """The effect as a part of the law."""
+        return self.variant.build(self.amplitude, **self.nuisance)
+
+    def to_json(self) -> dict[str, Any]:
+        """As in `discovery.json`."""
+        pair = [self.amplitude - 1.96 * self.sd, self.amplitude + 1.96 * self.sd]
+        own = {"value": finite(self.amplitude), "sd": finite(self.sd), "interval_95": [finite(v) for v in pair]}
+        fixed = {
+            name: {"value": float(value), "sd": None, "interval_95": None} for name, value in self.nuisance.items()
+        }
+        return {
+            "mechanism": self.mechanism,
+            "variant": self.variant.name,
+            "probability": float(self.probability),
+            "p_family_wise": float(self.p_family_wise),
+            "equation": self.variant.equation,
+            "explanation": self.variant.explanation,
+            "parameters": {self.variant.parameter: own, **fixed},
+            "unit": self.variant.unit,
+            "differs_from_test_to_test": self.at_random,
+        }
+
+
+@dataclass(frozen=True)
+class Discovery:
+    """What is missing in the law, how sure that is, and what would tell more.
+
+    Attributes:
+        verdict: NO_GAP, NAMED, SET, UNLISTED or FIT_NOT_CONVERGED.
+        summary: the answer in one paragraph.
+        base: the base fit.
+        system: its linear system.
+        effects: what was added, in order.
+        candidate_set: for each effect, the mechanisms that explain it as well, best first.
+        ranking: all mechanisms against the base law.
+        untestable: mechanisms these data cannot show, and what they need.
+        where: places of disagreement.
+        closure: a formula where no listed mechanism explains the gap.
+        held_out: the gap on particles that took no part; None if not asked for.
+        labels: what was added at each step of `held_out`.
+        p_any: family-wise probability that anything is missing.
+        before, after: the population's parameters without and with the effects.
+        next_experiments: what would tell the members of the set apart.
+        notes: what a reader must know.
+    """
+
+    verdict: Verdict
+    summary: str
+    base: Base | None
+    system: System | None
+    effects: tuple[Effect, ...]
+    candidate_set: tuple[tuple[str, ...], ...]
+    ranking: Ranking | None
+    untestable: tuple[dict[str, str], ...]
+    where: tuple[dict[str, Any], ...]
+    closure: Closure | None
+    held_out: HeldOut | None
+    labels: tuple[str | None, ...]
+    p_any: float
+    before: dict[str, Any]
+    after: dict[str, Any]
+    next_experiments: tuple[dict[str, Any], ...]
+    limits: dict[str, tuple[float, float, float]]
+    seed: int
+    runtime_s: float
+    notes: tuple[str, ...] = field(default=())
+
+    def gap(self) -> dict[str, Any]:
+        """The gap at every step, on held-out particles."""
+        if self.held_out is None:
+            return {"floor": 1.0, "heldout": None, "steps": [], "closed_fraction": None}
+        h = self.held_out
+        reference = h.elpd[0]
+        typical = self._typical_noise_um()
+        steps = []
+        for label, chi2, energy, elpd in zip(self.labels, h.chi2_per_dof, h.energy, h.elpd, strict=True):
+            difference = elpd - reference
+            sd = float(np.std(difference, ddof=1) * np.sqrt(len(difference))) if len(difference) > 1 else None
+            steps.append(
+                {
+                    "added": label,
+                    "chi2_per_dof": finite(float(chi2)),
+                    "systematic_um": finite(float(np.sqrt(max(energy, 0.0) / h.points.sum()) * typical)),
+                    "elpd": finite(float(difference.sum())),
+                    "elpd_se": sd,
+                }
+            )
+        closed = None
+        if len(h.energy) > 1 and h.energy[0] > 0:
+            closed = finite(float(min(1 - h.energy[-1] / h.energy[0], 1.0)))
+        return {"floor": 1.0, "heldout": "leave-one-particle-out", "steps": steps, "closed_fraction": closed}
+
+    def _typical_noise_um(self) -> float:
+        if self.base is None:
+            return 0.0
+        weight = np.asarray(self.base.fit.filters.weight)
+        return float(np.sqrt((weight > 0).sum() / np.maximum((weight**2).sum(), 1e-300)))
+
+    def to_json(self) -> dict[str, Any]:
+        """The contents of `discovery.json`."""
+        ranking = []
+        if self.ranking is not None and self.system is not None:
+            r = self.ranking
+            for i, name in enumerate(r.names):
+                variant = self.system.candidates[r.best[i]].variant
+                statistic, estimate, limit = self.limits[name]
+                ranking.append(
+                    {
+                        "mechanism": name,
+                        "variant": variant.name,
+                        "statistic": finite(statistic),
+                        "estimate": finite(estimate),
+                        "detection_limit": finite(limit),
+                        "unit": variant.unit,
+                        "parameter": variant.parameter,
+                        "probability": finite(float(r.probability[i])),
+                    }
+                )
+        return {
+            "schema": 1,
+            "verdict": self.verdict,
+            "summary": self.summary,
+            "effects": [effect.to_json() for effect in self.effects],
+            "candidate_set": [list(names) for names in self.candidate_set],
+            "ranking": ranking,
+            "untestable": list(self.untestable),
+            "where": list(self.where),
+            "closure": None if self.closure is None else self.closure.to_json(),
+            "gap": self.gap(),
+            "parameters_before": self.before,
+            "parameters_after": self.after,
+            "next_experiments": list(self.next_experiments),
+            "p_anything_missing": finite(self.p_any),
+            "equivalent_by_construction": [
+                {"names": list(e.names), "why": e.explanation, "told_apart_by": e.broken_by} for e in EQUIVALENCES
+            ],
+            "notes": list(self.notes),
+            "seed": self.seed,
+            "runtime_s": self.runtime_s,
+        }

@@ -1,0 +1,212 @@
+r"""Naming: how well each mechanism explains what the base law leaves, alone or together with others.
+
+With scores U and information I of a formula's amplitude (in units of the largest believable one), and a prior that
+spreads the amplitude over its plausible range, a mixture of normal distributions of scale s cut at the physical sign,
+
+.. math:: E = \frac{2}{\sqrt{1 + I s^2}} \exp\!\left(\frac{U^2 s^2}{2 (1 + I s^2)}\right)
+    \Phi\!\left(\frac{U s}{\sqrt{1 + I s^2}}\right)
+
+is the formula's evidence against nothing. A mechanism's evidence is the mean over its formulas: nature may use any of
+them, or one that resembles them.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import log_ndtr, logsumexp
+
+from ._score import Projection, project
+from ._system import System
+
+SCALES = (0.01, 0.03, 0.1, 0.3, 1.0)
+"""Scales of the amplitude's prior in units of the largest believable amplitude."""
+
+LOOSENESS = 0.02
+"""No family of formulas contains nature's own: of the explained chi2 so much may be missed by the true mechanism."""
+
+
+def log_evidence(U: np.ndarray, information: np.ndarray, sign: np.ndarray) -> np.ndarray:
+    """Log evidence of amplitudes against zero, element by element."""
+    U = np.where(sign == 0, U, U * np.where(sign == 0, 1, sign))[..., None]
+    scale = np.asarray(SCALES)
+    spread = 1 + information[..., None] * scale**2
+    z = U * scale / np.sqrt(spread)
+    cut = np.where((sign == 0)[..., None], 0.0, np.log(2) + log_ndtr(z))
+    return logsumexp(-0.5 * np.log(spread) + 0.5 * z**2 + cut, axis=-1) - np.log(len(scale))
+
+
+def log_evidence_at_random(
+    scores: np.ndarray, information: np.ndarray, sign: np.ndarray, groups: list[np.ndarray]
+) -> np.ndarray:
+    """Log evidence of amplitudes that differ from test to test: a normal distribution around zero, cut at the sign.
+
+    Args:
+        scores, information: shapes (..., N, K).
+        sign: physical signs, shape (K,).
+        groups: columns of which every test has one of its own, equally probable beforehand.
+
+    Returns:
+        One number per group, shape (..., G).
+    """
+    scale = np.asarray(SCALES)
+    U = np.where(sign == 0, scores, scores * np.where(sign == 0, 1, sign))[..., None]
+    spread = 1 + information[..., None] * scale**2
+    z = U * scale / np.sqrt(spread)
+    cut = np.where((sign == 0)[:, None], 0.0, np.log(2) + log_ndtr(z))
+    each = -0.5 * np.log(spread) + 0.5 * z**2 + cut
+    found = []
+    for members in groups:
+        one = logsumexp(each[..., members, :], axis=-2) - np.log(len(members))
+        found.append(logsumexp(one.sum(-2), axis=-1) - np.log(len(scale)))
+    return np.stack(found, -1)
+
+
+def random_groups(system: System) -> list[np.ndarray]:
+    """Candidates whose amplitude or location differs from test to test: each test has one member of its group."""
+    groups: dict[tuple, list[int]] = {}
+    for k, candidate in enumerate(system.candidates):
+        variant = candidate.variant
+        free = {n.name for n in variant.nuisances if n.random_per_test}
+        if variant.random_per_test or free:
+            fixed = tuple(sorted((n, v) for n, v in candidate.nuisance.items() if n not in free))
+            groups.setdefault((variant.mechanism, variant.name, fixed), []).append(k)
+    return [np.array(members) for members in groups.values()]
+
+
+def random_probability(system: System, projection: Projection, seed: int, *, draws: int = 400) -> float:
+    """Probability under the noise model that effects which differ from test to test seem as evident as they do."""
+    groups = random_groups(system)
+    if not groups:
+        return 1.0
+    index = np.concatenate(groups)
+    sign = np.array([system.candidates[k].variant.sign for k in index])
+    bounds = np.cumsum([0, *map(len, groups)])
+    local = [np.arange(a, b) for a, b in itertools.pairwise(bounds)]
+    information = projection.information[:, index][:, :, index]
+    each = np.einsum("nkk->nk", information)
+    # A test whose noise is larger than modelled must not look like an effect.
+    inflation = np.sqrt(np.maximum(projection.residual / np.maximum(system.points[projection.particles], 1), 1.0))
+    observed = log_evidence_at_random(projection.scores[:, index] / inflation[:, None], each, sign, local).max()
+    values, vectors = np.linalg.eigh(information)
+    factor = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    rng = np.random.default_rng([seed, 43])
+    exceed = 0
+    for _ in range(4):
+        normal = rng.standard_normal((draws // 4, *each.shape))
+        scores = np.einsum("nkl,bnl->bnk", factor, normal)
+        exceed += int((log_evidence_at_random(scores, each, sign, local).max(-1) >= observed).sum())
+    return (exceed + 1) / (draws + 1)
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """Mechanisms against what is left.
+
+    Attributes:
+        names: mechanisms, best first.
+        log_evidence: theirs, the mean over formulas.
+        probability: share of each among them all, tempered by `LOOSENESS`.
+        best: each one's best candidate.
+        gain: drop of -2 log likelihood by it.
+        at_random: whether amplitudes that differ from test to test explain more than a common one.
+        temperature: by which logarithms were divided.
+    """
+
+    names: tuple[str, ...]
+    log_evidence: np.ndarray
+    probability: np.ndarray
+    best: tuple[int, ...]
+    gain: np.ndarray
+    at_random: tuple[bool, ...]
+    temperature: float
+
+    def members(self, least: float) -> list[str]:
+        """Mechanisms whose probability is at least this share of the best one's."""
+        return [n for n, p in zip(self.names, self.probability, strict=True) if p >= least * self.probability[0]]
+
+
+def rank(system: System, projection: Projection, *, without: tuple[str, ...] = ()) -> Ranking:
+    """Rank all mechanisms by what they explain beyond what was projected off."""
+    sign = np.array([c.variant.sign for c in system.candidates])
+    U, total = projection.scores.sum(0), projection.total
+    alive = projection.survival > 1e-6
+    common = np.where(alive, log_evidence(U, total, sign), -np.inf)
+    each = np.einsum("nkk->nk", projection.information)
+    differing = np.full(len(sign), -np.inf)
+    groups = random_groups(system)
+    if groups:
+        values = log_evidence_at_random(projection.scores, each, sign, groups)
+        for members, value in zip(groups, values, strict=True):
+            differing[members] = value
+    random = np.isfinite(differing)
+    evidence = np.logaddexp(common, differing) - np.where(random, np.log(2), 0.0)
+    names = [n for n in dict.fromkeys(c.mechanism for c in system.candidates) if n not in without]
+    found = []
+    for name in names:
+        members = [k for k, c in enumerate(system.candidates) if c.mechanism == name]
+        variants = [system.candidates[k].variant.name for k in members]
+        weight = np.array([1 / variants.count(v) for v in variants])
+        value = logsumexp(evidence[members], b=weight / weight.sum())
+        best = members[int(np.argmax(evidence[members]))]
+        gain = U[best] ** 2 / max(total[best], 1e-300) if np.isfinite(evidence[best]) else 0.0
+        if differing[best] > common[best]:
+            gain = max(gain, 2 * differing[best])
+        found.append((value, best, gain, bool(differing[best] > common[best])))
+    order = np.argsort([-f[0] for f in found], kind="stable")
+    values = np.array([found[i][0] for i in order])
+    gains = np.array([found[i][2] for i in order])
+    temperature = 1 + LOOSENESS * max(2 * values[0], 0.0) if np.isfinite(values[0]) else 1.0
+    share = np.exp((values - values[0]) / temperature)
+    return Ranking(
+        tuple(names[i] for i in order),
+        values,
+        share / share.sum(),
+        tuple(found[i][1] for i in order),
+        gains,
+        tuple(found[i][3] for i in order),
+        float(temperature),
+    )
+
+
+def family_columns(system: System, names: tuple[str, ...]) -> np.ndarray:
+    """Columns of all formulas of some mechanisms."""
+    return np.array([system.column(k) for k, c in enumerate(system.candidates) if c.mechanism in names], int)
+
+
+def pairs(system: System, projection: Projection) -> list[tuple[float, int, int]]:
+    """Pairs of formulas of different mechanisms by the chi2 they take away together, best pair of mechanisms first."""
+    sign = np.array([c.variant.sign for c in system.candidates])
+    U, both = projection.scores.sum(0), projection.information.sum(0)
+    d = np.diagonal(both)
+    alive = (projection.survival > 1e-6) & (d > 0)
+    det = d[:, None] * d[None] - both**2
+    fine = alive[:, None] & alive[None] & (det > 1e-4 * d[:, None] * d[None])
+    safe = np.where(fine, det, 1.0)
+    first = (d[None] * U[:, None] - both * U[None]) / safe
+    second = first.T
+    right = _physical(first, sign[:, None]) & _physical(second, sign[None])
+    gain = np.where(fine & right, first * U[:, None] + second * U[None], -np.inf)
+    names = np.array([c.mechanism for c in system.candidates])
+    gain[names[:, None] == names[None]] = -np.inf
+    best: dict[tuple[str, str], tuple[float, int, int]] = {}
+    for flat in np.argsort(-gain, axis=None)[:4000]:
+        i, j = np.unravel_index(flat, gain.shape)
+        if not np.isfinite(gain[i, j]):
+            break
+        key = (min(names[i], names[j]), max(names[i], names[j]))
+        if key not in best:
+            best[key] = (float(gain[i, j]), int(i), int(j))
+    return sorted(best.values(), reverse=True)
+
+
+def _physical(theta: np.ndarray, sign: np.ndarray) -> np.ndarray:
+    return (sign == 0) | (theta * sign > 0)
+
+
+def again(system: System, inside: list[int], **options) -> Projection:
+    """Project the candidates with some of them inside the law."""
+    columns = np.array([system.column(k) for k in inside], int)
+    return project(system, system.candidate_columns, inside=columns, **options)

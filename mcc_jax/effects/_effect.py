@@ -1,0 +1,84 @@
+"""What an effect can do to a law."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from .._types import Scalar, Values, scalar
+from ..geometry import Particle
+from ..law import MccLaw
+from ._context import Context
+from ._record import Record
+
+Factors = tuple[Values, Values, Values]
+
+
+class AbstractEffect(eqx.Module):
+    """A mechanism that the law does not contain. Every hook does nothing by default; override those it needs.
+
+    They act in this order, and each once for all effects of a law:
+
+    1. `modify`: parameters of the law for this particle (size, shape, humidity).
+    2. `loading`: factors on the three terms of the loading curve at a strain (rate, friction, hardening).
+    3. `stiffness`: factor on the effective modulus at a peak (damage, densification).
+    4. `inside`: displacement added inside the law (creep, pop-in, adhesion); additions of several effects add up.
+    5. `observe`: displacement added to what the tester measures only (frame, drift, platens).
+
+    An effect with a memory of its own also gives `driver`, `start` and `evolve`; what `evolve` returns stands in
+    `context.memory` when `inside` is called.
+
+    Hooks are plain arithmetic on scalars or arrays over points, so that `vmap`, `jvp` and `grad` pass through. They
+    must be finite with finite derivatives at zero force, on full release, at repeated points and at amplitude zero,
+    where they must change nothing; `ExtendedLaw` makes sure that the law is then the base law to the last bit.
+
+    Attributes:
+        amplitude: strength of the effect, 0 for none; its unit is that of the `Variant`.
+    """
+
+    amplitude: Scalar = eqx.field(converter=scalar)
+
+    def modify(self, law: MccLaw, particle: Particle, record: Record) -> MccLaw:
+        """The law with other parameters for this particle."""
+        return law
+
+    def loading(self, law: MccLaw, particle: Particle, record: Record, strain: Values) -> Factors:
+        """Factors on the linear, cubic and quintic term of loading at a strain [-] >= 0."""
+        one = jnp.ones_like(strain)
+        return one, one, one
+
+    def stiffness(self, context: Context) -> Values:
+        """Factor on the effective modulus of the branch that starts at the peak."""
+        return jnp.ones_like(context.peak_strain)
+
+    def inside(self, context: Context) -> Values:
+        """Displacement [um] added inside the law."""
+        return jnp.zeros_like(context.displacement)
+
+    def observe(self, context: Context) -> Values:
+        """Displacement [um] added by what lies between particle and read-out."""
+        return jnp.zeros_like(context.displacement)
+
+    def driver(self, context: Context) -> Values:
+        """What drives the memory, at every point."""
+        return jnp.zeros_like(context.displacement)
+
+    def start(self, like: Scalar) -> Any:
+        """Memory of a virgin particle, in the precision of `like`; None for an effect without one."""
+        return None
+
+    def evolve(self, memory: Any, before: Scalar, now: Scalar, seconds: Scalar) -> tuple[Any, Any]:
+        """Memory after a step during which the driver went from `before` to `now`, and what `inside` gets to see."""
+        return memory, None
+
+
+def overrides(effect: AbstractEffect, *hooks: str) -> bool:
+    """Whether the effect has any of these hooks of its own."""
+    return any(getattr(type(effect), hook) is not getattr(AbstractEffect, hook) for hook in hooks)
+
+
+def at_least(x: Values, least: float) -> Values:
+    """`x`, but not below a floor: keeps a factor positive that an amplitude far from null would turn negative."""
+    return jnp.where(x > least, x, least)

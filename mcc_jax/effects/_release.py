@@ -1,0 +1,420 @@
+"""Effects on the elastic branch: its shape, adhesion, reverse plasticity, reload hysteresis, ratcheting."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from .._types import Scalar, Values, scalar
+from ..law import PUNCH_AREA, recovery
+from ._context import Context, contact_of, positive
+from ._effect import AbstractEffect
+from ._record import RELOAD, UNLOAD, reload_progress
+from ._variant import Mechanism, Need, Nuisance, Variant
+
+_NORM = 27 / 4
+BISECTIONS = 50
+
+
+# ---- shape of unloading ----------------------------------------------------------------------------------------------
+
+
+class AbstractBow(AbstractEffect):
+    """A bow on the elastic branch, its ends fixed; the amplitude is a share of the recoverable displacement."""
+
+    def bow(self, share: Values) -> Values:
+        """Height of the bow at u = F / F_P, 0 at both ends, 1 at most."""
+        raise NotImplementedError
+
+    def inside(self, context: Context) -> Values:
+        """Delta k g(u)."""
+        return self.amplitude * context.recoverable * self.bow(context.load_share)
+
+
+class SymmetricBow(AbstractBow):
+    """The same at half load."""
+
+    def bow(self, share: Values) -> Values:
+        """4 u (1 - u)."""
+        return 4 * share * (1 - share)
+
+
+class TailBow(AbstractBow):
+    """Most at a third of the load."""
+
+    def bow(self, share: Values) -> Values:
+        """6.75 u (1 - u)^2."""
+        return _NORM * share * (1 - share) ** 2
+
+
+class OnsetBow(AbstractBow):
+    """Most at two thirds of the load."""
+
+    def bow(self, share: Values) -> Values:
+        """6.75 u^2 (1 - u)."""
+        return _NORM * share**2 * (1 - share)
+
+
+class RecoveryExponent(AbstractEffect):
+    """Another exponent of the recovered share."""
+
+    def inside(self, context: Context) -> Values:
+        """Delta (s - s^(1 + k))."""
+        s = context.recovered_share
+        some = s > 0
+        power = jnp.exp(self.amplitude * jnp.log(jnp.where(some, s, 1.0)))
+        return context.recoverable * jnp.where(some, s * (1 - power), 0.0)
+
+
+def _bow(name: str, make: type[AbstractEffect], equation: str, explanation: str) -> Variant:
+    return Variant(
+        "unloading_shape", name, make, "bow", "-", 0, (0.01, 0.3), equation, explanation,
+        "Oliver and Pharr (1992); Etsion, Kligerman and Kadin (2005), Int. J. Solids Struct. 42, 3716",
+        needs=(Need.UNLOADING,),
+    )  # fmt: skip
+
+
+SHAPE_OF_UNLOADING = Mechanism(
+    "unloading_shape",
+    "The unloading curve has another shape than the arcsine, with the same two ends.",
+    (
+        _bow("symmetric_bow", SymmetricBow, "d = Delta k 4 u (1 - u)", "Bent most at half load."),
+        _bow("tail_bow", TailBow, "d = Delta k 6.75 u (1 - u)^2", "Bent most towards release."),
+        _bow("onset_bow", OnsetBow, "d = Delta k 6.75 u^2 (1 - u)", "Bent most near the peak."),
+        _bow("recovery_exponent", RecoveryExponent, "d = Delta (s - s^(1 + k))", "Another exponent of recovery."),
+    ),
+)  # fmt: skip
+
+
+# ---- adhesion --------------------------------------------------------------------------------------------------------
+
+
+class AbstractAdhesion(AbstractEffect):
+    r"""Attraction over the contact while the particle is unloaded; it vanishes at the onset and with the contact.
+
+    The law's branch carries what the tester measures plus the attraction, :math:`u' = u + \kappa g(s(u'))`, with
+    :math:`\kappa = 4 c^2 \epsilon_P s_{ad} / \sigma_P`: the stress over the contact's area at the peak. Of its
+    solutions the largest is stable. Derivatives follow from the implicit-function rule.
+    """
+
+    def attraction(self, recovered: Values) -> Values:
+        """Attraction over its strength, at the recovered share s."""
+        raise NotImplementedError
+
+    def inside(self, context: Context) -> Values:
+        """Delta [s(u) - s(u')]."""
+        share = context.load_share
+        carries = context.peak_stress > 1e-6
+        area = 4 * PUNCH_AREA * context.peak_strain / jnp.where(carries, context.peak_stress, 1.0)
+        strength = self.amplitude * jnp.where(carries, area, 0.0)
+        frozen, fixed = jax.lax.stop_gradient(share), jax.lax.stop_gradient(strength)
+
+        def excess(value: Values, share: Values, strength: Values) -> Values:
+            return value - share - strength * self.attraction(recovery(value))
+
+        def halve(_: Any, bracket: tuple[Values, Values]) -> tuple[Values, Values]:
+            low, high = bracket
+            middle = 0.5 * (low + high)
+            below = excess(middle, frozen, fixed) <= 0
+            return jnp.where(below, middle, low), jnp.where(below, high, middle)
+
+        high = jnp.where(frozen + positive(fixed) < 1, frozen + positive(fixed), 1.0)
+        low, _ = jax.lax.fori_loop(0, BISECTIONS, halve, (frozen, high))
+        slope = jax.jvp(lambda v: excess(v, frozen, fixed), (low,), (jnp.ones_like(low),))[1]
+        slope = jnp.where(slope > 0.05, slope, 0.05)
+        value = low - excess(low, share, strength) / slope
+        value = jnp.where(value < 1, value, 1.0)
+        return context.recoverable * (recovery(share) - recovery(value))
+
+
+class JkrAdhesion(AbstractAdhesion):
+    """Force of a crack that closes in from the edge."""
+
+    def attraction(self, recovered: Values) -> Values:
+        """phi^1.5 s, phi = a / a_P."""
+        phi = contact_of(recovered)
+        return phi * jnp.sqrt(phi + 1e-12) * recovered
+
+
+class BondAdhesion(AbstractAdhesion):
+    """Stress of bonds over the contact that is left."""
+
+    def attraction(self, recovered: Values) -> Values:
+        """phi^2 s."""
+        return (1 - recovered) * (1 + recovered) * recovered
+
+
+class TailAdhesion(AbstractAdhesion):
+    """Bridges that are stretched before they pull."""
+
+    def attraction(self, recovered: Values) -> Values:
+        """phi^1.5 s^4."""
+        phi = contact_of(recovered)
+        return phi * jnp.sqrt(phi + 1e-12) * recovered**4
+
+
+def _adhesion(name: str, make: type[AbstractEffect], equation: str, explanation: str, source: str) -> Variant:
+    return Variant(
+        "adhesion", name, make, "adhesive_stress_MPa", "MPa", 1, (0.02, 2.0), equation, explanation, source,
+        needs=(Need.UNLOADING,), helps=(Need.SEVERAL_PEAKS,),
+    )  # fmt: skip
+
+
+_GENERAL = "phi = a/a_P, u' = u + 4 c^2 eps_P s_ad / sigma_P g, d = Delta [s(u) - s(u')]"
+
+ADHESION = Mechanism(
+    "adhesion",
+    "The particle sticks to the platens: on unloading it recovers less at the same force.",
+    (
+        _adhesion("jkr", JkrAdhesion, f"g = phi^1.5 s; {_GENERAL}", "A crack closes in from the contact's edge.",
+                  "Johnson, Kendall and Roberts (1971); Mesarovic and Johnson (2000), J. Mech. Phys. Solids 48, 2009"),
+        _adhesion("bond", BondAdhesion, f"g = phi^2 s; {_GENERAL}", "Bonds over the area of contact that is left.",
+                  "Olsson and Larsson (2013); Gonzalez (2019), J. Mech. Phys. Solids"),
+        _adhesion("stretched_tail", TailAdhesion, f"g = phi^1.5 s^4; {_GENERAL}",
+                  "Bridges or fibres that pull only once they are stretched, close to release.", "liquid bridges"),
+    ),
+)  # fmt: skip
+
+
+# ---- reverse plasticity ----------------------------------------------------------------------------------------------
+
+
+class AbstractReversal(AbstractEffect):
+    """Extra recovery towards release, from the compressed core that yields backwards: a share of gamma_P."""
+
+    def tail(self, share: Values) -> Values:
+        """1 on full release, 0 at the peak."""
+        raise NotImplementedError
+
+    def inside(self, context: Context) -> Values:
+        """-gamma_P c g(u)."""
+        return -self.amplitude * context.peak_displacement * self.tail(context.load_share)
+
+
+class PowerReversal(AbstractReversal):
+    """A power of what is unloaded."""
+
+    power: int = eqx.field(static=True, default=4)
+
+    def tail(self, share: Values) -> Values:
+        """(1 - u)^power."""
+        return (1 - share) ** self.power
+
+
+class ThresholdReversal(AbstractReversal):
+    """Reverse yield that begins at a share of the load."""
+
+    onset_share: Scalar = eqx.field(converter=scalar)
+
+    def tail(self, share: Values) -> Values:
+        """((u_0 - u) / u_0)^2 below u_0."""
+        return (positive(self.onset_share - share) / self.onset_share) ** 2
+
+
+class ExponentialReversal(AbstractReversal):
+    """Reverse flow that grows exponentially towards release."""
+
+    decay_share: Scalar = eqx.field(converter=scalar)
+
+    def tail(self, share: Values) -> Values:
+        """(exp(-u / w) - exp(-1 / w)) / (1 - exp(-1 / w))."""
+        end = jnp.exp(-1 / self.decay_share)
+        return (jnp.exp(-share / self.decay_share) - end) / (1 - end)
+
+
+class StayingReversal(AbstractReversal):
+    """Reverse yield that a reload takes back only in proportion to force."""
+
+    def tail(self, share: Values) -> Values:
+        """(1 - u)^4."""
+        return (1 - share) ** 4
+
+    def inside(self, context: Context) -> Values:
+        """On a reload g(u_r) (1 - u) / (1 - u_r)."""
+        share = context.load_share
+        start = context.reload_from_share
+        back = 1 - reload_progress(share, start, jnp.ones_like(share))
+        tail = jnp.where(context.record.branch == RELOAD, self.tail(start) * back, self.tail(share))
+        return -self.amplitude * context.peak_displacement * tail
+
+
+def _reversal(name: str, make: type[AbstractEffect], equation: str, explanation: str, **more: Any) -> Variant:
+    return Variant(
+        "reverse_plasticity", name, make, "reverse_share", "-", 1, (5e-4, 3e-2), equation, explanation,
+        "Palomaki et al. (2015), Int. J. Pharm. (seen in MCC); Kadin, Kligerman and Etsion (2006)",
+        needs=(Need.UNLOADING,), helps=(Need.RELOAD,), **more,
+    )  # fmt: skip
+
+
+REVERSAL = Mechanism(
+    "reverse_plasticity",
+    "Close to release the compressed core yields backwards: the particle recovers more than elastically.",
+    (
+        _reversal("quartic", PowerReversal, "d = -gamma_P c (1 - u)^4", "Most of it close to release."),
+        _reversal("quadratic", PowerReversal, "d = -gamma_P c (1 - u)^2", "All along the branch.", fixed={"power": 2}),
+        _reversal("threshold", ThresholdReversal, "d = -gamma_P c ((u_0 - u) / u_0)^2 below u_0",
+                  "Reverse yield begins at a share of the peak load.",
+                  nuisances=(Nuisance("onset_share", (0.25, 0.5), (0.05, 0.95), "share of the peak load"),)),
+        _reversal("exponential", ExponentialReversal, "d = -gamma_P c (exp(-u / w) - e) / (1 - e), e = exp(-1 / w)",
+                  "Reverse flow with an exponential tail.",
+                  nuisances=(Nuisance("decay_share", (0.05, 0.2), (0.01, 1.0), "share of the peak load"),)),
+        _reversal("staying", StayingReversal, "d = -gamma_P c (1 - u)^4; on a reload (1 - u_r)^4 (1 - u) / (1 - u_r)",
+                  "As the quartic form, but a reload does not retrace it."),
+    ),
+)  # fmt: skip
+
+
+# ---- hysteresis of the reload ----------------------------------------------------------------------------------------
+
+
+class AbstractLag(AbstractEffect):
+    r"""Reloading that lags behind unloading: at the same force the displacement is smaller, the loop dissipates.
+
+    The amplitude is a share of the recoverable displacement, for a loop from full release; smaller loops lag less, in
+    proportion to their height. Where a reload turns back before the peak, the lag fades on the way down.
+    """
+
+    def lag(self, progress: Values) -> Values:
+        """Lag at a share of the way from the reload's beginning to the peak, 0 at both ends."""
+        raise NotImplementedError
+
+    def inside(self, context: Context) -> Values:
+        """-Delta h (1 - u_r) g(w)."""
+        record = context.record
+        now = reload_progress(record.force, record.reload_from, context.peak_force)
+        turned = reload_progress(record.unload_from, record.reload_from, context.peak_force)
+        fading = self.lag(turned) * reload_progress(record.force, record.reload_from, record.unload_from)
+        lag = jnp.where(record.branch == RELOAD, self.lag(now), jnp.where(record.branch == UNLOAD, fading, 0.0))
+        lag = jnp.where(record.reloads > 0, lag, 0.0)
+        return -self.amplitude * context.recoverable * (1 - context.reload_from_share) * lag
+
+
+class ParabolicLag(AbstractLag):
+    """Symmetric loop."""
+
+    def lag(self, progress: Values) -> Values:
+        """4 w (1 - w)."""
+        return 4 * progress * (1 - progress)
+
+
+class EarlyLag(AbstractLag):
+    """Loop that is widest soon after the reload began."""
+
+    def lag(self, progress: Values) -> Values:
+        """6.75 w (1 - w)^2."""
+        return _NORM * progress * (1 - progress) ** 2
+
+
+class LateLag(AbstractLag):
+    """Loop that is widest close to the peak."""
+
+    def lag(self, progress: Values) -> Values:
+        """6.75 w^2 (1 - w)."""
+        return _NORM * progress**2 * (1 - progress)
+
+
+class SlipLag(AbstractLag):
+    """Friction that is overcome first, then a constant ratio."""
+
+    def lag(self, progress: Values) -> Values:
+        """(1 - exp(-w / 0.05)) (1 - w)."""
+        return -jnp.expm1(-progress / 0.05) * (1 - progress)
+
+
+def _lag(name: str, make: type[AbstractEffect], equation: str, explanation: str) -> Variant:
+    return Variant(
+        "reload_hysteresis", name, make, "lag_share", "-", 1, (0.01, 0.5), equation, explanation,
+        "Kadin, Kligerman and Etsion (2006), Int. J. Solids Struct. 43, 7119; Zait et al. (2010)",
+        needs=(Need.RELOAD,), helps=(Need.SECOND_RELOAD, Need.TWO_RATES),
+    )  # fmt: skip
+
+
+HYSTERESIS = Mechanism(
+    "reload_hysteresis",
+    "Reloading does not retrace unloading: a loop opens that dissipates work at any rate.",
+    (
+        _lag("parabolic", ParabolicLag, "d = -Delta h (1 - u_r) 4 w (1 - w), w = (F - F_r) / (F_P - F_r)",
+             "A loop that is widest half way."),
+        _lag("early", EarlyLag, "d = -Delta h (1 - u_r) 6.75 w (1 - w)^2", "Widest soon after the reversal."),
+        _lag("late", LateLag, "d = -Delta h (1 - u_r) 6.75 w^2 (1 - w)", "Widest close to the peak."),
+        _lag("slip", SlipLag, "d = -Delta h (1 - u_r) (1 - exp(-20 w)) (1 - w)",
+             "Friction at the contact is overcome first."),
+    ),
+)  # fmt: skip
+
+
+# ---- ratcheting ------------------------------------------------------------------------------------------------------
+
+
+class AbstractRatchet(AbstractEffect):
+    """Permanent displacement with every reload; it comes in while reloading."""
+
+    def count(self, cycles: Values) -> Values:
+        """What so many reloads make."""
+        raise NotImplementedError
+
+    def inside(self, context: Context) -> Values:
+        """D_e r g(N)."""
+        return self.amplitude * context.particle.displacement(self.count(context.cycles))
+
+
+class LinearRatchet(AbstractRatchet):
+    """The same with every reload."""
+
+    def count(self, cycles: Values) -> Values:
+        """N."""
+        return cycles
+
+
+class LogarithmicRatchet(AbstractRatchet):
+    """Less and less, without end."""
+
+    def count(self, cycles: Values) -> Values:
+        """ln(1 + N) / ln 2."""
+        return jnp.log1p(cycles) / jnp.log(2.0)
+
+
+class ShakedownRatchet(AbstractRatchet):
+    """Less and less, to an end."""
+
+    cycles_to_rest: Scalar = eqx.field(converter=scalar)
+
+    def count(self, cycles: Values) -> Values:
+        """N_0 (1 - exp(-N / N_0))."""
+        return -self.cycles_to_rest * jnp.expm1(-cycles / self.cycles_to_rest)
+
+
+class ElasticRatchet(AbstractRatchet):
+    """The same share of the recoverable displacement with every reload."""
+
+    def inside(self, context: Context) -> Values:
+        """Delta r N."""
+        return self.amplitude * context.recoverable * context.cycles
+
+
+def _ratchet(name: str, make: type[AbstractEffect], equation: str, explanation: str, **more: Any) -> Variant:
+    return Variant(
+        "ratcheting", name, make,
+        **{"parameter": "ratchet_strain", "unit": "-", "plausible": (2e-4, 1e-2), **more},
+        sign=1, equation=equation, explanation=explanation,
+        source="Johnson (1985), Contact Mechanics, sec. 9.2; Kadin, Kligerman and Etsion (2006)",
+        needs=(Need.RELOAD,), helps=(Need.SECOND_RELOAD,),
+    )  # fmt: skip
+
+
+RATCHETING = Mechanism(
+    "ratcheting",
+    "Every cycle leaves some more permanent displacement, without any higher load.",
+    (
+        _ratchet("linear", LinearRatchet, "d = D_e r N", "The same with every reload."),
+        _ratchet("logarithmic", LogarithmicRatchet, "d = D_e r ld(1 + N)", "Less with every reload."),
+        _ratchet("shakedown", ShakedownRatchet, "d = D_e r N_0 (1 - exp(-N / N_0))", "It comes to rest.",
+                 nuisances=(Nuisance("cycles_to_rest", (1.0, 3.0), (0.3, 30.0), "reloads until it rests"),)),
+        _ratchet("elastic_share", ElasticRatchet, "d = Delta r N", "In proportion to the recoverable displacement.",
+                 parameter="ratchet_share", plausible=(5e-3, 0.3)),
+    ),
+    ("creep, as long as there is one reload only and no hold",),
+)  # fmt: skip

@@ -1,0 +1,105 @@
+"""What one unit of each effect would add to a measured curve, to first order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._numerics import running_max
+from .._types import Path, Scalar
+from ..geometry import Particle
+from ..law import MccLaw, recovery, tangent_modulus
+from ._context import Context
+from ._effect import AbstractEffect
+from ._extended import ExtendedLaw
+from ._record import Record
+from ._solve import recoverable_displacement
+
+
+def signatures(
+    base: MccLaw, particle: Particle, record: Record, effects: Sequence[AbstractEffect]
+) -> Float[Array, "effects steps"]:
+    r"""Derivatives of the displacement by the amplitude of each effect, all amplitudes being zero.
+
+    The same as one `jax.jvp` of `ExtendedLaw(base, (effect,)).respond` per effect, at a fraction of what that takes to
+    compile: at the null every effect acts through its own first-order change of parameters, loading strain, modulus and
+    displacement, and all share one pass through the law,
+
+    .. math:: \frac{\partial\gamma}{\partial\theta_k} = \frac{\partial\gamma}{\partial p}\cdot\frac{\partial p}
+        {\partial\theta_k} + \frac{\partial\Delta_k}{\partial\theta_k}.
+
+    Batch it over particles with `equinox.filter_vmap`.
+
+    Args:
+        base: the law.
+        particle: the particle.
+        record: its test.
+        effects: one for every point of every variant's grid; their amplitudes are taken as zero.
+
+    Returns:
+        Derivatives [um per unit of amplitude].
+    """
+    context = ExtendedLaw(base, ()).context(particle, record)
+    strain = _virgin_strain(base, context)
+    x = base.shape_factor(particle) * strain
+    K1, K3, K5 = base.plastic.polynomial
+    slope = tangent_modulus(K1, K3, K5, x) * base.shape_factor(particle)
+    least = 1e-3 * K1 * base.shape_factor(particle)
+    slope = jnp.where(slope > least, slope, least)
+
+    def changes(effect: AbstractEffect) -> tuple[Any, Path, Path, Path]:
+        """First-order change of the law's parameters, of loading strain, of the modulus, and what is added."""
+
+        def act(amplitude: Scalar) -> tuple[Any, Any, Path, Path]:
+            own = eqx.tree_at(lambda e: e.amplitude, effect, amplitude)
+            law = eqx.filter(own.modify(base, particle, record), eqx.is_inexact_array)
+            extended = ExtendedLaw(base, (own,))
+            start = eqx.tree_at(lambda s: s.point.time, extended.init(particle), record.time[0])
+            added = extended.add(start, context)[1]
+            return law, own.loading(base, particle, record, strain), own.stiffness(context), added
+
+        zero = jnp.zeros_like(effect.amplitude)
+        law, (f1, f3, f5), stiffness, added = jax.jvp(act, (zero,), (jnp.ones_like(zero),))[1]
+        square = x * x
+        shift = -x * (K1 * f1 - square * (K3 * f3 - square * (K5 * f5))) / slope
+        return law, shift, stiffness, added
+
+    groups: dict[object, list[int]] = {}
+    for i, effect in enumerate(effects):
+        groups.setdefault((type(effect), jax.tree.structure(effect)), []).append(i)
+    order, parts = [], []
+    for members in groups.values():
+        alike = [jax.tree.map(jnp.asarray, effects[i]) for i in members]
+        parts.append(jax.vmap(changes)(jax.tree.map(lambda *leaves: jnp.stack(leaves), *alike)))
+        order.extend(members)
+    law, shift, stiffness, added = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+    parameters, rest = eqx.partition(base, eqx.is_inexact_array)
+    still, one = jnp.zeros_like(strain), jnp.ones_like(strain)
+
+    def response(parameters: Any, shift: Path, stiffness: Path) -> Path:
+        return _response(eqx.combine(parameters, rest), context, shift, stiffness)
+
+    _, push = jax.linearize(response, parameters, still, one)
+    rows = jax.vmap(push)(law, shift, stiffness) + added
+    return rows[jnp.argsort(jnp.asarray(order))]
+
+
+def _virgin_strain(law: MccLaw, context: Context) -> Path:
+    """Strain of virgin loading at every force, whatever was before."""
+    particle = context.particle
+    return law.plastic.strain(particle.stress(context.record.force)) / law.shape_factor(particle)
+
+
+def _response(law: MccLaw, context: Context, shift: Path, stiffness: Path) -> Path:
+    """Displacement of a virgin particle whose loading strain is shifted and whose modulus has a factor."""
+    particle, record = context.particle, context.record
+    virgin = record.force >= context.peak_force
+    strain = _virgin_strain(law, context) + shift
+    peak = running_max(jnp.where(virgin, particle.displacement(strain), 0.0))
+    recoverable = recoverable_displacement(law, particle, peak, context.peak_force, stiffness)
+    return peak - jnp.where(record.force < context.peak_force, recoverable * recovery(context.load_share), 0.0)

@@ -1,0 +1,241 @@
+"""What is known about an effect before any data: its formula, its unit, its sign, what it takes to see it."""
+
+from __future__ import annotations
+
+import enum
+import itertools
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax.numpy as jnp
+
+from .._types import ScalarLike, scalar
+from ._effect import AbstractEffect
+
+
+class Need(enum.Enum):
+    """What a campaign must contain to show an effect; the value says it in words."""
+
+    LOW_LOAD = "points at low load"
+    UNLOADING = "an unloading segment"
+    HOLD = "a hold under load"
+    RELOAD = "a reload segment"
+    SECOND_RELOAD = "a second reload segment"
+    LONG_TIME = "tests of several minutes"
+    TWO_RATES = "two loading rates or more"
+    SEVERAL_SIZES = "particles of several sizes"
+    SEVERAL_SHAPES = "particles of several shapes"
+    SEVERAL_PEAKS = "several peak loads, of particles or of cycles"
+    HUMIDITY_COLUMN = "a column relative_humidity_percent with more than one value"
+
+
+@dataclass(frozen=True)
+class Nuisance:
+    """A further number of a formula, without meaning while the amplitude is zero.
+
+    All are absolute (seconds, MPa, mN, shares of the particle's own peak), never relative to a whole test: the effect
+    can then be followed point by point.
+
+    Attributes:
+        name: its name, with its unit.
+        grid: the few values at which to look for the effect.
+        plausible: smallest and largest sensible value.
+        explanation: what it is.
+        random_per_test: whether every test has a value of its own.
+    """
+
+    name: str
+    grid: tuple[float, ...]
+    plausible: tuple[float, float]
+    explanation: str
+    random_per_test: bool = False
+
+    @property
+    def middle(self) -> float:
+        """The value taken where none is given: the middle one of the grid."""
+        return self.grid[len(self.grid) // 2]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One formula of a mechanism.
+
+    Attributes:
+        mechanism: name of the mechanism.
+        name: name of the formula within the mechanism.
+        make: the class of the effect; called with the amplitude and the nuisance parameters by name.
+        parameter: name of the amplitude, with its unit.
+        unit: the amplitude's unit as it is printed; "-" if it has none.
+        sign: +1 if only positive amplitudes are physical, -1 if only negative ones, 0 if both are.
+        plausible: smallest and largest magnitude one would believe.
+        equation: the formula as text.
+        explanation: what happens physically.
+        source: where the formula is from.
+        nuisances: further numbers of the formula.
+        needs: what the data must contain, all of it.
+        helps: what would make the effect easier to tell from others.
+        random_per_test: whether the amplitude differs at random from test to test, with either sign.
+        fixed: settings of the class that make this formula.
+    """
+
+    mechanism: str
+    name: str
+    make: Callable[..., AbstractEffect]
+    parameter: str
+    unit: str
+    sign: int
+    plausible: tuple[float, float]
+    equation: str
+    explanation: str
+    source: str
+    nuisances: tuple[Nuisance, ...] = ()
+    needs: tuple[Need, ...] = ()
+    helps: tuple[Need, ...] = ()
+    random_per_test: bool = False
+    fixed: Mapping[str, Any] = field(default_factory=dict, hash=False)
+
+    def __post_init__(self) -> None:
+        low, high = self.plausible
+        if not 0 < low < high:
+            raise ValueError(f"{self.mechanism}:{self.name}: plausible must be two magnitudes, the smaller first")
+        if self.sign not in (-1, 0, 1):
+            raise ValueError(f"{self.mechanism}:{self.name}: sign must be -1, 0 or 1, got {self.sign}")
+        for nuisance in self.nuisances:
+            least, most = nuisance.plausible
+            if not (nuisance.grid and all(least <= value <= most for value in nuisance.grid)):
+                raise ValueError(
+                    f"{self.mechanism}:{self.name}: the grid of {nuisance.name} leaves its plausible range"
+                )
+
+    @property
+    def null(self) -> float:
+        """The amplitude at which nothing is added."""
+        return 0.0
+
+    @property
+    def typical(self) -> float:
+        """Geometric middle of the plausible range, with the physical sign (positive if both are)."""
+        return (self.sign or 1) * math.sqrt(self.plausible[0] * self.plausible[1])
+
+    def build(self, amplitude: ScalarLike, **nuisance: ScalarLike) -> AbstractEffect:
+        """The effect with this amplitude; nuisance parameters not given take the middle value of their grid.
+
+        Raises:
+            ValueError: for a parameter that the formula does not have.
+        """
+        known = {n.name: n.middle for n in self.nuisances}
+        unknown = sorted(set(nuisance) - set(known))
+        if unknown:
+            raise ValueError(
+                f"{self.mechanism}:{self.name} has no parameter {unknown[0]!r}; "
+                f"it has: {', '.join([self.parameter, *known])}"
+            )
+        strength = scalar(amplitude)
+        others = {
+            name: jnp.asarray(value, strength.dtype) if isinstance(value, int | float) else value
+            for name, value in {**known, **nuisance}.items()
+        }
+        return self.make(strength, **others, **self.fixed)
+
+    def grid(self) -> list[dict[str, float]]:
+        """All combinations of the nuisance parameters' values; one empty dictionary if there are none."""
+        names = [n.name for n in self.nuisances]
+        return [
+            dict(zip(names, values, strict=True)) for values in itertools.product(*(n.grid for n in self.nuisances))
+        ]
+
+
+@dataclass(frozen=True)
+class Mechanism:
+    """A physical cause: a family of formulas, of which nature may use one, or a similar one.
+
+    Attributes:
+        name: its name.
+        explanation: what it is, in plain words.
+        variants: its formulas, the most common first.
+        equivalences: what no data of this kind can tell from it; to be declared, never discovered.
+    """
+
+    name: str
+    explanation: str
+    variants: tuple[Variant, ...]
+    equivalences: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        names = [variant.name for variant in self.variants]
+        if len(set(names)) < len(names):
+            raise ValueError(f"{self.name} has two variants of one name")
+        strangers = [v.name for v in self.variants if v.mechanism != self.name]
+        if strangers:
+            raise ValueError(f"the variant {strangers[0]!r} is not one of {self.name}")
+
+    def __iter__(self) -> Iterator[Variant]:
+        return iter(self.variants)
+
+    def __getitem__(self, name: str) -> Variant:
+        """The variant of that name.
+
+        Raises:
+            KeyError: naming the variants there are.
+        """
+        for variant in self.variants:
+            if variant.name == name:
+                return variant
+        raise KeyError(f"{self.name} has no variant {name!r}; it has: {', '.join(v.name for v in self.variants)}")
+
+
+@dataclass(frozen=True)
+class Equivalence:
+    """Two or more descriptions that fit every possible measurement equally well.
+
+    Attributes:
+        names: what cannot be told apart.
+        explanation: why.
+        broken_by: the measurement that would tell them apart.
+    """
+
+    names: tuple[str, ...]
+    explanation: str
+    broken_by: str
+
+
+EQUIVALENCES = (
+    Equivalence(
+        ("load-cell gain", "C1, C3^3, C5^5 and the effective modulus scaled alike"),
+        "A force read too high by a constant factor scales every stress; the law scales with it.",
+        "a calibration weight on the load cell",
+    ),
+    Equivalence(
+        ("zero of force", "zero of displacement"),
+        "A small shift of force at first contact moves the curve along itself, as a shift of displacement does.",
+        "a record of the approach before contact",
+    ),
+    Equivalence(
+        ("shape parameter a", "mean of C1, C3 and C5"),
+        "If all particles have the same flatness, a multiplies all coefficients by one number.",
+        "particles of several shapes",
+    ),
+    Equivalence(
+        ("thermal_drift linear", "frame_compliance linear, on loading at one rate"),
+        "While force grows in proportion to time, both add displacement in proportion to force.",
+        "unloading, a hold, or a second rate",
+    ),
+    Equivalence(
+        ("damage", "densification_stiffening of opposite sign"),
+        "One says that the modulus falls with peak strain, the other that it grows; the sign decides between them.",
+        "nothing is needed: amplitudes below zero are not physical",
+    ),
+    Equivalence(
+        ("rate_dependence", "size_effect, at one force rate"),
+        "At one force rate the strain rate goes as the inverse square of size.",
+        "two rates in one class of size",
+    ),
+    Equivalence(
+        ("finite width of the punch", "nothing"),
+        "As long as no contact is wider than the punch, its width changes nothing.",
+        "particles whose contact outgrows the punch",
+    ),
+)
+"""What must be declared and can never be discovered."""

@@ -1,0 +1,149 @@
+"""Effects hidden in simulated tests: which one, how strong, and what each test draws."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..effects import LIBRARY, AbstractEffect, Mechanism, Variant, find_variant
+
+_STREAM = 0x0EFF_EC75
+"""Keeps the draws of effects apart from those of noise, coefficients and peaks."""
+
+
+@dataclass(frozen=True)
+class HiddenEffect:
+    """An effect for `simulate_campaign`.
+
+    Attributes:
+        variant: its formula.
+        amplitude: its strength in the variant's unit; where the variant differs at random from test to test, the
+            standard deviation. The middle of the plausible range if None.
+        nuisance: nuisance parameters by name, the same in all tests; those not given take the variant's middle value,
+            or are drawn for every test where the variant says so.
+
+    Raises:
+        ValueError: for an amplitude or a nuisance parameter without sense.
+    """
+
+    variant: Variant
+    amplitude: float | None = None
+    nuisance: Mapping[str, float] = field(default_factory=dict, hash=False)
+
+    def __post_init__(self) -> None:
+        variant, name = self.variant, f"{self.variant.mechanism}:{self.variant.name}"
+        if not math.isfinite(self.strength) or abs(self.strength) > 1e9:
+            raise ValueError(f"{name}: {variant.parameter} must be a number of sensible size, got {self.strength:g}")
+        if self.strength * variant.sign < 0:
+            sign = "zero or positive" if variant.sign > 0 else "zero or negative"
+            raise ValueError(f"{name}: {variant.parameter} must be {sign} to be physical, got {self.strength:g}")
+        known = {n.name: n for n in variant.nuisances}
+        for key, value in self.nuisance.items():
+            if key not in known:
+                names = ", ".join([variant.parameter, *known])
+                raise ValueError(f"{name} has no parameter {key!r}; it has: {names}")
+            least = known[key].plausible[0]
+            if not math.isfinite(value) or abs(value) > 1e9 or (least > 0 and value <= 0):
+                raise ValueError(f"{name}: {key} must be {'above 0' if least > 0 else 'finite'}, got {value:g}")
+
+    @property
+    def strength(self) -> float:
+        """The amplitude, or the middle of the plausible range."""
+        return self.variant.typical if self.amplitude is None else self.amplitude
+
+    def draw(self, seed: int, place: int, count: int) -> tuple[AbstractEffect, dict[str, np.ndarray]]:
+        """The effect of every test.
+
+        Args:
+            seed: seed of the campaign.
+            place: position among the campaign's effects; each has a stream of its own.
+            count: number of tests N.
+
+        Returns:
+            An effect whose every field has a leading axis N, and the parameters by name, shape (N,).
+        """
+        values = {self.variant.parameter: np.full(count, self.strength)}
+        for nuisance in self.variant.nuisances:
+            values[nuisance.name] = np.full(count, self.nuisance.get(nuisance.name, nuisance.middle))
+        for i, name in enumerate(self.random):
+            # A stream for each test: adding one leaves the others as they were.
+            sources = np.random.SeedSequence([seed, _STREAM, place, i]).spawn(count)
+            streams = [np.random.default_rng(source) for source in sources]
+            if name == self.variant.parameter:
+                values[name] = self.strength * np.array([rng.standard_normal() for rng in streams])
+            else:
+                low, high = self._range(name)
+                share = np.array([rng.random() for rng in streams])
+                values[name] = low * (high / low) ** share if low > 0 else low + (high - low) * share
+        amplitude, *others = (jnp.asarray(v, dtype=float) for v in values.values())
+        names = [n.name for n in self.variant.nuisances]
+        build: Any = lambda a, *n: self.variant.build(a, **dict(zip(names, n, strict=True)))  # noqa: E731
+        return eqx.filter_vmap(build)(amplitude, *others), values
+
+    @property
+    def random(self) -> tuple[str, ...]:
+        """Names of the parameters that every test draws for itself."""
+        names = [self.variant.parameter] if self.variant.random_per_test else []
+        names += [n.name for n in self.variant.nuisances if n.random_per_test and n.name not in self.nuisance]
+        return tuple(names)
+
+    def _range(self, name: str) -> tuple[float, float]:
+        """Between the ends of the grid where it is positive, as far as is plausible otherwise."""
+        nuisance = next(n for n in self.variant.nuisances if n.name == name)
+        return (min(nuisance.grid), max(nuisance.grid)) if nuisance.plausible[0] > 0 else nuisance.plausible
+
+    def describe(self) -> dict[str, Any]:
+        """For the campaign's metadata."""
+        fixed = {n.name: float(self.nuisance.get(n.name, n.middle)) for n in self.variant.nuisances}
+        return {
+            "mechanism": self.variant.mechanism,
+            "variant": self.variant.name,
+            self.variant.parameter: float(self.strength),
+            **{name: value for name, value in fixed.items() if name not in self.random},
+            "random_per_test": list(self.random),
+        }
+
+
+def read_effect(text: str, library: Mapping[str, Mechanism] = LIBRARY) -> HiddenEffect:
+    """An effect as text: `mechanism[:variant][=amplitude][,parameter=value...]`.
+
+    Raises:
+        ValueError: in words, naming the valid choices.
+    """
+    head, *rest = text.split(",")
+    name, equals, value = head.partition("=")
+    variant = find_variant(name.strip(), library)
+    amplitude = _number(variant.parameter, value) if equals else None
+    nuisance: dict[str, float] = {}
+    for part in rest:
+        key, equals, value = (piece.strip() for piece in part.partition("="))
+        if not equals:
+            raise ValueError(f"{part!r} is no parameter=value")
+        if key == variant.parameter:
+            if amplitude is not None:
+                raise ValueError(f"{key} is given twice")
+            amplitude = _number(key, value)
+        elif key in nuisance:
+            raise ValueError(f"{key} is given twice")
+        else:
+            nuisance[key] = _number(key, value)
+    return HiddenEffect(variant, amplitude, nuisance)
+
+
+def _number(name: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"{name} must be a number, got {text!r}") from None
+
+
+def batched_humidity(values: np.ndarray | None, count: int, reference: float) -> jax.Array:
+    """Relative humidity of every test [%], the reference where none is known."""
+    return jnp.full(count, reference) if values is None else jnp.asarray(values, dtype=float)

@@ -1,0 +1,134 @@
+"""The runner: resumes, survives whatever a solver does, and ends in tables."""
+
+import json
+
+import pytest
+
+from benchmarks.blind import adapter, run, score, sealing
+from benchmarks.blind.generator import tiers
+
+
+def small(folder, count):
+    cases = [tiers.Case(f"r{k}", "T0", "clean", "P0", count=2, resample=True) for k in range(count)]
+    sealing.seal(folder, cases, master=1, jobs=1)
+    return folder
+
+
+def test_every_mood_of_a_solver_is_a_result(tmp_path):
+    folder = small(tmp_path / "run", 6)
+    results = run.solve(folder, solver="fake_solvers:moody", jobs=2, timeout=6.0)
+    status = {key: (entry["status"], entry["error"]) for key, entry in results.items()}
+    assert status["c00001"][0] == "crash"
+    assert "ValueError: no" in status["c00001"][1]
+    assert status["c00002"][0] == "timeout"
+    assert status["c00003"] == ("crash", "the process died")
+    assert status["c00004"] == ("invalid", "verdict 'PERHAPS'")
+    assert status["c00005"][0] == status["c00006"][0] == "ok"
+
+
+def test_a_run_goes_on_where_it_stopped(tmp_path):
+    folder = small(tmp_path / "run", 3)
+    run.solve(folder, solver="fake_solvers:silent", jobs=1, keys=["c00001"])
+    path = folder / "results.jsonl"
+    path.write_text(path.read_text() + '{"key": "c00002", "status": "o')  # stopped while writing
+    results = run.solve(folder, solver="fake_solvers:silent", jobs=1)
+    assert set(results) == {"c00001", "c00002", "c00003"}
+    assert sum('"key": "c00001"' in line for line in path.read_text().splitlines()) == 1
+    before = path.read_text().split()
+    run.solve(folder, solver="fake_solvers:moody", jobs=1)
+    assert path.read_text().split() == before
+
+
+@pytest.mark.parametrize(("solver", "steady"), [("silent", True), ("unsteady", False)])
+def test_one_command_from_seal_to_tables(tmp_path, capsys, solver, steady):
+    folder = tmp_path / "run"
+    command = [
+        "--out",
+        str(folder),
+        "--tiers",
+        "T0,T6",
+        "--fraction",
+        "0.003",
+        "--seed",
+        "3",
+        "--jobs",
+        "1",
+        "--repeat",
+        "1",
+    ]
+    run.main([*command, "--solver", f"fake_solvers:{solver}"])
+    text = capsys.readouterr().out
+    assert f"{(folder / 'seal.txt').read_text().split()[0]}" in text
+    assert "# Blind test of the discovery workflow" in text
+    row = next(line for line in text.splitlines() if line.startswith("| same seed, same answer"))
+    assert row.endswith("PASS |") == steady
+    found, _, content = score.outcomes(folder)
+    assert len(found) == len(content["answers"]) == 6
+    score.report(folder)
+
+
+def test_a_broken_seal_is_not_scored(tmp_path):
+    folder = small(tmp_path / "run", 1)
+    run.solve(folder, solver="fake_solvers:silent", jobs=1)
+    answers = json.loads((folder / "answers.json").read_text())
+    answers["answers"]["c00001"]["effects"] = [{"mechanism": "creep"}]
+    (folder / "answers.json").write_text(json.dumps(answers))
+    with pytest.raises(sealing.SealBroken):
+        score.report(folder)
+
+
+def test_follow_up_tests_the_same_material_in_another_way(tmp_path):
+    case = tiers.Case(
+        "f", "T1", "frame_compliance", "P0", count=3, resample=True, effects=(("frame_compliance", "exact", 5.0),)
+    )
+    folder = tmp_path / "run"
+    sealing.seal(folder, [case], master=1, jobs=1)
+    moody = {
+        "key": "c00001",
+        "status": "ok",
+        "error": None,
+        "wall_s": 1.0,
+        "cold": False,
+        "discovery": {
+            "verdict": "SET",
+            "effects": [{"mechanism": "creep"}],
+            "candidate_set": [["creep", "frame_compliance"]],
+            "next_experiments": [{"experiment": "hold of 60 s at the peak load"}],
+        },
+    }
+    (folder / "results.jsonl").write_text(json.dumps(moody) + "\n")
+    made = run.follow_up(folder, sealing.open_answers(folder), solver="fake_solvers:silent", jobs=1)
+    assert made["c00001+next"]["changes"] == {"protocol": "P1"}
+    assert made["c00001+next"]["lambda"][0] > 5.0  # the hold tells more
+    assert run.read_results(folder)["c00001+next"]["discovery"]["verdict"] == "NO_GAP"
+    particles = [(folder / "campaigns" / key / "particles.csv").read_text() for key in ("c00001", "c00001+next")]
+    assert particles[0] == particles[1]
+    sealing.open_answers(folder)
+
+
+def test_names_of_solvers_and_experiments():
+    assert adapter.find("inprocess") is adapter.in_process
+    assert adapter.find("command") is adapter.by_command
+    with pytest.raises(ValueError, match="no solver"):
+        adapter.find("other")
+    P0 = {"protocol": "P0", "count": 20}
+    assert adapter.follow_up_of([{"experiment": "a second loading rate, ten times higher"}], P0) == {"protocol": "P2"}
+    assert adapter.follow_up_of([{"experiment": "reload after partial unloading"}], P0) == {"protocol": "P1"}
+    assert adapter.follow_up_of([{"experiment": "diamond platen"}], P0) is None
+    assert adapter.follow_up_of([], P0) is None
+
+
+@pytest.mark.parametrize(
+    ("discovery", "said"),
+    [
+        ({"verdict": "NO_GAP", "effects": []}, None),
+        ({"verdict": "SET", "effects": [{"mechanism": "creep"}]}, None),
+        ({"verdict": "NAMED", "effects": []}, "NAMED without an effect"),
+        ({"verdict": "NO_GAP", "effects": [{"mechanism": "creep"}]}, "NO_GAP with effects"),
+        ({"verdict": "?", "effects": []}, "verdict '?'"),
+        ({"verdict": "UNLISTED", "effects": None}, "effects are not a list of named effects"),
+        ([], "no dictionary"),
+    ],
+)
+def test_answers_are_checked(discovery, said):
+    assert adapter.problem(discovery) == said

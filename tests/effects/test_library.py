@@ -1,0 +1,195 @@
+"""What is said about each mechanism: names, units, signs, ranges; and how a user adds one."""
+
+import dataclasses
+import re
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tested import LAW, NAMES, PARTICLE, RECORD, VARIANTS, respond
+
+from mcc_jax.effects import (
+    EQUIVALENCES,
+    LIBRARY,
+    AbstractEffect,
+    ExtendedLaw,
+    Mechanism,
+    Need,
+    Nuisance,
+    Variant,
+    default_library,
+    find_variant,
+)
+
+CONTRACT = [
+    "frame_compliance",
+    "thermal_drift",
+    "creep",
+    "rate_dependence",
+    "adhesion",
+    "damage",
+    "densification_stiffening",
+    "reload_hysteresis",
+    "ratcheting",
+    "finite_hardening_exponent",
+    "unloading_shape",
+    "size_effect",
+    "shape_second_order",
+    "pop_in",
+    "toe_asperity",
+    "platen_friction",
+    "misalignment",
+    "platen_sink_in",
+    "reverse_plasticity",
+    "humidity",
+]
+UNITS = {"um/mN": "_um_per_mN", "um/s": "_um_per_s", "1/MPa": "_per_MPa", "1/GPa": "_per_GPa", "MPa": "_MPa"}
+UNITS |= {"um": "_um", "rad": "_rad", "1/%": "_per_percent_humidity"}
+NUISANCE_UNITS = ("_s", "_MPa", "_mN", "_um", "_rad", "_percent", "_strain", "_share", "exponent", "cycles_to_rest")
+
+
+def test_every_mechanism_of_the_contract_is_a_family():
+    assert list(LIBRARY) == CONTRACT
+    for name, mechanism in LIBRARY.items():
+        assert mechanism.name == name
+        assert len(mechanism.variants) >= 2
+        assert mechanism.explanation.endswith(".")
+        assert mechanism[mechanism.variants[-1].name] is mechanism.variants[-1]
+
+
+@pytest.mark.parametrize("variant", VARIANTS, ids=NAMES)
+def test_every_variant_says_what_it_is(variant):
+    low, high = variant.plausible
+    assert 0 < low < high
+    assert variant.null == 0
+    assert variant.typical * (variant.sign or 1) > 0
+    assert variant.parameter.endswith(UNITS.get(variant.unit, ""))
+    assert variant.unit in UNITS or (variant.unit == "-" and re.fullmatch(r"[a-z_]+", variant.parameter))
+    assert variant.equation
+    assert variant.source
+    assert variant.explanation.endswith(".")
+    assert all(isinstance(need, Need) for need in (*variant.needs, *variant.helps))
+    for nuisance in variant.nuisances:
+        assert nuisance.name.endswith(NUISANCE_UNITS)
+        assert nuisance.middle in nuisance.grid
+    grid = variant.grid()
+    assert len(grid) == np.prod([len(n.grid) for n in variant.nuisances], initial=1, dtype=int)
+    for point in grid:
+        effect = variant.build(0.5, **point)
+        assert isinstance(effect, AbstractEffect)
+        assert effect.amplitude == 0.5
+        for name, value in point.items():
+            assert getattr(effect, name) == value
+    with pytest.raises(ValueError, match=variant.parameter):
+        variant.build(0.5, nonsense=1.0)
+
+
+def test_a_nuisance_has_no_meaning_at_the_null_and_some_beyond():
+    for name in ("frame_compliance:stiffening", "creep:kelvin_voigt", "pop_in:sharp"):
+        variant = find_variant(name)
+        first, last = variant.grid()[0], variant.grid()[-1]
+        np.testing.assert_array_equal(respond(variant, 0.0, **first), respond(variant, 0.0, **last))
+        difference = respond(variant, variant.typical, **first) - respond(variant, variant.typical, **last)
+        assert jnp.max(jnp.abs(difference)) > 1e-4, name
+
+
+def test_what_differs_from_test_to_test_is_marked():
+    assert {v.mechanism for v in VARIANTS if v.random_per_test} == {"thermal_drift"}
+    assert all(v.sign == 0 for v in VARIANTS if v.random_per_test)
+    assert {v.mechanism for v in VARIANTS if any(n.random_per_test for n in v.nuisances)} == {"thermal_drift", "pop_in"}
+
+
+def test_equivalences_are_declared():
+    named = " ".join(name for e in EQUIVALENCES for name in e.names)
+    for word in ("load-cell gain", "zero of force", "shape parameter a", "frame_compliance"):
+        assert word in named
+    assert LIBRARY["damage"].equivalences
+
+
+def test_names_lead_to_variants():
+    assert find_variant("creep") is LIBRARY["creep"].variants[0]
+    assert find_variant("creep:power_law").name == "power_law"
+    with pytest.raises(ValueError, match="known are: frame_compliance, thermal_drift"):
+        find_variant("wobble")
+    with pytest.raises(ValueError, match="creep has no variant 'x'; it has: kelvin_voigt"):
+        find_variant("creep:x")
+
+
+def test_the_library_itself_stays_as_it_is():
+    own = default_library()
+    own.pop("creep")
+    assert "creep" in LIBRARY
+    with pytest.raises(TypeError):
+        LIBRARY["creep"] = None  # type: ignore[index]
+
+
+def test_descriptions_without_sense_are_refused():
+    variant = LIBRARY["creep"].variants[0]
+    for change in ({"plausible": (2.0, 1.0)}, {"sign": 2}, {"nuisances": (Nuisance("x", (5.0,), (0.0, 1.0), ""),)}):
+        with pytest.raises(ValueError, match="creep:kelvin_voigt"):
+            dataclasses.replace(variant, **change)
+    with pytest.raises(ValueError, match="two variants of one name"):
+        Mechanism("creep", "Twice.", (variant, variant))
+    with pytest.raises(ValueError, match="is not one of"):
+        Mechanism("other", "Another.", (variant,))
+
+
+# ---- an effect of one's own: all that it takes -----------------------------------------------------------------------
+
+
+class MagneticPull(AbstractEffect):
+    """A magnet under the platen that pulls more the closer it gets: d = -m D_e exp(-h / h_0)."""
+
+    range_um: jax.Array = eqx.field(converter=jnp.asarray)
+
+    def observe(self, context):
+        height = context.particle.D3 - context.displacement
+        return -self.amplitude * context.particle.displacement(jnp.exp(-height / self.range_um))
+
+
+MAGNET = Variant(
+    mechanism="magnet",
+    name="exponential",
+    make=MagneticPull,
+    parameter="pull_strain",
+    unit="-",
+    sign=1,
+    plausible=(1e-3, 1e-1),
+    equation="d = -m D_e exp(-h / h_0)",
+    explanation="A magnet pulls the platen.",
+    source="an example",
+    nuisances=(Nuisance("range_um", (30.0, 100.0), (1.0, 1000.0), "range of the magnet"),),
+    needs=(Need.UNLOADING,),
+)
+
+
+def test_an_effect_of_ones_own():
+    library = {**default_library(), "magnet": Mechanism("magnet", "A magnet pulls.", (MAGNET,))}
+    variant = find_variant("magnet", library)
+    base = LAW.path_load(PARTICLE, LAW.init(PARTICLE), RECORD.force)[1]
+    np.testing.assert_array_equal(respond(variant, 0.0), base)
+    shift = respond(variant, 0.01) - base
+    assert jnp.max(shift) < 0
+    assert jnp.argmin(shift) == jnp.argmax(base)
+    slope = jax.jvp(lambda a: respond(variant, a), (jnp.zeros(()),), (jnp.ones(()),))[1]
+    np.testing.assert_allclose(0.01 * slope, shift, rtol=1e-9)
+    both = ExtendedLaw(LAW, (variant.build(0.01), LIBRARY["creep"].variants[0].build(1e-4)))
+    assert jnp.all(jnp.isfinite(both.respond(PARTICLE, RECORD)))
+
+
+class Careless(AbstractEffect):
+    """A user's formula that is zero at amplitude 0 only but for rounding."""
+
+    def inside(self, context):
+        share = context.load_share
+        return context.recoverable * (jnp.exp((1 + self.amplitude) * jnp.log(share + 0.1)) - (share + 0.1))
+
+
+def test_the_null_is_exact_whatever_the_formula():
+    base = LAW.path_load(PARTICLE, LAW.init(PARTICLE), RECORD.force)[1]
+    run = lambda a: ExtendedLaw(LAW, (Careless(a),)).respond(PARTICLE, RECORD)  # noqa: E731
+    value, slope = jax.jvp(run, (jnp.zeros(()),), (jnp.ones(()),))
+    np.testing.assert_array_equal(value, base)
+    np.testing.assert_allclose(slope, (run(1e-6) - run(-1e-6)) / 2e-6, atol=1e-6 * jnp.abs(slope).max())

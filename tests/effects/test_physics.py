@@ -1,0 +1,286 @@
+"""What each mechanism must do: signs, limits, closed forms."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import paper_particle, sphere
+from tested import FORCE, LAW, PARTICLE, RECORD, TIME, VARIANTS, lanes, respond
+
+from mcc_jax.effects import LIBRARY, ExtendedLaw, clean_record, signatures
+from mcc_jax.geometry import Particle
+from mcc_jax.law import MccLaw, Plastic
+
+
+def family(*names):
+    variants = [v for v in VARIANTS if v.mechanism in names]
+    return pytest.mark.parametrize("variant", variants, ids=[f"{v.mechanism}:{v.name}" for v in variants])
+
+
+def shift(variant):
+    """What the effect adds at its typical amplitude [um]."""
+    values, _ = lanes(variant)
+    return values[4] - values[0]
+
+
+def at(time):
+    return int(np.flatnonzero(np.asarray(TIME) == time)[0])
+
+
+def ramp_and_hold(force=200.0, seconds=2000.0, ramp=1e-3, points=400):
+    """Almost a step of load, held."""
+    time = np.concatenate([[0.0, ramp], ramp + np.geomspace(1e-2, seconds, points)])
+    return clean_record(jnp.minimum(jnp.asarray(time) / ramp, 1.0) * force, jnp.asarray(time))
+
+
+def base(record, particle=PARTICLE):
+    return LAW.path_load(particle, LAW.init(particle), record.force)[1]
+
+
+@family("frame_compliance", "creep", "toe_asperity", "misalignment", "platen_sink_in", "pop_in", "ratcheting")
+def test_adds_displacement(variant):
+    added = shift(variant)
+    assert added.min() >= -1e-12
+    assert added.max() > 1e-3
+    assert abs(added[0]) < 1e-12
+
+
+@family("platen_friction", "reverse_plasticity", "reload_hysteresis")
+def test_takes_displacement_away(variant):
+    assert shift(variant).max() <= 1e-9
+    assert shift(variant).min() < -1e-2
+
+
+@family("frame_compliance")
+def test_a_frame_knows_only_force(variant):
+    added = shift(variant)
+    for force in (160.0, 100.0, 200.0, 0.0):
+        same = np.asarray(FORCE) == force
+        np.testing.assert_allclose(added[same], added[same][0], atol=1e-12)
+    order = np.argsort(np.asarray(FORCE), kind="stable")
+    assert (np.diff(added[order]) >= -1e-12).all()
+
+
+def test_the_linear_frame_is_a_spring():
+    variant = LIBRARY["frame_compliance"]["linear"]
+    np.testing.assert_allclose(shift(variant), variant.typical * np.asarray(FORCE), atol=1e-11)
+
+
+def test_drift_knows_only_time():
+    variants = LIBRARY["thermal_drift"].variants
+    other = signatures(LAW, PARTICLE, clean_record(0.3 * FORCE, TIME), [v.build(0.0) for v in variants])
+    for variant, slope in zip(variants, other, strict=True):
+        np.testing.assert_allclose(shift(variant), variant.typical * np.asarray(slope), atol=1e-11)
+
+
+@family("creep")
+def test_creep_makes_a_nose(variant):
+    """Displacement goes on growing in a hold; in the hold at no load it comes back, or stays."""
+    added = shift(variant)
+    assert added[at(280.0)] > added[at(240.0)] + 1e-4
+    assert added[at(390.0)] <= added[at(380.0)] + 1e-12
+
+
+def test_creep_functions_are_those_of_their_names():
+    record, amplitude = ramp_and_hold(), 1e-4
+    scale = amplitude * PARTICLE.effective_diameter * PARTICLE.stress(jnp.asarray(200.0))
+    time = np.asarray(record.time)[2:]
+    late = time > 0.3
+
+    def creep(name, **nuisance):
+        law = respond(LIBRARY["creep"][name], amplitude, record=record, **nuisance) - base(record)
+        return np.asarray(law / scale)[2:]
+
+    np.testing.assert_allclose(creep("kelvin_voigt", tau_s=20.0), -np.expm1(-time / 20), atol=1e-4)
+    np.testing.assert_allclose(creep("logarithmic", tau_s=10.0), np.log1p(time / 10), atol=2e-3, rtol=2e-3)
+    for n in (0.2, 0.4):
+        np.testing.assert_allclose(creep("power_law", exponent=n)[late], (time[late] / 100) ** n, rtol=0.01)
+    np.testing.assert_allclose(creep("viscous_flow"), time / 100, atol=1e-5)
+    np.testing.assert_allclose(creep("viscoplastic", tau_s=10.0), np.log1p(time / 10), atol=1e-3)
+    spread = creep("distributed", tau_s=20.0)
+    assert (np.diff(spread) > 0).all()
+    assert 0.45 < np.interp(14.0, time, spread) < 0.55
+    assert spread[-1] > 0.97
+
+
+def test_creep_of_a_slow_ramp_is_the_closed_form():
+    """Ramp of stress with Kelvin-Voigt and logarithmic creep functions, whatever the sampling."""
+    end, amplitude = 100.0, 1e-4
+    exact = {
+        "kelvin_voigt": end - 20 * -np.expm1(-end / 20),
+        "logarithmic": (end + 20) * np.log1p(end / 20) - end,
+    }
+    for points in (3, 40):
+        time = jnp.linspace(0.0, end, points)
+        record = clean_record(2.0 * time, time)
+        scale = amplitude * PARTICLE.effective_diameter * PARTICLE.stress(jnp.asarray(2.0))
+        for name, value in exact.items():
+            added = respond(LIBRARY["creep"][name], amplitude, record=record, tau_s=20.0) - base(record)
+            np.testing.assert_allclose(added[-1] / scale, value, rtol=2e-3)
+
+
+def test_faster_loading_is_harder():
+    """At one force the displacement falls with the rate, or is that of the reference rate."""
+    time = jnp.linspace(0.0, 1.0, 60)
+    variants = LIBRARY["rate_dependence"].variants
+    effects = [v.build(0.0) for v in variants]
+
+    @jax.vmap
+    def added(seconds):
+        return signatures(LAW, PARTICLE, clean_record(200.0 * time, seconds * time), effects)[:, -1]
+
+    slow, fast = jax.jit(added)(jnp.asarray([1000.0, 30.0]))
+    assert jnp.all(fast < slow - 3), [v.name for v in variants]
+
+
+@family("adhesion")
+def test_adhesion_holds_the_particle_back(variant):
+    """It acts on the elastic branch only, adds displacement there, most close to release."""
+    added, force = shift(variant), np.asarray(FORCE)
+    virgin = force >= np.maximum.accumulate(force)
+    assert np.abs(added[virgin]).max() < 1e-12
+    assert added.min() >= -1e-12
+    assert added[at(380.0)] > 0
+    branch = slice(at(280.0), at(380.0) + 1)
+    assert added[branch].argmax() > 0.6 * (branch.stop - branch.start)
+
+
+@pytest.mark.parametrize("name", ["damage", "densification_stiffening"])
+def test_damage_softens_and_densification_stiffens_unloading(name):
+    """Recovery from the highest peak grows or falls, and loading stays as it was."""
+    sign = 1 if name == "damage" else -1
+    force = np.asarray(FORCE)
+    virgin = force >= np.maximum.accumulate(force)
+    for variant in LIBRARY[name]:
+        values, _ = lanes(variant)
+        np.testing.assert_allclose(values[4][virgin], values[0][virgin], rtol=1e-12)
+        recovered = values[:, at(280.0)] - values[:, at(380.0)]
+        assert sign * (recovered[4] - recovered[0]) > 1e-3, variant.name
+
+
+def test_the_hysteresis_loop_dissipates():
+    """Work put in by a full reload minus that given back by the unloading before it, and the loop closes."""
+    time = jnp.asarray(np.linspace(0.0, 6.0, 601))
+    force = jnp.interp(time, jnp.arange(7.0), jnp.asarray([0.0, 200.0, 20.0, 200.0, 20.0, 200.0, 0.0]))
+    record = clean_record(force, time)
+    for variant in LIBRARY["reload_hysteresis"]:
+        displacement = np.asarray(respond(variant, variant.typical, record=record))
+        loop = slice(100, 301)
+        work = np.trapezoid(np.asarray(force)[loop], displacement[loop])
+        assert work > 0.1, variant.name
+        np.testing.assert_allclose(displacement[300], displacement[100], rtol=1e-12)
+        np.testing.assert_allclose(displacement[100:301], displacement[300:501], rtol=1e-9)
+
+
+def test_ratcheting_counts_reloads():
+    time = jnp.asarray(np.linspace(0.0, 7.0, 141))
+    force = jnp.interp(time, jnp.arange(8.0), jnp.asarray([0.0, 200.0, 0.0, 200.0, 0.0, 200.0, 0.0, 200.0]))
+    record = clean_record(force, time)
+    for variant in LIBRARY["ratcheting"]:
+        added = np.asarray(respond(variant, variant.typical, record=record) - base(record))
+        steps = np.diff(added[[20, 60, 100, 140]])
+        assert (np.diff(added) >= -1e-10).all()
+        assert (steps > 1e-3).all()
+        if variant.name in ("linear", "elastic_share"):
+            np.testing.assert_allclose(steps, steps[0], rtol=1e-9)
+        else:
+            assert (np.diff(steps) < 0).all()
+
+
+@family("unloading_shape")
+def test_another_shape_keeps_both_ends(variant):
+    added, force = shift(variant), np.asarray(FORCE)
+    ends = (force >= np.maximum.accumulate(force)) | (force <= 0)
+    assert np.abs(added[ends]).max() < 1e-9
+    assert np.abs(added).max() > 1e-3
+
+
+def test_sizes_and_shapes_that_are_the_reference_feel_nothing():
+    for name, particle in (("size_effect", sphere(200.0)), ("shape_second_order", sphere(150.0))):
+        for variant in LIBRARY[name]:
+            other = respond(variant, variant.typical, particle=particle)
+            np.testing.assert_allclose(other, base(RECORD, particle), rtol=1e-12)
+
+
+def test_small_particles_are_stronger():
+    small = Particle(100.0, 100.0, 100.0)
+    record = clean_record(0.2 * FORCE, TIME)
+    for variant in LIBRARY["size_effect"]:
+        assert respond(variant, 0.3, particle=small, record=record).max() < base(record, small).max()
+
+
+def test_shape_is_the_shape_factor():
+    """1 + b q^2 on eta_p: the response of a law whose a gives the same shape factor."""
+    variant, b = LIBRARY["shape_second_order"]["flatness_squared"], 0.4
+    q = float(PARTICLE.flatness)
+    eta = (1 + 1.43 * q) * (1 + b * q * q)
+    law = replace(LAW, a=jnp.asarray((eta - 1) / q))
+    np.testing.assert_allclose(respond(variant, b), law.path_load(PARTICLE, law.init(PARTICLE), FORCE)[1], rtol=1e-9)
+
+
+def test_a_pop_in_is_a_step_that_stays():
+    variant = LIBRARY["pop_in"]["sharp"]
+    added = np.asarray(respond(variant, 0.7, location_MPa=2.0) - base(RECORD))
+    stress = np.maximum.accumulate(np.asarray(PARTICLE.stress(FORCE)))
+    np.testing.assert_allclose(added[stress < 1.97], 0, atol=1e-12)
+    np.testing.assert_allclose(added[stress > 2.03], 0.7, atol=1e-12)
+
+
+def test_asperities_stay_flat():
+    for variant in LIBRARY["toe_asperity"]:
+        added = np.asarray(respond(variant, 0.01) - base(RECORD))
+        last = added[at(380.0)]
+        assert (abs(last) < 1e-9) if variant.name == "elastic" else last == pytest.approx(added.max(), rel=1e-9)
+
+
+def test_friction_and_hardening_meet_the_stress_they_say():
+    """The solved strain fulfils the equation: stress of the law times the factor is the stress applied."""
+    force = jnp.linspace(0.0, 300.0, 40)
+    record = clean_record(force, force / 2)
+    for mechanism, name, factor in (
+        ("platen_friction", "strain", lambda e, a: 1 + a * e),
+        ("finite_hardening_exponent", "all_terms", lambda e, a: (e / 0.2) ** (a / 2)),
+    ):
+        variant = LIBRARY[mechanism][name]
+        strain = PARTICLE.strain(respond(variant, variant.typical, record=record))[1:]
+        stress = LAW.loading_stress(PARTICLE, strain) * factor(strain, variant.typical)
+        np.testing.assert_allclose(stress, PARTICLE.stress(force)[1:], rtol=1e-9)
+
+
+def test_dry_air_hardens_and_an_unknown_humidity_does_nothing():
+    effects = [LIBRARY["humidity"][name].build(0.0) for name in ("C1", "flow", "flow_and_modulus", "flow_linear")]
+
+    @jax.vmap
+    def added(humidity):
+        record = eqx.tree_at(lambda r: r.relative_humidity, RECORD, humidity)
+        return signatures(LAW, PARTICLE, record, effects)
+
+    dry, reference, wet = jax.jit(added)(jnp.asarray([20.0, 45.0, 70.0]))
+    assert jnp.all(dry[:, at(280.0)] < -10)
+    assert jnp.all(wet[:, at(280.0)] > 10)
+    np.testing.assert_array_equal(reference, 0)
+    assert clean_record(FORCE, TIME).relative_humidity == 45
+
+
+def test_a_stiff_platen_does_not_give_way():
+    """The sink-in of a flat punch: F / (2 a E*), with the contact radius of the law."""
+    variant = LIBRARY["platen_sink_in"]["flat"]
+    added = np.asarray(respond(variant, 0.1) - base(RECORD))
+    top = at(240.0)
+    strain = float(base(RECORD)[top] / PARTICLE.effective_diameter)
+    radius = 2 * float(PARTICLE.effective_radius) * np.sqrt(1.43 * strain)
+    assert added[top] == pytest.approx(0.1 * 300.0 / (2 * radius), rel=2e-3)
+
+
+def test_particles_whose_law_is_not_monotone_stay_finite():
+    law = MccLaw(Plastic(4.0, 3.0, 2.4), 1.43, 16e3)
+    particle = paper_particle(6)
+    record = clean_record(0.5 * FORCE, TIME)
+    for names in (("platen_friction", "rate_dependence"), ("size_effect", "damage", "creep")):
+        effects = tuple(LIBRARY[n].variants[0].build(LIBRARY[n].variants[0].typical) for n in names)
+        displacement = ExtendedLaw(law, effects).respond(particle, record)
+        assert jnp.all(jnp.isfinite(displacement))
+        assert 0.5 < float(displacement.max() / law.path_load(particle, law.init(particle), 0.5 * FORCE)[1].max()) < 1.5

@@ -1,0 +1,120 @@
+"""Records of measured tests: from segments, robust against noise, equal to the clean ones in substance."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tested import FORCE, LAW, PARTICLE, RECORD, TIME, VARIANTS
+
+from mcc_jax import Hold, InputError, Instrument, Programme, Ramp, find_segments, paper_campaign
+from mcc_jax.effects import (
+    LIBRARY,
+    ExtendedLaw,
+    Need,
+    clean_record,
+    humidities,
+    present,
+    record_batch,
+    record_of,
+    signatures,
+)
+
+STEPS = (Ramp(0.6, 2.0), Ramp(0.2, 4.0), Ramp(1.0, 1.0), Hold(40.0), Ramp(0.3, 2.0), Ramp(0.9, 2.0), Ramp(0.0, 2.0))
+
+
+def campaign(noise=0.0, steps=STEPS, points=400):
+    instrument = Instrument(displacement_noise_um=noise, force_noise_mN=2.5 * noise)
+    return paper_campaign(3, instrument=instrument, programme=Programme("load", steps, points=points))
+
+
+def test_a_clean_path_is_cut_at_its_turns():
+    record = RECORD
+    assert record.reloads[-1] == 3
+    at = {float(t): i for i, t in enumerate(np.asarray(TIME))}
+    assert record.unload_from[at[140.0]] == 160
+    assert record.reload_from[at[170.0]] == 100
+    assert record.unload_from[at[180.0]] == 130
+    assert record.reload_from[at[220.0]] == 110
+    assert record.kind[at[280.0]] == 2
+    assert record.branch[at[280.0]] == 1
+    np.testing.assert_allclose(record.loading_rate[at[80.0]], 2.0, rtol=1e-9)
+    np.testing.assert_allclose(record.loading_rate[at[240.0]], 5.0, rtol=1e-9)
+    np.testing.assert_allclose(record.loading_rate[at[380.0]], 5.0, rtol=1e-9)
+    np.testing.assert_allclose(record.rate[at[380.0]], 3.0, rtol=1e-9)
+    # One whole reload would be 60 mN; half of it was made before it turned back.
+    np.testing.assert_allclose(record.progress[at[220.0]], 0.5, rtol=1e-9)
+
+
+def test_segments_and_clean_path_tell_the_same():
+    for curve in campaign().curves[:3]:
+        clean = clean_record(jnp.asarray(curve.force_mN), jnp.asarray(curve.time_s))
+        measured = record_of(curve, find_segments(curve, control="load"))
+        assert measured.reloads[-1] == clean.reloads[-1] == 2
+        # A turning point belongs to the segment before it in one, and to the one after it in the other.
+        assert np.mean(np.asarray(measured.branch) != np.asarray(clean.branch)) < 0.03
+        same = np.asarray(measured.branch) == np.asarray(clean.branch)
+        top = curve.force_mN.max()
+        for name, scale in (("unload_from", top), ("reload_from", top), ("loading_rate", 2.0), ("rate", 2.0)):
+            difference = np.abs(np.asarray(getattr(measured, name)) - np.asarray(getattr(clean, name)))[same]
+            assert np.quantile(difference, 0.97) < 0.02 * scale, name
+
+
+def test_noise_of_force_does_not_change_what_an_effect_adds():
+    """To first order, for every variant: what noise of force makes of its signature is small beside it."""
+    records = []
+    for noise in (0.0, 0.03):
+        curve = campaign(noise).curves[1]
+        records.append(record_of(curve, find_segments(curve, control="load"), relative_humidity_percent=75.0))
+    both = jax.tree.map(lambda *x: jnp.stack(x), *records)
+    effects = [v.build(0.0) for v in VARIANTS]
+    run = eqx.filter_jit(eqx.filter_vmap(lambda record: signatures(LAW, PARTICLE, record, effects)))
+    for variant, clean, noisy in zip(VARIANTS, *np.asarray(run(both)), strict=True):
+        assert np.sqrt(np.mean((noisy - clean) ** 2)) < 0.06 * np.abs(clean).max(), variant
+
+
+def test_batch_pads_with_the_last_point():
+    tests = campaign(points=120)
+    batch = record_batch(tests, multiple=16)
+    lengths = [len(c) for c in tests.curves]
+    assert batch.force.shape[1] % 16 == 0
+    for i, n in enumerate(lengths):
+        np.testing.assert_array_equal(batch.force[i, :n], tests.curves[i].force_mN)
+        for leaf in (batch.force, batch.time, batch.kind, batch.reloads, batch.loading_rate):
+            assert (np.asarray(leaf[i, n:]) == np.asarray(leaf[i, n - 1])).all()
+    assert batch.relative_humidity.shape == (20,)
+
+
+def test_humidity_comes_from_its_column():
+    tests = campaign(points=60)
+    assert humidities(tests) is None
+    wet = dataclasses.replace(tests, columns={"relative_humidity_percent": tuple(str(30 + i) for i in range(20))})
+    np.testing.assert_array_equal(record_batch(wet).relative_humidity, 30 + np.arange(20))
+    assert Need.HUMIDITY_COLUMN in present(wet)
+    for text in ("x", "-1", "101", "nan"):
+        bad = dataclasses.replace(tests, columns={"relative_humidity_percent": (text,) * 20})
+        with pytest.raises(InputError, match="relative humidity of particle '1'"):
+            humidities(bad)
+
+
+def test_what_a_campaign_holds():
+    simple = paper_campaign(1, programme=Programme.cycles(points=150))
+    assert {Need.UNLOADING, Need.SEVERAL_SIZES, Need.SEVERAL_SHAPES, Need.SEVERAL_PEAKS} <= present(simple)
+    assert not {Need.RELOAD, Need.HOLD, Need.TWO_RATES, Need.HUMIDITY_COLUMN} & present(simple)
+    assert {Need.RELOAD, Need.SECOND_RELOAD, Need.HOLD, Need.TWO_RATES} <= present(campaign())
+
+
+def test_segments_must_cover_the_curve():
+    curve = campaign(points=60).curves[0]
+    segments = find_segments(curve)
+    with pytest.raises(ValueError, match="cover"):
+        record_of(curve, segments[:-1])
+
+
+def test_times_may_begin_anywhere():
+    later = clean_record(FORCE, TIME + 1e4)
+    law = ExtendedLaw(LAW, tuple(LIBRARY[n].variants[0].build(1e-3) for n in ("creep", "damage")))
+    one, other = law.respond(PARTICLE, RECORD), law.respond(PARTICLE, later)
+    np.testing.assert_allclose(one, other, rtol=1e-9)

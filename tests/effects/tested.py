@@ -1,0 +1,71 @@
+"""One test with everything in it, and every variant's response along it at several amplitudes at once."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from helpers import paper_law, paper_particle, with_dtype
+
+from mcc_jax.calibrate.joint._forward import law_of
+from mcc_jax.effects import LIBRARY, ExtendedLaw, clean_record
+from mcc_jax.law import Unloading
+
+MECHANISMS = tuple(LIBRARY)
+VARIANTS = tuple(variant for mechanism in LIBRARY.values() for variant in mechanism)
+NAMES = [f"{v.mechanism}:{v.name}" for v in VARIANTS]
+PARTICLE = paper_particle(3)
+LAW = paper_law()
+HUMIDITY = 65.0
+
+# Load, hold, partial unload, reload, partial reload and back, second reload beyond at another rate, hold, full unload,
+# out of contact, reload to half, unload; with points that repeat, time included or not.
+TURNS = np.array(
+    [
+        (0, 0), (80, 160), (110, 160), (140, 100), (150, 100), (170, 130), (180, 110), (220, 200), (240, 300),
+        (280, 300), (380, 0), (390, 0), (390, 0), (460, 140), (500, 140), (570, 0), (570, 0),
+    ],
+    float,
+)  # fmt: skip
+
+
+def tested_path():
+    """Times [s] and forces [mN], every turn included."""
+    time = np.sort(np.concatenate([np.linspace(0, TURNS[-1, 0], 90), TURNS[:, 0], [40.0, 300.0]]))
+    return time, np.interp(time, TURNS[:, 0], TURNS[:, 1])
+
+
+TIME, FORCE = (jnp.asarray(x) for x in tested_path())
+RECORD = clean_record(FORCE, TIME, relative_humidity=jnp.asarray(HUMIDITY))
+START, MIDDLE = 1e-3, 1e-3  # steps of finite differences over the typical amplitude
+
+
+def latent_law():
+    """The same law as a fit has it: a = 0, coefficients multiplied by the shape factor."""
+    eta = LAW.shape_factor(PARTICLE)
+    C = jnp.stack([LAW.plastic.C1, LAW.plastic.C3, LAW.plastic.C5])
+    return law_of(jnp.concatenate([jnp.log(C * eta), jnp.log(LAW.effective_modulus)[None]]), Unloading.PRINTED)
+
+
+def respond(variant, amplitude, law=LAW, record=RECORD, particle=PARTICLE, **nuisance):
+    return ExtendedLaw(law, (variant.build(amplitude, **nuisance),)).respond(particle, record)
+
+
+@functools.cache
+def lanes(variant):
+    """Displacement and its derivative by the amplitude at 0, h, 2h, a - h, a, a + h, and at a with the fit's law."""
+    a = variant.typical
+    amplitudes = jnp.asarray([0, START * a, 2 * START * a, (1 - MIDDLE) * a, a, (1 + MIDDLE) * a, a])
+    laws = jax.tree.map(lambda x, y: jnp.stack([x] * 6 + [y]), LAW, latent_law())
+
+    def one(law, amplitude):
+        f = functools.partial(respond, variant, law=law)
+        return jax.jvp(lambda x: f(x), (amplitude,), (jnp.ones_like(amplitude),))
+
+    values, slopes = eqx.filter_vmap(one)(laws, amplitudes)
+    return np.asarray(values), np.asarray(slopes)
+
+
+def single(tree):
+    return with_dtype(tree, jnp.float32)
