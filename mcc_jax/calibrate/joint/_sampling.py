@@ -16,12 +16,14 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.sharding import PartitionSpec
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from ..._types import Scalar
 from ...law import Unloading
 from ._compile import compiled
 from ._data import Tests
+from ._devices import AXIS, mesh_of
 from ._forward import displacement
 from ._mode import PriorNumbers, Target, from_free
 from ._noise import Whitening
@@ -125,18 +127,53 @@ def draw_particles(
 ) -> ParticleDraws:
     """Draw the particles' parameters given each draw of the population, and compare with the exact likelihood.
 
+    Every particle has random numbers of its own, whatever others there are and on whatever device.
+
     Args:
         key: random key.
         population: draws, every field with a leading axis.
         exact: the tests.
         candidates: how many to draw and choose from; 0 draws one and does not look at the exact likelihood.
     """
-    draws = population.a.shape[0]
-    count = len(exact.tests)
+    keys = jax.random.split(key, population.a.shape[0])
+    return _draw_particles(keys, population, exact, jnp.arange(len(exact.tests)), candidates)
+
+
+def draw_particles_spread(
+    key: PRNGKeyArray, population: Population, exact: Exact, candidates: int = 1
+) -> ParticleDraws:
+    """`draw_particles` of tests that may be spread over devices: each draws its own."""
+    mesh = mesh_of(exact.tests.force)
+    if mesh is None:
+        return draw_particles(key, population, exact, candidates)
+    return _each_its_own(key, population, exact, candidates, mesh)
+
+
+@compiled
+def _each_its_own(key, population, exact, candidates, mesh):
+    own, all_ = PartitionSpec(AXIS), PartitionSpec()
+
+    def draw(keys, population, which, tests, filters, summary, zero_sd):
+        part = Exact(tests, filters, summary, exact.scatter, zero_sd, exact.unloading)
+        return _draw_particles(keys, population, part, which, candidates)
+
+    drawn = jax.shard_map(
+        draw,
+        mesh=mesh,
+        in_specs=(all_, all_, own, own, own, own, all_),
+        out_specs=PartitionSpec(None, AXIS),
+        check_vma=False,
+    )
+    keys, which = jax.random.split(key, population.a.shape[0]), jnp.arange(len(exact.tests))
+    return drawn(keys, population, which, exact.tests, exact.filters, exact.summary, exact.zero_sd)
+
+
+def _draw_particles(keys, population, exact, which, candidates) -> ParticleDraws:
+    draws, count, several = len(keys), len(which), max(candidates, 1)
 
     def one(arguments):
         key, at = arguments
-        deviate, zeros, pick = jax.random.split(key, 3)
+        own = jax.vmap(lambda i: jax.random.split(jax.random.fold_in(key, i), 3))(which)
 
         def candidate(normal, normal_zero):
             drawn = exact.draw(at, normal, normal_zero)
@@ -149,13 +186,13 @@ def draw_particles(
                 ratio = jnp.where(jnp.isfinite(ratio), ratio, -jnp.inf)
             return drawn.latent, drawn.zero, drawn.log_likelihood, ratio
 
-        shape = (max(candidates, 1), count)
-        latent, zero, likelihood, ratio = jax.vmap(candidate)(
-            jax.random.normal(deviate, (*shape, exact.scatter.size)), jax.random.normal(zeros, shape)
-        )
+        normal = jax.vmap(lambda k: jax.random.normal(k, (several, exact.scatter.size)), out_axes=1)(own[:, 0])
+        normal_zero = jax.vmap(lambda k: jax.random.normal(k, (several,)), out_axes=1)(own[:, 1])
+        latent, zero, likelihood, ratio = jax.vmap(candidate)(normal, normal_zero)
         if candidates <= 1:
             return ParticleDraws(latent[0], zero[0], likelihood[0], ratio[0])
-        chosen: Int[Array, " particles"] = jax.random.categorical(pick, jnp.maximum(ratio, -1e30), axis=0)
+        pick = jax.vmap(jax.random.categorical, in_axes=(0, 1))
+        chosen: Int[Array, " particles"] = pick(own[:, 2], jnp.maximum(ratio, -1e30))
         mean = jax.scipy.special.logsumexp(ratio, axis=0) - jnp.log(candidates)
 
         def take(values):
@@ -163,8 +200,8 @@ def draw_particles(
 
         return ParticleDraws(take(latent), take(zero), likelihood[0], mean)
 
-    batch = max(1, min(draws, 40_000 // (count * max(candidates, 1))))
-    return jax.lax.map(one, (jax.random.split(key, draws), population), batch_size=batch)
+    batch = max(1, min(draws, 40_000 // (count * several)))
+    return jax.lax.map(one, (keys, population), batch_size=batch)
 
 
 @compiled
