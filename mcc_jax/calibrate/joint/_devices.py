@@ -1,15 +1,12 @@
 """Particles spread over the devices of all processes, and their arrays back on the host.
 
-Every process calls the same functions with the same campaign and gets the same result. What is computed particle by
-particle is spread, and no number of one depends on where the others are. What concerns all of them (the noise, the
-population and its sampler) works on arrays that every process has gathered, in the order of one process: a sampler
-takes other turns for a sum that differs in its last bit. An array goes to the host through `host`, never by
-`numpy.asarray`; all processes ask for it together.
+Every process calls the same functions with the same campaign and gets the same result. Each holds and computes its
+particles only; what is summed over all of them is exchanged. Decisions are taken on the host from numbers that are the
+same everywhere: an array goes there through `host`, never by `numpy.asarray`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -21,9 +18,6 @@ from ._data import Tests, enlarged
 
 AXIS = "particles"
 """Name of the only axis of the mesh."""
-
-OWN, ALL = PartitionSpec(AXIS), PartitionSpec()
-"""Particles in front, and each device has its own; every device has the whole."""
 
 
 def mesh_of(x: Any) -> Mesh | None:
@@ -64,28 +58,6 @@ def host(x: Any) -> np.ndarray:
 
         return np.asarray(multihost_utils.process_allgather(x, tiled=True))
     return np.asarray(x)
-
-
-def on_each(function: Callable[..., Any], mesh: Mesh | None, takes: tuple[Any, ...], gives: Any) -> Callable[..., Any]:
-    """A function of arrays with particles in front, on every device for its own; itself where there is no mesh.
-
-    The compiler could split it by itself, but then into another program, whose last bits differ.
-
-    Args:
-        function: what to compute.
-        mesh: the devices.
-        takes: `OWN` or `ALL` for each argument, or trees of them.
-        gives: the same for the result.
-    """
-    if mesh is None:
-        return function
-    return jax.shard_map(function, mesh=mesh, in_specs=takes, out_specs=gives, check_vma=False)
-
-
-def gathered(tree: Any, tests: Tests) -> Any:
-    """Arrays with particles in front, whole and without copies on this process's own device, if the tests are spread;
-    otherwise as they are."""
-    return tree if mesh_of(tests.force) is None else local(tree, count_of(tests))
 
 
 def local(tree: Any, count: int | None = None) -> Any:

@@ -15,13 +15,13 @@ from jaxtyping import Array
 
 from ._compile import compiled
 from ._data import Tests
-from ._devices import count_of, gathered, host, mesh_of
+from ._devices import count_of, host, mesh_of
 from ._fit import JointFit, JointModel, population_at, populations, prior_numbers
 from ._mode import Target
 from ._noise import Whitening
 from ._nuts import Chains
 from ._population import COEFFICIENTS, Population, Scatter, Summary, laplace
-from ._sampling import Exact, draw_particles, draw_particles_spread, sample_joint, sample_population
+from ._sampling import Exact, draw_particles, sample_joint, sample_population
 from ._weights import diagnostics, ordered_resample, pareto_k, smoothed_weights, unrest
 
 MOST_CHECKED = 400_000
@@ -92,7 +92,7 @@ _laplace = compiled(laplace)
 def newton_steps(fit: JointFit, tests: Tests, model: JointModel) -> int:
     """How many Newton steps the integration over the particles needs: none if every coefficient is known sharply."""
     population = population_at(fit.mode, fit.numbers, model.scatter)
-    at = _laplace(population, gathered(fit.summary, tests), fit.numbers.flatness, model.scatter)
+    at = _laplace(population, fit.summary, tests.flatness, model.scatter)
     variance = np.diagonal(np.linalg.inv(host(at.hessian)[: count_of(tests)]), axis1=1, axis2=2)
     widest = float(np.max(np.sqrt(variance) * host(at.stretch)))
     return 0 if widest < SHARP else 4
@@ -106,15 +106,13 @@ def _stride(count: int, total: int) -> int:
 def draw_fast(key: Array, tests: Tests, model: JointModel, fit: JointFit, length: Length) -> dict[str, Any]:
     """The population sampled, the particles drawn back and corrected by exact weights: fields of the result."""
     scatter = replace(model.scatter, newton=newton_steps(fit, tests, model))
-    target = Target(fit.numbers, gathered(fit.summary, tests), scatter)
+    target = Target(fit.numbers, fit.summary, scatter)
     population_key, particle_key, check_key, pick_key = jax.random.split(key, 4)
     run, population = _settled(population_key, fit, target, length)
     count = count_of(tests)
     exact = Exact(tests, fit.filters, fit.summary, scatter, model.zero_sd, model.unloading)
     stride = _stride(count, length.total)
-    checked = [
-        np.array(host(v)[:, :count]) for v in draw_particles_spread(check_key, _every(population, stride), exact)
-    ]
+    checked = [np.array(host(v)[:, :count]) for v in draw_particles(check_key, _every(population, stride), exact)]
     ratio = checked[3]
     k = pareto_k(ratio)
     restless = np.flatnonzero(unrest(ratio) > RESTLESS)
@@ -149,7 +147,7 @@ def draw_fast(key: Array, tests: Tests, model: JointModel, fit: JointFit, length
             affected = ", ".join(str(i) for i in restless[:5])
             notes.append(f"{len(restless)} particles are far from their quadratic summary (positions {affected}, ...)")
         keep = max(1, -(-length.total * count // MOST_PARTICLE_DRAWS))
-        found = draw_particles_spread(particle_key, _every(population, keep), exact, 0)
+        found = draw_particles(particle_key, _every(population, keep), exact, 0)
         latent, zero, likelihood = (host(v)[:, :count] for v in found[:3])
     return {
         **_fields(run, population, names, stacked, (latent, zero, likelihood), tests, model, length, keep),
@@ -176,13 +174,9 @@ def _settled(key: Array, fit: JointFit, target: Target, length: Length) -> tuple
 
 
 def draw_joint(key: Array, tests: Tests, model: JointModel, fit: JointFit, length: Length) -> dict[str, Any]:
-    """Population and particles sampled together under the exact likelihood: fields of the result.
-
-    One density of everything, so each process has it all.
-    """
+    """Population and particles sampled together under the exact likelihood: fields of the result."""
     scatter = replace(model.scatter, newton=newton_steps(fit, tests, model))
-    parts = gathered((tests, fit.filters, fit.summary), tests)
-    exact = Exact(*parts, scatter, model.zero_sd, model.unloading)
+    exact = Exact(tests, fit.filters, fit.summary, scatter, model.zero_sd, model.unloading)
     found = sample_joint(key, fit.mode, fit.covariance, fit.numbers, exact, **length._asdict())
     run, free, *particles = jax.tree.map(host, found)
     count = count_of(tests)

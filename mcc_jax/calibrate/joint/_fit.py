@@ -19,7 +19,7 @@ from ...law import StrainScaling, Unloading
 from .._predict import point_noise_um
 from ._compile import compiled
 from ._data import Selection, Tests, enlarged, select_tests
-from ._devices import count_of, gathered, host, local, mesh_of, spread
+from ._devices import count_of, host, local, spread
 from ._individual import Particles, fit_particles, linear_starts
 from ._linearised import expected_latent, linear_data, summarise
 from ._mode import PriorNumbers, Target, from_free, most_probable, recentred, to_free
@@ -228,8 +228,8 @@ def fit_joint(
         tell: called with the name of each step.
     """
     scatter, zero_sd, priors = model.scatter, model.zero_sd, model.beliefs
-    flatness = gathered(tests.flatness, tests)
-    numbers = prior_numbers(priors, flatness, tests.weight if mesh_of(tests.force) is None else None)
+    flatness = tests.flatness
+    numbers = prior_numbers(priors, flatness, tests.weight)
     read_out = max(read_out_um, 1e-4)
     tell("fitting every particle")
     N = len(tests)
@@ -266,23 +266,23 @@ def fit_joint(
         tell("fitting the population")
         if turn:
             numbers, free = recentred(numbers, free)
-        target = Target(numbers, gathered(summary, tests), scatter)
+        target = Target(numbers, summary, scatter)
         free, covariance, mode_converged = most_probable(free, target)
         if turn == rounds:
             break
         turn += 1
         tell("fitting every particle")
-        expected = (host(v) for v in expected_latent(free, target))
-        # Of the particles only, where they are spread: then their copies get what the last one gets.
-        mean, spread, moved, shifted = (
-            np.pad(v, [(0, N - len(v))] + [(0, 0)] * (v.ndim - 1), "edge") for v in expected
+        mean, spread, moved, shifted = expected_latent(free, target)
+        starts = jnp.stack(
+            [
+                jnp.concatenate([latent, zero[:, None]], 1),
+                jnp.concatenate([moved, shifted[:, None]], 1),
+                jnp.concatenate([mean, zero[:, None]], 1),
+            ]
         )
-        before = host(zero)
-        pairs = ((host(latent), before), (moved, shifted), (mean, before))
-        starts = np.stack([np.concatenate([w, z[:, None]], 1) for w, z in pairs])
         sizes = _white_equivalent(filtered, tests)
-        within = jnp.asarray(np.maximum(spread, LEAST_WIDTH))
-        found = fit_particles(tests, sizes, jnp.asarray(mean), within, zero_sd, jnp.asarray(starts), model.unloading)
+        within = jnp.maximum(spread, LEAST_WIDTH)
+        found = fit_particles(tests, sizes, mean, within, zero_sd, starts, model.unloading)
         latent, zero = found.latent, found.zero
     converged = np.asarray([bool(np.all(host(individual.converged)[:count])), noise_converged, mode_converged])
     return JointFit(

@@ -10,13 +10,13 @@ from ..._types import Scalar
 from ...law import Unloading
 from ._compile import compiled
 from ._data import Tests
-from ._devices import ALL, OWN, mesh_of, on_each
 from ._forward import linearise_with_force, snap
 from ._mode import Target
-from ._noise import Linear, Noise, Whitening, spread_linear, whitening
+from ._noise import Linear, Noise, Whitening, whitening
 from ._population import Summary, draw_latent, moments
 
 
+@compiled
 def linear_data(
     latent: Float[Array, "particles 4"],
     zero: Float[Array, " particles"],
@@ -25,17 +25,12 @@ def linear_data(
     unloading: Unloading,
 ) -> Linear:
     """Residuals, their derivatives, and how noise of force moves them, around the given latent vectors and zeros."""
-    return _linear_data(latent, zero, tests, zero_sd, unloading, mesh_of(tests.force))
-
-
-@compiled
-def _linear_data(latent, zero, tests, zero_sd, unloading, mesh):
-    split = on_each(lambda w, z, own: linearise_with_force(w, z, own, unloading), mesh, (OWN, OWN, OWN), OWN)
-    value, J, moved, by_peak = split(latent, zero, tests)
+    value, J, moved, by_peak = linearise_with_force(latent, zero, tests, unloading)
     prior = jnp.concatenate([jnp.ones(4), 1 / zero_sd[None] ** 2])
     return Linear(value, J, prior, tests.step, tests.mask, moved, by_peak, tests.branch, tests.weight)
 
 
+@compiled
 def summarise(
     latent: Float[Array, "particles 4"],
     zero: Float[Array, " particles"],
@@ -49,18 +44,8 @@ def summarise(
     Returns:
         The summaries, and the noise filters, in which force noise has become noise of displacement.
     """
-    return _summarise(latent, zero, tests, data, noise, zero_sd, mesh_of(tests.force))
-
-
-@compiled
-def _summarise(latent, zero, tests, data, noise, zero_sd, mesh):
-    takes = (OWN, OWN, OWN, spread_linear(data), OWN, ALL, ALL)
-    return on_each(_summaries, mesh, takes, OWN)(latent, zero, tests, data, noise.scale, noise, zero_sd)
-
-
-def _summaries(latent, zero, tests, data, scale, noise, zero_sd):
     noise_filters = jax.vmap(lambda s, *path: whitening(noise, s, *path))(
-        scale, data.step, data.mask, data.compliance, data.peak, data.branch
+        noise.scale, data.step, data.mask, data.compliance, data.peak, data.branch
     )
     r = jax.vmap(lambda f, x: f(x))(noise_filters, data.residual)
     J = jax.vmap(lambda f, x: jax.vmap(f, in_axes=1, out_axes=1)(x))(noise_filters, data.jacobian)

@@ -12,18 +12,15 @@ Kalman filter turns residuals into independent ones in linear time, and each bra
 
 from __future__ import annotations
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
 from ..._types import Path, Scalar
 from ._compile import compiled
-from ._devices import ALL, AXIS, OWN, host, mesh_of, on_each
+from ._devices import host
 from ._small import Cholesky
 
 
@@ -169,11 +166,6 @@ class Linear(eqx.Module):
     weight: Float[Array, " particles"] | None = None
 
 
-def spread_linear(data: Linear) -> Any:
-    """Which of its arrays have particles in front: all but the prior."""
-    return eqx.tree_at(lambda one: one.prior, jax.tree.map(lambda _: OWN, data), ALL)
-
-
 def restricted_likelihood(noise: Noise, data: Linear) -> Float[Array, " particles"]:
     """Log likelihood of each test under the noise, with the particle's own parameters integrated out."""
 
@@ -202,16 +194,14 @@ class NoisePrior(eqx.Module):
 
 
 @compiled
-def _likelihoods(
-    logs: Float[Array, "many 4"], scale: Float[Array, " particles"], data: Linear, prior: NoisePrior, mesh
-):
-    """Of each particle, and the prior; not summed, so that the sum does not depend on where the particles are."""
+def _losses(logs: Float[Array, "many 4"], scale: Float[Array, " particles"], data: Linear, prior: NoisePrior):
+    def loss(one):
+        noise = Noise.from_logs(one, scale)
+        each = restricted_likelihood(noise, data)
+        total = jnp.sum(each if data.weight is None else data.weight * each)
+        return -(total + prior.log_density(one))
 
-    def likelihoods(logs, scale, data):
-        return jax.vmap(lambda one: restricted_likelihood(Noise.from_logs(one, scale), data))(logs)
-
-    split = on_each(likelihoods, mesh, (ALL, OWN, spread_linear(data)), PartitionSpec(None, AXIS))
-    return split(logs, scale, data), jax.vmap(prior.log_density)(logs)
+    return jax.vmap(loss)(logs)
 
 
 STEP = 1e-3
@@ -239,13 +229,9 @@ def estimate_noise(
     from scipy.optimize import minimize
 
     steps = STEP * np.concatenate([np.zeros((1, 4)), np.eye(4), -np.eye(4)])
-    mesh = mesh_of(data.step)
-    count = data.residual.shape[0] if data.weight is None else int(host(data.weight).sum())
 
     def value_and_gradient(logs: np.ndarray) -> tuple[float, np.ndarray]:
-        found = _likelihoods(jnp.asarray(logs + steps), start.scale, data, prior, mesh)
-        each, before = (host(v) for v in found)
-        values = -(np.ascontiguousarray(each[:, :count]).sum(1) + before)
+        values = host(_losses(jnp.asarray(logs + steps), start.scale, data, prior))
         return float(values[0]), (values[1:5] - values[5:]) / (2 * STEP)
 
     # No tester reads better than a few tenths of a nanometre: noise-free data, of a simulation say, get that much.

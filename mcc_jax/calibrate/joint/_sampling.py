@@ -16,14 +16,12 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.sharding import PartitionSpec
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from ..._types import Scalar
 from ...law import Unloading
 from ._compile import compiled
 from ._data import Tests
-from ._devices import AXIS, mesh_of
 from ._forward import displacement
 from ._mode import PriorNumbers, Target, from_free
 from ._noise import Whitening
@@ -127,53 +125,18 @@ def draw_particles(
 ) -> ParticleDraws:
     """Draw the particles' parameters given each draw of the population, and compare with the exact likelihood.
 
-    Every particle has random numbers of its own, whatever others there are and on whatever device.
-
     Args:
         key: random key.
         population: draws, every field with a leading axis.
         exact: the tests.
         candidates: how many to draw and choose from; 0 draws one and does not look at the exact likelihood.
     """
-    keys = jax.random.split(key, population.a.shape[0])
-    return _draw_particles(keys, population, exact, jnp.arange(len(exact.tests)), candidates)
-
-
-def draw_particles_spread(
-    key: PRNGKeyArray, population: Population, exact: Exact, candidates: int = 1
-) -> ParticleDraws:
-    """`draw_particles` of tests that may be spread over devices: each draws its own."""
-    mesh = mesh_of(exact.tests.force)
-    if mesh is None:
-        return draw_particles(key, population, exact, candidates)
-    return _each_its_own(key, population, exact, candidates, mesh)
-
-
-@compiled
-def _each_its_own(key, population, exact, candidates, mesh):
-    own, all_ = PartitionSpec(AXIS), PartitionSpec()
-
-    def draw(keys, population, which, tests, filters, summary, zero_sd):
-        part = Exact(tests, filters, summary, exact.scatter, zero_sd, exact.unloading)
-        return _draw_particles(keys, population, part, which, candidates)
-
-    drawn = jax.shard_map(
-        draw,
-        mesh=mesh,
-        in_specs=(all_, all_, own, own, own, own, all_),
-        out_specs=PartitionSpec(None, AXIS),
-        check_vma=False,
-    )
-    keys, which = jax.random.split(key, population.a.shape[0]), jnp.arange(len(exact.tests))
-    return drawn(keys, population, which, exact.tests, exact.filters, exact.summary, exact.zero_sd)
-
-
-def _draw_particles(keys, population, exact, which, candidates) -> ParticleDraws:
-    draws, count, several = len(keys), len(which), max(candidates, 1)
+    draws = population.a.shape[0]
+    count = len(exact.tests)
 
     def one(arguments):
         key, at = arguments
-        own = jax.vmap(lambda i: jax.random.split(jax.random.fold_in(key, i), 3))(which)
+        deviate, zeros, pick = jax.random.split(key, 3)
 
         def candidate(normal, normal_zero):
             drawn = exact.draw(at, normal, normal_zero)
@@ -186,13 +149,13 @@ def _draw_particles(keys, population, exact, which, candidates) -> ParticleDraws
                 ratio = jnp.where(jnp.isfinite(ratio), ratio, -jnp.inf)
             return drawn.latent, drawn.zero, drawn.log_likelihood, ratio
 
-        normal = jax.vmap(lambda k: jax.random.normal(k, (several, exact.scatter.size)), out_axes=1)(own[:, 0])
-        normal_zero = jax.vmap(lambda k: jax.random.normal(k, (several,)), out_axes=1)(own[:, 1])
-        latent, zero, likelihood, ratio = jax.vmap(candidate)(normal, normal_zero)
+        shape = (max(candidates, 1), count)
+        latent, zero, likelihood, ratio = jax.vmap(candidate)(
+            jax.random.normal(deviate, (*shape, exact.scatter.size)), jax.random.normal(zeros, shape)
+        )
         if candidates <= 1:
             return ParticleDraws(latent[0], zero[0], likelihood[0], ratio[0])
-        pick = jax.vmap(jax.random.categorical, in_axes=(0, 1))
-        chosen: Int[Array, " particles"] = pick(own[:, 2], jnp.maximum(ratio, -1e30))
+        chosen: Int[Array, " particles"] = jax.random.categorical(pick, jnp.maximum(ratio, -1e30), axis=0)
         mean = jax.scipy.special.logsumexp(ratio, axis=0) - jnp.log(candidates)
 
         def take(values):
@@ -200,8 +163,8 @@ def _draw_particles(keys, population, exact, which, candidates) -> ParticleDraws
 
         return ParticleDraws(take(latent), take(zero), likelihood[0], mean)
 
-    batch = max(1, min(draws, 40_000 // (count * several)))
-    return jax.lax.map(one, (keys, population), batch_size=batch)
+    batch = max(1, min(draws, 40_000 // (count * max(candidates, 1))))
+    return jax.lax.map(one, (jax.random.split(key, draws), population), batch_size=batch)
 
 
 @compiled
