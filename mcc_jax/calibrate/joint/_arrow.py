@@ -160,7 +160,7 @@ class Solution(eqx.Module):
     steps: Any
 
     def here(self, count: int) -> Solution:
-        """The same on this process's own device, of the first `count` particles."""
+        """The same on the default device, of the first `count` particles."""
         value, normal = self.value, self.normal
         return Solution(
             Parameters(local(value.local, count), local(value.shared)),

@@ -113,7 +113,7 @@ class JointFit(eqx.Module):
     converged: Bool[np.ndarray, " 3"]
 
     def here(self, count: int) -> JointFit:
-        """The same on this process's own device, of the first `count` particles."""
+        """The same on the default device, of the first `count` particles."""
         noise, numbers = local(self.noise), local(self.numbers)
         return JointFit(
             local(self.individual, count),

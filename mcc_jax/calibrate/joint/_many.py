@@ -43,7 +43,7 @@ def calibrate_many(
         method: "bayes" or "least-squares".
         threshold_MPa: points below this stress on loading do not count [MPa].
         workers: how many campaigns to calibrate at once, in threads; the first of each size goes ahead alone, so that
-            its compilation serves the others. With several processes (`jax.distributed`) there is one.
+            its compilation serves the others. With several devices there is one: each campaign takes them all.
         progress: called with a campaign's position and the name of its step, "done" or "failed" last; with several
             workers from their threads.
         settings: of `calibrate_bayes` or `calibrate_least_squares`: model, seed, chains, loss, ...
@@ -93,7 +93,7 @@ def calibrate_many(
         else:
             sizes[i] = (particles, points)
     groups = _groups(sizes, particles=settings.get("mode", "fast") == "fast")
-    if workers == 1 or jax.process_count() > 1:
+    if workers == 1 or jax.local_device_count() > 1:
         for size, members in groups:
             for i in members:
                 one((i, size))

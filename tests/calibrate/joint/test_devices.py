@@ -31,9 +31,10 @@ def run(devices):
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def test_two_devices_give_the_numbers_of_one():
+def test_several_devices_give_the_numbers_of_one():
     one, two, three = run(1), run(2), run(3)
-    # Four particles do not divide among three devices: then one does it all.
-    assert (one["devices"], two["devices"], three["devices"]) == (1, 2, 1)
-    np.testing.assert_allclose(two["mode"], one["mode"], rtol=1e-8, atol=1e-8)
-    np.testing.assert_allclose(two["latent"], one["latent"], rtol=1e-8)
+    # Four particles do not divide among three devices: two copies that count for nothing fill up.
+    assert (one["devices"], two["devices"], three["devices"]) == (1, 2, 3)
+    for several in (two, three):
+        np.testing.assert_allclose(several["mode"], one["mode"], rtol=1e-8, atol=1e-8)
+        np.testing.assert_allclose(several["latent"][:4], one["latent"], rtol=1e-8)
