@@ -1,8 +1,8 @@
 """Loading-unloading contact law of micro-crystalline cellulose particles: simulate, calibrate, discover, embed.
 
 Everything public is here or in `mcc_jax.law`, `mcc_jax.campaign`, `mcc_jax.effects`, `mcc_jax.simulate`,
-`mcc_jax.calibrate` and `mcc_jax.plots`. Units: MPa, um, mN, s, nJ. Switch JAX to double precision first, unless you
-mean single:
+`mcc_jax.calibrate`, `mcc_jax.discover` and `mcc_jax.plots`. Units: MPa, um, mN, s, nJ. Switch JAX to double precision
+first, unless you mean single:
 `jax.config.update("jax_enable_x64", True)`.
 """
 

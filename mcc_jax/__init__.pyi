@@ -31,6 +31,9 @@ from .campaign import find_segments as find_segments
 from .campaign import read_campaign as read_campaign
 from .campaign import read_tester_file as read_tester_file
 from .campaign import write_campaign as write_campaign
+from .discover import Discovery as Discovery
+from .discover import Plan as Plan
+from .discover import Power as Power
 from .effects import LIBRARY as LIBRARY
 from .effects import ExtendedLaw as ExtendedLaw
 from .effects import Record as Record

@@ -10,11 +10,12 @@ NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 
 
 def test_there_are_notebooks():
-    assert [n.name for n in NOTEBOOKS][:4] == [
+    assert [n.name for n in NOTEBOOKS][:5] == [
         "01_law.ipynb",
         "02_paper_calibration.ipynb",
         "03_least_squares.ipynb",
         "04_posterior.ipynb",
+        "05_discovery.ipynb",
     ]
 
 

@@ -20,7 +20,7 @@ def test_every_command_shown_exists():
     from mcc_jax.cli._main import cli
 
     shown = set(re.findall(r"mcc-jax ([a-z]+)", README))
-    assert {"demo", "convert", "calibrate", "simulate"} <= shown
+    assert {"demo", "convert", "calibrate", "simulate", "discover"} <= shown
     assert shown <= set(cli.commands), shown - set(cli.commands)
 
 

@@ -38,7 +38,7 @@ def write_calibration(calibration: Calibration, stage: Stage, *, figures: bool, 
         (stage.folder / FIGURES).mkdir()
         saved = _save(calibration, stage.folder / FIGURES)
         names = sorted(f"{FIGURES}/{path.name}" for path in saved)
-    stage.stale += [name for name in _listed(stage.directory / RESULT) if name not in names]
+    stage.stale += [name for name in earlier_figures(stage.directory / RESULT) if name not in names]
     files = []
     if isinstance(calibration, BayesCalibration):
         from ..calibrate import write_posterior
@@ -87,7 +87,7 @@ def _is_ours(file: Path) -> bool:
         return False
 
 
-def _listed(file: Path) -> list[str]:
+def earlier_figures(file: Path) -> list[str]:
     """Figures that an earlier result names; what is no such result names none."""
     try:
         listed = json.loads(file.read_text(encoding="utf-8"))["figures"]

@@ -19,21 +19,23 @@ CAMPAIGN_FILES = ("particles.csv", "curves.csv", "campaign.toml")
 @out_option(default="mcc-jax-demo", show_default=True)
 @seed_option()
 def demo(out: Path, seed: int) -> None:
-    """Simulate the paper's 20 particles, calibrate the law on them, draw the figures.
+    """Simulate the paper's 20 particles, calibrate the law on them, ask what it misses, draw the figures.
 
     The tests are simulated from the paper's tables (Bommireddy et al. 2018): it publishes its measured curves as
-    pictures only, not as numbers. DIR gets campaign/, calibration.json, posterior.nc and
-    figures/.
+    pictures only, not as numbers. DIR gets campaign/, calibration.json, posterior.nc,
+    discovery.json and figures/.
 
     \b
     Example:
       mcc-jax demo --out try --seed 1
     """
-    with session(14) as tell:
+    with session(26) as tell:
         from ..calibrate import calibrate_bayes
         from ..campaign import write_campaign
+        from ..discover import discover
         from ..simulate import paper_campaign
         from ._calibration import main_numbers, say_files, say_state, say_warnings, write_calibration
+        from ._discovery import DISCOVERY, main_finding, write_discovery
 
         with results(out) as stage:
             tell("simulating the campaign")
@@ -41,6 +43,8 @@ def demo(out: Path, seed: int) -> None:
             write_campaign(campaign, stage.folder / "campaign")
             calibration = calibrate_bayes(campaign, seed=seed, progress=tell)
             content = write_calibration(calibration, stage, figures=True, tell=tell)
+            found = discover(campaign, experiments=False, seed=seed, progress=tell)
+            missing = write_discovery(found, stage, figures=True, tell=tell)
     points = sum(len(curve) for curve in campaign.curves)
     say(f"The tests are SIMULATED from the paper's tables, not measured: {len(campaign)} particles, {points} points,")
     say("each with C1, C3 and C5 of its own drawn from Table 2, with noise of 0.02 um and 0.05 mN.")
@@ -51,10 +55,11 @@ def demo(out: Path, seed: int) -> None:
     say("After +-: the standard deviation of the posterior. Spreads of 20 particles differ from seed to seed.")
     say_warnings(content)
     say()
-    say_files(
-        out,
-        [*(f"campaign/{name}" for name in CAMPAIGN_FILES), *content["figures"], *content["files"], "calibration.json"],
-    )
+    say(f"Discovery ({missing['verdict']}): {main_finding(missing)}.")
+    say()
+    figures = [*content["figures"], *missing["figures"]]
+    files = [*(f"campaign/{name}" for name in CAMPAIGN_FILES), *content["files"], "calibration.json", DISCOVERY]
+    say_files(out, [*figures, *files])
     say()
     say("Next, for example:")
     folder = shlex.quote(str(out / "campaign"))
@@ -67,6 +72,11 @@ def demo(out: Path, seed: int) -> None:
             "one shared material, two cycles with holds",
             "simulate --out sim --shared-material --levels 0.5,1 --hold-s 30",
         ),
+        (
+            "an effect that the law does not contain, hidden in tests with holds",
+            "simulate --out hidden --levels 0.5,1 --hold-s 30 --noise-um 0.02 --effect creep",
+        ),
+        ("find it", "discover hidden --out found"),
         ("your own tests, from a tester's file", "convert FILE --out tests --diameters 200,190,180"),
     ):
         say(f"  mcc-jax {command}", nl=False)

@@ -14,6 +14,7 @@ import click
 from ._calibrate import calibrate
 from ._convert import convert
 from ._demo import demo
+from ._discover import discover
 from ._group import PROGRAM, OneLineGroup
 from ._simulate import simulate
 
@@ -22,6 +23,7 @@ Examples:
   mcc-jax demo
   mcc-jax simulate --out sim --levels 0.5,1 --hold-s 30 --noise-um 0.02
   mcc-jax calibrate sim --out fit
+  mcc-jax discover sim --out found
   mcc-jax convert FS1.txt --out tests --diameters 200,190,180
 
 \b
@@ -62,12 +64,12 @@ def _version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
 @click.option("--version", is_flag=True, is_eager=True, expose_value=False, callback=_version, help="Show the version.")
 @click.pass_context
 def cli(ctx: click.Context, debug: bool) -> None:
-    """Loading-unloading contact law of micro-crystalline cellulose particles: simulate tests, calibrate the law."""
+    """Loading-unloading contact law of micro-crystalline cellulose particles: simulate, calibrate, discover."""
     if ctx.invoked_subcommand is None:
         click.echo(ctx.get_help())
 
 
-for _command in (demo, simulate, convert, calibrate):
+for _command in (demo, simulate, convert, calibrate, discover):
     cli.add_command(_command)
 
 

@@ -2,33 +2,46 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+from scipy.stats import norm
 
 from .._errors import InputError
 from ..calibrate import JointModel
 from ..campaign import THRESHOLD_MPA, Campaign
-from ..effects import LIBRARY, Mechanism, present
+from ..effects import LIBRARY, Mechanism, Nuisance, Variant, present
+from ..law import PUNCH_AREA
 from ._candidates import untestable
 from ._closure import Closure, find_closure, pursue
 from ._confirm import held_out
 from ._experiments import next_experiments
 from ._refine import refined
 from ._result import Discovery, Effect, Verdict
-from ._score import Projection, family_wise, flips, project
+from ._score import DETECTABLE, Projection, family_wise, flips, project
 from ._search import Ranking, family_columns, pairs, random_probability, rank
-from ._system import GLOBALS, Base, Signals, System, base_fit, build_system, signals_of
+from ._system import GLOBALS, Base, System, base_fit, build_system, signals_of
 from ._where import where
+from ._words import summary_of
 
-LEVEL = 0.04
+LEVEL = 0.035
 LEVEL_AT_RANDOM = 0.01
-"""Family-wise levels of the two tests for a gap: common to all particles, different from test to test. Together 5 %."""
+LEVEL_OF_NOISE_MODEL = 0.005
+"""Family-wise levels of the three tests for a gap: common to all particles, by their scatter; different from test to
+test; common, by the noise model, for effects of which few particles carry most of the information. Together 5 %."""
+
+INDEPENDENT = 100
+"""So many independent columns are counted where no bootstrap does it."""
 
 LEVEL_OF_MORE = 0.01
 """Level at which something is missing besides the whole family of formulas of what was added."""
+
+BETTER, SHARE = 30.0, 0.1
+"""A formula of a few free words takes away this much chi2 more than any listed mechanism by chance and because no
+listed formula is nature's own, in addition this share of what the mechanism takes away. Beyond, it is not listed."""
 
 LIKE_THE_BEST = 0.1
 """A mechanism whose probability is at least this share of the best one's belongs to the set."""
@@ -67,7 +80,7 @@ def discover(
         The answer; "nothing is missing" and "cannot tell" are answers, too.
 
     Raises:
-        InputError: if no particle can be used, or a name to exclude is not known.
+        InputError: if no particle can be used, a name to exclude is not known, or no mechanism is left to look for.
     """
     started = time.perf_counter()
     tell = progress or (lambda _: None)
@@ -79,7 +92,9 @@ def discover(
     assumed = model or JointModel()
     assumed = JointModel(assumed.unloading, assumed.strain_scaling, True, assumed.shape_scatter, assumed.priors)
     base = base_fit(campaign, assumed, threshold_MPa=threshold_MPa, tell=tell)
-    testable, missing = untestable(known, present(campaign))
+    testable, missing = untestable(without_punch(known, base), present(campaign))
+    if not testable:
+        raise InputError("no mechanism is left to look for", remedy="Exclude fewer, or measure what the others need.")
     if not bool(np.all(np.asarray(base.fit.converged)[1:])) or not _mostly_converged(base):
         return _not_converged(base, missing, seed, started)
     tell("signatures of all effects")
@@ -91,7 +106,41 @@ def discover(
         if not changed:
             break
         system = build_system(base, signals)
-    return _judge(base, signals, system, missing, confirm, experiments, seed, started, tell)
+    return _judge(base, system, missing, confirm, experiments, seed, started, tell)
+
+
+def without_punch(library: Mapping[str, Mechanism], base: Base) -> dict[str, Mechanism]:
+    """The library without the finite width of the punch, unless a contact grows wider than the punch is known to be.
+
+    A formula that knows neither would be nothing but another name for the compliance of the frame.
+    """
+    diameter = base.campaign.metadata.punch_diameter_um
+    tests = base.tests
+    size = np.asarray(tests.particle.D1 * tests.particle.D2 / tests.particle.D3)
+    travel = np.where(np.asarray(tests.mask), np.asarray(tests.displacement), -np.inf).max(1) - np.asarray(
+        base.fit.zero
+    )
+    widest = float(np.max(np.sqrt(PUNCH_AREA * size * np.maximum(travel, 0.0))))
+    outgrown = diameter is not None and 2 * widest > diameter
+
+    def known(variant: Variant) -> Variant | None:
+        if not any(n.name == PUNCH for n in variant.nuisances):
+            return variant
+        if not outgrown or diameter is None:
+            return None
+        radius = Nuisance(PUNCH, (diameter / 2,), (diameter / 2, diameter / 2), "radius of the flat punch, as recorded")
+        others = tuple(n for n in variant.nuisances if n.name != PUNCH)
+        return dataclasses.replace(variant, nuisances=(*others, radius))
+
+    kept = {}
+    for name, mechanism in library.items():
+        variants = tuple(v for v in map(known, mechanism.variants) if v is not None)
+        if variants:
+            kept[name] = Mechanism(name, mechanism.explanation, variants, mechanism.equivalences)
+    return kept
+
+
+PUNCH = "punch_radius_um"
 
 
 def _mostly_converged(base: Base) -> bool:
@@ -134,38 +183,70 @@ def _signs(system: System) -> np.ndarray:
     return np.array([c.variant.sign for c in system.candidates])
 
 
-def _left(system: System, seed: int, inside: np.ndarray) -> float:
-    """Family-wise probability that nothing is left beside some columns, over candidates, map and words."""
+FREEDOM = 0.3
+"""How far nature's formula may differ from the best one of its family: by so much of it in every other one."""
+
+
+def _left(system: System, seed: int, chosen: list[int]) -> float:
+    """Family-wise probability that nothing is left beside some candidates, over candidates, map and words.
+
+    The candidates are fitted; the other formulas of their families are let in within `FREEDOM`.
+    """
+    inside, precision = _family(system, chosen)
     columns = np.concatenate([system.candidate_columns, system.place_columns, system.word_columns])
     sign = np.concatenate([_signs(system), np.zeros(len(columns) - len(system.candidates))])
-    view = project(system, columns, inside=inside)
+    view = project(system, columns, inside=inside, precision=precision)
     keep = view.survival > (1e-6 if not len(inside) else 1e-2)
     if not keep.any():
         return 1.0
-    return _probability(view.scores[:, keep], view.total[keep], sign[keep], seed)
+    scores, total, signs = view.scores[:, keep], view.total[keep], sign[keep]
+    found = _probability(scores, total, signs, seed)
+    # The scatter of few particles cannot be surer than their number of signs allows, however strong a second effect is.
+    return min(found, 2 * _by_noise_model(scores, total, signs)) if chosen else found
+
+
+def _family(system: System, chosen: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Columns of the families of some candidates, and how tightly each is held to zero."""
+    own = np.array([system.column(k) for k in chosen], int)
+    if not chosen:
+        return own, np.zeros(0)
+    theta = project(system, own[:0], inside=own).theta[len(system.globals) :]
+    strength = project(system, system.candidate_columns).total
+    columns, precision = list(own), [1e-12] * len(own)
+    for k, amplitude in zip(chosen, theta, strict=True):
+        effect = FREEDOM**2 * amplitude**2 * strength[k]
+        for j, candidate in enumerate(system.candidates):
+            if candidate.mechanism == system.candidates[k].mechanism and j not in chosen and strength[j] > 0:
+                columns.append(system.column(j))
+                precision.append(float(strength[j] / max(effect, 1e-300)))
+    return np.array(columns, int), np.array(precision)
 
 
 def _probability(scores: np.ndarray, total: np.ndarray, sign: np.ndarray, seed: int) -> float:
     if len(scores) < FEWEST:
-        from scipy.stats import norm
-
-        t = scores.sum(0) / np.sqrt(np.maximum(total, 1e-300))
-        largest = float(np.max(np.where(sign == 0, np.abs(t), t * sign)))
-        # Some thirty of the columns are independent of each other.
-        return float(min(1.0, 60 * norm.sf(largest)))
+        return _by_noise_model(scores, total, sign)
     return float(family_wise(scores, sign, flips(len(scores), seed))[0].min())
 
 
+def _by_noise_model(scores: np.ndarray, total: np.ndarray, sign: np.ndarray) -> float:
+    """Bonferroni's bound for the largest estimate over its standard error; a sign that is NaN does not count."""
+    t = scores.sum(0) / np.sqrt(np.maximum(total, 1e-300))
+    sided = np.where(np.isnan(sign), -np.inf, np.where(sign == 0, np.abs(t), t * np.nan_to_num(sign)))
+    return float(min(1.0, INDEPENDENT * norm.sf(float(np.max(sided)))))
+
+
 def _judge(
-    base: Base, signals: Signals, system: System, missing, confirm: bool, experiments: bool, seed: int, started, tell
+    base: Base, system: System, missing, confirm: bool, experiments: bool, seed: int, started, tell
 ) -> Discovery:
     tell("is something missing")
     view = project(system, system.candidate_columns)
     ranking = rank(system, view)
-    p_common = _left(system, seed, np.array([], int))
+    p_common = _left(system, seed, [])
     p_random = random_probability(system, view, seed)
-    gap = p_common <= LEVEL or p_random <= LEVEL_AT_RANDOM
-    p_any = min(1.0, p_common * 0.05 / LEVEL, p_random * 0.05 / LEVEL_AT_RANDOM)
+    p_model = _by_noise_model(view.scores, view.total, np.where(view.survival > 1e-6, _signs(system), np.nan))
+    tests = ((p_common, LEVEL), (p_random, LEVEL_AT_RANDOM), (p_model, LEVEL_OF_NOISE_MODEL))
+    p_any = min(1.0, *(p * 0.05 / level for p, level in tests))
+    gap = p_any <= 0.05
     notes = _notes(base, system)
     verdict: Verdict = "NO_GAP"
     chosen: list[int] = []
@@ -213,11 +294,7 @@ def _judge(
         runtime_s=0.0,
         notes=tuple(notes),
     )
-    from dataclasses import replace
-
-    from ._words import summary_of
-
-    return replace(found, summary=summary_of(found), runtime_s=time.perf_counter() - started)
+    return dataclasses.replace(found, summary=summary_of(found), runtime_s=time.perf_counter() - started)
 
 
 def _name(base: Base, system: System, view: Projection, ranking: Ranking, seed: int, tell):
@@ -225,30 +302,29 @@ def _name(base: Base, system: System, view: Projection, ranking: Ranking, seed: 
     first = ranking.best[0]
     top = ranking.names[0]
     absorbed = system.absorbing(family_columns(system, (top,))) if ranking.at_random[0] else system
-    family = family_columns(system, (top,))
-    p_left = _left(absorbed, seed, family)
+    p_left = _left(absorbed, seed, [first])
     members = tuple(ranking.members(LIKE_THE_BEST))
-    if p_left > LEVEL_OF_MORE:
+    gain_of_words = pursue(system)[1]
+    short = gain_of_words - float(ranking.gain[0])
+    if p_left > LEVEL_OF_MORE and short <= BETTER + SHARE * float(ranking.gain[0]):
         return ("NAMED" if len(members) == 1 else "SET"), [first], [members], [ranking], None
     tell("a second effect")
-    span = _span(base)
-    words, gain_of_words = pursue(system)
+    if ranking.at_random[0] and ranking.gain[0] > gain_of_words:
+        return ("NAMED" if len(members) == 1 else "SET"), [first], [members], [ranking], None
     best_pairs = pairs(system, view)
     if best_pairs and not ranking.at_random[0]:
         gain, i, j = best_pairs[0]
-        if view.scores[:, j].sum() ** 2 / view.total[j] > view.scores[:, i].sum() ** 2 / view.total[i]:
-            i, j = j, i
         both = tuple(system.candidates[k].mechanism for k in (i, j))
-        p_both = _left(system, seed, family_columns(system, both))
+        p_both = _left(system, seed, [i, j])
         enough = p_both > LEVEL_OF_MORE
-        if enough and gain >= gain_of_words - 10 * len(words):
+        if enough and gain >= gain_of_words - BETTER:
             one = rank(system, project(system, system.candidate_columns, inside=np.array([system.column(j)])))
             two = rank(system, project(system, system.candidate_columns, inside=np.array([system.column(i)])))
             sets = [_with(both[0], one), _with(both[1], two)]
             verdict: Verdict = "NAMED" if all(len(s) == 1 for s in sets) else "SET"
             return verdict, [i, j], sets, [one, two], None
     tell("a formula of its own")
-    closure = find_closure(system, span, seed, tell=tell)
+    closure = find_closure(system, _span(base), seed, tell=tell)
     if closure is None:
         return ("NAMED" if len(members) == 1 else "SET"), [first], [members], [ranking], None
     return "UNLISTED", [], [], [], closure
@@ -273,8 +349,6 @@ def _chooser(system: System, count: int, formula: bool) -> Callable[[np.ndarray]
         if not found:
             return [empty] * (count + 1)
         _, i, j = found[0]
-        if view.scores[:, j].sum() ** 2 / view.total[j] > view.scores[:, i].sum() ** 2 / view.total[i]:
-            i, j = j, i
         return [empty, np.array([system.column(i)]), np.array([system.column(i), system.column(j)])]
 
     return choose
@@ -307,10 +381,6 @@ def _effects(system: System, chosen: list[int], steps: list[Ranking], p_any: flo
             )
         )
     return tuple(found)
-
-
-DETECTABLE = 4.6
-"""Estimate over standard error that is found with 95 % probability at the family-wise level."""
 
 
 def _limits(system: System, view: Projection, ranking: Ranking) -> dict[str, tuple[float, float, float]]:

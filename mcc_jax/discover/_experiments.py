@@ -7,30 +7,33 @@ from typing import Any
 import numpy as np
 from scipy.stats import norm
 
-from ..effects import LIBRARY
+from ..effects import Mechanism
 from ..simulate import Programme
 from ._plan import Plan, planned_system
-from ._score import project
+from ._score import Projection, project
 from ._system import Base, System
 
-POINTS = 300
 ENOUGH = 0.9
 MOST_PARTICLES = 200
 
-MENU = (
-    Plan("a hold of 60 s at the largest load", (Programme.cycles(hold_s=60, points=POINTS),)),
-    Plan(
-        "a cycle at half load, a hold of 60 s at the largest load, and a reload",
-        (Programme.cycles(levels=(0.5, 1.0, 1.0), unload_to=0.3, hold_s=60, points=POINTS),),
-    ),
-    Plan(
-        "two loading rates, every second particle ten times faster, with a cycle and a hold",
-        (
-            Programme.cycles(levels=(0.5, 1.0, 1.0), unload_to=0.3, hold_s=60, points=POINTS),
-            Programme.cycles(levels=(0.5, 1.0, 1.0), unload_to=0.3, hold_s=60, rate=20.0, points=POINTS),
+TURNS = 16
+"""Points that turning points may add to a programme's own."""
+
+
+def menu(points: int) -> tuple[Plan, ...]:
+    """Further tests that every tester can do, sampled into about so many points."""
+    cycles = {"levels": (0.5, 1.0, 1.0), "unload_to": 0.3, "hold_s": 60.0, "points": points}
+    return (
+        Plan("a hold of 60 s at the largest load", (Programme.cycles(hold_s=60.0, points=points),)),
+        Plan(
+            "a cycle at half load, a hold of 60 s at the largest load, and a reload",
+            (Programme.cycles(**cycles),),
         ),
-    ),
-)
+        Plan(
+            "two loading rates, every second particle ten times faster, with a cycle and a hold",
+            (Programme.cycles(**cycles), Programme.cycles(rate=20.0, **cycles)),
+        ),
+    )
 
 
 def next_experiments(
@@ -46,11 +49,17 @@ def next_experiments(
     ]
     if not any(rivals for _, rivals in needed):
         return []
-    library = {name: LIBRARY[name] for name in dict.fromkeys(c.mechanism for c in system.candidates) if name in LIBRARY}
+    # The same formulas and the same number of points as in the campaign itself: everything is compiled already.
+    library: dict[str, Mechanism] = {}
+    for name in dict.fromkeys(c.mechanism for c in system.candidates):
+        variants = {c.variant.name: c.variant for c in system.candidates if c.mechanism == name}
+        library[name] = Mechanism(name, "", tuple(variants.values()))
+    points = max(base.tests.force.shape[1] - TURNS, 32)
     theta = project(system, system.candidate_columns[:0], inside=np.array([system.column(k) for k in chosen])).theta
     found = []
+    views: dict[str, Projection] = {}
     options: list[tuple[str, System]] = [("more particles, tested in the same way", system)]
-    options += [(plan.name, planned_system(base, plan, library)) for plan in MENU]
+    options += [(plan.name, planned_system(base, plan, library)) for plan in menu(points)]
     for (k, rivals), amplitude in zip(needed, theta[len(system.globals) :], strict=True):
         for name, other in options:
             same = [
@@ -60,9 +69,11 @@ def next_experiments(
             ]
             if not rivals or not same:
                 continue
-            per_particle = (
-                min(_separation(other, same[0], rival) for rival in rivals) * amplitude**2 / other.usable.sum()
-            )
+            if name not in views:
+                views[name] = project(other, other.candidate_columns)
+            view = views[name]
+            least = min(_separation(other, view, same[0], rival) for rival in rivals)
+            per_particle = least * amplitude**2 / other.usable.sum()
             count = int(system.usable.sum())
             first = 2 * count if other is system else count
             particles = next((n for n in range(first, MOST_PARTICLES, 2) if _power(n * per_particle) >= ENOUGH), None)
@@ -79,9 +90,8 @@ def next_experiments(
     return found
 
 
-def _separation(system: System, k: int, rival: str) -> float:
+def _separation(system: System, view: Projection, k: int, rival: str) -> float:
     """chi2 per squared amplitude of a candidate that no formula of the rival explains."""
-    view = project(system, system.candidate_columns)
     both = view.information.sum(0)
     least = both[k, k]
     for j, candidate in enumerate(system.candidates):

@@ -114,7 +114,7 @@ def words() -> tuple[Feature, ...]:
         k = 2 * jnp.pi / period
         found.append(Feature(f"sin(2 pi q/{period:g})", lambda c, k=k: jnp.sin(k * _q(c))))
         found.append(Feature(f"cos(2 pi q/{period:g}) - 1", lambda c, k=k: jnp.cos(k * _q(c)) - 1))
-    for period in (0.04, 0.08, 0.16):
+    for period in (0.03, 0.04, 0.05, 0.065, 0.08, 0.1, 0.13, 0.16, 0.2):
         k = 2 * jnp.pi / period
         found.append(Feature(f"sin(2 pi eps_P/{period:g})", lambda c, k=k: jnp.sin(k * c.peak_strain)))
         found.append(Feature(f"cos(2 pi eps_P/{period:g}) - 1", lambda c, k=k: jnp.cos(k * c.peak_strain) - 1))

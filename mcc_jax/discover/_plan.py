@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -20,11 +19,8 @@ from ..campaign import Campaign, Curve, Metadata
 from ..effects import LIBRARY, Mechanism, present
 from ..simulate import Programme, simulate_campaign
 from ._candidates import untestable
-from ._score import project
+from ._score import DETECTABLE, project
 from ._system import Base, System, _records, build_system, signals_of
-
-DETECTABLE = 4.6
-"""Estimate over standard error that is found with 95 % probability at the family-wise level."""
 
 ALIKE = 0.9
 
@@ -108,11 +104,8 @@ def power_of(system: System, missing: Sequence[dict[str, str]]) -> Power:
     """Detection limits and inseparable pairs of a linear system; residuals play no part."""
     view = project(system, system.candidate_columns)
     both = view.similarity()
-    first: dict[str, int] = {}
     limits, units, plausible = {}, {}, {}
     strength = view.total * (view.survival > 1e-6)
-    for k, candidate in enumerate(system.candidates):
-        first.setdefault(candidate.mechanism, k)
     members: dict[str, list[int]] = {}
     for k, candidate in enumerate(system.candidates):
         if strength[k] > 0:
@@ -158,10 +151,9 @@ def power(
     from ..calibrate.joint._fit import population_at
     from ..calibrate.joint._population import moments
     from ..campaign import particle_batch
-    from ..geometry import Particle
 
     particles = particle_batch(diameters_um)
-    flat = eqx.filter_vmap(Particle.flatness.fget)(particles)  # pyright: ignore[reportAttributeAccessIssue]
+    flat = eqx.filter_vmap(lambda particle: particle.flatness)(particles)
     population = population_at(base.fit.mode, base.fit.numbers, base.model.scatter)
     latent, _ = moments(population, flat, base.model.scatter)
     laws = eqx.filter_vmap(lambda w: law_of(w, base.model.unloading))(latent)
@@ -170,5 +162,4 @@ def power(
     planned = _expected(campaign, base.fit, base.model, latent, noise)
     testable, missing = untestable(library, present(campaign))
     system = build_system(planned, signals_of(planned, testable))
-    jax.block_until_ready(planned.fit.latent)
     return power_of(replace(system, usable=np.ones(len(system.points), bool)), missing)

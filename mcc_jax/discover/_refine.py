@@ -17,6 +17,7 @@ import numpy as np
 from ..calibrate.joint._linearised import linear_data, summarise
 from ..calibrate.joint._mode import Target, most_probable
 from ..calibrate.joint._noise import estimate_noise, particle_scales
+from ..calibrate.joint._population import Summary
 from ._score import project
 from ._system import Base, Signals, System
 
@@ -46,6 +47,15 @@ def systematic(system: System) -> tuple[np.ndarray, np.ndarray]:
     return chosen, theta
 
 
+def _least_squares(summary: Summary) -> np.ndarray:
+    """chi2 of every test at its own best parameters: those of the fit were best with the gap still in the residual."""
+    score = np.asarray(summary.score)[..., None]
+    curvature = np.asarray(summary.precision)
+    # What a test says nothing about gains nothing.
+    best = np.linalg.pinv(curvature, rcond=1e-10, hermitian=True) @ score
+    return np.asarray(summary.squares) - (score * best)[..., 0].sum(1)
+
+
 def refined(base: Base, system: System, signals: Signals) -> tuple[Base, bool]:
     """The base fit with noise and population from residuals without what is systematic, and whether that differs."""
     columns, theta = systematic(system)
@@ -60,7 +70,7 @@ def refined(base: Base, system: System, signals: Signals) -> tuple[Base, bool]:
     noise, _, fine = estimate_noise(data, priors.noise, fit.noise, uncertainty=False)
     summary, filters = summarise(fit.latent, fit.zero, tests, data, noise, zero_sd)
     old = np.asarray(noise.scale)
-    scale = particle_scales(old, np.asarray(summary.squares), np.asarray(summary.count) - 4)
+    scale = particle_scales(old, _least_squares(summary), np.asarray(summary.count) - 4)
     if np.any(scale != old):
         noise = eqx.tree_at(lambda n: n.scale, noise, jnp.asarray(scale))
         summary, filters = summarise(fit.latent, fit.zero, tests, data, noise, zero_sd)

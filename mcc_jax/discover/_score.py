@@ -21,6 +21,9 @@ from ._system import System
 
 FLIPS = 4000
 
+DETECTABLE = 4.6
+"""Estimate over standard error that is found with 95 % probability at the family-wise level."""
+
 
 @dataclass(frozen=True)
 class Projection:
@@ -78,7 +81,12 @@ LEAST_SURVIVAL = 1e-6
 
 
 def project(
-    system: System, columns: np.ndarray, *, inside: np.ndarray | None = None, particles: np.ndarray | None = None
+    system: System,
+    columns: np.ndarray,
+    *,
+    inside: np.ndarray | None = None,
+    particles: np.ndarray | None = None,
+    precision: np.ndarray | None = None,
 ) -> Projection:
     """Project population and effects in the law off the residual and off some columns.
 
@@ -87,13 +95,14 @@ def project(
         columns: the columns looked at.
         inside: columns of effects that are in the law already.
         particles: which particles take part; all usable ones if None.
+        precision: of the amplitudes inside the law around zero; none if None.
     """
     chosen = np.flatnonzero(system.usable) if particles is None else np.asarray(particles)
     extra = np.array([], int) if inside is None else np.asarray(inside, int)
     nuisance = np.concatenate([system.globals, extra])
     gram = system.gram[chosen]
     total = gram.sum(0)
-    prior = np.concatenate([system.prior, np.full(len(extra), 1e-12)])
+    prior = np.concatenate([system.prior, np.full(len(extra), 1e-12) if precision is None else precision])
     inner = total[np.ix_(nuisance, nuisance)] + np.diag(prior)
     covariance = np.linalg.pinv(inner, rcond=1e-13, hermitian=True)
     theta = -covariance @ total[nuisance, 0]

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import log_ndtr, logsumexp
 
-from ._score import Projection, project
+from ._score import Projection
 from ._system import System
 
 SCALES = (0.01, 0.03, 0.1, 0.3, 1.0)
@@ -177,7 +177,8 @@ def family_columns(system: System, names: tuple[str, ...]) -> np.ndarray:
 
 
 def pairs(system: System, projection: Projection) -> list[tuple[float, int, int]]:
-    """Pairs of formulas of different mechanisms by the chi2 they take away together, best pair of mechanisms first."""
+    """Pairs of formulas of different mechanisms by the chi2 they take away together, best pair of mechanisms first; the
+    formula that alone takes away more comes first in its pair."""
     sign = np.array([c.variant.sign for c in system.candidates])
     U, both = projection.scores.sum(0), projection.information.sum(0)
     d = np.diagonal(both)
@@ -196,17 +197,13 @@ def pairs(system: System, projection: Projection) -> list[tuple[float, int, int]
         i, j = np.unravel_index(flat, gain.shape)
         if not np.isfinite(gain[i, j]):
             break
-        key = (min(names[i], names[j]), max(names[i], names[j]))
+        key = (str(min(names[i], names[j])), str(max(names[i], names[j])))
         if key not in best:
-            best[key] = (float(gain[i, j]), int(i), int(j))
+            alone = U**2 / np.where(alive, d, np.inf)
+            stronger, weaker = (i, j) if alone[i] >= alone[j] else (j, i)
+            best[key] = (float(gain[i, j]), int(stronger), int(weaker))
     return sorted(best.values(), reverse=True)
 
 
 def _physical(theta: np.ndarray, sign: np.ndarray) -> np.ndarray:
     return (sign == 0) | (theta * sign > 0)
-
-
-def again(system: System, inside: list[int], **options) -> Projection:
-    """Project the candidates with some of them inside the law."""
-    columns = np.array([system.column(k) for k in inside], int)
-    return project(system, system.candidate_columns, inside=columns, **options)

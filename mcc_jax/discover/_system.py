@@ -28,9 +28,10 @@ from ..calibrate.joint._data import Selection, Tests
 from ..calibrate.joint._fit import JointFit, population_at, prepare
 from ..calibrate.joint._forward import law_of, snap
 from ..calibrate.joint._linearised import linear_data
-from ..calibrate.joint._population import moments
+from ..calibrate.joint._population import Population, Scatter, moments
 from ..campaign import Campaign, campaign_segments
 from ..effects import Context, ExtendedLaw, Mechanism, Record, record_batch, signatures
+from ..geometry import Particle
 from ._candidates import Candidate, candidates_of
 from ._features import Feature, map_features, words
 
@@ -179,13 +180,7 @@ def build_system(base: Base, signals: Signals) -> System:
     flat = tests.flatness
     mean, factor = moments(population, flat, scatter)
 
-    def mean_of(a: Array, rest: Array) -> Array:
-        moved = eqx.tree_at(lambda p: (p.a, p.log_modulus, p.mu), population, (a, rest[0], rest[1:]))
-        return moments(moved, flat, scatter)[0]
-
-    rest = jnp.concatenate([population.log_modulus[None], population.mu])
-    by_a, by_rest = jax.jit(jax.jacfwd(mean_of, argnums=(0, 1)))(population.a, rest)
-    by_globals = jnp.concatenate([by_a[..., None], by_rest], -1)
+    by_globals = _mean_by_globals(population, flat, scatter)
     gram = _gram(
         data.residual,
         data.jacobian,
@@ -200,11 +195,32 @@ def build_system(base: Base, signals: Signals) -> System:
         fit.zero - tests.contact,
     )
     top = jnp.max(tests.force, axis=1)
-    jump = np.asarray(eqx.filter_jit(jax.vmap(snap))(fit.latent, tests.particle))
+    jump = np.asarray(_jumps(fit.latent, tests.particle))
     usable = ~(jump < np.log(1.15 * np.asarray(top)))
     numbers = fit.numbers
     width = np.array([numbers.a[1], numbers.log_modulus[1], numbers.mu_1[1], 0.5, numbers.mu_5[1]])
     return System(np.asarray(gram), np.asarray(jnp.sum(tests.mask, 1)), candidates, places, some, 1 / width**2, usable)
+
+
+@compiled
+def _mean_by_globals(
+    population: Population, flat: Float[Array, " particles"], scatter: Scatter
+) -> Float[Array, "particles 4 globals"]:
+    """Derivatives of the particles' expected latent vectors by the population's parameters, in the order of GLOBALS."""
+
+    def mean_of(a: Array, rest: Array) -> Array:
+        moved = eqx.tree_at(lambda p: (p.a, p.log_modulus, p.mu), population, (a, rest[0], rest[1:]))
+        return moments(moved, flat, scatter)[0]
+
+    rest = jnp.concatenate([population.log_modulus[None], population.mu])
+    by_a, by_rest = jax.jacfwd(mean_of, argnums=(0, 1))(population.a, rest)
+    return jnp.concatenate([by_a[..., None], by_rest], -1)
+
+
+@compiled
+def _jumps(latent: Float[Array, "particles 4"], particles: Particle) -> Float[Array, " particles"]:
+    """Logarithm of the force at which each particle snaps through."""
+    return jax.vmap(snap)(latent, particles)
 
 
 @compiled

@@ -42,7 +42,7 @@ def where(base: Base, system: System) -> list[dict[str, Any]]:
                 ],
                 "share": share,
                 "particles": affected,
-                "direction": "more displacement than the law" if sign < 0 else "less displacement than the law",
+                "direction": "more displacement than the law" if sign > 0 else "less displacement than the law",
             }
         )
     return found

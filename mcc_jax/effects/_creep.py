@@ -118,15 +118,11 @@ class PowerLawCreep(AbstractLinearCreep):
         return rates, weights, (fastest * REFERENCE_TIME_S) ** (-n) / gamma
 
 
-class ViscousFlow(AbstractEffect):
-    """Steady flow: strain rate in proportion to stress, never recovered; the amplitude counts 100 s."""
-
-    def driver(self, context: Context) -> Values:
-        """Stress [MPa]."""
-        return context.stress
+class AbstractIntegral(AbstractEffect):
+    """A memory of the driver's integral over time."""
 
     def start(self, like: Scalar) -> Scalar:
-        """Nothing has flown."""
+        """Nothing yet."""
         return jnp.zeros_like(like)
 
     def evolve(self, memory: Scalar, before: Scalar, now: Scalar, seconds: Scalar) -> tuple[Scalar, Scalar]:
@@ -134,12 +130,20 @@ class ViscousFlow(AbstractEffect):
         memory = memory + 0.5 * (before + now) * seconds
         return memory, memory
 
+
+class ViscousFlow(AbstractIntegral):
+    """Steady flow: strain rate in proportion to stress, never recovered; the amplitude counts 100 s."""
+
+    def driver(self, context: Context) -> Values:
+        """Stress [MPa]."""
+        return context.stress
+
     def inside(self, context: Context) -> Values:
         """D_e c (integral of sigma dt) / 100 s."""
         return self.amplitude * context.particle.displacement(context.memory / REFERENCE_TIME_S)
 
 
-class ViscoplasticCreep(AbstractEffect):
+class ViscoplasticCreep(AbstractIntegral):
     """Permanent creep, only near the largest load: logarithmic in the time spent there."""
 
     tau_s: Scalar = eqx.field(converter=scalar)
@@ -148,15 +152,6 @@ class ViscoplasticCreep(AbstractEffect):
         """u^8: unloading by a tenth more than halves it."""
         square = context.load_share * context.load_share
         return square * square * square * square
-
-    def start(self, like: Scalar) -> Scalar:
-        """No time under load."""
-        return jnp.zeros_like(like)
-
-    def evolve(self, memory: Scalar, before: Scalar, now: Scalar, seconds: Scalar) -> tuple[Scalar, Scalar]:
-        """Time under load."""
-        memory = memory + 0.5 * (before + now) * seconds
-        return memory, memory
 
     def inside(self, context: Context) -> Values:
         """D_e c sigma_P ln(1 + t_load / tau)."""

@@ -96,9 +96,15 @@ class AbstractAdhesion(AbstractEffect):
     r"""Attraction over the contact while the particle is unloaded; it vanishes at the onset and with the contact.
 
     The law's branch carries what the tester measures plus the attraction, :math:`u' = u + \kappa g(s(u'))`, with
-    :math:`\kappa = 4 c^2 \epsilon_P s_{ad} / \sigma_P`: the stress over the contact's area at the peak. Of its
-    solutions the largest is stable. Derivatives follow from the implicit-function rule.
+    :math:`\kappa = 4 c^2 \epsilon_P s_{ad} / \sigma_P`, the stress over the contact's area at the peak, or
+    :math:`\kappa = s_{ad} / \sigma_P` if it is counted over the particle's section as all stresses of the law are. Of
+    its solutions the largest is stable. Derivatives follow from the implicit-function rule.
+
+    Attributes:
+        over_section: whether the stress is counted over the section.
     """
+
+    over_section: bool = eqx.field(static=True, default=False, kw_only=True)
 
     def attraction(self, recovered: Values) -> Values:
         """Attraction over its strength, at the recovered share s."""
@@ -108,7 +114,8 @@ class AbstractAdhesion(AbstractEffect):
         """Delta [s(u) - s(u')]."""
         share = context.load_share
         carries = context.peak_stress > 1e-6
-        area = 4 * PUNCH_AREA * context.peak_strain / jnp.where(carries, context.peak_stress, 1.0)
+        share_of_section = 1.0 if self.over_section else 4 * PUNCH_AREA * context.peak_strain
+        area = share_of_section / jnp.where(carries, context.peak_stress, 1.0)
         strength = self.amplitude * jnp.where(carries, area, 0.0)
         frozen, fixed = jax.lax.stop_gradient(share), jax.lax.stop_gradient(strength)
 
@@ -156,13 +163,16 @@ class TailAdhesion(AbstractAdhesion):
         return phi * jnp.sqrt(phi + 1e-12) * recovered**4
 
 
-def _adhesion(name: str, make: type[AbstractEffect], equation: str, explanation: str, source: str) -> Variant:
+def _adhesion(
+    name: str, make: type[AbstractEffect], equation: str, explanation: str, source: str, *, over_section: bool = False
+) -> Variant:
     return Variant(
         "adhesion", name, make, "adhesive_stress_MPa", "MPa", 1, (0.02, 2.0), equation, explanation, source,
-        needs=(Need.UNLOADING,), helps=(Need.SEVERAL_PEAKS,),
+        needs=(Need.UNLOADING,), helps=(Need.SEVERAL_PEAKS,), fixed={"over_section": over_section},
     )  # fmt: skip
 
 
+_SECTION = "phi = a/a_P, u' = u + s_ad / sigma_P g, d = Delta [s(u) - s(u')]"
 _GENERAL = "phi = a/a_P, u' = u + 4 c^2 eps_P s_ad / sigma_P g, d = Delta [s(u) - s(u')]"
 
 ADHESION = Mechanism(
@@ -175,6 +185,11 @@ ADHESION = Mechanism(
                   "Olsson and Larsson (2013); Gonzalez (2019), J. Mech. Phys. Solids"),
         _adhesion("stretched_tail", TailAdhesion, f"g = phi^1.5 s^4; {_GENERAL}",
                   "Bridges or fibres that pull only once they are stretched, close to release.", "liquid bridges"),
+        _adhesion("jkr_nominal", JkrAdhesion, f"g = phi^1.5 s; {_SECTION}",
+                  "As jkr, with a stress counted over the particle's section: larger contacts stick no more strongly.",
+                  "Mesarovic and Johnson (2000)", over_section=True),
+        _adhesion("bond_nominal", BondAdhesion, f"g = phi^2 s; {_SECTION}", "As bond, counted over the section.",
+                  "Gonzalez (2019)", over_section=True),
     ),
 )  # fmt: skip
 

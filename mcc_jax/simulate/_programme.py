@@ -126,8 +126,9 @@ class Programme:
             else:
                 value = step.to * peak
                 duration = abs(value - values[-1]) / step.rate
-            # A billionth of the time so far is no step: rounding of the times alone would change its rate.
-            if duration > 1e-9 * times[-1]:
+            # A billionth of the time so far is no step: rounding of the times alone would change its rate. Nor is a
+            # picosecond at the beginning: sampled, it would fall below the smallest number.
+            if duration > max(1e-9 * times[-1], 1e-12):
                 times.append(times[-1] + duration)
                 values.append(value)
         if len(times) < 2:

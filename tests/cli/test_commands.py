@@ -57,13 +57,13 @@ def test_names_of_the_options_are_those_of_the_law():
 def test_without_arguments_help_with_examples(run):
     text = done(run())
     assert text == done(run("--help"))
-    for word in ("demo", "simulate", "convert", "calibrate", "Examples:", "_MCC_JAX_COMPLETE"):
+    for word in ("demo", "simulate", "convert", "calibrate", "discover", "Examples:", "_MCC_JAX_COMPLETE"):
         assert word in text
-    assert set(cli.commands) == {"demo", "simulate", "convert", "calibrate"}
+    assert set(cli.commands) == {"demo", "simulate", "convert", "calibrate", "discover"}
     assert "0.1.0" in done(run("--version"))
 
 
-@pytest.mark.parametrize("command", ["demo", "simulate", "convert", "calibrate"])
+@pytest.mark.parametrize("command", ["demo", "simulate", "convert", "calibrate", "discover"])
 def test_every_command_has_help_with_an_example(run, command):
     text = done(run(command, "--help"))
     assert "xample" in text
@@ -80,10 +80,14 @@ def test_demo_does_the_whole_job(run, tmp_path):
     check_contract(content)
     assert content["converged"] is True
     assert len(content["figures"]) >= 6
-    expected = {"calibration.json", "campaign", "figures", *content["figures"]}
+    found = json.loads((out / "discovery.json").read_text(encoding="utf-8"))
+    assert found["verdict"] == "NO_GAP"
+    assert "Discovery (NO_GAP): nothing is missing" in text
+    assert {"figures/discovery_where.png", "figures/discovery_ranking.png"} <= set(found["figures"])
+    expected = {"calibration.json", "discovery.json", "campaign", "figures", *content["figures"], *found["figures"]}
     expected |= {f"campaign/{name}" for name in ("particles.csv", "curves.csv", "campaign.toml")} | {"posterior.nc"}
     assert set(snapshot(out)) == expected
-    for name in content["figures"]:
+    for name in (*content["figures"], *found["figures"]):
         assert (out / name).read_bytes().startswith(b"\x89PNG")
     for warning in content["warnings"]:
         assert warning[1:20] in text

@@ -27,7 +27,7 @@ def test_levels_holds_and_partial_unloads_are_all_reached():
 
 steps = st.lists(
     st.one_of(
-        st.builds(Ramp, st.floats(0, 2), st.floats(0.01, 100)),
+        st.builds(Ramp, st.one_of(st.just(0.0), st.floats(1e-6, 2)), st.floats(0.01, 100)),
         st.builds(Hold, st.floats(0.01, 100)),
     ),
     min_size=1,
@@ -52,6 +52,14 @@ def test_sampled_paths_increase_in_time_and_stay_within_the_levels(steps, peak, 
     # No ramp is faster than it was told to be.
     fastest = max([0.0] + [s.rate for s in steps if isinstance(s, Ramp)])
     assert np.abs(np.diff(value) / np.diff(time)).max() <= fastest * (1 + 1e-6) + 1e-9
+
+
+def test_a_ramp_of_less_than_a_picosecond_is_none():
+    with pytest.raises(ValueError, match="never leaves zero"):
+        Programme("load", (Ramp(5e-324, 1.0),), points=2).sample(1.0)
+    time, value = Programme("load", (Ramp(5e-324, 1.0), Ramp(1.0, 1.0)), points=3).sample(1.0)
+    np.testing.assert_allclose(time, [0, 0.5, 1])
+    np.testing.assert_allclose(value, [0, 0.5, 1])
 
 
 @pytest.mark.parametrize(

@@ -175,6 +175,9 @@ class Target(eqx.Module):
         return prior + self.numbers.total(marginal_likelihood(population, self.summary, self.flatness, self.scatter))
 
 
+LEFT_TO_GAIN = 1e-6
+"""Twice the log probability still to gain, by Newton's method, at which a mode is reached."""
+
 ATTEMPTS = 4
 
 
@@ -210,13 +213,16 @@ def most_probable(start: Float[Array, " d"], target: Target) -> tuple[Float[Arra
         success = bool(found.success)
         if success:
             break
-    curvature = expand(origin)[2]
+    _, slope, curvature = expand(origin)
     # Curvatures differ by many powers of ten: on the scale of each coordinate, what is not convex is taken as wide.
     scale = 1 / np.sqrt(np.maximum(np.abs(np.diagonal(curvature)), 1e-8))
     values, vectors = np.linalg.eigh(curvature * scale * scale[:, None])
+    convex = bool(np.all(values > 1e-7))
     values = np.where(values > 1e-7, values, 0.01)
     covariance = (vectors / values) @ vectors.T * scale * scale[:, None]
-    return jnp.asarray(origin), jnp.asarray(covariance), success
+    # Rounding may keep the optimiser from its tolerance at the very mode: what counts is what is left to gain.
+    there = convex and float(slope @ covariance @ slope) < LEFT_TO_GAIN
+    return jnp.asarray(origin), jnp.asarray(covariance), success or there
 
 
 def _newton(expand: Callable[[np.ndarray], tuple[float, np.ndarray, np.ndarray]], origin: np.ndarray, unit: np.ndarray):

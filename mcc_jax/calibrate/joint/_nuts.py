@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -65,7 +65,9 @@ def sample(
         return jnp.where(jnp.isnan(value), jnp.inf, value)
 
     def chain(key):
-        kernel = NUTS(potential_fn=potential, dense_mass=dimension < 40, target_accept_prob=accept)
+        # A traced number does as well as a Python one: another value then needs no new compilation.
+        target = cast(float, accept)
+        kernel = NUTS(potential_fn=potential, dense_mass=dimension < 40, target_accept_prob=target)
         start_key, key = jax.random.split(key)
         start = jax.random.normal(start_key, (dimension,), mode.dtype)
         state = kernel.init(key, warmup, start, (), {})

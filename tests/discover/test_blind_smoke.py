@@ -1,0 +1,42 @@
+"""Some of the blind bench's fixed cases, whose generator shares no code with the library; all forty as a long study.
+
+The study: `pytest -m study tests/discover/test_blind_smoke.py -n 2`.
+"""
+
+import pytest
+
+from benchmarks.blind import adapter, smoke
+from benchmarks.blind.generator import campaigns
+
+CASES = {case.id: case for case in smoke.cases()}
+FEW = (
+    "T0-clean-1",
+    "T0-clean-3",
+    "T1-thermal_drift.exact-20-P1-0",
+    "T1-creep.exact-20-P1-0",
+    "T1-reverse_plasticity.exact-20-P1-0",
+    "T4-mid_unloading_bump.unlisted-20-P1-1",
+    "T2-creep.logarithmic-20-P0-0",
+    "T6-reload_hysteresis-P0-0",
+)
+"""Two nulls, three exact formulas, one unlisted, one variant, one untestable; each protocol in one go."""
+
+
+def answer(case, folder, **options):
+    campaigns.write(campaigns.build(case, smoke.MASTER_SEED), folder / "campaign")
+    return adapter.in_process(folder / "campaign", exclude=case.exclude, options={**case.solver_options, **options})
+
+
+@pytest.mark.parametrize("name", FEW)
+def test_some_blind_cases_get_their_verdict(name, tmp_path):
+    told = answer(CASES[name], tmp_path, confirm=False, experiments=False)
+    assert adapter.problem(told) is None
+    assert smoke.check(CASES[name], told) is None
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("name", CASES)
+def test_every_blind_case_gets_its_verdict(name, tmp_path):
+    told = answer(CASES[name], tmp_path)
+    assert adapter.problem(told) is None
+    assert smoke.check(CASES[name], told) is None

@@ -1,0 +1,170 @@
+"""From curves to an answer: a hidden effect is named, nothing hidden is nothing found, the rest is declared."""
+
+import json
+
+import numpy as np
+import pytest
+from campaigns import FULL, SINGLE, cached, campaign
+
+from mcc_jax import InputError
+from mcc_jax.campaign import Campaign, Curve
+from mcc_jax.discover import discover
+from mcc_jax.effects import EQUIVALENCES, LIBRARY
+
+QUICK = {"confirm": False, "experiments": False}
+COMPLIANCE = 0.004
+
+
+@pytest.fixture(scope="module")
+def named():
+    return discover(cached(f"frame_compliance={COMPLIANCE}"), experiments=False)
+
+
+def content(found):
+    """What would stand in `discovery.json`, through text and back: no NaN, no infinity."""
+    return json.loads(json.dumps(found.to_json(), allow_nan=False))
+
+
+def test_a_hidden_effect_is_named_and_its_amplitude_found(named):
+    told = content(named)
+    assert told["verdict"] in ("NAMED", "SET")
+    assert "frame_compliance" in told["candidate_set"][0]
+    ranked = {one["mechanism"]: one for one in told["ranking"]}
+    assert ranked["frame_compliance"]["probability"] > 0.3
+    first = told["effects"][0]
+    assert first["p_family_wise"] < 0.05
+    if first["mechanism"] == "frame_compliance":
+        estimate = first["parameters"]["compliance_um_per_mN"]
+        assert abs(estimate["value"] - COMPLIANCE) < 3 * estimate["sd"] + 0.05 * COMPLIANCE
+    assert len(told["effects"]) == len(told["candidate_set"]) == 1
+
+
+def test_adding_it_closes_the_gap_and_brings_the_modulus_back(named):
+    told = content(named)
+    assert told["gap"]["closed_fraction"] > 0.9
+    first, last = told["gap"]["steps"][0], told["gap"]["steps"][-1]
+    assert first["added"] is None
+    assert last["added"] == told["effects"][0]["mechanism"]
+    assert last["chi2_per_dof"] < first["chi2_per_dof"]
+    assert last["systematic_um"] < first["systematic_um"]
+    assert last["elpd"] > 2 * last["elpd_se"]
+    before, after = (told[f"parameters_{w}"]["effective_modulus_MPa"]["value"] for w in ("before", "after"))
+    assert abs(np.log(after / 16_000)) < 0.5 * abs(np.log(before / 16_000))
+
+
+def test_the_answer_says_where_and_speaks_to_a_reader(named):
+    told = content(named)
+    assert told["where"]
+    assert sum(place["share"] for place in told["where"]) <= 1 + 1e-9
+    shares = [place["share"] for place in told["where"]]
+    assert shares == sorted(shares, reverse=True)
+    for place in told["where"]:
+        assert set(place["particles"]) <= set(named.base.campaign.particles)
+        low, high = place["load_fraction"]
+        assert 0 <= low < high <= 1
+    assert "disagree" in told["summary"]
+    assert "held-out" in told["summary"]
+
+
+def test_the_contract_s_keys_are_there(named):
+    told = content(named)
+    wanted = {
+        "schema", "verdict", "summary", "effects", "candidate_set", "ranking", "untestable", "where", "closure", "gap",
+        "parameters_before", "parameters_after", "next_experiments", "runtime_s",
+    }  # fmt: skip
+    assert wanted <= set(told)
+    assert {"floor", "heldout", "steps", "closed_fraction"} == set(told["gap"])
+    for effect in told["effects"]:
+        assert {"mechanism", "variant", "probability", "p_family_wise", "equation", "explanation", "parameters"} <= set(
+            effect
+        )
+    for one in told["ranking"]:
+        assert {"mechanism", "statistic", "estimate", "detection_limit", "unit"} <= set(one)
+
+
+def test_equivalents_are_declared_not_discovered(named):
+    declared = content(named)["equivalent_by_construction"]
+    assert [tuple(one["names"]) for one in declared] == [e.names for e in EQUIVALENCES]
+    assert all(one["why"] and one["told_apart_by"] for one in declared)
+    assert {e.mechanism for e in named.effects} <= set(LIBRARY)
+
+
+def test_what_was_added_is_an_ordinary_part_of_the_law(named):
+    effect = named.effects[0]
+    built = effect.build()
+    assert float(built.amplitude) == pytest.approx(effect.amplitude)
+    assert effect.by_particle.shape == (int(named.system.usable.sum()),)
+    assert np.median(effect.by_particle) == pytest.approx(effect.amplitude, rel=0.3)
+
+
+def test_the_same_seed_gives_the_same_answer(named):
+    again = discover(cached(f"frame_compliance={COMPLIANCE}"), experiments=False)
+    one, other = content(named), content(again)
+    assert one.pop("runtime_s") > 0
+    other.pop("runtime_s")
+    assert json.dumps(one) == json.dumps(other)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_nothing_hidden_nothing_found(seed):
+    told = content(discover(campaign(seed=seed), **QUICK))
+    assert told["verdict"] == "NO_GAP"
+    assert told["effects"] == told["candidate_set"] == told["where"] == []
+    assert told["p_anything_missing"] > 0.05
+    assert told["closure"] is None
+    assert "agree" in told["summary"]
+
+
+def test_an_excluded_name_is_not_named():
+    told = content(discover(cached(f"frame_compliance={COMPLIANCE}"), exclude=("frame_compliance",), **QUICK))
+    assert told["verdict"] != "NO_GAP"
+    assert "frame_compliance" not in {name for names in told["candidate_set"] for name in names}
+    assert "frame_compliance" not in {e["mechanism"] for e in told["effects"]}
+    assert "frame_compliance" not in {one["mechanism"] for one in told["ranking"]}
+
+
+def test_an_unknown_name_to_exclude_is_an_error():
+    with pytest.raises(InputError, match="no mechanism 'wobble'"):
+        discover(campaign(), exclude=("wobble",))
+
+
+def test_one_loading_and_unloading_cannot_show_what_needs_more():
+    told = content(discover(campaign(seed=1, programme=SINGLE), **QUICK))
+    needs = {one["mechanism"]: one["needs"] for one in told["untestable"]}
+    assert {"reload_hysteresis", "ratcheting", "humidity"} == set(needs)
+    assert needs["reload_hysteresis"] == needs["ratcheting"] == "a reload segment"
+    assert "relative_humidity_percent" in needs["humidity"]
+    assert not set(needs) & {one["mechanism"] for one in told["ranking"]}
+    assert all(name.replace("_", " ") in told["summary"] for name in needs)
+
+
+def bent(whole, change):
+    """The campaign with something added to its displacements."""
+    curves = tuple(Curve(c.time_s, c.force_mN, c.displacement_um + change(c)) for c in whole.curves)
+    return Campaign(whole.particles, whole.diameters_um, curves, whole.columns, whole.metadata)
+
+
+WRONG = {
+    "negative frame compliance": ("frame_compliance", lambda c: -0.004 * c.force_mN),
+    "negative creep in holds": ("creep", lambda c: -0.02 * np.log1p(c.time_s / 10) * c.force_mN / 100),
+    "a reload that gives back energy": ("reload_hysteresis", lambda c: 0.3 * reloading(c)),
+}
+
+
+def reloading(curve):
+    """A bump between the lowest and highest force of the second rise."""
+    share = curve.force_mN / curve.force_mN.max()
+    rises = np.gradient(curve.force_mN) > 0
+    late = np.arange(len(share)) > int(np.argmax(share > 0.49)) + 20
+    return np.where(rises & late, 4 * share * (1 - share), 0.0)
+
+
+@pytest.mark.parametrize("kind", WRONG)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_no_effect_is_ever_named_with_an_impossible_sign(kind, seed):
+    mechanism, change = WRONG[kind]
+    found = discover(bent(cached(seed=seed, programme=FULL), change), **QUICK)
+    told = content(found)
+    for effect in found.effects:
+        assert effect.variant.sign == 0 or effect.variant.sign * effect.amplitude > 0
+    assert mechanism not in {e["mechanism"] for e in told["effects"]}

@@ -1,0 +1,71 @@
+"""Effects planted in linear systems of known answer: named, both named, or nothing."""
+
+import numpy as np
+import pytest
+from linear_systems import FORMULAS, planted, random_campaign
+
+from mcc_jax.discover._discover import _left
+from mcc_jax.discover._refine import systematic
+from mcc_jax.discover._score import project
+from mcc_jax.discover._search import pairs, rank
+
+NOTHING = np.array([], int)
+
+
+@pytest.mark.parametrize("name", [mechanism for mechanism, _ in FORMULAS])
+def test_a_planted_effect_is_named(name):
+    system = planted(1, {name: 8.0})
+    assert _left(system, 0, []) < 0.01
+    ranking = rank(system, project(system, system.candidate_columns))
+    assert ranking.names[0] == name
+    assert ranking.probability[0] > 0.9
+    best = project(system, system.candidate_columns, inside=np.array([system.column(ranking.best[0])]))
+    assert best.residual.sum() < project(system, NOTHING).residual.sum() - 25
+
+
+@pytest.mark.parametrize("two", [("frame_compliance", "adhesion"), ("creep", "thermal_drift")])
+def test_two_planted_effects_are_both_named(two):
+    system = planted(2, dict.fromkeys(two, 9.0))
+    _, i, j = pairs(system, project(system, system.candidate_columns))[0]
+    assert {system.candidates[k].mechanism for k in (i, j)} == set(two)
+    columns, _ = systematic(system)
+    assert {system.column(i), system.column(j)} <= set(columns.tolist())
+
+
+def test_an_amplitude_comes_back_within_its_error():
+    strength = 12.0
+    for seed in range(6):
+        system = planted(seed, {"creep": strength})
+        k = [c.mechanism for c in system.candidates].index("creep")
+        view = project(system, system.candidate_columns)
+        assert abs(view.gaussian[k] - strength) < 4
+
+
+def test_nothing_planted_nothing_found():
+    """Forty campaigns: p is not small more often than by chance (P(more than 6 of 40 below 5 %) = 0.3 %)."""
+    p = [_left(random_campaign(100 + seed, particles=12)[0], seed, []) for seed in range(40)]
+    assert np.sum(np.array(p) < 0.05) <= 6
+    assert np.median(p) > 0.25
+
+
+@pytest.mark.parametrize("name", ["frame_compliance", "creep", "adhesion", "reload_hysteresis"])
+def test_an_effect_of_the_impossible_sign_is_not_named(name):
+    system = planted(3, {name: -9.0})
+    ranking = rank(system, project(system, system.candidate_columns))
+    assert ranking.names[0] != name
+    position = ranking.names.index(name)
+    assert ranking.probability[position] < 0.05
+    for _, i, j in pairs(system, project(system, system.candidate_columns)):
+        assert name not in {system.candidates[k].mechanism for k in (i, j)} or _right_way(system, i, j)
+
+
+def _right_way(system, i, j):
+    both = np.array([system.column(i), system.column(j)])
+    theta = project(system, NOTHING, inside=both).theta[len(system.globals) :]
+    signs = np.array([system.candidates[k].variant.sign for k in (i, j)])
+    return bool(((signs == 0) | (theta * signs > 0)).all())
+
+
+def test_what_is_systematic_leaves_nothing_where_nothing_is():
+    taken = [len(systematic(random_campaign(200 + seed, particles=12)[0])[0]) for seed in range(20)]
+    assert np.mean(taken) < 0.2
