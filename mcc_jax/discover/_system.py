@@ -122,8 +122,8 @@ def base_fit(
     campaign: Campaign, model: JointModel, *, threshold_MPa: float, tell: Callable[[str], None] = lambda _: None
 ) -> Base:
     """Fit the base law with everything natural free: every particle's coefficients and modulus, and the noise."""
-    selection, _, fit = prepare(campaign, model, threshold_MPa, tell=tell)
-    return Base(campaign, selection, model, fit, _records(campaign, selection))
+    selection, _, fit, _ = prepare(campaign, model, threshold_MPa, tell=tell)
+    return Base(campaign, selection, model, fit.first(len(selection.kept)), _records(campaign, selection))
 
 
 def _records(campaign: Campaign, selection: Selection) -> Record:

@@ -13,6 +13,7 @@ are solved through the Schur complement :math:`S - B^T D^{-1} B`, in a time line
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -21,7 +22,6 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from ._devices import local
 from ._small import Cholesky
 
 
@@ -159,23 +159,17 @@ class Solution(eqx.Module):
     converged: Bool[Array, ""]
     steps: Any
 
-    def here(self, count: int) -> Solution:
-        """The same on the default device, of the first `count` particles."""
+    def first(self, count: int) -> Solution:
+        """The same of the first `count` particles."""
         value, normal = self.value, self.normal
-        return Solution(
-            Parameters(local(value.local, count), local(value.shared)),
-            local(self.residual, count),
-            Normal(
-                local(normal.local, count),
-                local(normal.border, count),
-                local(normal.shared),
-                local(normal.gradient_local, count),
-                local(normal.gradient_shared),
-            ),
-            local(self.loss),
-            local(self.converged),
-            local(self.steps),
+        first = replace(
+            normal,
+            local=normal.local[:count],
+            border=normal.border[:count],
+            gradient_local=normal.gradient_local[:count],
         )
+        residual = jax.tree.map(lambda x: x[:count], self.residual)
+        return replace(self, value=value._replace(local=value.local[:count]), residual=residual, normal=first)
 
 
 def minimise(

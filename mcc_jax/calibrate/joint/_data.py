@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import equinox as eqx
@@ -62,28 +62,29 @@ class Tests(eqx.Module):
         return eqx.filter_vmap(lambda particle: particle.flatness)(self.particle)
 
 
-def enlarged(tests: Tests, particles: int, points: int = 0) -> Tests:
-    """The same tests among more, and longer: copies of the last particle that count for nothing, masked last points.
+def enlarged(tests: Tests, particles: int) -> Tests:
+    """The same tests among as many: copies of the last particle are added that count for nothing.
 
-    With `particles` given, every particle gets a weight, whether copies are needed or not: one kind of arrays, one
-    compilation. With 0 their number stays.
+    Every particle gets a weight, whether copies are needed or not: one kind of arrays, one compilation.
     """
-    count, length = tests.force.shape
-    more, longer = max(particles - count, 0), max(points - length, 0)
-    if not (particles or longer):
-        return tests
+    more = particles - len(tests)
 
-    def wider(x: Any) -> np.ndarray:
+    def longer(x: Any) -> Array:
         x = np.asarray(x)
-        last = "constant" if x.dtype == bool else "edge"
-        x = np.pad(x, [(0, 0), (0, longer)], mode=last) if x.ndim == 2 else x
-        return np.pad(x, [(0, more)] + [(0, 0)] * (x.ndim - 1), mode="edge")
+        return jnp.asarray(np.pad(x, [(0, more)] + [(0, 0)] * (x.ndim - 1), mode="edge") if more else x)
 
-    weight = np.ones(count) if tests.weight is None else np.asarray(tests.weight)
-    step = np.pad(np.asarray(tests.step), [(0, 0), (0, longer)])
-    wide = jax.tree.map(lambda x: jnp.asarray(wider(x)), eqx.tree_at(lambda t: t.step, tests, jnp.asarray(step)))
-    none = {"is_leaf": lambda x: x is None}
-    return eqx.tree_at(lambda t: t.weight, wide, jnp.asarray(np.pad(weight, (0, more))), **none) if particles else wide
+    weight = np.ones(len(tests)) if tests.weight is None else np.asarray(tests.weight)
+    return replace(jax.tree.map(longer, tests), weight=jnp.asarray(np.pad(weight, (0, more))))
+
+
+LENGTHS = (64, 128, 192, 320, 448)
+"""Numbers of points that records are padded to, and beyond them in steps of the last: campaigns of similar length
+share one compilation."""
+
+
+def padded_length(points: int) -> int:
+    """The length that records of so many points are padded to."""
+    return next((length for length in LENGTHS if length >= points), points + -points % LENGTHS[-1])
 
 
 @dataclass(frozen=True)
@@ -105,9 +106,7 @@ class Selection:
     notes: tuple[str, ...]
 
 
-def select_tests(
-    campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_points: int = 400, multiple: int = 64
-) -> Selection:
+def select_tests(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_points: int = 400) -> Selection:
     """Choose what the joint calibration uses.
 
     Points count from the threshold stress on, below which surface asperities and not the particle deform. On unloading
@@ -118,7 +117,6 @@ def select_tests(
         campaign: the tests.
         threshold_MPa: stress of the threshold [MPa].
         most_points: thin records longer than this.
-        multiple: round the common length up to this, so that campaigns of similar length share one compilation.
 
     Raises:
         InputError: if no particle can be used.
@@ -147,8 +145,7 @@ def select_tests(
             remedy="Check the diameters (they turn force into stress), or lower the threshold.",
         )
     used = [one for one in prepared if not isinstance(one, str)]
-    longest = max(len(one.rows) for one in used)
-    longest += -longest % multiple
+    longest = padded_length(max(len(one.rows) for one in used))
 
     def padded(values: list[np.ndarray], fill: str) -> np.ndarray:
         options = {"mode": "edge"} if fill == "edge" else {"mode": "constant", "constant_values": False}

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ._blocks import Blocks, count_of
 from ._compile import compiled
 from ._data import Tests
-from ._devices import count_of, host, mesh_of
 from ._fit import JointFit, JointModel, population_at, populations, prior_numbers
 from ._mode import Target
 from ._noise import Whitening
@@ -56,31 +56,36 @@ class Length(NamedTuple):
         return self.chains * self.draws
 
 
-def compile_ahead(tests: Tests, model: JointModel, length: Length) -> None:
+def compile_ahead(tests: Tests, block: int, model: JointModel, length: Length) -> None:
     """Compile what is needed last while the first steps run: the same functions, for arrays of the same shapes."""
-    if mesh_of(tests.force) is not None:
-        return  # the same shapes in other places: another compilation
     count, points = tests.force.shape
     d = 6 + model.scatter.size
+    blocks = Blocks(count, block)
 
     def dummy(*shape: int) -> Array:
         return jnp.asarray(np.ones(shape))
 
-    one, four = dummy(count), dummy(count, 4)
-    quadratic = Summary(four, dummy(count, 4, 4), four, one, one, one, four, one)
+    def quadratic(count: int) -> Summary:
+        one, four = dummy(count), dummy(count, 4)
+        return Summary(four, dummy(count, 4, 4), four, one, one, one, four, one)
+
     # Almost all campaigns pin their coefficients down; the others compile again.
     scatter = replace(model.scatter, newton=0)
-    target = Target(prior_numbers(model.beliefs, tests.flatness, tests.weight), quadratic, scatter)
+    target = Target(prior_numbers(model.beliefs, tests.flatness, tests.weight), quadratic(count), scatter)
     cast(Any, sample_population).lower(
         jax.random.key(0), dummy(d), dummy(d, d), target, dummy(), **length._asdict()
     ).compile()
-    filters = eqx.filter_vmap(Whitening)(*(dummy(count, points) for _ in range(4)), tests.branch)
-    exact = Exact(tests, filters, quadratic, scatter, model.zero_sd, model.unloading)
+    import arviz_stats.base  # noqa: F401  # seconds on a cold machine, so here too
+
+    if blocks.mesh is not None:
+        return  # for several devices it is another function
+    some_tests = jax.tree.map(lambda x: x[:block], tests)
+    filters = eqx.filter_vmap(Whitening)(*(dummy(block, points) for _ in range(4)), some_tests.branch)
+    exact = Exact(some_tests, filters, quadratic(block), scatter, model.zero_sd, model.unloading)
     several = dummy(len(range(0, length.total, _stride(count_of(tests), length.total))))
     triple = dummy(*several.shape, 3)
     some = eqx.filter_vmap(Population)(several, several, triple, triple, several, several, several)
-    cast(Any, draw_particles).lower(jax.random.key(0), some, exact).compile()
-    import arviz_stats.base  # noqa: F401  # seconds on a cold machine, so here too
+    cast(Any, draw_particles).lower(jax.random.key(0)[None], some, exact).compile()
 
 
 SHARP = 0.03
@@ -93,8 +98,8 @@ def newton_steps(fit: JointFit, tests: Tests, model: JointModel) -> int:
     """How many Newton steps the integration over the particles needs: none if every coefficient is known sharply."""
     population = population_at(fit.mode, fit.numbers, model.scatter)
     at = _laplace(population, fit.summary, tests.flatness, model.scatter)
-    variance = np.diagonal(np.linalg.inv(host(at.hessian)[: count_of(tests)]), axis1=1, axis2=2)
-    widest = float(np.max(np.sqrt(variance) * host(at.stretch)))
+    variance = np.diagonal(np.linalg.inv(np.asarray(at.hessian)[: count_of(tests)]), axis1=1, axis2=2)
+    widest = float(np.max(np.sqrt(variance) * np.asarray(at.stretch)))
     return 0 if widest < SHARP else 4
 
 
@@ -103,7 +108,7 @@ def _stride(count: int, total: int) -> int:
     return max(1, -(-total * count // MOST_CHECKED))
 
 
-def draw_fast(key: Array, tests: Tests, model: JointModel, fit: JointFit, length: Length) -> dict[str, Any]:
+def draw_fast(key: Array, tests: Tests, model: JointModel, fit: JointFit, length: Length, block: int) -> dict[str, Any]:
     """The population sampled, the particles drawn back and corrected by exact weights: fields of the result."""
     scatter = replace(model.scatter, newton=newton_steps(fit, tests, model))
     target = Target(fit.numbers, fit.summary, scatter)
@@ -112,7 +117,14 @@ def draw_fast(key: Array, tests: Tests, model: JointModel, fit: JointFit, length
     count = count_of(tests)
     exact = Exact(tests, fit.filters, fit.summary, scatter, model.zero_sd, model.unloading)
     stride = _stride(count, length.total)
-    checked = [np.array(host(v)[:, :count]) for v in draw_particles(check_key, _every(population, stride), exact)]
+    blocks = Blocks(len(tests), block)
+    own = blocks.cut(exact)
+
+    def drawn(key: Array, population: Population, candidates: int = 1) -> list[np.ndarray]:
+        found = blocks.each(draw_particles, blocks.keys(key), population, own, candidates, axis=1)
+        return [np.array(np.asarray(v)[:, :count]) for v in blocks.whole(found)]
+
+    checked = drawn(check_key, _every(population, stride))
     ratio = checked[3]
     k = pareto_k(ratio)
     restless = np.flatnonzero(unrest(ratio) > RESTLESS)
@@ -128,10 +140,11 @@ def draw_fast(key: Array, tests: Tests, model: JointModel, fit: JointFit, length
             # Always of one of a few sizes, the first one repeated: every size would be compiled anew.
             size = min(count, 4 ** int(np.ceil(np.log(max(len(restless), 2)) / np.log(4))))
             padded = np.concatenate([restless, np.full(size - len(restless), restless[0])])
+            # They are few: every process draws all of them.
             more = draw_particles(
-                jax.random.fold_in(pick_key, candidates), population, _some(exact, padded), candidates
+                jax.random.fold_in(pick_key, candidates)[None], population, _some(exact, padded), candidates
             )
-            better = [host(v)[:, : len(restless)] for v in more]
+            better = [np.asarray(v)[:, : len(restless)] for v in more]
             latent[:, restless], zero[:, restless], ratio[:, restless] = better[0], better[1], better[3]
             k[restless] = pareto_k(ratio[:, restless])
             restless = restless[np.argsort(-unrest(ratio[:, restless]))][:FEW]
@@ -147,8 +160,7 @@ def draw_fast(key: Array, tests: Tests, model: JointModel, fit: JointFit, length
             affected = ", ".join(str(i) for i in restless[:5])
             notes.append(f"{len(restless)} particles are far from their quadratic summary (positions {affected}, ...)")
         keep = max(1, -(-length.total * count // MOST_PARTICLE_DRAWS))
-        found = draw_particles(particle_key, _every(population, keep), exact, 0)
-        latent, zero, likelihood = (host(v)[:, :count] for v in found[:3])
+        latent, zero, likelihood, _ = drawn(particle_key, _every(population, keep), 0)
     return {
         **_fields(run, population, names, stacked, (latent, zero, likelihood), tests, model, length, keep),
         "pareto_k": k,
@@ -162,8 +174,10 @@ def _settled(key: Array, fit: JointFit, target: Target, length: Length) -> tuple
     """The sampler's run and its populations, with smaller steps if any trajectory diverged."""
 
     def run(accept: float) -> tuple[Chains, Population]:
-        found = sample_population(key, fit.mode, fit.covariance, target, jnp.asarray(accept), **length._asdict())
-        return cast(Any, jax.tree.map(host, found))
+        # From an array, not from a Python number: a weak type would be compiled anew after `compile_ahead`.
+        aim = jnp.asarray(np.asarray(accept))
+        found = sample_population(key, fit.mode, fit.covariance, target, aim, **length._asdict())
+        return cast(Any, jax.tree.map(np.asarray, found))
 
     chains, population = run(ACCEPT[0])
     for accept in ACCEPT[1:]:
@@ -178,9 +192,8 @@ def draw_joint(key: Array, tests: Tests, model: JointModel, fit: JointFit, lengt
     scatter = replace(model.scatter, newton=newton_steps(fit, tests, model))
     exact = Exact(tests, fit.filters, fit.summary, scatter, model.zero_sd, model.unloading)
     found = sample_joint(key, fit.mode, fit.covariance, fit.numbers, exact, **length._asdict())
-    run, free, *particles = jax.tree.map(host, found)
-    count = count_of(tests)
-    particles = [v[:, :, :count] for v in particles]
+    run, free, *particles = jax.tree.map(np.asarray, found)
+    count = len(tests)
     population = populations(free.reshape(-1, free.shape[-1]), fit.numbers, scatter)
     names, stacked = _stack(population, scatter, length)
     return {
@@ -213,7 +226,7 @@ def _fields(
     latent, zero, likelihood = (np.asarray(v) for v in particles)
     return {
         "population": population,
-        **_particles(latent, zero, population, host(tests.flatness)[:count], model, length.chains),
+        **_particles(latent, zero, population, np.asarray(tests.flatness)[:count], model, length.chains),
         "log_likelihood": likelihood.reshape(length.chains, -1, count),
         "divergences": int(np.sum(np.asarray(run.divergent))),
         "rhat": rhat,
@@ -244,7 +257,7 @@ def _every(population: Population, stride: int) -> Population:
 def _some(exact: Exact, which: np.ndarray) -> Exact:
     """The exact likelihood of some of the particles."""
     index = jnp.asarray(which)
-    take = partial(jax.tree.map, lambda x: jnp.asarray(host(x)[which]) if mesh_of(x) else x[index])
+    take = partial(jax.tree.map, lambda x: x[index])
     return replace(exact, tests=take(exact.tests), filters=take(exact.filters), summary=take(exact.summary))
 
 

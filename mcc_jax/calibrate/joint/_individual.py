@@ -5,7 +5,6 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.sharding import PartitionSpec
 from jaxtyping import Array, Bool, Float
 
 from ..._types import Path, Scalar
@@ -13,7 +12,6 @@ from ...geometry import Particle
 from ...law import Unloading
 from ._compile import compiled
 from ._data import Tests
-from ._devices import AXIS, mesh_of
 from ._forward import linearise
 from ._small import Cholesky
 
@@ -97,6 +95,7 @@ def linear_starts(tests: Tests, log_modulus: Scalar) -> Float[Array, "starts par
     return first[None] + jnp.pad(jnp.asarray(VARIATIONS), ((0, 0), (0, 2)))[:, None]
 
 
+@compiled
 def fit_particles(
     tests: Tests,
     noise: Float[Array, " particles"],
@@ -119,33 +118,6 @@ def fit_particles(
         starts: b1, b3, b5, e and zero to start from.
         unloading: form of unloading.
     """
-    mesh = mesh_of(tests.force)
-    if mesh is None:
-        return _fit(tests, noise, centre, width, zero_sd, starts, unloading)
-    return _fit_spread(tests, noise, centre, width, zero_sd, starts, unloading, mesh)
-
-
-@compiled
-def _fit_spread(tests, noise, centre, width, zero_sd, starts, unloading, mesh):
-    """Each device fits its own particles, and all take the same number of steps."""
-    own, all_ = PartitionSpec(AXIS), PartitionSpec()
-    parts = (own, own, own, own, all_, PartitionSpec(None, AXIS))
-    fit = jax.shard_map(
-        lambda *arrays: _steps(*arrays, unloading=unloading, axis=AXIS),
-        mesh=mesh,
-        in_specs=parts,
-        out_specs=own,
-        check_vma=False,
-    )
-    return fit(tests, noise, centre, width, zero_sd, starts)
-
-
-@compiled
-def _fit(tests, noise, centre, width, zero_sd, starts, unloading):
-    return _steps(tests, noise, centre, width, zero_sd, starts, unloading=unloading, axis=None)
-
-
-def _steps(tests, noise, centre, width, zero_sd, starts, *, unloading, axis):
     count = len(starts)
 
     def tile(x: Array) -> Array:
@@ -165,7 +137,7 @@ def _steps(tests, noise, centre, width, zero_sd, starts, *, unloading, axis):
         return jnp.where(jnp.isfinite(loss), loss, jnp.inf), g, H
 
     def step(carry):
-        y, loss, g, H, damping, count, _, _ = carry
+        y, loss, g, H, damping, count, _ = carry
         diagonal = jnp.diagonal(H, axis1=1, axis2=2)
         move = -Cholesky(H + jnp.eye(5)[None] * (damping[:, None] * diagonal)[:, None, :]).solve(g)
         # No logarithm moves by more than a factor of e, no zero by more than a tenth of its prior's reach, at a time.
@@ -179,27 +151,15 @@ def _steps(tests, noise, centre, width, zero_sd, starts, *, unloading, axis):
             return jnp.where(better.reshape(-1, *[1] * (old.ndim - 1)), new, old)
 
         damping = jnp.where(done, damping, jnp.where(better, jnp.maximum(damping / 8, 1e-9), damping * 4))
-        return (
-            *map(choose, (tried, new_loss, new_g, new_H), (y, loss, g, H)),
-            damping,
-            count + 1,
-            done,
-            finished(done),
-        )
+        return (*map(choose, (tried, new_loss, new_g, new_H), (y, loss, g, H)), damping, count + 1, done)
 
     y = starts.reshape(-1, 5)
-
-    def finished(done):
-        """Whether every particle is done, on whatever device."""
-        here = jnp.all(done)
-        return here if axis is None else jax.lax.pmin(here.astype(int), axis) > 0
-
     unfinished = jnp.zeros(len(y), bool)
     # The first pass evaluates the start: an infinite loss accepts whatever comes, and no force moves it.
     carry = (y, jnp.full(len(y), jnp.inf), jnp.zeros((len(y), 5)), jnp.broadcast_to(jnp.eye(5), (len(y), 5, 5)))
-    carry = (*carry, jnp.full(len(y), 1e-3), 0, unfinished, jnp.asarray(False))
-    going = lambda c: (c[5] < 2) | ((c[5] < MOST_STEPS) & ~c[7])  # noqa: E731  # a condition, no function
-    y, loss, _, _, _, _, done, _ = jax.lax.while_loop(going, step, carry)
+    carry = (*carry, jnp.full(len(y), 1e-3), 0, unfinished)
+    going = lambda c: (c[5] < 2) | ((c[5] < MOST_STEPS) & ~jnp.all(c[6]))  # noqa: E731  # a condition, no function
+    y, loss, _, _, _, _, done = jax.lax.while_loop(going, step, carry)
     y, loss, done = (v.reshape(count, len(tests), *v.shape[1:]) for v in (y, loss, done))
     best = jnp.argmin(loss, axis=0)
 

@@ -16,7 +16,6 @@ from .._result import estimate, finite, misfit_note
 from ._arrow import Parameters, Solution
 from ._bayes import log_estimate
 from ._data import Selection, Tests, own_misfit
-from ._devices import host, local
 from ._fit import JointFit, JointModel, population_at, prepare
 from ._pooled import Pooled, fit_pooled, unpack
 from ._population import COEFFICIENTS
@@ -263,6 +262,7 @@ def calibrate_least_squares(
     threshold_MPa: float = THRESHOLD_MPA,
     loss: Loss = "linear",
     seed: int = 0,
+    block: int | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> LeastSquaresCalibration:
     r"""Least squares for a, modulus, and every particle's C1, C3, C5 and zero at once.
@@ -280,30 +280,18 @@ def calibrate_least_squares(
         threshold_MPa: points below this stress on loading do not count [MPa].
         loss: "linear", or a robust one of the whitened residuals, "soft_l1" or "cauchy".
         seed: kept for the record.
+        block: particles of a block, as in `calibrate_bayes`; the last step, the fit of all together, is done by every
+            process for itself on one device.
         progress: called with the name of each step.
 
     Raises:
         InputError: if no particle can be used.
     """
-    return least_squares(campaign, model=model, threshold_MPa=threshold_MPa, loss=loss, seed=seed, progress=progress)
-
-
-def least_squares(
-    campaign: Campaign,
-    *,
-    model: JointModel | None = None,
-    threshold_MPa: float = THRESHOLD_MPA,
-    loss: Loss = "linear",
-    seed: int = 0,
-    progress: Callable[[str], None] | None = None,
-    size: tuple[int, int] = (0, 0),
-) -> LeastSquaresCalibration:
-    """`calibrate_least_squares` with the arrays filled up to at least `size`: particles and points."""
     started = time.perf_counter()
     tell = progress or (lambda _: None)
     model = model or JointModel()
-    selection, tests, fit = prepare(
-        campaign, model, threshold_MPa, size=size, tell=tell, correlated=loss == "linear", rounds=1
+    selection, tests, fit, _ = prepare(
+        campaign, model, threshold_MPa, block=block, tell=tell, correlated=loss == "linear", rounds=1
     )
     population = population_at(fit.mode, fit.numbers, model.scatter)
     settings = Pooled(
@@ -317,17 +305,15 @@ def least_squares(
         loss,
     )
     tell("fitting all particles together")
-    low, high = host(fit.numbers.a)[2:]
+    low, high = np.asarray(fit.numbers.a)[2:]
     starts = [float(population.a), *(a for a in STARTS if 0.9 * low < a < 0.9 * high)]
     mu, log_modulus = np.asarray(population.mu), float(population.log_modulus)
     found = [solve(fit, settings, tests, a, mu, log_modulus) for a in starts]
     losses = np.array([float(one.loss) for one in found])
     losses[~np.isfinite(losses)] = np.inf
-    best = found[int(np.argmin(losses))]
-    if tests is not selection.tests:
-        count = len(selection.kept)
-        fit, best = fit.here(count), best.here(count)
-        settings = replace(local(settings), whitening=fit.filters)
+    count = len(selection.kept)
+    fit, best = fit.first(count), found[int(np.argmin(losses))].first(count)
+    settings = replace(settings, whitening=fit.filters)
     agree = int(np.sum(losses <= losses.min() * (1 + 1e-5) + 1e-6))
     return LeastSquaresCalibration(
         campaign,

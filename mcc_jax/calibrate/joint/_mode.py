@@ -13,7 +13,6 @@ from jaxtyping import Array, Float
 
 from ..._types import Scalar
 from ._compile import compiled
-from ._devices import host
 from ._population import Population, Scatter, Summary, marginal_likelihood
 
 
@@ -192,14 +191,14 @@ def most_probable(start: Float[Array, " d"], target: Target) -> tuple[Float[Arra
     Newton's method in a trust region (SciPy), in coordinates scaled by the curvature at the start. The curvature comes
     from differences of exact gradients, which are quicker than second derivatives are to compile.
     """
-    origin = host(start)
+    origin = np.asarray(start)
     d = len(origin)
     width = np.full(d, 1e-5)
 
     def expand(free: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         steps = np.diag(width)
         points = free + np.concatenate([np.zeros((1, d)), steps, -steps])
-        value, slope = (host(v) for v in _gradients(jnp.asarray(points), target))
+        value, slope = (np.asarray(v) for v in _gradients(jnp.asarray(points), target))
         curvature = (slope[1 : d + 1] - slope[d + 1 :]) / (2 * width[:, None])
         return float(value[0]), slope[0], (curvature + curvature.T) / 2
 

@@ -118,7 +118,7 @@ def exact_log_likelihood(
 
 @compiled
 def draw_particles(
-    key: PRNGKeyArray,
+    keys: PRNGKeyArray,
     population: Population,
     exact: Exact,
     candidates: int = 1,
@@ -126,7 +126,7 @@ def draw_particles(
     """Draw the particles' parameters given each draw of the population, and compare with the exact likelihood.
 
     Args:
-        key: random key.
+        keys: a single random key; with an axis, so that blocks of particles on several devices have one each.
         population: draws, every field with a leading axis.
         exact: the tests.
         candidates: how many to draw and choose from; 0 draws one and does not look at the exact likelihood.
@@ -164,7 +164,7 @@ def draw_particles(
         return ParticleDraws(take(latent), take(zero), likelihood[0], mean)
 
     batch = max(1, min(draws, 40_000 // (count * max(candidates, 1))))
-    return jax.lax.map(one, (jax.random.split(key, draws), population), batch_size=batch)
+    return jax.lax.map(one, (jax.random.split(keys[0], draws), population), batch_size=batch)
 
 
 @compiled
