@@ -85,7 +85,7 @@ def compile_ahead(tests: Tests, block: int, model: JointModel, length: Length) -
     several = dummy(len(range(0, length.total, _stride(count_of(tests), length.total))))
     triple = dummy(*several.shape, 3)
     some = eqx.filter_vmap(Population)(several, several, triple, triple, several, several, several)
-    cast(Any, draw_particles).lower(jax.random.key(0)[None], some, exact).compile()
+    cast(Any, draw_particles).lower(jax.random.key(0)[None], some, exact, 1).compile()
 
 
 SHARP = 0.03

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
 from ..._types import Scalar
 from ...law import Unloading
@@ -118,7 +118,7 @@ def exact_log_likelihood(
 
 @compiled
 def draw_particles(
-    keys: PRNGKeyArray,
+    keys: Key[Array, " 1"],
     population: Population,
     exact: Exact,
     candidates: int = 1,

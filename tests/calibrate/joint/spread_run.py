@@ -5,21 +5,21 @@ import sys
 from pathlib import Path
 
 import jax
-
-jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_numpy_rank_promotion", "raise")
-jax.config.update("jax_numpy_dtype_promotion", "strict")
-
 import numpy as np
-from joint_cases import COEFFICIENTS, DIAMETERS, NOISE, SNAPPING, Programme, simulated
-
-from mcc_jax.calibrate import calibrate_bayes, write_posterior
 
 
 def main(folder: Path, address: str, processes: int, process: int, seed: int) -> None:
     """Calibrate five particles in blocks of two, and write what was found."""
+    jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_numpy_rank_promotion", "raise")
+    jax.config.update("jax_numpy_dtype_promotion", "strict")
     if processes > 1:
         jax.distributed.initialize(address, processes, process, initialization_timeout=60)
+    # Not before: nothing may ask for devices before the processes know of each other.
+    from joint_cases import COEFFICIENTS, DIAMETERS, NOISE, SNAPPING, Programme, simulated
+
+    from mcc_jax.calibrate import calibrate_bayes, write_posterior
+
     five = [0, 1, 2, 3, 0]
     C = np.concatenate([COEFFICIENTS, SNAPPING[None]])
     campaign = simulated(C, DIAMETERS[five], instrument=NOISE, programme=Programme.cycles(points=40), seed=seed)
