@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,8 +39,16 @@ class HeldOut:
         return self.chi2.sum(1) / self.points.sum()
 
 
-def held_out(system: System, choose: Choose) -> HeldOut:
-    """Leave out one particle after the other; search and fit with the others; see how far it is then from the law."""
+def held_out(system: System, choose: Choose, extended: Mapping[frozenset[int], System] | None = None) -> HeldOut:
+    """Leave out one particle after the other; search and fit with the others; see how far it is then from the law.
+
+    Args:
+        system: the linear system around the base law.
+        choose: the search.
+        extended: for some sets of columns, the system around the law with these effects: a fold that chooses one fits
+            and is judged there. The other particles alone fit its amplitudes; the system is only where lines are drawn.
+    """
+    around = dict(extended or {})
     usable = np.flatnonzero(system.usable)
     basis = np.concatenate([system.place_columns, system.word_columns])
     whole = project(system, basis)
@@ -57,9 +65,10 @@ def held_out(system: System, choose: Choose) -> HeldOut:
     for row, i in enumerate(usable):
         others = usable[usable != i] if len(usable) > 1 else usable
         for step, inside in enumerate(choose(others)):
-            fitted = project(system, basis[:0], inside=inside, particles=others)
+            there = around.get(frozenset(map(int, inside)), system)
+            fitted = project(there, basis[:0], inside=inside, particles=others)
             at = np.concatenate([nuisance, inside]).astype(int)
-            gram = system.gram[i]
+            gram = there.gram[i]
             left = gram[:, 0] + gram[:, at] @ fitted.theta
             chi2[step, row] = left[0] + fitted.theta @ left[at]
             inner = gram[np.ix_(at, at)]

@@ -20,10 +20,11 @@ from ._closure import Closure, find_closure, pursue
 from ._confirm import held_out
 from ._experiments import next_experiments
 from ._refine import refined
+from ._refit import Refit, refit, system_at
 from ._result import Discovery, Effect, Verdict
 from ._score import DETECTABLE, Projection, family_wise, flips, project
 from ._search import Ranking, family_columns, pairs, random_probability, rank
-from ._system import GLOBALS, Base, System, base_fit, build_system, signals_of
+from ._system import GLOBALS, Base, Signals, System, base_fit, build_system, signals_of
 from ._where import where
 from ._words import summary_of
 
@@ -39,12 +40,22 @@ INDEPENDENT = 100
 LEVEL_OF_MORE = 0.01
 """Level at which something is missing besides the whole family of formulas of what was added."""
 
+LEVEL_OF_UNLISTED = 0.001
+"""Level at which something is missing besides every name, for saying that no name is right: no listed formula is
+nature's own, so that a little is always left, and this is the stronger claim."""
+
 BETTER, SHARE = 30.0, 0.1
 """A formula of a few free words takes away this much chi2 more than any listed mechanism by chance and because no
 listed formula is nature's own, in addition this share of what the mechanism takes away. Beyond, it is not listed."""
 
 LIKE_THE_BEST = 0.1
 """A mechanism whose probability is at least this share of the best one's belongs to the set."""
+
+LARGE = 40.0
+"""Drop of chi2 by the best mechanism from which on the serious ones are fitted as they are: below, first order does."""
+
+SERIOUS, MOST_REFITS = 0.5, 8
+"""Mechanisms whose log evidence is at least this share of the best one's are serious; so many formulas at most."""
 
 REFINEMENTS = 2
 FEWEST = 4
@@ -106,7 +117,7 @@ def discover(
         if not changed:
             break
         system = build_system(base, signals)
-    return _judge(base, system, missing, confirm, experiments, seed, started, tell)
+    return _judge(base, system, signals, missing, confirm, experiments, seed, started, tell)
 
 
 def without_punch(library: Mapping[str, Mechanism], base: Base) -> dict[str, Mechanism]:
@@ -210,7 +221,7 @@ def _family(system: System, chosen: list[int]) -> tuple[np.ndarray, np.ndarray]:
     own = np.array([system.column(k) for k in chosen], int)
     if not chosen:
         return own, np.zeros(0)
-    theta = project(system, own[:0], inside=own).theta[len(system.globals) :]
+    theta = system.at[chosen] + project(system, own[:0], inside=own).theta[len(system.globals) :]
     strength = project(system, system.candidate_columns).total
     columns, precision = list(own), [1e-12] * len(own)
     for k, amplitude in zip(chosen, theta, strict=True):
@@ -235,8 +246,53 @@ def _by_noise_model(scores: np.ndarray, total: np.ndarray, sign: np.ndarray) -> 
     return float(min(1.0, INDEPENDENT * norm.sf(float(np.max(sided)))))
 
 
+class _Extensions:
+    """The law extended by effects, fitted as it is: once each, and only where first order may not do."""
+
+    def __init__(self, base: Base, system: System, signals: Signals) -> None:
+        self.base, self.system, self.signals = base, system, signals
+        self.known: dict[tuple[int, ...], Refit] = {}
+
+    def fit(self, chosen: tuple[int, ...]) -> Refit:
+        """The base law with some candidates."""
+        if chosen not in self.known:
+            inside = np.array([self.system.column(k) for k in chosen], int)
+            start = project(self.system, inside[:0], inside=inside).theta[len(GLOBALS) :]
+            candidates = tuple(self.system.candidates[k] for k in chosen)
+            self.known[chosen] = refit(self.base, candidates, start, self.system.prior)
+        return self.known[chosen]
+
+    def drop(self, chosen: tuple[int, ...]) -> float:
+        """By how much -2 log likelihood falls; not at all where an amplitude has a sign that it cannot have."""
+        found = self.fit(chosen)
+        return max(self.fit(()).deviance - found.deviance, 0.0) if found.physical else 0.0
+
+    def system_of(self, chosen: tuple[int, ...]) -> System:
+        """The linear system around the extended law."""
+        return system_at(self.base, self.system, self.signals, list(chosen), self.fit(chosen))
+
+
+def _serious(system: System, ranking: Ranking) -> list[int]:
+    """Candidates worth a fit of their own: of the mechanisms that may be true the best two formulas."""
+    chosen: list[int] = []
+    best = ranking.log_evidence[0]
+    for name, value, at_random in zip(ranking.names, ranking.log_evidence, ranking.at_random, strict=True):
+        if value < SERIOUS * best or len(chosen) >= MOST_REFITS:
+            break
+        if at_random:
+            continue
+        members = [k for k, c in enumerate(system.candidates) if c.mechanism == name]
+        members.sort(key=lambda k: -ranking.evidence[k])
+        formulas: dict[str, int] = {}
+        for k in members:
+            if np.isfinite(ranking.evidence[k]):
+                formulas.setdefault(system.candidates[k].variant.name, k)
+        chosen.extend(list(formulas.values())[:2])
+    return chosen[:MOST_REFITS]
+
+
 def _judge(
-    base: Base, system: System, missing, confirm: bool, experiments: bool, seed: int, started, tell
+    base: Base, system: System, signals: Signals, missing, confirm: bool, experiments: bool, seed: int, started, tell
 ) -> Discovery:
     tell("is something missing")
     view = project(system, system.candidate_columns)
@@ -254,18 +310,29 @@ def _judge(
     closure: Closure | None = None
     steps: list[Ranking] = []
     places: list[dict[str, Any]] = []
+    extended, last, around = system, None, {}
     if gap:
         tell("where")
         places = where(base, system)
         tell("what")
-        verdict, chosen, sets, steps, closure = _name(base, system, view, ranking, seed, tell)
-    effects = _effects(system, chosen, steps, p_any)
+        extensions = _Extensions(base, system, signals) if ranking.gain[0] >= LARGE else None
+        if extensions is not None:
+            tell("the serious names, fitted as they are")
+            drops = {k: extensions.drop((k,)) for k in _serious(system, ranking)}
+            ranking = rank(system, view, refitted=drops)
+        verdict, chosen, sets, steps, closure = _name(base, system, view, ranking, extensions, seed, tell)
+        if extensions is not None and chosen and not any(step.at_random[0] for step in steps):
+            last = extensions.fit(tuple(chosen))
+            if last.physical:
+                extended = extensions.system_of(tuple(chosen))
+                around[frozenset(system.column(k) for k in chosen)] = extended
+    effects = _effects(extended, last, chosen, steps, p_any)
     inside = np.array([system.column(k) for k in chosen], int)
     words = closure.words if closure is not None else np.array([], int)
     ladder, labels = None, (None,)
     if confirm and gap and int(system.usable.sum()) > 2:
         tell("held-out particles")
-        ladder = held_out(system, _chooser(system, len(chosen), closure is not None))
+        ladder = held_out(system, _chooser(system, len(chosen), closure is not None), around)
         labels = (None, *(e.mechanism for e in effects), *(("formula",) if closure is not None else ()))
     further: list[dict[str, Any]] = []
     if experiments and gap:
@@ -287,7 +354,7 @@ def _judge(
         labels=labels,
         p_any=p_any,
         before=_parameters(base, project(system, inside[:0])),
-        after=_parameters(base, project(system, inside[:0], inside=with_all)) if gap else {},
+        after=_parameters(base, project(extended, inside[:0], inside=with_all), extended.shift) if gap else {},
         next_experiments=tuple(further),
         limits=_limits(system, view, ranking),
         seed=seed,
@@ -297,17 +364,27 @@ def _judge(
     return dataclasses.replace(found, summary=summary_of(found), runtime_s=time.perf_counter() - started)
 
 
-def _name(base: Base, system: System, view: Projection, ranking: Ranking, seed: int, tell):
+def _name(
+    base: Base, system: System, view: Projection, ranking: Ranking, extensions: _Extensions | None, seed: int, tell
+):
     """Verdict, chosen candidates, their sets, rankings of each step, and the formula if nothing listed will do."""
-    first = ranking.best[0]
-    top = ranking.names[0]
-    absorbed = system.absorbing(family_columns(system, (top,))) if ranking.at_random[0] else system
-    p_left = _left(absorbed, seed, [first])
     members = tuple(ranking.members(LIKE_THE_BEST))
     gain_of_words = pursue(system)[1]
-    short = gain_of_words - float(ranking.gain[0])
-    if p_left > LEVEL_OF_MORE and short <= BETTER + SHARE * float(ranking.gain[0]):
-        return ("NAMED" if len(members) == 1 else "SET"), [first], [members], [ranking], None
+    # Any member of the set may be the one beside which nothing is left; the most probable is asked first.
+    most_left = 0.0
+    for name in members:
+        position = ranking.names.index(name)
+        first, gain = ranking.best[position], float(ranking.gain[position])
+        if ranking.at_random[position]:
+            around = system.absorbing(family_columns(system, (name,)))
+        else:
+            around = system if extensions is None else extensions.system_of((first,))
+        left = _left(around, seed, [first])
+        most_left = max(most_left, left)
+        if gain_of_words <= gain + BETTER + SHARE * gain and left > LEVEL_OF_MORE:
+            own = (name, *(m for m in members if m != name))
+            return ("NAMED" if len(members) == 1 else "SET"), [first], [own], [ranking], None
+    first = ranking.best[0]
     tell("a second effect")
     if ranking.at_random[0] and ranking.gain[0] > gain_of_words:
         return ("NAMED" if len(members) == 1 else "SET"), [first], [members], [ranking], None
@@ -315,9 +392,11 @@ def _name(base: Base, system: System, view: Projection, ranking: Ranking, seed: 
     if best_pairs and not ranking.at_random[0]:
         gain, i, j = best_pairs[0]
         both = tuple(system.candidates[k].mechanism for k in (i, j))
-        p_both = _left(system, seed, [i, j])
-        enough = p_both > LEVEL_OF_MORE
-        if enough and gain >= gain_of_words - BETTER:
+        with_both = system
+        if extensions is not None:
+            with_both, gain = extensions.system_of((i, j)), max(gain, extensions.drop((i, j)))
+        p_both = _left(with_both, seed, [i, j])
+        if p_both > LEVEL_OF_MORE and gain >= gain_of_words - BETTER:
             one = rank(system, project(system, system.candidate_columns, inside=np.array([system.column(j)])))
             two = rank(system, project(system, system.candidate_columns, inside=np.array([system.column(i)])))
             sets = [_with(both[0], one), _with(both[1], two)]
@@ -325,7 +404,8 @@ def _name(base: Base, system: System, view: Projection, ranking: Ranking, seed: 
             return verdict, [i, j], sets, [one, two], None
     tell("a formula of its own")
     closure = find_closure(system, _span(base), seed, tell=tell)
-    if closure is None:
+    unexplained = most_left <= LEVEL_OF_UNLISTED or gain_of_words > ranking.gain[0] * (1 + SHARE) + BETTER
+    if closure is None or not unexplained:
         return ("NAMED" if len(members) == 1 else "SET"), [first], [members], [ranking], None
     return "UNLISTED", [], [], [], closure
 
@@ -354,7 +434,10 @@ def _chooser(system: System, count: int, formula: bool) -> Callable[[np.ndarray]
     return choose
 
 
-def _effects(system: System, chosen: list[int], steps: list[Ranking], p_any: float) -> tuple[Effect, ...]:
+def _effects(
+    system: System, fit: Refit | None, chosen: list[int], steps: list[Ranking], p_any: float
+) -> tuple[Effect, ...]:
+    """The chosen effects, in the linear system around the law with them, if they were fitted as they are."""
     if not chosen:
         return ()
     inside = np.array([system.column(k) for k in chosen])
@@ -368,12 +451,17 @@ def _effects(system: System, chosen: list[int], steps: list[Ranking], p_any: flo
         others = inside[inside != inside[row]]
         alone = project(system, inside[row : row + 1], inside=others)
         own = alone.scores[:, 0] / np.maximum(alone.information[:, 0, 0], 1e-300)
+        own = own + system.at[k]
+        variance = fitted.covariance[start + row, start + row]
+        if fit is not None:
+            # With the further numbers free, an amplitude is less certain.
+            variance = max(variance, fit.spread(row)[0] ** 2)
         found.append(
             Effect(
                 candidate.variant,
                 dict(candidate.nuisance),
-                float(fitted.theta[start + row] * unit),
-                float(np.sqrt(fitted.covariance[start + row, start + row]) * unit),
+                float((fitted.theta[start + row] + system.at[k]) * unit),
+                float(np.sqrt(variance) * unit),
                 float(step.probability[position]),
                 p_any,
                 step.at_random[position],
@@ -397,13 +485,15 @@ def _limits(system: System, view: Projection, ranking: Ranking) -> dict[str, tup
     return found
 
 
-def _parameters(base: Base, view: Projection | None) -> dict[str, Any]:
-    """The population's parameters, moved as the linear system says."""
+def _parameters(base: Base, view: Projection | None, shift: np.ndarray | None = None) -> dict[str, Any]:
+    """The population's parameters, moved as a linear system says, which itself may stand a shift away."""
     from ..calibrate.joint._fit import population_at
 
     population = population_at(base.fit.mode, base.fit.numbers, base.model.scatter)
     values = np.array([float(population.a), float(population.log_modulus), *np.asarray(population.mu)])
     sd = np.full(len(GLOBALS), np.nan)
+    if shift is not None:
+        values = values + shift
     if view is not None:
         values = values + view.theta[: len(GLOBALS)]
         sd = np.sqrt(np.diagonal(view.covariance)[: len(GLOBALS)])

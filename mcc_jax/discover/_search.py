@@ -13,6 +13,7 @@ them, or one that resembles them.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -112,6 +113,7 @@ class Ranking:
         best: each one's best candidate.
         gain: drop of -2 log likelihood by it.
         at_random: whether amplitudes that differ from test to test explain more than a common one.
+        evidence: log evidence of every candidate, minus infinity for those the base law can imitate.
         temperature: by which logarithms were divided.
     """
 
@@ -121,6 +123,7 @@ class Ranking:
     best: tuple[int, ...]
     gain: np.ndarray
     at_random: tuple[bool, ...]
+    evidence: np.ndarray
     temperature: float
 
     def members(self, least: float) -> list[str]:
@@ -128,8 +131,15 @@ class Ranking:
         return [n for n, p in zip(self.names, self.probability, strict=True) if p >= least * self.probability[0]]
 
 
-def rank(system: System, projection: Projection, *, without: tuple[str, ...] = ()) -> Ranking:
-    """Rank all mechanisms by what they explain beyond what was projected off."""
+def rank(system: System, projection: Projection, *, refitted: Mapping[int, float] | None = None) -> Ranking:
+    """Rank all mechanisms by what they explain beyond what was projected off.
+
+    Args:
+        system: the system.
+        projection: scores and information of all candidates.
+        refitted: drop of -2 log likelihood by those candidates that were fitted as they are (`_refit`). It replaces the
+            linear one, and no formula of the same mechanism counts for more than the best of these.
+    """
     sign = np.array([c.variant.sign for c in system.candidates])
     U, total = projection.scores.sum(0), projection.total
     alive = projection.survival > 1e-6
@@ -143,7 +153,17 @@ def rank(system: System, projection: Projection, *, without: tuple[str, ...] = (
             differing[members] = value
     random = np.isfinite(differing)
     evidence = np.logaddexp(common, differing) - np.where(random, np.log(2), 0.0)
-    names = [n for n in dict.fromkeys(c.mechanism for c in system.candidates) if n not in without]
+    linear = np.where(alive, U**2 / np.maximum(total, 1e-300), 0.0)
+    exact = dict(refitted or {})
+    for k, drop in exact.items():
+        evidence[k] += (drop - linear[k]) / 2
+        linear[k] = drop
+    for name in {system.candidates[k].mechanism for k in exact}:
+        most = max(evidence[k] for k in exact if system.candidates[k].mechanism == name)
+        for k, candidate in enumerate(system.candidates):
+            if candidate.mechanism == name and k not in exact:
+                evidence[k] = min(evidence[k], most)
+    names = list(dict.fromkeys(c.mechanism for c in system.candidates))
     found = []
     for name in names:
         members = [k for k, c in enumerate(system.candidates) if c.mechanism == name]
@@ -151,7 +171,9 @@ def rank(system: System, projection: Projection, *, without: tuple[str, ...] = (
         weight = np.array([1 / variants.count(v) for v in variants])
         value = logsumexp(evidence[members], b=weight / weight.sum())
         best = members[int(np.argmax(evidence[members]))]
-        gain = U[best] ** 2 / max(total[best], 1e-300) if np.isfinite(evidence[best]) else 0.0
+        if exact.keys() & set(members):
+            best = max(exact.keys() & set(members), key=lambda k: evidence[k])
+        gain = linear[best] if np.isfinite(evidence[best]) else 0.0
         if differing[best] > common[best]:
             gain = max(gain, 2 * differing[best])
         found.append((value, best, gain, bool(differing[best] > common[best])))
@@ -167,6 +189,7 @@ def rank(system: System, projection: Projection, *, without: tuple[str, ...] = (
         tuple(found[i][1] for i in order),
         gains,
         tuple(found[i][3] for i in order),
+        evidence,
         float(temperature),
     )
 

@@ -52,6 +52,9 @@ class System:
         words: the features of formulas.
         prior: precision of the population's parameters.
         usable: which particles are close enough to linear to take part.
+        at: amplitudes around which the candidates' columns are taken, in their units: zero but where the law has been
+            extended (`_refit`).
+        shift: of the population's parameters from the base fit's, likewise.
     """
 
     gram: np.ndarray
@@ -61,6 +64,8 @@ class System:
     words: tuple[Feature, ...]
     prior: np.ndarray
     usable: np.ndarray
+    at: np.ndarray
+    shift: np.ndarray
 
     @property
     def globals(self) -> np.ndarray:
@@ -180,8 +185,8 @@ def build_system(base: Base, signals: Signals) -> System:
     flat = tests.flatness
     mean, factor = moments(population, flat, scatter)
 
-    by_globals = _mean_by_globals(population, flat, scatter)
-    gram = _gram(
+    by_globals = mean_by_globals(population, flat, scatter)
+    gram = gram_matrices(
         data.residual,
         data.jacobian,
         tests.mask,
@@ -199,11 +204,13 @@ def build_system(base: Base, signals: Signals) -> System:
     usable = ~(jump < np.log(1.15 * np.asarray(top)))
     numbers = fit.numbers
     width = np.array([numbers.a[1], numbers.log_modulus[1], numbers.mu_1[1], 0.5, numbers.mu_5[1]])
-    return System(np.asarray(gram), np.asarray(jnp.sum(tests.mask, 1)), candidates, places, some, 1 / width**2, usable)
+    points = np.asarray(jnp.sum(tests.mask, 1))
+    still, none = np.zeros(len(GLOBALS)), np.zeros(len(candidates))
+    return System(np.asarray(gram), points, candidates, places, some, 1 / width**2, usable, none, still)
 
 
 @compiled
-def _mean_by_globals(
+def mean_by_globals(
     population: Population, flat: Float[Array, " particles"], scatter: Scatter
 ) -> Float[Array, "particles 4 globals"]:
     """Derivatives of the particles' expected latent vectors by the population's parameters, in the order of GLOBALS."""
@@ -245,7 +252,7 @@ def _features(latent, tests: Tests, records: Record, model: JointModel, features
 
 
 @compiled
-def _gram(residual, jacobian, mask, filters, added, seen, away, by_globals, factor, zero_sd, zero_away):
+def gram_matrices(residual, jacobian, mask, filters, added, seen, away, by_globals, factor, zero_sd, zero_away):
     """Gram matrices of all columns, particles' deviations and zeros integrated out."""
     k = factor.shape[-1]
 

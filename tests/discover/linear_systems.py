@@ -75,7 +75,8 @@ def system_of(dense, candidates, places, some, usable=None):
     count, points = dense.columns.shape[:2]
     gram = np.stack([X.T @ np.linalg.solve(dense.covariance(i), X) for i, X in enumerate(dense.columns)])
     free = np.ones(count, bool) if usable is None else usable
-    return System(gram, np.full(count, points), candidates, places, some, dense.prior, free)
+    none, still = np.zeros(len(candidates)), np.zeros(len(dense.prior))
+    return System(gram, np.full(count, points), candidates, places, some, dense.prior, free, none, still)
 
 
 def planted(seed, amounts, *, particles=20, points=60, own=4):
