@@ -48,7 +48,7 @@ def least_squares(repeats: int) -> tuple[list[dict], list[dict]]:
     alone = []
     for _ in range(repeats):
         start = time.perf_counter()
-        found = solve(whole.fit, whole.settings, whole.selection, float(first[0]), first[2:], float(first[1]))
+        found = solve(whole.fit, whole.settings, whole.selection.tests, float(first[0]), first[2:], float(first[1]))
         jax.block_until_ready(found.value)
         alone.append(time.perf_counter() - start)
     ours = np.concatenate([np.asarray(found.value.local).ravel(), np.asarray(found.value.shared)])

@@ -14,6 +14,7 @@ from .calibrate import Priors as Priors
 from .calibrate import beside_paper as beside_paper
 from .calibrate import calibrate_bayes as calibrate_bayes
 from .calibrate import calibrate_least_squares as calibrate_least_squares
+from .calibrate import calibrate_many as calibrate_many
 from .calibrate import calibrate_paper as calibrate_paper
 from .calibrate import new_laws as new_laws
 from .calibrate import predict_measured as predict_measured

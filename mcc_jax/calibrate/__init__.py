@@ -36,6 +36,7 @@ from .joint import Priors as Priors
 from .joint import beside_paper as beside_paper
 from .joint import calibrate_bayes as calibrate_bayes
 from .joint import calibrate_least_squares as calibrate_least_squares
+from .joint import calibrate_many as calibrate_many
 from .joint import new_laws as new_laws
 from .joint import predict_measured as predict_measured
 from .joint import predict_new_particle as predict_new_particle

@@ -127,8 +127,8 @@ def base_fit(
     campaign: Campaign, model: JointModel, *, threshold_MPa: float, tell: Callable[[str], None] = lambda _: None
 ) -> Base:
     """Fit the base law with everything natural free: every particle's coefficients and modulus, and the noise."""
-    selection, _, fit = prepare(campaign, model, threshold_MPa, tell=tell)
-    return Base(campaign, selection, model, fit, records_of(campaign, selection))
+    selection, _, fit, _ = prepare(campaign, model, threshold_MPa, tell=tell)
+    return Base(campaign, selection, model, fit.first(len(selection.kept)), records_of(campaign, selection))
 
 
 def records_of(campaign: Campaign, selection: Selection) -> Record:

@@ -8,6 +8,7 @@ from ._fit import JointModel as JointModel
 from ._least_squares import Identifiability as Identifiability
 from ._least_squares import LeastSquaresCalibration as LeastSquaresCalibration
 from ._least_squares import calibrate_least_squares as calibrate_least_squares
+from ._many import calibrate_many as calibrate_many
 from ._noise import Noise as Noise
 from ._population import Population as Population
 from ._predictive import PredictedCurves as PredictedCurves

@@ -13,6 +13,7 @@ are solved through the Schur complement :math:`S - B^T D^{-1} B`, in a time line
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -157,6 +158,18 @@ class Solution(eqx.Module):
     loss: Float[Array, ""]
     converged: Bool[Array, ""]
     steps: Any
+
+    def first(self, count: int) -> Solution:
+        """The same of the first `count` particles."""
+        value, normal = self.value, self.normal
+        first = replace(
+            normal,
+            local=normal.local[:count],
+            border=normal.border[:count],
+            gradient_local=normal.gradient_local[:count],
+        )
+        residual = jax.tree.map(lambda x: x[:count], self.residual)
+        return replace(self, value=value._replace(local=value.local[:count]), residual=residual, normal=first)
 
 
 def minimise(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import jax
 import numpy as np
 
 from ._bayes import BayesCalibration
@@ -216,5 +217,9 @@ def _prior_curves(c: BayesCalibration, prior: dict[str, np.ndarray], row: int, c
 
 
 def write_posterior(calibration: BayesCalibration, file: str | Path) -> None:
-    """Write `posterior.nc` (NetCDF 4), readable by `arviz.from_netcdf` and `xarray.open_datatree`."""
-    to_arviz(calibration, seed=calibration.seed).to_netcdf(file, engine="h5netcdf")
+    """Write `posterior.nc` (NetCDF 4), readable by `arviz.from_netcdf` and `xarray.open_datatree`.
+
+    Of several processes, which all have the same posterior, only the first one writes.
+    """
+    if jax.process_index() == 0:
+        to_arviz(calibration, seed=calibration.seed).to_netcdf(file, engine="h5netcdf")

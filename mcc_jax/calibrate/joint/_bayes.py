@@ -290,9 +290,15 @@ def calibrate_bayes(
     warmup: int = 300,
     draws: int = 1000,
     seed: int = 0,
+    block: int | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> BayesCalibration:
     """The joint posterior of everything: a, modulus, population, noise, and every particle's C1, C3, C5 and zero.
+
+    The particles are worked on in blocks, which spread over all devices of the process and, once
+    `jax.distributed.initialize` has been called, over all processes: every one of them then calls this function with
+    the same campaign and settings, and gets the same result to the last bit, which depends neither on their number nor
+    on that of the devices.
 
     Args:
         campaign: the tests.
@@ -304,26 +310,32 @@ def calibrate_bayes(
         warmup: steps of each that tune the sampler and are thrown away.
         draws: of each that are kept.
         seed: random seed.
+        block: particles of a block; by default all in one up to 64, and about 64 of larger campaigns. Other blocks make
+            other draws of the same posterior. The mode "joint" has a single one.
         progress: called with the name of each step.
 
     Raises:
-        InputError: if no particle can be used.
+        InputError: if no particle can be used, or processes were given different campaigns.
+        ValueError: for blocks of no particles.
     """
     started = time.perf_counter()
     tell = progress or (lambda _: None)
     model = model or JointModel()
     length = Length(chains, warmup, draws)
-    ahead = (lambda tests: compile_ahead(tests, model, length)) if mode == "fast" else None
-    selection, tests, fit = prepare(campaign, model, threshold_MPa, meanwhile=ahead, tell=tell)
-    tell("sampling the population" if mode == "fast" else "sampling everything")
-    found = draw_fast if mode == "fast" else draw_joint
-    parts = found(jax.random.key(seed), tests, model, fit, length)
+    fast = mode == "fast"
+    ahead = (lambda tests, size: compile_ahead(tests, size, model, length)) if fast else None
+    selection, tests, fit, size = prepare(
+        campaign, model, threshold_MPa, fill_up=fast, block=block, meanwhile=ahead, tell=tell
+    )
+    tell("sampling the population" if fast else "sampling everything")
+    key = jax.random.key(seed)
+    parts = draw_fast(key, tests, model, fit, length, size) if fast else draw_joint(key, tests, model, fit, length)
     tell("diagnosing")
     return BayesCalibration(
         campaign=campaign,
         selection=selection,
         model=model,
-        fit=fit,
+        fit=fit.first(len(selection.kept)),
         mode=mode,
         seed=seed,
         runtime_s=time.perf_counter() - started,

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -37,6 +38,7 @@ class Tests(eqx.Module):
         step: share of the peak force passed since the point before [-], the path length of correlated residuals.
         branch: index of the point at which the largest force so far was reached: shared by the points of an elastic
             branch.
+        weight: 1 for particles, 0 for copies that only fill up; None where all are particles.
     """
 
     __test__ = False  # no test of ours, whatever pytest thinks of the name
@@ -49,6 +51,7 @@ class Tests(eqx.Module):
     contact: Float[Array, " particles"]
     step: Float[Array, "particles points"]
     branch: Int[Array, "particles points"]
+    weight: Float[Array, " particles"] | None = None
 
     def __len__(self) -> int:
         return self.force.shape[0]
@@ -64,17 +67,29 @@ class Tests(eqx.Module):
         return eqx.filter_vmap(lambda particle: particle.effective_diameter)(self.particle)
 
 
-def spread(tests: Tests) -> Tests:
-    """The same tests with their particles spread over this process's devices, if their number divides evenly.
+def enlarged(tests: Tests, particles: int) -> Tests:
+    """The same tests among as many: copies of the last particle are added that count for nothing.
 
-    Everything that follows acts on particles one by one and then sums, so the compiler splits it in the same way.
+    Every particle gets a weight, whether copies are needed or not: one kind of arrays, one compilation.
     """
-    devices = jax.local_devices()
-    if len(devices) < 2 or len(tests) % len(devices):
-        return tests
-    mesh = jax.sharding.Mesh(np.array(devices), ("particles",))
-    place = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("particles"))
-    return jax.tree.map(lambda x: jax.device_put(x, place), tests)
+    more = particles - len(tests)
+
+    def longer(x: Any) -> Array:
+        x = np.asarray(x)
+        return jnp.asarray(np.pad(x, [(0, more)] + [(0, 0)] * (x.ndim - 1), mode="edge") if more else x)
+
+    weight = np.ones(len(tests)) if tests.weight is None else np.asarray(tests.weight)
+    return replace(jax.tree.map(longer, tests), weight=jnp.asarray(np.pad(weight, (0, more))))
+
+
+LENGTHS = (64, 128, 192, 320, 448)
+"""Numbers of points that records are padded to, and beyond them in steps of the last: campaigns of similar length
+share one compilation."""
+
+
+def padded_length(points: int) -> int:
+    """The length that records of so many points are padded to."""
+    return next((length for length in LENGTHS if length >= points), points + -points % LENGTHS[-1])
 
 
 @dataclass(frozen=True)
@@ -96,9 +111,7 @@ class Selection:
     notes: tuple[str, ...]
 
 
-def select_tests(
-    campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_points: int = 400, multiple: int = 64
-) -> Selection:
+def select_tests(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_points: int = 400) -> Selection:
     """Choose what the joint calibration uses.
 
     Points count from the threshold stress on, below which surface asperities and not the particle deform. On unloading
@@ -109,7 +122,6 @@ def select_tests(
         campaign: the tests.
         threshold_MPa: stress of the threshold [MPa].
         most_points: thin records longer than this.
-        multiple: round the common length up to this, so that campaigns of similar length share one compilation.
 
     Raises:
         InputError: if no particle can be used.
@@ -138,8 +150,7 @@ def select_tests(
             remedy="Check the diameters (they turn force into stress), or lower the threshold.",
         )
     used = [one for one in prepared if not isinstance(one, str)]
-    longest = max(len(one.rows) for one in used)
-    longest += -longest % multiple
+    longest = padded_length(max(len(one.rows) for one in used))
 
     def padded(values: list[np.ndarray], fill: str) -> np.ndarray:
         options = {"mode": "edge"} if fill == "edge" else {"mode": "constant", "constant_values": False}

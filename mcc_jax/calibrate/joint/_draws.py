@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ._blocks import Blocks, count_of
 from ._compile import compiled
 from ._data import Tests
 from ._fit import JointFit, JointModel, population_at, populations, prior_numbers
@@ -54,29 +55,36 @@ class Length(NamedTuple):
         return self.chains * self.draws
 
 
-def compile_ahead(tests: Tests, model: JointModel, length: Length) -> None:
+def compile_ahead(tests: Tests, block: int, model: JointModel, length: Length) -> None:
     """Compile what is needed last while the first steps run: the same functions, for arrays of the same shapes."""
     count, points = tests.force.shape
     d = 6 + model.scatter.size
+    blocks = Blocks(count, block)
 
     def dummy(*shape: int) -> Array:
         return jnp.asarray(np.ones(shape))
 
-    one, four = dummy(count), dummy(count, 4)
-    quadratic = Summary(four, dummy(count, 4, 4), four, one, one, one, four, one)
+    def quadratic(count: int) -> Summary:
+        one, four = dummy(count), dummy(count, 4)
+        return Summary(four, dummy(count, 4, 4), four, one, one, one, four, one)
+
     # Almost all campaigns pin their coefficients down; the others compile again.
     scatter = replace(model.scatter, newton=0)
-    target = Target(prior_numbers(model.beliefs, tests.flatness), quadratic, scatter)
+    target = Target(prior_numbers(model.beliefs, tests.flatness, tests.weight), quadratic(count), scatter)
     cast(Any, sample_population).lower(
         jax.random.key(0), dummy(d), dummy(d, d), target, dummy(), **length._asdict()
     ).compile()
-    filters = eqx.filter_vmap(Whitening)(*(dummy(count, points) for _ in range(4)), tests.branch)
-    exact = Exact(tests, filters, quadratic, scatter, model.zero_sd, model.unloading)
-    several = dummy(len(range(0, length.total, _stride(count, length.total))))
+    import arviz_stats.base  # noqa: F401  # seconds on a cold machine, so here too
+
+    if blocks.mesh is not None:
+        return  # for several devices it is another function
+    some_tests = jax.tree.map(lambda x: x[:block], tests)
+    filters = eqx.filter_vmap(Whitening)(*(dummy(block, points) for _ in range(4)), some_tests.branch)
+    exact = Exact(some_tests, filters, quadratic(block), scatter, model.zero_sd, model.unloading)
+    several = dummy(len(range(0, length.total, _stride(count_of(tests), length.total))))
     triple = dummy(*several.shape, 3)
     some = eqx.filter_vmap(Population)(several, several, triple, triple, several, several, several)
-    cast(Any, draw_particles).lower(jax.random.key(0), some, exact).compile()
-    import arviz_stats.base  # noqa: F401  # seconds on a cold machine, so here too
+    cast(Any, draw_particles).lower(jax.random.key(0)[None], some, exact, 1).compile()
 
 
 SHARP = 0.03
@@ -89,7 +97,7 @@ def newton_steps(fit: JointFit, tests: Tests, model: JointModel) -> int:
     """How many Newton steps the integration over the particles needs: none if every coefficient is known sharply."""
     population = population_at(fit.mode, fit.numbers, model.scatter)
     at = _laplace(population, fit.summary, tests.flatness, model.scatter)
-    variance = np.diagonal(np.linalg.inv(np.asarray(at.hessian)), axis1=1, axis2=2)
+    variance = np.diagonal(np.linalg.inv(np.asarray(at.hessian)[: count_of(tests)]), axis1=1, axis2=2)
     widest = float(np.max(np.sqrt(variance) * np.asarray(at.stretch)))
     return 0 if widest < SHARP else 4
 
@@ -99,31 +107,41 @@ def _stride(count: int, total: int) -> int:
     return max(1, -(-total * count // MOST_CHECKED))
 
 
-def draw_fast(key: Array, tests: Tests, model: JointModel, fit: JointFit, length: Length) -> dict[str, Any]:
+def draw_fast(key: Array, tests: Tests, model: JointModel, fit: JointFit, length: Length, block: int) -> dict[str, Any]:
     """The population sampled, the particles drawn back and corrected by exact weights: fields of the result."""
     scatter = replace(model.scatter, newton=newton_steps(fit, tests, model))
     exact = Exact(tests, fit.filters, fit.summary, scatter, model.zero_sd, model.unloading)
-    return draw_around(key, fit.mode, fit.covariance, Target(fit.numbers, fit.summary, scatter), exact, model, length)
+    target = Target(fit.numbers, fit.summary, scatter)
+    return draw_around(key, fit.mode, fit.covariance, target, exact, model, length, block)
 
 
 def draw_around(
-    key: Array, mode: Array, covariance: Array, target: Target, exact: Exact, model: JointModel, length: Length
+    key: Array,
+    mode: Array,
+    covariance: Array,
+    target: Target,
+    exact: Exact,
+    model: JointModel,
+    length: Length,
+    block: int = 0,
 ) -> dict[str, Any]:
-    """The same for any density of the population, around its mode, and any exact likelihood of the tests."""
+    """The same for any density of the population, around its mode, and any exact likelihood of the tests.
+
+    More than one block (0 for a single one) takes tests whose every array has one row per particle.
+    """
     tests, scatter = exact.tests, exact.scatter
     population_key, particle_key, check_key, pick_key = jax.random.split(key, 4)
-
-    def sampled(accept: float) -> tuple[Chains, Population]:
-        return sample_population(population_key, mode, covariance, target, jnp.asarray(accept), **length._asdict())
-
-    run, population = sampled(ACCEPT[0])
-    for accept in ACCEPT[1:]:
-        if not np.any(np.asarray(run.divergent)):
-            break
-        run, population = sampled(accept)
-    count = len(tests)
+    run, population = _settled(population_key, mode, covariance, target, length)
+    count = count_of(tests)
     stride = _stride(count, length.total)
-    checked = [np.array(v) for v in draw_particles(check_key, _every(population, stride), exact)]
+    blocks = Blocks(len(tests), block)
+    own = blocks.cut(exact)
+
+    def drawn(key: Array, population: Population, candidates: int = 1) -> list[np.ndarray]:
+        found = blocks.each(draw_particles, blocks.keys(key), population, own, candidates, axis=1)
+        return [np.array(np.asarray(v)[:, :count]) for v in blocks.whole(found)]
+
+    checked = drawn(check_key, _every(population, stride))
     ratio = checked[3]
     k = pareto_k(ratio)
     restless = np.flatnonzero(unrest(ratio) > RESTLESS)
@@ -139,8 +157,9 @@ def draw_around(
             # Always of one of a few sizes, the first one repeated: every size would be compiled anew.
             size = min(count, 4 ** int(np.ceil(np.log(max(len(restless), 2)) / np.log(4))))
             padded = np.concatenate([restless, np.full(size - len(restless), restless[0])])
+            # They are few: every process draws all of them.
             more = draw_particles(
-                jax.random.fold_in(pick_key, candidates), population, exact.some(jnp.asarray(padded)), candidates
+                jax.random.fold_in(pick_key, candidates)[None], population, exact.some(jnp.asarray(padded)), candidates
             )
             better = [np.asarray(v)[:, : len(restless)] for v in more]
             latent[:, restless], zero[:, restless], ratio[:, restless] = better[0], better[1], better[3]
@@ -158,7 +177,7 @@ def draw_around(
             affected = ", ".join(str(i) for i in restless[:5])
             notes.append(f"{len(restless)} particles are far from their quadratic summary (positions {affected}, ...)")
         keep = max(1, -(-length.total * count // MOST_PARTICLE_DRAWS))
-        latent, zero, likelihood, _ = draw_particles(particle_key, _every(population, keep), exact, 0)
+        latent, zero, likelihood, _ = drawn(particle_key, _every(population, keep), 0)
     return {
         **_fields(run, population, names, stacked, (latent, zero, likelihood), tests, model, length, keep),
         "pareto_k": k,
@@ -168,16 +187,35 @@ def draw_around(
     }
 
 
+def _settled(key: Array, mode: Array, covariance: Array, target: Target, length: Length) -> tuple[Chains, Population]:
+    """The sampler's run and its populations, with smaller steps if any trajectory diverged."""
+
+    def run(accept: float) -> tuple[Chains, Population]:
+        # From an array, not from a Python number: a weak type would be compiled anew after `compile_ahead`.
+        aim = jnp.asarray(np.asarray(accept))
+        found = sample_population(key, mode, covariance, target, aim, **length._asdict())
+        return cast(Any, jax.tree.map(np.asarray, found))
+
+    chains, population = run(ACCEPT[0])
+    for accept in ACCEPT[1:]:
+        if not np.any(np.asarray(chains.divergent)):
+            break
+        chains, population = run(accept)
+    return chains, population
+
+
 def draw_joint(key: Array, tests: Tests, model: JointModel, fit: JointFit, length: Length) -> dict[str, Any]:
     """Population and particles sampled together under the exact likelihood: fields of the result."""
     scatter = replace(model.scatter, newton=newton_steps(fit, tests, model))
     exact = Exact(tests, fit.filters, fit.summary, scatter, model.zero_sd, model.unloading)
-    run, free, *particles = sample_joint(key, fit.mode, fit.covariance, fit.numbers, exact, **length._asdict())
+    found = sample_joint(key, fit.mode, fit.covariance, fit.numbers, exact, **length._asdict())
+    run, free, *particles = jax.tree.map(np.asarray, found)
+    count = len(tests)
     population = populations(free.reshape(-1, free.shape[-1]), fit.numbers, scatter)
     names, stacked = _stack(population, scatter, length)
     return {
         **_fields(run, population, names, stacked, particles, tests, model, length),
-        "pareto_k": np.zeros(len(tests)),
+        "pareto_k": np.zeros(count),
         "pareto_k_joint": None,
         "weights_applied": False,
     }
@@ -201,11 +239,11 @@ def _fields(
 
     population = jax.tree.map(shaped, population)
     rhat, bulk, tail = diagnostics(names, stacked)
+    count = count_of(tests)
     latent, zero, likelihood = (np.asarray(v) for v in particles)
-    count = len(tests)
     return {
         "population": population,
-        **_particles(latent, zero, population, np.asarray(tests.flatness), model, length.chains),
+        **_particles(latent, zero, population, np.asarray(tests.flatness)[:count], model, length.chains),
         "log_likelihood": likelihood.reshape(length.chains, -1, count),
         "divergences": int(np.sum(np.asarray(run.divergent))),
         "rhat": rhat,

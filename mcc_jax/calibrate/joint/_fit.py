@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import equinox as eqx
@@ -17,8 +17,9 @@ from ..._errors import InputError
 from ...campaign import Campaign
 from ...law import StrainScaling, Unloading
 from .._predict import point_noise_um
+from ._blocks import Blocks, Parts, block_size, count_of, filled_up, require_same
 from ._compile import compiled
-from ._data import Selection, Tests, select_tests, spread
+from ._data import Selection, Tests, select_tests
 from ._individual import Particles, fit_particles, linear_starts
 from ._linearised import expected_latent, linear_data, summarise
 from ._mode import PriorNumbers, Target, from_free, most_probable, recentred, to_free
@@ -111,8 +112,28 @@ class JointFit(eqx.Module):
     numbers: PriorNumbers
     converged: Bool[np.ndarray, " 3"]
 
+    def first(self, count: int) -> JointFit:
+        """The same of the first `count` particles: without copies that only fill up."""
 
-def prior_numbers(priors: Priors, flatness: Float[Array, " particles"]) -> PriorNumbers:
+        def some(tree: Any) -> Any:
+            return jax.tree.map(lambda x: x[:count], tree)
+
+        return replace(
+            self,
+            individual=some(self.individual),
+            noise=replace(self.noise, scale=self.noise.scale[:count]),
+            filters=some(self.filters),
+            latent=self.latent[:count],
+            zero=self.zero[:count],
+            residual=self.residual[:count],
+            summary=some(self.summary),
+            numbers=replace(self.numbers, flatness=self.numbers.flatness[:count], weight=None),
+        )
+
+
+def prior_numbers(
+    priors: Priors, flatness: Float[Array, " particles"], weight: Float[Array, " particles"] | None = None
+) -> PriorNumbers:
     """Priors as arrays; `a` is bounded to where every particle's shape factor is positive."""
     flat = np.asarray(flatness)
     most, least = max(flat.max(), 1e-3), min(flat.min(), -1e-3)
@@ -142,6 +163,7 @@ def prior_numbers(priors: Priors, flatness: Float[Array, " particles"]) -> Prior
         centre=jnp.asarray([np.log(priors.C1.median), _log_C3(priors), np.log(priors.C5.median)]),
         blur=jnp.asarray(np.full(3, BLUR)),
         flatness=flatness,
+        weight=weight,
     )
 
 
@@ -150,33 +172,48 @@ def prepare(
     model: JointModel,
     threshold_MPa: float,
     *,
-    meanwhile: Callable[[Tests], None] | None = None,
+    fill_up: bool = True,
+    block: int | None = None,
+    meanwhile: Callable[[Tests, int], None] | None = None,
     tell: Callable[[str], None] = lambda _: None,
     **settings: Any,
-) -> tuple[Selection, Tests, JointFit]:
-    """What every joint calibration begins with: points and particles selected, spread over the devices, and fitted.
+) -> tuple[Selection, Tests, JointFit, int]:
+    """What every joint calibration begins with: points and particles selected, filled up to blocks, and fitted.
 
     Args:
         campaign: the tests.
         model: what is assumed.
         threshold_MPa: points below this stress on loading do not count [MPa].
-        meanwhile: called with the tests in a thread of its own while the fit runs.
+        fill_up: let copies that count for nothing make up whole blocks; if False, all particles are one block.
+        block: particles of a block; by default `block_size` of their number.
+        meanwhile: called with the tests and the size of a block in a thread of its own while the fit runs.
         tell: called with the name of each step.
         settings: of `fit_joint`.
+
+    Returns:
+        What was selected, the tests with copies that fill up, their fit, and the size of a block.
+
+    Raises:
+        InputError: if no particle can be used, or processes were given different tests.
+        ValueError: for blocks of no particles.
     """
+    if block is not None and block < 1:
+        raise ValueError(f"a block must have at least one particle, got {block}")
     tell("selecting points")
     selection = select_tests(campaign, threshold_MPa=threshold_MPa)
-    tests = spread(selection.tests)
+    require_same(selection.tests)
+    size = (block or block_size(len(selection.tests))) if fill_up else len(selection.tests)
+    tests = filled_up(selection.tests, size) if fill_up else selection.tests
     read_out = float(np.median([point_noise_um(campaign.curves[i]) for i in selection.kept]))
     aside = None
     if meanwhile is not None:
         # No daemon: a compiler must not outlive the interpreter. Who interrupts the fit need not wait for it here.
-        aside = threading.Thread(target=meanwhile, args=(tests,))
+        aside = threading.Thread(target=meanwhile, args=(tests, size))
         aside.start()
-    fit = fit_joint(tests, model, read_out, tell=tell, **settings)
+    fit = fit_joint(tests, model, read_out, block=size, tell=tell, **settings)
     if aside is not None:
         aside.join()
-    return selection, tests, fit
+    return selection, tests, fit, size
 
 
 def fit_joint(
@@ -186,6 +223,7 @@ def fit_joint(
     *,
     correlated: bool = True,
     rounds: int = ROUNDS,
+    block: int = 0,
     tell: Callable[[str], None] = lambda _: None,
 ) -> JointFit:
     """Fit particles, noise and population.
@@ -200,42 +238,60 @@ def fit_joint(
         correlated: estimate the whole noise; if False, white noise of the residuals' median modulus, which outliers do
             not move.
         rounds: how often noise, population and particles take turns.
+        block: particles of a block (`Blocks`), of which there is a whole number; 0 for all in one.
         tell: called with the name of each step.
     """
     scatter, zero_sd, priors = model.scatter, model.zero_sd, model.beliefs
     flatness = tests.flatness
-    numbers = prior_numbers(priors, flatness)
+    numbers = prior_numbers(priors, flatness, tests.weight)
     read_out = max(read_out_um, 1e-4)
     tell("fitting every particle")
     N = len(tests)
+    count = count_of(tests)
     centre = np.broadcast_to(_centre(priors), (N, 4))
-    starts = linear_starts(tests, jnp.asarray(centre[0, 3]))
-    wide = jnp.asarray(np.full((N, 4), WIDE))
-    individual = fit_particles(
-        tests, jnp.asarray(np.full(N, read_out)), jnp.asarray(centre), wide, zero_sd, starts, model.unloading
-    )
+    blocks = Blocks(N, block)
+    own = blocks.cut(tests)
+
+    def fitted(sizes: Any, middle: Any, width: Any, starts: Any) -> Particles:
+        sizes, middle, width = (blocks.cut(jnp.asarray(v)) for v in (sizes, middle, width))
+        return blocks.whole(blocks.each(fit_particles, own, sizes, middle, width, zero_sd, starts, model.unloading))
+
+    starts = blocks.each(linear_starts, own, jnp.asarray(centre[0, 3]), axis=1)
+    individual = fitted(np.full(N, read_out), centre, np.full((N, 4), WIDE), starts)
     latent, zero = individual.latent, individual.zero
     four = [read_out, *np.asarray(priors.noise.median)[1:]]
     noise = Noise.from_logs(jnp.asarray(np.log(four)), jnp.asarray(np.ones(len(tests))))
     log_sd, noise_converged = jnp.asarray(np.full(4, np.nan)), True
-    numbers, free = _start(np.asarray(latent), np.asarray(flatness), model, numbers)
+    numbers, free = _start(np.asarray(latent)[:count], np.asarray(flatness)[:count], model, numbers)
+
+    def summarised(at: tuple[Parts, Parts], data: Parts, noise: Noise) -> tuple[Summary, Parts]:
+        """All particles' summaries, and this process's own filters."""
+        both = blocks.each(summarise, *at, own, data, blocks.cut(noise), zero_sd)
+        summaries, filters = (Parts(tuple(wave[k] for wave in both.waves)) for k in (0, 1))
+        return blocks.whole(summaries), filters
+
     turn = 0
     while True:
-        data = linear_data(latent, zero, tests, zero_sd, model.unloading)
+        at = blocks.cut(latent), blocks.cut(zero)
+        data = blocks.each(linear_data, *at, own, zero_sd, model.unloading)
         if not correlated:
-            width = 1.4826 * np.median(np.abs(np.asarray(data.residual)[np.asarray(tests.mask)]))
+            residual = np.asarray(blocks.whole(Parts(tuple(wave.residual for wave in data.waves))))[:count]
+            width = 1.4826 * np.median(np.abs(residual[np.asarray(tests.mask)[:count]]))
             none = jnp.asarray(0.0)
             noise = Noise(jnp.asarray(max(width, 1e-9)), none, none, jnp.asarray(1.0), jnp.asarray(np.ones(N)))
         elif turn < rounds:
             tell("estimating the noise")
-            noise, log_sd, noise_converged = estimate_noise(data, priors.noise, noise, uncertainty=turn == rounds - 1)
-        summary, filtered = summarise(latent, zero, tests, data, noise, zero_sd)
+            noise, log_sd, noise_converged = estimate_noise(
+                data, priors.noise, noise, uncertainty=turn == rounds - 1, blocks=blocks
+            )
+        summary, filtered = summarised(at, data, noise)
         if correlated and turn < rounds:
             old = np.asarray(noise.scale)
-            scale = particle_scales(old, np.asarray(summary.squares), np.asarray(summary.count) - 4)
+            parts = (old, np.asarray(summary.squares), np.asarray(summary.count) - 4)
+            scale = np.pad(particle_scales(*(part[:count] for part in parts)), (0, N - count), mode="edge")
             if np.any(scale != old):
                 noise = eqx.tree_at(lambda n: n.scale, noise, jnp.asarray(scale))
-                summary, filtered = summarise(latent, zero, tests, data, noise, zero_sd)
+                summary, filtered = summarised(at, data, noise)
         tell("fitting the population")
         if turn:
             numbers, free = recentred(numbers, free)
@@ -253,13 +309,13 @@ def fit_joint(
                 jnp.concatenate([mean, zero[:, None]], 1),
             ]
         )
-        sizes = _white_equivalent(filtered, tests)
-        within = jnp.maximum(spread, LEAST_WIDTH)
-        found = fit_particles(tests, sizes, mean, within, zero_sd, starts, model.unloading)
+        sizes = blocks.whole(blocks.each(_white_equivalent, filtered, own))
+        found = fitted(sizes, mean, jnp.maximum(spread, LEAST_WIDTH), blocks.cut(starts, axis=1))
         latent, zero = found.latent, found.zero
-    converged = np.asarray([bool(np.all(np.asarray(individual.converged))), noise_converged, mode_converged])
+    converged = np.asarray([bool(np.all(np.asarray(individual.converged)[:count])), noise_converged, mode_converged])
+    filters, residual = blocks.whole(filtered), blocks.whole(Parts(tuple(wave.residual for wave in data.waves)))
     return JointFit(
-        individual, noise, log_sd, filtered, latent, zero, data.residual, summary, free, covariance, numbers, converged
+        individual, noise, log_sd, filters, latent, zero, residual, summary, free, covariance, numbers, converged
     )
 
 

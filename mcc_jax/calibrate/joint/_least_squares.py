@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import jax
@@ -15,7 +15,7 @@ from ...campaign import THRESHOLD_MPA, Campaign
 from .._result import estimate, finite, misfit_note
 from ._arrow import Parameters, Solution
 from ._bayes import log_estimate
-from ._data import Selection, own_misfit
+from ._data import Selection, Tests, own_misfit
 from ._fit import JointFit, JointModel, population_at, prepare
 from ._pooled import Pooled, fit_pooled, unpack
 from ._population import COEFFICIENTS
@@ -265,6 +265,7 @@ def calibrate_least_squares(
     threshold_MPa: float = THRESHOLD_MPA,
     loss: Loss = "linear",
     seed: int = 0,
+    block: int | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> LeastSquaresCalibration:
     r"""Least squares for a, modulus, and every particle's C1, C3, C5 and zero at once.
@@ -282,6 +283,8 @@ def calibrate_least_squares(
         threshold_MPa: points below this stress on loading do not count [MPa].
         loss: "linear", or a robust one of the whitened residuals, "soft_l1" or "cauchy".
         seed: kept for the record.
+        block: particles of a block, as in `calibrate_bayes`; the last step, the fit of all together, is done by every
+            process for itself on one device.
         progress: called with the name of each step.
 
     Raises:
@@ -290,7 +293,9 @@ def calibrate_least_squares(
     started = time.perf_counter()
     tell = progress or (lambda _: None)
     model = model or JointModel()
-    selection, _, fit = prepare(campaign, model, threshold_MPa, tell=tell, correlated=loss == "linear", rounds=1)
+    selection, tests, fit, _ = prepare(
+        campaign, model, threshold_MPa, block=block, tell=tell, correlated=loss == "linear", rounds=1
+    )
     population = population_at(fit.mode, fit.numbers, model.scatter)
     settings = Pooled(
         fit.filters,
@@ -306,10 +311,12 @@ def calibrate_least_squares(
     low, high = np.asarray(fit.numbers.a)[2:]
     starts = [float(population.a), *(a for a in STARTS if 0.9 * low < a < 0.9 * high)]
     mu, log_modulus = np.asarray(population.mu), float(population.log_modulus)
-    found = [solve(fit, settings, selection, a, mu, log_modulus) for a in starts]
+    found = [solve(fit, settings, tests, a, mu, log_modulus) for a in starts]
     losses = np.array([float(one.loss) for one in found])
     losses[~np.isfinite(losses)] = np.inf
-    best = found[int(np.argmin(losses))]
+    count = len(selection.kept)
+    fit, best = fit.first(count), found[int(np.argmin(losses))].first(count)
+    settings = replace(settings, whitening=fit.filters)
     agree = int(np.sum(losses <= losses.min() * (1 + 1e-5) + 1e-6))
     return LeastSquaresCalibration(
         campaign,
@@ -326,10 +333,8 @@ def calibrate_least_squares(
     )
 
 
-def solve(
-    fit: JointFit, settings: Pooled, selection: Selection, a: float, mu: np.ndarray, log_modulus: float
-) -> Solution:
+def solve(fit: JointFit, settings: Pooled, tests: Tests, a: float, mu: np.ndarray, log_modulus: float) -> Solution:
     """The pooled least squares from the fitted particles and the given shared parameters."""
     local = [fit.latent[:, :3], fit.zero[:, None]] + ([fit.latent[:, 3:]] if settings.scatter.modulus else [])
     shared = jnp.asarray(np.concatenate([[a, log_modulus], mu]))
-    return fit_pooled(selection.tests, settings, Parameters(jnp.concatenate(local, 1), shared))
+    return fit_pooled(tests, settings, Parameters(jnp.concatenate(local, 1), shared))

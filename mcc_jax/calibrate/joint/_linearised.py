@@ -27,7 +27,8 @@ def linear_data(
     """Residuals, their derivatives, and how noise of force moves them, around the given latent vectors and zeros."""
     value, J, moved, by_peak = linearise_with_force(latent, zero, tests, unloading)
     prior = jnp.concatenate([jnp.ones(4), 1 / zero_sd[None] ** 2])
-    return Linear(value, J, prior, tests.step, tests.mask, moved, by_peak, tests.branch)
+    prior = jnp.broadcast_to(prior, (len(tests), 5))
+    return Linear(value, J, prior, tests.step, tests.mask, moved, by_peak, tests.branch, tests.weight)
 
 
 @compiled

@@ -33,6 +33,7 @@ class PriorNumbers(eqx.Module):
         centre: about where the mean b1, b3, b5 of the particles will be found.
         blur: how wide they are where nothing scatters.
         flatness: of the particles.
+        weight: 1 for particles, 0 for copies that only fill up; None where all are particles.
     """
 
     a: Float[Array, " 4"]
@@ -45,10 +46,21 @@ class PriorNumbers(eqx.Module):
     centre: Float[Array, " 3"]
     blur: Float[Array, " 3"]
     flatness: Float[Array, " particles"]
+    weight: Float[Array, " particles"] | None = None
+
+    @property
+    def count(self) -> Scalar | int:
+        """Number of particles."""
+        return len(self.flatness) if self.weight is None else jnp.sum(self.weight)
+
+    def total(self, values: Float[Array, " particles"]) -> Scalar:
+        """Sum over the particles."""
+        return jnp.sum(values) if self.weight is None else jnp.sum(self.weight * values)
 
     def mean_log_eta(self, a: Scalar) -> Scalar:
         """Mean logarithm of the particles' shape factors."""
-        return jnp.mean(jnp.log(1 + a * self.flatness))
+        log_eta = jnp.log(1 + a * self.flatness)
+        return jnp.mean(log_eta) if self.weight is None else self.total(log_eta) / self.count
 
 
 KNEE = 0.1
@@ -86,7 +98,7 @@ def from_free(free: Float[Array, " d"], numbers: PriorNumbers, scatter: Scatter)
     signed = free[6 : 6 + count]
     spread = spread_of(signed, scales)
     density += jnp.sum(-0.5 * (spread / scales) ** 2 + jnp.log(KNEE * jnp.cosh(signed)))
-    width = jnp.sqrt(spread[:3] ** 2 / len(numbers.flatness) + numbers.blur**2)
+    width = jnp.sqrt(spread[:3] ** 2 / numbers.count + numbers.blur**2)
     mu = numbers.centre + width * free[2:5] - numbers.mean_log_eta(a)
     density += jnp.sum(jnp.log(width))
     mu1, mu3, mu5 = mu
@@ -121,7 +133,7 @@ def to_free(
     chosen = [0, 1, 2] + ([3] if scatter.modulus else []) + ([4] if scatter.shape else [])
     spread = np.concatenate([tau, np.full(scatter.size - 3, 0.1)])
     signed = np.arcsinh(spread / (KNEE * np.asarray(numbers.spread)[chosen]))
-    width = np.sqrt(np.asarray(tau) ** 2 / len(numbers.flatness) + np.asarray(numbers.blur) ** 2)
+    width = np.sqrt(np.asarray(tau) ** 2 / float(numbers.count) + np.asarray(numbers.blur) ** 2)
     means = (mu + float(numbers.mean_log_eta(jnp.asarray(a))) - np.asarray(numbers.centre)) / width
     return jnp.asarray(np.concatenate([[np.log(unit / (1 - unit)), log_modulus, *means, 0.0], signed]))
 
@@ -129,7 +141,7 @@ def to_free(
 def recentred(numbers: PriorNumbers, free: Float[Array, " d"]) -> tuple[PriorNumbers, Float[Array, " d"]]:
     """The same population in coordinates whose centre it is."""
     tau = spread_of(free[6:9], numbers.spread[:3])
-    width = jnp.sqrt(tau**2 / len(numbers.flatness) + numbers.blur**2)
+    width = jnp.sqrt(tau**2 / numbers.count + numbers.blur**2)
     numbers = eqx.tree_at(lambda n: n.centre, numbers, numbers.centre + width * free[2:5])
     return numbers, free.at[2:5].set(0.0)
 
@@ -159,7 +171,7 @@ class Target(eqx.Module):
     def log_density(self, free: Float[Array, " d"]) -> Scalar:
         """Log density of the population given all tests, up to a constant."""
         population, prior = from_free(free, self.numbers, self.scatter)
-        return prior + jnp.sum(marginal_likelihood(population, self.summary, self.flatness, self.scatter))
+        return prior + self.numbers.total(marginal_likelihood(population, self.summary, self.flatness, self.scatter))
 
 
 LEFT_TO_GAIN = 1e-6

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..._types import Path, Scalar
+from ._blocks import Blocks, Parts
 from ._compile import compiled
 from ._small import Cholesky
 
@@ -149,33 +150,43 @@ class Linear(eqx.Module):
     Attributes:
         residual: at the point [um].
         jacobian: derivative with respect to the particle's P parameters.
-        prior: precision that keeps directions without data in place, shape (P,).
+        prior: precision that keeps directions without data in place.
         step, mask, compliance, peak, branch: as in `whitening`.
+        weight: 1 for particles, 0 for copies that only fill up; None where all are particles.
     """
 
     residual: Float[Array, "particles points"]
     jacobian: Float[Array, "particles points P"]
-    prior: Float[Array, " P"]
+    prior: Float[Array, "particles P"]
     step: Float[Array, "particles points"]
     mask: Bool[Array, "particles points"]
     compliance: Float[Array, "particles points"]
     peak: Float[Array, "particles points"]
     branch: Int[Array, "particles points"]
+    weight: Float[Array, " particles"] | None = None
 
 
 def restricted_likelihood(noise: Noise, data: Linear) -> Float[Array, " particles"]:
     """Log likelihood of each test under the noise, with the particle's own parameters integrated out."""
 
-    def one(scale, residual, jacobian, *path):
+    def one(scale, residual, jacobian, prior, *path):
         filtered = whitening(noise, scale, *path)
         r = filtered(residual)
         J = jax.vmap(filtered, in_axes=1, out_axes=1)(jacobian)
-        factor = Cholesky(J.T @ J + jnp.diag(data.prior))
+        factor = Cholesky(J.T @ J + jnp.diag(prior))
         explained = factor.forward(J.T @ r)
         return -0.5 * (filtered.log_det + r @ r - explained @ explained + factor.log_det())
 
     return jax.vmap(one)(
-        noise.scale, data.residual, data.jacobian, data.step, data.mask, data.compliance, data.peak, data.branch
+        noise.scale,
+        data.residual,
+        data.jacobian,
+        data.prior,
+        data.step,
+        data.mask,
+        data.compliance,
+        data.peak,
+        data.branch,
     )
 
 
@@ -185,18 +196,19 @@ class NoisePrior(eqx.Module):
     median: Float[Array, " 4"]
     log_sd: Float[Array, " 4"]
 
-    def log_density(self, logs: Float[Array, " 4"]) -> Scalar:
+    def log_density(self, logs: Float[Array, "*many 4"]) -> Float[Array, "*many"]:
         """Log density of the logarithms, up to a constant."""
-        return -0.5 * jnp.sum(((logs - jnp.log(self.median)) / self.log_sd) ** 2)
+        median, log_sd = (jnp.broadcast_to(v, logs.shape) for v in (self.median, self.log_sd))
+        return -0.5 * jnp.sum(((logs - jnp.log(median)) / log_sd) ** 2, -1)
 
 
 @compiled
-def _losses(logs: Float[Array, "many 4"], scale: Float[Array, " particles"], data: Linear, prior: NoisePrior):
-    def loss(one):
-        noise = Noise.from_logs(one, scale)
-        return -(jnp.sum(restricted_likelihood(noise, data)) + prior.log_density(one))
-
-    return jax.vmap(loss)(logs)
+def _likelihoods(
+    logs: Float[Array, "many 4"], scale: Float[Array, " particles"], data: Linear
+) -> Float[Array, "many particles"]:
+    """Log likelihood of each test under each of many noises; 0 of copies that only fill up."""
+    each = jax.vmap(lambda one: restricted_likelihood(Noise.from_logs(one, scale), data))(logs)
+    return each if data.weight is None else data.weight[None] * each
 
 
 STEP = 1e-3
@@ -204,7 +216,12 @@ STEP = 1e-3
 
 
 def estimate_noise(
-    data: Linear, prior: NoisePrior, start: Noise, *, uncertainty: bool = True
+    data: Linear | Parts,
+    prior: NoisePrior,
+    start: Noise,
+    *,
+    uncertainty: bool = True,
+    blocks: Blocks | None = None,
 ) -> tuple[Noise, Float[Array, " 4"], bool]:
     """Noise by restricted maximum likelihood with its prior.
 
@@ -212,10 +229,11 @@ def estimate_noise(
     differences, all of them in one batch, than to compile.
 
     Args:
-        data: linear residuals.
+        data: linear residuals; with `blocks`, of this process's own particles.
         prior: prior of the four numbers.
         start: where to begin, and the particles' scales.
         uncertainty: whether to work out standard deviations.
+        blocks: how the particles are cut; all in one block by default.
 
     Returns:
         The noise, standard deviations of the logarithms of its four numbers (or NaN), and whether the optimiser
@@ -223,10 +241,16 @@ def estimate_noise(
     """
     from scipy.optimize import minimize
 
+    blocks = blocks or Blocks(len(start.scale))
+    own = data if isinstance(data, Parts) else blocks.cut(data)
+    scale = blocks.cut(start.scale)
     steps = STEP * np.concatenate([np.zeros((1, 4)), np.eye(4), -np.eye(4)])
 
     def value_and_gradient(logs: np.ndarray) -> tuple[float, np.ndarray]:
-        values = np.asarray(_losses(jnp.asarray(logs + steps), start.scale, data, prior))
+        at = jnp.asarray(logs + steps)
+        each = blocks.whole(blocks.each(_likelihoods, at, scale, own, axis=1))
+        # Summed here, in one order, however the particles are spread.
+        values = -(np.sum(np.asarray(each), axis=1) + np.asarray(prior.log_density(at)))
         return float(values[0]), (values[1:5] - values[5:]) / (2 * STEP)
 
     # No tester reads better than a few tenths of a nanometre: noise-free data, of a simulation say, get that much.

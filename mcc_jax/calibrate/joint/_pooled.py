@@ -95,7 +95,11 @@ def pooled_residual(settings: Pooled, tests: Tests) -> Callable[[Parameters], tu
         mean, factor = moments(population, tests.flatness, settings.scatter)
         covariance = jnp.einsum("npk,nqk->npq", factor, factor)[:, :size, :size]
         pooled = Cholesky(covariance).forward((latent - mean)[:, :size])
-        return robust(settings.loss, data), pooled, ((zero - tests.contact) / settings.zero_sd)[:, None]
+        found = robust(settings.loss, data), pooled, ((zero - tests.contact) / settings.zero_sd)[:, None]
+        if tests.weight is None:
+            return found
+        weight = tests.weight[:, None]
+        return found[0] * weight, found[1] * weight, found[2] * weight
 
     return residual
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, PyTree
 
 from ..._types import Scalar
 from ...law import Unloading
@@ -139,7 +139,7 @@ class Exact(eqx.Module):
 
 @compiled
 def draw_particles(
-    key: PRNGKeyArray,
+    keys: Key[Array, " 1"],
     population: Population,
     exact: Exact,
     candidates: int = 1,
@@ -147,7 +147,7 @@ def draw_particles(
     """Draw the particles' parameters given each draw of the population, and compare with the exact likelihood.
 
     Args:
-        key: random key.
+        keys: a single random key; with an axis, so that blocks of particles on several devices have one each.
         population: draws, every field with a leading axis.
         exact: the tests.
         candidates: how many to draw and choose from; 0 draws one and does not look at the exact likelihood.
@@ -185,7 +185,7 @@ def draw_particles(
         return ParticleDraws(take(latent), take(zero), likelihood[0], mean)
 
     batch = max(1, min(draws, 40_000 // (count * max(candidates, 1))))
-    return jax.lax.map(one, (jax.random.split(key, draws), population), batch_size=batch)
+    return jax.lax.map(one, (jax.random.split(keys[0], draws), population), batch_size=batch)
 
 
 @compiled

@@ -148,7 +148,7 @@ def linear_problem(four, scale, *, points=POINTS, count=1, seed=0, masked=0.1):
         noise = np.linalg.cholesky(covariance) @ rng.standard_normal(points)
         residual[i] = noise + jacobian[i] @ rng.standard_normal(3)
     mask = rng.random((count, points)) >= masked
-    prior = np.array([0.5, 1.0, 2.0])
+    prior = np.tile([0.5, 1.0, 2.0], (count, 1))
     arrays = (residual, jacobian, prior, step, mask, compliance, peak, branch)
     return Linear(*(jnp.asarray(v) for v in arrays))
 
@@ -161,7 +161,7 @@ def test_restricted_likelihood_is_the_dense_gaussian_with_the_parameters_in_the_
     actual = np.asarray(jax.jit(restricted_likelihood)(noise, data))
     for i in range(2):
         mask, J = np.asarray(data.mask[i]), np.asarray(data.jacobian[i])
-        r, prior = np.asarray(data.residual[i])[mask], np.asarray(data.prior)
+        r, prior = np.asarray(data.residual[i])[mask], np.asarray(data.prior[i])
         path = (np.asarray(v[i]) for v in (data.step, data.compliance, data.peak, data.branch))
         V = dense_covariance(four, (scale, 1.0)[i], *path)
         total = (V + J @ np.diag(1 / prior) @ J.T)[mask][:, mask]

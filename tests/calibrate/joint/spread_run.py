@@ -1,0 +1,54 @@
+"""One process of a calibration that is spread over several: run by `test_spread.py`, one after another or together."""
+
+import json
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+
+
+def main(folder: Path, address: str, processes: int, process: int, seed: int) -> None:
+    """Calibrate five particles in blocks of two, and write what was found."""
+    jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_numpy_rank_promotion", "raise")
+    jax.config.update("jax_numpy_dtype_promotion", "strict")
+    if processes > 1:
+        jax.distributed.initialize(address, processes, process, initialization_timeout=60)
+    # Not before: nothing may ask for devices before the processes know of each other.
+    from joint_cases import COEFFICIENTS, DIAMETERS, NOISE, SNAPPING, Programme, simulated
+
+    from mcc_jax.calibrate import calibrate_bayes, write_posterior
+
+    five = [0, 1, 2, 3, 0]
+    C = np.concatenate([COEFFICIENTS, SNAPPING[None]])
+    campaign = simulated(C, DIAMETERS[five], instrument=NOISE, programme=Programme.cycles(points=40), seed=seed)
+    try:
+        found = calibrate_bayes(campaign, chains=2, warmup=100, draws=60, seed=3, block=2)
+    except Exception as error:
+        (folder / f"error_{process}.txt").write_text(f"{type(error).__name__}: {error}", encoding="utf-8")
+        raise
+    arrays = {
+        "mode": found.fit.mode,
+        "covariance": found.fit.covariance,
+        "noise": found.fit.noise.logs,
+        "noise_log_sd": found.fit.noise_log_sd,
+        "scale": found.fit.noise.scale,
+        "latent": found.fit.latent,
+        "residual": found.fit.residual,
+        "weight": found.fit.filters.weight,
+        "precision": found.fit.summary.precision,
+        **found.named_population(),
+        **{name: getattr(found, name) for name in ("C", "modulus_MPa", "zero_um", "log_likelihood", "pareto_k")},
+    }
+    np.savez(folder / f"arrays_{process}.npz", **{name: np.asarray(value) for name, value in arrays.items()})
+    devices = {"devices": jax.local_device_count(), "processes": jax.process_count()}
+    (folder / f"devices_{process}.json").write_text(json.dumps(devices), encoding="utf-8")
+    write_posterior(found, folder / "posterior.nc")
+    if jax.process_index() == 0:
+        content = {**found.to_json(), "runtime_s": None}
+        (folder / "calibration.json").write_text(json.dumps(content), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), sys.argv[2], *(int(v) for v in sys.argv[3:]))

@@ -1,0 +1,127 @@
+"""Many campaigns in a queue: the results of one by one, in order, errors in place, compilations shared."""
+
+import logging
+import re
+
+import jax
+import numpy as np
+import pytest
+from joint_cases import COEFFICIENTS, DIAMETERS, NOISE, Programme, simulated
+
+from mcc_jax import InputError, calibrate_bayes, calibrate_least_squares, calibrate_many
+from mcc_jax.calibrate.joint._data import LENGTHS, padded_length
+
+SETTINGS = {"chains": 2, "warmup": 150, "draws": 100, "seed": 3}
+FUNCTIONS = (
+    "fit_particles",
+    "linear_data",
+    "_likelihoods",
+    "summarise",
+    "_gradients",
+    "sample_population",
+    "draw_particles",
+)
+"""What a calibration waits for when it is compiled."""
+
+SHORT, LONG = Programme.cycles(points=70), Programme.cycles(points=110)
+
+
+@pytest.fixture(scope="module")
+def campaigns():
+    """Four of different lengths and sizes, one of which nothing can be made of."""
+    return [
+        simulated(instrument=NOISE, programme=SHORT),
+        simulated(COEFFICIENTS[:3], DIAMETERS[:3], instrument=NOISE, programme=LONG, seed=1),
+        simulated(instrument=NOISE, programme=SHORT, peak_MPa=0.1),
+        simulated(instrument=NOISE, programme=SHORT, seed=2),
+    ]
+
+
+@pytest.fixture(scope="module")
+def told():
+    return []
+
+
+class Compilations(logging.Handler):
+    """Names of the functions that JAX compiles, in whichever thread."""
+
+    def __init__(self):
+        super().__init__()
+        self.names = []
+
+    def emit(self, record):
+        if found := re.match(r"Compiling jit\((\w+)\)", record.getMessage()):
+            self.names.append(found[1])
+
+
+@pytest.fixture(scope="module")
+def queued(campaigns, told):
+    logger, seen = logging.getLogger("jax._src.interpreters.pxla"), Compilations()
+    propagates, logger.propagate = logger.propagate, False
+    logger.addHandler(seen)
+    jax.config.update("jax_log_compiles", True)
+    try:
+        found = calibrate_many(campaigns, progress=lambda i, step: told.append((i, step)), **SETTINGS)
+    finally:
+        jax.config.update("jax_log_compiles", False)
+        logger.removeHandler(seen)
+        logger.propagate = propagates
+    return found, seen.names
+
+
+def test_results_come_in_order_and_errors_in_place(queued, campaigns):
+    found, _ = queued
+    assert isinstance(found[2], InputError)
+    assert "no particle can be used" in str(found[2])
+    for i in (0, 1, 3):
+        assert found[i].campaign is campaigns[i]
+        assert found[i].C.shape == (2, 100, len(campaigns[i]), 3)
+        assert found[i].fit.latent.shape == (len(campaigns[i]), 4)
+
+
+def test_progress_names_the_campaign(queued, told):
+    for i, last in enumerate(["done", "done", "failed", "done"]):
+        assert [step for row, step in told if row == i][-1] == last
+    assert (0, "sampling the population") in told
+
+
+def test_campaigns_of_similar_size_share_their_compilations(queued):
+    _, compiled = queued
+    # Ahead, in a thread of its own, and for use: the same. The particles are fitted from three starts each time.
+    for name in FUNCTIONS:
+        assert compiled.count(name) == 1, (name, compiled)
+
+
+@pytest.mark.parametrize("i", [0, 1, 3])
+def test_the_numbers_are_those_of_one_by_one(queued, campaigns, i):
+    one, many = calibrate_bayes(campaigns[i], **SETTINGS), queued[0][i]
+    for name, draws in one.named_population().items():
+        np.testing.assert_array_equal(many.named_population()[name], draws, err_msg=name)
+    for name in ("C", "modulus_MPa", "zero_um", "shape_factor", "log_likelihood", "pareto_k"):
+        np.testing.assert_array_equal(getattr(many, name), getattr(one, name), err_msg=name)
+    assert many.warnings() == one.warnings()
+
+
+def test_least_squares_with_two_workers(campaigns):
+    found = calibrate_many(campaigns, method="least-squares", workers=2)
+    assert isinstance(found[2], InputError)
+    for i in (0, 1, 3):
+        one = calibrate_least_squares(campaigns[i])
+        for many, alone in zip(found[i].solution.value, one.solution.value, strict=True):
+            np.testing.assert_array_equal(many, alone)
+        assert float(found[i].solution.loss) == float(one.solution.loss)
+
+
+def test_records_are_padded_to_few_lengths():
+    assert [padded_length(n) for n in (1, 64, 65, 301, 448, 449)] == [64, 64, 128, 320, 448, 896]
+    assert all(padded_length(n) == n for n in LENGTHS)
+
+
+def test_wrong_arguments_are_told(campaigns):
+    with pytest.raises(ValueError, match="method"):
+        calibrate_many(campaigns, method="guess")
+    with pytest.raises(ValueError, match="worker"):
+        calibrate_many(campaigns, workers=0)
+    with pytest.raises(TypeError, match="speed"):
+        calibrate_many(campaigns, speed=3)
+    assert calibrate_many([]) == []

@@ -1,0 +1,160 @@
+"""Particles spread over devices and over processes give the numbers of one, to the last bit."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from joint_cases import NOISE, Programme, simulated
+
+from mcc_jax import calibrate_bayes
+from mcc_jax.calibrate.joint._blocks import MOST, SIZES, Blocks, Parts, block_size, count_of, filled_up
+from mcc_jax.calibrate.joint._data import select_tests
+
+LIMIT_S = 400
+HERE = Path(__file__).parent
+
+
+def start(folder, devices=1, processes=1, process=0, port=0, seed=0):
+    """One process of a run, its output in files: a full pipe would hold it up."""
+    environment = {**os.environ, "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}"}
+    environment["PYTHONPATH"] = str(HERE)
+    command = [sys.executable, str(HERE / "spread_run.py"), str(folder), f"127.0.0.1:{port}"]
+    with (folder / f"output_{process}.txt").open("w") as output:
+        return subprocess.Popen(
+            [*command, str(processes), str(process), str(seed)], env=environment, stdout=output, stderr=output
+        )
+
+
+def finish(folder, running, *, fine=True):
+    """Wait for all processes of a run; whatever happens, none is left."""
+    try:
+        codes = [one.wait(LIMIT_S) for one in running]
+    finally:
+        for one in running:
+            one.kill()
+            one.wait()
+    if fine:
+        said = "\n".join((folder / f"output_{i}.txt").read_text()[-2000:] for i in range(len(running)))
+        assert codes == [0] * len(running), said
+    return codes
+
+
+def free_port():
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return one.getsockname()[1]
+
+
+def arrays(folder, process=0):
+    with np.load(folder / f"arrays_{process}.npz") as file:
+        return {name: file[name] for name in file.files}
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("alone")
+    finish(folder, [start(folder)])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def two_processes(tmp_path_factory):
+    folder, port = tmp_path_factory.mktemp("two_processes"), free_port()
+    finish(folder, [start(folder, processes=2, process=i, port=port) for i in range(2)])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def four_devices(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("four_devices")
+    finish(folder, [start(folder, devices=4)])
+    return folder
+
+
+def assert_same(found, wanted):
+    assert found.keys() == wanted.keys()
+    for name, values in wanted.items():
+        np.testing.assert_allclose(found[name], values, rtol=1e-8, atol=1e-8, err_msg=name)
+        if name == "C":  # of every draw, not of the sum alone
+            np.testing.assert_allclose(found[name].mean((0, 1)), values.mean((0, 1)), rtol=1e-8)
+            np.testing.assert_allclose(found[name].std((0, 1)), values.std((0, 1)), rtol=1e-8)
+
+
+@pytest.mark.parametrize("process", [0, 1])
+def test_two_processes_give_the_numbers_of_one(alone, two_processes, process):
+    assert json.loads((two_processes / f"devices_{process}.json").read_text()) == {"devices": 1, "processes": 2}
+    assert_same(arrays(two_processes, process), arrays(alone))
+
+
+def test_four_devices_give_the_numbers_of_one(alone, four_devices):
+    assert json.loads((four_devices / "devices_0.json").read_text()) == {"devices": 4, "processes": 1}
+    assert_same(arrays(four_devices), arrays(alone))
+
+
+def test_only_the_first_process_writes_files(alone, two_processes):
+    written = {path.name for path in two_processes.glob("*") if not path.stem[-1].isdigit()}
+    assert written == {"calibration.json", "posterior.nc"}
+    one, two = (json.loads((folder / "calibration.json").read_text()) for folder in (alone, two_processes))
+    assert two == one
+
+
+def test_processes_with_different_campaigns_are_told(tmp_path):
+    port = free_port()
+    running = [start(tmp_path, processes=2, process=i, port=port, seed=i) for i in range(2)]
+    assert all(finish(tmp_path, running, fine=False))
+    for i in range(2):
+        assert "different tests" in (tmp_path / f"error_{i}.txt").read_text()
+
+
+@pytest.mark.parametrize("count", [1, 4, 5, 20, 33, 64, 65, 100, 1000, 10_000])
+def test_blocks_waste_little_and_have_few_sizes(count):
+    size = block_size(count)
+    filled = count + -count % size
+    assert size <= MOST
+    assert size in SIZES or count > MOST
+    assert filled - count <= max(3, count // 3 if count <= MOST else count // 8)
+    assert block_size(filled) == size  # what is filled up once stays as it is
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_what_is_cut_makes_up_the_whole(axis):
+    rng = np.random.default_rng(1)
+    blocks = Blocks(12, 4)
+    matrix = np.moveaxis(rng.standard_normal((12, 3)), 0, axis)
+    tree = {"matrix": matrix, "whole numbers": np.arange(12), "number": np.float64(2.0)}
+    parts = blocks.cut(tree if axis == 0 else {"matrix": matrix}, axis)
+    assert len(parts.waves) == blocks.number == 3
+    assert {wave["matrix"].shape[axis] for wave in parts.waves} == {4}
+    whole = blocks.whole(Parts(tuple({k: v for k, v in w.items() if k != "number"} for w in parts.waves), axis))
+    for name, values in whole.items():
+        np.testing.assert_array_equal(values, tree[name])
+
+
+def test_blocks_that_do_not_come_out_even_are_told():
+    with pytest.raises(ValueError, match="whole number of blocks"):
+        Blocks(5, 2)
+    campaign = simulated(instrument=NOISE, programme=Programme.cycles(points=40))
+    with pytest.raises(ValueError, match="at least one particle"):
+        calibrate_bayes(campaign, block=0)
+
+
+def test_what_fills_up_counts_for_nothing():
+    tests = select_tests(simulated(instrument=NOISE, programme=Programme.cycles(points=40))).tests
+    filled = filled_up(tests, 3)
+    assert (len(tests), len(filled), count_of(tests), count_of(filled)) == (4, 6, 4, 4)
+    np.testing.assert_array_equal(filled.weight, [1, 1, 1, 1, 0, 0])
+    np.testing.assert_array_equal(filled.force[4:], np.asarray(tests.force)[[3, 3]])
+    np.testing.assert_array_equal(filled_up(tests, 2).weight, np.ones(4))
+
+
+def test_every_block_has_random_numbers_of_its_own():
+    blocks = Blocks(6, 2)
+    keys = np.concatenate([jax.random.key_data(wave) for wave in blocks.keys(jax.random.key(0)).waves])
+    assert keys.shape == (3, 2)
+    assert len(np.unique(keys, axis=0)) == 3
