@@ -34,7 +34,7 @@ from mcc_jax.calibrate import (
     calibrate_bayes,
 )
 from mcc_jax.calibrate.joint._arviz import prior_draws
-from mcc_jax.calibrate.joint._fit import prior_numbers
+from mcc_jax.calibrate.joint._model import prior_numbers
 from mcc_jax.campaign import PAPER_DIAMETERS_UM, particle_batch
 from mcc_jax.geometry import Particle
 from mcc_jax.law import Plastic

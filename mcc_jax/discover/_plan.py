@@ -13,9 +13,9 @@ import numpy as np
 from ..calibrate import JointModel
 from ..calibrate._result import finite
 from ..calibrate.joint._data import Tests, select_tests
-from ..calibrate.joint._fit import JointFit
 from ..calibrate.joint._forward import law_of
 from ..calibrate.joint._linearised import linear_data, summarise
+from ..calibrate.joint._model import JointFit
 from ..calibrate.joint._noise import Noise
 from ..campaign import THRESHOLD_MPA, Campaign, Curve, Metadata
 from ..effects import LIBRARY, Mechanism, present

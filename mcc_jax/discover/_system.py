@@ -25,9 +25,10 @@ from jaxtyping import Array, Float
 from ..calibrate import JointModel
 from ..calibrate.joint._compile import compiled
 from ..calibrate.joint._data import Selection, Tests
-from ..calibrate.joint._fit import JointFit, population_at, prepare
+from ..calibrate.joint._fit import population_at, prepare
 from ..calibrate.joint._forward import law_of, snap
 from ..calibrate.joint._linearised import linear_data
+from ..calibrate.joint._model import JointFit
 from ..calibrate.joint._population import Population, Scatter, moments
 from ..campaign import Campaign, campaign_segments
 from ..effects import Context, ExtendedLaw, Mechanism, Record, record_batch, signatures

@@ -4,11 +4,11 @@ from ._arviz import to_arviz as to_arviz
 from ._arviz import write_posterior as write_posterior
 from ._bayes import BayesCalibration as BayesCalibration
 from ._bayes import calibrate_bayes as calibrate_bayes
-from ._fit import JointModel as JointModel
 from ._least_squares import Identifiability as Identifiability
 from ._least_squares import LeastSquaresCalibration as LeastSquaresCalibration
 from ._least_squares import calibrate_least_squares as calibrate_least_squares
 from ._many import calibrate_many as calibrate_many
+from ._model import JointModel as JointModel
 from ._noise import Noise as Noise
 from ._population import Population as Population
 from ._predictive import PredictedCurves as PredictedCurves

@@ -15,7 +15,8 @@ from ...campaign import THRESHOLD_MPA, Campaign
 from .._result import estimate, finite, misfit_note
 from ._data import Selection, own_misfit
 from ._draws import Length, compile_ahead, draw_fast, draw_joint
-from ._fit import JointFit, JointModel, prepare
+from ._fit import prepare
+from ._model import JointFit, JointModel
 from ._population import COEFFICIENTS, Population
 
 RHAT_MOST = 1.01

@@ -15,8 +15,9 @@ from jaxtyping import Array
 from ._blocks import Blocks, count_of
 from ._compile import compiled
 from ._data import Tests
-from ._fit import JointFit, JointModel, population_at, populations, prior_numbers
+from ._fit import population_at, populations
 from ._mode import Target
+from ._model import JointFit, JointModel, prior_numbers
 from ._noise import Whitening
 from ._nuts import Chains
 from ._population import COEFFICIENTS, Population, Scatter, Summary, laplace

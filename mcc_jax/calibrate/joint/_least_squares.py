@@ -16,7 +16,8 @@ from .._result import estimate, finite, misfit_note
 from ._arrow import Parameters, Solution
 from ._bayes import log_estimate
 from ._data import Selection, Tests, own_misfit
-from ._fit import JointFit, JointModel, population_at, prepare
+from ._fit import population_at, prepare
+from ._model import JointFit, JointModel
 from ._pooled import Pooled, fit_pooled, unpack
 from ._population import COEFFICIENTS
 

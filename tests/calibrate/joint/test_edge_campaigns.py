@@ -234,7 +234,7 @@ def test_no_usable_particle_is_told_by_name(method):
 def test_an_interrupted_fit_does_not_wait_for_what_runs_meanwhile(monkeypatch):
     begun, end = threading.Event(), threading.Event()
 
-    def meanwhile(_):
+    def meanwhile(*_):
         begun.set()
         assert end.wait(60)
 

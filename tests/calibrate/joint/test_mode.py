@@ -12,8 +12,9 @@ from joint_cases import random_summary
 
 from mcc_jax import InputError, JointModel
 from mcc_jax.calibrate.joint import NormalPrior, Priors
-from mcc_jax.calibrate.joint._fit import population_at, prior_numbers
+from mcc_jax.calibrate.joint._fit import population_at
 from mcc_jax.calibrate.joint._mode import PriorNumbers, Target, from_free, most_probable, recentred, to_free
+from mcc_jax.calibrate.joint._model import prior_numbers
 from mcc_jax.calibrate.joint._population import Population
 
 PLAIN = JointModel().scatter
