@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from ..calibrate._result import finite
-from ..calibrate.joint._bayes import ESS_LEAST, PARETO_K_MOST, RHAT_MOST, population_json, unmixed
+from ..calibrate.joint._bayes import ESS_LEAST, RHAT_MOST, population_json, unmixed
 from ..calibrate.joint._compile import compiled
 from ..calibrate.joint._draws import Length, draw_around, newton_steps
 from ..calibrate.joint._fit import population_at
@@ -35,6 +35,7 @@ from ..calibrate.joint._mode import Target, from_free, most_probable, to_free
 from ..calibrate.joint._noise import Whitening
 from ..calibrate.joint._population import Population, Summary, marginal_likelihood
 from ..calibrate.joint._sampling import Exact
+from ..calibrate.joint._weights import PARETO_K_MOST
 from ..effects import ExtendedLaw, Record
 from ._refit import Formula, Refit, effects_of, slices
 from ._system import Base

@@ -9,7 +9,8 @@ from typing import Any, Literal
 import numpy as np
 
 from ..calibrate._result import BAD_MISFIT
-from ..calibrate.joint._bayes import ESS_LEAST, PARETO_K_MOST, RHAT_MOST
+from ..calibrate.joint._bayes import ESS_LEAST, RHAT_MOST
+from ..calibrate.joint._weights import PARETO_K_MOST
 from ._compare import Shown
 from ._numbers import number, percent
 from ._read import Results, checksums_told

@@ -18,11 +18,12 @@ from ._draws import Length, compile_ahead, draw_fast, draw_joint
 from ._fit import prepare
 from ._model import JointFit, JointModel
 from ._population import COEFFICIENTS, Population
+from ._weights import PARETO_K_MOST
 
 RHAT_MOST = 1.01
 ESS_LEAST = 400.0
-PARETO_K_MOST = 0.7
-"""The gate: R-hat at most, bulk ESS at least, no divergence, Pareto k at most (Vehtari et al. 2021, 2024)."""
+"""The gate: R-hat at most, bulk ESS at least, no divergence, Pareto k at most `PARETO_K_MOST` (Vehtari et al. 2021,
+2024)."""
 
 Mode = Literal["fast", "joint"]
 

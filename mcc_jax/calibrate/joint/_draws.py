@@ -15,26 +15,34 @@ from jaxtyping import Array
 from ._blocks import Blocks, count_of
 from ._compile import compiled
 from ._data import Tests
+from ._drawer import RESTLESS, Drawer
 from ._fit import population_at, populations
+from ._large import PROBES, correction, log_densities, sample_weighted
 from ._mode import Target
 from ._model import JointFit, JointModel, prior_numbers
 from ._noise import Whitening
 from ._nuts import Chains
 from ._population import COEFFICIENTS, Population, Scatter, Summary, laplace
 from ._sampling import Exact, draw_particles, sample_joint, sample_population
-from ._weights import diagnostics, ordered_resample, pareto_k, smoothed_weights, unrest
+from ._weights import PARETO_K_MOST, diagnostics, ordered_resample, pareto_k, smoothed_weights, unrest
 
 MOST_CHECKED = 400_000
 """Up to as many draws of single particles, every one is compared with the exact likelihood and the weights are applied;
-of larger campaigns some draws are compared, to know how good each particle's summary is."""
+of larger campaigns some draws are compared, to know how good each particle's summary is, and the population is
+corrected by regression (`_large`)."""
 
-RESTLESS = 0.3
-"""A particle whose weight scatters by more than this share of its mean gets several candidates per draw."""
+CANDIDATES, CANDIDATES_OF_MANY = (16, 64), (4, 16)
+"""How many a restless particle gets: first, and the few that scatter most even then."""
 
-CANDIDATES = (16, 64)
-"""How many: first, and for the few that scatter most even then."""
+RESTLESS_OF_MANY = 0.1
+"""`RESTLESS` where the weights of the others are not applied: a mean of one of these is wrong by at most this share of
+its standard deviation."""
 
-FEW = 4
+LEAST_RATIO = -50.0
+"""Log ratio that counts for a probe at which the exact likelihood vanishes."""
+
+UNSURE = 0.3
+"""Standard error of the correction, in standard deviations of the posterior, from which on a reader is told."""
 
 MOST_PARTICLE_DRAWS = 4_000_000
 """At most as many draws of single particles are kept; of very large campaigns every n-th draw."""
@@ -72,9 +80,13 @@ def compile_ahead(tests: Tests, block: int, model: JointModel, length: Length) -
     # Almost all campaigns pin their coefficients down; the others compile again.
     scatter = replace(model.scatter, newton=0)
     target = Target(prior_numbers(model.beliefs, tests.flatness, tests.weight), quadratic(count), scatter)
-    cast(Any, sample_population).lower(
-        jax.random.key(0), dummy(d), dummy(d, d), target, dummy(), **length._asdict()
-    ).compile()
+    stride = _stride(count_of(tests), length.total)
+    if stride > 1:
+        cast(Any, log_densities).lower(dummy(length.total, d), target).compile()
+    else:
+        cast(Any, sample_population).lower(
+            jax.random.key(0), dummy(d), dummy(d, d), target, dummy(), **length._asdict()
+        ).compile()
     import arviz_stats.base  # noqa: F401  # seconds on a cold machine, so here too
 
     if blocks.mesh is not None:
@@ -82,10 +94,10 @@ def compile_ahead(tests: Tests, block: int, model: JointModel, length: Length) -
     some_tests = jax.tree.map(lambda x: x[:block], tests)
     filters = eqx.filter_vmap(Whitening)(*(dummy(block, points) for _ in range(4)), some_tests.branch)
     exact = Exact(some_tests, filters, quadratic(block), scatter, model.zero_sd, model.unloading)
-    several = dummy(len(range(0, length.total, _stride(count_of(tests), length.total))))
+    several = dummy(length.total if stride == 1 else PROBES)
     triple = dummy(*several.shape, 3)
     some = eqx.filter_vmap(Population)(several, several, triple, triple, several, several, several)
-    cast(Any, draw_particles).lower(jax.random.key(0)[None], some, exact, 1).compile()
+    cast(Any, draw_particles).lower(jax.random.key(0)[None], some, exact, 1, dummy() > 2).compile()
 
 
 SHARP = 0.03
@@ -132,64 +144,65 @@ def draw_around(
     """
     tests, scatter = exact.tests, exact.scatter
     population_key, particle_key, check_key, pick_key = jax.random.split(key, 4)
-    run, population = _settled(population_key, mode, covariance, target, length)
-    count = count_of(tests)
-    stride = _stride(count, length.total)
-    blocks = Blocks(len(tests), block)
-    own = blocks.cut(exact)
-
-    def drawn(key: Array, population: Population, candidates: int = 1) -> list[np.ndarray]:
-        found = blocks.each(draw_particles, blocks.keys(key), population, own, candidates, axis=1)
-        return [np.array(np.asarray(v)[:, :count]) for v in blocks.whole(found)]
-
-    checked = drawn(check_key, _every(population, stride))
-    ratio = checked[3]
-    k = pareto_k(ratio)
-    restless = np.flatnonzero(unrest(ratio) > RESTLESS)
-    applied = stride == 1
-    notes: list[str] = []
+    stride = _stride(count_of(tests), length.total)
+    drawer = Drawer(exact, block, None if stride == 1 else PROBES)
+    run, population = _sampled(population_key, mode, covariance, target, length, stride > 1)
     names, stacked = _stack(population, scatter, length)
-    keep, joint = 1, None
+    checked = drawer.all(check_key, _every(population, stride))
+    k = pareto_k(np.asarray(checked.log_ratio))
+    applied, keep, notes = stride == 1, 1, ()
+    scatters = unrest(np.asarray(checked.log_ratio)) > (RESTLESS if applied else RESTLESS_OF_MANY)
+    restless = np.flatnonzero(scatters | (k > PARETO_K_MOST))
     if applied:
-        latent, zero, likelihood, ratio = checked
-        for candidates in CANDIDATES:
-            if not len(restless):
-                break
-            # Always of one of a few sizes, the first one repeated: every size would be compiled anew.
-            size = min(count, 4 ** int(np.ceil(np.log(max(len(restless), 2)) / np.log(4))))
-            padded = np.concatenate([restless, np.full(size - len(restless), restless[0])])
-            # They are few: every process draws all of them.
-            more = draw_particles(
-                jax.random.fold_in(pick_key, candidates)[None], population, exact.some(jnp.asarray(padded)), candidates
-            )
-            better = [np.asarray(v)[:, : len(restless)] for v in more]
-            latent[:, restless], zero[:, restless], ratio[:, restless] = better[0], better[1], better[3]
-            k[restless] = pareto_k(ratio[:, restless])
-            restless = restless[np.argsort(-unrest(ratio[:, restless]))][:FEW]
-            restless = restless[unrest(ratio[:, restless]) > RESTLESS]
-        weight, joint = smoothed_weights(ratio.sum(1))
-        rows = (slice(c * length.draws, (c + 1) * length.draws) for c in range(length.chains))
-        chosen = np.concatenate([row.start + ordered_resample(weight[row], length.draws) for row in rows])
-        population = jax.tree.map(lambda x: np.asarray(x)[chosen], population)
-        latent, zero, likelihood = latent[chosen], zero[chosen], likelihood[chosen]
-        stacked = stacked.reshape(length.total, -1)[chosen].reshape(stacked.shape)
+        particles = checked
+        drawer.settle(pick_key, particles, population, k, restless, CANDIDATES)
+        chosen, joint = _resampled(np.asarray(particles.log_ratio).sum(1), length)
+        particles = jax.tree.map(lambda x: x[chosen], particles)
     else:
-        if len(restless):
-            affected = ", ".join(str(i) for i in restless[:5])
-            notes.append(f"{len(restless)} particles are far from their quadratic summary (positions {affected}, ...)")
-        keep = max(1, -(-length.total * count // MOST_PARTICLE_DRAWS))
-        latent, zero, likelihood, _ = drawn(particle_key, _every(population, keep), 0)
+
+        def total(which: int, rows: np.ndarray) -> np.ndarray:
+            probes, own = _every(population, rows), jax.random.fold_in(check_key, which)
+            ratio = np.asarray(drawer.all(own, probes, common=True).log_ratio)
+            if len(restless):
+                ratio[:, restless] = drawer.some(own, restless, probes, CANDIDATES_OF_MANY[0], common=True).log_ratio
+            return np.maximum(ratio, LEAST_RATIO).sum(1)
+
+        log_weight, error = correction(total, stacked.reshape(length.total, -1))
+        if error > UNSURE:
+            notes = (f"the population's means are uncertain by {error:.2f} standard deviations of their posterior",)
+        chosen, joint = _resampled(log_weight, length)
+        keep = max(1, -(-length.total * drawer.count // MOST_PARTICLE_DRAWS))
+        some = _every(_every(population, chosen), keep)
+        particles = drawer.all(particle_key, some, 0)
+        drawer.settle(pick_key, particles, some, k, restless, CANDIDATES_OF_MANY)
+    stacked = stacked.reshape(length.total, -1)[chosen].reshape(stacked.shape)
     return {
-        **_fields(run, population, names, stacked, (latent, zero, likelihood), tests, model, length, keep),
+        **_fields(run, _every(population, chosen), names, stacked, particles[:3], tests, model, length, keep),
         "pareto_k": k,
         "pareto_k_joint": joint,
         "weights_applied": applied,
-        "notes": tuple(notes),
+        "notes": notes,
     }
 
 
-def _settled(key: Array, mode: Array, covariance: Array, target: Target, length: Length) -> tuple[Chains, Population]:
-    """The sampler's run and its populations, with smaller steps if any trajectory diverged."""
+def _resampled(log_weight: np.ndarray, length: Length) -> tuple[np.ndarray, float]:
+    """Which draws stand for the weighted ones, in order within each chain, and the Pareto k of the weights."""
+    weight, k = smoothed_weights(log_weight)
+    rows = (slice(c * length.draws, (c + 1) * length.draws) for c in range(length.chains))
+    return np.concatenate([row.start + ordered_resample(weight[row], length.draws) for row in rows]), k
+
+
+def _sampled(
+    key: Array, mode: Array, covariance: Array, target: Target, length: Length, many: bool
+) -> tuple[Chains, Population]:
+    """Draws of the population: of many particles weighted ones, if they are good enough, else the sampler's.
+
+    If any trajectory diverged, the sampler runs again with smaller steps.
+    """
+    if many:
+        found = sample_weighted(key, mode, covariance, target, chains=length.chains, draws=length.draws)
+        if found is not None:
+            return found
 
     def run(accept: float) -> tuple[Chains, Population]:
         # From an array, not from a Python number: a weak type would be compiled anew after `compile_ahead`.
@@ -268,8 +281,10 @@ def _particles(
     return {"C": C, "modulus_MPa": modulus, "zero_um": zero.reshape(chains, -1, count), "shape_factor": eta}
 
 
-def _every(population: Population, stride: int) -> Population:
-    return jax.tree.map(lambda x: x[::stride], population)
+def _every(population: Population, which: int | np.ndarray) -> Population:
+    """Every so-many-th draw, or those at given positions."""
+    rows = slice(None, None, which) if isinstance(which, int) else which
+    return jax.tree.map(lambda x: np.asarray(x)[rows], population)
 
 
 def _stack(population: Population, scatter: Scatter, length: Length) -> tuple[list[str], np.ndarray]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -13,11 +14,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...campaign import Campaign
+from ...law import Unloading
 from .._predict import point_noise_um
 from ._blocks import Blocks, Parts, block_size, count_of, filled_up, require_same
 from ._compile import compiled
 from ._data import Selection, Tests, select_tests
-from ._individual import Particles, fit_particles, linear_starts
+from ._individual import FIRST_STEPS, MOST_STEPS, Particles, fit_particles, linear_starts
 from ._linearised import expected_latent, linear_data, summarise
 from ._mode import PriorNumbers, Target, from_free, most_probable, recentred, to_free
 from ._model import JointFit, JointModel, log_C3, prior_numbers
@@ -31,6 +33,10 @@ what keeps a coefficient finite about which its curve says nothing."""
 
 LEAST_WIDTH = 1e-3
 """Least such standard deviation under the population: any smaller and the problem is badly scaled."""
+
+NOISE_BLOCKS = 4
+"""The noise of campaigns of more blocks is estimated from the particles of so many, spread evenly over the campaign:
+fifty thousand points say enough about four numbers."""
 
 ROUNDS = 2
 """Noise, population and particles depend on each other a little: how often they are taken in turn."""
@@ -121,9 +127,9 @@ def fit_joint(
     blocks = Blocks(N, block)
     own = blocks.cut(tests)
 
-    def fitted(sizes: Any, middle: Any, width: Any, starts: Any) -> Particles:
-        sizes, middle, width = (blocks.cut(jnp.asarray(v)) for v in (sizes, middle, width))
-        return blocks.whole(blocks.each(fit_particles, own, sizes, middle, width, zero_sd, starts, model.unloading))
+    def fitted(sizes: Any, middle: Any, width: Any, starts: Parts) -> Particles:
+        arrays = (jnp.asarray(sizes), jnp.asarray(middle), jnp.asarray(width))
+        return _fitted(blocks, tests, own, arrays, zero_sd, starts, model.unloading)
 
     starts = blocks.each(linear_starts, own, jnp.asarray(centre[0, 3]), axis=1)
     individual = fitted(np.full(N, read_out), centre, np.full((N, 4), WIDE), starts)
@@ -150,9 +156,16 @@ def fit_joint(
             noise = Noise(jnp.asarray(max(width, 1e-9)), none, none, jnp.asarray(1.0), jnp.asarray(np.ones(N)))
         elif turn < rounds:
             tell("estimating the noise")
-            noise, log_sd, noise_converged = estimate_noise(
-                data, priors.noise, noise, uncertainty=turn == rounds - 1, blocks=blocks
+            chosen, some, start = blocks, data, noise
+            if blocks.number > NOISE_BLOCKS:
+                rows = np.linspace(0, count - 1, NOISE_BLOCKS * blocks.size).astype(int)
+                chosen, start = Blocks(len(rows), blocks.size), replace(noise, scale=noise.scale[rows])
+                at_rows = (chosen.cut(v) for v in _rows((latent, zero, tests), rows))
+                some = chosen.each(linear_data, *at_rows, zero_sd, model.unloading)
+            four, log_sd, noise_converged = estimate_noise(
+                some, priors.noise, start, uncertainty=turn == rounds - 1, blocks=chosen
             )
+            noise = replace(four, scale=noise.scale)
         summary, filtered = summarised(at, data, noise)
         if correlated and turn < rounds:
             old = np.asarray(noise.scale)
@@ -186,6 +199,49 @@ def fit_joint(
     return JointFit(
         individual, noise, log_sd, filters, latent, zero, residual, summary, free, covariance, numbers, converged
     )
+
+
+def _rows(tree: Any, rows: np.ndarray) -> Any:
+    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[rows]), tree)
+
+
+def _fitted(
+    blocks: Blocks,
+    tests: Tests,
+    own: Parts,
+    arrays: tuple[Array, Array, Array],
+    zero_sd: Array,
+    starts: Parts,
+    unloading: Unloading,
+) -> Particles:
+    """Every particle by itself, all blocks; what is late in many of them goes on in blocks of its own.
+
+    A block takes as long as its slowest particle, and nearly every block has one that is slow.
+
+    Args:
+        blocks: how the particles are cut.
+        tests: of all particles.
+        own: of this process.
+        arrays: noise, centre and width, as in `fit_particles`.
+        zero_sd, starts, unloading: as there.
+    """
+
+    def fit(blocks: Blocks, own: Parts, arrays: Iterable[Array], starts: Parts, most_steps: int) -> Particles:
+        cut = (blocks.cut(v) for v in arrays)
+        steps = jnp.asarray(np.asarray(most_steps))
+        return blocks.whole(blocks.each(fit_particles, own, *cut, zero_sd, starts, unloading, steps))
+
+    if blocks.whole_here:
+        return fit(blocks, own, arrays, starts, MOST_STEPS)
+    found = fit(blocks, own, arrays, starts, FIRST_STEPS)
+    late = np.flatnonzero(~np.asarray(found.settled))
+    if not len(late):
+        return found
+    rows = np.pad(late, (0, -len(late) % blocks.size), mode="edge")
+    few = Blocks(len(rows), blocks.size)
+    ends = few.cut(np.moveaxis(np.asarray(found.ends)[rows], 1, 0), axis=1)
+    again = fit(few, few.cut(_rows(tests, rows)), _rows(arrays, rows), ends, MOST_STEPS)
+    return jax.tree.map(lambda x, y: x.at[late].set(y[: len(late)]), found, again)
 
 
 def _centre(priors: Priors) -> np.ndarray:

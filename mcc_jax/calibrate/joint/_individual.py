@@ -5,7 +5,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..._types import Path, Scalar
 from ...geometry import Particle
@@ -22,7 +22,8 @@ SPREAD = 0.04
 VARIATIONS = ((0.0, 0.0, 0.0), (0.05, -0.1, 0.03), (-0.05, 0.06, -0.02))
 """What is added to the linear start's b1, b3, b5 for further starts."""
 
-MOST_STEPS = 60
+MOST_STEPS, FIRST_STEPS = 60, 10
+"""Most steps of a fit, and how many all particles of many blocks take before the late ones go on by themselves."""
 
 LEFT_TO_GAIN = 1e-6
 """Log probability still to gain at which a fit is finished, where residuals are as large as the noise."""
@@ -36,12 +37,16 @@ class Particles(eqx.Module):
         zero: zero of displacement [um].
         rms: root mean square residual [um].
         converged: whether the best start's fit met its tolerances.
+        ends: where the fit from each start ended: b1, b3, b5, e and zero.
+        settled: whether the fits from all starts met their tolerances.
     """
 
     latent: Float[Array, "particles 4"]
     zero: Float[Array, " particles"]
     rms: Float[Array, " particles"]
     converged: Bool[Array, " particles"]
+    ends: Float[Array, "particles starts 5"]
+    settled: Bool[Array, " particles"]
 
 
 def _polynomial(x: Path, stress: Path, weight: Path) -> Float[Array, " 3"]:
@@ -107,6 +112,7 @@ def fit_particles(
     zero_sd: Scalar,
     starts: Float[Array, "starts particles 5"],
     unloading: Unloading,
+    most_steps: int | Int[Array, ""] = MOST_STEPS,
 ) -> Particles:
     """Fit every particle by itself, its modulus included, from several starts.
 
@@ -120,6 +126,7 @@ def fit_particles(
         zero_sd: how far the zero may lie from the recorded contact [um].
         starts: b1, b3, b5, e and zero to start from.
         unloading: form of unloading.
+        most_steps: give up after as many.
     """
     count = len(starts)
 
@@ -165,7 +172,7 @@ def fit_particles(
     # The first pass evaluates the start: an infinite loss accepts whatever comes, and no force moves it.
     carry = (y, jnp.full(len(y), jnp.inf), jnp.zeros((len(y), 5)), jnp.broadcast_to(jnp.eye(5), (len(y), 5, 5)))
     carry = (*carry, jnp.full(len(y), 1e-3), 0, unfinished)
-    going = lambda c: (c[5] < 2) | ((c[5] < MOST_STEPS) & ~jnp.all(c[6]))  # noqa: E731  # a condition, no function
+    going = lambda c: (c[5] < 2) | ((c[5] < most_steps) & ~jnp.all(c[6]))  # noqa: E731  # a condition, no function
     y, loss, _, _, _, _, done = jax.lax.while_loop(going, step, carry)
     y, loss, done = (v.reshape(count, len(tests), *v.shape[1:]) for v in (y, loss, done))
     best = jnp.argmin(loss, axis=0)
@@ -175,4 +182,4 @@ def fit_particles(
 
     found = take(y)
     rms = noise * jnp.sqrt(2 * take(loss) / points[: len(tests)])
-    return Particles(found[:, :4], found[:, 4], rms, take(done))
+    return Particles(found[:, :4], found[:, 4], rms, take(done), jnp.moveaxis(y, 0, 1), jnp.all(done, 0))

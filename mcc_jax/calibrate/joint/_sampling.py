@@ -16,7 +16,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
 from ..._types import Scalar
 from ...law import Unloading
@@ -137,12 +137,17 @@ class Exact(eqx.Module):
         return -0.5 * (jnp.exp(-2 * population.log_noise) * total + at_zero) - points * population.log_noise
 
 
+ROWS, ROWS_OF_ACCELERATORS = 640, 40_000
+"""Single draws of single particles worked on at once: a processor keeps no more in its cache."""
+
+
 @compiled
 def draw_particles(
     keys: Key[Array, " 1"],
     population: Population,
     exact: Exact,
     candidates: int = 1,
+    common: bool | Bool[Array, ""] = False,
 ) -> ParticleDraws:
     """Draw the particles' parameters given each draw of the population, and compare with the exact likelihood.
 
@@ -151,6 +156,7 @@ def draw_particles(
         population: draws, every field with a leading axis.
         exact: the tests.
         candidates: how many to draw and choose from; 0 draws one and does not look at the exact likelihood.
+        common: use the same random numbers for every draw of the population.
     """
     draws = population.a.shape[0]
     count = len(exact.tests)
@@ -184,8 +190,10 @@ def draw_particles(
 
         return ParticleDraws(take(latent), take(zero), likelihood[0], mean)
 
-    batch = max(1, min(draws, 40_000 // (count * max(candidates, 1))))
-    return jax.lax.map(one, (jax.random.split(keys[0], draws), population), batch_size=batch)
+    rows = ROWS if jax.default_backend() == "cpu" else ROWS_OF_ACCELERATORS
+    batch = max(1, min(draws, rows // (count * max(candidates, 1))))
+    each = jnp.where(common, keys, jax.random.split(keys[0], draws))
+    return jax.lax.map(one, (each, population), batch_size=batch)
 
 
 @compiled

@@ -6,6 +6,9 @@ from typing import Any
 
 import numpy as np
 
+PARETO_K_MOST = 0.7
+"""Pareto k of importance weights above which they are not to be relied on (Vehtari et al. 2024)."""
+
 
 def diagnostics(names: list[str], draws: np.ndarray) -> tuple[dict[str, float], dict[str, float], dict[str, float]]:
     """R-hat, bulk and tail ESS by name, of draws with the axes (chain, draw, name)."""
@@ -57,6 +60,11 @@ def smoothed_weights(log_weight: np.ndarray) -> tuple[np.ndarray, float]:
         smooth, k = finite_weight, np.inf
     weight = np.exp(np.maximum(np.asarray(smooth) - np.max(smooth), -700.0))
     return weight / weight.sum(), float(k) if np.isfinite(k) else float("inf")
+
+
+def effective_share(weight: np.ndarray) -> float:
+    """Effective number of draws with normalised weights, as a share of their number."""
+    return float(1 / (len(weight) * np.sum(weight**2)))
 
 
 def ordered_resample(weight: np.ndarray, count: int) -> np.ndarray:

@@ -1,0 +1,143 @@
+r"""Populations of many particles, whose posterior is sharp and nearly normal: two shortcuts, both checked.
+
+The more particles, the dearer a gradient of the population's density and the closer that density to a normal one.
+So instead of many thousand gradients along trajectories, independent draws :math:`\theta_s` of a Student distribution
+around the mode are weighted,
+
+.. math:: w_s \propto p(\theta_s \mid \text{tests}) / q(\theta_s)
+
+and the proposal is fitted to its own weighted draws until the weights' Pareto k and effective size say that it is good
+enough (Cappe et al. 2004; Vehtari et al. 2024). If they never do, the sampler runs as for few particles.
+
+The exact weight of a draw is the product of all particles' ratios of exact to quadratic likelihood. Of many particles
+the product scatters far more than it says: nearly all of its scatter is that of the particles' own draws. With the same
+random numbers for every draw of the population that scatter cancels, and what is left of
+
+.. math:: T(\theta) = \sum_i \log r_i(\theta)
+
+is smooth in :math:`\theta`, and linear over the little that the posterior leaves open: some tens of draws tell it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import product
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ._compile import compiled
+from ._mode import Target
+from ._nuts import Chains
+from ._population import Population
+from ._weights import effective_share, ordered_resample, smoothed_weights
+
+MANY = 256
+"""From so many particles on the shortcuts are tried. Below, trajectories are cheap, and the draws of all particles can
+be weighted one by one."""
+
+FREEDOM = 10
+"""Degrees of freedom of the Student proposal: its tails are wider than the posterior's."""
+
+ROUNDS = 5
+"""How often the proposal may be fitted anew."""
+
+GOOD_K, GOOD_SHARE = 0.5, 0.6
+"""Largest Pareto k, and least effective share of the draws, with which weighted draws replace the sampler's."""
+
+FIRST_SPREAD = 6
+"""Position of the first spread among the coordinates (`_mode.from_free`)."""
+
+AT_ONCE = 4096
+"""Particles times draws worked on at once: so many numbers of each kind stay in a processor's cache."""
+
+
+@compiled
+def log_densities(free: Float[Array, "many d"], target: Target) -> Float[Array, " many"]:
+    """Log density of the population at many coordinates."""
+    return jax.lax.map(target.log_density, free, batch_size=max(1, AT_ONCE // len(target.flatness)))
+
+
+@compiled
+def _populations(free: Float[Array, "many d"], target: Target) -> Population:
+    return jax.vmap(target.population)(free)
+
+
+def sample_weighted(
+    key: Array, mode: Array, covariance: Array, target: Target, *, chains: int, draws: int
+) -> tuple[Chains, Population] | None:
+    """Draws of the population by importance resampling, in the sampler's form; None if the weights are not good enough.
+
+    A spread's coordinate may have either sign for the same spread: proposal and draws are folded to positive ones.
+
+    Args:
+        key: random key.
+        mode, covariance: of the population in unbounded coordinates.
+        target: its density.
+        chains, draws: shape of what is returned; each chain is resampled from proposals of its own.
+    """
+    from scipy.special import logsumexp
+    from scipy.stats import multivariate_t
+
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+    spreads = np.arange(len(mode))[FIRST_SPREAD : FIRST_SPREAD + target.scatter.size]
+    signs = np.ones((2 ** len(spreads), len(mode)))
+    signs[:, spreads] = list(product((1.0, -1.0), repeat=len(spreads)))
+
+    def folded(free: np.ndarray) -> np.ndarray:
+        free[..., spreads] = np.abs(free[..., spreads])
+        return free
+
+    centre, width = folded(np.array(mode)), np.asarray(covariance)
+    for _ in range(ROUNDS):
+        proposal = multivariate_t(centre, width * (1 - 2 / FREEDOM), FREEDOM)
+        free = folded(proposal.rvs(chains * draws, random_state=rng))
+        log_weight = np.asarray(log_densities(jnp.asarray(free), target))
+        log_weight = log_weight - logsumexp(proposal.logpdf(free[:, None] * signs), axis=1)
+        weight, k = smoothed_weights(log_weight)
+        if k <= GOOD_K and effective_share(weight) >= GOOD_SHARE:
+            rows = [slice(c * draws, (c + 1) * draws) for c in range(chains)]
+            free = np.concatenate([free[row][ordered_resample(weight[row], draws)] for row in rows])
+            still = np.zeros((chains, draws), int)
+            run = Chains(free.reshape(chains, draws, -1), still.astype(bool), still, np.zeros(chains))
+            return run, jax.tree.map(np.asarray, _populations(jnp.asarray(free), target))
+        centre = weight @ free
+        width = (free - centre).T @ (weight[:, None] * (free - centre)) + 1e-12 * np.diag(np.diagonal(width))
+    return None
+
+
+class Correction(NamedTuple):
+    """What the exact likelihood adds to the log density of the population.
+
+    Attributes:
+        log_weight: of every draw, up to a constant.
+        error: standard error of its slope, in standard deviations of the posterior by which it would move the means.
+    """
+
+    log_weight: np.ndarray
+    error: float
+
+
+PROBES = 25
+"""Draws of the population at which the sum of all particles' log ratios is worked out."""
+
+
+def correction(total: Callable[[int, np.ndarray], np.ndarray], draws: np.ndarray) -> Correction:
+    """Regression of the sum of log ratios on the population's parameters, and its prediction for every draw.
+
+    Args:
+        total: the sums at the given rows of `draws`, all with the same random numbers, which depend on the first
+            argument: 0 or 1.
+        draws: of the parameters, shape (draws, parameters).
+    """
+    rows = np.unique(np.linspace(0, len(draws) - 1, PROBES).astype(int))
+    unit, values, _ = np.linalg.svd(draws - draws.mean(0), full_matrices=False)
+    # Uncorrelated and of standard deviation 1, so that a slope is the shift of a mean in standard deviations.
+    white = unit[:, values > 1e-9 * values[0]] * np.sqrt(len(draws))
+    design = np.concatenate([np.ones((len(rows), 1)), white[rows]], 1)
+    slopes = np.stack([np.linalg.lstsq(design, total(which, rows), rcond=None)[0][1:] for which in (0, 1)])
+    # Two estimates from independent random numbers: half their difference is the standard error of their mean.
+    return Correction(white @ slopes.mean(0), float(np.linalg.norm(slopes[0] - slopes[1]) / 2))
