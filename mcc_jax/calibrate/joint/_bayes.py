@@ -13,8 +13,9 @@ import numpy as np
 
 from ...campaign import THRESHOLD_MPA, Campaign
 from .._result import estimate, finite, misfit_note
+from ._ahead import compile_ahead
 from ._data import Selection, own_misfit
-from ._draws import Length, compile_ahead, draw_fast, draw_joint
+from ._draws import Length, draw_fast, draw_joint
 from ._fit import prepare
 from ._model import JointFit, JointModel
 from ._population import COEFFICIENTS, Population

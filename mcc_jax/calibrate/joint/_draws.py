@@ -6,24 +6,22 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple, cast
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ._blocks import Blocks, count_of
+from ._blocks import count_of
 from ._compile import compiled
 from ._data import Tests
 from ._drawer import RESTLESS, Drawer
 from ._fit import population_at, populations
-from ._large import PROBES, correction, log_densities, sample_weighted
+from ._large import PROBES, correction, evenly, sample_weighted
 from ._mode import Target
-from ._model import JointFit, JointModel, prior_numbers
-from ._noise import Whitening
+from ._model import JointFit, JointModel
 from ._nuts import Chains
-from ._population import COEFFICIENTS, Population, Scatter, Summary, laplace
-from ._sampling import Exact, draw_particles, sample_joint, sample_population
+from ._population import COEFFICIENTS, Population, Scatter, laplace
+from ._sampling import Exact, ParticleDraws, sample_joint, sample_population
 from ._weights import PARETO_K_MOST, diagnostics, ordered_resample, pareto_k, smoothed_weights, unrest
 
 MOST_CHECKED = 400_000
@@ -31,7 +29,7 @@ MOST_CHECKED = 400_000
 of larger campaigns some draws are compared, to know how good each particle's summary is, and the population is
 corrected by regression (`_large`)."""
 
-CANDIDATES, CANDIDATES_OF_MANY = (16, 64), (4, 16)
+CANDIDATES, CANDIDATES_OF_MANY = (16, 64), (2, 16)
 """How many a restless particle gets: first, and the few that scatter most even then."""
 
 RESTLESS_OF_MANY = 0.1
@@ -64,42 +62,6 @@ class Length(NamedTuple):
         return self.chains * self.draws
 
 
-def compile_ahead(tests: Tests, block: int, model: JointModel, length: Length) -> None:
-    """Compile what is needed last while the first steps run: the same functions, for arrays of the same shapes."""
-    count, points = tests.force.shape
-    d = 6 + model.scatter.size
-    blocks = Blocks(count, block)
-
-    def dummy(*shape: int) -> Array:
-        return jnp.asarray(np.ones(shape))
-
-    def quadratic(count: int) -> Summary:
-        one, four = dummy(count), dummy(count, 4)
-        return Summary(four, dummy(count, 4, 4), four, one, one, one, four, one)
-
-    # Almost all campaigns pin their coefficients down; the others compile again.
-    scatter = replace(model.scatter, newton=0)
-    target = Target(prior_numbers(model.beliefs, tests.flatness, tests.weight), quadratic(count), scatter)
-    stride = _stride(count_of(tests), length.total)
-    if stride > 1:
-        cast(Any, log_densities).lower(dummy(length.total, d), target).compile()
-    else:
-        cast(Any, sample_population).lower(
-            jax.random.key(0), dummy(d), dummy(d, d), target, dummy(), **length._asdict()
-        ).compile()
-    import arviz_stats.base  # noqa: F401  # seconds on a cold machine, so here too
-
-    if blocks.mesh is not None:
-        return  # for several devices it is another function
-    some_tests = jax.tree.map(lambda x: x[:block], tests)
-    filters = eqx.filter_vmap(Whitening)(*(dummy(block, points) for _ in range(4)), some_tests.branch)
-    exact = Exact(some_tests, filters, quadratic(block), scatter, model.zero_sd, model.unloading)
-    several = dummy(length.total if stride == 1 else PROBES)
-    triple = dummy(*several.shape, 3)
-    some = eqx.filter_vmap(Population)(several, several, triple, triple, several, several, several)
-    cast(Any, draw_particles).lower(jax.random.key(0)[None], some, exact, 1, dummy() > 2).compile()
-
-
 SHARP = 0.03
 """Posterior standard deviation of the logarithm of a polynomial's coefficient below which one Newton step is enough."""
 
@@ -115,7 +77,7 @@ def newton_steps(fit: JointFit, tests: Tests, model: JointModel) -> int:
     return 0 if widest < SHARP else 4
 
 
-def _stride(count: int, total: int) -> int:
+def stride_of(count: int, total: int) -> int:
     """Every how many-th draw is compared with the exact likelihood: all of them for few particles."""
     return max(1, -(-total * count // MOST_CHECKED))
 
@@ -144,45 +106,93 @@ def draw_around(
     """
     tests, scatter = exact.tests, exact.scatter
     population_key, particle_key, check_key, pick_key = jax.random.split(key, 4)
-    stride = _stride(count_of(tests), length.total)
-    drawer = Drawer(exact, block, None if stride == 1 else PROBES)
-    run, population = _sampled(population_key, mode, covariance, target, length, stride > 1)
+    few = stride_of(count_of(tests), length.total) == 1
+    run, population = _sampled(population_key, mode, covariance, target, length, not few)
     names, stacked = _stack(population, scatter, length)
-    checked = drawer.all(check_key, _every(population, stride))
-    k = pareto_k(np.asarray(checked.log_ratio))
-    applied, keep, notes = stride == 1, 1, ()
-    scatters = unrest(np.asarray(checked.log_ratio)) > (RESTLESS if applied else RESTLESS_OF_MANY)
-    restless = np.flatnonzero(scatters | (k > PARETO_K_MOST))
-    if applied:
-        particles = checked
-        drawer.settle(pick_key, particles, population, k, restless, CANDIDATES)
-        chosen, joint = _resampled(np.asarray(particles.log_ratio).sum(1), length)
-        particles = jax.tree.map(lambda x: x[chosen], particles)
+    flat = stacked.reshape(length.total, -1)
+    if few:
+        found = _weighted(Drawer(exact, block), population, length, check_key, pick_key)
     else:
-
-        def total(which: int, rows: np.ndarray) -> np.ndarray:
-            probes, own = _every(population, rows), jax.random.fold_in(check_key, which)
-            ratio = np.asarray(drawer.all(own, probes, common=True).log_ratio)
-            if len(restless):
-                ratio[:, restless] = drawer.some(own, restless, probes, CANDIDATES_OF_MANY[0], common=True).log_ratio
-            return np.maximum(ratio, LEAST_RATIO).sum(1)
-
-        log_weight, error = correction(total, stacked.reshape(length.total, -1))
-        if error > UNSURE:
-            notes = (f"the population's means are uncertain by {error:.2f} standard deviations of their posterior",)
-        chosen, joint = _resampled(log_weight, length)
-        keep = max(1, -(-length.total * drawer.count // MOST_PARTICLE_DRAWS))
-        some = _every(_every(population, chosen), keep)
-        particles = drawer.all(particle_key, some, 0)
-        drawer.settle(pick_key, particles, some, k, restless, CANDIDATES_OF_MANY)
-    stacked = stacked.reshape(length.total, -1)[chosen].reshape(stacked.shape)
+        keys = check_key, pick_key, particle_key
+        found = _corrected(Drawer(exact, block, PROBES), population, flat, length, *keys)
+    stacked, population = flat[found.chosen].reshape(stacked.shape), _every(population, found.chosen)
+    particles = found.particles[:3]
     return {
-        **_fields(run, _every(population, chosen), names, stacked, particles[:3], tests, model, length, keep),
-        "pareto_k": k,
-        "pareto_k_joint": joint,
-        "weights_applied": applied,
-        "notes": notes,
+        **_fields(run, population, names, stacked, particles, tests, model, length, found.keep),
+        "pareto_k": found.k,
+        "pareto_k_joint": found.k_joint,
+        "weights_applied": few,
+        "notes": found.notes,
     }
+
+
+class _Drawn(NamedTuple):
+    """Particles drawn back.
+
+    Attributes:
+        chosen: which draws of the population stand for the weighted ones.
+        particles: under every `keep`-th of these.
+        k: Pareto k of every particle's weights.
+        k_joint: of the population's.
+        keep: see `particles`.
+        notes: what a reader must know.
+    """
+
+    chosen: np.ndarray
+    particles: ParticleDraws
+    k: np.ndarray
+    k_joint: float
+    keep: int = 1
+    notes: tuple[str, ...] = ()
+
+
+def _weighted(drawer: Drawer, population: Population, length: Length, check_key: Array, pick_key: Array) -> _Drawn:
+    """Few particles: the weight of a draw is the product of all particles' ratios of exact to quadratic likelihood."""
+    particles = drawer.all(check_key, population)
+    ratio = np.asarray(particles.log_ratio)
+    k = pareto_k(ratio)
+    restless = np.flatnonzero((unrest(ratio) > RESTLESS) | (k > PARETO_K_MOST))
+    drawer.settle(pick_key, particles, population, k, restless, CANDIDATES)
+    chosen, k_joint = _resampled(ratio.sum(1), length)
+    return _Drawn(chosen, jax.tree.map(lambda x: x[chosen], particles), k, k_joint)
+
+
+def _corrected(
+    drawer: Drawer,
+    population: Population,
+    parameters: np.ndarray,
+    length: Length,
+    check_key: Array,
+    pick_key: Array,
+    particle_key: Array,
+) -> _Drawn:
+    """Many particles: the draws of the population are weighted by regression (`_large.correction`).
+
+    Of each particle some draws are compared with the exact likelihood. Those whose weights scatter are drawn from
+    several candidates; of the others the draws are left as they are.
+    """
+    checks = PROBES * max(2, MOST_CHECKED // (PROBES * drawer.count))
+    ratio = np.asarray(drawer.all(check_key, _every(population, evenly(length.total, checks))).log_ratio)
+    scatter, k = unrest(ratio), pareto_k(ratio)
+    # Of a likelihood that ends at a cliff, single candidates fall off it as the population moves.
+    wild = np.flatnonzero(scatter > RESTLESS)
+
+    def total(which: int, rows: np.ndarray) -> np.ndarray:
+        probes, own = _every(population, rows), jax.random.fold_in(check_key, which)
+        ratio = np.asarray(drawer.all(own, probes, common=True).log_ratio)
+        if len(wild):
+            ratio[:, wild] = drawer.some(own, wild, probes, CANDIDATES[-1], common=True).log_ratio
+        return np.maximum(ratio, LEAST_RATIO).sum(1)
+
+    log_weight, error = correction(total, parameters)
+    notes = (f"the means of the population are known to {error:.2f} of their standard deviations only",)
+    chosen, k_joint = _resampled(log_weight, length)
+    keep = max(1, -(-length.total * drawer.count // MOST_PARTICLE_DRAWS))
+    some = _every(_every(population, chosen), keep)
+    particles = drawer.all(particle_key, some, 0)
+    restless = np.flatnonzero((scatter > RESTLESS_OF_MANY) | (k > PARETO_K_MOST))
+    drawer.settle(pick_key, particles, some, k, restless, CANDIDATES_OF_MANY)
+    return _Drawn(chosen, particles, k, k_joint, keep, notes if error > UNSURE else ())
 
 
 def _resampled(log_weight: np.ndarray, length: Length) -> tuple[np.ndarray, float]:

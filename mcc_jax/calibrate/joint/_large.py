@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -35,10 +35,6 @@ from ._nuts import Chains
 from ._population import Population
 from ._weights import effective_share, ordered_resample, smoothed_weights
 
-MANY = 256
-"""From so many particles on the shortcuts are tried. Below, trajectories are cheap, and the draws of all particles can
-be weighted one by one."""
-
 FREEDOM = 10
 """Degrees of freedom of the Student proposal: its tails are wider than the posterior's."""
 
@@ -50,6 +46,12 @@ GOOD_K, GOOD_SHARE = 0.5, 0.6
 
 FIRST_SPREAD = 6
 """Position of the first spread among the coordinates (`_mode.from_free`)."""
+
+AT_A_TIME = 250
+"""Draws whose densities are asked for in one go."""
+
+TRIAL = 500
+"""Draws that the proposal is tried on, and fitted to, before all are drawn."""
 
 AT_ONCE = 4096
 """Particles times draws worked on at once: so many numbers of each kind stay in a processor's cache."""
@@ -91,22 +93,50 @@ def sample_weighted(
         free[..., spreads] = np.abs(free[..., spreads])
         return free
 
+    def proposed(count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Draws of the proposal and their log weights."""
+        proposal = multivariate_t(centre, width * (1 - 2 / FREEDOM), FREEDOM)
+        free = folded(proposal.rvs(count + -count % AT_A_TIME, random_state=rng))
+        parts = [
+            np.asarray(log_densities(jnp.asarray(part), target)) for part in np.split(free, len(free) // AT_A_TIME)
+        ]
+        log_weight = np.concatenate(parts) - logsumexp(proposal.logpdf(free[:, None] * signs), axis=1)
+        return free[:count], log_weight[:count]
+
+    total = chains * draws
     centre, width = folded(np.array(mode)), np.asarray(covariance)
     for _ in range(ROUNDS):
-        proposal = multivariate_t(centre, width * (1 - 2 / FREEDOM), FREEDOM)
-        free = folded(proposal.rvs(chains * draws, random_state=rng))
-        log_weight = np.asarray(log_densities(jnp.asarray(free), target))
-        log_weight = log_weight - logsumexp(proposal.logpdf(free[:, None] * signs), axis=1)
-        weight, k = smoothed_weights(log_weight)
-        if k <= GOOD_K and effective_share(weight) >= GOOD_SHARE:
-            rows = [slice(c * draws, (c + 1) * draws) for c in range(chains)]
-            free = np.concatenate([free[row][ordered_resample(weight[row], draws)] for row in rows])
-            still = np.zeros((chains, draws), int)
-            run = Chains(free.reshape(chains, draws, -1), still.astype(bool), still, np.zeros(chains))
-            return run, jax.tree.map(np.asarray, _populations(jnp.asarray(free), target))
+        free, log_weight = proposed(min(TRIAL, total))
+        if _good(log_weight) and len(free) < total:
+            further, more = proposed(total - len(free))
+            free, log_weight = np.concatenate([free, further]), np.concatenate([log_weight, more])
+        if _good(log_weight) and len(free) == total:
+            return _resampled(free, log_weight, target, chains)
+        weight, _ = smoothed_weights(log_weight)
         centre = weight @ free
-        width = (free - centre).T @ (weight[:, None] * (free - centre)) + 1e-12 * np.diag(np.diagonal(width))
+        width = (free - centre).T @ (weight[:, None] * (free - centre))
+        width += np.diag(1e-12 * np.diagonal(width) + 1e-300)
     return None
+
+
+def _good(log_weight: np.ndarray) -> bool:
+    weight, k = smoothed_weights(log_weight)
+    return k <= GOOD_K and effective_share(weight) >= GOOD_SHARE
+
+
+def _resampled(free: np.ndarray, log_weight: np.ndarray, target: Target, chains: int) -> tuple[Chains, Population]:
+    """Weighted draws as equally weighted ones, each chain from draws of its own."""
+    several = zip(np.split(free, chains), np.split(smoothed_weights(log_weight)[0], chains), strict=True)
+    chosen = np.stack([part[ordered_resample(weight, len(part))] for part, weight in several])
+    still = np.zeros(chosen.shape[:2], int)
+    run = Chains(cast(Any, chosen), cast(Any, still > 0), cast(Any, still), cast(Any, np.zeros(chains)))
+    population = _populations(jnp.asarray(chosen.reshape(free.shape)), target)
+    return run, jax.tree.map(np.asarray, population)
+
+
+def evenly(count: int, some: int) -> np.ndarray:
+    """Positions of some of many draws, spread evenly."""
+    return np.linspace(0, count - 1, some).astype(int)
 
 
 class Correction(NamedTuple):
@@ -133,7 +163,7 @@ def correction(total: Callable[[int, np.ndarray], np.ndarray], draws: np.ndarray
             argument: 0 or 1.
         draws: of the parameters, shape (draws, parameters).
     """
-    rows = np.unique(np.linspace(0, len(draws) - 1, PROBES).astype(int))
+    rows = evenly(len(draws), PROBES)
     unit, values, _ = np.linalg.svd(draws - draws.mean(0), full_matrices=False)
     # Uncorrelated and of standard deviation 1, so that a slope is the shift of a mean in standard deviations.
     white = unit[:, values > 1e-9 * values[0]] * np.sqrt(len(draws))

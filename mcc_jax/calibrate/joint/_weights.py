@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any
 
 import numpy as np
@@ -54,7 +55,8 @@ def smoothed_weights(log_weight: np.ndarray) -> tuple[np.ndarray, float]:
     finite_weight = np.where(np.isfinite(log_weight), log_weight, -1e10)
     if np.std(finite_weight) <= 1e-9:
         return np.full(len(finite_weight), 1 / len(finite_weight)), 0.0
-    with np.errstate(all="ignore"):
+    smooth, k = finite_weight, np.inf
+    with np.errstate(all="ignore"), contextlib.suppress(ValueError):  # of a tail whose weights are all the same
         smooth, k = array_stats.psislw(-finite_weight, axis=-1)
     if not np.isfinite(smooth).all():  # one weight holds all: nothing to smooth
         smooth, k = finite_weight, np.inf

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mcc_jax import Instrument, Plastic, Programme, StrainScaling, Unloading, law_for_each, simulate_campaign
+from mcc_jax.calibrate.joint._data import select_tests
 from mcc_jax.calibrate.joint._population import Population, Summary
 
 A, EBAR = 1.43, 16_000.0
@@ -53,6 +54,17 @@ def simulated(
     return simulate_campaign(
         laws, np.asarray(diameters), peaks, programme, instrument=instrument, particles=particles, seed=seed
     )
+
+
+def five_particles(seed=0):
+    """Five particles, one of which snaps through."""
+    C = np.concatenate([COEFFICIENTS, SNAPPING[None]])
+    return simulated(C, DIAMETERS[[0, 1, 2, 3, 0]], instrument=NOISE, programme=Programme.cycles(points=40), seed=seed)
+
+
+def five_tests():
+    """What the joint calibration sees of them."""
+    return select_tests(five_particles()).tests
 
 
 def true_latent(C=COEFFICIENTS, diameters=DIAMETERS, *, unloading=Unloading.PRINTED, scaling=StrainScaling.RAW):

@@ -8,21 +8,38 @@ import jax
 import numpy as np
 
 
-def main(folder: Path, address: str, processes: int, process: int, seed: int) -> None:
+def blocks_only(folder: Path, process: int) -> None:
+    """One cheap function of five particles in blocks of two, and the random numbers of every block."""
+    from joint_cases import five_tests
+
+    from mcc_jax.calibrate.joint._blocks import Blocks, filled_up, require_same
+    from mcc_jax.calibrate.joint._individual import linear_starts
+
+    tests = filled_up(five_tests(), 2)
+    require_same(tests)
+    blocks = Blocks(len(tests), 2)
+    starts = blocks.whole(blocks.each(linear_starts, blocks.cut(tests), jax.numpy.asarray(np.asarray(9.0)), axis=1))
+    np.savez(folder / f"arrays_{process}.npz", starts=np.asarray(starts))
+
+
+def main(folder: Path, address: str, processes: int, process: int, seed: int, everything: int) -> None:
     """Calibrate five particles in blocks of two, and write what was found."""
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_numpy_rank_promotion", "raise")
     jax.config.update("jax_numpy_dtype_promotion", "strict")
     if processes > 1:
         jax.distributed.initialize(address, processes, process, initialization_timeout=60)
+    devices = {"devices": jax.local_device_count(), "processes": jax.process_count()}
+    (folder / f"devices_{process}.json").write_text(json.dumps(devices), encoding="utf-8")
+    if not everything:
+        blocks_only(folder, process)
+        return
     # Not before: nothing may ask for devices before the processes know of each other.
-    from joint_cases import COEFFICIENTS, DIAMETERS, NOISE, SNAPPING, Programme, simulated
+    from joint_cases import five_particles
 
     from mcc_jax.calibrate import calibrate_bayes, write_posterior
 
-    five = [0, 1, 2, 3, 0]
-    C = np.concatenate([COEFFICIENTS, SNAPPING[None]])
-    campaign = simulated(C, DIAMETERS[five], instrument=NOISE, programme=Programme.cycles(points=40), seed=seed)
+    campaign = five_particles(seed)
     try:
         found = calibrate_bayes(campaign, chains=2, warmup=100, draws=60, seed=3, block=2)
     except Exception as error:
@@ -42,8 +59,6 @@ def main(folder: Path, address: str, processes: int, process: int, seed: int) ->
         **{name: getattr(found, name) for name in ("C", "modulus_MPa", "zero_um", "log_likelihood", "pareto_k")},
     }
     np.savez(folder / f"arrays_{process}.npz", **{name: np.asarray(value) for name, value in arrays.items()})
-    devices = {"devices": jax.local_device_count(), "processes": jax.process_count()}
-    (folder / f"devices_{process}.json").write_text(json.dumps(devices), encoding="utf-8")
     write_posterior(found, folder / "posterior.nc")
     if jax.process_index() == 0:
         content = {**found.to_json(), "runtime_s": None}

@@ -8,26 +8,31 @@ import sys
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from joint_cases import NOISE, Programme, simulated
+from joint_cases import NOISE, Programme, five_tests, simulated
 
 from mcc_jax import calibrate_bayes
 from mcc_jax.calibrate.joint._blocks import MOST, SIZES, Blocks, Parts, block_size, count_of, filled_up
 from mcc_jax.calibrate.joint._data import select_tests
+from mcc_jax.calibrate.joint._individual import linear_starts
 
 LIMIT_S = 400
 HERE = Path(__file__).parent
 
 
-def start(folder, devices=1, processes=1, process=0, port=0, seed=0):
+def start(folder, devices=1, processes=1, process=0, port=0, seed=0, everything=True):
     """One process of a run, its output in files: a full pipe would hold it up."""
     environment = {**os.environ, "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}"}
     environment["PYTHONPATH"] = str(HERE)
     command = [sys.executable, str(HERE / "spread_run.py"), str(folder), f"127.0.0.1:{port}"]
     with (folder / f"output_{process}.txt").open("w") as output:
         return subprocess.Popen(
-            [*command, str(processes), str(process), str(seed)], env=environment, stdout=output, stderr=output
+            [*command, str(processes), str(process), str(seed), str(int(everything))],
+            env=environment,
+            stdout=output,
+            stderr=output,
         )
 
 
@@ -86,17 +91,32 @@ def assert_same(found, wanted):
             np.testing.assert_allclose(found[name].std((0, 1)), values.std((0, 1)), rtol=1e-8)
 
 
+def test_blocks_of_two_processes_with_two_devices_are_those_of_one(tmp_path):
+    port = free_port()
+    finish(tmp_path, [start(tmp_path, 2, 2, i, port, everything=False) for i in range(2)])
+    alone = Blocks(6, 2)
+    here = alone.cut(filled_up(five_tests(), 2))
+    wanted = alone.whole(alone.each(linear_starts, here, jnp.asarray(np.asarray(9.0)), axis=1))
+    for process in range(2):
+        told = json.loads((tmp_path / f"devices_{process}.json").read_text())
+        assert told == {"devices": 2, "processes": 2}
+        np.testing.assert_allclose(arrays(tmp_path, process)["starts"], wanted, rtol=1e-8)
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("process", [0, 1])
 def test_two_processes_give_the_numbers_of_one(alone, two_processes, process):
     assert json.loads((two_processes / f"devices_{process}.json").read_text()) == {"devices": 1, "processes": 2}
     assert_same(arrays(two_processes, process), arrays(alone))
 
 
+@pytest.mark.long
 def test_four_devices_give_the_numbers_of_one(alone, four_devices):
     assert json.loads((four_devices / "devices_0.json").read_text()) == {"devices": 4, "processes": 1}
     assert_same(arrays(four_devices), arrays(alone))
 
 
+@pytest.mark.long
 def test_only_the_first_process_writes_files(alone, two_processes):
     written = {path.name for path in two_processes.glob("*") if not path.stem[-1].isdigit()}
     assert written == {"calibration.json", "posterior.nc"}
@@ -104,6 +124,7 @@ def test_only_the_first_process_writes_files(alone, two_processes):
     assert two == one
 
 
+@pytest.mark.long
 def test_processes_with_different_campaigns_are_told(tmp_path):
     port = free_port()
     running = [start(tmp_path, processes=2, process=i, port=port, seed=i) for i in range(2)]

@@ -1,0 +1,135 @@
+"""Shortcuts for many particles: weighted independent draws against NUTS, and the exact likelihood by regression."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from joint_cases import random_summary
+
+from mcc_jax import calibrate_bayes, paper_campaign
+from mcc_jax.calibrate.joint import _draws
+from mcc_jax.calibrate.joint._large import correction, sample_weighted
+from mcc_jax.calibrate.joint._mode import Target, most_probable, to_free
+from mcc_jax.calibrate.joint._model import prior_numbers
+from mcc_jax.calibrate.joint._population import Scatter
+from mcc_jax.calibrate.joint._priors import Priors
+from mcc_jax.calibrate.joint._sampling import sample_population
+
+COUNT = 200
+
+
+@pytest.fixture(scope="module")
+def target():
+    """Summaries of particles drawn from a population whose log C3 does not scatter."""
+    rng = np.random.default_rng(1)
+    summary, flat = random_summary(rng, COUNT, precision=2000.0), rng.uniform(0.05, 0.4, COUNT)
+    truth = np.concatenate([np.log([6.5, 3.0, 2.7]) + rng.standard_normal((COUNT, 3)) * [0.3, 0.0, 0.08]], 1)
+    point = np.concatenate([truth + np.log(1 + 1.4 * flat)[:, None], np.full((COUNT, 1), 9.6)], 1)
+    spread = np.linalg.cholesky(np.linalg.inv(np.asarray(summary.precision)))
+    point += np.einsum("nij,nj->ni", spread, rng.standard_normal((COUNT, 4)))
+    summary = jax.tree.map(jnp.asarray, summary)
+    summary = type(summary)(**{**vars(summary), "point": jnp.asarray(point), "score": jnp.zeros((COUNT, 4))})
+    return Target(prior_numbers(Priors(), jnp.asarray(flat)), summary, Scatter(newton=0))
+
+
+@pytest.fixture(scope="module")
+def mode(target):
+    start = to_free(1.0, 9.6, np.log([6.5, 3.0, 2.7]), np.array([0.3, 0.02, 0.1]), target.numbers, target.scatter)
+    free, covariance, converged = most_probable(start, target)
+    assert converged
+    return free, covariance
+
+
+@pytest.fixture(scope="module")
+def weighted(target, mode):
+    return sample_weighted(jax.random.key(3), *mode, target, chains=2, draws=2000)
+
+
+def named(population):
+    return {
+        "a": population.a,
+        "log_modulus": population.log_modulus,
+        "log_noise": population.log_noise,
+        **{f"mu {j}": population.mu[:, j] for j in range(3)},
+        **{f"tau {j}": population.tau[:, j] for j in range(3)},
+    }
+
+
+def test_weighted_draws_are_those_of_the_sampler(target, mode, weighted):
+    accept = jnp.asarray(np.asarray(0.8))
+    _, sampled = sample_population(jax.random.key(1), *mode, target, accept, chains=2, warmup=300, draws=2000)
+    found, wanted = named(weighted[1]), named(sampled)
+    for name, values in wanted.items():
+        values, other = np.asarray(values), np.asarray(found[name])
+        sd = values.std()
+        assert abs(other.mean() - values.mean()) < 0.12 * sd, name
+        assert other.std() == pytest.approx(sd, rel=0.12), name
+        np.testing.assert_allclose(np.quantile(other, [0.05, 0.95]), np.quantile(values, [0.05, 0.95]), atol=0.25 * sd)
+
+
+def test_weighted_draws_have_the_form_of_chains(weighted, mode):
+    chains, population = weighted
+    assert chains.position.shape == (2, 2000, len(mode[0]))
+    assert not chains.divergent.any()
+    assert not chains.steps.any()
+    assert population.mu.shape == (4000, 3)
+    assert (np.asarray(chains.position)[..., 6:] >= 0).all()
+
+
+def test_a_hopeless_proposal_is_refused(target, mode):
+    free, covariance = mode
+    # So far off that no draw is near the posterior: the weights cannot tell where it is.
+    assert sample_weighted(jax.random.key(0), free + 50, 1e-6 * covariance, target, chains=2, draws=50) is None
+
+
+def test_a_slope_is_found_through_any_rotation_of_the_parameters():
+    rng = np.random.default_rng(0)
+    draws = rng.standard_normal((1000, 3)) @ rng.standard_normal((3, 3)) + 5.0
+    draws = np.concatenate([draws, draws[:, :1]], 1)  # one parameter twice
+    slope = np.array([0.3, -0.2, 0.1, 0.0])
+    found = correction(lambda _, rows: 1e3 + draws[rows] @ slope, draws)
+    np.testing.assert_allclose(found.log_weight, (draws - draws.mean(0)) @ slope, atol=1e-8)
+    assert found.error < 1e-8
+
+
+def test_the_error_is_that_of_the_random_numbers():
+    rng = np.random.default_rng(0)
+    draws = rng.standard_normal((4000, 2))
+    noise = {0: 0.4, 1: -0.2}
+    found = correction(lambda which, rows: (1 + noise[which]) * draws[rows, 0], draws)
+    assert found.error == pytest.approx(0.3, rel=0.05)
+    assert np.polyfit(draws[:, 0], found.log_weight, 1)[0] == pytest.approx(1.1, rel=0.01)
+
+
+@pytest.mark.long
+def test_the_shortcuts_agree_with_exact_weights(paper_posterior, monkeypatch):
+    monkeypatch.setattr(_draws, "MOST_CHECKED", 40_000)  # so that twenty particles count as many
+    many = calibrate_bayes(paper_campaign(0))
+    assert many.leapfrogs == 0
+    assert not many.weights_applied
+    assert many.converged, many.failures()
+    for name, wanted in paper_posterior.named_population().items():
+        found, sd = many.named_population()[name], wanted.std()
+        assert abs(found.mean() - wanted.mean()) < 0.15 * sd, name
+        assert found.std() == pytest.approx(sd, rel=0.15), name
+    for name in ("C", "zero_um"):
+        found, wanted = getattr(many, name), getattr(paper_posterior, name)
+        sd = wanted.std((0, 1))
+        np.testing.assert_array_less(np.abs(found.mean((0, 1)) - wanted.mean((0, 1))), 0.25 * sd, err_msg=name)
+        np.testing.assert_allclose(found.std((0, 1)), sd, rtol=0.25, err_msg=name)
+
+
+@pytest.mark.long
+def test_the_exact_likelihood_corrects_summaries_that_are_off(paper_posterior, monkeypatch):
+    """Summaries of all particles that pull the same way move the population; the regression moves it back."""
+    fit, selection, model = paper_posterior.fit, paper_posterior.selection, paper_posterior.model
+    length = _draws.Length(4, 300, 1000)
+    pulled = fit.summary.score.at[:, 0].add(0.15 * jnp.sqrt(fit.summary.precision[:, 0, 0]))
+    off = type(fit)(**{**vars(fit), "summary": type(fit.summary)(**{**vars(fit.summary), "score": pulled})})
+    monkeypatch.setattr(_draws, "MOST_CHECKED", 40_000)
+    corrected = _draws.draw_fast(jax.random.key(0), selection.tests, model, off, length, 0)["population"].mu[..., 0]
+    monkeypatch.setattr(_draws, "correction", lambda _, draws: (np.zeros(len(draws)), 0.0))
+    raw = _draws.draw_fast(jax.random.key(0), selection.tests, model, off, length, 0)["population"].mu[..., 0]
+    truth = np.asarray(paper_posterior.population.mu)[..., 0]
+    moved, left = abs(raw.mean() - truth.mean()), abs(corrected.mean() - truth.mean())
+    assert left < max(0.3 * moved, 0.1 * truth.std())
