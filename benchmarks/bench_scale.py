@@ -1,6 +1,6 @@
 """How do time and memory of the posterior grow with the number of particles?
 
-Run `uv run --group bench python benchmarks/bench_scale.py --write` (ten minutes). Every size runs in its own process,
+Run `uv run --group bench python benchmarks/bench_scale.py --write` (twelve minutes). Every size runs in its own process,
 twice: the second run shows the time without compilation. Memory is the process's peak, the campaign included.
 """
 
@@ -59,8 +59,11 @@ def one_size(count: int, points: int) -> dict:
         "modulus [MPa]": f"{named['effective_modulus_MPa'].mean():.1f} +- {named['effective_modulus_MPa'].std():.1f}",
         "smallest ESS": float(min(result.ess_bulk.values())),
         "largest k": float(result.pareto_k.max()),
+        "particles with k above 0.7": int((result.pareto_k > 0.7).sum()),
+        "k of the population": result.pareto_k_joint,
         "divergences": result.divergences,
-        "failures": "; ".join(result.failures())[:160],
+        "failures": "; ".join(result.failures()),
+        "notes": "; ".join(result.notes),
     }
 
 

@@ -13,11 +13,12 @@ from jaxtyping import Array
 
 from ._blocks import Blocks, count_of
 from ._data import Tests
-from ._draws import Length, stride_of
+from ._drawer import stride_of
 from ._large import AT_A_TIME, PROBES, log_densities
 from ._mode import Target
 from ._model import JointModel, prior_numbers
 from ._noise import Whitening
+from ._nuts import Length
 from ._population import Population, Summary
 from ._sampling import Exact, draw_particles, sample_population
 

@@ -57,11 +57,13 @@ class BayesCalibration:
             what leave-one-particle-out needs.
         mode: "fast" or "joint".
         pareto_k: of every particle's importance weights.
-        pareto_k_joint: of the weights of all particles together; None where they were not formed.
-        weights_applied: whether the draws were resampled by their weights.
+        pareto_k_joint: of the weights of all particles together, of many particles as the regression of `joint._large`
+            has them; None where they were not formed.
+        weights_applied: whether the draws were resampled by the particles' own weights. Of many particles those of the
+            population were by `pareto_k_joint`'s, and only particles whose weights scatter were drawn by theirs.
         divergences: number of divergent trajectories.
         rhat, ess_bulk, ess_tail: by parameter of the population, before any thinning.
-        leapfrogs: mean number of leapfrog steps of a draw.
+        leapfrogs: mean number of leapfrog steps of a draw; 0 if independent draws were weighted (`joint._large`).
         seed, runtime_s: for the record.
     """
 
@@ -297,6 +299,10 @@ def calibrate_bayes(
     progress: Callable[[str], None] | None = None,
 ) -> BayesCalibration:
     """The joint posterior of everything: a, modulus, population, noise, and every particle's C1, C3, C5 and zero.
+
+    Of many particles (more than 400,000 draws of single ones) the population is drawn around its mode and weighted,
+    instead of sampled along trajectories, and at most four million draws of single particles are kept: see
+    `joint._large`.
 
     The particles are worked on in blocks, which spread over all devices of the process and, once
     `jax.distributed.initialize` has been called, over all processes: every one of them then calls this function with

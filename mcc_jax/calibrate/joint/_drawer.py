@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +11,11 @@ import numpy as np
 from jaxtyping import Array
 
 from ._blocks import Blocks, count_of
+from ._large import PROBES, correction, evenly
+from ._nuts import Length
 from ._population import Population
 from ._sampling import Exact, ParticleDraws, draw_particles
-from ._weights import pareto_k, unrest
+from ._weights import PARETO_K_MOST, ordered_resample, pareto_k, smoothed_weights, unrest
 
 RESTLESS = 0.3
 """A particle whose weight scatters by more than this share of its mean gets several candidates per draw."""
@@ -23,6 +25,42 @@ FEW = 4
 
 GROUP = 64
 """Most restless particles drawn at once."""
+
+MOST_CHECKED = 400_000
+"""Up to as many draws of single particles, every one is compared with the exact likelihood and the weights are applied;
+of larger campaigns some draws are compared, to know how good each particle's summary is, and the population is
+corrected by regression (`_large`)."""
+
+CANDIDATES, CANDIDATES_OF_MANY = (16, 64), (2, 16)
+"""How many a restless particle gets: first, and the few that scatter most even then."""
+
+RESTLESS_OF_MANY = 0.1
+"""`RESTLESS` where the weights of the others are not applied: a mean of one of these is wrong by at most this share of
+its standard deviation."""
+
+UNSTEADY = 0.1
+"""Most that a particle's log ratio may change over the posterior of many particles, which is narrow for one of them:
+what changes more gets more candidates, or does not count."""
+
+LOWEST = -1e3
+"""Log ratio that counts where the exact likelihood vanishes: differences of infinities say nothing."""
+
+UNSURE = 0.3
+"""Standard error of the correction, in standard deviations of the posterior, from which on a reader is told."""
+
+MOST_PARTICLE_DRAWS = 4_000_000
+"""At most as many draws of single particles are kept; of very large campaigns every n-th draw."""
+
+
+def stride_of(count: int, total: int) -> int:
+    """Every how many-th draw is compared with the exact likelihood: all of them for few particles."""
+    return max(1, -(-total * count // MOST_CHECKED))
+
+
+def every(population: Population, which: int | np.ndarray) -> Population:
+    """Every so-many-th draw, or those at given positions."""
+    rows = slice(None, None, which) if isinstance(which, int) else which
+    return jax.tree.map(lambda x: np.asarray(x)[rows], population)
 
 
 class Drawer:
@@ -123,3 +161,87 @@ class Drawer:
             k[restless] = pareto_k(ratio[:, restless])
             restless = restless[np.argsort(-unrest(ratio[:, restless]))][:few]
             restless = restless[unrest(ratio[:, restless]) > RESTLESS]
+
+
+class Drawn(NamedTuple):
+    """Particles drawn back.
+
+    Attributes:
+        chosen: which draws of the population stand for the weighted ones.
+        particles: under every `keep`-th of these.
+        k: Pareto k of every particle's weights.
+        k_joint: of the population's.
+        keep: see `particles`.
+        notes: what a reader must know.
+    """
+
+    chosen: np.ndarray
+    particles: ParticleDraws
+    k: np.ndarray
+    k_joint: float
+    keep: int = 1
+    notes: tuple[str, ...] = ()
+
+
+def weighted(drawer: Drawer, population: Population, length: Length, check_key: Array, pick_key: Array) -> Drawn:
+    """Few particles: the weight of a draw is the product of all particles' ratios of exact to quadratic likelihood."""
+    particles = drawer.all(check_key, population)
+    ratio = np.asarray(particles.log_ratio)
+    k = pareto_k(ratio)
+    restless = np.flatnonzero((unrest(ratio) > RESTLESS) | (k > PARETO_K_MOST))
+    drawer.settle(pick_key, particles, population, k, restless, CANDIDATES)
+    chosen, k_joint = _resampled(ratio.sum(1), length)
+    return Drawn(chosen, jax.tree.map(lambda x: x[chosen], particles), k, k_joint)
+
+
+def corrected(
+    drawer: Drawer,
+    population: Population,
+    parameters: np.ndarray,
+    length: Length,
+    check_key: Array,
+    pick_key: Array,
+    particle_key: Array,
+) -> Drawn:
+    """Many particles: the draws of the population are weighted by regression (`_large.correction`).
+
+    Of each particle some draws are compared with the exact likelihood. Those whose weights scatter are drawn from
+    several candidates; of the others the draws are left as they are.
+    """
+    checks = PROBES * max(2, MOST_CHECKED // (PROBES * drawer.count))
+    ratio = np.asarray(drawer.all(check_key, every(population, evenly(length.total, checks))).log_ratio)
+    scatter, k = unrest(ratio), pareto_k(ratio)
+    wild: set[int] = set()
+
+    def total(which: int, rows: np.ndarray) -> np.ndarray:
+        probes, own = every(population, rows), jax.random.fold_in(check_key, which)
+        ratio = np.maximum(drawer.all(own, probes, common=True).log_ratio, LOWEST)
+        # A single candidate may fall off a cliff of the likelihood as the population moves, which says nothing of all.
+        if len(unsteady := np.flatnonzero(np.ptp(ratio, axis=0) > UNSTEADY)):
+            better = drawer.some(own, unsteady, probes, CANDIDATES[-1], common=True).log_ratio
+            ratio[:, unsteady] = np.maximum(better, LOWEST)
+        if len(unsteady := np.flatnonzero(np.ptp(ratio, axis=0) > UNSTEADY)):
+            wild.update(unsteady.tolist())
+            ratio[:, unsteady] = 0.0
+        return ratio.sum(1)
+
+    log_weight, error = correction(total, parameters)
+    notes = []
+    if error > UNSURE:
+        notes.append(f"the means of the population are known to {error:.2f} of their standard deviations only")
+    if wild:
+        notes.append(f"{len(wild)} particles act on the population through their quadratic summary alone")
+    chosen, k_joint = _resampled(log_weight, length)
+    keep = max(1, -(-length.total * drawer.count // MOST_PARTICLE_DRAWS))
+    some = every(every(population, chosen), keep)
+    particles = drawer.all(particle_key, some, 0)
+    restless = np.flatnonzero((scatter > RESTLESS_OF_MANY) | (k > PARETO_K_MOST))
+    drawer.settle(pick_key, particles, some, k, restless, CANDIDATES_OF_MANY)
+    return Drawn(chosen, particles, k, k_joint, keep, tuple(notes))
+
+
+def _resampled(log_weight: np.ndarray, length: Length) -> tuple[np.ndarray, float]:
+    """Which draws stand for the weighted ones, in order within each chain, and the Pareto k of the weights."""
+    weight, k = smoothed_weights(log_weight)
+    rows = (slice(c * length.draws, (c + 1) * length.draws) for c in range(length.chains))
+    return np.concatenate([row.start + ordered_resample(weight[row], length.draws) for row in rows]), k

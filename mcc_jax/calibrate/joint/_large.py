@@ -33,7 +33,7 @@ from ._compile import compiled
 from ._mode import Target
 from ._nuts import Chains
 from ._population import Population
-from ._weights import effective_share, ordered_resample, smoothed_weights
+from ._weights import PARETO_K_MOST, effective_share, ordered_resample, smoothed_weights
 
 FREEDOM = 10
 """Degrees of freedom of the Student proposal: its tails are wider than the posterior's."""
@@ -41,8 +41,8 @@ FREEDOM = 10
 ROUNDS = 5
 """How often the proposal may be fitted anew."""
 
-GOOD_K, GOOD_SHARE = 0.5, 0.6
-"""Largest Pareto k, and least effective share of the draws, with which weighted draws replace the sampler's."""
+GOOD_SHARE = 0.5
+"""Least effective share of the draws with which weighted ones replace the sampler's, beside the gate of Pareto k."""
 
 FIRST_SPREAD = 6
 """Position of the first spread among the coordinates (`_mode.from_free`)."""
@@ -50,7 +50,7 @@ FIRST_SPREAD = 6
 AT_A_TIME = 250
 """Draws whose densities are asked for in one go."""
 
-TRIAL = 500
+TRIAL = 1000
 """Draws that the proposal is tried on, and fitted to, before all are drawn."""
 
 AT_ONCE = 4096
@@ -121,7 +121,7 @@ def sample_weighted(
 
 def _good(log_weight: np.ndarray) -> bool:
     weight, k = smoothed_weights(log_weight)
-    return k <= GOOD_K and effective_share(weight) >= GOOD_SHARE
+    return k <= PARETO_K_MOST and effective_share(weight) >= GOOD_SHARE
 
 
 def _resampled(free: np.ndarray, log_weight: np.ndarray, target: Target, chains: int) -> tuple[Chains, Population]:

@@ -28,6 +28,19 @@ class Chains(NamedTuple):
     step_size: Float[Array, " chains"]
 
 
+class Length(NamedTuple):
+    """How long the sampler runs: chains, and draws of each before and after it has settled."""
+
+    chains: int
+    warmup: int
+    draws: int
+
+    @property
+    def total(self) -> int:
+        """Draws kept of all chains."""
+        return self.chains * self.draws
+
+
 def sample(
     key: PRNGKeyArray,
     log_density: Callable[[Float[Array, " d"]], Scalar],

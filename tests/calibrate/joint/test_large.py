@@ -7,7 +7,7 @@ import pytest
 from joint_cases import random_summary
 
 from mcc_jax import calibrate_bayes, paper_campaign
-from mcc_jax.calibrate.joint import _draws
+from mcc_jax.calibrate.joint import _drawer, _draws
 from mcc_jax.calibrate.joint._large import correction, sample_weighted
 from mcc_jax.calibrate.joint._mode import Target, most_probable, to_free
 from mcc_jax.calibrate.joint._model import prior_numbers
@@ -103,7 +103,7 @@ def test_the_error_is_that_of_the_random_numbers():
 
 @pytest.mark.long
 def test_the_shortcuts_agree_with_exact_weights(paper_posterior, monkeypatch):
-    monkeypatch.setattr(_draws, "MOST_CHECKED", 40_000)  # so that twenty particles count as many
+    monkeypatch.setattr(_drawer, "MOST_CHECKED", 40_000)  # so that twenty particles count as many
     many = calibrate_bayes(paper_campaign(0))
     assert many.leapfrogs == 0
     assert not many.weights_applied
@@ -126,9 +126,9 @@ def test_the_exact_likelihood_corrects_summaries_that_are_off(paper_posterior, m
     length = _draws.Length(4, 300, 1000)
     pulled = fit.summary.score.at[:, 0].add(0.15 * jnp.sqrt(fit.summary.precision[:, 0, 0]))
     off = type(fit)(**{**vars(fit), "summary": type(fit.summary)(**{**vars(fit.summary), "score": pulled})})
-    monkeypatch.setattr(_draws, "MOST_CHECKED", 40_000)
+    monkeypatch.setattr(_drawer, "MOST_CHECKED", 40_000)
     corrected = _draws.draw_fast(jax.random.key(0), selection.tests, model, off, length, 0)["population"].mu[..., 0]
-    monkeypatch.setattr(_draws, "correction", lambda _, draws: (np.zeros(len(draws)), 0.0))
+    monkeypatch.setattr(_drawer, "correction", lambda _, draws: (np.zeros(len(draws)), 0.0))
     raw = _draws.draw_fast(jax.random.key(0), selection.tests, model, off, length, 0)["population"].mu[..., 0]
     truth = np.asarray(paper_posterior.population.mu)[..., 0]
     moved, left = abs(raw.mean() - truth.mean()), abs(corrected.mean() - truth.mean())
