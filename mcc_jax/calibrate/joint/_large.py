@@ -41,6 +41,9 @@ FREEDOM = 10
 ROUNDS = 5
 """How often the proposal may be fitted anew."""
 
+ENOUGH = 5
+"""Effective draws per coordinate that a proposal may be fitted to."""
+
 GOOD_SHARE = 0.5
 """Least effective share of the draws with which weighted ones replace the sampler's, beside the gate of Pareto k."""
 
@@ -81,6 +84,7 @@ def sample_weighted(
         target: its density.
         chains, draws: shape of what is returned; each chain is resampled from proposals of its own.
     """
+    from scipy.linalg import solve_triangular
     from scipy.special import logsumexp
     from scipy.stats import multivariate_t
 
@@ -94,15 +98,18 @@ def sample_weighted(
         return free
 
     def proposed(count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Draws of the proposal and their log weights."""
-        proposal = multivariate_t(centre, width * (1 - 2 / FREEDOM), FREEDOM)
-        free = folded(proposal.rvs(count + -count % AT_A_TIME, random_state=rng))
-        parts = [
-            np.asarray(log_densities(jnp.asarray(part), target)) for part in np.split(free, len(free) // AT_A_TIME)
-        ]
-        log_weight = np.concatenate(parts) - logsumexp(proposal.logpdf(free[:, None] * signs), axis=1)
+        """Draws of the proposal and their log weights, up to a constant."""
+        factor = np.linalg.cholesky(width)
+        free = folded(centre + unit.rvs(count + -count % AT_A_TIME, random_state=rng) @ factor.T)
+        every_sign = (free[:, None] * signs - centre).reshape(-1, len(mode))
+        density = unit.logpdf(solve_triangular(factor, every_sign.T, lower=True).T).reshape(len(free), -1)
+        parts = (jnp.asarray(part) for part in np.split(free, len(free) // AT_A_TIME))
+        log_density = np.concatenate([np.asarray(log_densities(part, target)) for part in parts])
+        log_weight = log_density - logsumexp(density, axis=1)
         return free[:count], log_weight[:count]
 
+    # Standard deviations of coordinates differ by many powers of ten, for which SciPy takes a matrix to be singular.
+    unit = multivariate_t(np.zeros(len(mode)), np.eye(len(mode)) * (1 - 2 / FREEDOM), FREEDOM)
     total = chains * draws
     centre, width = folded(np.array(mode)), np.asarray(covariance)
     for _ in range(ROUNDS):
@@ -113,9 +120,10 @@ def sample_weighted(
         if _good(log_weight) and len(free) == total:
             return _resampled(free, log_weight, target, chains)
         weight, _ = smoothed_weights(log_weight)
+        if effective_share(weight) * len(weight) < ENOUGH * len(mode):
+            return None
         centre = weight @ free
         width = (free - centre).T @ (weight[:, None] * (free - centre))
-        width += np.diag(1e-12 * np.diagonal(width) + 1e-300)
     return None
 
 
