@@ -8,7 +8,8 @@ import pytest
 from joint_cases import COEFFICIENTS, DIAMETERS, NOISE, SNAPPING, modulus_of, simulated, true_latent
 
 from mcc_jax import Instrument, StrainScaling, Unloading
-from mcc_jax.calibrate.joint import JointModel
+from mcc_jax.calibrate.joint import JointModel, _fit
+from mcc_jax.calibrate.joint._blocks import Blocks
 from mcc_jax.calibrate.joint._data import select_tests
 from mcc_jax.calibrate.joint._fit import WIDE, _centre
 from mcc_jax.calibrate.joint._forward import raw_residual
@@ -80,6 +81,21 @@ def test_a_curve_that_snaps_is_reproduced_within_noise(snapping):
 def test_coefficients_of_a_curve_that_snaps_are_near_the_truth(snapping):
     _, _, found = snapping
     np.testing.assert_allclose(np.asarray(found.latent)[:, :3], true_latent(SNAPS)[:, :3], atol=0.05)
+
+
+@pytest.mark.long
+def test_late_fits_go_on_in_blocks_of_their_own(snapping, monkeypatch):
+    _, tests, wanted = snapping
+    monkeypatch.setattr(_fit, "FIRST_STEPS", 3)  # nobody is done by then
+    blocks = Blocks(4, 2)
+    own, zero_sd = blocks.cut(tests), jnp.asarray(5.0)
+    centre = jnp.asarray(np.broadcast_to(_centre(JointModel().beliefs), (4, 4)))
+    arrays = jnp.full(4, 0.03), centre, jnp.full((4, 4), WIDE)
+    starts = blocks.cut(linear_starts(tests, centre[0, 3]), axis=1)
+    found = _fit._fitted(blocks, tests, own, arrays, zero_sd, starts, Unloading.PRINTED)
+    assert np.all(np.asarray(found.converged))
+    np.testing.assert_allclose(found.latent, wanted.latent, atol=1e-4)
+    np.testing.assert_allclose(found.rms, wanted.rms, rtol=1e-4)
 
 
 def test_coefficients_are_within_their_noise():

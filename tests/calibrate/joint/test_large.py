@@ -15,7 +15,7 @@ from mcc_jax.calibrate.joint._population import Scatter
 from mcc_jax.calibrate.joint._priors import Priors
 from mcc_jax.calibrate.joint._sampling import sample_population
 
-COUNT = 200
+COUNT = 80
 
 
 @pytest.fixture(scope="module")
