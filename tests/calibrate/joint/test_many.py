@@ -69,6 +69,7 @@ def queued(campaigns, told):
     return found, seen.names
 
 
+@pytest.mark.long
 def test_results_come_in_order_and_errors_in_place(queued, campaigns):
     found, _ = queued
     assert isinstance(found[2], InputError)
@@ -79,12 +80,14 @@ def test_results_come_in_order_and_errors_in_place(queued, campaigns):
         assert found[i].fit.latent.shape == (len(campaigns[i]), 4)
 
 
+@pytest.mark.long
 def test_progress_names_the_campaign(queued, told):
     for i, last in enumerate(["done", "done", "failed", "done"]):
         assert [step for row, step in told if row == i][-1] == last
     assert (0, "sampling the population") in told
 
 
+@pytest.mark.long
 def test_campaigns_of_similar_size_share_their_compilations(queued):
     _, compiled = queued
     # Ahead, in a thread of its own, and for use: the same. The particles are fitted from three starts each time.
@@ -92,6 +95,7 @@ def test_campaigns_of_similar_size_share_their_compilations(queued):
         assert compiled.count(name) == 1, (name, compiled)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("i", [0, 1, 3])
 def test_the_numbers_are_those_of_one_by_one(queued, campaigns, i):
     one, many = calibrate_bayes(campaigns[i], **SETTINGS), queued[0][i]
@@ -103,10 +107,15 @@ def test_the_numbers_are_those_of_one_by_one(queued, campaigns, i):
 
 
 def test_least_squares_with_two_workers(campaigns):
-    found = calibrate_many(campaigns, method="least-squares", workers=2)
-    assert isinstance(found[2], InputError)
-    for i in (0, 1, 3):
-        one = calibrate_least_squares(campaigns[i])
+    """Two campaigns of one size, and between them one nothing can be made of."""
+    three, told = [campaigns[i] for i in (0, 2, 3)], []
+    found = calibrate_many(three, method="least-squares", workers=2, progress=lambda i, step: told.append((i, step)))
+    assert isinstance(found[1], InputError)
+    assert "no particle can be used" in str(found[1])
+    assert {(0, "done"), (1, "failed"), (2, "done")} <= set(told)
+    for i in (0, 2):
+        one = calibrate_least_squares(three[i])
+        assert found[i].campaign is three[i]
         for many, alone in zip(found[i].solution.value, one.solution.value, strict=True):
             np.testing.assert_array_equal(many, alone)
         assert float(found[i].solution.loss) == float(one.solution.loss)

@@ -25,7 +25,7 @@ HERE = Path(__file__).parent
 def start(folder, devices=1, processes=1, process=0, port=0, seed=0, everything=True):
     """One process of a run, its output in files: a full pipe would hold it up."""
     environment = {**os.environ, "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}"}
-    environment["PYTHONPATH"] = str(HERE)
+    environment["PYTHONPATH"] = f"{HERE}{os.pathsep}{environment.get('PYTHONPATH', '')}"
     command = [sys.executable, str(HERE / "spread_run.py"), str(folder), f"127.0.0.1:{port}"]
     with (folder / f"output_{process}.txt").open("w") as output:
         return subprocess.Popen(
