@@ -84,7 +84,7 @@ class ExtendedPopulation(Population):
 
     def further(self) -> dict[str, Array]:
         """The free numbers, by position."""
-        return {f"theta_{i}": self.theta[..., i] for i in range(self.theta.shape[-1])}
+        return {f"theta_{i}": jnp.asarray(self.theta)[..., i] for i in range(self.theta.shape[-1])}
 
 
 class ExtendedTarget(Target):
