@@ -1,7 +1,7 @@
 """How do time and memory of the posterior grow with the number of particles?
 
-Run `uv run --group bench python benchmarks/bench_scale.py --write` (twelve minutes). Every size runs in its own process,
-twice: the second run shows the time without compilation. Memory is the process's peak, the campaign included.
+Run `uv run --group bench python benchmarks/bench_scale.py --write` (twelve minutes). Every size runs in its own
+process, twice: the second run shows the time without compilation. Memory is the process's peak, the campaign included.
 """
 
 from __future__ import annotations
