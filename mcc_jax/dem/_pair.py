@@ -12,7 +12,7 @@ from jaxtyping import Array
 
 from .._errors import InputError
 from .._numerics import shared
-from .._types import Flag, Scalar
+from .._types import Scalar
 from ..law import energy_ratio, stress_ratio
 from ..law._branch import branch_force
 from ..law._loading_inverse import secant_modulus, tangent_modulus
@@ -259,7 +259,7 @@ def _series_jvp(primals, tangents):
 
 def _solve(i: _Numbers, j: _Numbers, overlap: Scalar) -> _Series:
     whole = jnp.where(overlap > 0, overlap, 0.0)
-    # One number leaves the iteration and a barrier closes it: with more, or without, XLA iterates again for each use.
+    # A barrier closes the iteration, here and within: without, XLA iterates again for each use.
     d = jax.lax.optimization_barrier(_split(i, j, whole))
     # One more step, on both sides separately: beside a side much stiffer, what is left of the overlap has no digits.
     rest = whole - d
@@ -271,35 +271,40 @@ def _solve(i: _Numbers, j: _Numbers, overlap: Scalar) -> _Series:
 
 
 def _split(i: _Numbers, j: _Numbers, whole: Scalar) -> Scalar:
-    """Compression of i at equal force, by Newton's method with the curvature (Halley), kept between bounds."""
-    d = shared(j.k1 / (i.k1 + j.k1)) * whole
-    bracket = _Bracket(d, jnp.zeros_like(d), whole, jnp.ones_like(d, bool))
+    """Compression of i at equal force, by Newton's method with the curvature (Halley), kept between bounds.
+
+    Most contacts are done after a fixed number of steps, which compile to one loop over the data with one result. A
+    split that still moves leaves it with a negative sign, and goes on between new bounds.
+    """
+    zero = jnp.zeros_like(whole)
+    bracket = _Bracket(-shared(j.k1 / (i.k1 + j.k1)) * whole, zero, whole)
     for _ in range(SPLIT_STEPS):
         bracket = _narrowed(i, j, whole, bracket)
+    d = jax.lax.optimization_barrier(bracket.d)
 
     def unfinished(carry: tuple[Array, _Bracket]) -> Array:
         step, bracket = carry
-        return bracket.moves & (step < SPLIT_STEPS_AT_MOST)
+        return (bracket.d < 0) & (step < SPLIT_STEPS_AT_MOST)
 
     def further(carry: tuple[Array, _Bracket]) -> tuple[Array, _Bracket]:
         step, bracket = carry
         return step + 1, _narrowed(i, j, whole, bracket)
 
-    return jax.lax.while_loop(unfinished, further, (jnp.asarray(SPLIT_STEPS, jnp.int32), bracket))[1].d
+    start = jnp.asarray(SPLIT_STEPS, jnp.int32), _Bracket(d, zero, whole)
+    return jnp.abs(jax.lax.while_loop(unfinished, further, start)[1].d)
 
 
 class _Bracket(NamedTuple):
-    """Compression of one side, what it lies between, and whether the last step was more than rounding."""
+    """Compression of one side, negative while it moves by more than rounding, and what its size lies between."""
 
     d: Scalar
     low: Scalar
     high: Scalar
-    moves: Flag
 
 
 def _narrowed(i: _Numbers, j: _Numbers, whole: Scalar, bracket: _Bracket) -> _Bracket:
     """One step. A split that meets the force but for rounding stays: asked again, the bounds would throw it out."""
-    d, low, high, _ = bracket
+    d, low, high = jnp.abs(bracket.d), bracket.low, bracket.high
     force_i, slope_i, bend_i = _polynomial(i, d)
     force_j, slope_j, bend_j = _polynomial(j, whole - d)
     excess, slope, bend = force_i - force_j, slope_i + slope_j, bend_i - bend_j
@@ -313,7 +318,7 @@ def _narrowed(i: _Numbers, j: _Numbers, whole: Scalar, bracket: _Bracket) -> _Br
     new = jnp.where(settled, d, new)
     # The method cubes the error: after a step of 1e-5 of the smaller side only rounding is left.
     least = 1e-5 * jnp.minimum(new, whole - new) + 2 * jnp.finfo(d.dtype).eps * whole
-    return _Bracket(new, low, high, jnp.abs(new - d) > least)
+    return _Bracket(jnp.where(jnp.abs(new - d) > least, -new, new), low, high)
 
 
 def _polynomial(side: _Numbers, d: Scalar) -> tuple[Scalar, Scalar, Scalar]:
