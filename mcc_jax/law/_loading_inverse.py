@@ -128,8 +128,8 @@ def _start(K1: Scalar, K3: Scalar, K5: Scalar, target: Values, floor: Scalar) ->
     over_root = shared(1 / root)
     around_bend = bend + jnp.where(concave, -1.0, 1.0) * (root - p * over_root)
 
-    # An upper bound: K5 x^5 is at most 9/4 of the stress (monotone), or else half of stress + K3 x^3. Where K1 x is more
-    # than K5 x^5 the place where they are equal will do.
+    # An upper bound: K5 x^5 is at most 9/4 of the stress (monotone), or else half of stress + K3 x^3. Where K1 x is
+    # more than K5 x^5 the place where they are equal will do.
     quotient = K1 * over_K5
     bound = 1.05 * _rough(jnp.maximum(2.25 * target * over_K5, quotient * _rough(quotient, 0.25)), 0.2)
     bound = jnp.maximum(bound, jnp.where(falls, 2.6, 0.0) * bend)
