@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import datetime
 import json
 import os
 import platform
@@ -20,13 +21,25 @@ def parser(description):
 
 
 def environment(*packages):
-    """Versions, number of cores and the C allocator's settings, for the record."""
+    """Date, processor, versions, number of cores and the C allocator's settings, for the record."""
     return {
+        "date": datetime.date.today().isoformat(),
+        "processor": _processor(),
         "python": platform.python_version(),
         **{name: version(name) for name in packages},
         "cores": len(os.sched_getaffinity(0)),
         "GLIBC_TUNABLES": os.environ.get("GLIBC_TUNABLES", ""),
     }
+
+
+def _processor():
+    """The processor's type."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
 
 
 def verdict(target, value, limit, *, at_least=False):

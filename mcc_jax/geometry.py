@@ -5,7 +5,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax.numpy as jnp
 
-from ._numerics import positive_pow, shared
+from ._numerics import compiled_whole, positive_pow, shared
 from ._types import Scalar, ScalarLike, Values, scalar
 
 
@@ -73,6 +73,7 @@ class Particle(eqx.Module):
         return stress * self.effective_area * 1e-3
 
 
+@compiled_whole
 def plastic_shape_factor(particle: Particle, a: ScalarLike) -> Scalar:
     r"""Shape factor of plastic loading.
 
@@ -92,6 +93,7 @@ def plastic_shape_factor(particle: Particle, a: ScalarLike) -> Scalar:
     return 1 + scalar(a) * particle.flatness
 
 
+@compiled_whole
 def elastic_shape_factor(particle: Particle) -> Scalar:
     r"""Shape factor of the elastic (Hertz) contact, in closed form.
 

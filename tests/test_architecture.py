@@ -30,7 +30,7 @@ LAYERS = {
     "calibrate": 6,
     "dem": 7,
     "discover": 7,
-    "export": 7,
+    "export": 8,
     "plots": 8,
     "report": 9,
     "cli": 10,

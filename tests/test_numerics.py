@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from mcc_jax._numerics import horner, positive_pow, running_max
+from mcc_jax._numerics import horner, positive_pow, rough_power, running_max, two_thirds_power
 from mcc_jax._types import scalar
 
 DTYPES = [jnp.float32, jnp.float64]
@@ -103,3 +103,27 @@ def test_scalar_converter():
     # Unwrapped: the run-time type checker of the tests would speak first.
     with pytest.raises(ValueError, match=r"Expected a scalar, got shape \(2,\).*filter_vmap"):
         inspect.unwrap(scalar)(jnp.zeros(2))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("p", [-1 / 3, 0.2, 0.25, 1 / 3, 0.5])
+def test_rough_power_is_within_five_percent(dtype, p):
+    x = np.geomspace(1e-37, 1e37, 20_001).astype(dtype)
+    assert np.max(np.abs(np.asarray(rough_power(jnp.asarray(x), p)) / x.astype(float) ** p - 1)) < 0.05
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_two_thirds_power_is_exact_to_rounding(dtype):
+    x = np.concatenate([np.geomspace(1e-35, 1, 20_001), 1 - np.geomspace(1e-16, 1, 1000)]).astype(dtype)
+    want = np.cbrt(x.astype(np.longdouble)) ** 2
+    got = np.asarray(two_thirds_power(jnp.asarray(x)), np.longdouble)
+    np.testing.assert_array_less(np.abs(got - want), 1.6 * np.finfo(dtype).eps * want + 1e-300)
+
+
+def test_two_thirds_power_at_the_ends():
+    x = jnp.asarray([0.0, 5e-324, 1e-310, 1e-40, 1.0, jnp.nan])
+    got = np.asarray(two_thirds_power(x))
+    assert (got[:4] <= np.asarray(x)[:4] ** (2 / 3) + 1e-300).all()
+    assert (got[:4] >= 0).all()
+    assert got[4] == 1
+    assert np.isnan(got[5])

@@ -37,9 +37,11 @@ from ._pair import ContactEnergy as ContactEnergy
 from ._pair import largest_overlap as largest_overlap
 from ._pair import pair_energy as pair_energy
 from ._pair import pair_force as pair_force
+from ._pair import pair_recovery as pair_recovery
 from ._pair import pair_split as pair_split
 from ._pair import wall_energy as wall_energy
 from ._pair import wall_force as wall_force
+from ._pair import wall_recovery as wall_recovery
 from ._precision import in_single as in_single
 from ._quasistatic import Compaction as Compaction
 from ._quasistatic import compact as compact

@@ -8,7 +8,6 @@ from ._golden import golden_table as golden_table
 from ._jax_artefact import Artefact as Artefact
 from ._jax_artefact import jax_artefact as jax_artefact
 from ._origin import Origin as Origin
-from ._pair import pair_force as pair_force
 from ._recipes import lammps_recipe as lammps_recipe
 from ._recipes import yade_recipe as yade_recipe
 from ._tables import CurveTables as CurveTables

@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._types import Values
+from .._types import Scalar, Values
+from ..dem import HalfContact, half_contact, pair_force, pair_recovery, wall_force, wall_recovery
 from ..geometry import Particle
 from ..law import TESTED_STRAIN, MccLaw
-from ._pair import pair_force
 from ._respond import respond
 
 if TYPE_CHECKING:
@@ -76,26 +76,46 @@ def golden_pair_table(
 ) -> Table:
     """Paths of the overlap of two half contacts: with itself, with one of 0.6 times the size, and with a rigid wall.
 
-    Both sides carry one force; see `pair_force`. Columns as of `golden_table`, and `partner`: `equal`, `smaller`,
-    `wall`.
+    Both sides carry one force; see `dem.pair_force`. Columns as of `golden_table`, and `partner`: `equal`, `smaller`,
+    `wall`. Where the law is not monotone a pair has several answers, and the table holds one of them.
     """
     import pandas as pd
 
     smaller = jax.tree.map(lambda d: d * OTHER_SIZE, particle)
+    side = half_contact(law, particle)
     tables = []
-    for partner, other in (("equal", particle), ("smaller", smaller), ("wall", None)):
-        sides = [particle] if other is None else [particle, other]
-        valid = [TESTED_STRAIN * float(p.effective_diameter / law.shape_factor(p)) / 2 for p in sides]
-        scale = len(valid) * min(valid)
+    for partner, other in (("equal", side), ("smaller", half_contact(law, smaller)), ("wall", None)):
+        scale = float(side.tested) if other is None else 2 * min(float(side.tested), float(other.tested))
 
-        def recovered(peak: np.ndarray, other: Particle | None = other) -> np.ndarray:
-            return pair_force(law, particle, law, other, peak, peak)[2]
+        def recovered(peak: np.ndarray, other: HalfContact | None = other) -> np.ndarray:
+            return np.asarray(_recovered_overlap(side, other, jnp.atleast_1d(peak))).reshape(np.shape(peak))
 
-        for number, path in enumerate(_paths(scale, recovered, seed)):
-            past = np.maximum.accumulate(np.maximum(path, 0.0))
-            force, tangent, _ = pair_force(law, particle, law, other, path, past)
-            tables.append(_rows(number, path, past, force, tangent).assign(partner=partner))
+        paths = _paths(scale, recovered, seed)
+        pasts = [np.maximum.accumulate(np.maximum(path, 0.0)) for path in paths]
+        number = np.repeat(np.arange(len(paths)), [len(path) for path in paths])
+        x, past = np.concatenate(paths), np.concatenate(pasts)
+        force, tangent = (np.asarray(v) for v in _contact(side, other, jnp.asarray(past), jnp.asarray(x)))
+        rows = _rows(number, 1e6 * x, 1e6 * past, 1e3 * force, 1e-3 * tangent)
+        tables.append(rows.assign(partner=partner))
     return _in_units(pd.concat(tables, ignore_index=True), units)
+
+
+@eqx.filter_jit
+@eqx.filter_vmap(in_axes=(None, None, 0))
+def _recovered_overlap(side: HalfContact, other: HalfContact | None, peak: Scalar) -> Scalar:
+    """Overlap recovered on full release [m]."""
+    return wall_recovery(side, peak) if other is None else pair_recovery(side, other, peak)
+
+
+@eqx.filter_jit
+@eqx.filter_vmap(in_axes=(None, None, 0, 0))
+def _contact(side: HalfContact, other: HalfContact | None, peak: Scalar, overlap: Scalar) -> tuple[Scalar, Scalar]:
+    """Force [N] and tangent [N/m] of a pair, or with a rigid wall."""
+
+    def force(overlap: Scalar) -> Scalar:
+        return wall_force(side, peak, overlap) if other is None else pair_force(side, other, peak, overlap)
+
+    return jax.value_and_grad(force)(overlap)
 
 
 def _paths(scale: float, recovered: Callable[[np.ndarray], np.ndarray], seed: int) -> list[np.ndarray]:

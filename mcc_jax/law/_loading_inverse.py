@@ -16,7 +16,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from .._numerics import shared
+from .._numerics import rough_power, shared
 from .._types import Scalar, Values
 
 HALLEY_STEPS = 4
@@ -61,9 +61,10 @@ def loading_strain(K1: Scalar, K3: Scalar, K5: Scalar, stress: Values, floor: Sc
     rounding = 2 * jnp.finfo(x.dtype).eps * target
     for _ in range(HALLEY_STEPS):
         square = x * x
-        slope = tangent_modulus(K1, K3, K5, x)
-        excess = x * (K1 - square * (K3 - square * K5)) - target
-        half_curvature = x * (10 * square * K5 - 3 * K3)
+        hardening = square * K5
+        slope = K1 - square * (3 * K3 - 5 * hardening)
+        excess = x * (K1 - square * (K3 - hardening)) - target
+        half_curvature = x * (10 * hardening - 3 * K3)
         squared = slope * slope
         divisor = jnp.maximum(squared - excess * half_curvature, 0.5 * squared)
         moves = (slope > noise) & (jnp.abs(excess) > rounding)
@@ -89,6 +90,11 @@ def _root(x: Values) -> Values:
     return shared(jnp.sqrt(jnp.maximum(x, 0.0)))
 
 
+def _rough(x: Values, p: float) -> Values:
+    """A power within 5 %, of numbers kept within what float32 can hold."""
+    return rough_power(jnp.clip(x, 1e-37, 1e37), p)
+
+
 def _start(K1: Scalar, K3: Scalar, K5: Scalar, target: Values, floor: Scalar) -> Values:
     # Written with maxima, and with each costly value used in few places: it then compiles to few loops over the data.
     tiny = jnp.finfo(target.dtype).tiny ** 0.5
@@ -102,34 +108,32 @@ def _start(K1: Scalar, K3: Scalar, K5: Scalar, target: Values, floor: Scalar) ->
 
     # Below a peak, H0 e^2 + H1 e^3 = drop: e = E g(H1 E / H0) with E = sqrt(drop / H0) and g(z) = (1 + 3z/2)^(-1/3),
     # right at both ends and 13 % off at worst between them.
-    H0 = jnp.maximum(peak * (3 * K3 - 10 * K5 * y), tiny)
-    E = _root(drop / H0)
-    widening = 1 + jnp.maximum(15 * K5 * y - 1.5 * K3, 0.0) * E / H0
+    over_H0 = shared(1 / jnp.maximum(peak * (3 * K3 - 10 * K5 * y), tiny))
+    E = _root(drop * over_H0)
+    widening = 1 + jnp.maximum(15 * K5 * y - 1.5 * K3, 0.0) * E * over_H0
 
     # Around the bend, d^3 + 3 p d = 2 q. With K3 -> 0 there is no bend; the cubic then stands in for K5 x^5.
-    bend_squared = shared(0.3 * K3 / K5)
+    over_K5 = shared(1 / jnp.maximum(K5, tiny))
+    bend_squared = 0.3 * K3 * over_K5
     bend = _root(bend_squared)
-    factor = shared(1 / jnp.maximum(2 * K3, _root(K1 * K5)))
-    p = (K1 - 1.5 * bend_squared * K3) * factor / 3
+    factor = shared(1 / jnp.maximum(2 * K3, _rough(K1 * K5, 0.5)))
+    p = (K1 - 1.5 * bend_squared * K3) * factor * (1 / 3)
     secant = K1 - 0.7 * bend_squared * K3
-    q = (target - bend * secant) * factor / 2
+    q = (target - bend * secant) * factor * 0.5
     concave = (q < 0) & ~falls
     half = jnp.abs(q)
     # One cube root for both; that of a start need not be exact.
     root_cubed = jnp.where(first_branch, widening, half + _root(half * half + p * p * p))
-    root = jnp.maximum(
-        shared(jnp.exp(jnp.log(jnp.maximum(root_cubed, tiny)) / 3)), jnp.where(first_branch, 1.0, _root(-p))
-    )
-    around_bend = bend + jnp.where(concave, -1.0, 1.0) * (root - p / root)
+    root = jnp.maximum(_rough(root_cubed, 1 / 3), jnp.where(first_branch, 1.0, _root(-p)))
+    over_root = shared(1 / root)
+    around_bend = bend + jnp.where(concave, -1.0, 1.0) * (root - p * over_root)
 
-    # An upper bound: K5 x^5 is at most 9/4 of the stress (monotone), or else half of stress + K3 x^3. The 7/32th power
-    # of what exceeds the place where K1 x = K5 x^5 is above its fifth root, and cheaper.
-    balance = _root(_root(K1 / K5))
-    eighth = _root(_root(_root(jnp.maximum(2.25 * target / (K1 * balance), 1.0))))
-    sixteenth = _root(eighth)
-    bound = balance * eighth * sixteenth * _root(sixteenth)
+    # An upper bound: K5 x^5 is at most 9/4 of the stress (monotone), or else half of stress + K3 x^3. Where K1 x is
+    # more than K5 x^5 the place where they are equal will do.
+    quotient = K1 * over_K5
+    bound = 1.05 * _rough(jnp.maximum(2.25 * target * over_K5, quotient * _rough(quotient, 0.25)), 0.2)
     bound = jnp.maximum(bound, jnp.where(falls, 2.6, 0.0) * bend)
     bound = jnp.where(concave, target / secant, bound)  # left of the bend, the chord
-    x = jnp.where(first_branch, peak - E / root, jnp.minimum(around_bend, bound))
+    x = jnp.where(first_branch, peak - E * over_root, jnp.minimum(around_bend, bound))
     # At or left of the root of a concave piece.
     return jnp.maximum(x, jnp.where((q < 0) | first_branch, target / K1, 0.0))

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._numerics import running_max, shared
+from .._numerics import compiled_whole, running_max, shared
 from .._types import Flag, Path, Scalar, scalar
 from ..geometry import Particle, plastic_shape_factor
 from ._base import AbstractContactLaw
@@ -110,10 +110,12 @@ class MccLaw(AbstractContactLaw[History]):
 
     # ---- stress and strain -------------------------------------------------------------------------------------------
 
+    @compiled_whole
     def loading_stress(self, particle: Particle, strain: AnyShape) -> AnyShape:
         """Stress [MPa] of plastic loading at the strain [-]."""
         return self.plastic.stress(self.shape_factor(particle) * strain)
 
+    @compiled_whole
     def recoverable_strain(self, particle: Particle, strain_max: AnyShape) -> AnyShape:
         r"""Strain :math:`\delta` [-] recovered on full release from the largest strain :math:`\epsilon_P` [-].
 
@@ -128,6 +130,7 @@ class MccLaw(AbstractContactLaw[History]):
         _, _, recoverable = self._elastic(eta, eta * strain_max)
         return recoverable
 
+    @compiled_whole
     def unloading_stress(self, particle: Particle, strain: AnyShape, strain_max: AnyShape) -> AnyShape:
         """Stress [MPa] on the elastic branch that starts at `strain_max`."""
         eta = self.shape_factor(particle)
@@ -139,6 +142,7 @@ class MccLaw(AbstractContactLaw[History]):
         strain_max = particle.strain(history.displacement_max)
         return strain_max, self.loading_stress(particle, strain_max)
 
+    @compiled_whole
     def residual_displacement(self, particle: Particle, history: History) -> Scalar:
         """Displacement [um] that stays after full release."""
         strain_max = particle.strain(history.displacement_max)
@@ -161,12 +165,14 @@ class MccLaw(AbstractContactLaw[History]):
         """A virgin particle."""
         return History(jnp.zeros_like(particle.D3))
 
+    @compiled_whole
     def step(self, particle: Particle, state: History, displacement: Scalar) -> tuple[History, Scalar]:
         """Force [mN] at the platen displacement [um] (negative: not yet touching), and the history after it."""
         # Asked this way round, a displacement that is NaN shows; so it is below.
         peak = jnp.where(displacement < state.displacement_max, state.displacement_max, displacement)
         return History(peak), self._force(particle, displacement, peak)
 
+    @compiled_whole
     def step_load(self, particle: Particle, state: History, force: Scalar) -> tuple[History, Scalar]:
         """Platen displacement [um] under the force [mN], and the history after it.
 
@@ -175,12 +181,14 @@ class MccLaw(AbstractContactLaw[History]):
         peak, displacement = self.peak_and_displacement(particle, state, force, force)
         return History(peak), displacement
 
+    @compiled_whole
     def path(self, particle: Particle, state: History, displacement: Path) -> tuple[History, Path]:
         """Forces [mN] along a path of displacements [um], in closed form over the running maximum (no scan)."""
         highest = running_max(displacement)
         peak = jnp.where(highest < state.displacement_max, state.displacement_max, highest)
         return History(peak[-1]), self._force(particle, displacement, peak)
 
+    @compiled_whole
     def path_load(self, particle: Particle, state: History, force: Path) -> tuple[History, Path]:
         """Displacements [um] along a path of forces [mN], in closed form over the running maximum (no scan)."""
         peak, displacement = self.peak_and_displacement(particle, state, force, running_max(force))
@@ -234,6 +242,7 @@ class MccLaw(AbstractContactLaw[History]):
 
     # ---- energy ------------------------------------------------------------------------------------------------------
 
+    @compiled_whole
     def loading_work(self, particle: Particle, displacement: Scalar) -> Scalar:
         r"""Work [nJ] of plastic loading from zero to the displacement [um].
 
@@ -244,6 +253,7 @@ class MccLaw(AbstractContactLaw[History]):
         density = self.plastic.work(eta * particle.strain(displacement)) / eta
         return particle.force(density) * particle.effective_diameter
 
+    @compiled_whole
     def energy(self, particle: Particle, history: History, displacement: Scalar) -> Energy:
         r"""Energy balance [nJ] at a displacement [um] on the branch that starts at the history's peak.
 

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._numerics import compiled_whole
 from .._types import Flag, Scalar, ScalarLike, scalar
 from ._loading_inverse import loading_strain, secant_modulus, tangent_modulus
 
@@ -61,6 +62,7 @@ class Plastic(eqx.Module):
         K1, K3, K5 = self.polynomial
         return tangent_modulus(K1, K3, K5, x)
 
+    @compiled_whole
     def strain(self, stress: Float[Array, ...]) -> Float[Array, ...]:
         """Scaled strain at which the stress [MPa] is first reached from the virgin state; 0 for stress <= 0.
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from .._numerics import horner, shared
+from .._numerics import horner, shared, two_thirds_power
 from .._types import Values
 from ._recovery_coefficients import ENERGY_64, RATIO_32, RATIO_64, RECOVERY_32, RECOVERY_64
 
@@ -65,8 +65,9 @@ def recovery(ratio: Values) -> Values:
         beyond it, where the platen no longer touches.
     """
     r = jnp.clip(ratio, 0, 1)
-    w = shared(jnp.exp(2 * jnp.log(r) / 3))  # as close as a power, closer than jnp.cbrt, and a third of their cost
-    return jnp.clip((1 - w) * horner(RECOVERY_64 if _is_double(w) else RECOVERY_32, 2 * w - 1), 0, 1)
+    w = two_thirds_power(r)
+    rest = shared((1 - r) * (1 + r) / (1 + w * (1 + w)))  # 1 - w, all digits kept towards the peak
+    return jnp.clip(rest * horner(RECOVERY_64 if _is_double(w) else RECOVERY_32, 2 * w - 1), 0, 1)
 
 
 @recovery.defjvp

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._numerics import compiled_whole
 from .._types import Scalar, ScalarLike, scalar
 from ..geometry import Particle
 
@@ -29,6 +30,7 @@ AGM_STEPS = 7
 NEWTON_STEPS = 7
 
 
+@compiled_whole
 def hertz_shape_factor(particle: Particle) -> Scalar:
     r"""Shape factor of the elastic contact, exactly: the elliptic contact of Hertz.
 

@@ -72,6 +72,7 @@ def test_every_command_has_help_with_an_example(run, command):
     assert "--out DIR" in text
 
 
+@pytest.mark.long  # `.ci/run` runs the demo as its users do
 def test_demo_does_the_whole_job(run, tmp_path):
     out = tmp_path / "new" / "demo"
     text = done(run("demo", "--out", out))

@@ -130,6 +130,7 @@ def test_same_seed_same_file_and_stale_figures_go(found, tests, tmp_path):
     assert first == second
 
 
+@pytest.mark.long
 def test_nothing_is_found_where_nothing_is_hidden_and_excluded_names_are_gone(tests, tmp_path):
     excluded = ["--exclude", "toe_asperity", "--exclude", "pop_in"]
     text = done(call("discover", tests / "null", "--out", tmp_path, "--no-held-out", "--no-figures", *excluded))

@@ -85,7 +85,10 @@ def interruptible():
 
 @posix
 @pytest.mark.usefixtures("interruptible")
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)])
+@pytest.mark.parametrize(
+    ("number", "status"),
+    [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.long), (signal.SIGKILL, -9)],
+)
 def test_killed_in_the_middle(tmp_path, number, status):
     out = tmp_path / "out"
     (out / "campaign").mkdir(parents=True)

@@ -117,6 +117,7 @@ def test_two_processes_give_the_numbers_of_one():
         check(result)
 
 
+@pytest.mark.long
 def test_single_precision_errs_as_documented():
     """Forces in float32 to about 1e-6, because places stay in float64."""
     packing = spheres(paper_law(), jax.random.uniform(jax.random.key(1), (24,), minval=80.0, maxval=120.0))

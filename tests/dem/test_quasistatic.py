@@ -228,6 +228,7 @@ def test_packing_of_a_population_scatters_the_same_particles_in_every_draw():
     np.testing.assert_allclose(slope, first, rtol=1e-12)
 
 
+@pytest.mark.long
 def test_bands_agree_for_small_scatter(pressed):
     _, state, heights, _, rows, _ = pressed
     draws = np.random.default_rng(1).normal(0.0, 0.01, (8, 2))

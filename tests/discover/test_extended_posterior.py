@@ -32,6 +32,7 @@ def posterior(extended):
     return extended_posterior(*extended)
 
 
+@pytest.mark.long
 def test_moved_summaries_are_those_of_moved_residuals(extended):
     base, found = extended
     fit, tests, state, zero_sd = base.fit, base.tests, found.state, base.model.zero_sd

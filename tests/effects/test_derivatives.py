@@ -97,7 +97,7 @@ def all_effects(dtype):
     return np.asarray(base), np.asarray(value), np.asarray(reverse), np.asarray(weights)
 
 
-@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+@pytest.mark.parametrize("dtype", [jnp.float64, pytest.param(jnp.float32, marks=pytest.mark.long)])
 def test_all_effects_at_their_null_leave_the_compiled_law_alone(dtype):
     base, value, reverse, _ = all_effects(dtype)
     assert value.dtype == dtype

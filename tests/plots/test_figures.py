@@ -34,6 +34,7 @@ from mcc_jax.plots._elastic import collapsed_branches
 from mcc_jax.plots._law import law_strain, stretches_outside
 
 KINDS = ("paper", "cycles", "two", "dropped", "many")
+QUICK = [pytest.param(kind, marks=pytest.mark.long if kind in ("two", "many") else ()) for kind in KINDS]
 UNIT = re.compile(r"\[(MPa|GPa|mN|µm|-)\]$")
 
 
@@ -60,7 +61,7 @@ def within(box, page):
     return page.x0 <= box.x0 and box.x1 <= page.x1 and page.y0 <= box.y0 and box.y1 <= page.y1
 
 
-@pytest.fixture(scope="module", params=KINDS)
+@pytest.fixture(scope="module", params=QUICK)
 def kind(request):
     return request.param
 

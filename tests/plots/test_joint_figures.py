@@ -28,7 +28,7 @@ from mcc_jax.plots._forest import CoefficientTable, draw_forest, posterior_table
 from mcc_jax.plots._joint import density, spread_over, with_sd
 from mcc_jax.simulate import paper_campaign
 
-KINDS = ("paper", pytest.param("one", marks=pytest.mark.long), "odd")
+KINDS = ("paper", *(pytest.param(kind, marks=pytest.mark.long) for kind in ("one", "odd")))
 STEMS = ["pairs", "prior_posterior", "forest", "shrinkage", "bands", "new_particle", "whitened", "fits", "estimates"]
 UNIT = re.compile(r"\[(GPa|mN|µm|-)\]$")
 

@@ -208,7 +208,8 @@ def test_two_particles_of_one_shape(method):
         assert content["a"]["sd"] > 0.5
 
 
-@few
+@pytest.mark.long
+@methods
 def test_two_spheres(method):
     """Flatness is exactly zero: a is in no equation at all."""
     campaign = simulated(COEFFICIENTS[:2], np.array([[150.0] * 3, [180.0] * 3]), instrument=NOISE)

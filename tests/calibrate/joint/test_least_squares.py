@@ -163,7 +163,7 @@ def with_outliers():
     return replace(campaign, curves=tuple(curves))
 
 
-@pytest.mark.parametrize("loss", ["soft_l1", "cauchy"])
+@pytest.mark.parametrize("loss", ["soft_l1", pytest.param("cauchy", marks=pytest.mark.long)])
 def test_a_robust_loss_resists_outliers(with_outliers, loss):
     found = calibrate_least_squares(with_outliers, loss=loss)
     linear = calibrate_least_squares(with_outliers)

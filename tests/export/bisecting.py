@@ -1,11 +1,8 @@
 """The pair of half contacts, by bisection: slow and plain, the reference of what other engines get."""
 
-from __future__ import annotations
-
 import numpy as np
 
-from ..geometry import Particle
-from ..law import MccLaw
+from mcc_jax import MccLaw, Particle
 
 Numbers = np.ndarray | float
 HALVINGS = 1100  # down to the smallest floating-point number
