@@ -5,6 +5,9 @@ computes them, and a sampler that sees other bits draws another chain. So the pr
 whose size and members depend on the campaign alone. Every process computes blocks of its own, on all its local devices;
 the numbers are then gathered by all processes, byte by byte, and whatever sums over particles, or concerns the
 population, is done by every process for itself: from the same bits, with the same program, on one device.
+
+Several processes therefore give the draws of one. Several devices of one process give the same fits to 1e-9 or so: a
+processor's devices share its threads, and sums are divided otherwise. Their draws are other draws of one posterior.
 """
 
 from __future__ import annotations

@@ -100,7 +100,8 @@ def sample_weighted(
     def proposed(count: int) -> tuple[np.ndarray, np.ndarray]:
         """Draws of the proposal and their log weights, up to a constant."""
         factor = np.linalg.cholesky(width)
-        free = folded(centre + unit.rvs(count + -count % AT_A_TIME, random_state=rng) @ factor.T)
+        standard = np.asarray(unit.rvs(size=int(count + -count % AT_A_TIME), random_state=rng))
+        free = folded(centre + standard @ factor.T)
         every_sign = (free[:, None] * signs - centre).reshape(-1, len(mode))
         density = unit.logpdf(solve_triangular(factor, every_sign.T, lower=True).T).reshape(len(free), -1)
         parts = (jnp.asarray(part) for part in np.split(free, len(free) // AT_A_TIME))
@@ -109,7 +110,8 @@ def sample_weighted(
         return free[:count], log_weight[:count]
 
     # Standard deviations of coordinates differ by many powers of ten, for which SciPy takes a matrix to be singular.
-    unit = multivariate_t(np.zeros(len(mode)), np.eye(len(mode)) * (1 - 2 / FREEDOM), FREEDOM)
+    shape = cast(Any, np.eye(len(mode)) * (1 - 2 / FREEDOM))  # its stub takes a number
+    unit = multivariate_t(np.zeros(len(mode)), shape, FREEDOM)
     total = chains * draws
     centre, width = folded(np.array(mode)), np.asarray(covariance)
     for _ in range(ROUNDS):
