@@ -19,6 +19,7 @@ from ._schema import Control, Metadata
 
 _QUANTITIES = {"force_resolution": FORCE, "displacement_resolution": LENGTH, "punch_diameter": LENGTH}
 _WORDS = ("control", "provenance", "corrections")
+_LARGEST_INTEGER = 2**63
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 
@@ -29,7 +30,7 @@ def load_toml(text: str, file: Path) -> dict[str, Any]:
         InputError: naming the line with the mistake.
     """
     try:
-        return tomllib.loads(text)
+        entries = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         place = re.search(r" \(at line (\d+), column \d+\)", str(error))
         problem = str(error)[: place.start()] if place else str(error).removesuffix(" (at end of document)")
@@ -39,6 +40,19 @@ def load_toml(text: str, file: Path) -> dict[str, Any]:
             row=int(place[1]) if place else text.rstrip().count("\n") + 1,
             remedy='Write key = value lines, text in double quotes, for example control = "load"',
         ) from None
+    # TOML promises 64 bits only. Python reads more, and fails later: no float holds them, some cannot even be printed.
+    for key, value in entries.items():
+        if _has_huge(value):
+            raise InputError(
+                "holds an integer of more than 64 bits", file=file, column=key, remedy="Write it with a decimal point"
+            )
+    return entries
+
+
+def _has_huge(value: Any) -> bool:
+    if isinstance(value, dict | list):
+        return any(_has_huge(item) for item in (value.values() if isinstance(value, dict) else value))
+    return isinstance(value, int) and not -_LARGEST_INTEGER <= value < _LARGEST_INTEGER
 
 
 def load_toml_file(path: str | Path, what: str) -> dict[str, Any]:
@@ -53,7 +67,7 @@ def load_toml_file(path: str | Path, what: str) -> dict[str, Any]:
     """
     file = Path(path)
     try:
-        text = file.read_text(encoding="utf-8")
+        text = file.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", file=file, remedy=f"Give {what}.") from error
     except UnicodeDecodeError as error:

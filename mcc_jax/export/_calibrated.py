@@ -134,7 +134,7 @@ def _estimate(content: Mapping[str, Any], keys: tuple[str, ...], file: Path) -> 
 
 
 def _is_number(value: Any) -> TypeGuard[float]:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, int | float) and not isinstance(value, bool) and -1e300 <= value <= 1e300
 
 
 def _log(content: Mapping[str, Any], name: str, file: Path) -> dict[str, Any]:

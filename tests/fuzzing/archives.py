@@ -10,7 +10,19 @@ from random import Random
 from mutators import mutate
 
 NAMES = (
-    *("a.txt", "b/a.txt", "../../x", "/etc/passwd", "C:\\x.txt", "..", ".", "x/", "a\nb.txt", "\x1b[31m.txt", "con.txt"),
+    *(
+        "a.txt",
+        "b/a.txt",
+        "../../x",
+        "/etc/passwd",
+        "C:\\x.txt",
+        "..",
+        ".",
+        "x/",
+        "a\nb.txt",
+        "\x1b[31m.txt",
+        "con.txt",
+    ),
     *("é.txt", "\u202etxt.a", "a" * 300, " ", ".txt", "a,b.txt", '"a".txt', "a\x00b.txt", "a/../../b.txt", "1.txt"),
 )
 METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)

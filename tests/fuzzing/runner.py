@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from worker import COLUMNS, HEAD, keep, progress_of
+from worker import COLUMNS, keep, progress_of
 
 SECONDS = 5.0
 POLL_S = 0.05
@@ -57,8 +57,8 @@ def run(run: Watched) -> dict[str, dict[str, float]]:
             if kind is None:
                 break
             place, number = int(here[0]), int(here[1])
-            if place < 0:
-                raise RuntimeError(f"the worker ended before its first input ({kind}):\n{text}")
+            if np.isinf(here[2]):
+                raise RuntimeError(f"the worker broke between two inputs ({kind}):\n{text}")
             reader = readers[place]
             keep(run.out, reader, run.seed, number, kind, text)
             table[place][0] += 1
@@ -67,7 +67,6 @@ def run(run: Watched) -> dict[str, dict[str, float]]:
             plan = _behind(plan, reader.name, number)
         names = [name for name, _, _ in run.plan]
         found = {r.name: dict(zip(COLUMNS, table[i].tolist(), strict=True)) for i, r in enumerate(readers)}
-        assert len(here) == HEAD
         return {name: found[name] for name in names}
 
 
@@ -80,8 +79,13 @@ def _behind(plan: list[Part], name: str, number: int) -> list[Part]:
 def _one_worker(run: Watched, plan: list[Part], shared: Path, here: np.ndarray) -> tuple[str | None, str]:
     """Watch one worker; what ended it, or None, and what it said of that."""
     settings = {
-        **{"module": run.module, "plan": plan, "seed": run.seed, "out": str(run.out.absolute())},
-        **{"shared": str(shared), "seconds": run.seconds, "double": run.double},
+        "module": run.module,
+        "plan": plan,
+        "seed": run.seed,
+        "out": str(run.out.absolute()),
+        "shared": str(shared),
+        "seconds": run.seconds,
+        "double": run.double,
     }
     said = shared.with_name("said")
     with said.open("w+b") as stream:

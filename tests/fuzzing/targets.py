@@ -47,7 +47,14 @@ def folder_of(name: str) -> tuple[str, ...]:
 
 def damaged(name: str) -> Callable[[Random], Case]:
     """One sample with damage, spliced now and then with any other text sample."""
-    others = ("fischer.txt", "hysitron.hld", "hysitron_lc.txt", "micromaterials.txt", "campaign/curves.csv", "priors.toml")
+    others = (
+        "fischer.txt",
+        "hysitron.hld",
+        "hysitron_lc.txt",
+        "micromaterials.txt",
+        "campaign/curves.csv",
+        "priors.toml",
+    )
 
     def make(rng: Random) -> Case:
         other = sample(name if rng.random() < 0.7 else rng.choice(others))
@@ -101,7 +108,9 @@ def state(rng: Random) -> Case:
 
 
 def diameters(rng: Random) -> Case:
-    return {"text": mutate(rng, b"200.0,190.5,1.8e2", b"1,2,3")} if rng.random() < 0.5 else damaged("campaign/particles.csv")(rng)
+    if rng.random() < 0.5:
+        return damaged("campaign/particles.csv")(rng)
+    return {"text": mutate(rng, b"200.0,190.5,1.8e2", b"1,2,3")}
 
 
 def read_campaign(folder: Path) -> None:

@@ -24,6 +24,7 @@ MEMORY = 1 << 30
 COLUMNS = ("inputs", "refused", "read", "failures", "slowest_ms", "peak_MiB", "seconds")
 # Before the table: the reader's place, the number of the input, and when it began.
 HEAD = 3
+WARMING_S = 60.0
 KEPT = 3
 """So many inputs that fail alike are kept."""
 
@@ -35,7 +36,9 @@ def progress_of(file: Path, readers: int, mode: Any) -> tuple[np.ndarray, np.nda
 
 
 def case_of(reader: Any, seed: int, number: int) -> dict[str, bytes]:
-    return reader.make(Random(f"{seed}/{reader.name}/{number}"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # zipfile finds names that stand there twice worth a warning
+        return reader.make(Random(f"{seed}/{reader.name}/{number}"))
 
 
 def keep(out: Path, reader: Any, seed: int, number: int, kind: str, text: str) -> None:
@@ -71,11 +74,15 @@ def outcome(reader: Any, folder: Path) -> tuple[str, str]:
 
 
 def _listing(folder: Path) -> tuple[list[str], list[str]]:
-    return os.listdir(folder), os.listdir(folder.parent)
+    return sorted(p.name for p in folder.iterdir()), sorted(p.name for p in folder.parent.iterdir())
 
 
 def _address_space(status: int) -> int:
     return int(os.pread(status, 64, 0).split()[0]) * resource.getpagesize()
+
+
+def _limit_memory(size: int) -> None:
+    resource.setrlimit(resource.RLIMIT_AS, (size, resource.RLIM_INFINITY))
 
 
 def _peak_MiB() -> float:
@@ -88,21 +95,25 @@ def work(module: str, plan: Sequence[tuple[str, int, int]], seed: int, out: Path
     readers = {reader.name: (i, reader) for i, reader in enumerate(importlib.import_module(module).READERS)}
     here, table = progress_of(shared, len(readers), "r+")
     folder = shared.parent / "work" / "case"
-    with open("/proc/self/statm", "rb", buffering=0) as statm:
+    with Path("/proc/self/statm").open("rb", buffering=0) as statm:
         for name, first, stop in plan:
             place, reader = readers[name]
-            _read_whole(reader, seed, folder)
+            # The first is read twice: importing and compiling are not what is timed.
+            here[:] = place, first, time.monotonic() + WARMING_S
+            _write(case_of(reader, seed, first), folder)
+            outcome(reader, folder)
+            here[2] = np.inf
             # From here on the peak is that of this reader.
             Path("/proc/self/clear_refs").write_text("5")
             for number in range(first, stop):
                 case = case_of(reader, seed, number)
                 _write(case, folder)
-                resource.setrlimit(resource.RLIMIT_AS, (_address_space(statm.fileno()) + MEMORY, resource.RLIM_INFINITY))
+                _limit_memory(_address_space(statm.fileno()) + MEMORY)
                 here[:] = place, number, time.monotonic()
                 kind, text = outcome(reader, folder)
                 took = time.monotonic() - here[2]
                 here[2] = np.inf
-                resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+                _limit_memory(resource.RLIM_INFINITY)
                 if took > seconds and kind in ("read", "refused"):
                     kind, text = "slow", f"took {took:.1f} s"
                 row = table[place]
@@ -123,12 +134,6 @@ def _write(case: dict[str, bytes], folder: Path) -> None:
         if "/" in name:
             (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_bytes(content)
-
-
-def _read_whole(reader: Any, seed: int, folder: Path) -> None:
-    """One input beforehand, whatever comes of it: importing and compiling are not what is timed."""
-    _write(case_of(reader, seed, -1), folder)
-    outcome(reader, folder)
 
 
 if __name__ == "__main__":
