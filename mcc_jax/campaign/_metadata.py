@@ -7,7 +7,7 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, get_args
 
@@ -19,7 +19,7 @@ from ._schema import Control, Metadata
 
 _QUANTITIES = {"force_resolution": FORCE, "displacement_resolution": LENGTH, "punch_diameter": LENGTH}
 _WORDS = ("control", "provenance", "corrections")
-_LARGEST_INTEGER = 2**63
+_DEEPEST = 100
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 
@@ -40,19 +40,31 @@ def load_toml(text: str, file: Path) -> dict[str, Any]:
             row=int(place[1]) if place else text.rstrip().count("\n") + 1,
             remedy='Write key = value lines, text in double quotes, for example control = "load"',
         ) from None
-    # TOML promises 64 bits only. Python reads more, and fails later: no float holds them, some cannot even be printed.
-    for key, value in entries.items():
-        if _has_huge(value):
-            raise InputError(
-                "holds an integer of more than 64 bits", file=file, column=key, remedy="Write it with a decimal point"
-            )
+    _check_sizes(entries, file)
     return entries
 
 
-def _has_huge(value: Any) -> bool:
-    if isinstance(value, dict | list):
-        return any(_has_huge(item) for item in (value.values() if isinstance(value, dict) else value))
-    return isinstance(value, int) and not -_LARGEST_INTEGER <= value < _LARGEST_INTEGER
+def _check_sizes(entries: dict[str, Any], file: Path) -> None:
+    """Refuse what Python reads and then fails on: integers that no float holds, tables too deep to walk through."""
+    level: list[tuple[str, Any]] = list(entries.items())
+    for _ in range(_DEEPEST):
+        for key, value in level:
+            # TOML promises 64 bits only.
+            if isinstance(value, int) and not -(2**63) <= value < 2**63:
+                raise InputError(
+                    "holds an integer of more than 64 bits",
+                    file=file,
+                    column=key,
+                    remedy="Write it with a decimal point",
+                )
+        level = [(key, item) for key, value in level for item in _items(value)]
+        if not level:
+            return
+    raise InputError(f"is nested more than {_DEEPEST} deep", file=file, column=level[0][0], remedy="Flatten it")
+
+
+def _items(value: Any) -> Iterable[Any]:
+    return value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
 
 
 def load_toml_file(path: str | Path, what: str) -> dict[str, Any]:

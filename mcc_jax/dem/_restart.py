@@ -63,7 +63,7 @@ def load_state(path: str | Path) -> tuple[Packing, State]:
         # Opened here: NumPy leaves the file open when the archive turns out to be damaged.
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
             header = json.loads(bytes(stored["header"]))
-            leaves = [stored[f"leaf_{k}"] for k in range(len(stored.files) - 1)]
+            leaves = [np.asarray(stored[f"leaf_{k}"]) for k in range(len(stored.files) - 1)]
     except FileNotFoundError:
         raise InputError("there is no such file", file=path, remedy="Name one that `save_state` wrote.") from None
     # NumPy, zipfile and the tokenizer behind them report damage through a dozen exception types.

@@ -33,7 +33,7 @@ def _read(folder: Path) -> None:
 
 
 def _reader(number: int) -> Reader:
-    return Reader(f"fault {number}", 1, lambda _: {"number": b"%d" % number}, _read)
+    return Reader(f"fault {number}", 1, {"number": b"0"}, lambda *_: {"number": b"%d" % number}, _read)
 
 
 READERS = tuple(_reader(number) for number in range(9))

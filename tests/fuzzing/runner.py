@@ -15,11 +15,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from worker import COLUMNS, keep, progress_of
+from worker import COLUMNS, Part, keep, progress_of
 
 SECONDS = 5.0
 POLL_S = 0.05
-Part = tuple[str, int, int]
 
 
 @dataclass(frozen=True)

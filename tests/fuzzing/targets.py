@@ -7,15 +7,17 @@ import shutil
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from random import Random
 
-from archives import hostile_archive
+from archives import hostile_archive, pack
 from mutators import mutate, mutate_json
 
 SAMPLES = Path(__file__).parent / "samples"
 Case = dict[str, bytes]
+
+
+Damage = Callable[[Random, Case], Case]
 
 
 @dataclass(frozen=True)
@@ -25,77 +27,61 @@ class Reader:
     Attributes:
         name: as in the table and after --only.
         share: of the inputs, relative to the others; slow readers get fewer.
-        make: the files of one input, by their path within a folder.
+        whole: files that it reads, by their path within a folder.
+        damage: what becomes of them in one input.
         read: reads them in that folder; returns, or raises `InputError`.
     """
 
     name: str
     share: float
-    make: Callable[[Random], Case]
+    whole: Case
+    damage: Damage
     read: Callable[[Path], object]
 
 
-@cache
 def sample(name: str) -> bytes:
     return (SAMPLES / name).read_bytes()
 
 
-@cache
-def folder_of(name: str) -> tuple[str, ...]:
-    return tuple(sorted(file.name for file in (SAMPLES / name).iterdir()))
+def samples(folder: str) -> Case:
+    return {file.name: file.read_bytes() for file in sorted((SAMPLES / folder).iterdir())}
 
 
-def damaged(name: str) -> Callable[[Random], Case]:
-    """One sample with damage, spliced now and then with any other text sample."""
-    others = (
-        "fischer.txt",
-        "hysitron.hld",
-        "hysitron_lc.txt",
-        "micromaterials.txt",
-        "campaign/curves.csv",
-        "priors.toml",
-    )
-
-    def make(rng: Random) -> Case:
-        other = sample(name if rng.random() < 0.7 else rng.choice(others))
-        return {Path(name).name: mutate(rng, sample(name), other)}
-
-    return make
+CAMPAIGN = {f"campaign/{name}": content for name, content in samples("campaign").items()}
+RESULTS = samples("results")
+OTHERS = [sample(name) for name in ("fischer.txt", "hysitron.hld", "hysitron_lc.txt", "campaign/curves.csv")]
 
 
-def damaged_in(folder: str, name: str, *keep: str) -> Callable[[Random], Case]:
-    """A folder in which one file has damage; of the others only `keep` are there, if given."""
+def bytes_of(name: str) -> Damage:
+    """Damage to one file, spliced now and then with a sample of another kind."""
 
-    def make(rng: Random) -> Case:
-        names = keep or folder_of(folder)
-        return {other: sample(f"{folder}/{other}") for other in names} | damaged(f"{folder}/{name}")(rng)
+    def damage(rng: Random, whole: Case) -> Case:
+        other = whole[name] if rng.random() < 0.7 else rng.choice(OTHERS)
+        return whole | {name: mutate(rng, whole[name], other)}
 
-    return make
-
-
-def json_in(*files: str) -> Callable[[Random], Case]:
-    """Results beside their campaign, one of the files with other values or with damaged bytes."""
-
-    def make(rng: Random) -> Case:
-        case = {f"campaign/{name}": sample(f"campaign/{name}") for name in folder_of("campaign")}
-        case |= {name: sample(f"results/{name}") for name in files}
-        name = rng.choice(files)
-        case[name] = mutate_json(rng, case[name]) if rng.random() < 0.7 else mutate(rng, case[name], case[files[0]])
-        return case
-
-    return make
+    return damage
 
 
-def archive(rng: Random) -> Case:
+def values_of(*names: str) -> Damage:
+    """Other values in one of several JSON files, or damaged bytes."""
+
+    def damage(rng: Random, whole: Case) -> Case:
+        name = rng.choice(names)
+        return whole | {name: mutate_json(rng, whole[name])} if rng.random() < 0.7 else bytes_of(name)(rng, whole)
+
+    return damage
+
+
+def archive(rng: Random, _: Case) -> Case:
     return {"tests.zip": hostile_archive(rng, sample("micromaterials.txt"), sample("hysitron_lc.txt"))}
 
 
-def state(rng: Random) -> Case:
+def state(rng: Random, whole: Case) -> Case:
     """A saved state with damage outside or, with checksums that fit, inside."""
     if rng.random() < 0.3:
-        return {"state.npz": mutate(rng, sample("state.npz"), sample("fischer.txt"))}
+        return bytes_of("state.npz")(rng, whole)
     buffer = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(sample("state.npz"))) as old, zipfile.ZipFile(buffer, "w") as new:
+    with zipfile.ZipFile(io.BytesIO(whole["state.npz"])) as old, zipfile.ZipFile(buffer, "w") as new:
         names = old.namelist()
         chosen = rng.sample(names, rng.choice((1, 1, 2)))
         for name in names:
@@ -107,9 +93,9 @@ def state(rng: Random) -> Case:
     return {"state.npz": buffer.getvalue()}
 
 
-def diameters(rng: Random) -> Case:
+def diameters(rng: Random, whole: Case) -> Case:
     if rng.random() < 0.5:
-        return damaged("campaign/particles.csv")(rng)
+        return bytes_of("particles.csv")(rng, whole)
     return {"text": mutate(rng, b"200.0,190.5,1.8e2", b"1,2,3")}
 
 
@@ -190,28 +176,27 @@ def read_state(folder: Path) -> None:
     load_state(folder / "state.npz")
 
 
+FOLDER, MAPPED = samples("campaign"), samples("mapped")
+ZIP = {"tests.zip": pack(Random(0), [sample("micromaterials.txt")])}
+BOTH = ("calibration.json", "discovery.json")
+TESTERS = (
+    ("Fischer", "fischer.txt"),
+    ("Hysitron hld", "hysitron.hld"),
+    ("Hysitron text", "hysitron_lc.txt"),
+    ("Micro Materials", "micromaterials.txt"),
+)
 READERS = (
-    *(Reader(name, 3, damaged_in("campaign", name), read_campaign) for name in ("particles.csv", "campaign.toml")),
-    Reader("curves.csv", 5, damaged_in("campaign", "curves.csv"), read_campaign),
-    Reader("diameters", 2, diameters, read_diameters),
-    *(
-        Reader(label, 4, damaged(name), convert(name))
-        for label, name in (
-            ("Fischer", "fischer.txt"),
-            ("Hysitron hld", "hysitron.hld"),
-            ("Hysitron text", "hysitron_lc.txt"),
-            ("Micro Materials", "micromaterials.txt"),
-        )
-    ),
-    Reader("archive", 5, archive, convert("tests.zip")),
-    Reader("mapped table", 4, damaged_in("mapped", "table.txt"), convert("table.txt", "mapping.toml")),
-    Reader("mapping", 4, damaged_in("mapped", "mapping.toml"), convert("table.txt", "mapping.toml")),
-    Reader("priors", 2, damaged("priors.toml"), read_priors),
-    Reader("programme", 2, damaged("programme.toml"), read_programme),
-    Reader("calibration.json", 2, json_in("calibration.json"), read_results),
-    Reader("discovery.json", 2, json_in("discovery.json"), read_results),
-    Reader("posterior.nc", 2, damaged_in("results", "posterior.nc", "posterior.nc"), read_results),
-    Reader("saved state", 1, state, read_state),
-    Reader("export", 0.2, json_in("calibration.json"), export),
-    Reader("report page", 0.1, json_in("calibration.json", "discovery.json"), report),
+    *(Reader(name, 4, FOLDER, bytes_of(name), read_campaign) for name in FOLDER),
+    Reader("diameters", 2, {"particles.csv": FOLDER["particles.csv"]}, diameters, read_diameters),
+    *(Reader(label, 4, {name: sample(name)}, bytes_of(name), convert(name)) for label, name in TESTERS),
+    Reader("archive", 5, ZIP, archive, convert("tests.zip")),
+    Reader("mapped table", 4, MAPPED, bytes_of("table.txt"), convert("table.txt", "mapping.toml")),
+    Reader("mapping", 4, MAPPED, bytes_of("mapping.toml"), convert("table.txt", "mapping.toml")),
+    Reader("priors", 2, {"priors.toml": sample("priors.toml")}, bytes_of("priors.toml"), read_priors),
+    Reader("programme", 2, {"programme.toml": sample("programme.toml")}, bytes_of("programme.toml"), read_programme),
+    *(Reader(name, 2, CAMPAIGN | {name: RESULTS[name]}, values_of(name), read_results) for name in BOTH),
+    Reader("posterior.nc", 2, {"posterior.nc": RESULTS["posterior.nc"]}, bytes_of("posterior.nc"), read_results),
+    Reader("saved state", 1, {"state.npz": sample("state.npz")}, state, read_state),
+    Reader("export", 0.2, CAMPAIGN | RESULTS, values_of("calibration.json"), export),
+    Reader("report page", 0.1, CAMPAIGN | RESULTS, values_of(*BOTH), report),
 )

@@ -24,7 +24,7 @@ MEMORY = 1 << 30
 COLUMNS = ("inputs", "refused", "read", "failures", "slowest_ms", "peak_MiB", "seconds")
 # Before the table: the reader's place, the number of the input, and when it began.
 HEAD = 3
-WARMING_S = 60.0
+Part = tuple[str, int, int]
 KEPT = 3
 """So many inputs that fail alike are kept."""
 
@@ -38,7 +38,7 @@ def progress_of(file: Path, readers: int, mode: Any) -> tuple[np.ndarray, np.nda
 def case_of(reader: Any, seed: int, number: int) -> dict[str, bytes]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # zipfile finds names that stand there twice worth a warning
-        return reader.make(Random(f"{seed}/{reader.name}/{number}"))
+        return reader.damage(Random(f"{seed}/{reader.name}/{number}"), reader.whole)
 
 
 def keep(out: Path, reader: Any, seed: int, number: int, kind: str, text: str) -> None:
@@ -90,7 +90,7 @@ def _peak_MiB() -> float:
     return int(line.split()[1]) / 1024
 
 
-def work(module: str, plan: Sequence[tuple[str, int, int]], seed: int, out: Path, shared: Path, seconds: float) -> None:
+def work(module: str, plan: Sequence[Part], seed: int, out: Path, shared: Path, seconds: float) -> None:
     """Go through the plan: reader, first number, number behind the last."""
     readers = {reader.name: (i, reader) for i, reader in enumerate(importlib.import_module(module).READERS)}
     here, table = progress_of(shared, len(readers), "r+")
@@ -98,11 +98,10 @@ def work(module: str, plan: Sequence[tuple[str, int, int]], seed: int, out: Path
     with Path("/proc/self/statm").open("rb", buffering=0) as statm:
         for name, first, stop in plan:
             place, reader = readers[name]
-            # The first is read twice: importing and compiling are not what is timed.
-            here[:] = place, first, time.monotonic() + WARMING_S
-            _write(case_of(reader, seed, first), folder)
-            outcome(reader, folder)
-            here[2] = np.inf
+            # Undamaged first: importing and compiling are not what is timed.
+            _write(reader.whole, folder)
+            if (found := outcome(reader, folder))[0] != "read":
+                raise RuntimeError(f"{name} does not read its own sample: {found}")
             # From here on the peak is that of this reader.
             Path("/proc/self/clear_refs").write_text("5")
             for number in range(first, stop):
