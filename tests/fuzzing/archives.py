@@ -41,6 +41,13 @@ def pack(rng: Random, members: list[bytes]) -> bytes:
     return buffer.getvalue()
 
 
+def plain_archive(member: bytes) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(zipfile.ZipInfo("test.txt"), member)
+    return buffer.getvalue()
+
+
 def hostile_archive(rng: Random, member: bytes, other: bytes) -> bytes:
     """An archive with damaged members, with members that swell, or one that is damaged itself."""
     members = [member, other][: rng.choice((0, 1, 1, 2, 2))]

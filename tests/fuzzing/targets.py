@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from random import Random
 
-from archives import hostile_archive, pack
+from archives import hostile_archive, plain_archive
 from mutators import mutate, mutate_json
 
 SAMPLES = Path(__file__).parent / "samples"
@@ -177,7 +177,7 @@ def read_state(folder: Path) -> None:
 
 
 FOLDER, MAPPED = samples("campaign"), samples("mapped")
-ZIP = {"tests.zip": pack(Random(0), [sample("micromaterials.txt")])}
+ZIP = {"tests.zip": plain_archive(sample("micromaterials.txt"))}
 BOTH = ("calibration.json", "discovery.json")
 TESTERS = (
     ("Fischer", "fischer.txt"),

@@ -52,8 +52,8 @@ def test_damage_keeps_files_small():
 
 
 def test_the_command_names_what_it_did(tmp_path):
-    command = [sys.executable, "-m", "tests.fuzzing", "--inputs", "20", "--only", "priors", "--out", tmp_path]
+    command = [sys.executable, "-m", "tests.fuzzing", "--inputs", "20", "--only", "diameters", "--out", tmp_path]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "priors" in done.stdout
+    assert "diameters" in done.stdout
     assert "20 inputs with seed 0" in done.stdout
