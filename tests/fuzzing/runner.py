@@ -19,6 +19,7 @@ from worker import COLUMNS, Part, keep, progress_of
 
 SECONDS = 5.0
 POLL_S = 0.05
+IN_MEMORY = Path("/dev/shm")
 
 
 @dataclass(frozen=True)
@@ -47,12 +48,15 @@ def run(run: Watched) -> dict[str, dict[str, float]]:
     """
     readers = importlib.import_module(run.module).READERS
     plan = list(run.plan)
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(dir=IN_MEMORY if IN_MEMORY.is_dir() else None) as folder:
         shared = Path(folder) / "progress"
         here, table = progress_of(shared, len(readers), "w+")
         while plan:
             here[:] = -1, -1, np.inf
-            kind, text = _one_worker(run, plan, shared, here)
+            try:
+                kind, text = _one_worker(run, plan, shared, here)
+            except KeyboardInterrupt:  # the table so far is worth printing
+                break
             if kind is None:
                 break
             place, number = int(here[0]), int(here[1])

@@ -198,5 +198,5 @@ READERS = (
     Reader("posterior.nc", 2, {"posterior.nc": RESULTS["posterior.nc"]}, bytes_of("posterior.nc"), read_results),
     Reader("saved state", 1, {"state.npz": sample("state.npz")}, state, read_state),
     Reader("export", 0.2, CAMPAIGN | RESULTS, values_of("calibration.json"), export),
-    Reader("report page", 0.1, CAMPAIGN | RESULTS, values_of(*BOTH), report),
+    Reader("report page", 0.05, CAMPAIGN | RESULTS, values_of(*BOTH), report),
 )
