@@ -83,8 +83,11 @@ def load_state(path: str | Path) -> tuple[Packing, State]:
 def _skeleton(header: dict, file: Path) -> tuple[Packing, State]:
     """A packing and a state of the right structure; their leading axes tell what they count."""
     walls, power, particles = (header.get(key) for key in ("walls", "power", "particles"))
-    known = isinstance(walls, list) and all(name in ("Plane", "Cylinder") for name in walls)
-    if not known or type(power) is not int or type(particles) is not int:
+    if (
+        not isinstance(walls, list)
+        or not all(name in ("Plane", "Cylinder") for name in walls)
+        or {type(power), type(particles)} != {int}
+    ):
         raise InputError("has a damaged header", file=file, remedy="Save it again.")
 
     def empty(*shape: int, kind: type = float) -> jax.Array:

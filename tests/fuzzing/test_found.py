@@ -112,6 +112,16 @@ def test_integers_that_no_float_holds(tmp_path):
     assert "a has no value" in refused(read_calibration, tmp_path)
 
 
+@pytest.mark.parametrize(("seed", "words"), [("NaN", "not JSON"), ("1e400", "not JSON"), ("5", None)])
+def test_what_json_cannot_hold_again(tmp_path, seed, words):
+    content = json.loads((SAMPLES / "results" / "calibration.json").read_bytes()) | {"seed": "here", "warnings": 1.5}
+    (tmp_path / "calibration.json").write_text(json.dumps(content).replace('"here"', seed))
+    if words is None:
+        assert read_calibration(tmp_path)[2].calibration["seed"] == 5
+    else:
+        assert words in refused(read_calibration, tmp_path)
+
+
 def change_header(arrays, **changes):
     header = json.loads(bytes(arrays["header"])) | changes
     arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
