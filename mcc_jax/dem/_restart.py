@@ -86,7 +86,8 @@ def _skeleton(header: dict, file: Path) -> tuple[Packing, State]:
     if (
         not isinstance(walls, list)
         or not all(name in ("Plane", "Cylinder") for name in walls)
-        or {type(power), type(particles)} != {int}
+        or not isinstance(power, int)
+        or not isinstance(particles, int)
     ):
         raise InputError("has a damaged header", file=file, remedy="Save it again.")
 
