@@ -7,7 +7,7 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, get_args
 
@@ -19,6 +19,7 @@ from ._schema import Control, Metadata
 
 _QUANTITIES = {"force_resolution": FORCE, "displacement_resolution": LENGTH, "punch_diameter": LENGTH}
 _WORDS = ("control", "provenance", "corrections")
+_DEEPEST = 100
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 
@@ -29,7 +30,7 @@ def load_toml(text: str, file: Path) -> dict[str, Any]:
         InputError: naming the line with the mistake.
     """
     try:
-        return tomllib.loads(text)
+        entries = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         place = re.search(r" \(at line (\d+), column \d+\)", str(error))
         problem = str(error)[: place.start()] if place else str(error).removesuffix(" (at end of document)")
@@ -39,6 +40,31 @@ def load_toml(text: str, file: Path) -> dict[str, Any]:
             row=int(place[1]) if place else text.rstrip().count("\n") + 1,
             remedy='Write key = value lines, text in double quotes, for example control = "load"',
         ) from None
+    _check_sizes(entries, file)
+    return entries
+
+
+def _check_sizes(entries: dict[str, Any], file: Path) -> None:
+    """Refuse what Python reads and then fails on: integers that no float holds, tables too deep to walk through."""
+    level: list[tuple[str, Any]] = list(entries.items())
+    for _ in range(_DEEPEST):
+        for key, value in level:
+            # TOML promises 64 bits only.
+            if isinstance(value, int) and not -(2**63) <= value < 2**63:
+                raise InputError(
+                    "holds an integer of more than 64 bits",
+                    file=file,
+                    column=key,
+                    remedy="Write it with a decimal point",
+                )
+        level = [(key, item) for key, value in level for item in _items(value)]
+        if not level:
+            return
+    raise InputError(f"is nested more than {_DEEPEST} deep", file=file, column=level[0][0], remedy="Flatten it")
+
+
+def _items(value: Any) -> Iterable[Any]:
+    return value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
 
 
 def load_toml_file(path: str | Path, what: str) -> dict[str, Any]:
@@ -53,7 +79,7 @@ def load_toml_file(path: str | Path, what: str) -> dict[str, Any]:
     """
     file = Path(path)
     try:
-        text = file.read_text(encoding="utf-8")
+        text = file.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", file=file, remedy=f"Give {what}.") from error
     except UnicodeDecodeError as error:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,8 @@ from ._state import State
 from ._walls import Cylinder, Plane
 
 SCHEMA = 1
+# Lengths that stand for those of a file, which no number of walls or dimensions equals.
+_PARTICLES, _EDGES = 3571, 3581
 
 
 def save_state(path: str | Path, packing: Packing, state: State) -> None:
@@ -57,14 +58,16 @@ def load_state(path: str | Path) -> tuple[Packing, State]:
     Raises:
         InputError: if the file is missing, damaged, of another version, or of something else.
     """
+    path = Path(path)
     try:
         # Opened here: NumPy leaves the file open when the archive turns out to be damaged.
-        with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
             header = json.loads(bytes(stored["header"]))
-            leaves = [stored[f"leaf_{k}"] for k in range(len(stored.files) - 1)]
+            leaves = [np.asarray(stored[f"leaf_{k}"]) for k in range(len(stored.files) - 1)]
     except FileNotFoundError:
         raise InputError("there is no such file", file=path, remedy="Name one that `save_state` wrote.") from None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    # NumPy, zipfile and the tokenizer behind them report damage through a dozen exception types.
+    except Exception as error:
         raise InputError(f"is not a saved state ({error})", file=path, remedy="Save it again.") from None
     if not isinstance(header, dict) or header.get("schema") != SCHEMA:
         raise InputError(
@@ -72,26 +75,48 @@ def load_state(path: str | Path) -> tuple[Packing, State]:
             file=path,
             remedy=f"This one reads schema {SCHEMA}; run it again from the start.",
         )
-    skeleton = _skeleton(header)
-    wanted = jax.tree.leaves(skeleton)
-    if len(wanted) != len(leaves):
-        raise InputError(f"holds {len(leaves)} arrays instead of {len(wanted)}", file=path, remedy="Save it again.")
+    skeleton = _skeleton(header, path)
+    _check_leaves(leaves, jax.tree.leaves(skeleton), header["particles"], path)
     return jax.tree.unflatten(jax.tree.structure(skeleton), [jnp.asarray(leaf) for leaf in leaves])
 
 
-def _skeleton(header: dict) -> tuple[Packing, State]:
-    """A packing and a state of the right structure, with nothing in them."""
+def _skeleton(header: dict, file: Path) -> tuple[Packing, State]:
+    """A packing and a state of the right structure; their leading axes tell what they count."""
+    walls, power, particles = (header.get(key) for key in ("walls", "power", "particles"))
+    if (
+        not isinstance(walls, list)
+        or not all(name in ("Plane", "Cylinder") for name in walls)
+        or not isinstance(power, int)
+        or not isinstance(particles, int)
+    ):
+        raise InputError("has a damaged header", file=file, remedy="Save it again.")
 
     def empty(*shape: int, kind: type = float) -> jax.Array:
         return jnp.zeros(shape, kind)
 
-    one, vector, number = empty(1), empty(1, 3), empty()
-    point = empty(3)
-    side = HalfContact(number, number, number, number, number, header["power"])
+    one, vector, number, point = empty(_PARTICLES), empty(_PARTICLES, 3), empty(), empty(3)
+    side = HalfContact(number, number, number, number, number, power)
+    sides = jax.tree.map(lambda _: one, side)  # one for each particle, as `jax.vmap(half_contact)` gives them
     made = {"Plane": Plane(point, point, point), "Cylinder": Cylinder(number, number, number, point)}
-    walls = tuple(made[name] for name in header["walls"])
-    index = empty(1, kind=int)
-    edges = Edges(index, index, index, one, vector, empty(kind=int), header["particles"])
-    history = WallHistory.virgin(1, len(walls))
-    packing = Packing(one, one, side)
-    return packing, State(vector, vector, vector, edges, history, walls, vector, number, number)
+    index, edge = empty(_EDGES, kind=int), empty(_EDGES)
+    edges = Edges(index, index, index, edge, empty(_EDGES, 3), empty(kind=int), particles)
+    history = WallHistory.virgin(_PARTICLES, len(walls))
+    packing = Packing(one, one, sides)
+    state = State(vector, vector, vector, edges, history, tuple(made[name] for name in walls), vector, number, number)
+    return packing, state
+
+
+def _check_leaves(leaves: list[np.ndarray], wanted: list[jax.Array], particles: int, file: Path) -> None:
+    if len(wanted) != len(leaves):
+        raise InputError(f"holds {len(leaves)} arrays instead of {len(wanted)}", file=file, remedy="Save it again.")
+    lengths = {_PARTICLES: particles}
+    for k, (leaf, like) in enumerate(zip(leaves, wanted, strict=True)):
+        if like.shape[:1] == (_EDGES,) and leaf.ndim:
+            lengths.setdefault(_EDGES, len(leaf))
+        shape = tuple(lengths.get(length, length) for length in like.shape)
+        if leaf.shape != shape or leaf.dtype.kind != like.dtype.kind:
+            raise InputError(
+                f"array {k} is {leaf.dtype} of shape {leaf.shape}, where {like.dtype} of shape {shape} is expected",
+                file=file,
+                remedy="Save it again.",
+            )

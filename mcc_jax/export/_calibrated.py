@@ -58,7 +58,8 @@ def read_calibration(
     }
     logs = {f"log_{name}": _log(content, name, file) for name in COEFFICIENTS}
     notes = [f"the calibration of {file.name} did not converge"] if not content.get("converged") else []
-    notes += [str(w) for w in content.get("warnings") or () if isinstance(w, str)]
+    told = content.get("warnings")
+    notes += [w for w in told if isinstance(w, str)] if isinstance(told, list) else []
     if entry is None:
         estimates |= {name: _median(logs[f"log_{name}"]["mean"]) for name in COEFFICIENTS}
     else:
@@ -96,7 +97,7 @@ def _read(file: Path) -> tuple[dict[str, Any], str]:
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", file=file, remedy=_AGAIN) from error
     try:
-        content = json.loads(raw)
+        content = json.loads(raw, parse_float=_finite, parse_constant=_finite)
     except json.JSONDecodeError as error:
         raise InputError(f"is not JSON: {error.msg}", file=file, row=error.lineno, remedy=_AGAIN) from error
     except (ValueError, RecursionError) as error:
@@ -104,6 +105,14 @@ def _read(file: Path) -> tuple[dict[str, Any], str]:
     if not isinstance(content, dict) or content.get("schema") != 1:
         raise InputError("is no calibration.json of schema 1", file=file, remedy=_AGAIN)
     return content, hashlib.sha256(raw).hexdigest()
+
+
+def _finite(text: str) -> float:
+    """A number that JSON can hold again: Python also reads NaN and 1e400, and would write neither."""
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(text)
+    return number
 
 
 def _forms(content: Mapping[str, Any], file: Path) -> tuple[Unloading, StrainScaling]:
@@ -134,7 +143,7 @@ def _estimate(content: Mapping[str, Any], keys: tuple[str, ...], file: Path) -> 
 
 
 def _is_number(value: Any) -> TypeGuard[float]:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, int | float) and not isinstance(value, bool) and -1e300 <= value <= 1e300
 
 
 def _log(content: Mapping[str, Any], name: str, file: Path) -> dict[str, Any]:

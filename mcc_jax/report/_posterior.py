@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,8 @@ import numpy as np
 from .._errors import InputError
 
 COEFFICIENTS = ("C1", "C3", "C5")
+MOST_VALUES = 2**24
+"""In one array; a damaged shape may ask for any memory, and a kilobyte of chunks may fill it."""
 
 
 @dataclass(frozen=True)
@@ -69,8 +72,8 @@ def read_posterior(file: Path) -> Posterior:
 
 
 def _draws(group: Any) -> dict[str, np.ndarray]:
-    mu, tau = (np.asarray(group[name], float).reshape(-1, 3) for name in ("mu", "tau"))
-    found = {name: np.asarray(group[name], float).ravel() for name in ("a", "effective_modulus_MPa")}
+    mu, tau = (_values(group[name]).reshape(-1, 3) for name in ("mu", "tau"))
+    found = {name: _values(group[name]).ravel() for name in ("a", "effective_modulus_MPa")}
     for j, name in enumerate(COEFFICIENTS):
         found[f"{name}_median"], found[f"{name}_spread"] = np.exp(mu[:, j]), tau[:, j]
     for name, draws in found.items():
@@ -81,26 +84,34 @@ def _draws(group: Any) -> dict[str, np.ndarray]:
 
 def _bands(tree: Any) -> tuple[dict[str, Band], float | None]:
     group, constant = tree["posterior_predictive"], tree["constant_data"]
-    names = [_text(name) for name in group["particle"][:]]
+    names = [_text(name) for name in _values(group["particle"], kind=None)]
     draws = group["displacement_um"]
     inside = count = 0
     bands = {}
     for row, name in enumerate(names):
-        force, mask = np.asarray(constant["force_mN"][row], float), np.asarray(constant["mask"][row], bool)
+        force, mask = _values(constant["force_mN"], row), _values(constant["mask"], row, kind=bool)
         # Where no point is compared nothing was drawn.
         some = np.flatnonzero(mask)
         middle, low, high = np.full((3, len(force)), np.nan)
         if len(some):
             # One particle at a time: the whole array may be larger than one wants in memory.
-            own = np.asarray(draws[:, :, row, :], float).reshape(-1, len(force))[:, some]
+            own = _values(draws, slice(None), slice(None), row).reshape(-1, len(force))[:, some]
             # Of two hundred draws mean and standard deviation say the ends of a near-normal band better than quantiles.
             centre, half = own.mean(0), 1.96 * own.std(0)
             middle[some], low[some], high[some] = centre, centre - half, centre + half
-            measured = np.asarray(tree["observed_data"]["displacement_um"][row], float)[some]
+            measured = _values(tree["observed_data"]["displacement_um"], row)[some]
             inside += int(((measured >= low[some]) & (measured <= high[some])).sum())
             count += len(some)
         bands[name] = Band(force, middle, low, high)
     return bands, inside / count if count else None
+
+
+def _values(dataset: Any, *where: Any, kind: type | None = float) -> np.ndarray:
+    """A part of a stored array, unless it is too large to be what we wrote."""
+    lengths = [n for i, n in enumerate(dataset.shape) if i >= len(where) or isinstance(where[i], slice)]
+    if math.prod(lengths) > MOST_VALUES:
+        raise ValueError(f"{dataset.name} has the shape {dataset.shape}")
+    return np.asarray(dataset[where], kind)
 
 
 def _text(value: Any) -> str:

@@ -174,7 +174,7 @@ BAD_MAPPING = {
     "diameters no table": ("diameters_um = 3\n" + without("diameters_um"), ["'diameters_um'", "all = "]),
     "diameters two": (MAPPING.replace(", 180", ""), ["three positive lengths"]),
     "diameters text": (MAPPING.replace("180", '"180"'), ["'diameters_um.all'", "three numbers"]),
-    "diameters huge": (MAPPING.replace("180", "1" + "0" * 400), ["three positive lengths"]),
+    "diameters huge": (MAPPING.replace("180", "1" + "0" * 400), ["'diameters_um'", "64 bits"]),
     "diameters zero": (MAPPING.replace("180", "0"), ["three positive lengths"]),
 }
 

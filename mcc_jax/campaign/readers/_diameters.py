@@ -32,7 +32,7 @@ def read_diameters(text: str | os.PathLike[str]) -> Diameters:
         InputError: if it is neither, or a diameter is not positive.
     """
     parts = str(text).split(",")
-    if len(parts) == 3 and not Path(text).is_file():
+    if len(parts) == 3 and not _is_file(Path(text)):
         try:
             values = [parse_number(part) for part in parts]
         except ValueError as error:
@@ -41,6 +41,13 @@ def read_diameters(text: str | os.PathLike[str]) -> Diameters:
         return values
     names, diameters, _ = read_particles(Path(text))
     return dict(zip(names, diameters.tolist(), strict=True))
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # three long numbers are no name of a file
+        return False
 
 
 def check_triple(triple: Triple, what: str, file: str | Path) -> None:

@@ -13,9 +13,9 @@ from .._schema import Curve
 from ._text import Tests, checked_curve, cut_off, number_block
 
 _TEST = re.compile(r"Block\s*:\s*(\d+)\s+Value\s*:\s*(\d+)")
-_COUNT = re.compile(r"(\d+)\tn\tStatistics of block")
+_COUNT = re.compile(r"(\d{1,9})\tn\tStatistics of block")
 # Greatest force [N], time at which it is reached [s], then hardness.
-_PEAK = re.compile(r"HM\s+([\d.]+)/\s*([\d.]+)/")
+_PEAK = re.compile(r"HM\s+(\d+\.?\d*)/\s*(\d+\.?\d*)/")
 _COLUMNS = "F\th\tt"
 
 

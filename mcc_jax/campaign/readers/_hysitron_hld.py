@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from .._schema import Control
-from ._text import Tests, checked_curve, cut_off, leading_number, number_block
+from ._text import Tests, checked_curve, cut_off, leading_number, number_block, refuse_twice
 
-_BLOCK = re.compile(r"(Sample Approach|Drift Measurement|Test) Data Points: *(\d+)\s*")
+_BLOCK = re.compile(r"(Sample Approach|Drift Measurement|Test) Data Points: *(\d{1,9})\s*")
 _FORCES = ("Force_µN", "Force_uN", "Force_μN")
 
 
@@ -49,6 +49,9 @@ def read(lines: list[str], file: Path) -> Tests:
         first, stop = i + 2, i + 2 + count
         if stop > len(lines) or (count and not lines[stop - 1].strip()):
             raise cut_off(f"{match[1]} announces {count} rows, the file ends before", file, i + 1)
+        if match[1] in blocks:
+            raise cut_off(f"the block '{match[1]} Data Points' stands there twice", file, i + 1)
+        refuse_twice(names, file, i + 2)
         numbers = number_block(lines, first, stop, names, file)
         blocks[match[1]] = dict(zip(names, numbers.T, strict=True))
         if match[1] == "Test":

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ._text import Tests, checked_curve, cut_off, number_block
+from ._text import Tests, checked_curve, cut_off, number_block, refuse_twice
 
-_COUNT = re.compile(r"Number of Points *= *(\d+)\s*")
+_COUNT = re.compile(r"Number of Points *= *(\d{1,9})\s*")
 _TIME, _DEPTH, _LOAD = "Time (s)", "Depth (nm)", "Load (µN)"
 
 
@@ -40,6 +40,7 @@ def read(lines: list[str], file: Path) -> Tests:
     for name in (_TIME, _DEPTH, _LOAD):
         if name not in names:
             raise cut_off(f"the column {name!r} is missing", file, head + 1)
+    refuse_twice(names, file, head + 1)
     rows = [i for i in range(head + 1, len(lines)) if lines[i].strip()]
     if len(rows) != announced:
         raise cut_off(f"{announced} points are announced, the file holds {len(rows)}", file, count_row)

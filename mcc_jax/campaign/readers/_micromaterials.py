@@ -20,6 +20,9 @@ from ._text import Tests, checked_curve, decode_lines, number_block
 _ROW = re.compile(r"-?\d+\.\d{6}\t-?\d+\.\d{6}\t-?\d+\.\d{6}\s*")
 _NAMES = ("t", "h", "F")
 LARGEST_TOTAL = 512 * 1024**2
+# Measured numbers as text deflate to a fifth or so; what shrinks to a hundredth is no measurement.
+LARGEST_SWELLING = 100
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 MOST_ENTRIES = 10_000
 
 
@@ -64,9 +67,8 @@ def read_zip(data: bytes, file: Path) -> Tests:
 
 
 def _curve(lines: list[str], file: Path, name: str) -> Curve:
-    while lines and not lines[-1].strip():
-        lines = lines[:-1]
-    numbers = number_block(lines, 0, len(lines), _NAMES, file)
+    end = next((i for i in range(len(lines), 0, -1) if lines[i - 1].strip()), 0)
+    numbers = number_block(lines, 0, end, _NAMES, file)
     return checked_curve(numbers[:, 0], numbers[:, 2], numbers[:, 1] / 1e3, file, 1, name)
 
 
@@ -78,12 +80,17 @@ def _entries(data: bytes, file: Path) -> Iterator[tuple[str, bytes]]:
     except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError, EOFError):
         raise broken from None
     with archive:
-        if len(entries) > MOST_ENTRIES or sum(entry.file_size for entry in entries) > LARGEST_TOTAL:
+        whole = sum(entry.file_size for entry in entries)
+        if len(entries) > MOST_ENTRIES or whole > LARGEST_TOTAL or whole > LARGEST_SWELLING * max(len(data), 10_000):
             raise InputError("the archive is too large for a tester's export", file=file, remedy="Split it")
         total = 0
         for entry in entries:
             if entry.flag_bits & 0x1:
                 raise InputError(f"the entry {entry.filename!r} is encrypted", file=file, remedy="Unpack it first")
+            if entry.compress_type not in _METHODS:  # others may ask for gigabytes before the first byte
+                raise InputError(
+                    f"the entry {entry.filename!r} is compressed in an unusual way", file=file, remedy="Unpack it first"
+                )
             try:
                 # The size in the directory may lie; no more than it says is unpacked.
                 with archive.open(entry) as stream:

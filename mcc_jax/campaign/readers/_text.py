@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -110,6 +111,17 @@ def checked_curve(
 def cut_off(problem: str, file: Path, row: int | None = None) -> InputError:
     """The error for a file that ends too early or lacks a part."""
     return InputError(problem, file=file, row=row, remedy="The file is cut off or damaged; export it again")
+
+
+def refuse_twice(names: Sequence[str], file: Path, row: int) -> None:
+    """Refuse a header that names two columns alike: one of them would be lost.
+
+    Raises:
+        InputError: naming the column.
+    """
+    name, count = Counter(names).most_common(1)[0]
+    if count > 1:
+        raise InputError(f"stands there {count} times", file=file, row=row, column=name, remedy="Export the file again")
 
 
 def leading_number(text: str) -> float | None:

@@ -1,0 +1,202 @@
+"""Every reader that a file of a user reaches: how to damage its files, and how to read them."""
+
+from __future__ import annotations
+
+import io
+import shutil
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from random import Random
+
+from archives import hostile_archive, plain_archive
+from mutators import mutate, mutate_json
+
+SAMPLES = Path(__file__).parent / "samples"
+Case = dict[str, bytes]
+
+
+Damage = Callable[[Random, Case], Case]
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A reader under test.
+
+    Attributes:
+        name: as in the table and after --only.
+        share: of the inputs, relative to the others; slow readers get fewer.
+        whole: files that it reads, by their path within a folder.
+        damage: what becomes of them in one input.
+        read: reads them in that folder; returns, or raises `InputError`.
+    """
+
+    name: str
+    share: float
+    whole: Case
+    damage: Damage
+    read: Callable[[Path], object]
+
+
+def sample(name: str) -> bytes:
+    return (SAMPLES / name).read_bytes()
+
+
+def samples(folder: str) -> Case:
+    return {file.name: file.read_bytes() for file in sorted((SAMPLES / folder).iterdir())}
+
+
+CAMPAIGN = {f"campaign/{name}": content for name, content in samples("campaign").items()}
+RESULTS = samples("results")
+OTHERS = [sample(name) for name in ("fischer.txt", "hysitron.hld", "hysitron_lc.txt", "campaign/curves.csv")]
+
+
+def bytes_of(name: str) -> Damage:
+    """Damage to one file, spliced now and then with a sample of another kind."""
+
+    def damage(rng: Random, whole: Case) -> Case:
+        other = whole[name] if rng.random() < 0.7 else rng.choice(OTHERS)
+        return whole | {name: mutate(rng, whole[name], other)}
+
+    return damage
+
+
+def values_of(*names: str) -> Damage:
+    """Other values in one of several JSON files, or damaged bytes."""
+
+    def damage(rng: Random, whole: Case) -> Case:
+        name = rng.choice(names)
+        return whole | {name: mutate_json(rng, whole[name])} if rng.random() < 0.7 else bytes_of(name)(rng, whole)
+
+    return damage
+
+
+def archive(rng: Random, _: Case) -> Case:
+    return {"tests.zip": hostile_archive(rng, sample("micromaterials.txt"), sample("hysitron_lc.txt"))}
+
+
+def state(rng: Random, whole: Case) -> Case:
+    """A saved state with damage outside or, with checksums that fit, inside."""
+    if rng.random() < 0.3:
+        return bytes_of("state.npz")(rng, whole)
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(whole["state.npz"])) as old, zipfile.ZipFile(buffer, "w") as new:
+        names = old.namelist()
+        chosen = rng.sample(names, rng.choice((1, 1, 2)))
+        for name in names:
+            content = old.read(name)
+            if name not in chosen:
+                new.writestr(zipfile.ZipInfo(name), content)
+            elif rng.random() < 0.95:
+                new.writestr(zipfile.ZipInfo(name), mutate(rng, content, old.read(rng.choice(names))))
+    return {"state.npz": buffer.getvalue()}
+
+
+def diameters(rng: Random, whole: Case) -> Case:
+    if rng.random() < 0.5:
+        return bytes_of("particles.csv")(rng, whole)
+    return {"text": mutate(rng, b"200.0,190.5,1.8e2", b"1,2,3")}
+
+
+def read_campaign(folder: Path) -> None:
+    from mcc_jax.campaign import check_campaign, read_campaign
+    from mcc_jax.effects import humidities
+
+    campaign = read_campaign(folder)
+    check_campaign(campaign, file=folder)
+    humidities(campaign)
+
+
+def read_diameters(folder: Path) -> None:
+    from mcc_jax.campaign import read_diameters
+
+    text = folder / "text"
+    read_diameters(text.read_bytes().decode("utf-8", "replace") if text.exists() else folder / "particles.csv")
+
+
+def convert(name: str, mapping: str | None = None) -> Callable[[Path], None]:
+    """What `mcc-jax convert` does: read, write, and what was written must read back the same."""
+
+    def read(folder: Path) -> None:
+        from mcc_jax.campaign import read_campaign, read_tester_file, write_campaign
+
+        described = None if mapping is None else folder / mapping
+        sizes = None if mapping is not None else [200.0, 190.0, 180.0]
+        campaign = read_tester_file(folder / name, diameters_um=sizes, mapping=described)
+        again = folder / "converted"
+        try:
+            write_campaign(campaign, again)
+            assert read_campaign(again).particles == campaign.particles
+        finally:
+            shutil.rmtree(again, ignore_errors=True)
+
+    return read
+
+
+def read_priors(folder: Path) -> None:
+    from mcc_jax.calibrate import read_priors
+
+    read_priors(folder / "priors.toml")
+
+
+def read_programme(folder: Path) -> None:
+    from mcc_jax.simulate import read_programme
+
+    read_programme(folder / "programme.toml")
+
+
+def read_results(folder: Path) -> None:
+    from mcc_jax.report import read_results
+
+    read_results(folder)
+
+
+def report(folder: Path) -> None:
+    from mcc_jax.report import read_results, report_page
+
+    report_page(read_results(folder)).encode("utf-8")
+
+
+def export(folder: Path) -> None:
+    from mcc_jax.export import read_calibration, write_export
+
+    law, shown, origin = read_calibration(folder, particle="1")
+    out = folder / "out"
+    out.mkdir()
+    try:
+        write_export("json", law, shown, out, origin=origin, seed=0)
+    finally:
+        shutil.rmtree(out)
+
+
+def read_state(folder: Path) -> None:
+    from mcc_jax.dem import load_state
+
+    load_state(folder / "state.npz")
+
+
+FOLDER, MAPPED = samples("campaign"), samples("mapped")
+ZIP = {"tests.zip": plain_archive(sample("micromaterials.txt"))}
+BOTH = ("calibration.json", "discovery.json")
+TESTERS = (
+    ("Fischer", "fischer.txt"),
+    ("Hysitron hld", "hysitron.hld"),
+    ("Hysitron text", "hysitron_lc.txt"),
+    ("Micro Materials", "micromaterials.txt"),
+)
+READERS = (
+    *(Reader(name, 4, FOLDER, bytes_of(name), read_campaign) for name in FOLDER),
+    Reader("diameters", 2, {"particles.csv": FOLDER["particles.csv"]}, diameters, read_diameters),
+    *(Reader(label, 4, {name: sample(name)}, bytes_of(name), convert(name)) for label, name in TESTERS),
+    Reader("archive", 5, ZIP, archive, convert("tests.zip")),
+    Reader("mapped table", 4, MAPPED, bytes_of("table.txt"), convert("table.txt", "mapping.toml")),
+    Reader("mapping", 4, MAPPED, bytes_of("mapping.toml"), convert("table.txt", "mapping.toml")),
+    Reader("priors", 2, {"priors.toml": sample("priors.toml")}, bytes_of("priors.toml"), read_priors),
+    Reader("programme", 2, {"programme.toml": sample("programme.toml")}, bytes_of("programme.toml"), read_programme),
+    *(Reader(name, 2, CAMPAIGN | {name: RESULTS[name]}, values_of(name), read_results) for name in BOTH),
+    Reader("posterior.nc", 2, {"posterior.nc": RESULTS["posterior.nc"]}, bytes_of("posterior.nc"), read_results),
+    Reader("saved state", 1, {"state.npz": sample("state.npz")}, state, read_state),
+    Reader("export", 0.2, CAMPAIGN | RESULTS, values_of("calibration.json"), export),
+    Reader("report page", 0.05, CAMPAIGN | RESULTS, values_of(*BOTH), report),
+)

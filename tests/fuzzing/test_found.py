@@ -1,0 +1,171 @@
+"""What fuzzing found in the readers, each with the damage that showed it: one line that says what is wrong."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from mcc_jax import InputError
+from mcc_jax.calibrate import read_priors
+from mcc_jax.campaign import read_diameters, read_tester_file
+from mcc_jax.dem import load_state
+from mcc_jax.export import read_calibration
+from mcc_jax.report import read_results
+
+SAMPLES = Path(__file__).parent / "samples"
+SIZES = [200.0, 190.0, 180.0]
+
+
+def refused(read, *arguments, **options) -> str:
+    with pytest.raises(InputError) as caught:
+        read(*arguments, **options)
+    assert str(caught.value).isprintable()
+    return str(caught.value)
+
+
+TESTERS = {
+    "peak with two points": ("fischer.txt", b"HM  0.020000/", b"HM  0.02.000/", None),
+    "digits of a count": ("fischer.txt", b"\r\n2\tn\t", b"\r\n" + b"2" * 5000 + b"\tn\t", None),
+    "digits of points": ("hysitron.hld", b"Test Data Points: 12", b"Test Data Points: " + b"1" * 5000, "neither"),
+    "block twice": ("hysitron.hld", b"Sample Approach Data", b"Drift Measurement Data", "stands there twice"),
+    "hld column twice": ("hysitron.hld", b"\tDisp_V", b"\tDisp_nm", "'Disp_nm': stands there 2 times"),
+    "lc digits": ("hysitron_lc.txt", b"Points = 12", b"Points = " + b"1" * 5000, "the format is not known"),
+    "lc column twice": ("hysitron_lc.txt", b"\tDepth (V)", b"\tTime (s)", "'Time (s)': stands there 2 times"),
+}
+
+
+@pytest.mark.parametrize("case", TESTERS)
+def test_testers_files(tmp_path, case):
+    name, old, new, words = TESTERS[case]
+    data = (SAMPLES / name).read_bytes()
+    assert old in data
+    file = tmp_path / name
+    file.write_bytes(data.replace(old, new, 1))
+    if words is None:  # what cannot be understood of the header is no reason to refuse whole tests
+        assert len(read_tester_file(file, diameters_um=SIZES)) == 2
+    else:
+        assert words in refused(read_tester_file, file, diameters_um=SIZES)
+
+
+def test_many_empty_lines_behind_the_samples(tmp_path):
+    """They were taken off one by one, each time with a copy of all others, which took minutes."""
+    file = tmp_path / "a.txt"
+    file.write_bytes((SAMPLES / "micromaterials.txt").read_bytes() + b"\n" * 300_000)
+    assert len(read_tester_file(file, diameters_um=SIZES).curves[0]) == 12
+
+
+def archive(content: bytes, method: int) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", method) as file:
+        file.writestr("a.txt", content)
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2])
+def test_unusual_compression(tmp_path, method):
+    (tmp_path / "a.zip").write_bytes(archive((SAMPLES / "micromaterials.txt").read_bytes(), method))
+    assert "unusual" in refused(read_tester_file, tmp_path / "a.zip", diameters_um=SIZES)
+
+
+def test_contents_that_swell(tmp_path):
+    """Forty megabytes of one row in forty kilobytes."""
+    row = b"1.000000\t1.000000\t1.000000\n"
+    (tmp_path / "a.zip").write_bytes(archive(row * (40_000_000 // len(row)), zipfile.ZIP_DEFLATED))
+    assert "too large" in refused(read_tester_file, tmp_path / "a.zip", diameters_um=SIZES)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[a]\nmean = 0x" + "f" * 5000, "64 bits"),
+        ("[a]\nmean = 1" + "0" * 400, "64 bits"),
+        ("[a]\nmean = [[9223372036854775808]]", "64 bits"),
+        ("a" + ".b" * 500 + " = 1", "nested"),
+        ("[a]\nmean = -9223372036854775808", None),
+        ("\ufeff[a]\nmean = 1", None),
+    ],
+    ids=["hexadecimal", "decimal", "in lists", "deep", "the least", "byte order mark"],
+)
+def test_toml(tmp_path, text, words):
+    (tmp_path / "p.toml").write_text(text, encoding="utf-8")
+    if words is None:
+        assert read_priors(tmp_path / "p.toml").changed == ("a",)
+    else:
+        assert words in refused(read_priors, tmp_path / "p.toml")
+
+
+def test_three_long_numbers_are_no_file():
+    assert "too large" in refused(read_diameters, f"1,2,{'9' * 300}")
+    assert "not a number" in refused(read_diameters, f"1,2,{'x' * 300}")
+
+
+def test_integers_that_no_float_holds(tmp_path):
+    content = json.loads((SAMPLES / "results" / "calibration.json").read_bytes())
+    content["a"]["value"] = 10**400
+    (tmp_path / "calibration.json").write_text(json.dumps(content))
+    assert "a has no value" in refused(read_calibration, tmp_path)
+
+
+@pytest.mark.parametrize(("seed", "words"), [("NaN", "not JSON"), ("1e400", "not JSON"), ("5", None)])
+def test_what_json_cannot_hold_again(tmp_path, seed, words):
+    content = json.loads((SAMPLES / "results" / "calibration.json").read_bytes()) | {"seed": "here", "warnings": 1.5}
+    (tmp_path / "calibration.json").write_text(json.dumps(content).replace('"here"', seed))
+    if words is None:
+        assert read_calibration(tmp_path)[2].calibration["seed"] == 5
+    else:
+        assert words in refused(read_calibration, tmp_path)
+
+
+def change_header(arrays, **changes):
+    header = json.loads(bytes(arrays["header"])) | changes
+    arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
+
+
+STATES = {
+    "wall": (lambda a: change_header(a, walls=["Sphere"]), "header"),
+    "power": (lambda a: change_header(a, power=None), "header"),
+    "particles": (lambda a: change_header(a, particles=10**12), "array 0"),
+    "text": (lambda a: a.update(leaf_3=np.array(["x"])), "array 3"),
+    "shape": (lambda a: a.update(leaf_7=a["leaf_7"][:, :2]), "array 7"),
+    "kind": (lambda a: a.update(leaf_0=a["leaf_0"].astype(complex)), "array 0"),
+    "leaf": (lambda a: a.pop("leaf_4"), "is not a saved state"),
+}
+
+
+@pytest.mark.parametrize("case", STATES)
+def test_saved_states(tmp_path, case):
+    change, words = STATES[case]
+    with np.load(SAMPLES / "state.npz") as stored:
+        arrays = dict(stored)
+    change(arrays)
+    np.savez(tmp_path / "state.npz", **arrays)
+    assert words in refused(load_state, tmp_path / "state.npz")
+
+
+@pytest.mark.parametrize("name", ["header.npy", "leaf_0.npy"])
+def test_saved_states_with_damaged_headers(tmp_path, name):
+    with zipfile.ZipFile(SAMPLES / "state.npz") as old, zipfile.ZipFile(tmp_path / "state.npz", "w") as new:
+        for entry in old.namelist():
+            content = old.read(entry)
+            new.writestr(entry, content.replace(b"(", b"((", 1) if entry == name else content)
+    assert "is not a saved state" in refused(load_state, tmp_path / "state.npz")
+
+
+@pytest.mark.parametrize(
+    "name", ["posterior/mu", "posterior_predictive/displacement_um", "observed_data/displacement_um"]
+)
+def test_a_posterior_that_would_fill_the_memory(tmp_path, name):
+    """Terabytes of fill value, in a file of some kilobytes."""
+    file = tmp_path / "posterior.nc"
+    file.write_bytes((SAMPLES / "results" / "posterior.nc").read_bytes())
+    with h5py.File(file, "r+") as tree:
+        shape = (10**4,) * 3 if name == "posterior/mu" else (10**4,) * 4 if "predictive" in name else (2, 10**12)
+        del tree[name]
+        tree.create_dataset(name, shape, "f8", chunks=True)
+    assert "shape" in refused(read_results, tmp_path)
