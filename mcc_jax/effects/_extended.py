@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .._numerics import compiled_whole, running_max
+from .._numerics import running_max
 from .._types import Flag, Path, Scalar, Values
 from ..geometry import Particle
 from ..law import History, MccLaw, recovery
@@ -93,13 +93,11 @@ class ExtendedLaw(eqx.Module):
 
     # ---- load control ------------------------------------------------------------------------------------------------
 
-    @compiled_whole
     def respond(self, particle: Particle, record: Record) -> Path:
         """Displacement [um] of a virgin particle along a record: what a fit compares with the measurement."""
         start = eqx.tree_at(lambda s: s.point.time, self.init(particle), record.time[0])
         return self._along(particle, start, record)[1]
 
-    @compiled_whole
     def path_load(
         self, particle: Particle, state: ExtendedState, force: Path, time: Path
     ) -> tuple[ExtendedState, Path]:
@@ -116,7 +114,6 @@ class ExtendedLaw(eqx.Module):
         )
         return self._along(particle, state, record)
 
-    @compiled_whole
     def step_load(
         self, particle: Particle, state: ExtendedState, force: Scalar, time: Scalar
     ) -> tuple[ExtendedState, Scalar]:
@@ -238,7 +235,6 @@ class ExtendedLaw(eqx.Module):
 
     # ---- displacement control ----------------------------------------------------------------------------------------
 
-    @compiled_whole
     def step(
         self, particle: Particle, state: ExtendedState, displacement: Scalar, time: Scalar
     ) -> tuple[ExtendedState, Scalar]:
@@ -265,7 +261,6 @@ class ExtendedLaw(eqx.Module):
         force = root + jnp.where(touches, change, 0.0)
         return self.step_load(particle, state, force, time)[0], force
 
-    @compiled_whole
     def path(
         self, particle: Particle, state: ExtendedState, displacement: Path, time: Path
     ) -> tuple[ExtendedState, Path]:

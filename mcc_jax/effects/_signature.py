@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._numerics import compiled_whole, running_max
+from .._numerics import running_max
 from .._types import Path, Scalar
 from ..geometry import Particle
 from ..law import MccLaw, recovery, tangent_modulus
@@ -21,7 +21,6 @@ from ._record import Record
 from ._solve import recoverable_displacement
 
 
-@compiled_whole
 def signatures(
     base: MccLaw, particle: Particle, record: Record, effects: Sequence[AbstractEffect]
 ) -> Float[Array, "effects steps"]:
