@@ -101,7 +101,7 @@ def _read(file: Path) -> tuple[dict[str, Any], str]:
     except json.JSONDecodeError as error:
         raise InputError(f"is not JSON: {error.msg}", file=file, row=error.lineno, remedy=_AGAIN) from error
     except (ValueError, RecursionError) as error:
-        raise InputError(f"is not JSON: {type(error).__name__}", file=file, remedy=_AGAIN) from error
+        raise InputError(f"is not JSON: {error}", file=file, remedy=_AGAIN) from error
     if not isinstance(content, dict) or content.get("schema") != 1:
         raise InputError("is no calibration.json of schema 1", file=file, remedy=_AGAIN)
     return content, hashlib.sha256(raw).hexdigest()
@@ -111,7 +111,7 @@ def _finite(text: str) -> float:
     """A number that JSON can hold again: Python also reads NaN and 1e400, and would write neither."""
     number = float(text)
     if not math.isfinite(number):
-        raise ValueError(text)
+        raise ValueError(f"{text[:40]} is no number")
     return number
 
 
