@@ -16,14 +16,14 @@ import time
 from pathlib import Path
 
 HERE = Path(__file__).parent
-COMMANDS = {
-    "law": ["bench_law.py"],
-    "import": ["bench_import.py"],
-    "calibrate": ["bench_calibrate.py"],
-    "dem": ["bench_dem.py"],
-    "bench_dem_quasistatic": ["bench_dem_quasistatic.py"],
-    "dem_lammps": ["bench_dem_lammps.py"],
-    "scale": ["bench_scale.py"],
+SCRIPTS = {
+    "law": "bench_law.py",
+    "import": "bench_import.py",
+    "calibrate": "bench_calibrate.py",
+    "dem": "bench_dem.py",
+    "bench_dem_quasistatic": "bench_dem_quasistatic.py",
+    "dem_lammps": "bench_dem_lammps.py",
+    "scale": "bench_scale.py",
 }
 START, END = "<!-- targets -->", "<!-- end of targets -->"
 
@@ -33,14 +33,14 @@ def run(name: str) -> float:
     began = time.monotonic()
     # Fresh memory costs every row alike with this setting; without it, whichever is lucky with the allocator.
     environment = {"GLIBC_TUNABLES": "glibc.malloc.hugetlb=1", **os.environ}
-    subprocess.run([sys.executable, HERE / COMMANDS[name][0], "--write"], check=True, env=environment)
+    subprocess.run([sys.executable, HERE / SCRIPTS[name], "--write"], check=True, env=environment)
     return time.monotonic() - began
 
 
 def gathered() -> list[str]:
     """Lines of the table: every target in `results/`, with command, device and date."""
     lines = ["| claim | measured | limit | | command | device | date |", "|---|---|---|---|---|---|---|"]
-    for name, (script, *_) in COMMANDS.items():
+    for name, script in SCRIPTS.items():
         file = HERE / "results" / f"{name}.json"
         content = json.loads(file.read_text()) if file.exists() else {}
         settings = {row["setting"]: row["value"] for row in content.get("Settings", [])}
@@ -59,7 +59,7 @@ def gathered() -> list[str]:
 def main() -> int:
     """Run, gather, and say what failed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", choices=list(COMMANDS), default=list(COMMANDS))
+    parser.add_argument("--only", nargs="+", choices=list(SCRIPTS), default=list(SCRIPTS))
     parser.add_argument("--gather", action="store_true", help="run nothing, rewrite the table")
     arguments = parser.parse_args()
     failed = []

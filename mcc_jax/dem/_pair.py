@@ -15,7 +15,7 @@ from .._numerics import shared
 from .._types import Scalar
 from ..law import energy_ratio, stress_ratio
 from ..law._branch import branch_force
-from ..law._loading_inverse import secant_modulus, tangent_modulus
+from ..law._loading_inverse import quintic, secant_modulus, tangent_modulus
 from ._side import HalfContact
 
 SPLIT_STEPS = 8
@@ -102,8 +102,7 @@ def pair_recovery(i: HalfContact, j: HalfContact, overlap_max: Scalar) -> Scalar
 
     It is 1 where no force was carried.
     """
-    series = _series(_numbers(i), _numbers(j), overlap_max)
-    return _span(i.power, i.c, series.force, series.d_i) + _span(j.power, j.c, series.force, series.d_j)
+    return _both_spans(i, j, _series(_numbers(i), _numbers(j), overlap_max))
 
 
 def wall_recovery(side: HalfContact, overlap_max: Scalar) -> Scalar:
@@ -122,7 +121,7 @@ def pair_energy(i: HalfContact, j: HalfContact, overlap_max: Scalar, overlap: Sc
     """
     peak = largest_overlap(overlap_max, overlap)
     series = _series(_numbers(i), _numbers(j), peak)
-    span = _span(i.power, i.c, series.force, series.d_i) + _span(j.power, j.c, series.force, series.d_j)
+    span = _both_spans(i, j, series)
     return _energy(_work(i, series.d_i) + _work(j, series.d_j), series.force, span, peak - overlap)
 
 
@@ -220,6 +219,10 @@ def _span(power: int, c: Scalar, force: Scalar, d: Scalar) -> Scalar:
     return shared(jnp.sqrt(jnp.where(carries & (square > 0), square, 1.0)))
 
 
+def _both_spans(i: HalfContact, j: HalfContact, series: _Series) -> Scalar:
+    return _span(i.power, i.c, series.force, series.d_i) + _span(j.power, j.c, series.force, series.d_j)
+
+
 def _ratio(span: Scalar, drop: Scalar) -> tuple[Scalar, Scalar]:
     q = shared(drop / span)
     return q, jnp.where(drop <= 0, 1.0, stress_ratio(q))
@@ -305,8 +308,8 @@ class _Bracket(NamedTuple):
 def _narrowed(i: _Numbers, j: _Numbers, whole: Scalar, bracket: _Bracket) -> _Bracket:
     """One step. A split that meets the force but for rounding stays: asked again, the bounds would throw it out."""
     d, low, high = jnp.abs(bracket.d), bracket.low, bracket.high
-    force_i, slope_i, bend_i = _polynomial(i, d)
-    force_j, slope_j, bend_j = _polynomial(j, whole - d)
+    force_i, slope_i, bend_i = quintic(i.k1, i.k3, i.k5, d)
+    force_j, slope_j, bend_j = quintic(j.k1, j.k3, j.k5, whole - d)
     excess, slope, bend = force_i - force_j, slope_i + slope_j, bend_i - bend_j
     low = jnp.where(excess < 0, d, low)
     high = jnp.where(excess > 0, d, high)
@@ -319,10 +322,3 @@ def _narrowed(i: _Numbers, j: _Numbers, whole: Scalar, bracket: _Bracket) -> _Br
     # The method cubes the error: after a step of 1e-5 of the smaller side only rounding is left.
     least = 1e-5 * jnp.minimum(new, whole - new) + 2 * jnp.finfo(d.dtype).eps * whole
     return _Bracket(jnp.where(jnp.abs(new - d) > least, -new, new), low, high)
-
-
-def _polynomial(side: _Numbers, d: Scalar) -> tuple[Scalar, Scalar, Scalar]:
-    """Force, slope and half the curvature of a side."""
-    square = d * d
-    k3, k5 = square * side.k3, square * side.k5
-    return d * (side.k1 - k3 + square * k5), side.k1 - 3 * k3 + 5 * square * k5, d * (10 * k5 - 3 * side.k3)

@@ -38,6 +38,14 @@ def tangent_modulus(K1: Scalar, K3: Scalar, K5: Scalar, x: Values) -> Values:
     return K1 - square * (3 * K3 - 5 * square * K5)
 
 
+def quintic(K1: Scalar, K3: Scalar, K5: Scalar, x: Values) -> tuple[Values, Values, Values]:
+    """Value, slope and half the curvature of K1 x - K3 x^3 + K5 x^5: what a step of Halley's method takes."""
+    square = x * x
+    hardening = square * K5
+    value = x * (K1 - square * (K3 - hardening))
+    return value, K1 - square * (3 * K3 - 5 * hardening), x * (10 * hardening - 3 * K3)
+
+
 @jax.custom_jvp
 def loading_strain(K1: Scalar, K3: Scalar, K5: Scalar, stress: Values, floor: Scalar) -> Values:
     """Smallest scaled strain, not on a branch already left behind, at which loading reaches the stress.
@@ -60,11 +68,8 @@ def loading_strain(K1: Scalar, K3: Scalar, K5: Scalar, stress: Values, floor: Sc
     noise = 8 * jnp.finfo(x.dtype).eps * K1
     rounding = 2 * jnp.finfo(x.dtype).eps * target
     for _ in range(HALLEY_STEPS):
-        square = x * x
-        hardening = square * K5
-        slope = K1 - square * (3 * K3 - 5 * hardening)
-        excess = x * (K1 - square * (K3 - hardening)) - target
-        half_curvature = x * (10 * hardening - 3 * K3)
+        stress_there, slope, half_curvature = quintic(K1, K3, K5, x)
+        excess = stress_there - target
         squared = slope * slope
         divisor = jnp.maximum(squared - excess * half_curvature, 0.5 * squared)
         moves = (slope > noise) & (jnp.abs(excess) > rounding)

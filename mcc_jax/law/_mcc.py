@@ -206,6 +206,7 @@ class MccLaw(AbstractContactLaw[History]):
         compliance = shared(diameter * diameter * diameter / stiffness)
         return branch_force(power, K1, K3 * square, K5 * (square * square), compliance, peak, peak - displacement)
 
+    @compiled_whole
     def peak_and_displacement(
         self, particle: Particle, state: History, force: AnyShape, highest: AnyShape
     ) -> tuple[AnyShape, AnyShape]:

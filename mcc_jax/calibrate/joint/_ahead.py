@@ -15,7 +15,7 @@ from ._blocks import Blocks, count_of
 from ._data import Tests
 from ._drawer import stride_of
 from ._large import AT_A_TIME, PROBES, log_densities
-from ._mode import Target
+from ._mode import FIRST_SPREAD, Target
 from ._model import JointModel, prior_numbers
 from ._noise import Whitening
 from ._nuts import Length
@@ -26,7 +26,7 @@ from ._sampling import Exact, draw_particles, sample_population
 def compile_ahead(tests: Tests, block: int, model: JointModel, length: Length) -> None:
     """Compile the same functions as will be called, for arrays of the same shapes."""
     count, points = tests.force.shape
-    d = 6 + model.scatter.size
+    d = FIRST_SPREAD + model.scatter.size
     blocks = Blocks(count, block)
 
     def dummy(*shape: int) -> Array:

@@ -119,12 +119,11 @@ def draw_joint(key: Array, tests: Tests, model: JointModel, fit: JointFit, lengt
     exact = Exact(tests, fit.filters, fit.summary, scatter, model.zero_sd, model.unloading)
     found = sample_joint(key, fit.mode, fit.covariance, fit.numbers, exact, **length._asdict())
     run, free, *particles = jax.tree.map(np.asarray, found)
-    count = len(tests)
     population = populations(free.reshape(-1, free.shape[-1]), fit.numbers, scatter)
     names, stacked = _stack(population, scatter, length)
     return {
         **_fields(run, population, names, stacked, particles, tests, model, length),
-        "pareto_k": np.zeros(count),
+        "pareto_k": np.zeros(len(tests)),
         "pareto_k_joint": None,
         "weights_applied": False,
     }

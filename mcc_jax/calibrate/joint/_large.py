@@ -30,7 +30,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ._compile import compiled
-from ._mode import Target
+from ._mode import FIRST_SPREAD, Target
 from ._nuts import Chains
 from ._population import Population
 from ._weights import PARETO_K_MOST, effective_share, ordered_resample, smoothed_weights
@@ -46,9 +46,6 @@ ENOUGH = 5
 
 GOOD_SHARE = 0.5
 """Least effective share of the draws with which weighted ones replace the sampler's, beside the gate of Pareto k."""
-
-FIRST_SPREAD = 6
-"""Position of the first spread among the coordinates (`_mode.from_free`)."""
 
 AT_A_TIME = 250
 """Draws whose densities are asked for in one go."""

@@ -63,6 +63,9 @@ class PriorNumbers(eqx.Module):
         return jnp.mean(log_eta) if self.weight is None else self.total(log_eta) / self.count
 
 
+FIRST_SPREAD = 6
+"""Position of the first spread among the coordinates: behind a, log modulus, three means and log noise."""
+
 KNEE = 0.1
 """Share of its prior's scale below which a spread's coordinate is linear in it, above which logarithmic."""
 
@@ -95,7 +98,7 @@ def from_free(free: Float[Array, " d"], numbers: PriorNumbers, scatter: Scatter)
     scales = numbers.spread[jnp.asarray(chosen)]
     # The coordinate may have either sign: the density is even and smooth at 0, so that a spread that is 0 is no
     # boundary and has no tail towards minus infinity.
-    signed = free[6 : 6 + count]
+    signed = free[FIRST_SPREAD : FIRST_SPREAD + count]
     spread = spread_of(signed, scales)
     density += jnp.sum(-0.5 * (spread / scales) ** 2 + jnp.log(KNEE * jnp.cosh(signed)))
     width = jnp.sqrt(spread[:3] ** 2 / numbers.count + numbers.blur**2)
@@ -140,7 +143,7 @@ def to_free(
 
 def recentred(numbers: PriorNumbers, free: Float[Array, " d"]) -> tuple[PriorNumbers, Float[Array, " d"]]:
     """The same population in coordinates whose centre it is."""
-    tau = spread_of(free[6:9], numbers.spread[:3])
+    tau = spread_of(free[FIRST_SPREAD : FIRST_SPREAD + 3], numbers.spread[:3])
     width = jnp.sqrt(tau**2 / numbers.count + numbers.blur**2)
     numbers = eqx.tree_at(lambda n: n.centre, numbers, numbers.centre + width * free[2:5])
     return numbers, free.at[2:5].set(0.0)
