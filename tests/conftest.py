@@ -19,26 +19,75 @@ hypothesis.settings.load_profile("repository")
 def pytest_configure(config):
     """What took long to compile is kept for later modules, notebooks and commands, until this run of pytest ends.
 
-    Every worker has a folder of its own: JAX writes entries in place, and another process might read half of one.
+    All workers share one folder, which the first process makes. JAX locks a folder that is limited in size; otherwise
+    one process might read half of what another is writing.
     """
+    if hasattr(config, "workerinput"):
+        return  # set by what the environment says
     folder = tempfile.mkdtemp(prefix="compiled-")
     config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
-    settings = {"jax_compilation_cache_dir": folder, "jax_persistent_cache_min_compile_time_secs": 0.1}
+    settings = {
+        "jax_compilation_cache_dir": folder,
+        "jax_compilation_cache_max_size": 8 * 2**30,
+        "jax_persistent_cache_min_compile_time_secs": 0.1,
+    }
     for name, value in settings.items():
         jax.config.update(name, value)
-        os.environ[name.upper()] = str(value)  # for processes that tests start
+        os.environ[name.upper()] = str(value)  # for workers and for processes that tests start
+
+
+GROUPS = {
+    "discover": ("tests/discover/", "tests/cli/test_discover", "tests/plots/test_discovery_figures"),
+    "posterior": ("tests/calibrate/joint/test_posterior", "tests/plots/test_joint_figures", "tests/plots/test_figures"),
+    "effects": ("tests/effects/",),
+    "law": ("tests/law/",),
+    "dem": ("tests/dem/",),
+}
+"""Files that run on one worker, one after the other, since they compile the same functions."""
+
+FIRST = ("discover", "posterior", "tests/calibrate/joint/", "tests/cli/", "tests/plots/")
+"""The longest first: begun last, they would keep one worker busy while the other waits."""
+
+
+def group_of(nodeid):
+    """The group of a test, or else its file."""
+    file = nodeid.split("::")[0]
+    return next((group for group, starts in GROUPS.items() if file.startswith(starts)), file)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """With `--dist loadfile`, a group is what a file is otherwise."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class ByGroup(LoadFileScheduling):
+        def _split_scope(self, nodeid):
+            return group_of(nodeid)
+
+    return ByGroup(config, log) if config.getoption("dist") == "loadfile" else None
 
 
 def pytest_collection_modifyitems(items):
-    """The longest files first: begun last, they would keep one worker busy while the other waits."""
-    first = ("/discover/", "/joint/", "/cli/", "/plots/")
-    items.sort(key=lambda item: next((i for i, part in enumerate(first) if part in item.nodeid), len(first)))
+    """Tests of one group stand together, the longest first."""
+
+    def place(item):
+        group = group_of(item.nodeid)
+        first = next((i for i, start in enumerate(FIRST) if group.startswith(start)), len(FIRST))
+        return first, list(GROUPS).index(group) if group in GROUPS else len(GROUPS)
+
+    items.sort(key=place)
+
+
+_latest_group = None
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _compiled_functions_live_for_one_module():
-    yield
-    jax.clear_caches()
+def _compiled_functions_live_for_one_group(request):
+    global _latest_group
+    group = group_of(request.node.nodeid)
+    if group != _latest_group:
+        jax.clear_caches()
+    _latest_group = group
 
 
 @pytest.fixture(scope="session")

@@ -56,7 +56,7 @@ def close(actual, expected, *, rel=0.0, scale=0.0):
 
 
 def all_finite(tree):
-    return all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(tree))
+    return all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(tree))
 
 
 def paper_particle(number):

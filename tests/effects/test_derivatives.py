@@ -18,10 +18,11 @@ from tested import (
     VARIANTS,
     lanes,
     respond,
+    signature_rows,
     single,
 )
 
-from mcc_jax.effects import ExtendedLaw, signatures
+from mcc_jax.effects import LIBRARY, ExtendedLaw
 
 EVERY = pytest.mark.parametrize("variant", VARIANTS, ids=NAMES)
 
@@ -66,25 +67,30 @@ def test_the_law_of_a_fit_gives_the_same(variant):
 
 
 def test_signatures_are_the_derivatives_at_the_null():
-    rows = eqx.filter_jit(signatures)(LAW, PARTICLE, RECORD, [v.build(0.0) for v in VARIANTS])
+    rows, again = signature_rows(RECORD, RECORD)
+    np.testing.assert_array_equal(rows, again)
     for variant, row in zip(VARIANTS, rows, strict=True):
         exact = lanes(variant)[1][0]
         np.testing.assert_allclose(row, exact, atol=1e-9 * np.abs(exact).max(), rtol=0)
 
 
-def together(amplitudes, law=LAW, particle=PARTICLE, record=RECORD):
-    effects = tuple(v.build(a) for v, a in zip(VARIANTS, amplitudes, strict=True))
+FEW = tuple(mechanism.variants[0] for mechanism in LIBRARY.values())
+"""One of each mechanism: a law with all variants takes long to compile."""
+
+
+def together(amplitudes, variants, law=LAW, particle=PARTICLE, record=RECORD):
+    effects = tuple(v.build(a) for v, a in zip(variants, amplitudes, strict=True))
     return ExtendedLaw(law, effects).respond(particle, record)
 
 
 @functools.cache
-def all_effects(dtype):
-    """All effects in one law, compiled once: base, null, and in double precision the derivatives by reverse mode."""
+def all_effects(variants, dtype):
+    """Effects in one law, compiled once: base, null, and in double precision the derivatives by reverse mode."""
     law, particle, record = (with_dtype(t, dtype) for t in (LAW, PARTICLE, RECORD))
     base = jax.jit(lambda law, p, f: law.path_load(p, law.init(p), f)[1])(law, particle, record.force)
     weights = jnp.asarray(np.random.default_rng(1).normal(size=FORCE.size), dtype)
-    null = jnp.zeros(len(VARIANTS), dtype)
-    run = functools.partial(together, law=law, particle=particle, record=record)
+    null = jnp.zeros(len(variants), dtype)
+    run = functools.partial(together, variants=variants, law=law, particle=particle, record=record)
 
     @jax.jit
     def evaluate(null):
@@ -97,19 +103,26 @@ def all_effects(dtype):
     return np.asarray(base), np.asarray(value), np.asarray(reverse), np.asarray(weights)
 
 
+TOGETHER = pytest.mark.parametrize(
+    "variants", [FEW, pytest.param(VARIANTS, marks=pytest.mark.long)], ids=["few", "all"]
+)
+
+
+@TOGETHER
 @pytest.mark.parametrize("dtype", [jnp.float64, pytest.param(jnp.float32, marks=pytest.mark.long)])
-def test_all_effects_at_their_null_leave_the_compiled_law_alone(dtype):
-    base, value, reverse, _ = all_effects(dtype)
+def test_effects_at_their_null_leave_the_compiled_law_alone(variants, dtype):
+    base, value, reverse, _ = all_effects(variants, dtype)
     assert value.dtype == dtype
     np.testing.assert_array_equal(value, base)
     assert np.isfinite(reverse).all()
 
 
-def test_reverse_mode_is_forward_mode():
+@TOGETHER
+def test_reverse_mode_is_forward_mode(variants):
     """The gradient of a weighted sum at the null, by reverse mode all at once, against each derivative by forward."""
-    *_, reverse, weights = all_effects(jnp.float64)
-    forward = np.array([weights @ lanes(variant)[1][0] for variant in VARIANTS])
-    scale = np.array([np.abs(weights * lanes(variant)[1][0]).sum() for variant in VARIANTS])
+    *_, reverse, weights = all_effects(variants, jnp.float64)
+    forward = np.array([weights @ lanes(variant)[1][0] for variant in variants])
+    scale = np.array([np.abs(weights * lanes(variant)[1][0]).sum() for variant in variants])
     np.testing.assert_array_less(np.abs(forward - reverse), 1e-10 * scale)
 
 

@@ -2,12 +2,10 @@
 
 import dataclasses
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tested import FORCE, LAW, PARTICLE, RECORD, TIME, VARIANTS
+from tested import FORCE, LAW, PARTICLE, RECORD, TIME, VARIANTS, signature_rows
 
 from mcc_jax import Hold, InputError, Instrument, Programme, Ramp, find_segments, paper_campaign
 from mcc_jax.effects import (
@@ -19,7 +17,6 @@ from mcc_jax.effects import (
     present,
     record_batch,
     record_of,
-    signatures,
 )
 
 STEPS = (Ramp(0.6, 2.0), Ramp(0.2, 4.0), Ramp(1.0, 1.0), Hold(40.0), Ramp(0.3, 2.0), Ramp(0.9, 2.0), Ramp(0.0, 2.0))
@@ -68,10 +65,7 @@ def test_noise_of_force_does_not_change_what_an_effect_adds():
     for noise in (0.0, 0.03):
         curve = campaign(noise).curves[1]
         records.append(record_of(curve, find_segments(curve, control="load"), relative_humidity_percent=75.0))
-    both = jax.tree.map(lambda *x: jnp.stack(x), *records)
-    effects = [v.build(0.0) for v in VARIANTS]
-    run = eqx.filter_jit(eqx.filter_vmap(lambda record: signatures(LAW, PARTICLE, record, effects)))
-    for variant, clean, noisy in zip(VARIANTS, *np.asarray(run(both)), strict=True):
+    for variant, clean, noisy in zip(VARIANTS, *signature_rows(*records), strict=True):
         assert np.sqrt(np.mean((noisy - clean) ** 2)) < 0.06 * np.abs(clean).max(), variant
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from helpers import paper_law, paper_particle, with_dtype
 
 from mcc_jax.calibrate.joint._forward import law_of
-from mcc_jax.effects import LIBRARY, ExtendedLaw, clean_record
+from mcc_jax.effects import LIBRARY, ExtendedLaw, clean_record, signatures
 from mcc_jax.law import Unloading
 
 MECHANISMS = tuple(LIBRARY)
@@ -65,6 +65,26 @@ def lanes(variant):
 
     values, slopes = eqx.filter_vmap(one)(laws, amplitudes)
     return np.asarray(values), np.asarray(slopes)
+
+
+LENGTH = 400
+
+
+@functools.cache
+def _signature_rows():
+    effects = [v.build(0.0) for v in VARIANTS]
+    return eqx.filter_jit(eqx.filter_vmap(lambda record: signatures(LAW, PARTICLE, record, effects)))
+
+
+def signature_rows(one, other):
+    """Signatures of every variant along two records: one function, compiled for records of one length."""
+
+    def padded(x):
+        return jnp.asarray(np.pad(x, (0, LENGTH - len(x)), mode="edge")) if x.ndim else x
+
+    both = jax.tree.map(lambda *x: jnp.stack([padded(x) for x in x]), one, other)
+    rows = np.asarray(_signature_rows()(both))
+    return rows[0][:, : one.force.size], rows[1][:, : other.force.size]
 
 
 def single(tree):

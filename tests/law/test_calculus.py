@@ -113,23 +113,23 @@ PEAK = 80.0
 
 def special_points(law, p, dtype):
     """(state, displacement) and (state, force) at every place where the model has a branch or a kink."""
-    peak = jnp.asarray(PEAK, dtype)
-    state = History(peak)
-    end = law.residual_displacement(p, state)
-    top = law.step(p, state, peak)[1]
-    zero = jnp.zeros_like(peak)
+    # In NumPy: JAX would compile each of these operations.
+    peak, zero = np.asarray(PEAK, dtype)[()], np.asarray(0, dtype)[()]
+    state = History(jnp.asarray(peak))
+    end = np.asarray(law.residual_displacement(p, state))[()]
+    top = np.asarray(law.step(p, state, jnp.asarray(peak))[1])[()]
     # A load so small that single precision cannot square it is out of its reach.
     small = [1e-9, 1e-6] if dtype == jnp.float32 else [1e-30, 1e-9]
-    below = [jnp.nextafter(peak, zero), peak * (1 - 1e-12), peak * (1 - 1e-9), (peak + end) / 2]
-    beyond = [jnp.nextafter(end, peak), end, jnp.nextafter(end, zero), end - 1, zero, -peak]
+    below = [np.nextafter(peak, zero), peak * (1 - 1e-12), peak * (1 - 1e-9), (peak + end) / 2]
+    beyond = [np.nextafter(end, peak), end, np.nextafter(end, zero), end - 1, zero, -peak]
     displacements = [peak, *below, *beyond, peak + 1]
-    forces = [top, jnp.nextafter(top, zero), top * (1 - 1e-12), top * (1 - 1e-9), top / 2, top * 1e-6]
-    forces += [jnp.asarray(jnp.finfo(dtype).tiny, dtype), zero, -zero, -top, top * 1.5]
+    forces = [top, np.nextafter(top, zero), top * (1 - 1e-12), top * (1 - 1e-9), top / 2, top * 1e-6]
+    forces += [np.finfo(dtype).tiny, zero, -zero, -top, top * 1.5]
     pairs = []
     for values, extreme in ((displacements, peak), (forces, top)):
         virgin = [-extreme, zero, *small, extreme]
         h = [PEAK] * len(values) + [0.0] * len(virgin)
-        pairs.append((jnp.asarray(h, dtype), jnp.stack([jnp.asarray(v, dtype) for v in values + virgin])))
+        pairs.append((np.asarray(h, dtype), np.asarray(values + virgin, dtype)))
     return pairs
 
 
@@ -156,8 +156,9 @@ def finite_everywhere(unloading, scaling, dtype, function):
         accuracy = 1e-4 if dtype == jnp.float32 else 1e-12
         for one, other in zip(forward, reverse, strict=True):
             axes = tuple(range(1, one.ndim))
-            scale = jnp.max(jnp.abs(one), axis=axes, keepdims=True)
-            assert jnp.all(jnp.abs(one - other) <= accuracy * scale)
+            one, other = np.asarray(one), np.asarray(other)
+            scale = np.max(np.abs(one), axis=axes, keepdims=True)
+            assert np.all(np.abs(one - other) <= accuracy * scale)
 
 
 @SOME_FORMS
