@@ -67,7 +67,7 @@ def lanes(variant):
     return np.asarray(values), np.asarray(slopes)
 
 
-LENGTH = 400
+LENGTH = 448
 
 
 @functools.cache
