@@ -143,6 +143,7 @@ def _estimate(content: Mapping[str, Any], keys: tuple[str, ...], file: Path) -> 
 
 
 def _is_number(value: Any) -> TypeGuard[float]:
+    # The bounds and not `math.isfinite`, which fails at an integer of more than 308 digits.
     return isinstance(value, int | float) and not isinstance(value, bool) and -1e300 <= value <= 1e300
 
 
