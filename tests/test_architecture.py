@@ -17,6 +17,7 @@ LAYERS = {
     "__main__": 99,
     "_errors": LEAF,
     "_types": LEAF,
+    "_memory": LEAF,
     "_numerics": LEAF,
     "_results": LEAF,
     "_version": LEAF,

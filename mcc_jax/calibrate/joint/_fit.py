@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..._memory import make_room
 from ...campaign import Campaign
 from ...law import Unloading
 from .._predict import point_noise_um
@@ -74,6 +75,7 @@ def prepare(
     """
     if block is not None and block < 1:
         raise ValueError(f"a block must have at least one particle, got {block}")
+    make_room()
     tell("selecting points")
     selection = select_tests(campaign, threshold_MPa=threshold_MPa)
     require_same(selection.tests)
