@@ -68,6 +68,7 @@ def lanes(variant):
 
 
 LENGTH = 448
+"""Points to which records are filled up for one compilation: as many as the longest has, or more."""
 
 
 @functools.cache
@@ -82,7 +83,7 @@ def signature_rows(one, other):
     def padded(x):
         return jnp.asarray(np.pad(x, (0, LENGTH - len(x)), mode="edge")) if x.ndim else x
 
-    both = jax.tree.map(lambda *x: jnp.stack([padded(x) for x in x]), one, other)
+    both = jax.tree.map(lambda *leaves: jnp.stack([padded(leaf) for leaf in leaves]), one, other)
     rows = np.asarray(_signature_rows()(both))
     return rows[0][:, : one.force.size], rows[1][:, : other.force.size]
 

@@ -77,8 +77,8 @@ def add_gap(table, listed, nulls):
     worse = []
     for o in nulls:
         steps = (o.found.get("gap") or {}).get("steps") or []
-        if o.failed or len(steps) < 2:  # an answer to which nothing was added predicts as before
-            worse.append(not o.failed)
+        if o.failed or len(steps) < 2:  # where nothing was added, the law predicts as before
+            worse.append(not o.failed and (len(steps) == 1 or o.found.get("verdict") == "NO_GAP"))
             continue
         loss = (steps[0].get("elpd") or 0.0) - (steps[-1].get("elpd") or 0.0)
         worse.append(loss <= (steps[-1].get("elpd_se") or 0.0))
