@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from mcc_jax._blocks import BLOCK, in_blocks
+from mcc_jax import in_blocks
 from mcc_jax.geometry import Particle
 from mcc_jax.law import History, MccLaw, Plastic
 
@@ -119,14 +119,14 @@ def traces(function, *arguments):
     return count
 
 
-def measure(kind, p, peak, given, displacement_control, load_control, numpy_arguments, repeats, block):
+def measure(kind, p, peak, given, displacement_control, load_control, numpy_arguments, repeats, plain):
     """Rows, verdicts and accuracy of one kind of work."""
     devices = tuple(jax.devices())
-    many = jax.vmap if block is None else functools.partial(in_blocks, block=block, devices=devices)
+    many = jax.vmap if plain else functools.partial(in_blocks, devices=devices)
     state, displacement = eqx.filter_vmap(History)(jnp.asarray(peak)), jnp.asarray(given)
     spread = NamedSharding(Mesh(np.array(devices), ("contacts",)), PartitionSpec("contacts"))
     everything = (*modules(p), state, displacement)
-    everything = everything if block is None else jax.device_put(everything, spread)
+    everything = everything if plain else jax.device_put(everything, spread)
     law, particle, state, displacement = everything
     forward, (_, force) = compiled(displacement_control.__name__, many(displacement_control), *everything)
     load, _ = compiled(load_control.__name__, many(load_control), law, particle, state, force)
@@ -204,8 +204,8 @@ def main():
     p = draw(rng, arguments.contacts)
     peak = reach(p) * rng.uniform(0.2, 0.6, arguments.contacts)
     given = peak * rng.uniform(0.96, 1.02, arguments.contacts)
-    size = {"block": None if arguments.plain else BLOCK, "repeats": arguments.repeats}
-    contacts = measure("contacts", p, peak, given, step, step_load, (*p.values(), peak, given), **size)
+    how = {"plain": arguments.plain, "repeats": arguments.repeats}
+    contacts = measure("contacts", p, peak, given, step, step_load, (*p.values(), peak, given), **how)
 
     p = draw(rng, arguments.particles)
     ramp = np.linspace(0, 1, arguments.points // 3)
@@ -213,8 +213,7 @@ def main():
     given = (reach(p) * rng.uniform(0.4, 0.67, arguments.particles))[:, None] * shape
     peak = np.zeros(arguments.particles)
     columns = (*(v[:, None] for v in p.values()), peak[:, None], given)
-    size["block"] = None if arguments.plain else max(8 * BLOCK // arguments.points, 1)
-    paths = measure("paths", p, peak, given, path, path_load, columns, **size)
+    paths = measure("paths", p, peak, given, path, path_load, columns, **how)
 
     rows, verdicts, accuracy = (a + b for a, b in zip(contacts, paths, strict=True))
     settings = {

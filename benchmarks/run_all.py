@@ -25,14 +25,25 @@ SCRIPTS = {
     "dem_lammps": "bench_dem_lammps.py",
     "scale": "bench_scale.py",
 }
+# Memory for large results is kept between calls. Without it a process is lucky or unlucky with the allocator, and page
+# faults of the results cost as much as the law.
+KEEP_MEMORY = ":".join(
+    f"glibc.malloc.{name}={value}"
+    for name, value in {
+        "hugetlb": 1,
+        "mmap_threshold": 2**25,
+        "trim_threshold": 2**34,
+        "arena_max": 1,
+        "top_pad": 2**26,
+    }.items()
+)
 START, END = "<!-- targets -->", "<!-- end of targets -->"
 
 
 def run(name: str) -> float:
     """Seconds that the benchmark took; raises if it fails."""
     began = time.monotonic()
-    # Fresh memory costs every row alike with this setting; without it, whichever is lucky with the allocator.
-    environment = {"GLIBC_TUNABLES": "glibc.malloc.hugetlb=1", **os.environ}
+    environment = {"GLIBC_TUNABLES": KEEP_MEMORY, **os.environ}
     subprocess.run([sys.executable, HERE / SCRIPTS[name], "--write"], check=True, env=environment)
     return time.monotonic() - began
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -12,11 +13,13 @@ from jax.sharding import Mesh, PartitionSpec
 
 from ._errors import InputError
 
-BLOCK = 2048
+CONTACTS = 2048
+NUMBERS = 2 * CONTACTS
+"""Of one array in a block: with the dozen arrays between, that is half of a small core's second cache."""
 
 
 def in_blocks[**P, R](
-    function: Callable[P, R], *, block: int = BLOCK, devices: tuple[Any, ...] | None = None
+    function: Callable[P, R], *, block: int | None = None, devices: tuple[Any, ...] | None = None
 ) -> Callable[P, R]:
     r"""Map a function of one contact over many contacts, in blocks.
 
@@ -31,7 +34,8 @@ def in_blocks[**P, R](
 
     Args:
         function: of one contact; its positional arguments are trees of arrays without a batch axis.
-        block: contacts in a block, >= 1. The actual one may be smaller, so that blocks come out even.
+        block: contacts in a block, >= 1; if None, what suits a cache: 2048, or fewer where each brings a path. The
+            actual one may be smaller, so that blocks come out even.
         devices: JAX devices over which the contacts are divided, in equal shares; the default device if None.
 
     Returns:
@@ -40,15 +44,16 @@ def in_blocks[**P, R](
     Raises:
         InputError: if the arrays differ in length, have no axis to divide, or cannot be shared out equally.
     """
-    if block < 1:
+    if block is not None and block < 1:
         raise InputError(f"a block of {block} contacts", remedy="Give at least 1.")
     one = jax.checkpoint(jax.vmap(function))
 
     def share(*arguments: Any) -> Any:
         count = jax.tree.leaves(arguments)[0].shape[0]
-        if count <= block:
+        largest = _suitable(arguments) if block is None else block
+        if count <= largest:
             return one(*arguments)
-        size = _even(count, block)
+        size = _even(count, largest)
         whole = count // size * size
         parts = jax.tree.map(lambda x: x[:whole].reshape(-1, size, *x.shape[1:]), arguments)
         found = jax.lax.map(lambda part: one(*part), parts)
@@ -67,6 +72,12 @@ def in_blocks[**P, R](
         return jax.shard_map(share, mesh=mesh, in_specs=axis, out_specs=axis)(*arguments)
 
     return call  # pyright: ignore[reportReturnType]
+
+
+def _suitable(arguments: Any) -> int:
+    """Contacts whose largest array still has no more than `NUMBERS` numbers."""
+    each = max(math.prod(leaf.shape[1:]) for leaf in jax.tree.leaves(arguments))
+    return max(1, min(CONTACTS, NUMBERS // max(each, 1)))
 
 
 def _even(count: int, block: int) -> int:

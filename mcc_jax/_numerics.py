@@ -33,12 +33,28 @@ def _running_max_jvp(primals, tangents):
     highest = running_max(path)
     if isinstance(tangent, SymbolicZero):
         return highest, tangent
-    steps = jnp.arange(path.shape[0], dtype=jnp.int32)
-    record = jnp.concatenate([steps[:1] == 0, path[1:] > highest[:-1]])
-    return highest, tangent[_running_max(jnp.where(record, steps, 0))]
+    own = jnp.arange(path.shape[0], dtype=path.dtype)
+    record = jnp.concatenate([own[:1] == 0, path[1:] > highest[:-1]])
+    return highest, _held(tangent, own - _running_max(jnp.where(record, own, 0)))
 
 
-def _running_max(path: Shaped[Array, " steps"], width: int = 10) -> Shaped[Array, " steps"]:
+def _held(values: Path, age: Path) -> Path:
+    """The value `age` steps before each, where age counts from the last step at which it was 0; linear in the values.
+
+    The same as `values[own - age]`, by doubling. Transposed, that is a sum over the steps that hold a value, where
+    indexing would become a scatter, on a CPU a loop over single numbers.
+    """
+    steps = values.shape[0]
+    held = jnp.where(age == 0, values, 0.0)
+    span = 1  # what is younger than that is in place
+    while span < steps:
+        earlier = jnp.pad(held[:-span], (span, 0))
+        held = jax.lax.optimization_barrier(held + jnp.where(age >= span, earlier, 0.0))
+        span *= 2
+    return held
+
+
+def _running_max(path: Shaped[Array, " steps"], width: int = 8) -> Shaped[Array, " steps"]:
     """The larger of the last `width` values and of the blocks of as many before them: one loop over the data.
 
     `lax.cummax` makes a logarithmic number of strided copies instead and takes five times as long on a CPU.
@@ -46,10 +62,23 @@ def _running_max(path: Shaped[Array, " steps"], width: int = 10) -> Shaped[Array
     steps = path.shape[0]
     if steps <= width:
         return jax.lax.cummax(path)
-    blocks = jnp.max(path[: steps // width * width].reshape(-1, width), axis=1)
-    earlier = jnp.repeat(_running_max(blocks), width)[: steps - width]
+    blocks = path[: steps // width * width].reshape(-1, width)
+    earlier = jnp.repeat(_running_max(_largest_of_each(blocks), width), width)[: steps - width]
     recent = (path[width - k : steps - k] for k in range(width))
     return jnp.concatenate([jax.lax.cummax(path[:width]), functools.reduce(jnp.maximum, recent, earlier)])
+
+
+def _largest_of_each(blocks: Shaped[Array, "blocks width"]) -> Shaped[Array, " blocks"]:
+    """Largest value of each row; NaN if there is one.
+
+    A plain maximum XLA hands to a library whose calls cost more than the work, here half of a law's time on a path.
+    """
+
+    def larger(a, b):
+        return jax.lax.select((b > a) | (b != b), b, a)
+
+    lowest = -jnp.inf if jnp.issubdtype(blocks.dtype, jnp.floating) else jnp.iinfo(blocks.dtype).min
+    return jax.lax.reduce(blocks, jnp.asarray(lowest, blocks.dtype), larger, (1,))
 
 
 def horner(coefficients: tuple[float, ...], x: Float[Array, ...]) -> Float[Array, ...]:
@@ -77,6 +106,20 @@ def shared(x: Values) -> Values:
     """
     kind = jnp.finfo(x.dtype)
     return jax.lax.reduce_precision(x, kind.nexp, kind.nmant)
+
+
+@jax.custom_jvp
+def derivative_kept(x: Values) -> Values:
+    """`x` itself, whose derivative is worked out once and kept for all its users.
+
+    In reverse mode XLA otherwise computes what arrives here again in the loop of every input that it goes on to.
+    """
+    return x
+
+
+@derivative_kept.defjvp
+def _derivative_kept_jvp(primals, tangents):
+    return primals[0], jax.lax.optimization_barrier(tangents[0])
 
 
 def rough_power(x: Values, p: float) -> Values:

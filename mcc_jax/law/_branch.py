@@ -11,6 +11,81 @@ from .._numerics import shared
 from .._types import Scalar, Values
 from ._loading_inverse import secant_modulus, tangent_modulus
 from ._recovery import stress_ratio
+from ._unloading import StrainScaling, Unloading
+
+AREA = 1e-3 * jnp.pi / 4
+"""Effective area over the diameter squared, times what makes mN of MPa um^2."""
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def branch_coefficients(
+    unloading: Unloading,
+    scaling: StrainScaling,
+    K1: Scalar,
+    K3: Scalar,
+    K5: Scalar,
+    modulus: Scalar,
+    eta: Scalar,
+    diameter: Scalar,
+) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+    r"""What `branch_force` needs, from the law and the particle.
+
+    With :math:`A = \tfrac{\pi}{4} D_e^2`, the stress :math:`\sigma = K_1 x - K_3 x^3 + K_5 x^5` at
+    :math:`x = \eta_p \gamma / D_e` becomes a force as a quintic of the displacement, and the recoverable displacement
+
+    .. math:: k_m = A K_m (\eta_p / D_e)^m, \qquad c = \frac{D_e^3}{k\, \eta_p^p\, (\bar E A)^n}
+
+    with k and n of the `Unloading` form and p of the `StrainScaling`. Derivatives are written out, because reverse mode
+    then takes half as many operations.
+
+    Args:
+        unloading: form of the recovered strain.
+        scaling: how the shape factor enters it.
+        K1: factor of x [MPa].
+        K3: factor of -x^3 [MPa].
+        K5: factor of x^5 [MPa].
+        modulus: effective modulus [MPa].
+        eta: shape factor [-].
+        diameter: effective diameter [um].
+
+    Returns:
+        k1 [mN/um], k3 [mN/um^3], k5 [mN/um^5] and c [um^3/mN for n = 1, um^3/mN^2 for n = 2].
+    """
+    slope = shared(eta / diameter)
+    square = slope * slope
+    first = AREA * (eta * diameter)
+    third = first * square
+    return K1 * first, K3 * third, K5 * (third * square), _compliance(unloading, scaling, modulus, eta, diameter)
+
+
+@branch_coefficients.defjvp
+def _branch_coefficients_jvp(unloading, scaling, primals, tangents):
+    K1, K3, K5, modulus, eta, diameter = primals
+    dK1, dK3, dK5, dmodulus, deta, ddiameter = tangents
+    slope = shared(eta / diameter)
+    square = slope * slope
+    first = AREA * (eta * diameter)
+    third = first * square
+    by_eta, by_diameter = AREA * diameter, AREA * eta
+    c = _compliance(unloading, scaling, modulus, eta, diameter)
+    n, p = unloading.stress_power, scaling.power
+    dc = (3 - 2 * n) * shared(c / diameter) * ddiameter - n * shared(c / modulus) * dmodulus
+    changes = (
+        first * dK1 + K1 * (by_eta * deta + by_diameter * ddiameter),
+        third * dK3 + K3 * square * (3 * by_eta * deta - by_diameter * ddiameter),
+        third * square * dK5 + K5 * (square * square) * (5 * by_eta * deta - 3 * by_diameter * ddiameter),
+        dc - p * shared(c / eta) * deta if p else dc,
+    )
+    values = K1 * first, K3 * third, K5 * (third * square), c
+    # Transposed, these are barriers for the cotangents, which otherwise would be computed again for each input. One for
+    # each: what does not depend on the input at hand has no transpose.
+    return values, tuple(map(jax.lax.optimization_barrier, changes))
+
+
+def _compliance(unloading, scaling, modulus, eta, diameter):
+    n = unloading.stress_power
+    stiffness = unloading.constant * eta**scaling.power * (modulus * AREA) ** n
+    return shared((diameter if n == 1 else 1 / diameter) / stiffness)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))

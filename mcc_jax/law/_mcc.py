@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._numerics import compiled_whole, running_max, shared
+from .._numerics import compiled_whole, derivative_kept, running_max, shared
 from .._types import Flag, Path, Scalar, scalar
 from ..geometry import Particle, plastic_shape_factor
 from ._base import AbstractContactLaw
-from ._branch import branch_force
+from ._branch import AREA, branch_coefficients, branch_force
 from ._loading_inverse import loading_strain, secant_modulus
 from ._plastic import Plastic
 from ._recovery import energy_ratio, recovery, stress_ratio
@@ -195,16 +195,11 @@ class MccLaw(AbstractContactLaw[History]):
         return History(peak[-1]), displacement
 
     def _force(self, particle: Particle, displacement: AnyShape, peak: AnyShape) -> AnyShape:
-        # The quintic of force against displacement: a path then depends on its particle through four numbers only.
-        diameter, area = particle.effective_diameter, 1e-3 * particle.effective_area
-        eta = self.shape_factor(particle)
-        scale = shared(eta / diameter)
-        square = scale * scale
-        K1, K3, K5 = (K * (scale * area) for K in self.plastic.polynomial)
-        power = self.unloading.stress_power
-        stiffness = self.unloading.constant * eta**self.strain_scaling.power * (self.effective_modulus * area) ** power
-        compliance = shared(diameter * diameter * diameter / stiffness)
-        return branch_force(power, K1, K3 * square, K5 * (square * square), compliance, peak, peak - displacement)
+        # A path then depends on its particle through four numbers only.
+        eta, diameter = derivative_kept(self.shape_factor(particle)), derivative_kept(particle.effective_diameter)
+        form = self.unloading, self.strain_scaling
+        k1, k3, k5, c = branch_coefficients(*form, *self.plastic.polynomial, self.effective_modulus, eta, diameter)
+        return branch_force(self.unloading.stress_power, k1, k3, k5, c, peak, peak - displacement)
 
     @compiled_whole
     def peak_and_displacement(
@@ -218,27 +213,27 @@ class MccLaw(AbstractContactLaw[History]):
             force: forces [mN].
             highest: the largest force up to each of them [mN].
         """
-        # The barriers make three stages that share nothing but what they are given. Where they share intermediate
-        # values, XLA stores those and cuts the loop over the data of the inverse in many pieces.
-        past = jax.lax.optimization_barrier(
-            particle.force(self.loading_stress(particle, particle.strain(state.displacement_max)))
-        )
+        # The barriers make stages that share nothing but what they are given. Where they share intermediate values, XLA
+        # stores those and cuts the loop over the data of the inverse in many pieces.
+        eta, diameter = jax.lax.optimization_barrier((self.shape_factor(particle), particle.effective_diameter))
 
-        law, p, state, highest = jax.lax.optimization_barrier((self, particle, state, highest))
-        scale = shared(p.effective_diameter / law.shape_factor(p))
-        stress = p.stress(jnp.where(highest < past, past, highest))
+        carried = self.plastic.stress(shared(eta * state.displacement_max / diameter))
+        past = jax.lax.optimization_barrier(AREA * (diameter * diameter) * carried)
+
+        law, eta, diameter, state, highest = jax.lax.optimization_barrier((self, eta, diameter, state, highest))
+        scale, area = shared(diameter / eta), AREA * (diameter * diameter)
+        stress = shared(jnp.where(highest < past, past, highest) / area)
         reached = scale * loading_strain(*law.plastic.polynomial, stress, state.displacement_max / scale)
         elastic = (highest < past) | (reached < state.displacement_max)
         peak = jax.lax.optimization_barrier(jnp.where(elastic, state.displacement_max, reached))
 
-        law, p, force, highest = jax.lax.optimization_barrier((self, particle, force, highest))
+        law, eta, diameter, force, highest = jax.lax.optimization_barrier((self, eta, diameter, force, highest))
         peak_force = jnp.where(highest < past, past, highest)
-        eta = law.shape_factor(p)
-        _, carries, recoverable = law._elastic(eta, shared(eta * peak / p.effective_diameter))
+        _, carries, recoverable = law._elastic(eta, shared(eta * peak / diameter))
         # Below that, the quotient's derivatives overflow.
         loaded = carries & (peak_force > jnp.finfo(peak_force.dtype).tiny ** 0.5)
         ratio = shared(jnp.where(loaded, force, 0.0) / jnp.where(loaded, peak_force, 1.0))
-        released = p.displacement(recoverable) * recovery(ratio)
+        released = diameter * recoverable * recovery(ratio)
         return peak, peak - jnp.where(loaded & (force < peak_force), released, 0.0)
 
     # ---- energy ------------------------------------------------------------------------------------------------------
