@@ -9,7 +9,7 @@ from typing import Any, cast
 import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, Float, Shaped
+from jaxtyping import Array, Bool, Float, Shaped
 
 from ._types import Path, Values
 
@@ -33,23 +33,23 @@ def _running_max_jvp(primals, tangents):
     highest = running_max(path)
     if isinstance(tangent, SymbolicZero):
         return highest, tangent
-    own = jnp.arange(path.shape[0], dtype=path.dtype)
-    record = jnp.concatenate([own[:1] == 0, path[1:] > highest[:-1]])
-    return highest, _held(tangent, own - _running_max(jnp.where(record, own, 0)))
+    first = jnp.ones_like(path[:1], bool)
+    return highest, _held(tangent, jnp.concatenate([first, path[1:] > highest[:-1]]))
 
 
-def _held(values: Path, age: Path) -> Path:
-    """The value `age` steps before each, where age counts from the last step at which it was 0; linear in the values.
+def _held(values: Path, record: Bool[Array, " steps"]) -> Path:
+    """The value at the last record up to each step, the first step being one; linear in the values.
 
-    The same as `values[own - age]`, by doubling. Transposed, that is a sum over the steps that hold a value, where
-    indexing would become a scatter, on a CPU a loop over single numbers.
+    By doubling. Transposed, that is a sum over the steps that hold a value, where indexing would become a scatter, on a
+    CPU a loop over single numbers.
     """
     steps = values.shape[0]
-    held = jnp.where(age == 0, values, 0.0)
-    span = 1  # what is younger than that is in place
+    held, since = jnp.where(record, values, 0.0), ~record
+    span = 1  # what has held for less than that is in place; `since` tells whether nothing else was a record for so long
     while span < steps:
-        earlier = jnp.pad(held[:-span], (span, 0))
-        held = jax.lax.optimization_barrier(held + jnp.where(age >= span, earlier, 0.0))
+        held = held + jnp.where(since, jnp.pad(held[:-span], (span, 0)), 0.0)
+        since = since & jnp.pad(since[:-span], (span, 0))
+        held, since = jax.lax.optimization_barrier(held), jax.lax.optimization_barrier(since)
         span *= 2
     return held
 
