@@ -18,7 +18,7 @@ from ._large import AT_A_TIME, PROBES, log_densities
 from ._mode import FIRST_SPREAD, Target
 from ._model import JointModel, prior_numbers
 from ._noise import Whitening
-from ._nuts import Length
+from ._nuts import Length, chains_together
 from ._population import Population, Summary
 from ._sampling import Exact, draw_particles, sample_population
 
@@ -43,8 +43,9 @@ def compile_ahead(tests: Tests, block: int, model: JointModel, length: Length) -
     if stride > 1:
         cast(Any, log_densities).lower(dummy(AT_A_TIME, d), target).compile()
     else:
+        keys = jax.random.split(jax.random.key(0), chains_together(length.chains))
         cast(Any, sample_population).lower(
-            jax.random.key(0), dummy(d), dummy(d, d), target, dummy(), **length._asdict()
+            keys, dummy(d), dummy(d, d), target, dummy(), warmup=length.warmup, draws=length.draws
         ).compile()
     import arviz_stats.base  # noqa: F401  # seconds on a cold machine, so here too
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from ._fit import population_at, populations
 from ._large import PROBES, sample_weighted
 from ._mode import Target
 from ._model import JointFit, JointModel
-from ._nuts import Chains, Length
+from ._nuts import Chains, Length, by_chains
 from ._population import COEFFICIENTS, Population, Scatter, laplace
 from ._sampling import Exact, sample_joint, sample_population
 from ._weights import diagnostics
@@ -102,8 +102,8 @@ def _sampled(
     def run(accept: float) -> tuple[Chains, Population]:
         # From an array, not from a Python number: a weak type would be compiled anew after `compile_ahead`.
         aim = jnp.asarray(np.asarray(accept))
-        found = sample_population(key, mode, covariance, target, aim, **length._asdict())
-        return cast(Any, jax.tree.map(np.asarray, found))
+        rest = {"warmup": length.warmup, "draws": length.draws}
+        return by_chains(sample_population, key, length.chains, mode, covariance, target, aim, **rest)
 
     chains, population = run(ACCEPT[0])
     for accept in ACCEPT[1:]:
@@ -117,8 +117,9 @@ def draw_joint(key: Array, tests: Tests, model: JointModel, fit: JointFit, lengt
     """Population and particles sampled together under the exact likelihood: fields of the result."""
     scatter = replace(model.scatter, newton=newton_steps(fit, tests, model))
     exact = Exact(tests, fit.filters, fit.summary, scatter, model.zero_sd, model.unloading)
-    found = sample_joint(key, fit.mode, fit.covariance, fit.numbers, exact, **length._asdict())
-    run, free, *particles = jax.tree.map(np.asarray, found)
+    rest = {"warmup": length.warmup, "draws": length.draws}
+    found = by_chains(sample_joint, key, length.chains, fit.mode, fit.covariance, fit.numbers, exact, **rest)
+    run, free, *particles = found
     population = populations(free.reshape(-1, free.shape[-1]), fit.numbers, scatter)
     names, stacked = _stack(population, scatter, length)
     return {

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
 
 from ..._types import Scalar, ScalarLike
+
+PAIR = 2
 
 
 class Chains(NamedTuple):
@@ -41,13 +46,38 @@ class Length(NamedTuple):
         return self.chains * self.draws
 
 
+def by_chains[T](function: Callable[..., T], key: PRNGKeyArray, chains: int, *arguments: object, **options: int) -> T:
+    """What `function(keys, *arguments, **options)` returns for a key per chain, as NumPy arrays.
+
+    On a CPU, where a chain keeps one core busy with small operations, chains run two by two, side by side. The pairs do
+    not depend on the number of cores: the same seed gives the same bits on any.
+
+    Args:
+        function: compiled; every array of its result has the chains, or their draws in a row, along its first axis.
+        key: random key.
+        chains: number of chains.
+        arguments: passed on.
+        options: passed on.
+    """
+    keys = jax.random.split(key, chains)
+    size = chains_together(chains)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        groups = [keys[i : i + size] for i in range(0, chains, size)]
+        results = list(pool.map(lambda some: jax.tree.map(np.asarray, function(some, *arguments, **options)), groups))
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *results)
+
+
+def chains_together(chains: int) -> int:
+    """How many chains one call of `by_chains` takes: all of them on an accelerator, which advances them in step."""
+    return PAIR if jax.default_backend() == "cpu" and chains % PAIR == 0 else chains
+
+
 def sample(
-    key: PRNGKeyArray,
+    keys: Key[Array, " chains"],
     log_density: Callable[[Float[Array, " d"]], Scalar],
     mode: Float[Array, " d"],
     factor: Float[Array, "d d"],
     *,
-    chains: int,
     warmup: int,
     draws: int,
     accept: ScalarLike = 0.8,
@@ -59,11 +89,10 @@ def sample(
     inside `jit`: MCMC objects of NumPyro compile anew for every data set, this does so once per shape.
 
     Args:
-        key: random key.
+        keys: a random key for every chain.
         log_density: log density in unbounded coordinates.
         mode: centre of the coordinates; chains begin scattered around it.
         factor: Cholesky factor of the covariance.
-        chains: number of chains.
         warmup: draws thrown away while the step size adapts.
         draws: draws kept per chain.
         accept: mean acceptance that the step size aims at; higher is slower and follows narrower densities.
@@ -93,7 +122,6 @@ def sample(
         state, (z, divergent, steps) = jax.lax.scan(advance, state, None, length=warmup + draws)
         return z[warmup:], divergent[warmup:], steps[warmup:], state.adapt_state.step_size
 
-    keys = jax.random.split(key, chains)
     # NumPyro counts on JAX's usual promotion of types and ranks, whatever the caller's settings are.
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         z, divergent, steps, step_size = jax.vmap(chain)(keys) if together else jax.lax.map(chain, keys)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..._types import Scalar
 from ...law import Unloading
@@ -47,25 +47,23 @@ class ParticleDraws(NamedTuple):
 
 @compiled
 def sample_population(
-    key: PRNGKeyArray,
+    keys: Key[Array, " chains"],
     mode: Float[Array, " d"],
     covariance: Float[Array, "d d"],
     target: Target,
     accept: Scalar,
     *,
-    chains: int,
     warmup: int,
     draws: int,
 ) -> tuple[Chains, Population]:
-    """NUTS over the population, all particles integrated out; populations of all chains in one row."""
+    """NUTS over the population, all particles integrated out, a chain for each key; populations of all in one row."""
     factor = jnp.linalg.cholesky(covariance)
     together = jax.default_backend() != "cpu"
     run = sample(
-        key,
+        keys,
         target.log_density,
         mode,
         factor,
-        chains=chains,
         warmup=warmup,
         draws=draws,
         accept=accept,
@@ -198,13 +196,12 @@ def draw_particles(
 
 @compiled
 def sample_joint(
-    key: PRNGKeyArray,
+    keys: Key[Array, " chains"],
     mode: Float[Array, " d"],
     covariance: Float[Array, "d d"],
     numbers: PriorNumbers,
     exact: Exact,
     *,
-    chains: int,
     warmup: int,
     draws: int,
 ) -> tuple[
@@ -236,7 +233,7 @@ def sample_joint(
     size = d + count * (k + 1)
     factor = jnp.eye(size).at[:d, :d].set(jnp.linalg.cholesky(covariance))
     centre = jnp.zeros(size).at[:d].set(mode)
-    run = sample(key, log_density, centre, factor, chains=chains, warmup=warmup, draws=draws)
+    run = sample(keys, log_density, centre, factor, warmup=warmup, draws=draws)
 
     def latents(position):
         _, _, drawn = place(position)

@@ -84,7 +84,7 @@ def test_weighted_draws_are_those_of_the_sampler(target):
     assert converged
     _, weighted = sample_weighted(jax.random.key(3), *mode, target, chains=2, draws=2000)
     accept = jnp.asarray(np.asarray(0.8))
-    _, sampled = sample_population(jax.random.key(1), *mode, target, accept, chains=2, warmup=300, draws=2000)
+    _, sampled = sample_population(jax.random.split(jax.random.key(1)), *mode, target, accept, warmup=300, draws=2000)
     found, wanted = named(weighted), named(sampled)
     for name, values in wanted.items():
         values, other = np.asarray(values), np.asarray(found[name])
