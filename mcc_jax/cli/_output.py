@@ -20,6 +20,8 @@ from .._errors import InputError
 from ._lock import locked
 
 WORK = ".mcc-jax-work-"
+MOVES = "moves.json"
+"""In the work folder, while its results are moved into place: which files, so that the next run can finish the job."""
 _CANNOT_WRITE = (
     errno.EACCES,
     errno.EPERM,
@@ -53,7 +55,8 @@ def results(directory: Path) -> Iterator[Stage]:
     """A stage for results; they are moved into the folder if the body ends well.
 
     If it does not, or they cannot be moved, the folder is as it was, and folders made for it are gone. Only files that
-    the run wrote, or named as stale, are touched. The folder is locked meanwhile.
+    the run wrote, or named as stale, are touched. The folder is locked meanwhile. A process killed before the results
+    are complete leaves the folder as it was; one killed while they are moved leaves the rest to the next run.
 
     Args:
         directory: the folder, made with its parents if need be.
@@ -71,7 +74,7 @@ def results(directory: Path) -> Iterator[Stage]:
                     stage = Stage(directory, work / "new")
                     stage.folder.mkdir()
                     yield stage
-                    _place(stage, work / "old")
+                    _place(stage, work)
                 finally:
                     with _undisturbed():  # by the second Ctrl-C of somebody impatient
                         shutil.rmtree(work, ignore_errors=True)
@@ -126,33 +129,58 @@ def _make(directory: Path) -> list[Path]:
 
 def _work_folder(directory: Path) -> Path:
     for left_over in directory.glob(WORK + "*"):  # of runs that were killed: we hold the lock
+        if (left_over / MOVES).exists():
+            _finish(directory, left_over)
         shutil.rmtree(left_over, ignore_errors=True)
     # Inside the folder itself: the same file system for certain, even where the folder is a mount point.
     return Path(tempfile.mkdtemp(prefix=WORK, dir=directory))
 
 
-def _place(stage: Stage, old: Path) -> None:
+def _finish(directory: Path, work: Path) -> None:
+    """Move what a run had still to move when it was killed: all its results were complete."""
+    try:
+        moves = json.loads((work / MOVES).read_text())
+        new, stale = ([str(name) for name in moves[key]] for key in ("new", "stale"))
+    except (ValueError, KeyError, TypeError):  # not written by us, who make it whole
+        return
+    if any(Path(name).is_absolute() or ".." in Path(name).parts for name in new + stale):
+        return
+    for name in new:
+        if (work / "new" / name).is_file():
+            _make((directory / name).parent)
+            (work / "new" / name).replace(directory / name)
+    for name in stale:
+        (directory / name).unlink(missing_ok=True)
+
+
+def _place(stage: Stage, work: Path) -> None:
     """Move the files into the folder; if one cannot be moved, put all back as it was."""
+    old = work / "old"
     names = [str(file.relative_to(stage.folder)) for file in sorted(stage.folder.rglob("*")) if file.is_file()]
     for name in names:
         _flush(stage.folder / name)
+    stale = [name for name in stage.stale if name not in names and (stage.directory / name).is_file()]
+    note = work / "note"
+    note.write_text(json.dumps({"new": names, "stale": stale}))
+    _flush(note)
     done: list[str] = []
     made: list[Path] = []
     with _undisturbed():
         try:
+            note.replace(work / MOVES)
             for name in names:
                 target = stage.directory / name
                 made += _make(target.parent)
                 _keep(target, old / name)
                 done.append(name)
                 (stage.folder / name).replace(target)
-            for name in stage.stale:
+            for name in stale:
                 target = stage.directory / name
-                if name not in names and target.is_file():
-                    _keep(target, old / name)
-                    done.append(name)
-                    target.unlink()
+                _keep(target, old / name)
+                done.append(name)
+                target.unlink()
         except BaseException:
+            (work / MOVES).unlink(missing_ok=True)  # first: from here on nobody may finish this
             for name in reversed(done):
                 if (old / name).exists():
                     (old / name).replace(stage.directory / name)

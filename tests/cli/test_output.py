@@ -1,4 +1,5 @@
 import errno
+import json
 import os
 from pathlib import Path
 
@@ -7,7 +8,7 @@ from asserting import snapshot
 
 from mcc_jax import InputError
 from mcc_jax.cli._lock import LOCK, locked
-from mcc_jax.cli._output import WORK, json_text, results
+from mcc_jax.cli._output import MOVES, WORK, json_text, results
 
 
 def test_results_appear_together(tmp_path):
@@ -131,6 +132,55 @@ def test_left_overs_of_a_killed_run_are_cleared(tmp_path):
     with results(tmp_path) as stage:
         (stage.folder / "a").write_text("a")
     assert snapshot(tmp_path) == {"a": b"a"}
+
+
+@pytest.mark.parametrize("moved", [0, 1, 2, 3])
+def test_what_a_run_killed_while_moving_had_still_to_move_is_moved(tmp_path, moved):
+    work = tmp_path / f"{WORK}x"
+    new = {"a": "new a", "figures/b.png": "new b", "c": "new c"}
+    (tmp_path / "figures").mkdir()
+    (work / "new" / "figures").mkdir(parents=True)
+    for i, (name, text) in enumerate(new.items()):
+        (tmp_path / name).write_text(text if i < moved else "old")
+        if i >= moved:
+            (work / "new" / name).write_text(text)
+    (tmp_path / "dropped").write_text("old")
+    (work / MOVES).write_text(json.dumps({"new": list(new), "stale": ["dropped"]}))
+    (tmp_path / "of the user").write_text("kept")
+    with results(tmp_path) as stage:
+        assert (tmp_path / "a").read_text() == "new a"  # whoever reads first sees them
+        (stage.folder / "d").write_text("d")
+    found = {name: data for name, data in snapshot(tmp_path).items() if data is not None}
+    assert found == {name: text.encode() for name, text in (new | {"of the user": "kept", "d": "d"}).items()}
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", '{"new": ["../b"], "stale": []}', '{"new": [], "stale": ["/etc/hostname"]}']
+)
+def test_a_list_of_moves_by_somebody_else_moves_nothing(tmp_path, text):
+    out, work = tmp_path / "out", tmp_path / "out" / f"{WORK}x"
+    (work / "new").mkdir(parents=True)
+    (work / "b").write_text("b")
+    (work / MOVES).write_text(text)
+    with results(out):
+        pass
+    assert snapshot(tmp_path) == {"out": None}
+
+
+def test_a_move_that_fails_leaves_nothing_to_finish(tmp_path):
+    (tmp_path / "b").mkdir()
+    seen = []
+
+    def write():
+        with results(tmp_path) as stage:
+            (stage.folder / "a").write_text("a")
+            (stage.folder / "b").write_text("b")
+            seen.append(stage.folder.parent)
+
+    with pytest.raises(InputError, match="there is a folder"):
+        write()
+    assert not seen[0].exists()
+    assert set(snapshot(tmp_path)) == {"b"}
 
 
 def test_a_lock_that_vanishes_is_taken_anew(tmp_path, monkeypatch):
