@@ -54,7 +54,8 @@ def posterior():
     a, C3 = draws["a"].ravel(), np.exp(draws["mu_C3"].ravel())
     true_C3 = float(np.exp(mcc.paper_population().C3.mean))
     figure, ax = panel("A posterior", "shape parameter a [-]", "C3 of the median particle [-]")
-    ax.plot(a, C3, ".", ms=2.5, mew=0, color=BLUE, alpha=0.5, label="draws")
+    ax.plot(a, C3, ".", ms=2.5, mew=0, color=BLUE, alpha=0.5)
+    ax.plot([], [], ".", ms=8, mew=0, color=BLUE, label="draws")  # in the legend larger, or nobody sees them
     ax.plot(1.43, true_C3, "+", ms=15, mew=2.2, color=VERMILION, label="truth")
     ax.legend(frameon=False, markerscale=1.0)
     return figure

@@ -13,6 +13,7 @@ from ._batch import batch as batch
 from ._batch import of_each_particle as of_each_particle
 from ._batch import particle_batch as particle_batch
 from ._checksums import file_checksums as file_checksums
+from ._csv import check_folder as check_folder
 from ._csv import read_campaign as read_campaign
 from ._csv import read_particles as read_particles
 from ._metadata import load_toml_file as load_toml_file

@@ -36,7 +36,7 @@ def read_campaign(folder: str | os.PathLike[str]) -> Campaign:
         InputError: if anything is missing, damaged or contradictory; it names file, row and column.
     """
     path = Path(folder)
-    _check_folder(path)
+    check_folder(path)
     table = read_table(path / PARTICLES)
     names, diameters, columns = _parse_particles(table)
     curves = read_curves(path / CURVES)
@@ -56,7 +56,12 @@ def read_campaign(folder: str | os.PathLike[str]) -> Campaign:
     return campaign
 
 
-def _check_folder(path: Path) -> None:
+def check_folder(path: Path) -> None:
+    """Whether a folder has the files of a campaign.
+
+    Raises:
+        InputError: saying what was expected and what is there.
+    """
     expected = f"a campaign is a folder with {PARTICLES} and {CURVES}"
     try:
         if not path.exists():
@@ -77,7 +82,11 @@ def _check_folder(path: Path) -> None:
             lower = {entry.lower(): entry for entry in there}
             close = get_close_matches(name, list(lower), n=1, cutoff=0.8)
             found = ", ".join(there[:8]) + (", ..." if len(there) > 8 else "") if there else "nothing"
-            remedy = f"Rename {lower[close[0]]!r} to it" if close else f"Expected: {expected}; found: {found}"
+            remedy = f"Expected: {expected} (mcc-jax convert makes one of a tester's file); found: {found}"
+            if close:
+                remedy = f"Rename {lower[close[0]]!r} to it"
+            elif (inside := next((d for d in there if (path / d / PARTICLES).exists()), None)) is not None:
+                remedy = f"Did you mean {path / inside}?"
             raise InputError(f"{name} is missing", file=path, remedy=remedy)
 
 

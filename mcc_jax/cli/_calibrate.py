@@ -10,7 +10,7 @@ from click.core import ParameterSource
 
 from ._output import json_text, results
 from ._session import say, say_table, session
-from ._types import Location, law_options, out_option, priors_option, seed_option, threshold_option
+from ._types import CampaignFolder, law_options, out_option, priors_option, seed_option, threshold_option
 
 METHODS = ("paper", "least-squares", "bayes")
 # Which methods an option belongs to; given with another one it would be ignored, so it is refused.
@@ -34,7 +34,7 @@ def _applies(name: str, method: str) -> bool:
 
 
 @click.command(short_help="Fit the law to a campaign.")
-@click.argument("campaign", type=Location(), metavar="CAMPAIGN")
+@click.argument("campaign", type=CampaignFolder(), metavar="CAMPAIGN")
 @out_option(required=True)
 @click.option("--method", type=click.Choice(METHODS), default="bayes", show_default=True, help="How to calibrate.")
 @threshold_option(". paper: of the offset step, which 0 leaves out; otherwise: points below it do not count.")

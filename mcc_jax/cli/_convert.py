@@ -43,7 +43,9 @@ def convert(file: Path, out: Path, diameters: str | None, mapping: Path | None, 
       delimiter = "semicolon"       # comma, semicolon, tab, space
       decimal_mark = ","
       skip_rows = 3                 # rows above the header
+      tests = "column"              # a column names the test; leave out if the file is one test
       [columns]
+      test = { column = "Sample" }
       time = { column = "t", unit = "s" }
       force = { column = "Load", unit = "N" }
       displacement = { column = "Depth", unit = "nm", sign = -1 }

@@ -51,6 +51,12 @@ def explain(error: BaseException, debug: bool) -> Stop:
             return Stop(DONE, "")  # whoever reads our output has seen enough
         case InputError():
             return Stop(BAD_INPUT, f"error: {error}")
+        case click.MissingParameter(param=click.Option(name="out"), ctx=click.Context(command_path=command)):
+            return Stop(
+                BAD_INPUT,
+                f"error: no folder is given for the results. Add --out DIR, a new folder or one of earlier results; "
+                f"see '{command} --help'.",
+            )
         case click.UsageError():
             command = error.ctx.command_path if error.ctx else PROGRAM
             problem = one_line(error.format_message())

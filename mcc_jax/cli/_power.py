@@ -9,13 +9,21 @@ import click
 
 from ._output import json_text, results
 from ._session import say, say_table, session
-from ._types import Location, exclude_option, law_options, out_option, priors_option, seed_option, threshold_option
+from ._types import (
+    CampaignFolder,
+    exclude_option,
+    law_options,
+    out_option,
+    priors_option,
+    seed_option,
+    threshold_option,
+)
 
 POWER = "power.json"
 
 
 @click.command(short_help="Say what a planned campaign could show.")
-@click.argument("campaign", type=Location(), metavar="CAMPAIGN")
+@click.argument("campaign", type=CampaignFolder(), metavar="CAMPAIGN")
 @out_option(required=True)
 @exclude_option
 @threshold_option()

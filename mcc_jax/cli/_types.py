@@ -110,6 +110,23 @@ class Location(click.Path):
         return super().convert(value, param, ctx)
 
 
+class CampaignFolder(Location):
+    """A campaign; a path that cannot be one is refused before anything else is asked for."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The path of a text.
+
+        Raises:
+            InputError: saying what was expected and what is there.
+        """
+        path = super().convert(value, param, ctx)
+        if not all((path / name).exists() for name in ("particles.csv", "curves.csv")):
+            from ..campaign import check_folder
+
+            check_folder(path)
+        return path
+
+
 def out_option(**settings: Any) -> Any:
     """`--out DIR`."""
     return click.option("--out", metavar="DIR", type=Location(), help="Folder for the results.", **settings)

@@ -242,6 +242,7 @@ def test_bad_folders(tmp_path):
     assert "found: particles.csv" in message(folder)
     (tmp_path / "empty").mkdir()
     assert "found: nothing" in message(tmp_path / "empty")
+    assert f"Did you mean {folder}?" in message(tmp_path)
     (folder / "curves.csv").mkdir()
     assert "folder where a file is expected" in message(folder)
 

@@ -147,6 +147,7 @@ BAD_MAPPING = {
     "unknown key": ('delimeter = ","\n' + MAPPING, ["'delimeter'", "Did you mean 'delimiter'?"]),
     "unknown key far off": ("zzz = 1\n" + MAPPING, ["'zzz'", "Known keys"]),
     "unknown key of columns": (MAPPING + "[columns.temperature]\ncolumn = 4\n", ["'columns.temperature'"]),
+    "particle column": (MAPPING + "[columns.particle]\ncolumn = 4\n", ["'columns.particle'", 'tests = "column"']),
     "unknown key of a column": (MAPPING.replace("unit", "units"), ["'columns.time.units'", "Did you mean"]),
     "no columns": ("skip_rows = 1", ["'columns' is missing"]),
     "no time": (without("columns.time"), ["'columns.time' is missing"]),

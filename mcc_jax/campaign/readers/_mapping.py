@@ -160,6 +160,14 @@ def _columns(entries: dict[str, Any], values: dict[str, Any], file: Path) -> dic
         )
     by_column = values.get("tests") == "column"
     needed = [*DIMENSIONS, *(["test"] if by_column else [])]
+    for name in ("test", "particle", "sample", "specimen"):
+        if name in tables and name not in needed:
+            raise InputError(
+                "is not a key of a mapping file",
+                file=file,
+                column=f"columns.{name}",
+                remedy='If a column names the test, write tests = "column" above [columns] and call it test there',
+            )
     _only(tables, needed, file, "columns.")
     found: dict[str, Column] = {}
     for name in needed:

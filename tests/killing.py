@@ -105,4 +105,5 @@ def _whole(fit: Path) -> bool:
     return all(p.startswith(b"\x89PNG") and p.endswith(b"IEND\xaeB`\x82") for p in pictures) and not left_over
 
 
-sys.exit(main())
+if __name__ == "__main__":
+    sys.exit(main())
