@@ -23,6 +23,7 @@ LAYERS = {
     "_version": LEAF,
     "units": LEAF,
     "_blocks": 1,
+    "_text": 1,
     "geometry": 1,
     "law": 2,
     "campaign": 3,

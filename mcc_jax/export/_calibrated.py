@@ -12,6 +12,7 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from .._errors import InputError
+from .._text import check_text
 from ..campaign import read_diameters
 from ..geometry import Particle
 from ..law import MccLaw, Plastic, StrainScaling, Unloading
@@ -102,6 +103,7 @@ def _read(file: Path) -> tuple[dict[str, Any], str]:
         raise InputError(f"is not JSON: {error.msg}", file=file, row=error.lineno, remedy=_AGAIN) from error
     except (ValueError, RecursionError) as error:
         raise InputError(f"is not JSON: {error}", file=file, remedy=_AGAIN) from error
+    check_text(content, file, _AGAIN)
     if not isinstance(content, dict) or content.get("schema") != 1:
         raise InputError("is no calibration.json of schema 1", file=file, remedy=_AGAIN)
     return content, hashlib.sha256(raw).hexdigest()

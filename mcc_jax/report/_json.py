@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from .._errors import InputError
+from .._text import check_text
 
 SCHEMA = 1
 LONGEST = 160
@@ -48,6 +49,7 @@ def read_result(file: Path, again: str) -> dict[str, Any]:
         raise InputError(f"is no JSON: {error.msg}", file=file, row=error.lineno, remedy=remedy) from None
     except (ValueError, RecursionError) as error:
         raise InputError(f"is no JSON: {str(error)[:LONGEST]}", file=file, remedy=remedy) from None
+    check_text(content, file, remedy)
     number = content.get("schema") if isinstance(content, dict) else None
     if isinstance(number, int) and number != SCHEMA:
         raise InputError(

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import io
 import math
+import os
+import subprocess
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from .._errors import InputError
 
-COEFFICIENTS = ("C1", "C3", "C5")
-MOST_VALUES = 2**24
-"""In one array; a damaged shape may ask for any memory, and a kilobyte of chunks may fill it."""
+SECONDS, BYTES_PER_SECOND = 4.0, 10e6
+"""So long a whole file takes at most, on a slow machine."""
+LONGEST = 160
+"""So much of the HDF5 library's message is shown."""
 
 
 @dataclass(frozen=True)
@@ -49,70 +53,40 @@ class Posterior:
 
 
 def read_posterior(file: Path) -> Posterior:
-    """Read a `posterior.nc`.
+    """Read a `posterior.nc`, in a process of its own with limits: a damaged one may never come to an end.
 
     Raises:
-        InputError: if it is none.
+        InputError: if it is none, or takes longer than a whole one of its size would.
     """
-    import h5py
-
+    damaged = "Write it again with mcc-jax calibrate, or move it away"
     try:
-        with h5py.File(file) as tree:
-            draws = _draws(tree["posterior"])
-            bands, inside = _bands(tree) if "posterior_predictive" in tree else ({}, None)
-    except PermissionError as error:
-        raise InputError(f"cannot be read: {error}", file=file, remedy="Check the permissions") from None
-    except (OSError, KeyError, ValueError, TypeError, IndexError, AttributeError, RuntimeError) as error:
+        with file.open("rb") as stream:
+            size = stream.seek(0, os.SEEK_END)
+    except OSError as error:
         raise InputError(
-            f"is no posterior that mcc-jax wrote: {error}",
-            file=file,
-            remedy="Write it again with mcc-jax calibrate, or move it away",
+            f"cannot be read: {error.strerror or error}", file=file, remedy="Check the permissions"
         ) from None
-    return Posterior(draws, bands, inside)
-
-
-def _draws(group: Any) -> dict[str, np.ndarray]:
-    mu, tau = (_values(group[name]).reshape(-1, 3) for name in ("mu", "tau"))
-    found = {name: _values(group[name]).ravel() for name in ("a", "effective_modulus_MPa")}
-    for j, name in enumerate(COEFFICIENTS):
-        found[f"{name}_median"], found[f"{name}_spread"] = np.exp(mu[:, j]), tau[:, j]
-    for name, draws in found.items():
-        if draws.size == 0 or not np.isfinite(draws).all():
-            raise ValueError(f"{name} has no draws, or some that are not finite")
-    return found
-
-
-def _bands(tree: Any) -> tuple[dict[str, Band], float | None]:
-    group, constant = tree["posterior_predictive"], tree["constant_data"]
-    names = [_text(name) for name in _values(group["particle"], kind=None)]
-    draws = group["displacement_um"]
-    inside = count = 0
-    bands = {}
-    for row, name in enumerate(names):
-        force, mask = _values(constant["force_mN"], row), _values(constant["mask"], row, kind=bool)
-        # Where no point is compared nothing was drawn.
-        some = np.flatnonzero(mask)
-        middle, low, high = np.full((3, len(force)), np.nan)
-        if len(some):
-            # One particle at a time: the whole array may be larger than one wants in memory.
-            own = _values(draws, slice(None), slice(None), row).reshape(-1, len(force))[:, some]
-            # Of two hundred draws mean and standard deviation say the ends of a near-normal band better than quantiles.
-            centre, half = own.mean(0), 1.96 * own.std(0)
-            middle[some], low[some], high[some] = centre, centre - half, centre + half
-            measured = _values(tree["observed_data"]["displacement_um"], row)[some]
-            inside += int(((measured >= low[some]) & (measured <= high[some])).sum())
-            count += len(some)
-        bands[name] = Band(force, middle, low, high)
-    return bands, inside / count if count else None
-
-
-def _values(dataset: Any, *where: Any, kind: type | None = float) -> np.ndarray:
-    """A part of a stored array, unless it is too large to be what we wrote."""
-    lengths = [n for i, n in enumerate(dataset.shape) if i >= len(where) or isinstance(where[i], slice)]
-    if math.prod(lengths) > MOST_VALUES:
-        raise ValueError(f"{dataset.name} has the shape {dataset.shape}")
-    return np.asarray(dataset[where], kind)
-
-
-def _text(value: Any) -> str:
-    return value.decode("utf-8") if isinstance(value, bytes) else str(value)
+    reader = Path(__file__).with_name("_hdf5_reader.py")
+    # One thread: threads of a linear algebra that is not needed would count as memory.
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    seconds = SECONDS + size / BYTES_PER_SECOND
+    try:
+        done = subprocess.run(
+            [sys.executable, str(reader), str(file.absolute())],
+            capture_output=True,
+            stdin=subprocess.DEVNULL,
+            env=environment,
+            timeout=seconds,
+        )
+    except subprocess.TimeoutExpired:
+        raise InputError(f"is damaged: no end after {seconds:.0f} s of reading", file=file, remedy=damaged) from None
+    if done.returncode:
+        said = done.stderr.decode("utf-8", "replace").strip().splitlines()
+        why = said[-1][:LONGEST] if said and done.returncode == 1 else "the HDF5 library gave up"
+        raise InputError(f"is no posterior that mcc-jax wrote: {why}", file=file, remedy=damaged)
+    with np.load(io.BytesIO(done.stdout), allow_pickle=False) as found:
+        draws = {name.removeprefix("draws/"): found[name] for name in found.files if name.startswith("draws/")}
+        names = [str(name) for name in found["names"]] if "names" in found.files else []
+        bands = {name: Band(*found[f"bands/{row}"]) for row, name in enumerate(names)}
+        inside = float(found["inside"]) if "inside" in found.files else math.nan
+    return Posterior(draws, bands, inside if math.isfinite(inside) else None)

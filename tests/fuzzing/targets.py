@@ -195,7 +195,8 @@ READERS = (
     Reader("priors", 2, {"priors.toml": sample("priors.toml")}, bytes_of("priors.toml"), read_priors),
     Reader("programme", 2, {"programme.toml": sample("programme.toml")}, bytes_of("programme.toml"), read_programme),
     *(Reader(name, 2, CAMPAIGN | {name: RESULTS[name]}, values_of(name), read_results) for name in BOTH),
-    Reader("posterior.nc", 2, {"posterior.nc": RESULTS["posterior.nc"]}, bytes_of("posterior.nc"), read_results),
+    # Few, since each is read in a process of its own.
+    Reader("posterior.nc", 0.1, {"posterior.nc": RESULTS["posterior.nc"]}, bytes_of("posterior.nc"), read_results),
     Reader("saved state", 1, {"state.npz": sample("state.npz")}, state, read_state),
     Reader("export", 0.2, CAMPAIGN | RESULTS, values_of("calibration.json"), export),
     Reader("report page", 0.05, CAMPAIGN | RESULTS, values_of(*BOTH), report),

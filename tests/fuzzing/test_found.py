@@ -16,7 +16,7 @@ from mcc_jax.calibrate import read_priors
 from mcc_jax.campaign import read_diameters, read_tester_file
 from mcc_jax.dem import load_state
 from mcc_jax.export import read_calibration
-from mcc_jax.report import read_results
+from mcc_jax.report import _posterior, read_results
 
 SAMPLES = Path(__file__).parent / "samples"
 SIZES = [200.0, 190.0, 180.0]
@@ -169,3 +169,30 @@ def test_a_posterior_that_would_fill_the_memory(tmp_path, name):
         del tree[name]
         tree.create_dataset(name, shape, "f8", chunks=True)
     assert "shape" in refused(read_results, tmp_path)
+
+
+def test_a_posterior_that_the_library_reads_for_ever(tmp_path, monkeypatch):
+    """Fifteen bytes of it are damaged, and libhdf5 does not come back."""
+    monkeypatch.setattr(_posterior, "SECONDS", 2.0)
+    (tmp_path / "posterior.nc").write_bytes((SAMPLES.with_name("damaged") / "endless.nc").read_bytes())
+    assert "no end after 2 s" in refused(read_results, tmp_path)
+
+
+@pytest.mark.parametrize("huge", ["mu", "displacement_um"])
+def test_numbers_of_a_posterior_that_overflow(tmp_path, huge):
+    file = tmp_path / "posterior.nc"
+    file.write_bytes((SAMPLES / "results" / "posterior.nc").read_bytes())
+    with h5py.File(file, "r+") as tree:
+        values = (tree["posterior"] if huge == "mu" else tree["posterior_predictive"])[huge]
+        values[...] = 1e300
+        values[0] = -1e300
+    assert "finite" in refused(read_results, tmp_path)
+
+
+@pytest.mark.parametrize("read", [read_results, read_calibration])
+def test_half_a_character(tmp_path, read):
+    text = (SAMPLES / "results" / "calibration.json").read_text(encoding="utf-8")
+    assert '"warnings": [' in text
+    text = text.replace('"warnings": [', '"warnings": ["\\ud800"' + ("" if '"warnings": []' in text else ", "), 1)
+    (tmp_path / "calibration.json").write_text(text, encoding="utf-8")
+    assert "not Unicode" in refused(read, tmp_path)
