@@ -51,35 +51,37 @@ def branch_coefficients(
     Returns:
         k1 [mN/um], k3 [mN/um^3], k5 [mN/um^5] and c [um^3/mN for n = 1, um^3/mN^2 for n = 2].
     """
-    slope = shared(eta / diameter)
-    square = slope * slope
-    first = AREA * (eta * diameter)
-    third = first * square
-    return K1 * first, K3 * third, K5 * (third * square), _compliance(unloading, scaling, modulus, eta, diameter)
+    first, third, fifth, _ = _powers(eta, diameter)
+    return K1 * first, K3 * third, K5 * fifth, _compliance(unloading, scaling, modulus, eta, diameter)
 
 
 @branch_coefficients.defjvp
 def _branch_coefficients_jvp(unloading, scaling, primals, tangents):
     K1, K3, K5, modulus, eta, diameter = primals
     dK1, dK3, dK5, dmodulus, deta, ddiameter = tangents
-    slope = shared(eta / diameter)
-    square = slope * slope
-    first = AREA * (eta * diameter)
-    third = first * square
+    first, third, fifth, square = _powers(eta, diameter)
     by_eta, by_diameter = AREA * diameter, AREA * eta
-    c = _compliance(unloading, scaling, modulus, eta, diameter)
+    values = *_, c = branch_coefficients(unloading, scaling, *primals)
     n, p = unloading.stress_power, scaling.power
     dc = (3 - 2 * n) * shared(c / diameter) * ddiameter - n * shared(c / modulus) * dmodulus
     changes = (
         first * dK1 + K1 * (by_eta * deta + by_diameter * ddiameter),
         third * dK3 + K3 * square * (3 * by_eta * deta - by_diameter * ddiameter),
-        third * square * dK5 + K5 * (square * square) * (5 * by_eta * deta - 3 * by_diameter * ddiameter),
+        fifth * dK5 + K5 * (square * square) * (5 * by_eta * deta - 3 * by_diameter * ddiameter),
         dc - p * shared(c / eta) * deta if p else dc,
     )
-    values = K1 * first, K3 * third, K5 * (third * square), c
     # Transposed, these are barriers for the cotangents, which otherwise would be computed again for each input. One for
     # each: what does not depend on the input at hand has no transpose.
     return values, tuple(map(jax.lax.optimization_barrier, changes))
+
+
+def _powers(eta, diameter):
+    """k_m / K_m for m = 1, 3, 5, and the square of the scaled strain over the displacement."""
+    slope = shared(eta / diameter)
+    square = slope * slope
+    first = AREA * (eta * diameter)
+    third = first * square
+    return first, third, third * square, square
 
 
 def _compliance(unloading, scaling, modulus, eta, diameter):

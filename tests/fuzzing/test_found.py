@@ -172,7 +172,7 @@ def test_a_posterior_that_would_fill_the_memory(tmp_path, name):
 
 
 def test_a_posterior_that_the_library_reads_for_ever(tmp_path, monkeypatch):
-    """Fifteen bytes of it are damaged, and libhdf5 does not come back."""
+    """libhdf5 does not come back from this damage."""
     monkeypatch.setattr(_posterior, "SECONDS", 2.0)
     (tmp_path / "posterior.nc").write_bytes((SAMPLES.with_name("damaged") / "endless.nc").read_bytes())
     assert "no end after 2 s" in refused(read_results, tmp_path)

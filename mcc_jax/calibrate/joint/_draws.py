@@ -102,8 +102,7 @@ def _sampled(
     def run(accept: float) -> tuple[Chains, Population]:
         # From an array, not from a Python number: a weak type would be compiled anew after `compile_ahead`.
         aim = jnp.asarray(np.asarray(accept))
-        rest = {"warmup": length.warmup, "draws": length.draws}
-        return by_chains(sample_population, key, length.chains, mode, covariance, target, aim, **rest)
+        return by_chains(sample_population, key, length, mode, covariance, target, aim)
 
     chains, population = run(ACCEPT[0])
     for accept in ACCEPT[1:]:
@@ -117,9 +116,7 @@ def draw_joint(key: Array, tests: Tests, model: JointModel, fit: JointFit, lengt
     """Population and particles sampled together under the exact likelihood: fields of the result."""
     scatter = replace(model.scatter, newton=newton_steps(fit, tests, model))
     exact = Exact(tests, fit.filters, fit.summary, scatter, model.zero_sd, model.unloading)
-    rest = {"warmup": length.warmup, "draws": length.draws}
-    found = by_chains(sample_joint, key, length.chains, fit.mode, fit.covariance, fit.numbers, exact, **rest)
-    run, free, *particles = found
+    run, free, *particles = by_chains(sample_joint, key, length, fit.mode, fit.covariance, fit.numbers, exact)
     population = populations(free.reshape(-1, free.shape[-1]), fit.numbers, scatter)
     names, stacked = _stack(population, scatter, length)
     return {

@@ -46,8 +46,8 @@ class Length(NamedTuple):
         return self.chains * self.draws
 
 
-def by_chains[T](function: Callable[..., T], key: PRNGKeyArray, chains: int, *arguments: object, **options: int) -> T:
-    """What `function(keys, *arguments, **options)` returns for a key per chain, as NumPy arrays.
+def by_chains[T](function: Callable[..., T], key: PRNGKeyArray, length: Length, *arguments: object) -> T:
+    """What `function(keys, *arguments, warmup=..., draws=...)` returns for a key per chain, as NumPy arrays.
 
     On a CPU, where a chain keeps one core busy with small operations, chains run two by two, side by side. The pairs do
     not depend on the number of cores: the same seed gives the same bits on any.
@@ -55,15 +55,17 @@ def by_chains[T](function: Callable[..., T], key: PRNGKeyArray, chains: int, *ar
     Args:
         function: compiled; every array of its result has the chains, or their draws in a row, along its first axis.
         key: random key.
-        chains: number of chains.
+        length: how many chains, and how long.
         arguments: passed on.
-        options: passed on.
     """
-    keys = jax.random.split(key, chains)
-    size = chains_together(chains)
+    keys = jax.random.split(key, length.chains)
+    size = chains_together(length.chains)
+
+    def run(some: Array) -> T:
+        return jax.tree.map(np.asarray, function(some, *arguments, warmup=length.warmup, draws=length.draws))
+
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        groups = [keys[i : i + size] for i in range(0, chains, size)]
-        results = list(pool.map(lambda some: jax.tree.map(np.asarray, function(some, *arguments, **options)), groups))
+        results = list(pool.map(run, [keys[i : i + size] for i in range(0, length.chains, size)]))
     return jax.tree.map(lambda *parts: np.concatenate(parts), *results)
 
 
