@@ -23,7 +23,7 @@ from ._types import (
 @click.argument("campaign", type=CampaignFolder(), metavar="CAMPAIGN")
 @out_option(required=True)
 @exclude_option
-@threshold_option()
+@threshold_option(default=0.0)
 @priors_option()
 @law_options
 @click.option(

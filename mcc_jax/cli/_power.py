@@ -26,7 +26,7 @@ POWER = "power.json"
 @click.argument("campaign", type=CampaignFolder(), metavar="CAMPAIGN")
 @out_option(required=True)
 @exclude_option
-@threshold_option()
+@threshold_option(default=0.0)
 @priors_option()
 @law_options
 @seed_option("For the record: nothing here is random.")

@@ -144,13 +144,13 @@ def seed_option(help: str = "Seed of all draws.") -> Any:
     )
 
 
-def threshold_option(use: str = ": points below it do not count.") -> Any:
+def threshold_option(use: str = ": points below it do not count.", default: float = 0.2) -> Any:
     """`--threshold-MPa`; `use` says what it does."""
     return click.option(
         "--threshold-MPa",
         "threshold_MPa",
         type=Number(0, metavar="MPa"),
-        default=0.2,
+        default=default,
         show_default=True,
         help=f"Stress below which only surface asperities deform{use}",
     )

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ._score import project
+from ._score import LEAST_SURVIVAL, project
 from ._system import System
 
-DIRECTIONS = 12
-"""Most informative directions of the smooth features in which a systematic gap is looked for."""
+SHARE = 0.9
+"""Share of the information of all formulas, places and words, each taken as unit, in the directions in which a
+systematic gap is looked for."""
 
 Choose = Callable[[np.ndarray], list[np.ndarray]]
 """From the particles of a fold, the columns inside the law at each step, the base law first."""
@@ -50,12 +51,14 @@ def held_out(system: System, choose: Choose, extended: Mapping[frozenset[int], S
     """
     around = extended or {}
     usable = np.flatnonzero(system.usable)
-    basis = np.concatenate([system.place_columns, system.word_columns])
+    basis = np.concatenate([system.candidate_columns, system.place_columns, system.word_columns])
     whole = project(system, basis)
-    values, vectors = np.linalg.eigh(whole.information.sum(0))
-    order = np.argsort(-values)[:DIRECTIONS]
-    order = order[values[order] > 1e-9 * values[order[0]]]
-    directions = vectors[:, order] / np.sqrt(values[order])
+    alive = whole.survival > LEAST_SURVIVAL
+    basis, whole = basis[alive], whole.only(alive)
+    values, vectors = np.linalg.eigh(whole.similarity())
+    values, vectors = values[::-1], vectors[:, ::-1]
+    count = 1 + int(np.sum(np.cumsum(values) < SHARE * values.sum()))
+    directions = vectors[:, :count] / np.sqrt(values[:count]) / np.sqrt(whole.total)[:, None]
     nuisance = system.globals
     # The basis with the population projected off, as in the whole campaign.
     shift = _shift(system, basis, usable)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from ._refit import Refit, refit, system_at
-from ._score import project
 from ._search import Ranking
-from ._system import GLOBALS, Base, Signals, System
+from ._system import Base, Signals, System
 
-SERIOUS, MOST_REFITS = 0.5, 8
-"""Mechanisms whose log evidence is at least this share of the best one's are serious; so many formulas at most."""
+SERIOUS, LEAST_GAIN, MOST_REFITS = 0.3, 9.0, 10
+"""Mechanisms whose log evidence is at least this share of the best one's are serious, if their best formula takes away
+so much chi2; so many formulas at most. The share is small: where the base law has moved far to take up an effect, first
+order may see a third of it."""
 
 
 class Extensions:
@@ -23,10 +24,8 @@ class Extensions:
     def fit(self, chosen: tuple[int, ...]) -> Refit:
         """The base law with some candidates."""
         if chosen not in self.known:
-            inside = np.array([self.system.column(k) for k in chosen], int)
-            start = project(self.system, inside[:0], inside=inside).theta[len(GLOBALS) :]
             candidates = tuple(self.system.candidates[k] for k in chosen)
-            self.known[chosen] = refit(self.base, candidates, start, self.system.prior)
+            self.known[chosen] = refit(self.base, candidates, self.system.prior)
         return self.known[chosen]
 
     def drop(self, chosen: tuple[int, ...]) -> float:
@@ -43,10 +42,11 @@ def serious(system: System, ranking: Ranking) -> list[int]:
     """Candidates worth a fit of their own: of the mechanisms that may be true the best two formulas."""
     chosen: list[int] = []
     best = ranking.log_evidence[0]
-    for name, value, at_random in zip(ranking.names, ranking.log_evidence, ranking.at_random, strict=True):
+    found = zip(ranking.names, ranking.log_evidence, ranking.gain, ranking.at_random, strict=True)
+    for name, value, gain, at_random in found:
         if value < SERIOUS * best or len(chosen) >= MOST_REFITS:
             break
-        if at_random:
+        if at_random or gain < LEAST_GAIN:
             continue
         members = [k for k, c in enumerate(system.candidates) if c.mechanism == name]
         members.sort(key=lambda k: -ranking.evidence[k])

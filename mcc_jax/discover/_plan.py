@@ -15,9 +15,8 @@ from ..calibrate._result import finite
 from ..calibrate.joint._data import Tests, select_tests
 from ..calibrate.joint._forward import law_of
 from ..calibrate.joint._linearised import linear_data, summarise
-from ..calibrate.joint._model import JointFit
 from ..calibrate.joint._noise import Noise
-from ..campaign import THRESHOLD_MPA, Campaign, Curve, Metadata
+from ..campaign import Campaign, Curve, Metadata
 from ..effects import LIBRARY, Mechanism, present
 from ..simulate import Programme, simulate_campaign
 from ._candidates import untestable
@@ -54,11 +53,12 @@ def planned_base(base: Base, plan: Plan) -> Base:
     laws = eqx.filter_vmap(lambda w: law_of(w, base.model.unloading))(fit.latent)
     peaks = np.asarray(jnp.max(base.tests.force, axis=1))
     campaign = planned_campaign(laws, base.campaign.diameters_um[kept], peaks, plan)
-    return _expected(campaign, fit, base.model, fit.latent, fit.noise)
+    return _expected(campaign, base, fit.latent, fit.noise)
 
 
-def _expected(campaign: Campaign, fit: JointFit, model: JointModel, latent, noise: Noise) -> Base:
-    selection = select_tests(campaign)
+def _expected(campaign: Campaign, base: Base, latent, noise: Noise) -> Base:
+    fit, model = base.fit, base.model
+    selection = select_tests(campaign, threshold_MPa=base.threshold_MPa)
     kept = np.asarray(selection.kept)
     tests: Tests = selection.tests
     latent = latent[kept]
@@ -73,7 +73,7 @@ def _expected(campaign: Campaign, fit: JointFit, model: JointModel, latent, nois
         fit,
         (noise, filters, latent, zero, data.residual, summary, numbers),
     )
-    return Base(campaign, selection, model, new, records_of(campaign, selection))
+    return Base(campaign, selection, model, new, records_of(campaign, selection), base.threshold_MPa)
 
 
 def planned_system(base: Base, plan: Plan, library: Mapping[str, Mechanism]) -> System:
@@ -179,7 +179,7 @@ def power(
     laws = eqx.filter_vmap(lambda w: law_of(w, base.model.unloading))(latent)
     campaign = planned_campaign(laws, np.asarray(diameters_um, float), np.asarray(peaks_mN, float), plan)
     noise = eqx.tree_at(lambda n: n.scale, base.fit.noise, jnp.ones(len(diameters_um)))
-    planned = _expected(campaign, base.fit, base.model, latent, noise)
+    planned = _expected(campaign, base, latent, noise)
     system, missing = _testable(planned, library)
     return power_of(replace(system, usable=np.ones(len(system.points), bool)), missing)
 
@@ -189,7 +189,7 @@ def power_of_campaign(
     *,
     library: Mapping[str, Mechanism] = LIBRARY,
     model: JointModel | None = None,
-    threshold_MPa: float = THRESHOLD_MPA,
+    threshold_MPa: float = 0.0,
     progress: Callable[[str], None] | None = None,
 ) -> Power:
     """What a campaign can show: one that was simulated as planned, with the tester's noise, or one that was measured.
@@ -198,7 +198,7 @@ def power_of_campaign(
         campaign: the tests.
         library: the mechanisms.
         model: form of unloading and priors; the modulus may always scatter between particles.
-        threshold_MPa: points below this stress on loading do not count [MPa].
+        threshold_MPa: points below this stress do not count [MPa].
         progress: called with the name of each step.
 
     Raises:

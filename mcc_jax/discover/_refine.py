@@ -10,16 +10,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from ..calibrate.joint._blocks import Parts
 from ..calibrate.joint._linearised import linear_data, summarise
 from ..calibrate.joint._mode import Target, most_probable
-from ..calibrate.joint._noise import estimate_noise, particle_scales
+from ..calibrate.joint._noise import Noise, Whitening, estimate_noise, particle_scales
 from ..calibrate.joint._population import Summary
 from ._score import project
-from ._system import Base, Signals, System
+from ._system import Base, Signals, System, longer
 
 STRONG = 3.5
 """Estimate over standard error from which on a column is taken off."""
@@ -61,24 +61,39 @@ def refined(base: Base, system: System, signals: Signals) -> tuple[Base, bool]:
     columns, theta = systematic(system)
     if not len(columns):
         return base, False
-    fit, tests, model = base.fit, base.tests, base.model
-    zero_sd = model.zero_sd
-    data = linear_data(fit.latent, fit.zero, tests, zero_sd, model.unloading)
+    fit, model, count = base.fit, base.model, len(base.tests)
+    # Filled up as for the fit itself: everything is compiled already.
+    tests, blocks = base.filled()
     gap = jnp.einsum("k,nkp->np", jnp.asarray(theta), signals.of(columns))
-    data = eqx.tree_at(lambda d: d.residual, data, jnp.where(tests.mask, data.residual + gap, 0.0))
-    priors = model.beliefs
-    noise, _, fine = estimate_noise(data, priors.noise, fit.noise, uncertainty=False)
-    summary, filters = summarise(fit.latent, fit.zero, tests, data, noise, zero_sd)
+    latent, zero, gap, scale = longer((fit.latent, fit.zero, gap, fit.noise.scale), len(tests))
+    own, at = blocks.cut(tests), (blocks.cut(latent), blocks.cut(zero))
+    waves = zip(blocks.each(linear_data, *at, own, model.zero_sd, model.unloading).waves, blocks.cut(gap).waves)
+    data = Parts(tuple(replace(wave, residual=jnp.where(wave.mask, wave.residual + g, 0.0)) for wave, g in waves))
+
+    def summarised(noise: Noise) -> tuple[Summary, Whitening]:
+        both = blocks.each(summarise, *at, own, data, blocks.cut(noise), model.zero_sd)
+        summary, filters = (blocks.whole(Parts(tuple(wave[k] for wave in both.waves))) for k in (0, 1))
+        return summary, filters
+
+    start = replace(fit.noise, scale=scale)
+    noise, _, fine = estimate_noise(data, model.beliefs.noise, start, uncertainty=False, blocks=blocks)
+    summary, filters = summarised(noise)
     old = np.asarray(noise.scale)
-    scale = particle_scales(old, _least_squares(summary), np.asarray(summary.count) - 4)
-    if np.any(scale != old):
-        noise = eqx.tree_at(lambda n: n.scale, noise, jnp.asarray(scale))
-        summary, filters = summarise(fit.latent, fit.zero, tests, data, noise, zero_sd)
-    mode, covariance, reached = most_probable(fit.mode, Target(fit.numbers, summary, model.scatter))
-    converged = np.asarray(fit.converged) & np.array([True, fine, reached])
-    new = eqx.tree_at(
-        lambda f: (f.noise, f.filters, f.summary, f.mode, f.covariance, f.converged),
+    parts = (old, _least_squares(summary), np.asarray(summary.count) - 4)
+    some = np.pad(particle_scales(*(part[:count] for part in parts)), (0, len(tests) - count), mode="edge")
+    if np.any(some != old):
+        noise = replace(noise, scale=jnp.asarray(some))
+        summary, filters = summarised(noise)
+    numbers = replace(fit.numbers, flatness=tests.flatness, weight=tests.weight)
+    mode, covariance, reached = most_probable(fit.mode, Target(numbers, summary, model.scatter))
+    new = replace(
         fit,
-        (noise, filters, summary, mode, covariance, converged),
+        noise=noise,
+        filters=filters,
+        summary=summary,
+        mode=mode,
+        covariance=covariance,
+        numbers=numbers,
+        converged=np.asarray(fit.converged) & np.array([True, fine, reached]),
     )
-    return replace(base, fit=new), True
+    return replace(base, fit=new.first(count)), True

@@ -21,18 +21,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..calibrate.joint._compile import compiled
-from ..calibrate.joint._data import Tests
 from ..calibrate.joint._fit import population_at
 from ..calibrate.joint._forward import law_of
 from ..calibrate.joint._noise import Whitening
 from ..calibrate.joint._population import Population, Scatter, moments
 from ..effects import AbstractEffect, ExtendedLaw, Nuisance, Record, Variant
+from ..geometry import Particle
 from ..law import Unloading
 from ._candidates import Candidate
-from ._system import Base, Signals, System, gram_matrices, mean_by_globals
+from ._system import Base, Signals, System, gram_matrices, in_batches, mean_by_globals
 
 STEPS = 12
 ENOUGH = 0.02
@@ -176,29 +176,27 @@ class Refit:
         return all(a > 0 or f.variant.sign == 0 for a, f in zip(amplitudes, self.formulas, strict=True))
 
 
-def refit(base: Base, candidates: tuple[Candidate, ...], amplitudes: np.ndarray, prior: np.ndarray) -> Refit:
-    """Fit the law with these effects to a campaign, beginning at some amplitudes.
+def refit(base: Base, candidates: tuple[Candidate, ...], prior: np.ndarray) -> Refit:
+    """Fit the law with these effects to a campaign, beginning at the base law.
+
+    There the particles fit; the first step moves them and the amplitudes together.
 
     Args:
         base: the base fit, of which noise, spreads and priors are taken.
         candidates: the formulas; none for the base law itself.
-        amplitudes: where to begin, in the candidates' units.
         prior: precision of the population's parameters around the base fit's.
     """
     formulas = tuple(Formula.of(c) for c in candidates)
-    start = np.concatenate(
-        [np.zeros(0), *(np.r_[a, np.zeros(f.size - 1)] for f, a in zip(formulas, amplitudes, strict=True))]
-    )
-    if len(start) > SLOTS:
-        raise ValueError(f"{len(start)} free numbers, at most {SLOTS} can be fitted together")
     own = np.concatenate([np.zeros(0), *(f.precision for f in formulas)])
+    if len(own) > SLOTS:
+        raise ValueError(f"{len(own)} free numbers, at most {SLOTS} can be fitted together")
     problem = _Problem(base, formulas, np.asarray(prior, float), own)
     state = State(
         base.fit.latent,
         base.fit.zero,
         jnp.zeros((len(base.tests), base.model.scatter.size)),
         jnp.zeros(len(prior)),
-        jnp.asarray(start),
+        jnp.zeros(len(own)),
     )
     # The fitted latent vectors are none of this population's to the last digit: a step makes them so.
     state = problem.move(state, problem.step(state, problem.linearise(state), hold=True), 1.0)
@@ -249,7 +247,7 @@ def system_at(base: Base, system: System, signals: Signals, chosen: list[int], f
     for i, (k, formula) in enumerate(zip(chosen, found.formulas, strict=True)):
         candidates[k] = Candidate(formula.variant, {**candidates[k].nuisance, **formula.nuisance(found.own(i))})
         at[k] = found.own(i)[0]
-    return replace(system, gram=np.asarray(gram), candidates=tuple(candidates), at=at, shift=np.asarray(state.shift))
+    return replace(system, gram=gram, candidates=tuple(candidates), at=at, shift=np.asarray(state.shift))
 
 
 class _Step(eqx.Module):
@@ -282,9 +280,9 @@ class _Problem:
     def linearise(self, state: State) -> tuple[Array, Array, Array]:
         """Residuals and their derivatives."""
         base = self.base
-        return _linearise(
-            state.latent, state.zero, state.theta, self.formulas, base.tests, base.records, base.model.unloading
-        )
+        tests, unloading = base.tests, base.model.unloading
+        rows = (state.latent, state.zero, tests.particle, base.records, tests.displacement, tests.mask)
+        return in_batches(lambda *rows: _linearise(*rows, state.theta, self.formulas, unloading), rows)
 
     def deviance(self, state: State, view: tuple[Array, Array, Array]) -> float:
         """D."""
@@ -353,10 +351,12 @@ def _moved(
 def _linearise(
     latent: Float[Array, "particles 4"],
     zero: Float[Array, " particles"],
+    particles: Particle,
+    records: Record,
+    displacement: Float[Array, "particles points"],
+    mask: Bool[Array, "particles points"],
     theta: Float[Array, " size"],
     formulas: tuple[Formula, ...],
-    tests: Tests,
-    records: Record,
     unloading: Unloading,
 ) -> tuple[Array, Array, Array]:
     def one(w, z, particle, record, measured, mask):
@@ -371,7 +371,7 @@ def _linearise(
         residual = jnp.where(mask, measured - value - z, 0.0)
         return residual, jnp.where(used, J, 0.0).T, jnp.where(used, -by_theta, 0.0)
 
-    return jax.vmap(one)(latent, zero, tests.particle, records, tests.displacement, tests.mask)
+    return jax.vmap(one)(latent, zero, particles, records, displacement, mask)
 
 
 @compiled

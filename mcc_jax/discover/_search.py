@@ -61,8 +61,20 @@ def log_evidence_at_random(
     found = []
     for members in groups:
         one = logsumexp(each[..., members, :], axis=-2) - np.log(len(members))
-        found.append(logsumexp(one.sum(-2), axis=-1) - np.log(len(scale)))
+        found.append(logsumexp(_not_odd(one).sum(-2), axis=-1) - np.log(len(scale)))
     return np.stack(found, -1)
+
+
+COMMON = 1.0
+"""Probability of all other formulas of a mechanism together, that of its first, the common one, being 1."""
+
+ODD = 0.02
+"""Share of tests of which something else is odd, whatever effect there is."""
+
+
+def _not_odd(log_ratio: np.ndarray) -> np.ndarray:
+    """A test's evidence for an effect where the test may be odd otherwise: one test alone proves nothing of all."""
+    return -np.logaddexp(np.log(ODD), np.log1p(-ODD) - log_ratio)
 
 
 def random_groups(system: System) -> list[np.ndarray]:
@@ -168,7 +180,9 @@ def rank(system: System, projection: Projection, *, refitted: Mapping[int, float
     for name in names:
         members = [k for k, c in enumerate(system.candidates) if c.mechanism == name]
         variants = [system.candidates[k].variant.name for k in members]
-        weight = np.array([1 / variants.count(v) for v in variants])
+        # The common formula counts as much as all the others together.
+        others = max(len(set(variants)) - 1, 1)
+        weight = np.array([(1 if v == variants[0] else COMMON / others) / variants.count(v) for v in variants])
         value = logsumexp(evidence[members], b=weight / weight.sum())
         best = members[int(np.argmax(evidence[members]))]
         if exact.keys() & set(members):

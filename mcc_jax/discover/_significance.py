@@ -3,13 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import norm
-
-from ._score import family_wise, flips, project
+from ._score import family_wise, project
 from ._system import System
-
-INDEPENDENT = 100
-"""So many independent columns are counted where no bootstrap does it."""
 
 FREEDOM = 0.3
 """How far nature's formula may differ from the best one of its family: by so much of it in every other one."""
@@ -30,10 +25,8 @@ def p_nothing_left(system: System, seed: int, chosen: list[int]) -> float:
     keep = view.survival > (1e-6 if not len(inside) else 1e-2)
     if not keep.any():
         return 1.0
-    scores, total, signs = view.scores[:, keep], view.total[keep], sign[keep]
-    found = _probability(scores, total, signs, seed)
-    # The scatter of few particles cannot be surer than their number of signs allows, however strong a second effect is.
-    return min(found, 2 * by_noise_model(scores, total, signs)) if chosen else found
+    few = len(view.particles) < FEWEST
+    return float(family_wise(view.only(keep), sign[keep], seed, few=few)[0].min())
 
 
 def _family(system: System, chosen: list[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -51,19 +44,6 @@ def _family(system: System, chosen: list[int]) -> tuple[np.ndarray, np.ndarray]:
                 columns.append(system.column(j))
                 precision.append(float(strength[j] / max(effect, 1e-300)))
     return np.array(columns, int), np.array(precision)
-
-
-def _probability(scores: np.ndarray, total: np.ndarray, sign: np.ndarray, seed: int) -> float:
-    if len(scores) < FEWEST:
-        return by_noise_model(scores, total, sign)
-    return float(family_wise(scores, sign, flips(len(scores), seed))[0].min())
-
-
-def by_noise_model(scores: np.ndarray, total: np.ndarray, sign: np.ndarray) -> float:
-    """Bonferroni's bound for the largest estimate over its standard error; a sign that is NaN does not count."""
-    t = scores.sum(0) / np.sqrt(np.maximum(total, 1e-300))
-    sided = np.where(np.isnan(sign), -np.inf, np.where(sign == 0, np.abs(t), t * np.nan_to_num(sign)))
-    return float(min(1.0, INDEPENDENT * norm.sf(float(np.max(sided)))))
 
 
 def signs_of(system: System) -> np.ndarray:

@@ -13,8 +13,9 @@ algebra alone, without another look at the curves.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -23,16 +24,19 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..calibrate import JointModel
+from ..calibrate.joint._blocks import Blocks, block_size, filled_up
 from ..calibrate.joint._compile import compiled
 from ..calibrate.joint._data import Selection, Tests
 from ..calibrate.joint._fit import population_at, prepare
 from ..calibrate.joint._forward import law_of, snap
 from ..calibrate.joint._linearised import linear_data
 from ..calibrate.joint._model import JointFit
+from ..calibrate.joint._noise import Linear
 from ..calibrate.joint._population import Population, Scatter, moments
 from ..campaign import Campaign, campaign_segments
-from ..effects import Context, ExtendedLaw, Mechanism, Record, record_batch, signatures
+from ..effects import LIBRARY, Context, ExtendedLaw, Mechanism, Record, record_batch, signatures
 from ..geometry import Particle
+from ..law import Unloading
 from ._candidates import Candidate, candidates_of
 from ._features import Feature, map_features, words
 
@@ -110,6 +114,7 @@ class Base:
         model: what was assumed.
         fit: the joint fit.
         records: what the tester did, by particle, the rows of the selection.
+        threshold_MPa: stress below which points of loading do not count.
     """
 
     campaign: Campaign
@@ -117,11 +122,30 @@ class Base:
     model: JointModel
     fit: JointFit
     records: Record
+    threshold_MPa: float
 
     @property
     def tests(self) -> Tests:
         """The arrays of the tests."""
         return self.selection.tests
+
+    def filled(self) -> tuple[Tests, Blocks]:
+        """The tests filled up with copies to whole blocks, as for the joint fit."""
+        size = block_size(len(self.tests))
+        tests = filled_up(self.tests, size)
+        return tests, Blocks(len(tests), size)
+
+    def linear(self) -> Linear:
+        """Residuals at the fit, and their derivatives by every particle's own parameters."""
+        tests, blocks = self.filled()
+        at = (blocks.cut(v) for v in longer((self.fit.latent, self.fit.zero), len(tests)))
+        data = blocks.each(linear_data, *at, blocks.cut(tests), self.model.zero_sd, self.model.unloading)
+        return jax.tree.map(lambda x: x[: len(self.tests)] if x.ndim and len(x) == len(tests) else x, blocks.whole(data))
+
+
+def longer(tree: Any, count: int) -> Any:
+    """Arrays over as many particles; copies of the last one are added."""
+    return jax.tree.map(lambda x: jnp.pad(x, [(0, count - len(x))] + [(0, 0)] * (x.ndim - 1), mode="edge"), tree)
 
 
 def base_fit(
@@ -129,7 +153,8 @@ def base_fit(
 ) -> Base:
     """Fit the base law with everything natural free: every particle's coefficients and modulus, and the noise."""
     selection, _, fit, _ = prepare(campaign, model, threshold_MPa, tell=tell)
-    return Base(campaign, selection, model, fit.first(len(selection.kept)), records_of(campaign, selection))
+    own = fit.first(len(selection.kept))
+    return Base(campaign, selection, model, own, records_of(campaign, selection), threshold_MPa)
 
 
 def records_of(campaign: Campaign, selection: Selection) -> Record:
@@ -169,12 +194,48 @@ class Signals:
 def signals_of(base: Base, library: Mapping[str, Mechanism]) -> Signals:
     """All formulas of a library and all features along the tests of a fitted campaign."""
     candidates = candidates_of(library)
-    effects = tuple(c.effect for c in candidates)
+    latent, tests, unloading = base.fit.latent, base.tests, base.model.unloading
+    batch = (latent, tests.particle, base.records)
+
+    def added_by(some: Sequence[Candidate]) -> Array:
+        effects = tuple(c.effect for c in some)
+        return in_batches(lambda *rows: _added(*rows, effects, unloading), batch)
+
+    # Most of the library is computed as the whole of it, so that all campaigns share what is compiled.
+    whole = candidates_of(LIBRARY)
+    known = {_identity(c) for c in whole} & {_identity(c) for c in candidates}
+    if 2 * len(known) > len(whole):
+        strangers = tuple(c for c in candidates if _identity(c) not in known)
+        place = {_identity(c): i for i, c in enumerate((*whole, *strangers))}
+        parts = [added_by(some) for some in (whole, strangers) if some]
+        added = jnp.concatenate(parts, 1)[:, np.array([place[_identity(c)] for c in candidates])]
+    else:
+        added = added_by(candidates)
     units = jnp.asarray([c.unit_amplitude for c in candidates])
-    latent, tests = base.fit.latent, base.tests
-    added = _added(latent, tests, base.records, effects, base.model)
-    seen = _features(latent, tests, base.records, base.model, (*map_features(), *words()))
+    seen = in_batches(lambda *rows: _features(*rows, unloading, (*map_features(), *words())), batch)
     return Signals(candidates, -added * units[None, :, None], -seen)
+
+
+def _identity(candidate: Candidate) -> tuple[Any, ...]:
+    return candidate.variant, *sorted(candidate.nuisance.items())
+
+
+BATCH = 20
+"""Particles at a time: campaigns of any number share what is compiled."""
+
+
+def in_batches[T](function: Callable[..., T], rows: tuple[Any, ...]) -> T:
+    """A function over the particles of some trees of arrays, `BATCH` at a time; the last batch is filled up with
+    copies."""
+    count = len(jax.tree.leaves(rows)[0])
+    if count == BATCH:
+        return function(*rows)
+    parts = []
+    for start in range(0, count, BATCH):
+        index = np.minimum(np.arange(start, start + BATCH), count - 1)
+        part = function(*jax.tree.map(lambda leaf, index=index: jnp.asarray(np.asarray(leaf)[index]), rows))
+        parts.append(jax.tree.map(lambda leaf, start=start: leaf[: count - start], part))
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves) if len(leaves) > 1 else leaves[0], *parts)
 
 
 def build_system(base: Base, signals: Signals) -> System:
@@ -183,7 +244,7 @@ def build_system(base: Base, signals: Signals) -> System:
     fit, tests = base.fit, base.tests
     scatter = base.model.scatter
     population = population_at(fit.mode, fit.numbers, scatter)
-    data = linear_data(fit.latent, fit.zero, tests, base.model.zero_sd, base.model.unloading)
+    data = base.linear()
     flat = tests.flatness
     mean, factor = moments(population, flat, scatter)
 
@@ -208,7 +269,7 @@ def build_system(base: Base, signals: Signals) -> System:
     width = np.array([numbers.a[1], numbers.log_modulus[1], numbers.mu_1[1], 0.5, numbers.mu_5[1]])
     points = np.asarray(jnp.sum(tests.mask, 1))
     still, none = np.zeros(len(GLOBALS)), np.zeros(len(candidates))
-    return System(np.asarray(gram), points, candidates, places, some, 1 / width**2, usable, none, still)
+    return System(gram, points, candidates, places, some, 1 / width**2, usable, none, still)
 
 
 @compiled
@@ -234,28 +295,46 @@ def _jumps(latent: Float[Array, "particles 4"], particles: Particle) -> Float[Ar
 
 @compiled
 def _added(
-    latent, tests: Tests, records: Record, effects, model: JointModel
+    latent, particles: Particle, records: Record, effects, unloading: Unloading
 ) -> Float[Array, "particles effects points"]:
     def one(w, particle, record):
-        return signatures(law_of(w, model.unloading), particle, record, effects)
+        return signatures(law_of(w, unloading), particle, record, effects)
 
-    return eqx.filter_vmap(one)(latent, tests.particle, records)
+    return eqx.filter_vmap(one)(latent, particles, records)
 
 
 @compiled
-def _features(latent, tests: Tests, records: Record, model: JointModel, features) -> Float[Array, "particles f points"]:
+def _features(
+    latent, particles: Particle, records: Record, unloading: Unloading, features
+) -> Float[Array, "particles f points"]:
     def one(w, particle, record):
-        context: Context = ExtendedLaw(law_of(w, model.unloading), ()).context(particle, record)
+        context: Context = ExtendedLaw(law_of(w, unloading), ()).context(particle, record)
         columns = [jnp.broadcast_to(f.value(context), context.force.shape) for f in features]
         empty = jnp.zeros((0, *context.force.shape))
         return particle.effective_diameter * jnp.stack(columns) if columns else empty
 
-    return eqx.filter_vmap(one)(latent, tests.particle, records)
+    return eqx.filter_vmap(one)(latent, particles, records)
+
+
+def gram_matrices(
+    residual, jacobian, mask, filters, added, seen, away, by_globals, factor, zero_sd, zero_away
+) -> np.ndarray:
+    """Gram matrices of all columns, particles' deviations and zeros integrated out."""
+    missing = -added.shape[1] % COLUMNS
+    wide = jnp.pad(added, ((0, 0), (0, missing), (0, 0)))
+    rows = (residual, jacobian, mask, filters, wide, seen, away, by_globals, factor, zero_away)
+    gram = np.asarray(in_batches(lambda *rows: _gram(*rows, zero_sd), rows))
+    end = 1 + by_globals.shape[-1] + added.shape[1]
+    kept = np.r_[:end, end + missing : gram.shape[1]]
+    return gram[:, kept[:, None], kept]
+
+
+COLUMNS = 200
+"""Columns of candidates are filled up to a multiple of this: libraries of any size share what is compiled."""
 
 
 @compiled
-def gram_matrices(residual, jacobian, mask, filters, added, seen, away, by_globals, factor, zero_sd, zero_away):
-    """Gram matrices of all columns, particles' deviations and zeros integrated out."""
+def _gram(residual, jacobian, mask, filters, added, seen, away, by_globals, factor, zero_away, zero_sd):
     k = factor.shape[-1]
 
     def one(r, J, used, white, extra, words, offset, slope, S, z):

@@ -1,6 +1,7 @@
 """Tests on Gram matrices against the same questions asked of tall dense matrices."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,8 +12,8 @@ from scipy.integrate import quad
 from scipy.stats import kstest, norm
 
 from mcc_jax.discover._confirm import held_out
-from mcc_jax.discover._score import FLIPS, family_wise, flips, project
-from mcc_jax.discover._search import SCALES, log_evidence, log_evidence_at_random, pairs, rank
+from mcc_jax.discover._score import Projection, common_scatter, family_wise, project
+from mcc_jax.discover._search import ODD, SCALES, log_evidence, log_evidence_at_random, pairs, rank
 
 seeds = st.integers(0, 10_000)
 
@@ -158,64 +159,112 @@ def test_columns_lie_one_after_the_other():
 # ---- significance ----------------------------------------------------------------------------------------------------
 
 
-def test_flips_are_all_signs_of_few_particles_and_seeded_signs_of_many():
-    for count in (1, 2, 3, 5, 11):
-        signs = flips(count, 0)
-        assert {tuple(row) for row in signs} == set(itertools.product((-1.0, 1.0), repeat=count))
-        assert len(signs) == 2**count
-        np.testing.assert_array_equal(signs, flips(count, 7))
-    many = flips(12, 3)
-    assert many.shape == (FLIPS, 12)
-    assert set(np.unique(many)) == {-1.0, 1.0}
-    np.testing.assert_array_equal(many, flips(12, 3))
-    assert not np.array_equal(many, flips(12, 4))
-    assert abs(many.mean()) < 5 / np.sqrt(many.size)
+def simulated(rng, *, particles=20, columns=12, scale=1.0, effect=0.0):
+    """Scores of correlated columns under the noise model, times `scale`; the first column's estimate over its standard
+    error is `effect` on average."""
+    X = rng.normal(size=(particles, 30, columns)) * np.exp(0.3 * rng.normal(size=particles))[:, None, None]
+    X[..., 1:2] += X[..., :1]
+    information = np.einsum("npk,npl->nkl", X, X)
+    noise = rng.normal(size=(particles, 30)) * np.broadcast_to(scale, (particles,))[:, None]
+    length = np.sqrt(information[:, 0, 0].sum())
+    scores = np.einsum("npk,np->nk", X, noise + effect / length * X[..., 0])
+    ones = np.ones(columns)
+    none = np.zeros(0)
+    at = np.arange(columns)
+    return Projection(at, np.arange(particles), scores, information, np.ones(particles), none, none, ones)
 
 
-@given(seed=seeds, count=st.integers(2, 6), columns=st.integers(1, 4))
-@settings(max_examples=30)
-def test_family_wise_probability_by_brute_force(seed, count, columns):
-    rng = np.random.default_rng(seed)
-    scores = rng.normal(size=(count, columns)) * rng.uniform(0.1, 5, count)[:, None]
-    sign = rng.integers(-1, 2, columns)
-    p, observed = family_wise(scores, sign, flips(count, 0))
+def smallest(views, sign):
+    return np.array([family_wise(view, sign, seed)[0].min() for seed, view in enumerate(views)])
 
-    def statistic(s, k):
-        t = s[:, k].sum() / np.sqrt((s[:, k] ** 2).sum())
-        return abs(t) if sign[k] == 0 else sign[k] * t
 
-    for k in range(columns):
-        mine = statistic(scores, k)
-        assert observed[k] == pytest.approx(mine)
-        hits = 0
-        for signs in itertools.product((-1.0, 1.0), repeat=count):
-            flipped = scores * np.array(signs)[:, None]
-            hits += max(statistic(flipped, j) for j in range(columns)) >= mine - 1e-9
-        assert p[k] == pytest.approx((hits + 1) / (2**count + 1))
+SIDES = np.array([0, 1, 1, -1] * 3)
 
 
 def test_p_is_uniform_where_nothing_is_missing():
-    """600 campaigns of unequal particles: the smallest family-wise p is uniform (99.9 % band of Kolmogorov's test)."""
+    """300 campaigns: the smallest family-wise p is uniform (99.9 % band of Kolmogorov's test)."""
     rng = np.random.default_rng(11)
-    signs = flips(14, 0)
-    smallest = []
-    for _ in range(600):
-        scores = rng.standard_t(4, size=(14, 5)) * np.exp(rng.normal(size=14))[:, None]
-        smallest.append(family_wise(scores, np.array([0, 1, 1, -1, 0]), signs)[0].min())
-    assert kstest(smallest, "uniform").pvalue > 1e-3
-    assert 0.02 < np.mean(np.array(smallest) <= 0.05) < 0.09
+    p = smallest([simulated(rng) for _ in range(300)], SIDES)
+    assert kstest(p, "uniform").pvalue > 1e-3
+
+
+@pytest.mark.parametrize("scale", [0.6, 2.0], ids=["too_wide", "too_narrow"])
+def test_a_noise_model_that_is_wrong_by_a_factor_does_not_matter(scale):
+    rng = np.random.default_rng(12)
+    views = [simulated(rng, scale=scale) for _ in range(200)]
+    assert kstest(smallest(views, SIDES), "uniform").pvalue > 1e-3
+    # With many directions the common scatter is the square of that factor.
+    wide = [common_scatter(simulated(rng, scale=scale, columns=30))[0] for _ in range(20)]
+    assert np.mean(wide) == pytest.approx(scale**2, rel=0.05)
+
+
+def test_no_false_alarms_where_the_noise_model_is_wrong_test_by_test():
+    """Tests whose noise differs threefold and more from what the model says, which scores and scatter both show."""
+    rng = np.random.default_rng(13)
+    views = [simulated(rng, scale=np.exp(0.7 * rng.normal(size=20))) for _ in range(200)]
+    assert np.mean(smallest(views, SIDES) <= 0.05) < 0.10
+
+
+def test_the_noise_model_is_not_trusted_where_columns_scatter_unlike():
+    """Where half of the directions scatter eight times as much, few degrees of freedom are left to the common scatter."""
+    rng = np.random.default_rng(14)
+    trusted = []
+    for wrong in (False, True):
+        view = simulated(rng, columns=30)
+        each = np.einsum("nkk->nk", view.information)
+        scores = rng.normal(size=each.shape) * np.sqrt(each) * np.where(wrong, np.r_[np.full(15, 8.0), np.ones(15)], 1.0)
+        information = np.einsum("nk,kl->nkl", each, np.eye(30))
+        trusted.append(common_scatter(replace(view, scores=scores, information=information))[1])
+    assert trusted[0] > 60
+    assert trusted[1] < 6
+
+
+def test_an_effect_of_five_standard_errors_is_found():
+    """In nine of ten campaigns of 20 particles, of which a test on the scatter alone sees six."""
+    rng = np.random.default_rng(15)
+    p = smallest([simulated(rng, effect=5.0) for _ in range(60)], SIDES)
+    assert np.mean(p <= 0.04) > 0.85
 
 
 def test_only_the_physical_sign_counts():
     """The same strong common score is significant with its own sign or both, and not at all with the other one."""
-    rng = np.random.default_rng(2)
-    scores = rng.normal(3.0, 1.0, size=(10, 1))
-    p = {sign: family_wise(scores, np.array([sign]), flips(10, 0))[0][0] for sign in (-1, 0, 1)}
-    assert p[1] < 2e-3
-    assert p[0] < 4e-3
+    view = simulated(np.random.default_rng(2), columns=2, effect=7.0).only(np.array([True, False]))
+    p = {sign: family_wise(view, np.array([sign]), 0)[0][0] for sign in (-1, 0, 1)}
+    assert p[1] < 1e-3
+    assert p[0] < 1e-3
     assert p[-1] > 0.99
-    reverse = {sign: family_wise(-scores, np.array([sign]), flips(10, 0))[0][0] for sign in (-1, 0, 1)}
+    reverse = {sign: family_wise(replace(view, scores=-view.scores), np.array([sign]), 0)[0][0] for sign in (-1, 0, 1)}
     assert (reverse[-1], reverse[0], reverse[1]) == (p[1], p[0], p[-1])
+
+
+@pytest.mark.parametrize("particles", [1, 2, 3])
+def test_few_particles_are_judged_by_the_noise_model(particles):
+    rng = np.random.default_rng(particles)
+    view = simulated(rng, particles=particles, columns=1)
+    p, t = family_wise(view, np.array([1]), 0, few=True)
+    z = view.scores.sum() / np.sqrt(view.information.sum())
+    assert t[0] == pytest.approx(z)
+    assert p[0] == pytest.approx(norm.sf(z), abs=0.03)
+
+
+def test_the_same_seed_gives_the_same_probability():
+    view = simulated(np.random.default_rng(5))
+    first, again, other = (family_wise(view, SIDES, seed)[0] for seed in (3, 3, 4))
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+def test_one_odd_test_is_no_effect_that_differs_from_test_to_test():
+    """Evidence of one test counts for little more than the odds that something else is wrong with it."""
+    count = 20
+    information, sign, groups = np.ones((count, 1)) * 400.0, np.array([1.0]), [np.array([0])]
+    none = np.zeros((count, 1))
+    one, all_of_them = none.copy(), none + 5 * np.sqrt(400.0)
+    one[3] = 12 * np.sqrt(400.0)
+    nothing, odd, effect = (log_evidence_at_random(U, information, sign, groups)[0] for U in (none, one, all_of_them))
+    assert odd < nothing + 8
+    assert odd < 3
+    assert effect > 40
 
 
 # ---- evidence --------------------------------------------------------------------------------------------------------
@@ -271,7 +320,7 @@ def test_evidence_at_random_is_an_integral_over_every_particle():
                         lambda t, U=U, h=h, s=s, f=factor: f * np.exp(U * t - 0.5 * h * t * t) * norm.pdf(t, 0, s),
                         low, high, points=inside, epsrel=1e-11, epsabs=0, limit=400,
                     )[0]  # fmt: skip
-                product *= one / len(members)
+                product *= 1 / (ODD + (1 - ODD) / (one / len(members)))
             by_scale.append(product)
         assert value == pytest.approx(np.log(np.mean(by_scale)), rel=1e-8)
 

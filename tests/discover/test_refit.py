@@ -30,14 +30,14 @@ def soft():
     k = candidate(system, "frame_compliance")
     inside = np.array([system.column(k)])
     linear = float(project(system, inside[:0], inside=inside).theta[-1])
-    return base, signals, system, k, linear, refit(base, (system.candidates[k],), np.array([linear]), system.prior)
+    return base, signals, system, k, linear, refit(base, (system.candidates[k],), system.prior)
 
 
 @pytest.fixture(scope="module")
 def creeping():
     base, _, system = refined_system(campaign(f"creep:kelvin_voigt={CREEP},tau_s={TAU}"), SMALL)
     k = candidate(system, "creep")
-    return base, system, k, refit(base, (system.candidates[k],), np.array([0.1]), system.prior)
+    return base, system, k, refit(base, (system.candidates[k],), system.prior)
 
 
 def test_a_large_amplitude_is_found_where_first_order_misses_it(soft):
@@ -60,16 +60,21 @@ def test_a_further_number_is_found_between_the_grid_s_values(creeping):
     assert width < 0.3
 
 
-def test_it_is_a_minimum(soft):
-    base, _, system, k, _, found = soft
-    again = refit(base, (system.candidates[k],), np.array([1.1 * found.own(0)[0]]), system.prior)
-    assert again.deviance == pytest.approx(found.deviance, abs=0.05)
-    assert again.own(0)[0] == pytest.approx(found.own(0)[0], abs=0.05 * found.spread(0)[0])
+def test_neighbours_on_the_grid_lead_to_the_same_minimum(creeping):
+    base, system, k, found = creeping
+    tau = system.candidates[k].nuisance["tau_s"]
+    others = [c for c in system.candidates if c.mechanism == "creep" and c.nuisance["tau_s"] != tau]
+    near = min(others, key=lambda c: abs(np.log(c.nuisance["tau_s"] / TAU)))
+    again = refit(base, (near,), system.prior)
+    assert again.converged
+    # The grid's value is a weak prior of its own, so the minima are not the same to the last digit.
+    assert again.deviance == pytest.approx(found.deviance, abs=2.0)
+    assert again.own(0)[0] == pytest.approx(found.own(0)[0], abs=found.spread(0)[0])
 
 
 def test_the_extended_law_fits_better_than_the_base_law(soft):
     base, _, system, _, _, found = soft
-    alone = refit(base, (), np.zeros(0), system.prior)
+    alone = refit(base, (), system.prior)
     assert len(alone.state.theta) == 0
     assert np.isfinite(alone.deviance)
     assert alone.deviance > found.deviance + 100
@@ -91,7 +96,7 @@ def test_around_the_extended_law_nothing_is_left_to_move(soft):
 def test_two_effects_together(soft):
     base, _, system, k, *_ = soft
     other = candidate(system, "creep")
-    both = refit(base, (system.candidates[k], system.candidates[other]), np.array([1.0, 0.0]), system.prior)
+    both = refit(base, (system.candidates[k], system.candidates[other]), system.prior)
     unit = both.formulas[0].variant.plausible[1]
     assert abs(both.own(0)[0] * unit - COMPLIANCE) < 4 * both.spread(0)[0] * unit
     assert abs(both.own(1)[0]) < 4 * both.spread(1)[0]
@@ -111,4 +116,4 @@ def test_a_refit_replaces_the_linear_gain_in_the_ranking(soft):
 def test_more_numbers_than_slots_are_refused(soft):
     base, _, system, k, *_ = soft
     with pytest.raises(ValueError, match="at most"):
-        refit(base, (system.candidates[k],) * 7, np.ones(7), system.prior)
+        refit(base, (system.candidates[k],) * 7, system.prior)
