@@ -185,6 +185,22 @@ def follow_up(folder, content, **options):
     return answers
 
 
+def _fractions(text):
+    """The share of each tier; under "" that of those not named."""
+    found = {}
+    for part in text.split(","):
+        tier, _, share = part.rpartition("=")
+        if tier and tier not in tiers.TIERS:
+            raise argparse.ArgumentTypeError(f"no tier {tier!r}; there are {', '.join(tiers.TIERS)}")
+        try:
+            found[tier] = float(share)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"{share!r} is no number") from None
+        if not 0 < found[tier] <= 1:
+            raise argparse.ArgumentTypeError(f"a share must be more than 0 and at most 1, got {share}")
+    return found
+
+
 def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder of the run; an existing one is continued")
@@ -193,7 +209,9 @@ def main(arguments=None):
     parser.add_argument(
         "--seeds", type=int, default=tiers.SEEDS, help="campaigns per cell (T0: times 50 clean, 20 per nuisance)"
     )
-    parser.add_argument("--fraction", type=float, default=1.0, help="share of each tier to run")
+    parser.add_argument(
+        "--fraction", type=_fractions, default={}, help="share of each tier to run: 0.02, or T0=0.1,T1=0.02"
+    )
     parser.add_argument("--smoke", action="store_true", help="the fixed 40 cases instead of tiers")
     parser.add_argument("--seed", type=int, help="master seed of the generator (default: random, told in the answers)")
     parser.add_argument("--solver", default="inprocess", help="inprocess, command or module:function")
@@ -219,7 +237,10 @@ def main(arguments=None):
         if args.smoke:
             cases, master = smoke.cases(), smoke.MASTER_SEED
         else:
-            cases, master = tiers.plan(tuple(args.tiers.split(",")), args.seeds, args.fraction), args.seed
+            chosen = args.tiers.split(",")
+            share = [args.fraction.get(tier, args.fraction.get("", 1.0)) for tier in chosen]
+            parts = [tiers.plan((t,), args.seeds, f) for t, f in zip(chosen, share, strict=True)]
+            cases, master = [case for part in parts for case in part], args.seed
         sealing.seal(args.out, cases, master, args.jobs, args.name, progress=_progress("generating"))
     print((args.out / "seal.txt").read_text(), end="")
     if args.write:

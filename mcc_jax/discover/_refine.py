@@ -67,7 +67,8 @@ def refined(base: Base, system: System, signals: Signals) -> tuple[Base, bool]:
     gap = jnp.einsum("k,nkp->np", jnp.asarray(theta), signals.of(columns))
     latent, zero, gap, scale = longer((fit.latent, fit.zero, gap, fit.noise.scale), len(tests))
     own, at = blocks.cut(tests), (blocks.cut(latent), blocks.cut(zero))
-    waves = zip(blocks.each(linear_data, *at, own, model.zero_sd, model.unloading).waves, blocks.cut(gap).waves)
+    linear = blocks.each(linear_data, *at, own, model.zero_sd, model.unloading)
+    waves = zip(linear.waves, blocks.cut(gap).waves, strict=True)
     data = Parts(tuple(replace(wave, residual=jnp.where(wave.mask, wave.residual + g, 0.0)) for wave, g in waves))
 
     def summarised(noise: Noise) -> tuple[Summary, Whitening]:

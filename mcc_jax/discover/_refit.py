@@ -16,6 +16,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -282,7 +283,7 @@ class _Problem:
         base = self.base
         tests, unloading = base.tests, base.model.unloading
         rows = (state.latent, state.zero, tests.particle, base.records, tests.displacement, tests.mask)
-        return in_batches(lambda *rows: _linearise(*rows, state.theta, self.formulas, unloading), rows)
+        return in_batches(partial(_linearise, theta=state.theta, formulas=self.formulas, unloading=unloading), rows)
 
     def deviance(self, state: State, view: tuple[Array, Array, Array]) -> float:
         """D."""

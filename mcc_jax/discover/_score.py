@@ -13,6 +13,7 @@ trusted, and counts all candidates: the probability is that of the largest stati
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 from scipy.optimize import brentq
@@ -203,7 +204,7 @@ def common_scatter(projection: Projection) -> tuple[float, float]:
     excess = float(np.var(logs, ddof=1) - np.mean(polygamma(1, own / 2)))
     freedom = MOST_FREEDOM
     if excess > polygamma(1, MOST_FREEDOM / 2):
-        freedom = 2 * float(brentq(lambda x: polygamma(1, x) - excess, 1e-3, MOST_FREEDOM / 2))
+        freedom = 2 * cast(float, brentq(lambda x: polygamma(1, x) - excess, 1e-3, MOST_FREEDOM / 2))
     return float(np.exp(np.mean(logs) + digamma(freedom / 2) - np.log(freedom / 2))), freedom
 
 

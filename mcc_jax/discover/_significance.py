@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+
 from ._score import family_wise, project
 from ._system import System
 

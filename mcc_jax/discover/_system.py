@@ -15,7 +15,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import partial
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -140,7 +141,7 @@ class Base:
         tests, blocks = self.filled()
         at = (blocks.cut(v) for v in longer((self.fit.latent, self.fit.zero), len(tests)))
         data = blocks.each(linear_data, *at, blocks.cut(tests), self.model.zero_sd, self.model.unloading)
-        return jax.tree.map(lambda x: x[: len(self.tests)] if x.ndim and len(x) == len(tests) else x, blocks.whole(data))
+        return jax.tree.map(lambda x: x[: len(self.tests)], blocks.whole(data))
 
 
 def longer(tree: Any, count: int) -> Any:
@@ -199,7 +200,7 @@ def signals_of(base: Base, library: Mapping[str, Mechanism]) -> Signals:
 
     def added_by(some: Sequence[Candidate]) -> Array:
         effects = tuple(c.effect for c in some)
-        return in_batches(lambda *rows: _added(*rows, effects, unloading), batch)
+        return in_batches(partial(_added, effects=effects, unloading=unloading), batch)
 
     # Most of the library is computed as the whole of it, so that all campaigns share what is compiled.
     whole = candidates_of(LIBRARY)
@@ -212,7 +213,7 @@ def signals_of(base: Base, library: Mapping[str, Mechanism]) -> Signals:
     else:
         added = added_by(candidates)
     units = jnp.asarray([c.unit_amplitude for c in candidates])
-    seen = in_batches(lambda *rows: _features(*rows, unloading, (*map_features(), *words())), batch)
+    seen = in_batches(partial(_features, unloading=unloading, features=(*map_features(), *words())), batch)
     return Signals(candidates, -added * units[None, :, None], -seen)
 
 
@@ -235,7 +236,7 @@ def in_batches[T](function: Callable[..., T], rows: tuple[Any, ...]) -> T:
         index = np.minimum(np.arange(start, start + BATCH), count - 1)
         part = function(*jax.tree.map(lambda leaf, index=index: jnp.asarray(np.asarray(leaf)[index]), rows))
         parts.append(jax.tree.map(lambda leaf, start=start: leaf[: count - start], part))
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves) if len(leaves) > 1 else leaves[0], *parts)
+    return cast(T, jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts))
 
 
 def build_system(base: Base, signals: Signals) -> System:
@@ -323,7 +324,7 @@ def gram_matrices(
     missing = -added.shape[1] % COLUMNS
     wide = jnp.pad(added, ((0, 0), (0, missing), (0, 0)))
     rows = (residual, jacobian, mask, filters, wide, seen, away, by_globals, factor, zero_away)
-    gram = np.asarray(in_batches(lambda *rows: _gram(*rows, zero_sd), rows))
+    gram = np.asarray(in_batches(partial(_gram, zero_sd=zero_sd), rows))
     end = 1 + by_globals.shape[-1] + added.shape[1]
     kept = np.r_[:end, end + missing : gram.shape[1]]
     return gram[:, kept[:, None], kept]

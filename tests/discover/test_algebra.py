@@ -206,13 +206,14 @@ def test_no_false_alarms_where_the_noise_model_is_wrong_test_by_test():
 
 
 def test_the_noise_model_is_not_trusted_where_columns_scatter_unlike():
-    """Where half of the directions scatter eight times as much, few degrees of freedom are left to the common scatter."""
+    """Where half of the directions scatter eight times as much, the common scatter keeps few degrees of freedom."""
     rng = np.random.default_rng(14)
     trusted = []
     for wrong in (False, True):
         view = simulated(rng, columns=30)
         each = np.einsum("nkk->nk", view.information)
-        scores = rng.normal(size=each.shape) * np.sqrt(each) * np.where(wrong, np.r_[np.full(15, 8.0), np.ones(15)], 1.0)
+        factor = np.repeat([8.0 if wrong else 1.0, 1.0], 15)
+        scores = rng.normal(size=each.shape) * np.sqrt(each) * factor
         information = np.einsum("nk,kl->nkl", each, np.eye(30))
         trusted.append(common_scatter(replace(view, scores=scores, information=information))[1])
     assert trusted[0] > 60
