@@ -36,6 +36,10 @@ def in_process(folder, *, exclude=(), seed=0, options=None):
     result = discover(read_campaign(folder), **{name: value for name, value in wanted.items() if name in offered})
     data = result.to_json()
     data = json.loads(data) if isinstance(data, str) else json.loads(json.dumps(data))
+    if data.get("closure") is not None:
+        # Without NaN: rows that took no part are not corrected.
+        rows = {name: [v if v == v else 0.0 for v in map(float, um)] for name, um in result.correction_um().items()}
+        data["closure"]["correction_um"] = rows
     return {**data, "options_not_offered": [name for name in missing if name != "seed"]}
 
 

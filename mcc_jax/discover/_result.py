@@ -13,7 +13,7 @@ from ._closure import Closure
 from ._confirm import HeldOut
 from ._posterior import ExtendedPosterior
 from ._search import Ranking
-from ._system import Base, System
+from ._system import Base, System, feature_values
 
 Verdict = Literal["NO_GAP", "NAMED", "SET", "UNLISTED", "FIT_NOT_CONVERGED"]
 
@@ -143,6 +143,23 @@ class Discovery:
         if len(h.energy) > 1 and h.energy[0] > 0:
             closed = finite(float(min(1 - h.energy[-1] / h.energy[0], 1.0)))
         return {"floor": 1.0, "heldout": "leave-one-particle-out", "steps": steps, "closed_fraction": closed}
+
+    def correction_um(self) -> dict[str, np.ndarray]:
+        """Displacement that the formula adds to the base law's at every row of every test that took part [um].
+
+        Empty without a formula. Rows that the fit leaves out, of an approach or of a record that was thinned, are NaN.
+        """
+        if self.closure is None or self.base is None or self.system is None:
+            return {}
+        base, chosen = self.base, self.closure.words - self.system.word_columns[0]
+        values = feature_values(base, tuple(self.system.words[int(w)] for w in chosen))
+        added = np.einsum("w,nwp->np", self.closure.coefficients, np.asarray(values))
+        found = {}
+        for i, rows, of_test in zip(base.selection.kept, base.selection.rows, added, strict=True):
+            whole = np.full(len(base.campaign.curves[i]), np.nan)
+            whole[rows] = of_test[: len(rows)]
+            found[base.campaign.particles[i]] = whole
+        return found
 
     def _typical_noise_um(self) -> float:
         if self.base is None:

@@ -213,8 +213,14 @@ def signals_of(base: Base, library: Mapping[str, Mechanism]) -> Signals:
     else:
         added = added_by(candidates)
     units = jnp.asarray([c.unit_amplitude for c in candidates])
-    seen = in_batches(partial(_features, unloading=unloading, features=(*map_features(), *words())), batch)
+    seen = feature_values(base, (*map_features(), *words()))
     return Signals(candidates, -added * units[None, :, None], -seen)
+
+
+def feature_values(base: Base, features: tuple[Feature, ...]) -> Float[Array, "particles features points"]:
+    """Features along the tests of a fitted campaign, displacement [um] per unit of coefficient."""
+    rows = (base.fit.latent, base.tests.particle, base.records)
+    return in_batches(partial(_features, unloading=base.model.unloading, features=features), rows)
 
 
 def _identity(candidate: Candidate) -> tuple[Any, ...]:

@@ -1,5 +1,7 @@
 """The linear system against differences of the real forward model; noise estimated without what is systematic."""
 
+from types import SimpleNamespace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,8 +14,10 @@ from mcc_jax.calibrate.joint._fit import population_at
 from mcc_jax.calibrate.joint._forward import law_of, raw_residual
 from mcc_jax.calibrate.joint._population import moments
 from mcc_jax.campaign import THRESHOLD_MPA
+from mcc_jax.discover._closure import Closure
 from mcc_jax.discover._refine import refined, systematic
-from mcc_jax.discover._system import base_fit, build_system, signals_of
+from mcc_jax.discover._result import Discovery
+from mcc_jax.discover._system import BATCH, base_fit, build_system, in_batches, signals_of
 from mcc_jax.effects import LIBRARY, ExtendedLaw, Mechanism
 
 MODEL = JointModel(modulus_scatter=True)
@@ -156,3 +160,47 @@ def test_nothing_is_taken_off_where_nothing_is_hidden():
         same, changed = refined(plain, system, signals)
         assert same is plain
         assert not changed
+
+
+@pytest.mark.parametrize("count", [1, BATCH - 1, BATCH, BATCH + 3, 2 * BATCH])
+def test_batches_give_what_all_together_give(count):
+    rng = np.random.default_rng(count)
+    rows = (jnp.asarray(rng.normal(size=(count, 3))), {"b": jnp.asarray(rng.normal(size=count))})
+    sizes = []
+
+    def one(a, tree):
+        sizes.append(len(a))
+        return a * tree["b"][:, None], tree["b"] ** 2
+
+    first, second = in_batches(one, rows)
+    assert set(sizes) == {BATCH}
+    np.testing.assert_array_equal(first, np.asarray(rows[0]) * np.asarray(rows[1]["b"])[:, None])
+    np.testing.assert_array_equal(second, np.asarray(rows[1]["b"]) ** 2)
+
+
+def test_all_points_of_loading_count_at_a_threshold_of_zero(fitted):
+    base, *_ = fitted
+    whole = base_fit(base.campaign, MODEL, threshold_MPa=0.0)
+    loading = np.asarray(whole.tests.loading)
+    assert (np.asarray(whole.tests.mask) & loading).sum() > (np.asarray(base.tests.mask) & loading).sum()
+    stress = (
+        np.asarray(whole.tests.force) / (np.pi / 4 * np.asarray(whole.tests.effective_diameter)[:, None] ** 2) * 1e3
+    )
+    counted = stress[np.asarray(whole.tests.mask) & loading]
+    assert 0 < counted.min() < THRESHOLD_MPA
+
+
+def test_the_correction_of_a_formula_stands_at_the_rows_of_the_tests(fitted):
+    base, signals, system = fitted
+    words, coefficients = system.word_columns[[1, 4]], np.array([2e-3, -1e-3])
+    closure = Closure(words, coefficients, coefficients, "", 0.0, 1.0, (), {})
+    found = Discovery.correction_um(SimpleNamespace(base=base, system=system, closure=closure))
+    assert list(found) == list(base.campaign.particles)
+    # What is added to the prediction is taken off the residual.
+    residual = np.einsum("w,nwp->np", coefficients, np.asarray(signals.of(words)))
+    for i, (rows, curve) in enumerate(zip(base.selection.rows, base.campaign.curves, strict=True)):
+        whole = found[base.campaign.particles[i]]
+        assert len(whole) == len(curve)
+        np.testing.assert_allclose(whole[rows], -residual[i, : len(rows)], rtol=1e-12)
+        assert np.isnan(np.delete(whole, rows)).all()
+    assert Discovery.correction_um(SimpleNamespace(base=base, system=system, closure=None)) == {}
