@@ -97,7 +97,7 @@ def find_closure(
     start = len(system.word_columns)
     scale = np.sqrt(np.maximum(np.diagonal(both)[start:], 1e-300))
     cosine = coefficients @ both[own][:, start:] / scale / length
-    cosine = np.where(view.survival[start:] > 1e-6, cosine, 0.0)
+    cosine = np.where(view.alive[start:], cosine, 0.0)
     signs = np.array([c.variant.sign for c in system.candidates])
     cosine = np.where(signs == 0, np.abs(cosine), cosine * signs)
     best: dict[str, float] = {}

@@ -7,12 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ._score import LEAST_SURVIVAL, project
+from ._score import project
 from ._system import System
-
-SHARE = 0.9
-"""Share of the information of all formulas, places and words, each taken as unit, in the directions in which a
-systematic gap is looked for."""
 
 Choose = Callable[[np.ndarray], list[np.ndarray]]
 """From the particles of a fold, the columns inside the law at each step, the base law first."""
@@ -53,12 +49,7 @@ def held_out(system: System, choose: Choose, extended: Mapping[frozenset[int], S
     usable = np.flatnonzero(system.usable)
     basis = np.concatenate([system.candidate_columns, system.place_columns, system.word_columns])
     whole = project(system, basis)
-    alive = whole.survival > LEAST_SURVIVAL
-    basis, whole = basis[alive], whole.only(alive)
-    values, vectors = np.linalg.eigh(whole.similarity())
-    values, vectors = values[::-1], vectors[:, ::-1]
-    count = 1 + int(np.sum(np.cumsum(values) < SHARE * values.sum()))
-    directions = vectors[:, :count] / np.sqrt(values[:count]) / np.sqrt(whole.total)[:, None]
+    basis, directions = basis[whole.alive], whole.only(whole.alive).directions()
     nuisance = system.globals
     # The basis with the population projected off, as in the whole campaign.
     shift = _shift(system, basis, usable)

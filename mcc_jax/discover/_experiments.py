@@ -95,7 +95,7 @@ def _separation(system: System, view: Projection, k: int, rival: str) -> float:
     both = view.information.sum(0)
     least = both[k, k]
     for j, candidate in enumerate(system.candidates):
-        if candidate.mechanism == rival and view.survival[j] > 1e-6:
+        if candidate.mechanism == rival and view.alive[j]:
             least = min(least, both[k, k] - both[k, j] ** 2 / both[j, j])
     return max(float(least), 0.0)
 

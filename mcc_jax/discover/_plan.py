@@ -125,7 +125,7 @@ def power_of(system: System, missing: Sequence[dict[str, str]]) -> Power:
     view = project(system, system.candidate_columns)
     both = view.similarity()
     limits, units, plausible = {}, {}, {}
-    strength = view.total * (view.survival > 1e-6)
+    strength = view.total * view.alive
     members: dict[str, list[int]] = {}
     for k, candidate in enumerate(system.candidates):
         if strength[k] > 0:

@@ -14,12 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..calibrate.joint._blocks import Parts
+from ..calibrate.joint._data import longer
 from ..calibrate.joint._linearised import linear_data, summarise
 from ..calibrate.joint._mode import Target, most_probable
 from ..calibrate.joint._noise import Noise, Whitening, estimate_noise, particle_scales
 from ..calibrate.joint._population import Summary
 from ._score import project
-from ._system import Base, Signals, System, longer
+from ._system import Base, Signals, System
 
 STRONG = 3.5
 """Estimate over standard error from which on a column is taken off."""

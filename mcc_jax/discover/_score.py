@@ -13,6 +13,7 @@ trusted, and counts all candidates: the probability is that of the largest stati
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import cast
 
 import numpy as np
@@ -76,9 +77,9 @@ class Projection:
         return self.scores.sum(0) / np.sqrt(np.maximum(self.total, 1e-300))
 
     @property
-    def clustered(self) -> np.ndarray:
-        """The statistic t, whose scale comes from the scatter between particles."""
-        return self.scores.sum(0) / np.sqrt(np.maximum((self.scores**2).sum(0), 1e-300))
+    def alive(self) -> np.ndarray:
+        """Which columns the base law cannot make itself."""
+        return self.survival > LEAST_SURVIVAL
 
     def similarity(self) -> np.ndarray:
         """Correlation of the projected columns, shape (K, K)."""
@@ -86,9 +87,26 @@ class Projection:
         scale = np.sqrt(np.maximum(np.diagonal(both), 1e-300))
         return both / scale / scale[:, None]
 
+    @cached_property
+    def spectrum(self) -> tuple[np.ndarray, np.ndarray]:
+        """Eigenvalues of the similarity, the smallest first, and its eigenvectors."""
+        values, vectors = np.linalg.eigh(self.similarity())
+        return values, vectors
+
+    def directions(self) -> np.ndarray:
+        """Sums of columns, each of unit information and none like another, that hold `SHARE` of all information, every
+        column taken as unit: shape (K, R)."""
+        values, vectors = (v[..., ::-1] for v in self.spectrum)
+        count = 1 + int(np.sum(np.cumsum(values) < SHARE * values.sum()))
+        scale = np.sqrt(np.maximum(self.total, 1e-300))
+        return vectors[:, :count] / np.sqrt(values[:count]) / scale[:, None]
+
 
 LEAST_SURVIVAL = 1e-6
 """A column of whose information less survives is one that the base law can make itself."""
+
+SHARE = 0.9
+"""Share of the information of all columns, each taken as unit, in the directions by which they are judged together."""
 
 
 def project(
@@ -158,15 +176,14 @@ def family_wise(
     """
     scores, each = projection.scores, np.einsum("nkk->nk", projection.information)
     total = np.maximum(projection.total, 1e-300)
-    both = projection.similarity()
     prior, freedom = (1.0, MOST_FREEDOM) if few else common_scatter(projection)
     scatter, own = _scatter(scores, each)
     if few:
         own = np.zeros_like(own)
-    width = np.sqrt((freedom * prior + own * np.where(own > 0, scatter, 0.0)) / (freedom + own))
+    width = np.sqrt((freedom * prior + own * scatter) / (freedom + own))
     observed = _sided(scores.sum(0) / np.sqrt(total) / width, sign)
     rng = np.random.default_rng([seed, 41])
-    values, vectors = np.linalg.eigh(both)
+    values, vectors = projection.spectrum
     kept = values > 1e-8 * values[-1]
     factor = vectors[:, kept] * np.sqrt(values[kept])
     drawn = rng.standard_normal((DRAWS, int(kept.sum()))) @ factor.T
@@ -183,17 +200,10 @@ DRAWS = 4000
 MOST_FREEDOM = 100.0
 """Degrees of freedom beyond which the noise model's word is not taken."""
 
-SHARE = 0.9
-"""Share of all columns' information in the directions by which the scatter is judged."""
-
 
 def common_scatter(projection: Projection) -> tuple[float, float]:
     """Scatter of the particles' scores over what the noise model says, and its degrees of freedom: v_0 and d_0."""
-    total = np.sqrt(np.maximum(projection.total, 1e-300))
-    values, vectors = np.linalg.eigh(projection.similarity())
-    values, vectors = values[::-1], vectors[:, ::-1]
-    count = 1 + int(np.sum(np.cumsum(values) < SHARE * values.sum()))
-    turn = vectors[:, :count] / np.sqrt(values[:count]) / total[:, None]
+    turn = projection.directions()
     each = np.einsum("kr,nkl,lr->nr", turn, projection.information, turn, optimize=True)
     scatter, own = _scatter(projection.scores @ turn, each)
     fine = (own > 0.5) & (scatter > 0)

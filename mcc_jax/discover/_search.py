@@ -154,7 +154,7 @@ def rank(system: System, projection: Projection, *, refitted: Mapping[int, float
     """
     sign = np.array([c.variant.sign for c in system.candidates])
     U, total = projection.scores.sum(0), projection.total
-    alive = projection.survival > 1e-6
+    alive = projection.alive
     common = np.where(alive, log_evidence(U, total, sign), -np.inf)
     each = np.einsum("nkk->nk", projection.information)
     differing = np.full(len(sign), -np.inf)
@@ -219,7 +219,7 @@ def pairs(system: System, projection: Projection) -> list[tuple[float, int, int]
     sign = np.array([c.variant.sign for c in system.candidates])
     U, both = projection.scores.sum(0), projection.information.sum(0)
     d = np.diagonal(both)
-    alive = (projection.survival > 1e-6) & (d > 0)
+    alive = projection.alive & (d > 0)
     det = d[:, None] * d[None] - both**2
     fine = alive[:, None] & alive[None] & (det > 1e-4 * d[:, None] * d[None])
     safe = np.where(fine, det, 1.0)

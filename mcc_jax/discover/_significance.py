@@ -23,7 +23,7 @@ def p_nothing_left(system: System, seed: int, chosen: list[int]) -> float:
     columns = np.concatenate([system.candidate_columns, system.place_columns, system.word_columns])
     sign = np.concatenate([signs_of(system), np.zeros(len(columns) - len(system.candidates))])
     view = project(system, columns, inside=inside, precision=precision)
-    keep = view.survival > (1e-6 if not len(inside) else 1e-2)
+    keep = view.survival > 1e-2 if len(inside) else view.alive
     if not keep.any():
         return 1.0
     few = len(view.particles) < FEWEST

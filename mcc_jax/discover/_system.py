@@ -27,7 +27,7 @@ from jaxtyping import Array, Float
 from ..calibrate import JointModel
 from ..calibrate.joint._blocks import Blocks, block_size, filled_up
 from ..calibrate.joint._compile import compiled
-from ..calibrate.joint._data import Selection, Tests
+from ..calibrate.joint._data import Selection, Tests, longer
 from ..calibrate.joint._fit import population_at, prepare
 from ..calibrate.joint._forward import law_of, snap
 from ..calibrate.joint._linearised import linear_data
@@ -142,11 +142,6 @@ class Base:
         at = (blocks.cut(v) for v in longer((self.fit.latent, self.fit.zero), len(tests)))
         data = blocks.each(linear_data, *at, blocks.cut(tests), self.model.zero_sd, self.model.unloading)
         return jax.tree.map(lambda x: x[: len(self.tests)], blocks.whole(data))
-
-
-def longer(tree: Any, count: int) -> Any:
-    """Arrays over as many particles; copies of the last one are added."""
-    return jax.tree.map(lambda x: jnp.pad(x, [(0, count - len(x))] + [(0, 0)] * (x.ndim - 1), mode="edge"), tree)
 
 
 def base_fit(

@@ -72,14 +72,19 @@ def enlarged(tests: Tests, particles: int) -> Tests:
 
     Every particle gets a weight, whether copies are needed or not: one kind of arrays, one compilation.
     """
-    more = particles - len(tests)
+    weight = np.ones(len(tests)) if tests.weight is None else np.asarray(tests.weight)
+    return replace(longer(tests, particles), weight=jnp.asarray(np.pad(weight, (0, particles - len(tests)))))
 
-    def longer(x: Any) -> Array:
+
+def longer(tree: Any, particles: int) -> Any:
+    """Arrays over as many particles; copies of the last one are added."""
+
+    def one(x: Any) -> Array:
         x = np.asarray(x)
+        more = particles - len(x)
         return jnp.asarray(np.pad(x, [(0, more)] + [(0, 0)] * (x.ndim - 1), mode="edge") if more else x)
 
-    weight = np.ones(len(tests)) if tests.weight is None else np.asarray(tests.weight)
-    return replace(jax.tree.map(longer, tests), weight=jnp.asarray(np.pad(weight, (0, more))))
+    return jax.tree.map(one, tree)
 
 
 LENGTHS = (64, 128, 192, 320, 448)
