@@ -90,12 +90,19 @@ def problem(discovery):
 
 def follow_up_of(experiments, case):
     """What the first proposed experiment changes in the case, or None where the generator cannot do it."""
-    for experiment in experiments[:1]:
-        text = json.dumps(experiment.get("experiment", "")).lower()
-        if "rate" in text and case["protocol"] != "P2":
-            return {"protocol": "P2"}
-        if any(word in text for word in ("hold", "reload", "cycle")) and case["protocol"] == "P0":
-            return {"protocol": "P1"}
-        if any(word in text for word in ("more particles", "more of the same", "repeat")):
-            return {"count": 3 * case["count"], "resample": True}
-    return None
+    if not experiments:
+        return None
+    text = json.dumps(experiments[0].get("experiment", "")).lower()
+    if "rate" in text:
+        protocol = "P2"
+    elif any(word in text for word in ("hold", "reload", "cycle")):
+        protocol = "P1" if case["protocol"] == "P0" else case["protocol"]
+    elif any(word in text for word in ("more particles", "more of the same", "repeat")):
+        protocol = case["protocol"]
+    else:
+        return None
+    count = experiments[0].get("particles", case["count"])
+    changes = {} if protocol == case["protocol"] else {"protocol": protocol}
+    if count != case["count"]:
+        changes |= {"count": count, "resample": True}
+    return changes or None

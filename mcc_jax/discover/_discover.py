@@ -219,7 +219,7 @@ def _judge(
     further: list[dict[str, Any]] = []
     if experiments and gap:
         tell("next experiments")
-        further = next_experiments(base, system, chosen, sets)
+        further = next_experiments(base, system, chosen, steps, seed=seed)
     found = Discovery(
         verdict=verdict,
         summary="",

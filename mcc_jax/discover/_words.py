@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from ._experiments import ENOUGH
+
 if TYPE_CHECKING:
     from ._result import Discovery
 
@@ -49,9 +51,12 @@ def summary_of(found: Discovery) -> str:
     if found.next_experiments:
         best = found.next_experiments[0]
         names = _listed([_plain(n) for n in best["separates"]])
+        sure = best["power"] >= ENOUGH
+        doubt = "" if sure else f"No further test of those tried on paper would surely separate {names}. "
+        done = f"separate {names}" if sure else "do so"
         sentences.append(
-            f"Next: {best['experiment']}, {best['particles']} particles, would separate {names} with probability "
-            f"{best['power']:.2f}."
+            f"{doubt}{'Next' if sure else 'The best'}: {best['experiment']}, {best['particles']} particles, would "
+            f"{done} with probability {best['power']:.2f}."
         )
     if found.untestable:
         sentences.append(

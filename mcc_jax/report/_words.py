@@ -18,6 +18,9 @@ SURE = {
     "least-squares": "as the 95 % confidence interval",
 }
 
+LIKELY = 0.9
+"""Probability from which on a further test is recommended without a doubt."""
+
 
 def plain(name: str) -> str:
     """A mechanism's name for a sentence."""
@@ -125,11 +128,12 @@ def _after(found: dict[str, Any]) -> list[tuple[str, str]]:
     verdict = found["verdict"]
     if found["next_experiments"]:
         best = found["next_experiments"][0]
-        text = (
-            f"Measure: {best['experiment']}, {number(best['particles'])} particles. It would separate "
-            f"{listed([plain(n) for n in best['separates']])} with probability {probability(best['power'])}."
-        )
-        return [(text, "")]
+        names, power = listed([plain(n) for n in best["separates"]]), probability(best["power"])
+        test = f"{best['experiment']}, {number(best['particles'])} particles"
+        if best["power"] >= LIKELY:
+            return [(f"Measure: {test}. It would separate {names} with probability {power}.", "")]
+        doubt = f"No further test of those tried on paper would surely separate {names}."
+        return [(f"{doubt} The best: {test}, would do so with probability {power}.", "")]
     if verdict in ("NAMED", "SET", "UNLISTED"):
         return [("Use the law together with what was added (parameters “after” below), not alone.", "")]
     if verdict == "NO_GAP" and found["untestable"]:

@@ -114,6 +114,12 @@ def test_names_of_solvers_and_experiments():
     P0 = {"protocol": "P0", "count": 20}
     assert adapter.follow_up_of([{"experiment": "a second loading rate, ten times higher"}], P0) == {"protocol": "P2"}
     assert adapter.follow_up_of([{"experiment": "reload after partial unloading"}], P0) == {"protocol": "P1"}
+    more = {"experiment": "more particles, tested in the same way", "particles": 60}
+    assert adapter.follow_up_of([more], P0) == {"count": 60, "resample": True}
+    held = {"experiment": "a hold of 60 s at the largest load", "particles": 40}
+    assert adapter.follow_up_of([held], P0) == {"protocol": "P1", "count": 40, "resample": True}
+    assert adapter.follow_up_of([held], {"protocol": "P2", "count": 20}) == {"count": 40, "resample": True}
+    assert adapter.follow_up_of([{**held, "particles": 20}], {"protocol": "P1", "count": 20}) is None
     assert adapter.follow_up_of([{"experiment": "diamond platen"}], P0) is None
     assert adapter.follow_up_of([], P0) is None
 

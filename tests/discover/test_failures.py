@@ -122,6 +122,7 @@ def test_an_indentation_is_not_said_to_agree_with_the_law(indentation):
 
 
 @pytest.mark.long
-@pytest.mark.xfail(reason="the base fit does not converge: it uses the branch behind a snap-through at first contact")
-def test_an_indentation_s_gap_is_mostly_closed(indentation):
-    assert indentation["gap"]["closed_fraction"] > 0.5
+def test_an_indentation_s_gap_is_mostly_closed_by_a_formula(indentation):
+    assert indentation["verdict"] == "UNLISTED"
+    assert indentation["gap"]["closed_fraction"] > 0.8
+    assert "s^0.5" in indentation["closure"]["formula"]  # of a sharp tip, displacement goes with the root of force

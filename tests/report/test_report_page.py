@@ -242,6 +242,16 @@ def test_every_verdict_is_told(folder, verdict, words):
     assert ("0.1 * x**2" in text) == (verdict == "UNLISTED")
 
 
+@pytest.mark.parametrize(("power", "words"), [(0.95, "Measure: a hold"), (0.3, "would surely separate")])
+def test_an_experiment_that_may_not_tell_is_not_simply_recommended(folder, power, words):
+    keep(folder, "discovery")
+    one = {"experiment": "a hold of 60 s at the largest load", "separates": ["frame_compliance", "creep"]}
+    further = [{**one, "particles": 6, "power": power}]
+    text = Page(report_page(changed(folder, "discovery.json", verdict="SET", next_experiments=further))).text
+    assert words in text
+    assert ("Measure: a hold" in text) == (power > 0.9)
+
+
 def test_equal_input_gives_an_equal_page(complete, page):
     from bokeh.models import ColumnDataSource
 

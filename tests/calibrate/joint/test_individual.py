@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from mcc_jax.calibrate.joint import JointModel, _fit
 from mcc_jax.calibrate.joint._blocks import Blocks
 from mcc_jax.calibrate.joint._data import select_tests
 from mcc_jax.calibrate.joint._fit import WIDE, _centre
-from mcc_jax.calibrate.joint._forward import raw_residual
+from mcc_jax.calibrate.joint._forward import raw_residual, snap
 from mcc_jax.calibrate.joint._individual import fit_particles, linear_starts
 
 SNAPS = np.stack([COEFFICIENTS[0], SNAPPING, COEFFICIENTS[2], SNAPPING * np.array([1.0, 1.01, 0.99])])
@@ -23,7 +24,7 @@ def fitted(campaign, noise, unloading=Unloading.PRINTED, zero_sd=5.0):
     return tests, fit(tests, noise, unloading, zero_sd)
 
 
-def fit(tests, noise, unloading=Unloading.PRINTED, zero_sd=5.0):
+def fit(tests, noise, unloading=Unloading.PRINTED, zero_sd=5.0, starts=None):
     centre = np.broadcast_to(_centre(JointModel(unloading).beliefs), (len(tests), 4))
     return fit_particles(
         tests,
@@ -31,7 +32,7 @@ def fit(tests, noise, unloading=Unloading.PRINTED, zero_sd=5.0):
         jnp.asarray(centre),
         jnp.full((len(tests), 4), WIDE),
         jnp.asarray(zero_sd),
-        linear_starts(tests, jnp.asarray(centre[0, 3])),
+        linear_starts(tests, jnp.asarray(centre[0, 3])) if starts is None else starts,
         unloading,
     )
 
@@ -115,3 +116,25 @@ def test_without_unloading_the_modulus_stays_at_its_prior():
     assert np.all(np.abs(np.asarray(found.latent)[:, :3] - true_latent()[:, :3]) < 0.05)
     assert abs(float(centre[3]) - np.log(modulus_of(Unloading.PRINTED))) > 0.1
     assert len(DIAMETERS) == len(found.zero)
+
+
+def test_no_snap_through_is_put_where_nothing_shows_it():
+    """A sharp rise, F ~ d^2 as under a sharp tip: best fitted by a snap-through below the first load that counts."""
+    campaign = simulated(instrument=NOISE, seed=5)
+    sharp = [
+        replace(curve, displacement_um=8 * np.sqrt(np.maximum(curve.force_mN, 0) / curve.force_mN.max()))
+        for curve in campaign.curves
+    ]
+    tests = select_tests(replace(campaign, curves=tuple(sharp)), threshold_MPa=0.0).tests
+    first = jnp.min(jnp.where(tests.mask & tests.loading, tests.force, jnp.inf), 1)
+
+    def unseen(latent):
+        return np.asarray(jax.vmap(snap)(latent, tests.particle) < jnp.log(first))
+
+    alone = fit(tests, 0.03)
+    assert unseen(alone.latent).any()  # no start led anywhere else: there is nothing better to say
+    steep = jnp.asarray([9.0, 2.5, 4.5, 12.0, 0.0])
+    both = jnp.concatenate([jnp.moveaxis(alone.ends, 1, 0), jnp.broadcast_to(steep, (1, len(tests), 5))])
+    found = fit(tests, 0.03, starts=both)
+    assert not unseen(found.latent).any()
+    assert np.all(np.asarray(found.rms) > 0.999 * np.asarray(alone.rms))
