@@ -290,6 +290,9 @@ def test_follow_up_counts_sets_that_collapse(perfect_run, tmp_path):
     }
     metric = "proposed experiment resolves the set (simulated)"
     assert rows(found, {**results, key: resolved}, tmp_path)[metric]["observed"] == "100.0% (1/1)"
+    sure = "  of these with a stated power of 0.9 or more"
+    stated = float(asked.found["next_experiments"][0].get("power", 0.0)) >= 0.9
+    assert ("1/1" in rows(found, {**results, key: resolved}, tmp_path)[sure]["observed"]) == stated
     assert rows(found, {**results, key: asked.result}, tmp_path)[metric]["observed"] == "0.0% (0/1)"
 
 
