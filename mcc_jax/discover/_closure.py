@@ -98,7 +98,7 @@ def find_closure(
     scale = np.sqrt(np.maximum(np.diagonal(both)[start:], 1e-300))
     cosine = coefficients @ both[own][:, start:] / scale / length
     cosine = np.where(view.alive[start:], cosine, 0.0)
-    signs = np.array([c.variant.sign for c in system.candidates])
+    signs = system.signs
     cosine = np.where(signs == 0, np.abs(cosine), cosine * signs)
     best: dict[str, float] = {}
     for candidate, value in zip(system.candidates, cosine, strict=True):

@@ -47,7 +47,7 @@ def held_out(system: System, choose: Choose, extended: Mapping[frozenset[int], S
     """
     around = extended or {}
     usable = np.flatnonzero(system.usable)
-    basis = np.concatenate([system.candidate_columns, system.place_columns, system.word_columns])
+    basis, _ = system.looked_at()
     whole = project(system, basis)
     basis, directions = basis[whole.alive], whole.only(whole.alive).directions()
     nuisance = system.globals

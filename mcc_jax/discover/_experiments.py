@@ -133,7 +133,7 @@ class _Trial:
 
     def fewest(self, *, first: int, seed: int) -> tuple[int, float]:
         """The smallest number of particles that is enough, or else the largest, and its power."""
-        count = len(self.view.particles)
+        count = len(self.system.points)
         tried = [c for c in COPIES if c >= first and c * count <= MOST_PARTICLES] or [first]
         most = self.power(tried[-1], seed)
         if most < ENOUGH:

@@ -139,7 +139,7 @@ def power_of(system: System, missing: Sequence[dict[str, str]]) -> Power:
         plausible[name] = system.candidates[k].variant.plausible
     alike = []
     names = list(members)
-    signs = np.array([c.variant.sign for c in system.candidates])
+    signs = system.signs
     for a, one in enumerate(names):
         for other in names[a + 1 :]:
             block = both[np.ix_(members[one], members[other])]

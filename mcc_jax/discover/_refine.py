@@ -30,10 +30,7 @@ MOST = 5
 
 def systematic(system: System) -> tuple[np.ndarray, np.ndarray]:
     """Columns that explain what is left, one after the other (orthogonal matching pursuit), and their coefficients."""
-    columns = np.concatenate([system.candidate_columns, system.place_columns, system.word_columns])
-    sign = np.concatenate(
-        [[c.variant.sign for c in system.candidates], np.zeros(len(columns) - len(system.candidates))]
-    )
+    columns, sign = system.looked_at()
     inside: list[int] = []
     for _ in range(MOST):
         found = project(system, columns, inside=np.array(inside, int))

@@ -95,7 +95,7 @@ def random_probability(system: System, projection: Projection, seed: int, *, dra
     if not groups:
         return 1.0
     index = np.concatenate(groups)
-    sign = np.array([system.candidates[k].variant.sign for k in index])
+    sign = system.signs[index]
     bounds = np.cumsum([0, *map(len, groups)])
     local = [np.arange(a, b) for a, b in itertools.pairwise(bounds)]
     information = projection.information[:, index][:, :, index]
@@ -152,7 +152,7 @@ def rank(system: System, projection: Projection, *, refitted: Mapping[int, float
         refitted: drop of -2 log likelihood by those candidates that were fitted as they are (`_refit`). It replaces the
             linear one, and no formula of the same mechanism counts for more than the best of these.
     """
-    sign = np.array([c.variant.sign for c in system.candidates])
+    sign = system.signs
     U, total = projection.scores.sum(0), projection.total
     alive = projection.alive
     common = np.where(alive, log_evidence(U, total, sign), -np.inf)
@@ -216,7 +216,7 @@ def family_columns(system: System, names: tuple[str, ...]) -> np.ndarray:
 def pairs(system: System, projection: Projection) -> list[tuple[float, int, int]]:
     """Pairs of formulas of different mechanisms by the chi2 they take away together, best pair of mechanisms first; the
     formula that alone takes away more comes first in its pair."""
-    sign = np.array([c.variant.sign for c in system.candidates])
+    sign = system.signs
     U, both = projection.scores.sum(0), projection.information.sum(0)
     d = np.diagonal(both)
     alive = projection.alive & (d > 0)

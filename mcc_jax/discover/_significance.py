@@ -20,8 +20,7 @@ def p_nothing_left(system: System, seed: int, chosen: list[int]) -> float:
     The candidates are fitted; the other formulas of their families are let in within `FREEDOM`.
     """
     inside, precision = _family(system, chosen)
-    columns = np.concatenate([system.candidate_columns, system.place_columns, system.word_columns])
-    sign = np.concatenate([signs_of(system), np.zeros(len(columns) - len(system.candidates))])
+    columns, sign = system.looked_at()
     view = project(system, columns, inside=inside, precision=precision)
     keep = view.survival > 1e-2 if len(inside) else view.alive
     if not keep.any():
@@ -45,8 +44,3 @@ def _family(system: System, chosen: list[int]) -> tuple[np.ndarray, np.ndarray]:
                 columns.append(system.column(j))
                 precision.append(float(strength[j] / max(effect, 1e-300)))
     return np.array(columns, int), np.array(precision)
-
-
-def signs_of(system: System) -> np.ndarray:
-    """The sign that each candidate's amplitude must have; 0 where both are possible."""
-    return np.array([c.variant.sign for c in system.candidates])

@@ -97,6 +97,16 @@ class System:
         """Columns of the words."""
         return 1 + len(GLOBALS) + len(self.candidates) + len(self.places) + np.arange(len(self.words))
 
+    @property
+    def signs(self) -> np.ndarray:
+        """The sign that each candidate's amplitude must have; 0 where both are possible."""
+        return np.array([c.variant.sign for c in self.candidates])
+
+    def looked_at(self) -> tuple[np.ndarray, np.ndarray]:
+        """Columns of candidates, map and words, and the sign that each one's coefficient must have."""
+        columns = np.concatenate([self.candidate_columns, self.place_columns, self.word_columns])
+        return columns, np.concatenate([self.signs, np.zeros(len(columns) - len(self.candidates))])
+
     def absorbing(self, columns: np.ndarray) -> System:
         """The system in which every particle may have its own amount of some columns."""
         at = np.asarray(columns)
