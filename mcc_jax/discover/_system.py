@@ -23,6 +23,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.optimize import brentq
+from scipy.stats import t as student
 
 from ..calibrate import JointModel
 from ..calibrate.joint._blocks import Blocks, block_size, filled_up
@@ -32,7 +34,7 @@ from ..calibrate.joint._fit import population_at, prepare
 from ..calibrate.joint._forward import law_of, snap
 from ..calibrate.joint._linearised import linear_data
 from ..calibrate.joint._model import JointFit
-from ..calibrate.joint._noise import Linear
+from ..calibrate.joint._noise import Linear, Whitening
 from ..calibrate.joint._population import Population, Scatter, moments
 from ..campaign import Campaign, campaign_segments
 from ..effects import LIBRARY, Context, ExtendedLaw, Mechanism, Record, record_batch, signatures
@@ -61,6 +63,8 @@ class System:
         at: amplitudes around which the candidates' columns are taken, in their units: zero but where the law has been
             extended (`_refit`).
         shift: of the population's parameters from the base fit's, likewise.
+        tails: degrees of freedom of Student's distribution whose tails are those of the noise; infinite where it is
+            normal.
     """
 
     gram: np.ndarray
@@ -72,6 +76,7 @@ class System:
     usable: np.ndarray
     at: np.ndarray
     shift: np.ndarray
+    tails: float = np.inf
 
     @property
     def globals(self) -> np.ndarray:
@@ -281,7 +286,32 @@ def build_system(base: Base, signals: Signals) -> System:
     width = np.array([numbers.a[1], numbers.log_modulus[1], numbers.mu_1[1], 0.5, numbers.mu_5[1]])
     points = np.asarray(jnp.sum(tests.mask, 1))
     still, none = np.zeros(len(GLOBALS)), np.zeros(len(candidates))
-    return System(gram, points, candidates, places, some, 1 / width**2, usable, none, still)
+    white = np.asarray(in_batches(_whitened, (data.residual, fit.filters)))[np.asarray(tests.mask)]
+    return System(gram, points, candidates, places, some, 1 / width**2, usable, none, still, tails_of(white))
+
+
+OFTEN = 0.98
+"""Share of the points up to which the tails of the noise are looked at: a rare jump of a particle is no noise."""
+
+
+def tails_of(white: np.ndarray) -> float:
+    """Degrees of freedom of Student's distribution with the ratio of the points' `OFTEN` quantile to their median."""
+    size, far = np.quantile(np.abs(white), [0.5, OFTEN])
+
+    def excess(freedom: float) -> float:
+        return float(student.ppf((1 + OFTEN) / 2, freedom) / student.ppf(0.75, freedom)) * size - far
+
+    if excess(MOST_TAILS) >= 0:
+        return np.inf
+    return cast(float, brentq(excess, LEAST_TAILS, MOST_TAILS)) if excess(LEAST_TAILS) > 0 else LEAST_TAILS
+
+
+LEAST_TAILS, MOST_TAILS = 2.5, 100.0
+
+
+@compiled
+def _whitened(residual: Float[Array, "particles points"], filters: Whitening) -> Float[Array, "particles points"]:
+    return jax.vmap(lambda white, r: white(r))(filters, residual)
 
 
 @compiled

@@ -1,13 +1,16 @@
 """Effects planted in linear systems of known answer: named, both named, or nothing."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from linear_systems import FORMULAS, planted, random_campaign
 
 from mcc_jax.discover._refine import systematic
 from mcc_jax.discover._score import project
-from mcc_jax.discover._search import pairs, rank
+from mcc_jax.discover._search import pairs, random_probability, rank
 from mcc_jax.discover._significance import p_nothing_left
+from mcc_jax.effects import LIBRARY
 
 NOTHING = np.array([], int)
 
@@ -69,3 +72,14 @@ def _right_way(system, i, j):
 def test_what_is_systematic_leaves_nothing_where_nothing_is():
     taken = [len(systematic(random_campaign(200 + seed, particles=12)[0])[0]) for seed in range(20)]
     assert np.mean(taken) < 0.2
+
+
+def test_heavy_tails_of_the_noise_make_jumps_less_of_a_wonder():
+    """What shows in a few points of a test has the tails of the noise; what differs in size alone has not."""
+    jump = ("pop_in", next(v.name for v in LIBRARY["pop_in"].variants if any(n.random_per_test for n in v.nuisances)))
+    system, _ = random_campaign(5, particles=12, formulas=(jump,) * 16)  # sixteen places
+    view = project(system, system.candidate_columns)
+    view.scores[:, 0] = 0.0
+    view.scores[:3, 0] = 3.0 * np.sqrt(view.information[:3, 0, 0])
+    p = {tails: random_probability(replace(system, tails=tails), view, 0) for tails in (3.0, 8.0, np.inf)}
+    assert 1.5 * p[np.inf] < p[8.0] < p[3.0] / 1.3

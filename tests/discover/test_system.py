@@ -17,7 +17,7 @@ from mcc_jax.campaign import THRESHOLD_MPA
 from mcc_jax.discover._closure import Closure
 from mcc_jax.discover._refine import refined, systematic
 from mcc_jax.discover._result import Discovery
-from mcc_jax.discover._system import BATCH, base_fit, build_system, in_batches, signals_of
+from mcc_jax.discover._system import BATCH, base_fit, build_system, in_batches, signals_of, tails_of
 from mcc_jax.effects import LIBRARY, ExtendedLaw, Mechanism
 
 MODEL = JointModel(modulus_scatter=True)
@@ -204,3 +204,18 @@ def test_the_correction_of_a_formula_stands_at_the_rows_of_the_tests(fitted):
         np.testing.assert_allclose(whole[rows], -residual[i, : len(rows)], rtol=1e-12)
         assert np.isnan(np.delete(whole, rows)).all()
     assert Discovery.correction_um(SimpleNamespace(base=base, system=system, closure=None)) == {}
+
+
+@pytest.mark.parametrize(("freedom", "low", "high"), [(4, 3.2, 5.0), (6, 4.8, 8.0), (np.inf, 25.0, np.inf)])
+def test_tails_of_noise_are_found(freedom, low, high):
+    rng = np.random.default_rng(3)
+    white = 0.7 * (rng.standard_normal(6000) if np.isinf(freedom) else rng.standard_t(freedom, 6000))
+    assert low <= tails_of(white) <= high
+    # One jump in every test is no heavy tail.
+    jumping = white.copy()
+    jumping[::300] = 15.0
+    assert tails_of(jumping) >= 0.75 * min(tails_of(white), 30.0)
+
+
+def test_simulated_noise_is_normal(fitted):
+    assert fitted[2].tails > 15
