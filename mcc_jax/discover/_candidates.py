@@ -33,6 +33,11 @@ class Candidate:
         return self.variant.mechanism
 
     @property
+    def between_particles(self) -> bool:
+        """Whether the effect shows by how particles differ, and in none of them alone."""
+        return bool({Need.SEVERAL_SIZES, Need.SEVERAL_SHAPES, Need.HUMIDITY_COLUMN} & set(self.variant.needs))
+
+    @property
     def effect(self) -> AbstractEffect:
         """The effect at amplitude zero."""
         return self.variant.build(0.0, **self.nuisance)

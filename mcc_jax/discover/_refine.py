@@ -12,6 +12,8 @@ from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.stats import norm
+from scipy.stats import t as student
 
 from ..calibrate.joint._blocks import Parts
 from ..calibrate.joint._data import longer
@@ -25,24 +27,49 @@ from ._system import Base, Signals, System
 STRONG = 3.5
 """Estimate over standard error from which on a column is taken off."""
 
+STRONG_BETWEEN = 3.0
+"""The same for effects that differ between particles only: they are few."""
+
 MOST = 5
 
 
 def systematic(system: System) -> tuple[np.ndarray, np.ndarray]:
     """Columns that explain what is left, one after the other (orthogonal matching pursuit), and their coefficients."""
     columns, sign = system.looked_at()
+    between = np.flatnonzero([c.between_particles for c in system.candidates])  # candidates come first
+    enough = np.full(len(columns), STRONG)
+    enough[between] = STRONG_BETWEEN
     inside: list[int] = []
     for _ in range(MOST):
         found = project(system, columns, inside=np.array(inside, int))
         t = np.where(found.survival > 1e-3, found.gaussian, 0.0)
         t = np.where(sign == 0, np.abs(t), t * sign)
-        best = int(np.argmax(t))
-        if t[best] < STRONG:
+        t[between] = unbounded(t[between], len(found.particles))
+        best = int(np.argmax(t / enough))
+        if t[best] < enough[best]:
             break
         inside.append(int(columns[best]))
     chosen = np.array(inside, int)
     theta = project(system, chosen[:0], inside=chosen).theta[len(system.globals) :] if inside else np.zeros(0)
     return chosen, theta
+
+
+def unbounded(t: np.ndarray, count: int) -> np.ndarray:
+    r"""What estimates over standard errors are worth if their effect is part of the scatter that gives the error.
+
+    An effect that differs between particles only, with their size, say, is a regression over particles. The scatter
+    fitted without it contains it, so that however large it is, t stays below the root of the number of particles N:
+
+    .. math:: t = \sqrt{N} R, \qquad t' = R \sqrt{\frac{N - 2}{1 - R^2}}
+
+    with R the correlation; t' follows Student's distribution with N - 2 degrees of freedom. Returned is the normal
+    deviate as improbable as t'.
+    """
+    if count < 4:
+        return t
+    R = np.minimum(np.abs(t) / np.sqrt(count), 1 - 1e-9)
+    student_t = R * np.sqrt((count - 2) / (1 - R**2))
+    return np.sign(t) * norm.isf(np.maximum(student.sf(student_t, count - 2), 1e-300))
 
 
 def _least_squares(summary: Summary) -> np.ndarray:

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import log_ndtr, logsumexp
 
+from ._candidates import located
 from ._score import Projection
 from ._system import System
 
@@ -107,7 +108,7 @@ def random_probability(system: System, projection: Projection, seed: int, *, dra
     factor = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     rng = np.random.default_rng([seed, 43])
     # What has a place of its own in every test shows in a few points, which have the tails of the noise.
-    placed = np.array([any(n.random_per_test for n in system.candidates[k].variant.nuisances) for k in index])
+    placed = np.array([located(system.candidates[k].variant) for k in index])
     exceed = 0
     for _ in range(4):
         normal = rng.standard_normal((draws // 4, *each.shape))

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from linear_systems import FORMULAS, planted, random_campaign
 
-from mcc_jax.discover._refine import systematic
+from mcc_jax.discover._candidates import candidates_of
+from mcc_jax.discover._refine import systematic, unbounded
 from mcc_jax.discover._score import project
 from mcc_jax.discover._search import pairs, random_probability, rank
 from mcc_jax.discover._significance import p_nothing_left
@@ -83,3 +84,27 @@ def test_heavy_tails_of_the_noise_make_jumps_less_of_a_wonder():
     view.scores[:3, 0] = 3.0 * np.sqrt(view.information[:3, 0, 0])
     p = {tails: random_probability(replace(system, tails=tails), view, 0) for tails in (3.0, 8.0, np.inf)}
     assert 1.5 * p[np.inf] < p[8.0] < p[3.0] / 1.3
+
+
+def test_a_regression_over_particles_is_worth_what_its_correlation_is():
+    """An effect of the particles' sizes, say: its error holds it, so its t ends at the root of their number."""
+    rng = np.random.default_rng(8)
+    count = 20
+    x = rng.standard_normal((4000, count))
+    y = rng.standard_normal((4000, count))
+    R = np.einsum("ij,ij->i", x, y) / np.sqrt((x**2).sum(1) * (y**2).sum(1))
+    # Both means are known here: one degree of freedom more than `unbounded` takes.
+    worth = unbounded(np.sqrt(count) * R, count)
+    assert np.abs(worth.mean()) < 0.05
+    assert 0.9 < worth.std() < 1.05
+    assert 0.5 * 0.0027 < np.mean(np.abs(worth) > 3) + 1e-3 < 3 * 0.0027
+    strong = unbounded(np.array([-4.4, 1.0, 3.2, 4.4]), count)
+    assert strong[0] == -strong[3]
+    assert abs(strong[1] - 1.0) < 0.1
+    assert 3.2 < strong[2] < 4.4 < strong[3] < np.inf
+    np.testing.assert_array_equal(unbounded(np.array([1.5]), 3), [1.5])
+
+
+def test_effects_between_particles_are_those_of_size_shape_and_humidity():
+    between = {c.mechanism for c in candidates_of(LIBRARY) if c.between_particles}
+    assert between == {"size_effect", "shape_second_order", "humidity"}
