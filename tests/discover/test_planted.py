@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from linear_systems import FORMULAS, planted, random_campaign
 
-from mcc_jax.discover._candidates import candidates_of
+from mcc_jax.discover._candidates import candidates_of, located
 from mcc_jax.discover._refine import systematic, unbounded
 from mcc_jax.discover._score import project
 from mcc_jax.discover._search import pairs, random_probability, rank
@@ -77,7 +77,7 @@ def test_what_is_systematic_leaves_nothing_where_nothing_is():
 
 def test_heavy_tails_of_the_noise_make_jumps_less_of_a_wonder():
     """What shows in a few points of a test has the tails of the noise; what differs in size alone has not."""
-    jump = ("pop_in", next(v.name for v in LIBRARY["pop_in"].variants if any(n.random_per_test for n in v.nuisances)))
+    jump = ("pop_in", next(v.name for v in LIBRARY["pop_in"].variants if located(v)))
     system, _ = random_campaign(5, particles=12, formulas=(jump,) * 16)  # sixteen places
     view = project(system, system.candidate_columns)
     view.scores[:, 0] = 0.0
