@@ -276,7 +276,7 @@ def test_determinism_ignores_the_time_only(perfect_run):
     assert rows(found, other)["same seed, same answer"]["result"] is False
 
 
-def test_follow_up_counts_sets_that_collapse(perfect_run, tmp_path):
+def test_follow_up_counts_sets_that_collapse(perfect_run, tmp_path, monkeypatch):
     found, results = perfect_run
     asked = next(o for o in found if o.verdict == "SET")
     key = f"{asked.key}+next"
@@ -291,8 +291,9 @@ def test_follow_up_counts_sets_that_collapse(perfect_run, tmp_path):
     metric = "proposed experiment resolves the set (simulated)"
     assert rows(found, {**results, key: resolved}, tmp_path)[metric]["observed"] == "100.0% (1/1)"
     sure = "  of these with a stated power of 0.9 or more"
-    stated = float(asked.found["next_experiments"][0].get("power", 0.0)) >= 0.9
-    assert ("1/1" in rows(found, {**results, key: resolved}, tmp_path)[sure]["observed"]) == stated
+    for power in (0.95, 0.3):
+        monkeypatch.setitem(asked.found["next_experiments"][0], "power", power)
+        assert ("1/1" in rows(found, {**results, key: resolved}, tmp_path)[sure]["observed"]) == (power > 0.9)
     assert rows(found, {**results, key: asked.result}, tmp_path)[metric]["observed"] == "0.0% (0/1)"
 
 
