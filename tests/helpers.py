@@ -97,6 +97,12 @@ def force_along(law, particle, displacements):
 
 
 @eqx.filter_jit
+def displacement_along(law, particle, forces):
+    """Displacements [um] along a path of forces [mN] that starts on a fresh contact."""
+    return law.path_load(particle, law.init(particle), forces)[1]
+
+
+@eqx.filter_jit
 def master_stress(plastic, x):
     """Stress [MPa] of the master curve at scaled strains."""
     return plastic.stress(x)

@@ -12,7 +12,7 @@ from ._score import project
 from ._system import System
 
 MOST_WORDS = 3
-WORTH = 12.0
+WORTH = 14.0
 """Least drop of chi2 for which another word is taken: about log of the number of words, twice, and one parameter."""
 
 RESAMPLES = 40
@@ -107,7 +107,8 @@ def find_closure(
     first = system.word_columns[0]
     terms = [f"{c:+.3g} {system.words[w - first].text}" for c, w in zip(coefficients, chosen, strict=True)]
     formula = (
-        "added displacement / D_e = " + " ".join(terms) + "; q = peak stress/10 MPa, s = stress/10 MPa, u = F/F_peak"
+        "added displacement / D_e = " + " ".join(terms) + "; q = peak stress/10 MPa, s = stress/10 MPa, u = F/F_peak, "
+        "eps_P = peak strain, gamma = displacement, t = time, r = time since the latest reversal, h = 200 um/D_e"
     )
     return Closure(np.array(chosen), coefficients, sd, formula, gain, frequency, resembles, span)
 

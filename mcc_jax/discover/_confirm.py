@@ -47,13 +47,16 @@ def held_out(system: System, choose: Choose, extended: Mapping[frozenset[int], S
     """
     around = extended or {}
     usable = np.flatnonzero(system.usable)
+    chosen = choose(usable)
     basis, _ = system.looked_at()
+    if not np.isin(np.concatenate(chosen), system.waves).any():
+        basis = np.setdiff1d(basis, system.waves)  # as many directions as all others, in which there is only noise
     whole = project(system, basis)
     basis, directions = basis[whole.alive], whole.only(whole.alive).directions()
     nuisance = system.globals
     # The basis with the population projected off, as in the whole campaign.
     shift = _shift(system, basis, usable)
-    steps = len(choose(usable))
+    steps = len(chosen)
     chi2, elpd = np.zeros((steps, len(usable))), np.zeros((steps, len(usable)))
     pattern = np.zeros((steps, len(usable), directions.shape[1]))
     for row, i in enumerate(usable):

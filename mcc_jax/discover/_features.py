@@ -3,17 +3,20 @@ r"""Smooth functions of what a test did: where law and data disagree, and the wo
 Two families, both additions to displacement in units of strain (times :math:`D_e`):
 
 - a map, tent functions of load share on every kind of branch: they say where, whatever the cause;
-- words, from which a sparse formula is put together when no listed mechanism explains the gap: powers, hinges, bumps
-  and ripples in peak stress, the same in load share on the elastic branch, time, and size.
+- words, from which a sparse formula is put together when no listed mechanism explains the gap: powers, hinges, bumps,
+  steps and ripples in peak stress and strain, the same in load share on the elastic branch, what follows a reversal,
+  time, and size; and waves in time and in displacement, as a room or a gauge makes them.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 
 from .._types import Values
 from ..effects import Context
@@ -38,12 +41,62 @@ class Feature:
         value: its values, strain [-] per unit of coefficient.
         kind: for the map, the kind of segment; empty for words.
         share: for the map, the range of the load share that it covers.
+        wave: if the function is a wave, which.
     """
 
     text: str
     value: Callable[[Context], Values]
     kind: str = ""
     share: tuple[float, float] = (0.0, 1.0)
+    wave: Wave | None = None
+
+
+@dataclass(frozen=True)
+class Wave:
+    """h sin(2 pi f x), or h (cos(2 pi f x) - 1), with h a number of each particle.
+
+    Attributes:
+        of: the coordinate x.
+        frequency: f, in 1 / unit of x.
+        cosine: which of the two.
+        height: h.
+    """
+
+    of: Callable[[Context], Values]
+    frequency: float
+    cosine: bool
+    height: Callable[[Context], Values]
+
+    def __call__(self, context: Context) -> Values:
+        """Its values."""
+        return self.height(context) * _wave(2 * jnp.pi * self.frequency * self.of(context), self.cosine)
+
+
+def _wave(phase: Values, cosine) -> Values:
+    return jnp.where(cosine, jnp.cos(phase) - 1, jnp.sin(phase))
+
+
+def values_of(features: Sequence[Feature], context: Context) -> Values:
+    """Values of features over the points of a test, shape (features, points); all waves in one operation, since each
+    operation takes time to compile."""
+    rows: dict[int, Values] = {}
+    waves: dict[tuple[Callable[[Context], Values], ...], list[int]] = {}
+    for i, feature in enumerate(features):
+        if feature.wave is None:
+            rows[i] = jnp.broadcast_to(feature.value(context), context.force.shape)
+        else:
+            waves.setdefault((feature.wave.of, feature.wave.height), []).append(i)
+    order, parts = list(rows), [jnp.stack(list(rows.values()))] if rows else []
+    for (of, height), members in waves.items():
+        x = jnp.broadcast_to(of(context), context.force.shape)
+        some = [wave for i in members if (wave := features[i].wave) is not None]
+        k = jnp.asarray([2 * np.pi * wave.frequency for wave in some], x.dtype)
+        cosine = jnp.asarray([wave.cosine for wave in some])
+        parts.append(height(context) * _wave(k[:, None] * x[None], cosine[:, None]))
+        order += members
+    if not parts:
+        return jnp.zeros((0, *context.force.shape), context.force.dtype)
+    return jnp.concatenate(parts)[np.argsort(order)]
 
 
 def overall_share(context: Context) -> Values:
@@ -93,6 +146,34 @@ def _u(context: Context) -> Values:
     return context.load_share
 
 
+def _eps(context: Context) -> Values:
+    return context.peak_strain
+
+
+def _t(context: Context) -> Values:
+    return context.record.time
+
+
+def _gamma(context: Context) -> Values:
+    return context.displacement
+
+
+def _one(context: Context) -> Values:
+    return jnp.ones_like(context.particle.effective_diameter)
+
+
+def _um(context: Context) -> Values:
+    """h = 200 um / D_e: what is as many micrometres for every particle, in units of strain."""
+    return DIAMETER / context.particle.effective_diameter
+
+
+def _since_turn(context: Context) -> Values:
+    """Time since the latest reversal of the ramp [s]."""
+    time, falls = context.record.time, context.record.branch == UNLOAD
+    turned = jnp.concatenate([jnp.ones_like(falls[:1]), falls[1:] != falls[:-1]])
+    return time - jax.lax.cummax(jnp.where(turned, time, -jnp.inf))
+
+
 def _power(of: Callable[[Context], Values], p: float) -> Callable[[Context], Values]:
     return lambda context: jnp.maximum(of(context), 1e-9) ** p
 
@@ -110,14 +191,19 @@ def words() -> tuple[Feature, ...]:
         )
     for at in (0.02, 0.06):
         found.append(Feature(f"exp(-q/{at:g})", lambda c, at=at: jnp.exp(-_q(c) / at)))
-    for period in (0.15, 0.25, 0.4):
-        k = 2 * jnp.pi / period
-        found.append(Feature(f"sin(2 pi q/{period:g})", lambda c, k=k: jnp.sin(k * _q(c))))
-        found.append(Feature(f"cos(2 pi q/{period:g}) - 1", lambda c, k=k: jnp.cos(k * _q(c)) - 1))
-    for period in (0.03, 0.04, 0.05, 0.065, 0.08, 0.1, 0.13, 0.16, 0.2):
-        k = 2 * jnp.pi / period
-        found.append(Feature(f"sin(2 pi eps_P/{period:g})", lambda c, k=k: jnp.sin(k * c.peak_strain)))
-        found.append(Feature(f"cos(2 pi eps_P/{period:g}) - 1", lambda c, k=k: jnp.cos(k * c.peak_strain) - 1))
+    found += _waves("q", _q, [1 / period for period in (0.15, 0.25, 0.4)])
+    periods = (0.03, 0.04, 0.05, 0.065, 0.08, 0.1, 0.13, 0.16, 0.2)
+    found += _waves("eps_P", _eps, [1 / period for period in periods])
+    for at in (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4):
+        found.append(
+            Feature(f"exp(-((eps_P - {at:g})/0.03)^2)", lambda c, at=at: jnp.exp(-(((_eps(c) - at) / 0.03) ** 2)))
+        )
+        found.append(
+            Feature(
+                f"tanh((eps_P - {at:g})/0.02)",
+                lambda c, at=at: jnp.tanh((_eps(c) - at) / 0.02) + jnp.tanh(at / 0.02),
+            )
+        )
     released = [Feature(f"(1 - u)^{p:g}", lambda c, p=p: (1 - _u(c)) ** p) for p in (1.0, 2.0, 4.0, 8.0)]
     released += [
         Feature("u (1 - u)", lambda c: _u(c) * (1 - _u(c))),
@@ -139,4 +225,56 @@ def words() -> tuple[Feature, ...]:
         Feature("[reload] u (1 - u)", lambda c: c.reloading * _u(c) * (1 - _u(c))),
         Feature("[reload] 1", lambda c: c.cycles),
     ]
-    return tuple(found)
+    # Of the instrument: the same number of micrometres for every particle.
+    for far in (0.02, 0.06):
+        found.append(
+            Feature(f"(1 - exp(-(1 - u)/{far:g})) h", lambda c, far=far: _um(c) * (1 - jnp.exp(-(1 - _u(c)) / far)))
+        )
+    for length in (3, 10, 30):
+        found.append(
+            Feature(f"exp(-r/{length:g} s) h", lambda c, length=length: _um(c) * jnp.exp(-_since_turn(c) / length))
+        )
+    for period in (5, 7, 10, 14, 20):  # a control loop that rings
+        for name, wave in (("sin", jnp.sin), ("cos", jnp.cos)):
+            found.append(
+                Feature(
+                    f"exp(-r/{period:g} s) {name}(2 pi r/{period:g} s) h",
+                    lambda c, period=period, wave=wave: _um(c) * _ringing(_since_turn(c) / period, wave),
+                )
+            )
+    return (*found, *waves())
+
+
+def _ringing(cycles: Values, wave: Callable[[Values], Values]) -> Values:
+    return jnp.exp(-cycles) * wave(2 * jnp.pi * cycles)
+
+
+@functools.cache
+def waves() -> tuple[Feature, ...]:
+    """Waves in time and in displacement, which come from the room and from the gauge, not from the particle.
+
+    Frequencies are as far apart as a test of ten minutes, or of 100 um, tells them apart. They are a family of their
+    own in the test for a gap (`p_nothing_left`): as many as all other words, they would cost these their power.
+    """
+    return (
+        *_waves("t", _t, np.arange(1, 44) * 0.0015, " s", _um),
+        *_waves("gamma", _gamma, np.arange(2, 35) * 0.01, " um", _um),
+    )
+
+
+def _waves(
+    name: str,
+    of: Callable[[Context], Values],
+    frequencies: Sequence[float] | np.ndarray,
+    unit: str = "",
+    height: Callable[[Context], Values] | None = None,
+) -> list[Feature]:
+    found = []
+    for f in frequencies:
+        for text, cosine in (
+            (f"sin(2 pi {name}/{1 / f:.3g}{unit})", False),
+            (f"(cos(2 pi {name}/{1 / f:.3g}{unit}) - 1)", True),
+        ):
+            wave = Wave(of, float(f), cosine, height or _one)
+            found.append(Feature(text if height is None else f"{text} h", wave, wave=wave))
+    return found

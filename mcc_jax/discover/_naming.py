@@ -33,6 +33,7 @@ def name_missing(
     base: Base, system: System, view: Projection, ranking: Ranking, extensions: Extensions | None, seed: int, tell
 ):
     """Verdict, chosen candidates, their sets, rankings of each step, and the formula if nothing listed will do."""
+    evident = bool(ranking.log_evidence[0] > 0)  # or the gap is one that no name has anything to do with
     members = tuple(ranking.members(LIKE_THE_BEST))
     gain_of_words = pursue(system)[1]
     # Any member of the set may be the one beside which nothing is left; the most probable is asked first.
@@ -46,7 +47,7 @@ def name_missing(
             around = system if extensions is None else extensions.system_of((first,))
         left = p_nothing_left(around, seed, [first])
         most_left = max(most_left, left)
-        if gain_of_words <= gain + BETTER + SHARE * gain and left > LEVEL_OF_MORE:
+        if evident and gain_of_words <= gain + BETTER + SHARE * gain and left > LEVEL_OF_MORE:
             own = (name, *(m for m in members if m != name))
             return ("NAMED" if len(members) == 1 else "SET"), [first], [own], [ranking], None
     first = ranking.best[0]
@@ -68,7 +69,8 @@ def name_missing(
             return verdict, [i, j], sets, steps, None
     tell("a formula of its own")
     closure = find_closure(system, _span(base), seed, tell=tell)
-    unexplained = most_left <= LEVEL_OF_UNLISTED or gain_of_words > ranking.gain[0] * (1 + SHARE) + BETTER
+    far_better = gain_of_words > ranking.gain[0] * (1 + SHARE) + BETTER
+    unexplained = not evident or most_left <= LEVEL_OF_UNLISTED or far_better
     if closure is None or not unexplained:
         return ("NAMED" if len(members) == 1 else "SET"), [first], [members], [ranking], None
     return "UNLISTED", [], [], [], closure

@@ -30,6 +30,9 @@ STRONG = 3.5
 STRONG_BETWEEN = 3.0
 """The same for effects that differ between particles only: they are few."""
 
+STRONG_WAVE = 4.2
+"""The same for waves in time and displacement, which are many."""
+
 MOST = 5
 
 
@@ -39,6 +42,7 @@ def systematic(system: System) -> tuple[np.ndarray, np.ndarray]:
     between = np.flatnonzero([c.between_particles for c in system.candidates])  # candidates come first
     enough = np.full(len(columns), STRONG)
     enough[between] = STRONG_BETWEEN
+    enough[np.isin(columns, system.waves)] = STRONG_WAVE
     inside: list[int] = []
     for _ in range(MOST):
         found = project(system, columns, inside=np.array(inside, int))

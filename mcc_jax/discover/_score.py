@@ -150,8 +150,12 @@ def project(
     return Projection(columns, chosen, scores, information, residual, theta, covariance, survival)
 
 
+DRAWS = 4000
+"""Draws of the largest statistic."""
+
+
 def family_wise(
-    projection: Projection, sign: np.ndarray, seed: int, *, few: bool = False
+    projection: Projection, sign: np.ndarray, seed: int, *, few: bool = False, draws: int = DRAWS
 ) -> tuple[np.ndarray, np.ndarray]:
     r"""Family-wise probability of every column's statistic, and the statistics, one-sided where a sign is physical.
 
@@ -173,6 +177,7 @@ def family_wise(
         sign: +1, -1 or 0 for both, shape (K,).
         seed: of the draws.
         few: take the noise model's word, because there are too few particles to scatter.
+        draws: how many; no probability below one over them can be told.
     """
     scores, each = projection.scores, np.einsum("nkk->nk", projection.information)
     total = np.maximum(projection.total, 1e-300)
@@ -186,16 +191,14 @@ def family_wise(
     values, vectors = projection.spectrum
     kept = values > 1e-8 * values[-1]
     factor = vectors[:, kept] * np.sqrt(values[kept])
-    drawn = rng.standard_normal((DRAWS, int(kept.sum()))) @ factor.T
+    drawn = rng.standard_normal((draws, int(kept.sum()))) @ factor.T
     # Wilson and Hilferty's cube for chi2 over its degrees of freedom.
     ninth = 2 / (9 * (freedom + own))
-    chi = np.maximum(1 - ninth + rng.standard_normal((DRAWS, 1)) * np.sqrt(ninth), 0.1) ** 1.5
+    chi = np.maximum(1 - ninth + rng.standard_normal((draws, 1)) * np.sqrt(ninth), 0.1) ** 1.5
     largest = np.sort(_sided(drawn / chi, sign).max(1))
-    exceed = DRAWS - np.searchsorted(largest, observed - 1e-12)
-    return (exceed + 1) / (DRAWS + 1), observed
+    exceed = draws - np.searchsorted(largest, observed - 1e-12)
+    return (exceed + 1) / (draws + 1), observed
 
-
-DRAWS = 4000
 
 MOST_FREEDOM = 100.0
 """Degrees of freedom beyond which the noise model's word is not taken."""

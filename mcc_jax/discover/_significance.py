@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from ._score import family_wise, project
+from ._score import DRAWS, family_wise, project
 from ._system import System
 
 FREEDOM = 0.3
 """How far nature's formula may differ from the best one of its family: by so much of it in every other one."""
+
+SHARE_OF_WAVES = 0.125
+"""Share of the level that waves in time and displacement have: they are many, and come from room and gauge only."""
 
 FEWEST = 4
 """Below so many particles their scatter says nothing; the noise model has to do."""
@@ -26,7 +29,13 @@ def p_nothing_left(system: System, seed: int, chosen: list[int]) -> float:
     if not keep.any():
         return 1.0
     few = len(view.particles) < FEWEST
-    return float(family_wise(view.only(keep), sign[keep], seed, few=few)[0].min())
+    wave = np.isin(columns, system.waves)
+    found = 1.0
+    for share, members in ((1 - SHARE_OF_WAVES, keep & ~wave), (SHARE_OF_WAVES, keep & wave)):
+        if members.any():
+            p = family_wise(view.only(members), sign[members], seed, few=few, draws=round(DRAWS / share))[0].min()
+            found = min(found, float(p) / share)
+    return found
 
 
 def _family(system: System, chosen: list[int]) -> tuple[np.ndarray, np.ndarray]:

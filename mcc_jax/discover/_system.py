@@ -41,7 +41,7 @@ from ..effects import LIBRARY, Context, ExtendedLaw, Mechanism, Record, record_b
 from ..geometry import Particle
 from ..law import Unloading
 from ._candidates import Candidate, candidates_of
-from ._features import Feature, map_features, words
+from ._features import Feature, map_features, values_of, waves, words
 
 GLOBALS = ("a", "log modulus", "mu C1", "mu C3", "mu C5")
 
@@ -106,6 +106,12 @@ class System:
     def signs(self) -> np.ndarray:
         """The sign that each candidate's amplitude must have; 0 where both are possible."""
         return np.array([c.variant.sign for c in self.candidates])
+
+    @property
+    def waves(self) -> np.ndarray:
+        """Columns of the words that are waves in time or displacement."""
+        names = {word.text for word in waves()}
+        return np.array([c for c, w in zip(self.word_columns, self.words, strict=True) if w.text in names], int)
 
     def looked_at(self) -> tuple[np.ndarray, np.ndarray]:
         """Columns of candidates, map and words, and the sign that each one's coefficient must have."""
@@ -351,9 +357,7 @@ def _features(
 ) -> Float[Array, "particles f points"]:
     def one(w, particle, record):
         context: Context = ExtendedLaw(law_of(w, unloading), ()).context(particle, record)
-        columns = [jnp.broadcast_to(f.value(context), context.force.shape) for f in features]
-        empty = jnp.zeros((0, *context.force.shape))
-        return particle.effective_diameter * jnp.stack(columns) if columns else empty
+        return particle.effective_diameter * values_of(features, context)
 
     return eqx.filter_vmap(one)(latent, particles, records)
 

@@ -268,7 +268,7 @@ def test_what_the_base_law_can_take_up_has_no_strength():
 
 @pytest.mark.parametrize("name", effects.MECHANISMS)
 def test_lambda_is_hit(name):
-    case = tiers.Case(f"hit-{name}", "T1", name, "P1", effects=((name, "exact", 8.0),), humidity=True)
+    case = tiers.Case(f"hit-{name}", "T1", name, "P1", count=10, effects=((name, "exact", 8.0),), humidity=True)
     if name == "size_effect":
         case = tiers.Case(f"hit-{name}", "T1", name, "P1", count=60, resample=True, effects=((name, "exact", 3.0),))
     built = campaigns.build(case, 11)

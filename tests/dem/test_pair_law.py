@@ -47,7 +47,7 @@ def driven(force, overlaps):
     return force(jnp.asarray(np.maximum(before, 0.0)), jnp.asarray(overlaps))
 
 
-PAIRS, SPLITS, WALLS = jax.vmap(pair_force), jax.vmap(pair_split), jax.vmap(wall_force)
+PAIRS, SPLITS, WALLS = (jax.jit(jax.vmap(f)) for f in (pair_force, pair_split, wall_force))
 ON_PATH = jax.jit(jax.vmap(pair_force, (None, None, 0, 0)))
 WALL_PATH = jax.jit(jax.vmap(wall_force, (None, 0, 0)))
 
@@ -185,19 +185,30 @@ def summed(vector):
     return pair_force(i, j, vector[8], vector[9])
 
 
-def vector_of(peak, overlap):
+SUMMED = jax.jit(summed)
+JACOBIANS = jax.jit(lambda at: (jax.jacfwd(summed)(at), jax.jacrev(summed)(at)))
+VALUE_AND_GRADIENT = jax.jit(jax.value_and_grad(summed))
+
+
+@functools.cache
+def two_sides():
+    """The numbers of two unlike sides."""
     i = half_contact(law_of(), PARTICLE)
     j = half_contact(law_of(C1=11.0, C3=3.0, C5=2.6, modulus=12000.0), Particle(60.0, 62.0, 50.0))
-    return jnp.asarray([i.k1, i.k3, i.k5, i.c, j.k1, j.k3, j.k5, j.c, peak * UM, overlap * UM])
+    return [float(k) for k in (i.k1, i.k3, i.k5, i.c, j.k1, j.k3, j.k5, j.c)]
+
+
+def vector_of(peak, overlap):
+    return jnp.asarray([*two_sides(), peak * UM, overlap * UM])
 
 
 @pytest.mark.parametrize(("peak", "overlap"), [(0.0, 8.0), (0.0, 25.0), (25.0, 24.9), (25.0, 24.0), (30.0, 29.5)])
 def test_derivatives_equal_differences(peak, overlap):
     """T7: every parameter, on loading and unloading, both modes."""
     at = vector_of(peak, overlap)
-    value = summed(at)
+    value = SUMMED(at)
     assert value > 0
-    forward, reverse = jax.jacfwd(summed)(at), jax.jacrev(summed)(at)
+    forward, reverse = JACOBIANS(at)
     np.testing.assert_allclose(forward, reverse, rtol=1e-12)
     for k in range(at.shape[0]):
         step = 1e-5 * at[k] if at[k] else 0.0
@@ -205,8 +216,8 @@ def test_derivatives_equal_differences(peak, overlap):
             assert forward[k] == 0
             continue
         difference = (
-            8 * (summed(at.at[k].add(step)) - summed(at.at[k].add(-step)))
-            - (summed(at.at[k].add(2 * step)) - summed(at.at[k].add(-2 * step)))
+            8 * (SUMMED(at.at[k].add(step)) - SUMMED(at.at[k].add(-step)))
+            - (SUMMED(at.at[k].add(2 * step)) - SUMMED(at.at[k].add(-2 * step)))
         ) / (12 * step)
         assert abs(forward[k] - difference) * at[k] <= 1e-6 * value, k
 
@@ -219,9 +230,6 @@ def test_finite_everywhere(peak, share):
     assert np.isfinite(value)
     assert value >= 0
     assert np.all(np.isfinite(gradient))
-
-
-VALUE_AND_GRADIENT = jax.jit(jax.value_and_grad(summed))
 
 
 @pytest.mark.parametrize("unloading", list(Unloading))
@@ -258,7 +266,7 @@ def test_compiled_split_converges(spread_of_sizes):
     sides = jax.vmap(lambda R: half_contact(MccLaw(plastic, 1.43, 16000.0), Particle(2 * R, 2 * R, 2 * R)))(radii)
     i, j = (jax.tree.map(lambda x, k=k: jnp.ravel(jnp.meshgrid(x, x)[k]), sides) for k in (0, 1))
     for share in (1e-6, 0.3, 1.0, 1.6):
-        d_i, d_j = jax.jit(SPLITS)(i, j, share * (i.tested + j.tested))
+        d_i, d_j = SPLITS(i, j, share * (i.tested + j.tested))
         zero = jnp.zeros_like(d_i)
         np.testing.assert_allclose(WALLS(i, zero, d_i), WALLS(j, zero, d_j), rtol=2e-14)
 

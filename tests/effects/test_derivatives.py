@@ -134,7 +134,7 @@ def test_single_precision():
     law, particle, record = (single(t) for t in (LAW, PARTICLE, RECORD))
     base = law.path_load(particle, law.init(particle), record.force)[1]
     for variant in SOME:
-        run = functools.partial(respond, variant, law=law, particle=particle, record=record)
+        run = jax.jit(functools.partial(respond, variant, law=law, particle=particle, record=record))
         null, typical = run(jnp.float32(0)), run(jnp.float32(variant.typical))
         assert null.dtype == typical.dtype == jnp.float32
         np.testing.assert_array_equal(null, base)

@@ -222,8 +222,8 @@ def test_slopes_on_the_two_sides_of_the_peak(form, mode):
     law, p = paper_law(form), paper_particle(12)
     peak = p.displacement(jnp.array(0.4))
     state, top = History(peak), law.step(p, History(peak), peak)[1]
-    slope = mode(lambda d: law.step(p, state, d)[1])
-    compliance = mode(lambda f: law.step_load(p, state, f)[1])
+    slope = jax.jit(mode(lambda d: law.step(p, state, d)[1]))
+    compliance = jax.jit(mode(lambda f: law.step_load(p, state, f)[1]))
     onset = 4 / np.pi * top / p.displacement(law.recoverable_strain(p, p.strain(peak)))
     loading = jax.grad(lambda d: p.force(law.loading_stress(p, p.strain(d))))(peak)
     close(slope(jnp.nextafter(peak, 0.0)), onset, rel=1e-12)
