@@ -67,11 +67,10 @@ def check_folder(path: Path) -> None:
         if not path.exists():
             raise InputError("there is no such folder", file=path, remedy=f"Check the path; {expected}")
         if not path.is_dir():
-            raise InputError(
-                "is a file, not a campaign folder",
-                file=path,
-                remedy=f"{expected.capitalize()}; mcc-jax convert makes one of a tester's file",
-            )
+            remedy = f"{expected.capitalize()}; mcc-jax convert makes one of a tester's file"
+            if all((path.parent / name).exists() for name in (PARTICLES, CURVES)):
+                remedy = f"Did you mean the folder it lies in, {path.parent}?"
+            raise InputError("is a file, not a campaign folder", file=path, remedy=remedy)
         there = sorted(entry.name for entry in path.iterdir())
     except OSError as error:
         raise InputError(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +17,18 @@ WORTH = 14.0
 """Least drop of chi2 for which another word is taken: about log of the number of words, twice, and one parameter."""
 
 RESAMPLES = 40
+
+LETTERS = {
+    "q": "peak stress/10 MPa",
+    "s": "stress/10 MPa",
+    "u": "F/F_peak",
+    "eps_P": "peak strain",
+    "gamma": "displacement",
+    "t": "time",
+    "r": "time since the latest reversal",
+    "h": "200 um/D_e",
+}
+"""What stands for what in a formula."""
 
 
 @dataclass(frozen=True)
@@ -106,11 +119,17 @@ def find_closure(
     resembles = tuple(sorted(((n, v) for n, v in best.items() if v > 0.3), key=lambda pair: -pair[1])[:5])
     first = system.word_columns[0]
     terms = [f"{c:+.3g} {system.words[w - first].text}" for c, w in zip(coefficients, chosen, strict=True)]
-    formula = (
-        "added displacement / D_e = " + " ".join(terms) + "; q = peak stress/10 MPa, s = stress/10 MPa, u = F/F_peak, "
-        "eps_P = peak strain, gamma = displacement, t = time, r = time since the latest reversal, h = 200 um/D_e"
-    )
+    formula = "added displacement / D_e = " + " ".join(terms)
+    letters = ", ".join(meanings([system.words[w - first].text for w in chosen]))
+    formula = f"{formula}; {letters}" if letters else formula
     return Closure(np.array(chosen), coefficients, sd, formula, gain, frequency, resembles, span)
+
+
+def meanings(texts: Sequence[str]) -> list[str]:
+    """What the letters in the words of a formula stand for."""
+    # The s of "41 s" is no stress.
+    used = [letter for letter in LETTERS if any(re.search(rf"(?<!\d )\b{letter}\b", text) for text in texts)]
+    return [f"{letter} = {LETTERS[letter]}" for letter in used]
 
 
 def _frequency(system: System, chosen: list[int], alike: np.ndarray, position: dict[int, int], seed: int) -> float:

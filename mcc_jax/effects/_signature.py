@@ -69,6 +69,8 @@ def signatures(
         shift = -x * (K1 * f1 - square * (K3 * f3 - square * (K5 * f5))) / slope
         return law, shift, stiffness, added
 
+    if not effects:
+        return jnp.zeros((0, *record.force.shape), record.force.dtype)
     groups: dict[object, list[int]] = {}
     for i, effect in enumerate(effects):
         groups.setdefault((type(effect), jax.tree.structure(effect)), []).append(i)

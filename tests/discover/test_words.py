@@ -1,5 +1,6 @@
 """Words of formulas: their values, waves all at once, and artefacts of room and gauge that no mechanism explains."""
 
+import json
 import re
 
 import equinox as eqx
@@ -11,9 +12,12 @@ from helpers import paper_law, paper_particle
 
 from mcc_jax.campaign import Campaign, Curve
 from mcc_jax.discover import discover
+from mcc_jax.discover._closure import meanings
 from mcc_jax.discover._features import _since_turn, map_features, values_of, waves, words
 from mcc_jax.discover._system import GLOBALS, System
-from mcc_jax.effects import ExtendedLaw, clean_record
+from mcc_jax.effects import ExtendedLaw, clean_record, signatures
+from mcc_jax.plots import discovery_figures, save_figures
+from mcc_jax.plots._leftover import leftover
 
 TIME = jnp.linspace(0.0, 260.0, 131)
 FORCE = jnp.interp(TIME, jnp.asarray([0.0, 80, 110, 160, 230, 260]), jnp.asarray([0.0, 160, 160, 40, 180, 90]))
@@ -75,6 +79,11 @@ def test_time_since_the_latest_reversal():
     assert (np.diff(since) < 0).sum() == 3
 
 
+def test_no_effects_have_no_signatures():
+    rows = signatures(paper_law(), paper_particle(2), clean_record(FORCE, TIME), ())
+    assert rows.shape == (0, FORCE.size)
+
+
 def test_columns_of_waves_are_theirs():
     some = (*words()[:3], *waves()[:2])
     none = np.zeros(0)
@@ -93,14 +102,46 @@ def disturbed(added):
 @pytest.mark.parametrize(
     ("added", "pattern", "period"),
     [
-        (lambda c: 0.08 * np.sin(2 * np.pi * c.time_s / 41.0), r"pi t/([\d.]+) s", 41.0),
+        pytest.param(
+            lambda c: 0.08 * np.sin(2 * np.pi * c.time_s / 41.0), r"pi t/([\d.]+) s", 41.0, marks=pytest.mark.long
+        ),
         (lambda c: 0.08 * np.cos(2 * np.pi * c.displacement_um / 7.9), r"pi gamma/([\d.]+) um", 7.9),
     ],
     ids=["air conditioning", "interpolation of the gauge"],
 )
-def test_a_wave_of_the_instrument_is_a_formula_with_its_period(added, pattern, period):
-    found = discover(disturbed(added), confirm=False, experiments=False, posterior=False)
+def test_a_wave_of_the_instrument_is_a_formula_with_its_period(added, pattern, period, tmp_path):
+    found = discover(disturbed(added), experiments=False)
     assert found.verdict == "UNLISTED", found.summary
     seen = [float(p) for p in re.findall(pattern, found.closure.formula)]
     assert seen, found.closure.formula
     assert min(abs(p / period - 1) for p in seen) < 0.06
+    # No name, no effect: what is written, drawn and told is about the formula.
+    told = json.loads(json.dumps(found.to_json(), allow_nan=False))
+    assert told["effects"] == told["candidate_set"] == []
+    assert told["closure"]["formula"] in told["summary"]
+    assert [step["added"] for step in told["gap"]["steps"]] == [None, "formula"]
+    assert told["gap"]["closed_fraction"] > 0.8
+    left = leftover(found)
+    assert np.sum(left.white_after**2) < 0.9 * np.sum(left.white_before**2)
+    files = save_figures(discovery_figures(found), tmp_path, dpi=80)
+    assert {file.stem for file in files} >= {"discovery_before_after", "discovery_gap", "discovery_where"}
+
+
+def test_a_formula_says_what_its_letters_mean_and_no_others():
+    """The s of seconds is no stress."""
+    for texts, letters in (
+        (["q^1", "s^0.5"], ["q", "s"]),
+        (["(cos(2 pi t/41.7 s) - 1) h"], ["t", "h"]),
+        (["exp(-r/3 s) h", "sin(2 pi gamma/7.69 um) h"], ["gamma", "r", "h"]),
+        (["tanh((eps_P - 0.2)/0.02)", "max(0.5 - u, 0)"], ["u", "eps_P"]),
+        (["[reload] 1"], []),
+    ):
+        assert [meaning.split(" = ")[0] for meaning in meanings(texts)] == letters
+
+
+def test_every_letter_of_every_word_is_explained():
+    functions = {"exp", "max", "tanh", "sin", "cos", "pi", "ln", "reload", "s", "um"}
+    for word in words():
+        told = {meaning.split(" = ")[0] for meaning in meanings([word.text])}
+        letters = set(re.findall(r"[A-Za-z]\w*", word.text)) - functions
+        assert letters - {"D_e"} <= told, word.text
