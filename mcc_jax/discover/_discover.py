@@ -19,7 +19,7 @@ from ._confirm import held_out
 from ._estimates import detection_limits, estimated_effects, population_parameters, with_draws
 from ._experiments import next_experiments
 from ._extensions import Extensions, serious
-from ._naming import chooser, name_missing
+from ._naming import chooser, name_missing, span_of
 from ._posterior import extended_posterior
 from ._punch import without_punch
 from ._refine import refined
@@ -179,7 +179,7 @@ def _judge(
             drops = {k: extensions.drop((k,)) for k in serious(system, ranking)}
             ranking = rank(system, view, refitted=drops)
         verdict, chosen, sets, steps, closure = name_missing(
-            base, system, view, ranking, extensions if large else None, seed, tell
+            system, view, ranking, extensions if large else None, span_of(base), seed, tell
         )
         if large and chosen and not any(step.at_random[0] for step in steps):
             last = extensions.fit(tuple(chosen))

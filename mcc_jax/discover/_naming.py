@@ -30,9 +30,25 @@ LIKE_THE_BEST = 0.1
 
 
 def name_missing(
-    base: Base, system: System, view: Projection, ranking: Ranking, extensions: Extensions | None, seed: int, tell
+    system: System,
+    view: Projection,
+    ranking: Ranking,
+    extensions: Extensions | None,
+    span: dict[str, tuple[float, float]],
+    seed: int,
+    tell,
 ):
-    """Verdict, chosen candidates, their sets, rankings of each step, and the formula if nothing listed will do."""
+    """Verdict, chosen candidates, their sets, rankings of each step, and the formula if nothing listed will do.
+
+    Args:
+        system: the linear system of the campaign.
+        view: the candidates in it.
+        ranking: theirs.
+        extensions: fits of the extended law; None where first order does.
+        span: range of the variables over which a formula would be found (`span_of`).
+        seed: of the bootstrap.
+        tell: called with the name of each step.
+    """
     evident = bool(ranking.log_evidence[0] > 0)  # or the gap is one that no name has anything to do with
     members = tuple(ranking.members(LIKE_THE_BEST))
     gain_of_words = pursue(system)[1]
@@ -68,7 +84,7 @@ def name_missing(
             verdict: Verdict = "NAMED" if all(len(s) == 1 for s in sets) else "SET"
             return verdict, [i, j], sets, steps, None
     tell("a formula of its own")
-    closure = find_closure(system, _span(base), seed, tell=tell)
+    closure = find_closure(system, span, seed, tell=tell)
     far_better = gain_of_words > ranking.gain[0] * (1 + SHARE) + BETTER
     unexplained = not evident or most_left <= LEVEL_OF_UNLISTED or far_better
     if closure is None or not unexplained:
@@ -105,7 +121,8 @@ def chooser(system: System, count: int, formula: bool) -> Callable[[np.ndarray],
     return choose
 
 
-def _span(base: Base) -> dict[str, tuple[float, float]]:
+def span_of(base: Base) -> dict[str, tuple[float, float]]:
+    """Range of stress, size and time in the tests that took part."""
     tests = base.tests
     force = np.where(np.asarray(tests.mask), np.asarray(tests.force), np.nan)
     diameter = np.asarray(tests.effective_diameter)

@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from linear_systems import FORMULAS, planted, random_campaign
+from linear_systems import FORMULAS, Dense, planted, random_campaign, system_of
 
 from mcc_jax.discover._candidates import candidates_of, located
+from mcc_jax.discover._naming import name_missing
 from mcc_jax.discover._refine import systematic, unbounded
 from mcc_jax.discover._score import project
 from mcc_jax.discover._search import pairs, random_probability, rank
@@ -108,3 +109,19 @@ def test_a_regression_over_particles_is_worth_what_its_correlation_is():
 def test_effects_between_particles_are_those_of_size_shape_and_humidity():
     between = {c.mechanism for c in candidates_of(LIBRARY) if c.between_particles}
     assert between == {"size_effect", "shape_second_order", "humidity"}
+
+
+def test_a_gap_with_which_no_name_has_anything_to_do_is_no_set_of_names():
+    """A word explains it, weakly; the names all explain less than chance does."""
+    system, dense = random_campaign(12, particles=20, points=60, own=4, words_used=12)
+    word = int(system.word_columns[3])
+    X = dense.columns.copy()
+    X[:, :, 0] -= 3.5 / np.sqrt(project(system, np.array([word])).total[0]) * X[:, :, word]
+    system = system_of(Dense(dense.own, X, dense.prior), system.candidates, system.places, system.words)
+    view = project(system, system.candidate_columns)
+    ranking = rank(system, view)
+    assert ranking.log_evidence[0] <= 0
+    verdict, chosen, sets, _, closure = name_missing(system, view, ranking, None, {}, 0, lambda _: None)
+    assert (verdict, chosen, sets) == ("UNLISTED", [], [])
+    assert word in closure.words
+    assert closure.gain < 50
