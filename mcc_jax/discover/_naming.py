@@ -78,7 +78,8 @@ def name_missing(
         if extensions is not None:
             with_both, gain = extensions.system_of((i, j)), max(gain, extensions.drop((i, j)))
         p_both = p_nothing_left(with_both, seed, [i, j])
-        if p_both > LEVEL_OF_MORE and gain >= gain_of_words - BETTER:
+        enough = evident or gain > BETTER  # of so many pairs one takes away half of that by chance
+        if enough and p_both > LEVEL_OF_MORE and gain >= gain_of_words - BETTER:
             steps = [_beside(system, other) for other in (j, i)]  # each is judged with the other one in the law
             sets = [_with(name, step) for name, step in zip(both, steps, strict=True)]
             verdict: Verdict = "NAMED" if all(len(s) == 1 for s in sets) else "SET"
