@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ._score import project
+from ._score import project, project_summed
 from ._system import System
 
 MOST_WORDS = 3
@@ -71,19 +71,17 @@ def pursue(system: System, *, particles: np.ndarray | None = None, most: int = M
     Returns:
         Columns, and the drop of chi2 by all of them.
     """
-    columns = system.word_columns
-    start = project(system, columns, particles=particles)
-    base = start.residual.sum()
+    columns, total = system.word_columns, system.total(particles)
     inside: list[int] = []
-    gain = 0.0
+    found = project_summed(total, system, columns, np.array(inside, int), 1e-4)
+    base, gain = found.residual, 0.0
     for _ in range(most):
-        found = project(system, columns, inside=np.array(inside, int), particles=particles)
-        drop = np.where(found.survival > 1e-4, found.gaussian**2, 0.0)
-        best = int(np.argmax(drop))
-        if drop[best] < WORTH:
+        best = int(np.argmax(found.drop))
+        if found.drop[best] < WORTH:
             break
         inside.append(int(columns[best]))
-        gain = base - project(system, columns[:0], inside=np.array(inside, int), particles=particles).residual.sum()
+        found = project_summed(total, system, columns, np.array(inside, int), 1e-4)
+        gain = base - found.residual
     return inside, float(gain)
 
 

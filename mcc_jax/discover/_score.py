@@ -129,25 +129,71 @@ def project(
     chosen = np.flatnonzero(system.usable) if particles is None else np.asarray(particles)
     extra = np.array([], int) if inside is None else np.asarray(inside, int)
     nuisance = np.concatenate([system.globals, extra])
-    gram = system.gram[chosen]
-    total = gram.sum(0)
-    prior = np.concatenate([system.prior, np.full(len(extra), 1e-12) if precision is None else precision])
-    inner = total[np.ix_(nuisance, nuisance)] + np.diag(prior)
-    covariance = np.linalg.pinv(inner, rcond=1e-13, hermitian=True)
-    theta = -covariance @ total[nuisance, 0]
-    shift = -covariance @ total[np.ix_(nuisance, columns)]
-    some, at = gram[:, nuisance], gram[:, columns]
+    # Only what is needed: the whole of it is a hundred megabytes, and folds ask for it again and again.
+    gram = system.gram
+    among = gram[np.ix_(chosen, nuisance, nuisance)]
+    own, alone = gram[np.ix_(chosen, nuisance, RESIDUAL)][:, :, 0], gram[chosen, 0, 0]
+    at, own_at = gram[np.ix_(chosen, columns, nuisance)], gram[np.ix_(chosen, columns, RESIDUAL)][:, :, 0]
+    theta, covariance, shift = _absorbed(system, among.sum(0), own.sum(0), at.sum(0).T, precision)
     # residual + sum theta * column; a projected column + sum shift * column
-    among = some[:, :, nuisance]
-    left = at[:, :, 0] + at[:, :, nuisance] @ theta
-    under = some[:, :, 0] + among @ theta
+    left = own_at + at @ theta
+    under = own + among @ theta
     scores = -(left + under @ shift)
-    cross = at[:, :, nuisance] @ shift
-    information = at[:, :, columns] + cross + np.swapaxes(cross, 1, 2) + shift.T @ (among @ shift)
-    residual = gram[:, 0, 0] + 2 * some[:, :, 0] @ theta + (among @ theta) @ theta
-    raw = np.maximum(np.diagonal(total)[columns], 1e-300)
+    cross = at @ shift
+    information = gram[np.ix_(chosen, columns, columns)]
+    raw = np.maximum(np.einsum("nkk->k", information), 1e-300)
+    information += cross + np.swapaxes(cross, 1, 2) + shift.T @ (among @ shift)
+    residual = alone + 2 * own @ theta + (among @ theta) @ theta
     survival = np.einsum("nkk->k", information) / raw
     return Projection(columns, chosen, scores, information, residual, theta, covariance, survival)
+
+
+RESIDUAL = np.array([0])
+"""Column of the residual."""
+
+
+def _absorbed(
+    system: System, inner: np.ndarray, own: np.ndarray, columns: np.ndarray, precision: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Coefficients of what is projected off the residual, their covariance, and those of some columns."""
+    extra = len(inner) - len(system.prior)
+    prior = np.concatenate([system.prior, np.full(extra, 1e-12) if precision is None else precision])
+    covariance = np.linalg.pinv(inner + np.diag(prior), rcond=1e-13, hermitian=True)
+    return -covariance @ own, covariance, -covariance @ columns
+
+
+@dataclass(frozen=True)
+class Summed:
+    """What all particles together say about some columns: the sums of a `Projection`, without their parts.
+
+    Attributes:
+        drop: of chi2 by each column alone; zero where the rest can make it.
+        residual: chi2 of all particles.
+    """
+
+    drop: np.ndarray
+    residual: float
+
+
+def project_summed(total: np.ndarray, system: System, columns: np.ndarray, inside: np.ndarray, least: float) -> Summed:
+    """The same as `project`, from the sum of the particles' Gram matrices (`System.total`).
+
+    Args:
+        total: the sum, shape (Q, Q).
+        system: the system.
+        columns: the columns looked at.
+        inside: columns of effects that are in the law already.
+        least: share of a column's information that must survive.
+    """
+    nuisance = np.concatenate([system.globals, inside]).astype(int)
+    inner, at = total[np.ix_(nuisance, nuisance)], total[np.ix_(nuisance, columns)]
+    theta, _, shift = _absorbed(system, inner, total[nuisance, 0], at, None)
+    scores = -(total[columns, 0] + at.T @ theta + (total[nuisance, 0] + inner @ theta) @ shift)
+    raw = np.maximum(np.diagonal(total)[columns], 1e-300)
+    information = raw + ((2 * at + inner @ shift) * shift).sum(0)
+    drop = np.where(information > least * raw, scores**2 / np.maximum(information, 1e-300), 0.0)
+    residual = total[0, 0] + 2 * total[nuisance, 0] @ theta + theta @ inner @ theta
+    return Summed(drop, float(residual))
 
 
 DRAWS = 4000

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, cast
 
 import equinox as eqx
@@ -101,6 +101,19 @@ class System:
     def word_columns(self) -> np.ndarray:
         """Columns of the words."""
         return 1 + len(GLOBALS) + len(self.candidates) + len(self.places) + np.arange(len(self.words))
+
+    @cached_property
+    def _usable_total(self) -> np.ndarray:
+        return self.gram[self.usable].sum(0)
+
+    def total(self, particles: np.ndarray | None = None) -> np.ndarray:
+        """Sum of the Gram matrices of some particles, or of all usable ones, shape (Q, Q)."""
+        if particles is None:
+            return self._usable_total
+        others = np.setdiff1d(np.flatnonzero(self.usable), particles)
+        if len(others) < len(particles) and self.usable[particles].all():
+            return self._usable_total - self.gram[others].sum(0)
+        return self.gram[particles].sum(0)
 
     @property
     def signs(self) -> np.ndarray:

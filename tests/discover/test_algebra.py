@@ -12,7 +12,7 @@ from scipy.integrate import quad
 from scipy.stats import kstest, norm
 
 from mcc_jax.discover._confirm import held_out
-from mcc_jax.discover._score import Projection, common_scatter, family_wise, project
+from mcc_jax.discover._score import Projection, common_scatter, family_wise, project, project_summed
 from mcc_jax.discover._search import ODD, SCALES, log_evidence, log_evidence_at_random, pairs, rank
 
 seeds = st.integers(0, 10_000)
@@ -400,3 +400,19 @@ def test_the_fold_that_leaves_a_particle_out_does_not_see_it():
 
     held_out(system, choose)
     assert sorted(s for s in seen if len(s) == 5) == sorted(itertools.combinations(range(6), 5))
+
+
+@pytest.mark.parametrize("left_out", [None, [0], [2, 5, 6], [0, 1, 2, 3, 4]])
+@pytest.mark.parametrize("count", [0, 2])
+def test_the_sum_over_particles_needs_no_particle(left_out, count):
+    """What `project_summed` says from the sum of Gram matrices is what `project` says of the particles."""
+    system, _ = random_campaign(5)
+    inside = system.candidate_columns[:count]
+    particles = None if left_out is None else np.setdiff1d(np.arange(7), left_out)
+    whole = project(system, system.word_columns, inside=inside, particles=particles)
+    found = project_summed(system.total(particles), system, system.word_columns, inside, 1e-4)
+    np.testing.assert_allclose(found.drop, whole.gaussian**2, rtol=1e-9)
+    np.testing.assert_allclose(found.residual, whole.residual.sum(), rtol=1e-10)
+    # A column that is inside already takes away nothing.
+    again = project_summed(system.total(particles), system, inside, inside, 1e-4)
+    np.testing.assert_array_equal(again.drop, np.zeros(count))
