@@ -73,16 +73,15 @@ def pursue(system: System, *, particles: np.ndarray | None = None, most: int = M
     """
     columns, total = system.word_columns, system.total(particles)
     inside: list[int] = []
-    found = project_summed(total, system, columns, np.array(inside, int), 1e-4)
-    base, gain = found.residual, 0.0
-    for _ in range(most):
-        best = int(np.argmax(found.drop))
-        if found.drop[best] < WORTH:
-            break
-        inside.append(int(columns[best]))
+    base = float("nan")
+    while True:
         found = project_summed(total, system, columns, np.array(inside, int), 1e-4)
-        gain = base - found.residual
-    return inside, float(gain)
+        if not inside:
+            base = found.residual
+        best = int(np.argmax(found.drop))
+        if len(inside) == most or found.drop[best] < WORTH:
+            return inside, base - found.residual
+        inside.append(int(columns[best]))
 
 
 def find_closure(

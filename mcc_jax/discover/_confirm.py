@@ -55,7 +55,7 @@ def held_out(system: System, choose: Choose, extended: Mapping[frozenset[int], S
     basis, directions = basis[whole.alive], whole.only(whole.alive).directions()
     nuisance = system.globals
     # The basis with the population projected off, as in the whole campaign.
-    shift = _shift(system, basis, usable)
+    shift = _shift(system, basis)
     steps = len(chosen)
     chi2, elpd = np.zeros((steps, len(usable))), np.zeros((steps, len(usable)))
     pattern = np.zeros((steps, len(usable), directions.shape[1]))
@@ -79,7 +79,7 @@ def held_out(system: System, choose: Choose, extended: Mapping[frozenset[int], S
     return HeldOut(chi2, system.points[usable].astype(float), total, elpd)
 
 
-def _shift(system: System, basis: np.ndarray, usable: np.ndarray) -> np.ndarray:
-    total = system.gram[usable].sum(0)
+def _shift(system: System, basis: np.ndarray) -> np.ndarray:
+    total = system.total()
     inner = total[np.ix_(system.globals, system.globals)] + np.diag(system.prior)
     return -np.linalg.solve(inner, total[np.ix_(system.globals, basis)])

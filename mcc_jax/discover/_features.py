@@ -41,14 +41,12 @@ class Feature:
         value: its values, strain [-] per unit of coefficient.
         kind: for the map, the kind of segment; empty for words.
         share: for the map, the range of the load share that it covers.
-        wave: if the function is a wave, which.
     """
 
     text: str
     value: Callable[[Context], Values]
     kind: str = ""
     share: tuple[float, float] = (0.0, 1.0)
-    wave: Wave | None = None
 
 
 @dataclass(frozen=True)
@@ -80,20 +78,20 @@ def values_of(features: Sequence[Feature], context: Context) -> Values:
     """Values of features over the points of a test, shape (features, points); all waves in one operation, since each
     operation takes time to compile."""
     rows: dict[int, Values] = {}
-    waves: dict[tuple[Callable[[Context], Values], ...], list[int]] = {}
+    waves: dict[tuple[Callable[[Context], Values], ...], list[tuple[int, Wave]]] = {}
     for i, feature in enumerate(features):
-        if feature.wave is None:
-            rows[i] = jnp.broadcast_to(feature.value(context), context.force.shape)
+        wave = feature.value
+        if isinstance(wave, Wave):
+            waves.setdefault((wave.of, wave.height), []).append((i, wave))
         else:
-            waves.setdefault((feature.wave.of, feature.wave.height), []).append(i)
+            rows[i] = jnp.broadcast_to(feature.value(context), context.force.shape)
     order, parts = list(rows), [jnp.stack(list(rows.values()))] if rows else []
     for (of, height), members in waves.items():
         x = jnp.broadcast_to(of(context), context.force.shape)
-        some = [wave for i in members if (wave := features[i].wave) is not None]
-        k = jnp.asarray([2 * np.pi * wave.frequency for wave in some], x.dtype)
-        cosine = jnp.asarray([wave.cosine for wave in some])
+        k = jnp.asarray([2 * np.pi * wave.frequency for _, wave in members], x.dtype)
+        cosine = jnp.asarray([wave.cosine for _, wave in members])
         parts.append(height(context) * _wave(k[:, None] * x[None], cosine[:, None]))
-        order += members
+        order += [i for i, _ in members]
     if not parts:
         return jnp.zeros((0, *context.force.shape), context.force.dtype)
     return jnp.concatenate(parts)[np.argsort(order)]
@@ -276,5 +274,5 @@ def _waves(
             (f"(cos(2 pi {name}/{1 / f:.3g}{unit}) - 1)", True),
         ):
             wave = Wave(of, float(f), cosine, height or _one)
-            found.append(Feature(text if height is None else f"{text} h", wave, wave=wave))
+            found.append(Feature(text if height is None else f"{text} h", wave))
     return found

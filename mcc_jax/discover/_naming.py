@@ -54,7 +54,7 @@ def name_missing(
     gain_of_words = pursue(system)[1]
     # Any member of the set may be the one beside which nothing is left; the most probable is asked first.
     most_left = 0.0
-    for name in members:
+    for name in members if evident else ():
         position = ranking.names.index(name)
         first, gain = ranking.best[position], float(ranking.gain[position])
         if ranking.at_random[position]:
@@ -63,7 +63,7 @@ def name_missing(
             around = system if extensions is None else extensions.system_of((first,))
         left = p_nothing_left(around, seed, [first])
         most_left = max(most_left, left)
-        if evident and gain_of_words <= gain + BETTER + SHARE * gain and left > LEVEL_OF_MORE:
+        if gain_of_words <= gain + BETTER + SHARE * gain and left > LEVEL_OF_MORE:
             own = (name, *(m for m in members if m != name))
             return ("NAMED" if len(members) == 1 else "SET"), [first], [own], [ranking], None
     first = ranking.best[0]

@@ -13,7 +13,7 @@ from helpers import paper_law, paper_particle
 from mcc_jax.campaign import Campaign, Curve
 from mcc_jax.discover import discover
 from mcc_jax.discover._closure import meanings
-from mcc_jax.discover._features import _since_turn, map_features, values_of, waves, words
+from mcc_jax.discover._features import Wave, _since_turn, map_features, values_of, waves, words
 from mcc_jax.discover._system import GLOBALS, System
 from mcc_jax.effects import ExtendedLaw, clean_record, signatures
 from mcc_jax.plots import discovery_figures, save_figures
@@ -37,8 +37,8 @@ def test_waves_computed_together_are_the_waves_one_by_one():
     """In any order, among words that are none."""
     whole = (*map_features(), *words())
     chosen = tuple(whole[i] for i in np.random.default_rng(0).permutation(len(whole))[:24])
-    assert any(f.wave for f in chosen)
-    assert not all(f.wave for f in chosen)
+    assert any(isinstance(f.value, Wave) for f in chosen)
+    assert not all(isinstance(f.value, Wave) for f in chosen)
     found = together(paper_particle(2), chosen)
     context = context_of(paper_particle(2))
     for values, feature in zip(found, chosen, strict=True):
