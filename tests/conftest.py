@@ -17,11 +17,12 @@ hypothesis.settings.load_profile("repository")
 
 
 def pytest_configure(config):
-    """What took long to compile is kept for later modules, notebooks and commands, until this run of pytest ends.
+    """What is compiled is kept for later modules, notebooks and commands, until this run of pytest ends.
 
     All workers share one folder, which the first process makes. JAX locks a folder that is limited in size; otherwise
     one process might read half of what another is writing.
     """
+    _keep_everything()
     if hasattr(config, "workerinput"):
         return  # set by what the environment says
     folder = tempfile.mkdtemp(prefix="compiled-")
@@ -29,11 +30,23 @@ def pytest_configure(config):
     settings = {
         "jax_compilation_cache_dir": folder,
         "jax_compilation_cache_max_size": 8 * 2**30,
-        "jax_persistent_cache_min_compile_time_secs": 0.1,
+        "jax_persistent_cache_min_compile_time_secs": 0.03,
     }
     for name, value in settings.items():
         jax.config.update(name, value)
         os.environ[name.upper()] = str(value)  # for workers and for processes that tests start
+
+
+def _keep_everything():
+    """With a limited size JAX reads the age of every file before it adds one: with thousands, longer than compiling.
+
+    What all tests compile is a hundredth of the limit.
+    """
+    try:
+        from jax._src.lru_cache import LRUCache
+    except ImportError:  # not public: another version of JAX keeps its own way, and the tests only take longer
+        return
+    LRUCache._evict_if_needed = lambda self, **_: None
 
 
 GROUPS = {
