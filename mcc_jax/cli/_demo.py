@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from ._output import results
-from ._session import say, say_table, session
+from ._session import beside, say, say_table, session
 from ._types import out_option, seed_option
 
 CAMPAIGN_FILES = ("particles.csv", "curves.csv", "campaign.toml")
@@ -32,23 +32,26 @@ def demo(out: Path, seed: int) -> None:
     with session(29) as tell:
         from ..calibrate import calibrate_bayes
         from ..campaign import write_campaign
-        from ..discover import discover
-        from ..report import read_results, report_page
         from ..simulate import paper_campaign
         from ._calibration import main_numbers, say_files, say_state, say_warnings, write_calibration
-        from ._discovery import DISCOVERY, main_finding, write_discovery
         from ._provenance import provenance
-        from ._report import REPORT
 
         with results(out) as stage:
             tell("simulating the campaign")
             campaign = paper_campaign(seed)
             write_campaign(campaign, stage.folder / "campaign")
             origin = provenance("demo", stage.folder / "campaign", {"seed": seed}, told="campaign")
-            calibration = calibrate_bayes(campaign, seed=seed, progress=tell)
-            content = write_calibration(calibration, stage, origin=origin, figures=True, tell=tell)
-            found = discover(campaign, experiments=False, seed=seed, progress=tell)
-            missing = write_discovery(found, stage, origin=origin, figures=True, tell=tell)
+            with beside(_import_the_rest):  # compilers leave a core to Python
+                calibration = calibrate_bayes(campaign, seed=seed, progress=tell)
+            from ..discover import discover
+            from ..report import read_results, report_page
+            from ._discovery import DISCOVERY, main_finding, write_discovery
+            from ._report import REPORT
+
+            # One core draws while the others compile.
+            with beside(lambda: discover(campaign, experiments=False, seed=seed, progress=tell)) as found:
+                content = write_calibration(calibration, stage, origin=origin, figures=True, tell=tell)
+            missing = write_discovery(found(), stage, origin=origin, figures=True, tell=tell)
             page = report_page(read_results(stage.folder, name=out.resolve().name), seed=seed, progress=tell)
             (stage.folder / REPORT).write_text(page, encoding="utf-8")
     points = sum(len(curve) for curve in campaign.curves)
@@ -87,6 +90,14 @@ def demo(out: Path, seed: int) -> None:
     ):
         say(f"  mcc-jax {command}", nl=False)
         say(f"   # {comment}", dim=True)
+
+
+def _import_the_rest() -> None:
+    """What the demo needs after calibrating, seconds to import: discovery, drawing, the page, the posterior's file."""
+    import arviz  # noqa: F401
+
+    from .. import plots, report  # noqa: F401
+    from . import _discovery, _report  # noqa: F401
 
 
 def _paper_values() -> list[str]:

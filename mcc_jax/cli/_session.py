@@ -6,7 +6,9 @@ import contextlib
 import logging
 import os
 import sys
+import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, wait
 from typing import Any
 
 import click
@@ -61,6 +63,32 @@ def _keep_compiled(config: Any) -> None:
         config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
         config.update("jax_persistent_cache_min_entry_size_bytes", 0)
         config.update("jax_compilation_cache_max_size", CACHE_BYTES)
+
+
+@contextlib.contextmanager
+def beside[R](work: Callable[[], R]) -> Iterator[Callable[[], R]]:
+    """Let work go on in a thread of its own while the block runs.
+
+    A block that fails waits for the thread, since an interpreter that ends under a compiler may crash. One that is
+    interrupted does not: nothing the work has is kept, and the process ends at once.
+
+    Yields:
+        A function that waits for the work and returns its result, or raises what it raised.
+    """
+    future: Future[R] = Future()
+
+    def run() -> None:
+        try:
+            future.set_result(work())
+        except BaseException as error:  # whatever it is, it is raised where the result is asked for
+            future.set_exception(error)
+
+    threading.Thread(target=run, daemon=True).start()
+    try:
+        yield future.result
+    except Exception:
+        wait([future])
+        raise
 
 
 @contextlib.contextmanager
