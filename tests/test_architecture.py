@@ -38,7 +38,10 @@ LAYERS = {
     "cli": 10,
 }
 # What importing the package must not load: slow, optional, or for the command line only.
-HEAVY = ("numpyro", "arviz", "pandas", "matplotlib", "pint", "rich", "click", "bokeh", "jinja2", "jsonschema")
+HEAVY = (
+    *("numpyro", "arviz", "pandas", "matplotlib", "scipy.optimize", "scipy.stats"),
+    *("pint", "rich", "click", "bokeh", "jinja2", "jsonschema"),
+)
 FILES = sorted(p for p in PACKAGE.rglob("*.py"))
 
 

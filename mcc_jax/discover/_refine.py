@@ -12,8 +12,6 @@ from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import norm
-from scipy.stats import t as student
 
 from ..calibrate.joint._blocks import Parts
 from ..calibrate.joint._data import longer
@@ -69,6 +67,9 @@ def unbounded(t: np.ndarray, count: int) -> np.ndarray:
     with R the correlation; t' follows Student's distribution with N - 2 degrees of freedom. Returned is the normal
     deviate as improbable as t'.
     """
+    from scipy.stats import norm
+    from scipy.stats import t as student
+
     if count < 4:
         return t
     R = np.minimum(np.abs(t) / np.sqrt(count), 1 - 1e-9)

@@ -17,7 +17,6 @@ from functools import cached_property
 from typing import cast
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.special import digamma, polygamma
 
 from ._system import System
@@ -252,6 +251,8 @@ MOST_FREEDOM = 100.0
 
 def common_scatter(projection: Projection) -> tuple[float, float]:
     """Scatter of the particles' scores over what the noise model says, and its degrees of freedom: v_0 and d_0."""
+    from scipy.optimize import brentq
+
     turn = projection.directions()
     each = np.einsum("kr,nkl,lr->nr", turn, projection.information, turn, optimize=True)
     scatter, own = _scatter(projection.scores @ turn, each)

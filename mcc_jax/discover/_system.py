@@ -23,8 +23,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.optimize import brentq
-from scipy.stats import t as student
 
 from ..calibrate import JointModel
 from ..calibrate.joint._blocks import Blocks, block_size, filled_up
@@ -315,6 +313,9 @@ OFTEN = 0.98
 
 def tails_of(white: np.ndarray) -> float:
     """Degrees of freedom of Student's distribution with the ratio of the points' `OFTEN` quantile to their median."""
+    from scipy.optimize import brentq
+    from scipy.stats import t as student
+
     size, far = np.quantile(np.abs(white), [0.5, OFTEN])
 
     def excess(freedom: float) -> float:
