@@ -108,14 +108,17 @@ def posterior(repeats: int, budget: float) -> tuple[list[dict], list[dict]]:
         cold, again = (_new_process(kept) for _ in range(2))
     campaign = paper_campaign(0)
     calibrate_bayes(campaign)
-    seconds = []
+    seconds, results = [], []
     for seed in range(repeats):
         start = time.perf_counter()
-        result = calibrate_bayes(campaign, seed=seed)
+        results.append(calibrate_bayes(campaign, seed=seed))
         seconds.append(time.perf_counter() - start)
     warm = float(np.median(seconds))
-    least = min(result.ess_bulk.values())
-    rows = [_sampler("mcc_jax, warm", warm, least, max(result.rhat.values()), result.divergences, result.converged)]
+    # The worst of all seeds: one seed's smallest ESS is itself a matter of luck.
+    least = min(min(result.ess_bulk.values()) for result in results)
+    worst = max(max(result.rhat.values()) for result in results)
+    divergences = sum(result.divergences for result in results)
+    rows = [_sampler("mcc_jax, warm", warm, least, worst, divergences, all(r.converged for r in results))]
     data = _textbook.data_from_campaign(campaign)
     settings = {"draws": 1000, "warmup": 1000, "chains": 2, "seed": 0, "timeout_s": budget}
     for name, module, centred in (
@@ -138,7 +141,7 @@ def posterior(repeats: int, budget: float) -> tuple[list[dict], list[dict]]:
         _report.verdict("posterior from a new process, compiled by an earlier one [s]", again, 15.0),
         _report.verdict("posterior, warm [s]", warm, 2.0),
         _report.verdict("smallest bulk ESS", float(least), 2000, at_least=True),
-        _report.verdict("divergences", result.divergences, 0),
+        _report.verdict("divergences", divergences, 0),
     ]
     for row in rows[1:]:
         ratio = ours / row["ESS per s"] if row["ESS per s"] > 0 else float("inf")

@@ -167,9 +167,8 @@ def ragged(count: int, header: tuple[str, ...], file: Path, row: int) -> InputEr
     few = count < len(header)
     where = header[count] if few else None
     hint = "Fill the cell" if few else f"Use decimal points and quote text that holds commas, or run {CONVERT}"
-    return InputError(
-        f"{count} cells where the header has {len(header)}", file=file, row=row, column=where, remedy=hint
-    )
+    cells = "1 cell" if count == 1 else f"{count} cells"
+    return InputError(f"{cells} where the header has {len(header)}", file=file, row=row, column=where, remedy=hint)
 
 
 def parse_table(text: str, file: Path) -> Table:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import click
 from click.core import ParameterSource
 
 from ._output import json_text, results
-from ._session import say, say_table, session
+from ._session import beside, import_writers, say, say_table, session
 from ._types import CampaignFolder, law_options, out_option, priors_option, seed_option, threshold_option
 
 METHODS = ("paper", "least-squares", "bayes")
@@ -129,7 +130,8 @@ def calibrate(
         require_particle(reference, data.particles, data.source)
         settings: dict[str, Any] = {"threshold_MPa": threshold_MPa, "seed": seed, "progress": tell}
         origin = provenance("calibrate", campaign, {n: v for n, v in context.params.items() if _applies(n, method)})
-        with results(out) as stage:
+        writers = functools.partial(import_writers, figures=not no_figures, posterior=method == "bayes")
+        with results(out) as stage, beside(writers):
             if method == "paper":
                 from ..calibrate import calibrate_paper
                 from ..law import StrainScaling, Unloading

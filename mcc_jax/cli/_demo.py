@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from ._output import results
-from ._session import beside, say, say_table, session
+from ._session import beside, import_writers, say, say_table, session
 from ._types import out_option, seed_option
 
 CAMPAIGN_FILES = ("particles.csv", "curves.csv", "campaign.toml")
@@ -94,10 +94,10 @@ def demo(out: Path, seed: int) -> None:
 
 def _import_the_rest() -> None:
     """What the demo needs after calibrating, seconds to import: discovery, drawing, the page, the posterior's file."""
-    import arviz  # noqa: F401
-
-    from .. import plots, report  # noqa: F401
+    from .. import report  # noqa: F401
     from . import _discovery, _report  # noqa: F401
+
+    import_writers(figures=True, posterior=True)
 
 
 def _paper_values() -> list[str]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 import click
 
 from ._output import json_text, results
-from ._session import say, session
+from ._session import beside, import_writers, say, session
 from ._types import (
     CampaignFolder,
     exclude_option,
@@ -91,7 +92,8 @@ def discover(
             "seed": seed,
         }
         origin = provenance("discover", campaign, settings)
-        with results(out) as stage:
+        writers = functools.partial(import_writers, figures=not no_figures, posterior=False)
+        with results(out) as stage, beside(writers):
             found = find(
                 data,
                 exclude=exclude,

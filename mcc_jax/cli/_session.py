@@ -65,15 +65,24 @@ def _keep_compiled(config: Any) -> None:
         config.update("jax_compilation_cache_max_size", CACHE_BYTES)
 
 
+def import_writers(*, figures: bool, posterior: bool) -> None:
+    """Import what draws and what writes posteriors: seconds of Python, beside compilers that leave it a core."""
+    if figures:
+        from .. import plots  # noqa: F401
+    if posterior:
+        import arviz  # noqa: F401
+
+
 @contextlib.contextmanager
 def beside[R](work: Callable[[], R]) -> Iterator[Callable[[], R]]:
     """Let work go on in a thread of its own while the block runs.
 
-    A block that fails waits for the thread, since an interpreter that ends under a compiler may crash. One that is
-    interrupted does not: nothing the work has is kept, and the process ends at once.
+    The block ends when the work has ended, too: an interpreter that ends under a compiler or an import may crash. Only
+    an interrupt does not wait, since nothing of the work is kept and the process ends at once.
 
     Yields:
-        A function that waits for the work and returns its result, or raises what it raised.
+        A function that waits for the work and returns its result, or raises what it raised. Work of which nobody
+        asks for the result may fail unnoticed.
     """
     future: Future[R] = Future()
 
@@ -89,6 +98,7 @@ def beside[R](work: Callable[[], R]) -> Iterator[Callable[[], R]]:
     except Exception:
         wait([future])
         raise
+    wait([future])
 
 
 @contextlib.contextmanager

@@ -1,5 +1,6 @@
 """Work that goes on in a thread beside a command."""
 
+import contextlib
 import threading
 
 import pytest
@@ -31,20 +32,22 @@ def test_what_the_work_raises_is_raised_where_the_result_is_asked_for():
         found()
 
 
-def test_a_block_that_fails_waits_for_the_work():
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_block_ends_after_the_work_whether_it_fails_or_not(fails):
     may_end, ended = threading.Event(), threading.Event()
 
     def work():
         assert may_end.wait(60)
         ended.set()
 
-    def fail():
+    def block():
         with beside(work):
             may_end.set()
-            raise ValueError("the block")
+            if fails:
+                raise ValueError("the block")
 
-    with pytest.raises(ValueError, match="the block"):
-        fail()
+    with pytest.raises(ValueError, match="the block") if fails else contextlib.nullcontext():
+        block()
     assert ended.is_set()
 
 
