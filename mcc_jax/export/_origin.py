@@ -43,6 +43,10 @@ def numbers(law: MccLaw) -> dict[str, float]:
     }
 
 
+HUGE = 1e44
+"""No engine could compute with larger numbers: C5^5 and its square would not be finite."""
+
+
 def check(law: MccLaw, particle: Particle, *, allow_not_monotone: bool = False) -> tuple[str, ...]:
     """Refuse a law that other engines could not use.
 
@@ -57,8 +61,11 @@ def check(law: MccLaw, particle: Particle, *, allow_not_monotone: bool = False) 
     Raises:
         InputError: if a parameter is out of its range, the particle carries no stress, or the curve falls.
     """
-    if not bool(law.is_valid):
-        raise InputError(f"the law is not usable: {numbers(law)}", remedy="C1, C5 and the modulus must be positive")
+    if not bool(law.is_valid) or not all(abs(number) < HUGE for number in numbers(law).values()):
+        raise InputError(
+            f"the law is not usable: {numbers(law)}",
+            remedy=f"C1, C5 and the modulus must be positive, and all below {HUGE:g}",
+        )
     if not bool(law.carries_stress(particle)):
         sizes = ", ".join(f"{float(d):g}" for d in (particle.D1, particle.D2, particle.D3))
         raise InputError(

@@ -140,6 +140,7 @@ BAD = {
     "text for a": (changed(a=estimate("large")), (), "a has no value"),
     "infinite a": (broken(json.dumps(content(a=estimate(float("inf"))))), (), "is not JSON: Infinity is no number"),
     "negative modulus": (changed(effective_modulus_MPa=estimate(-1.0)), (), "must be positive"),
+    "huge modulus": (changed(effective_modulus_MPa=estimate(1e300)), (), "all below 1e+44"),
     "huge mean": (changed(log_C1={"mean": estimate(1e6), "sd": estimate(0.1)}), (), "no sensible value"),
     "no mean": (changed(log_C1=None), (), "log_C1.mean has no value"),
     "steep shape": (changed(a=estimate(-20.0)), (), "the shape factor"),

@@ -122,6 +122,16 @@ def test_what_json_cannot_hold_again(tmp_path, seed, words):
         assert words in refused(read_calibration, tmp_path)
 
 
+def test_a_coefficient_whose_fifth_power_is_no_number(tmp_path):
+    """It went through, and the parameter card then could not be written."""
+    content = json.loads((SAMPLES / "results" / "calibration.json").read_bytes())
+    content["particles"][0]["C5"]["value"] = 1e300
+    (tmp_path / "calibration.json").write_text(json.dumps(content))
+    name = content["particles"][0]["particle"]
+    message = refused(read_calibration, tmp_path, particle=name, diameters="200,190,180")
+    assert "all below 1e+44" in message
+
+
 def change_header(arrays, **changes):
     header = json.loads(bytes(arrays["header"])) | changes
     arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
