@@ -162,13 +162,18 @@ def parse_header(cells: list[str], file: Path) -> tuple[str, ...]:
     return header
 
 
+def number_of_cells(count: int) -> str:
+    """The number of cells of a row, in words."""
+    return "1 cell" if count == 1 else f"{count} cells"
+
+
 def ragged(count: int, header: tuple[str, ...], file: Path, row: int) -> InputError:
     """The error for a row with too many or too few cells."""
     few = count < len(header)
     where = header[count] if few else None
     hint = "Fill the cell" if few else f"Use decimal points and quote text that holds commas, or run {CONVERT}"
-    cells = "1 cell" if count == 1 else f"{count} cells"
-    return InputError(f"{cells} where the header has {len(header)}", file=file, row=row, column=where, remedy=hint)
+    problem = f"{number_of_cells(count)} where the header has {len(header)}"
+    return InputError(problem, file=file, row=row, column=where, remedy=hint)
 
 
 def parse_table(text: str, file: Path) -> Table:

@@ -44,7 +44,7 @@ def numbers(law: MccLaw) -> dict[str, float]:
 
 
 HUGE = 1e44
-"""No engine could compute with larger numbers: C5^5 and its square would not be finite."""
+"""Above every median that a log_C may have (exp 100), and small enough for C1 C5^5 and C3^6 to be finite."""
 
 
 def check(law: MccLaw, particle: Particle, *, allow_not_monotone: bool = False) -> tuple[str, ...]:

@@ -197,6 +197,7 @@ BAD_TABLE = {
     "NaN": (TABLE.replace("0.001", "nan"), "", ["row 3", "'Load'", "not a finite"]),
     "overflow in its unit": (TABLE.replace("0.001", "1e14"), "", ["row 3", "'Load'", "too large"]),
     "cells too few": (TABLE.replace(",500", ""), "", ["row 3", "2 cells where 3"]),
+    "one cell": (TABLE.replace(",0.001,500", ""), "", ["row 3", "1 cell where 3"]),
     "cells too many": (TABLE.replace(",500", ",5,00"), "", ["row 3", "4 cells where 3"]),
     "time goes back": (TABLE + "1.5,1,1\n", "", ["row 5", "goes back"]),
     "quotes": (TABLE.replace("0.001", '"0.001'), "", ["row 3", "quotes"]),

@@ -11,7 +11,7 @@ import numpy as np
 from ..._errors import InputError
 from .._columns import convert
 from .._schema import Curve
-from .._table import binary_kind, parse_number
+from .._table import binary_kind, number_of_cells, parse_number
 from .._validate import check_magnitudes
 from ._mapping import DIMENSIONS, MappingFile
 from ._text import Tests, checked_curve, cut_off, decode_lines
@@ -51,7 +51,8 @@ def read_mapped(data: bytes, file: Path, mapping: MappingFile) -> Tests:
         cells = _split(line, mapping, file, i)
         width = len(cells) if width is None else width
         if len(cells) != width or max(where.values()) >= width:
-            raise cut_off(f"{len(cells)} cells where {max(width, max(where.values()) + 1)} are expected", file, i + 1)
+            expected = max(width, max(where.values()) + 1)
+            raise cut_off(f"{number_of_cells(len(cells))} where {expected} are expected", file, i + 1)
         if mapping.tests == "blank line":
             block += parted and bool(samples)
             name = str(block)

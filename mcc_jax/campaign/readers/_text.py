@@ -13,7 +13,7 @@ import numpy as np
 
 from ..._errors import InputError
 from .._schema import Control, Curve
-from .._table import parse_number
+from .._table import number_of_cells, parse_number
 
 _NUMBER = re.compile(r"[-+]?[0-9]+(?:\.[0-9]*)?(?:[eE][-+]?[0-9]+)?")
 
@@ -70,7 +70,7 @@ def number_block(
         cells = lines[i].rstrip("\t ").split("\t")
         if len(cells) != len(names):
             raise InputError(
-                f"{len(cells)} cells where {len(names)} are expected ({', '.join(names)})",
+                f"{number_of_cells(len(cells))} where {len(names)} are expected ({', '.join(names)})",
                 file=file,
                 row=i + 1,
                 remedy="The file is damaged or cut off; export it again",
