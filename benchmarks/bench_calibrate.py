@@ -23,13 +23,14 @@ from _numpy_residual import numpy_residual
 
 from mcc_jax.calibrate import calibrate_bayes, calibrate_least_squares
 from mcc_jax.calibrate.joint._least_squares import solve
+from mcc_jax.campaign import write_campaign
 from mcc_jax.simulate import paper_campaign
 
 COLD = """
-import jax, time
+import jax, sys
 jax.config.update("jax_enable_x64", True)
-from mcc_jax import calibrate_bayes, paper_campaign
-calibrate_bayes(paper_campaign(0))
+from mcc_jax import calibrate_bayes, read_campaign
+calibrate_bayes(read_campaign(sys.argv[1]))
 """
 
 
@@ -105,8 +106,9 @@ def _row(name: str, seconds: float, x: np.ndarray, loss: float, ours: np.ndarray
 def posterior(repeats: int, budget: float) -> tuple[list[dict], list[dict]]:
     """Ours, from new processes and warm, and the textbook model's."""
     with tempfile.TemporaryDirectory() as kept:
+        campaign = paper_campaign(0)
+        write_campaign(campaign, f"{kept}/campaign")
         cold, again = (_new_process(kept) for _ in range(2))
-    campaign = paper_campaign(0)
     calibrate_bayes(campaign)
     seconds, results = [], []
     for seed in range(repeats):
@@ -150,14 +152,15 @@ def posterior(repeats: int, budget: float) -> tuple[list[dict], list[dict]]:
 
 
 def _new_process(kept: str) -> float:
-    """Seconds from the start of Python to the posterior; compiled functions are kept as the command line keeps them."""
+    """Seconds from the start of Python to the posterior of the campaign in a folder; compiled functions are kept there,
+    as the command line keeps them."""
     keep = {
-        "JAX_COMPILATION_CACHE_DIR": kept,
+        "JAX_COMPILATION_CACHE_DIR": f"{kept}/compiled",
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1",
         "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "0",
     }
     start = time.perf_counter()
-    subprocess.run([sys.executable, "-c", COLD], check=True, env=os.environ | keep)
+    subprocess.run([sys.executable, "-c", COLD, f"{kept}/campaign"], check=True, env=os.environ | keep)
     return time.perf_counter() - start
 
 

@@ -66,7 +66,7 @@ def _expected(campaign: Campaign, base: Base, latent, noise: Noise) -> Base:
     noise = eqx.tree_at(lambda n: n.scale, noise, noise.scale[kept])
     data = linear_data(latent, zero, tests, model.zero_sd, model.unloading)
     data = eqx.tree_at(lambda d: d.residual, data, jnp.zeros_like(data.residual))
-    summary, filters = summarise(latent, zero, tests, data, noise, model.zero_sd)
+    summary, filters, _ = summarise(latent, zero, tests, data, noise, model.zero_sd)
     numbers = eqx.tree_at(lambda n: n.flatness, fit.numbers, tests.flatness)
     new = eqx.tree_at(
         lambda f: (f.noise, f.filters, f.latent, f.zero, f.residual, f.summary, f.numbers),

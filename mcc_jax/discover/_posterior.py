@@ -15,7 +15,7 @@ extended law itself.
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
@@ -26,11 +26,12 @@ from jaxtyping import Array, Float, PyTree
 
 from ..calibrate._result import finite
 from ..calibrate.joint._bayes import ESS_LEAST, RHAT_MOST, population_json, unmixed
+from ..calibrate.joint._blocks import count_of
 from ..calibrate.joint._compile import compiled
-from ..calibrate.joint._draws import Length, draw_around, newton_steps
+from ..calibrate.joint._draws import Length, draw_around
 from ..calibrate.joint._fit import population_at
 from ..calibrate.joint._forward import law_of
-from ..calibrate.joint._linearised import linear_data, summarise
+from ..calibrate.joint._linearised import careful_enough, linear_data, summarise
 from ..calibrate.joint._mode import Target, from_free, most_probable, to_free
 from ..calibrate.joint._noise import Whitening
 from ..calibrate.joint._population import Population, Summary, marginal_likelihood
@@ -241,10 +242,10 @@ def extended_posterior(base: Base, found: Refit, *, length: Length = LENGTH, see
     zero_sd = model.zero_sd
     data = linear_data(fit.latent, fit.zero, tests, zero_sd, model.unloading)
     data = eqx.tree_at(lambda d: (d.residual, d.jacobian), data, (found.residual, found.jacobian))
-    at, filters = summarise(state.latent, state.zero, tests, data, fit.noise, zero_sd)
+    at, filters, _ = summarise(state.latent, state.zero, tests, data, fit.noise, zero_sd)
     away = state.zero - tests.contact
     movable = _movable(at, state.theta, found.residual, found.jacobian, found.columns, filters, away, zero_sd)
-    scatter = replace(model.scatter, newton=newton_steps(fit, tests, model))
+    scatter = careful_enough(fit.mode, Target(fit.numbers, fit.summary, model.scatter), count_of(tests))
     precision = np.concatenate([f.precision for f in found.formulas])
     width = np.sqrt(np.maximum(np.diagonal(found.covariance), 1e-300))
     target = ExtendedTarget(fit.numbers, at, scatter, movable, jnp.asarray(precision), jnp.asarray(width))

@@ -9,7 +9,7 @@ from ._numbers import interval, number, percent, probability
 from ._read import Results
 
 METHODS = {
-    "bayes": "the joint posterior of all tests at once (NumPyro's NUTS)",
+    "bayes": "the joint posterior of all tests at once",
     "least-squares": "joint least squares of all tests at once (Optimistix)",
     "paper": "the paper's own steps, one after the other",
 }

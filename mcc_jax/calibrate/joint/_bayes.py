@@ -63,7 +63,7 @@ class BayesCalibration:
             population were by `pareto_k_joint`'s, and only particles whose weights scatter were drawn by theirs.
         divergences: number of divergent trajectories.
         rhat, ess_bulk, ess_tail: by parameter of the population, before any thinning.
-        leapfrogs: mean number of leapfrog steps of a draw; 0 if independent draws were weighted (`joint._large`).
+        leapfrogs: mean number of leapfrog steps of a draw; 0 of independent draws (`joint._importance`).
         seed, runtime_s: for the record.
     """
 
@@ -300,9 +300,9 @@ def calibrate_bayes(
 ) -> BayesCalibration:
     """The joint posterior of everything: a, modulus, population, noise, and every particle's C1, C3, C5 and zero.
 
-    Of many particles (more than 400,000 draws of single ones) the population is drawn around its mode and weighted,
-    instead of sampled along trajectories, and at most four million draws of single particles are kept: see
-    `joint._large`.
+    The population is drawn around its mode and weighted, or sampled by NUTS where the weights are not good enough: see
+    `joint._importance`. Of many particles (more than 400,000 draws of single ones) the exact likelihood enters by
+    regression, and at most four million draws of single particles are kept: see `joint._large`.
 
     The particles are worked on in blocks, which spread over all devices of the process and, once
     `jax.distributed.initialize` has been called, over all processes: every one of them then calls this function with
@@ -315,8 +315,8 @@ def calibrate_bayes(
         threshold_MPa: points below this stress on loading do not count [MPa].
         mode: "fast" integrates the particles out through quadratic summaries of their tests and corrects by exact
             importance weights; "joint" samples everything at once under the exact likelihood, the reference.
-        chains: how many of the sampler run side by side.
-        warmup: steps of each that tune the sampler and are thrown away.
+        chains: how many, each from random numbers of its own.
+        warmup: steps of each that tune NUTS, where it runs, and are thrown away.
         draws: of each that are kept.
         seed: random seed.
         block: particles of a block; by default all in one up to 64, and about 64 of larger campaigns. Other blocks make

@@ -12,7 +12,7 @@ from jaxtyping import Array
 
 from ._blocks import Blocks, count_of
 from ._large import PROBES, correction, evenly
-from ._nuts import Length
+from ._nuts import PAIR, Length, side_by_side
 from ._population import Population
 from ._sampling import Exact, ParticleDraws, draw_particles
 from ._weights import PARETO_K_MOST, ordered_resample, pareto_k, smoothed_weights, unrest
@@ -57,6 +57,11 @@ def stride_of(count: int, total: int) -> int:
     return max(1, -(-total * count // MOST_CHECKED))
 
 
+def chunk_of(total: int) -> int | None:
+    """Draws of a chunk where all are compared: on a CPU two of them run side by side, on any number of cores."""
+    return -(-total // PAIR) if jax.default_backend() == "cpu" else None
+
+
 def every(population: Population, which: int | np.ndarray) -> Population:
     """Every so-many-th draw, or those at given positions."""
     rows = slice(None, None, which) if isinstance(which, int) else which
@@ -77,7 +82,7 @@ class Drawer:
             exact: the tests.
             block: particles of a block; 0 for a single one.
             chunk: draws of the population worked on in one go, so that one compilation serves any number of them; all
-                by default.
+                by default. Chunks run side by side where all particles are one block.
         """
         self.count = count_of(exact.tests)
         self._exact, self._blocks, self._chunk = exact, Blocks(len(exact.tests), block), chunk
@@ -104,11 +109,14 @@ class Drawer:
         """Draws under all populations, the last one repeated to fill up chunks."""
         draws = len(np.asarray(population.a))
         chunk = self._chunk or draws
-        found = []
-        for i in range(0, draws, chunk):
-            rows = np.minimum(np.arange(i, i + chunk), draws - 1)
-            own = key if common or not i else jax.random.fold_in(key, i)
-            found.append(draw(own, jax.tree.map(lambda x, rows=rows: jnp.asarray(np.asarray(x)[rows]), population)))
+
+        def one(first: int) -> list[np.ndarray]:
+            rows = np.minimum(np.arange(first, first + chunk), draws - 1)
+            own = key if common or not first else jax.random.fold_in(key, first)
+            return draw(own, jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[rows]), population))
+
+        # Several processes exchange the numbers of their blocks, in one order.
+        found = (side_by_side if self._blocks.whole_here else map)(one, range(0, draws, chunk))
         return ParticleDraws(*(cast(Any, np.concatenate(several)[:draws]) for several in zip(*found, strict=True)))
 
     def some(

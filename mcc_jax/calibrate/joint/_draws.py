@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import jax
@@ -12,40 +11,26 @@ import numpy as np
 from jaxtyping import Array
 
 from ._blocks import count_of
-from ._compile import compiled
 from ._data import Tests
-from ._drawer import Drawer, corrected, every, stride_of, weighted
-from ._fit import population_at, populations
-from ._large import PROBES, sample_weighted
+from ._drawer import Drawer, chunk_of, corrected, every, stride_of, weighted
+from ._fit import populations
+from ._importance import sample_weighted
+from ._large import PROBES
+from ._linearised import careful_enough
 from ._mode import Target
 from ._model import JointFit, JointModel
 from ._nuts import Chains, Length, by_chains
-from ._population import COEFFICIENTS, Population, Scatter, laplace
+from ._population import COEFFICIENTS, Population, Scatter
 from ._sampling import Exact, sample_joint, sample_population
 from ._weights import diagnostics
 
-ACCEPT = (0.8, 0.95, 0.99)
+ACCEPT = (0.7, 0.95, 0.99)
 """Acceptance that the sampler aims at: after divergences once more, and once more, with smaller steps."""
-
-
-SHARP = 0.03
-"""Posterior standard deviation of the logarithm of a polynomial's coefficient below which one Newton step is enough."""
-
-_laplace = compiled(laplace)
-
-
-def newton_steps(fit: JointFit, tests: Tests, model: JointModel) -> int:
-    """How many Newton steps the integration over the particles needs: none if every coefficient is known sharply."""
-    population = population_at(fit.mode, fit.numbers, model.scatter)
-    at = _laplace(population, fit.summary, tests.flatness, model.scatter)
-    variance = np.diagonal(np.linalg.inv(np.asarray(at.hessian)[: count_of(tests)]), axis1=1, axis2=2)
-    widest = float(np.max(np.sqrt(variance) * np.asarray(at.stretch)))
-    return 0 if widest < SHARP else 4
 
 
 def draw_fast(key: Array, tests: Tests, model: JointModel, fit: JointFit, length: Length, block: int) -> dict[str, Any]:
     """The population sampled, the particles drawn back and corrected by exact weights: fields of the result."""
-    scatter = replace(model.scatter, newton=newton_steps(fit, tests, model))
+    scatter = careful_enough(fit.mode, Target(fit.numbers, fit.summary, model.scatter), count_of(tests))
     exact = Exact(tests, fit.filters, fit.summary, scatter, model.zero_sd, model.unloading)
     target = Target(fit.numbers, fit.summary, scatter)
     return draw_around(key, fit.mode, fit.covariance, target, exact, model, length, block)
@@ -72,7 +57,7 @@ def draw_around(
     names, stacked = _stack(population, scatter, length)
     flat = stacked.reshape(length.total, -1)
     if few:
-        found = weighted(Drawer(exact, block), population, length, check_key, pick_key)
+        found = weighted(Drawer(exact, block, chunk_of(length.total)), population, length, check_key, pick_key)
     else:
         keys = check_key, pick_key, particle_key
         found = corrected(Drawer(exact, block, PROBES), population, flat, length, *keys)
@@ -90,14 +75,13 @@ def draw_around(
 def _sampled(
     key: Array, mode: Array, covariance: Array, target: Target, length: Length, many: bool
 ) -> tuple[Chains, Population]:
-    """Draws of the population: of many particles weighted ones, if they are good enough, else the sampler's.
+    """Draws of the population: independent ones, weighted, if the weights are good enough, else the sampler's.
 
     If any trajectory diverged, the sampler runs again with smaller steps.
     """
-    if many:
-        found = sample_weighted(key, mode, covariance, target, chains=length.chains, draws=length.draws)
-        if found is not None:
-            return found
+    found = sample_weighted(key, mode, covariance, target, chains=length.chains, draws=length.draws, many=many)
+    if found is not None:
+        return found
 
     def run(accept: float) -> tuple[Chains, Population]:
         # From an array, not from a Python number: a weak type would be compiled anew after `compile_ahead`.
@@ -114,7 +98,7 @@ def _sampled(
 
 def draw_joint(key: Array, tests: Tests, model: JointModel, fit: JointFit, length: Length) -> dict[str, Any]:
     """Population and particles sampled together under the exact likelihood: fields of the result."""
-    scatter = replace(model.scatter, newton=newton_steps(fit, tests, model))
+    scatter = careful_enough(fit.mode, Target(fit.numbers, fit.summary, model.scatter), count_of(tests))
     exact = Exact(tests, fit.filters, fit.summary, scatter, model.zero_sd, model.unloading)
     run, free, *particles = by_chains(sample_joint, key, length, fit.mode, fit.covariance, fit.numbers, exact)
     population = populations(free.reshape(-1, free.shape[-1]), fit.numbers, scatter)

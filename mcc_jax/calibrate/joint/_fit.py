@@ -21,10 +21,10 @@ from ._blocks import Blocks, Parts, block_size, count_of, filled_up, require_sam
 from ._compile import compiled
 from ._data import Selection, Tests, select_tests
 from ._individual import FIRST_STEPS, MOST_STEPS, Particles, fit_particles, linear_starts
-from ._linearised import expected_latent, linear_data, summarise
+from ._linearised import careful_enough, expected_latent, linear_data, summarise
 from ._mode import PriorNumbers, Target, from_free, most_probable, recentred, to_free
 from ._model import JointFit, JointModel, log_C3, prior_numbers
-from ._noise import Noise, Whitening, estimate_noise, particle_scales
+from ._noise import Noise, estimate_noise, particle_scales
 from ._population import Population, Scatter, Summary
 from ._priors import Priors
 
@@ -137,15 +137,15 @@ def fit_joint(
     individual = fitted(np.full(N, read_out), centre, np.full((N, 4), WIDE), starts)
     latent, zero = individual.latent, individual.zero
     four = [read_out, *np.asarray(priors.noise.median)[1:]]
-    noise = Noise.from_logs(jnp.asarray(np.log(four)), jnp.asarray(np.ones(len(tests))))
+    noise = Noise.of(four, jnp.asarray(np.ones(len(tests))))
     log_sd, noise_converged = jnp.asarray(np.full(4, np.nan)), True
     numbers, free = _start(np.asarray(latent)[:count], np.asarray(flatness)[:count], model, numbers)
 
-    def summarised(at: tuple[Parts, Parts], data: Parts, noise: Noise) -> tuple[Summary, Parts]:
-        """All particles' summaries, and this process's own filters."""
-        both = blocks.each(summarise, *at, own, data, blocks.cut(noise), zero_sd)
-        summaries, filters = (Parts(tuple(wave[k] for wave in both.waves)) for k in (0, 1))
-        return blocks.whole(summaries), filters
+    def summarised(at: tuple[Parts, Parts], data: Parts, noise: Noise) -> tuple[Summary, Parts, Array]:
+        """All particles' summaries, this process's own filters, and the white noise of equal weight."""
+        found = blocks.each(summarise, *at, own, data, blocks.cut(noise), zero_sd)
+        summaries, filters, white = (Parts(tuple(wave[k] for wave in found.waves)) for k in range(3))
+        return blocks.whole(summaries), filters, blocks.whole(white)
 
     turn = 0
     while True:
@@ -168,33 +168,30 @@ def fit_joint(
                 some, priors.noise, start, uncertainty=turn == rounds - 1, blocks=chosen
             )
             noise = replace(four, scale=noise.scale)
-        summary, filtered = summarised(at, data, noise)
+        summary, filtered, white = summarised(at, data, noise)
         if correlated and turn < rounds:
             old = np.asarray(noise.scale)
             parts = (old, np.asarray(summary.squares), np.asarray(summary.count) - 4)
             scale = np.pad(particle_scales(*(part[:count] for part in parts)), (0, N - count), mode="edge")
             if np.any(scale != old):
                 noise = eqx.tree_at(lambda n: n.scale, noise, jnp.asarray(scale))
-                summary, filtered = summarised(at, data, noise)
+                summary, filtered, white = summarised(at, data, noise)
         tell("fitting the population")
         if turn:
             numbers, free = recentred(numbers, free)
         target = Target(numbers, summary, scatter)
-        free, covariance, mode_converged = most_probable(free, target)
+        sharp = replace(target, scatter=careful_enough(free, target, count))
+        free, covariance, mode_converged = most_probable(free, sharp)
         if turn == rounds:
             break
         turn += 1
         tell("fitting every particle")
-        mean, spread, moved, shifted = expected_latent(free, target)
-        starts = jnp.stack(
-            [
-                jnp.concatenate([latent, zero[:, None]], 1),
-                jnp.concatenate([moved, shifted[:, None]], 1),
-                jnp.concatenate([mean, zero[:, None]], 1),
-            ]
-        )
-        sizes = blocks.whole(blocks.each(_white_equivalent, filtered, own))
-        found = fitted(sizes, mean, jnp.maximum(spread, LEAST_WIDTH), blocks.cut(starts, axis=1))
+        expected = expected_latent(free, target)
+        several = (latent, zero), (expected.latent, expected.zero), (expected.mean, zero)
+        # By NumPy, here and wherever a handful of numbers is put together once: JAX would compile every operation.
+        starts = jnp.asarray(np.stack([np.column_stack([np.asarray(w), np.asarray(z)]) for w, z in several]))
+        width = np.maximum(np.asarray(expected.sd), LEAST_WIDTH)
+        found = fitted(white, expected.mean, width, blocks.cut(starts, axis=1))
         latent, zero = found.latent, found.zero
     converged = np.asarray([bool(np.all(np.asarray(individual.converged)[:count])), noise_converged, mode_converged])
     filters, residual = blocks.whole(filtered), blocks.whole(Parts(tuple(wave.residual for wave in data.waves)))
@@ -251,14 +248,6 @@ def _centre(priors: Priors) -> np.ndarray:
     log_eta = np.log(1.4)
     C = np.array([np.log(priors.C1.median), log_C3(priors), np.log(priors.C5.median)])
     return np.append(C + log_eta, np.log(priors.effective_modulus_MPa.median))
-
-
-@compiled
-def _white_equivalent(filters: Whitening, tests: Tests) -> Float[Array, " particles"]:
-    """Standard deviation of white noise that weighs a test as much as its filter does [um]."""
-    return jnp.sqrt(
-        jnp.sum(tests.mask, 1).astype(filters.weight.dtype) / jnp.maximum(jnp.sum(filters.weight**2, 1), 1e-30)
-    )
 
 
 @compiled

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..._types import Scalar
@@ -13,7 +17,7 @@ from ._data import Tests
 from ._forward import linearise_with_force, snap
 from ._mode import Target
 from ._noise import Linear, Noise, Whitening, whitening
-from ._population import Summary, draw_latent, moments
+from ._population import Scatter, Summary, laplace, straighten
 
 
 @compiled
@@ -39,11 +43,12 @@ def summarise(
     data: Linear,
     noise: Noise,
     zero_sd: Scalar,
-) -> tuple[Summary, Whitening]:
+) -> tuple[Summary, Whitening, Float[Array, " particles"]]:
     """Quadratic summaries of all tests around the given latent vectors and zeros, by Gauss-Newton curvature.
 
     Returns:
-        The summaries, and the noise filters, in which force noise has become noise of displacement.
+        The summaries; the noise filters, in which force noise has become noise of displacement; and the standard
+        deviation [um] of white noise that would weigh a test as much as its filter does.
     """
     noise_filters = jax.vmap(lambda s, *path: whitening(noise, s, *path))(
         noise.scale, data.step, data.mask, data.compliance, data.peak, data.branch
@@ -72,7 +77,9 @@ def summarise(
         zero_slope=-border * width[:, None],
         zero_sd=jnp.sqrt(width),
     )
-    return summary, noise_filters
+    points = jnp.sum(data.mask, 1).astype(zero.dtype)
+    white = jnp.sqrt(points / jnp.maximum(jnp.sum(noise_filters.weight**2, 1), 1e-30))
+    return summary, noise_filters, white
 
 
 def _snap_evidence(latent, particle, force, used):
@@ -96,16 +103,49 @@ def _snap_evidence(latent, particle, force, used):
     return jnp.where(seen, slope, 0.0), middle, jnp.where(seen, 12 / width**2, 0.0)
 
 
+class Expected(NamedTuple):
+    """What a population says of its particles, and what the tests add.
+
+    Attributes:
+        mean, sd: of the latent vectors under the population, shape (N, 4).
+        latent: most probable latent vectors given the tests, too, shape (N, 4).
+        zero: most probable zeros [um], shape (N,).
+        hessian, stretch: of `Laplace`.
+    """
+
+    mean: Float[Array, "particles 4"]
+    sd: Float[Array, "particles 4"]
+    latent: Float[Array, "particles 4"]
+    zero: Float[Array, " particles"]
+    hessian: Float[Array, "particles k k"]
+    stretch: Float[Array, " k"]
+
+
 @compiled
-def expected_latent(
-    free: Float[Array, " d"], target: Target
-) -> tuple[
-    Float[Array, "particles 4"], Float[Array, "particles 4"], Float[Array, "particles 4"], Float[Array, " particles"]
-]:
-    """Mean and standard deviation of the particles' latent vectors under the population, then the most probable latent
-    vectors and zeros given the tests, too."""
-    population = target.population(free)
-    mean, factor = moments(population, target.flatness, target.scatter)
-    still = jnp.zeros((mean.shape[0], target.scatter.size))
-    found = draw_latent(population, target.summary, target.flatness, target.scatter, still, still[:, 0])
-    return mean, jnp.sqrt(jnp.sum(factor**2, -1)), found.latent, found.zero
+def expected_latent(free: Float[Array, " d"], target: Target) -> Expected:
+    """The particles under the population at unbounded coordinates."""
+    summary = target.summary
+    at = laplace(target.population(free), summary, target.flatness, target.scatter)
+    latent = at.mean + jnp.einsum("npk,nk->np", at.factor, at.deviations)
+    kappa, _ = straighten(latent - summary.point)
+    zero = summary.zero + jnp.einsum("np,np->n", summary.zero_slope, kappa)
+    return Expected(at.mean, jnp.sqrt(jnp.sum(at.factor**2, -1)), latent, zero, at.hessian, at.stretch)
+
+
+SHARP = 0.03
+"""Posterior standard deviation of the logarithm of a polynomial's coefficient below which one Newton step is enough."""
+
+
+def careful_enough(free: Float[Array, " d"], target: Target, count: int) -> Scatter:
+    """`target.scatter` with as many Newton steps as the integration over the particles needs: none if every coefficient
+    is known sharply.
+
+    Args:
+        free: population in unbounded coordinates.
+        target: of the tests.
+        count: number of particles, without copies that only fill up.
+    """
+    at = expected_latent(free, target)
+    variance = np.diagonal(np.linalg.inv(np.asarray(at.hessian)[:count]), axis1=1, axis2=2)
+    widest = float(np.max(np.sqrt(variance) * np.asarray(at.stretch)))
+    return replace(target.scatter, newton=0) if widest < SHARP else target.scatter

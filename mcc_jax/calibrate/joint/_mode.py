@@ -137,16 +137,20 @@ def to_free(
     spread = np.concatenate([tau, np.full(scatter.size - 3, 0.1)])
     signed = np.arcsinh(spread / (KNEE * np.asarray(numbers.spread)[chosen]))
     width = np.sqrt(np.asarray(tau) ** 2 / float(numbers.count) + np.asarray(numbers.blur) ** 2)
-    means = (mu + float(numbers.mean_log_eta(jnp.asarray(a))) - np.asarray(numbers.centre)) / width
+    log_eta = np.log(1 + a * np.asarray(numbers.flatness))
+    weight = None if numbers.weight is None else np.asarray(numbers.weight)
+    means = (mu + np.average(log_eta, weights=weight) - np.asarray(numbers.centre)) / width
     return jnp.asarray(np.concatenate([[np.log(unit / (1 - unit)), log_modulus, *means, 0.0], signed]))
 
 
 def recentred(numbers: PriorNumbers, free: Float[Array, " d"]) -> tuple[PriorNumbers, Float[Array, " d"]]:
     """The same population in coordinates whose centre it is."""
-    tau = spread_of(free[FIRST_SPREAD : FIRST_SPREAD + 3], numbers.spread[:3])
-    width = jnp.sqrt(tau**2 / numbers.count + numbers.blur**2)
-    numbers = eqx.tree_at(lambda n: n.centre, numbers, numbers.centre + width * free[2:5])
-    return numbers, free.at[2:5].set(0.0)
+    here = np.array(free)
+    tau = KNEE * np.asarray(numbers.spread)[:3] * np.sinh(np.abs(here[FIRST_SPREAD : FIRST_SPREAD + 3]))
+    width = np.sqrt(tau**2 / float(numbers.count) + np.asarray(numbers.blur) ** 2)
+    centre = np.asarray(numbers.centre) + width * here[2:5]
+    here[2:5] = 0.0
+    return eqx.tree_at(lambda n: n.centre, numbers, jnp.asarray(centre)), jnp.asarray(here)
 
 
 class Target(eqx.Module):
@@ -184,7 +188,8 @@ ATTEMPTS = 4
 
 
 @compiled
-def _gradients(free: Float[Array, "many d"], target: Target) -> tuple[Float[Array, " many"], Float[Array, "many d"]]:
+def gradients(free: Float[Array, "many d"], target: Target) -> tuple[Float[Array, " many"], Float[Array, "many d"]]:
+    """Minus the log density at many coordinates, and its gradients."""
     return jax.lax.map(jax.value_and_grad(lambda one: -target.log_density(one)), free)
 
 
@@ -201,7 +206,7 @@ def most_probable(start: Float[Array, " d"], target: Target) -> tuple[Float[Arra
     def expand(free: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         steps = np.diag(width)
         points = free + np.concatenate([np.zeros((1, d)), steps, -steps])
-        value, slope = (np.asarray(v) for v in _gradients(jnp.asarray(points), target))
+        value, slope = (np.asarray(v) for v in gradients(jnp.asarray(points), target))
         curvature = (slope[1 : d + 1] - slope[d + 1 :]) / (2 * width[:, None])
         return float(value[0]), slope[0], (curvature + curvature.T) / 2
 

@@ -12,6 +12,8 @@ Kalman filter turns residuals into independent ones in linear time, and each bra
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -45,6 +47,12 @@ class Noise(eqx.Module):
     def logs(self) -> Float[Array, " 4"]:
         """Logarithms of the four numbers."""
         return jnp.log(jnp.stack([self.displacement, self.force, self.correlated, self.length]))
+
+    @classmethod
+    def of(cls, numbers: Sequence[float] | np.ndarray, scale: Float[Array, " particles"]) -> Noise:
+        """From the four numbers, outside compiled functions."""
+        displacement, force, correlated, length = (jnp.asarray(np.asarray(v, float)) for v in numbers)
+        return cls(displacement, force, correlated, length, scale)
 
     @classmethod
     def from_logs(cls, logs: Float[Array, " 4"], scale: Float[Array, " particles"]) -> Noise:
@@ -196,10 +204,9 @@ class NoisePrior(eqx.Module):
     median: Float[Array, " 4"]
     log_sd: Float[Array, " 4"]
 
-    def log_density(self, logs: Float[Array, "*many 4"]) -> Float[Array, "*many"]:
-        """Log density of the logarithms, up to a constant."""
-        median, log_sd = (jnp.broadcast_to(v, logs.shape) for v in (self.median, self.log_sd))
-        return -0.5 * jnp.sum(((logs - jnp.log(median)) / log_sd) ** 2, -1)
+    def log_density(self, logs: np.ndarray) -> np.ndarray:
+        """Log density of the logarithms, up to a constant; shape (..., 4) becomes (...)."""
+        return -0.5 * np.sum(((logs - np.log(self.median)) / np.asarray(self.log_sd)) ** 2, -1)
 
 
 @compiled
@@ -247,17 +254,18 @@ def estimate_noise(
     steps = STEP * np.concatenate([np.zeros((1, 4)), np.eye(4), -np.eye(4)])
 
     def value_and_gradient(logs: np.ndarray) -> tuple[float, np.ndarray]:
-        at = jnp.asarray(logs + steps)
-        each = blocks.whole(blocks.each(_likelihoods, at, scale, own, axis=1))
+        at = logs + steps
+        each = blocks.whole(blocks.each(_likelihoods, jnp.asarray(at), scale, own, axis=1))
         # Summed here, in one order, however the particles are spread.
-        values = -(np.sum(np.asarray(each), axis=1) + np.asarray(prior.log_density(at)))
+        values = -(np.sum(np.asarray(each), axis=1) + prior.log_density(at))
         return float(values[0]), (values[1:5] - values[5:]) / (2 * STEP)
 
     # No tester reads better than a few tenths of a nanometre: noise-free data, of a simulation say, get that much.
     bounds = [(m - 3 * s, m + 6 * s) for m, s in zip(np.log(prior.median), np.asarray(prior.log_sd), strict=True)]
-    inside = np.clip(np.asarray(start.logs), *np.transpose(bounds))
+    numbers = start.displacement, start.force, start.correlated, start.length
+    inside = np.clip(np.log([float(v) for v in numbers]), *np.transpose(bounds))
     found = minimize(value_and_gradient, inside, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-9})
-    noise = Noise.from_logs(jnp.asarray(found.x), start.scale)
+    noise = Noise.of(np.exp(found.x), start.scale)
     if not uncertainty:
         return noise, jnp.asarray(np.full(4, np.nan)), bool(found.success)
     width = 0.02

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple, cast
 
@@ -64,9 +64,14 @@ def by_chains[T](function: Callable[..., T], key: PRNGKeyArray, length: Length, 
     def run(some: Array) -> T:
         return jax.tree.map(np.asarray, function(some, *arguments, warmup=length.warmup, draws=length.draws))
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        results = list(pool.map(run, [keys[i : i + size] for i in range(0, length.chains, size)]))
+    results = side_by_side(run, [keys[i : i + size] for i in range(0, length.chains, size)])
     return jax.tree.map(lambda *parts: np.concatenate(parts), *results)
+
+
+def side_by_side[A, B](function: Callable[[A], B], arguments: Iterable[A]) -> list[B]:
+    """What a function returns for each of its arguments, on as many threads as there are cores."""
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return list(pool.map(function, arguments))
 
 
 def chains_together(chains: int) -> int:

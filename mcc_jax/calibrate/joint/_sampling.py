@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..._types import Scalar
 from ...law import Unloading
-from ._compile import compiled
+from ._compile import compiled, even_batch
 from ._data import Tests
 from ._forward import displacement
 from ._mode import PriorNumbers, Target, from_free
@@ -189,7 +189,7 @@ def draw_particles(
         return ParticleDraws(take(latent), take(zero), likelihood[0], mean)
 
     rows = ROWS if jax.default_backend() == "cpu" else ROWS_OF_ACCELERATORS
-    batch = max(1, min(draws, rows // (count * max(candidates, 1))))
+    batch = even_batch(draws, rows // (count * max(candidates, 1)))
     each = jnp.where(common, keys, jax.random.split(keys[0], draws))
     return jax.lax.map(one, (each, population), batch_size=batch)
 

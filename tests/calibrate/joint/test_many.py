@@ -17,8 +17,8 @@ FUNCTIONS = (
     "linear_data",
     "_likelihoods",
     "summarise",
-    "_gradients",
-    "sample_population",
+    "gradients",
+    "log_densities",
     "draw_particles",
 )
 """What a calibration waits for when it is compiled."""

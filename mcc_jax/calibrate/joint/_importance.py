@@ -1,0 +1,147 @@
+r"""Independent draws of the population, by adaptive importance sampling.
+
+With the particles integrated out the population's posterior has seven to eleven coordinates, in which it is nearly
+normal. So instead of following gradients along trajectories, independent draws :math:`\theta_s` of a Student
+distribution around the mode are weighted,
+
+.. math:: w_s \propto p(\theta_s \mid \text{tests}) / q(\theta_s)
+
+and the proposal is fitted to its own weighted draws until the weights' Pareto k and effective size say that it is good
+enough (Cappe et al. 2004; Vehtari et al. 2024). If they never do, the sampler has to run (`_nuts`). A density without
+its gradient takes a tenth of the time to compile, and all draws are worked on side by side.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ._compile import compiled, even_batch
+from ._mode import FIRST_SPREAD, Target
+from ._nuts import Chains, side_by_side
+from ._population import Population
+from ._weights import PARETO_K_MOST, effective_share, ordered_resample, smoothed_weights
+
+FREEDOM = 10
+"""Degrees of freedom of the Student proposal: its tails are wider than the posterior's."""
+
+ROUNDS = 6
+"""How often the proposal may be fitted anew."""
+
+ENOUGH = 5
+"""Effective draws per coordinate that a proposal may be fitted to."""
+
+GOOD_SHARE = 0.5
+"""Effective share of the proposed draws from which on the proposal need not be fitted any better, beside the gate of
+Pareto k."""
+
+LEAST_SHARE = 0.2
+"""Least effective share with which the proposed draws are used: less, and the sampler is the safer choice."""
+
+SPARE = 3
+"""How many are proposed for each draw that is kept. Of large campaigns, whose densities are dear, one."""
+
+AT_A_TIME = 250
+"""Draws whose densities are asked for in one go."""
+
+TRIAL = 4000
+"""Draws that a proposal is tried on, and fitted to. Of large campaigns as many as are kept, at most a quarter of it."""
+
+AT_ONCE = 4096
+"""Particles times draws worked on at once: so many numbers of each kind stay in a processor's cache."""
+
+
+@compiled
+def log_densities(free: Float[Array, "many d"], target: Target) -> Float[Array, " many"]:
+    """Log density of the population at many coordinates."""
+    return jax.lax.map(target.log_density, free, batch_size=even_batch(len(free), AT_ONCE // len(target.flatness)))
+
+
+@compiled
+def _populations(free: Float[Array, "many d"], target: Target) -> Population:
+    return jax.vmap(target.population)(free)
+
+
+def sample_weighted(
+    key: Array, mode: Array, covariance: Array, target: Target, *, chains: int, draws: int, many: bool = False
+) -> tuple[Chains, Population] | None:
+    """Draws of the population by importance resampling, in the sampler's form; None if the weights are not good enough.
+
+    A spread's coordinate may have either sign for the same spread: proposal and draws are folded to positive ones.
+
+    Args:
+        key: random key.
+        mode, covariance: of the population in unbounded coordinates.
+        target: its density.
+        chains, draws: shape of what is returned; each chain is resampled from proposals of its own.
+        many: propose no more than is kept: a density is dear.
+    """
+    from scipy.linalg import solve_triangular
+    from scipy.special import logsumexp
+    from scipy.stats import multivariate_t
+
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+    spreads = np.arange(len(mode))[FIRST_SPREAD : FIRST_SPREAD + target.scatter.size]
+    signs = np.ones((2 ** len(spreads), len(mode)))
+    signs[:, spreads] = list(product((1.0, -1.0), repeat=len(spreads)))
+
+    def folded(free: np.ndarray) -> np.ndarray:
+        free[..., spreads] = np.abs(free[..., spreads])
+        return free
+
+    def densities(part: np.ndarray) -> np.ndarray:
+        return np.asarray(log_densities(jnp.asarray(part), target))
+
+    def proposed(count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Draws of the proposal and their log weights, up to a constant."""
+        factor = np.linalg.cholesky(width)
+        standard = np.asarray(unit.rvs(size=int(count + -count % AT_A_TIME), random_state=rng))
+        free = folded(centre + standard @ factor.T)
+        every_sign = (free[:, None] * signs - centre).reshape(-1, len(mode))
+        density = unit.logpdf(solve_triangular(factor, every_sign.T, lower=True).T).reshape(len(free), -1)
+        log_density = np.concatenate(side_by_side(densities, np.split(free, len(free) // AT_A_TIME)))
+        log_weight = log_density - logsumexp(density, axis=1)
+        return free[:count], log_weight[:count]
+
+    # Standard deviations of coordinates differ by many powers of ten, for which SciPy takes a matrix to be singular.
+    shape = cast(Any, np.eye(len(mode)) * (1 - 2 / FREEDOM))  # its stub takes a number
+    unit = multivariate_t(np.zeros(len(mode)), shape, FREEDOM)
+    total = chains * draws * (1 if many else SPARE)
+    trial = min(TRIAL // 4, total) if many else TRIAL
+    centre, width = folded(np.array(mode)), np.asarray(covariance)
+    for turn in range(ROUNDS):
+        free, log_weight = proposed(trial)
+        last = turn == ROUNDS - 1
+        if _good(log_weight, LEAST_SHARE if last else GOOD_SHARE):
+            further, more = proposed(max(total - trial, 0))
+            free, log_weight = np.concatenate([free, further])[:total], np.concatenate([log_weight, more])[:total]
+            if _good(log_weight, LEAST_SHARE):
+                return _resampled(free, log_weight, target, chains, draws)
+        weight, _ = smoothed_weights(log_weight)
+        if last or effective_share(weight) * len(weight) < ENOUGH * len(mode):
+            return None
+        centre = weight @ free
+        width = (free - centre).T @ (weight[:, None] * (free - centre))
+    return None
+
+
+def _good(log_weight: np.ndarray, share: float) -> bool:
+    weight, k = smoothed_weights(log_weight)
+    return k <= PARETO_K_MOST and effective_share(weight) >= share
+
+
+def _resampled(
+    free: np.ndarray, log_weight: np.ndarray, target: Target, chains: int, draws: int
+) -> tuple[Chains, Population]:
+    """Weighted draws as equally weighted ones, each chain from draws of its own."""
+    several = zip(np.split(free, chains), np.split(smoothed_weights(log_weight)[0], chains), strict=True)
+    chosen = np.stack([part[ordered_resample(weight, draws)] for part, weight in several])
+    still = np.zeros(chosen.shape[:2], int)
+    run = Chains(cast(Any, chosen), cast(Any, still > 0), cast(Any, still), cast(Any, np.zeros(chains)))
+    population = _populations(jnp.asarray(chosen.reshape(-1, len(free[0]))), target)
+    return run, jax.tree.map(np.asarray, population)
