@@ -118,8 +118,10 @@ def sample_weighted(
         free, log_weight = proposed(trial)
         last = turn == ROUNDS - 1
         if _good(log_weight, LEAST_SHARE if last else GOOD_SHARE):
-            further, more = proposed(max(total - trial, 0))
-            free, log_weight = np.concatenate([free, further])[:total], np.concatenate([log_weight, more])[:total]
+            if total > trial:
+                further, more = proposed(total - trial)
+                free, log_weight = np.concatenate([free, further]), np.concatenate([log_weight, more])
+            free, log_weight = free[:total], log_weight[:total]
             if _good(log_weight, LEAST_SHARE):
                 return _resampled(free, log_weight, target, chains, draws)
         weight, _ = smoothed_weights(log_weight)

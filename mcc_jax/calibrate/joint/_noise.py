@@ -206,7 +206,7 @@ class NoisePrior(eqx.Module):
 
     def log_density(self, logs: np.ndarray) -> np.ndarray:
         """Log density of the logarithms, up to a constant; shape (..., 4) becomes (...)."""
-        return -0.5 * np.sum(((logs - np.log(self.median)) / np.asarray(self.log_sd)) ** 2, -1)
+        return np.asarray(-0.5 * np.sum(((logs - np.log(self.median)) / np.asarray(self.log_sd)) ** 2, -1))
 
 
 @compiled

@@ -58,6 +58,7 @@ class Compilations(logging.Handler):
 def queued(campaigns, told):
     logger, seen = logging.getLogger("jax._src.interpreters.pxla"), Compilations()
     propagates, logger.propagate = logger.propagate, False
+    jax.clear_caches()  # of other tests
     logger.addHandler(seen)
     jax.config.update("jax_log_compiles", True)
     try:
