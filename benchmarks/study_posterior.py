@@ -15,8 +15,12 @@ Run `uv run --group bench python benchmarks/study_posterior.py --write` (an hour
 
 from __future__ import annotations
 
+import os
 import tempfile
 import time
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 
 import _report
@@ -83,7 +87,7 @@ def one_campaign(seed: int, count: int, collapsed: bool, model: JointModel):
     truth, diameters, laws, peaks = draw_truth(seed, count, collapsed, model)
     programme = Programme.cycles(points=POINTS)
     campaign = simulate_campaign(laws, diameters, peaks, programme, instrument=INSTRUMENT, seed=seed)
-    posterior = calibrate_bayes(campaign, model=model, chains=2, draws=500, warmup=300, seed=seed)
+    posterior = calibrate_bayes(campaign, model=model, seed=seed)
     named = posterior.named_population()
     values = {"a": truth["a"], "effective_modulus_MPa": truth["effective_modulus_MPa"]}
     for j, name in enumerate(("C1", "C3", "C5")):
@@ -171,9 +175,14 @@ def plot(results: dict[str, list[dict]], file: Path) -> None:
     figure.savefig(file, dpi=110)
 
 
+def _in_float64() -> None:
+    jax.config.update("jax_enable_x64", True)
+
+
 def main():
     parser = _report.parser(__doc__)
-    parser.add_argument("--campaigns", type=int, default=300)
+    parser.add_argument("--campaigns", type=int, default=1000)
+    parser.add_argument("--workers", type=int, default=os.cpu_count())
     parser.add_argument("--settings", nargs="+", default=["prior", "collapsed", "five"])
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
@@ -184,10 +193,12 @@ def main():
         model = JointModel(priors=None if setting == "wide" else AROUND)
         started = time.perf_counter()
         rows = []
-        for seed in range(arguments.campaigns):
-            rows.append(one_campaign(seed, count, setting == "collapsed", model))
-            if seed % 20 == 19:
-                print(f"{setting}: {seed + 1} campaigns, {time.perf_counter() - started:.0f} s", flush=True)
+        work = partial(one_campaign, count=count, collapsed=setting == "collapsed", model=model)
+        with ProcessPoolExecutor(arguments.workers, get_context("spawn"), _in_float64) as pool:
+            for row in pool.map(work, range(arguments.campaigns), chunksize=5):
+                rows.append(row)
+                if len(rows) % 20 == 0:
+                    print(f"{setting}: {len(rows)} campaigns, {time.perf_counter() - started:.0f} s", flush=True)
         results[setting] = rows
         verdicts += judge(rows, setting)
         runs.append(

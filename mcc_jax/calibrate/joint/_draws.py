@@ -24,7 +24,7 @@ from ._population import COEFFICIENTS, Population, Scatter
 from ._sampling import Exact, sample_joint, sample_population
 from ._weights import diagnostics
 
-ACCEPT = (0.7, 0.95, 0.99)
+ACCEPT = (0.8, 0.95, 0.99)
 """Acceptance that the sampler aims at: after divergences once more, and once more, with smaller steps."""
 
 

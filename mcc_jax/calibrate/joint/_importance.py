@@ -13,6 +13,7 @@ its gradient takes a tenth of the time to compile, and all draws are worked on s
 
 from __future__ import annotations
 
+import math
 from itertools import product
 from typing import Any, cast
 
@@ -40,11 +41,12 @@ GOOD_SHARE = 0.5
 """Effective share of the proposed draws from which on the proposal need not be fitted any better, beside the gate of
 Pareto k."""
 
-LEAST_SHARE = 0.2
+LEAST_SHARE = 0.1
 """Least effective share with which the proposed draws are used: less, and the sampler is the safer choice."""
 
-SPARE = 3
-"""How many are proposed for each draw that is kept. Of large campaigns, whose densities are dear, one."""
+EFFECTIVE = 2.0
+"""So many times as many effective draws as are kept are proposed. Of large campaigns, whose densities are dear, as many
+as are kept are proposed, and `GOOD_SHARE` is asked of them."""
 
 AT_A_TIME = 250
 """Draws whose densities are asked for in one go."""
@@ -111,18 +113,21 @@ def sample_weighted(
     # Standard deviations of coordinates differ by many powers of ten, for which SciPy takes a matrix to be singular.
     shape = cast(Any, np.eye(len(mode)) * (1 - 2 / FREEDOM))  # its stub takes a number
     unit = multivariate_t(np.zeros(len(mode)), shape, FREEDOM)
-    total = chains * draws * (1 if many else SPARE)
-    trial = min(TRIAL // 4, total) if many else TRIAL
+    kept = chains * draws
+    trial = min(TRIAL // 4, kept) if many else TRIAL
+    least = GOOD_SHARE if many else LEAST_SHARE
     centre, width = folded(np.array(mode)), np.asarray(covariance)
     for turn in range(ROUNDS):
         free, log_weight = proposed(trial)
         last = turn == ROUNDS - 1
-        if _good(log_weight, LEAST_SHARE if last else GOOD_SHARE):
+        if _good(log_weight, least if last else GOOD_SHARE):
+            share = effective_share(smoothed_weights(log_weight)[0])
+            total = kept if many else chains * math.ceil(EFFECTIVE * draws / share)
             if total > trial:
                 further, more = proposed(total - trial)
                 free, log_weight = np.concatenate([free, further]), np.concatenate([log_weight, more])
             free, log_weight = free[:total], log_weight[:total]
-            if _good(log_weight, LEAST_SHARE):
+            if _good(log_weight, least):
                 return _resampled(free, log_weight, target, chains, draws)
         weight, _ = smoothed_weights(log_weight)
         if last or effective_share(weight) * len(weight) < ENOUGH * len(mode):

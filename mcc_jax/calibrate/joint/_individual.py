@@ -25,6 +25,9 @@ VARIATIONS = ((0.0, 0.0, 0.0), (0.05, -0.1, 0.03), (-0.05, 0.06, -0.02))
 MOST_STEPS, FIRST_STEPS = 200, 10
 """Most steps of a fit, and how many all particles of many blocks take before the late ones go on by themselves."""
 
+FAR = 4.0
+"""How many times the least sum of squares a fit without an unseen snap-through may leave, to be preferred."""
+
 LEFT_TO_GAIN = 1e-6
 """Log probability still to gain at which a fit is finished, where residuals are as large as the noise."""
 
@@ -180,7 +183,9 @@ def fit_particles(
     first = jnp.min(jnp.where(many.mask & many.loading, many.force, jnp.inf), 1)
     unseen = jax.vmap(snap)(y.reshape(-1, 5)[:, :4], many.particle) < jnp.log(first)
     seen = jnp.where(unseen.reshape(loss.shape), jnp.inf, loss)
-    best = jnp.argmin(jnp.where(jnp.any(jnp.isfinite(seen), 0), seen, loss), axis=0)
+    # Unless nothing else comes near the data: then the particle has snapped through before anybody looked.
+    near = jnp.min(seen, axis=0) < FAR * jnp.min(loss, axis=0) + FAR
+    best = jnp.argmin(jnp.where(near[None], seen, loss), axis=0)
 
     def take(values):
         return jnp.take_along_axis(values, best.reshape(1, -1, *[1] * (values.ndim - 2)), axis=0)[0]

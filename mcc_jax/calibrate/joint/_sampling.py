@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -135,6 +136,9 @@ class Exact(eqx.Module):
         return -0.5 * (jnp.exp(-2 * population.log_noise) * total + at_zero) - points * population.log_noise
 
 
+REACH = 3.0
+"""Every other candidate is drawn from a distribution so many times as wide: what a summary is too narrow for is there."""
+
 ROWS, ROWS_OF_ACCELERATORS = 640, 40_000
 """Single draws of single particles worked on at once: a processor keeps no more in its cache."""
 
@@ -163,20 +167,27 @@ def draw_particles(
         key, at = arguments
         deviate, zeros, pick = jax.random.split(key, 3)
 
-        def candidate(normal, normal_zero):
+        def candidate(normal, normal_zero, reach):
+            normal, normal_zero = reach * normal, reach * normal_zero
             drawn = exact.draw(at, normal, normal_zero)
             ratio = jnp.zeros(count)
             if candidates:
                 truth = exact.log_likelihood(at, drawn.latent, drawn.zero)
                 prior = -0.5 * jnp.sum(drawn.deviations**2, -1)
-                proposal = -0.5 * (jnp.sum(normal**2, -1) + normal_zero**2) - drawn.log_volume
+                square = 0.5 * (jnp.sum(normal**2, -1) + normal_zero**2)
+                proposal = -square - drawn.log_volume
+                if candidates > 1:
+                    far = -square / REACH**2 - (exact.scatter.size + 1) * math.log(REACH)
+                    proposal = jnp.logaddexp(-square, far) - math.log(2) - drawn.log_volume
                 ratio = truth + prior - proposal - drawn.log_likelihood - jnp.log(exact.summary.zero_sd)
                 ratio = jnp.where(jnp.isfinite(ratio), ratio, -jnp.inf)
             return drawn.latent, drawn.zero, drawn.log_likelihood, ratio
 
         shape = (max(candidates, 1), count)
         latent, zero, likelihood, ratio = jax.vmap(candidate)(
-            jax.random.normal(deviate, (*shape, exact.scatter.size)), jax.random.normal(zeros, shape)
+            jax.random.normal(deviate, (*shape, exact.scatter.size)),
+            jax.random.normal(zeros, shape),
+            jnp.where(jnp.arange(shape[0]) % 2 == 0, 1.0, REACH),
         )
         if candidates <= 1:
             return ParticleDraws(latent[0], zero[0], likelihood[0], ratio[0])
