@@ -181,7 +181,7 @@ def _in_float64() -> None:
 
 def main():
     parser = _report.parser(__doc__)
-    parser.add_argument("--campaigns", type=int, default=1000)
+    parser.add_argument("--campaigns", type=int, default=700)
     parser.add_argument("--workers", type=int, default=os.cpu_count())
     parser.add_argument("--settings", nargs="+", default=["prior", "collapsed", "five"])
     arguments = parser.parse_args()

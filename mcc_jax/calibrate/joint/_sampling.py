@@ -137,7 +137,8 @@ class Exact(eqx.Module):
 
 
 REACH = 3.0
-"""Every other candidate is drawn from a distribution so many times as wide: what a summary is too narrow for is there."""
+"""Every other candidate is drawn from a distribution so many times as wide: there lies what a summary is too narrow
+for."""
 
 ROWS, ROWS_OF_ACCELERATORS = 640, 40_000
 """Single draws of single particles worked on at once: a processor keeps no more in its cache."""
