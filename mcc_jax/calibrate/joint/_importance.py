@@ -7,8 +7,8 @@ distribution around the mode are weighted,
 .. math:: w_s \propto p(\theta_s \mid \text{tests}) / q(\theta_s)
 
 and the proposal is fitted to its own weighted draws until the weights' Pareto k and effective size say that it is good
-enough (Cappe et al. 2004; Vehtari et al. 2024). If they never do, the sampler has to run (`_nuts`). The density by itself
-takes a quarter of the sampler's time to compile, and all draws are worked on side by side.
+enough (Cappe et al. 2004; Vehtari et al. 2024). If they never do, the sampler has to run (`_nuts`). The density by
+itself takes a quarter of the sampler's time to compile, and all draws are worked on side by side.
 """
 
 from __future__ import annotations
