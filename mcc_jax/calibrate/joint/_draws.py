@@ -84,7 +84,7 @@ def _sampled(
         return found
 
     def run(accept: float) -> tuple[Chains, Population]:
-        # From an array, not from a Python number: a weak type would be compiled anew after `compile_ahead`.
+        # From an array, not from a Python number: another number would be compiled anew.
         aim = jnp.asarray(np.asarray(accept))
         return by_chains(sample_population, key, length, mode, covariance, target, aim)
 

@@ -119,35 +119,31 @@ def sample_weighted(
     centre, width = folded(np.array(mode)), np.asarray(covariance)
     for turn in range(ROUNDS):
         free, log_weight = proposed(trial)
-        last = turn == ROUNDS - 1
-        if _good(log_weight, least if last else GOOD_SHARE):
-            share = effective_share(smoothed_weights(log_weight)[0])
+        weight, k = smoothed_weights(log_weight)
+        share = effective_share(weight)
+        if k <= PARETO_K_MOST and share >= (GOOD_SHARE if turn < ROUNDS - 1 else least):
             total = kept if many else chains * math.ceil(EFFECTIVE * draws / share)
             if total > trial:
                 further, more = proposed(total - trial)
                 free, log_weight = np.concatenate([free, further]), np.concatenate([log_weight, more])
             free, log_weight = free[:total], log_weight[:total]
-            if _good(log_weight, least):
-                return _resampled(free, log_weight, target, chains, draws)
-        weight, _ = smoothed_weights(log_weight)
-        if last or effective_share(weight) * len(weight) < ENOUGH * len(mode):
+            weight, k = smoothed_weights(log_weight)
+            share = effective_share(weight)
+            if k <= PARETO_K_MOST and share >= least:
+                return _resampled(free, weight, target, chains, draws)
+        if share * len(weight) < ENOUGH * len(mode):
             return None
         centre = weight @ free
         width = (free - centre).T @ (weight[:, None] * (free - centre))
     return None
 
 
-def _good(log_weight: np.ndarray, share: float) -> bool:
-    weight, k = smoothed_weights(log_weight)
-    return k <= PARETO_K_MOST and effective_share(weight) >= share
-
-
 def _resampled(
-    free: np.ndarray, log_weight: np.ndarray, target: Target, chains: int, draws: int
+    free: np.ndarray, weight: np.ndarray, target: Target, chains: int, draws: int
 ) -> tuple[Chains, Population]:
     """Weighted draws as equally weighted ones, each chain from draws of its own."""
-    several = zip(np.split(free, chains), np.split(smoothed_weights(log_weight)[0], chains), strict=True)
-    chosen = np.stack([part[ordered_resample(weight, draws)] for part, weight in several])
+    several = zip(np.split(free, chains), np.split(weight, chains), strict=True)
+    chosen = np.stack([part[ordered_resample(own, draws)] for part, own in several])
     still = np.zeros(chosen.shape[:2], int)
     run = Chains(cast(Any, chosen), cast(Any, still > 0), cast(Any, still), cast(Any, np.zeros(chains)))
     population = _populations(jnp.asarray(chosen.reshape(-1, len(free[0]))), target)
