@@ -10,6 +10,7 @@ from joint_cases import COEFFICIENTS, DIAMETERS, NOISE, Programme, simulated
 
 from mcc_jax import InputError, calibrate_bayes, calibrate_least_squares, calibrate_many
 from mcc_jax.calibrate.joint._data import LENGTHS, padded_length
+from mcc_jax.calibrate.joint._drawer import CANDIDATES
 
 SETTINGS = {"chains": 2, "warmup": 150, "draws": 100, "seed": 3}
 FUNCTIONS = (
@@ -61,18 +62,25 @@ def queued(campaigns, told):
     jax.clear_caches()  # of other tests
     logger.addHandler(seen)
     jax.config.update("jax_log_compiles", True)
+    first = []
+
+    def progress(i, step):
+        told.append((i, step))
+        if (i, step) == (0, "done"):
+            first.extend(seen.names)
+
     try:
-        found = calibrate_many(campaigns, progress=lambda i, step: told.append((i, step)), **SETTINGS)
+        found = calibrate_many(campaigns, progress=progress, **SETTINGS)
     finally:
         jax.config.update("jax_log_compiles", False)
         logger.removeHandler(seen)
         logger.propagate = propagates
-    return found, seen.names
+    return found, first, seen.names[len(first) :]
 
 
 @pytest.mark.long
 def test_results_come_in_order_and_errors_in_place(queued, campaigns):
-    found, _ = queued
+    found, *_ = queued
     assert isinstance(found[2], InputError)
     assert "no particle can be used" in str(found[2])
     for i in (0, 1, 3):
@@ -90,10 +98,12 @@ def test_progress_names_the_campaign(queued, told):
 
 @pytest.mark.long
 def test_campaigns_of_similar_size_share_their_compilations(queued):
-    _, compiled = queued
-    # Ahead, in a thread of its own, and for use: the same. The particles are fitted from three starts each time.
+    _, first, further = queued
     for name in FUNCTIONS:
-        assert compiled.count(name) == 1, (name, compiled)
+        # Ahead, in a thread of its own, and for use: the same. Restless particles are drawn by another program.
+        most = 1 + len(CANDIDATES) if name == "draw_particles" else 1
+        assert 1 <= first.count(name) <= most, (name, first)
+        assert name not in further
 
 
 @pytest.mark.long
