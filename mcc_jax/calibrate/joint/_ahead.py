@@ -14,12 +14,12 @@ from jaxtyping import Array
 from ._blocks import Blocks, count_of
 from ._data import Tests
 from ._drawer import chunk_of, stride_of
-from ._importance import AT_A_TIME, log_densities
+from ._importance import log_densities
 from ._large import PROBES
-from ._linearised import expected_latent
-from ._mode import FIRST_SPREAD, Target, gradients
+from ._linearised import expected_latent, summarise
+from ._mode import FIRST_SPREAD, ROWS, Target, gradients
 from ._model import JointModel, prior_numbers
-from ._noise import Whitening
+from ._noise import DIFFERENCES, Linear, Noise, Whitening, likelihoods
 from ._nuts import Length, side_by_side
 from ._population import Population, Scatter, Summary
 from ._sampling import Exact, draw_particles
@@ -28,41 +28,50 @@ from ._sampling import Exact, draw_particles
 def compile_ahead(tests: Tests, block: int, model: JointModel, length: Length) -> None:
     """Compile the same functions as will be called, for arrays of the same shapes.
 
-    Those of the population and those of the particles side by side: the fit, which compiles what it needs itself, would
-    otherwise wait for this to end.
+    In the order in which they are needed, and side by side, since the fit would otherwise wait for this to end: it
+    compiles itself only what it begins with.
     """
     # Almost all campaigns pin their coefficients down; the others compile again.
     sharp = replace(model.scatter, newton=0)
-    side_by_side(
-        lambda compile_part: compile_part(),
-        (lambda: _population(tests, model, sharp), lambda: _particles(tests, block, model, sharp, length)),
-    )
+    many = stride_of(count_of(tests), length.total) > 1
+    one_block = jax.tree.map(lambda x: x[:block], tests)
+    chunk = PROBES if many else chunk_of(length.total) or length.total
+    parts = [lambda: _population(tests, model, sharp, many)]
+    if Blocks(len(tests), block).mesh is None:  # for several devices the particles' are other functions
+        parts += [lambda: _particles(one_block, model, sharp, chunk), lambda: _noise(one_block, model)]
+    side_by_side(lambda compile_part: compile_part(), parts)
 
 
-def _population(tests: Tests, model: JointModel, sharp: Scatter) -> None:
+def _population(tests: Tests, model: JointModel, sharp: Scatter, many: bool) -> None:
     """What finds the population's mode, and draws around it; the sampler proper is hardly ever called for."""
-    d = FIRST_SPREAD + model.scatter.size
+    d = FIRST_SPREAD + sharp.size
     numbers = prior_numbers(model.beliefs, tests.flatness, tests.weight)
-    target = Target(numbers, _quadratic(len(tests)), model.scatter)
+    target = Target(numbers, _quadratic(len(tests)), sharp)
     cast(Any, expected_latent).lower(_dummy(d), target).compile()
-    target = replace(target, scatter=sharp)
-    cast(Any, gradients).lower(_dummy(2 * d + 1, d), target).compile()
-    cast(Any, log_densities).lower(_dummy(AT_A_TIME, d), target).compile()
+    gradients(np.zeros((0, d)), target)
+    if many:
+        cast(Any, log_densities).lower(_dummy(ROWS, d), target).compile()
 
 
-def _particles(tests: Tests, block: int, model: JointModel, sharp: Scatter, length: Length) -> None:
+def _noise(tests: Tests, model: JointModel) -> None:
+    """What estimates the noise and summarises the tests under it."""
+    shape = count, points = tests.force.shape
+    moved, one = _dummy(*shape), _dummy(count)
+    jacobian, prior = _dummy(count, points, 5), _dummy(count, 5)
+    data = Linear(moved, jacobian, prior, tests.step, tests.mask, moved, moved, tests.branch, tests.weight)
+    cast(Any, likelihoods).lower(_dummy(*DIFFERENCES.shape), one, data).compile()
+    noise = Noise.of(np.ones(4), one)
+    cast(Any, summarise).lower(_dummy(count, 4), one, tests, data, noise, model.zero_sd).compile()
+
+
+def _particles(tests: Tests, model: JointModel, sharp: Scatter, draws: int) -> None:
     """What draws the particles back and looks at the draws."""
     import arviz_stats.base  # noqa: F401  # seconds on a cold machine, so here too
 
-    if Blocks(len(tests), block).mesh is not None:
-        return  # for several devices it is another function
-    some_tests = jax.tree.map(lambda x: x[:block], tests)
-    points = tests.force.shape[1]
-    filters = eqx.filter_vmap(Whitening)(*(_dummy(block, points) for _ in range(4)), some_tests.branch)
-    exact = Exact(some_tests, filters, _quadratic(block), sharp, model.zero_sd, model.unloading)
-    all_compared = stride_of(count_of(tests), length.total) == 1
-    several = _dummy((chunk_of(length.total) or length.total) if all_compared else PROBES)
-    triple = _dummy(*several.shape, 3)
+    count, points = tests.force.shape
+    filters = eqx.filter_vmap(Whitening)(*(_dummy(count, points) for _ in range(4)), tests.branch)
+    exact = Exact(tests, filters, _quadratic(count), sharp, model.zero_sd, model.unloading)
+    several, triple = _dummy(draws), _dummy(draws, 3)
     some = eqx.filter_vmap(Population)(several, several, triple, triple, several, several, several)
     cast(Any, draw_particles).lower(jax.random.key(0)[None], some, exact, 1, _dummy() > 2).compile()
 

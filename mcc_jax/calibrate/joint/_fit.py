@@ -118,7 +118,7 @@ def fit_joint(
         block: particles of a block (`Blocks`), of which there is a whole number; 0 for all in one.
         tell: called with the name of each step.
     """
-    scatter, zero_sd, priors = model.scatter, model.zero_sd, model.beliefs
+    zero_sd, priors = model.zero_sd, model.beliefs
     flatness = tests.flatness
     numbers = prior_numbers(priors, flatness, tests.weight)
     read_out = max(read_out_um, 1e-4)
@@ -179,9 +179,9 @@ def fit_joint(
         tell("fitting the population")
         if turn:
             numbers, free = recentred(numbers, free)
-        target = Target(numbers, summary, scatter)
-        sharp = replace(target, scatter=careful_enough(free, target, count))
-        free, covariance, mode_converged = most_probable(free, sharp)
+        target = Target(numbers, summary, model.scatter)
+        target = replace(target, scatter=careful_enough(free, target, count))
+        free, covariance, mode_converged = most_probable(free, target)
         if turn == rounds:
             break
         turn += 1

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ._compile import compiled, even_batch
-from ._mode import FIRST_SPREAD, Target
+from ._mode import FIRST_SPREAD, ROWS, Target, gradients
 from ._nuts import Chains, side_by_side
 from ._population import Population
 from ._weights import PARETO_K_MOST, effective_share, ordered_resample, smoothed_weights
@@ -47,9 +47,6 @@ LEAST_SHARE = 0.1
 EFFECTIVE = 2.0
 """So many times as many effective draws as are kept are proposed. Of large campaigns, whose densities are dear, as many
 as are kept are proposed, and `GOOD_SHARE` is asked of them."""
-
-AT_A_TIME = 250
-"""Draws whose densities are asked for in one go."""
 
 TRIAL = 4000
 """Draws that a proposal is tried on, and fitted to. Of large campaigns as many as are kept, at most a quarter of it."""
@@ -97,16 +94,17 @@ def sample_weighted(
         return free
 
     def densities(part: np.ndarray) -> np.ndarray:
-        return np.asarray(log_densities(jnp.asarray(part), target))
+        # Of few particles a gradient takes no time to speak of, and what the mode was found by is compiled already.
+        return np.asarray(log_densities(jnp.asarray(part), target)) if many else -gradients(part, target)[0]
 
     def proposed(count: int) -> tuple[np.ndarray, np.ndarray]:
         """Draws of the proposal and their log weights, up to a constant."""
         factor = np.linalg.cholesky(width)
-        standard = np.asarray(unit.rvs(size=int(count + -count % AT_A_TIME), random_state=rng))
+        standard = np.asarray(unit.rvs(size=int(count + -count % ROWS), random_state=rng))
         free = folded(centre + standard @ factor.T)
         every_sign = (free[:, None] * signs - centre).reshape(-1, len(mode))
         density = unit.logpdf(solve_triangular(factor, every_sign.T, lower=True).T).reshape(len(free), -1)
-        log_density = np.concatenate(side_by_side(densities, np.split(free, len(free) // AT_A_TIME)))
+        log_density = np.concatenate(side_by_side(densities, np.split(free, len(free) // ROWS)))
         log_weight = log_density - logsumexp(density, axis=1)
         return free[:count], log_weight[:count]
 

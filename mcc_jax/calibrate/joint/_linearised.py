@@ -145,7 +145,8 @@ def careful_enough(free: Float[Array, " d"], target: Target, count: int) -> Scat
         target: of the tests.
         count: number of particles, without copies that only fill up.
     """
-    at = expected_latent(free, target)
+    sharp = replace(target.scatter, newton=0)
+    at = expected_latent(free, replace(target, scatter=sharp))
     variance = np.diagonal(np.linalg.inv(np.asarray(at.hessian)[:count]), axis1=1, axis2=2)
     widest = float(np.max(np.sqrt(variance) * np.asarray(at.stretch)))
-    return replace(target.scatter, newton=0) if widest < SHARP else target.scatter
+    return sharp if widest < SHARP else target.scatter

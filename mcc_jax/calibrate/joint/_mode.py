@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import log_ndtr
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ..._types import Scalar
 from ._compile import compiled
@@ -181,6 +181,9 @@ class Target(eqx.Module):
         return prior + self.numbers.total(marginal_likelihood(population, self.summary, self.flatness, self.scatter))
 
 
+ROWS = 250
+"""Most coordinates that gradients are asked for in one go."""
+
 LEFT_TO_GAIN = 1e-6
 """Twice the log probability still to gain, by Newton's method, at which a mode is reached."""
 
@@ -188,9 +191,25 @@ ATTEMPTS = 4
 
 
 @compiled
-def gradients(free: Float[Array, "many d"], target: Target) -> tuple[Float[Array, " many"], Float[Array, "many d"]]:
-    """Minus the log density at many coordinates, and its gradients."""
-    return jax.lax.map(jax.value_and_grad(lambda one: -target.log_density(one)), free)
+def _gradients(
+    free: Float[Array, "rows d"], count: Int[Array, ""], target: Target
+) -> tuple[Float[Array, " rows"], Float[Array, "rows d"]]:
+    expand = jax.value_and_grad(lambda one: -target.log_density(one))
+
+    def add(i, found):
+        return jax.tree.map(lambda all_rows, one: all_rows.at[i].set(one), found, expand(free[i]))
+
+    return jax.lax.fori_loop(0, count, add, (jnp.zeros_like(free[:, 0]), jnp.zeros_like(free)))
+
+
+def gradients(free: np.ndarray, target: Target) -> tuple[np.ndarray, np.ndarray]:
+    """Minus the log density at up to `ROWS` coordinates, shape (many, d), and its gradients.
+
+    Always compiled for `ROWS`, so that few and many of them share their compilation.
+    """
+    rows = jnp.asarray(np.pad(free, ((0, ROWS - len(free)), (0, 0))))
+    value, slope = _gradients(rows, jnp.asarray(np.asarray(len(free))), target)
+    return np.asarray(value)[: len(free)], np.asarray(slope)[: len(free)]
 
 
 def most_probable(start: Float[Array, " d"], target: Target) -> tuple[Float[Array, " d"], Float[Array, "d d"], bool]:
@@ -206,7 +225,7 @@ def most_probable(start: Float[Array, " d"], target: Target) -> tuple[Float[Arra
     def expand(free: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         steps = np.diag(width)
         points = free + np.concatenate([np.zeros((1, d)), steps, -steps])
-        value, slope = (np.asarray(v) for v in gradients(jnp.asarray(points), target))
+        value, slope = gradients(points, target)
         curvature = (slope[1 : d + 1] - slope[d + 1 :]) / (2 * width[:, None])
         return float(value[0]), slope[0], (curvature + curvature.T) / 2
 

@@ -210,7 +210,7 @@ class NoisePrior(eqx.Module):
 
 
 @compiled
-def _likelihoods(
+def likelihoods(
     logs: Float[Array, "many 4"], scale: Float[Array, " particles"], data: Linear
 ) -> Float[Array, "many particles"]:
     """Log likelihood of each test under each of many noises; 0 of copies that only fill up."""
@@ -220,6 +220,9 @@ def _likelihoods(
 
 STEP = 1e-3
 """Step of the differences in the logarithms; the loss is smooth on the scale of 1 and exact to 1e-12 of its size."""
+
+DIFFERENCES = STEP * np.concatenate([np.zeros((1, 4)), np.eye(4), -np.eye(4)])
+"""What is added to the logarithms for a value and its gradient."""
 
 
 def estimate_noise(
@@ -251,11 +254,10 @@ def estimate_noise(
     blocks = blocks or Blocks(len(start.scale))
     own = data if isinstance(data, Parts) else blocks.cut(data)
     scale = blocks.cut(start.scale)
-    steps = STEP * np.concatenate([np.zeros((1, 4)), np.eye(4), -np.eye(4)])
 
     def value_and_gradient(logs: np.ndarray) -> tuple[float, np.ndarray]:
-        at = logs + steps
-        each = blocks.whole(blocks.each(_likelihoods, jnp.asarray(at), scale, own, axis=1))
+        at = logs + DIFFERENCES
+        each = blocks.whole(blocks.each(likelihoods, jnp.asarray(at), scale, own, axis=1))
         # Summed here, in one order, however the particles are spread.
         values = -(np.sum(np.asarray(each), axis=1) + prior.log_density(at))
         return float(values[0]), (values[1:5] - values[5:]) / (2 * STEP)

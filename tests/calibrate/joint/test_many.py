@@ -16,7 +16,7 @@ SETTINGS = {"chains": 2, "warmup": 150, "draws": 100, "seed": 3}
 FUNCTIONS = (
     "fit_particles",
     "linear_data",
-    "_likelihoods",
+    "likelihoods",
     "summarise",
     "gradients",
     "log_densities",
