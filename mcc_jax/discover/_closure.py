@@ -1,22 +1,27 @@
-"""A formula for a gap that no listed mechanism explains: few words, found by matching pursuit, tried on resamples."""
+"""A formula for a gap that no listed mechanism explains: few words, their numbers fitted, tried on resamples."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from ._score import project, project_summed
-from ._system import System
+from ._score import project
+from ._system import Base, Signals, System, build_system
+from ._tuning import Tuner, Words
 
-MOST_WORDS = 3
-WORTH = 14.0
-"""Least drop of chi2 for which another word is taken: about log of the number of words, twice, and one parameter."""
+RESAMPLES = 10
+"""Random two thirds of the particles for which the formula is looked for once more."""
 
-RESAMPLES = 40
+FOLDS = 5
+"""Parts of the campaign that are left out in turn to find the formula by which these particles are judged."""
+
+ALIKE = 0.9
+"""Cosine from which on two words, projected, are taken to be the same."""
 
 LETTERS = {
     "q": "peak stress/10 MPa",
@@ -43,6 +48,7 @@ class Closure:
         selection_frequency: mean share of resamples of the particles in which its words, or near copies, are chosen.
         resembles: the mechanisms whose projected signatures it resembles, with the cosine, best first.
         span: range of the variables over which it was found.
+        folds: particles that were left out, and the columns of the formula that the others make.
     """
 
     words: np.ndarray
@@ -53,6 +59,7 @@ class Closure:
     selection_frequency: float
     resembles: tuple[tuple[str, float], ...]
     span: dict[str, tuple[float, float]]
+    folds: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """As in `discovery.json`."""
@@ -65,46 +72,68 @@ class Closure:
         }
 
 
-def pursue(system: System, *, particles: np.ndarray | None = None, most: int = MOST_WORDS) -> tuple[list[int], float]:
-    """Words one after the other, each time the one that takes away most together with those before.
-
-    Returns:
-        Columns, and the drop of chi2 by all of them.
-    """
-    columns, total = system.word_columns, system.total(particles)
-    inside: list[int] = []
-    base = float("nan")
-    while True:
-        found = project_summed(total, system, columns, np.array(inside, int), 1e-4)
-        if not inside:
-            base = found.residual
-        best = int(np.argmax(found.drop))
-        if len(inside) == most or found.drop[best] < WORTH:
-            return inside, base - found.residual
-        inside.append(int(columns[best]))
-
-
 def find_closure(
-    system: System, span: dict[str, tuple[float, float]], seed: int, *, tell: Callable[[str], None] = lambda _: None
-) -> Closure | None:
-    """The formula, or None if no word is worth its place."""
-    chosen, gain = pursue(system)
-    if not chosen:
-        return None
+    base: Base,
+    signals: Signals,
+    system: System,
+    span: dict[str, tuple[float, float]],
+    seed: int,
+    *,
+    tell: Callable[[str], None] = lambda _: None,
+) -> tuple[Closure | None, System]:
+    """The formula, or None if no word is worth its place, and the system with it and those of the folds.
+
+    Args:
+        base: the fitted campaign.
+        signals: what effects and features add in it.
+        system: its linear system.
+        span: range of the variables over which the formula is found.
+        seed: of the resamples.
+        tell: called with the name of each step.
+    """
+    tuner = Tuner(base, system)
+    usable = np.flatnonzero(system.usable)
+    whole = tuner.search(usable)
+    if not whole.words:
+        return None, system
     tell("trying the formula on resamples")
-    nuisance = len(system.globals)
-    fitted = project(system, system.candidate_columns[:0], inside=np.array(chosen))
-    coefficients = fitted.theta[nuisance:]
-    sd = np.sqrt(np.maximum(np.diagonal(fitted.covariance)[nuisance:], 0))
-    everything = np.concatenate([system.word_columns, system.candidate_columns])
-    view = project(system, everything)
-    alike = view.similarity()
-    position = {int(c): i for i, c in enumerate(everything)}
-    own = [position[c] for c in chosen]
-    frequency = _frequency(system, chosen, alike, position, seed)
+    rng = np.random.default_rng([seed, 47])
+    halves = [rng.choice(usable, max(len(usable) * 2 // 3, 3), replace=False) for _ in range(RESAMPLES)]
+    again = [tuner.search(np.sort(half)).words for half in halves] if len(usable) > 3 else []
+    groups = [usable[k::FOLDS] for k in range(min(FOLDS, len(usable)))]
+    others = [tuner.search(np.setdiff1d(usable, group)).words for group in groups] if len(usable) > 2 else []
+    formula = (*whole.words, *(word for words in others for word in words))
+    system = build_system(base, signals.with_formula(formula, tuner.values(formula)))
+    starts = system.formula_columns[0] + np.cumsum([0, len(whole.words), *map(len, others)])
+    parts = [np.arange(first, end) for first, end in pairwise(starts)]
+    chosen = parts[0]
+    fitted = project(system, chosen[:0], inside=chosen)
+    coefficients = fitted.theta[len(system.globals) :]
+    sd = np.sqrt(np.maximum(np.diagonal(fitted.covariance)[len(system.globals) :], 0))
+    gain = float(project(system, chosen[:0]).residual.sum() - fitted.residual.sum())
+    terms = [f"{c:+.3g} {word.text}" for c, word in zip(coefficients, whole.words, strict=True)]
+    text = "added displacement / D_e = " + " ".join(terms)
+    letters = ", ".join(meanings([word.text for word in whole.words]))
+    closure = Closure(
+        chosen,
+        coefficients,
+        sd,
+        f"{text}; {letters}" if letters else text,
+        gain,
+        _frequency(tuner, whole.words, again, usable),
+        _resembling(system, chosen, coefficients),
+        span,
+        tuple(zip(groups, parts[1:], strict=False)),
+    )
+    return closure, system
+
+
+def _resembling(system: System, chosen: np.ndarray, coefficients: np.ndarray) -> tuple[tuple[str, float], ...]:
+    """Mechanisms whose projected signatures the formula resembles, with the cosine, best first."""
+    view = project(system, np.concatenate([chosen, system.candidate_columns]))
+    own, start = np.arange(len(chosen)), len(chosen)
     both = view.information.sum(0)
     length = np.sqrt(max(coefficients @ both[np.ix_(own, own)] @ coefficients, 1e-300))
-    start = len(system.word_columns)
     scale = np.sqrt(np.maximum(np.diagonal(both)[start:], 1e-300))
     cosine = coefficients @ both[own][:, start:] / scale / length
     cosine = np.where(view.alive[start:], cosine, 0.0)
@@ -113,13 +142,7 @@ def find_closure(
     best: dict[str, float] = {}
     for candidate, value in zip(system.candidates, cosine, strict=True):
         best[candidate.mechanism] = max(best.get(candidate.mechanism, -1.0), float(value))
-    resembles = tuple(sorted(((n, v) for n, v in best.items() if v > 0.3), key=lambda pair: -pair[1])[:5])
-    first = system.word_columns[0]
-    terms = [f"{c:+.3g} {system.words[w - first].text}" for c, w in zip(coefficients, chosen, strict=True)]
-    formula = "added displacement / D_e = " + " ".join(terms)
-    letters = ", ".join(meanings([system.words[w - first].text for w in chosen]))
-    formula = f"{formula}; {letters}" if letters else formula
-    return Closure(np.array(chosen), coefficients, sd, formula, gain, frequency, resembles, span)
+    return tuple(sorted(((n, v) for n, v in best.items() if v > 0.3), key=lambda pair: -pair[1])[:5])
 
 
 def meanings(texts: Sequence[str]) -> list[str]:
@@ -129,15 +152,10 @@ def meanings(texts: Sequence[str]) -> list[str]:
     return [f"{letter} = {LETTERS[letter]}" for letter in used]
 
 
-def _frequency(system: System, chosen: list[int], alike: np.ndarray, position: dict[int, int], seed: int) -> float:
-    rng = np.random.default_rng([seed, 47])
-    usable = np.flatnonzero(system.usable)
-    if len(usable) < 4:
-        return 0.0
-    hits = 0.0
-    for _ in range(RESAMPLES):
-        half = rng.choice(usable, size=max(len(usable) * 2 // 3, 3), replace=False)
-        again, _ = pursue(system, particles=half, most=len(chosen))
-        near = [max((abs(alike[position[c], position[d]]) for d in again), default=0.0) > 0.9 for c in chosen]
-        hits += float(np.mean(near))
-    return hits / RESAMPLES
+def _frequency(tuner: Tuner, chosen: Words, again: Sequence[Words], particles: np.ndarray) -> float:
+    """Mean share of other formulas in which the words of one, or words like them, stand."""
+    shares = []
+    for other in again:
+        alike = np.abs(tuner.cosines((*chosen, *other), particles))[: len(chosen), len(chosen) :]
+        shares.append(np.mean(np.max(alike, axis=1, initial=0.0) > ALIKE))
+    return float(np.mean(shares)) if shares else 0.0

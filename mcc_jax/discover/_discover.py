@@ -14,7 +14,7 @@ from ..calibrate import JointModel
 from ..campaign import Campaign
 from ..effects import LIBRARY, Mechanism, present
 from ._candidates import untestable
-from ._closure import Closure
+from ._closure import Closure, find_closure
 from ._confirm import held_out
 from ._estimates import detection_limits, estimated_effects, population_parameters, with_draws
 from ._experiments import next_experiments
@@ -178,9 +178,11 @@ def _judge(
             tell("the serious names, fitted as they are")
             drops = {k: extensions.drop((k,)) for k in serious(system, ranking)}
             ranking = rank(system, view, refitted=drops)
-        verdict, chosen, sets, steps, closure = name_missing(
-            system, view, ranking, extensions if large else None, span_of(base), seed, tell
-        )
+        verdict, chosen, sets, steps = name_missing(system, view, ranking, extensions if large else None, seed, tell)
+        if verdict == "UNLISTED":
+            tell("a formula of its own")
+            closure, system = find_closure(base, signals, system, span_of(base), seed, tell=tell)
+            extended = system
         if large and chosen and not any(step.at_random[0] for step in steps):
             last = extensions.fit(tuple(chosen))
             if last.physical:
@@ -214,7 +216,7 @@ def _judge(
     ladder, labels = None, (None,)
     if confirm and gap and int(system.usable.sum()) > 2:
         tell("held-out particles")
-        ladder = held_out(system, chooser(system, len(chosen), closure is not None), around)
+        ladder = held_out(system, chooser(system, len(chosen), closure), around)
         labels = (None, *(e.mechanism for e in effects), *(("formula",) if closure is not None else ()))
     further: list[dict[str, Any]] = []
     if experiments and gap:

@@ -6,8 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ._closure import find_closure, pursue
+from ._closure import Closure
 from ._extensions import Extensions
+from ._pursuit import pursue
 from ._result import Verdict
 from ._score import Projection, project
 from ._search import Ranking, family_columns, pairs, rank
@@ -34,18 +35,16 @@ def name_missing(
     view: Projection,
     ranking: Ranking,
     extensions: Extensions | None,
-    span: dict[str, tuple[float, float]],
     seed: int,
-    tell,
-):
-    """Verdict, chosen candidates, their sets, rankings of each step, and the formula if nothing listed will do.
+    tell: Callable[[str], None],
+) -> tuple[Verdict, list[int], list[tuple[str, ...]], list[Ranking]]:
+    """Verdict, chosen candidates, their sets, and rankings of each step.
 
     Args:
         system: the linear system of the campaign.
         view: the candidates in it.
         ranking: theirs.
         extensions: fits of the extended law; None where first order does.
-        span: range of the variables over which a formula would be found (`span_of`).
         seed: of the bootstrap.
         tell: called with the name of each step.
     """
@@ -65,11 +64,11 @@ def name_missing(
         most_left = max(most_left, left)
         if gain_of_words <= gain + BETTER + SHARE * gain and left > LEVEL_OF_MORE:
             own = (name, *(m for m in members if m != name))
-            return ("NAMED" if len(members) == 1 else "SET"), [first], [own], [ranking], None
+            return _verdict(members), [first], [own], [ranking]
     first = ranking.best[0]
     tell("a second effect")
     if ranking.at_random[0] and ranking.gain[0] > gain_of_words:
-        return ("NAMED" if len(members) == 1 else "SET"), [first], [members], [ranking], None
+        return _verdict(members), [first], [members], [ranking]
     best_pairs = pairs(system, view)
     if best_pairs and not ranking.at_random[0]:
         gain, i, j = best_pairs[0]
@@ -82,15 +81,17 @@ def name_missing(
         if enough and p_both > LEVEL_OF_MORE and gain >= gain_of_words - BETTER:
             steps = [_beside(system, other) for other in (j, i)]  # each is judged with the other one in the law
             sets = [_with(name, step) for name, step in zip(both, steps, strict=True)]
-            verdict: Verdict = "NAMED" if all(len(s) == 1 for s in sets) else "SET"
-            return verdict, [i, j], sets, steps, None
-    tell("a formula of its own")
-    closure = find_closure(system, span, seed, tell=tell)
+            return _verdict(*sets), [i, j], sets, steps
     far_better = gain_of_words > ranking.gain[0] * (1 + SHARE) + BETTER
     unexplained = not evident or most_left <= LEVEL_OF_UNLISTED or far_better
-    if closure is None or not unexplained:
-        return ("NAMED" if len(members) == 1 else "SET"), [first], [members], [ranking], None
-    return "UNLISTED", [], [], [], closure
+    if gain_of_words == 0 or not unexplained:
+        return _verdict(members), [first], [members], [ranking]
+    return "UNLISTED", [], [], []
+
+
+def _verdict(*sets: tuple[str, ...]) -> Verdict:
+    """The verdict for some sets of names."""
+    return "NAMED" if all(len(names) == 1 for names in sets) else "SET"
 
 
 def _beside(system: System, other: int) -> Ranking:
@@ -103,13 +104,15 @@ def _with(name: str, ranking: Ranking) -> tuple[str, ...]:
     return (name, *(m for m in members if m != name))
 
 
-def chooser(system: System, count: int, formula: bool) -> Callable[[np.ndarray], list[np.ndarray]]:
+def chooser(system: System, count: int, closure: Closure | None) -> Callable[[np.ndarray], list[np.ndarray]]:
     """The search as it is repeated within a fold."""
-    empty = np.array([], int)
+    empty, usable = np.array([], int), np.flatnonzero(system.usable)
 
     def choose(particles: np.ndarray) -> list[np.ndarray]:
-        if formula:
-            return [empty, np.array(pursue(system, particles=particles)[0], int)]
+        if closure is not None:
+            out = np.setdiff1d(usable, particles)
+            without = [words for group, words in closure.folds if np.isin(out, group).any()]
+            return [empty, without[0] if without else closure.words]
         view = project(system, system.candidate_columns, particles=particles)
         if count == 1:
             return [empty, np.array([system.column(rank(system, view).best[0])])]

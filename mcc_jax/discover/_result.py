@@ -151,8 +151,8 @@ class Discovery:
         """
         if self.closure is None or self.base is None or self.system is None:
             return {}
-        base, chosen = self.base, self.closure.words - self.system.word_columns[0]
-        values = feature_values(base, tuple(self.system.words[int(w)] for w in chosen))
+        base = self.base
+        values = feature_values(base, tuple(self.system.word(int(w)) for w in self.closure.words))
         added = np.einsum("w,nwp->np", self.closure.coefficients, np.asarray(values))
         found = {}
         for i, rows, of_test in zip(base.selection.kept, base.selection.rows, added, strict=True):

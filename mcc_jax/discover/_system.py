@@ -39,7 +39,7 @@ from ..effects import LIBRARY, Context, ExtendedLaw, Mechanism, Record, record_b
 from ..geometry import Particle
 from ..law import Unloading
 from ._candidates import Candidate, candidates_of
-from ._features import Feature, map_features, values_of, waves, words
+from ._features import GAUGE, ROOM, Feature, map_features, values_of, words
 
 GLOBALS = ("a", "log modulus", "mu C1", "mu C3", "mu C5")
 
@@ -48,7 +48,7 @@ GLOBALS = ("a", "log modulus", "mu C1", "mu C3", "mu C5")
 class System:
     """The linear system of a campaign.
 
-    Columns are ordered: the residual, the population's parameters, the candidates, the map, the words.
+    Columns are ordered: the residual, the population's parameters, the candidates, the map, the words, the formula.
 
     Attributes:
         gram: X^T M X of every particle, its own parameters integrated out, shape (N, Q, Q).
@@ -63,6 +63,7 @@ class System:
         shift: of the population's parameters from the base fit's, likewise.
         tails: degrees of freedom of Student's distribution whose tails are those of the noise; infinite where it is
             normal.
+        formula: words with fitted numbers, of the formula that was found and of those without some particles.
     """
 
     gram: np.ndarray
@@ -75,6 +76,7 @@ class System:
     at: np.ndarray
     shift: np.ndarray
     tails: float = np.inf
+    formula: tuple[Feature, ...] = ()
 
     @property
     def globals(self) -> np.ndarray:
@@ -91,14 +93,27 @@ class System:
         return 1 + len(GLOBALS) + np.arange(len(self.candidates))
 
     @property
+    def _features_from(self) -> int:
+        return 1 + len(GLOBALS) + len(self.candidates)
+
+    @property
     def place_columns(self) -> np.ndarray:
         """Columns of the map."""
-        return 1 + len(GLOBALS) + len(self.candidates) + np.arange(len(self.places))
+        return self._features_from + np.arange(len(self.places))
 
     @property
     def word_columns(self) -> np.ndarray:
         """Columns of the words."""
-        return 1 + len(GLOBALS) + len(self.candidates) + len(self.places) + np.arange(len(self.words))
+        return self._features_from + len(self.places) + np.arange(len(self.words))
+
+    @property
+    def formula_columns(self) -> np.ndarray:
+        """Columns of the formula."""
+        return self._features_from + len(self.places) + len(self.words) + np.arange(len(self.formula))
+
+    def word(self, column: int) -> Feature:
+        """The word or part of the formula of a column."""
+        return (*self.words, *self.formula)[column - self.word_columns[0]]
 
     @cached_property
     def _usable_total(self) -> np.ndarray:
@@ -120,9 +135,10 @@ class System:
 
     @property
     def waves(self) -> np.ndarray:
-        """Columns of the words that are waves in time or displacement."""
-        names = {word.text for word in waves()}
-        return np.array([c for c, w in zip(self.word_columns, self.words, strict=True) if w.text in names], int)
+        """Columns of words that are waves in time or displacement, of those in the formula, too."""
+        several = (*self.words, *self.formula)
+        waves = [i for i, word in enumerate(several) if word.form in (ROOM, GAUGE)]
+        return self._features_from + len(self.places) + np.array(waves, int)
 
     def looked_at(self) -> tuple[np.ndarray, np.ndarray]:
         """Columns of candidates, map and words, and the sign that each one's coefficient must have."""
@@ -207,11 +223,17 @@ class Signals:
         candidates: the formulas.
         added: shape (N, K, points), [um] per unit amplitude.
         seen: of the features, shape (N, F, points).
+        formula: the features behind map and words.
     """
 
     candidates: tuple[Candidate, ...]
     added: Float[Array, "particles K points"]
     seen: Float[Array, "particles F points"]
+    formula: tuple[Feature, ...] = ()
+
+    def with_formula(self, formula: tuple[Feature, ...], values: Float[Array, "particles F points"]) -> Signals:
+        """The same, and words with fitted numbers behind the others, with their values [um]."""
+        return replace(self, seen=jnp.concatenate([self.seen, -values], 1), formula=formula)
 
     def of(self, columns: np.ndarray) -> Float[Array, "particles columns points"]:
         """Change of the residual per unit of some of the system's columns."""
@@ -304,7 +326,9 @@ def build_system(base: Base, signals: Signals) -> System:
     points = np.asarray(jnp.sum(tests.mask, 1))
     still, none = np.zeros(len(GLOBALS)), np.zeros(len(candidates))
     white = np.asarray(in_batches(_whitened, (data.residual, fit.filters)))[np.asarray(tests.mask)]
-    return System(gram, points, candidates, places, some, 1 / width**2, usable, none, still, tails_of(white))
+    return System(
+        gram, points, candidates, places, some, 1 / width**2, usable, none, still, tails_of(white), signals.formula
+    )
 
 
 OFTEN = 0.98

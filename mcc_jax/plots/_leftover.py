@@ -15,7 +15,7 @@ from ..calibrate.joint._linearised import linear_data
 from ..calibrate.joint._population import moments
 from ..discover import Discovery
 from ..discover._score import project
-from ..discover._system import Base, Candidate, System, build_system, signals_of
+from ..discover._system import Base, Candidate, System, build_system, feature_values, signals_of
 from ..effects import Mechanism, Variant
 
 
@@ -106,6 +106,9 @@ def _as_found(base: Base, system: System, found: Discovery) -> tuple[System, np.
         return system, inside, jnp.zeros((len(system.points), 0, base.tests.force.shape[1]))
     formulas = [_fixed_at(effect.variant, effect.nuisance) for effect in found.effects]
     signals = signals_of(base, {str(i): Mechanism(v.mechanism, "", (v,)) for i, v in enumerate(formulas)})
+    if found.closure is not None:
+        words = tuple(system.word(int(column)) for column in found.closure.words)
+        signals = signals.with_formula(words, feature_values(base, words))
     # Columns of features stand behind those of all candidates, so they move with the number of these.
     moved = len(signals.candidates) - len(system.candidates)
     columns = np.array([*(system.column(i) for i in range(len(formulas))), *(inside[len(formulas) :] + moved)], int)
