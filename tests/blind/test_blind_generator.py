@@ -137,10 +137,12 @@ def test_programmes(protocol):
 def test_population_follows_table_2():
     rng = np.random.default_rng(3)
     particles = designs.population(rng, np.repeat(designs.TABLE_1, 200, axis=0))
-    # Nearly non-monotone draws are replaced, which moves the means by about 0.01.
-    for name, (mean, sd) in law.LOG_C.items():
+    # Nearly non-monotone draws are replaced, which moves the means by about 0.01: what an answer calls true.
+    moved = law.monotone_means(designs.MARGIN)
+    assert abs(moved[0] - law.LOG_C["C1"][0]) > 0.01
+    for (name, (_, sd)), mean in zip(law.LOG_C.items(), moved, strict=True):
         logs = np.log(getattr(particles, name))
-        assert logs.mean() == pytest.approx(mean, abs=0.02 + 4 * sd / 63)
+        assert logs.mean() == pytest.approx(mean, abs=1e-9 + 4 * sd / 63)
         assert logs.std() == pytest.approx(sd, rel=0.1)
     assert law.is_monotone(particles.C1, particles.C3, particles.C5).all()
     jumping = designs.population(rng, designs.TABLE_1, snap_through=True)

@@ -1,6 +1,7 @@
 """The runner: resumes, survives whatever a solver does, and ends in tables."""
 
 import json
+import os
 
 import pytest
 
@@ -104,6 +105,22 @@ def test_follow_up_tests_the_same_material_in_another_way(tmp_path):
     particles = [(folder / "campaigns" / key / "particles.csv").read_text() for key in ("c00001", "c00001+next")]
     assert particles[0] == particles[1]
     sealing.open_answers(folder)
+
+
+def test_one_campaign_of_twenty_is_solved_alone_once(tmp_path, monkeypatch):
+    few = tiers.Case("f", "T1", "frame_compliance", "P0", count=3, resample=True, effects=())
+    twenty = tiers.Case("t", "T0", "clean", "P0", count=20)
+    folder = tmp_path / "run"
+    sealing.seal(folder, [few, twenty], master=1, jobs=1)
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
+    for _ in range(2):
+        run.solve_cold(folder, solver="fake_solvers:silent")
+    assert os.environ["XLA_FLAGS"] == "--xla_cpu_multi_thread_eigen=false"
+    (key,) = run.read_results(folder)
+    base = key.removesuffix("#cold")
+    assert len((folder / "campaigns" / base / "particles.csv").read_text().splitlines()) == 21
+    assert len((folder / "results.jsonl").read_text().split()) > 0
+    assert set(run.solve(folder, solver="fake_solvers:silent", jobs=1)) == {"c00001", "c00002", key}
 
 
 def test_names_of_solvers_and_experiments():

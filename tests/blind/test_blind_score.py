@@ -118,6 +118,7 @@ def perfect_run():
         found.append(scoring.Outcome(f"c{number:05d}", answer, result))
     results = {o.key: o.result for o in found}
     results["c00000#repeat"] = {**found[0].result, "discovery": {**found[0].found, "runtime_s": 9.0}}
+    results["c00000#cold"] = {**found[0].result, "wall_s": 80.0}
     return found, results
 
 
@@ -251,6 +252,29 @@ def test_biased_parameters_fail(perfect_run):
     assert table["bias of effective_modulus_MPa, in SE (absolute mean)"]["observed"].startswith("4")
     assert table["95% interval covers log_C1"]["result"] is False  # 100 % is too wide
     assert table["bias of a, in SE (absolute mean)"]["result"] is True
+
+
+def test_the_time_from_nothing_is_that_of_the_campaign_solved_alone(perfect_run):
+    found, results = perfect_run
+    name = "run time of one campaign of 20, cold (largest)"
+    assert rows(found, results)[name]["observed"].startswith("80 s")
+    slow = {**results, "c00000#cold": {**results["c00000#cold"], "wall_s": 91.0}}
+    assert rows(found, slow)[name]["result"] is False
+
+
+def test_a_cut_of_bias_is_judged_by_what_was_drawn(perfect_run):
+    """A campaign's particles lie away from the population by chance, whatever the effect."""
+    found, results = perfect_run
+    name = "bias of log_C1 cut by adding the effect (mean over mechanisms biased by more than 1 SE)"
+    assert rows(found, results)[name]["result"] is True
+    estimates = {"log_C1": {"mean": estimate(2.4, 0.1)}}
+    wrong = changed(found, lambda o: o.tier == "T1", parameters_after=estimates)
+    assert rows(wrong, results)[name]["result"] is False
+    drawn = [
+        scoring.Outcome(o.key, {**o.answer, "truth": {**o.answer["truth"], "log_C1_drawn": 2.4 + 0.01}}, o.result)
+        for o in changed(wrong, lambda o: True, parameters_before={"log_C1": {"mean": estimate(2.9, 0.1)}})
+    ]
+    assert rows(drawn, results)[name]["result"] is True
 
 
 def test_clopper_pearson():

@@ -20,6 +20,7 @@ TABLE_1 = np.array(
 )  # fmt: skip
 
 PEAK_MPA = (7.0, 16.0)
+MARGIN = 0.9  # of a loading curve that is not replaced, from falling
 LOAD_RATE_MN_PER_S = 2.0
 POINTS = 260
 PROTOCOLS = ("P0", "P1", "P2")
@@ -75,7 +76,7 @@ def population(rng, diameters, modulus_spread=0.0, snap_through=False, humidity=
             kept = np.concatenate([kept, trial[accept(*trial.T)]])
         return kept[:wanted]
 
-    C = draw(count, lambda C1, C3, C5: is_monotone(C1, C3, C5, margin=0.9))
+    C = draw(count, lambda C1, C3, C5: is_monotone(C1, C3, C5, margin=MARGIN))
     if snap_through:
         jumping = int(rng.integers(1, 3))
         C[rng.choice(count, jumping, replace=False)] = draw(jumping, lambda *c: ~is_monotone(*c))

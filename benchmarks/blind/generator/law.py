@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 
 import numpy as np
+from scipy.stats import norm
 
 SHAPE_PARAMETER = 1.43
 CONTACT_AREA = 1.43  # the paper's c^2 for perfect plasticity; equal to the shape parameter by coincidence
@@ -67,6 +68,15 @@ def master_stress(x, C1, C3, C5):
 def is_monotone(C1, C3, C5, margin=1.0):
     """Whether the loading polynomial never falls; `margin` below one asks for more than that."""
     return margin * 20.0 * C1 * C5**5 >= 9.0 * C3**6
+
+
+def monotone_means(margin):
+    """Means of ln C1, ln C3, ln C5 over draws that are monotone with a margin: a normal distribution cut by a plane."""
+    means, sds = np.array(list(LOG_C.values())).T
+    along = np.array([1.0, -6.0, 5.0])
+    spread = np.sqrt(np.sum((along * sds) ** 2))
+    z = (np.log(9.0 / (20.0 * margin)) - along @ means) / spread
+    return means + along * sds**2 / spread * norm.pdf(z) / norm.sf(z)
 
 
 def unloading_ratio(s):

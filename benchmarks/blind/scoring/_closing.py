@@ -109,8 +109,10 @@ def add_recovery(table, exact):
                 covered.append(low <= truth <= high)
             if after and after.get("sd"):
                 pull.append((after["value"] - truth) / after["sd"])
+            # By how much the effect has moved an estimate, not by how much a few particles differ from the population.
+            here = o.answer["truth"].get(f"{name}_drawn", truth)
             if after and before and after.get("sd"):
-                errors[o.truth[0]].append((before["value"] - truth, after["value"] - truth, after["sd"]))
+                errors[o.truth[0]].append((before["value"] - here, after["value"] - here, after["sd"]))
         share = np.mean(covered) if covered else 0.0
         if covered:
             low, high = interval(sum(covered), len(covered))
