@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ._pursuit import pursue
 from ._score import project
 from ._system import Base, Signals, System, build_system
 from ._tuning import Tuner, Words
@@ -91,10 +92,11 @@ def find_closure(
         seed: of the resamples.
         tell: called with the name of each step.
     """
-    tuner = Tuner(base, system)
+    tuner = Tuner(base, signals, system)
     usable = np.flatnonzero(system.usable)
-    whole = tuner.search(usable)
-    if not whole.words:
+    # A gap just large enough to be called one may have no word that is worth its numbers: then the listed ones.
+    whole = tuner.search(usable).words or tuple(system.word(column) for column in pursue(system)[0])
+    if not whole:
         return None, system
     tell("trying the formula on resamples")
     rng = np.random.default_rng([seed, 47])
@@ -102,25 +104,25 @@ def find_closure(
     again = [tuner.search(np.sort(half)).words for half in halves] if len(usable) > 3 else []
     groups = [usable[k::FOLDS] for k in range(min(FOLDS, len(usable)))]
     others = [tuner.search(np.setdiff1d(usable, group)).words for group in groups] if len(usable) > 2 else []
-    formula = (*whole.words, *(word for words in others for word in words))
+    formula = (*whole, *(word for words in others for word in words))
     system = build_system(base, signals.with_formula(formula, tuner.values(formula)))
-    starts = system.formula_columns[0] + np.cumsum([0, len(whole.words), *map(len, others)])
+    starts = system.formula_columns[0] + np.cumsum([0, len(whole), *map(len, others)])
     parts = [np.arange(first, end) for first, end in pairwise(starts)]
     chosen = parts[0]
     fitted = project(system, chosen[:0], inside=chosen)
     coefficients = fitted.theta[len(system.globals) :]
     sd = np.sqrt(np.maximum(np.diagonal(fitted.covariance)[len(system.globals) :], 0))
     gain = float(project(system, chosen[:0]).residual.sum() - fitted.residual.sum())
-    terms = [f"{c:+.3g} {word.text}" for c, word in zip(coefficients, whole.words, strict=True)]
+    terms = [f"{c:+.3g} {word.text}" for c, word in zip(coefficients, whole, strict=True)]
     text = "added displacement / D_e = " + " ".join(terms)
-    letters = ", ".join(meanings([word.text for word in whole.words]))
+    letters = ", ".join(meanings([word.text for word in whole]))
     closure = Closure(
         chosen,
         coefficients,
         sd,
         f"{text}; {letters}" if letters else text,
         gain,
-        _frequency(tuner, whole.words, again, usable),
+        _frequency(tuner, whole, again, usable),
         _resembling(system, chosen, coefficients),
         span,
         tuple(zip(groups, parts[1:], strict=False)),

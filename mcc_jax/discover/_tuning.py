@@ -28,9 +28,9 @@ from ..calibrate.joint._noise import Whitening
 from ..calibrate.joint._population import moments
 from ..effects import Context, ExtendedLaw
 from ..law import Unloading
-from ._features import Feature, Form, further_words, words
+from ._features import Feature, Form, further_words
 from ._pursuit import MOST_WORDS
-from ._system import Base, System, feature_values, in_batches, law_of, mean_by_globals
+from ._system import Base, Signals, System, feature_values, in_batches, law_of, mean_by_globals
 
 MOST_NUMBERS = 3
 """Most numbers that a form has."""
@@ -54,8 +54,11 @@ MOST_PARTICLES = 100
 MODEST = 1e-3
 """What the base law takes up of a formula is not seen, so that nothing keeps it small: this share of its chi2 does."""
 
-EXACT = 1e-5
-STEPS = 25
+LEAST_LEFT = 1e-4
+"""Share of a word that the words before it must leave."""
+
+EXACT, STEPS = 1e-5, 25
+"""Relative tolerances of a fit and its most evaluations: a chi2 of some thousands is exact to a few hundredths."""
 
 Words = tuple[Feature, ...]
 
@@ -85,68 +88,146 @@ class Tuner:
     parameters, for all of them the population's.
     """
 
-    def __init__(self, base: Base, system: System) -> None:
+    def __init__(self, base: Base, signals: Signals, system: System) -> None:
+        """Bring residual and listed words into that space.
+
+        Args:
+            base: the fitted campaign.
+            signals: what effects and features add in it.
+            system: its linear system.
+        """
         fit, tests, scatter = base.fit, base.tests, base.model.scatter
         population = population_at(fit.mode, fit.numbers, scatter)
         flat, data = tests.flatness, base.linear()
         mean, factor = moments(population, flat, scatter)
         by_globals = mean_by_globals(population, flat, scatter)
         contexts = partial(_contexts, unloading=base.model.unloading)
-        self._tests = in_batches(contexts, (fit.latent, tests.particle, base.records)), tests.mask
-        self._space = data.jacobian, fit.filters, factor
-        self._zero_sd, self._prior, self._usable = base.model.zero_sd, system.prior, np.flatnonzero(system.usable)
+        seen = in_batches(contexts, (fit.latent, tests.particle, base.records)), tests.mask
+        self._rows = _Rows(seen, (data.jacobian, fit.filters, factor), base.model.zero_sd)
+        self._prior = system.prior
         away = mean - fit.latent, fit.zero - tests.contact
-        fixed = in_batches(_fixed, (data.residual, data.jacobian, *away, by_globals))
-        self._residual, _ = self._reduced(fixed)
-        self._listed = (*words(), *further_words())
-        values = feature_values(base, self._listed)
-        parts = [self._reduced(values[:, i : i + WIDTH])[0] for i in range(0, len(self._listed), WIDTH)]
-        self._values = np.concatenate(parts, 1)
+        self._fixed = self._rows.reduced(in_batches(_fixed, (data.residual, data.jacobian, *away, by_globals)))[0]
+        self._listed = (*system.words, *further_words())
+        values = (-signals.of(system.word_columns), feature_values(base, further_words()))
+        self._values = np.concatenate([self._rows.reduced(part)[0] for part in values], 1)
 
     def values(self, formula: Words) -> Float[Array, "particles words points"]:
         """Displacement that words add, per unit of coefficient [um]."""
-        return jnp.stack([self._word(word)[:, 0] for word in formula], 1)
+        return jnp.stack([self._rows.word(word)[:, 0] for word in formula], 1)
 
     def cosines(self, formula: Words, particles: np.ndarray) -> np.ndarray:
         """Cosines of words among themselves, as far as the base law cannot take them up."""
-        space = _Space(self._residual[particles], self._prior)
-        parts = [self._reduced(self.values(formula[i : i + WIDTH]))[0] for i in range(0, len(formula), WIDTH)]
-        columns = space.off(_stacked(np.concatenate(parts, 1)[particles]))
+        gap = self._gap(particles)
+        columns = gap.off(self._rows.reduced(self.values(formula))[0][particles])
         columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
         return columns.T @ columns
 
     def search(self, particles: np.ndarray) -> Fitted:
         """The formula for the gap of some particles: words one after the other, each time with all numbers fitted."""
         some = particles[np.linspace(0, len(particles) - 1, min(len(particles), MOST_PARTICLES)).astype(int)]
-        space = _Space(self._residual[some], self._prior)
-        listed = space.off(_stacked(self._values[some]))
+        gap = self._gap(some)
+        listed = gap.off(self._values[some])
         found = Fitted()
         for starts in STARTS:
-            left, basis = (space.y, listed[:, :0]) if not found.words else self._left(space, found.words, some)
+            left, basis = gap.beside(found.words)
             free = listed - basis @ (basis.T @ listed)
             size = np.sum(free**2, 0)
-            drop = np.where(size > 1e-4 * np.sum(listed**2, 0), (left @ free) ** 2 / np.maximum(size, 1e-300), 0.0)
+            alive = size > LEAST_LEFT * np.sum(listed**2, 0)
+            drop = np.where(alive, (left @ free) ** 2 / np.maximum(size, 1e-300), 0.0)
             best = [self._listed[i] for i in np.argsort(-drop, kind="stable")]
             forms = [word.form for word in best]
             several = [word for i, word in enumerate(best) if forms[:i].count(word.form) < OF_A_FORM]
-            tried = [self._fit(space, (*found.words, word), some) for word in several[:starts]]
-            further = max(tried, key=lambda one: one.worth)
+            further = max((gap.fit((*found.words, word)) for word in several[:starts]), key=lambda one: one.worth)
             if further.worth - found.worth < WORTH:
                 break
-            found = self._pruned(space, further, some)
+            found = _pruned(gap, further)
         return found
 
-    def _pruned(self, space: _Space, formula: Fitted, particles: np.ndarray) -> Fitted:
-        """Without words that others have made worthless: the first one is chosen when it stands alone."""
-        while len(formula.words) > 1:
-            fewer = [formula.words[:i] + formula.words[i + 1 :] for i in range(len(formula.words))]
-            best = max((self._fit(space, words, particles) for words in fewer), key=lambda one: one.worth)
-            if formula.worth - best.worth >= WORTH:
-                break
-            formula = best
-        return formula
+    def _gap(self, particles: np.ndarray) -> _Gap:
+        return _Gap(self._rows.some(particles), self._fixed[particles], self._prior)
 
-    def _fit(self, space: _Space, start: Words, particles: np.ndarray) -> Fitted:
+
+def _pruned(gap: _Gap, formula: Fitted) -> Fitted:
+    """Without words that others have made worthless: the first one is chosen when it stands alone."""
+    while len(formula.words) > 1:
+        fewer = (formula.words[:i] + formula.words[i + 1 :] for i in range(len(formula.words)))
+        best = max(map(gap.fit, fewer), key=lambda one: one.worth)
+        if formula.worth - best.worth >= WORTH:
+            break
+        formula = best
+    return formula
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Tests of some particles, and the space in which they are compared.
+
+    Attributes:
+        seen: what words are told, and which points count.
+        space: derivatives by every particle's own parameters, whitening filters, spread of the particles.
+        zero_sd: spread of the zeros.
+    """
+
+    seen: tuple[Context, Array]
+    space: tuple[Array, Whitening, Array]
+    zero_sd: Array
+
+    def some(self, particles: np.ndarray) -> _Rows:
+        """Those of some particles."""
+        seen, space = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[particles]), (self.seen, self.space))
+        return _Rows(seen, space, self.zero_sd)
+
+    def word(self, word: Feature) -> Float[Array, "particles columns points"]:
+        """A word and its derivatives by its numbers."""
+        numbers = jnp.asarray(np.asarray(word.numbers, float))
+        return in_batches(partial(_word, form=word.form, numbers=numbers), self.seen)
+
+    def reduced(self, columns: Float[Array, "particles W points"]) -> tuple[np.ndarray, np.ndarray]:
+        """Columns whitened, with every particle's own parameters projected off, shape (N, W, R); and their squares
+        before that, shape (N, W)."""
+        found, squares = [], []
+        for first in range(0, columns.shape[1], WIDTH):
+            part = columns[:, first : first + WIDTH]
+            wide = jnp.pad(part, ((0, 0), (0, WIDTH - part.shape[1]), (0, 0)))
+            left, square = in_batches(partial(_reduce, zero_sd=self.zero_sd), (wide, *self.space))
+            found.append(np.asarray(left)[:, : part.shape[1]])
+            squares.append(np.asarray(square)[:, : part.shape[1]])
+        return np.concatenate(found, 1), np.concatenate(squares, 1)
+
+
+class _Gap:
+    """What the base law leaves of some particles' tests, the population's parameters projected off.
+
+    Attributes:
+        y: the residual.
+    """
+
+    def __init__(self, rows: _Rows, fixed: np.ndarray, prior: np.ndarray) -> None:
+        """Project off.
+
+        Args:
+            rows: the tests.
+            fixed: residual and the population's columns, shape (N, 1 + globals, R).
+            prior: precision of the population's parameters.
+        """
+        self._rows, self._more = rows, len(prior)
+        whole = np.concatenate([_stacked(fixed), np.column_stack([np.zeros(len(prior)), np.diag(np.sqrt(prior))])])
+        self._basis, _ = np.linalg.qr(whole[:, 1:])
+        self.y = whole[:, 0] - self._basis @ (self._basis.T @ whole[:, 0])
+
+    def off(self, columns: np.ndarray) -> np.ndarray:
+        """Columns of the same particles likewise, as rows one under the other."""
+        wide = np.concatenate([_stacked(columns), np.zeros((self._more, columns.shape[1]))])
+        return wide - self._basis @ (self._basis.T @ wide)
+
+    def beside(self, formula: Words) -> tuple[np.ndarray, np.ndarray]:
+        """What a formula leaves of the residual, and an orthonormal basis of its words."""
+        if not formula:
+            return self.y, np.zeros((len(self.y), 0))
+        left, _, basis = self._solve(formula)
+        return left[: len(self.y)], basis[: len(self.y)]
+
+    def fit(self, start: Words) -> Fitted:
         """Words with the numbers that explain most."""
         from scipy.optimize import least_squares
 
@@ -156,7 +237,7 @@ class Tuner:
         def at(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             if x.tobytes() not in known:
                 known.clear()
-                known[x.tobytes()] = self._solve(space, _with(start, x), particles)[:2]
+                known[x.tobytes()] = self._solve(_with(start, x))[:2]
             return known[x.tobytes()]
 
         formula = start
@@ -174,25 +255,20 @@ class Tuner:
                 max_nfev=STEPS,
             )
             formula = _with(start, found.x)
-        left = self._solve(space, formula, particles)[0]
-        return Fitted(formula, float(space.y @ space.y - left @ left))
+        left = self._solve(formula)[0]
+        return Fitted(formula, float(self.y @ self.y - left @ left))
 
-    def _left(self, space: _Space, formula: Words, particles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What a formula leaves of the residual, and an orthonormal basis of its words."""
-        left, _, basis = self._solve(space, formula, particles)
-        return left[: len(space.y)], basis[: len(space.y)]
-
-    def _solve(self, space: _Space, formula: Words, particles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _solve(self, formula: Words) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What is left of the residual with the best coefficients, its derivatives by the numbers, and a basis of the
         words; behind the points a row for every word that keeps its coefficient modest."""
-        columns = [self._word(word) for word in formula]
-        reduced, squares = self._reduced(jnp.concatenate(columns, 1))
-        reduced = space.off(_stacked(reduced[particles]))
+        columns = [self._rows.word(word) for word in formula]
+        reduced, squares = self._rows.reduced(jnp.concatenate(columns, 1))
+        reduced = self.off(reduced)
         ends = np.cumsum([c.shape[1] for c in columns])
         values = ends - [c.shape[1] for c in columns]
-        modest = np.diag(np.sqrt(MODEST * squares[particles][:, values].sum(0)))
+        modest = np.diag(np.sqrt(MODEST * squares[:, values].sum(0)))
         F = np.concatenate([reduced[:, values], modest])
-        y = np.concatenate([space.y, np.zeros(len(modest))])
+        y = np.concatenate([self.y, np.zeros(len(modest))])
         basis, triangle = np.linalg.qr(F)
         coefficients = np.linalg.lstsq(triangle, basis.T @ y, rcond=1e-10)[0]
         left = y - F @ coefficients
@@ -200,38 +276,6 @@ class Tuner:
         slopes = np.concatenate([-c * reduced[:, first + 1 : end] for c, first, end in several], 1)
         slopes = np.concatenate([slopes, np.zeros((len(modest), slopes.shape[1]))])
         return left, slopes - basis @ (basis.T @ slopes), basis
-
-    def _word(self, word: Feature) -> Float[Array, "particles columns points"]:
-        numbers = jnp.asarray(np.asarray(word.numbers, float))
-        return in_batches(partial(_word, form=word.form, numbers=numbers), self._tests)
-
-    def _reduced(self, columns: Float[Array, "particles W points"]) -> tuple[np.ndarray, np.ndarray]:
-        """Columns whitened, with every particle's own parameters projected off, shape (N, W, R); and their squares
-        before that, shape (N, W)."""
-        count = columns.shape[1]
-        wide = jnp.pad(columns, ((0, 0), (0, WIDTH - count), (0, 0)))
-        found, squares = in_batches(partial(_reduce, zero_sd=self._zero_sd), (wide, *self._space))
-        return np.asarray(found)[:, :count], np.asarray(squares)[:, :count]
-
-
-class _Space:
-    """Rows of some particles, with the population's parameters projected off.
-
-    Attributes:
-        y: the residual.
-    """
-
-    def __init__(self, fixed: np.ndarray, prior: np.ndarray) -> None:
-        """Args: residual and the population's columns, shape (N, 1 + globals, R), and the precision of the latter."""
-        self._more = len(prior)
-        rows = np.concatenate([_stacked(fixed), np.column_stack([np.zeros(len(prior)), np.diag(np.sqrt(prior))])])
-        self._basis, _ = np.linalg.qr(rows[:, 1:])
-        self.y = rows[:, 0] - self._basis @ (self._basis.T @ rows[:, 0])
-
-    def off(self, columns: np.ndarray) -> np.ndarray:
-        """Some columns likewise."""
-        wide = np.concatenate([columns, np.zeros((self._more, columns.shape[1]))])
-        return wide - self._basis @ (self._basis.T @ wide)
 
 
 WIDTH = MOST_WORDS * (1 + MOST_NUMBERS)

@@ -11,6 +11,7 @@ from mcc_jax.campaign import Campaign, Curve
 from mcc_jax.discover import _features as words
 from mcc_jax.discover._closure import FOLDS, find_closure
 from mcc_jax.discover._naming import chooser
+from mcc_jax.discover._pursuit import pursue
 from mcc_jax.discover._score import project
 from mcc_jax.discover._system import base_fit, build_system, feature_values, signals_of
 from mcc_jax.discover._tuning import MOST_NUMBERS, Fitted, Tuner
@@ -49,7 +50,7 @@ def disturbed(clean):
 
 @pytest.fixture(scope="module")
 def tuner(disturbed):
-    return Tuner(disturbed[0], disturbed[2])
+    return Tuner(*disturbed)
 
 
 @pytest.fixture(scope="module")
@@ -72,10 +73,10 @@ def test_derivatives_by_the_numbers_are_differences(tuner):
             continue
         # Away from the ends of the ranges, where powers begin.
         numbers = np.asarray(form.numbers) + 0.07 * np.minimum(np.asarray(form.form.high) - form.numbers, 1.0)
-        columns = np.asarray(tuner._word(form.form.at(*map(float, numbers))))
+        columns = np.asarray(tuner._rows.word(form.form.at(*map(float, numbers))))
         for k in range(len(numbers)):
             h = 1e-6 * np.eye(len(numbers))[k]
-            ahead, behind = (tuner._word(form.form.at(*map(float, numbers + s * h)))[:, 0] for s in (1, -1))
+            ahead, behind = (tuner._rows.word(form.form.at(*map(float, numbers + s * h)))[:, 0] for s in (1, -1))
             slope = (np.asarray(ahead) - np.asarray(behind)) / 2e-6
             size = np.max(np.abs(slope)) + 1e-3 * np.max(np.abs(columns[:, 0]))
             np.testing.assert_allclose(columns[:, 1 + k], slope, atol=1e-4 * size, err_msg=form.text)
@@ -84,7 +85,7 @@ def test_derivatives_by_the_numbers_are_differences(tuner):
 def test_derivatives_are_finite_at_the_ends_of_the_ranges(tuner):
     for word in {word.form: word for word in (*words.words(), *words.further_words())}.values():
         for numbers in (word.form.low, word.form.high):
-            assert np.isfinite(np.asarray(tuner._word(word.form.at(*numbers)))).all(), word.form.at(*numbers).text
+            assert np.isfinite(np.asarray(tuner._rows.word(word.form.at(*numbers)))).all(), word.form.at(*numbers).text
 
 
 def test_a_planted_bump_is_found_with_its_place_and_width(tuner, disturbed):
@@ -150,9 +151,20 @@ def test_the_same_seed_makes_the_same_formula(disturbed, found):
     assert again.selection_frequency == found[0].selection_frequency
 
 
+def test_a_gap_without_a_word_worth_its_numbers_has_the_listed_words(disturbed, monkeypatch):
+    base, signals, system = disturbed
+    monkeypatch.setattr(Tuner, "search", lambda self, particles: Fitted())
+    closure, extended = find_closure(base, signals, system, {}, 0)
+    assert [extended.word(int(c)) for c in closure.words] == [system.word(c) for c in pursue(system)[0]]
+    assert closure.gain == pytest.approx(pursue(system)[1])
+    assert closure.selection_frequency == 0
+    usable = np.flatnonzero(system.usable)
+    assert all(len(chooser(extended, 0, closure)(usable[usable != i])[1]) == 0 for i in usable)
+
+
 def test_nothing_is_found_where_nothing_is_missing(clean):
     base, signals, system = clean
-    assert Tuner(base, system).search(np.flatnonzero(system.usable)) == Fitted()
+    assert Tuner(*clean).search(np.flatnonzero(system.usable)) == Fitted()
     closure, same = find_closure(base, signals, system, {}, 0)
     assert closure is None
     assert same is system
@@ -161,7 +173,7 @@ def test_nothing_is_found_where_nothing_is_missing(clean):
 def test_words_add_up_to_what_the_law_adds(tuner):
     """Their values in micrometres: strain times the effective diameter, 0 where nothing was measured."""
     (values,) = np.moveaxis(np.asarray(tuner.values((words.PEAK_POWER.at(1.0),))), 1, 0)
-    contexts, mask = tuner._tests
+    contexts, mask = tuner._rows.seen
     diameter = np.asarray(jax.vmap(lambda particle: particle.effective_diameter)(contexts.particle))[:, None]
     expected = diameter * np.maximum(np.asarray(contexts.peak_force) / (np.pi / 4 * diameter**2) * 1e3 / 10, 1e-9)
     np.testing.assert_allclose(values, np.where(np.asarray(mask), expected, 0.0), rtol=1e-9)
