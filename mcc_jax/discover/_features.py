@@ -74,10 +74,6 @@ class Feature:
         """The function as it stands in a formula."""
         return self.form.text(*self.numbers)
 
-    def value(self, context: Context) -> Values:
-        """Its values over the points of a test."""
-        return values_of((self,), context)[0]
-
 
 def values_of(features: Sequence[Feature], context: Context) -> Values:
     """Values of features over the points of a test, shape (features, points); all of one form in one operation, since
@@ -322,9 +318,7 @@ CYCLES = _fixed("[reload] 1", lambda c: c.cycles)
 SLACK = _scaled("(1 - exp(-(1 - u)/{0})) h", lambda c, far: _um(c) * (1 - jnp.exp(-(1 - _u(c)) / far)), 0.003, 1.0)
 SETTLING = _scaled("exp(-r/{0} s) h", lambda c, tau: _um(c) * jnp.exp(-_since_turn(c) / tau), 0.5, 300.0)
 RINGING = Form(
-    lambda tau, period, phase: (
-        f"exp(-r/{tau:.3g} s) sin(2 pi r/{period:.3g} s {'+' if phase >= 0 else '-'} {abs(phase):.3g}) h"
-    ),
+    lambda tau, period, phase: f"exp(-r/{tau:.3g} s) sin(2 pi r/{period:.3g} s {_signed(phase)}) h",
     lambda c, n: _um(c) * jnp.exp(-_since_turn(c) / n[0]) * jnp.sin(2 * jnp.pi * _since_turn(c) / n[1] + n[2]),
     (0.5, 0.5, -2 * np.pi),
     (300.0, 300.0, 2 * np.pi),

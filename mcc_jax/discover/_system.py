@@ -413,6 +413,17 @@ def gram_matrices(
     return gram[:, kept[:, None], kept]
 
 
+def own_rows(jacobian, factor) -> Float[Array, "columns points"]:
+    """What a particle's own deviations, in units of the population's spread, and its zero do to its residual."""
+    return jnp.concatenate([(jacobian[:, :4] @ factor).T, jacobian[:, 4][None]])
+
+
+def common_rows(residual, jacobian, offset, zero_away, by_globals) -> Float[Array, "columns points"]:
+    """The residual of a particle that is as the population expects, and what the population's parameters do to it."""
+    own, zero = jacobian[:, :4], jacobian[:, 4]
+    return jnp.concatenate([(residual + own @ offset - zero * zero_away)[None], (own @ by_globals).T])
+
+
 COLUMNS = 200
 """Columns of candidates are filled up to a multiple of this: libraries of any size share what is compiled."""
 
@@ -422,13 +433,10 @@ def _gram(residual, jacobian, mask, filters, added, seen, away, by_globals, fact
     k = factor.shape[-1]
 
     def one(r, J, used, white, extra, words, offset, slope, S, z):
-        own, zero = J[:, :4], J[:, 4]
         columns = jnp.concatenate(
             [
-                (own @ S).T,
-                zero[None],
-                (r + own @ offset - zero * z)[None],
-                (own @ slope).T,
+                own_rows(J, S),
+                common_rows(r, J, offset, z, slope),
                 jnp.where(used[None], extra, 0.0),
                 jnp.where(used[None], words, 0.0),
             ]

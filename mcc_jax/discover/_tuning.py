@@ -30,7 +30,17 @@ from ..effects import Context, ExtendedLaw
 from ..law import Unloading
 from ._features import Feature, Form, further_words
 from ._pursuit import MOST_WORDS
-from ._system import Base, Signals, System, feature_values, in_batches, law_of, mean_by_globals
+from ._system import (
+    Base,
+    Signals,
+    System,
+    common_rows,
+    feature_values,
+    in_batches,
+    law_of,
+    mean_by_globals,
+    own_rows,
+)
 
 MOST_NUMBERS = 3
 """Most numbers that a form has."""
@@ -240,23 +250,24 @@ class _Gap:
                 known[x.tobytes()] = self._solve(_with(start, x))[:2]
             return known[x.tobytes()]
 
-        formula = start
-        if len(numbers):
-            low, high = (np.concatenate([np.asarray(getattr(w.form, end)) for w in start]) for end in ("low", "high"))
-            found = least_squares(
-                lambda x: at(x)[0],
-                np.clip(numbers, low, high),
-                jac=cast(Any, lambda x: at(x)[1]),  # its stub knows texts only
-                bounds=(low, high),
-                x_scale=np.maximum(np.abs(numbers), 0.05 * (high - low)),
-                ftol=EXACT,
-                xtol=EXACT,
-                gtol=EXACT,
-                max_nfev=STEPS,
-            )
-            formula = _with(start, found.x)
-        left = self._solve(formula)[0]
-        return Fitted(formula, float(self.y @ self.y - left @ left))
+        def fitted(formula: Words, left: np.ndarray) -> Fitted:
+            return Fitted(formula, float(self.y @ self.y - left @ left))
+
+        if not len(numbers):
+            return fitted(start, self._solve(start)[0])
+        low, high = (np.concatenate([np.asarray(getattr(w.form, end)) for w in start]) for end in ("low", "high"))
+        found = least_squares(
+            lambda x: at(x)[0],
+            np.clip(numbers, low, high),
+            jac=cast(Any, lambda x: at(x)[1]),  # its stub knows texts only
+            bounds=(low, high),
+            x_scale=np.maximum(np.abs(numbers), 0.05 * (high - low)),
+            ftol=EXACT,
+            xtol=EXACT,
+            gtol=EXACT,
+            max_nfev=STEPS,
+        )
+        return fitted(_with(start, found.x), found.fun)
 
     def _solve(self, formula: Words) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What is left of the residual with the best coefficients, its derivatives by the numbers, and a basis of the
@@ -302,9 +313,7 @@ def _contexts(latent, particles, records, unloading: Unloading) -> Context:
 @compiled
 def _fixed(residual, jacobian, offset, zero_away, by_globals) -> Float[Array, "particles columns points"]:
     """The residual and the population's columns, as in `_system`."""
-    own, zero = jacobian[..., :4], jacobian[..., 4]
-    first = residual + jnp.einsum("npk,nk->np", own, offset) - zero * zero_away[:, None]
-    return jnp.concatenate([first[:, None], jnp.einsum("npk,nkg->ngp", own, by_globals)], 1)
+    return jax.vmap(common_rows)(residual, jacobian, offset, zero_away, by_globals)
 
 
 @compiled
@@ -326,8 +335,7 @@ def _reduce(columns, jacobian, filters: Whitening, factor, zero_sd):
     k = factor.shape[-1]
 
     def one(x, J, white, S):
-        own = jnp.concatenate([(J[:, :4] @ S).T, J[:, 4][None]])
-        Z = jnp.concatenate([jax.vmap(white)(own), jnp.diag(jnp.append(jnp.ones(k), 1 / zero_sd))], 1).T
+        Z = jnp.concatenate([jax.vmap(white)(own_rows(J, S)), jnp.diag(jnp.append(jnp.ones(k), 1 / zero_sd))], 1).T
         y = jnp.concatenate([jax.vmap(white)(x), jnp.zeros((len(x), k + 1))], 1)
         Q, _ = jnp.linalg.qr(Z)
         return y - (y @ Q) @ Q.T, jnp.sum(y**2, 1)
