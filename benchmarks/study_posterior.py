@@ -58,7 +58,7 @@ AROUND = Priors(
     C5=LogNormalPrior(2.7, 0.1),
     softening=LogNormalPrior(0.33, 0.3),
     tau_C1=HalfNormalPrior(0.3),
-    tau_C3=HalfNormalPrior(0.02),
+    tau_C3=HalfNormalPrior(0.02, power=4.0),
     tau_C5=HalfNormalPrior(0.08),
 )
 

@@ -11,7 +11,7 @@ import numpy as np
 from ._bayes import BayesCalibration
 from ._population import COEFFICIENTS
 from ._predictive import predict_measured
-from ._priors import LogNormalPrior, NormalPrior, Priors
+from ._priors import HalfNormalPrior, LogNormalPrior, NormalPrior, Priors
 
 if TYPE_CHECKING:
     from xarray import DataTree
@@ -53,6 +53,9 @@ def prior_draws(priors: Priors, low: float, high: float, shape: tuple[int, int],
             return prior.mean + prior.sd * rng.standard_normal(shape)
         return np.log(prior.median) + prior.log_sd * rng.standard_normal(shape)
 
+    def spread(prior: HalfNormalPrior) -> np.ndarray:
+        return prior.sd * np.abs(rng.standard_normal(shape)) ** prior.power
+
     from scipy.stats import truncnorm
 
     bounds = ((low - priors.a.mean) / priors.a.sd, (high - priors.a.mean) / priors.a.sd)
@@ -64,9 +67,9 @@ def prior_draws(priors: Priors, low: float, high: float, shape: tuple[int, int],
         "a": a,
         "effective_modulus_MPa": np.exp(normal(priors.effective_modulus_MPa)),
         "mu": np.stack([mu_1, mu_3, mu_5], -1),
-        "tau": np.stack([np.abs(p.sd * rng.standard_normal(shape)) for p in spreads], -1),
-        "modulus_scatter": np.abs(priors.modulus_scatter.sd * rng.standard_normal(shape)),
-        "shape_scatter": np.abs(priors.shape_scatter.sd * rng.standard_normal(shape)),
+        "tau": np.stack([spread(p) for p in spreads], -1),
+        "modulus_scatter": spread(priors.modulus_scatter),
+        "shape_scatter": spread(priors.shape_scatter),
         "noise_factor": np.exp(normal(priors.noise_factor)),
     }
 

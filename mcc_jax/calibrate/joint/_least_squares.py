@@ -17,6 +17,7 @@ from ._arrow import Parameters, Solution
 from ._bayes import log_estimate
 from ._data import Selection, Tests, own_misfit
 from ._fit import population_at, prepare
+from ._mode import FIRST_SPREAD, KNEE
 from ._model import JointFit, JointModel
 from ._pooled import Pooled, fit_pooled, unpack
 from ._population import COEFFICIENTS
@@ -166,8 +167,8 @@ class LeastSquaresCalibration:
                     "why_not": self.selection.why_not[i],
                 }
             )
-        spread_sd = np.sqrt(np.diagonal(np.asarray(self.fit.covariance)))[6:9]
         tau = np.asarray(self.settings.tau)
+        spread_sd = self._spread_sd()
         logs, log_sds = np.asarray(self.fit.noise.logs), np.asarray(self.fit.noise_log_sd)
         numbers = ("displacement_um", "force_mN", "correlated_um", "correlation_length")
         steps = int(self.solution.steps)
@@ -227,6 +228,14 @@ class LeastSquaresCalibration:
     def _alone(self) -> bool:
         """Whether one particle is all there is: the mode of a spread of one is 0, and means nothing."""
         return len(self.selection.kept) == 1
+
+    def _spread_sd(self) -> np.ndarray:
+        """Standard deviations of the three spreads, from those of their coordinates."""
+        spreads = slice(FIRST_SPREAD, FIRST_SPREAD + 3)
+        scale, power = np.asarray(self.fit.numbers.spread)[:3].T
+        x = np.abs(np.asarray(self.fit.mode)[spreads])
+        slope = KNEE * scale * power * np.sinh(x) ** (power - 1) * np.cosh(x)  # of `spread_of`
+        return slope * np.sqrt(np.diagonal(np.asarray(self.fit.covariance)))[spreads]
 
     def _chi2(self) -> float:
         used = int(np.asarray(self.selection.tests.mask).sum())

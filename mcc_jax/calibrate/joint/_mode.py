@@ -21,14 +21,14 @@ class PriorNumbers(eqx.Module):
 
     What data say of a mean is the mean of the particles' b, and how well they say it goes with the spread: a funnel, if
     a mild one. The coordinate of a mean is therefore the mean b, counted from `centre` in units of
-    sqrt(tau^2/n + blur^2); a spread's coordinate is logarithmic where the spread is large and linear around 0. Both
-    only help the sampler: the density takes the volumes into account.
+    sqrt(tau^2/n + blur^2); a spread's coordinate is logarithmic where the spread is large and, around 0, linear in its
+    root of the prior's power. Both only help the sampler: the density takes the volumes into account.
 
     Attributes:
         a: mean, sd, lower and upper bound of the shape parameter.
         log_modulus, mu_1, mu_5: mean and sd.
         softening: mean and sd of its logarithm.
-        spread: scales of the half-normal priors of tau 1, 3, 5, of the modulus' and of a's scatter.
+        spread: scale s and power p of the priors of tau 1, 3, 5, of the modulus' and of a's scatter.
         log_noise: mean and standard deviation.
         centre: about where the mean b1, b3, b5 of the particles will be found.
         blur: how wide they are where nothing scatters.
@@ -41,7 +41,7 @@ class PriorNumbers(eqx.Module):
     mu_1: Float[Array, " 2"]
     mu_5: Float[Array, " 2"]
     softening: Float[Array, " 2"]
-    spread: Float[Array, " 5"]
+    spread: Float[Array, "5 2"]
     log_noise: Float[Array, " 2"]
     centre: Float[Array, " 3"]
     blur: Float[Array, " 3"]
@@ -67,12 +67,18 @@ FIRST_SPREAD = 6
 """Position of the first spread among the coordinates: behind a, log modulus, three means and log noise."""
 
 KNEE = 0.1
-"""Share of its prior's scale below which a spread's coordinate is linear in it, above which logarithmic."""
+"""Share of its prior's scale above which a spread's coordinate is logarithmic."""
 
 
-def spread_of(coordinate: Float[Array, " k"], scale: Float[Array, " k"]) -> Float[Array, " k"]:
-    """Spreads >= 0 at coordinates that may have either sign, each with its prior's scale."""
-    return KNEE * scale * jnp.sinh(jnp.abs(coordinate))
+def spread_of(coordinate: Float[Array, " k"], prior: Float[Array, "k 2"]) -> Float[Array, " k"]:
+    r"""Spreads at coordinates x that may have either sign: :math:`\tau = k s \sinh^p |x|`, k the knee."""
+    scale, power = prior.T
+    return KNEE * scale * jnp.sinh(jnp.abs(coordinate)) ** power
+
+
+def with_coordinates(scatter: Scatter) -> np.ndarray:
+    """Which of the five spreads have a coordinate."""
+    return np.asarray([0, 1, 2] + [3] * scatter.modulus + [4] * scatter.shape)
 
 
 def given_mu_3(mu_1: Scalar, mu_5: Scalar, softening: Float[Array, " 2"]) -> tuple[Scalar, Scalar]:
@@ -93,14 +99,13 @@ def from_free(free: Float[Array, " d"], numbers: PriorNumbers, scatter: Scatter)
     density = -0.5 * ((a - mean) / sd) ** 2 - jnp.log(sd) - inside
     density += jnp.log(high - low) + jax.nn.log_sigmoid(free[0]) + jax.nn.log_sigmoid(-free[0])
     log_modulus, log_noise = free[1], free[5]
-    count = scatter.size
-    chosen = [0, 1, 2] + ([3] if scatter.modulus else []) + ([4] if scatter.shape else [])
-    scales = numbers.spread[jnp.asarray(chosen)]
+    priors = numbers.spread[with_coordinates(scatter)]
     # The coordinate may have either sign: the density is even and smooth at 0, so that a spread that is 0 is no
-    # boundary and has no tail towards minus infinity.
-    signed = free[FIRST_SPREAD : FIRST_SPREAD + count]
-    spread = spread_of(signed, scales)
-    density += jnp.sum(-0.5 * (spread / scales) ** 2 + jnp.log(KNEE * jnp.cosh(signed)))
+    # boundary and has no tail towards minus infinity. It is that of z = (tau/s)^(1/p), which is linear in sinh x.
+    signed = free[FIRST_SPREAD : FIRST_SPREAD + scatter.size]
+    spread = spread_of(signed, priors)
+    steep = KNEE ** (1 / priors[:, 1])
+    density += jnp.sum(-0.5 * (steep * jnp.sinh(signed)) ** 2 + jnp.log(steep * jnp.cosh(signed)))
     width = jnp.sqrt(spread[:3] ** 2 / numbers.count + numbers.blur**2)
     mu = numbers.centre + width * free[2:5] - numbers.mean_log_eta(a)
     density += jnp.sum(jnp.log(width))
@@ -133,9 +138,9 @@ def to_free(
     """Unbounded coordinates of a population, kept away from the bounds of `a`; further scatter begins at a tenth."""
     low, high = np.asarray(numbers.a)[2:]
     unit = np.clip((a - low) / (high - low), 1e-3, 1 - 1e-3)
-    chosen = [0, 1, 2] + ([3] if scatter.modulus else []) + ([4] if scatter.shape else [])
+    scale, power = np.asarray(numbers.spread)[with_coordinates(scatter)].T
     spread = np.concatenate([tau, np.full(scatter.size - 3, 0.1)])
-    signed = np.arcsinh(spread / (KNEE * np.asarray(numbers.spread)[chosen]))
+    signed = np.arcsinh((spread / (KNEE * scale)) ** (1 / power))
     width = np.sqrt(np.asarray(tau) ** 2 / float(numbers.count) + np.asarray(numbers.blur) ** 2)
     log_eta = np.log(1 + a * np.asarray(numbers.flatness))
     weight = None if numbers.weight is None else np.asarray(numbers.weight)
@@ -146,7 +151,8 @@ def to_free(
 def recentred(numbers: PriorNumbers, free: Float[Array, " d"]) -> tuple[PriorNumbers, Float[Array, " d"]]:
     """The same population in coordinates whose centre it is."""
     here = np.array(free)
-    tau = KNEE * np.asarray(numbers.spread)[:3] * np.sinh(np.abs(here[FIRST_SPREAD : FIRST_SPREAD + 3]))
+    scale, power = np.asarray(numbers.spread)[:3].T
+    tau = KNEE * scale * np.sinh(np.abs(here[FIRST_SPREAD : FIRST_SPREAD + 3])) ** power
     width = np.sqrt(tau**2 / float(numbers.count) + np.asarray(numbers.blur) ** 2)
     centre = np.asarray(numbers.centre) + width * here[2:5]
     here[2:5] = 0.0

@@ -34,9 +34,29 @@ class LogNormalPrior:
 
 @dataclass(frozen=True)
 class HalfNormalPrior:
-    """A normal distribution cut off below 0."""
+    r"""A spread :math:`\tau = s |z|^p` with z standard normal.
+
+    Attributes:
+        sd: s; at p = 1 the standard deviation of the normal distribution that is cut off below 0.
+        power: p, at least 1. At 1 every spread much below s is as likely as any other, so that one below s/1000 is a
+            thing of one in a thousand. At 4 even the order of magnitude is open: half of all spreads lie below s/5, one
+            in five below s/200, one in ten below s/4000.
+
+    Raises:
+        InputError: if s is not positive, or p below 1 (no spread could then be 0).
+    """
 
     sd: float
+    power: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Refuse what is no distribution of a spread."""
+        if not self.sd > 0:
+            raise InputError(f"the scale of a spread must be positive, not {self.sd!r}", remedy="Correct sd.")
+        if not self.power >= 1:
+            raise InputError(
+                f"the power of a spread's prior must be 1 or more, not {self.power!r}", remedy="Correct it."
+            )
 
 
 @dataclass(frozen=True)
@@ -52,7 +72,9 @@ class Priors:
         softening: :math:`9 C_3^6 / (20 C_1 C_5^5)` of the median particle [-], 0.33 in the paper: the share of the
             initial slope that is lost at the curve's bend. It stands in for C3, whose median follows. At 1 the curve is
             flat there, beyond 1 its stress falls; most powders stay well below, single particles need not.
-        tau_C1, tau_C3, tau_C5: standard deviation of log C over the particles.
+        tau_C1, tau_C3, tau_C5: standard deviation of log C over the particles. That of C3 is open in its order of
+            magnitude: the paper's 20 particles show none at all (Table 2), and the smaller it is, the better a and the
+            means are known.
         modulus_scatter: standard deviation of the logarithm of the modulus over the particles, if it may scatter.
         shape_scatter: standard deviation of a over the particles, if it may scatter.
         zero_um: how far the true zero of displacement may lie from the recorded contact [um].
@@ -66,7 +88,7 @@ class Priors:
     C5: LogNormalPrior = LogNormalPrior(2.7, 0.3)
     softening: LogNormalPrior = LogNormalPrior(0.33, 0.6)
     tau_C1: HalfNormalPrior = HalfNormalPrior(0.5)
-    tau_C3: HalfNormalPrior = HalfNormalPrior(0.05)
+    tau_C3: HalfNormalPrior = HalfNormalPrior(0.05, power=4.0)
     tau_C5: HalfNormalPrior = HalfNormalPrior(0.15)
     modulus_scatter: HalfNormalPrior = HalfNormalPrior(0.3)
     shape_scatter: HalfNormalPrior = HalfNormalPrior(0.3)
@@ -143,8 +165,8 @@ def read_priors(file: str | Path, unloading: Unloading = Unloading.PRINTED) -> P
                     f"prior {name!r} has no entry {key!r}", file=str(file), remedy=f"Its entries: {', '.join(fields)}."
                 )
             number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-            if not number or (key in _POSITIVE and value <= 0):
-                allowed = "a positive number" if key in _POSITIVE else "a number"
+            if not number or (key in _POSITIVE and value <= 0) or (key == "power" and value < 1):
+                allowed = "1 or more" if key == "power" else "a positive number" if key in _POSITIVE else "a number"
                 raise InputError(
                     f"{name}.{key} must be {allowed}, not {value!r}", file=str(file), remedy="Correct the entry."
                 )

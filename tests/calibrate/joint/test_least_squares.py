@@ -52,6 +52,12 @@ def test_the_truth_is_within_four_standard_deviations(result, content):
         assert abs(mean["value"] - expected) < 4 * mean["sd"]
 
 
+def test_the_spread_of_well_known_coefficients_is_as_uncertain_as_that_of_normal_numbers(content):
+    """Each log C1 is known to a percent, their spread to tau/sqrt(2 (N - 1))."""
+    spread, count = content["log_C1"]["sd"], len(content["particles"])
+    assert spread["sd"] == pytest.approx(spread["value"] / np.sqrt(2 * (count - 1)), rel=0.15)
+
+
 def test_residuals_are_as_large_as_the_noise(result, content):
     assert 0.8 < content["diagnostics"]["chi2_per_dof"] < 1.2
     rms = np.array([p["rms_um"] for p in content["particles"]])

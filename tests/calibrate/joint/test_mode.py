@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from joint_cases import random_summary
+from numpyro.distributions.transforms import AffineTransform, PowerTransform
 
 from mcc_jax import InputError, JointModel
 from mcc_jax.calibrate.joint import NormalPrior, Priors
@@ -27,7 +28,7 @@ NUMBERS = PriorNumbers(
     mu_1=jnp.asarray([1.8, 0.7]),
     mu_5=jnp.asarray([1.0, 0.3]),
     softening=jnp.asarray([-1.1, 0.6]),
-    spread=jnp.asarray([0.5, 0.1, 0.2, 0.3, 0.25]),
+    spread=jnp.asarray([[0.5, 1.0], [0.1, 4.0], [0.2, 1.0], [0.3, 1.0], [0.25, 2.0]]),
     log_noise=jnp.asarray([0.1, 0.5]),
     centre=jnp.asarray([2.1, 1.3, 1.2]),
     blur=jnp.asarray([0.02, 0.01, 0.03]),
@@ -58,7 +59,12 @@ def model_log_density(population):
 
 @pytest.mark.parametrize("scatter", SCATTERS, ids=["plain", "modulus", "shape", "both"])
 def test_the_prior_is_numpyro_s_up_to_a_constant(scatter):
-    scales = np.asarray(NUMBERS.spread)[[0, 1, 2] + [3] * scatter.modulus + [4] * scatter.shape]
+    scale, power = np.asarray(NUMBERS.spread)[[0, 1, 2] + [3] * scatter.modulus + [4] * scatter.shape].T
+    powers = [PowerTransform(p) for p in power]
+    priors = [
+        dist.TransformedDistribution(dist.HalfNormal(1.0), [p, AffineTransform(0.0, s)])
+        for s, p in zip(scale, powers, strict=True)
+    ]
     rng = np.random.default_rng(1)
 
     @jax.jit
@@ -67,12 +73,11 @@ def test_the_prior_is_numpyro_s_up_to_a_constant(scatter):
             return as_vector(from_free(f, NUMBERS, scatter)[0], scatter)
 
         population, volume = place(free), jnp.linalg.slogdet(jax.jacfwd(place)(free))[1]
-        # Each sign of a coordinate carries half of the half-normal's density.
-        spreads = jnp.sum(dist.HalfNormal(jnp.asarray(scales)).log_prob(population[6:]) - jnp.log(2.0))
+        spreads = sum(prior.log_prob(tau) for prior, tau in zip(priors, population[6:], strict=True))
         return from_free(free, NUMBERS, scatter)[1], model_log_density(population) + spreads + volume
 
     centre = np.array([0.0, 9.0, 0.0, 0.0, 0.0, 0.0, *[0.0] * scatter.size])
-    draws = centre + rng.standard_normal((20, 6 + scatter.size)) * np.array([3, 1, 2, 2, 2, 1, *[2.0] * scatter.size])
+    draws = centre + rng.standard_normal((20, 6 + scatter.size)) * np.array([3, 1, 2, 2, 2, 1, *[1.0] * scatter.size])
     with jax.numpy_dtype_promotion("standard"):
         gap = np.array([float(theirs - ours) for ours, theirs in (both(jnp.asarray(f)) for f in draws)])
     np.testing.assert_allclose(gap, gap[0], rtol=0, atol=1e-9)
@@ -83,14 +88,14 @@ def test_the_population_at_unbounded_coordinates():
     free = jnp.asarray([0.3, 9.0, 2.0, -1.0, 0.5, -0.2, -0.4, 0.1, -0.2, -0.3, 0.2])
     population: Population = population_at(free, NUMBERS, scatter)
     a = -1.5 + 5.5 / (1 + np.exp(-0.3))
-    tau = 0.1 * np.array([0.5, 0.1, 0.2]) * np.sinh([0.4, 0.1, 0.2])
+    tau = 0.1 * np.array([0.5, 0.1, 0.2]) * np.sinh([0.4, 0.1, 0.2]) ** np.array([1, 4, 1])
     width = np.sqrt(tau**2 / 12 + np.array([0.02, 0.01, 0.03]) ** 2)
     mu = np.array([2.1, 1.3, 1.2]) + width * np.array([2.0, -1.0, 0.5]) - np.log(1 + a * np.asarray(FLAT)).mean()
     np.testing.assert_allclose(float(population.a), a, rtol=1e-12)
     np.testing.assert_allclose(population.mu, mu, rtol=1e-12)
     np.testing.assert_allclose(population.tau, tau, rtol=1e-12)
     np.testing.assert_allclose(float(population.modulus_scatter), 0.03 * np.sinh(0.3), rtol=1e-12)
-    np.testing.assert_allclose(float(population.shape_scatter), 0.025 * np.sinh(0.2), rtol=1e-12)
+    np.testing.assert_allclose(float(population.shape_scatter), 0.025 * np.sinh(0.2) ** 2, rtol=1e-12)
     assert float(population.log_noise) == -0.2
     plain = population_at(free[:9], NUMBERS, PLAIN)
     assert float(plain.modulus_scatter) == float(plain.shape_scatter) == 0.0
@@ -196,10 +201,14 @@ def test_the_covariance_is_the_inverse_curvature(posterior, mode):
     np.testing.assert_allclose(product, np.eye(9), atol=1e-2)
 
 
-def test_the_start_does_not_matter(summary, mode):
+@pytest.mark.parametrize("seed", range(6))
+def test_the_start_does_not_matter(summary, mode, seed):
     _, (free, covariance, _) = mode
     width = np.sqrt(np.diag(np.asarray(covariance)))
-    elsewhere = to_free(3.0, 8.0, np.array([1.0, 0.9, 0.7]), np.array([0.6, 0.3, 0.4]), NUMBERS, PLAIN)
+    rng = np.random.default_rng(seed)
+    mu = np.array([1.8, 1.1, 1.0]) + rng.uniform(-0.5, 0.5, 3)
+    tau = np.exp(rng.uniform(np.log(0.03), np.log(0.6), 3))
+    elsewhere = to_free(rng.uniform(-1.0, 3.5), rng.uniform(8.5, 10.5), mu, tau, NUMBERS, PLAIN)
     again, _, converged = most_probable(elsewhere, Target(NUMBERS, summary, PLAIN))
     assert converged
     expected, found = np.asarray(free).copy(), np.asarray(again).copy()

@@ -5,9 +5,11 @@ import json
 
 import numpy as np
 import pytest
+from scipy.stats import halfnorm
 
 from mcc_jax import InputError, JointModel, Priors, Unloading, read_priors
 from mcc_jax.calibrate.joint import HalfNormalPrior, LogNormalPrior, NormalPrior
+from mcc_jax.calibrate.joint._arviz import prior_draws
 
 
 @pytest.fixture
@@ -31,7 +33,7 @@ def test_whole_numbers_and_several_tables(read):
     found = read("[a]\nmean = 2\n[C1]\nmedian = 5\nlog_sd = 0.25\n[tau_C3]\nsd = 1\n")
     assert found.a == NormalPrior(2.0, Priors().a.sd)
     assert LogNormalPrior(5.0, 0.25) == found.C1
-    assert found.tau_C3 == HalfNormalPrior(1.0)
+    assert found.tau_C3 == HalfNormalPrior(1.0, Priors().tau_C3.power)
     assert set(found.changed) == {"a", "C1", "tau_C3"}
     assert isinstance(found.a.mean, float)
 
@@ -66,6 +68,8 @@ def test_what_is_not_named_is_the_default_of_the_form(read, unloading):
         ("[tau_C1]\nmean = 1.0\n", ["tau_C1", "mean", "sd"]),
         ("[a]\nsd = -0.1\n", ["a.sd", "positive", "-0.1"]),
         ("[a]\nsd = 0.0\n", ["a.sd", "positive"]),
+        ("[tau_C3]\npower = 0.5\n", ["tau_C3.power", "1 or more", "0.5"]),
+        ("[tau_C3]\nsd = 0\npower = 2\n", ["tau_C3.sd", "positive"]),
         ("[C1]\nmedian = -6.0\n", ["C1.median", "positive"]),
         ("[C1]\nlog_sd = nan\n", ["C1.log_sd", "positive", "nan"]),
         ("[a]\nmean = inf\n", ["a.mean", "a number", "inf"]),
@@ -104,7 +108,31 @@ def test_json_holds_every_prior_with_its_numbers():
     assert content["a"] == {"distribution": "normal", "mean": 1.4, "sd": 0.3}
     assert content["C1"]["distribution"] == "log-normal"
     assert set(content["C1"]) == {"distribution", "median", "log_sd"}
-    assert content["tau_C1"]["distribution"] == "half-normal"
+    assert content["tau_C1"] == {"distribution": "half-normal", "sd": 0.5, "power": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("sd", "power"), [(0.0, 1.0), (-1.0, 1.0), (float("nan"), 1.0), (0.1, 0.9), (0.1, float("nan"))]
+)
+def test_no_prior_of_a_spread(sd, power):
+    with pytest.raises(InputError, match=r"spread"):
+        HalfNormalPrior(sd, power)
+
+
+@pytest.mark.parametrize("power", [1.0, 4.0])
+def test_draws_of_a_spread_s_prior(power):
+    """Quantiles of sd |z|^power are those of |z|, raised: and the shares that its docstring names."""
+    priors = dataclasses.replace(Priors(), tau_C3=HalfNormalPrior(0.2, power))
+    tau = prior_draws(priors, -1.0, 3.0, (1, 100_000), 0)["tau"][0, :, 1]
+    for share in (0.1, 0.2, 0.5, 0.9):
+        expected = 0.2 * halfnorm.ppf(share) ** power
+        assert abs((tau < expected).mean() - share) < 4 * np.sqrt(share * (1 - share) / 100_000)
+
+
+def test_what_the_power_4_leaves_open():
+    shares = halfnorm.cdf(np.array([1 / 5, 1 / 200, 1 / 4000]) ** 0.25)
+    np.testing.assert_allclose(shares, [0.5, 0.2, 0.1], atol=0.01)
+    assert halfnorm.cdf(1 / 1000) == pytest.approx(0.001, abs=2.1e-4)
 
 
 def test_the_noise_s_priors_stand_together():
