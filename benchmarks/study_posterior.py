@@ -30,9 +30,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from mcc_jax.calibrate import (
-    HalfNormalPrior,
     JointModel,
     LogNormalPrior,
+    NakagamiPrior,
     NormalPrior,
     Priors,
     calibrate_bayes,
@@ -57,9 +57,9 @@ AROUND = Priors(
     C1=LogNormalPrior(6.7, 0.2),
     C5=LogNormalPrior(2.7, 0.1),
     softening=LogNormalPrior(0.33, 0.3),
-    tau_C1=HalfNormalPrior(0.3),
-    tau_C3=HalfNormalPrior(0.02, power=4.0),
-    tau_C5=HalfNormalPrior(0.08),
+    tau_C1=NakagamiPrior(0.3),
+    tau_C3=NakagamiPrior(0.02, shape=0.125),
+    tau_C5=NakagamiPrior(0.08),
 )
 
 

@@ -2,11 +2,11 @@ from ._blocks import in_blocks as in_blocks
 from ._errors import InputError as InputError
 from ._results import RESULTS as RESULTS
 from .calibrate import BayesCalibration as BayesCalibration
-from .calibrate import HalfNormalPrior as HalfNormalPrior
 from .calibrate import Identifiability as Identifiability
 from .calibrate import JointModel as JointModel
 from .calibrate import LeastSquaresCalibration as LeastSquaresCalibration
 from .calibrate import LogNormalPrior as LogNormalPrior
+from .calibrate import NakagamiPrior as NakagamiPrior
 from .calibrate import NormalPrior as NormalPrior
 from .calibrate import PaperCalibration as PaperCalibration
 from .calibrate import PredictedCurves as PredictedCurves

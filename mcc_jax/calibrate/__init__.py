@@ -25,11 +25,11 @@ from ._shape import ShapeFit as ShapeFit
 from ._shape import choose_reference as choose_reference
 from ._shape import fit_shape_parameter as fit_shape_parameter
 from .joint import BayesCalibration as BayesCalibration
-from .joint import HalfNormalPrior as HalfNormalPrior
 from .joint import Identifiability as Identifiability
 from .joint import JointModel as JointModel
 from .joint import LeastSquaresCalibration as LeastSquaresCalibration
 from .joint import LogNormalPrior as LogNormalPrior
+from .joint import NakagamiPrior as NakagamiPrior
 from .joint import NormalPrior as NormalPrior
 from .joint import PredictedCurves as PredictedCurves
 from .joint import Priors as Priors

@@ -16,8 +16,8 @@ from ._predictive import beside_paper as beside_paper
 from ._predictive import new_laws as new_laws
 from ._predictive import predict_measured as predict_measured
 from ._predictive import predict_new_particle as predict_new_particle
-from ._priors import HalfNormalPrior as HalfNormalPrior
 from ._priors import LogNormalPrior as LogNormalPrior
+from ._priors import NakagamiPrior as NakagamiPrior
 from ._priors import NormalPrior as NormalPrior
 from ._priors import Priors as Priors
 from ._priors import read_priors as read_priors

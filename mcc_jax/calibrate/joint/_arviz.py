@@ -11,7 +11,7 @@ import numpy as np
 from ._bayes import BayesCalibration
 from ._population import COEFFICIENTS
 from ._predictive import predict_measured
-from ._priors import HalfNormalPrior, LogNormalPrior, NormalPrior, Priors
+from ._priors import LogNormalPrior, NakagamiPrior, NormalPrior, Priors
 
 if TYPE_CHECKING:
     from xarray import DataTree
@@ -53,8 +53,8 @@ def prior_draws(priors: Priors, low: float, high: float, shape: tuple[int, int],
             return prior.mean + prior.sd * rng.standard_normal(shape)
         return np.log(prior.median) + prior.log_sd * rng.standard_normal(shape)
 
-    def spread(prior: HalfNormalPrior) -> np.ndarray:
-        return prior.sd * np.abs(rng.standard_normal(shape)) ** prior.power
+    def spread(prior: NakagamiPrior) -> np.ndarray:
+        return prior.sd * np.sqrt(2 * rng.gamma(prior.shape, size=shape))
 
     from scipy.stats import truncnorm
 

@@ -22,13 +22,14 @@ class PriorNumbers(eqx.Module):
     What data say of a mean is the mean of the particles' b, and how well they say it goes with the spread: a funnel, if
     a mild one. The coordinate of a mean is therefore the mean b, counted from `centre` in units of
     sqrt(tau^2/n + blur^2); a spread's coordinate is logarithmic where the spread is large and, around 0, linear in its
-    root of the prior's power. Both only help the sampler: the density takes the volumes into account.
+    power 2m of the prior's shape m. Both only help the sampler: the density takes the volumes into account.
 
     Attributes:
         a: mean, sd, lower and upper bound of the shape parameter.
         log_modulus, mu_1, mu_5: mean and sd.
         softening: mean and sd of its logarithm.
-        spread: scale s and power p of the priors of tau 1, 3, 5, of the modulus' and of a's scatter.
+        spread: scale s of the priors of tau 1, 3, 5, of the modulus' and of a's scatter, and the power 1/(2m) to which
+            a coordinate is raised.
         log_noise: mean and standard deviation.
         centre: about where the mean b1, b3, b5 of the particles will be found.
         blur: how wide they are where nothing scatters.
@@ -101,11 +102,10 @@ def from_free(free: Float[Array, " d"], numbers: PriorNumbers, scatter: Scatter)
     log_modulus, log_noise = free[1], free[5]
     priors = numbers.spread[with_coordinates(scatter)]
     # The coordinate may have either sign: the density is even and smooth at 0, so that a spread that is 0 is no
-    # boundary and has no tail towards minus infinity. It is that of z = (tau/s)^(1/p), which is linear in sinh x.
+    # boundary and has no tail towards minus infinity. Of tau^(2m-1) and d tau/dx only cosh x is left.
     signed = free[FIRST_SPREAD : FIRST_SPREAD + scatter.size]
     spread = spread_of(signed, priors)
-    steep = KNEE ** (1 / priors[:, 1])
-    density += jnp.sum(-0.5 * (steep * jnp.sinh(signed)) ** 2 + jnp.log(steep * jnp.cosh(signed)))
+    density += jnp.sum(-0.5 * (spread / priors[:, 0]) ** 2 + jnp.log(KNEE * jnp.cosh(signed)))
     width = jnp.sqrt(spread[:3] ** 2 / numbers.count + numbers.blur**2)
     mu = numbers.centre + width * free[2:5] - numbers.mean_log_eta(a)
     density += jnp.sum(jnp.log(width))
@@ -266,11 +266,15 @@ def _newton(expand: Callable[[np.ndarray], tuple[float, np.ndarray, np.ndarray]]
         key = z.tobytes()
         if key not in memory:
             memory.clear()
-            memory[key] = expand(origin + unit * z)
+            found = expand(origin + unit * z)
+            # A step may lead to where spreads overflow: then it is refused, for which SciPy wants finite derivatives.
+            if not all(np.isfinite(part).all() for part in found):
+                found = (np.inf, np.zeros_like(origin), np.eye(len(origin)))
+            memory[key] = found
         return memory[key]
 
     return minimize(
-        lambda z: at(z)[0] if np.isfinite(at(z)[0]) else np.inf,
+        lambda z: at(z)[0],
         np.zeros_like(origin),
         jac=lambda z: at(z)[1] * unit,
         hess=lambda z: at(z)[2] * unit * unit[:, None],

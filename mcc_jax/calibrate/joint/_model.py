@@ -140,7 +140,7 @@ def prior_numbers(
         mu_1=log_pair(priors.C1),
         mu_5=log_pair(priors.C5),
         softening=log_pair(priors.softening),
-        spread=jnp.asarray([[p.sd, p.power] for p in spreads]),
+        spread=jnp.asarray([[p.sd, 1 / (2 * p.shape)] for p in spreads]),
         log_noise=log_pair(priors.noise_factor),
         centre=jnp.asarray([np.log(priors.C1.median), log_C3(priors), np.log(priors.C5.median)]),
         blur=jnp.asarray(np.full(3, BLUR)),

@@ -33,30 +33,35 @@ class LogNormalPrior:
 
 
 @dataclass(frozen=True)
-class HalfNormalPrior:
-    r"""A spread :math:`\tau = s |z|^p` with z standard normal.
+class NakagamiPrior:
+    r"""A spread :math:`\tau \ge 0` with the density :math:`p(\tau) \propto \tau^{2m - 1} e^{-\tau^2 / (2 s^2)}`.
+
+    That is Nakagami's distribution (1960) with :math:`\Omega = 2 m s^2`; at m = 1/2 it is half-normal.
 
     Attributes:
-        sd: s; at p = 1 the standard deviation of the normal distribution that is cut off below 0.
-        power: p, at least 1. At 1 every spread much below s is as likely as any other, so that one below s/1000 is a
-            thing of one in a thousand. At 4 even the order of magnitude is open: half of all spreads lie below s/5, one
-            in five below s/200, one in ten below s/4000.
+        sd: s, beyond which no spread is expected; at m = 1/2 the standard deviation of the normal distribution that is
+            cut off below 0.
+        shape: m, at most 1/2. At 1/2 all spreads much below s are equally likely, so that one below s/1000 is a thing
+            of one in a thousand. At 1/8 even the order of magnitude is open: half of all spreads lie below s/14, one
+            in five below s/560, one in ten below s/9000.
 
     Raises:
-        InputError: if s is not positive, or p below 1 (no spread could then be 0).
+        InputError: if s is not positive, or m not between 0 and 1/2 (beyond, no spread could be 0).
     """
 
     sd: float
-    power: float = 1.0
+    shape: float = 0.5
 
     def __post_init__(self) -> None:
         """Refuse what is no distribution of a spread."""
         if not self.sd > 0:
             raise InputError(f"the scale of a spread must be positive, not {self.sd!r}", remedy="Correct sd.")
-        if not self.power >= 1:
-            raise InputError(
-                f"the power of a spread's prior must be 1 or more, not {self.power!r}", remedy="Correct it."
-            )
+        if not 0 < self.shape <= MOST_SHAPE:
+            raise InputError(f"the shape of a spread's prior {_OF_SHAPE}, not {self.shape!r}", remedy="Correct shape.")
+
+
+MOST_SHAPE = 0.5
+_OF_SHAPE = "must be above 0 and at most 1/2"
 
 
 @dataclass(frozen=True)
@@ -87,11 +92,11 @@ class Priors:
     C1: LogNormalPrior = LogNormalPrior(6.0, 0.5)
     C5: LogNormalPrior = LogNormalPrior(2.7, 0.3)
     softening: LogNormalPrior = LogNormalPrior(0.33, 0.6)
-    tau_C1: HalfNormalPrior = HalfNormalPrior(0.5)
-    tau_C3: HalfNormalPrior = HalfNormalPrior(0.05, power=4.0)
-    tau_C5: HalfNormalPrior = HalfNormalPrior(0.15)
-    modulus_scatter: HalfNormalPrior = HalfNormalPrior(0.3)
-    shape_scatter: HalfNormalPrior = HalfNormalPrior(0.3)
+    tau_C1: NakagamiPrior = NakagamiPrior(0.5)
+    tau_C3: NakagamiPrior = NakagamiPrior(0.05, shape=0.125)
+    tau_C5: NakagamiPrior = NakagamiPrior(0.15)
+    modulus_scatter: NakagamiPrior = NakagamiPrior(0.3)
+    shape_scatter: NakagamiPrior = NakagamiPrior(0.3)
     zero_um: NormalPrior = NormalPrior(0.0, 5.0)
     noise_displacement_um: LogNormalPrior = LogNormalPrior(0.02, 1.5)
     noise_force_mN: LogNormalPrior = LogNormalPrior(0.05, 1.0)
@@ -127,9 +132,9 @@ class Priors:
 _NAMES = {
     NormalPrior: "normal",
     LogNormalPrior: "log-normal",
-    HalfNormalPrior: "half-normal",
+    NakagamiPrior: "nakagami",
 }
-_POSITIVE = {"sd", "log_sd", "median"}
+_POSITIVE = {"sd", "log_sd", "median", "shape"}
 
 
 def read_priors(file: str | Path, unloading: Unloading = Unloading.PRINTED) -> Priors:
@@ -165,10 +170,8 @@ def read_priors(file: str | Path, unloading: Unloading = Unloading.PRINTED) -> P
                     f"prior {name!r} has no entry {key!r}", file=str(file), remedy=f"Its entries: {', '.join(fields)}."
                 )
             number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-            if not number or (key in _POSITIVE and value <= 0) or (key == "power" and value < 1):
-                allowed = "1 or more" if key == "power" else "a positive number" if key in _POSITIVE else "a number"
-                raise InputError(
-                    f"{name}.{key} must be {allowed}, not {value!r}", file=str(file), remedy="Correct the entry."
-                )
+            if not number or (key in _POSITIVE and value <= 0) or (key == "shape" and value > MOST_SHAPE):
+                must = _OF_SHAPE if key == "shape" else f"must be a {'positive ' if key in _POSITIVE else ''}number"
+                raise InputError(f"{name}.{key} {must}, not {value!r}", file=str(file), remedy="Correct the entry.")
         changes[name] = dataclasses.replace(known[name], **{k: float(v) for k, v in entry.items()})
     return dataclasses.replace(priors, **changes, changed=tuple(changes))

@@ -5,10 +5,10 @@ import json
 
 import numpy as np
 import pytest
-from scipy.stats import halfnorm
+from scipy.stats import halfnorm, nakagami
 
 from mcc_jax import InputError, JointModel, Priors, Unloading, read_priors
-from mcc_jax.calibrate.joint import HalfNormalPrior, LogNormalPrior, NormalPrior
+from mcc_jax.calibrate.joint import LogNormalPrior, NakagamiPrior, NormalPrior
 from mcc_jax.calibrate.joint._arviz import prior_draws
 
 
@@ -33,7 +33,7 @@ def test_whole_numbers_and_several_tables(read):
     found = read("[a]\nmean = 2\n[C1]\nmedian = 5\nlog_sd = 0.25\n[tau_C3]\nsd = 1\n")
     assert found.a == NormalPrior(2.0, Priors().a.sd)
     assert LogNormalPrior(5.0, 0.25) == found.C1
-    assert found.tau_C3 == HalfNormalPrior(1.0, Priors().tau_C3.power)
+    assert found.tau_C3 == NakagamiPrior(1.0, Priors().tau_C3.shape)
     assert set(found.changed) == {"a", "C1", "tau_C3"}
     assert isinstance(found.a.mean, float)
 
@@ -68,8 +68,9 @@ def test_what_is_not_named_is_the_default_of_the_form(read, unloading):
         ("[tau_C1]\nmean = 1.0\n", ["tau_C1", "mean", "sd"]),
         ("[a]\nsd = -0.1\n", ["a.sd", "positive", "-0.1"]),
         ("[a]\nsd = 0.0\n", ["a.sd", "positive"]),
-        ("[tau_C3]\npower = 0.5\n", ["tau_C3.power", "1 or more", "0.5"]),
-        ("[tau_C3]\nsd = 0\npower = 2\n", ["tau_C3.sd", "positive"]),
+        ("[tau_C3]\nshape = 0.6\n", ["tau_C3.shape", "at most 1/2", "0.6"]),
+        ("[tau_C3]\nshape = 0\n", ["tau_C3.shape", "above 0", "0"]),
+        ("[tau_C3]\nsd = 0\nshape = 0.2\n", ["tau_C3.sd", "positive"]),
         ("[C1]\nmedian = -6.0\n", ["C1.median", "positive"]),
         ("[C1]\nlog_sd = nan\n", ["C1.log_sd", "positive", "nan"]),
         ("[a]\nmean = inf\n", ["a.mean", "a number", "inf"]),
@@ -108,31 +109,30 @@ def test_json_holds_every_prior_with_its_numbers():
     assert content["a"] == {"distribution": "normal", "mean": 1.4, "sd": 0.3}
     assert content["C1"]["distribution"] == "log-normal"
     assert set(content["C1"]) == {"distribution", "median", "log_sd"}
-    assert content["tau_C1"] == {"distribution": "half-normal", "sd": 0.5, "power": 1.0}
+    assert content["tau_C1"] == {"distribution": "nakagami", "sd": 0.5, "shape": 0.5}
 
 
 @pytest.mark.parametrize(
-    ("sd", "power"), [(0.0, 1.0), (-1.0, 1.0), (float("nan"), 1.0), (0.1, 0.9), (0.1, float("nan"))]
+    ("sd", "shape"), [(0.0, 0.5), (-1.0, 0.5), (np.nan, 0.5), (0.1, 0.6), (0.1, 0.0), (0.1, np.nan)]
 )
-def test_no_prior_of_a_spread(sd, power):
+def test_no_prior_of_a_spread(sd, shape):
     with pytest.raises(InputError, match=r"spread"):
-        HalfNormalPrior(sd, power)
+        NakagamiPrior(sd, shape)
 
 
-@pytest.mark.parametrize("power", [1.0, 4.0])
-def test_draws_of_a_spread_s_prior(power):
-    """Quantiles of sd |z|^power are those of |z|, raised: and the shares that its docstring names."""
-    priors = dataclasses.replace(Priors(), tau_C3=HalfNormalPrior(0.2, power))
+@pytest.mark.parametrize("shape", [0.5, 0.125])
+def test_draws_of_a_spread_s_prior(shape):
+    priors = dataclasses.replace(Priors(), tau_C3=NakagamiPrior(0.2, shape))
     tau = prior_draws(priors, -1.0, 3.0, (1, 100_000), 0)["tau"][0, :, 1]
+    theirs = nakagami(shape, scale=0.2 * np.sqrt(2 * shape))
     for share in (0.1, 0.2, 0.5, 0.9):
-        expected = 0.2 * halfnorm.ppf(share) ** power
-        assert abs((tau < expected).mean() - share) < 4 * np.sqrt(share * (1 - share) / 100_000)
+        assert abs((tau < theirs.ppf(share)).mean() - share) < 4 * np.sqrt(share * (1 - share) / 100_000)
 
 
-def test_what_the_power_4_leaves_open():
-    shares = halfnorm.cdf(np.array([1 / 5, 1 / 200, 1 / 4000]) ** 0.25)
-    np.testing.assert_allclose(shares, [0.5, 0.2, 0.1], atol=0.01)
-    assert halfnorm.cdf(1 / 1000) == pytest.approx(0.001, abs=2.1e-4)
+def test_a_shape_of_one_half_is_half_normal_and_one_eighth_leaves_the_order_open():
+    shares = np.array([0.1, 0.2, 0.5])
+    np.testing.assert_allclose(nakagami.ppf(shares, 0.5), halfnorm.ppf(shares))
+    np.testing.assert_allclose(1 / nakagami.ppf(shares, 0.125, scale=0.5), [9000, 560, 14], rtol=0.03)
 
 
 def test_the_noise_s_priors_stand_together():
