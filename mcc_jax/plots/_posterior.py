@@ -202,9 +202,11 @@ def _prior_posterior(
     if inside and not close[0] <= paper <= close[-1]:
         close = np.linspace(min(close[0], paper - 0.1 * reach), max(close[-1], paper + 0.1 * reach), 300)
     options = {"positive": parameter.positive, "log": parameter.log}
-    peak = density(prior, far, **options)
-    for ax, x in ((whole, far), (near, close)):
-        before = np.interp(x, far, peak)
+    everywhere = density(prior, far, **options)
+    for ax, x, before in (
+        (whole, far, everywhere),
+        (near, close, enlarged_prior(prior, far, everywhere, close, parameter)),
+    ):
         ax.fill_between(x, before, color=PALE, alpha=0.5, linewidth=0)
         ax.plot(x, before, color=GREY, linewidth=1.0)
         after = density(posterior, x, **options)
@@ -222,6 +224,24 @@ def _prior_posterior(
     near.set_title(with_sd(float(posterior.mean()), float(posterior.std())), fontsize=8, color=BLACK)
     if paper is not None and not inside:
         note(near, f"paper {paper:.4g}", place="upper left" if paper < close[0] else "upper right")
+
+
+ENOUGH_DRAWS = 100
+
+
+def enlarged_prior(
+    prior: np.ndarray, far: np.ndarray, everywhere: np.ndarray, close: np.ndarray, parameter: Parameter
+) -> np.ndarray:
+    """The prior's density where the posterior is.
+
+    That of a spread may pile up at 0 far within one kernel of all draws: then from those near by alone, over the
+    largest value there.
+    """
+    row = flat_draws(prior)
+    beside = row[row <= 2 * close[-1]]
+    if parameter.positive and len(beside) >= ENOUGH_DRAWS:
+        return density(beside, close, positive=True)
+    return np.interp(close, far, everywhere)
 
 
 def posterior_figures(calibration: BayesCalibration) -> dict[str, Figure]:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.collections import LineCollection
 from matplotlib.quiver import Quiver
+from scipy.stats import nakagami
 
 from mcc_jax.calibrate import calibrate_bayes, calibrate_least_squares
 from mcc_jax.campaign import Metadata
@@ -26,6 +27,7 @@ from mcc_jax.plots import (
 )
 from mcc_jax.plots._forest import CoefficientTable, draw_forest, posterior_table, shrinkage
 from mcc_jax.plots._joint import density, spread_over, with_sd
+from mcc_jax.plots._posterior import PARAMETERS, enlarged_prior
 from mcc_jax.simulate import paper_campaign
 
 KINDS = ("paper", *(pytest.param(kind, marks=pytest.mark.long) for kind in ("one", "odd")))
@@ -288,6 +290,17 @@ def test_density_is_reflected_at_zero_and_even_in_the_logarithm():
     log = density(np.exp(rng.standard_normal(4000)), x, log=True)
     assert np.all(log[x <= 0] == 0)
     assert x[np.argmax(log)] == pytest.approx(np.exp(-1), abs=0.1)
+
+
+def test_a_prior_that_piles_up_at_zero_is_no_level_line_where_it_is_enlarged():
+    prior, tau = nakagami.rvs(0.125, size=20_000, random_state=0), PARAMETERS["tau_C3"]
+    far, close = np.linspace(0, 4, 300), np.linspace(0, 0.01, 300)
+    everywhere = density(prior, far, positive=True)
+    few = enlarged_prior(prior[:50], far, everywhere, close, tau)
+    assert few.min() > 0.9  # too few draws near by: all of them, which know no finer
+    fine = enlarged_prior(prior, far, everywhere, close, tau)
+    assert fine.max() == fine[0] == 1.0
+    assert fine[-1] < 0.2
 
 
 @pytest.mark.parametrize(
