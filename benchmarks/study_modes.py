@@ -4,7 +4,7 @@ The same 20 particles by both: the population drawn with the particles integrate
 under the exact likelihood, run long. Means are to agree within 0.05 standard deviations, standard deviations within
 5 %; what chance alone makes of both (Monte-Carlo standard errors of the two runs together) stands beside.
 
-Run `uv run --group bench python benchmarks/study_modes.py --write` (three minutes on 2 cores); `--draws 300` for
+Run `uv run --group bench python benchmarks/study_modes.py --write` (four minutes on 2 cores); `--draws 300` for
 a look.
 """
 

@@ -182,10 +182,12 @@ def _in_float64() -> None:
 def main():
     parser = _report.parser(__doc__)
     parser.add_argument("--campaigns", type=int, default=700)
+    parser.add_argument("--first", type=int, default=0, help="seed of the first campaign: others are a fresh study")
     parser.add_argument("--workers", type=int, default=os.cpu_count())
     parser.add_argument("--settings", nargs="+", default=["prior", "collapsed", "five"])
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
+    seeds = range(arguments.first, arguments.first + arguments.campaigns)
     results: dict[str, list[dict]] = {}
     verdicts, runs = [], []
     for setting in arguments.settings:
@@ -195,7 +197,7 @@ def main():
         rows = []
         work = partial(one_campaign, count=count, collapsed=setting == "collapsed", model=model)
         with ProcessPoolExecutor(arguments.workers, get_context("spawn"), _in_float64) as pool:
-            for row in pool.map(work, range(arguments.campaigns), chunksize=5):
+            for row in pool.map(work, seeds, chunksize=5):
                 rows.append(row)
                 if len(rows) % 20 == 0:
                     print(f"{setting}: {len(rows)} campaigns, {time.perf_counter() - started:.0f} s", flush=True)
@@ -227,6 +229,7 @@ def main():
     tables = {"Coverage": verdicts, "Runs": runs}
     settings = {
         "points per test": POINTS,
+        "seeds": f"{seeds.start} to {seeds.stop - 1}",
         "instrument": str(INSTRUMENT),
         **_report.environment("jax", "numpyro", "numpy"),
     }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -75,32 +75,33 @@ def draw_around(
 def _sampled(
     key: Array, mode: Array, covariance: Array, target: Target, length: Length, many: bool
 ) -> tuple[Chains, Population]:
-    """Draws of the population: independent ones, weighted, if the weights are good enough, else the sampler's.
-
-    If any trajectory diverged, the sampler runs again with smaller steps.
-    """
+    """Draws of the population: independent ones, weighted, if the weights are good enough, else the sampler's."""
     found = sample_weighted(key, mode, covariance, target, chains=length.chains, draws=length.draws, many=many)
     if found is not None:
         return found
 
-    def run(accept: float) -> tuple[Chains, Population]:
-        # From an array, not from a Python number: another number would be compiled anew.
-        aim = jnp.asarray(np.asarray(accept))
-        return by_chains(sample_population, key, length, mode, covariance, target, aim)
+    return _patient(lambda aim: by_chains(sample_population, key, length, mode, covariance, target, aim))
 
-    chains, population = run(ACCEPT[0])
-    for accept in ACCEPT[1:]:
-        if not np.any(np.asarray(chains.divergent)):
+
+def _patient[*Ts](run: Callable[[Array], tuple[Chains, *Ts]]) -> tuple[Chains, *Ts]:
+    """What the sampler finds; where any trajectory diverged it runs again, with smaller steps."""
+    # From arrays, not from Python numbers: another number would be compiled anew.
+    first, *smaller = (jnp.asarray(np.asarray(accept)) for accept in ACCEPT)
+    found = run(first)
+    for accept in smaller:
+        if not np.any(np.asarray(found[0].divergent)):
             break
-        chains, population = run(accept)
-    return chains, population
+        found = run(accept)
+    return found
 
 
 def draw_joint(key: Array, tests: Tests, model: JointModel, fit: JointFit, length: Length) -> dict[str, Any]:
     """Population and particles sampled together under the exact likelihood: fields of the result."""
     scatter = careful_enough(fit.mode, Target(fit.numbers, fit.summary, model.scatter), count_of(tests))
     exact = Exact(tests, fit.filters, fit.summary, scatter, model.zero_sd, model.unloading)
-    run, free, *particles = by_chains(sample_joint, key, length, fit.mode, fit.covariance, fit.numbers, exact)
+    run, free, *particles = _patient(
+        lambda aim: by_chains(sample_joint, key, length, fit.mode, fit.covariance, fit.numbers, exact, aim)
+    )
     population = populations(free.reshape(-1, free.shape[-1]), fit.numbers, scatter)
     names, stacked = _stack(population, scatter, length)
     return {

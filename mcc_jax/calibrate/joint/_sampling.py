@@ -213,6 +213,7 @@ def sample_joint(
     covariance: Float[Array, "d d"],
     numbers: PriorNumbers,
     exact: Exact,
+    accept: Scalar,
     *,
     warmup: int,
     draws: int,
@@ -245,7 +246,7 @@ def sample_joint(
     size = d + count * (k + 1)
     factor = jnp.eye(size).at[:d, :d].set(jnp.linalg.cholesky(covariance))
     centre = jnp.zeros(size).at[:d].set(mode)
-    run = sample(keys, log_density, centre, factor, warmup=warmup, draws=draws)
+    run = sample(keys, log_density, centre, factor, warmup=warmup, draws=draws, accept=accept)
 
     def latents(position):
         _, _, drawn = place(position)
