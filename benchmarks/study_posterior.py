@@ -9,7 +9,7 @@ draws is uniform (Talts et al. 2018), and intervals cover as often as they say. 
 - five: 5 particles;
 - wide: the library's default priors, whose corners hold powders that nobody has seen (C1 of 1 MPa, snap-through).
 
-Run `uv run --group bench python benchmarks/study_posterior.py --write` (40 minutes on 2 cores);
+Run `uv run --group bench python benchmarks/study_posterior.py --write` (50 minutes on 2 cores);
 `--campaigns 20` for a look.
 """
 

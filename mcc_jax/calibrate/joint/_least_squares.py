@@ -17,7 +17,7 @@ from ._arrow import Parameters, Solution
 from ._bayes import log_estimate
 from ._data import Selection, Tests, own_misfit
 from ._fit import population_at, prepare
-from ._mode import FIRST_SPREAD, KNEE
+from ._mode import FIRST_SPREAD, spread_slope
 from ._model import JointFit, JointModel
 from ._pooled import Pooled, fit_pooled, unpack
 from ._population import COEFFICIENTS
@@ -232,9 +232,7 @@ class LeastSquaresCalibration:
     def _spread_sd(self) -> np.ndarray:
         """Standard deviations of the three spreads, from those of their coordinates."""
         spreads = slice(FIRST_SPREAD, FIRST_SPREAD + 3)
-        scale, power = np.asarray(self.fit.numbers.spread)[:3].T
-        x = np.abs(np.asarray(self.fit.mode)[spreads])
-        slope = KNEE * scale * power * np.sinh(x) ** (power - 1) * np.cosh(x)  # of `spread_of`
+        slope = spread_slope(np.asarray(self.fit.mode)[spreads], np.asarray(self.fit.numbers.spread)[:3])
         return slope * np.sqrt(np.diagonal(np.asarray(self.fit.covariance)))[spreads]
 
     def _chi2(self) -> float:

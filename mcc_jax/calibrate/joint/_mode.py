@@ -77,6 +77,13 @@ def spread_of(coordinate: Float[Array, " k"], prior: Float[Array, "k 2"]) -> Flo
     return KNEE * scale * jnp.sinh(jnp.abs(coordinate)) ** power
 
 
+def spread_slope(coordinate: np.ndarray, prior: np.ndarray) -> np.ndarray:
+    """Derivative of `spread_of` by the size of the coordinate."""
+    scale, power = prior.T
+    x = np.abs(coordinate)
+    return KNEE * scale * power * np.sinh(x) ** (power - 1) * np.cosh(x)
+
+
 def with_coordinates(scatter: Scatter) -> np.ndarray:
     """Which of the five spreads have a coordinate."""
     return np.asarray([0, 1, 2] + [3] * scatter.modulus + [4] * scatter.shape)

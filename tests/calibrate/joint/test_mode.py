@@ -13,7 +13,16 @@ from joint_cases import random_summary
 from mcc_jax import InputError, JointModel
 from mcc_jax.calibrate.joint import NormalPrior, Priors
 from mcc_jax.calibrate.joint._fit import population_at
-from mcc_jax.calibrate.joint._mode import PriorNumbers, Target, from_free, most_probable, recentred, to_free
+from mcc_jax.calibrate.joint._mode import (
+    PriorNumbers,
+    Target,
+    from_free,
+    most_probable,
+    recentred,
+    spread_of,
+    spread_slope,
+    to_free,
+)
 from mcc_jax.calibrate.joint._model import prior_numbers
 from mcc_jax.calibrate.joint._population import Population
 
@@ -95,6 +104,13 @@ def test_the_population_at_unbounded_coordinates():
     assert float(population.log_noise) == -0.2
     plain = population_at(free[:9], NUMBERS, PLAIN)
     assert float(plain.modulus_scatter) == float(plain.shape_scatter) == 0.0
+
+
+def test_the_slope_of_a_spread_is_its_derivative():
+    x = jnp.asarray([0.4, -0.1, 2.0, 1e-3, -3.0])
+    slope = jax.jacfwd(lambda x: spread_of(x, NUMBERS.spread))(x)
+    found = spread_slope(np.asarray(x), np.asarray(NUMBERS.spread))
+    np.testing.assert_allclose(found, np.abs(np.diagonal(slope)), rtol=1e-12)
 
 
 def test_recentred_coordinates_describe_the_same_population():
