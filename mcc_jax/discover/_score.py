@@ -12,6 +12,7 @@ trusted, and counts all candidates: the probability is that of the largest stati
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import cast
@@ -224,6 +225,50 @@ def family_wise(
         few: take the noise model's word, because there are too few particles to scatter.
         draws: how many; no probability below one over them can be told.
     """
+    observed, drawn = _statistics(projection, sign, seed, few, draws)
+    largest = np.sort(drawn.max(1))
+    return _exceeding(observed, largest), observed
+
+
+def smallest_of_families(
+    projection: Projection,
+    sign: np.ndarray,
+    seed: int,
+    families: Sequence[np.ndarray],
+    *,
+    few: bool = False,
+    draws: int = DRAWS,
+) -> float:
+    """Probability that the most improbable largest statistic of several families of columns is so improbable.
+
+    Every family counts as much as any other, however many columns it has: in a small one a column needs less to be
+    significant. The families' correlations are those of the columns.
+
+    Args:
+        projection, sign, seed, few, draws: as in `family_wise`.
+        families: which columns each has, shape (K,), not all of them empty.
+    """
+    observed, drawn = _statistics(projection, sign, seed, few, draws)
+    found, other = 1.0, np.ones(draws)
+    for members in families:
+        if members.any():
+            largest = drawn[:, members].max(1)
+            in_order = np.sort(largest)
+            found = min(found, float(_exceeding(observed[members], in_order).min()))
+            other = np.minimum(other, (draws - np.searchsorted(in_order, largest)) / draws)
+    return float((np.sum(other <= found) + 1) / (draws + 1))
+
+
+def _exceeding(observed: np.ndarray, largest: np.ndarray) -> np.ndarray:
+    """Share of draws, in order, that reach what was observed."""
+    draws = len(largest)
+    return (draws - np.searchsorted(largest, observed - 1e-12) + 1) / (draws + 1)
+
+
+def _statistics(
+    projection: Projection, sign: np.ndarray, seed: int, few: bool, draws: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Every column's statistic, and draws of it if nothing is missing, shape (draws, K)."""
     scores, each = projection.scores, np.einsum("nkk->nk", projection.information)
     total = np.maximum(projection.total, 1e-300)
     prior, freedom = (1.0, MOST_FREEDOM) if few else common_scatter(projection)
@@ -240,9 +285,7 @@ def family_wise(
     # Wilson and Hilferty's cube for chi2 over its degrees of freedom.
     ninth = 2 / (9 * (freedom + own))
     chi = np.maximum(1 - ninth + rng.standard_normal((draws, 1)) * np.sqrt(ninth), 0.1) ** 1.5
-    largest = np.sort(_sided(drawn / chi, sign).max(1))
-    exceed = draws - np.searchsorted(largest, observed - 1e-12)
-    return (exceed + 1) / (draws + 1), observed
+    return observed, _sided(drawn / chi, sign)
 
 
 MOST_FREEDOM = 100.0

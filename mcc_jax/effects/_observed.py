@@ -8,7 +8,8 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._types import Scalar, Values, scalar
-from ._context import Context
+from ..law import PUNCH_AREA
+from ._context import Context, root
 from ._effect import AbstractEffect
 from ._variant import Mechanism, Need, Nuisance, Variant
 
@@ -117,6 +118,17 @@ class LayerSinkIn(AbstractEffect):
         return self.amplitude * context.force * 10.0 / (jnp.pi * radius * radius)
 
 
+class YieldSinkIn(AbstractEffect):
+    """The same with a contact whose pressure stays that of first yield; its radius follows the force, up and down."""
+
+    def observe(self, context: Context) -> Values:
+        """F / (2 a E*), a = D_e sqrt(c^2 sigma / (C1 eta))."""
+        diameter, law = context.particle.effective_diameter, context.law
+        slope = law.plastic.C1 * law.shape_factor(context.particle)
+        radius = diameter * (root(PUNCH_AREA * context.stress / slope) + 1e-3)
+        return self.amplitude * context.force / (2 * radius)
+
+
 def _radius(context: Context, shrinks: bool) -> Values:
     """Contact radius [um], not below 1e-3 D_e: there the force has vanished, and a quotient must stay finite."""
     radius = context.contact_radius if shrinks else context.peak_contact_radius
@@ -218,6 +230,8 @@ SINK_IN = Mechanism(
               _SNEDDON),
         _sink("current_contact", PlatenSinkIn, "d = F / (2 a E*)", "The same with the radius left on unloading.",
               _SNEDDON, fixed={"shrinks": True}),
+        _sink("yield_pressure", YieldSinkIn, "d = F / (2 a E*), a = D_e sqrt(c^2 sigma / (C1 eta))",
+              "The radius follows the force at the pressure of first yield.", _SNEDDON),
         _sink("layer", LayerSinkIn, "d = F h / (pi a_P^2 E), h = 10 um", "A thin soft layer, dust or glue.",
               "Johnson (1985), sec. 5.8", plausible=(0.3, 30.0)),
         _sink(

@@ -198,15 +198,28 @@ ADHESION = Mechanism(
 
 
 class AbstractReversal(AbstractEffect):
-    """Extra recovery towards release, from the compressed core that yields backwards: a share of gamma_P."""
+    """Extra recovery towards release, from the compressed core that yields backwards.
+
+    Attributes:
+        of: what the amplitude is a share of: the particle's size D_e ("size"), the displacement at the peak gamma_P
+            ("peak"), or what the law recovers, Delta ("recovery").
+    """
+
+    of: str = eqx.field(static=True, default="peak", kw_only=True)
 
     def tail(self, share: Values) -> Values:
         """1 on full release, 0 at the peak."""
         raise NotImplementedError
 
+    def whole(self, context: Context) -> Values:
+        """L: D_e, gamma_P or Delta [um]."""
+        if self.of == "size":
+            return context.particle.displacement(jnp.ones_like(context.peak_displacement))
+        return context.recoverable if self.of == "recovery" else context.peak_displacement
+
     def inside(self, context: Context) -> Values:
-        """-gamma_P c g(u)."""
-        return -self.amplitude * context.peak_displacement * self.tail(context.load_share)
+        """-L c g(u)."""
+        return -self.amplitude * self.whole(context) * self.tail(context.load_share)
 
 
 class PowerReversal(AbstractReversal):
@@ -253,14 +266,25 @@ class StayingReversal(AbstractReversal):
         start = context.reload_from_share
         back = 1 - reload_progress(share, start, jnp.ones_like(share))
         tail = jnp.where(context.record.branch == RELOAD, self.tail(start) * back, self.tail(share))
-        return -self.amplitude * context.peak_displacement * tail
+        return -self.amplitude * self.whole(context) * tail
 
 
-def _reversal(name: str, make: type[AbstractEffect], equation: str, explanation: str, **more: Any) -> Variant:
+_REVERSED = {
+    "size": ("reverse_strain", (2e-4, 1e-2)),
+    "peak": ("reverse_share", (5e-4, 3e-2)),
+    "recovery": ("recovery_share", (1e-2, 0.5)),
+}
+"""Name of the amplitude and its plausible range, by what it is a share of."""
+
+
+def _reversal(
+    name: str, make: type[AbstractEffect], equation: str, explanation: str, *, of: str = "peak", **more: Any
+) -> Variant:
+    parameter, plausible = _REVERSED[of]
     return Variant(
-        "reverse_plasticity", name, make, "reverse_share", "-", 1, (5e-4, 3e-2), equation, explanation,
+        "reverse_plasticity", name, make, parameter, "-", 1, plausible, equation, explanation,
         "Palomaki et al. (2015), Int. J. Pharm. (seen in MCC); Kadin, Kligerman and Etsion (2006)",
-        needs=(Need.UNLOADING,), helps=(Need.RELOAD,), **more,
+        needs=(Need.UNLOADING,), helps=(Need.RELOAD,), **{**more, "fixed": {"of": of, **more.get("fixed", {})}},
     )  # fmt: skip
 
 
@@ -268,7 +292,15 @@ REVERSAL = Mechanism(
     "reverse_plasticity",
     "Close to release the compressed core yields backwards: the particle recovers more than elastically.",
     (
+        _reversal("quartic_strain", PowerReversal, "d = -D_e c (1 - u)^4",
+                  "Most of it close to release, the same strain for every particle.", of="size"),
         _reversal("quartic", PowerReversal, "d = -gamma_P c (1 - u)^4", "Most of it close to release."),
+        _reversal("quartic_recovery", PowerReversal, "d = -Delta c (1 - u)^4",
+                  "Most of it close to release, in proportion to what recovers elastically.", of="recovery"),
+        _reversal("threshold_recovery", ThresholdReversal, "d = -Delta c ((u_0 - u) / u_0)^2 below u_0",
+                  "Reverse yield begins at a share of the peak load, in proportion to what recovers elastically.",
+                  of="recovery",
+                  nuisances=(Nuisance("onset_share", (0.5, 0.8), (0.05, 0.95), "share of the peak load"),)),
         _reversal("quadratic", PowerReversal, "d = -gamma_P c (1 - u)^2", "All along the branch.", fixed={"power": 2}),
         _reversal("threshold", ThresholdReversal, "d = -gamma_P c ((u_0 - u) / u_0)^2 below u_0",
                   "Reverse yield begins at a share of the peak load.",
