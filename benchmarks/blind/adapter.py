@@ -37,9 +37,10 @@ def in_process(folder, *, exclude=(), seed=0, options=None):
     data = result.to_json()
     data = json.loads(data) if isinstance(data, str) else json.loads(json.dumps(data))
     if data.get("closure") is not None:
-        # Without NaN: rows that took no part are not corrected.
-        rows = {name: [v if v == v else 0.0 for v in map(float, um)] for name, um in result.correction_um().items()}
-        data["closure"]["correction_um"] = rows
+        for key, held_out in (("correction_um", False), ("held_out_correction_um", True)):
+            # Without NaN: rows that took no part are not corrected.
+            found = result.correction_um(held_out=held_out)
+            data["closure"][key] = {name: [v if v == v else 0.0 for v in map(float, um)] for name, um in found.items()}
     return {**data, "options_not_offered": [name for name in missing if name != "seed"]}
 
 

@@ -138,8 +138,11 @@ def _progress(what):
     return show
 
 
-def solve(folder, *, solver="inprocess", jobs=2, seed=0, timeout=300.0, repeat=0, keys=None):
-    """Run the solver on every task of a sealed folder that has no result yet."""
+def solve(folder, *, solver="inprocess", jobs=2, seed=0, timeout=300.0, repeat=0, keys=None, asked=None):
+    """Run the solver on every task of a sealed folder that has no result yet.
+
+    keys: the tasks; those of the folder if None. asked: options of tasks that are not the folder's own.
+    """
     folder = Path(folder)
     tasks = json.loads((folder / "tasks.json").read_text())
     done = read_results(folder)
@@ -149,7 +152,7 @@ def solve(folder, *, solver="inprocess", jobs=2, seed=0, timeout=300.0, repeat=0
         {
             "key": key,
             "folder": str(folder / "campaigns" / base.split("#")[0]),
-            **tasks.get(base, {"exclude": [], "options": {}}),
+            **tasks.get(base, {"exclude": [], "options": asked or {}}),
         }
         for key, base in wanted.items()
         if key not in done
@@ -191,6 +194,10 @@ SHARED_SETTINGS = ("XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR")
 """What workers side by side are told, and a user's process is not."""
 
 
+NAMES_ONLY = {"confirm": False, "experiments": False, "posterior": False}
+"""What a solver is asked once a proposed experiment was carried out: is one name left?"""
+
+
 def follow_up(folder, content, **options):
     """Carry out the first proposed experiment of every campaign that got a set, and ask again."""
     results = read_results(folder)
@@ -204,7 +211,7 @@ def follow_up(folder, content, **options):
         made = sealing.follow_up(folder, key, answer, changes) if changes else None
         answers[f"{key}+next"] = made and {"changes": changes, "lambda": [e["lambda"] for e in made["effects"]]}
     path.write_text(json.dumps(answers) + "\n")
-    solve(folder, keys=[key for key, made in answers.items() if made], **options)
+    solve(folder, keys=[key for key, made in answers.items() if made], asked=NAMES_ONLY, **options)
     return answers
 
 

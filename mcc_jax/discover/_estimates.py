@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 
 from ..calibrate.joint._bayes import summary
+from ._candidates import Candidate
 from ._refit import Refit
 from ._result import Effect
 from ._score import DETECTABLE, Projection, project
-from ._search import Ranking
+from ._search import Ranking, jumps
+from ._steps import Jump, is_step
 from ._system import GLOBALS, Base, System
 
 
@@ -33,6 +35,10 @@ def estimated_effects(
         alone = project(system, inside[row : row + 1], inside=others)
         own = alone.scores[:, 0] / np.maximum(alone.information[:, 0, 0], 1e-300)
         own = own + system.at[k]
+        broken = jumps(system, alone) if step.at_random[position] and is_step(candidate) else ()
+        if broken:
+            found.append(_of_jumps(candidate, broken, float(step.probability[position]), p_any, alone.particles))
+            continue
         variance = fitted.covariance[start + row, start + row]
         if fit is not None:
             # With the further numbers free, an amplitude is less certain.
@@ -50,6 +56,22 @@ def estimated_effects(
             )
         )
     return tuple(found)
+
+
+def _of_jumps(
+    candidate: Candidate, broken: tuple[Jump, ...], probability: float, p_any: float, particles: np.ndarray
+) -> Effect:
+    """Sudden steps in some tests: the amplitude is their mean size, and each test has its own."""
+    unit = candidate.unit_amplitude
+    size = unit * np.array([jump.size for jump in broken])
+    known = unit * np.array([jump.sd for jump in broken])
+    own = np.zeros(len(particles))
+    own[np.searchsorted(particles, [jump.particle for jump in broken])] = size
+    spread = np.var(size, ddof=1) if len(size) > 1 else 0.0
+    where = {"location_MPa": float(np.median([jump.stress_MPa for jump in broken]))}
+    several = tuple(dataclasses.replace(j, size=unit * j.size, sd=unit * j.sd) for j in broken)
+    sd = float(np.sqrt(max(spread, np.mean(known**2)) / len(size)))
+    return Effect(candidate.variant, where, float(size.mean()), sd, probability, p_any, True, own, jumps=several)
 
 
 def with_draws(effect: Effect, draws: dict[str, np.ndarray]) -> Effect:

@@ -129,7 +129,8 @@ class _Trial:
             # As large as what it takes away says, fitted as it is.
             amplitude = np.sign(now.estimate[k]) * np.sqrt(max(gain, 0.0) / max(now.total[k], 1e-300))
             truths.append((int(np.flatnonzero(keep == at[k])[0]), float(amplitude), float(share)))
-        return cls(replace(other, candidates=tuple(other.candidates[j] for j in keep)), view, tuple(truths))
+        # Steps at any point are not drawn: places on the grid stand for them.
+        return cls(replace(other, candidates=tuple(other.candidates[j] for j in keep), steps=None), view, tuple(truths))
 
     def fewest(self, *, first: int, seed: int) -> tuple[int, float]:
         """The smallest number of particles that is enough, or else the largest, and its power."""

@@ -33,7 +33,16 @@ from ..effects import AbstractEffect, ExtendedLaw, Nuisance, Record, Variant
 from ..geometry import Particle
 from ..law import Unloading
 from ._candidates import Candidate
-from ._system import Base, Signals, System, gram_matrices, in_batches, mean_by_globals
+from ._system import (
+    Base,
+    Signals,
+    System,
+    first_loaded,
+    gram_matrices,
+    in_batches,
+    mean_by_globals,
+    steps_of,
+)
 
 STEPS = 12
 ENOUGH = 0.02
@@ -231,10 +240,11 @@ def system_at(base: Base, system: System, signals: Signals, chosen: list[int], f
     amplitudes = np.array([own.start for own in slices(found.formulas)], int)
     added = signals.added.at[:, np.array(chosen)].set(found.columns[:, amplitudes])
     tests, state = base.tests, found.state
-    gram = gram_matrices(
+    gram, *of_steps = gram_matrices(
         found.residual,
         found.jacobian,
         tests.mask,
+        first_loaded(tests),
         base.fit.filters,
         added,
         signals.seen,
@@ -248,7 +258,8 @@ def system_at(base: Base, system: System, signals: Signals, chosen: list[int], f
     for i, (k, formula) in enumerate(zip(chosen, found.formulas, strict=True)):
         candidates[k] = Candidate(formula.variant, {**candidates[k].nuisance, **formula.nuisance(found.own(i))})
         at[k] = found.own(i)[0]
-    return replace(system, gram=gram, candidates=tuple(candidates), at=at, shift=np.asarray(state.shift))
+    steps = steps_of(tests, system.candidates, *of_steps)
+    return replace(system, gram=gram, steps=steps, candidates=tuple(candidates), at=at, shift=np.asarray(state.shift))
 
 
 class _Step(eqx.Module):

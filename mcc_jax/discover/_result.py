@@ -12,7 +12,9 @@ from ..effects import EQUIVALENCES, AbstractEffect, Variant
 from ._closure import Closure
 from ._confirm import HeldOut
 from ._posterior import ExtendedPosterior
+from ._score import project
 from ._search import Ranking
+from ._steps import Jump
 from ._system import Base, System, feature_values
 
 Verdict = Literal["NO_GAP", "NAMED", "SET", "UNLISTED", "FIT_NOT_CONVERGED"]
@@ -31,6 +33,8 @@ class Effect:
         at_random: whether the amplitude differs from test to test.
         by_particle: each test's own estimate of the amplitude.
         estimates: amplitude and further parameters with their uncertainty, by name, where the posterior was sampled.
+        jumps: sudden steps, size in the variant's unit, of the tests that probably have one; the amplitude is then
+            their mean size.
     """
 
     variant: Variant
@@ -42,6 +46,7 @@ class Effect:
     at_random: bool
     by_particle: np.ndarray
     estimates: dict[str, dict[str, Any]] = field(default_factory=dict)
+    jumps: tuple[Jump, ...] = ()
 
     @property
     def mechanism(self) -> str:
@@ -144,22 +149,56 @@ class Discovery:
             closed = finite(float(min(1 - h.energy[-1] / h.energy[0], 1.0)))
         return {"floor": 1.0, "heldout": "leave-one-particle-out", "steps": steps, "closed_fraction": closed}
 
-    def correction_um(self) -> dict[str, np.ndarray]:
+    def correction_um(self, *, held_out: bool = False) -> dict[str, np.ndarray]:
         """Displacement that the formula adds to the base law's at every row of every test that took part [um].
 
         Empty without a formula. Rows that the fit leaves out, of an approach or of a record that was thinned, are NaN.
+
+        Args:
+            held_out: every test by the formula that the tests without its fold make, words and numbers looked for
+                anew; by the whole formula where there are too few tests for folds.
         """
         if self.closure is None or self.base is None or self.system is None:
             return {}
-        base = self.base
-        values = feature_values(base, tuple(self.system.word(int(w)) for w in self.closure.words))
-        added = np.einsum("w,nwp->np", self.closure.coefficients, np.asarray(values))
+        base, system = self.base, self.system
+        coefficients = np.zeros((len(base.tests), len(system.formula)))
+        coefficients[:, self.closure.words - system.formula_columns[0]] = self.closure.coefficients
+        for group, words in self.closure.folds if held_out else ():
+            others = np.setdiff1d(np.flatnonzero(system.usable), group)
+            fitted = project(system, words[:0], inside=words, particles=others).theta[len(system.globals) :]
+            coefficients[group] = 0.0
+            coefficients[group[:, None], words - system.formula_columns[0]] = fitted
+        added = np.einsum("nw,nwp->np", coefficients, np.asarray(feature_values(base, system.formula)))
         found = {}
         for i, rows, of_test in zip(base.selection.kept, base.selection.rows, added, strict=True):
             whole = np.full(len(base.campaign.curves[i]), np.nan)
             whole[rows] = of_test[: len(rows)]
             found[base.campaign.particles[i]] = whole
         return found
+
+    def name_of(self, row: int) -> str:
+        """The particle of a row of the tests that took part."""
+        if self.base is None:
+            return str(row + 1)
+        return self.base.campaign.particles[self.base.selection.kept[row]]
+
+    def _jumps(self, effect: Effect) -> dict[str, Any]:
+        """The sudden steps of an effect, one for each test that probably has one."""
+        if not effect.jumps:
+            return {}
+        unit = effect.variant.unit
+        return {
+            "jumps": [
+                {
+                    "particle": self.name_of(jump.particle),
+                    "stress_MPa": jump.stress_MPa,
+                    f"size_{unit}": jump.size,
+                    f"sd_{unit}": jump.sd,
+                    "probability": jump.probability,
+                }
+                for jump in effect.jumps
+            ]
+        }
 
     def _typical_noise_um(self) -> float:
         if self.base is None:
@@ -191,7 +230,7 @@ class Discovery:
             "schema": 1,
             "verdict": self.verdict,
             "summary": self.summary,
-            "effects": [effect.to_json() for effect in self.effects],
+            "effects": [effect.to_json() | self._jumps(effect) for effect in self.effects],
             "candidate_set": [list(names) for names in self.candidate_set],
             "ranking": ranking,
             "untestable": list(self.untestable),

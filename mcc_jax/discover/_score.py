@@ -39,6 +39,7 @@ class Projection:
         theta: coefficients of what was projected off, population first.
         covariance: theirs.
         survival: share of every column's information that survives the projection.
+        nuisance: which columns were projected off.
     """
 
     columns: np.ndarray
@@ -49,6 +50,7 @@ class Projection:
     theta: np.ndarray
     covariance: np.ndarray
     survival: np.ndarray
+    nuisance: np.ndarray
 
     def only(self, keep: np.ndarray) -> Projection:
         """Some of the columns."""
@@ -145,7 +147,7 @@ def project(
     information += cross + np.swapaxes(cross, 1, 2) + shift.T @ (among @ shift)
     residual = alone + 2 * own @ theta + (among @ theta) @ theta
     survival = np.einsum("nkk->k", information) / raw
-    return Projection(columns, chosen, scores, information, residual, theta, covariance, survival)
+    return Projection(columns, chosen, scores, information, residual, theta, covariance, survival, nuisance)
 
 
 RESIDUAL = np.array([0])

@@ -21,10 +21,8 @@ from scipy.special import log_ndtr, logsumexp
 
 from ._candidates import located
 from ._score import Projection
+from ._steps import ODD, ODD_STEP, SCALES, SHARES, Jump, Steps, is_step, over_tests, tamed
 from ._system import System
-
-SCALES = (0.01, 0.03, 0.1, 0.3, 1.0)
-"""Scales of the amplitude's prior in units of the largest believable amplitude."""
 
 LOOSENESS = 0.02
 """No family of formulas contains nature's own: of the explained chi2 so much may be missed by the true mechanism."""
@@ -41,7 +39,11 @@ def log_evidence(U: np.ndarray, information: np.ndarray, sign: np.ndarray) -> np
 
 
 def log_evidence_at_random(
-    scores: np.ndarray, information: np.ndarray, sign: np.ndarray, groups: list[np.ndarray]
+    scores: np.ndarray,
+    information: np.ndarray,
+    sign: np.ndarray,
+    groups: list[np.ndarray],
+    placed: np.ndarray | None = None,
 ) -> np.ndarray:
     """Log evidence of amplitudes that differ from test to test: a normal distribution around zero, cut at the sign.
 
@@ -49,6 +51,8 @@ def log_evidence_at_random(
         scores, information: shapes (..., N, K).
         sign: physical signs, shape (K,).
         groups: columns of which every test has one of its own, equally probable beforehand.
+        placed: which columns are of effects that some tests may not have, those with a place of their own; none if
+            None.
 
     Returns:
         One number per group, shape (..., G).
@@ -62,20 +66,13 @@ def log_evidence_at_random(
     found = []
     for members in groups:
         one = logsumexp(each[..., members, :], axis=-2) - np.log(len(members))
-        found.append(logsumexp(_not_odd(one).sum(-2), axis=-1) - np.log(len(scale)))
+        some = placed is not None and placed[members].all()
+        found.append(over_tests(one, SHARES, ODD_STEP) if some else over_tests(one, (1.0,), ODD))
     return np.stack(found, -1)
 
 
 COMMON = 1.0
 """Probability of all other formulas of a mechanism together, that of its first, the common one, being 1."""
-
-ODD = 0.02
-"""Share of tests of which something else is odd, whatever effect there is."""
-
-
-def _not_odd(log_ratio: np.ndarray) -> np.ndarray:
-    """A test's evidence for an effect where the test may be odd otherwise: one test alone proves nothing of all."""
-    return -np.logaddexp(np.log(ODD), np.log1p(-ODD) - log_ratio)
 
 
 def random_groups(system: System) -> list[np.ndarray]:
@@ -90,34 +87,81 @@ def random_groups(system: System) -> list[np.ndarray]:
     return [np.array(members) for members in groups.values()]
 
 
+def _placed(system: System, columns: np.ndarray) -> np.ndarray:
+    """Which candidates have a place of their own in every test."""
+    return np.array([located(system.candidates[k].variant) for k in columns], bool)
+
+
+def _tamed(system: System, scores: np.ndarray, information: np.ndarray, placed: np.ndarray) -> np.ndarray:
+    """Scores of what has a place of its own shrunk: it shows in a few points, which have the tails of the noise."""
+    if not np.isfinite(system.tails) or not placed.any():
+        return scores
+    scale = np.sqrt(np.maximum(information, 1e-300))
+    return np.where(placed, scale * tamed(scores / scale, system.tails), scores)
+
+
+def evidence_of_steps(system: System, projection: Projection, inflation: np.ndarray | float = 1.0) -> float:
+    """Log evidence of sudden steps at any points beside what was projected off; minus infinity without any to look
+    for.
+
+    Args:
+        system: the system.
+        projection: of which particles, and what was projected off.
+        inflation: by which the noise of every particle is larger than modelled.
+    """
+    if system.steps is None:
+        return -np.inf
+    _, shrunk = _scores_of_steps(system, system.steps, projection, inflation)
+    return float(system.steps.evidence(shrunk, projection.particles))
+
+
+def jumps(system: System, projection: Projection) -> tuple[Jump, ...]:
+    """The sudden steps that are more probable than not beside what was projected off."""
+    if system.steps is None:
+        return ()
+    return system.steps.jumps(*_scores_of_steps(system, system.steps, projection, 1.0), projection.particles)
+
+
+def _scores_of_steps(
+    system: System, steps: Steps, projection: Projection, inflation: np.ndarray | float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Scores of steps, and as far as they count."""
+    particles = projection.particles
+    scores = steps.scores(particles, projection.nuisance, projection.theta)
+    scores = scores / np.broadcast_to(inflation, len(particles))[:, None]
+    return scores, _tamed(system, scores, steps.information[particles], np.ones(scores.shape[1:], bool))
+
+
 def random_probability(system: System, projection: Projection, seed: int, *, draws: int = 400) -> float:
     """Probability under the noise model that effects which differ from test to test seem as evident as they do."""
     groups = random_groups(system)
     if not groups:
         return 1.0
-    index = np.concatenate(groups)
-    sign = system.signs[index]
-    bounds = np.cumsum([0, *map(len, groups)])
-    local = [np.arange(a, b) for a, b in itertools.pairwise(bounds)]
-    information = projection.information[:, index][:, :, index]
-    each = np.einsum("nkk->nk", information)
     # A test whose noise is larger than modelled must not look like an effect.
     inflation = np.sqrt(np.maximum(projection.residual / np.maximum(system.points[projection.particles], 1), 1.0))
-    observed = log_evidence_at_random(projection.scores[:, index] / inflation[:, None], each, sign, local).max()
-    values, vectors = np.linalg.eigh(information)
-    factor = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    observed = evidence_of_steps(system, projection, inflation)
     rng = np.random.default_rng([seed, 43])
-    # What has a place of its own in every test shows in a few points, which have the tails of the noise.
-    placed = np.array([located(system.candidates[k].variant) for k in index])
-    exceed = 0
-    for _ in range(4):
-        normal = rng.standard_normal((draws // 4, *each.shape))
-        scores = np.einsum("nkl,bnl->bnk", factor, normal)
-        if np.isfinite(system.tails):
-            wide = np.sqrt((system.tails - 2) / rng.chisquare(system.tails, scores.shape))
-            scores = np.where(placed, scores * wide, scores)
-        exceed += int((log_evidence_at_random(scores, each, sign, local).max(-1) >= observed).sum())
-    return (exceed + 1) / (draws + 1)
+    drawn = np.full(draws, -np.inf)
+    if system.steps is not None:
+        drawn = system.steps.drawn_evidence(projection.particles, draws, rng)
+        groups = [members for members in groups if not is_step(system.candidates[members[0]])]
+    if groups:
+        index = np.concatenate(groups)
+        sign, placed = system.signs[index], _placed(system, index)
+        bounds = np.cumsum([0, *map(len, groups)])
+        local = [np.arange(a, b) for a, b in itertools.pairwise(bounds)]
+        information = projection.information[:, index][:, :, index]
+        each = np.einsum("nkk->nk", information)
+        scores = _tamed(system, projection.scores[:, index] / inflation[:, None], each, placed)
+        observed = max(observed, float(log_evidence_at_random(scores, each, sign, local, placed).max()))
+        values, vectors = np.linalg.eigh(information)
+        factor = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+        for some in np.array_split(np.arange(draws), 4):
+            normal = rng.standard_normal((len(some), *each.shape))
+            scores = np.einsum("nkl,bnl->bnk", factor, normal)
+            own = log_evidence_at_random(scores, each, sign, local, placed).max(-1)
+            drawn[some] = np.maximum(drawn[some], own)
+    return (int((drawn >= observed).sum()) + 1) / (draws + 1)
 
 
 @dataclass(frozen=True)
@@ -166,9 +210,13 @@ def rank(system: System, projection: Projection, *, refitted: Mapping[int, float
     differing = np.full(len(sign), -np.inf)
     groups = random_groups(system)
     if groups:
-        values = log_evidence_at_random(projection.scores, each, sign, groups)
+        placed = _placed(system, np.arange(len(sign)))
+        scores = _tamed(system, projection.scores, each, placed)
+        values = log_evidence_at_random(scores, each, sign, groups, placed)
+        anywhere = evidence_of_steps(system, projection)
         for members, value in zip(groups, values, strict=True):
-            differing[members] = value
+            some = np.isfinite(anywhere) and is_step(system.candidates[members[0]])
+            differing[members] = anywhere if some else value
     random = np.isfinite(differing)
     evidence = np.logaddexp(common, differing) - np.where(random, np.log(2), 0.0)
     linear = np.where(alive, U**2 / np.maximum(total, 1e-300), 0.0)

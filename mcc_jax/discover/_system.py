@@ -22,7 +22,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..calibrate import JointModel
 from ..calibrate.joint._blocks import Blocks, block_size, filled_up
@@ -40,6 +40,7 @@ from ..geometry import Particle
 from ..law import Unloading
 from ._candidates import Candidate, candidates_of
 from ._features import GAUGE, ROOM, Feature, map_features, values_of, words
+from ._steps import Steps, is_step
 
 GLOBALS = ("a", "log modulus", "mu C1", "mu C3", "mu C5")
 
@@ -64,6 +65,7 @@ class System:
         tails: degrees of freedom of Student's distribution whose tails are those of the noise; infinite where it is
             normal.
         formula: words with fitted numbers, of the formula that was found and of those without some particles.
+        steps: sudden steps at every point; None where nobody looks for them.
     """
 
     gram: np.ndarray
@@ -77,6 +79,7 @@ class System:
     shift: np.ndarray
     tails: float = np.inf
     formula: tuple[Feature, ...] = ()
+    steps: Steps | None = None
 
     @property
     def globals(self) -> np.ndarray:
@@ -150,7 +153,8 @@ class System:
         at = np.asarray(columns)
         inner = self.gram[:, at][:, :, at] + np.eye(len(at))
         border = self.gram[:, at]
-        return replace(self, gram=self.gram - np.swapaxes(border, 1, 2) @ np.linalg.solve(inner, border))
+        gram = self.gram - np.swapaxes(border, 1, 2) @ np.linalg.solve(inner, border)
+        return replace(self, gram=gram, steps=None)
 
 
 @dataclass(frozen=True)
@@ -305,10 +309,11 @@ def build_system(base: Base, signals: Signals) -> System:
     mean, factor = moments(population, flat, scatter)
 
     by_globals = mean_by_globals(population, flat, scatter)
-    gram = gram_matrices(
+    gram, *of_steps = gram_matrices(
         data.residual,
         data.jacobian,
         tests.mask,
+        first_loaded(tests),
         fit.filters,
         signals.added,
         signals.seen,
@@ -327,8 +332,35 @@ def build_system(base: Base, signals: Signals) -> System:
     still, none = np.zeros(len(GLOBALS)), np.zeros(len(candidates))
     white = np.asarray(in_batches(_whitened, (data.residual, fit.filters)))[np.asarray(tests.mask)]
     return System(
-        gram, points, candidates, places, some, 1 / width**2, usable, none, still, tails_of(white), signals.formula
+        gram,
+        points,
+        candidates,
+        places,
+        some,
+        1 / width**2,
+        usable,
+        none,
+        still,
+        tails_of(white),
+        signals.formula,
+        steps_of(tests, candidates, *of_steps),
     )
+
+
+def first_loaded(tests: Tests) -> Bool[Array, "particles points"]:
+    """Points at which force is larger than ever before in the test."""
+    force = jnp.where(tests.mask, tests.force, -jnp.inf)
+    before = jax.lax.cummax(force, axis=1)[:, :-1]
+    return jnp.concatenate([jnp.zeros_like(tests.mask[:, :1]), force[:, 1:] > before], 1)
+
+
+def steps_of(tests: Tests, candidates: Sequence[Candidate], cross: np.ndarray, among: np.ndarray) -> Steps | None:
+    """Sudden steps as large as one would believe, from those of 1 um; None where nobody looks for them."""
+    unit = next((c.unit_amplitude for c in candidates if is_step(c)), None)
+    if unit is None:
+        return None
+    stress = np.asarray(tests.force) / (np.pi / 4 * np.asarray(tests.effective_diameter)[:, None] ** 2) * 1e3
+    return Steps(unit * cross, unit**2 * among, np.where(first_loaded(tests), stress, np.nan))
 
 
 OFTEN = 0.98
@@ -401,16 +433,17 @@ def _features(
 
 
 def gram_matrices(
-    residual, jacobian, mask, filters, added, seen, away, by_globals, factor, zero_sd, zero_away
-) -> np.ndarray:
-    """Gram matrices of all columns, particles' deviations and zeros integrated out."""
+    residual, jacobian, mask, loaded, filters, added, seen, away, by_globals, factor, zero_sd, zero_away
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Gram matrices, particles' deviations and zeros integrated out: of all columns; of steps of 1 um at the points of
+    first loading with these; of steps among themselves."""
     missing = -added.shape[1] % COLUMNS
     wide = jnp.pad(added, ((0, 0), (0, missing), (0, 0)))
-    rows = (residual, jacobian, mask, filters, wide, seen, away, by_globals, factor, zero_away)
-    gram = np.asarray(in_batches(partial(_gram, zero_sd=zero_sd), rows))
+    rows = (residual, jacobian, mask, loaded, filters, wide, seen, away, by_globals, factor, zero_away)
+    gram, cross, among = map(np.asarray, in_batches(partial(_gram, zero_sd=zero_sd), rows))
     end = 1 + by_globals.shape[-1] + added.shape[1]
     kept = np.r_[:end, end + missing : gram.shape[1]]
-    return gram[:, kept[:, None], kept]
+    return gram[:, kept[:, None], kept], cross[:, :, kept], among
 
 
 def own_rows(jacobian, factor) -> Float[Array, "columns points"]:
@@ -429,22 +462,26 @@ COLUMNS = 200
 
 
 @compiled
-def _gram(residual, jacobian, mask, filters, added, seen, away, by_globals, factor, zero_away, zero_sd):
-    k = factor.shape[-1]
+def _gram(residual, jacobian, mask, loaded, filters, added, seen, away, by_globals, factor, zero_away, zero_sd):
+    k, places = factor.shape[-1], jnp.arange(residual.shape[-1])
 
-    def one(r, J, used, white, extra, words, offset, slope, S, z):
+    def one(r, J, used, first, white, extra, words, offset, slope, S, z):
+        after = (places[None] >= places[:, None]) & used[None] & first[:, None]
         columns = jnp.concatenate(
             [
                 own_rows(J, S),
                 common_rows(r, J, offset, z, slope),
                 jnp.where(used[None], extra, 0.0),
                 jnp.where(used[None], words, 0.0),
+                jnp.where(after, -1.0, 0.0),
             ]
         )
         X = jax.vmap(white)(columns)
         A = X @ X.T
         prior = jnp.concatenate([jnp.ones(k), 1 / zero_sd[None] ** 2])
         inner, border = A[: k + 1, : k + 1] + jnp.diag(prior), A[: k + 1, k + 1 :]
-        return A[k + 1 :, k + 1 :] - border.T @ jnp.linalg.solve(inner, border)
+        left = A[k + 1 :, k + 1 :] - border.T @ jnp.linalg.solve(inner, border)
+        end = left.shape[0] - len(places)
+        return left[:end, :end], left[end:, :end], left[end:, end:]
 
-    return jax.vmap(one)(residual, jacobian, mask, filters, added, seen, away, by_globals, factor, zero_away)
+    return jax.vmap(one)(residual, jacobian, mask, loaded, filters, added, seen, away, by_globals, factor, zero_away)

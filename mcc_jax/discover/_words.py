@@ -10,6 +10,10 @@ if TYPE_CHECKING:
     from ._result import Discovery
 
 
+SHOWN = 5
+"""Most jumps that are told one by one."""
+
+
 def _listed(names: list[str]) -> str:
     return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " or " + names[-1]
 
@@ -33,6 +37,15 @@ def summary_of(found: Discovery) -> str:
         value = f"{effect.variant.parameter} = {effect.amplitude:.3g} +- {effect.sd:.2g}"
         rivals = [_plain(n) for n in names if n != effect.mechanism]
         sentences.append(f"Best name: {_plain(effect.mechanism)} (probability {effect.probability:.2f}; {value}).")
+        if effect.jumps:
+            largest = sorted(effect.jumps, key=lambda jump: -jump.size)[:SHOWN]
+            each = [
+                f"{j.size:.2g} {effect.variant.unit} at {j.stress_MPa:.2g} MPa in {found.name_of(j.particle)}"
+                for j in largest
+            ]
+            more = len(effect.jumps) - len(largest)
+            rest = f" and {more} more" if more else ""
+            sentences.append(f"It jumps by {', by '.join(each)}{rest}.")
         if rivals:
             sentences.append(f"These data cannot tell it from {_listed(rivals)}.")
     if found.closure is not None:

@@ -163,7 +163,8 @@ POP_IN = Mechanism(
     "pop_in",
     "Something breaks inside the particle at a certain load: the platen drops by a step, anywhere in a test.",
     (
-        _pop("sharp", "jump_um", "um", (0.1, 5.0), "d = J H(sigma_P - sigma_j)", "A jump of one size in all tests."),
+        _pop("sharp", "jump_um", "um", (0.1, 5.0), "d = J H(sigma_P - sigma_j)",
+             "A jump, in some tests or all, at a stress of its own in each."),
         _pop("gradual", "jump_um", "um", (0.1, 5.0), "d = J S(sigma_P; sigma_j -+ 15 %)", "A break that takes a while.",
              width=0.3),
         _pop("strain", "jump_strain", "-", (5e-4, 2e-2), "d = J D_e H(sigma_P - sigma_j)",

@@ -260,6 +260,22 @@ def test_lambda_is_the_estimate_over_its_standard_error():
     )
 
 
+def test_what_the_base_law_takes_up_is_not_left_unexplained():
+    """The change less its best fit by tangents, which are weighed as the strength weighs them."""
+    particles, path = small("P1")
+    projection = strength.Projection(particles, path, noise.CLEAN, np.ones(5))
+    columns = strength._tangents(particles, path, law.SHAPE_PARAMETER)
+    change = 1e-3 * path.force
+    left = projection.unexplained(change)
+    np.testing.assert_allclose(projection.unexplained(change + 0.3 * columns["modulus"]), left, atol=1e-7)
+    own = np.zeros_like(change)
+    own[2] = 0.1 * columns["C1"][2] + 0.5
+    taken = projection.unexplained(own)
+    assert np.abs(taken).max() < 0.15 * np.abs(own).max()
+    assert 0.01 < np.abs(left).max() < np.abs(change).max()
+    np.testing.assert_allclose(projection.unexplained(2 * change), 2 * left, rtol=1e-9, atol=1e-12)
+
+
 def test_what_the_base_law_can_take_up_has_no_strength():
     particles, path = small("P1")
     projection = strength.Projection(particles, path, noise.CLEAN, np.ones(5))

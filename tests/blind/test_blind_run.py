@@ -101,7 +101,9 @@ def test_follow_up_tests_the_same_material_in_another_way(tmp_path):
     made = run.follow_up(folder, sealing.open_answers(folder), solver="fake_solvers:silent", jobs=1)
     assert made["c00001+next"]["changes"] == {"protocol": "P1"}
     assert made["c00001+next"]["lambda"][0] > 5.0  # the hold tells more
-    assert run.read_results(folder)["c00001+next"]["discovery"]["verdict"] == "NO_GAP"
+    after = run.read_results(folder)["c00001+next"]["discovery"]
+    assert after["verdict"] == "NO_GAP"
+    assert after["asked"] == {"confirm": False, "experiments": False, "posterior": False}
     particles = [(folder / "campaigns" / key / "particles.csv").read_text() for key in ("c00001", "c00001+next")]
     assert particles[0] == particles[1]
     sealing.open_answers(folder)

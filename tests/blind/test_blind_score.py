@@ -349,6 +349,15 @@ def test_closure_error_sees_only_what_the_base_law_cannot_take_up():
     assert error(0.5 * change) == pytest.approx(0.5, abs=0.01)
     assert error(np.zeros_like(change)) == pytest.approx(1.0)
 
+    def of_range(curves):
+        return scoring.curve_error(answer, {str(i + 1): row.tolist() for i, row in enumerate(curves)})
+
+    assert of_range(change) == pytest.approx(0.0, abs=1e-9)
+    assert of_range(change + stiffer) < 0.005
+    assert of_range(0.5 * change) == pytest.approx(0.5 * of_range(np.zeros_like(change)), rel=1e-6)
+    # A root mean square over a range: below a half for any curve around zero.
+    assert 0.05 < of_range(np.zeros_like(change)) < 0.5
+
 
 def test_tables_and_pictures(perfect_run, tmp_path):
     found, results = perfect_run

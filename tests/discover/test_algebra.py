@@ -12,8 +12,16 @@ from scipy.integrate import quad
 from scipy.stats import kstest, norm
 
 from mcc_jax.discover._confirm import held_out
-from mcc_jax.discover._score import Projection, common_scatter, family_wise, project, project_summed
-from mcc_jax.discover._search import ODD, SCALES, log_evidence, log_evidence_at_random, pairs, rank
+from mcc_jax.discover._score import (
+    Projection,
+    common_scatter,
+    family_wise,
+    project,
+    project_summed,
+    smallest_of_families,
+)
+from mcc_jax.discover._search import log_evidence, log_evidence_at_random, pairs, rank
+from mcc_jax.discover._steps import ODD, SCALES
 
 seeds = st.integers(0, 10_000)
 
@@ -171,7 +179,9 @@ def simulated(rng, *, particles=20, columns=12, scale=1.0, effect=0.0):
     ones = np.ones(columns)
     none = np.zeros(0)
     at = np.arange(columns)
-    return Projection(at, np.arange(particles), scores, information, np.ones(particles), none, none, ones)
+    return Projection(
+        at, np.arange(particles), scores, information, np.ones(particles), none, none, ones, none.astype(int)
+    )
 
 
 def smallest(views, sign):
@@ -246,6 +256,32 @@ def test_few_particles_are_judged_by_the_noise_model(particles):
     z = view.scores.sum() / np.sqrt(view.information.sum())
     assert t[0] == pytest.approx(z)
     assert p[0] == pytest.approx(norm.sf(z), abs=0.03)
+
+
+SMALL = np.arange(12) < 2
+
+
+def test_families_together_are_uniform_where_nothing_is_missing():
+    """300 campaigns: the smaller of two families' p, judged by its own draws (99.9 % band of Kolmogorov's test)."""
+    rng = np.random.default_rng(16)
+    views = [simulated(rng) for _ in range(300)]
+    p = [smallest_of_families(view, SIDES, seed, [SMALL, ~SMALL]) for seed, view in enumerate(views)]
+    assert kstest(p, "uniform").pvalue > 1e-3
+
+
+def test_in_a_small_family_an_effect_needs_less():
+    rng = np.random.default_rng(17)
+    views = [simulated(rng, effect=3.3, columns=60) for _ in range(40)]
+    sign = np.zeros(60)
+    first = np.arange(60) < 1
+    apart = np.array([smallest_of_families(v, sign, 0, [first, ~first]) for v in views])
+    together = np.array([smallest_of_families(v, sign, 0, [np.ones(60, bool)]) for v in views])
+    assert np.median(apart) < 0.6 * np.median(together)
+    # One family is the largest statistic of all; an empty one is none.
+    one = [family_wise(v, sign, 0)[0].min() for v in views]
+    np.testing.assert_allclose(together, one, atol=2e-3)
+    with_none = [smallest_of_families(v, sign, 0, [np.ones(60, bool), np.zeros(60, bool)]) for v in views[:3]]
+    np.testing.assert_array_equal(with_none, together[:3])
 
 
 def test_the_same_seed_gives_the_same_probability():

@@ -17,6 +17,7 @@ from mcc_jax.campaign import THRESHOLD_MPA
 from mcc_jax.discover._closure import Closure
 from mcc_jax.discover._refine import refined, systematic
 from mcc_jax.discover._result import Discovery
+from mcc_jax.discover._score import project
 from mcc_jax.discover._system import BATCH, base_fit, build_system, in_batches, signals_of, tails_of
 from mcc_jax.effects import LIBRARY, ExtendedLaw, Mechanism
 
@@ -193,8 +194,14 @@ def test_all_points_of_loading_count_at_a_threshold_of_zero(fitted):
 def test_the_correction_of_a_formula_stands_at_the_rows_of_the_tests(fitted):
     base, signals, system = fitted
     words, coefficients = system.word_columns[[1, 4]], np.array([2e-3, -1e-3])
-    closure = Closure(words, coefficients, coefficients, "", 0.0, 1.0, (), {})
-    found = Discovery.correction_um(SimpleNamespace(base=base, system=system, closure=closure))
+    formula = tuple(system.word(int(w)) for w in words)
+    with_formula = signals.with_formula((*formula, formula[0]), -signals.of(np.append(words, words[0])))
+    system = build_system(base, with_formula)
+    # The formula that tests 0 and 3 are judged by has the first word only.
+    folds = ((np.array([0, 3]), system.formula_columns[2:]),)
+    closure = Closure(system.formula_columns[:2], coefficients, coefficients, "", 0.0, 1.0, (), {}, folds)
+    answer = SimpleNamespace(base=base, system=system, closure=closure)
+    found = Discovery.correction_um(answer)
     assert list(found) == list(base.campaign.particles)
     # What is added to the prediction is taken off the residual.
     residual = np.einsum("w,nwp->np", coefficients, np.asarray(signals.of(words)))
@@ -203,6 +210,13 @@ def test_the_correction_of_a_formula_stands_at_the_rows_of_the_tests(fitted):
         assert len(whole) == len(curve)
         np.testing.assert_allclose(whole[rows], -residual[i, : len(rows)], rtol=1e-12)
         assert np.isnan(np.delete(whole, rows)).all()
+    apart = Discovery.correction_um(answer, held_out=True)
+    others = np.setdiff1d(np.arange(len(base.tests)), [0, 3])
+    own = project(system, words[:0], inside=system.formula_columns[2:], particles=others).theta[-1]
+    for i, rows in enumerate(base.selection.rows):
+        name = base.campaign.particles[i]
+        one = -own * np.asarray(signals.of(words))[i, 0, : len(rows)]
+        np.testing.assert_allclose(apart[name][rows], one if i in (0, 3) else found[name][rows], rtol=1e-8, atol=1e-12)
     assert Discovery.correction_um(SimpleNamespace(base=base, system=system, closure=None)) == {}
 
 

@@ -56,6 +56,15 @@ class Projection:
         white = self.whiten(change)
         return white - self._q @ (self._q.T @ white)
 
+    def unexplained(self, change):
+        """What of a change of the displacements the base law, refitted, cannot take up; um, (particles, samples)."""
+        left = self.project(change).reshape(self.base.shape)
+        out = np.empty_like(left)
+        for i, (cholesky, white, Z) in enumerate(zip(self._cholesky, left, self._Z, strict=True)):
+            back = solve_triangular(cholesky, white, lower=True, trans="T", check_finite=False)
+            out[i] = cholesky @ white - Z @ (self._sd**2 * (Z.T @ back))
+        return out
+
     def change(self, effects):
         """Change of the displacements that `effects` make, um."""
         return simulate(self.particles, self.path, effects) - self.base

@@ -2,6 +2,7 @@
 
 from ._acceptance import acceptance as acceptance
 from ._closing import closure_error as closure_error
+from ._closing import curve_error as curve_error
 from ._outcome import Outcome as Outcome
 from ._pictures import pictures as pictures
 from ._reliability import reliability as reliability
