@@ -142,7 +142,7 @@ def test_a_perfect_solver_passes_every_row_that_can_be_measured(perfect_run):
     assert not bad
     missing = {name for name, result in judged.items() if result == "not measured"}
     assert missing == {
-        "closure, T4, lambda>=20: relative error of the projected correction (median)",
+        "closure, T4, lambda>=20: NRMSE of the correction on held-out particles (median)",
         "proposed experiment resolves the set (simulated)",
     }
 
