@@ -149,11 +149,16 @@ def over_tests(log_ratio: np.ndarray, shares: tuple[float, ...], odd: float) -> 
 
 
 def tamed(z: np.ndarray, tails: float) -> np.ndarray:
-    """Normal deviates as improbable as deviates of noise with such tails and the same variance."""
+    """Normal deviates as improbable as deviates of noise with such tails and the same variance, where smaller.
+
+    Nearer to zero they would be larger, since noise with tails is the more peaked: that is no reason to count them for
+    more.
+    """
     from scipy.stats import norm
     from scipy.stats import t as student
 
     if not np.isfinite(tails):
         return z
     far = np.abs(z) * np.sqrt(tails / (tails - 2))
-    return np.asarray(np.sign(z) * norm.isf(np.maximum(student.sf(far, tails), 1e-300)))
+    as_improbable = norm.isf(np.maximum(student.sf(far, tails), 1e-300))
+    return np.asarray(np.sign(z) * np.minimum(np.abs(z), as_improbable))
