@@ -13,6 +13,7 @@ from ._naming import LIKE_THE_BEST
 from ._plan import Plan, planned_system
 from ._score import Projection, project
 from ._search import Ranking, rank
+from ._steps import root_of
 from ._system import Base, System
 
 ENOUGH = 0.9
@@ -148,8 +149,7 @@ class _Trial:
     def power(self, copies: int, seed: int) -> float:
         """Probability that the true name alone is left, with so many times the particles."""
         view = self.view
-        values, vectors = np.linalg.eigh(view.information)
-        factor = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+        factor = root_of(view.information)
         rng = np.random.default_rng([seed, 53])
         information = np.tile(view.information, (copies, 1, 1))
         weight, power = 0.0, 0.0

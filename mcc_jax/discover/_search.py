@@ -17,11 +17,23 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import log_ndtr, logsumexp
+from scipy.special import logsumexp
 
 from ._candidates import located
 from ._score import Projection
-from ._steps import ODD, ODD_STEP, SCALES, SHARES, Jump, Steps, is_step, over_tests, tamed
+from ._steps import (
+    ODD,
+    ODD_STEP,
+    SCALES,
+    SHARES,
+    Jump,
+    Steps,
+    evidence_by_scale,
+    is_step,
+    over_tests,
+    root_of,
+    tamed,
+)
 from ._system import System
 
 LOOSENESS = 0.02
@@ -30,12 +42,7 @@ LOOSENESS = 0.02
 
 def log_evidence(U: np.ndarray, information: np.ndarray, sign: np.ndarray) -> np.ndarray:
     """Log evidence of amplitudes against zero, element by element."""
-    U = np.where(sign == 0, U, U * np.where(sign == 0, 1, sign))[..., None]
-    scale = np.asarray(SCALES)
-    spread = 1 + information[..., None] * scale**2
-    z = U * scale / np.sqrt(spread)
-    cut = np.where((sign == 0)[..., None], 0.0, np.log(2) + log_ndtr(z))
-    return logsumexp(-0.5 * np.log(spread) + 0.5 * z**2 + cut, axis=-1) - np.log(len(scale))
+    return logsumexp(evidence_by_scale(U, information, sign), axis=-1) - np.log(len(SCALES))
 
 
 def log_evidence_at_random(
@@ -57,12 +64,7 @@ def log_evidence_at_random(
     Returns:
         One number per group, shape (..., G).
     """
-    scale = np.asarray(SCALES)
-    U = np.where(sign == 0, scores, scores * np.where(sign == 0, 1, sign))[..., None]
-    spread = 1 + information[..., None] * scale**2
-    z = U * scale / np.sqrt(spread)
-    cut = np.where((sign == 0)[:, None], 0.0, np.log(2) + log_ndtr(z))
-    each = -0.5 * np.log(spread) + 0.5 * z**2 + cut
+    each = evidence_by_scale(scores, information, sign)
     found = []
     for members in groups:
         one = logsumexp(each[..., members, :], axis=-2) - np.log(len(members))
@@ -154,8 +156,7 @@ def random_probability(system: System, projection: Projection, seed: int, *, dra
         each = np.einsum("nkk->nk", information)
         scores = _tamed(system, projection.scores[:, index] / inflation[:, None], each, placed)
         observed = max(observed, float(log_evidence_at_random(scores, each, sign, local, placed).max()))
-        values, vectors = np.linalg.eigh(information)
-        factor = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+        factor = root_of(information)
         for some in np.array_split(np.arange(draws), 4):
             normal = rng.standard_normal((len(some), *each.shape))
             scores = np.einsum("nkl,bnl->bnk", factor, normal)

@@ -75,8 +75,9 @@ class Steps:
 
     def scores(self, particles: np.ndarray, nuisance: np.ndarray, theta: np.ndarray) -> np.ndarray:
         """Scores of some particles' steps, columns with their coefficients taken off the residual first."""
-        cross = self.cross[particles]
-        return -(cross[:, :, 0] + cross[:, :, nuisance] @ theta)
+        # Few of the columns: all of them are tens of megabytes, and folds ask again and again.
+        residual, others = self.cross[:, :, 0][particles], self.cross[:, :, nuisance][particles]
+        return -(residual + others @ theta)
 
     def evidence(self, scores: np.ndarray, particles: np.ndarray) -> np.ndarray:
         """Log evidence of steps in some tests against none, shape (...)."""
@@ -84,10 +85,7 @@ class Steps:
 
     def _of_places(self, scores: np.ndarray, particles: np.ndarray) -> np.ndarray:
         """Log evidence of a step at every point, minus infinity off first loading, shape (..., N, points, scales)."""
-        scale = np.asarray(SCALES)
-        spread = 1 + self.information[particles][..., None] * scale**2
-        z = scores[..., None] * scale / np.sqrt(spread)
-        each = -0.5 * np.log(spread) + 0.5 * z**2 + np.log(2) + log_ndtr(z)
+        each = evidence_by_scale(scores, self.information[particles], np.array(1))
         return np.where(np.isfinite(self.stress[particles])[..., None], each, -np.inf)
 
     def _of_tests(self, scores: np.ndarray, particles: np.ndarray) -> np.ndarray:
@@ -122,14 +120,29 @@ class Steps:
 
     def drawn_evidence(self, particles: np.ndarray, draws: int, rng: np.random.Generator) -> np.ndarray:
         """The same where there is nothing but noise, shape (draws,)."""
-        values, vectors = np.linalg.eigh(self.among[particles])
-        factor = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+        factor = root_of(self.among[particles])
         step = max(1, DRAWN_AT_ONCE // factor[..., 0].size)
         found = []
         for first in range(0, draws, step):
             normal = rng.standard_normal((min(step, draws - first), *factor.shape[::2]))
             found.append(self.evidence(np.einsum("nlk,bnk->bnl", factor, normal, optimize=True), particles))
         return np.concatenate(found)
+
+
+def evidence_by_scale(U: np.ndarray, information: np.ndarray, sign: np.ndarray) -> np.ndarray:
+    """Log evidence of amplitudes against zero for every scale of their prior, cut at the sign, shape (..., scales)."""
+    U = (U * np.where(sign == 0, 1, sign))[..., None]
+    scale = np.asarray(SCALES)
+    spread = 1 + information[..., None] * scale**2
+    z = U * scale / np.sqrt(spread)
+    cut = np.where((sign == 0)[..., None], 0.0, np.log(2) + log_ndtr(z))
+    return -0.5 * np.log(spread) + 0.5 * z**2 + cut
+
+
+def root_of(information: np.ndarray) -> np.ndarray:
+    """Factors R with R R^T the information of every particle: R times normal numbers are scores of noise alone."""
+    values, vectors = np.linalg.eigh(information)
+    return vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
 
 
 def over_tests(log_ratio: np.ndarray, shares: tuple[float, ...], odd: float) -> np.ndarray:

@@ -8,8 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._types import Scalar, Values, scalar
-from ..law import PUNCH_AREA
-from ._context import Context, root
+from ._context import Context, contact_radius
 from ._effect import AbstractEffect
 from ._variant import Mechanism, Need, Nuisance, Variant
 
@@ -123,15 +122,18 @@ class YieldSinkIn(AbstractEffect):
 
     def observe(self, context: Context) -> Values:
         """F / (2 a E*), a = D_e sqrt(c^2 sigma / (C1 eta))."""
-        diameter, law = context.particle.effective_diameter, context.law
-        slope = law.plastic.C1 * law.shape_factor(context.particle)
-        radius = diameter * (root(PUNCH_AREA * context.stress / slope) + 1e-3)
-        return self.amplitude * context.force / (2 * radius)
+        slope = context.law.plastic.C1 * context.law.shape_factor(context.particle)
+        radius = contact_radius(context.particle, context.stress / slope)
+        return self.amplitude * context.force / (2 * _floored(context, radius))
 
 
 def _radius(context: Context, shrinks: bool) -> Values:
-    """Contact radius [um], not below 1e-3 D_e: there the force has vanished, and a quotient must stay finite."""
-    radius = context.contact_radius if shrinks else context.peak_contact_radius
+    """Contact radius now or at the peak [um]."""
+    return _floored(context, context.contact_radius if shrinks else context.peak_contact_radius)
+
+
+def _floored(context: Context, radius: Values) -> Values:
+    """A radius [um] not below 1e-3 D_e: there the force has vanished, and a quotient must stay finite."""
     return radius + 1e-3 * context.particle.effective_diameter
 
 

@@ -214,7 +214,7 @@ class AbstractReversal(AbstractEffect):
     def whole(self, context: Context) -> Values:
         """L: D_e, gamma_P or Delta [um]."""
         if self.of == "size":
-            return context.particle.displacement(jnp.ones_like(context.peak_displacement))
+            return context.particle.effective_diameter
         return context.recoverable if self.of == "recovery" else context.peak_displacement
 
     def inside(self, context: Context) -> Values:

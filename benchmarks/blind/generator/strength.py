@@ -59,11 +59,18 @@ class Projection:
     def unexplained(self, change):
         """What of a change of the displacements the base law, refitted, cannot take up; um, (particles, samples)."""
         left = self.project(change).reshape(self.base.shape)
-        out = np.empty_like(left)
-        for i, (cholesky, white, Z) in enumerate(zip(self._cholesky, left, self._Z, strict=True)):
-            back = solve_triangular(cholesky, white, lower=True, trans="T", check_finite=False)
-            out[i] = cholesky @ white - Z @ (self._sd**2 * (Z.T @ back))
-        return out
+        own = self._own(self._cholesky, left, self._Z)
+        return np.einsum("nst,nt->ns", self._cholesky, left) - np.einsum("ntk,nk->nt", self._Z, own)
+
+    def _own(self, cholesky, left, Z):
+        """Deviations of the particles, (particles, 5), that whitened, projected curves ask for."""
+        back = np.stack(
+            [
+                solve_triangular(L, v, lower=True, trans="T", check_finite=False)
+                for L, v in zip(cholesky, left, strict=True)
+            ]
+        )
+        return self._sd**2 * np.einsum("ntk,nt->nk", Z, back)
 
     def change(self, effects):
         """Change of the displacements that `effects` make, um."""
@@ -129,13 +136,7 @@ class Projection:
                 break
             best = value
             new_common = np.linalg.solve(r, fitted)
-            back = np.stack(
-                [
-                    solve_triangular(L, v, lower=True, trans="T", check_finite=False)
-                    for L, v in zip(cholesky, left, strict=True)
-                ]
-            )
-            new_shift = self._sd**2 * np.einsum("ntk,nt->nk", Z, back)
+            new_shift = self._own(cholesky, left, Z)
             size = max(np.abs(new_common - common).max(), np.abs(new_shift[:, :4] - shift[:, :4]).max())
             move = min(1.0, 0.5 / max(size, 1e-12))
             common = common + move * (new_common - common)
