@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from ._extensions import Extensions
 from ._pursuit import pursue
 from ._result import Verdict
 from ._score import Projection, project
-from ._search import Ranking, family_columns, pairs, rank
+from ._search import Pair, Ranking, family_columns, pairs, rank
 from ._significance import p_nothing_left
 from ._system import Base, System
 
@@ -22,11 +22,25 @@ LEVEL_OF_UNLISTED = 0.001
 """Level at which something is missing besides every name, for saying that no name is right: no listed formula is
 nature's own, so that a little is always left, and this is the stronger claim."""
 
-BETTER, SHARE = 30.0, 0.1
-"""A formula of a few free words takes away this much chi2 more than any listed mechanism by chance and because no
-listed formula is nature's own, in addition this share of what the mechanism takes away. Beyond, it is not listed."""
+EACH = 11.0
+"""Drop of chi2 that one more name or word takes away by chance, the best of some hundred formulas. What explains the
+gap is judged by what it takes away beyond so much for each.
 
-LIKE_THE_BEST = 0.1
+Two names stand only where they do no worse than words: two listed formulas can imitate nearly any one that is not
+listed, but seldom better than words; if they are nature's own, they do."""
+
+BETTER, SHARE = 12.0, 0.04
+"""Words do so much better than any listed mechanism by chance and because no listed formula is nature's own, in
+addition this share of what the mechanism takes away. Beyond, it is not listed."""
+
+LEAST_OF_TWO = 30.0
+"""Least drop of chi2 by two names where no single one is evident: of so many pairs one takes away half of that by
+chance."""
+
+CLOSE, MOST_PAIRS = 4.0, 4
+"""Pairs of which the log evidence is so close to the best one's are fitted as they are, so many at most."""
+
+LIKE_THE_BEST = 0.05
 """A mechanism whose probability is at least this share of the best one's belongs to the set."""
 
 
@@ -50,43 +64,49 @@ def name_missing(
     """
     evident = bool(ranking.log_evidence[0] > 0)  # or the gap is one that no name has anything to do with
     members = tuple(ranking.members(LIKE_THE_BEST))
-    gain_of_words = pursue(system)[1]
+    words, gain_of_words = pursue(system)
+    by_words = gain_of_words - EACH * len(words)
     # Any member of the set may be the one beside which nothing is left; the most probable is asked first.
-    most_left = 0.0
+    tolerable: list[tuple[str, int]] = []
     for name in members if evident else ():
         position = ranking.names.index(name)
-        first, gain = ranking.best[position], float(ranking.gain[position])
+        k, gain = ranking.best[position], float(ranking.gain[position])
+        if by_words > gain - EACH + BETTER + SHARE * gain:
+            continue
         if ranking.at_random[position]:
             around = system.absorbing(family_columns(system, (name,)))
         else:
-            around = system if extensions is None else extensions.system_of((first,))
-        left = p_nothing_left(around, seed, [first])
-        most_left = max(most_left, left)
-        if gain_of_words <= gain + BETTER + SHARE * gain and left > LEVEL_OF_MORE:
-            own = (name, *(m for m in members if m != name))
-            return _verdict(members), [first], [own], [ranking]
-    first = ranking.best[0]
+            around = system if extensions is None else extensions.system_of((k,))
+        left = p_nothing_left(around, seed, [k])
+        if left > LEVEL_OF_MORE:
+            return _verdict(members), [k], [_led_by(name, members)], [ranking]
+        if left > LEVEL_OF_UNLISTED:
+            tolerable.append((name, k))
     tell("a second effect")
     if ranking.at_random[0] and ranking.gain[0] > gain_of_words:
-        return _verdict(members), [first], [members], [ranking]
-    best_pairs = pairs(system, view)
-    if best_pairs and not ranking.at_random[0]:
-        gain, i, j = best_pairs[0]
+        return _verdict(members), [ranking.best[0]], [members], [ranking]
+    pair = None if ranking.at_random[0] else _best_pair(pairs(system, view), extensions)
+    if pair is not None:
+        i, j = pair.stronger, pair.weaker
         both = tuple(system.candidates[k].mechanism for k in (i, j))
-        with_both = system
-        if extensions is not None:
-            with_both, gain = extensions.system_of((i, j)), max(gain, extensions.drop((i, j)))
-        p_both = p_nothing_left(with_both, seed, [i, j])
-        enough = evident or gain > BETTER  # of so many pairs one takes away half of that by chance
-        if enough and p_both > LEVEL_OF_MORE and gain >= gain_of_words - BETTER:
+        p_both = p_nothing_left(system if extensions is None else extensions.system_of((i, j)), seed, [i, j])
+        enough = pair.gain > (0.0 if evident else LEAST_OF_TWO) and pair.gain - 2 * EACH >= by_words
+        if enough and p_both > LEVEL_OF_MORE:
             steps = [_beside(system, other) for other in (j, i)]  # each is judged with the other one in the law
-            sets = [_with(name, step) for name, step in zip(both, steps, strict=True)]
+            sets = [_led_by(name, step.members(LIKE_THE_BEST)) for name, step in zip(both, steps, strict=True)]
             return _verdict(*sets), [i, j], sets, steps
-    far_better = gain_of_words > ranking.gain[0] * (1 + SHARE) + BETTER
-    unexplained = not evident or most_left <= LEVEL_OF_UNLISTED or far_better
-    if gain_of_words == 0 or not unexplained:
-        return _verdict(members), [first], [members], [ranking]
-    return "UNLISTED", [], [], []
+    if words and not tolerable:
+        return "UNLISTED", [], [], []
+    name, k = tolerable[0] if tolerable else (members[0], ranking.best[0])
+    return _verdict(members), [k], [_led_by(name, members)], [ranking]
+
+
+def _best_pair(found: list[Pair], extensions: Extensions | None) -> Pair | None:
+    """The most evident pair, those close to it fitted as they are; None without any."""
+    if not found or extensions is None:
+        return found[0] if found else None
+    close = [p for p in found[:MOST_PAIRS] if p.log_evidence > found[0].log_evidence - CLOSE]
+    return max((p.fitted(extensions.drop((p.stronger, p.weaker))) for p in close), key=lambda p: p.log_evidence)
 
 
 def _verdict(*sets: tuple[str, ...]) -> Verdict:
@@ -99,8 +119,8 @@ def _beside(system: System, other: int) -> Ranking:
     return rank(system, project(system, system.candidate_columns, inside=np.array([system.column(other)])))
 
 
-def _with(name: str, ranking: Ranking) -> tuple[str, ...]:
-    members = ranking.members(LIKE_THE_BEST)
+def _led_by(name: str, members: Sequence[str]) -> tuple[str, ...]:
+    """A set with this name first."""
     return (name, *(m for m in members if m != name))
 
 
@@ -119,7 +139,7 @@ def chooser(system: System, count: int, closure: Closure | None) -> Callable[[np
         found = pairs(system, view)
         if not found:
             return [empty] * (count + 1)
-        _, i, j = found[0]
+        i, j = found[0].stronger, found[0].weaker
         return [empty, np.array([system.column(i)]), np.array([system.column(i), system.column(j)])]
 
     return choose

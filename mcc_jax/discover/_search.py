@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import logsumexp
@@ -36,7 +36,7 @@ from ._steps import (
 )
 from ._system import System
 
-LOOSENESS = 0.02
+LOOSENESS = 0.012
 """No family of formulas contains nature's own: of the explained chi2 so much may be missed by the true mechanism."""
 
 
@@ -75,6 +75,19 @@ def log_evidence_at_random(
 
 COMMON = 1.0
 """Probability of all other formulas of a mechanism together, that of its first, the common one, being 1."""
+
+
+def weights(system: System) -> np.ndarray:
+    """Probability of every candidate among those of its mechanism: the common formula counts as much as all the others
+    together."""
+    found = np.zeros(len(system.candidates))
+    for name in {c.mechanism for c in system.candidates}:
+        members = [k for k, c in enumerate(system.candidates) if c.mechanism == name]
+        variants = [system.candidates[k].variant.name for k in members]
+        others = max(len(set(variants)) - 1, 1)
+        share = np.array([(1 if v == variants[0] else COMMON / others) / variants.count(v) for v in variants])
+        found[members] = share / share.sum()
+    return found
 
 
 def random_groups(system: System) -> list[np.ndarray]:
@@ -231,14 +244,11 @@ def rank(system: System, projection: Projection, *, refitted: Mapping[int, float
             if candidate.mechanism == name and k not in exact:
                 evidence[k] = min(evidence[k], most)
     names = list(dict.fromkeys(c.mechanism for c in system.candidates))
+    weight = weights(system)
     found = []
     for name in names:
         members = [k for k, c in enumerate(system.candidates) if c.mechanism == name]
-        variants = [system.candidates[k].variant.name for k in members]
-        # The common formula counts as much as all the others together.
-        others = max(len(set(variants)) - 1, 1)
-        weight = np.array([(1 if v == variants[0] else COMMON / others) / variants.count(v) for v in variants])
-        value = logsumexp(evidence[members], b=weight / weight.sum())
+        value = logsumexp(evidence[members], b=weight[members])
         best = members[int(np.argmax(evidence[members]))]
         if exact.keys() & set(members):
             best = max(exact.keys() & set(members), key=lambda k: evidence[k])
@@ -268,33 +278,63 @@ def family_columns(system: System, names: tuple[str, ...]) -> np.ndarray:
     return np.array([system.column(k) for k, c in enumerate(system.candidates) if c.mechanism in names], int)
 
 
-def pairs(system: System, projection: Projection) -> list[tuple[float, int, int]]:
-    """Pairs of formulas of different mechanisms by the chi2 they take away together, best pair of mechanisms first; the
-    formula that alone takes away more comes first in its pair."""
+@dataclass(frozen=True)
+class Pair:
+    """Two formulas of different mechanisms together.
+
+    Attributes:
+        log_evidence: of their mechanisms together, the mean over both families of formulas.
+        gain: drop of -2 log likelihood by the two formulas.
+        stronger, weaker: the two most evident formulas; the one that takes away more alone comes first.
+    """
+
+    log_evidence: float
+    gain: float
+    stronger: int
+    weaker: int
+
+    def fitted(self, drop: float) -> Pair:
+        """The same where the two formulas, fitted as they are, take away so much."""
+        return replace(self, log_evidence=self.log_evidence + (drop - self.gain) / 2, gain=drop)
+
+
+def pairs(system: System, projection: Projection) -> list[Pair]:
+    r"""Pairs of mechanisms by their evidence together, the best first.
+
+    .. math:: E_{ij} = E(U_j, I_j) \, E(U_{i|j}, I_{i|j}), \qquad U_{i|j} = U_i - I_{ij} U_j / I_j, \quad
+        I_{i|j} = I_i - I_{ij}^2 / I_j
+
+    with j the formula of more evidence alone; none where one of both amplitudes together has an impossible sign.
+    """
     sign = system.signs
     U, both = projection.scores.sum(0), projection.information.sum(0)
     d = np.diagonal(both)
-    alive = projection.alive & (d > 0)
-    det = d[:, None] * d[None] - both**2
-    fine = alive[:, None] & alive[None] & (det > 1e-4 * d[:, None] * d[None])
-    safe = np.where(fine, det, 1.0)
-    first = (d[None] * U[:, None] - both * U[None]) / safe
-    second = first.T
-    right = _physical(first, sign[:, None]) & _physical(second, sign[None])
-    gain = np.where(fine & right, first * U[:, None] + second * U[None], -np.inf)
     names = np.array([c.mechanism for c in system.candidates])
-    gain[names[:, None] == names[None]] = -np.inf
-    best: dict[tuple[str, str], tuple[float, int, int]] = {}
-    for flat in np.argsort(-gain, axis=None)[:4000]:
-        i, j = np.unravel_index(flat, gain.shape)
-        if not np.isfinite(gain[i, j]):
-            break
-        key = (str(min(names[i], names[j])), str(max(names[i], names[j])))
-        if key not in best:
-            alone = U**2 / np.where(alive, d, np.inf)
-            stronger, weaker = (i, j) if alone[i] >= alone[j] else (j, i)
-            best[key] = (float(gain[i, j]), int(stronger), int(weaker))
-    return sorted(best.values(), reverse=True)
+    alive = projection.alive & (d > 0)
+    left = d[:, None] - both**2 / np.where(alive, d, 1.0)[None]  # information of i beside j
+    fine = alive[:, None] & alive[None] & (left > 1e-4 * d[:, None]) & (names[:, None] != names[None])
+    left = np.where(fine, left, 1.0)
+    beside = np.where(fine, U[:, None] - both * (U / np.where(alive, d, 1.0))[None], 0.0)
+    theta = beside / left
+    right = fine & _physical(theta, sign[:, None]) & _physical(theta.T, sign[None])
+    alone = np.where(alive, log_evidence(U, d, sign), -np.inf)
+    stronger = (alone[None] > alone[:, None]) | ((alone[None] == alone[:, None]) & np.tri(len(U), k=-1, dtype=bool))
+    weight = np.log(weights(system))
+    own = np.where(right & stronger, alone[None] + log_evidence(beside, left, sign[:, None]), -np.inf)
+    evidence = np.maximum(own, own.T)
+    families = {name: np.flatnonzero(names == name) for name in dict.fromkeys(names)}
+    found = []
+    for one, other in itertools.combinations(families.values(), 2):
+        block = evidence[np.ix_(one, other)]
+        if np.isfinite(block).any():
+            row, column = np.unravel_index(np.argmax(block), block.shape)
+            i, j = int(one[row]), int(other[column])
+            if not stronger[j, i]:
+                i, j = j, i
+            value = np.asarray(logsumexp(block + weight[one][:, None] + weight[other][None]))
+            gain = U[i] ** 2 / d[i] + beside[j, i] ** 2 / left[j, i]
+            found.append(Pair(float(value), float(gain), i, j))
+    return sorted(found, key=lambda p: -p.log_evidence)
 
 
 def _physical(theta: np.ndarray, sign: np.ndarray) -> np.ndarray:

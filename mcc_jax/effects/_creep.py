@@ -178,7 +178,7 @@ CREEP = Mechanism(
     (
         _creep("kelvin_voigt", KelvinVoigt, "tau dy/dt + y = sigma; d = D_e c y",
                "A spring with a dashpot beside it: delayed, bounded and fully recovered.", _MCC,
-               nuisances=_tau(5.0, 20.0, 80.0, 320.0)),
+               nuisances=_tau(5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0)),
         _creep("logarithmic", LogarithmicCreep, "d = D_e c [ln(1 + t / tau) convolved with d sigma]",
                "Many retardation times: slower and slower, without end.", "Nowick and Berry (1972), ch. 4",
                nuisances=_tau(1.0, 10.0, 100.0)),
@@ -186,7 +186,8 @@ CREEP = Mechanism(
                "Creep as a power of time.", "Andrade (1910); Findley et al. (1976)",
                nuisances=(Nuisance("exponent", (0.2, 0.4), (0.05, 0.8), "power of time"),)),
         _creep("distributed", DistributedCreep, "d = D_e c [mean of 1 - exp(-t / tau') convolved with d sigma]",
-               "Retardation times spread over two decades.", "Ferry (1980), ch. 3", nuisances=_tau(20.0, 200.0)),
+               "Retardation times spread over two decades.", "Ferry (1980), ch. 3",
+               nuisances=_tau(20.0, 60.0, 200.0, 600.0)),
         _creep("viscous_flow", ViscousFlow, "d = D_e c (integral of sigma dt) / 100 s",
                "Steady flow in proportion to stress; none of it comes back.", "Maxwell model; Ferry (1980)"),
         _creep("viscoplastic", ViscoplasticCreep, "d = D_e c sigma_P ln(1 + t_load / tau), t_load = integral of u^8 dt",

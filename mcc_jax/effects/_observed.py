@@ -165,7 +165,11 @@ FRAME = Mechanism(
         _frame(
             "stiffening", StiffeningFrame, "d = C F_s ln(1 + F / F_s)",
             "Play that closes: the compliance falls as 1 / (1 + F / F_s).", "engineering practice of bolted joints",
-            nuisances=(Nuisance("seat_force_mN", (10.0, 50.0, 250.0), (1.0, 2000.0), "force at which it has halved"),),
+            nuisances=(
+                Nuisance(
+                    "seat_force_mN", (10.0, 22.0, 50.0, 110.0, 250.0), (1.0, 2000.0), "force at which it has halved"
+                ),
+            ),
         ),
         _frame(
             "softening", FrameCompliance, "d = C F (F / 100 mN)^(1/2)",
@@ -194,7 +198,14 @@ DRIFT = Mechanism(
         _drift(
             "settling", SettlingDrift, "d = v tau (1 - exp(-t / tau))",
             "A temperature that settles after the sample was placed.",
-            nuisances=(Nuisance("tau_s", (10.0, 40.0, 160.0), (2.0, 2000.0), "time in which it settles"),),
+            nuisances=(
+                Nuisance(
+                    "tau_s",
+                    (10.0, 16.0, 25.0, 40.0, 63.0, 100.0, 160.0),
+                    (2.0, 2000.0),
+                    "time in which it settles",
+                ),
+            ),
         ),
         _drift("sqrt_time", PowerDrift, "d = v t (t / 100 s)^(-1/2)", "Heat that diffuses into a thick body.",
                fixed={"power": 0.5}),

@@ -20,7 +20,7 @@ from mcc_jax.discover._score import (
     project_summed,
     smallest_of_families,
 )
-from mcc_jax.discover._search import log_evidence, log_evidence_at_random, pairs, rank
+from mcc_jax.discover._search import Pair, log_evidence, log_evidence_at_random, pairs, rank, weights
 from mcc_jax.discover._steps import ODD, SCALES
 
 seeds = st.integers(0, 10_000)
@@ -377,15 +377,39 @@ def test_pairs_take_away_what_two_columns_together_do():
     view = project(system, system.candidate_columns)
     best = pairs(system, view)
     assert best
-    gains = [gain for gain, _, _ in best]
-    assert gains == sorted(gains, reverse=True)
+    assert [p.log_evidence for p in best] == sorted((p.log_evidence for p in best), reverse=True)
     both = view.information.sum(0)
     U = view.scores.sum(0)
     sign = np.array([c.variant.sign for c in system.candidates])
-    for gain, i, j in best:
+    for pair in best:
+        i, j = pair.stronger, pair.weaker
         theta = np.linalg.solve(both[np.ix_([i, j], [i, j])], U[[i, j]])
         assert ((sign[[i, j]] == 0) | (theta * sign[[i, j]] > 0)).all()
-        assert gain == pytest.approx(theta @ U[[i, j]], rel=1e-9)
+        assert pair.gain == pytest.approx(theta @ U[[i, j]], rel=1e-9)
+
+
+def test_a_pair_is_as_evident_as_one_and_then_the_other_beside_it():
+    """Against the second one's evidence where the first is projected off; every family here is one formula."""
+    system, _ = random_campaign(8)
+    view = project(system, system.candidate_columns)
+    alone = log_evidence(view.scores.sum(0), view.total, system.signs)
+    for pair in pairs(system, view)[:5]:
+        i, j = pair.stronger, pair.weaker
+        assert alone[i] >= alone[j]
+        beside = project(system, system.candidate_columns[[j]], inside=np.array([system.column(i)]))
+        other = log_evidence(beside.scores.sum(0), beside.total, system.signs[[j]])
+        assert pair.log_evidence == pytest.approx(alone[i] + other[0], abs=1e-6)
+
+
+def test_fitting_a_pair_counts_half_of_what_it_takes_away_more():
+    pair = Pair(10.0, 30.0, 3, 5)
+    assert pair.fitted(34.0) == Pair(12.0, 34.0, 3, 5)
+
+
+def test_the_common_formula_weighs_as_much_as_all_others_together():
+    formulas = (("frame_compliance", "linear"), ("frame_compliance", "softening"), ("frame_compliance", "conical_seat"))
+    system, _ = random_campaign(8, formulas=(*formulas, ("creep", "viscous_flow")))
+    same(weights(system), np.array([0.5, 0.25, 0.25, 1.0]))
 
 
 @given(seed=seeds)

@@ -32,7 +32,8 @@ def test_a_planted_effect_is_named(name):
 @pytest.mark.parametrize("two", [("frame_compliance", "adhesion"), ("creep", "thermal_drift")])
 def test_two_planted_effects_are_both_named(two):
     system = planted(2, dict.fromkeys(two, 9.0))
-    _, i, j = pairs(system, project(system, system.candidate_columns))[0]
+    best = pairs(system, project(system, system.candidate_columns))[0]
+    i, j = best.stronger, best.weaker
     assert {system.candidates[k].mechanism for k in (i, j)} == set(two)
     columns, _ = systematic(system)
     assert {system.column(i), system.column(j)} <= set(columns.tolist())
@@ -61,7 +62,8 @@ def test_an_effect_of_the_impossible_sign_is_not_named(name):
     assert ranking.names[0] != name
     position = ranking.names.index(name)
     assert ranking.probability[position] < 0.05
-    for _, i, j in pairs(system, project(system, system.candidate_columns)):
+    for pair in pairs(system, project(system, system.candidate_columns)):
+        i, j = pair.stronger, pair.weaker
         assert name not in {system.candidates[k].mechanism for k in (i, j)} or _right_way(system, i, j)
 
 
