@@ -250,9 +250,10 @@ def _judge(
 
 def _notes(base: Base, system: System) -> list[str]:
     notes = list(base.selection.notes)
-    for i in np.flatnonzero(~system.usable):
-        name = base.campaign.particles[base.selection.kept[i]]
-        notes.append(f"particle {name!r} snaps through in its loading; it is fitted, but takes no part in the search")
+    notes.extend(
+        f"particle {base.name_of(i)!r} snaps through in its loading; it is fitted, but takes no part in the search"
+        for i in np.flatnonzero(~system.usable)
+    )
     for name, reason in zip(base.campaign.particles, base.selection.why_not, strict=True):
         if reason is not None:
             notes.append(f"particle {name!r} {reason}")

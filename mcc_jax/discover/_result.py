@@ -178,9 +178,7 @@ class Discovery:
 
     def name_of(self, row: int) -> str:
         """The particle of a row of the tests that took part."""
-        if self.base is None:
-            return str(row + 1)
-        return self.base.campaign.particles[self.base.selection.kept[row]]
+        return str(row + 1) if self.base is None else self.base.name_of(row)
 
     def _jumps(self, effect: Effect) -> dict[str, Any]:
         """The sudden steps of an effect, one for each test that probably has one."""

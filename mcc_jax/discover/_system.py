@@ -182,6 +182,10 @@ class Base:
         """The arrays of the tests."""
         return self.selection.tests
 
+    def name_of(self, row: int) -> str:
+        """Name of a particle that took part, by its row."""
+        return self.campaign.particles[self.selection.kept[row]]
+
     def filled(self) -> tuple[Tests, Blocks]:
         """The tests filled up with copies to whole blocks, as for the joint fit."""
         size = block_size(len(self.tests))

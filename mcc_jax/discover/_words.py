@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from ._experiments import ENOUGH
 
 if TYPE_CHECKING:
-    from ._result import Discovery
+    from ._result import Discovery, Effect
 
 
 SHOWN = 5
@@ -38,14 +38,7 @@ def summary_of(found: Discovery) -> str:
         rivals = [_plain(n) for n in names if n != effect.mechanism]
         sentences.append(f"Best name: {_plain(effect.mechanism)} (probability {effect.probability:.2f}; {value}).")
         if effect.jumps:
-            largest = sorted(effect.jumps, key=lambda jump: -jump.size)[:SHOWN]
-            each = [
-                f"{j.size:.2g} {effect.variant.unit} at {j.stress_MPa:.2g} MPa in {found.name_of(j.particle)}"
-                for j in largest
-            ]
-            more = len(effect.jumps) - len(largest)
-            rest = f" and {more} more" if more else ""
-            sentences.append(f"It jumps by {', by '.join(each)}{rest}.")
+            sentences.append(_jumps(found, effect))
         if rivals:
             sentences.append(f"These data cannot tell it from {_listed(rivals)}.")
     if found.closure is not None:
@@ -78,6 +71,15 @@ def summary_of(found: Discovery) -> str:
             + "."
         )
     return " ".join(sentences)
+
+
+def _jumps(found: Discovery, effect: Effect) -> str:
+    """The largest sudden steps, one by one."""
+    largest = sorted(effect.jumps, key=lambda jump: -jump.size)[:SHOWN]
+    unit = effect.variant.unit
+    each = [f"{j.size:.2g} {unit} at {j.stress_MPa:.2g} MPa in {found.name_of(j.particle)}" for j in largest]
+    more = len(effect.jumps) - len(largest)
+    return f"It jumps by {', by '.join(each)}{f' and {more} more' if more else ''}."
 
 
 def _place(found: Discovery) -> str:

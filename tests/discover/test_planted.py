@@ -129,3 +129,38 @@ def test_a_gap_with_which_no_name_has_anything_to_do_is_no_set_of_names():
     columns, gain = pursue(system)
     assert word in columns
     assert gain < 50
+
+
+TWO = ("frame_compliance", "adhesion")
+
+
+def _asked(system):
+    view = project(system, system.candidate_columns)
+    return name_missing(system, view, rank(system, view), None, 0, lambda _: None)
+
+
+def test_two_names_stand_where_they_explain_more_than_words():
+    system = planted(2, dict.fromkeys(TWO, 9.0))
+    verdict, chosen, sets, steps = _asked(system)
+    assert verdict == "NAMED"
+    assert {system.candidates[k].mechanism for k in chosen} == set(TWO)
+    assert [names[0] for names in sets] == [system.candidates[k].mechanism for k in chosen]
+    assert len(steps) == 2
+
+
+def test_two_names_do_not_stand_where_one_word_explains_as_much():
+    """A word that is the sum of both signatures, planted: the names imitate it to the last digit, but are two."""
+    system, dense = random_campaign(2, particles=20, points=60, own=4)
+    total = project(system, system.candidate_columns).total
+    names = [c.mechanism for c in system.candidates]
+    X = dense.columns.copy()
+    word = system.word_columns[0]
+    X[:, :, word] = sum(X[:, :, system.column(names.index(n))] / np.sqrt(total[names.index(n)]) for n in TWO)
+    X[:, :, 0] -= 9.0 * X[:, :, word]
+    system = system_of(Dense(dense.own, X, dense.prior), system.candidates, system.places, system.words)
+    best = pairs(system, project(system, system.candidate_columns))[0]
+    assert {names[best.stronger], names[best.weaker]} == set(TWO)
+    words, gain = pursue(system)
+    assert words[0] == word
+    assert best.gain > gain - 5.0
+    assert _asked(system)[:3] == ("UNLISTED", [], [])
