@@ -252,7 +252,7 @@ def _notes(base: Base, system: System) -> list[str]:
     notes = list(base.selection.notes)
     notes.extend(
         f"particle {base.name_of(i)!r} snaps through in its loading; it is fitted, but takes no part in the search"
-        for i in np.flatnonzero(~system.usable)
+        for i in np.flatnonzero(~system.usable).tolist()
     )
     for name, reason in zip(base.campaign.particles, base.selection.why_not, strict=True):
         if reason is not None:

@@ -49,7 +49,7 @@ def serious(system: System, ranking: Ranking) -> list[int]:
         if at_random or gain < LEAST_GAIN:
             continue
         members = [k for k, c in enumerate(system.candidates) if c.mechanism == name]
-        members.sort(key=lambda k: -ranking.evidence[k])
+        members.sort(key=lambda k: -ranking.favour[k])
         formulas: dict[str, int] = {}
         for k in members:
             if np.isfinite(ranking.evidence[k]):

@@ -77,17 +77,22 @@ COMMON = 1.0
 """Probability of all other formulas of a mechanism together, that of its first, the common one, being 1."""
 
 
-def weights(system: System) -> np.ndarray:
-    """Probability of every candidate among those of its mechanism: the common formula counts as much as all the others
-    together."""
+def formula_weights(system: System) -> np.ndarray:
+    """Probability of every candidate's formula among those of its mechanism, whatever its further numbers: the common
+    formula counts as much as all the others together."""
     found = np.zeros(len(system.candidates))
     for name in {c.mechanism for c in system.candidates}:
         members = [k for k, c in enumerate(system.candidates) if c.mechanism == name]
-        variants = [system.candidates[k].variant.name for k in members]
-        others = max(len(set(variants)) - 1, 1)
-        share = np.array([(1 if v == variants[0] else COMMON / others) / variants.count(v) for v in variants])
-        found[members] = share / share.sum()
+        variants = list(dict.fromkeys(system.candidates[k].variant.name for k in members))
+        share = {v: COMMON / (len(variants) - 1) for v in variants[1:]} | {variants[0]: 1.0}
+        found[members] = [share[system.candidates[k].variant.name] / sum(share.values()) for k in members]
     return found
+
+
+def weights(system: System) -> np.ndarray:
+    """Probability of every candidate among those of its mechanism, further numbers and all."""
+    formulas = [(c.mechanism, c.variant.name) for c in system.candidates]
+    return formula_weights(system) / np.array([formulas.count(f) for f in formulas])
 
 
 def random_groups(system: System) -> list[np.ndarray]:
@@ -186,10 +191,11 @@ class Ranking:
         names: mechanisms, best first.
         log_evidence: theirs, the mean over formulas.
         probability: share of each among them all, tempered by `LOOSENESS`.
-        best: each one's best candidate.
+        best: each one's best candidate, the common formula preferred as far as it is the more probable one beforehand.
         gain: drop of -2 log likelihood by it.
         at_random: whether amplitudes that differ from test to test explain more than a common one.
         evidence: log evidence of every candidate, minus infinity for those the base law can imitate.
+        favour: the same with the probability of its formula beforehand.
         temperature: by which logarithms were divided.
     """
 
@@ -200,6 +206,7 @@ class Ranking:
     gain: np.ndarray
     at_random: tuple[bool, ...]
     evidence: np.ndarray
+    favour: np.ndarray
     temperature: float
 
     def members(self, least: float) -> list[str]:
@@ -244,14 +251,12 @@ def rank(system: System, projection: Projection, *, refitted: Mapping[int, float
             if candidate.mechanism == name and k not in exact:
                 evidence[k] = min(evidence[k], most)
     names = list(dict.fromkeys(c.mechanism for c in system.candidates))
-    weight = weights(system)
+    weight, favour = weights(system), evidence + np.log(formula_weights(system))
     found = []
     for name in names:
         members = [k for k, c in enumerate(system.candidates) if c.mechanism == name]
         value = logsumexp(evidence[members], b=weight[members])
-        best = members[int(np.argmax(evidence[members]))]
-        if exact.keys() & set(members):
-            best = max(exact.keys() & set(members), key=lambda k: evidence[k])
+        best = max(exact.keys() & set(members) or members, key=lambda k: favour[k])
         gain = linear[best] if np.isfinite(evidence[best]) else 0.0
         if differing[best] > common[best]:
             gain = max(gain, 2 * differing[best])
@@ -269,6 +274,7 @@ def rank(system: System, projection: Projection, *, refitted: Mapping[int, float
         gains,
         tuple(found[i][3] for i in order),
         evidence,
+        favour,
         float(temperature),
     )
 
@@ -319,7 +325,7 @@ def pairs(system: System, projection: Projection) -> list[Pair]:
     right = fine & _physical(theta, sign[:, None]) & _physical(theta.T, sign[None])
     alone = np.where(alive, log_evidence(U, d, sign), -np.inf)
     stronger = (alone[None] > alone[:, None]) | ((alone[None] == alone[:, None]) & np.tri(len(U), k=-1, dtype=bool))
-    weight = np.log(weights(system))
+    weight, formula = np.log(weights(system)), np.log(formula_weights(system))
     own = np.where(right & stronger, alone[None] + log_evidence(beside, left, sign[:, None]), -np.inf)
     evidence = np.maximum(own, own.T)
     families = {name: np.flatnonzero(names == name) for name in dict.fromkeys(names)}
@@ -327,7 +333,7 @@ def pairs(system: System, projection: Projection) -> list[Pair]:
     for one, other in itertools.combinations(families.values(), 2):
         block = evidence[np.ix_(one, other)]
         if np.isfinite(block).any():
-            row, column = np.unravel_index(np.argmax(block), block.shape)
+            row, column = np.unravel_index(np.argmax(block + formula[one][:, None] + formula[other]), block.shape)
             i, j = int(one[row]), int(other[column])
             if not stronger[j, i]:
                 i, j = j, i

@@ -20,7 +20,7 @@ def where(base: Base, system: System) -> list[dict[str, Any]]:
     if energy.sum() <= 0:
         return []
     usable = np.flatnonzero(system.usable)
-    names = [base.name_of(i) for i in usable]
+    names = [base.name_of(i) for i in usable.tolist()]
     strain = _strains(base)
     found = []
     for k in np.argsort(-energy):
