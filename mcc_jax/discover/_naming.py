@@ -66,9 +66,37 @@ def name_missing(
     members = tuple(ranking.members(LIKE_THE_BEST))
     words, gain_of_words = pursue(system)
     by_words = gain_of_words - EACH * len(words)
-    # Any member of the set may be the one beside which nothing is left; the most probable is asked first.
     tolerable: list[tuple[str, int]] = []
-    for name in members if evident else ():
+    if evident:
+        tolerable, left = _tolerable(system, ranking, extensions, by_words, seed)
+        if left > LEVEL_OF_MORE:
+            name, k = tolerable[-1]
+            return _verdict(members), [k], [_led_by(name, members)], [ranking]
+    tell("a second effect")
+    if ranking.at_random[0]:
+        if ranking.gain[0] > gain_of_words:
+            return _verdict(members), [ranking.best[0]], [members], [ranking]
+    elif chosen := _two_names(system, view, extensions, 0.0 if evident else LEAST_OF_TWO, by_words, seed):
+        steps = [_beside(system, other) for other in reversed(chosen)]  # each is judged with the other one in the law
+        both = [system.candidates[k].mechanism for k in chosen]
+        sets = [_led_by(name, step.members(LIKE_THE_BEST)) for name, step in zip(both, steps, strict=True)]
+        return _verdict(*sets), chosen, sets, steps
+    if words and not tolerable:
+        return "UNLISTED", [], [], []
+    name, k = tolerable[0] if tolerable else (members[0], ranking.best[0])
+    return _verdict(members), [k], [_led_by(name, members)], [ranking]
+
+
+def _tolerable(
+    system: System, ranking: Ranking, extensions: Extensions | None, by_words: float, seed: int
+) -> tuple[list[tuple[str, int]], float]:
+    """Names of the set beside which not much is left and than which words are not much better, with their candidates,
+    and the probability that nothing is left beside the last of them.
+
+    Any member may be the one beside which nothing is left. The most probable is asked first, and no other after it.
+    """
+    found, left = list[tuple[str, int]](), 0.0
+    for name in ranking.members(LIKE_THE_BEST):
         position = ranking.names.index(name)
         k, gain = ranking.best[position], float(ranking.gain[position])
         if by_words > gain - EACH + BETTER + SHARE * gain:
@@ -78,27 +106,23 @@ def name_missing(
         else:
             around = system if extensions is None else extensions.system_of((k,))
         left = p_nothing_left(around, seed, [k])
-        if left > LEVEL_OF_MORE:
-            return _verdict(members), [k], [_led_by(name, members)], [ranking]
         if left > LEVEL_OF_UNLISTED:
-            tolerable.append((name, k))
-    tell("a second effect")
-    if ranking.at_random[0] and ranking.gain[0] > gain_of_words:
-        return _verdict(members), [ranking.best[0]], [members], [ranking]
-    pair = None if ranking.at_random[0] else _best_pair(pairs(system, view), extensions)
-    if pair is not None:
-        i, j = pair.stronger, pair.weaker
-        both = tuple(system.candidates[k].mechanism for k in (i, j))
-        p_both = p_nothing_left(system if extensions is None else extensions.system_of((i, j)), seed, [i, j])
-        enough = pair.gain > (0.0 if evident else LEAST_OF_TWO) and pair.gain - 2 * EACH >= by_words
-        if enough and p_both > LEVEL_OF_MORE:
-            steps = [_beside(system, other) for other in (j, i)]  # each is judged with the other one in the law
-            sets = [_led_by(name, step.members(LIKE_THE_BEST)) for name, step in zip(both, steps, strict=True)]
-            return _verdict(*sets), [i, j], sets, steps
-    if words and not tolerable:
-        return "UNLISTED", [], [], []
-    name, k = tolerable[0] if tolerable else (members[0], ranking.best[0])
-    return _verdict(members), [k], [_led_by(name, members)], [ranking]
+            found.append((name, k))
+        if left > LEVEL_OF_MORE:
+            break
+    return found, left
+
+
+def _two_names(
+    system: System, view: Projection, extensions: Extensions | None, least: float, by_words: float, seed: int
+) -> list[int]:
+    """The best pair, if it takes away more than `least`, does no worse than words, and nothing is left beside it."""
+    pair = _best_pair(pairs(system, view), extensions)
+    if pair is None or pair.gain <= least or pair.gain - 2 * EACH < by_words:
+        return []
+    chosen = [pair.stronger, pair.weaker]
+    around = system if extensions is None else extensions.system_of((pair.stronger, pair.weaker))
+    return chosen if p_nothing_left(around, seed, chosen) > LEVEL_OF_MORE else []
 
 
 def _best_pair(found: list[Pair], extensions: Extensions | None) -> Pair | None:
