@@ -66,16 +66,15 @@ def name_missing(
     members = tuple(ranking.members(LIKE_THE_BEST))
     words, gain_of_words = pursue(system)
     by_words = gain_of_words - EACH * len(words)
-    tolerable: list[tuple[str, int]] = []
-    if evident:
-        tolerable, left = _tolerable(system, ranking, extensions, by_words, seed)
-        if left > LEVEL_OF_MORE:
-            name, k = tolerable[-1]
-            return _verdict(members), [k], [_led_by(name, members)], [ranking]
+    tolerable, left = _tolerable(system, ranking, extensions, by_words, seed) if evident else ([], 0.0)
+    name, k = tolerable[0] if tolerable else (members[0], ranking.best[0])
+    single = _verdict(members), [k], [_led_by(name, members)], [ranking]
+    if left > LEVEL_OF_MORE:
+        return single
     tell("a second effect")
     if ranking.at_random[0]:
         if ranking.gain[0] > gain_of_words:
-            return _verdict(members), [ranking.best[0]], [members], [ranking]
+            return single
     elif chosen := _two_names(system, view, extensions, 0.0 if evident else LEAST_OF_TWO, by_words, seed):
         steps = [_beside(system, other) for other in reversed(chosen)]  # each is judged with the other one in the law
         both = [system.candidates[k].mechanism for k in chosen]
@@ -83,8 +82,7 @@ def name_missing(
         return _verdict(*sets), chosen, sets, steps
     if words and not tolerable:
         return "UNLISTED", [], [], []
-    name, k = tolerable[0] if tolerable else (members[0], ranking.best[0])
-    return _verdict(members), [k], [_led_by(name, members)], [ranking]
+    return single
 
 
 def _tolerable(
@@ -93,9 +91,10 @@ def _tolerable(
     """Names of the set beside which not much is left and than which words are not much better, with their candidates,
     and the probability that nothing is left beside the last of them.
 
-    Any member may be the one beside which nothing is left. The most probable is asked first, and no other after it.
+    Any member may be the one beside which nothing is left: they are asked in turn until it is found. The first of the
+    names is that of the largest product of its probability and, up to the level, of that of nothing left beside it.
     """
-    found, left = list[tuple[str, int]](), 0.0
+    found, left = list[tuple[float, str, int]](), 0.0
     for name in ranking.members(LIKE_THE_BEST):
         position = ranking.names.index(name)
         k, gain = ranking.best[position], float(ranking.gain[position])
@@ -107,10 +106,11 @@ def _tolerable(
             around = system if extensions is None else extensions.system_of((k,))
         left = p_nothing_left(around, seed, [k])
         if left > LEVEL_OF_UNLISTED:
-            found.append((name, k))
+            worth = float(ranking.probability[position]) * min(left, LEVEL_OF_MORE)
+            found.append((worth, name, k))
         if left > LEVEL_OF_MORE:
             break
-    return found, left
+    return [(name, k) for _, name, k in sorted(found, key=lambda f: -f[0])], left
 
 
 def _two_names(
