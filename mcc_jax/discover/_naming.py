@@ -120,8 +120,8 @@ def _two_names(
     pair = _best_pair(pairs(system, view), extensions)
     if pair is None or pair.gain <= least or pair.gain - 2 * EACH < by_words:
         return []
-    chosen = [pair.stronger, pair.weaker]
-    around = system if extensions is None else extensions.system_of((pair.stronger, pair.weaker))
+    chosen = list(pair.both)
+    around = system if extensions is None else extensions.system_of(pair.both)
     return chosen if p_nothing_left(around, seed, chosen) > LEVEL_OF_MORE else []
 
 
@@ -130,7 +130,7 @@ def _best_pair(found: list[Pair], extensions: Extensions | None) -> Pair | None:
     if not found or extensions is None:
         return found[0] if found else None
     close = [p for p in found[:MOST_PAIRS] if p.log_evidence > found[0].log_evidence - CLOSE]
-    return max((p.fitted(extensions.drop((p.stronger, p.weaker))) for p in close), key=lambda p: p.log_evidence)
+    return max((p.fitted(extensions.drop(p.both)) for p in close), key=lambda p: p.log_evidence)
 
 
 def _verdict(*sets: tuple[str, ...]) -> Verdict:
@@ -163,7 +163,7 @@ def chooser(system: System, count: int, closure: Closure | None) -> Callable[[np
         found = pairs(system, view)
         if not found:
             return [empty] * (count + 1)
-        i, j = found[0].stronger, found[0].weaker
+        i, j = found[0].both
         return [empty, np.array([system.column(i)]), np.array([system.column(i), system.column(j)])]
 
     return choose

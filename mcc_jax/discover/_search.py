@@ -13,6 +13,7 @@ them, or one that resembles them.
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -89,10 +90,11 @@ def formula_weights(system: System) -> np.ndarray:
     return found
 
 
-def weights(system: System) -> np.ndarray:
-    """Probability of every candidate among those of its mechanism, further numbers and all."""
-    formulas = [(c.mechanism, c.variant.name) for c in system.candidates]
-    return formula_weights(system) / np.array([formulas.count(f) for f in formulas])
+def weights(system: System, formulas: np.ndarray) -> np.ndarray:
+    """Probability of every candidate among those of its mechanism, from that of its formula: shared by its points."""
+    names = [(c.mechanism, c.variant.name) for c in system.candidates]
+    count = Counter(names)
+    return formulas / np.array([count[name] for name in names])
 
 
 def random_groups(system: System) -> list[np.ndarray]:
@@ -251,7 +253,8 @@ def rank(system: System, projection: Projection, *, refitted: Mapping[int, float
             if candidate.mechanism == name and k not in exact:
                 evidence[k] = min(evidence[k], most)
     names = list(dict.fromkeys(c.mechanism for c in system.candidates))
-    weight, favour = weights(system), evidence + np.log(formula_weights(system))
+    formulas = formula_weights(system)
+    weight, favour = weights(system, formulas), evidence + np.log(formulas)
     found = []
     for name in names:
         members = [k for k, c in enumerate(system.candidates) if c.mechanism == name]
@@ -299,6 +302,11 @@ class Pair:
     stronger: int
     weaker: int
 
+    @property
+    def both(self) -> tuple[int, int]:
+        """The two formulas."""
+        return self.stronger, self.weaker
+
     def fitted(self, drop: float) -> Pair:
         """The same where the two formulas, fitted as they are, take away so much."""
         return replace(self, log_evidence=self.log_evidence + (drop - self.gain) / 2, gain=drop)
@@ -325,7 +333,8 @@ def pairs(system: System, projection: Projection) -> list[Pair]:
     right = fine & _physical(theta, sign[:, None]) & _physical(theta.T, sign[None])
     alone = np.where(alive, log_evidence(U, d, sign), -np.inf)
     stronger = (alone[None] > alone[:, None]) | ((alone[None] == alone[:, None]) & np.tri(len(U), k=-1, dtype=bool))
-    weight, formula = np.log(weights(system)), np.log(formula_weights(system))
+    formulas = formula_weights(system)
+    weight, formula = np.log(weights(system, formulas)), np.log(formulas)
     own = np.where(right & stronger, alone[None] + log_evidence(beside, left, sign[:, None]), -np.inf)
     evidence = np.maximum(own, own.T)
     families = {name: np.flatnonzero(names == name) for name in dict.fromkeys(names)}
