@@ -19,6 +19,9 @@ from ._system import Base, System
 ENOUGH = 0.9
 """Probability of a verdict of one name from which on an experiment is worth it."""
 
+EVEN = 0.5
+"""Least probability of it with which an experiment is proposed: particles are too dear for less than an even chance."""
+
 COPIES = (1, 2, 3, 5, 10)
 """Times the particles of the campaign that are tried."""
 
@@ -65,7 +68,7 @@ def next_experiments(
 
     Returns:
         As in `discovery.json`, the most telling experiment first; of those that tell enough, the one with the fewest
-        particles.
+        particles. None that has less than an even chance.
     """
     needed = [(k, step) for k, step in zip(chosen, steps, strict=True) if len(step.members(LIKE_THE_BEST)) > 1]
     if not needed:
@@ -86,6 +89,8 @@ def next_experiments(
             if trial is None:
                 continue
             particles, power = trial.fewest(first=2 if other is system else 1, seed=seed)
+            if power < EVEN:
+                continue
             found.append(
                 {
                     "experiment": name,

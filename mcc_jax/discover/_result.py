@@ -96,7 +96,8 @@ class Discovery:
         labels: what was added at each step of `held_out`.
         p_any: family-wise probability that anything is missing.
         before, after: the population's parameters without and with the effects.
-        next_experiments: what would tell the members of the set apart.
+        next_experiments: further tests that would probably tell the members of a set apart.
+        checks: for every member of a set with rivals, what would show it by itself: `mechanism`, `check`.
         posterior: of the extended law; None where nothing was added, its fit has an impossible sign, or it was not
             asked for.
         notes: what a reader must know.
@@ -121,6 +122,7 @@ class Discovery:
     limits: dict[str, tuple[float, float, float]]
     seed: int
     runtime_s: float
+    checks: tuple[dict[str, str], ...] = ()
     posterior: ExtendedPosterior | None = None
     notes: tuple[str, ...] = field(default=())
 
@@ -239,6 +241,7 @@ class Discovery:
             "parameters_after": self.after,
             "posterior": None if self.posterior is None else self.posterior.to_json(),
             "next_experiments": list(self.next_experiments),
+            "checks": list(self.checks),
             "p_anything_missing": finite(self.p_any),
             "equivalent_by_construction": [
                 {"names": list(e.names), "why": e.explanation, "told_apart_by": e.broken_by} for e in EQUIVALENCES

@@ -13,6 +13,9 @@ if TYPE_CHECKING:
 SHOWN = 5
 """Most jumps that are told one by one."""
 
+CHECKED = 3
+"""Most members of a set of which is told what would show them by themselves."""
+
 
 def _listed(names: list[str]) -> str:
     return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " or " + names[-1]
@@ -64,6 +67,11 @@ def summary_of(found: Discovery) -> str:
             f"{doubt}{'Next' if sure else 'The best'}: {best['experiment']}, {best['particles']} particles, would "
             f"{done} with probability {best['power']:.2f}."
         )
+    if not found.next_experiments or found.next_experiments[0]["power"] < ENOUGH:
+        first = found.checks[:CHECKED]
+        if first:
+            each = "; ".join(f"{_plain(one['mechanism'])}: {one['check']}" for one in first)
+            sentences.append(f"Each would show by itself ({each}).")
     if found.untestable:
         sentences.append(
             "These data say nothing about "

@@ -83,6 +83,7 @@ TOE = Mechanism(
         _toe("elastic", ElasticToe, "d = D_e d_t (1 - exp(-sigma / s))", "The asperities spring back on unloading."),
     ),
     ("zero of displacement, where the toe lies below all data",),
+    check="measure how rough particles and platens are; on a reload asperities stay flat",
 )  # fmt: skip
 
 
@@ -125,6 +126,7 @@ MISALIGNMENT = Mechanism(
               "The force levels the platens.",
               nuisances=(Nuisance("radius_share", (0.1, 0.3), (0.02, 2.0), "radius of levelling over D_e"),)),
     ),
+    check="turn the punch by 90 degrees, level the platens, and repeat",
 )  # fmt: skip
 
 
@@ -176,4 +178,5 @@ POP_IN = Mechanism(
              "A break after which the particle is softer.", softening=0.5),
     ),
     ("the law's own snap-through, where a loading curve is not monotone",),
+    check="watch the particle from the side, or listen to it, while the step occurs",
 )  # fmt: skip

@@ -194,4 +194,5 @@ CREEP = Mechanism(
                "Permanent creep while the load is near its maximum, logarithmic in the time spent there.",
                "Oyen and Cook (2003); logarithmic indentation creep", nuisances=_tau(1.0, 10.0, 100.0)),
     ),
+    check="hold at the largest load, and repeat at a tenth and at ten times the rate",
 )  # fmt: skip

@@ -167,6 +167,7 @@ RATE = Mechanism(
               "Flow stress and unloading stiffness grow together.", _RATE),
     ),
     ("size_effect, at one force rate",),
+    check="load at two rates or more within one class of sizes",
 )  # fmt: skip
 
 
@@ -257,6 +258,7 @@ FRICTION = Mechanism(
         _friction("strain", StrainFriction, "sigma(eps) (1 + mu eps)", "A constraint that grows with strain alone.",
                   "first-order form"),
     ),
+    check="repeat with lubricated and with roughened platens",
 )  # fmt: skip
 
 
@@ -330,4 +332,5 @@ HARDENING = Mechanism(
                    "Hardening that begins at a yield strain.", "Ludwik (1909); Swift (1952)",
                    nuisances=(Nuisance("yield_strain", (0.01, 0.05), (0.001, 0.3), "strain where hardening sets in"),)),
     ),
+    check="repeat between polished platens, or indent a compact of the same powder",
 )  # fmt: skip

@@ -107,6 +107,7 @@ SIZE = Mechanism(
               "Geometrically necessary dislocations, or any length of the material's own.", _COOPER, terms=_ALL),
     ),
     ("rate_dependence, at one force rate",),
+    check="test sieved classes of size, each at the rate that strains it as fast as the others",
 )  # fmt: skip
 
 
@@ -194,6 +195,7 @@ SHAPE = Mechanism(
                "Flat and upright particles alike deviate from spheres."),
     ),
     ("shape parameter a and mean coefficients, if all particles have one shape",),
+    check="test elongated particles both lying and standing",
 )  # fmt: skip
 
 
@@ -250,6 +252,7 @@ HUMIDITY = Mechanism(
                   "Nothing happens until about 5 % of water is taken up.", fixed={"terms": _ALL},
                   nuisances=(Nuisance("threshold_percent", (40.0, 60.0), (5.0, 90.0), "humidity where it begins"),)),
     ),
+    check="test in a chamber at 10, 40 and 75 % relative humidity",
 )  # fmt: skip
 
 
@@ -342,6 +345,7 @@ DAMAGE = Mechanism(
                 needs=(Need.RELOAD,), helps=(Need.SECOND_RELOAD,)),
     ),
     ("densification_stiffening with a negative amplitude",),
+    check="cycle one particle to rising peaks: from peak to peak it unloads softer",
 )  # fmt: skip
 
 
@@ -374,4 +378,5 @@ DENSIFICATION = Mechanism(
                nuisances=(Nuisance("heckel_stress_MPa", (3.0, 10.0), (0.5, 100.0), "stress that closes most pores"),)),
     ),
     ("damage with a negative amplitude",),
+    check="cycle one particle to rising peaks, its porosity measured by tomography before and after",
 )  # fmt: skip

@@ -86,6 +86,7 @@ SHAPE_OF_UNLOADING = Mechanism(
         _bow("onset_bow", OnsetBow, "d = Delta k 6.75 u^2 (1 - u)", "Bent most near the peak."),
         _bow("recovery_exponent", RecoveryExponent, "d = Delta (s - s^(1 + k))", "Another exponent of recovery."),
     ),
+    check="unload slowly to zero under control of displacement, with a point for every percent of load",
 )  # fmt: skip
 
 
@@ -163,12 +164,31 @@ class TailAdhesion(AbstractAdhesion):
         return phi * jnp.sqrt(phi + 1e-12) * recovered**4
 
 
+class MobilisedAdhesion(AbstractAdhesion):
+    """Attraction that is there in full once the contact has opened a little."""
+
+    mobilised_share: Scalar = eqx.field(converter=scalar)
+
+    def attraction(self, recovered: Values) -> Values:
+        """phi^1.5 s^2 / (s^2 + s_0^2)."""
+        phi = contact_of(recovered)
+        opened = recovered**2
+        return phi * jnp.sqrt(phi + 1e-12) * opened / (opened + self.mobilised_share**2)
+
+
 def _adhesion(
-    name: str, make: type[AbstractEffect], equation: str, explanation: str, source: str, *, over_section: bool = False
+    name: str,
+    make: type[AbstractEffect],
+    equation: str,
+    explanation: str,
+    source: str,
+    *,
+    over_section: bool = False,
+    nuisances: tuple[Nuisance, ...] = (),
 ) -> Variant:
     return Variant(
         "adhesion", name, make, "adhesive_stress_MPa", "MPa", 1, (0.02, 2.0), equation, explanation, source,
-        needs=(Need.UNLOADING,), helps=(Need.SEVERAL_PEAKS,), fixed={"over_section": over_section},
+        needs=(Need.UNLOADING,), helps=(Need.SEVERAL_PEAKS,), fixed={"over_section": over_section}, nuisances=nuisances,
     )  # fmt: skip
 
 
@@ -190,9 +210,15 @@ ADHESION = Mechanism(
                   "Olsson and Larsson (2013); Gonzalez (2019), J. Mech. Phys. Solids"),
         _adhesion("stretched_tail", TailAdhesion, f"g = phi^1.5 s^4; {_GENERAL}",
                   "Bridges or fibres that pull only once they are stretched, close to release.", "liquid bridges"),
+        _adhesion("mobilised", MobilisedAdhesion, f"g = phi^1.5 s^2 / (s^2 + s_0^2); {_SECTION}",
+                  "A cohesive zone that pulls in full once the contact has opened a little.",
+                  "Needleman (1987), J. Appl. Mech. 54, 525; Olsson and Larsson (2013)", over_section=True,
+                  nuisances=(Nuisance("mobilised_share", (0.25, 0.4, 0.6), (0.05, 1.0),
+                                      "recovered share at which half of it pulls"),)),
         _adhesion("bond_nominal", BondAdhesion, f"g = phi^2 s; {_SECTION}", "As bond, counted over the section.",
                   "Gonzalez (2019)", over_section=True),
     ),
+    check="pull off under control of displacement, and repeat with a dry punch that does not stick",
 )  # fmt: skip
 
 
@@ -313,6 +339,7 @@ REVERSAL = Mechanism(
         _reversal("staying", StayingReversal, "d = -gamma_P c (1 - u)^4; on a reload (1 - u_r)^4 (1 - u) / (1 - u_r)",
                   "As the quartic form, but a reload does not retrace it."),
     ),
+    check="unload, hold close to zero load, reload and unload once more",
 )  # fmt: skip
 
 
@@ -392,6 +419,7 @@ HYSTERESIS = Mechanism(
         _lag("slip", SlipLag, "d = -Delta h (1 - u_r) (1 - exp(-20 w)) (1 - w)",
              "Friction at the contact is overcome first."),
     ),
+    check="reload at two rates: a loop of friction dissipates as much at both",
 )  # fmt: skip
 
 
@@ -466,4 +494,5 @@ RATCHETING = Mechanism(
                  parameter="ratchet_share", plausible=(5e-3, 0.3)),
     ),
     ("creep, as long as there is one reload only and no hold",),
+    check="cycle one particle ten times or more to the same load",
 )  # fmt: skip

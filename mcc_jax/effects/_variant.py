@@ -156,12 +156,14 @@ class Mechanism:
         explanation: what it is, in plain words.
         variants: its formulas, the most common first.
         equivalences: what no data of this kind can tell from it; to be declared, never discovered.
+        check: what would show it by itself, apart from what more tests of the same kind would tell.
     """
 
     name: str
     explanation: str
     variants: tuple[Variant, ...]
     equivalences: tuple[str, ...] = ()
+    check: str = ""
 
     def __post_init__(self) -> None:
         names = [variant.name for variant in self.variants]

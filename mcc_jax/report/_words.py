@@ -134,6 +134,9 @@ def _after(found: dict[str, Any]) -> list[tuple[str, str]]:
             return [(f"Measure: {test}. It would separate {names} with probability {power}.", "")]
         doubt = f"No further test of those tried on paper would surely separate {names}."
         return [(f"{doubt} The best: {test}, would do so with probability {power}.", "")]
+    if found.get("checks"):
+        first = found["checks"][0]
+        return [(f"Check directly. For {plain(first['mechanism'])}: {first['check']}. For the others, see below.", "")]
     if verdict in ("NAMED", "SET", "UNLISTED"):
         return [("Use the law together with what was added (parameters “after” below), not alone.", "")]
     if verdict == "NO_GAP" and found["untestable"]:
