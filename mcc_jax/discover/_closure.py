@@ -105,7 +105,7 @@ def find_closure(
     groups = [usable[k::FOLDS] for k in range(min(FOLDS, len(usable)))]
     others = [tuner.search(np.setdiff1d(usable, group)).words for group in groups] if len(usable) > 2 else []
     formula = (*whole, *(word for words in others for word in words))
-    system = build_system(base, signals.with_formula(formula, tuner.values(formula)))
+    system = build_system(base, signals.with_formula(base, formula, tuner.values(formula)))
     starts = system.formula_columns[0] + np.cumsum([0, len(whole), *map(len, others)])
     parts = [np.arange(first, end) for first, end in pairwise(starts)]
     chosen = parts[0]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -93,7 +93,7 @@ def discover(
     if not bool(np.all(np.asarray(base.fit.converged)[1:])) or not _mostly_converged(base):
         return _not_converged(base, missing, seed, started)
     tell("signatures of all effects")
-    signals = signals_of(base, testable)
+    signals = signals_of(base, testable, turned=True)
     system = build_system(base, signals)
     for _ in range(REFINEMENTS):
         tell("noise without what is systematic")
@@ -101,7 +101,15 @@ def discover(
         if not changed:
             break
         system = build_system(base, signals)
-    return _judge(base, system, signals, missing, confirm, experiments, posterior, seed, started, tell)
+    found = _judge(base, system, signals, missing, confirm, experiments, posterior, seed, tell)
+    found = dataclasses.replace(found, checks=_checks(known, found.candidate_set))
+    return dataclasses.replace(found, summary=summary_of(found), runtime_s=time.perf_counter() - started)
+
+
+def _checks(known: Mapping[str, Mechanism], sets: Sequence[tuple[str, ...]]) -> tuple[dict[str, str], ...]:
+    """For every mechanism that has rivals, what would show it by itself."""
+    rivals = dict.fromkeys(name for names in sets if len(names) > 1 for name in names)
+    return tuple({"mechanism": name, "check": known[name].check} for name in rivals if known[name].check)
 
 
 def _mostly_converged(base: Base) -> bool:
@@ -149,7 +157,6 @@ def _judge(
     experiments: bool,
     posterior: bool,
     seed: int,
-    started,
     tell,
 ) -> Discovery:
     tell("is something missing")
@@ -222,7 +229,7 @@ def _judge(
     if experiments and gap:
         tell("next experiments")
         further = next_experiments(base, system, chosen, steps, seed=seed)
-    found = Discovery(
+    return Discovery(
         verdict=verdict,
         summary="",
         base=base,
@@ -245,7 +252,6 @@ def _judge(
         runtime_s=0.0,
         notes=tuple(notes),
     )
-    return dataclasses.replace(found, summary=summary_of(found), runtime_s=time.perf_counter() - started)
 
 
 def _notes(base: Base, system: System) -> list[str]:

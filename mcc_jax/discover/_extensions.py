@@ -25,7 +25,7 @@ class Extensions:
         """The base law with some candidates."""
         if chosen not in self.known:
             candidates = tuple(self.system.candidates[k] for k in chosen)
-            self.known[chosen] = refit(self.base, candidates, self.system.prior)
+            self.known[chosen] = refit(self.base, candidates, self.system.prior, self.system.curved(chosen))
         return self.known[chosen]
 
     def drop(self, chosen: tuple[int, ...]) -> float:

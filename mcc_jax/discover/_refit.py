@@ -6,9 +6,11 @@ matter are fitted in the extended law itself, with the population, every particl
 amplitudes and their further numbers free together,
 
 .. math:: D = \sum_i \lVert W_i (d_i - z_i - \gamma(F_i; w_i, \theta)) \rVert^2 + \lVert\xi_i\rVert^2
-    + (z_i - z_{i0})^2/s_z^2 + \beta^T P \beta + \phi^T Q \phi, \qquad w_i = m_i(\beta) + S \xi_i
+    + (z_i - z_{i0})^2/s_z^2 + \beta^T P \beta + \phi^T Q \phi + 2 c^T (\beta, \theta),
+    \qquad w_i = m_i(\beta) + S \xi_i
 
-with the noise filters W of the refined fit. Every step is the linear system once more, around the latest values.
+with the noise filters W of the refined fit and c what curvature adds (`_turning`, taken at the base law). Every step is
+the linear system once more, around the latest values.
 """
 
 from __future__ import annotations
@@ -42,6 +44,7 @@ from ._system import (
     in_batches,
     mean_by_globals,
     steps_of,
+    turning_of,
 )
 
 STEPS = 12
@@ -186,7 +189,7 @@ class Refit:
         return all(a > 0 or f.variant.sign == 0 for a, f in zip(amplitudes, self.formulas, strict=True))
 
 
-def refit(base: Base, candidates: tuple[Candidate, ...], prior: np.ndarray) -> Refit:
+def refit(base: Base, candidates: tuple[Candidate, ...], prior: np.ndarray, curved: np.ndarray | None = None) -> Refit:
     """Fit the law with these effects to a campaign, beginning at the base law.
 
     There the particles fit; the first step moves them and the amplitudes together.
@@ -195,12 +198,18 @@ def refit(base: Base, candidates: tuple[Candidate, ...], prior: np.ndarray) -> R
         base: the base fit, of which noise, spreads and priors are taken.
         candidates: the formulas; none for the base law itself.
         prior: precision of the population's parameters around the base fit's.
+        curved: what curvature adds to the derivative of D / 2 by the population's parameters and each formula's
+            amplitude (`System.curved`); nothing if None.
     """
     formulas = tuple(Formula.of(c) for c in candidates)
     own = np.concatenate([np.zeros(0), *(f.precision for f in formulas)])
     if len(own) > SLOTS:
         raise ValueError(f"{len(own)} free numbers, at most {SLOTS} can be fitted together")
-    problem = _Problem(base, formulas, np.asarray(prior, float), own)
+    push = np.zeros(len(prior) + len(own))
+    if curved is not None:
+        amplitudes = [len(prior) + one.start for one in slices(formulas)]
+        push[[*range(len(prior)), *amplitudes]] = curved
+    problem = _Problem(base, formulas, np.asarray(prior, float), own, push)
     state = State(
         base.fit.latent,
         base.fit.zero,
@@ -240,7 +249,8 @@ def system_at(base: Base, system: System, signals: Signals, chosen: list[int], f
     amplitudes = np.array([own.start for own in slices(found.formulas)], int)
     added = signals.added.at[:, np.array(chosen)].set(found.columns[:, amplitudes])
     tests, state = base.tests, found.state
-    gram, *of_steps = gram_matrices(
+    gram, turned, *of_steps = gram_matrices(
+        turning_of(base, signals, found.jacobian, found.by_globals, found.factor),
         found.residual,
         found.jacobian,
         tests.mask,
@@ -259,7 +269,8 @@ def system_at(base: Base, system: System, signals: Signals, chosen: list[int], f
         candidates[k] = Candidate(formula.variant, {**candidates[k].nuisance, **formula.nuisance(found.own(i))})
         at[k] = found.own(i)[0]
     steps = steps_of(tests, system.candidates, *of_steps)
-    return replace(system, gram=gram, steps=steps, candidates=tuple(candidates), at=at, shift=np.asarray(state.shift))
+    shift = np.asarray(state.shift)
+    return replace(system, gram=gram, turned=turned, steps=steps, candidates=tuple(candidates), at=at, shift=shift)
 
 
 class _Step(eqx.Module):
@@ -274,8 +285,11 @@ class _Step(eqx.Module):
 class _Problem:
     """The equations of one extended law and one campaign."""
 
-    def __init__(self, base: Base, formulas: tuple[Formula, ...], prior: np.ndarray, own: np.ndarray) -> None:
+    def __init__(
+        self, base: Base, formulas: tuple[Formula, ...], prior: np.ndarray, own: np.ndarray, push: np.ndarray
+    ) -> None:
         self.base, self.formulas = base, formulas
+        self.push = push
         self.prior = jnp.asarray(prior)
         self.size = len(own)
         self.own = jnp.asarray(own)
@@ -303,6 +317,8 @@ class _Problem:
         value = float(_squares(view[0], base.fit.filters)) + float(np.sum(np.asarray(state.deviations) ** 2))
         value += float(np.sum(away**2)) + float(np.sum(np.asarray(self.prior) * np.asarray(state.shift) ** 2))
         value += float(np.sum(np.asarray(self.own) * np.asarray(state.theta) ** 2))
+        moved = np.concatenate([np.asarray(state.shift), np.asarray(state.theta)])
+        value += 2 * float(self.push @ moved)
         return value if np.isfinite(value) else np.inf
 
     def step(self, state: State, view: tuple[Array, Array, Array], *, hold: bool = False) -> _Step:
@@ -334,6 +350,7 @@ class _Problem:
             self.prior,
             jnp.pad(state.theta, (0, SLOTS - self.size)),
             own,
+            jnp.asarray(np.pad(self.push, (0, SLOTS - self.size))),
         )
 
     def move(self, state: State, step: _Step, share: float) -> State:
@@ -393,7 +410,21 @@ def _squares(residual: Float[Array, "particles points"], filters: Whitening) -> 
 
 @compiled
 def _solve(
-    residual, jacobian, columns, mask, filters, away, by_globals, factor, zero_sd, zero_away, shift, prior, theta, own
+    residual,
+    jacobian,
+    columns,
+    mask,
+    filters,
+    away,
+    by_globals,
+    factor,
+    zero_sd,
+    zero_away,
+    shift,
+    prior,
+    theta,
+    own,
+    push,
 ):
     """Deviations, zeros' changes, changes of the population and of the effects that minimise the linear problem."""
     k = factor.shape[-1]
@@ -416,7 +447,7 @@ def _solve(
     total = left.sum(0)
     weight = jnp.concatenate([prior, own])
     H = total[1:, 1:] + jnp.diag(weight)
-    g = total[1:, 0] + weight * jnp.concatenate([shift, theta])
+    g = total[1:, 0] + weight * jnp.concatenate([shift, theta]) + push
     scale = 1 / jnp.sqrt(jnp.diagonal(H))
     change = -scale * jnp.linalg.solve(H * scale[None] * scale[:, None], scale * g)
     inverse = jnp.linalg.inv(H * scale[None] * scale[:, None]) * scale[None] * scale[:, None]

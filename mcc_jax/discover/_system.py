@@ -41,6 +41,7 @@ from ..law import Unloading
 from ._candidates import Candidate, candidates_of
 from ._features import GAUGE, ROOM, Feature, map_features, values_of, words
 from ._steps import Steps, is_step
+from ._turning import Turned, by_latent, turning
 
 GLOBALS = ("a", "log modulus", "mu C1", "mu C3", "mu C5")
 
@@ -62,6 +63,7 @@ class System:
         at: amplitudes around which the candidates' columns are taken, in their units: zero but where the law has been
             extended (`_refit`).
         shift: of the population's parameters from the base fit's, likewise.
+        turned: what curvature has added to every column's product with the residual, shape (N, Q) (`_turning`).
         tails: degrees of freedom of Student's distribution whose tails are those of the noise; infinite where it is
             normal.
         formula: words with fitted numbers, of the formula that was found and of those without some particles.
@@ -78,6 +80,7 @@ class System:
     at: np.ndarray
     shift: np.ndarray
     tails: float = np.inf
+    turned: np.ndarray | None = None
     formula: tuple[Feature, ...] = ()
     steps: Steps | None = None
 
@@ -130,6 +133,13 @@ class System:
         if len(others) < len(particles) and self.usable[particles].all():
             return self._usable_total - self.gram[others].sum(0)
         return self.gram[particles].sum(0)
+
+    def curved(self, chosen: Sequence[int]) -> np.ndarray | None:
+        """What curvature has added for the population's parameters and some candidates, all particles together."""
+        if self.turned is None:
+            return None
+        columns = [*self.globals.tolist(), *(self.column(k) for k in chosen)]
+        return self.turned[self.usable][:, columns].sum(0)
 
     @property
     def signs(self) -> np.ndarray:
@@ -192,10 +202,12 @@ class Base:
         tests = filled_up(self.tests, size)
         return tests, Blocks(len(tests), size)
 
-    def linear(self) -> Linear:
-        """Residuals at the fit, and their derivatives by every particle's own parameters."""
+    def linear(self, latent: Float[Array, "particles 4"] | None = None) -> Linear:
+        """Residuals at the fit, and their derivatives by every particle's own parameters; at other latent vectors, if
+        given."""
         tests, blocks = self.filled()
-        at = (blocks.cut(v) for v in longer((self.fit.latent, self.fit.zero), len(tests)))
+        own = self.fit.latent if latent is None else latent
+        at = (blocks.cut(v) for v in longer((own, self.fit.zero), len(tests)))
         data = blocks.each(linear_data, *at, blocks.cut(tests), self.model.zero_sd, self.model.unloading)
         return jax.tree.map(lambda x: x[: len(self.tests)], blocks.whole(data))
 
@@ -232,16 +244,25 @@ class Signals:
         added: shape (N, K, points), [um] per unit amplitude.
         seen: of the features, shape (N, F, points).
         formula: the features behind map and words.
+        turned: how all of them, and the residual's own derivatives, change with the latent vectors; None where no
+            residual is looked at.
     """
 
     candidates: tuple[Candidate, ...]
     added: Float[Array, "particles K points"]
     seen: Float[Array, "particles F points"]
     formula: tuple[Feature, ...] = ()
+    turned: Turned | None = None
 
-    def with_formula(self, formula: tuple[Feature, ...], values: Float[Array, "particles F points"]) -> Signals:
+    def with_formula(
+        self, base: Base, formula: tuple[Feature, ...], values: Float[Array, "particles F points"]
+    ) -> Signals:
         """The same, and words with fitted numbers behind the others, with their values [um]."""
-        return replace(self, seen=jnp.concatenate([self.seen, -values], 1), formula=formula)
+        turned = self.turned
+        if turned is not None:
+            more = by_latent(lambda at: -feature_values(base, formula, at), base.fit.latent, -values)
+            turned = replace(turned, signals=np.concatenate([turned.signals, more], 2))
+        return replace(self, seen=jnp.concatenate([self.seen, -values], 1), formula=formula, turned=turned)
 
     def of(self, columns: np.ndarray) -> Float[Array, "particles columns points"]:
         """Change of the residual per unit of some of the system's columns."""
@@ -249,34 +270,57 @@ class Signals:
         return jnp.concatenate([self.added, self.seen], 1)[:, at]
 
 
-def signals_of(base: Base, library: Mapping[str, Mechanism]) -> Signals:
-    """All formulas of a library and all features along the tests of a fitted campaign."""
+def signals_of(base: Base, library: Mapping[str, Mechanism], *, turned: bool = False) -> Signals:
+    """All formulas of a library and all features along the tests of a fitted campaign.
+
+    Args:
+        base: the base fit.
+        library: the mechanisms.
+        turned: how they change with the particles' own parameters, too.
+    """
     candidates = candidates_of(library)
-    latent, tests, unloading = base.fit.latent, base.tests, base.model.unloading
-    batch = (latent, tests.particle, base.records)
+    units = jnp.asarray([c.unit_amplitude for c in candidates])
+    features = (*map_features(), *words())
+
+    def at(latent: Array) -> Array:
+        added = _added_by(base, candidates, latent) * units[None, :, None]
+        return -jnp.concatenate([added, feature_values(base, features, latent)], 1)
+
+    both = at(base.fit.latent)
+    slopes = None
+    if turned:
+        own = by_latent(lambda latent: base.linear(latent).jacobian, base.fit.latent, base.linear().jacobian)
+        slopes = Turned(own, by_latent(at, base.fit.latent, both))
+    return Signals(candidates, both[:, : len(candidates)], both[:, len(candidates) :], turned=slopes)
+
+
+def _added_by(base: Base, candidates: tuple[Candidate, ...], latent: Array) -> Float[Array, "particles K points"]:
+    """What candidates add to displacement, per unit of amplitude.
+
+    Most of the library is computed as the whole of it, so that all campaigns share what is compiled.
+    """
+    batch = (latent, base.tests.particle, base.records)
 
     def added_by(some: Sequence[Candidate]) -> Array:
         effects = tuple(c.effect for c in some)
-        return in_batches(partial(_added, effects=effects, unloading=unloading), batch)
+        return in_batches(partial(_added, effects=effects, unloading=base.model.unloading), batch)
 
-    # Most of the library is computed as the whole of it, so that all campaigns share what is compiled.
     whole = candidates_of(LIBRARY)
     known = {_identity(c) for c in whole} & {_identity(c) for c in candidates}
-    if 2 * len(known) > len(whole):
-        strangers = tuple(c for c in candidates if _identity(c) not in known)
-        place = {_identity(c): i for i, c in enumerate((*whole, *strangers))}
-        parts = [added_by(some) for some in (whole, strangers) if some]
-        added = jnp.concatenate(parts, 1)[:, np.array([place[_identity(c)] for c in candidates])]
-    else:
-        added = added_by(candidates)
-    units = jnp.asarray([c.unit_amplitude for c in candidates])
-    seen = feature_values(base, (*map_features(), *words()))
-    return Signals(candidates, -added * units[None, :, None], -seen)
+    if 2 * len(known) <= len(whole):
+        return added_by(candidates)
+    strangers = tuple(c for c in candidates if _identity(c) not in known)
+    place = {_identity(c): i for i, c in enumerate((*whole, *strangers))}
+    parts = [added_by(some) for some in (whole, strangers) if some]
+    return jnp.concatenate(parts, 1)[:, np.array([place[_identity(c)] for c in candidates])]
 
 
-def feature_values(base: Base, features: tuple[Feature, ...]) -> Float[Array, "particles features points"]:
-    """Features along the tests of a fitted campaign, displacement [um] per unit of coefficient."""
-    rows = (base.fit.latent, base.tests.particle, base.records)
+def feature_values(
+    base: Base, features: tuple[Feature, ...], latent: Float[Array, "particles 4"] | None = None
+) -> Float[Array, "particles features points"]:
+    """Features along the tests of a fitted campaign, displacement [um] per unit of coefficient; at other latent vectors
+    than the fit's, if given."""
+    rows = (base.fit.latent if latent is None else latent, base.tests.particle, base.records)
     return in_batches(partial(_features, unloading=base.model.unloading, features=features), rows)
 
 
@@ -313,7 +357,8 @@ def build_system(base: Base, signals: Signals) -> System:
     mean, factor = moments(population, flat, scatter)
 
     by_globals = mean_by_globals(population, flat, scatter)
-    gram, *of_steps = gram_matrices(
+    gram, turned, *of_steps = gram_matrices(
+        turning_of(base, signals, data.jacobian, by_globals, factor),
         data.residual,
         data.jacobian,
         tests.mask,
@@ -346,9 +391,19 @@ def build_system(base: Base, signals: Signals) -> System:
         none,
         still,
         tails_of(white),
+        turned,
         signals.formula,
         steps_of(tests, candidates, *of_steps),
     )
+
+
+def turning_of(base: Base, signals: Signals, jacobian: Array, by_globals: Array, factor: Array) -> np.ndarray:
+    """What curvature adds to every column's product with the residual (`_turning`); zero where nobody looks at it."""
+    count = factor.shape[-1] + 1 + 1 + by_globals.shape[-1] + signals.added.shape[1] + signals.seen.shape[1]
+    if signals.turned is None:
+        return np.zeros((len(base.tests), count))
+    own = (base.tests.mask, base.fit.filters, factor, by_globals, base.model.zero_sd)
+    return turning(jacobian, signals.turned, *own, in_batches)
 
 
 def first_loaded(tests: Tests) -> Bool[Array, "particles points"]:
@@ -437,17 +492,20 @@ def _features(
 
 
 def gram_matrices(
-    residual, jacobian, mask, loaded, filters, added, seen, away, by_globals, factor, zero_sd, zero_away
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Gram matrices, particles' deviations and zeros integrated out: of all columns; of steps of 1 um at the points of
-    first loading with these; of steps among themselves."""
+    turned, residual, jacobian, mask, loaded, filters, added, seen, away, by_globals, factor, zero_sd, zero_away
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Gram matrices, particles' deviations and zeros integrated out: of all columns; what curvature adds to their
+    products with the residual; of steps of 1 um at the points of first loading with these; of steps among themselves.
+    """
     missing = -added.shape[1] % COLUMNS
     wide = jnp.pad(added, ((0, 0), (0, missing), (0, 0)))
-    rows = (residual, jacobian, mask, loaded, filters, wide, seen, away, by_globals, factor, zero_away)
-    gram, cross, among = map(np.asarray, in_batches(partial(_gram, zero_sd=zero_sd), rows))
     end = 1 + by_globals.shape[-1] + added.shape[1]
+    behind = factor.shape[-1] + 1 + end
+    turn = jnp.asarray(np.insert(turned, [behind] * missing, 0.0, axis=1))
+    rows = (turn, residual, jacobian, mask, loaded, filters, wide, seen, away, by_globals, factor, zero_away)
+    gram, curved, cross, among = map(np.asarray, in_batches(partial(_gram, zero_sd=zero_sd), rows))
     kept = np.r_[:end, end + missing : gram.shape[1]]
-    return gram[:, kept[:, None], kept], cross[:, :, kept], among
+    return gram[:, kept[:, None], kept], curved[:, kept], cross[:, :, kept], among
 
 
 def own_rows(jacobian, factor) -> Float[Array, "columns points"]:
@@ -466,10 +524,10 @@ COLUMNS = 200
 
 
 @compiled
-def _gram(residual, jacobian, mask, loaded, filters, added, seen, away, by_globals, factor, zero_away, zero_sd):
+def _gram(turned, residual, jacobian, mask, loaded, filters, added, seen, away, by_globals, factor, zero_away, zero_sd):
     k, places = factor.shape[-1], jnp.arange(residual.shape[-1])
 
-    def one(r, J, used, first, white, extra, words, offset, slope, S, z):
+    def one(turn, r, J, used, first, white, extra, words, offset, slope, S, z):
         after = (places[None] >= places[:, None]) & used[None] & first[:, None]
         columns = jnp.concatenate(
             [
@@ -484,8 +542,14 @@ def _gram(residual, jacobian, mask, loaded, filters, added, seen, away, by_globa
         A = X @ X.T
         prior = jnp.concatenate([jnp.ones(k), 1 / zero_sd[None] ** 2])
         inner, border = A[: k + 1, : k + 1] + jnp.diag(prior), A[: k + 1, k + 1 :]
-        left = A[k + 1 :, k + 1 :] - border.T @ jnp.linalg.solve(inner, border)
+        solved = jnp.linalg.solve(inner, border)
+        left = A[k + 1 :, k + 1 :] - border.T @ solved
+        # chi2 itself is left as it is: what curvature adds there is the same for all columns.
+        added = jnp.pad(turn[k + 1 :], (0, len(places))) - turn[: k + 1] @ solved
+        added = added.at[0].set(0.0)
+        left = left.at[0].add(added).at[:, 0].add(added)
         end = left.shape[0] - len(places)
-        return left[:end, :end], left[end:, :end], left[end:, end:]
+        return left[:end, :end], added[:end], left[end:, :end], left[end:, end:]
 
-    return jax.vmap(one)(residual, jacobian, mask, loaded, filters, added, seen, away, by_globals, factor, zero_away)
+    rows = (turned, residual, jacobian, mask, loaded, filters, added, seen, away, by_globals, factor, zero_away)
+    return jax.vmap(one)(*rows)

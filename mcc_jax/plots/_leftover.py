@@ -108,7 +108,7 @@ def _as_found(base: Base, system: System, found: Discovery) -> tuple[System, np.
     signals = signals_of(base, {str(i): Mechanism(v.mechanism, "", (v,)) for i, v in enumerate(formulas)})
     if found.closure is not None:
         words = tuple(system.word(int(column)) for column in found.closure.words)
-        signals = signals.with_formula(words, feature_values(base, words))
+        signals = signals.with_formula(base, words, feature_values(base, words))
     # Columns of features stand behind those of all candidates, so they move with the number of these.
     moved = len(signals.candidates) - len(system.candidates)
     columns = np.array([*(system.column(i) for i in range(len(formulas))), *(inside[len(formulas) :] + moved)], int)

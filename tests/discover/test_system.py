@@ -195,7 +195,7 @@ def test_the_correction_of_a_formula_stands_at_the_rows_of_the_tests(fitted):
     base, signals, system = fitted
     words, coefficients = system.word_columns[[1, 4]], np.array([2e-3, -1e-3])
     formula = tuple(system.word(int(w)) for w in words)
-    with_formula = signals.with_formula((*formula, formula[0]), -signals.of(np.append(words, words[0])))
+    with_formula = signals.with_formula(base, (*formula, formula[0]), -signals.of(np.append(words, words[0])))
     system = build_system(base, with_formula)
     # The formula that tests 0 and 3 are judged by has the first word only.
     folds = ((np.array([0, 3]), system.formula_columns[2:]),)
