@@ -11,7 +11,7 @@ from ._extensions import Extensions
 from ._pursuit import pursue
 from ._result import Verdict
 from ._score import Projection, project
-from ._search import Pair, Ranking, family_columns, pairs, rank
+from ._search import Pair, Ranking, family_columns, other_formulas, pairs, rank
 from ._significance import p_nothing_left
 from ._system import Base, System
 
@@ -39,6 +39,10 @@ chance."""
 
 CLOSE, MOST_PAIRS = 4.0, 4
 """Pairs of which the log evidence is so close to the best one's are fitted as they are, so many at most."""
+
+LOST, OTHERS = 0.1, 3
+"""Where a pair, fitted as it is, takes away so much less than first order says (a share), other formulas of its
+mechanisms are tried, so many of each: strong effects of one mechanism differ more than weak ones."""
 
 LIKE_THE_BEST = 0.05
 """A mechanism whose probability is at least this share of the best one's belongs to the set."""
@@ -117,7 +121,7 @@ def _two_names(
     system: System, view: Projection, extensions: Extensions | None, least: float, by_words: float, seed: int
 ) -> list[int]:
     """The best pair, if it takes away more than `least`, does no worse than words, and nothing is left beside it."""
-    pair = _best_pair(pairs(system, view), extensions)
+    pair = _best_pair(system, view, extensions)
     if pair is None or pair.gain <= least or pair.gain - 2 * EACH < by_words:
         return []
     chosen = list(pair.both)
@@ -125,12 +129,20 @@ def _two_names(
     return chosen if p_nothing_left(around, seed, chosen) > LEVEL_OF_MORE else []
 
 
-def _best_pair(found: list[Pair], extensions: Extensions | None) -> Pair | None:
+def _best_pair(system: System, view: Projection, extensions: Extensions | None) -> Pair | None:
     """The most evident pair, those close to it fitted as they are; None without any."""
+    found = pairs(system, view)
     if not found or extensions is None:
         return found[0] if found else None
-    close = [p for p in found[:MOST_PAIRS] if p.log_evidence > found[0].log_evidence - CLOSE]
-    return max((p.fitted(extensions.drop(p.both)) for p in close), key=lambda p: p.log_evidence)
+    fitted = []
+    for pair in found[:MOST_PAIRS]:
+        if pair.log_evidence <= found[0].log_evidence - CLOSE:
+            continue
+        fitted.append(pair.fitted(extensions.drop(pair.both)))
+        if fitted[-1].gain < (1 - LOST) * pair.gain:
+            others = other_formulas(system, view, pair, OTHERS)
+            fitted += [other.fitted(extensions.drop(other.both)) for other in others]
+    return max(fitted, key=lambda pair: pair.log_evidence)
 
 
 def _verdict(*sets: tuple[str, ...]) -> Verdict:

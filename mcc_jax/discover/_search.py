@@ -312,6 +312,27 @@ class Pair:
         return replace(self, log_evidence=self.log_evidence + (drop - self.gain) / 2, gain=drop)
 
 
+def other_formulas(system: System, projection: Projection, pair: Pair, most: int) -> list[Pair]:
+    """The pair with another formula of one of its mechanisms: of each, those that take away most beside the other, one
+    for every variant and `most` at most."""
+    U, both, sign = projection.scores.sum(0), projection.information.sum(0), system.signs
+    d = np.maximum(np.diagonal(both), 1e-300)
+    found: list[Pair] = []
+    for own, other in (pair.both, pair.both[::-1]):
+        left = d - both[:, other] ** 2 / d[other]
+        beside = U - both[:, other] * U[other] / d[other]
+        gain = np.where(_physical(beside, sign) & (left > 1e-4 * d), beside**2 / np.maximum(left, 1e-300), 0.0)
+        now = system.candidates[own]
+        best: dict[str, int] = {}
+        for k in np.argsort(-gain, kind="stable").tolist():
+            c = system.candidates[k]
+            if c.mechanism == now.mechanism and c.variant.name != now.variant.name and gain[k] > 0:
+                best.setdefault(c.variant.name, k)
+        place = "stronger" if own == pair.stronger else "weaker"
+        found.extend(replace(pair, **{place: k}) for k in list(best.values())[:most])
+    return found
+
+
 def pairs(system: System, projection: Projection) -> list[Pair]:
     r"""Pairs of mechanisms by their evidence together, the best first.
 

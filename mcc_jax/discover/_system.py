@@ -159,12 +159,19 @@ class System:
         return columns, np.concatenate([self.signs, np.zeros(len(columns) - len(self.candidates))])
 
     def absorbing(self, columns: np.ndarray) -> System:
-        """The system in which every particle may have its own amount of some columns."""
-        at = np.asarray(columns)
-        inner = self.gram[:, at][:, :, at] + np.eye(len(at))
-        border = self.gram[:, at]
-        gram = self.gram - np.swapaxes(border, 1, 2) @ np.linalg.solve(inner, border)
-        return replace(self, gram=gram, steps=None)
+        """The system in which every particle may have its own amount of some columns.
+
+        Without what curvature adds: that is another where a particle has more parameters of its own.
+        """
+        at, whole = np.asarray(columns), self.gram
+        if self.turned is not None:
+            whole = whole.copy()
+            whole[:, 0] -= self.turned
+            whole[:, :, 0] -= self.turned
+        inner = whole[:, at][:, :, at] + np.eye(len(at))
+        border = whole[:, at]
+        gram = whole - np.swapaxes(border, 1, 2) @ np.linalg.solve(inner, border)
+        return replace(self, gram=gram, steps=None, turned=None)
 
 
 @dataclass(frozen=True)

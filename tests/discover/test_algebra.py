@@ -25,6 +25,7 @@ from mcc_jax.discover._search import (
     formula_weights,
     log_evidence,
     log_evidence_at_random,
+    other_formulas,
     pairs,
     rank,
     weights,
@@ -394,6 +395,38 @@ def test_pairs_take_away_what_two_columns_together_do():
         theta = np.linalg.solve(both[np.ix_([i, j], [i, j])], U[[i, j]])
         assert ((sign[[i, j]] == 0) | (theta * sign[[i, j]] > 0)).all()
         assert pair.gain == pytest.approx(theta @ U[[i, j]], rel=1e-9)
+
+
+SEVERAL = (
+    ("frame_compliance", "linear"),
+    ("frame_compliance", "stiffening"),
+    ("frame_compliance", "conical_seat"),
+    ("adhesion", "bond"),
+    ("adhesion", "jkr"),
+    ("unloading_shape", "symmetric_bow"),
+)
+
+
+@pytest.mark.parametrize("most", [1, 3])
+def test_other_formulas_of_a_pair_take_away_most_beside_the_one_that_stays(most):
+    system, _ = random_campaign(8, formulas=SEVERAL)
+    view = project(system, system.candidate_columns)
+    U, both, names = view.scores.sum(0), view.information.sum(0), [c.mechanism for c in system.candidates]
+    checked = 0
+    for pair in pairs(system, view):
+        found = other_formulas(system, view, pair, most)
+        for own, other in (pair.both, pair.both[::-1]):
+            gains = {}
+            for k, name in enumerate(names):
+                theta = np.linalg.solve(both[np.ix_([k, other], [k, other])], U[[k, other]]) if k != other else [0.0]
+                if name == names[own] and k != own and (system.signs[k] == 0 or theta[0] * system.signs[k] > 0):
+                    gains[k] = theta @ U[[k, other]]
+            expected = sorted(gains, key=lambda k: -gains[k])[:most]
+            kept = [next(iter(set(p.both) - {other})) for p in found if other in p.both and own not in p.both]
+            assert kept == expected
+            checked += len(kept)
+        assert all({names[k] for k in p.both} == {names[k] for k in pair.both} for p in found)
+    assert checked > 3
 
 
 def test_a_pair_is_as_evident_as_one_and_then_the_other_beside_it():

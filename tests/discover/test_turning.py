@@ -73,6 +73,24 @@ def test_curvature_adds_to_products_with_the_residual_alone(fitted):
     assert not plain.turned.any()
 
 
+def test_where_particles_have_more_parameters_of_their_own_curvature_is_left_out(fitted):
+    base, _, system = fitted
+    plain = build_system(base, signals_of(base, SMALL))
+    columns = system.candidate_columns[:1]
+    absorbed = system.absorbing(columns)
+    scale = np.abs(plain.gram).max()
+    np.testing.assert_allclose(absorbed.gram / scale, plain.absorbing(columns).gram / scale, atol=1e-12)
+    assert absorbed.turned is None
+    assert absorbed.curved([0]) is None
+
+
+def test_curvature_of_chosen_columns_is_that_of_all_usable_particles(fitted):
+    _, _, system = fitted
+    added = system.curved([2, 0])
+    columns = [*system.globals.tolist(), system.column(2), system.column(0)]
+    np.testing.assert_allclose(added, system.turned[:, columns].sum(0), rtol=1e-12)
+
+
 def scattering(seed, count=60):
     """One loading of particles whose stiffness scatters by 20 %, in more noise than tells it from a word by shape."""
     rng = np.random.default_rng(seed)
