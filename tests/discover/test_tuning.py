@@ -145,6 +145,7 @@ def test_every_particle_is_judged_by_a_formula_found_without_it(found):
             assert system.word(int(column)).form is words.STRAIN_BUMP
 
 
+@pytest.mark.long
 def test_the_same_seed_makes_the_same_formula(disturbed, found):
     again, _ = find_closure(*disturbed, {}, 0)
     assert again.formula == found[0].formula
