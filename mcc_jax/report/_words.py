@@ -134,7 +134,7 @@ def _after(found: dict[str, Any]) -> list[tuple[str, str]]:
             return [(f"Measure: {test}. It would separate {names} with probability {power}.", "")]
         doubt = f"No further test of those tried on paper would surely separate {names}."
         return [(f"{doubt} The best: {test}, would do so with probability {power}.", "")]
-    if found.get("checks"):
+    if found["checks"]:
         first = found["checks"][0]
         return [(f"Check directly. For {plain(first['mechanism'])}: {first['check']}. For the others, see below.", "")]
     if verdict in ("NAMED", "SET", "UNLISTED"):

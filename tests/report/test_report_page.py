@@ -252,6 +252,20 @@ def test_an_experiment_that_may_not_tell_is_not_simply_recommended(folder, power
     assert ("Measure: a hold" in text) == (power > 0.9)
 
 
+def test_what_would_show_each_candidate_by_itself_is_told(folder):
+    keep(folder, "discovery")
+    checks = [
+        {"mechanism": "frame_compliance", "check": "press the bare platen"},
+        {"mechanism": "platen_sink_in", "check": "repeat on diamond"},
+    ]
+    text = Page(report_page(changed(folder, "discovery.json", verdict="SET", next_experiments=[], checks=checks))).text
+    assert "None is proposed" in text
+    assert "Check directly. For frame compliance: press the bare platen." in text
+    assert "platen sink in: repeat on diamond." in text
+    without = Page(report_page(changed(folder, "discovery.json", checks=[]))).text
+    assert "by itself" not in without
+
+
 def test_equal_input_gives_an_equal_page(complete, page):
     from bokeh.models import ColumnDataSource
 
