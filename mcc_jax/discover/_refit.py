@@ -35,17 +35,8 @@ from ..effects import AbstractEffect, ExtendedLaw, Nuisance, Record, Variant
 from ..geometry import Particle
 from ..law import Unloading
 from ._candidates import Candidate
-from ._system import (
-    Base,
-    Signals,
-    System,
-    first_loaded,
-    gram_matrices,
-    in_batches,
-    mean_by_globals,
-    steps_of,
-    turning_of,
-)
+from ._gram import gram_matrices, in_batches
+from ._system import Base, Signals, System, first_loaded, mean_by_globals, steps_of, turning_of
 
 STEPS = 12
 ENOUGH = 0.02

@@ -29,18 +29,9 @@ from ..calibrate.joint._population import moments
 from ..effects import Context, ExtendedLaw
 from ..law import Unloading
 from ._features import Feature, Form, further_words
+from ._gram import common_rows, in_batches, own_rows
 from ._pursuit import MOST_WORDS
-from ._system import (
-    Base,
-    Signals,
-    System,
-    common_rows,
-    feature_values,
-    in_batches,
-    law_of,
-    mean_by_globals,
-    own_rows,
-)
+from ._system import Base, Signals, System, feature_values, law_of, mean_by_globals
 
 MOST_NUMBERS = 3
 """Most numbers that a form has."""

@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..calibrate.joint._compile import compiled
+from ._gram import in_batches, own_rows
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ def _weights(jacobian, mask, filters, factor, zero_sd) -> Float[Array, "particle
     k = factor.shape[-1]
 
     def one(J, used, white, S):
-        rows = jnp.where(used[None], jnp.concatenate([(J[:, :4] @ S).T, J[:, 4][None]]), 0.0)
+        rows = jnp.where(used[None], own_rows(J, S), 0.0)
         whiten = jax.vmap(white)
         X, back = jax.vjp(whiten, rows)
         inner = X @ X.T + jnp.diag(jnp.concatenate([jnp.ones(k), 1 / zero_sd[None] ** 2]))
@@ -70,18 +71,15 @@ def _weights(jacobian, mask, filters, factor, zero_sd) -> Float[Array, "particle
     return jax.vmap(one)(jacobian, mask, filters, factor)
 
 
-def turning(
-    jacobian: Array, turned: Turned, mask, filters, factor, by_globals, zero_sd, batches: Callable[..., Array]
-) -> np.ndarray:
+def turning(jacobian: Array, turned: Turned, mask, filters, factor, by_globals, zero_sd) -> np.ndarray:
     """t of a particle's own columns, residual (0), population's parameters and signals, shape (N, k + 1 + Q).
 
     Args:
         jacobian: of the residuals by latent vector and zero, shape (N, points, 5).
         turned: how it and the signals change.
         mask, filters, factor, by_globals, zero_sd: as for the Gram matrices.
-        batches: runs a function over the particles.
     """
-    weights = np.asarray(batches(partial(_weights, zero_sd=zero_sd), (jacobian, mask, filters, factor)))
+    weights = np.asarray(in_batches(partial(_weights, zero_sd=zero_sd), (jacobian, mask, filters, factor)))
     own = np.einsum("nlp,nlpm->nm", weights, turned.own[..., :4])
     seen = np.einsum("nlp,nlcp->nc", weights.astype(np.float32), turned.signals, optimize=True)
     none = np.zeros((len(own), 1))

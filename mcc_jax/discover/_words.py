@@ -67,11 +67,10 @@ def summary_of(found: Discovery) -> str:
             f"{doubt}{'Next' if sure else 'The best'}: {best['experiment']}, {best['particles']} particles, would "
             f"{done} with probability {best['power']:.2f}."
         )
-    if not found.next_experiments or found.next_experiments[0]["power"] < ENOUGH:
-        first = found.checks[:CHECKED]
-        if first:
-            each = "; ".join(f"{_plain(one['mechanism'])}: {one['check']}" for one in first)
-            sentences.append(f"Each would show by itself ({each}).")
+    surely = found.next_experiments and found.next_experiments[0]["power"] >= ENOUGH
+    if found.checks and not surely:
+        each = "; ".join(f"{_plain(one['mechanism'])}: {one['check']}" for one in found.checks[:CHECKED])
+        sentences.append(f"Each would show by itself ({each}).")
     if found.untestable:
         sentences.append(
             "These data say nothing about "

@@ -195,6 +195,9 @@ def _adhesion(
 _SECTION = "phi = a/a_P, u' = u + s_ad / sigma_P g, d = Delta [s(u) - s(u')]"
 _GENERAL = "phi = a/a_P, u' = u + 4 c^2 eps_P s_ad / sigma_P g, d = Delta [s(u) - s(u')]"
 
+_COHESIVE = "Needleman (1987), J. Appl. Mech. 54, 525; Olsson and Larsson (2013)"
+_MOBILISED = Nuisance("mobilised_share", (0.25, 0.4, 0.6), (0.05, 1.0), "recovered share at which half of it pulls")
+
 ADHESION = Mechanism(
     "adhesion",
     "The particle sticks to the platens: on unloading it recovers less at the same force.",
@@ -210,18 +213,11 @@ ADHESION = Mechanism(
                   "Olsson and Larsson (2013); Gonzalez (2019), J. Mech. Phys. Solids"),
         _adhesion("stretched_tail", TailAdhesion, f"g = phi^1.5 s^4; {_GENERAL}",
                   "Bridges or fibres that pull only once they are stretched, close to release.", "liquid bridges"),
-        *(
-            _adhesion(name, MobilisedAdhesion, f"g = phi^1.5 s^2 / (s^2 + s_0^2); {equation}", explanation,
-                      "Needleman (1987), J. Appl. Mech. 54, 525; Olsson and Larsson (2013)", over_section=over_section,
-                      nuisances=(Nuisance("mobilised_share", (0.25, 0.4, 0.6), (0.05, 1.0),
-                                          "recovered share at which half of it pulls"),))
-            for name, equation, explanation, over_section in (
-                ("mobilised_nominal", _SECTION,
-                 "A cohesive zone that pulls in full once the contact has opened a little, counted over the section.",
-                 True),
-                ("mobilised", _GENERAL, "The same with the stress of the contact itself.", False),
-            )
-        ),
+        _adhesion("mobilised_nominal", MobilisedAdhesion, f"g = phi^1.5 s^2 / (s^2 + s_0^2); {_SECTION}",
+                  "A cohesive zone that pulls in full once the contact has opened a little, counted over the section.",
+                  _COHESIVE, over_section=True, nuisances=(_MOBILISED,)),
+        _adhesion("mobilised", MobilisedAdhesion, f"g = phi^1.5 s^2 / (s^2 + s_0^2); {_GENERAL}",
+                  "The same with the stress of the contact itself.", _COHESIVE, nuisances=(_MOBILISED,)),
         _adhesion("bond_nominal", BondAdhesion, f"g = phi^2 s; {_SECTION}", "As bond, counted over the section.",
                   "Gonzalez (2019)", over_section=True),
     ),

@@ -106,7 +106,7 @@ def _as_found(base: Base, system: System, found: Discovery) -> tuple[System, np.
         return system, inside, jnp.zeros((len(system.points), 0, base.tests.force.shape[1]))
     formulas = [_fixed_at(effect.variant, effect.nuisance) for effect in found.effects]
     library = {str(i): Mechanism(v.mechanism, "", (v,)) for i, v in enumerate(formulas)}
-    signals = signals_of(base, library, turned=system.turned is not None)
+    signals = signals_of(base, library, turned=True)
     if found.closure is not None:
         words = tuple(system.word(int(column)) for column in found.closure.words)
         signals = signals.with_formula(base, words, feature_values(base, words))

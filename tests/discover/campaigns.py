@@ -19,22 +19,29 @@ FULL = Programme.cycles(levels=(0.5, 1.0, 1.0), unload_to=0.3, hold_s=30.0, poin
 SINGLE = Programme.cycles(points=POINTS)
 
 
+def monotone_draws(seed, count):
+    """Draws of the paper's coefficients; some fall for a stretch and jump there: a test of theirs is another matter."""
+    plastic = paper_population().sample(jax.random.key(seed), 4 * count)
+    C = np.stack([np.asarray(plastic.C1), np.asarray(plastic.C3), np.asarray(plastic.C5)])
+    smooth = np.flatnonzero(20 * C[0] * C[2] ** 5 > 1.2 * 9 * C[1] ** 6)[:count]
+    return jax.tree.map(lambda leaf: leaf[smooth], plastic)
+
+
+def peaks_at(stress_MPa, diameters):
+    """Forces at which particles are under a stress [mN]."""
+    D1, D2, D3 = diameters.T
+    return stress_MPa * np.pi / 4 * (D1 * D2 / D3) ** 2 * 1e-3
+
+
 def campaign(*effects, seed=0, programme=FULL, particles=N, peaks_MPa=None, humidity=None, instrument=INSTRUMENT):
     """Particles of the paper's sizes, monotone draws of its coefficients, effects as text."""
     rng = np.random.default_rng([seed, 5])
     diameters = PAPER_DIAMETERS_UM[rng.permutation(20)[:particles]]
-    plastic = paper_population().sample(jax.random.key(seed), 4 * particles)
-    C = np.stack([np.asarray(plastic.C1), np.asarray(plastic.C3), np.asarray(plastic.C5)])
-    # Some draws fall for a stretch and jump there; a test of theirs is another matter.
-    smooth = np.flatnonzero(20 * C[0] * C[2] ** 5 > 1.2 * 9 * C[1] ** 6)[:particles]
-    plastic = jax.tree.map(lambda x: x[smooth], plastic)
-    D1, D2, D3 = diameters.T
     stress = rng.uniform(7, 16, particles) if peaks_MPa is None else np.asarray(peaks_MPa, float)
-    peaks = stress * np.pi / 4 * (D1 * D2 / D3) ** 2 * 1e-3
     return simulate_campaign(
-        law_for_each(plastic, 1.43, 16_000.0),
+        law_for_each(monotone_draws(seed, particles), 1.43, 16_000.0),
         diameters,
-        peaks,
+        peaks_at(stress, diameters),
         programme,
         instrument=instrument,
         effects=tuple(read_effect(e) for e in effects),

@@ -15,10 +15,11 @@ from mcc_jax.calibrate.joint._forward import law_of, raw_residual
 from mcc_jax.calibrate.joint._population import moments
 from mcc_jax.campaign import THRESHOLD_MPA
 from mcc_jax.discover._closure import Closure
+from mcc_jax.discover._gram import BATCH, in_batches
 from mcc_jax.discover._refine import refined, systematic
 from mcc_jax.discover._result import Discovery
 from mcc_jax.discover._score import project
-from mcc_jax.discover._system import BATCH, base_fit, build_system, in_batches, signals_of, tails_of
+from mcc_jax.discover._system import base_fit, build_system, signals_of, tails_of
 from mcc_jax.effects import LIBRARY, ExtendedLaw, Mechanism
 
 MODEL = JointModel(modulus_scatter=True)

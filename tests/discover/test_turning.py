@@ -5,15 +5,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from campaigns import MODEL, SINGLE, campaign
+from campaigns import MODEL, SINGLE, campaign, monotone_draws, peaks_at
 
 from mcc_jax.calibrate.joint._fit import population_at
 from mcc_jax.calibrate.joint._population import moments
 from mcc_jax.campaign import PAPER_DIAMETERS_UM
+from mcc_jax.discover._gram import own_rows
 from mcc_jax.discover._score import project
-from mcc_jax.discover._system import base_fit, build_system, own_rows, signals_of
+from mcc_jax.discover._system import base_fit, build_system, signals_of
 from mcc_jax.effects import LIBRARY, Mechanism
-from mcc_jax.simulate import Instrument, law_for_each, paper_population, simulate_campaign
+from mcc_jax.simulate import Instrument, law_for_each, simulate_campaign
 
 CHOSEN = {"frame_compliance": "linear", "misalignment": "edge", "damage": "exponential", "unloading_shape": "tail_bow"}
 SMALL = {n: Mechanism(n, LIBRARY[n].explanation, (LIBRARY[n][v],)) for n, v in CHOSEN.items()}
@@ -94,17 +95,13 @@ def test_curvature_of_chosen_columns_is_that_of_all_usable_particles(fitted):
 def scattering(seed, count=60):
     """One loading of particles whose stiffness scatters by 20 %, in more noise than tells it from a word by shape."""
     rng = np.random.default_rng(seed)
-    plastic = paper_population().sample(jax.random.key(seed), 4 * count)
-    C = np.stack([np.asarray(plastic.C1), np.asarray(plastic.C3), np.asarray(plastic.C5)])
-    smooth = np.flatnonzero(20 * C[0] * C[2] ** 5 > 1.2 * 9 * C[1] ** 6)[:count]
-    laws = law_for_each(jax.tree.map(lambda leaf: leaf[smooth], plastic), 1.43, 16_000.0)
+    laws = law_for_each(monotone_draws(seed, count), 1.43, 16_000.0)
     moduli = laws.effective_modulus * jnp.exp(0.2 * rng.standard_normal(count))
     diameters = PAPER_DIAMETERS_UM[rng.integers(20, size=count)]
-    peaks = 10.0 * np.pi / 4 * (diameters[:, 0] * diameters[:, 1] / diameters[:, 2]) ** 2 * 1e-3
     return simulate_campaign(
         eqx.tree_at(lambda law: law.effective_modulus, laws, moduli),
         diameters,
-        peaks,
+        peaks_at(10.0, diameters),
         SINGLE,
         instrument=Instrument(displacement_noise_um=0.4, zero_um=0.5),
         seed=seed,
