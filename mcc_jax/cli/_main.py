@@ -86,19 +86,38 @@ def _terminate(number: int, _: Any) -> None:
 
 INSIST_S = 5.0
 
+SOON_S = 0.05
+
+
+def _send(number: int, after_s: float) -> None:
+    """Send the signal once more, unless the process is gone by then."""
+    again = threading.Timer(after_s, _thread.interrupt_main, (number,))
+    again.daemon = True
+    again.start()
+
 
 def _interrupt(*_: Any) -> None:
     """Interrupt, and again unless the process is gone: raised in a library's callback from C, it would be swallowed."""
-    again = threading.Timer(INSIST_S, _thread.interrupt_main)
-    again.daemon = True
-    again.start()
+    _send(signal.SIGINT, INSIST_S)
     raise KeyboardInterrupt
+
+
+def _unraisable(found: Any) -> None:
+    """What a signal's handler raised within a destructor would be lost there: send the signal again, outside of it."""
+    match found.exc_value:
+        case KeyboardInterrupt():
+            _send(signal.SIGINT, SOON_S)
+        case _Terminated(code=int(status)):
+            _send(status - 128, SOON_S)
+        case _:
+            sys.__unraisablehook__(found)
 
 
 def main() -> None:
     """Entry point of `mcc-jax` and `python -m mcc_jax`."""
     if not sys.warnoptions:
         warnings.simplefilter("ignore")
+    sys.unraisablehook = _unraisable
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _interrupt)
     for name in ("SIGTERM", "SIGHUP"):  # so that a run which is told to end clears up behind itself

@@ -124,6 +124,26 @@ def test_who_interrupts_does_not_wait_for_other_threads():
 
 
 @posix
+@pytest.mark.usefixtures("interruptible")
+@pytest.mark.parametrize(
+    ("number", "status", "line"), [(signal.SIGINT, 130, "mcc-jax: interrupted\n"), (signal.SIGTERM, 143, "")]
+)
+def test_a_signal_within_a_destructor_is_not_lost(number, status, line):
+    code = (
+        "import os, time; from mcc_jax.cli import _main\n"
+        "class Shy:\n"
+        f"    def __del__(self): os.kill(os.getpid(), {number:d}); time.sleep(1)\n"
+        "@_main.cli.command()\n"
+        "def halt():\n"
+        "    Shy()\n"
+        "    for _ in range(40): time.sleep(0.1)\n"
+        "_main.main()"
+    )
+    result = subprocess.run([sys.executable, "-c", code, "halt"], capture_output=True, text=True, timeout=30)
+    assert (result.returncode, result.stdout, result.stderr) == (status, "", line)
+
+
+@posix
 def test_two_at_once_and_the_lock_of_a_dead_one(tmp_path):
     holder = (
         "import sys, time; from pathlib import Path; from mcc_jax.cli._output import results\n"
