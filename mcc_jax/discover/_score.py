@@ -171,13 +171,28 @@ class Summed:
     Attributes:
         drop: of chi2 by each column alone; zero where the rest can make it.
         residual: chi2 of all particles.
+        of_both: drop by both columns of a pair, zero where either can be made by the rest or by the other.
     """
 
     drop: np.ndarray
     residual: float
+    of_both: np.ndarray
 
 
-def project_summed(total: np.ndarray, system: System, columns: np.ndarray, inside: np.ndarray, least: float) -> Summed:
+NO_PAIRS = np.zeros((0, 2), int)
+
+LEAST_APART = 1e-3
+"""Least 1 - rho^2 of two columns that are judged together."""
+
+
+def project_summed(
+    total: np.ndarray,
+    system: System,
+    columns: np.ndarray,
+    inside: np.ndarray,
+    least: float,
+    pairs: np.ndarray = NO_PAIRS,
+) -> Summed:
     """The same as `project`, from the sum of the particles' Gram matrices (`System.total`).
 
     Args:
@@ -186,6 +201,7 @@ def project_summed(total: np.ndarray, system: System, columns: np.ndarray, insid
         columns: the columns looked at.
         inside: columns of effects that are in the law already.
         least: share of a column's information that must survive.
+        pairs: which of the columns are judged two by two, too, as positions, shape (P, 2).
     """
     nuisance = np.concatenate([system.globals, inside]).astype(int)
     inner, at = total[np.ix_(nuisance, nuisance)], total[np.ix_(nuisance, columns)]
@@ -193,9 +209,25 @@ def project_summed(total: np.ndarray, system: System, columns: np.ndarray, insid
     scores = -(total[columns, 0] + at.T @ theta + (total[nuisance, 0] + inner @ theta) @ shift)
     raw = np.maximum(np.diagonal(total)[columns], 1e-300)
     information = raw + ((2 * at + inner @ shift) * shift).sum(0)
-    drop = np.where(information > least * raw, scores**2 / np.maximum(information, 1e-300), 0.0)
+    survives = information > least * raw
+    drop = np.where(survives, scores**2 / np.maximum(information, 1e-300), 0.0)
     residual = total[0, 0] + 2 * total[nuisance, 0] @ theta + theta @ inner @ theta
-    return Summed(drop, float(residual))
+    i, j = pairs.T
+    among = total[columns[i], columns[j]] + (at[:, i] * shift[:, j] + shift[:, i] * (at + inner @ shift)[:, j]).sum(0)
+    scale, there = np.sqrt(np.where(survives, information, 1.0)), survives[i] & survives[j]
+    of_both = _of_both(scores / scale, pairs, np.where(there, among / scale[i] / scale[j], 1.0)) ** 2
+    return Summed(drop, float(residual), of_both)
+
+
+def _of_both(t: np.ndarray, pairs: np.ndarray, rho: np.ndarray) -> np.ndarray:
+    r"""The statistic of two columns together, zero where they are hardly two.
+
+    .. math:: t_{ij} = \sqrt{\frac{t_i^2 - 2 \rho_{ij} t_i t_j + t_j^2}{1 - \rho_{ij}^2}}
+    """
+    apart = 1 - rho**2
+    one, other = t[..., pairs[:, 0]], t[..., pairs[:, 1]]
+    squared = (one**2 - 2 * rho * one * other + other**2) / np.maximum(apart, LEAST_APART)
+    return np.where(apart > LEAST_APART, np.sqrt(np.maximum(squared, 0.0)), 0.0)
 
 
 DRAWS = 4000
@@ -238,6 +270,7 @@ def smallest_of_families(
     seed: int,
     families: Sequence[np.ndarray],
     *,
+    pairs: np.ndarray = NO_PAIRS,
     few: bool = False,
     draws: int = DRAWS,
 ) -> float:
@@ -249,8 +282,9 @@ def smallest_of_families(
     Args:
         projection, sign, seed, few, draws: as in `family_wise`.
         families: which columns each has, shape (K,), not all of them empty.
+        pairs: columns that are judged two by two, as positions, shape (P, 2): for each the statistic is that of both.
     """
-    observed, drawn = _statistics(projection, sign, seed, few, draws)
+    observed, drawn = _statistics(projection, sign, seed, few, draws, pairs)
     found, other = 1.0, np.ones(draws)
     for members in families:
         if members.any():
@@ -268,7 +302,7 @@ def _exceeding(observed: np.ndarray, largest: np.ndarray) -> np.ndarray:
 
 
 def _statistics(
-    projection: Projection, sign: np.ndarray, seed: int, few: bool, draws: int
+    projection: Projection, sign: np.ndarray, seed: int, few: bool, draws: int, pairs: np.ndarray = NO_PAIRS
 ) -> tuple[np.ndarray, np.ndarray]:
     """Every column's statistic, and draws of it if nothing is missing, shape (draws, K)."""
     scores, each = projection.scores, np.einsum("nkk->nk", projection.information)
@@ -278,7 +312,7 @@ def _statistics(
     if few:
         own = np.zeros_like(own)
     width = np.sqrt((freedom * prior + own * scatter) / (freedom + own))
-    observed = _sided(scores.sum(0) / np.sqrt(total) / width, sign)
+    observed = scores.sum(0) / np.sqrt(total) / width
     rng = np.random.default_rng([seed, 41])
     values, vectors = projection.spectrum
     kept = values > 1e-8 * values[-1]
@@ -287,7 +321,16 @@ def _statistics(
     # Wilson and Hilferty's cube for chi2 over its degrees of freedom.
     ninth = 2 / (9 * (freedom + own))
     chi = np.maximum(1 - ninth + rng.standard_normal((draws, 1)) * np.sqrt(ninth), 0.1) ** 1.5
-    return observed, _sided(drawn / chi, sign)
+    drawn /= chi
+    rho = projection.similarity()[pairs[:, 0], pairs[:, 1]]
+    fine = 1 - rho**2 > LEAST_APART
+    pairs, rho = pairs[fine], rho[fine]
+    found = []
+    for t in (observed, drawn):
+        one, both = _sided(t, sign), _of_both(t, pairs, rho)
+        one[..., pairs[:, 0]], one[..., pairs[:, 1]] = both, both
+        found.append(one)
+    return found[0], found[1]
 
 
 MOST_FREEDOM = 100.0

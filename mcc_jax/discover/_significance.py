@@ -33,12 +33,24 @@ def p_nothing_left(system: System, seed: int, chosen: list[int]) -> float:
     found = 1.0
     for share, members in ((1 - SHARE_OF_WAVES, keep & ~wave), (SHARE_OF_WAVES, keep & wave)):
         if members.any():
-            families = [common[members], ~common[members]]
             p = smallest_of_families(
-                view.only(members), sign[members], seed, families, few=few, draws=round(DRAWS / share)
+                view.only(members),
+                sign[members],
+                seed,
+                [common[members], ~common[members]],
+                pairs=_places(system.quadratures, columns[members]),
+                few=few,
+                draws=round(DRAWS / share),
             )
             found = min(found, p / share)
     return found
+
+
+def _places(pairs: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Where pairs of columns are among some columns; without those that are not there both."""
+    there = np.isin(pairs, columns).all(1)
+    order = np.argsort(columns)
+    return order[np.searchsorted(columns, pairs[there], sorter=order)]
 
 
 def _common(system: System) -> np.ndarray:

@@ -154,6 +154,15 @@ class System:
         waves = [i for i, word in enumerate(several) if word.form in (ROOM, GAUGE)]
         return self._features_from + len(self.places) + np.array(waves, int)
 
+    @property
+    def quadratures(self) -> np.ndarray:
+        """Columns of sine and cosine of the same wave in time or displacement, shape (W, 2): its phase may be any."""
+        found: dict[tuple, list[int]] = {}
+        for column in np.intersect1d(self.waves, self.word_columns).tolist():
+            word = self.word(column)
+            found.setdefault((word.form, word.numbers[0]), []).append(column)
+        return np.array([both for both in found.values() if len(both) == 2], int).reshape(-1, 2)
+
     def looked_at(self) -> tuple[np.ndarray, np.ndarray]:
         """Columns of candidates, map and words, and the sign that each one's coefficient must have."""
         columns = np.concatenate([self.candidate_columns, self.place_columns, self.word_columns])

@@ -7,8 +7,9 @@ import pytest
 from linear_systems import FORMULAS, Dense, planted, random_campaign, system_of
 
 from mcc_jax.discover._candidates import candidates_of, located
+from mcc_jax.discover._features import waves, words
 from mcc_jax.discover._naming import name_missing
-from mcc_jax.discover._pursuit import pursue
+from mcc_jax.discover._pursuit import WORTH, WORTH_OF_WAVE, pursue
 from mcc_jax.discover._refine import systematic, unbounded
 from mcc_jax.discover._score import project
 from mcc_jax.discover._search import pairs, random_probability, rank
@@ -131,6 +132,25 @@ def test_a_gap_with_which_no_name_has_anything_to_do_is_no_set_of_names():
     assert gain < 50
 
 
+def test_a_weak_wave_of_any_phase_is_found_by_sine_and_cosine():
+    """Neither is worth a word alone; the phase of an air conditioning is nobody's choice."""
+    system, dense = random_campaign(12, particles=20, points=60, own=4, words_used=12)
+    some = (*words()[:8], *waves()[:4])
+    system = system_of(dense, system.candidates, system.places, some)
+    both = system.quadratures[0]
+    by_chance = project(system, both)
+    size = np.linalg.solve(by_chance.similarity(), 3.4 - by_chance.gaussian)  # so that each has 3.4 standard errors
+    X = dense.columns.copy()
+    X[:, :, 0] -= X[:, :, both] @ (size / np.sqrt(by_chance.total))
+    system = system_of(Dense(dense.own, X, dense.prior), system.candidates, system.places, some)
+    assert project(system, system.word_columns).gaussian.max() ** 2 < WORTH
+    columns, gain = pursue(system)
+    assert columns == both.tolist()
+    assert gain > WORTH_OF_WAVE
+    assert p_nothing_left(system, 0, []) < 0.01
+    assert pursue(system, most=1) == ([], 0.0)
+
+
 TWO = ("frame_compliance", "adhesion")
 
 
@@ -160,7 +180,7 @@ def test_two_names_do_not_stand_where_one_word_explains_as_much():
     system = system_of(Dense(dense.own, X, dense.prior), system.candidates, system.places, system.words)
     best = pairs(system, project(system, system.candidate_columns))[0]
     assert {names[best.stronger], names[best.weaker]} == set(TWO)
-    words, gain = pursue(system)
-    assert words[0] == word
+    found, gain = pursue(system)
+    assert found[0] == word
     assert best.gain > gain - 5.0
     assert _asked(system)[:3] == ("UNLISTED", [], [])

@@ -1,5 +1,6 @@
 """Words of formulas: their values, waves all at once, and artefacts of room and gauge that no mechanism explains."""
 
+import dataclasses
 import json
 import re
 
@@ -90,6 +91,10 @@ def test_columns_of_waves_are_theirs():
     system = System(np.zeros((1, 1, 1)), none, (), map_features()[:2], some, none, none, none, none)
     start = 1 + len(GLOBALS) + 2
     np.testing.assert_array_equal(system.waves, [start + 3, start + 4])
+    np.testing.assert_array_equal(system.quadratures, [[start + 3, start + 4]])
+    # Half of a wave is none, nor is one in a formula, of which the phase is fitted.
+    half = dataclasses.replace(system, words=(*some, waves()[2]), formula=(waves()[3],))
+    np.testing.assert_array_equal(half.quadratures, system.quadratures)
 
 
 def disturbed(added):
