@@ -34,7 +34,7 @@ from mcc_jax.plots._elastic import collapsed_branches
 from mcc_jax.plots._law import law_strain, stretches_outside
 
 KINDS = ("paper", "cycles", "two", "dropped", "many")
-QUICK = [pytest.param(kind, marks=pytest.mark.long if kind in ("two", "many") else ()) for kind in KINDS]
+QUICK = [pytest.param(kind, marks=pytest.mark.long if kind in ("two", "many", "dropped") else ()) for kind in KINDS]
 UNIT = re.compile(r"\[(MPa|GPa|mN|µm|-)\]$")
 
 

@@ -117,6 +117,7 @@ def test_the_numbers_are_those_of_one_by_one(queued, campaigns, i):
     assert many.warnings() == one.warnings()
 
 
+@pytest.mark.long
 def test_least_squares_with_two_workers(campaigns):
     """Two campaigns of one size, and between them one nothing can be made of."""
     three, told = [campaigns[i] for i in (0, 2, 3)], []
