@@ -12,7 +12,7 @@ trusted, and counts all candidates: the probability is that of the largest stati
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import cast
@@ -259,40 +259,59 @@ def family_wise(
         few: take the noise model's word, because there are too few particles to scatter.
         draws: how many; no probability below one over them can be told.
     """
-    observed, drawn = _statistics(projection, sign, seed, few, draws)
-    largest = np.sort(drawn.max(1))
+    t, drawn = _estimates(projection, seed, few, draws)
+    observed, largest = _sided(t, sign), np.sort(_sided(drawn, sign).max(1))
     return _exceeding(observed, largest), observed
+
+
+Statistic = Callable[[np.ndarray], np.ndarray]
+"""Of estimates over standard errors, shape (..., K): one number, shape (...), the larger the less by chance."""
 
 
 def smallest_of_families(
     projection: Projection,
     sign: np.ndarray,
     seed: int,
-    families: Sequence[np.ndarray],
+    families: Sequence[np.ndarray | Statistic],
     *,
     pairs: np.ndarray = NO_PAIRS,
     few: bool = False,
     draws: int = DRAWS,
 ) -> float:
-    """Probability that the most improbable largest statistic of several families of columns is so improbable.
+    """Probability that the most improbable statistic of several families of columns is so improbable.
 
     Every family counts as much as any other, however many columns it has: in a small one a column needs less to be
     significant. The families' correlations are those of the columns.
 
     Args:
         projection, sign, seed, few, draws: as in `family_wise`.
-        families: which columns each has, shape (K,), not all of them empty.
+        families: which columns each has, shape (K,), not all of them empty: their largest statistic counts; or another
+            statistic of all columns.
         pairs: columns that are judged two by two, as positions, shape (P, 2): for each the statistic is that of both.
     """
-    observed, drawn = _statistics(projection, sign, seed, few, draws, pairs)
+    t, null = _estimates(projection, seed, few, draws)
+    rho = projection.similarity()[pairs[:, 0], pairs[:, 1]]
+    fine = 1 - rho**2 > LEAST_APART
+    one, drawn = (_by_pairs(x, _sided(x, sign), pairs[fine], rho[fine]) for x in (t, null))
     found, other = 1.0, np.ones(draws)
-    for members in families:
-        if members.any():
-            largest = drawn[:, members].max(1)
-            in_order = np.sort(largest)
-            found = min(found, float(_exceeding(observed[members], in_order).min()))
-            other = np.minimum(other, (draws - np.searchsorted(in_order, largest)) / draws)
+    for family in families:
+        if not callable(family):
+            if not family.any():
+                continue
+            observed, chance = one[family].max(), drawn[:, family].max(1)
+        else:
+            observed, chance = family(t), family(null)
+        in_order = np.sort(chance)
+        found = min(found, float(_exceeding(np.atleast_1d(observed), in_order)[0]))
+        other = np.minimum(other, (draws - np.searchsorted(in_order, chance)) / draws)
     return float((np.sum(other <= found) + 1) / (draws + 1))
+
+
+def _by_pairs(t: np.ndarray, one: np.ndarray, pairs: np.ndarray, rho: np.ndarray) -> np.ndarray:
+    """Statistics of columns, those of a pair replaced by that of both."""
+    both = _of_both(t, pairs, rho)
+    one[..., pairs[:, 0]], one[..., pairs[:, 1]] = both, both
+    return one
 
 
 def _exceeding(observed: np.ndarray, largest: np.ndarray) -> np.ndarray:
@@ -301,10 +320,8 @@ def _exceeding(observed: np.ndarray, largest: np.ndarray) -> np.ndarray:
     return (draws - np.searchsorted(largest, observed - 1e-12) + 1) / (draws + 1)
 
 
-def _statistics(
-    projection: Projection, sign: np.ndarray, seed: int, few: bool, draws: int, pairs: np.ndarray = NO_PAIRS
-) -> tuple[np.ndarray, np.ndarray]:
-    """Every column's statistic, and draws of it if nothing is missing, shape (draws, K)."""
+def _estimates(projection: Projection, seed: int, few: bool, draws: int) -> tuple[np.ndarray, np.ndarray]:
+    """Every column's estimate over its standard error, and draws of it if nothing is missing, shape (draws, K)."""
     scores, each = projection.scores, np.einsum("nkk->nk", projection.information)
     total = np.maximum(projection.total, 1e-300)
     prior, freedom = (1.0, MOST_FREEDOM) if few else common_scatter(projection)
@@ -312,7 +329,6 @@ def _statistics(
     if few:
         own = np.zeros_like(own)
     width = np.sqrt((freedom * prior + own * scatter) / (freedom + own))
-    observed = scores.sum(0) / np.sqrt(total) / width
     rng = np.random.default_rng([seed, 41])
     values, vectors = projection.spectrum
     kept = values > 1e-8 * values[-1]
@@ -321,16 +337,7 @@ def _statistics(
     # Wilson and Hilferty's cube for chi2 over its degrees of freedom.
     ninth = 2 / (9 * (freedom + own))
     chi = np.maximum(1 - ninth + rng.standard_normal((draws, 1)) * np.sqrt(ninth), 0.1) ** 1.5
-    drawn /= chi
-    rho = projection.similarity()[pairs[:, 0], pairs[:, 1]]
-    fine = 1 - rho**2 > LEAST_APART
-    pairs, rho = pairs[fine], rho[fine]
-    found = []
-    for t in (observed, drawn):
-        one, both = _sided(t, sign), _of_both(t, pairs, rho)
-        one[..., pairs[:, 0]], one[..., pairs[:, 1]] = both, both
-        found.append(one)
-    return found[0], found[1]
+    return scores.sum(0) / np.sqrt(total) / width, drawn / chi
 
 
 MOST_FREEDOM = 100.0

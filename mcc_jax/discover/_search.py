@@ -21,7 +21,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from ._candidates import located
-from ._score import Projection
+from ._score import Projection, Statistic
 from ._steps import (
     ODD,
     ODD_STEP,
@@ -98,6 +98,22 @@ def weights(system: System, formulas: np.ndarray) -> np.ndarray:
     names = [(c.mechanism, c.variant.name) for c in system.candidates]
     count = Counter(names)
     return formulas / np.array([count[name] for name in names])
+
+
+def evidence_of_any(system: System, projection: Projection) -> Statistic:
+    """Log evidence that one of the mechanisms is there, each as probable beforehand as any other: of estimates over
+    standard errors of the projection's columns, among them formulas."""
+    at = np.flatnonzero(np.isin(projection.columns, system.candidate_columns))
+    k = projection.columns[at] - system.candidate_columns[0]
+    information, sign = projection.total[at], system.signs[k]
+    weight = weights(system, formula_weights(system))[k]
+
+    def statistic(t: np.ndarray) -> np.ndarray:
+        scores = np.atleast_2d(t)[:, at] * np.sqrt(information)
+        parts = (log_evidence(some, information, sign) for some in np.array_split(scores, max(t.size // 10**6, 1)))
+        return np.concatenate([logsumexp(part, b=weight, axis=-1) for part in parts]).reshape(t.shape[:-1])
+
+    return statistic
 
 
 def random_groups(system: System) -> list[np.ndarray]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ._score import DRAWS, project, smallest_of_families
+from ._search import evidence_of_any
 from ._system import System
 
 FREEDOM = 0.3
@@ -20,7 +21,9 @@ FEWEST = 4
 def p_nothing_left(system: System, seed: int, chosen: list[int]) -> float:
     """Family-wise probability that nothing is left beside some candidates, over candidates, map and words.
 
-    The candidates are fitted; the other formulas of their families are let in within `FREEDOM`.
+    The candidates are fitted; the other formulas of their families are let in within `FREEDOM`. Beside nothing it is
+    the evidence of all mechanisms together that counts, which finds more than the largest of their statistics: formulas
+    are alike and add up, and what could be seen at impossible sizes only does not count.
     """
     inside, precision = _family(system, chosen)
     columns, sign = system.looked_at()
@@ -33,11 +36,14 @@ def p_nothing_left(system: System, seed: int, chosen: list[int]) -> float:
     found = 1.0
     for share, members in ((1 - SHARE_OF_WAVES, keep & ~wave), (SHARE_OF_WAVES, keep & wave)):
         if members.any():
+            own = view.only(members)
+            first = common[members]
+            any_mechanism = not chosen and bool(first.any())
             p = smallest_of_families(
-                view.only(members),
+                own,
                 sign[members],
                 seed,
-                [common[members], ~common[members]],
+                [evidence_of_any(system, own) if any_mechanism else first, ~first],
                 pairs=_places(system.quadratures, columns[members]),
                 few=few,
                 draws=round(DRAWS / share),

@@ -11,8 +11,8 @@ from mcc_jax.discover._features import waves, words
 from mcc_jax.discover._naming import name_missing
 from mcc_jax.discover._pursuit import WORTH, WORTH_OF_WAVE, pursue
 from mcc_jax.discover._refine import systematic, unbounded
-from mcc_jax.discover._score import project
-from mcc_jax.discover._search import pairs, random_probability, rank
+from mcc_jax.discover._score import project, smallest_of_families
+from mcc_jax.discover._search import evidence_of_any, log_evidence, pairs, random_probability, rank
 from mcc_jax.discover._significance import p_nothing_left
 from mcc_jax.effects import LIBRARY
 
@@ -130,6 +130,39 @@ def test_a_gap_with_which_no_name_has_anything_to_do_is_no_set_of_names():
     columns, gain = pursue(system)
     assert word in columns
     assert gain < 50
+
+
+def test_evidence_of_any_mechanism_is_the_mean_over_mechanisms_and_formulas():
+    system, _ = random_campaign(8, formulas=(*FORMULAS, ("creep", "viscous_flow")))
+    view = project(system, np.concatenate([system.place_columns, system.candidate_columns]))
+    t = np.random.default_rng(4).normal(size=(5, len(view.columns))) * 2
+    found = evidence_of_any(system, view)(t)
+    information, count = view.total[len(system.places) :], len(FORMULAS) + 1
+    each = np.exp(log_evidence(t[:, len(system.places) :] * np.sqrt(information), information, system.signs))
+    creep = [i for i, c in enumerate(system.candidates) if c.mechanism == "creep"]
+    alone = np.setdiff1d(np.arange(count), creep)
+    np.testing.assert_allclose(np.exp(found), each[:, alone].sum(1) + each[:, creep].mean(1), rtol=1e-10)
+    assert evidence_of_any(system, view)(t[0]) == pytest.approx(found[0])
+
+
+def test_a_gap_that_many_formulas_explain_is_found_where_none_is_significant():
+    """The evidence of mechanisms counts together: six formulas nearly alike say more than the best of them."""
+    found, largest = [], []
+    for seed in range(20):
+        system, dense = random_campaign(300 + seed, particles=12)
+        X, first = dense.columns.copy(), system.column(0)
+        for k in range(1, 6):
+            X[:, :, system.column(k)] = X[:, :, first] * system.signs[k] + 0.3 * X[:, :, system.column(k)]
+        once = system_of(Dense(dense.own, X, dense.prior), system.candidates, system.places, system.words)
+        X[:, :, 0] -= X[:, :, first] * system.signs[0] * 3.0 / np.sqrt(project(once, np.array([first])).total)
+        system = system_of(Dense(dense.own, X, dense.prior), system.candidates, system.places, system.words)
+        view = project(system, system.candidate_columns)
+        families = [[evidence_of_any(system, view)], [np.ones(len(view.columns), bool)]]
+        p = [smallest_of_families(view, system.signs, seed, family) for family in families]
+        found.append(p[0])
+        largest.append(p[1])
+    assert np.median(found) < np.median(largest)
+    assert np.median(found) < 0.05
 
 
 def test_a_weak_wave_of_any_phase_is_found_by_sine_and_cosine():
