@@ -111,7 +111,7 @@ def evidence_of_any(system: System, projection: Projection) -> Statistic:
     def statistic(t: np.ndarray) -> np.ndarray:
         scores = np.atleast_2d(t)[:, at] * np.sqrt(information)
         parts = (log_evidence(some, information, sign) for some in np.array_split(scores, max(t.size // 10**6, 1)))
-        return np.concatenate([logsumexp(part, b=weight, axis=-1) for part in parts]).reshape(t.shape[:-1])
+        return np.concatenate([np.asarray(logsumexp(part, b=weight, axis=-1)) for part in parts]).reshape(t.shape[:-1])
 
     return statistic
 
