@@ -210,6 +210,21 @@ class Humidity(AbstractStrength):
         return jnp.exp(-self.amplitude * (record.relative_humidity - REFERENCE_HUMIDITY_PERCENT))
 
 
+class TwoRateHumidity(Humidity):
+    """Water softens yield and elasticity, each at a rate of its own."""
+
+    modulus_share: Scalar = eqx.field(converter=scalar, kw_only=True)
+
+    def modify(self, law: MccLaw, particle: Particle, record: Record) -> MccLaw:
+        """C1 exp(-k (RH - 45 %)) and E exp(-r k (RH - 45 %))."""
+        wetter = record.relative_humidity - REFERENCE_HUMIDITY_PERCENT
+        first, modulus = (
+            at_least(jnp.exp(-rate * wetter), LEAST_FACTOR)
+            for rate in (self.amplitude, self.modulus_share * self.amplitude)
+        )
+        return scaled(law, first, jnp.ones_like(first), modulus)
+
+
 class LinearHumidity(AbstractStrength):
     """Water softens in proportion."""
 
@@ -239,6 +254,9 @@ HUMIDITY = Mechanism(
     "humidity",
     "Water in the particle softens it: in humid air it deforms under less stress.",
     (
+        _humidity("C1_and_modulus", TwoRateHumidity, "C1 exp(-k (RH - 45)) and E exp(-r k (RH - 45))",
+                  "The yield term softens, and the modulus with it.",
+                  nuisances=(Nuisance("modulus_share", (0.5, 1.0), (0.0, 3.0), "rate of E over that of C1"),)),
         _humidity("C1", Humidity, "C1 exp(-k (RH - 45))", "The yield term softens."),
         _humidity("flow", Humidity, "sigma(eps) exp(-k (RH - 45))", "The whole loading curve softens.",
                   fixed={"terms": _ALL}),

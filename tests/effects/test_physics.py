@@ -265,6 +265,18 @@ def test_dry_air_hardens_and_an_unknown_humidity_does_nothing():
     assert clean_record(FORCE, TIME).relative_humidity == 45
 
 
+def test_water_softens_yield_and_modulus_at_two_rates():
+    both = LIBRARY["humidity"]["C1_and_modulus"].build(0.01, modulus_share=0.5)
+    wet = eqx.tree_at(lambda r: r.relative_humidity, RECORD, jnp.asarray(65.0))
+    law = both.modify(LAW, PARTICLE, wet)
+    np.testing.assert_allclose(law.plastic.C1, LAW.plastic.C1 * np.exp(-0.2), rtol=1e-12)
+    np.testing.assert_allclose(law.effective_modulus, LAW.effective_modulus * np.exp(-0.1), rtol=1e-12)
+    np.testing.assert_array_equal((law.plastic.C3, law.plastic.C5), (LAW.plastic.C3, LAW.plastic.C5))
+    alone = LIBRARY["humidity"]["C1"].build(0.01).modify(LAW, PARTICLE, wet)
+    none = LIBRARY["humidity"]["C1_and_modulus"].build(0.01, modulus_share=0.0).modify(LAW, PARTICLE, wet)
+    assert eqx.tree_equal(none, alone, rtol=1e-12)
+
+
 def test_a_stiff_platen_does_not_give_way():
     """The sink-in of a flat punch: F / (2 a E*), with the contact radius of the law."""
     variant = LIBRARY["platen_sink_in"]["flat"]
