@@ -217,12 +217,8 @@ class TwoRateHumidity(Humidity):
 
     def modify(self, law: MccLaw, particle: Particle, record: Record) -> MccLaw:
         """C1 exp(-k (RH - 45 %)) and E exp(-r k (RH - 45 %))."""
-        wetter = record.relative_humidity - REFERENCE_HUMIDITY_PERCENT
-        first, modulus = (
-            at_least(jnp.exp(-rate * wetter), LEAST_FACTOR)
-            for rate in (self.amplitude, self.modulus_share * self.amplitude)
-        )
-        return scaled(law, first, jnp.ones_like(first), modulus)
+        first = at_least(self.factor(particle, record), LEAST_FACTOR)
+        return scaled(law, first, jnp.ones_like(first), first**self.modulus_share)
 
 
 class LinearHumidity(AbstractStrength):
