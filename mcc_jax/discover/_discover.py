@@ -31,8 +31,8 @@ from ._system import Base, Signals, System, base_fit, build_system, signals_of
 from ._where import where
 from ._words import summary_of
 
-LEVEL = 0.04
-LEVEL_AT_RANDOM = 0.01
+LEVEL = 0.045
+LEVEL_AT_RANDOM = 0.005
 """Family-wise levels of the two tests for a gap: common to all particles, or different from test to test. Together
 5 %."""
 

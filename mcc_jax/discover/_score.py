@@ -274,27 +274,29 @@ def smallest_of_families(
     seed: int,
     families: Sequence[np.ndarray | Statistic],
     *,
+    shares: Sequence[float] | None = None,
     pairs: np.ndarray = NO_PAIRS,
     few: bool = False,
     draws: int = DRAWS,
 ) -> float:
     """Probability that the most improbable statistic of several families of columns is so improbable.
 
-    Every family counts as much as any other, however many columns it has: in a small one a column needs less to be
-    significant. The families' correlations are those of the columns.
+    A family counts for its share, however many columns it has: in a small one a column needs less to be significant.
+    What is compared is every family's own p over its share; the families' correlations are those of the columns.
 
     Args:
         projection, sign, seed, few, draws: as in `family_wise`.
         families: which columns each has, shape (K,), not all of them empty: their largest statistic counts; or another
             statistic of all columns.
+        shares: how much each family counts; all the same if None.
         pairs: columns that are judged two by two, as positions, shape (P, 2): for each the statistic is that of both.
     """
     t, null = _estimates(projection, seed, few, draws)
     rho = projection.similarity()[pairs[:, 0], pairs[:, 1]]
     fine = 1 - rho**2 > LEAST_APART
     one, drawn = (_by_pairs(x, _sided(x, sign), pairs[fine], rho[fine]) for x in (t, null))
-    found, other = 1.0, np.ones(draws)
-    for family in families:
+    found, other = np.inf, np.full(draws, np.inf)
+    for family, share in zip(families, shares or [1.0] * len(families), strict=True):
         if not callable(family):
             if not family.any():
                 continue
@@ -302,8 +304,8 @@ def smallest_of_families(
         else:
             observed, chance = family(t), family(null)
         in_order = np.sort(chance)
-        found = min(found, float(_exceeding(np.atleast_1d(observed), in_order)[0]))
-        other = np.minimum(other, (draws - np.searchsorted(in_order, chance)) / draws)
+        found = min(found, float(_exceeding(np.atleast_1d(observed), in_order)[0]) / share)
+        other = np.minimum(other, (draws - np.searchsorted(in_order, chance)) / draws / share)
     return float((np.sum(other <= found) + 1) / (draws + 1))
 
 

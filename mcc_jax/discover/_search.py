@@ -174,7 +174,7 @@ def _scores_of_steps(
     return scores, _tamed(system, scores, steps.information[particles], np.ones(scores.shape[1:], bool))
 
 
-def random_probability(system: System, projection: Projection, seed: int, *, draws: int = 400) -> float:
+def random_probability(system: System, projection: Projection, seed: int, *, draws: int = 800) -> float:
     """Probability under the noise model that effects which differ from test to test seem as evident as they do."""
     groups = random_groups(system)
     if not groups:
@@ -197,7 +197,7 @@ def random_probability(system: System, projection: Projection, seed: int, *, dra
         scores = _tamed(system, projection.scores[:, index] / inflation[:, None], each, placed)
         observed = max(observed, float(log_evidence_at_random(scores, each, sign, local, placed).max()))
         factor = root_of(information)
-        for some in np.array_split(np.arange(draws), 4):
+        for some in np.array_split(np.arange(draws), 8):
             normal = rng.standard_normal((len(some), *each.shape))
             scores = np.einsum("nkl,bnl->bnk", factor, normal)
             own = log_evidence_at_random(scores, each, sign, local, placed).max(-1)

@@ -11,8 +11,15 @@ from ._system import System
 FREEDOM = 0.3
 """How far nature's formula may differ from the best one of its family: by so much of it in every other one."""
 
-SHARE_OF_WAVES = 0.125
-"""Share of the level that waves in time and displacement have: they are many, and come from room and gauge only."""
+BESIDE_NOTHING = (0.8, 0.15, 0.05)
+"""How much counts what all mechanisms together explain, what the formulas that are not common, map and words do, and
+what waves in time and displacement do, which are many and come from room and gauge only.
+
+An effect is far more often a known one. Whatever the shares, the level is kept."""
+
+BESIDE_NAMES = (0.4375, 0.4375, 0.125)
+"""The same where names are in the law already: the common formulas of all mechanisms come first there, and another
+formula, or a place, is as likely to be what they leave."""
 
 FEWEST = 4
 """Below so many particles their scatter says nothing; the noise model has to do."""
@@ -31,25 +38,20 @@ def p_nothing_left(system: System, seed: int, chosen: list[int]) -> float:
     keep = view.survival > 1e-2 if len(inside) else view.alive
     if not keep.any():
         return 1.0
-    few = len(view.particles) < FEWEST
+    own, sign, columns = view.only(keep), sign[keep], columns[keep]
     wave, common = np.isin(columns, system.waves), np.isin(columns, _common(system))
-    found = 1.0
-    for share, members in ((1 - SHARE_OF_WAVES, keep & ~wave), (SHARE_OF_WAVES, keep & wave)):
-        if members.any():
-            own = view.only(members)
-            first = common[members]
-            any_mechanism = not chosen and bool(first.any())
-            p = smallest_of_families(
-                own,
-                sign[members],
-                seed,
-                [evidence_of_any(system, own) if any_mechanism else first, ~first],
-                pairs=_places(system.quadratures, columns[members]),
-                few=few,
-                draws=round(DRAWS / share),
-            )
-            found = min(found, p / share)
-    return found
+    any_mechanism = not chosen and bool(common.any())
+    return smallest_of_families(
+        own,
+        sign,
+        seed,
+        [evidence_of_any(system, own) if any_mechanism else common, ~common & ~wave, wave],
+        shares=BESIDE_NAMES if chosen else BESIDE_NOTHING,
+        pairs=_places(system.quadratures, columns),
+        few=len(view.particles) < FEWEST,
+        # The smallest share must be able to reach the least level that is asked for (`LEVEL_OF_UNLISTED`).
+        draws=3 * DRAWS,
+    )
 
 
 def _places(pairs: np.ndarray, columns: np.ndarray) -> np.ndarray:

@@ -112,6 +112,20 @@ def test_families_together_are_uniform_where_nothing_is_missing():
     assert kstest(p, "uniform").pvalue > 1e-3
 
 
+def test_families_of_unlike_shares_are_uniform_and_the_larger_share_needs_less():
+    """300 campaigns with nothing missing (99.9 % band), and forty in which the first column is 3 standard errors."""
+    rng = np.random.default_rng(19)
+    views = [simulated(rng) for _ in range(300)]
+    p = [smallest_of_families(v, SIDES, i, [SMALL, ~SMALL], shares=(0.9, 0.1)) for i, v in enumerate(views)]
+    assert kstest(p, "uniform").pvalue > 1e-3
+    views = [simulated(rng, effect=3.0) for _ in range(40)]
+    much, alike, little = (
+        np.median([smallest_of_families(v, SIDES, 0, [SMALL, ~SMALL], shares=shares) for v in views])
+        for shares in ((0.9, 0.1), None, (0.1, 0.9))
+    )
+    assert much < alike < little
+
+
 def test_in_a_small_family_an_effect_needs_less():
     rng = np.random.default_rng(17)
     views = [simulated(rng, effect=3.3, columns=60) for _ in range(40)]

@@ -48,6 +48,9 @@ def acceptance(found, results, folder=None):
             ambition or "-",
             at_least=gate,
         )
+        if gate:
+            leads = [o.leads for o in cells(exact, strength, protocol)]
+            table.rate("  of these first in the ranking, whatever the verdict", leads, NO_GATE, "-")
     strong = [o for v in (5.0, 10.0, 20.0) for o in cells(exact, v)]
     table.rate(
         "true effect in the set, exact, lambda>=5",
@@ -56,6 +59,8 @@ def acceptance(found, results, folder=None):
         "98%",
         at_least=0.95,
     )
+    said = [o.truth[0] in o.first_set for o in strong if o.verdict != "NO_GAP"]
+    table.rate("  of these where a gap was found", said, NO_GATE, "-")
     for strength, gate, ambition in ((5.0, 4.0, "<=3"), (10.0, 2.0, "<=1.5")):
         table.value(
             f"mean size of the set, lambda={strength:g}",

@@ -72,3 +72,9 @@ class Outcome:
     @property
     def right(self):
         return self.top is not None and self.top == self.truth[0]
+
+    @property
+    def leads(self):
+        """Whether the hidden mechanism is the most probable one, though it may not be significant."""
+        ranking = self.found.get("ranking") or []
+        return bool(ranking) and max(ranking, key=lambda r: r["probability"] or 0.0)["mechanism"] == self.truth[0]
