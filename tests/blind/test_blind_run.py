@@ -2,9 +2,11 @@
 
 import json
 import os
+import shutil
 
 import pytest
 
+from benchmarks import _report
 from benchmarks.blind import adapter, run, score, sealing
 from benchmarks.blind.generator import tiers
 
@@ -66,6 +68,32 @@ def test_one_command_from_seal_to_tables(tmp_path, capsys, solver, steady):
     found, _, content = score.outcomes(folder)
     assert len(found) == len(content["answers"]) == 6
     score.report(folder)
+
+
+def test_runs_are_scored_together_and_each_against_its_own_seal(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(sealing, "SEALED", tmp_path)
+    monkeypatch.setattr(_report, "RESULTS", tmp_path)
+    folders = [tmp_path / name for name in ("one", "two")]
+    for seed, folder in enumerate(folders):
+        cases = [tiers.Case(f"r{k}", "T0", "clean", "P0", count=2, resample=True) for k in range(2 + seed)]
+        sealing.seal(folder, cases, master=seed, jobs=1, name=folder.name)
+        shutil.copy(folder / "seal.txt", tmp_path / f"{folder.name}.txt")
+        run.solve(folder, solver="fake_solvers:silent", jobs=1, repeat=1)
+    score.main([*map(str, folders), "--write"])
+    table = {row["metric"]: row for row in json.loads((tmp_path / "blind_runs.json").read_text())[TOGETHER]}
+    assert table["false alarm, clean null"]["observed"] == "0.0% (0/5)"
+    assert table["same seed, same answer"]["observed"].endswith("(2/2)")
+    with pytest.raises(SystemExit, match="given twice"):
+        score.main([str(folders[0])] * 2)
+    with pytest.raises(SystemExit):
+        score.main([*map(str, folders), "--seal", str(folders[0] / "seal.txt")])
+    assert "--seal is for one run" in capsys.readouterr().err
+    (tmp_path / "two.txt").write_text("0" * 64)
+    with pytest.raises(sealing.SealBroken):
+        score.main([*map(str, folders), "--write"])
+
+
+TOGETHER = "Acceptance, all runs together"
 
 
 def test_a_broken_seal_is_not_scored(tmp_path):

@@ -122,8 +122,8 @@ def perfect_run():
     return found, results
 
 
-def rows(found, results=None, folder=None):
-    return {row["metric"]: row for row in scoring.acceptance(found, results or {}, folder)}
+def rows(found, results=None):
+    return {row["metric"]: row for row in scoring.acceptance(found, results or {})}
 
 
 def changed(found, which, **discovery):
@@ -300,11 +300,10 @@ def test_determinism_ignores_the_time_only(perfect_run):
     assert rows(found, other)["same seed, same answer"]["result"] is False
 
 
-def test_follow_up_counts_sets_that_collapse(perfect_run, tmp_path, monkeypatch):
+def test_follow_up_counts_sets_that_collapse(perfect_run, monkeypatch):
     found, results = perfect_run
     asked = next(o for o in found if o.verdict == "SET")
     key = f"{asked.key}+next"
-    (tmp_path / "follow_up.json").write_text(json.dumps({key: {"changes": {"protocol": "P1"}}, "x+next": None}))
     name = asked.truth[0]
     resolved = {
         "status": "ok",
@@ -313,12 +312,12 @@ def test_follow_up_counts_sets_that_collapse(perfect_run, tmp_path, monkeypatch)
         "discovery": {"verdict": "NAMED", "effects": [{"mechanism": name}], "candidate_set": [[name]]},
     }
     metric = "proposed experiment resolves the set (simulated)"
-    assert rows(found, {**results, key: resolved}, tmp_path)[metric]["observed"] == "100.0% (1/1)"
+    assert rows(found, {**results, key: resolved})[metric]["observed"] == "100.0% (1/1)"
     sure = "  of these with a stated power of 0.9 or more"
     for power in (0.95, 0.3):
         monkeypatch.setitem(asked.found["next_experiments"][0], "power", power)
-        assert ("1/1" in rows(found, {**results, key: resolved}, tmp_path)[sure]["observed"]) == (power > 0.9)
-    assert rows(found, {**results, key: asked.result}, tmp_path)[metric]["observed"] == "0.0% (0/1)"
+        assert ("1/1" in rows(found, {**results, key: resolved})[sure]["observed"]) == (power > 0.9)
+    assert rows(found, {**results, key: asked.result})[metric]["observed"] == "0.0% (0/1)"
 
 
 def test_closure_error_sees_only_what_the_base_law_cannot_take_up():

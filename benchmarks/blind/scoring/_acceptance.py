@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import defaultdict
-from pathlib import Path
 
 import numpy as np
 
@@ -17,8 +16,8 @@ from ._reliability import add_calibration
 from ._table import NO_GATE, Table
 
 
-def acceptance(found, results, folder=None):
-    """The acceptance table as a list of rows."""
+def acceptance(found, results):
+    """The acceptance table as a list of rows: of one run, or of several whose keys differ."""
     table = Table()
     by = defaultdict(list)
     for outcome in found:
@@ -76,7 +75,7 @@ def acceptance(found, results, folder=None):
     )
     add_calibration(table, exact + by["T2"])
     _separation(table, exact)
-    _experiments(table, found, results, folder)
+    _experiments(table, found, results)
     _unlisted(table, by, exact + by["T2"])
     add_closure(table, by["T4"])
     add_gap(table, exact + by["T2"], by["T0"])
@@ -114,13 +113,11 @@ STATED = 0.9
 """Power from which on an experiment is proposed without a doubt; the gate counts the others, too."""
 
 
-def _experiments(table, found, results, folder):
-    path = Path(folder) / "follow_up.json" if folder else None
-    made = json.loads(path.read_text()) if path and path.exists() else {}
+def _experiments(table, found, results):
     flags, sure = [], []
     for o in found:
         key = f"{o.key}+next"
-        if made.get(key) and key in results:
+        if key in results:
             after = Outcome(key, o.answer, results[key])
             flags.append(after.first_set == o.truth)
             if o.found["next_experiments"][0].get("power", 0.0) >= STATED:
