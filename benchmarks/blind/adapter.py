@@ -90,7 +90,7 @@ def problem(discovery):
 
 
 def follow_up_of(experiments, case):
-    """What the first proposed experiment changes in the case, or None where the generator cannot do it."""
+    """What the first proposed experiment changes in the case, or None where there is none that the generator can do."""
     if not experiments:
         return None
     text = json.dumps(experiments[0].get("experiment", "")).lower()
@@ -106,4 +106,4 @@ def follow_up_of(experiments, case):
     changes = {} if protocol == case["protocol"] else {"protocol": protocol}
     if count != case["count"]:
         changes |= {"count": count, "resample": True}
-    return changes or None
+    return changes

@@ -208,7 +208,7 @@ def follow_up(folder, content, **options):
         if f"{key}+next" in answers or answer["case"]["tier"] not in ("T1", "T2") or found.get("verdict") != "SET":
             continue
         changes = adapter.follow_up_of(found.get("next_experiments") or [], answer["case"])
-        made = sealing.follow_up(folder, key, answer, changes) if changes else None
+        made = None if changes is None else sealing.follow_up(folder, key, answer, changes)
         answers[f"{key}+next"] = made and {"changes": changes, "lambda": [e["lambda"] for e in made["effects"]]}
     path.write_text(json.dumps(answers) + "\n")
     solve(folder, keys=[key for key, made in answers.items() if made], asked=NAMES_ONLY, **options)

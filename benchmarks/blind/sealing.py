@@ -26,8 +26,8 @@ class SealBroken(Exception):
 
 
 def _make(job):
-    record, master, folder, amplitudes = job
-    built = campaigns.build(tiers.from_record(record), master, amplitudes)
+    record, master, folder, known = job
+    built = campaigns.build(tiers.from_record(record), master, known)
     digest = campaigns.write(built, folder)
     return built.answer, digest
 
@@ -97,8 +97,19 @@ def _digest(place):
 
 
 def follow_up(folder, key, answer, changes):
-    """The same material and effect tested in another way; written as `campaigns/KEY+next`, answer returned."""
-    record = {**answer["case"], **changes}
-    amplitudes = [effect["amplitude"] for effect in answer["effects"]]
-    job = (record, answer["master_seed"], str(Path(folder) / "campaigns" / f"{key}+next"), amplitudes)
-    return _make(job)[0]
+    """New particles of the same material and effect, tested in another way, beside those tested already.
+
+    Both are written as `campaigns/KEY+next`, the new particles after the old ones; the new ones' answer is returned.
+    """
+    case = answer["case"]
+    record = {**case, **changes, "id": f"{case['id']}+next"}
+    place, made = Path(folder) / "campaigns" / f"{key}+next", Path(folder) / "campaigns" / key
+    new = _make((record, answer["master_seed"], str(place), answer["effects"]))[0]
+    for name in ("particles.csv", "curves.csv"):
+        header, *later = (place / name).read_text().splitlines()
+        first, *before = (made / name).read_text().splitlines()
+        if header != first:
+            raise ValueError(f"{place / name} has other columns than {made / name}")
+        renamed = [f"next-{row}" for row in later]
+        (place / name).write_text("\n".join([header, *before, *renamed]) + "\n")
+    return new

@@ -176,6 +176,7 @@ def _judge(
     places: list[dict[str, Any]] = []
     extensions = Extensions(base, system, signals)
     extended, last, around = system, None, {}
+    drops: dict[int, float] = {}
     if gap:
         tell("where")
         places = where(base, system)
@@ -228,7 +229,9 @@ def _judge(
     further: list[dict[str, Any]] = []
     if experiments and gap:
         tell("next experiments")
-        further = next_experiments(base, system, chosen, steps, seed=seed)
+        # Two names were judged in the linear system.
+        refitted = drops if len(chosen) == 1 else {}
+        further = next_experiments(base, system, chosen, steps, refitted=refitted, seed=seed)
     return Discovery(
         verdict=verdict,
         summary="",

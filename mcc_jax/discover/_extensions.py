@@ -8,10 +8,14 @@ from ._refit import Refit, refit, system_at
 from ._search import Ranking
 from ._system import Base, Signals, System
 
-SERIOUS, LEAST_GAIN, MOST_REFITS = 0.3, 9.0, 10
+SERIOUS, LEAST_GAIN, MOST_REFITS = 0.1, 9.0, 12
 """Mechanisms whose log evidence is at least this share of the best one's are serious, if their best formula takes away
-so much chi2; so many formulas at most. The share is small: where the base law has moved far to take up an effect, first
-order may see a third of it."""
+so much chi2; so many formulas at most. The share is small: where the base law has moved far to take up an effect, or
+the effect grows faster than its amplitude, first order may see a tenth of it."""
+
+BEST = 2
+"""Formulas of a serious mechanism that are fitted: so many by evidence, and as many by evidence and what is known
+beforehand, mostly the same ones."""
 
 
 class Extensions:
@@ -39,7 +43,7 @@ class Extensions:
 
 
 def serious(system: System, ranking: Ranking) -> list[int]:
-    """Candidates worth a fit of their own: of the mechanisms that may be true the best two formulas."""
+    """Candidates worth a fit of their own: the best few formulas of every mechanism that may be true."""
     chosen: list[int] = []
     best = ranking.log_evidence[0]
     found = zip(ranking.names, ranking.log_evidence, ranking.gain, ranking.at_random, strict=True)
@@ -48,11 +52,17 @@ def serious(system: System, ranking: Ranking) -> list[int]:
             break
         if at_random or gain < LEAST_GAIN:
             continue
-        members = [k for k, c in enumerate(system.candidates) if c.mechanism == name]
-        members.sort(key=lambda k: -ranking.favour[k])
-        formulas: dict[str, int] = {}
-        for k in members:
-            if np.isfinite(ranking.evidence[k]):
-                formulas.setdefault(system.candidates[k].variant.name, k)
-        chosen.extend(list(formulas.values())[:2])
+        members = np.array([k for k, c in enumerate(system.candidates) if c.mechanism == name])
+        chosen += dict.fromkeys(
+            k for worth in (ranking.favour, ranking.evidence) for k in _best_formulas(system, members, worth)
+        )
     return chosen[:MOST_REFITS]
+
+
+def _best_formulas(system: System, members: np.ndarray, worth: np.ndarray) -> list[int]:
+    """The best candidate of each of the best few formulas."""
+    formulas: dict[str, int] = {}
+    for k in members[np.argsort(-worth[members], kind="stable")].tolist():
+        if np.isfinite(worth[k]):
+            formulas.setdefault(system.candidates[k].variant.name, k)
+    return list(formulas.values())[:BEST]

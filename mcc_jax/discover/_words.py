@@ -64,8 +64,8 @@ def summary_of(found: Discovery) -> str:
         doubt = "" if sure else f"No further test of those tried on paper would surely separate {names}. "
         done = f"separate {names}" if sure else "do so"
         sentences.append(
-            f"{doubt}{'Next' if sure else 'The best'}: {best['experiment']}, {best['particles']} particles, would "
-            f"{done} with probability {best['power']:.2f}."
+            f"{doubt}{'Next' if sure else 'The best'}: {best['experiment']}, {best['particles']} further particles, "
+            f"judged together with these, would {done} with probability {best['power']:.2f}."
         )
     surely = found.next_experiments and found.next_experiments[0]["power"] >= ENOUGH
     if found.checks and not surely:

@@ -58,6 +58,18 @@ class OnsetBow(AbstractBow):
         return _NORM * share**2 * (1 - share)
 
 
+class PowerLawBow(AbstractBow):
+    """From the arcsine towards a power law of what is still to recover, as indentation records are reduced by."""
+
+    exponent: Scalar = eqx.field(converter=scalar)
+
+    def bow(self, share: Values) -> Values:
+        """s(u) - (1 - u^(1/m))."""
+        some = share > 0
+        power = jnp.exp(jnp.log(jnp.where(some, share, 1.0)) / self.exponent)
+        return jnp.where(some, recovery(share) - (1 - power), 0.0)
+
+
 class RecoveryExponent(AbstractEffect):
     """Another exponent of the recovered share."""
 
@@ -69,10 +81,12 @@ class RecoveryExponent(AbstractEffect):
         return context.recoverable * jnp.where(some, s * (1 - power), 0.0)
 
 
-def _bow(name: str, make: type[AbstractEffect], equation: str, explanation: str) -> Variant:
+def _bow(name: str, make: type[AbstractEffect], equation: str, explanation: str, **more: Any) -> Variant:
     return Variant(
-        "unloading_shape", name, make, "bow", "-", 0, (0.01, 0.3), equation, explanation,
-        "Oliver and Pharr (1992); Etsion, Kligerman and Kadin (2005), Int. J. Solids Struct. 42, 3716",
+        "unloading_shape", name, make,
+        **{"parameter": "bow", "unit": "-", "sign": 0, "plausible": (0.01, 0.3), **more},
+        equation=equation, explanation=explanation,
+        source="Oliver and Pharr (1992); Etsion, Kligerman and Kadin (2005), Int. J. Solids Struct. 42, 3716",
         needs=(Need.UNLOADING,),
     )  # fmt: skip
 
@@ -85,6 +99,11 @@ SHAPE_OF_UNLOADING = Mechanism(
         _bow("tail_bow", TailBow, "d = Delta k 6.75 u (1 - u)^2", "Bent most towards release."),
         _bow("onset_bow", OnsetBow, "d = Delta k 6.75 u^2 (1 - u)", "Bent most near the peak."),
         _bow("recovery_exponent", RecoveryExponent, "d = Delta (s - s^(1 + k))", "Another exponent of recovery."),
+        _bow("power_law", PowerLawBow, "d = Delta k (s - 1 + u^(1/m))",
+             "In part a power law, F ~ (d - d_0)^m, as indentation records are reduced by: m = 1 for a flat contact, "
+             "2 for a cone; with m = 3/2 it is nearly the arcsine.",
+             parameter="power_law_share", plausible=(0.05, 1.0),
+             nuisances=(Nuisance("exponent", (1.2, 2.0), (1.0, 3.0), "exponent of the power law"),)),
     ),
     check="unload slowly to zero under control of displacement, with a point for every percent of load",
 )  # fmt: skip

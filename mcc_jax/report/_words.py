@@ -129,7 +129,7 @@ def _after(found: dict[str, Any]) -> list[tuple[str, str]]:
     if found["next_experiments"]:
         best = found["next_experiments"][0]
         names, power = listed([plain(n) for n in best["separates"]]), probability(best["power"])
-        test = f"{best['experiment']}, {number(best['particles'])} particles"
+        test = f"{best['experiment']}, {number(best['particles'])} further particles"
         if best["power"] >= LIKELY:
             return [(f"Measure: {test}. It would separate {names} with probability {power}.", "")]
         doubt = f"No further test of those tried on paper would surely separate {names}."

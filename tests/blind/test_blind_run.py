@@ -128,12 +128,20 @@ def test_follow_up_tests_the_same_material_in_another_way(tmp_path):
     (folder / "results.jsonl").write_text(json.dumps(moody) + "\n")
     made = run.follow_up(folder, sealing.open_answers(folder), solver="fake_solvers:silent", jobs=1)
     assert made["c00001+next"]["changes"] == {"protocol": "P1"}
-    assert made["c00001+next"]["lambda"][0] > 5.0  # the hold tells more
+    assert made["c00001+next"]["lambda"][0] > 1.0
     after = run.read_results(folder)["c00001+next"]["discovery"]
     assert after["verdict"] == "NO_GAP"
     assert after["asked"] == {"confirm": False, "experiments": False, "posterior": False}
-    particles = [(folder / "campaigns" / key / "particles.csv").read_text() for key in ("c00001", "c00001+next")]
-    assert particles[0] == particles[1]
+    before, both = (
+        [(folder / "campaigns" / key / name).read_text().splitlines() for name in ("particles.csv", "curves.csv")]
+        for key in ("c00001", "c00001+next")
+    )
+    for one, other in zip(before, both, strict=True):
+        assert other[: len(one)] == one
+        assert all(row.startswith("next-") for row in other[len(one) :])
+    assert len(both[0]) == 1 + 2 * 3
+    # New particles, not the old ones once more.
+    assert not {row.partition(",")[2] for row in before[0][1:]} & {row.partition(",")[2] for row in both[0][4:]}
     sealing.open_answers(folder)
 
 
@@ -166,7 +174,7 @@ def test_names_of_solvers_and_experiments():
     held = {"experiment": "a hold of 60 s at the largest load", "particles": 40}
     assert adapter.follow_up_of([held], P0) == {"protocol": "P1", "count": 40, "resample": True}
     assert adapter.follow_up_of([held], {"protocol": "P2", "count": 20}) == {"count": 40, "resample": True}
-    assert adapter.follow_up_of([{**held, "particles": 20}], {"protocol": "P1", "count": 20}) is None
+    assert adapter.follow_up_of([{**held, "particles": 20}], {"protocol": "P1", "count": 20}) == {}
     assert adapter.follow_up_of([{"experiment": "diamond platen"}], P0) is None
     assert adapter.follow_up_of([], P0) is None
 

@@ -198,6 +198,20 @@ def test_another_shape_keeps_both_ends(variant):
     assert np.abs(added).max() > 1e-3
 
 
+def test_the_whole_of_a_power_law_unloads_by_it():
+    """F / F_P = ((d - d_0) / (d_P - d_0))^m; with m = 3/2 the arcsine is nearly that already."""
+    variant = LIBRARY["unloading_shape"]["power_law"]
+    force = 200.0 * np.concatenate([np.linspace(0.01, 1.0, 50), np.linspace(0.99, 0.0, 100)])
+    record = clean_record(jnp.asarray(force), jnp.asarray(np.linspace(0.0, 200.0, len(force))))
+    left = {}
+    for m in (1.2, 1.5, 2.0):
+        response = np.asarray(ExtendedLaw(LAW, (variant.build(1.0, exponent=m),)).respond(PARTICLE, record))[49:]
+        recovering = (response - response[-1]) / (response[0] - response[-1])
+        np.testing.assert_allclose(recovering[:-1] ** m, force[49:-1] / force.max(), rtol=1e-9)
+        left[m] = np.abs(response - np.asarray(base(record))[49:]).max() / (response[0] - response[-1])
+    assert left[1.5] < 0.05 < min(left[1.2], left[2.0])
+
+
 def test_sizes_and_shapes_that_are_the_reference_feel_nothing():
     for name, particle in (("size_effect", sphere(200.0)), ("shape_second_order", sphere(150.0))):
         for variant in LIBRARY[name]:

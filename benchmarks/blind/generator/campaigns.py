@@ -42,8 +42,11 @@ class Design:
     effects: tuple[Effect, ...]
 
 
-def design(case, master):
-    """Particles, path, noise and the circumstances of the effects of one case."""
+def design(case, master, known=None):
+    """Particles, path, noise and the circumstances of the effects of one case.
+
+    `known` are the effects of an answer: their signs and what all particles share are taken from there.
+    """
     rng = case.rng(master)
     noise = noise_.Noise(**case.noise)
     particles = designs.population(
@@ -56,22 +59,27 @@ def design(case, master):
     path = designs.programme(rng, particles, case.protocol)
     scale = noise_.scales(rng, noise, case.count)
     effects = []
-    for mechanism, form, _ in case.effects:
+    for place, (mechanism, form, _) in enumerate(case.effects):
         found = BY_NAME[mechanism, form]
         sign = int(rng.choice(found.signs))
-        effects.append(Effect(found, found.draw(rng, case.count), sign))
+        circumstances = found.draw(rng, case.count)
+        if known is not None:
+            sign = 1 if known[place]["amplitude"] >= 0 else -1
+            shared = {k: v for k, v in known[place]["circumstances"].items() if np.ndim(v) == 0}
+            circumstances = {**circumstances, **shared}
+        effects.append(Effect(found, circumstances, sign))
     if case.tier == "T6" and case.cell in _SILENT:
         effects.append(Effect(EXACT[case.cell]))
     return Design(particles, path, noise, scale, tuple(effects)), rng
 
 
-def build(case, master, amplitudes=None):
+def build(case, master, known=None):
     """The campaign of a case and its answer.
 
-    `amplitudes` (signed, one for each effect) are taken as they are instead of being set from lambda: the same material
-    tested in another way.
+    `known` are the effects of another answer, taken as they are instead of being set from lambda: the same material
+    tested once more.
     """
-    drawn, rng = design(case, master)
+    drawn, rng = design(case, master, known)
     particles, path = drawn.particles, drawn.path
     length = noise_.path_length(particles, path)
     on_displacement, on_force = noise_.draw(rng, drawn.noise, length, drawn.scale)
@@ -96,10 +104,10 @@ def build(case, master, amplitudes=None):
                 (_admissible(name, rho[name]) ** 2 for name in allowed if name != effect.form.mechanism), default=0.0
             )
             wanted = target if not case.residual else min(LARGEST_LAMBDA, target / np.sqrt(max(left, 1e-6)))
-            if amplitudes is None:
+            if known is None:
                 amplitude, reached = amplitude_for(projection, effect, wanted, largest=effect.form.largest)
             else:
-                amplitude = abs(amplitudes[len(directions)])
+                amplitude = abs(known[len(directions)]["amplitude"])
                 reached = projection.strength(effect(amplitude))
             active += effect(amplitude)
             low, high = effect.form.plausible
