@@ -16,6 +16,7 @@ from ._checksums import file_checksums as file_checksums
 from ._csv import check_folder as check_folder
 from ._csv import read_campaign as read_campaign
 from ._csv import read_particles as read_particles
+from ._join import join_campaigns as join_campaigns
 from ._metadata import load_toml_file as load_toml_file
 from ._paper import PAPER_DIAMETERS_UM as PAPER_DIAMETERS_UM
 from ._paper import PAPER_EFFECTIVE_MODULUS_MPA as PAPER_EFFECTIVE_MODULUS_MPA

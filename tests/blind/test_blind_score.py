@@ -231,6 +231,24 @@ def test_a_solver_that_never_decides_is_found_out(perfect_run):
     assert table["'cannot separate' said, lambda^2(1-rho^2)>=30 (pairs)"]["result"] is False
 
 
+def test_who_leads_the_ranking_counts_whatever_the_verdict(perfect_run):
+    found, results = perfect_run
+    one = next(o for o in found if o.tier == "T1")
+    ranked = [{"mechanism": "other", "probability": 0.3}, {"mechanism": one.truth[0], "probability": 0.6}]
+    led = {**one.result, "discovery": {**one.found, "verdict": "NO_GAP", "effects": [], "ranking": ranked}}
+    assert scoring.Outcome("c", one.answer, led).leads
+    assert not scoring.Outcome("c", one.answer, led).right
+    for other in (
+        [],
+        [{"mechanism": "other", "probability": 1.0}],
+        [{**ranked[0]}, {**ranked[1], "probability": None}],
+    ):
+        lost = {**led, "discovery": {**led["discovery"], "ranking": other}}
+        assert not scoring.Outcome("c", one.answer, lost).leads
+    metrics = [row["metric"] for row in scoring.acceptance(found, results)]
+    assert len(set(metrics)) == len(metrics)
+
+
 def test_campaigns_off_their_strength_do_not_count_for_it(perfect_run):
     found, _ = perfect_run
     o = next(o for o in found if o.tier == "T1" and o.strength == 10.0)

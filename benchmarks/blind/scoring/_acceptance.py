@@ -49,7 +49,8 @@ def acceptance(found, results):
         )
         if gate:
             leads = [o.leads for o in cells(exact, strength, protocol)]
-            table.rate("  of these first in the ranking, whatever the verdict", leads, NO_GATE, "-")
+            place = f"lambda={strength:g}, {protocol}"
+            table.rate(f"  first in the ranking, {place}, whatever the verdict", leads, NO_GATE, "-")
     strong = [o for v in (5.0, 10.0, 20.0) for o in cells(exact, v)]
     table.rate(
         "true effect in the set, exact, lambda>=5",
