@@ -167,14 +167,14 @@ class _Trial:
         weight = weights(measured, formula_weights(measured))
         names = [measured.candidates[k].mechanism for k in family]
         truths = []
-        for name, best, random, share in zip(members, step.best, step.at_random, step.probability, strict=False):
+        ranked = zip(members, step.best, step.gain, step.at_random, step.probability, strict=False)
+        for name, best, gain, random, share in ranked:
             # A step at random is drawn as it was found.
             own = [family.index(best)] if random else [i for i, mechanism in enumerate(names) if mechanism == name]
             evidence = np.array([step.evidence[family[i]] for i in own])
             likely = weight[[family[i] for i in own]] * np.exp(evidence - evidence.max())
             amplitude, information = made.estimate[own], np.maximum(made.total[own], 1e-300)
             if random:
-                gain = step.gain[members.index(name)]
                 amplitude = np.sign(amplitude) * np.sqrt(max(gain, 0.0) / information)
             truths.append(_Truth(float(share), np.array(own), likely / likely.sum(), amplitude, information**-0.5))
         # Steps at any point are not drawn: places on the grid stand for them.

@@ -81,13 +81,20 @@ class RecoveryExponent(AbstractEffect):
         return context.recoverable * jnp.where(some, s * (1 - power), 0.0)
 
 
-def _bow(name: str, make: type[AbstractEffect], equation: str, explanation: str, **more: Any) -> Variant:
+def _bow(
+    name: str,
+    make: type[AbstractEffect],
+    equation: str,
+    explanation: str,
+    *,
+    parameter: str = "bow",
+    plausible: tuple[float, float] = (0.01, 0.3),
+    nuisances: tuple[Nuisance, ...] = (),
+) -> Variant:
     return Variant(
-        "unloading_shape", name, make,
-        **{"parameter": "bow", "unit": "-", "sign": 0, "plausible": (0.01, 0.3), **more},
-        equation=equation, explanation=explanation,
-        source="Oliver and Pharr (1992); Etsion, Kligerman and Kadin (2005), Int. J. Solids Struct. 42, 3716",
-        needs=(Need.UNLOADING,),
+        "unloading_shape", name, make, parameter, "-", 0, plausible, equation, explanation,
+        "Oliver and Pharr (1992); Etsion, Kligerman and Kadin (2005), Int. J. Solids Struct. 42, 3716",
+        nuisances=nuisances, needs=(Need.UNLOADING,),
     )  # fmt: skip
 
 
