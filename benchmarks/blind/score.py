@@ -51,11 +51,10 @@ def report(folder, record=False, seal_file=None):
     found, results, content = outcomes(folder, seal_file)
     if not found:
         raise SystemExit(f"{folder} holds no results")
-    seal = _seal(folder)
     missing = sorted({name for o in found for name in o.found.get("options_not_offered") or []})
     run = {
-        **seal,
-        "scored": f"{len(found)} of {len(content['answers'])}",
+        **_seal(folder),
+        "scored": _scored(found, content),
         "options the solver does not offer": ", ".join(missing) or "none",
         **{str(k): str(v) for k, v in _report.environment("numpy", "scipy").items()},
     }
@@ -63,19 +62,8 @@ def report(folder, record=False, seal_file=None):
         "Run": [{"what": key, "value": value} for key, value in run.items()],
         "Acceptance": acceptance(found, results),
     }
-    optional = {
-        "Named first, beside an ideal score test": against_ideal(found),
-        "Named first, by mechanism (lambda and protocol)": by_mechanism(found),
-        "Named first, by noise and number of particles (lambda >= 5)": by_noise(found),
-        "Confusion, exact formulas, lambda 10 and 20": confusion_rows(confusion(found)),
-        "Held-out gap": gaps(found),
-        "Failures": failures(found),
-    }
-    tables |= {heading: rows for heading, rows in optional.items() if rows}
-    place = _report.RESULTS if record else Path(folder)
-    made = pictures(found, place)
-    if made:
-        tables["Pictures"] = [{"picture": f"![{name}]({name})"} for name in made]
+    tables |= _tables_of(found)
+    tables |= _pictures(found, _report.RESULTS if record else Path(folder), "blind")
     _report.write("blind", "Blind test of the discovery workflow", tables, record)
     return tables
 
@@ -86,8 +74,32 @@ def _seal(folder):
     return {"sealed answers (SHA-256)": first.split()[0], **dict(line.split(": ", 1) for line in rest if ": " in line)}
 
 
+def _scored(found, content):
+    return f"{len(found)} of {len(content['answers'])}"
+
+
+def _tables_of(found):
+    """What stands beside the acceptance, as far as the campaigns say something about it."""
+    tables = {
+        "Named first, beside an ideal score test": against_ideal(found),
+        "Named first, by mechanism (lambda and protocol)": by_mechanism(found),
+        "Named first, by noise and number of particles (lambda >= 5)": by_noise(found),
+        "Confusion, exact formulas, lambda 10 and 20": confusion_rows(confusion(found)),
+        "Held-out gap": gaps(found),
+        "Failures": failures(found),
+    }
+    return {heading: rows for heading, rows in tables.items() if rows}
+
+
+def _pictures(found, place, prefix):
+    """The pictures, made in a folder, as a table."""
+    made = pictures(found, place, prefix)
+    return {"Pictures": [{"picture": f"![{name}]({name})"} for name in made]} if made else {}
+
+
 def report_together(folders, record=False):
-    """Score several runs as one: print the tables, and with `record` keep them in `benchmarks/results/`.
+    """Score several runs as one: print the tables, and with `record` keep them in `benchmarks/results/`; without, the
+    pictures lie in the first folder.
 
     Raises:
         sealing.SealBroken: if answers are not the sealed ones; with `record`, those whose seal the repository holds.
@@ -99,7 +111,7 @@ def report_together(folders, record=False):
         if any(name == row["run"] for row in runs):
             raise SystemExit(f"{folder}: run {name!r} is given twice; leave one out")
         own, answers, content = outcomes(folder, sealing.SEALED / f"{name}.txt" if record else None)
-        runs.append({"run": name, "scored": f"{len(own)} of {len(content['answers'])}", **seal})
+        runs.append({"run": name, "scored": _scored(own, content), **seal})
         found += [replace(o, key=f"{name}/{o.key}") for o in own]
         results |= {f"{name}/{key}": entry for key, entry in answers.items()}
     tables = {
@@ -108,6 +120,8 @@ def report_together(folders, record=False):
         ],
         "Acceptance, all runs together": acceptance(found, results),
     }
+    tables |= _tables_of(found)
+    tables |= _pictures(found, _report.RESULTS if record else Path(folders[0]), "blind_runs")
     _report.write("blind_runs", "Sealed blind tests together, each solved by the solver of its day", tables, record)
     return tables
 

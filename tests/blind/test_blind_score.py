@@ -378,7 +378,7 @@ def test_closure_error_sees_only_what_the_base_law_cannot_take_up():
 
 def test_tables_and_pictures(perfect_run, tmp_path):
     found, results = perfect_run
-    made = scoring.pictures(found, tmp_path)
+    made = scoring.pictures(found, tmp_path, "blind")
     assert made == ["blind_confusion.png", "blind_reliability.png", "blind_power.png"]
     assert all((tmp_path / name).stat().st_size > 10_000 for name in made)
     for table in (

@@ -13,8 +13,8 @@ from ._summaries import confusion
 from ._table import interval
 
 
-def pictures(found, place, prefix="blind"):
-    """Confusion matrix, reliability diagram and power curves as PNG files in `place`; returns their names."""
+def pictures(found, place, prefix):
+    """Confusion matrix, reliability diagram and power curves as files PREFIX_*.png in `place`; returns their names."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -33,12 +33,18 @@ def pictures(found, place, prefix="blind"):
     if counts:
         columns = [*MECHANISMS, "UNLISTED", "NO_GAP", "failed"]
         matrix = np.array([[row[c] for c in columns] for row in counts.values()], dtype=float)
-        matrix /= np.maximum(matrix.sum(axis=1, keepdims=True), 1.0)
+        campaigns = matrix.sum(axis=1)
+        matrix /= np.maximum(campaigns, 1.0)[:, None]
         figure, axes = plt.subplots(figsize=(10, 8.5), layout="constrained")
         image = axes.imshow(matrix, cmap="Blues", vmin=0, vmax=1)
         axes.set_xticks(range(len(columns)), [c.replace("_", " ") for c in columns], rotation=90)
-        axes.set_yticks(range(len(counts)), [name.replace("_", " ") for name in counts])
-        axes.set(xlabel="named first", ylabel="hidden", title="Exact formulas, lambda 10 and 20: share of campaigns")
+        rows = [f"{name.replace('_', ' ')} ({n:.0f})" for name, n in zip(counts, campaigns, strict=True)]
+        axes.set_yticks(range(len(counts)), rows)
+        axes.set(
+            xlabel="named first",
+            ylabel="hidden (campaigns)",
+            title="Exact formulas, lambda 10 and 20: per cent of campaigns",
+        )
         for i, j in zip(*np.nonzero(matrix), strict=True):
             axes.text(
                 j,
