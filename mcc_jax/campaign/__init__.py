@@ -32,6 +32,13 @@ from ._segments import SegmentKind as SegmentKind
 from ._segments import find_segments as find_segments
 from ._segments import summarise_segments as summarise_segments
 from ._validate import check_campaign as check_campaign
+from ._signal import point_noise as point_noise
 from ._write import write_campaign as write_campaign
 from .readers import read_diameters as read_diameters
 from .readers import read_tester_file as read_tester_file
+from .findings import Finding as Finding
+from .findings import worst as worst
+from .quality import QualityOptions as QualityOptions
+from .quality import campaign_findings as campaign_findings
+from .quality import check_tests as check_tests
+from .quality import named as named

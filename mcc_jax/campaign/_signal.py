@@ -20,6 +20,14 @@ def noise_level(values: np.ndarray, span: float) -> float:
     return float(np.hypot(scatter, _resolution(values, span) / 2))
 
 
+def point_noise(values: np.ndarray) -> float:
+    """Standard deviation from reading to reading: second differences cancel any smooth course."""
+    if len(values) < 4:
+        return 0.0
+    second = np.diff(values, 2)
+    return float(np.median(np.abs(second - np.median(second))) / 0.6745 / np.sqrt(6))
+
+
 def _resolution(values: np.ndarray, span: float) -> float:
     """The step of a read-out that is rounded so coarsely that it stays and jumps; else 0."""
     steps = np.abs(np.diff(values))

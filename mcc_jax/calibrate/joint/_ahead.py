@@ -58,7 +58,9 @@ def _noise(tests: Tests, model: JointModel) -> None:
     shape = count, points = tests.force.shape
     moved, one = _dummy(*shape), _dummy(count)
     jacobian, prior = _dummy(count, points, 5), _dummy(count, 5)
-    data = Linear(moved, jacobian, prior, tests.step, tests.mask, moved, moved, tests.branch, tests.weight)
+    common = None if tests.force_zero_sd is None else moved
+    path = tests.step, tests.mask, moved, moved, tests.branch
+    data = Linear(moved, jacobian, prior, *path, tests.weight, tests.peak_sd, common)
     cast(Any, likelihoods).lower(_dummy(*DIFFERENCES.shape), one, data).compile()
     noise = Noise.of(np.ones(4), one)
     cast(Any, summarise).lower(_dummy(count, 4), one, tests, data, noise, model.zero_sd).compile()
@@ -69,7 +71,8 @@ def _particles(tests: Tests, model: JointModel, sharp: Scatter, draws: int) -> N
     import arviz_stats.base  # noqa: F401  # seconds on a cold machine, so here too
 
     count, points = tests.force.shape
-    filters = eqx.filter_vmap(Whitening)(*(_dummy(count, points) for _ in range(4)), tests.branch)
+    common = None if tests.force_zero_sd is None else _dummy(count, points)
+    filters = eqx.filter_vmap(Whitening)(*(_dummy(count, points) for _ in range(4)), tests.branch, common)
     exact = Exact(tests, filters, _quadratic(count), sharp, model.zero_sd, model.unloading)
     several, triple = _dummy(draws), _dummy(draws, 3)
     some = eqx.filter_vmap(Population)(several, several, triple, triple, several, several, several)

@@ -13,7 +13,16 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..._errors import InputError
-from ...campaign import THRESHOLD_MPA, Campaign, Curve, Segment, campaign_segments, particle_batch, stress_and_strain
+from ...campaign import (
+    THRESHOLD_MPA,
+    Campaign,
+    Curve,
+    Segment,
+    campaign_segments,
+    check_tests,
+    particle_batch,
+    stress_and_strain,
+)
 from ...geometry import Particle
 from .._elastic import LEAST_RATIO
 from .._predict import point_noise_um
@@ -39,6 +48,9 @@ class Tests(eqx.Module):
         branch: index of the point at which the largest force so far was reached: shared by the points of an elastic
             branch.
         weight: 1 for particles, 0 for copies that only fill up; None where all are particles.
+        force_zero_sd: standard deviation of each test's zero of force [mN]; None where none was measured.
+        peak_sd: standard deviation of the force of each point's branch peak where it was worked out [mN]; None where
+            all were read.
     """
 
     __test__ = False  # no test of ours, whatever pytest thinks of the name
@@ -52,6 +64,8 @@ class Tests(eqx.Module):
     step: Float[Array, "particles points"]
     branch: Int[Array, "particles points"]
     weight: Float[Array, " particles"] | None = None
+    force_zero_sd: Float[Array, " particles"] | None = None
+    peak_sd: Float[Array, "particles points"] | None = None
 
     def __len__(self) -> int:
         return self.force.shape[0]
@@ -105,7 +119,7 @@ class Selection:
         tests: the arrays of those that do.
         kept: their positions in the campaign.
         why_not: for each particle of the campaign, None if kept, else the reason.
-        rows: for each kept particle, the rows of its curve that stand in `tests`.
+        rows: for each kept particle, the rows of its curve, as `check_tests` left it, that stand in `tests`.
         notes: what a reader must know about particles that are kept.
     """
 
@@ -140,6 +154,7 @@ def select_tests(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, mo
             "the joint calibration needs double precision; "
             'call jax.config.update("jax_enable_x64", True) before anything else'
         )
+    campaign = check_tests(campaign)
     segments = campaign_segments(campaign)
     prepared = [
         _prepare(curve, diameters, parts, threshold_MPa, most_points)
@@ -164,6 +179,7 @@ def select_tests(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, mo
     curves = [campaign.curves[i] for i in kept]
     force = padded([c.force_mN[one.rows] for c, one in zip(curves, used, strict=True)], "edge").astype(float)
     largest = force.max(axis=1, keepdims=True)
+    branch = _branches(force)
     tests = Tests(
         particle_batch(campaign.diameters_um[list(kept)]),
         jnp.asarray(force),
@@ -172,11 +188,27 @@ def select_tests(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, mo
         jnp.asarray(padded([one.loading for one in used], "false")),
         jnp.asarray([one.contact for one in used]),
         jnp.asarray(np.abs(np.diff(force, axis=1, prepend=force[:, :1])) / largest),
-        jnp.asarray(_branches(force)),
+        jnp.asarray(branch),
+        None,
+        *_errors_of_force(curves, used, branch),
     )
     return Selection(
         tests, kept, why_not, tuple(one.rows for one in used), tuple(_notes(campaign, kept, used, most_points))
     )
+
+
+def _errors_of_force(
+    curves: Sequence[Curve], used: Sequence[_Prepared], branch: np.ndarray
+) -> tuple[Array | None, Array | None]:
+    """Errors of the zeros of force, and of the peaks of branches that were worked out; None where there are none."""
+    checked = [c.checked for c in curves]
+    zero = np.array([0.0 if one is None else one.force_zero_sd_mN for one in checked])
+    peak = np.zeros(branch.shape)
+    for row, (one, of) in enumerate(zip(checked, used, strict=True)):
+        if one is not None:
+            peak[row, : len(of.rows)] = one.force_sd_mN[of.rows]
+    peak = np.take_along_axis(peak, branch, axis=1)
+    return (jnp.asarray(zero) if zero.any() else None), (jnp.asarray(peak) if peak.any() else None)
 
 
 def _branches(force: np.ndarray) -> np.ndarray:
@@ -223,6 +255,8 @@ def _prepare(
     loading = (kind[rows] == "load") & (stress[rows] >= threshold) & (stress[rows] > 0)
     elastic = np.isin(kind[rows], ("hold", "unload", "reload")) & (stress[rows] >= LEAST_RATIO * peak)
     mask = loading | (elastic & (stress[rows] >= threshold) & (peak > 0))
+    if curve.checked is not None:
+        mask, loading = mask & curve.checked.compared[rows], loading & curve.checked.compared[rows]
     if stress.max() <= threshold:
         return f"reaches {stress.max():.3g} MPa only, not the threshold of {threshold:g} MPa"
     if loading.sum() < LEAST_POINTS:

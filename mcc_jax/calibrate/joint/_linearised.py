@@ -32,7 +32,11 @@ def linear_data(
     value, J, moved, by_peak = linearise_with_force(latent, zero, tests, unloading)
     prior = jnp.concatenate([jnp.ones(4), 1 / zero_sd[None] ** 2])
     prior = jnp.broadcast_to(prior, (len(tests), 5))
-    return Linear(value, J, prior, tests.step, tests.mask, moved, by_peak, tests.branch, tests.weight)
+    # All forces of a test, its peak among them, share the error of its zero of force.
+    zero_sd_mN = tests.force_zero_sd
+    common = None if zero_sd_mN is None else zero_sd_mN[:, None] * (moved + by_peak)
+    path = tests.step, tests.mask, moved, by_peak, tests.branch
+    return Linear(value, J, prior, *path, tests.weight, tests.peak_sd, common)
 
 
 @compiled
@@ -51,7 +55,7 @@ def summarise(
         deviation [um] of white noise that would weigh a test as much as its filter does.
     """
     noise_filters = jax.vmap(lambda s, *path: whitening(noise, s, *path))(
-        noise.scale, data.step, data.mask, data.compliance, data.peak, data.branch
+        noise.scale, data.step, data.mask, data.compliance, data.peak, data.branch, data.peak_sd, data.common
     )
     r = jax.vmap(lambda f, x: f(x))(noise_filters, data.residual)
     J = jax.vmap(lambda f, x: jax.vmap(f, in_axes=1, out_axes=1)(x))(noise_filters, data.jacobian)

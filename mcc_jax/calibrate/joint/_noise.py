@@ -75,6 +75,8 @@ class Whitening(eqx.Module):
         weight: one over the standard deviation of a surprise, 0 where the point is masked.
         peak: whitened change of every point with the noise of its branch's peak, 0 on loading.
         branch: which branch a point belongs to.
+        common: whitened change of every point with the error of the zero of force, which all points share; None where
+            no zero was measured.
     """
 
     decay: Path
@@ -82,6 +84,7 @@ class Whitening(eqx.Module):
     weight: Path
     peak: Path
     branch: Int[Array, " steps"]
+    common: Path | None = None
 
     def __call__(self, residual: Path) -> Path:
         """Independent residuals of standard deviation 1 (0 where masked)."""
@@ -97,7 +100,13 @@ class Whitening(eqx.Module):
         power = self._power()
         shrink = (1 - 1 / jnp.sqrt(1 + power)) / jnp.where(power > 0, power, 1.0)
         along = jax.ops.segment_sum(self.peak * white, self.branch, len(white))
-        return white - self.peak * (shrink * along)[self.branch]
+        white = white - self.peak * (shrink * along)[self.branch]
+        if self.common is None:
+            return white
+        shared = self.common @ self.common
+        # Division by its root along one more direction; the second form of (1 - 1/sqrt(1 + p))/p is finite at p = 0.
+        root = jnp.sqrt(1 + shared)
+        return white - self.common * (self.common @ white) / (root * (1 + root))
 
     @property
     def least_squares(self) -> Scalar:
@@ -112,7 +121,8 @@ class Whitening(eqx.Module):
         """Logarithm of the covariance's determinant, over the points that are not masked."""
         used = self.weight > 0
         own = -2 * jnp.sum(jnp.where(used, jnp.log(jnp.where(used, self.weight, 1.0)), 0.0))
-        return own + jnp.sum(jnp.log1p(self._power()))
+        shared = 0.0 if self.common is None else jnp.log1p(self.common @ self.common)
+        return own + jnp.sum(jnp.log1p(self._power())) + shared
 
 
 def whitening(
@@ -123,6 +133,8 @@ def whitening(
     compliance: Path,
     peak: Path,
     branch: Int[Array, " steps"],
+    peak_sd: Path | None = None,
+    common: Path | None = None,
 ) -> Whitening:
     """The filter of one test.
 
@@ -134,6 +146,10 @@ def whitening(
         compliance: how far noise of force moves the predicted displacement [um/mN].
         peak: how far noise of the branch's peak force moves it [um/mN].
         branch: which branch a point belongs to.
+        peak_sd: standard deviation of the branch's peak force where it was worked out, not read [mN]; None where all
+            were read.
+        common: how far one standard deviation of the zero of force moves the predicted displacement [um]; None where
+            no zero was measured.
     """
     decay = jnp.exp(-step / noise.length)
     stationary = noise.correlated**2
@@ -149,7 +165,12 @@ def whitening(
     _, (gain, total) = jax.lax.scan(advance, stationary, (decay, mask, read_out))
     weight = jnp.where(mask, 1 / (scale * jnp.sqrt(total)), 0.0)
     still = Whitening(decay, gain, weight, jnp.zeros_like(step), branch)
-    return Whitening(decay, gain, weight, still(jnp.where(mask, scale * noise.force * peak, 0.0)), branch)
+    read = scale * noise.force
+    level = read if peak_sd is None else jnp.sqrt(read**2 + peak_sd**2)
+    filtered = Whitening(decay, gain, weight, still(jnp.where(mask, level * peak, 0.0)), branch)
+    if common is None:
+        return filtered
+    return Whitening(decay, gain, weight, filtered.peak, branch, filtered(jnp.where(mask, common, 0.0)))
 
 
 class Linear(eqx.Module):
@@ -159,7 +180,7 @@ class Linear(eqx.Module):
         residual: at the point [um].
         jacobian: derivative with respect to the particle's P parameters.
         prior: precision that keeps directions without data in place.
-        step, mask, compliance, peak, branch: as in `whitening`.
+        step, mask, compliance, peak, branch, peak_sd, common: as in `whitening`.
         weight: 1 for particles, 0 for copies that only fill up; None where all are particles.
     """
 
@@ -172,6 +193,8 @@ class Linear(eqx.Module):
     peak: Float[Array, "particles points"]
     branch: Int[Array, "particles points"]
     weight: Float[Array, " particles"] | None = None
+    peak_sd: Float[Array, "particles points"] | None = None
+    common: Float[Array, "particles points"] | None = None
 
 
 def restricted_likelihood(noise: Noise, data: Linear) -> Float[Array, " particles"]:
@@ -195,6 +218,8 @@ def restricted_likelihood(noise: Noise, data: Linear) -> Float[Array, " particle
         data.compliance,
         data.peak,
         data.branch,
+        data.peak_sd,
+        data.common,
     )
 
 

@@ -1,0 +1,262 @@
+"""A channel at the end of its range: readings that repeat the extreme while the other channel goes on.
+
+Such readings are censored: the true value lies beyond. Displacement is what the law is compared in, so readings at the
+end of its range are simply not compared. Force is what the law is driven with, and its largest value decides the whole
+unloading: there the turning point is taken from what still moves. The loading curve below the end of the range, in the
+law's own form
+
+.. math:: F = k_1 x - k_3 x^3 + k_5 x^5, \\qquad x = (d - z) / D_e
+
+is fitted by least squares in displacement (the noise is there), and read at the largest displacement; the covariance of
+the fit and the noise of the turning point give the force's standard deviation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ._schema import Curve, Note
+from ._signal import point_noise
+
+LEAST_REPEATS = 4
+"""Readings that repeat the extreme, at least. Two equal readings around a turning point are not rare."""
+
+COARSE = 3.0
+"""And so many times as many as the channel repeats elsewhere: a coarse read-out repeats every value."""
+
+GOES_ON = 0.5
+"""Share of its pace before that the other channel keeps up, at least. In a hold it stands still, or creeps."""
+
+FITTED_FROM = 0.25
+"""Share of the end of the range from which on loading is fitted: below it, asperities deform, not the particle."""
+
+TRUSTED = 0.25
+"""Share of the end of the range by which the turning point may lie beyond it: of simulated tests clipped at 98, 95, 90
+and 85 % the intervals of the modulus hold the truth; farther on nobody has looked."""
+
+
+@dataclass(frozen=True)
+class CensoredForce:
+    """A test whose force channel saturated.
+
+    Attributes:
+        curve: the readings below the end of the range, and one turning point for each stretch at it that goes beyond
+            any displacement reached before.
+        rows: which readings of the given curve these are.
+        compared: False at the turning points.
+        force_sd_mN: standard deviation of the force at the turning points, 0 elsewhere [mN].
+        note: in words.
+    """
+
+    curve: Curve
+    rows: np.ndarray
+    compared: np.ndarray
+    force_sd_mN: np.ndarray
+    note: Note
+
+
+@dataclass(frozen=True)
+class CensoredDisplacement:
+    """Which readings of displacement stand at the end of the range, and a note."""
+
+    rows: np.ndarray
+    note: Note
+
+
+def plateaus(values: np.ndarray, other: np.ndarray, time: np.ndarray, noise: float) -> list[tuple[int, int]]:
+    """Stretches [start, stop) at the largest value of a channel during which the other channel goes on.
+
+    Args:
+        values: the channel, shape (n,).
+        other: the other channel.
+        time: when [s].
+        noise: standard deviation of the other channel's readings.
+    """
+    count = len(values)
+    if count < 12:
+        return []
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(values)) + 1, [count]])
+    lengths = np.diff(edges)
+    top = values[edges[:-1]] == values.max()
+    if not top.any() or np.all(top):
+        return []
+    usual = float(np.quantile(lengths[~top], 0.9))
+    found = []
+    for start, length in zip(edges[:-1][top], lengths[top], strict=True):
+        stop = int(start + length)
+        start = int(start)
+        if length < max(LEAST_REPEATS, COARSE * usual) or start < 4:
+            continue
+        before = np.arange(max(start - 12, 0), start)
+        line = np.polynomial.Polynomial.fit(time[before], other[before], 1)
+        pace = float(line.deriv()(time[start - 1]))
+        # Halfway, or at the end where the record ends there: a ramp that turns has come farthest.
+        some = max(int(length) // 3, 1)
+        middle = np.arange(stop - some, stop) if stop == count else start + int(length) // 2 + np.arange(some) - some // 2
+        elapsed = float(np.mean(time[middle]) - time[start - 1])
+        advance = float(np.mean(other[middle]) - line(time[start - 1]))
+        error = noise * np.sqrt(1 / some + 4 / len(before))
+        if pace > 0 and elapsed > 0 and advance > max(GOES_ON * pace * elapsed, 3 * error):
+            found.append((start, stop))
+    if not found:
+        return []
+    # Other stretches at the same end of the range are at it, too, however short.
+    return [(int(a), int(a + n)) for a, n in zip(edges[:-1][top], lengths[top], strict=True) if n >= 2 or (a, a + n) in found]
+
+
+def censor_force(curve: Curve) -> CensoredForce | None:
+    """The test with the turning points that its force channel did not see; None if the channel did not saturate.
+
+    Args:
+        curve: the test, its zero of force taken off.
+    """
+    force, path = curve.force_mN, curve.displacement_um
+    noise = point_noise(path)
+    found = plateaus(force, path, curve.time_s, noise)
+    if not found:
+        return None
+    end = float(force.max())
+    hidden = np.zeros(len(force), bool)
+    for start, stop in found:
+        hidden[start:stop] = True
+    fitted = _loading(force, path, hidden, found[0][0], end)
+    keep, turning = ~hidden, {}
+    reached = -np.inf
+    for start, stop in found:
+        reached = max(reached, float(np.max(path[:start])))
+        farthest = start + int(np.argmax(path[start:stop]))
+        top = _turning(path[start:stop], farthest - start, noise)
+        if top <= reached:
+            continue  # reloading that stays below what was reached before: elastic, the history does not change
+        keep[farthest] = True
+        turning[farthest] = top
+        reached = top
+    largest, sds = [], []
+    new_force, new_path = force.copy(), path.copy()
+    sd = np.zeros(len(force))
+    for row, top in turning.items():
+        value, error = (np.nan, np.nan) if fitted is None else fitted.at(top, noise)
+        if not np.isfinite(value) or value < end:
+            value, error = end, max(noise * _pace(force, path, found[0][0]), 0.0)
+        new_force[row], new_path[row], sd[row] = value, top, error
+        largest.append(value)
+        sds.append(error)
+    note = _note(end, int(hidden.sum()), largest, sds)
+    compared = np.ones(len(force), bool)
+    compared[list(turning)] = False
+    checked = Curve(curve.time_s[keep], new_force[keep], new_path[keep])
+    return CensoredForce(checked, np.flatnonzero(keep), compared[keep], sd[keep], note)
+
+
+def censor_displacement(curve: Curve) -> CensoredDisplacement | None:
+    """Readings of displacement at the end of its range; None if there are none."""
+    found = plateaus(curve.displacement_um, curve.force_mN, curve.time_s, point_noise(curve.force_mN))
+    if not found:
+        return None
+    rows = np.zeros(len(curve), bool)
+    for start, stop in found:
+        rows[start:stop] = True
+    note = Note(
+        "saturation",
+        "look",
+        "displacement stands at {} um, the end of its range, for {} readings while the force goes on; they are not "
+        "compared with the law",
+        (float(curve.displacement_um.max()), int(rows.sum())),
+        "Measure with a larger range of displacement",
+    )
+    return CensoredDisplacement(rows, note)
+
+
+def _note(end: float, count: int, largest: list[float], sds: list[float]) -> Note:
+    remedy = "Measure with a load cell of a larger range"
+    if not largest:
+        sentence = "force stands at {} mN, the end of its range, for {} readings, which are left out"
+        return Note("saturation", "look", sentence, (end, count), remedy)
+    top, sd = max(largest), max(sds)
+    sentence = (
+        "force stands at {} mN, the end of its range, for {} readings while the platens go on; they are left out and the "
+        "turning point is taken from the displacement ({} +- {} mN)"
+    )
+    far = top > (1 + TRUSTED) * end or not sd < 0.5 * TRUSTED * end
+    if far:
+        sentence += ", too far beyond the range to be relied on"
+    return Note("saturation", "bad" if far else "look", sentence, (end, count, top, sd), remedy)
+
+
+def _pace(force: np.ndarray, path: np.ndarray, start: int) -> float:
+    """Slope of force over displacement before a reading [mN/um]."""
+    before = slice(max(start - 12, 0), start)
+    reach = float(np.ptp(path[before]))
+    return float(np.ptp(force[before])) / reach if reach > 0 else 0.0
+
+
+def _turning(part: np.ndarray, top: int, noise: float) -> float:
+    """The largest displacement of a stretch: of the readings within the noise of the largest, their mean.
+
+    The largest of several noisy readings lies too high; the mean of those near it does not by more than the noise's
+    share that the turn itself leaves.
+    """
+    near = np.abs(np.arange(len(part)) - top) <= 2
+    close = part[near & (part > part[top] - 2.5 * noise)]
+    return float(np.mean(close)) if noise > 0 else float(part[top])
+
+
+@dataclass(frozen=True)
+class _Loading:
+    """Loading in the law's form, fitted below the end of the range."""
+
+    parameters: np.ndarray  # zero, and the three factors per mN
+    covariance: np.ndarray
+    scale_um: float
+
+    def force(self, parameters: np.ndarray, path: np.ndarray | float) -> np.ndarray:
+        x = (np.asarray(path, float) - parameters[0] * self.scale_um) / self.scale_um
+        return parameters[1] * x - parameters[2] * x**3 + parameters[3] * x**5
+
+    def at(self, path: float, noise: float) -> tuple[float, float]:
+        """Force at a displacement, and its standard deviation [mN]."""
+        value = float(self.force(self.parameters, path))
+        steps = 1e-6 * np.maximum(np.abs(self.parameters), 1e-6)
+        slope = np.array(
+            [
+                (float(self.force(self.parameters + h * e, path)) - value) / h
+                for h, e in zip(steps, np.eye(4), strict=True)
+            ]
+        )
+        h = 1e-5 * self.scale_um
+        along = (float(self.force(self.parameters, path + h)) - value) / h
+        return value, float(np.sqrt(max(slope @ self.covariance @ slope, 0.0) + (along * noise) ** 2))
+
+
+def _loading(force: np.ndarray, path: np.ndarray, hidden: np.ndarray, start: int, end: float) -> _Loading | None:
+    """The loading curve before the force channel saturates for the first time."""
+    from scipy.optimize import least_squares
+
+    rows = np.arange(start)
+    virgin = rows[(path[rows] >= np.maximum.accumulate(path[rows])) & (force[rows] >= FITTED_FROM * end) & ~hidden[rows]]
+    if len(virgin) < 8:
+        return None
+    f, d = force[virgin], path[virgin]
+    scale = float(d[-1] - d[0]) / (1 - FITTED_FROM)
+    if not scale > 0:
+        return None
+    unit = _Loading(np.zeros(4), np.zeros((4, 4)), scale)
+
+    def slope(parameters: np.ndarray) -> np.ndarray:
+        x = d / scale - parameters[0]
+        k1, k3, k5 = parameters[1:]
+        return np.maximum((k1 - 3 * k3 * x**2 + 5 * k5 * x**4) / scale, 1e-3 * end / scale)
+
+    first = d[0] / scale - FITTED_FROM
+    x = d / scale - first
+    design = np.stack([x, -(x**3), x**5], 1)
+    start_at = np.concatenate([[first], np.linalg.lstsq(design, f, rcond=None)[0]])
+    solution = least_squares(
+        lambda p: (unit.force(p, d) - f) / slope(p), start_at, x_scale=np.maximum(np.abs(start_at), 1e-3), max_nfev=100
+    )
+    misfit = float(np.sum(solution.fun**2) / max(len(d) - 4, 1))
+    curvature = solution.jac.T @ solution.jac
+    covariance = misfit * np.linalg.pinv(curvature)
+    return _Loading(solution.x, covariance, scale)
