@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import equinox as eqx
@@ -15,7 +15,9 @@ from ..campaign import (
     THRESHOLD_MPA,
     Adjustment,
     Campaign,
+    Finding,
     adjust,
+    check_tests,
     of_each_particle,
     particle_batch,
 )
@@ -25,8 +27,9 @@ from ._elastic import ElasticFit, campaign_branches, fit_effective_modulus
 from ._master import MasterCurve, StrainTable, master_curve, strain_table
 from ._plastic import PlasticFit, fit_population
 from ._predict import ParticleFit, point_noise_um, predict_particles
-from ._result import estimate, finite, misfit_note
+from ._result import estimate, finite, force_zero, misfit_note
 from ._shape import Objective, ShapeFit, fit_shape_parameter
+from .judgement import judged, none_usable, numbers_in_reach, unlike_others
 
 PLAUSIBLE_SHAPE_FACTOR = 4.0
 """Shape factors beyond this, twice the paper's largest, come from curves that do not collapse, not from shape."""
@@ -37,7 +40,7 @@ class PaperCalibration:
     """Everything that the paper's calibration finds, with what it was made from.
 
     Attributes:
-        campaign: the tests.
+        campaign: the tests, checked; `campaign.raw` as they were given.
         adjustment: the offset step.
         table: strain over stress of the kept particles.
         shape: `a` by the full objective; the one in `law`, unless the reference objective was asked for.
@@ -52,6 +55,7 @@ class PaperCalibration:
             residuals.
         seed: kept for the record; nothing here is random.
         runtime_s: time taken.
+        findings: what a reader must know of the tests and of the plausibility of the answer.
     """
 
     campaign: Campaign
@@ -68,6 +72,7 @@ class PaperCalibration:
     displacement_noise_um: float
     seed: int
     runtime_s: float
+    findings: tuple[Finding, ...] = ()
 
     @property
     def a(self) -> float:
@@ -86,6 +91,7 @@ class PaperCalibration:
     def warnings(self) -> list[str]:
         """What a reader of the numbers must know, one sentence each."""
         notes = [reason for reason in (self._chosen.reason, self.elastic.reason) if reason]
+        notes += map(str, self.findings)
         if self.plastic.at_bound:
             notes.append(
                 f"{', '.join(self.plastic.at_bound)} ended at the lower bound: a collapsed estimate, not a measurement"
@@ -153,6 +159,7 @@ class PaperCalibration:
                     "own_rms_um": finite(fit.own_rms_um) if fit else None,
                     "kept": fit is not None,
                     "why_not": self.adjustment.why_not[i],
+                    "force_zero_mN": force_zero(self.campaign.curves[i]),
                 }
             )
         reference = self.shape_reference
@@ -181,6 +188,7 @@ class PaperCalibration:
             "adjustment": {"threshold_MPa": self.adjustment.threshold_MPa, "strain": self.adjustment.strain},
             "particles": entries,
             "warnings": self.warnings(),
+            "findings": [one.to_json() for one in self.findings],
             "diagnostics": {
                 "rhat_max": None,
                 "ess_bulk_min": None,
@@ -206,6 +214,7 @@ def calibrate_paper(
     unloading: Unloading = Unloading.PRINTED,
     strain_scaling: StrainScaling = StrainScaling.RAW,
     seed: int = 0,
+    without_flagged: bool = True,
     progress: Callable[[str], None] | None = None,
 ) -> PaperCalibration:
     """The paper's calibration: offset step, shape parameter, master curve, plastic coefficients, effective modulus.
@@ -218,6 +227,8 @@ def calibrate_paper(
         unloading: form of unloading that the modulus belongs to.
         strain_scaling: how the shape factor enters unloading.
         seed: kept for the record.
+        without_flagged: where single particles are flagged (a broken one, one unlike all others), calibrate again
+            without them and say what the answer is then.
         progress: called with the name of each step.
 
     Raises:
@@ -228,35 +239,32 @@ def calibrate_paper(
     """
     started = time.perf_counter()
     tell = progress or (lambda _: None)
+    campaign = check_tests(campaign)
     tell("adjusting the curves")
     adjustment = adjust(campaign, threshold_MPa)
     if adjustment.kept.sum() < 2:
-        reasons = "; ".join(
-            f"particle {n!r} {r}" for n, r in zip(campaign.particles, adjustment.why_not, strict=True) if r is not None
-        )
-        raise InputError(
-            f"the calibration needs two usable particles or more, {int(adjustment.kept.sum())} can be used ({reasons})",
-            file=campaign.source or None,
-            remedy="Check the diameters (they turn force into stress), or lower the threshold.",
-        )
-    table = strain_table(adjustment, campaign.diameters_um)
-    tell("fitting the shape parameter")
-    shape = fit_shape_parameter(table)
-    shape_reference = _reference_fit(campaign, table, objective, reference)
-    chosen = shape_reference if objective == "reference" and shape_reference is not None else shape
-    tell("fitting the plastic coefficients")
-    master = master_curve(table, chosen.a)
-    plastic = fit_population(master, adjustment.threshold_MPa)
-    tell("fitting the effective modulus")
-    eta = of_each_particle(campaign.diameters_um, lambda p: plastic_shape_factor(p, chosen.a))
-    elastic = fit_effective_modulus(campaign_branches(campaign, adjustment), eta, unloading, strain_scaling)
-    # Without any unloading the modulus cannot matter to a prediction; a stiff one keeps the law defined.
-    modulus = elastic.effective_modulus_MPa if elastic.effective_modulus_MPa is not None else 1e9
-    law = MccLaw(plastic.population.mean_law, chosen.a, modulus, unloading, strain_scaling)
-    tell("predicting every particle")
-    particles = predict_particles(campaign, adjustment, law, eta)
-    noise = float(np.median([point_noise_um(curve) for curve in campaign.curves]))
-    return PaperCalibration(
+        count = int(adjustment.kept.sum())
+        problem = f"the paper's method needs two usable particles or more, {count} can be used"
+        raise none_usable(campaign, adjustment.why_not, problem)
+    with numbers_in_reach(campaign):
+        table = strain_table(adjustment, campaign.diameters_um)
+        tell("fitting the shape parameter")
+        shape = fit_shape_parameter(table)
+        shape_reference = _reference_fit(campaign, table, objective, reference)
+        chosen = shape_reference if objective == "reference" and shape_reference is not None else shape
+        tell("fitting the plastic coefficients")
+        master = master_curve(table, chosen.a)
+        plastic = fit_population(master, adjustment.threshold_MPa)
+        tell("fitting the effective modulus")
+        eta = of_each_particle(campaign.diameters_um, lambda p: plastic_shape_factor(p, chosen.a))
+        elastic = fit_effective_modulus(campaign_branches(campaign, adjustment), eta, unloading, strain_scaling)
+        # Without any unloading the modulus cannot matter to a prediction; a stiff one keeps the law defined.
+        modulus = elastic.effective_modulus_MPa if elastic.effective_modulus_MPa is not None else 1e9
+        law = MccLaw(plastic.population.mean_law, chosen.a, modulus, unloading, strain_scaling)
+        tell("predicting every particle")
+        particles = predict_particles(campaign, adjustment, law, eta)
+        noise = float(np.median([point_noise_um(curve) for curve in campaign.curves]))
+    calibration = PaperCalibration(
         campaign,
         adjustment,
         table,
@@ -272,6 +280,19 @@ def calibrate_paper(
         seed,
         time.perf_counter() - started,
     )
+    fits = [p for p in particles if p is not None and p.used.any()]
+    names = [n for n, p in zip(campaign.particles, particles, strict=True) if p is not None and p.used.any()]
+    ranges = np.array([np.ptp(p.measured_um[p.used]) for p in fits])
+    outlying = unlike_others(names, np.array([p.own_rms_um for p in fits]), ranges)
+
+    def again(some: Campaign) -> dict[str, Any]:
+        settings: dict[str, Any] = {"threshold_MPa": threshold_MPa, "objective": objective, "seed": seed}
+        form: dict[str, Any] = {"unloading": unloading, "strain_scaling": strain_scaling}
+        chosen = None if reference not in some.particles else reference
+        return calibrate_paper(some, reference=chosen, without_flagged=False, **settings, **form).to_json()
+
+    findings = judged(campaign, calibration.to_json(), outlying, again if without_flagged else None)
+    return replace(calibration, findings=findings, runtime_s=time.perf_counter() - started)
 
 
 def _reference_fit(campaign: Campaign, table: StrainTable, objective: Objective, name: str | None) -> ShapeFit | None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from ..campaign import Curve
+
 BAD_MISFIT = 0.05
 """Share of the range of displacement; with the law's own data and a tester's noise it stays below 0.01."""
 
@@ -35,3 +37,12 @@ def estimate(
         "sd": None if sd is None else finite(sd),
         "interval_95": [float(end) for end in interval_95] if interval_95 is not None and known else None,
     }
+
+
+def force_zero(curve: Curve) -> dict[str, Any]:
+    """The zero of force [mN] that was taken off a test; null where no reading in the air tells it."""
+    checked = curve.checked
+    if checked is None or not (checked.force_zero_mN or checked.force_zero_sd_mN):
+        return estimate(None)
+    value, sd = checked.force_zero_mN, checked.force_zero_sd_mN
+    return estimate(value, sd, (value - 1.96 * sd, value + 1.96 * sd))

@@ -1,6 +1,7 @@
 """Measured (or simulated) tests on single particles: reading, checking, converting and segmenting them."""
 
 from ._adjustment import THRESHOLD_MPA as THRESHOLD_MPA
+from ._adjustment import UNLOADING_ONLY as UNLOADING_ONLY
 from ._adjustment import Adjustment as Adjustment
 from ._adjustment import LoadingCurve as LoadingCurve
 from ._adjustment import adjust as adjust
@@ -8,6 +9,7 @@ from ._adjustment import campaign_segments as campaign_segments
 from ._adjustment import effective_diameter_um as effective_diameter_um
 from ._adjustment import loading_curve as loading_curve
 from ._adjustment import stress_and_strain as stress_and_strain
+from ._adjustment import without_loading as without_loading
 from ._batch import Batch as Batch
 from ._batch import batch as batch
 from ._batch import of_each_particle as of_each_particle
@@ -31,14 +33,16 @@ from ._segments import Segment as Segment
 from ._segments import SegmentKind as SegmentKind
 from ._segments import find_segments as find_segments
 from ._segments import summarise_segments as summarise_segments
-from ._validate import check_campaign as check_campaign
 from ._signal import point_noise as point_noise
+from ._validate import check_campaign as check_campaign
 from ._write import write_campaign as write_campaign
-from .readers import read_diameters as read_diameters
-from .readers import read_tester_file as read_tester_file
 from .findings import Finding as Finding
 from .findings import worst as worst
+from .plausibility import PlausibilityOptions as PlausibilityOptions
+from .plausibility import check_plausibility as check_plausibility
 from .quality import QualityOptions as QualityOptions
 from .quality import campaign_findings as campaign_findings
 from .quality import check_tests as check_tests
 from .quality import named as named
+from .readers import read_diameters as read_diameters
+from .readers import read_tester_file as read_tester_file

@@ -64,6 +64,20 @@ def stress_and_strain(
     return 1e3 * curve.force_mN / (np.pi * diameter**2 / 4), (curve.displacement_um - zero) / diameter
 
 
+UNLOADING_ONLY = "begins at its largest force"
+"""How the reason begins that `without_loading` gives for a record of the unloading alone."""
+
+
+def without_loading(curve: Curve) -> str:
+    """Why a test has no loading, for a reader of `particle ... <reason>`."""
+    force = np.asarray(curve.force_mN, float)
+    tenth = max(len(force) // 10, 1)
+    level, span = float(np.median(force[:tenth])), float(np.ptp(force))
+    if span > 0 and level > force.min() + 0.8 * span and float(np.median(force[-tenth:])) < force.min() + 0.8 * span:
+        return f"{UNLOADING_ONLY} (unloading only); the loading in front of it is missing"
+    return "has no loading: force never rises above its noise"
+
+
 def loading_curve(curve: Curve, diameters_um: np.ndarray, segments: tuple[Segment, ...]) -> LoadingCurve | None:
     """The virgin loading of a test, over all its cycles, as strain over stress.
 
@@ -143,7 +157,7 @@ def adjust(campaign: Campaign, threshold_MPa: float = THRESHOLD_MPA) -> Adjustme
     why_not: list[str | None] = []
     for curve in raw:
         if curve is None:
-            why_not.append("no loading found")
+            why_not.append(without_loading(campaign.curves[len(why_not)]))
         elif curve.stress_max_MPa <= threshold_MPa:
             why_not.append(f"reaches {curve.stress_max_MPa:.3g} MPa only, not the threshold of {threshold_MPa:g} MPa")
         else:

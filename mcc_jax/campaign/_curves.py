@@ -35,7 +35,8 @@ class CurveRows:
     text: str
 
     def curve(self, name: str) -> Curve:
-        return Curve(*(np.ascontiguousarray(column[self.groups[name]]) for column in self.values))
+        time, force, displacement = (np.ascontiguousarray(column[self.groups[name]]) for column in self.values)
+        return Curve(time, force, displacement)
 
     def row(self, record: int) -> int:
         return parse_table(self.text, self.file).rows[record]

@@ -45,4 +45,5 @@ class Finding:
 def worst(findings: Iterable[Finding]) -> Level | None:
     """The most serious level among findings, None where there are none."""
     order: tuple[Level, ...] = ("told", "look", "bad")
-    return max((f.level for f in findings), key=order.index, default=None)
+    levels = {f.level for f in findings}
+    return next((level for level in reversed(order) if level in levels), None)

@@ -21,6 +21,7 @@ from ._schema import Campaign, Checked, Control, Curve, Note
 from ._segments import find_segments
 from ._signal import point_noise, two_lines
 from .findings import Finding
+from .plausibility import wrong_signs
 from .saturation import censor_displacement, censor_force
 
 
@@ -78,6 +79,8 @@ def check_tests(campaign: Campaign, options: QualityOptions | None = None) -> Ca
     if campaign.raw is not None:
         return campaign
     options = options or QualityOptions()
+    if wrong_signs(campaign):
+        return replace(campaign, raw=campaign)  # what looks like air or breakage is the test read backwards
     control = campaign.metadata.control
     curves = tuple(check_test(curve, control, options) for curve in campaign.curves)
     return replace(campaign, curves=curves, raw=campaign)
@@ -337,7 +340,9 @@ def air_until(curve: Curve, control: Control | None, options: QualityOptions) ->
 
 
 def _spike_note(name: str, count: int) -> Note:
-    return Note("spikes", "told", f"{{}} single readings of {name} lie far from their neighbours and are left out", (count,))
+    return Note(
+        "spikes", "told", f"{{}} single readings of {name} lie far from their neighbours and are left out", (count,)
+    )
 
 
 def _stuck_note(name: str, count: int) -> Note:

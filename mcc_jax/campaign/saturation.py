@@ -94,7 +94,9 @@ def plateaus(values: np.ndarray, other: np.ndarray, time: np.ndarray, noise: flo
         pace = float(line.deriv()(time[start - 1]))
         # Halfway, or at the end where the record ends there: a ramp that turns has come farthest.
         some = max(int(length) // 3, 1)
-        middle = np.arange(stop - some, stop) if stop == count else start + int(length) // 2 + np.arange(some) - some // 2
+        middle = (
+            np.arange(stop - some, stop) if stop == count else start + int(length) // 2 + np.arange(some) - some // 2
+        )
         elapsed = float(np.mean(time[middle]) - time[start - 1])
         advance = float(np.mean(other[middle]) - line(time[start - 1]))
         error = noise * np.sqrt(1 / some + 4 / len(before))
@@ -103,7 +105,11 @@ def plateaus(values: np.ndarray, other: np.ndarray, time: np.ndarray, noise: flo
     if not found:
         return []
     # Other stretches at the same end of the range are at it, too, however short.
-    return [(int(a), int(a + n)) for a, n in zip(edges[:-1][top], lengths[top], strict=True) if n >= 2 or (a, a + n) in found]
+    return [
+        (int(a), int(a + n))
+        for a, n in zip(edges[:-1][top], lengths[top], strict=True)
+        if n >= 2 or (a, a + n) in found
+    ]
 
 
 def censor_force(curve: Curve) -> CensoredForce | None:
@@ -176,8 +182,8 @@ def _note(end: float, count: int, largest: list[float], sds: list[float]) -> Not
         return Note("saturation", "look", sentence, (end, count), remedy)
     top, sd = max(largest), max(sds)
     sentence = (
-        "force stands at {} mN, the end of its range, for {} readings while the platens go on; they are left out and the "
-        "turning point is taken from the displacement ({} +- {} mN)"
+        "force stands at {} mN, the end of its range, for {} readings while the platens go on; they are left out and "
+        "the turning point is taken from the displacement ({} +- {} mN)"
     )
     far = top > (1 + TRUSTED) * end or not sd < 0.5 * TRUSTED * end
     if far:
@@ -235,7 +241,9 @@ def _loading(force: np.ndarray, path: np.ndarray, hidden: np.ndarray, start: int
     from scipy.optimize import least_squares
 
     rows = np.arange(start)
-    virgin = rows[(path[rows] >= np.maximum.accumulate(path[rows])) & (force[rows] >= FITTED_FROM * end) & ~hidden[rows]]
+    virgin = rows[
+        (path[rows] >= np.maximum.accumulate(path[rows])) & (force[rows] >= FITTED_FROM * end) & ~hidden[rows]
+    ]
     if len(virgin) < 8:
         return None
     f, d = force[virgin], path[virgin]

@@ -9,9 +9,18 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
+from ._group import NOT_CONVERGED
 from ._output import json_text, results
 from ._session import beside, import_writers, say, say_table, session
-from ._types import CampaignFolder, law_options, out_option, priors_option, seed_option, threshold_option
+from ._types import (
+    CampaignFolder,
+    law_options,
+    leave_out_option,
+    out_option,
+    priors_option,
+    seed_option,
+    threshold_option,
+)
 
 METHODS = ("paper", "least-squares", "bayes")
 # Which methods an option belongs to; given with another one it would be ignored, so it is refused.
@@ -38,6 +47,7 @@ def _applies(name: str, method: str) -> bool:
 @click.argument("campaign", type=CampaignFolder(), metavar="CAMPAIGN")
 @out_option(required=True)
 @click.option("--method", type=click.Choice(METHODS), default="bayes", show_default=True, help="How to calibrate.")
+@leave_out_option
 @threshold_option(". paper: of the offset step, which 0 leaves out; otherwise: points below it do not count.")
 @priors_option("  [least-squares, bayes]")
 @click.option(
@@ -82,6 +92,7 @@ def calibrate(
     campaign: Path,
     out: Path,
     method: str,
+    leave_out: tuple[str, ...],
     threshold_MPa: float,
     priors: Path | None,
     modulus_scatter: bool,
@@ -97,7 +108,7 @@ def calibrate(
     no_figures: bool,
     seed: int,
     as_json: bool,
-) -> None:
+) -> int | None:
     """Fit the law to the tests in the folder CAMPAIGN.
 
     Writes calibration.json and figures/ into DIR, which may be the campaign's own folder; with bayes also posterior.nc,
@@ -108,6 +119,8 @@ def calibrate(
       bayes          everything at once, with honest uncertainty (the default)
       least-squares  everything at once, the best fit and its covariance
       paper          the paper's own steps one after the other, values only
+
+    The exit status is 3 if the calibration did not converge; its files are written all the same.
 
     \b
     Examples:
@@ -122,11 +135,19 @@ def calibrate(
             raise click.UsageError(f"{option} belongs to --method {' or '.join(methods)}, not to {method}.")
     with session(12) as tell:
         from ..campaign import read_campaign
-        from ._calibration import main_numbers, require_particle, say_files, say_state, say_warnings, write_calibration
+        from ._calibration import (
+            left_out,
+            main_numbers,
+            require_particle,
+            say_files,
+            say_state,
+            say_warnings,
+            write_calibration,
+        )
         from ._provenance import provenance
 
         tell("reading the campaign")
-        data = read_campaign(campaign)
+        data = left_out(read_campaign(campaign), leave_out)
         require_particle(reference, data.particles, data.source)
         settings: dict[str, Any] = {"threshold_MPa": threshold_MPa, "seed": seed, "progress": tell}
         origin = provenance("calibrate", campaign, {n: v for n, v in context.params.items() if _applies(n, method)})
@@ -156,7 +177,7 @@ def calibrate(
             content = write_calibration(calibration, stage, origin=origin, figures=not no_figures, tell=tell)
     if as_json:
         click.echo(json_text(content).encode(), nl=False)  # JSON is UTF-8, whatever the terminal speaks
-        return
+        return None if content["converged"] else NOT_CONVERGED
     say_state(content)
     say_table(("quantity", "value"), main_numbers(content))
     misfit = content["diagnostics"].get("relative_misfit")
@@ -164,3 +185,4 @@ def calibrate(
         say(f"The mean law misses the displacements by {100 * misfit:.1f} % of their range (median over particles).")
     say_warnings(content)
     say_files(out, [*content["figures"], *content["files"], "calibration.json"])
+    return None if content["converged"] else NOT_CONVERGED

@@ -11,6 +11,7 @@ from typing import Any
 
 from .._errors import InputError
 from ..calibrate import BayesCalibration, JointModel, LeastSquaresCalibration, PaperCalibration
+from ..campaign import Campaign, Finding
 from ._figures import FIGURES, write_figures, write_result
 from ._output import Stage
 from ._session import Tell, say
@@ -126,22 +127,42 @@ def _number(value: float | None) -> str:
     return "unknown" if value is None else f"{value:.4g}"
 
 
+def left_out(campaign: Campaign, names: tuple[str, ...]) -> Campaign:
+    """The campaign without the particles of `--leave-out`.
+
+    Raises:
+        InputError: for a name that is not there, or if none is left.
+    """
+    for name in names:
+        require_particle(name, campaign.particles, campaign.source, option="--leave-out")
+    return campaign.without(*names) if names else campaign
+
+
 def say_state(content: dict[str, Any]) -> None:
-    """Print how many particles took part and whether the fit converged."""
+    """Print how many particles took part, whether the fit converged, and whether its numbers can be true."""
     used = sum(entry["kept"] for entry in content["particles"])
     law = content["law"]
     say(
         f"Method {content['method']}: {used} of {len(content['particles'])} particles, "
         + (f"a by the {content['a_objective']} objective, " if "a_objective" in content else "")
         + f"unloading {law['unloading']}, strain scaling {law['strain_scaling']}; "
-        + ("converged." if content["converged"] else "NOT converged.")
+        + _state(content)
     )
+
+
+def _state(content: dict[str, Any]) -> str:
+    if not content["converged"]:
+        return "NOT converged."
+    bad = any(one["level"] == "bad" for one in content["findings"])
+    return "the optimisers converged, but NOT TO BE TRUSTED: see below." if bad else "converged."
 
 
 def say_warnings(content: dict[str, Any]) -> None:
     """Print what a reader of the numbers must know."""
-    for warning in content["warnings"]:
-        say(f"Warning: {warning[:1].upper()}{warning[1:].rstrip('.')}.", fg="yellow")
+    bad = {str(Finding(**one)) for one in content["findings"] if one["level"] == "bad"}
+    for warning in sorted(content["warnings"], key=lambda text: text not in bad):
+        colour = "red" if warning in bad else "yellow"
+        say(f"Warning: {warning[:1].upper()}{warning[1:].rstrip('.')}.", fg=colour, bold=warning in bad)
     for entry in content["particles"]:
         if not entry["kept"]:
             say(f"Not used: particle {entry['particle']}: {entry['why_not']}.", fg="yellow")
@@ -158,8 +179,8 @@ def say_files(directory: Path, names: list[str]) -> None:
         say(f"  {FIGURES}/ ({len(figures)} png)")
 
 
-def require_particle(name: str | None, names: tuple[str, ...], source: str) -> None:
-    """Refuse a reference particle that is not there, before anything is computed.
+def require_particle(name: str | None, names: tuple[str, ...], source: str, *, option: str = "--reference") -> None:
+    """Refuse a particle that is not there, before anything is computed.
 
     Raises:
         InputError: naming those that are.
@@ -167,5 +188,5 @@ def require_particle(name: str | None, names: tuple[str, ...], source: str) -> N
     if name is not None and name not in names:
         shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
         raise InputError(
-            f"there is no particle {name!r}", file=source or None, remedy=f"--reference takes one of: {shown}"
+            f"there is no particle {name!r}", file=source or None, remedy=f"{option} takes one of: {shown}"
         )

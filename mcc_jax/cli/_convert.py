@@ -53,7 +53,15 @@ def convert(file: Path, out: Path, diameters: str | None, mapping: Path | None, 
     if diameters is not None and not diameters.strip():
         raise click.BadParameter("it is empty.", param_hint="--diameters")
     with session(3) as tell:
-        from ..campaign import find_segments, read_diameters, read_tester_file, write_campaign
+        from ..campaign import (
+            campaign_findings,
+            check_plausibility,
+            check_tests,
+            find_segments,
+            read_diameters,
+            read_tester_file,
+            write_campaign,
+        )
 
         tell("reading the file")
         sizes = None if diameters is None else read_diameters(diameters)
@@ -81,5 +89,7 @@ def convert(file: Path, out: Path, diameters: str | None, mapping: Path | None, 
         say(f"  ... and {len(rows) - SHOWN} more")
     total = sum(segments, Counter())
     say("Segments in all: " + ", ".join(f"{total[kind]} {kind}" for kind in KINDS) + ".")
+    for one in (*check_plausibility(campaign), *campaign_findings(check_tests(campaign))):
+        say(f"{'Warning' if one.level != 'told' else 'Note'}: {one}", fg="red" if one.level == "bad" else "yellow")
     say(f"Written into {out}: particles.csv, curves.csv, campaign.toml")
     say(f"Next: mcc-jax calibrate {shlex.quote(str(out))} --out fit")

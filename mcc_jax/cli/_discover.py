@@ -13,6 +13,7 @@ from ._types import (
     CampaignFolder,
     exclude_option,
     law_options,
+    leave_out_option,
     out_option,
     priors_option,
     seed_option,
@@ -24,6 +25,7 @@ from ._types import (
 @click.argument("campaign", type=CampaignFolder(), metavar="CAMPAIGN")
 @out_option(required=True)
 @exclude_option
+@leave_out_option
 @threshold_option(default=0.0)
 @priors_option()
 @law_options
@@ -41,6 +43,7 @@ def discover(
     campaign: Path,
     out: Path,
     exclude: tuple[str, ...],
+    leave_out: tuple[str, ...],
     threshold_MPa: float,
     priors: Path | None,
     unloading: str,
@@ -73,15 +76,16 @@ def discover(
     with session(20) as tell:
         from ..campaign import read_campaign
         from ..discover import discover as find
-        from ._calibration import joint_model, say_files
+        from ._calibration import joint_model, left_out, say_files
         from ._discovery import require_mechanisms, say_discovery, write_discovery
         from ._provenance import provenance
 
         require_mechanisms(exclude)
         tell("reading the campaign")
-        data = read_campaign(campaign)
+        data = left_out(read_campaign(campaign), leave_out)
         settings = {
             "exclude": exclude,
+            "leave_out": leave_out,
             "threshold_MPa": threshold_MPa,
             "priors": priors,
             "unloading": unloading,

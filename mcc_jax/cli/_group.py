@@ -1,4 +1,4 @@
-"""How every command ends: exit status 0, 1, 2 or 130, and at most one line on standard error."""
+"""How every command ends: exit status 0, 1, 2, 3 or 130, and at most one line on standard error."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import click
 from .._errors import InputError
 
 PROGRAM = "mcc-jax"
-DONE, DEFECT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+DONE, DEFECT, BAD_INPUT, NOT_CONVERGED, INTERRUPTED = 0, 1, 2, 3, 130
 
 
 class Stop(Exception):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -183,3 +184,13 @@ def law_options(command: Any) -> Any:
         help="Form of the unloading law; the paper's 16 GPa belongs to 'printed' only.",
     )
     return unloading(scaling(command))
+
+
+def leave_out_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Particles that take no part; `apply` it to the campaign by `left_out`."""
+    return click.option(
+        "--leave-out",
+        multiple=True,
+        metavar="NAME",
+        help="Leave this particle out; may be given several times.",
+    )(command)

@@ -11,7 +11,9 @@ import numpy as np
 
 from .._errors import InputError
 from ..calibrate import JointModel
-from ..campaign import Campaign
+from ..calibrate.joint._data import ranges_um
+from ..calibrate.judgement import unlike_others
+from ..campaign import Campaign, Finding, campaign_findings, check_plausibility, check_tests, named
 from ..effects import LIBRARY, Mechanism, present
 from ._candidates import untestable
 from ._closure import Closure, find_closure
@@ -86,12 +88,18 @@ def discover(
         known.pop(name)
     assumed = model or JointModel()
     assumed = JointModel(assumed.unloading, assumed.strain_scaling, True, assumed.shape_scatter, assumed.priors)
-    base = base_fit(campaign, assumed, threshold_MPa=threshold_MPa, tell=tell)
+    campaign = check_tests(campaign)
+    findings = campaign_findings(campaign)
+    wrong = [one for one in check_plausibility(campaign.raw or campaign) if one.level == "bad"]
+    if wrong:
+        return _not_settled((*wrong, *findings), seed, started)
+    base, left_out = _settled_fit(campaign, findings, assumed, threshold_MPa, tell)
+    findings = (*findings, *left_out)
     testable, missing = untestable(without_punch(known, base), present(campaign))
     if not testable:
         raise InputError("no mechanism is left to look for", remedy="Exclude fewer, or measure what the others need.")
     if not bool(np.all(np.asarray(base.fit.converged)[1:])) or not _mostly_converged(base):
-        return _not_converged(base, missing, seed, started)
+        return _not_converged(base, findings, missing, seed, started)
     tell("signatures of all effects")
     signals = signals_of(base, testable, turned=True)
     system = build_system(base, signals)
@@ -103,7 +111,40 @@ def discover(
         system = build_system(base, signals)
     found = _judge(base, system, signals, missing, confirm, experiments, posterior, seed, tell)
     found = dataclasses.replace(found, checks=_checks(known, found.candidate_set))
+    found = dataclasses.replace(found, findings=findings, notes=(*map(str, findings), *found.notes))
     return dataclasses.replace(found, summary=summary_of(found), runtime_s=time.perf_counter() - started)
+
+
+def _settled_fit(
+    campaign: Campaign,
+    findings: Sequence[Finding],
+    model: JointModel,
+    threshold_MPa: float,
+    tell: Callable[[str], None],
+) -> tuple[Base, list[Finding]]:
+    """The base fit of the tests that are of one kind, and what is said of those left out.
+
+    Particles whose turning point cannot be relied on, and those whose residual is unlike all others', would be taken
+    for physics. They take no part in the search.
+    """
+    unsafe = tuple(dict.fromkeys(name for one in findings if one.level == "bad" for name in one.particles))
+    told = []
+    if unsafe and len(unsafe) < len(campaign):
+        told.append(_left_out(unsafe, len(campaign), "cannot be relied on, as said above"))
+        campaign = campaign.without(*unsafe)
+    base = base_fit(campaign, model, threshold_MPa=threshold_MPa, tell=tell)
+    mask = np.asarray(base.tests.mask)
+    rms = np.sqrt((np.asarray(base.fit.residual) ** 2).sum(1) / np.maximum(mask.sum(1), 1))
+    names = [base.name_of(row) for row in range(len(base.tests))]
+    outlying = unlike_others(names, rms, ranges_um(base.tests))
+    if outlying is not None:
+        told.append(dataclasses.replace(outlying, sentence=f"{outlying.sentence}; it takes no part in the search"))
+        base = base_fit(campaign.without(*outlying.particles), model, threshold_MPa=threshold_MPa, tell=tell)
+    return base, told
+
+
+def _left_out(names: tuple[str, ...], of: int, why: str) -> Finding:
+    return Finding("left out", "look", f"{named(names, of)}: {why}; no part in the search", "", names)
 
 
 def _checks(known: Mapping[str, Mechanism], sets: Sequence[tuple[str, ...]]) -> tuple[dict[str, str], ...]:
@@ -116,18 +157,38 @@ def _mostly_converged(base: Base) -> bool:
     return float(np.mean(np.asarray(base.fit.individual.converged))) >= 0.7
 
 
-def _not_converged(base: Base, missing, seed: int, started: float) -> Discovery:
+def _not_converged(base: Base, findings: Sequence[Finding], missing, seed: int, started: float) -> Discovery:
     reasons = [
         name
         for name, fine in zip(("particles", "noise", "population"), np.asarray(base.fit.converged), strict=True)
         if not fine
     ]
+    summary = (
+        f"The base law could not be fitted well enough to ask what it lacks (not converged: {', '.join(reasons)}). "
+        "Nothing is named. Look at the curves and the diameters, leave out damaged tests, and try again."
+    )
+    before = population_parameters(base, None)
+    return _nothing_asked(summary, base, before, findings, missing, seed, started)
+
+
+def _not_settled(findings: Sequence[Finding], seed: int, started: float) -> Discovery:
+    """The answer for tests whose numbers cannot be true: no physics is looked for before that is settled."""
+    summary = f"These numbers cannot be true as they stand: {findings[0]} Nothing is looked for before that is settled."
+    return _nothing_asked(summary, None, {}, findings, (), seed, started)
+
+
+def _nothing_asked(
+    summary: str,
+    base: Base | None,
+    before: dict[str, Any],
+    findings: Sequence[Finding],
+    missing,
+    seed: int,
+    started: float,
+) -> Discovery:
     return Discovery(
         verdict="FIT_NOT_CONVERGED",
-        summary=(
-            f"The base law could not be fitted well enough to ask what it lacks (not converged: {', '.join(reasons)}). "
-            "Nothing is named. Look at the curves and the diameters, leave out damaged tests, and try again."
-        ),
+        summary=summary,
         base=base,
         system=None,
         effects=(),
@@ -139,12 +200,14 @@ def _not_converged(base: Base, missing, seed: int, started: float) -> Discovery:
         held_out=None,
         labels=(),
         p_any=float("nan"),
-        before=population_parameters(base, None),
+        before=before,
         after={},
         next_experiments=(),
         limits={},
         seed=seed,
         runtime_s=time.perf_counter() - started,
+        findings=tuple(findings),
+        notes=tuple(map(str, findings)),
     )
 
 

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..calibrate._result import finite
+from ..campaign import Finding
 from ..effects import EQUIVALENCES, AbstractEffect, Variant
 from ._closure import Closure
 from ._confirm import HeldOut
@@ -101,6 +102,7 @@ class Discovery:
         posterior: of the extended law; None where nothing was added, its fit has an impossible sign, or it was not
             asked for.
         notes: what a reader must know.
+        findings: what the checks of the tests found, and which particles took no part for it.
     """
 
     verdict: Verdict
@@ -125,6 +127,7 @@ class Discovery:
     checks: tuple[dict[str, str], ...] = ()
     posterior: ExtendedPosterior | None = None
     notes: tuple[str, ...] = field(default=())
+    findings: tuple[Finding, ...] = field(default=())
 
     def gap(self) -> dict[str, Any]:
         """The gap at every step, on held-out particles."""
@@ -247,6 +250,7 @@ class Discovery:
                 {"names": list(e.names), "why": e.explanation, "told_apart_by": e.broken_by} for e in EQUIVALENCES
             ],
             "notes": list(self.notes),
+            "findings": [one.to_json() for one in self.findings],
             "seed": self.seed,
             "runtime_s": self.runtime_s,
         }

@@ -119,7 +119,8 @@ def _compared(curve: Any, diameters: np.ndarray, segments: Any, kind: np.ndarray
     told = calibration["provenance"]["settings"].get("threshold_MPa")
     threshold = told if isinstance(told, int | float) else THRESHOLD_MPA
     elastic = (kind == KINDS.index("load")) | (stress >= LEAST_RATIO * np.maximum.accumulate(stress))
-    return touching & elastic & (stress >= threshold)
+    seen = np.ones(len(curve), bool) if curve.checked is None else curve.checked.compared
+    return touching & elastic & (stress >= threshold) & seen
 
 
 def _predicted(campaign: Campaign, shown: list[Shown], entries: dict[str, Any], calibration: dict[str, Any]):

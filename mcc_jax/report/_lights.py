@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from ..calibrate._result import BAD_MISFIT
 from ..calibrate.joint._bayes import ESS_LEAST, RHAT_MOST
 from ..calibrate.joint._weights import PARETO_K_MOST
+from ..campaign import Finding, campaign_findings, check_plausibility, check_tests, worst
 from ._compare import Shown
 from ._numbers import number, percent
 from ._read import Results, checksums_told
@@ -52,7 +53,8 @@ def lights(results: Results, shown: Sequence[Shown] = ()) -> list[Light]:
         results: what a folder holds.
         shown: its particles with their predictions, for what the calibration itself does not tell.
     """
-    found = []
+    findings = tested(results)
+    found = [_finding(one) for one in findings]
     if results.calibration is not None:
         found += _calibration(results.calibration)
         if results.calibration["method"] == "bayes":
@@ -64,7 +66,30 @@ def lights(results: Results, shown: Sequence[Shown] = ()) -> list[Light]:
         found.append(_data(results))
     if results.discovery is not None:
         found.append(_discovery(results.discovery))
+    if worst(findings) == "bad":
+        # Beside numbers that cannot be true nothing is fine: what would be is not judged.
+        found = [replace(light, level="unknown") if light.level == "good" else light for light in found]
     return found
+
+
+def tested(results: Results) -> tuple[Finding, ...]:
+    """What the checks of the tests found: as the results tell it, or by the campaign itself where there are none."""
+    told = [one for _, content in results.results for one in content.get("findings", [])]
+    if told:
+        unique = {(one["check"], tuple(one["particles"]), one["sentence"]): one for one in told}
+        return tuple(Finding(**{**one, "particles": tuple(one["particles"])}) for one in unique.values())
+    if results.results or results.campaign is None:
+        return ()
+    return (
+        *check_plausibility(results.campaign.raw or results.campaign),
+        *campaign_findings(check_tests(results.campaign)),
+    )
+
+
+def _finding(one: Finding) -> Light:
+    level: dict[str, Level] = {"told": "good", "look": "look", "bad": "bad"}
+    value = {"told": "settled", "look": "look at it", "bad": "cannot be true as it stands"}[one.level]
+    return Light(level[one.level], f"Tests: {one.check}", value, "nothing found", str(one))
 
 
 def _calibration(content: dict[str, Any]) -> list[Light]:

@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from .._version import own_version
+from ..campaign import worst
 from ..plots._text import particle_labels
 from . import _pictures as pictures
 from ._chart import LOOKS, chart_data, chart_items, chart_scripts
 from ._compare import KINDS, Shown, compare
-from ._lights import lights
+from ._lights import lights, tested
 from ._numbers import interval, number, percent, probability, with_sd
 from ._read import Results
 from ._tables import measured, parameters, particle_facts, particle_rows
@@ -182,12 +183,12 @@ def _cards(results: Results, checks: list[Any]) -> list[dict[str, str]]:
     if results.calibration is not None:
         content = results.calibration
         used = sum(entry["kept"] for entry in content["particles"])
-        done = content["converged"]
+        done, trusted = content["converged"], worst(tested(results)) != "bad"
         found.append(
             {
-                "level": "good" if done else "bad",
+                "level": "good" if done and trusted else "bad",
                 "title": "Calibration",
-                "answer": "Converged" if done else "Not converged",
+                "answer": "Not converged" if not done else "Converged" if trusted else "Not to be trusted",
                 "line": f"{used} of {len(content['particles'])} particles, method {content['method']}",
             }
         )
@@ -197,7 +198,7 @@ def _cards(results: Results, checks: list[Any]) -> list[dict[str, str]]:
             {
                 "level": "bad" if bad else "look" if look else "good",
                 "title": "Checks",
-                "answer": f"{good} of {len(checks)} fine",
+                "answer": f"{good} of {len(checks)} fine" if trusted else "Numbers cannot be true",
                 "line": f"{listed(words)}, see Diagnostics" if words else "nothing stands out",
             }
         )

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from .._errors import InputError
-from ..campaign import Campaign, file_checksums, read_campaign
+from ..campaign import Campaign, check_tests, file_checksums, read_campaign
 from ._json import read_result
 from ._posterior import Posterior, read_posterior
 
@@ -90,7 +90,7 @@ def read_results(folder: str | Path, campaign: str | Path | None = None, *, name
     discovery = read_result(path / DISCOVERY, "mcc-jax discover") if DISCOVERY in there else None
     results = [(n, c) for n, c in ((CALIBRATION, calibration), (DISCOVERY, discovery)) if c is not None]
     where, why = _find(path, there, campaign, [content for _, content in results])
-    data = None if where is None else read_campaign(where)
+    data = None if where is None else check_tests(read_campaign(where))
     checksums = {} if where is None else file_checksums(where)
     posterior = read_posterior(path / POSTERIOR) if POSTERIOR in there else None
     if data is None and posterior is None and not results:

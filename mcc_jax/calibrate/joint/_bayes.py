@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
 
-from ...campaign import THRESHOLD_MPA, Campaign
-from .._result import estimate, finite, misfit_note
+from ...campaign import THRESHOLD_MPA, Campaign, Finding, check_tests
+from .._result import estimate, finite, force_zero, misfit_note
+from ..judgement import judged, numbers_in_reach, unlike_others
 from ._ahead import compile_ahead
-from ._data import Selection, own_misfit
+from ._data import Selection, own_misfit, ranges_um
 from ._draws import Length, draw_fast, draw_joint
 from ._fit import prepare
 from ._model import JointFit, JointModel
@@ -44,7 +45,7 @@ class BayesCalibration:
     each chain, so every draw counts the same.
 
     Attributes:
-        campaign: the tests.
+        campaign: the tests, checked; `campaign.raw` as they were given.
         selection: which particles and points took part.
         model: what was assumed.
         fit: the joint fit it started from.
@@ -65,6 +66,7 @@ class BayesCalibration:
         rhat, ess_bulk, ess_tail: by parameter of the population, before any thinning.
         leapfrogs: mean number of leapfrog steps of a draw; 0 of independent draws (`joint._importance`).
         seed, runtime_s: for the record.
+        findings: what a reader must know of the tests and of the plausibility of the answer.
     """
 
     campaign: Campaign
@@ -89,6 +91,7 @@ class BayesCalibration:
     seed: int
     runtime_s: float
     notes: tuple[str, ...] = field(default=())
+    findings: tuple[Finding, ...] = field(default=())
 
     @property
     def particles(self) -> tuple[str, ...]:
@@ -145,7 +148,7 @@ class BayesCalibration:
 
     def warnings(self) -> list[str]:
         """What a reader of the numbers must know, one sentence each."""
-        notes = [*self.failures(), *self.selection.notes, *self.notes]
+        notes = [*self.failures(), *map(str, self.findings), *self.selection.notes, *self.notes]
         misfit = misfit_note(own_misfit(self.selection.tests, self.fit.residual))
         if misfit is not None:
             notes.append(misfit)
@@ -210,6 +213,7 @@ class BayesCalibration:
                     "pareto_k": finite(float(self.pareto_k[row])) if row is not None else None,
                     "kept": row is not None,
                     "why_not": self.selection.why_not[i],
+                    "force_zero_mN": force_zero(self.campaign.curves[i]),
                 }
             )
         return {
@@ -232,6 +236,7 @@ class BayesCalibration:
             "priors": self.model.beliefs.to_json(),
             "particles": entries,
             "warnings": self.warnings(),
+            "findings": [one.to_json() for one in self.findings],
             "diagnostics": {
                 "rhat_max": finite(max(self.rhat.values())),
                 "ess_bulk_min": finite(min(self.ess_bulk.values())),
@@ -296,6 +301,7 @@ def calibrate_bayes(
     draws: int = 1000,
     seed: int = 0,
     block: int | None = None,
+    without_flagged: bool = True,
     progress: Callable[[str], None] | None = None,
 ) -> BayesCalibration:
     """The joint posterior of everything: a, modulus, population, noise, and every particle's C1, C3, C5 and zero.
@@ -330,17 +336,19 @@ def calibrate_bayes(
     started = time.perf_counter()
     tell = progress or (lambda _: None)
     model = model or JointModel()
+    campaign = check_tests(campaign)
     length = Length(chains, warmup, draws)
     fast = mode == "fast"
     ahead = (lambda tests, size: compile_ahead(tests, size, model, length)) if fast else None
-    selection, tests, fit, size = prepare(
-        campaign, model, threshold_MPa, fill_up=fast, block=block, meanwhile=ahead, tell=tell
-    )
-    tell("sampling the population" if fast else "sampling everything")
-    key = jax.random.key(seed)
-    parts = draw_fast(key, tests, model, fit, length, size) if fast else draw_joint(key, tests, model, fit, length)
+    with numbers_in_reach(campaign):
+        selection, tests, fit, size = prepare(
+            campaign, model, threshold_MPa, fill_up=fast, block=block, meanwhile=ahead, tell=tell
+        )
+        tell("sampling the population" if fast else "sampling everything")
+        key = jax.random.key(seed)
+        parts = draw_fast(key, tests, model, fit, length, size) if fast else draw_joint(key, tests, model, fit, length)
     tell("diagnosing")
-    return BayesCalibration(
+    calibration = BayesCalibration(
         campaign=campaign,
         selection=selection,
         model=model,
@@ -350,3 +358,13 @@ def calibrate_bayes(
         runtime_s=time.perf_counter() - started,
         **parts,
     )
+    tests = calibration.selection.tests
+    outlying = unlike_others(calibration.particles, calibration.rms_um(), ranges_um(tests))
+
+    def again(some: Campaign) -> dict[str, Any]:
+        settings: dict[str, Any] = {"threshold_MPa": threshold_MPa, "mode": mode, "seed": seed, "block": block}
+        few: dict[str, Any] = {"chains": chains, "warmup": warmup, "draws": draws}
+        return calibrate_bayes(some, model=model, without_flagged=False, **settings, **few).to_json()
+
+    findings = judged(campaign, calibration.to_json(), outlying, again if without_flagged else None)
+    return replace(calibration, findings=findings, runtime_s=time.perf_counter() - started)

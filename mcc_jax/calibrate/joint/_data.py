@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..._errors import InputError
 from ...campaign import (
     THRESHOLD_MPA,
     Campaign,
@@ -22,10 +21,12 @@ from ...campaign import (
     check_tests,
     particle_batch,
     stress_and_strain,
+    without_loading,
 )
 from ...geometry import Particle
 from .._elastic import LEAST_RATIO
 from .._predict import point_noise_um
+from ..judgement import none_usable
 
 LEAST_POINTS = 12
 """Fewer usable points than this cannot carry three coefficients, a zero and their noise."""
@@ -163,12 +164,7 @@ def select_tests(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, mo
     why_not = tuple(one if isinstance(one, str) else None for one in prepared)
     kept = tuple(i for i, one in enumerate(prepared) if not isinstance(one, str))
     if not kept:
-        reasons = "; ".join(f"particle {n!r} {r}" for n, r in zip(campaign.particles[:5], why_not, strict=False))
-        raise InputError(
-            f"no particle can be used ({reasons}{'; ...' if len(why_not) > 5 else ''})",
-            file=campaign.source or None,
-            remedy="Check the diameters (they turn force into stress), or lower the threshold.",
-        )
+        raise none_usable(campaign, why_not, "no particle can be used")
     used = [one for one in prepared if not isinstance(one, str)]
     longest = padded_length(max(len(one.rows) for one in used))
 
@@ -247,7 +243,7 @@ def _prepare(
     for part in segments:
         kind[part.start : part.stop] = part.kind
     if not (kind == "load").any():
-        return "has no loading: force never rises above its noise"
+        return without_loading(curve)
     first = segments[0]
     contact = float(curve.displacement_um[first.stop]) if first.kind == "approach" and len(segments) > 1 else None
     rows = rows_from_contact(curve, segments, most_points)
@@ -269,12 +265,17 @@ def _prepare(
     return _Prepared(rows, mask, loading, float(curve.displacement_um[0] if contact is None else contact))
 
 
+def ranges_um(tests: Tests) -> np.ndarray:
+    """Range of the displacements that are compared, of every test [um], shape (N,)."""
+    mask, measured = np.asarray(tests.mask), np.asarray(tests.displacement)
+    return np.where(mask, measured, -np.inf).max(1) - np.where(mask, measured, np.inf).min(1)
+
+
 def own_misfit(tests: Tests, residual: Float[Array, "particles points"]) -> float:
     """Median over the particles of the root mean square residual, in shares of the range of displacement [-]."""
-    mask, measured = np.asarray(tests.mask), np.asarray(tests.displacement)
-    rms = np.sqrt((np.asarray(residual) ** 2).sum(1) / np.maximum(mask.sum(1), 1))
-    high, low = np.where(mask, measured, -np.inf).max(1), np.where(mask, measured, np.inf).min(1)
-    return float(np.median(rms / np.maximum(high - low, 1e-300)))
+    count = np.maximum(np.asarray(tests.mask).sum(1), 1)
+    rms = np.sqrt((np.asarray(residual) ** 2).sum(1) / count)
+    return float(np.median(rms / np.maximum(ranges_um(tests), 1e-300)))
 
 
 def _notes(campaign: Campaign, kept: tuple[int, ...], used: Sequence[_Prepared], most_points: int):

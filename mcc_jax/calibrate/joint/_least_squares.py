@@ -11,11 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ...campaign import THRESHOLD_MPA, Campaign
-from .._result import estimate, finite, misfit_note
+from ...campaign import THRESHOLD_MPA, Campaign, Finding, check_tests
+from .._result import estimate, finite, force_zero, misfit_note
+from ..judgement import judged, numbers_in_reach, unlike_others
 from ._arrow import Parameters, Solution
 from ._bayes import log_estimate
-from ._data import Selection, Tests, own_misfit
+from ._data import Selection, Tests, own_misfit, ranges_um
 from ._fit import population_at, prepare
 from ._mode import FIRST_SPREAD, spread_slope
 from ._model import JointFit, JointModel
@@ -60,7 +61,7 @@ class LeastSquaresCalibration:
     """The joint least-squares fit of a campaign.
 
     Attributes:
-        campaign: the tests.
+        campaign: the tests, checked; `campaign.raw` as they were given.
         selection: which particles and points took part.
         model: what was assumed.
         loss: the loss of the residuals.
@@ -70,6 +71,7 @@ class LeastSquaresCalibration:
         identifiability: what the data leave open.
         agreeing_starts: how many starts ended at the same optimum, of how many.
         seed, runtime_s: for the record; nothing here is random.
+        findings: what a reader must know of the tests and of the plausibility of the answer.
     """
 
     campaign: Campaign
@@ -83,6 +85,7 @@ class LeastSquaresCalibration:
     agreeing_starts: tuple[int, int]
     seed: int
     runtime_s: float
+    findings: tuple[Finding, ...] = ()
 
     @property
     def particles(self) -> tuple[str, ...]:
@@ -107,6 +110,7 @@ class LeastSquaresCalibration:
     def warnings(self) -> list[str]:
         """What a reader of the numbers must know, one sentence each."""
         notes = [self.reason] if self.reason else []
+        notes += map(str, self.findings)
         notes += [f"the data leave this combination open: {text}" for text in self.identifiability.open]
         agree, count = self.agreeing_starts
         if agree < count:
@@ -138,9 +142,7 @@ class LeastSquaresCalibration:
         flat = np.asarray(tests.flatness)
         eta = 1 + a * flat
         slope = flat / eta
-        mask = np.asarray(tests.mask)
-        count = np.maximum(mask.sum(1), 1)
-        rms = np.sqrt((np.asarray(self.residual()) ** 2).sum(1) / count)
+        rms = self.rms_um()
         position = {i: row for row, i in enumerate(self.selection.kept)}
         entries = []
         for i, name in enumerate(self.campaign.particles):
@@ -165,6 +167,7 @@ class LeastSquaresCalibration:
                     "noise_scale": finite(float(self.fit.noise.scale[row])) if row is not None else None,
                     "kept": row is not None,
                     "why_not": self.selection.why_not[i],
+                    "force_zero_mN": force_zero(self.campaign.curves[i]),
                 }
             )
         tau = np.asarray(self.settings.tau)
@@ -201,6 +204,7 @@ class LeastSquaresCalibration:
             "priors": self.model.beliefs.to_json(),
             "particles": entries,
             "warnings": self.warnings(),
+            "findings": [one.to_json() for one in self.findings],
             "diagnostics": {
                 "rhat_max": None,
                 "ess_bulk_min": None,
@@ -223,6 +227,11 @@ class LeastSquaresCalibration:
         return np.asarray(
             jax.jit(raw_residual, static_argnums=3)(latent, zero, self.selection.tests, self.model.unloading)
         )
+
+    def rms_um(self) -> np.ndarray:
+        """Root mean square residual of every particle [um], shape (N,)."""
+        count = np.maximum(np.asarray(self.selection.tests.mask).sum(1), 1)
+        return np.sqrt((np.asarray(self.residual()) ** 2).sum(1) / count)
 
     @property
     def _alone(self) -> bool:
@@ -274,6 +283,7 @@ def calibrate_least_squares(
     loss: Loss = "linear",
     seed: int = 0,
     block: int | None = None,
+    without_flagged: bool = True,
     progress: Callable[[str], None] | None = None,
 ) -> LeastSquaresCalibration:
     r"""Least squares for a, modulus, and every particle's C1, C3, C5 and zero at once.
@@ -293,6 +303,8 @@ def calibrate_least_squares(
         seed: kept for the record.
         block: particles of a block, as in `calibrate_bayes`; the last step, the fit of all together, is done by every
             process for itself on one device.
+        without_flagged: where single particles are flagged (a broken one, one unlike all others), calibrate again
+            without them and say what the answer is then.
         progress: called with the name of each step.
 
     Raises:
@@ -301,32 +313,34 @@ def calibrate_least_squares(
     started = time.perf_counter()
     tell = progress or (lambda _: None)
     model = model or JointModel()
-    selection, tests, fit, _ = prepare(
-        campaign, model, threshold_MPa, block=block, tell=tell, correlated=loss == "linear", rounds=1
-    )
-    population = population_at(fit.mode, fit.numbers, model.scatter)
-    settings = Pooled(
-        fit.filters,
-        population.tau,
-        population.modulus_scatter,
-        population.shape_scatter,
-        model.zero_sd,
-        model.unloading,
-        model.scatter,
-        loss,
-    )
-    tell("fitting all particles together")
-    low, high = np.asarray(fit.numbers.a)[2:]
-    starts = [float(population.a), *(a for a in STARTS if 0.9 * low < a < 0.9 * high)]
-    mu, log_modulus = np.asarray(population.mu), float(population.log_modulus)
-    found = [solve(fit, settings, tests, a, mu, log_modulus) for a in starts]
-    losses = np.array([float(one.loss) for one in found])
-    losses[~np.isfinite(losses)] = np.inf
+    campaign = check_tests(campaign)
+    with numbers_in_reach(campaign):
+        selection, tests, fit, _ = prepare(
+            campaign, model, threshold_MPa, block=block, tell=tell, correlated=loss == "linear", rounds=1
+        )
+        population = population_at(fit.mode, fit.numbers, model.scatter)
+        settings = Pooled(
+            fit.filters,
+            population.tau,
+            population.modulus_scatter,
+            population.shape_scatter,
+            model.zero_sd,
+            model.unloading,
+            model.scatter,
+            loss,
+        )
+        tell("fitting all particles together")
+        low, high = np.asarray(fit.numbers.a)[2:]
+        starts = [float(population.a), *(a for a in STARTS if 0.9 * low < a < 0.9 * high)]
+        mu, log_modulus = np.asarray(population.mu), float(population.log_modulus)
+        found = [solve(fit, settings, tests, a, mu, log_modulus) for a in starts]
+        losses = np.array([float(one.loss) for one in found])
+        losses[~np.isfinite(losses)] = np.inf
     count = len(selection.kept)
     fit, best = fit.first(count), found[int(np.argmin(losses))].first(count)
     settings = replace(settings, whitening=fit.filters)
     agree = int(np.sum(losses <= losses.min() * (1 + 1e-5) + 1e-6))
-    return LeastSquaresCalibration(
+    calibration = LeastSquaresCalibration(
         campaign,
         selection,
         model,
@@ -339,6 +353,14 @@ def calibrate_least_squares(
         seed,
         time.perf_counter() - started,
     )
+    outlying = unlike_others(calibration.particles, calibration.rms_um(), ranges_um(selection.tests))
+
+    def again(some: Campaign) -> dict[str, Any]:
+        settings: dict[str, Any] = {"threshold_MPa": threshold_MPa, "loss": loss, "seed": seed, "block": block}
+        return calibrate_least_squares(some, model=model, without_flagged=False, **settings).to_json()
+
+    findings = judged(campaign, calibration.to_json(), outlying, again if without_flagged else None)
+    return replace(calibration, findings=findings, runtime_s=time.perf_counter() - started)
 
 
 def solve(fit: JointFit, settings: Pooled, tests: Tests, a: float, mu: np.ndarray, log_modulus: float) -> Solution:

@@ -1,0 +1,198 @@
+"""What a reader of a calibration must know of its tests: faults, outlying particles, implausible numbers.
+
+Whatever is found of single particles is told with the answer without them, so that no flagged test moves or widens the
+answer of the others in silence.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from .._errors import InputError
+from ..campaign import UNLOADING_ONLY, Campaign, Finding, campaign_findings, check_plausibility, named
+
+
+@dataclass(frozen=True)
+class JudgementOptions:
+    """When a particle is unlike all others, and how much is done about flagged ones.
+
+    Attributes:
+        outlying: a particle is unlike the others if the logarithm of its residual lies so many robust standard
+            deviations (1.4826 times the median absolute deviation) above their median: of 1000 normal ones none does.
+        times: and if its residual is so many times their median, at least: smaller differences do no harm.
+        share: of the particles, at most, can be unlike all others; more are a mixture.
+        least: particles, at least, to know what is usual.
+        answers: so many sets of flagged particles are left out in turn to tell the answer without them, at most.
+        left: particles, at least, that an answer without the flagged ones rests on.
+    """
+
+    outlying: float = 5.0
+    times: float = 3.0
+    share: float = 0.2
+    least: int = 5
+    answers: int = 4
+    left: int = 3
+
+
+def unlike_others(
+    names: Sequence[str], rms_um: np.ndarray, range_um: np.ndarray, options: JudgementOptions | None = None
+) -> Finding | None:
+    """The particles whose residual is unlike all others', both in micrometres and as a share of their range.
+
+    Args:
+        names: of N particles.
+        rms_um: root mean square residuals [um], shape (N,).
+        range_um: ranges of their displacements [um], shape (N,).
+        options: see `JudgementOptions`.
+    """
+    options = options or JudgementOptions()
+    rms, reach = np.asarray(rms_um, float), np.asarray(range_um, float)
+    known = np.isfinite(rms) & (rms > 0) & (reach > 0)
+    if known.sum() < options.least:
+        return None
+    far = np.zeros(len(rms), bool)
+    far[known] = _far(np.log(rms[known]), options) & _far(np.log(rms[known] / reach[known]), options)
+    if not far.any() or far.sum() > max(1, options.share * len(rms)):
+        return None
+    which = tuple(n for n, out in zip(names, far, strict=True) if out)
+    times = rms[far] / np.median(rms[known])
+    low, high = f"{times.min():.2g}", f"{times.max():.2g}"
+    text = f"{named(which, len(names))}: the residual is {low if low == high else f'{low} to {high}'} times the others'"
+    return Finding(
+        "unlike the others", "look", text, "Look at the curve, and leave the particle out if it is no test", which
+    )
+
+
+def _far(logs: np.ndarray, options: JudgementOptions) -> np.ndarray:
+    away = logs - np.median(logs)
+    spread = 1.4826 * float(np.median(np.abs(away)))
+    return away > max(options.outlying * spread, np.log(options.times))
+
+
+def judged(
+    campaign: Campaign,
+    content: Mapping[str, Any],
+    outlying: Finding | None,
+    again: Callable[[Campaign], Mapping[str, Any]] | None,
+    options: JudgementOptions | None = None,
+) -> tuple[Finding, ...]:
+    """All findings of a calibrated campaign, each with what the answer is without the particles that it names.
+
+    Args:
+        campaign: the checked campaign.
+        content: a, modulus and their errors as in `calibration.json`.
+        outlying: what `unlike_others` found.
+        again: calibrates a campaign and gives the same numbers; None to leave the answers without them out.
+        options: see `JudgementOptions`.
+    """
+    options = options or JudgementOptions()
+    found = [*campaign_findings(campaign), *([] if outlying is None else [outlying])]
+    found += check_plausibility(campaign.raw or campaign, modulus_MPa=content["effective_modulus_MPa"]["value"])
+    if again is None:
+        return tuple(found)
+    answers: dict[tuple[str, ...], str] = {}
+    told = []
+    for one in found:
+        few = 0 < len(one.particles) <= len(campaign) / 2 and len(campaign) - len(one.particles) >= options.left
+        if one.level != "told" and few:
+            if one.particles not in answers and len(answers) < options.answers:
+                answers[one.particles] = _without(campaign, content, one.particles, again)
+            answer = answers.get(one.particles)
+            one = one if answer is None else replace(one, sentence=f"{one.sentence}; {answer}")
+        told.append(one)
+    return tuple(told)
+
+
+def none_usable(campaign: Campaign, why_not: Sequence[str | None], problem: str) -> InputError:
+    """The error where too few particles can be used: each reason once, with the particles it holds for.
+
+    Args:
+        campaign: the tests.
+        why_not: for each particle, why it cannot be used, None if it can.
+        problem: what cannot be done.
+    """
+    members: dict[str, list[str]] = {}
+    for name, reason in zip(campaign.particles, why_not, strict=True):
+        if reason is not None:
+            members.setdefault(reason, []).append(name)
+    told = [f"{_lower(named(tuple(names), len(campaign)))} {reason}" for reason, names in list(members.items())[:3]]
+    more = "; ..." if len(members) > 3 else ""
+    remedy = "Look at the curves, and check diameters, units and the threshold"
+    if members and all(reason.startswith(UNLOADING_ONLY) for reason in members):
+        remedy = "Join each test's loading in front of its unloading, in the order of time"
+    return no_answer(campaign, f"{problem} ({'; '.join(told)}{more})" if told else problem, remedy)
+
+
+def _lower(text: str) -> str:
+    return text[:1].lower() + text[1:]
+
+
+def no_answer(campaign: Campaign, problem: str, remedy: str) -> InputError:
+    """The error for a campaign that cannot be calibrated: what is wrong, and the likely slip where there is one."""
+    slips = [one for one in check_plausibility(campaign.raw or campaign) if one.level == "bad"]
+    if slips:
+        problem, remedy = f"{problem}; {slips[0].sentence}", slips[0].remedy
+    return InputError(problem, file=campaign.source or None, remedy=remedy)
+
+
+@contextlib.contextmanager
+def numbers_in_reach(campaign: Campaign) -> Iterator[None]:
+    """Turn what linear algebra says of numbers beyond its reach into one line that a person can act on.
+
+    Raises:
+        InputError: in place of a matrix that is singular or not finite.
+    """
+    try:
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)
+            yield
+    except InputError:
+        raise
+    except (np.linalg.LinAlgError, FloatingPointError, OverflowError, ZeroDivisionError, ValueError) as error:
+        text = str(error)
+        # A ValueError of ours is about an argument; those of NumPy and SciPy that are meant here speak of NaN.
+        if isinstance(error, ValueError) and not isinstance(error, np.linalg.LinAlgError) and "infs or NaN" not in text:
+            raise
+        raise no_answer(
+            campaign,
+            f"the law cannot be fitted to these tests: their numbers are beyond what arithmetic can resolve ({text})",
+            "Look at the curves, leave out the test that is unlike the others, and check the units",
+        ) from None
+
+
+def _without(
+    campaign: Campaign,
+    content: Mapping[str, Any],
+    names: tuple[str, ...],
+    again: Callable[[Campaign], Mapping[str, Any]],
+) -> str:
+    it = "it" if len(names) == 1 else "them"
+    try:
+        other = again(campaign.without(*names))
+    except InputError as error:
+        return f"without {it} there is no answer ({error.problem})"
+    return f"without {it} {_answer(other)}, with {it} {_answer(content)}"
+
+
+def _answer(content: Mapping[str, Any]) -> str:
+    parts = []
+    modulus = content["effective_modulus_MPa"]
+    if modulus["value"] is None:
+        parts.append("the modulus is unknown")
+    else:
+        parts.append(f"the modulus is {_pair(modulus, 1e-3)} GPa")
+    parts.append(f"a {_pair(content['a'])}")
+    return " and ".join(parts) + ("" if content.get("converged", True) else " (not converged)")
+
+
+def _pair(estimate: Mapping[str, Any], factor: float = 1.0) -> str:
+    value, sd = estimate["value"], estimate["sd"]
+    if value is None:
+        return "unknown"
+    return f"{factor * value:.4g}" + ("" if sd is None else f" +- {factor * sd:.2g}")
