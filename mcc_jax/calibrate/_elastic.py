@@ -123,11 +123,13 @@ def recoverable_strain(
     shape_power: Float[Array, " branches"],
     unloading: Unloading,
 ) -> Float[Array, " branches"]:
-    """Recoverable strain from the *measured* peak of each branch, whatever the loading law."""
+    """Recoverable strain from the *measured* peak of each branch, whatever the loading law; never more than the peak."""
     modulus = jnp.exp(log_modulus)
     if unloading is Unloading.PRINTED:
-        return jnp.sqrt(stress_max / (unloading.constant * modulus * shape_power * strain_max))
-    return stress_max / (modulus * jnp.sqrt(unloading.constant * shape_power * strain_max))
+        found = jnp.sqrt(stress_max / (unloading.constant * modulus * shape_power * strain_max))
+    else:
+        found = stress_max / (modulus * jnp.sqrt(unloading.constant * shape_power * strain_max))
+    return jnp.minimum(found, strain_max)
 
 
 @partial(jax.jit, static_argnames=("unloading", "count"))

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from .._types import Scalar, Values
 from ..geometry import Particle
-from ..law import MccLaw, Unloading, loading_strain
+from ..law import MccLaw, Unloading, loading_strain, recoverable_share, work_per_square
 from ._effect import AbstractEffect, Factors
 from ._record import Record
 
@@ -110,5 +110,7 @@ def recoverable_displacement(
         square = shape * secant / (law.unloading.constant * modulus)
     else:
         square = shape * x * (secant / modulus) ** 2 / law.unloading.constant
+    most = shared(recoverable_share(secant, work_per_square(*law.plastic.polynomial, x)) * x / eta)
+    square = jnp.minimum(square, shared(most * most))
     carries = moved & (square > jnp.finfo(square.dtype).tiny)
     return particle.displacement(jnp.where(carries, jnp.sqrt(jnp.where(carries, square, 1.0)), 0.0))

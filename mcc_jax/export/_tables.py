@@ -29,7 +29,8 @@ class CurveTables:
 
     Attributes:
         loading: `scaled_strain` (eta_p eps), `stress_MPa`, `tangent_MPa` (d stress / d scaled strain) and
-            `recovered_strain_at_eta_1`: the strain recovered from there, to be multiplied by eta_p^((1 - p)/2).
+            `recovered_strain_at_eta_1`: the strain recovered from there, to be multiplied by eta_p^((1 - p)/2);
+            no more than the peak strain eps_P, nor than 3 pi W / (4 sigma_P) with W the integral of stress over strain.
         unloading: `recovered_share` s and `stress_share` g(s) of the peak stress.
         error: largest error of linear interpolation, as a share of each column's largest value.
     """

@@ -1,6 +1,8 @@
 """The contact law: loading, unloading, reloading, its inverse, its energy, its population, its references."""
 
 from ._base import AbstractContactLaw as AbstractContactLaw
+from ._branch import recoverable_share as recoverable_share
+from ._branch import work_per_square as work_per_square
 from ._loading_inverse import loading_strain as loading_strain
 from ._loading_inverse import tangent_modulus as tangent_modulus
 from ._mcc import TESTED_STRAIN as TESTED_STRAIN

@@ -11,7 +11,7 @@ from .._numerics import compiled_whole, derivative_kept, running_max, shared
 from .._types import Flag, Path, Scalar, scalar
 from ..geometry import Particle, plastic_shape_factor
 from ._base import AbstractContactLaw
-from ._branch import AREA, branch_coefficients, branch_force
+from ._branch import AREA, branch_coefficients, branch_force, recoverable_share, work_per_square
 from ._loading_inverse import loading_strain, secant_modulus
 from ._plastic import Plastic
 from ._recovery import energy_ratio, recovery, stress_ratio
@@ -123,8 +123,11 @@ class MccLaw(AbstractContactLaw[History]):
             \delta^2 = \frac{\sigma_P}{4.12\, \bar E\, \eta_p^p\, \epsilon_P} \ (\text{printed}), \qquad
             \delta^2 = \frac{\sigma_P^2}{k\, \bar E^2\, \eta_p^p\, \epsilon_P} \ (\text{punch forms})
 
-        with p of the `StrainScaling`. The printed form does not vanish at zero strain: below a peak strain of about
-        0.01 (0.2 MPa) its residual strain is negative, and just below that its unloading creates energy.
+        with p of the `StrainScaling`, and never more than gives back the work of loading, nor than :math:`\epsilon_P`
+        itself (`Unloading`). The printed formula does not vanish
+        at zero strain: from peaks below about 0.01 (0.2 MPa, the stress from which the paper's own data count) it would
+        recover more strain than there was, and give back more energy than loading took. There the contact is elastic
+        as a whole; above, the formula is as printed.
         """
         eta = self.shape_factor(particle)
         _, _, recoverable = self._elastic(eta, eta * strain_max)
@@ -156,6 +159,9 @@ class MccLaw(AbstractContactLaw[History]):
             square = shared(eta ** (1 - power) * secant / (k * self.effective_modulus))
         else:
             square = eta ** (1 - power) * x * shared(secant / self.effective_modulus) ** 2 / k
+        share = recoverable_share(secant, work_per_square(*self.plastic.polynomial, x))
+        most = shared(share * x / eta)
+        square = jnp.minimum(square, shared(most * most))
         carries = (x > 0) & (square > jnp.finfo(square.dtype).tiny)  # down to where the root still has a derivative
         return x * secant, carries, shared(jnp.sqrt(jnp.where(carries, square, 1.0)))
 
