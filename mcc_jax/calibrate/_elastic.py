@@ -123,7 +123,7 @@ def recoverable_strain(
     shape_power: Float[Array, " branches"],
     unloading: Unloading,
 ) -> Float[Array, " branches"]:
-    """Recoverable strain from the *measured* peak of each branch, whatever the loading law; never more than the peak."""
+    """Recoverable strain from the *measured* peak of each branch, whatever the loading law; at most the peak's own."""
     modulus = jnp.exp(log_modulus)
     if unloading is Unloading.PRINTED:
         found = jnp.sqrt(stress_max / (unloading.constant * modulus * shape_power * strain_max))

@@ -12,7 +12,7 @@ from jaxtyping import Array
 
 from .._errors import InputError
 from .._numerics import shared
-from .._types import Scalar
+from .._types import Flag, Scalar, Values
 from ..law import energy_ratio, stress_ratio
 from ..law._branch import branch_force, recoverable_share, work_per_square
 from ..law._loading_inverse import quintic, secant_modulus, tangent_modulus
@@ -231,7 +231,7 @@ def _tangent(side: _Numbers, d: Scalar) -> Scalar:
 
 
 def _span(power: int, side: _Numbers | HalfContact, force: Scalar, d: Scalar) -> Scalar:
-    """Compression recovered on full release, no more than gives back the work of loading; 1 where nothing is carried."""
+    """Compression recovered on full release, no more than gives back the work taken; 1 where nothing is carried."""
     square, carries = _span_squared(power, side.c, force, d)
     most = shared(_most_share(side, d) * d)
     square = jnp.minimum(square, shared(most * most))

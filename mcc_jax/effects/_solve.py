@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from .._numerics import shared
 from .._types import Scalar, Values
 from ..geometry import Particle
 from ..law import MccLaw, Unloading, loading_strain, recoverable_share, work_per_square

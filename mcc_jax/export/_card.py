@@ -19,7 +19,8 @@ FORMULAE = {
     "shape_factor": "eta_p = 1 + a (1 - D3^2 / (D1 D2))",
     "loading": "sigma / MPa = C1 x - (C3 x)^3 + (C5 x)^5 with x = eta_p eps, for eps >= eps_P",
     "history": "eps_P is the largest strain so far, sigma_P the loading stress there",
-    "recovered_strain": "delta^2 = (sigma_P / E)^n / (k eta_p^p eps_P), but delta <= eps_P and delta <= 3 pi W / (4 sigma_P), W the work of loading: no contact gives back more than it took",
+    "recovered_strain": "delta^2 = (sigma_P / E)^n / (k eta_p^p eps_P), but delta <= eps_P and "
+    "delta <= 3 pi W / (4 sigma_P), W the work of loading: no contact gives back more than it took",
     "unloading": "sigma = sigma_P g(s), g(s) = (2/pi) (acos s - s sqrt(1 - s^2)), s = (eps_P - eps) / delta, "
     "for eps < eps_P; 0 for s >= 1; reloading retraces it",
     "unloading_slope": "dg/ds = -(4/pi) sqrt(1 - s^2)",

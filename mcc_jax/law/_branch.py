@@ -97,10 +97,12 @@ def branch_force(power: int, k1: Scalar, k3: Scalar, k5: Scalar, c: Scalar, peak
     .. math:: F = F_P f(d / \Delta), \quad F_P = k_P \gamma_P, \quad k_P = k_1 - k_3 \gamma_P^2 + k_5 \gamma_P^4, \quad
         \Delta^2 = c\, k_P^n \gamma_P^{n-1}
 
-    and :math:`\Delta` at most what `recoverable_share` allows. Derivatives are written out, because reverse mode then stores half as many arrays along a path. With
-    :math:`h = -\tfrac12 s f'`:
+    and :math:`\Delta` at most what `recoverable_share` allows. Derivatives are written out, because reverse mode then
+    stores half as many arrays along a path. With :math:`h = -\tfrac12 s f'`, where the formula holds:
 
     .. math:: dF = (f + n h)\, dF_P - h k_P\, d\gamma_P + h F_P\, dc/c + F_P f'\, d(d)/\Delta
+
+    and in general :math:`dF = f\, dF_P + 2 h F_P\, d\log\Delta + F_P f'\, d(d)/\Delta`.
 
     Args:
         power: n, 1 (printed form) or 2 (punch forms).
@@ -133,7 +135,7 @@ def _branch_force_jvp(power, primals, tangents):
     h = 0.5 * s * fall
     by_constants = peak * (dk1 - square * (dk3 - square * dk5))
     dforce = by_constants + tangent_modulus(k1, k3, k5, peak) * dpeak
-    # 2 h F_P d(log of the recovered displacement): by the formula, where all strain is recovered, and where all work is.
+    # The terms with h are 2 h F_P d(log Delta): by the formula, where all strain is recovered, and where all work is.
     own = jnp.where(all_strain | all_work, 0.0, h)
     share = shared(jnp.where(all_work, 2 * h * secant / work_per_square(k1, k3, k5, peak), 0.0))
     factor = jnp.where(secant > 0, ratio + power * own - jnp.where(all_work, 2 * h, 0.0), 0.0)

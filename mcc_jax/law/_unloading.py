@@ -29,9 +29,9 @@ class Unloading(enum.Enum):
 
     .. math:: \delta \le \epsilon_P, \qquad \tfrac{4}{3\pi} \sigma_P \delta \le \int_0^{\epsilon_P} \sigma\, d\epsilon
 
-    With the paper's numbers the first binds below a peak strain of 0.010 to 0.014 (0.1 MPa; its data count from 0.2 MPa on)
-    in the printed form and of 2e-7 in the punch forms, the second nowhere. Above, the formulas are as printed. The second
-    binds where loading hardens and the modulus is no larger than the stress.
+    With the paper's numbers the first binds below a peak strain of 0.010 to 0.014 (0.1 MPa; its data count from 0.2 MPa
+    on) in the printed form and of 2e-7 in the punch forms, the second nowhere. Above, the formulas are as printed. The
+    second binds where loading hardens and the modulus is no larger than the stress.
 
     References:
         Bommireddy et al. (2018), eq. 24; Mesarovic and Johnson (2000); Hill and Storakers (1990).
