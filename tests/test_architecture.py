@@ -24,6 +24,7 @@ LAYERS = {
     "units": LEAF,
     "_blocks": 1,
     "_text": 1,
+    "files": 1,
     "geometry": 1,
     "law": 2,
     "campaign": 3,

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from pathlib import Path
 
-from .._errors import InputError
+from ..files import LIMITS, open_regular
 from ._csv import CURVES, METADATA
 from ._curves import PARTICLES
 
@@ -19,13 +20,8 @@ def file_checksums(folder: str | Path) -> dict[str, str]:
     found = {}
     for name in (PARTICLES, CURVES, METADATA):
         file = Path(folder) / name
-        if not file.is_file():
+        if not os.path.lexists(file):
             continue
-        try:
-            with file.open("rb") as stream:
-                found[name] = hashlib.file_digest(stream, "sha256").hexdigest()
-        except OSError as error:
-            raise InputError(
-                f"cannot be read: {error.strerror or error}", file=file, remedy="Check the permissions"
-            ) from None
+        with open_regular(file, LIMITS.table_bytes, "Split the campaign into several folders") as stream:
+            found[name] = hashlib.file_digest(stream, "sha256").hexdigest()
     return found

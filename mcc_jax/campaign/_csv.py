@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import unicodedata
 from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -10,17 +11,18 @@ from pathlib import Path
 import numpy as np
 
 from .._errors import InputError
+from ..files import LIMITS, FileLimits
 from ._columns import LENGTH, convert, find_column
 from ._curves import PARTICLES, CurveRows, name_column, read_curves
-from ._metadata import parse_metadata
+from ._metadata import parse_metadata, read_settings
 from ._schema import Campaign
-from ._table import Table, decode, read_bytes, read_table
+from ._table import Table, read_table
 from ._validate import check_magnitudes
 
 CURVES, METADATA = "curves.csv", "campaign.toml"
 
 
-def read_campaign(folder: str | os.PathLike[str]) -> Campaign:
+def read_campaign(folder: str | os.PathLike[str], *, limits: FileLimits = LIMITS) -> Campaign:
     """Read a campaign folder and check all of it.
 
     Lengths become um, forces mN, times s, whatever units the columns are named with. Rows of different particles
@@ -28,6 +30,7 @@ def read_campaign(folder: str | os.PathLike[str]) -> Campaign:
 
     Args:
         folder: the folder that holds `particles.csv`, `curves.csv` and perhaps `campaign.toml`.
+        limits: how large these files may be.
 
     Returns:
         The campaign, with every value finite, every diameter positive and every curve at least two rows long.
@@ -37,18 +40,17 @@ def read_campaign(folder: str | os.PathLike[str]) -> Campaign:
     """
     path = Path(folder)
     check_folder(path)
-    table = read_table(path / PARTICLES)
+    table = read_table(path / PARTICLES, limits)
     names, diameters, columns = _parse_particles(table)
-    curves = read_curves(path / CURVES)
+    curves = read_curves(path / CURVES, limits)
     _check_match(table, names, curves, path)
     metadata_file = path / METADATA
-    toml = decode(read_bytes(metadata_file), metadata_file) if _has_content(metadata_file) else ""
     campaign = Campaign(
         particles=names,
         diameters_um=diameters,
         curves=tuple(curves.curve(name) for name in names),
         columns=columns,
-        metadata=parse_metadata(toml, metadata_file),
+        metadata=parse_metadata(_metadata_text(metadata_file, limits), metadata_file),
         source=str(path),
     )
     for name, curve in zip(names, campaign.curves, strict=True):
@@ -89,8 +91,21 @@ def check_folder(path: Path) -> None:
             raise InputError(f"{name} is missing", file=path, remedy=remedy)
 
 
-def _has_content(file: Path) -> bool:
-    return file.is_file() and file.stat().st_size > 0 if file.exists() else False
+def _metadata_text(file: Path, limits: FileLimits) -> str:
+    """The text of `campaign.toml`; empty if there is none. What stands there under that name is never passed over.
+
+    Raises:
+        InputError: if it cannot be read, or the name is written in another way, so that nobody would look for it.
+    """
+    if os.path.lexists(file):
+        return read_settings(file, limits)
+    for entry in file.parent.iterdir():
+        plain = unicodedata.normalize("NFKC", entry.name).strip().casefold()
+        if plain in (METADATA, f"{METADATA}.txt"):
+            raise InputError(
+                f"would be ignored under this name: it is not {METADATA!r}", file=entry, remedy="Rename it"
+            )
+    return ""
 
 
 def read_particles(file: str | Path) -> tuple[tuple[str, ...], np.ndarray, dict[str, tuple[str, ...]]]:

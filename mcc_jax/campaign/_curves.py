@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from .._errors import InputError
+from ..files import LIMITS, FileLimits
 from ._columns import FORCE, LARGEST_MAGNITUDE, LENGTH, TIME, convert, find_column, missing_column
 from ._schema import Curve
 from ._table import decode, parse_table, read_bytes
@@ -75,8 +76,8 @@ class CurveRows:
                 )
 
 
-def read_curves(file: Path) -> CurveRows:
-    data = read_bytes(file)
+def read_curves(file: Path, limits: FileLimits = LIMITS) -> CurveRows:
+    data = read_bytes(file, limits)
     text = decode(data, file)
     first = re.split(r"[\r\n]", text, maxsplit=1)[0]
     layout = _curve_layout(parse_table(f"{first}\n{first}", file).header, file) if first else None

@@ -14,8 +14,10 @@ from typing import Any, get_args
 import numpy as np
 
 from .._errors import InputError
+from ..files import LIMITS, FileLimits, check_toml, read_regular
 from ._columns import FORCE, LENGTH, convert, find_column
 from ._schema import Control, Metadata
+from ._table import decode
 
 _QUANTITIES = {"force_resolution": FORCE, "displacement_resolution": LENGTH, "punch_diameter": LENGTH}
 _WORDS = ("control", "provenance", "corrections")
@@ -29,6 +31,7 @@ def load_toml(text: str, file: Path) -> dict[str, Any]:
     Raises:
         InputError: naming the line with the mistake.
     """
+    check_toml(text, file)
     try:
         entries = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
@@ -79,12 +82,22 @@ def load_toml_file(path: str | Path, what: str) -> dict[str, Any]:
     """
     file = Path(path)
     try:
-        text = file.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", file=file, remedy=f"Give {what}.") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"is no text in UTF-8: {error}", file=file, remedy="Save it as UTF-8.") from error
+        text = read_settings(file)
+    except InputError as error:
+        raise InputError(
+            error.problem, file=file, row=error.row, column=error.column, remedy=f"{error.remedy}: {what}"
+        ) from None
     return load_toml(text, file)
+
+
+def read_settings(file: Path, limits: FileLimits = LIMITS) -> str:
+    """The text of a TOML file, which may be empty.
+
+    Raises:
+        InputError: if it cannot be read, is too large, or is no UTF-8 text.
+    """
+    data = read_regular(file, limits.settings_bytes, "Keep settings alone in it; readings belong in a table")
+    return decode(data, file, "plain text in UTF-8")
 
 
 def parse_metadata(text: str, file: Path) -> Metadata:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from .._errors import InputError
+from ..files import LIMITS, FileLimits, read_table_bytes
 from ._columns import LARGEST_MAGNITUDE
 
 CONVERT = "mcc-jax convert with a mapping file"
@@ -40,27 +41,19 @@ def binary_kind(data: bytes) -> str | None:
     return "binary (it holds NUL bytes)" if b"\0" in data else None
 
 
-def read_bytes(file: Path) -> bytes:
-    """The bytes of a file.
+def read_bytes(file: Path, limits: FileLimits = LIMITS) -> bytes:
+    """The bytes of a table or a tester's export.
 
     Raises:
-        InputError: if it cannot be read, or is empty.
+        InputError: if it cannot be read, is empty or too large; see `mcc_jax.files`.
     """
-    try:
-        data = file.read_bytes()
-    except FileNotFoundError:
-        raise InputError("there is no such file", file=file, remedy="Check the path") from None
-    except IsADirectoryError:
-        raise InputError("this is a folder where a file is expected", file=file, remedy="Give a file") from None
-    except (OSError, ValueError) as error:
-        why = (isinstance(error, OSError) and error.strerror) or str(error)
-        raise InputError(f"cannot be read: {why}", file=file, remedy="Check the permissions and the path") from None
+    data = read_table_bytes(file, limits)
     if not data.strip(b" \t\r\n\xef\xbb\xbf"):
         raise InputError("the file is empty", file=file, remedy="Export it again")
     return data
 
 
-def decode(data: bytes, file: Path) -> str:
+def decode(data: bytes, file: Path, wanted: str = "plain CSV text in UTF-8") -> str:
     """UTF-8 text, without a byte order mark.
 
     Raises:
@@ -68,7 +61,7 @@ def decode(data: bytes, file: Path) -> str:
     """
     kind = binary_kind(data)
     if kind is not None:
-        raise InputError(f"the file is {kind}, not text", file=file, remedy="Save it as plain CSV text in UTF-8")
+        raise InputError(f"the file is {kind}, not text", file=file, remedy=f"Save it as {wanted}")
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -209,6 +202,6 @@ def parse_table(text: str, file: Path) -> Table:
     return Table(file, header, records, rows)
 
 
-def read_table(file: Path) -> Table:
+def read_table(file: Path, limits: FileLimits = LIMITS) -> Table:
     """Read and split a table; see `decode` and `parse_table` for what is refused."""
-    return parse_table(decode(read_bytes(file), file), file)
+    return parse_table(decode(read_bytes(file, limits), file), file)

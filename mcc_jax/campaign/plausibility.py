@@ -90,15 +90,13 @@ def _slips() -> tuple[Slip, ...]:
         ("displacement", "um", "nm", "mm"),
         ("diameter", "um", "nm", "mm"),
     ):
-        column = {"force": "the force column", "displacement": "the displacement column", "diameter": "D1, D2, D3"}[
-            name
-        ]
+        column = "D1, D2, D3" if name == "diameter" else f"the {name} column"
         verb = "are" if name == "diameter" else "is"
         for factor, unit in ((1e-3, smaller), (1e3, larger)):
             words = f"{column} {verb} in {unit} and called {symbol} (or off by {1 / factor:g} in another way)"
             remedy = f"Name the unit as it is: _{unit} instead of _{symbol} in the header, or unit in the mapping file"
-            factors = [factor if other == name else 1.0 for other in ("force", "displacement", "diameter")]
-            found.append(Slip(words, remedy, *factors))
+            undo = {other: factor if other == name else 1.0 for other in ("force", "displacement", "diameter")}
+            found.append(Slip(words, remedy, undo["force"], undo["displacement"], undo["diameter"]))
     found.append(
         Slip("radii are given for the diameters", "Enter diameters: D1, D2, D3 are twice the radii", diameter=2.0)
     )

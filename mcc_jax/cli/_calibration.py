@@ -12,6 +12,7 @@ from typing import Any
 from .._errors import InputError
 from ..calibrate import BayesCalibration, JointModel, LeastSquaresCalibration, PaperCalibration
 from ..campaign import Campaign, Finding
+from ..files import LIMITS, read_regular
 from ._figures import FIGURES, write_figures, write_result
 from ._output import Stage
 from ._session import Tell, say
@@ -82,8 +83,8 @@ def joint_model(
 def _is_ours(file: Path) -> bool:
     """Whether an earlier result says that it wrote a posterior beside it."""
     try:
-        return POSTERIOR in json.loads(file.read_text(encoding="utf-8"))["files"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return POSTERIOR in json.loads(read_regular(file, LIMITS.result_bytes, ""))["files"]
+    except (ValueError, KeyError, TypeError, RecursionError):
         return False
 
 

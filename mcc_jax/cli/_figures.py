@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from ..files import LIMITS, read_regular
 from ._output import Stage, json_text
 from ._session import Tell
 
@@ -41,8 +42,8 @@ def write_figures(stage: Stage, result: str, draw: Callable[[Path], list[Path]] 
 def _earlier(file: Path) -> list[str]:
     """Figures that an earlier result names; what is no such result names none."""
     try:
-        listed = json.loads(file.read_text(encoding="utf-8"))["figures"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        listed = json.loads(read_regular(file, LIMITS.result_bytes, ""))["figures"]
+    except (ValueError, KeyError, TypeError, RecursionError):
         return []
     names = listed if isinstance(listed, list) else []
     return [name for name in names if isinstance(name, str) and _FIGURE.fullmatch(name)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import stat
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -47,9 +48,14 @@ def locked(directory: Path) -> Iterator[None]:
 
 def _acquire(path: Path) -> int:
     while True:
-        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        # Whoever may write into the folder may have put a link there, or a pipe, for us to write through.
+        handle = os.open(
+            path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0), 0o666
+        )
         with contextlib.ExitStack() as failing:
             failing.callback(os.close, handle)
+            if not stat.S_ISREG(os.fstat(handle).st_mode):
+                raise InputError("is no regular file, and cannot lock the folder", file=path, remedy="Remove it")
             if not _try_lock(handle):
                 raise _busy(handle, path.parent)
             # The run before may have removed the file between our opening and locking it.

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from .._errors import InputError
+from ..files import LIMITS, read_regular
 from ._lock import locked
 
 WORK = ".mcc-jax-work-"
@@ -139,7 +140,7 @@ def _work_folder(directory: Path) -> Path:
 def _finish(directory: Path, work: Path) -> None:
     """Move what a run had still to move when it was killed: all its results were complete."""
     try:
-        moves = json.loads((work / MOVES).read_text())
+        moves = json.loads(read_regular(work / MOVES, LIMITS.result_bytes, ""))
         new, stale = ([str(name) for name in moves[key]] for key in ("new", "stale"))
     except (ValueError, KeyError, TypeError):  # not written by us, who make it whole
         return

@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 import os
 import tempfile
+import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from .._errors import InputError
+from ..files import LIMITS, open_regular
 from ._edges import Edges
 from ._forces import Packing, WallHistory
 from ._side import HalfContact
@@ -61,11 +63,10 @@ def load_state(path: str | Path) -> tuple[Packing, State]:
     path = Path(path)
     try:
         # Opened here: NumPy leaves the file open when the archive turns out to be damaged.
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-            header = json.loads(bytes(stored["header"]))
-            leaves = [np.asarray(stored[f"leaf_{k}"]) for k in range(len(stored.files) - 1)]
-    except FileNotFoundError:
-        raise InputError("there is no such file", file=path, remedy="Name one that `save_state` wrote.") from None
+        with open_regular(path, LIMITS.posterior_bytes, "Name one that `save_state` wrote.") as stream:
+            header, leaves = _arrays(stream)
+    except InputError:
+        raise
     # NumPy, zipfile and the tokenizer behind them report damage through a dozen exception types.
     except Exception as error:
         raise InputError(f"is not a saved state ({error})", file=path, remedy="Save it again.") from None
@@ -78,6 +79,21 @@ def load_state(path: str | Path) -> tuple[Packing, State]:
     skeleton = _skeleton(header, path)
     _check_leaves(leaves, jax.tree.leaves(skeleton), header["particles"], path)
     return jax.tree.unflatten(jax.tree.structure(skeleton), [jnp.asarray(leaf) for leaf in leaves])
+
+
+def _arrays(stream: BinaryIO) -> tuple[Any, list[np.ndarray]]:
+    """The arrays of an archive and its header.
+
+    Raises:
+        ValueError: if it unpacks to more than it holds: what `save_state` writes is not compressed.
+    """
+    with zipfile.ZipFile(stream) as archive:
+        if sum(entry.file_size for entry in archive.infolist()) > stream.seek(0, os.SEEK_END):
+            raise ValueError("it is compressed")
+    stream.seek(0)
+    with np.load(stream, allow_pickle=False) as stored:
+        header = json.loads(bytes(stored["header"]))
+        return header, [np.asarray(stored[f"leaf_{k}"]) for k in range(len(stored.files) - 1)]
 
 
 def _skeleton(header: dict, file: Path) -> tuple[Packing, State]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeGuard
@@ -14,6 +15,7 @@ import numpy as np
 from .._errors import InputError
 from .._text import check_text
 from ..campaign import read_diameters
+from ..files import LIMITS, read_regular
 from ..geometry import Particle
 from ..law import MccLaw, Plastic, StrainScaling, Unloading
 from ._origin import Origin, check
@@ -91,12 +93,9 @@ def read_calibration(
 def _read(file: Path) -> tuple[dict[str, Any], str]:
     if not file.parent.is_dir():
         raise InputError("no such folder", file=file.parent, remedy=_AGAIN)
-    try:
-        raw = file.read_bytes()
-    except FileNotFoundError:
-        raise InputError(f"{file.name} is missing", file=file.parent, remedy=_AGAIN) from None
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", file=file, remedy=_AGAIN) from error
+    if not os.path.lexists(file):
+        raise InputError(f"{file.name} is missing", file=file.parent, remedy=_AGAIN)
+    raw = read_regular(file, LIMITS.result_bytes, _AGAIN)
     try:
         content = json.loads(raw, parse_float=_finite, parse_constant=_finite)
     except json.JSONDecodeError as error:
@@ -196,7 +195,7 @@ def _own_shape(entry: Mapping[str, Any], sizes: Particle, shared: dict[str, Any]
 
 
 def _sizes(folder: Path, particle: str | None, diameters: str | None) -> tuple[Particle, str]:
-    table = next((t for t in (folder / PARTICLES, folder / "campaign" / PARTICLES) if t.is_file()), None)
+    table = next((t for t in (folder / PARTICLES, folder / "campaign" / PARTICLES) if os.path.lexists(t)), None)
     if diameters is None and table is None:
         if particle is not None:
             raise InputError(

@@ -10,6 +10,7 @@ from typing import Any, NoReturn
 
 from .._errors import InputError
 from .._text import check_text
+from ..files import LIMITS, read_regular
 
 SCHEMA = 1
 LONGEST = 160
@@ -40,11 +41,10 @@ def read_result(file: Path, again: str) -> dict[str, Any]:
     """
     remedy = f"Write it again: {again}"
     try:
-        content = json.loads(file.read_text(encoding="utf-8"), parse_constant=_no_constant)
-    except OSError as error:
-        raise InputError(
-            f"cannot be read: {error.strerror or error}", file=file, remedy="Check the permissions"
-        ) from None
+        data = read_regular(file, LIMITS.result_bytes, remedy)
+        content = json.loads(data.decode("utf-8"), parse_constant=_no_constant)
+    except InputError:
+        raise
     except json.JSONDecodeError as error:
         raise InputError(f"is no JSON: {error.msg}", file=file, row=error.lineno, remedy=remedy) from None
     except (ValueError, RecursionError) as error:

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from .._errors import InputError
+from ..files import LIMITS, open_regular
 
 SECONDS, BYTES_PER_SECOND = 4.0, 10e6
 """So long a whole file takes at most, on a slow machine."""
@@ -59,13 +60,8 @@ def read_posterior(file: Path) -> Posterior:
         InputError: if it is none, or takes longer than a whole one of its size would.
     """
     damaged = "Write it again with mcc-jax calibrate, or move it away"
-    try:
-        with file.open("rb") as stream:
-            size = stream.seek(0, os.SEEK_END)
-    except OSError as error:
-        raise InputError(
-            f"cannot be read: {error.strerror or error}", file=file, remedy="Check the permissions"
-        ) from None
+    with open_regular(file, LIMITS.posterior_bytes, "Calibrate with fewer --draws, or move it away") as stream:
+        size = stream.seek(0, os.SEEK_END)
     reader = Path(__file__).with_name("_hdf5_reader.py")
     # One thread: threads of a linear algebra that is not needed would count as memory.
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}

@@ -38,9 +38,8 @@ from typing import Any, Literal, get_args
 
 from ..._errors import InputError
 from .._columns import EXAMPLES, FORCE, LENGTH, TIME, unit_factor
-from .._metadata import load_toml
+from .._metadata import load_toml_file
 from .._schema import Control
-from .._table import decode, read_bytes
 from ._diameters import Diameters, check_triple
 
 _DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
@@ -86,7 +85,7 @@ def read_mapping(path: str | os.PathLike[str]) -> MappingFile:
         InputError: naming the key that is missing, unknown or wrong.
     """
     file = Path(path)
-    entries = load_toml(decode(read_bytes(file), file), file)
+    entries = load_toml_file(file, "a TOML mapping file")
     known = [name for name in MappingFile.__dataclass_fields__ if name != "file"]
     _only(entries, known, file)
     values: dict[str, Any] = {}

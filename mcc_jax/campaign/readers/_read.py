@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from ...files import LIMITS, FileLimits
 from .._schema import Campaign, Metadata
 from .._table import read_bytes
 from .._validate import check_campaign
@@ -19,6 +20,7 @@ def read_tester_file(
     *,
     diameters_um: Diameters | None = None,
     mapping: str | os.PathLike[str] | None = None,
+    limits: FileLimits = LIMITS,
 ) -> Campaign:
     """A tester's export as a campaign; the format is told by the content, not by the file's name.
 
@@ -30,6 +32,7 @@ def read_tester_file(
             anything that a mapping file describes.
         diameters_um: D1, D2, D3 [um] for all tests, or a mapping from tests to such triples; see `read_diameters`.
         mapping: a TOML file that describes the table; see `mcc_jax.campaign.readers._mapping`.
+        limits: how large the file may be.
 
     Returns:
         The campaign; particles have the tests' names.
@@ -38,7 +41,7 @@ def read_tester_file(
         InputError: if the file is unknown or damaged, or diameters are missing.
     """
     file = Path(path)
-    data = read_bytes(file)
+    data = read_bytes(file, limits)
     if mapping is None:
         tests = read_known(data, file)
     else:
