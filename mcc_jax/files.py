@@ -13,8 +13,8 @@ import re
 import stat
 from collections.abc import Iterator
 from dataclasses import dataclass
+from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
@@ -68,7 +68,7 @@ LIMITS = FileLimits()
 
 
 @contextlib.contextmanager
-def open_regular(path: str | os.PathLike[str], most_bytes: int, remedy: str) -> Iterator[BinaryIO]:
+def open_regular(path: str | os.PathLike[str], most_bytes: int, remedy: str) -> Iterator[BufferedReader]:
     """Open a regular file for reading bytes; anything else is refused by name without being opened.
 
     Args:

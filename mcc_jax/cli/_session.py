@@ -5,13 +5,18 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import shutil
+import stat
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, wait
+from pathlib import Path
 from typing import Any
 
 import click
+
+from .._errors import InputError
 
 Tell = Callable[[str], None]
 
@@ -34,7 +39,27 @@ def session(steps: int) -> Iterator[Tell]:
 
         jax.config.update("jax_enable_x64", True)
         _keep_compiled(jax.config)
+        require_device()
         yield tell
+
+
+def require_device() -> None:
+    """Start JAX on the device that it was told to use.
+
+    Raises:
+        InputError: if there is none of that kind.
+    """
+    import jax
+
+    try:
+        jax.devices()
+    except (RuntimeError, AssertionError) as error:  # of a platform that is not installed it says either
+        asked = os.environ.get("JAX_PLATFORMS") or jax.config.read("jax_platforms") or "the default"
+        why = " ".join(str(error).split())[:160]
+        raise InputError(
+            f"JAX finds no device for JAX_PLATFORMS={asked}" + (f" ({why})" if why else ""),
+            remedy="Unset JAX_PLATFORMS to compute on the processor, or install JAX for your accelerator",
+        ) from None
 
 
 CACHE_BYTES = 300 * 2**20
@@ -45,7 +70,8 @@ def _keep_compiled(config: Any) -> None:
     """Let the next process find what this one compiles, in the user's folder for caches.
 
     A setting of one's own (JAX_COMPILATION_CACHE_DIR, JAX_ENABLE_COMPILATION_CACHE=0) has precedence. Compiled code
-    belongs to one machine: where several share a home, each has a folder. A folder that cannot be written is left.
+    belongs to one machine: where several share a home, each has a folder. It is code that will be run, so nobody else
+    may be able to write it: a folder that is not ours alone is made so, or left where it cannot be.
     """
     if config.jax_compilation_cache_dir is not None or not config.jax_enable_compilation_cache:
         return
@@ -53,16 +79,33 @@ def _keep_compiled(config: Any) -> None:
 
     import platformdirs
 
-    folder = platformdirs.user_cache_path("mcc_jax") / f"{platform.node()}-{platform.machine()}"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return
-    if os.access(folder, os.W_OK):
+    above = platformdirs.user_cache_path("mcc_jax")
+    folder = above / f"{platform.node()}-{platform.machine()}"
+    if _private(above) and _private(folder):
         config.update("jax_compilation_cache_dir", str(folder))
         config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
         config.update("jax_persistent_cache_min_entry_size_bytes", 0)
         config.update("jax_compilation_cache_max_size", CACHE_BYTES)
+
+
+def _private(folder: Path) -> bool:
+    """Whether a folder is there, no link, ours, and open to nobody else; made so where it can be."""
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        found = folder.lstat()
+        if not stat.S_ISDIR(found.st_mode):
+            return False
+        if hasattr(os, "geteuid") and found.st_uid != os.geteuid():
+            return False
+        if os.name == "posix" and stat.S_IMODE(found.st_mode) != 0o700:
+            if stat.S_IMODE(found.st_mode) & 0o022:
+                # Others could write here until now, so what lies here may be theirs.
+                shutil.rmtree(folder)
+                folder.mkdir(mode=0o700)
+            folder.chmod(0o700)
+    except OSError:
+        return False
+    return os.access(folder, os.W_OK)
 
 
 def import_writers(*, figures: bool, posterior: bool) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from importlib.resources import files
 from typing import Any
 
@@ -23,9 +24,14 @@ LOOKS = {
 COLUMNS = ("displacement", "force", "residual", "marker", "colour", "alpha", "particle", "segment", "time", "compared")
 
 
+LOADED_FROM = re.compile(r"https://(?:cdn\.jsdelivr\.net|maps\.googleapis\.com)/[^\"'`\\\s]*")
+"""What Bokeh's script would load from elsewhere: MathJax, icons and maps, none of which the page uses."""
+
+
 def chart_scripts() -> str:
-    """Bokeh's own script, to stand in the page."""
-    return files("bokeh").joinpath("server", "static", "js", "bokeh.min.js").read_text(encoding="utf-8")
+    """Bokeh's own script, to stand in the page; the addresses that it might load more from are taken out."""
+    script = files("bokeh").joinpath("server", "static", "js", "bokeh.min.js").read_text(encoding="utf-8")
+    return LOADED_FROM.sub("about:blank", script)
 
 
 def chart_items() -> dict[str, Any]:

@@ -1,12 +1,13 @@
 """Every column of the independently computed table of the paper's 20 particles, and what is said about them."""
 
-import csv
+import json
+from pathlib import Path
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import SHARED, A, check, close, paper_law, paper_population
+from helpers import A, check, close, paper_law, paper_population
 
 from mcc_jax.campaign._paper import PAPER_DIAMETERS_UM, PAPER_LOAD_RATE_MN_PER_S
 from mcc_jax.geometry import Particle, elastic_shape_factor, plastic_shape_factor
@@ -18,9 +19,8 @@ CUT_OFF = 0.2  # MPa, where the paper's curves begin
 
 @pytest.fixture(scope="module")
 def expected():
-    with (SHARED / "data" / "particles_expected.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+    table = json.loads((Path(__file__).parents[1] / "data" / "twenty_particles.json").read_text(encoding="utf-8"))
+    return {name: np.array(values, float) for name, values in table.items() if name != "about"}
 
 
 def columns_of(particle):
