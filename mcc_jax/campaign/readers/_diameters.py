@@ -80,7 +80,8 @@ def diameters_for(
     """Diameters in the order of the tests, and how many entries of a table no test needed.
 
     Args:
-        keys: by the name of each test, the names under which a table may hold its diameters, the first that fits counts.
+        keys: by the name of each test the names under which a table may hold its diameters; the first that fits
+            counts.
         diameters: one triple for all tests, or a table by name, which counts before what the file tells.
         told: what the tests' files tell, or why they do not.
         file: for messages.
@@ -102,7 +103,9 @@ def diameters_for(
     used: set[str] = set()
     lacking: dict[str, InputError | None] = {}
     for name, others in keys.items():
-        key = next((k if k in table else form[same_text(k)] for k in others if k in table or same_text(k) in form), None)
+        key = next(
+            (k if k in table else form[same_text(k)] for k in others if k in table or same_text(k) in form), None
+        )
         own = told.get(name)
         if key is not None:
             check_triple(table[key], f"particle {name!r}", file)

@@ -42,7 +42,9 @@ def read_mapped(data: bytes, file: Path, mapping: MappingFile) -> Tests:
     if not reader.samples:
         remedy = f"Check skip_rows, header_rows and {'end' if mapping.end else 'skip_footer'} in {mapping.file.name}"
         if reader.missing:
-            raise InputError("every row has a missing reading", file=file, remedy=f"Check missing in {mapping.file.name}")
+            raise InputError(
+                "every row has a missing reading", file=file, remedy=f"Check missing in {mapping.file.name}"
+            )
         raise InputError("there are no rows of data", file=file, remedy=remedy)
     for name in reader.missing:
         if name not in reader.samples:
@@ -264,7 +266,8 @@ class _Reader:
             return False
         cells = self.rows.cells(i)
         return all(
-            self.where[q] < len(cells) and (self._is_number(cells[self.where[q]]) or self._is_missing(cells[self.where[q]]))
+            self.where[q] < len(cells)
+            and (self._is_number(cells[self.where[q]]) or self._is_missing(cells[self.where[q]]))
             for q in self.wanted
         )
 
@@ -440,7 +443,7 @@ def _quoted(text: str) -> str:
 
 
 def _is_no_reading(cell: str) -> bool:
-    """Whether a cell looks like what testers write where there is no reading: nothing, dashes, NaN, the largest number."""
+    """Whether a cell looks like what testers write for "no reading": nothing, dashes, NaN, the largest number."""
     if not any(c.isalnum() for c in cell) or cell.lower().strip("+-#") in ("nan", "inf", "na", "n/a", "null", "none"):
         return True
     try:
@@ -466,11 +469,15 @@ def _index(column: str | int | None, header: list[str] | None, file: Path, row: 
     if found:
         remedy = "Give its number"
     elif len(names) == 1 and other:
-        remedy = f'If its columns are parted by a {other[0]}, write delimiter = "{other[0]}" in {reader.mapping.file.name}'
+        remedy = (
+            f'If its columns are parted by a {other[0]}, write delimiter = "{other[0]}" in {reader.mapping.file.name}'
+        )
     elif close:
         remedy = f"Did you mean {close[0]!r}?"
     else:
-        remedy = f"There are: {', '.join(names)}; if this is not the header, correct skip_rows in {reader.mapping.file.name}"
+        remedy = (
+            f"There are: {', '.join(names)}; if this is not the header, correct skip_rows in {reader.mapping.file.name}"
+        )
     raise InputError(problem, file=file, row=row, remedy=remedy)
 
 

@@ -177,9 +177,7 @@ def read_mapping(path: str | os.PathLike[str]) -> MappingFile:
     if "thousands" in values:
         values["thousands"] = _THOUSANDS.get(values["thousands"]) or _SAME[values["thousands"]]
     if "missing" in values:
-        values["missing"] = tuple(
-            mark.strip() if isinstance(mark, str) else float(mark) for mark in values["missing"]
-        )
+        values["missing"] = tuple(mark.strip() if isinstance(mark, str) else float(mark) for mark in values["missing"])
     _check_marks(values, file)
     if values.get("test_name") is not None and values.get("tests", "file") != "file":
         raise InputError('is for tests = "file" only', file=file, column="test_name", remedy="Remove it")
@@ -199,7 +197,10 @@ def _check_marks(values: dict[str, Any], file: Path) -> None:
     if values.get("decimal_mark", ".") in thousands or (values.get("delimiter") == " " and " " in thousands):
         other = "decimal mark" if values.get("decimal_mark", ".") in thousands else "delimiter"
         raise InputError(
-            f"the mark between thousands is also the {other}", file=file, column="thousands", remedy="Correct one of them"
+            f"the mark between thousands is also the {other}",
+            file=file,
+            column="thousands",
+            remedy="Correct one of them",
         )
     if "begin" in values and "skip_rows" in values:
         raise InputError("is given beside 'skip_rows'", file=file, column="begin", remedy="Keep one of them")
@@ -244,9 +245,7 @@ def _only(entries: MappingABC[str, Any], known: list[str], file: Path, inside: s
             raise InputError("is not a key of a mapping file", file=file, column=inside + key, remedy=remedy)
 
 
-def _columns(
-    entries: dict[str, Any], values: dict[str, Any], file: Path
-) -> tuple[dict[str, Column], Pace | None]:
+def _columns(entries: dict[str, Any], values: dict[str, Any], file: Path) -> tuple[dict[str, Column], Pace | None]:
     tables = entries.get("columns")
     if not isinstance(tables, dict):
         raise InputError(
@@ -303,12 +302,14 @@ def _pace(table: dict[str, Any], file: Path) -> Pace:
     _only(table, [which, "unit"], file, f"{place}.")
     value, unit = table[which], table.get("unit")
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1e15:
-        raise InputError(f"{value!r} is not a positive number", file=file, column=f"{place}.{which}", remedy="Correct it")
+        raise InputError(
+            f"{value!r} is not a positive number", file=file, column=f"{place}.{which}", remedy="Correct it"
+        )
     example = "mm/s, um/s, mm/min" if which == "speed" else EXAMPLES[TIME]
     length, slash, time = str(unit).partition("/")
     try:
         if not isinstance(unit, str) or bool(slash) != (which == "speed"):
-            raise ValueError("the unit is missing" if unit is None else f"{unit!r} is no unit of {which}")
+            raise ValueError("the unit is missing" if unit is None else f"{unit!r} is no unit of {which}")  # noqa: TRY301
         if which == "interval":
             return Pace(interval_s=float(value * unit_factor(unit, TIME)))
         factor = unit_factor(length.strip(), LENGTH) / unit_factor(time.strip(), TIME)
@@ -321,7 +322,11 @@ def _in_header(table: Any, file: Path) -> InHeader:
     """The rows above the samples that hold the diameters."""
     names = table.get("header") if isinstance(table, dict) else None
     names = [names] if isinstance(names, str) else names
-    if not isinstance(names, list) or len(names) not in (1, 3) or not all(isinstance(n, str) and n.strip() for n in names):
+    if (
+        not isinstance(names, list)
+        or len(names) not in (1, 3)
+        or not all(isinstance(n, str) and n.strip() for n in names)
+    ):
         raise InputError(
             "must name one row, or three",
             file=file,

@@ -55,7 +55,9 @@ def read_tester_file(
     findings: list[Finding] = []
     if place.is_dir():
         if described is not None and described.test_name is not None:
-            raise InputError("is for one file, not for a folder", file=mapping, column="test_name", remedy="Remove it")
+            raise InputError(
+                "is for one file, not for a folder", file=described.file, column="test_name", remedy="Remove it"
+            )
         tests, keys, findings = read_folder(place, read, skip)
         origin = f"folder {place.resolve().name}, {tests.format}"
     else:
@@ -68,7 +70,7 @@ def read_tester_file(
     if diameters_um is None and described is not None:
         diameters_um = described.diameters_um
     sizes, unused = diameters_for(keys, diameters_um, tests.diameters_um, place)
-    findings += [*_missing(tests.missing), *_unused(unused, len(keys))]
+    findings += [*_missing(tests.missing), *_unused(unused)]
     other = dict(tests.other)
     if findings:
         other["conversion"] = {"findings": [finding.to_json() for finding in findings]}
@@ -93,8 +95,8 @@ def _missing(missing: dict[str, int]) -> list[Finding]:
     return [Finding("missing readings", "told", f"{rows} dropped, in {where}", "", tuple(missing))]
 
 
-def _unused(unused: int, tests: int) -> list[Finding]:
+def _unused(unused: int) -> list[Finding]:
     if not unused:
         return []
     rows = "1 row of the diameters is" if unused == 1 else f"{unused} rows of the diameters are"
-    return [Finding("diameters", "told", f"{rows} for none of the {tests} tests and not used", "")]
+    return [Finding("diameters", "told", f"{rows} for no test here and not used")]

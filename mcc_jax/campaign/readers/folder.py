@@ -12,7 +12,6 @@ import hashlib
 import re
 import shlex
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,8 @@ from ..findings import Finding
 from ._text import Tests
 
 NO_DATA = frozenset(
-    ".bmp .db .doc .docx .gif .ini .jpeg .jpg .lnk .md .odt .pdf .png .ppt .pptx .py .svg .tif .tiff .toml".split()
+    f".{ending}"
+    for ending in "bmp db doc docx gif ini jpeg jpg lnk md odt pdf png ppt pptx py svg tif tiff toml".split()  # noqa: SIM905
 )
 """Endings of pictures, documents and settings, in which no tester writes samples."""
 _READ_ME = re.compile(r"(read[-_ ]?me|licen[cs]e)(\..*)?", re.IGNORECASE)
@@ -101,7 +101,7 @@ def read_folder(
             if name in tests.missing:
                 missing[full] = tests.missing[name]
     formats = sorted({tests.format for tests in found.values()})
-    form = f"{len(files)} files, {' and '.join(formats)}"
+    form = f"{_count(files)}, {' and '.join(formats)}"
     return Tests(curves, form, _control(found), _other(found), told, missing), keys, findings
 
 
@@ -124,7 +124,9 @@ def _files(folder: Path, skip: Sequence[str]) -> tuple[list[Path], list[Finding]
         fitting = [entry for entry in rest if _fits(entry, pattern)]
         if not fitting:
             raise InputError(
-                f"--skip {shlex.quote(pattern)} fits no file", file=folder, remedy="Give a name as in the folder, or a pattern"
+                f"--skip {shlex.quote(pattern)} fits no file",
+                file=folder,
+                remedy="Give a name as in the folder, or a pattern",
             )
         skipped += [entry for entry in fitting if entry not in skipped]
     files = [entry for entry in rest if entry not in skipped]
@@ -168,7 +170,11 @@ def _unreadable(failed: dict[Path, InputError], files: int) -> InputError:
     rest = " ..." if len(names) > _SHOWN else ""
     leave = f"or leave it out{others} with {shown}{rest}"
     return InputError(
-        error.problem, file=error.file, row=error.row, column=error.column, remedy=f"{remedy}, {leave}" if remedy else leave
+        error.problem,
+        file=error.file,
+        row=error.row,
+        column=error.column,
+        remedy=f"{remedy}, {leave}" if remedy else leave,
     )
 
 
@@ -210,7 +216,7 @@ def _other(found: dict[Path, Tests]) -> dict[str, Any]:
 def _short(value: Any) -> Any:
     if isinstance(value, dict):
         kept = {key: _short(item) for key, item in value.items()}
-        return {key: item for key, item in kept.items() if not _is_long(item)}
+        return {key: item for key, item in kept.items() if item != {} and not _is_long(item)}
     return value
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from ._mapping import Pace
@@ -28,7 +30,7 @@ def paced(displacement_um: np.ndarray, pace: Pace) -> np.ndarray:
     path = np.zeros(len(displacement_um))
     turns = turning_points(displacement_um, pace.reversal_share * float(np.ptp(displacement_um)))
     gone = 0.0
-    for start, stop in zip(turns[:-1], turns[1:], strict=True):
+    for start, stop in pairwise(turns):
         leg = displacement_um[start : stop + 1]
         sign = 1.0 if leg[-1] >= leg[0] else -1.0
         path[start : stop + 1] = gone + np.maximum.accumulate(sign * (leg - leg[0]))
