@@ -58,27 +58,22 @@ def read_sheet(
 
     _check_size(data, file)
     try:
-        with pd.ExcelFile(io.BytesIO(data), engine="calamine") as book:
-            names = [str(name) for name in book.sheet_names]
-            wanted = _choose(names, sheet, preferred, file)
-            frames: dict[str, Any] = {
-                name: book.parse(name, header=None, dtype=object, na_filter=False)
-                for name in (names if wanted is None else [wanted])
-            }
+        frames: dict[Any, Any] = pd.read_excel(
+            io.BytesIO(data), sheet_name=None, engine="calamine", header=None, dtype=object, na_filter=False
+        )
     except ImportError:
         raise InputError(
             "this is an Excel workbook, and the package that reads them is not installed",
             file=file,
             remedy="Install it with: pip install 'mcc-jax[excel]', or save the sheet as CSV",
         ) from None
-    except InputError:
-        raise
     # The engine's errors have no common type, and its panics are no Exception.
     except BaseException as error:
         if isinstance(error, KeyboardInterrupt | SystemExit | MemoryError):
             raise
         raise InputError("the workbook is damaged", file=file, remedy=_REMEDY) from None
-    held = {name: frame for name, frame in frames.items() if frame.size}
+    wanted = _choose([str(name) for name in frames], sheet, preferred, file)
+    held = {name: frame for name, frame in frames.items() if frame.size and wanted in (None, name)}
     if not held:
         where = f"the sheet {wanted!r}" if wanted is not None else "every sheet"
         raise InputError(f"{where} is empty", file=file, remedy="Save the workbook again with the table in it")

@@ -139,7 +139,7 @@ def test_tables_with_semicolons_and_tabs(tmp_path, mark, comma):
 
 def test_a_thousands_mark_in_a_german_table_is_not_taken_for_a_decimal_point(tmp_path):
     with pytest.raises(
-        InputError, match="row 3, column 'D2_um': '1.140' is not a number .a mark between the thousands"
+        InputError, match=r"row 3, column 'D2_um': '1\.140' is not a number .a mark between the thousands"
     ):
         campaign_of(tmp_path, PARTICLES.replace(",", ";").replace("190", "190,5").replace("140", "1.140"))
 

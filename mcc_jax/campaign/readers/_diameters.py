@@ -125,7 +125,9 @@ def _no_diameters(
 ) -> InputError:
     name, why = next(iter(lacking.items()))
     if why is not None:
-        return why
+        others = list(lacking)[1:]
+        more = f" (so it is with {_shown(others)}, too)" if others else ""
+        return InputError(why.problem + more, file=why.file, row=why.row, column=why.column, remedy=why.remedy)
     if not table:
         return InputError("a tester's file knows no particle diameters", file=file, remedy=_HOW)
     if len(lacking) == len(names):

@@ -42,7 +42,7 @@ def passed_over(name: str) -> bool:
 def natural(name: str) -> list[tuple[int, int, str]]:
     """A key that sorts names as people do: digits by their number, letters without regard to case first."""
     parts = re.findall(r"[0-9]{1,18}|[^0-9]+", name)
-    return [(0, int(p), "") if p[0].isdigit() else (1, 0, p.lower()) for p in parts] + [(2, 0, name)]
+    return [(0, int(p), "") if p[0] in "0123456789" else (1, 0, p.lower()) for p in parts] + [(2, 0, name)]
 
 
 def read_folder(
@@ -96,8 +96,8 @@ def read_folder(
                 )
             curves[full], origin[full] = curve, file
             keys[full] = (full, file.name, stem, *([name] if own[name] == 1 else []))
-            if name in tests.diameters_um:
-                told[full] = tests.diameters_um[name]
+            if (size := tests.diameters_um.get(name)) is not None:
+                told[full] = size if isinstance(size, list) else _or_skip(size, f"--skip {shlex.quote(file.name)}")
             if name in tests.missing:
                 missing[full] = tests.missing[name]
     formats = sorted({tests.format for tests in found.values()})
@@ -161,21 +161,20 @@ def _listed(files: Sequence[Path]) -> str:
 def _unreadable(failed: dict[Path, InputError], files: int) -> InputError:
     error = next(iter(failed.values()))
     names = [file.name for file in failed]
-    remedy = (error.remedy or "").rstrip(".")
     if len(failed) == files:
         more = f". So it is with all {files} files" if files > 1 else ""
-        return InputError(error.problem, file=error.file, row=error.row, column=error.column, remedy=remedy + more)
+        remedy = (error.remedy or "").rstrip(".") + more
+        return InputError(error.problem, file=error.file, row=error.row, column=error.column, remedy=remedy)
     shown = " ".join(f"--skip {shlex.quote(name)}" for name in names[:_SHOWN])
     others = f" ({len(names)} of {files} files cannot be read)" if len(names) > 1 else ""
     rest = " ..." if len(names) > _SHOWN else ""
-    leave = f"or leave it out{others} with {shown}{rest}"
-    return InputError(
-        error.problem,
-        file=error.file,
-        row=error.row,
-        column=error.column,
-        remedy=f"{remedy}, {leave}" if remedy else leave,
-    )
+    return _or_skip(error, shown + rest, others)
+
+
+def _or_skip(error: InputError, how: str, others: str = "") -> InputError:
+    """The same error, with the way to leave the file out."""
+    remedy = ", ".join([*([error.remedy.rstrip(".")] if error.remedy else []), f"or leave it out{others} with {how}"])
+    return InputError(error.problem, file=error.file, row=error.row, column=error.column, remedy=remedy)
 
 
 def _twice(files: Sequence[Path]) -> Finding:
