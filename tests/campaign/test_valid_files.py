@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mcc_jax._errors import InputError
-from mcc_jax.campaign import Campaign, Curve, read_campaign, read_diameters, read_tester_file
+from mcc_jax.campaign import Campaign, read_campaign, read_diameters, read_tester_file
 from mcc_jax.campaign._table import parse_number
 
 COLUMNS = """
@@ -462,5 +462,6 @@ def test_noise_of_the_displacement_adds_no_time(seed, cycles, noise):
     assert np.abs(times - path).max() <= 4 * noise * len(corners) / 0.5 + 1e-12
 
 
-def test_curve_type(tmp_path):
-    assert isinstance(convert(tmp_path, table()).curves[0], Curve)
+@pytest.mark.parametrize("pace", ['{ speed = 1e-15, unit = "nm/year" }', '{ interval = 1e15, unit = "year" }'])
+def test_a_pace_that_cannot_be(tmp_path, pace):
+    assert "too large to be real" in told(tmp_path, table(), "", without_time(pace))

@@ -492,6 +492,7 @@ def _curve(name: str, rows: list[tuple[int, list[float]]], mapping: MappingFile,
         check_magnitudes(columns[quantity], file, at, str(column.column))
     if mapping.pace is not None:
         columns["time"] = paced(columns["displacement"], mapping.pace)
+        check_magnitudes(columns["time"], file, at, "time")
     time = columns["time"]
     back = np.flatnonzero(np.diff(time) < 0)
     # Rows of one test need not follow each other, so the row of the first sample is no guide.

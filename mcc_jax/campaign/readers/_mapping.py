@@ -301,7 +301,7 @@ def _pace(table: dict[str, Any], file: Path) -> Pace:
     place = "columns.time"
     _only(table, [which, "unit"], file, f"{place}.")
     value, unit = table[which], table.get("unit")
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1e15:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 1e-15 <= value <= 1e15:
         raise InputError(
             f"{value!r} is not a positive number", file=file, column=f"{place}.{which}", remedy="Correct it"
         )

@@ -35,7 +35,8 @@ def paced(displacement_um: np.ndarray, pace: Pace) -> np.ndarray:
         sign = 1.0 if leg[-1] >= leg[0] else -1.0
         path[start : stop + 1] = gone + np.maximum.accumulate(sign * (leg - leg[0]))
         gone = float(path[stop])
-    return path / pace.speed_um_per_s
+    with np.errstate(over="ignore"):  # the caller checks the size
+        return path / pace.speed_um_per_s
 
 
 def turning_points(values: np.ndarray, least: float) -> list[int]:
