@@ -114,10 +114,15 @@ def _check_size(data: bytes, file: Path) -> None:
             if sum(entry.file_size for entry in entries) > LARGEST_UNPACKED:
                 raise InputError("the workbook is too large", file=file, remedy="Save the sheet alone, or as CSV")
             for entry in entries:
-                if not entry.filename.startswith("xl/worksheets/"):
-                    continue
+                if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                    raise zipfile.BadZipFile  # noqa: TRY301
+                # The size in the directory may lie; no more than it says is unpacked.
                 with archive.open(entry) as stream:
                     content = stream.read(entry.file_size + 1)
+                if len(content) != entry.file_size:
+                    raise zipfile.BadZipFile  # noqa: TRY301
+                if not entry.filename.startswith("xl/worksheets/"):
+                    continue
                 last = [0, 0]
                 for cell in _LAST.finditer(content):
                     letters, digits = cell.groups()

@@ -77,6 +77,8 @@ def convert(
 
         tell("reading")
         sizes = None if diameters is None else read_diameters(diameters)
+        given = [path for path in (mapping, None if diameters is None else Path(diameters)) if path is not None]
+        skip += tuple(path.name for path in given if _lies_in(path, file) and path.name not in skip)
         campaign = read_tester_file(file, diameters_um=sizes, mapping=mapping, skip=skip)
         tell("finding the segments")
         segments = [Counter(part.kind for part in find_segments(curve)) for curve in campaign.curves]
@@ -112,3 +114,14 @@ def convert(
         say(f"Note: {finding['sentence']}." + (f" {finding['remedy']}." if finding["remedy"] else ""))
     say(f"Written into {out}: particles.csv, curves.csv, campaign.toml")
     say(f"Next: mcc-jax calibrate {shlex.quote(str(out))} --out fit")
+
+
+def _lies_in(path: Path, folder: Path) -> bool:
+    """Whether a file given by another option lies among the tests, which is then none of them."""
+    from ..campaign.readers.folder import passed_over
+
+    try:
+        inside = folder.is_dir() and path.is_file() and path.resolve().parent == folder.resolve()
+    except (OSError, ValueError):  # three long numbers are no name of a file
+        return False
+    return inside and not passed_over(path.name)

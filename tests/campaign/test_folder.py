@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import zipfile
 
@@ -109,6 +110,18 @@ def test_a_file_that_cannot_be_read_is_named_with_the_way_to_leave_it_out(tmp_pa
 def _all_bad(tmp_path):
     (tmp_path / "bad").mkdir()
     return folder_of(tmp_path / "bad", {"a.txt": "x", "b.txt": "y"})
+
+
+def test_names_that_no_file_can_hold(tmp_path):
+    folder = folder_of(tmp_path, TESTS)
+    try:
+        (folder / os.fsdecode(b"P\xff.txt")).write_text(text_of(1))
+    except OSError:
+        pytest.skip("this file system has names in Unicode only")
+    assert "no Unicode text" in told(folder)
+    assert len(read(folder, skip=["P?.txt"])) == 2
+    (folder / "P\n5").write_text(text_of(5))
+    assert findings(read(folder, skip=["P?.txt", "P\n5"]))[0].isprintable()
 
 
 def test_names_must_differ(tmp_path):

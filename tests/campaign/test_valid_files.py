@@ -291,6 +291,13 @@ def test_missing_readings(tmp_path, mark, column):
         assert f'missing = ["{mark}"]' in text
 
 
+def test_the_number_nan_of_a_mapping_and_comments_of_delimiters(tmp_path):
+    text = "; a remark\n" + table(rows=[*ROWS, ("4", "nan", "1")], mark=";").replace("t,F,d", "t;F;d")
+    assert_read(convert(tmp_path, text, 'delimiter = ";"\ncomment_prefix = ";"\nskip_rows = 1\nmissing = [nan]'))
+    body = text.partition("\n")[2].replace("2;5", "; two\n2;5")
+    assert_read(convert(tmp_path, body, 'delimiter = ";"\ncomment_prefix = ";"\nmissing = [nan]'))
+
+
 def test_every_reading_missing(tmp_path):
     assert "every row has a missing reading" in told(
         tmp_path, table(rows=[("1", "-", "2"), ("2", "-", "3")]), 'missing = ["-"]'

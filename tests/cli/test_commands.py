@@ -275,6 +275,12 @@ def test_convert_a_folder_keeps_its_words_short(run, tmp_path):
     names = read_campaign(out).particles
     assert names[:7] == ("P1", "P2", "P3", "P4", "P5", "P6", "P8")
     assert names[-1] == "P40"
+    table = folder / "sizes.csv"
+    table.write_text("file;D1_um;D2_um;D3_um\n" + "".join(f"P{i}.txt;20{i},5;190;180\n" for i in range(1, 41)))
+    text = done(run("convert", folder, "--out", out, "--mapping", mapping, "--diameters", table))
+    assert "1 file skipped as asked: sizes.csv" in text
+    assert read_campaign(out).diameters_um[3].tolist() == [204.5, 190, 180]
+    table.unlink()
     refused = run(*arguments, "--skip", "P99")
     assert refused.exit_code == 2
     assert "--skip P99 fits no file" in refused.stderr

@@ -72,8 +72,9 @@ class _Rows:
         return not self.lines[i].strip(self.nothing)
 
     def begins(self, i: int, text: str) -> bool:
-        """Whether the first thing that a row holds begins with a text."""
-        return same_text(self.lines[i].lstrip(self.nothing)).startswith(text)
+        """Whether a row, or the first thing that it holds, begins with a text."""
+        line, text = same_text(self.lines[i].lstrip()), same_text(text)
+        return line.startswith(text) or line.lstrip(self.nothing).startswith(text)
 
     def cells(self, i: int) -> list[str]:
         """The cells of a row."""
@@ -105,7 +106,7 @@ class _Sheet(_Rows):
 
     def begins(self, i: int, text: str) -> bool:
         first = next((cell for cell in self.rows[i] if cell.strip()), "")
-        return same_text(first.lstrip()).startswith(text)
+        return same_text(first.lstrip()).startswith(same_text(text))
 
     def cells(self, i: int) -> list[str]:
         return self.rows[i]

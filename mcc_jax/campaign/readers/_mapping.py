@@ -47,6 +47,7 @@ the last column that has a name, and rows of delimiters only, hold nothing.
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping as MappingABC
 from dataclasses import dataclass, field
@@ -177,7 +178,11 @@ def read_mapping(path: str | os.PathLike[str]) -> MappingFile:
     if "thousands" in values:
         values["thousands"] = _THOUSANDS.get(values["thousands"]) or _SAME[values["thousands"]]
     if "missing" in values:
-        values["missing"] = tuple(mark.strip() if isinstance(mark, str) else float(mark) for mark in values["missing"])
+        # TOML has a number nan, which equals nothing, itself included.
+        values["missing"] = tuple(
+            float(mark) if not isinstance(mark, str) and math.isfinite(mark) else str(mark).strip()
+            for mark in values["missing"]
+        )
     _check_marks(values, file)
     if values.get("test_name") is not None and values.get("tests", "file") != "file":
         raise InputError('is for tests = "file" only', file=file, column="test_name", remedy="Remove it")

@@ -67,6 +67,8 @@ def read_folder(
     same: dict[str, list[Path]] = {}
     for file in files:
         try:
+            if not _is_text(file.name):
+                raise InputError("the file's name is no Unicode text", file=file, remedy="Rename it")  # noqa: TRY301
             data = read_bytes(file)
             found[file] = read(file, data)
             same.setdefault(hashlib.sha256(data).hexdigest(), []).append(file)
@@ -150,12 +152,21 @@ def _fits(entry: Path, pattern: str) -> bool:
     return wanted in (name, stem) or fnmatchcase(name, wanted)
 
 
+def _is_text(name: str) -> bool:
+    """Whether a name can be written into a file; one in another encoding than the system's cannot."""
+    try:
+        return bool(name.encode("utf-8"))
+    except UnicodeEncodeError:
+        return False
+
+
 def _count(files: Sequence[Path]) -> str:
     return "1 file" if len(files) == 1 else f"{len(files)} files"
 
 
 def _listed(files: Sequence[Path]) -> str:
-    return ", ".join(file.name for file in files[:_SHOWN]) + (", ..." if len(files) > _SHOWN else "")
+    names = ", ".join(file.name for file in files[:_SHOWN]) + (", ..." if len(files) > _SHOWN else "")
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in names)
 
 
 def _unreadable(failed: dict[Path, InputError], files: int) -> InputError:
