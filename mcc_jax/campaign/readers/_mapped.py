@@ -61,7 +61,7 @@ class _Rows:
     """Lines of text, split when they are asked for."""
 
     def __init__(self, lines: list[str], file: Path, mapping: MappingFile) -> None:
-        self.lines, self.file, self.delimiter = lines, file, mapping.delimiter
+        self.lines, self.file, self.delimiter, self.mapping = lines, file, mapping.delimiter, mapping.file.name
         self.nothing = '" \t' if mapping.delimiter == " " else mapping.delimiter + '" \t'
 
     def __len__(self) -> int:
@@ -87,7 +87,10 @@ class _Rows:
             return next(csv.reader([line], delimiter=self.delimiter, strict=True))
         except (csv.Error, StopIteration) as error:
             raise InputError(
-                f"quotes are damaged ({error})", file=self.file, row=i + 1, remedy="Close every double quote"
+                f"quotes are damaged ({error})",
+                file=self.file,
+                row=i + 1,
+                remedy=f"Close every double quote, or correct delimiter in {self.mapping}",
             ) from None
 
 
