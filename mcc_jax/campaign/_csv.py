@@ -16,8 +16,9 @@ from ._columns import LENGTH, convert, find_column
 from ._curves import PARTICLES, CurveRows, name_column, read_curves
 from ._metadata import parse_metadata, read_settings
 from ._schema import Campaign
-from ._table import Table, read_table
+from ._table import Table, decode, make_table, parse_table, read_bytes, read_table
 from ._validate import check_magnitudes
+from .workbook import is_workbook, read_sheet
 
 CURVES, METADATA = "curves.csv", "campaign.toml"
 
@@ -41,8 +42,8 @@ def read_campaign(folder: str | os.PathLike[str], *, limits: FileLimits = LIMITS
     path = Path(folder)
     check_folder(path)
     table = read_table(path / PARTICLES, limits)
-    names, diameters, columns = _parse_particles(table)
-    curves = read_curves(path / CURVES, limits)
+    names, diameters, columns = parse_particles(table)
+    curves = read_curves(path / CURVES, limits).named_as(names)
     _check_match(table, names, curves, path)
     metadata_file = path / METADATA
     campaign = Campaign(
@@ -108,8 +109,14 @@ def _metadata_text(file: Path, limits: FileLimits) -> str:
     return ""
 
 
-def read_particles(file: str | Path) -> tuple[tuple[str, ...], np.ndarray, dict[str, tuple[str, ...]]]:
+def read_particles(
+    file: str | Path, named: Sequence[str] = ("particle",)
+) -> tuple[tuple[str, ...], np.ndarray, dict[str, tuple[str, ...]]]:
     """Read a table of particles alone: `particle,D1_um,D2_um,D3_um` and any further columns.
+
+    Args:
+        file: a text table, or an Excel workbook whose only sheet, or the one called "particles", is the table.
+        named: what the column of names may be called.
 
     Returns:
         Names, diameters [um] of shape (N, 3), and the further columns as text.
@@ -117,20 +124,35 @@ def read_particles(file: str | Path) -> tuple[tuple[str, ...], np.ndarray, dict[
     Raises:
         InputError: naming file, row and column.
     """
-    return _parse_particles(read_table(Path(file)))
+    path = Path(file)
+    data = read_bytes(path)
+    if is_workbook(data):
+        return parse_particles(make_table(read_sheet(data, path, preferred=Path(PARTICLES).stem), path), named)
+    return parse_particles(parse_table(decode(data, path), path), named)
 
 
-def _parse_particles(table: Table) -> tuple[tuple[str, ...], np.ndarray, dict[str, tuple[str, ...]]]:
-    where = name_column(table.header, table.file)
+def parse_particles(
+    table: Table, named: Sequence[str] = ("particle",)
+) -> tuple[tuple[str, ...], np.ndarray, dict[str, tuple[str, ...]]]:
+    """Names, diameters [um] and further columns of a table of particles.
+
+    Args:
+        table: the table.
+        named: what the column of names may be called.
+
+    Raises:
+        InputError: naming file, row and column.
+    """
+    where = name_column(table.header, table.file, named)
     names = _checked_names(table.text(where), table)
-    used, diameters = [where], []
-    for quantity in ("D1", "D2", "D3"):
-        column, factor = find_column(table.header, quantity, LENGTH, table.file)
-        values = convert(table.numbers(column), factor)
+    found = [find_column(table.header, quantity, LENGTH, table.file) for quantity in ("D1", "D2", "D3")]
+    used = [column for column, _ in found]
+    diameters = []
+    for (column, factor), raw in zip(found, table.numbers(used), strict=True):
+        values = convert(raw, factor)
         check_magnitudes(values, table.file, table.rows, table.header[column], diameter=True)
-        used.append(column)
         diameters.append(values)
-    columns = {name: tuple(table.text(i)) for i, name in enumerate(table.header) if i not in used}
+    columns = {name: tuple(table.text(i)) for i, name in enumerate(table.header) if i not in (where, *used)}
     return names, np.stack(diameters, axis=-1), columns
 
 

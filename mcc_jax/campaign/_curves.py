@@ -6,7 +6,7 @@ import csv
 import io
 import re
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from .._errors import InputError
 from ..files import LIMITS, FileLimits
 from ._columns import FORCE, LARGEST_MAGNITUDE, LENGTH, TIME, convert, find_column, missing_column
 from ._schema import Curve
-from ._table import decode, parse_table, read_bytes
+from ._table import decode, parse_table, read_bytes, same_text
 from ._validate import check_magnitudes
 
 PARTICLES = "particles.csv"
@@ -34,6 +34,16 @@ class CurveRows:
     values: np.ndarray  # (3, rows of data), canonical units
     groups: dict[str, np.ndarray]  # name -> indices of its records, in the order of the file
     text: str
+
+    def named_as(self, names: Sequence[str]) -> CurveRows:
+        """The same with the given names, where a name differs from one of them in its Unicode form only."""
+        known = set(names)
+        form = {same_text(name): name for name in reversed(names)}
+        parts: dict[str, list[np.ndarray]] = {}
+        for name, records in self.groups.items():
+            parts.setdefault(name if name in known else form.get(same_text(name), name), []).append(records)
+        groups = {name: np.sort(np.concatenate(each)) if len(each) > 1 else each[0] for name, each in parts.items()}
+        return replace(self, groups=groups)
 
     def curve(self, name: str) -> Curve:
         time, force, displacement = (np.ascontiguousarray(column[self.groups[name]]) for column in self.values)
@@ -80,13 +90,14 @@ def read_curves(file: Path, limits: FileLimits = LIMITS) -> CurveRows:
     data = read_bytes(file, limits)
     text = decode(data, file)
     first = re.split(r"[\r\n]", text, maxsplit=1)[0]
-    layout = _curve_layout(parse_table(f"{first}\n{first}", file).header, file) if first else None
-    fast = _split_fast(text, layout) if layout is not None else None
+    head = parse_table(f"{first}\n{first}", file) if first.strip(",;\t ") else None
+    layout = _curve_layout(head.header, file) if head is not None else None
+    fast = _split_fast(text, layout) if head is not None and layout is not None and head.delimiter == "," else None
     if layout is None or fast is None:
         table = parse_table(text, file)
         layout = _curve_layout(table.header, file)
         names = table.text(layout.name)
-        raw = [table.numbers(column) for column in layout.columns]
+        raw = table.numbers(layout.columns)
         groups = _group(names)
     else:
         raw, groups = fast
@@ -193,7 +204,9 @@ def _group(names: list[str]) -> dict[str, np.ndarray]:
     return {name: np.array(indices) for name, indices in members.items()}
 
 
-def name_column(header: Sequence[str], file: Path) -> int:
-    if "particle" not in header:
-        raise missing_column(header, "particle", file)
-    return list(header).index("particle")
+def name_column(header: Sequence[str], file: Path, allowed: Sequence[str] = ("particle",)) -> int:
+    """Which column holds the names; `allowed` are the names that the column itself may have, the usual one first."""
+    for name in allowed:
+        if name in header:
+            return list(header).index(name)
+    raise missing_column(header, allowed[0], file)

@@ -1,12 +1,20 @@
-"""Text tables with commas: reading them strictly, and saying where they are wrong as an editor counts rows."""
+"""Tables of a campaign: reading them strictly, and saying where they are wrong as an editor counts rows.
+
+Columns are parted by commas, or, as spreadsheets of many countries write, by semicolons or tabs; only then may numbers
+have a decimal comma. A delimiter behind the last cell of a row, and rows of delimiters only, hold nothing.
+"""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
+import re
+import unicodedata
 from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +23,9 @@ from .._errors import InputError
 from ..files import LIMITS, FileLimits, read_table_bytes
 from ._columns import LARGEST_MAGNITUDE
 
-CONVERT = "mcc-jax convert with a mapping file"
+SPACES = " \u00a0\u2007\u2009\u202f"
+"""Blank, no-break, figure, thin and narrow no-break space: nobody sees which of them parts the thousands."""
+APOSTROPHES = "'\u2019"
 _MAGIC = {
     b"\x1f\x8b": "gzip-compressed",
     b"PK\x03\x04": "a zip archive or an Excel workbook",
@@ -73,39 +83,65 @@ def decode(data: bytes, file: Path, wanted: str = "plain CSV text in UTF-8") -> 
         ) from None
 
 
+def same_text(text: str) -> str:
+    """A name in the one form (Unicode NFC) in which names are compared: an accent may be a character of its own."""
+    return unicodedata.normalize("NFC", text)
+
+
 @dataclass(frozen=True)
 class Table:
-    """A table as text: names of columns, records, and the row at which each record starts."""
+    """A table as text: names of columns, records, the row at which each record starts, and what parts the columns."""
 
     file: Path
     header: tuple[str, ...]
     records: list[list[str]]
     rows: list[int]
+    delimiter: str = ","
 
     def text(self, column: int) -> list[str]:
         """The cells of a column, as they stand."""
         return [record[column] for record in self.records]
 
-    def numbers(self, column: int) -> np.ndarray:
-        """The cells of a column as finite numbers.
+    def decimal_mark(self, columns: Sequence[int]) -> str:
+        """The decimal mark of some columns: a comma if one stands in them and none parts the columns."""
+        commas = self.delimiter != "," and any("," in record[i] for record in self.records for i in columns)
+        return "," if commas else "."
+
+    def numbers(self, columns: Sequence[int]) -> list[np.ndarray]:
+        """The cells of some columns as finite numbers, all with the same decimal mark.
 
         Raises:
-            InputError: at the first cell that is none.
+            InputError: at the first cell of a column that is none.
         """
+        mark = self.decimal_mark(columns)
+        return [self._numbers(column, mark) for column in columns]
+
+    def _numbers(self, column: int, mark: str) -> np.ndarray:
         values = np.empty(len(self.records))
         for i, record in enumerate(self.records):
             try:
-                values[i] = parse_number(record[column])
+                values[i] = parse_number(record[column], mark)
             except ValueError as error:
-                remedy = "Write a number with a decimal point, or remove the row"
+                point = "a decimal point" if mark == "." else "a decimal comma, as in the other rows,"
+                if thousands_mark(record[column], mark):
+                    point += " and no mark between the thousands"
                 raise InputError(
-                    str(error), file=self.file, row=self.rows[i], column=self.header[column], remedy=remedy
+                    str(error),
+                    file=self.file,
+                    row=self.rows[i],
+                    column=self.header[column],
+                    remedy=f"Write a number with {point}, or remove the row",
                 ) from None
         return values
 
 
-def parse_number(cell: str, decimal_mark: str = ".") -> float:
+def parse_number(cell: str, decimal_mark: str = ".", thousands: str = "") -> float:
     """A cell's number.
+
+    Args:
+        cell: the text.
+        decimal_mark: "." or ",".
+        thousands: characters each of which may stand between groups of three digits; none if empty.
 
     Raises:
         ValueError: if the cell is empty, text, not finite, or too large; the text says which.
@@ -115,13 +151,22 @@ def parse_number(cell: str, decimal_mark: str = ".") -> float:
         raise ValueError("the cell is empty")
     plain = stripped if decimal_mark == "." else stripped.replace(decimal_mark, ".")
     shown = stripped if len(stripped) <= 40 else stripped[:40] + "..."
+    foreign = decimal_mark != "." and "." in stripped
+    if thousands and any(mark in stripped for mark in thousands):
+        grouped = _grouped(thousands, decimal_mark).fullmatch(stripped)
+        if grouped is None:
+            raise ValueError(f"{shown!r} is not a number with groups of three digits")
+        plain = re.sub(f"[{re.escape(thousands)}]", "", stripped).replace(decimal_mark, ".")
+        foreign = False
     try:
         # Python also reads 1_000 and digits of other scripts; in a data file both are mistakes.
         number = float(plain) if plain.isascii() and "_" not in plain else None
     except ValueError:
         number = None
-    if number is None or (decimal_mark != "." and "." in stripped):
+    if number is None or foreign:
         hint = " (a decimal comma?)" if decimal_mark == "." and stripped.count(",") == 1 else ""
+        if thousands_mark(stripped, decimal_mark):
+            hint = " (a mark between the thousands?)" if not hint or "." in stripped else hint
         raise ValueError(f"{shown!r} is not a number{hint}")
     if math.isnan(number) or (math.isinf(number) and "n" in plain.lower()):
         raise ValueError(f"{shown!r} is not a finite number")
@@ -130,21 +175,35 @@ def parse_number(cell: str, decimal_mark: str = ".") -> float:
     return number
 
 
+@cache
+def _grouped(thousands: str, decimal_mark: str) -> re.Pattern[str]:
+    mark, point = f"[{re.escape(thousands)}]", re.escape(decimal_mark)
+    return re.compile(rf"[-+]?[0-9]{{1,3}}({mark})[0-9]{{3}}(?:\1[0-9]{{3}})*(?:{point}[0-9]*)?(?:[eE][-+]?[0-9]+)?")
+
+
+def thousands_mark(cell: str, decimal_mark: str = ".") -> str | None:
+    """The mark between groups of three digits in a cell that is no number without it; None if there is none."""
+    for mark in (".", ",", *APOSTROPHES, *SPACES):
+        if mark != decimal_mark and _grouped(mark, decimal_mark).fullmatch(cell.strip()):
+            return mark
+    return None
+
+
+def delimiter_of(header: str) -> str:
+    """What parts the columns of a table, told by its header: the commonest of comma, semicolon and tab."""
+    return max(",;\t", key=re.sub('"[^"]*"', "", header).count)
+
+
 def parse_header(cells: list[str], file: Path) -> tuple[str, ...]:
     """Names of the columns, without blanks around them.
 
     Raises:
-        InputError: if the delimiter is not a comma, a name is empty or stands there twice.
+        InputError: if the delimiter is none of those known, a name is empty or stands there twice.
     """
-    if len(cells) == 1:
-        for mark, name in ((";", "';'"), ("\t", "tabs"), ("|", "'|'")):
-            if mark in cells[0]:
-                raise InputError(
-                    f"the columns are separated by {name}, not by commas",
-                    file=file,
-                    row=1,
-                    remedy=f"Use commas and decimal points, or run {CONVERT}",
-                )
+    if len(cells) == 1 and "|" in cells[0]:
+        raise InputError(
+            "the columns are separated by '|'", file=file, row=1, remedy="Use commas, semicolons or tabs instead"
+        )
     header = tuple(cell.strip().strip("\ufeff").strip() for cell in cells)
     for i, name in enumerate(header):
         if not name:
@@ -160,46 +219,71 @@ def number_of_cells(count: int) -> str:
     return "1 cell" if count == 1 else f"{count} cells"
 
 
-def ragged(count: int, header: tuple[str, ...], file: Path, row: int) -> InputError:
+def ragged(count: int, header: tuple[str, ...], file: Path, row: int, delimiter: str = ",") -> InputError:
     """The error for a row with too many or too few cells."""
     few = count < len(header)
     where = header[count] if few else None
-    hint = "Fill the cell" if few else f"Use decimal points and quote text that holds commas, or run {CONVERT}"
+    extra = "Use decimal points and quote" if delimiter == "," else "Quote"
+    what = {",": "commas", ";": "semicolons", "\t": "tabs"}[delimiter]
+    hint = "Fill the cell" if few else f"{extra} text that holds {what}"
     problem = f"{number_of_cells(count)} where the header has {len(header)}"
     return InputError(problem, file=file, row=row, column=where, remedy=hint)
 
 
+def make_table(found: Iterable[tuple[int, list[str]]], file: Path, delimiter: str = ",") -> Table:
+    """A table from rows that are already split; rows whose cells are all empty are passed over.
+
+    Empty cells behind the last column that has a name hold nothing and are passed over, too.
+
+    Args:
+        found: number of the row and its cells, the header first.
+        file: for messages.
+        delimiter: what parts the columns.
+
+    Raises:
+        InputError: if a row has another number of cells than the header, or there are no rows.
+    """
+    full = [(row, cells) for row, cells in found if any(cell.strip() for cell in cells)]
+    if not full:
+        raise InputError("the file is empty", file=file, remedy="Export it again")
+    names = full[0][1]
+    width = _filled(names)
+    # A column without a name that holds something is a mistake, which the header's check names.
+    if any(len(names) >= len(cells) > width and _filled(cells) > width for _, cells in full[1:]):
+        width = len(names)
+    header = parse_header(names[:width], file)
+    if len(full) == 1:
+        raise InputError("there is a header but no row of data", file=file, row=1, remedy="Export it again")
+    for row, cells in full[1:]:
+        if len(cells) < width or _filled(cells) > width:
+            raise ragged(len(cells) if len(cells) < width else _filled(cells), header, file, row, delimiter)
+    return Table(file, header, [cells[:width] for _, cells in full[1:]], [row for row, _ in full[1:]], delimiter)
+
+
+def _filled(cells: list[str]) -> int:
+    """The number of cells up to the last one that holds something."""
+    return next((i for i in range(len(cells), 0, -1) if cells[i - 1].strip()), 0)
+
+
 def parse_table(text: str, file: Path) -> Table:
-    """The whole of a comma-separated table; rows that are wholly empty are passed over.
+    """The whole of a table; rows that are wholly empty are passed over.
 
     Raises:
         InputError: if quotes do not close, a row has another number of cells than the header, or there are no rows.
     """
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-    header: tuple[str, ...] | None = None
-    records: list[list[str]] = []
-    rows: list[int] = []
+    delimiter = delimiter_of(text.lstrip().partition("\n")[0].partition("\r")[0])
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True, delimiter=delimiter)
+    found: list[tuple[int, list[str]]] = []
     row = 1
     try:
         for record in reader:
-            if record:
-                if header is None:
-                    header = parse_header(record, file)
-                elif len(record) != len(header):
-                    raise ragged(len(record), header, file, row)
-                else:
-                    records.append(record)
-                    rows.append(row)
+            found.append((row, record))
             row = reader.line_num + 1
     except csv.Error as error:
         raise InputError(
             f"quotes or cells are damaged ({error})", file=file, row=row, remedy="Close every double quote"
         ) from None
-    if header is None:
-        raise InputError("the file is empty", file=file, remedy="Export it again")
-    if not records:
-        raise InputError("there is a header but no row of data", file=file, row=1, remedy="Export it again")
-    return Table(file, header, records, rows)
+    return make_table(found, file, delimiter)
 
 
 def read_table(file: Path, limits: FileLimits = LIMITS) -> Table:

@@ -13,42 +13,62 @@ from ._output import results
 from ._session import say, say_table, session
 from ._types import Location, out_option, seed_option
 
-SHOWN = 24
+SHOWN = 12
+"""Rows of the table of tests; a folder may hold hundreds."""
 KINDS = ("approach", "load", "hold", "unload", "reload")
 
 
-@click.command(short_help="Turn a tester's file into a campaign.")
-@click.argument("file", type=Location(), metavar="FILE")
+@click.command(short_help="Turn a tester's file, or a folder of them, into a campaign.")
+@click.argument("file", type=Location(), metavar="FILE|FOLDER")
 @out_option(required=True)
 @click.option(
     "--diameters",
     metavar="D1,D2,D3|FILE",
-    help="Diameters in um of all tests, or a CSV table with particle,D1_um,D2_um,D3_um; D3 lies along the compression.",
+    help="Diameters in um of all tests, or a table (CSV or xlsx) with particle,D1_um,D2_um,D3_um, in which particles "
+    "are called like tests or files; D3 lies along the compression.",
 )
 @click.option(
     "--mapping",
     type=Location(),
     metavar="FILE",
-    help="TOML file that says what stands where in FILE, for any other text table.",
+    help="TOML file that says what stands where, for any other text table or Excel workbook.",
+)
+@click.option(
+    "--skip",
+    multiple=True,
+    metavar="NAME",
+    help='A file of FOLDER to leave out; may hold "*" and "?"; repeatable.',
 )
 @seed_option("Recorded in campaign.toml; converting itself draws no random number.")
-def convert(file: Path, out: Path, diameters: str | None, mapping: Path | None, seed: int) -> None:
-    """Turn FILE, a tester's export, into a campaign.
+def convert(
+    file: Path, out: Path, diameters: str | None, mapping: Path | None, skip: tuple[str, ...], seed: int
+) -> None:
+    """Turn FILE, a tester's export, or all exports of FOLDER into a campaign.
 
     Known formats: Fischer HM, Hysitron hld, Hysitron load-control text, Micro Materials text or zip; they are told
-    apart by content. Any other text table needs a mapping file. Units are converted; nothing is shifted or smoothed.
+    apart by content. Any other text table, or Excel workbook, needs a mapping file. Units are converted; nothing is
+    shifted or smoothed.
+
+    Of a folder every file is read, in natural order, but for hidden files, READMEs, licences, pictures, documents and
+    settings (.md, .pdf, .png, .toml, .ini, .db, ...) and folders in it; they are counted. A test is called like its
+    file; a file that cannot be read stops all, until it is left out with --skip.
 
     \b
     Example of a mapping file (--mapping):
       delimiter = "semicolon"       # comma, semicolon, tab, space
       decimal_mark = ","
-      skip_rows = 3                 # rows above the header
+      thousands = "point"           # if 1.000,0 is a thousand
+      skip_rows = 3                 # rows above the header; or begin = "t": how it begins
+      end = "Maximum"               # how the first row below the samples begins
+      missing = ["NaN", ""]         # rows with such a cell are dropped and counted
       tests = "column"              # a column names the test; leave out if the file is one test
       [columns]
       test = { column = "Sample" }
-      time = { column = "t", unit = "s" }
+      time = { column = "t", unit = "s" }     # or { speed = 0.05, unit = "mm/s" }
       force = { column = "Load", unit = "N" }
       displacement = { column = "Depth", unit = "nm", sign = -1 }
+      [diameters]                   # if a row above the samples tells the diameter
+      header = "Gage length"
     """
     if diameters is not None and not diameters.strip():
         raise click.BadParameter("it is empty.", param_hint="--diameters")
@@ -63,17 +83,21 @@ def convert(file: Path, out: Path, diameters: str | None, mapping: Path | None, 
             write_campaign,
         )
 
-        tell("reading the file")
+        tell("reading")
         sizes = None if diameters is None else read_diameters(diameters)
-        campaign = read_tester_file(file, diameters_um=sizes, mapping=mapping)
+        given = [path for path in (mapping, None if diameters is None else Path(diameters)) if path is not None]
+        skip += tuple(path.name for path in given if _lies_in(path, file) and path.name not in skip)
+        campaign = read_tester_file(file, diameters_um=sizes, mapping=mapping, skip=skip)
         tell("finding the segments")
         segments = [Counter(part.kind for part in find_segments(curve)) for curve in campaign.curves]
         tell("writing")
-        metadata = replace(campaign.metadata, other={**campaign.metadata.other, "conversion": {"seed": seed}})
+        conversion = campaign.metadata.other.get("conversion", {})
+        other = {**campaign.metadata.other, "conversion": {"seed": seed, **conversion}}
         with results(out) as stage:
-            write_campaign(replace(campaign, metadata=metadata), stage.folder)
+            write_campaign(replace(campaign, metadata=replace(campaign.metadata, other=other)), stage.folder)
     points = sum(len(curve) for curve in campaign.curves)
-    say(f"{len(campaign)} tests, {points} points ({campaign.metadata.provenance}).")
+    source = (campaign.metadata.provenance or "").partition(";")[0]
+    say(f"{len(campaign)} test{'s' if len(campaign) > 1 else ''}, {points} points ({source}).")
     rows = [
         (
             name,
@@ -86,10 +110,28 @@ def convert(file: Path, out: Path, diameters: str | None, mapping: Path | None, 
     ]
     say_table(("test", "points", "max force mN", "max displ um", *KINDS), rows[:SHOWN])
     if len(rows) > SHOWN:
-        say(f"  ... and {len(rows) - SHOWN} more")
+        force = [curve.force_mN.max() for curve in campaign.curves]
+        displacement = [curve.displacement_um.max() for curve in campaign.curves]
+        say(
+            f"  ... and {len(rows) - SHOWN} more; in all, max force {min(force):.4g} to {max(force):.4g} mN, "
+            f"max displ {min(displacement):.4g} to {max(displacement):.4g} um"
+        )
     total = sum(segments, Counter())
     say("Segments in all: " + ", ".join(f"{total[kind]} {kind}" for kind in KINDS) + ".")
+    for finding in conversion.get("findings", ()):
+        say(f"Note: {finding['sentence']}." + (f" {finding['remedy']}." if finding["remedy"] else ""))
     for one in (*check_plausibility(campaign), *campaign_findings(check_tests(campaign))):
         say(f"{'Warning' if one.level != 'told' else 'Note'}: {one}", fg="red" if one.level == "bad" else "yellow")
     say(f"Written into {out}: particles.csv, curves.csv, campaign.toml")
     say(f"Next: mcc-jax calibrate {shlex.quote(str(out))} --out fit")
+
+
+def _lies_in(path: Path, folder: Path) -> bool:
+    """Whether a file given by another option lies among the tests, which is then none of them."""
+    from ..campaign.readers.folder import passed_over
+
+    try:
+        inside = folder.is_dir() and path.is_file() and path.resolve().parent == folder.resolve()
+    except (OSError, ValueError):  # three long numbers are no name of a file
+        return False
+    return inside and not passed_over(path.name)

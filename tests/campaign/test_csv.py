@@ -178,9 +178,14 @@ BAD = {
     "too few cells": (C, CURVES.replace("A,2,5,0.2", "A,2,5"), ["row 4", "'displacement_um'", "3 cells", "Fill"]),
     "quotes open": (C, CURVES.replace("A,2", '"A,2'), ["row 4", "quotes", "Close"]),
     "quotes with a tail": (C, CURVES.replace("A,2", '"A"b,2'), ["row 4", "quotes"]),
-    "semicolons": (C, CURVES.replace(",", ";"), ["row 1", "';'", "mcc-jax convert", "mapping file"]),
-    "tabs": (P, PARTICLES.replace(",", "\t"), ["row 1", "tabs", "mcc-jax convert"]),
-    "semicolons and commas": (C, CURVES.replace(",", ";").replace(".", ","), ["row 1", "';'", "convert"]),
+    "bars between columns": (C, CURVES.replace(",", "|"), ["row 1", "'|'", "Use commas"]),
+    "thousands": (P, PARTICLES.replace("200", '"1,200.5"'), ["row 2", "'D1_um'", "between the thousands"]),
+    "two decimal marks": (
+        P,
+        PARTICLES.replace(",", ";").replace("190", "190,5").replace("140", "140.5"),
+        ["row 3", "'D2_um'", "decimal comma"],
+    ),
+    "semicolons and a cell too many": (P, PARTICLES.replace(",", ";").replace(";x", ";x;y"), ["row 2", "6 cells"]),
     "Latin-1": (P, PARTICLES.replace("A,", "\xb5,").encode("latin-1"), ["row 2", "0xb5", "UTF-8"]),
     "Latin-1 behind a mark": (
         P,

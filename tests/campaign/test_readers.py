@@ -126,8 +126,8 @@ def test_diameters(tmp_path):
         ([1.0, 2.0], "three positive lengths"),
         ([1.0, 2.0, -3.0], "three positive lengths"),
         ([1.0, 2.0, float("nan")], "three positive lengths"),
-        ({}, "has no diameters"),
-        ({"RobinSteel0000LC": SIZES, "x": SIZES}, "is no test of the file"),
+        ({}, "--diameters"),
+        ({"x": SIZES}, "none of the diameters is for a test"),
         ({"RobinSteel0000LC": [1.0]}, "three positive lengths"),
     ],
 )
@@ -292,7 +292,7 @@ def test_unknown_files(tmp_path, data, piece):
 
 def test_missing_file(tmp_path):
     assert "no such file" in message(tmp_path / "none")
-    assert "a folder" in message(tmp_path)
+    assert "no tester's file in the folder" in message(tmp_path)
 
 
 @settings(max_examples=60, deadline=None)

@@ -251,6 +251,41 @@ def test_convert_then_calibrate_says_that_the_law_does_not_fit(run, tmp_path):
     assert snapshot(fit).keys() == {"calibration.json"}
 
 
+def test_convert_a_folder_keeps_its_words_short(run, tmp_path):
+    folder, mapping, out = tmp_path / "my tests", tmp_path / "map.toml", tmp_path / "out"
+    folder.mkdir()
+    for i in range(1, 41):
+        (folder / f"P{i}.txt").write_text(f"t,F,d\n0,0,0\n1,{i},1\n2,-,1\n3,0,0.5\n")
+    (folder / ".hidden").write_text("x")
+    mapping.write_text(
+        'missing = ["-"]\n[columns]\ntime = { column = "t", unit = "s" }\nforce = { column = "F", unit = "N" }\n'
+        'displacement = { column = "d", unit = "um" }\n'
+    )
+    arguments = ("convert", folder, "--out", out, "--mapping", mapping, "--diameters", "200,190,180")
+    text = done(run(*arguments, "--skip", "P7", "--skip", "P1?.txt"))
+    assert len(text.splitlines()) < 24
+    for piece in (
+        "29 tests, 87 points (folder my tests, 29 files, mapped by map.toml",
+        "and 17 more; in all, max force 1000 to 4e+04 mN",
+        "Note: 1 file passed over, by name no tester's: .hidden.",
+        "Note: 11 files skipped as asked: P7.txt, P10.txt,",
+        "Note: 29 rows with a missing reading were dropped, in 29 tests.",
+    ):
+        assert piece in text
+    names = read_campaign(out).particles
+    assert names[:7] == ("P1", "P2", "P3", "P4", "P5", "P6", "P8")
+    assert names[-1] == "P40"
+    table = folder / "sizes.csv"
+    table.write_text("file;D1_um;D2_um;D3_um\n" + "".join(f"P{i}.txt;20{i},5;190;180\n" for i in range(1, 41)))
+    text = done(run("convert", folder, "--out", out, "--mapping", mapping, "--diameters", table))
+    assert "1 file skipped as asked: sizes.csv" in text
+    assert read_campaign(out).diameters_um[3].tolist() == [204.5, 190, 180]
+    table.unlink()
+    refused = run(*arguments, "--skip", "P99")
+    assert refused.exit_code == 2
+    assert "--skip P99 fits no file" in refused.stderr
+
+
 def test_convert_by_a_mapping_file_with_diameters_from_a_table(run, tmp_path):
     tests, table, mapping = tmp_path / "lab.txt", tmp_path / "sizes.csv", tmp_path / "map.toml"
     tests.write_text("made by hand\nt;F;d;who\n0;0;0;é 1\n1;0,5;-1;é 1\n0;0;0;2\n1;1;-2;2\n", encoding="latin-1")

@@ -45,6 +45,7 @@ def runnable(page):
 def write(block, folder):
     name = Path(block.title)
     assert not name.is_absolute()
+    (folder / name).parent.mkdir(parents=True, exist_ok=True)
     (folder / name).write_text(block.text, encoding="utf-8")
 
 

@@ -176,7 +176,7 @@ def read_state(folder: Path) -> None:
     load_state(folder / "state.npz")
 
 
-FOLDER, MAPPED = samples("campaign"), samples("mapped")
+FOLDER, MAPPED, HEADED = samples("campaign"), samples("mapped"), samples("headed")
 ZIP = {"tests.zip": plain_archive(sample("micromaterials.txt"))}
 BOTH = ("calibration.json", "discovery.json")
 TESTERS = (
@@ -192,6 +192,8 @@ READERS = (
     Reader("archive", 5, ZIP, archive, convert("tests.zip")),
     Reader("mapped table", 4, MAPPED, bytes_of("table.txt"), convert("table.txt", "mapping.toml")),
     Reader("mapping", 4, MAPPED, bytes_of("mapping.toml"), convert("table.txt", "mapping.toml")),
+    Reader("headed table", 4, HEADED, bytes_of("table.txt"), convert("table.txt", "mapping.toml")),
+    Reader("headed mapping", 4, HEADED, bytes_of("mapping.toml"), convert("table.txt", "mapping.toml")),
     Reader("priors", 2, {"priors.toml": sample("priors.toml")}, bytes_of("priors.toml"), read_priors),
     Reader("programme", 2, {"programme.toml": sample("programme.toml")}, bytes_of("programme.toml"), read_programme),
     *(Reader(name, 2, CAMPAIGN | {name: RESULTS[name]}, values_of(name), read_results) for name in BOTH),

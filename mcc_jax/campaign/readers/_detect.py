@@ -6,6 +6,7 @@ from pathlib import Path
 
 from ..._errors import InputError
 from .._table import binary_kind
+from ..workbook import is_workbook
 from . import _fischer, _hysitron_hld, _hysitron_lc, _micromaterials
 from ._text import Tests, decode_lines
 
@@ -31,6 +32,12 @@ def read_known(data: bytes, file: Path) -> Tests:
     Raises:
         InputError: if the format is unknown or the file is damaged.
     """
+    if is_workbook(data):
+        raise InputError(
+            "an Excel workbook has no format of its own",
+            file=file,
+            remedy=f"Write a TOML mapping file and give it with --mapping; for example {_EXAMPLE}",
+        )
     if data.startswith((b"PK\x03\x04", b"PK\x05\x06")):
         return _micromaterials.read_zip(data, file)
     kind = binary_kind(data)

@@ -10,20 +10,23 @@ import numpy as np
 
 from ..._errors import InputError
 from .._csv import read_particles
-from .._table import parse_number
+from .._table import parse_number, same_text
 from .._validate import SMALLEST_DIAMETER_UM
 
 Triple = Sequence[float | int] | np.ndarray
 Diameters = Mapping[str, Triple] | Triple
-_HOW = "Give --diameters D1,D2,D3 in um for all, or --diameters FILE, a CSV table with particle,D1_um,D2_um,D3_um"
+_NAMED = ("particle", "file", "test")
+_HOW = (
+    "Give --diameters D1,D2,D3 in um for all, or --diameters FILE, a CSV or xlsx table with particle,D1_um,D2_um,D3_um"
+)
 
 
 def read_diameters(text: str | os.PathLike[str]) -> Diameters:
     """Diameters from the command line: three numbers for all particles, or a table with one row for each.
 
     Args:
-        text: `D1,D2,D3` in um, or the path of a CSV table with the columns `particle`, `D1_um`, `D2_um`, `D3_um`
-            (or other units of length).
+        text: `D1,D2,D3` in um, or the path of a table (CSV, with semicolons or tabs, or xlsx) with the columns
+            `particle` (or `file`, `test`), `D1_um`, `D2_um`, `D3_um` (or other units of length).
 
     Returns:
         Three numbers [um], or a mapping from names to three numbers [um].
@@ -39,7 +42,7 @@ def read_diameters(text: str | os.PathLike[str]) -> Diameters:
             raise InputError(f"--diameters: {error}", remedy=_HOW) from None
         check_triple(values, "all particles", "--diameters")
         return values
-    names, diameters, _ = read_particles(Path(text))
+    names, diameters, _ = read_particles(Path(text), _NAMED)
     return dict(zip(names, diameters.tolist(), strict=True))
 
 
@@ -68,29 +71,79 @@ def check_triple(triple: Triple, what: str, file: str | Path) -> None:
         )
 
 
-def diameters_for(names: Sequence[str], diameters: Diameters | None, file: Path) -> np.ndarray:
-    """Diameters in the order of the names, shape (N, 3) [um].
+def diameters_for(
+    keys: Mapping[str, Sequence[str]],
+    diameters: Diameters | None,
+    told: Mapping[str, list[float] | InputError],
+    file: Path,
+) -> tuple[np.ndarray, int]:
+    """Diameters in the order of the tests, and how many entries of a table no test needed.
+
+    Args:
+        keys: by the name of each test the names under which a table may hold its diameters; the first that fits
+            counts.
+        diameters: one triple for all tests, or a table by name, which counts before what the file tells.
+        told: what the tests' files tell, or why they do not.
+        file: for messages.
+
+    Returns:
+        Diameters [um], shape (N, 3), and the number of entries left over.
 
     Raises:
-        InputError: if they are missing, or the mapping has another set of names.
+        InputError: if a test has none.
     """
-    if diameters is None:
-        raise InputError("a tester's file knows no particle diameters", file=file, remedy=_HOW)
-    if not isinstance(diameters, Mapping):
+    if diameters is not None and not isinstance(diameters, Mapping):
         check_triple(diameters, "all particles", file)
-        return np.tile(np.asarray(diameters, float), (len(names), 1))
-    shown = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
-    for name in names:
-        if name not in diameters:
-            raise InputError(
-                f"the test {name!r} has no diameters", file=file, remedy=f"Add a row for it; the tests are: {shown}"
-            )
-        check_triple(diameters[name], f"particle {name!r}", file)
-    for name in diameters:
-        if name not in names:
-            raise InputError(
-                f"diameters are given for {name!r}, which is no test of the file",
-                file=file,
-                remedy=f"Rename or remove it; the tests are: {shown}",
-            )
-    return np.array([np.asarray(diameters[name], float) for name in names])
+        return np.tile(np.asarray(diameters, float), (len(keys), 1)), 0
+    table = dict(diameters or {})
+    form: dict[str, str] = {}
+    for name in table:
+        form.setdefault(same_text(name), name)
+    found: list[list[float]] = []
+    used: set[str] = set()
+    lacking: dict[str, InputError | None] = {}
+    for name, others in keys.items():
+        key = next(
+            (k if k in table else form[same_text(k)] for k in others if k in table or same_text(k) in form), None
+        )
+        own = told.get(name)
+        if key is not None:
+            check_triple(table[key], f"particle {name!r}", file)
+            used.add(key)
+            found.append([float(value) for value in table[key]])
+        elif isinstance(own, list):
+            found.append(own)
+        else:
+            lacking[name] = own
+    if lacking:
+        raise _no_diameters(lacking, list(keys), table, file)
+    return np.array(found), len(table) - len(used)
+
+
+def _no_diameters(
+    lacking: Mapping[str, InputError | None], names: list[str], table: Mapping[str, Triple], file: Path
+) -> InputError:
+    name, why = next(iter(lacking.items()))
+    if why is not None:
+        others = list(lacking)[1:]
+        more = f" (so it is with {_shown(others)}, too)" if others else ""
+        return InputError(why.problem + more, file=why.file, row=why.row, column=why.column, remedy=why.remedy)
+    if not table:
+        return InputError("a tester's file knows no particle diameters", file=file, remedy=_HOW)
+    if len(lacking) == len(names):
+        there, tests = _shown(list(table)), _shown(names)
+        return InputError(
+            f"none of the diameters is for a test: they are for {there}, the tests are {tests}",
+            file=file,
+            remedy="Name the particles in the table like the tests or their files",
+        )
+    more = f" (nor have {len(lacking) - 1} more)" if len(lacking) > 1 else ""
+    return InputError(
+        f"the test {name!r} has no diameters{more}",
+        file=file,
+        remedy=f"Add a row for it; the table has rows for: {_shown(list(table))}",
+    )
+
+
+def _shown(names: list[str]) -> str:
+    return ", ".join(map(repr, names[:8])) + (", ..." if len(names) > 8 else "")

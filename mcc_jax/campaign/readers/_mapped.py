@@ -1,20 +1,29 @@
-"""Reading a text table as a mapping file describes it."""
+"""Reading a table, of text or of a workbook, as a mapping file describes it."""
 
 from __future__ import annotations
 
 import csv
+from collections import Counter
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
 
 from ..._errors import InputError
-from .._columns import convert
+from .._columns import LARGEST_MAGNITUDE, LENGTH, convert, unit_factor
 from .._schema import Curve
-from .._table import binary_kind, number_of_cells, parse_number
+from .._table import APOSTROPHES, binary_kind, number_of_cells, parse_number, same_text, thousands_mark
 from .._validate import check_magnitudes
-from ._mapping import DIMENSIONS, MappingFile
-from ._text import Tests, checked_curve, cut_off, decode_lines
+from ..workbook import is_workbook, read_sheet
+from ._diameters import check_triple
+from ._mapping import DIMENSIONS, InHeader, MappingFile
+from ._text import Tests, checked_curve, decode_lines
+from .pace import paced
+
+_FURTHEST = 200
+"""Rows above a header found by `begin`, within which it is looked for again; a tester's preamble has a few dozen."""
+_OWN_DIAMETER = "Add it to the file, or give this test's diameters in a table by --diameters"
 
 
 def read_mapped(data: bytes, file: Path, mapping: MappingFile) -> Tests:
@@ -28,96 +37,468 @@ def read_mapped(data: bytes, file: Path, mapping: MappingFile) -> Tests:
     Raises:
         InputError: if the file does not hold what the mapping says, or a cell is damaged.
     """
+    reader = _Reader(_rows(data, file, mapping), file, mapping)
+    reader.run()
+    if not reader.samples:
+        remedy = f"Check skip_rows, header_rows and {'end' if mapping.end else 'skip_footer'} in {mapping.file.name}"
+        if reader.missing:
+            raise InputError(
+                "every row has a missing reading", file=file, remedy=f"Check missing in {mapping.file.name}"
+            )
+        raise InputError("there are no rows of data", file=file, remedy=remedy)
+    for name in reader.missing:
+        if name not in reader.samples:
+            raise InputError(
+                f"every row of the test {name!r} has a missing reading", file=file, remedy="Remove the test's rows"
+            )
+    curves = {name: _curve(name, rows, mapping, file) for name, rows in reader.samples.items()}
+    other = {"mapping_provenance": mapping.provenance} if mapping.provenance else {}
+    form = f"mapped by {mapping.file.name}"
+    return Tests(curves, form, mapping.control, other, reader.diameters_um, dict(reader.missing))
+
+
+class _Rows:
+    """Lines of text, split when they are asked for."""
+
+    def __init__(self, lines: list[str], file: Path, mapping: MappingFile) -> None:
+        self.lines, self.file, self.delimiter, self.mapping = lines, file, mapping.delimiter, mapping.file.name
+        self.nothing = '" \t' if mapping.delimiter == " " else mapping.delimiter + '" \t'
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    def blank(self, i: int) -> bool:
+        """Whether a row holds nothing but delimiters."""
+        return not self.lines[i].strip(self.nothing)
+
+    def begins(self, i: int, text: str) -> bool:
+        """Whether a row, or the first thing that it holds, begins with a text."""
+        line, text = same_text(self.lines[i].lstrip()), same_text(text)
+        return line.startswith(text) or line.lstrip(self.nothing).startswith(text)
+
+    def cells(self, i: int) -> list[str]:
+        """The cells of a row."""
+        line = self.lines[i]
+        if self.delimiter == " ":
+            return line.split()
+        if '"' not in line:
+            return line.split(self.delimiter)
+        try:
+            return next(csv.reader([line], delimiter=self.delimiter, strict=True))
+        except (csv.Error, StopIteration) as error:
+            raise InputError(
+                f"quotes are damaged ({error})",
+                file=self.file,
+                row=i + 1,
+                remedy=f"Close every double quote, or correct delimiter in {self.mapping}",
+            ) from None
+
+
+class _Sheet(_Rows):
+    """Rows of a workbook's sheet, as they are."""
+
+    def __init__(self, rows: list[list[str]], file: Path, mapping: MappingFile) -> None:
+        super().__init__([], file, mapping)
+        self.rows = rows
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def blank(self, i: int) -> bool:
+        return not any(cell.strip() for cell in self.rows[i])
+
+    def begins(self, i: int, text: str) -> bool:
+        first = next((cell for cell in self.rows[i] if cell.strip()), "")
+        return same_text(first.lstrip()).startswith(same_text(text))
+
+    def cells(self, i: int) -> list[str]:
+        return self.rows[i]
+
+
+def _rows(data: bytes, file: Path, mapping: MappingFile) -> _Rows:
+    if is_workbook(data):
+        how = f'Write sheet = "..." in {mapping.file.name}'
+        rows = read_sheet(data, file, mapping.sheet, decimal_mark=mapping.decimal_mark, how=how)
+        return _Sheet([cells for _, cells in rows], file, mapping)
+    if mapping.sheet is not None:
+        raise InputError(
+            f"is no Excel workbook (xlsx), though {mapping.file.name} names a sheet",
+            file=file,
+            remedy="Remove the key sheet, or save the file as xlsx",
+        )
     kind = binary_kind(data)
     if kind is not None and not mapping.encoding.lower().replace("_", "-").startswith(("utf-16", "utf-32")):
-        raise InputError(f"the file is {kind}", file=file, remedy="Unpack it, or name its encoding in the mapping file")
+        raise InputError(
+            f"the file is {kind}", file=file, remedy="Unpack it, save it as xlsx or text, or name its encoding"
+        )
     lines = decode_lines(data, mapping.encoding, file)
     if lines and lines[0].startswith("\ufeff"):
         lines[0] = lines[0][1:]
-    head = mapping.skip_rows
-    body = head + mapping.header_rows
-    header = _split(lines[head], mapping, file, head) if mapping.header_rows and head < len(lines) else None
-    where = {name: _index(column.column, header, file, head + 1) for name, column in mapping.columns.items()}
-    width = len(header) if header is not None else None
-    samples: dict[str, list[tuple[int, list[str]]]] = {}
-    block, parted = 1, True
-    for i in range(body, len(lines)):
-        line = lines[i]
-        if not line.strip() or (mapping.delimiter != " " and not line.strip(mapping.delimiter + " ")):
-            parted = True
-            continue
-        if mapping.comment_prefix is not None and line.lstrip().startswith(mapping.comment_prefix):
-            continue
-        cells = _split(line, mapping, file, i)
-        width = len(cells) if width is None else width
-        if len(cells) != width or max(where.values()) >= width:
-            expected = max(width, max(where.values()) + 1)
-            raise cut_off(f"{number_of_cells(len(cells))} where {expected} are expected", file, i + 1)
-        if mapping.tests == "blank line":
-            block += parted and bool(samples)
-            name = str(block)
-        elif mapping.tests == "column":
-            name = cells[where["test"]].strip()
-            if not name:
-                raise cut_off("the test's name is empty", file, i + 1)
-        else:
-            name = mapping.test_name or file.stem
-        parted = False
-        samples.setdefault(name, []).append((i + 1, cells))
-    if not samples:
-        raise InputError(
-            "there are no rows of data", file=file, remedy=f"Check skip_rows and header_rows in {mapping.file.name}"
+    return _Rows(lines, file, mapping)
+
+
+@dataclass
+class _Reader:
+    """Goes through the rows once and keeps what belongs to each test."""
+
+    rows: _Rows
+    file: Path
+    mapping: MappingFile
+    samples: dict[str, list[tuple[int, list[float]]]] = field(default_factory=dict)
+    missing: Counter[str] = field(default_factory=Counter)
+    diameters_um: dict[str, list[float] | InputError] = field(default_factory=dict)
+    parted: bool = False  # whether the next sample begins a test
+
+    def run(self) -> None:
+        """Read all rows.
+
+        Raises:
+            InputError: at the first row that is neither sample, header nor footer.
+        """
+        rows, mapping = self.rows, self.mapping
+        head = self._head()
+        self.header = self._header(head)
+        self.stop = self._stop(head + mapping.header_rows)
+        self.where = {n: _index(c.column, self.header, self.file, head + 1, self) for n, c in mapping.columns.items()}
+        self.wanted = [quantity for quantity in DIMENSIONS if quantity in self.where]
+        self.width, self.raw_width = self._widths(head)
+        sizes = self._diameters(0, head)
+        block, ended = 1, False
+        i = head + mapping.header_rows
+        while i < self.stop:
+            if rows.blank(i):
+                self.parted = self.parted or mapping.tests == "blank line"
+                ended = ended and mapping.tests != "blank line"
+                i += 1
+                continue
+            if mapping.comment_prefix is not None and rows.begins(i, mapping.comment_prefix):
+                i += 1
+                continue
+            again = self._header_again(i)
+            if again is not None:
+                if mapping.tests == "file" and mapping.pace is not None:
+                    raise InputError(
+                        "the header comes again, so this is more than one test",
+                        file=self.file,
+                        row=again + 1,
+                        remedy=f'Write tests = "header" in {mapping.file.name}',
+                    )
+                if mapping.diameters is not None and again > i:
+                    sizes = self._diameters(i, again)
+                self.parted, ended = self.parted or mapping.tests == "header", False
+                i = again + mapping.header_rows
+                continue
+            ended = ended or (mapping.end is not None and rows.begins(i, mapping.end))
+            if not ended:
+                cells = self._fit(i)
+                numbers = self._numbers(cells, i)
+                if mapping.tests in ("blank line", "header"):
+                    block += self.parted and bool(self.samples or self.missing)
+                name = self._name(cells, block, i)
+                self.parted = False
+                if numbers is None:
+                    self.missing[name] += 1
+                else:
+                    self.samples.setdefault(name, []).append((i + 1, numbers))
+                if sizes is not None:
+                    self.diameters_um.setdefault(name, sizes)
+            i += 1
+
+    def _head(self) -> int:
+        """The index of the header, or of the first row of data where there is none."""
+        begin = self.mapping.begin
+        if begin is None:
+            return self.mapping.skip_rows
+        found = next((i for i in range(len(self.rows)) if self.rows.begins(i, begin)), None)
+        if found is None:
+            raise InputError(
+                f"no row begins with {begin!r}", file=self.file, remedy=f"Correct begin in {self.mapping.file.name}"
+            )
+        return found
+
+    def _header(self, head: int) -> list[str] | None:
+        if not self.mapping.header_rows or head >= len(self.rows):
+            return None
+        return self.rows.cells(head)
+
+    def _stop(self, body: int) -> int:
+        """The index behind the last row, without the footer."""
+        full = [i for i in range(body, len(self.rows)) if not self.rows.blank(i)]
+        footer = self.mapping.skip_footer
+        return full[-footer] if 0 < footer < len(full) else body if footer and footer >= len(full) else len(self.rows)
+
+    def _widths(self, head: int) -> tuple[int, int]:
+        """The number of cells that a row must have: without and with what is empty behind the last column."""
+        first = self.header
+        if first is None:
+            first = next((self.rows.cells(i) for i in range(head, self.stop) if not self.rows.blank(i)), [])
+        needed = max(self.where.values()) + 1
+        return max(needed, _filled(first)), max(needed, len(first))
+
+    def _header_again(self, i: int) -> int | None:
+        """The index of the header if it comes again at this row, or below rows that are no samples; else None."""
+        rows, mapping = self.rows, self.mapping
+        if self.header is None or self._is_sample(i):
+            return None
+        above = mapping.skip_rows if mapping.begin is None else _FURTHEST
+        for j in range(i, min(i + above + 1, self.stop)):
+            if mapping.begin is not None and rows.begins(j, mapping.begin):
+                return self._same_columns(j)
+            if mapping.begin is None and not rows.blank(j) and rows.cells(j) == self.header:
+                return j
+            if self._is_sample(j):
+                return None
+        return None
+
+    def _same_columns(self, i: int) -> int:
+        """Refuse a header that begins like the first and names the columns in another order."""
+        names = [same_text(name).strip() for name in self.rows.cells(i)]
+        for place in self.where.values():
+            first = same_text((self.header or [])[place]).strip()
+            if place >= len(names) or names[place] != first:
+                raise InputError(
+                    f"the header comes again without {first!r} as its column {place + 1}",
+                    file=self.file,
+                    row=i + 1,
+                    remedy="Put tests with other columns into a file of their own",
+                )
+        return i
+
+    def _is_sample(self, i: int) -> bool:
+        """Whether every reading of a row is a number, or marked as missing."""
+        if self.rows.blank(i):
+            return False
+        cells = self.rows.cells(i)
+        return all(
+            self.where[q] < len(cells)
+            and (self._is_number(cells[self.where[q]]) or self._is_missing(cells[self.where[q]]))
+            for q in self.wanted
         )
-    curves = {name: _curve(name, rows, where, mapping, file) for name, rows in samples.items()}
-    other = {"mapping_provenance": mapping.provenance} if mapping.provenance else {}
-    return Tests(curves, f"mapped by {mapping.file.name}", mapping.control, other)
+
+    def _is_number(self, cell: str) -> bool:
+        try:
+            parse_number(cell, self.mapping.decimal_mark, self.mapping.thousands)
+        except ValueError:
+            return False
+        return True
+
+    def _fit(self, i: int) -> list[str]:
+        """The cells of a row of data, of which those behind the last column are empty."""
+        cells = self.rows.cells(i)
+        if len(cells) == self.raw_width or (len(cells) >= self.width and _filled(cells) <= self.width):
+            return cells
+        count = len(cells) if len(cells) < self.width else _filled(cells)
+        name = self.mapping.file.name
+        if self._is_footer(i):
+            remedy = self._footer_remedy(i)
+        elif count > self.width and self.mapping.delimiter == self.mapping.decimal_mark:
+            remedy = "Quote every number that has a decimal comma, or part the columns by another character"
+        elif count > self.width:
+            remedy = f"Check delimiter and decimal_mark in {name}, and quote text that holds the delimiter"
+        else:
+            remedy = "Fill the row or delete it; if the file was cut off here, export it again"
+        raise InputError(
+            f"{number_of_cells(count)} where {self.width} are expected", file=self.file, row=i + 1, remedy=remedy
+        )
+
+    def _numbers(self, cells: list[str], i: int) -> list[float] | None:
+        """The readings of a row, None where one of them is missing."""
+        mapping = self.mapping
+        if mapping.missing and any(self._is_missing(cells[self.where[q]]) for q in self.wanted):
+            return None
+        found = []
+        for quantity in self.wanted:
+            cell = cells[self.where[quantity]]
+            try:
+                found.append(parse_number(cell, mapping.decimal_mark, mapping.thousands))
+            except ValueError as error:
+                raise InputError(
+                    str(error),
+                    file=self.file,
+                    row=i + 1,
+                    column=str(mapping.columns[quantity].column),
+                    remedy=self._number_remedy(cell.strip(), i),
+                ) from None
+        return found
+
+    def _is_missing(self, cell: str) -> bool:
+        cell = cell.strip()
+        for mark in self.mapping.missing:
+            if isinstance(mark, str) and cell.lower() == mark.lower():
+                return True
+            try:
+                number = parse_number(str(mark)) if isinstance(mark, str) else mark
+                if parse_number(cell, self.mapping.decimal_mark, self.mapping.thousands) == number:
+                    return True
+            except ValueError:
+                continue
+        return False
+
+    def _number_remedy(self, cell: str, i: int) -> str:
+        """What to do about a cell that is no number, by what it looks like."""
+        name, mark = self.mapping.file.name, thousands_mark(cell, self.mapping.decimal_mark)
+        if mark is not None and not self.mapping.thousands:
+            word = {".": "point", ",": "comma"}.get(mark, "apostrophe" if mark in APOSTROPHES else "space")
+            other = ' (or decimal_mark = ",")' if mark == "," and cell.count(",") == 1 and "." not in cell else ""
+            return f'If the mark parts thousands, write thousands = "{word}"{other} in {name}'
+        if self._is_footer(i):
+            return self._footer_remedy(i)
+        word = any(c.isalpha() for c in cell) and not _is_no_reading(cell)
+        if word and not (self.samples or self.missing):
+            return f"If this row belongs to the header, correct skip_rows or header_rows in {name}"
+        if word and self.parted:
+            return f"If the rows above this test are not those above the first, name the header with begin in {name}"
+        if _is_no_reading(cell):
+            return f"Mend the cell, or write missing = [{_quoted(cell)}] in {name} to drop such readings"
+        return f"Mend the cell, or decimal_mark and unit in {name}"
+
+    def _is_footer(self, i: int) -> bool:
+        """Whether a row that begins with text has samples above and, in its test, none below."""
+        text = _first(self.rows.cells(i))
+        if self.parted or not (self.samples or self.missing) or self._is_number(text) or _is_no_reading(text):
+            return False
+        return not any(self._is_sample(j) for j in range(i, self._end_of_test(i)))
+
+    def _end_of_test(self, i: int) -> int:
+        blank = (j for j in range(i, self.stop) if self.rows.blank(j))
+        return next(blank, self.stop) if self.mapping.tests == "blank line" else self.stop
+
+    def _footer_remedy(self, i: int) -> str:
+        way = f"end = {_quoted(_first(self.rows.cells(i))[:20])}"
+        below = [j for j in range(i, self.stop) if not self.rows.blank(j)]
+        if below[-1] < self._end_of_test(i):
+            way += f" or skip_footer = {len(below) + self.mapping.skip_footer}"
+        return f"If the samples end above it, write {way} in {self.mapping.file.name}"
+
+    def _name(self, cells: list[str], block: int, i: int) -> str:
+        match self.mapping.tests:
+            case "blank line" | "header":
+                return str(block)
+            case "column":
+                name = same_text(cells[self.where["test"]].strip())
+                if not name:
+                    raise InputError(
+                        "the test's name is empty",
+                        file=self.file,
+                        row=i + 1,
+                        column=str(self.mapping.columns["test"].column),
+                        remedy="Fill the cell, or remove the row",
+                    )
+                return name
+            case "file":
+                return same_text(self.mapping.test_name or self.file.stem)
+
+    def _diameters(self, start: int, stop: int) -> list[float] | InputError | None:
+        """D1, D2, D3 [um] as the rows from `start` to `stop` tell them, or why not: a table may hold them."""
+        asked = self.mapping.diameters
+        if asked is None:
+            return None
+        try:
+            found = [self._length(name, asked, start, min(stop, len(self.rows))) for name in asked.names]
+            triple = found * 3 if len(found) == 1 else found
+            check_triple(triple, "the header", self.file)
+        except InputError as error:
+            return error
+        return triple
+
+    def _length(self, name: str, asked: InHeader, start: int, stop: int) -> float:
+        for i in range(start, stop):
+            if not self.rows.begins(i, name):
+                continue
+            text = same_text(" ".join(cell.strip() for cell in self.rows.cells(i) if cell.strip()))
+            rest = text[len(name) :]
+            if rest[:1].isalnum():
+                continue
+            words = rest.replace(":", " ").replace("=", " ").split()
+            units = [w.strip("[]()") for w in words if not self._is_number(w)]
+            numbers = [w for w in words if self._is_number(w)]
+            if len(numbers) != 1:
+                problem = f"{name!r} holds {len(numbers) or 'no'} number{'s' if numbers else ''}"
+                raise InputError(problem, file=self.file, row=i + 1, remedy=_OWN_DIAMETER)
+            value = parse_number(numbers[0], self.mapping.decimal_mark, self.mapping.thousands)
+            try:
+                if asked.factor is None and not units:
+                    raise ValueError("the unit is missing")  # noqa: TRY301
+                factor = unit_factor(units[0], LENGTH) if asked.factor is None else asked.factor
+            except ValueError as error:
+                remedy = f'Write unit = "mm" below header in {self.mapping.file.name}'
+                raise InputError(str(error), file=self.file, row=i + 1, column=name, remedy=remedy) from None
+            if not value > 0:
+                problem = f"the diameter {value:g} is not positive"
+                raise InputError(problem, file=self.file, row=i + 1, column=name, remedy=_OWN_DIAMETER)
+            return float(convert(np.array([value]), factor)[0])
+        raise InputError(
+            f"no row above the samples begins with {name!r}, which is to tell a diameter",
+            file=self.file,
+            remedy=_OWN_DIAMETER,
+        )
 
 
-def _split(line: str, mapping: MappingFile, file: Path, i: int) -> list[str]:
-    if mapping.delimiter == " ":
-        return line.split()
+def _filled(cells: list[str]) -> int:
+    return next((i for i in range(len(cells), 0, -1) if cells[i - 1].strip()), 0)
+
+
+def _first(cells: list[str]) -> str:
+    return next((cell.strip() for cell in cells if cell.strip()), "")
+
+
+def _quoted(text: str) -> str:
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+def _is_no_reading(cell: str) -> bool:
+    """Whether a cell looks like what testers write for "no reading": nothing, dashes, NaN, the largest number."""
+    if not any(c.isalnum() for c in cell) or cell.lower().strip("+-#") in ("nan", "inf", "na", "n/a", "null", "none"):
+        return True
     try:
-        return next(csv.reader([line], delimiter=mapping.delimiter, strict=True))
-    except (csv.Error, StopIteration) as error:
-        raise cut_off(f"quotes are damaged ({error})", file, i + 1) from None
+        return abs(float(cell.replace(",", "."))) > LARGEST_MAGNITUDE
+    except ValueError:
+        return False
 
 
-def _index(column: str | int, header: list[str] | None, file: Path, row: int) -> int:
+def _index(column: str | int | None, header: list[str] | None, file: Path, row: int, reader: _Reader) -> int:
     if isinstance(column, int):
         if header is not None and column > len(header):
             raise InputError(
                 f"there is no column {column}, only {len(header)}", file=file, row=row, remedy="Count again"
             )
         return column - 1
-    names = [name.strip() for name in header or []]
-    found = [i for i, name in enumerate(names) if name == column]
+    names = [same_text(name).strip() for name in header or []]
+    found = [i for i, name in enumerate(names) if name == same_text(str(column))]
     if len(found) == 1:
         return found[0]
     problem = f"there are {len(found)} columns called {column!r}" if found else f"there is no column {column!r}"
-    close = get_close_matches(column, names, n=1)
-    remedy = (
-        "Give its number" if found else f"Did you mean {close[0]!r}?" if close else f"There are: {', '.join(names)}"
-    )
+    close = get_close_matches(str(column), names, n=1)
+    other = [word for word, mark in (("semicolon", ";"), ("tab", "\t"), ("comma", ",")) if mark in "".join(names)]
+    if found:
+        remedy = "Give its number"
+    elif len(names) == 1 and other:
+        remedy = (
+            f'If its columns are parted by a {other[0]}, write delimiter = "{other[0]}" in {reader.mapping.file.name}'
+        )
+    elif close:
+        remedy = f"Did you mean {close[0]!r}?"
+    else:
+        remedy = (
+            f"There are: {', '.join(names)}; if this is not the header, correct skip_rows in {reader.mapping.file.name}"
+        )
     raise InputError(problem, file=file, row=row, remedy=remedy)
 
 
-def _curve(
-    name: str, rows: list[tuple[int, list[str]]], where: dict[str, int], mapping: MappingFile, file: Path
-) -> Curve:
+def _curve(name: str, rows: list[tuple[int, list[float]]], mapping: MappingFile, file: Path) -> Curve:
+    wanted = [quantity for quantity in DIMENSIONS if quantity in mapping.columns]
+    raw = np.array([numbers for _, numbers in rows]).T
+    at = [row for row, _ in rows]
     columns: dict[str, np.ndarray] = {}
-    for quantity in DIMENSIONS:
+    for quantity, values in zip(wanted, raw, strict=True):
         column = mapping.columns[quantity]
-        raw = np.empty(len(rows))
-        for k, (row, cells) in enumerate(rows):
-            try:
-                raw[k] = parse_number(cells[where[quantity]], mapping.decimal_mark)
-            except ValueError as error:
-                remedy = f"Mend the cell, or decimal_mark and unit in {mapping.file.name}"
-                raise InputError(str(error), file=file, row=row, column=str(column.column), remedy=remedy) from None
-        columns[quantity] = column.sign * convert(raw, column.factor)
-        check_magnitudes(columns[quantity], file, [row for row, _ in rows], str(column.column))
+        columns[quantity] = column.sign * convert(np.ascontiguousarray(values), column.factor)
+        check_magnitudes(columns[quantity], file, at, str(column.column))
+    if mapping.pace is not None:
+        columns["time"] = paced(columns["displacement"], mapping.pace)
+        check_magnitudes(columns["time"], file, at, "time")
     time = columns["time"]
     back = np.flatnonzero(np.diff(time) < 0)
     # Rows of one test need not follow each other, so the row of the first sample is no guide.
-    first = rows[int(back[0]) + 1][0] - int(back[0]) - 1 if len(back) else rows[0][0]
+    first = at[int(back[0]) + 1] - int(back[0]) - 1 if len(back) else at[0]
     return checked_curve(time, columns["force"], columns["displacement"], file, first, name)

@@ -1,15 +1,23 @@
-"""Any other text table, described by a TOML mapping file.
+"""Any other table, as text or in an Excel workbook, described by a TOML mapping file.
 
 A mapping file has these keys; all but `columns` may be left out, and any other key is an error:
 
-    encoding = "utf-8"         # a name that Python knows: "latin-1", "utf-16", "cp1252", "gb18030", ...
-    delimiter = "comma"        # "comma", "semicolon", "tab", "space" (any number of blanks), or one character
-    decimal_mark = "."         # "." or ","
+    encoding = "utf-8"         # of text: a name that Python knows: "latin-1", "utf-16", "cp1252", "gb18030", ...
+    delimiter = "comma"        # of text: "comma", "semicolon", "tab", "space" (any number of blanks), or one character
+    sheet = "Data"             # of a workbook: the sheet's name, or its number, 1 for the first
+    decimal_mark = "."         # "." or ","; the same as the delimiter where such numbers stand in double quotes
+    thousands = "point"        # what parts groups of three digits: "point", "comma", "apostrophe", "space" (no-break,
+                               # narrow and thin ones, too), or the character; never guessed
+    missing = ["NaN", "", -999]   # cells that mean "no reading"; rows with one are dropped, counted and told
     comment_prefix = "#"       # rows that begin so are passed over
     skip_rows = 0              # rows above the header, whatever they hold
+    begin = "Time"             # instead of skip_rows: the header is the first row that begins so
     header_rows = 1            # rows of the header: names in the first, for instance units in the next; 0 for none
+    skip_footer = 0            # rows below the samples, at the end of the file
+    end = "Maximum"            # the samples end above a row that begins so, in every test
     tests = "file"             # how tests are told apart: "file" (the file is one test), "blank line" (tests are
-                               # parted by empty rows and called 1, 2, ...) or "column" (a column names the test)
+                               # parted by empty rows and called 1, 2, ...), "header" (a test begins wherever the
+                               # header comes again; called 1, 2, ...) or "column" (a column names the test)
     test_name = "A1"           # for tests = "file": the name; otherwise that of the file without its ending
     control = "load"           # "load" or "displacement", as in campaign.toml
     provenance = "..."         # in words; added to what the reader writes itself
@@ -19,15 +27,27 @@ A mapping file has these keys; all but `columns` may be left out, and any other 
     unit = "s"                 # any unit of time (force, length)
     sign = 1                   # -1 turns the sign round, where the tester counts compression as negative
 
+    [columns.time]             # where the file has no column of time, one of these two instead of column
+    speed = 0.05               # the displacement moves at this speed, up and down; unit = "mm/s", "um/min", ...
+    interval = 0.1             # between one sample and the next; unit = "s", "ms", ...
+
     [columns.test]             # for tests = "column"
     column = "Sample"
 
     [diameters_um]             # instead of --diameters: D1, D2, D3 of all tests, or of each by its name
     all = [200.0, 190.0, 180.0]
+
+    [diameters]                # or: every file tells the diameters above its samples
+    header = "Gage length"     # the row that begins so holds the diameter of a sphere; three names for D1, D2 and D3
+    unit = "mm"                # of the number; where left out, the file tells it behind the number
+
+The header, with up to `skip_rows` rows above it, may come again anywhere and is passed over there. Empty cells behind
+the last column that has a name, and rows of delimiters only, hold nothing.
 """
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping as MappingABC
 from dataclasses import dataclass, field
@@ -40,11 +60,44 @@ from ..._errors import InputError
 from .._columns import EXAMPLES, FORCE, LENGTH, TIME, unit_factor
 from .._metadata import load_toml_file
 from .._schema import Control
+from .._table import APOSTROPHES, SPACES, same_text
 from ._diameters import Diameters, check_triple
 
 _DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
 DIMENSIONS = {"time": TIME, "force": FORCE, "displacement": LENGTH}
-Split = Literal["file", "blank line", "column"]
+Split = Literal["file", "blank line", "header", "column"]
+_THOUSANDS = {"point": ".", "comma": ",", "apostrophe": APOSTROPHES, "space": SPACES}
+_SAME = {**dict.fromkeys(SPACES, SPACES), **dict.fromkeys(APOSTROPHES, APOSTROPHES), ".": ".", ",": ","}
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How time is told where no column holds it.
+
+    Attributes:
+        interval_s: time between one sample and the next [s]; None if the speed tells the time.
+        speed_um_per_s: speed of the displacement [um/s]; None if the interval tells the time.
+        reversal_share: the displacement turns round where it goes back by more than this share of its range; less is
+            noise, in which no time passes. Noise of a displacement is some 1e-4 of its range, elastic recovery on
+            unloading some 1e-1: two hundredths lie between.
+    """
+
+    interval_s: float | None = None
+    speed_um_per_s: float | None = None
+    reversal_share: float = 0.02
+
+
+@dataclass(frozen=True)
+class InHeader:
+    """Rows above the samples that hold the diameters.
+
+    Attributes:
+        names: how the rows begin: one for a sphere, or three for D1, D2, D3.
+        factor: micrometres in the unit of the numbers; None where the file tells it.
+    """
+
+    names: tuple[str, ...]
+    factor: Fraction | None = None
 
 
 @dataclass(frozen=True)
@@ -62,17 +115,25 @@ class MappingFile:
 
     file: Path
     columns: dict[str, Column]
+    pace: Pace | None = None
     encoding: str = "utf-8"
     delimiter: str = ","
+    sheet: str | int | None = None
     decimal_mark: str = "."
+    thousands: str = ""
+    missing: tuple[str | float, ...] = ()
     comment_prefix: str | None = None
     skip_rows: int = 0
+    begin: str | None = None
     header_rows: int = 1
+    skip_footer: int = 0
+    end: str | None = None
     tests: Split = "file"
     test_name: str | None = None
     control: Control | None = None
     provenance: str | None = None
     diameters_um: Diameters | None = field(default=None)
+    diameters: InHeader | None = None
 
 
 def read_mapping(path: str | os.PathLike[str]) -> MappingFile:
@@ -86,17 +147,23 @@ def read_mapping(path: str | os.PathLike[str]) -> MappingFile:
     """
     file = Path(path)
     entries = load_toml_file(file, "a TOML mapping file")
-    known = [name for name in MappingFile.__dataclass_fields__ if name != "file"]
+    known = [name for name in MappingFile.__dataclass_fields__ if name not in ("file", "pace")]
     _only(entries, known, file)
     values: dict[str, Any] = {}
     for key, kind, wanted in (
         ("encoding", str, 'a name such as "latin-1"'),
         ("delimiter", str, '"comma", "semicolon", "tab", "space" or one character'),
+        ("sheet", (str, int), "the sheet's name, or its number from 1 on"),
         ("decimal_mark", str, '"." or ","'),
+        ("thousands", str, '"point", "comma", "apostrophe", "space" or one of these characters'),
+        ("missing", list, 'a list of texts and numbers such as ["NaN", "", -999]'),
         ("comment_prefix", str, 'text such as "#"'),
         ("skip_rows", int, "a whole number, 0 or more"),
+        ("begin", str, "the text that the header begins with"),
         ("header_rows", int, "a whole number, 0 or more"),
-        ("tests", str, '"file", "blank line" or "column"'),
+        ("skip_footer", int, "a whole number, 0 or more"),
+        ("end", str, "the text that the first row below the samples begins with"),
+        ("tests", str, '"file", "blank line", "header" or "column"'),
         ("test_name", str, "text"),
         ("control", str, '"load" or "displacement"'),
         ("provenance", str, "text"),
@@ -108,20 +175,54 @@ def read_mapping(path: str | os.PathLike[str]) -> MappingFile:
             values[key] = value
     if "delimiter" in values:
         values["delimiter"] = _DELIMITERS.get(values["delimiter"], values["delimiter"])
-    if values.get("delimiter", ",") == values.get("decimal_mark", "."):
-        raise InputError(
-            "the delimiter is also the decimal mark", file=file, column="delimiter", remedy="Give both as in the file"
+    if "thousands" in values:
+        values["thousands"] = _THOUSANDS.get(values["thousands"]) or _SAME[values["thousands"]]
+    if "missing" in values:
+        # TOML has a number nan, which equals nothing, itself included.
+        values["missing"] = tuple(
+            float(mark) if not isinstance(mark, str) and math.isfinite(mark) else str(mark).strip()
+            for mark in values["missing"]
         )
+    _check_marks(values, file)
     if values.get("test_name") is not None and values.get("tests", "file") != "file":
         raise InputError('is for tests = "file" only', file=file, column="test_name", remedy="Remove it")
-    values["columns"] = _columns(entries, values, file)
+    values["columns"], values["pace"] = _columns(entries, values, file)
+    if "diameters" in entries:
+        if "diameters_um" in entries:
+            raise InputError("is given beside 'diameters_um'", file=file, column="diameters", remedy="Keep one of them")
+        values["diameters"] = _in_header(entries["diameters"], file)
     if "diameters_um" in entries:
         values["diameters_um"] = _diameters(entries["diameters_um"], file)
     return MappingFile(file=file, **values)
 
 
+def _check_marks(values: dict[str, Any], file: Path) -> None:
+    """Refuse keys that contradict each other."""
+    thousands = values.get("thousands", "")
+    if values.get("decimal_mark", ".") in thousands or (values.get("delimiter") == " " and " " in thousands):
+        other = "decimal mark" if values.get("decimal_mark", ".") in thousands else "delimiter"
+        raise InputError(
+            f"the mark between thousands is also the {other}",
+            file=file,
+            column="thousands",
+            remedy="Correct one of them",
+        )
+    if "begin" in values and "skip_rows" in values:
+        raise InputError("is given beside 'skip_rows'", file=file, column="begin", remedy="Keep one of them")
+    needing = "begin" if "begin" in values else "tests" if values.get("tests") == "header" else None
+    if needing is not None and values.get("header_rows", 1) == 0:
+        raise InputError("needs a header", file=file, column=needing, remedy="Write header_rows of at least 1")
+
+
 def _allowed(key: str, value: Any) -> bool:
     match key:
+        case "thousands":
+            return value in _THOUSANDS or value in _SAME
+        case "missing":
+            numbers = all(isinstance(mark, str | int | float) and not isinstance(mark, bool) for mark in value)
+            return bool(value) and numbers
+        case "sheet" if isinstance(value, int):
+            return value >= 1
         case "encoding":
             try:
                 return "".encode(value) is not None
@@ -131,7 +232,7 @@ def _allowed(key: str, value: Any) -> bool:
             return value in _DELIMITERS or (len(value) == 1 and value not in '"\r\n\0')
         case "decimal_mark":
             return value in (".", ",")
-        case "skip_rows" | "header_rows":
+        case "skip_rows" | "header_rows" | "skip_footer":
             return value >= 0
         case "tests":
             return value in get_args(Split)
@@ -149,7 +250,7 @@ def _only(entries: MappingABC[str, Any], known: list[str], file: Path, inside: s
             raise InputError("is not a key of a mapping file", file=file, column=inside + key, remedy=remedy)
 
 
-def _columns(entries: dict[str, Any], values: dict[str, Any], file: Path) -> dict[str, Column]:
+def _columns(entries: dict[str, Any], values: dict[str, Any], file: Path) -> tuple[dict[str, Column], Pace | None]:
     tables = entries.get("columns")
     if not isinstance(tables, dict):
         raise InputError(
@@ -169,12 +270,17 @@ def _columns(entries: dict[str, Any], values: dict[str, Any], file: Path) -> dic
             )
     _only(tables, needed, file, "columns.")
     found: dict[str, Column] = {}
+    pace: Pace | None = None
     for name in needed:
         place = f"columns.{name}"
         table = tables.get(name)
         if not isinstance(table, dict):
             raise InputError(f"the table {place!r} is missing", file=file, remedy=f"Add [{place}]")
-        _only(table, ["column", "unit", "sign"] if name in DIMENSIONS else ["column"], file, place + ".")
+        if name == "time" and ("speed" in table or "interval" in table):
+            pace = _pace(table, file)
+            continue
+        further = ["speed", "interval"] if name == "time" else []
+        _only(table, ["column", "unit", "sign", *further] if name in DIMENSIONS else ["column"], file, place + ".")
         column = table.get("column")
         if isinstance(column, bool) or not isinstance(column, str | int) or column in ("",) or column == 0:
             raise InputError(
@@ -191,7 +297,56 @@ def _columns(entries: dict[str, Any], values: dict[str, Any], file: Path) -> dic
                 remedy="Count columns from 1; names need header_rows of at least 1",
             )
         found[name] = Column(column, *_meaning(table, name, file)) if name in DIMENSIONS else Column(column)
-    return found
+    return found, pace
+
+
+def _pace(table: dict[str, Any], file: Path) -> Pace:
+    """The time from `speed` or `interval`."""
+    which = "speed" if "speed" in table else "interval"
+    place = "columns.time"
+    _only(table, [which, "unit"], file, f"{place}.")
+    value, unit = table[which], table.get("unit")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 1e-15 <= value <= 1e15:
+        raise InputError(
+            f"{value!r} is not a positive number", file=file, column=f"{place}.{which}", remedy="Correct it"
+        )
+    example = "mm/s, um/s, mm/min" if which == "speed" else EXAMPLES[TIME]
+    length, slash, time = str(unit).partition("/")
+    try:
+        if not isinstance(unit, str) or bool(slash) != (which == "speed"):
+            raise ValueError("the unit is missing" if unit is None else f"{unit!r} is no unit of {which}")  # noqa: TRY301
+        if which == "interval":
+            return Pace(interval_s=float(value * unit_factor(unit, TIME)))
+        factor = unit_factor(length.strip(), LENGTH) / unit_factor(time.strip(), TIME)
+    except ValueError as error:
+        raise InputError(str(error), file=file, column=f"{place}.unit", remedy=f"Write one of {example}") from None
+    return Pace(speed_um_per_s=float(value * factor))
+
+
+def _in_header(table: Any, file: Path) -> InHeader:
+    """The rows above the samples that hold the diameters."""
+    names = table.get("header") if isinstance(table, dict) else None
+    names = [names] if isinstance(names, str) else names
+    if (
+        not isinstance(names, list)
+        or len(names) not in (1, 3)
+        or not all(isinstance(n, str) and n.strip() for n in names)
+    ):
+        raise InputError(
+            "must name one row, or three",
+            file=file,
+            column="diameters.header",
+            remedy='Write header = "Gage length", or header = ["D1", "D2", "D3"]; diameters of your own belong in '
+            "[diameters_um]",
+        )
+    _only(table, ["header", "unit"], file, "diameters.")
+    unit = table.get("unit")
+    try:
+        factor = None if unit is None else unit_factor(str(unit), LENGTH)
+    except ValueError as error:
+        remedy = f"Write one of {EXAMPLES[LENGTH]}"
+        raise InputError(str(error), file=file, column="diameters.unit", remedy=remedy) from None
+    return InHeader(tuple(same_text(name).strip() for name in names), factor)
 
 
 def _meaning(table: dict[str, Any], name: str, file: Path) -> tuple[Fraction, int]:

@@ -20,12 +20,23 @@ _NUMBER = re.compile(r"[-+]?[0-9]+(?:\.[0-9]*)?(?:[eE][-+]?[0-9]+)?")
 
 @dataclass(frozen=True)
 class Tests:
-    """What a reader finds in a file: named curves, and what the file says about them."""
+    """What a reader finds in a file: named curves, and what the file says about them.
+
+    Attributes:
+        curves: the tests by their names.
+        format: what kind of file it is, in words.
+        control: the controlled quantity, where the file or a mapping tells it.
+        other: what else the file says, kept as it is.
+        diameters_um: D1, D2, D3 [um] of tests whose file should tell them, or why it does not.
+        missing: how many rows with a missing reading were dropped, by test.
+    """
 
     curves: dict[str, Curve]
     format: str
     control: Control | None = None
     other: dict[str, Any] = field(default_factory=dict)
+    diameters_um: dict[str, list[float] | InputError] = field(default_factory=dict)
+    missing: dict[str, int] = field(default_factory=dict)
 
 
 def decode_lines(data: bytes, encoding: str | None = None, file: Path | None = None) -> list[str]:

@@ -1,0 +1,142 @@
+"""Sheets of Excel workbooks (xlsx) as rows of text, by pandas and its calamine engine."""
+
+from __future__ import annotations
+
+import io
+import re
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+from .._errors import InputError
+
+_BOOK = "xl/workbook.xml"
+LARGEST_UNPACKED = 512 * 2**20
+"""Bytes that a workbook may unpack to: what a zip archive of tests may, see `readers._micromaterials`."""
+MOST_CELLS = 40_000_000
+"""Cells of a sheet's rectangle, empty ones included, since the engine makes room for all (32 bytes each): a full
+sheet of 1,048,576 rows has 38 columns then; a cell alone in the last row and column would ask for 17e9."""
+_LAST = re.compile(rb'<c\b[^>]*?\br="([A-Z]{1,3})([0-9]{1,7})"')
+_REMEDY = "Open it in a spreadsheet program and save it again, or save the sheet as CSV"
+
+
+def is_workbook(data: bytes) -> bool:
+    """Whether a file is an Excel workbook, not another zip archive."""
+    if not data.startswith(b"PK\x03\x04"):
+        return False
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            return _BOOK in archive.namelist()
+    except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError, EOFError):
+        return False
+
+
+def read_sheet(
+    data: bytes,
+    file: Path,
+    sheet: str | int | None = None,
+    *,
+    preferred: str | None = None,
+    decimal_mark: str = ".",
+    how: str = "",
+) -> list[tuple[int, list[str]]]:
+    """The rows of a sheet: the number of each and its cells as text, numbers with all their digits.
+
+    Args:
+        data: the workbook's bytes.
+        file: for messages.
+        sheet: the sheet's name, or its number, 1 for the first; None for the only one that holds anything.
+        preferred: the name of the sheet to take, if there is one, where `sheet` is None.
+        decimal_mark: how numbers are written; "." or ",".
+        how: how a sheet is chosen, for the message where there are several; one sentence.
+
+    Raises:
+        InputError: if it is damaged or too large, the sheet is not there or not told, or calamine is not installed.
+    """
+    import pandas as pd
+
+    _check_size(data, file)
+    try:
+        frames: dict[Any, Any] = pd.read_excel(
+            io.BytesIO(data), sheet_name=None, engine="calamine", header=None, dtype=object, na_filter=False
+        )
+    except ImportError:
+        raise InputError(
+            "this is an Excel workbook, and the package that reads them is not installed",
+            file=file,
+            remedy="Install it with: pip install 'mcc-jax[excel]', or save the sheet as CSV",
+        ) from None
+    # The engine's errors have no common type, and its panics are no Exception.
+    except BaseException as error:
+        if isinstance(error, KeyboardInterrupt | SystemExit | MemoryError):
+            raise
+        raise InputError("the workbook is damaged", file=file, remedy=_REMEDY) from None
+    wanted = _choose([str(name) for name in frames], sheet, preferred, file)
+    held = {name: frame for name, frame in frames.items() if frame.size and wanted in (None, name)}
+    if not held:
+        where = f"the sheet {wanted!r}" if wanted is not None else "every sheet"
+        raise InputError(f"{where} is empty", file=file, remedy="Save the workbook again with the table in it")
+    if len(held) > 1:
+        listed = ", ".join(map(repr, held))
+        raise InputError(
+            f"{len(held)} sheets hold something: {listed}",
+            file=file,
+            remedy=how or f"Call the sheet with the table {preferred!r}, or save it alone",
+        )
+    (frame,) = held.values()
+    cells = ([_text(value, decimal_mark) for value in row] for row in frame.itertuples(index=False, name=None))
+    return [(number, row) for number, row in enumerate(cells, start=1)]
+
+
+def _choose(names: list[str], sheet: str | int | None, preferred: str | None, file: Path) -> str | None:
+    if isinstance(sheet, int) and sheet <= len(names):
+        return names[sheet - 1]
+    if sheet is None:
+        return preferred if preferred in names else None
+    if sheet not in names:
+        what = f"sheet {sheet}" if isinstance(sheet, int) else f"sheet called {sheet!r}"
+        raise InputError(f"there is no {what}", file=file, remedy=f"The sheets are: {', '.join(map(repr, names))}")
+    return str(sheet)
+
+
+def _text(value: Any, decimal_mark: str) -> str:
+    if isinstance(value, float):
+        return repr(value).replace(".", decimal_mark)
+    return str(value)
+
+
+def _check_size(data: bytes, file: Path) -> None:
+    """Refuse what would not fit into memory before the engine unpacks it."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            entries = archive.infolist()
+            if sum(entry.file_size for entry in entries) > LARGEST_UNPACKED:
+                raise InputError("the workbook is too large", file=file, remedy="Save the sheet alone, or as CSV")
+            for entry in entries:
+                if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                    raise zipfile.BadZipFile  # noqa: TRY301
+                # The size in the directory may lie; no more than it says is unpacked.
+                with archive.open(entry) as stream:
+                    content = stream.read(entry.file_size + 1)
+                if len(content) != entry.file_size:
+                    raise zipfile.BadZipFile  # noqa: TRY301
+                if not entry.filename.startswith("xl/worksheets/"):
+                    continue
+                last = [0, 0]
+                for cell in _LAST.finditer(content):
+                    letters, digits = cell.groups()
+                    column = 0
+                    for letter in letters:
+                        column = 26 * column + letter - 64
+                    last = [max(last[0], int(digits)), max(last[1], column)]
+                if last[0] * last[1] > MOST_CELLS:
+                    raise InputError(
+                        f"a sheet reaches to row {last[0]} and column {last[1]}, which is too large",
+                        file=file,
+                        remedy="Delete the rows and columns without content behind the table, or save it as CSV",
+                    )
+    except (zipfile.BadZipFile, zlib.error, ValueError, OSError, NotImplementedError, EOFError, RuntimeError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError("the workbook is damaged", file=file, remedy=_REMEDY) from None
