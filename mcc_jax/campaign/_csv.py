@@ -147,6 +147,7 @@ def parse_particles(
     names = _checked_names(table.text(where), table)
     found = [find_column(table.header, quantity, LENGTH, table.file) for quantity in ("D1", "D2", "D3")]
     used = [column for column, _ in found]
+    table.refuse_groups(used)
     diameters = []
     for (column, factor), raw in zip(found, table.numbers(used), strict=True):
         values = convert(raw, factor)

@@ -90,7 +90,7 @@ def read_curves(file: Path, limits: FileLimits = LIMITS) -> CurveRows:
     data = read_bytes(file, limits)
     text = decode(data, file)
     first = re.split(r"[\r\n]", text, maxsplit=1)[0]
-    head = parse_table(f"{first}\n{first}", file) if first.strip(",;\t ") else None
+    head = parse_table(f"{first}\n{first}", file) if first.strip(",;\t ") and "sep=" not in first else None
     layout = _curve_layout(head.header, file) if head is not None else None
     fast = _split_fast(text, layout) if head is not None and layout is not None and head.delimiter == "," else None
     if layout is None or fast is None:
@@ -98,6 +98,8 @@ def read_curves(file: Path, limits: FileLimits = LIMITS) -> CurveRows:
         layout = _curve_layout(table.header, file)
         names = table.text(layout.name)
         raw = table.numbers(layout.columns)
+        if table.delimiter != ",":
+            table.refuse_groups(layout.columns)
         groups = _group(names)
     else:
         raw, groups = fast

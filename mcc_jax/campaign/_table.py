@@ -1,7 +1,8 @@
 """Tables of a campaign: reading them strictly, and saying where they are wrong as an editor counts rows.
 
-Columns are parted by commas, or, as spreadsheets of many countries write, by semicolons or tabs; only then may numbers
-have a decimal comma. A delimiter behind the last cell of a row, and rows of delimiters only, hold nothing.
+Columns are parted by commas, or, as spreadsheets of many countries write, by semicolons or tabs. Numbers may have a
+decimal comma, between quotes where commas part the columns, as long as it cannot be a mark between thousands. A
+delimiter behind the last cell of a row, and rows of delimiters only, hold nothing.
 """
 
 from __future__ import annotations
@@ -103,9 +104,45 @@ class Table:
         return [record[column] for record in self.records]
 
     def decimal_mark(self, columns: Sequence[int]) -> str:
-        """The decimal mark of some columns: a comma if one stands in them and none parts the columns."""
-        commas = self.delimiter != "," and any("," in record[i] for record in self.records for i in columns)
-        return "," if commas else "."
+        """The decimal mark of some columns: a comma if one stands in them and is no mark between thousands.
+
+        Spreadsheets part columns by semicolons where the comma is the decimal mark, so there it always is. With tabs,
+        or commas and quotes, 1,500 is either: then a comma counts if no point stands in the columns and some cell,
+        such as 1,5, has other than three digits behind it.
+        """
+        cells = [cell for record in self.records for cell in (record[i].strip() for i in columns)]
+        commas = [cell for cell in cells if "," in cell]
+        if not commas or self.delimiter == ";":
+            return "," if commas else "."
+        if any("." in cell for cell in cells) or all(_one_group(",").fullmatch(cell) for cell in commas):
+            return "."
+        return ","
+
+    def refuse_groups(self, columns: Sequence[int]) -> None:
+        """Refuse numbers that look as if the decimal mark parted thousands; see `Grouping`.
+
+        Args:
+            columns: those whose numbers have one decimal mark; those with one unit are judged together.
+
+        Raises:
+            InputError: naming the cell.
+        """
+        mark = self.decimal_mark(columns)
+        by_unit: dict[str, Grouping] = {}
+        for column in columns:
+            grouping = by_unit.setdefault(self.header[column].rpartition("_")[2], Grouping(mark))
+            for row, record in zip(self.rows, self.records, strict=True):
+                grouping.see(record[column], (row, column))
+        for grouping in by_unit.values():
+            if (found := grouping.found()) is not None:
+                (row, column), problem = found
+                raise InputError(
+                    problem,
+                    file=self.file,
+                    row=row,
+                    column=self.header[column],
+                    remedy="Write numbers without marks between the thousands, or all with as many decimals",
+                )
 
     def numbers(self, columns: Sequence[int]) -> list[np.ndarray]:
         """The cells of some columns as finite numbers, all with the same decimal mark.
@@ -173,6 +210,47 @@ def parse_number(cell: str, decimal_mark: str = ".", thousands: str = "") -> flo
     if abs(number) > LARGEST_MAGNITUDE * 1e12:
         raise ValueError(f"{shown!r} is too large to be a measurement")
     return number
+
+
+class Grouping:
+    """Whether a decimal mark may be one between thousands, so that readings would be a thousandth of what they are.
+
+    So it looks where some cells of a quantity hold whole numbers of three digits and more without the mark (500), and
+    every other one has one to three digits, the mark, and three digits (1.500). Programs write neither: with a fixed
+    number of decimals 500 would be 500.000, and without a fixed one 1.500 would be 1.5.
+    """
+
+    def __init__(self, decimal_mark: str) -> None:
+        self.mark = decimal_mark
+        self.cleared = False
+        self.grouped: tuple[tuple[int, int], str] | None = None
+        self.whole: str | None = None
+
+    def see(self, cell: str, place: tuple[int, int]) -> None:
+        """Take a cell in a place, its row and column, into account."""
+        if self.cleared:
+            return
+        cell = cell.strip()
+        if self.mark in cell:
+            self.cleared = _one_group(self.mark).fullmatch(cell) is None
+            self.grouped = self.grouped or (place, cell)
+        elif self.whole is None and _WHOLE.fullmatch(cell):
+            self.whole = cell
+
+    def found(self) -> tuple[tuple[int, int], str] | None:
+        """The place of the first such cell and what is wrong with it; None if nothing is."""
+        if self.cleared or self.grouped is None or self.whole is None:
+            return None
+        place, cell = self.grouped
+        return place, f"{cell!r} beside {self.whole!r} looks like a mark between thousands, not a decimal mark"
+
+
+_WHOLE = re.compile(r"[-+]?[1-9][0-9]{2,}")
+
+
+@cache
+def _one_group(mark: str) -> re.Pattern[str]:
+    return re.compile(rf"[-+]?[1-9][0-9]{{0,2}}{re.escape(mark)}[0-9]{{3}}")
 
 
 @cache
@@ -260,6 +338,9 @@ def make_table(found: Iterable[tuple[int, list[str]]], file: Path, delimiter: st
     return Table(file, header, [cells[:width] for _, cells in full[1:]], [row for row, _ in full[1:]], delimiter)
 
 
+_SEPARATOR = re.compile(r'"?sep=([,;\t])"?[,;\t]*(?:\r\n|\r|\n)', re.IGNORECASE)
+
+
 def _filled(cells: list[str]) -> int:
     """The number of cells up to the last one that holds something."""
     return next((i for i in range(len(cells), 0, -1) if cells[i - 1].strip()), 0)
@@ -271,14 +352,17 @@ def parse_table(text: str, file: Path) -> Table:
     Raises:
         InputError: if quotes do not close, a row has another number of cells than the header, or there are no rows.
     """
-    delimiter = delimiter_of(text.lstrip().partition("\n")[0].partition("\r")[0])
+    row, told = 1, _SEPARATOR.match(text)
+    if told is not None:  # a line by which a spreadsheet is told what parts the columns
+        text, row = text[told.end() :], 2
+    delimiter = told[1] if told is not None else delimiter_of(text.lstrip().partition("\n")[0].partition("\r")[0])
     reader = csv.reader(io.StringIO(text, newline=""), strict=True, delimiter=delimiter)
     found: list[tuple[int, list[str]]] = []
-    row = 1
+    above = row
     try:
         for record in reader:
             found.append((row, record))
-            row = reader.line_num + 1
+            row = reader.line_num + above
     except csv.Error as error:
         raise InputError(
             f"quotes or cells are damaged ({error})", file=file, row=row, remedy="Close every double quote"

@@ -201,7 +201,7 @@ BAD = {
     "displacements all zero": (C, HEAD + "A,0,1,0\nA,1,0,0\n01,0,1,1\n01,1,1,1\n", ["'displacement_um'", "no data"]),
     "TOML broken": (T, 'control = "load"\nx = = 1\n', ["row 2", "not TOML", "double quotes"]),
     "TOML cut off": (T, 'control = "load"\nx = ', ["row 2", "not TOML"]),
-    "TOML deep": (T, "x = " + "[" * 20_000, ["not TOML"]),
+    "TOML deep": (T, "x = " + "[" * 20_000, ["nested"]),
     "control unknown": (T, 'control = "force"', ["'control'", "'force'", '"displacement"']),
     "control no text": (T, "control = [1]", ["'control'", "Write"]),
     "key in wrong case": (T, 'Control = "load"', ["'Control'", "Did you mean 'control'"]),

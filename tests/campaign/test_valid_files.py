@@ -463,7 +463,8 @@ def test_noise_of_the_displacement_adds_no_time(seed, cycles, noise):
     rng = np.random.default_rng(seed)
     corners = np.ravel([[rng.uniform(0, 0.3), rng.uniform(0.7, 1)] for _ in range(cycles)])
     true = np.concatenate([np.linspace(a, b, 200) for a, b in pairwise(corners)])
-    times = paced(true + rng.uniform(-noise, noise, len(true)), Pace(speed_um_per_s=0.5))
+    measured = true + rng.uniform(-noise, noise, len(true))
+    times = paced(measured, np.arange(len(true)), Pace(speed_um_per_s=0.5))
     path = np.concatenate([[0], np.cumsum(np.abs(np.diff(true)))]) / 0.5
     assert (np.diff(times) >= 0).all()
     assert np.abs(times - path).max() <= 4 * noise * len(corners) / 0.5 + 1e-12

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections import Counter
 from dataclasses import dataclass, field
 from difflib import get_close_matches
@@ -13,7 +14,7 @@ import numpy as np
 from ..._errors import InputError
 from .._columns import LARGEST_MAGNITUDE, LENGTH, convert, unit_factor
 from .._schema import Curve
-from .._table import APOSTROPHES, binary_kind, number_of_cells, parse_number, same_text, thousands_mark
+from .._table import APOSTROPHES, Grouping, binary_kind, number_of_cells, parse_number, same_text, thousands_mark
 from .._validate import check_magnitudes
 from ..workbook import is_workbook, read_sheet
 from ._diameters import check_triple
@@ -51,7 +52,8 @@ def read_mapped(data: bytes, file: Path, mapping: MappingFile) -> Tests:
             raise InputError(
                 f"every row of the test {name!r} has a missing reading", file=file, remedy="Remove the test's rows"
             )
-    curves = {name: _curve(name, rows, mapping, file) for name, rows in reader.samples.items()}
+    again = reader.header_came_again
+    curves = {name: _curve(name, rows, mapping, file, again) for name, rows in reader.samples.items()}
     other = {"mapping_provenance": mapping.provenance} if mapping.provenance else {}
     form = f"mapped by {mapping.file.name}"
     return Tests(curves, form, mapping.control, other, reader.diameters_um, dict(reader.missing))
@@ -137,6 +139,9 @@ def _rows(data: bytes, file: Path, mapping: MappingFile) -> _Rows:
     return _Rows(lines, file, mapping)
 
 
+_Sample = tuple[int, int, list[float]]  # its row in the file, the row's number in the test, and the readings
+
+
 @dataclass
 class _Reader:
     """Goes through the rows once and keeps what belongs to each test."""
@@ -144,10 +149,11 @@ class _Reader:
     rows: _Rows
     file: Path
     mapping: MappingFile
-    samples: dict[str, list[tuple[int, list[float]]]] = field(default_factory=dict)
+    samples: dict[str, list[_Sample]] = field(default_factory=dict)
     missing: Counter[str] = field(default_factory=Counter)
     diameters_um: dict[str, list[float] | InputError] = field(default_factory=dict)
     parted: bool = False  # whether the next sample begins a test
+    header_came_again: bool = False
 
     def run(self) -> None:
         """Read all rows.
@@ -162,6 +168,7 @@ class _Reader:
         self.where = {n: _index(c.column, self.header, self.file, head + 1, self) for n, c in mapping.columns.items()}
         self.wanted = [quantity for quantity in DIMENSIONS if quantity in self.where]
         self.width, self.raw_width = self._widths(head)
+        self.groupings = {quantity: Grouping(mapping.decimal_mark) for quantity in self.wanted}
         sizes = self._diameters(0, head)
         block, ended = 1, False
         i = head + mapping.header_rows
@@ -173,6 +180,11 @@ class _Reader:
                 continue
             if mapping.comment_prefix is not None and rows.begins(i, mapping.comment_prefix):
                 i += 1
+                continue
+            below = self._rows_above_again(i)
+            if below is not None:
+                sizes = self._diameters(i, below) if mapping.diameters is not None else sizes
+                i = below
                 continue
             again = self._header_again(i)
             if again is not None:
@@ -186,6 +198,7 @@ class _Reader:
                 if mapping.diameters is not None and again > i:
                     sizes = self._diameters(i, again)
                 self.parted, ended = self.parted or mapping.tests == "header", False
+                self.header_came_again = True
                 i = again + mapping.header_rows
                 continue
             ended = ended or (mapping.end is not None and rows.begins(i, mapping.end))
@@ -199,10 +212,31 @@ class _Reader:
                 if numbers is None:
                     self.missing[name] += 1
                 else:
-                    self.samples.setdefault(name, []).append((i + 1, numbers))
+                    self.samples.setdefault(name, []).append(
+                        (i + 1, len(self.samples.get(name, ())) + self.missing[name], numbers)
+                    )
                 if sizes is not None:
                     self.diameters_um.setdefault(name, sizes)
             i += 1
+        self._refuse_groups()
+
+    def _refuse_groups(self) -> None:
+        """Refuse a column of text whose decimal mark looks like one between thousands, unless the mapping says none."""
+        if self.mapping.thousands is not None or isinstance(self.rows, _Sheet):
+            return
+        for quantity, grouping in self.groupings.items():
+            if (found := grouping.found()) is not None:
+                (row, _), problem = found
+                word = {".": "point", ",": "comma"}[self.mapping.decimal_mark]
+                other = {".": ",", ",": "."}[self.mapping.decimal_mark]
+                raise InputError(
+                    problem,
+                    file=self.file,
+                    row=row,
+                    column=str(self.mapping.columns[quantity].column),
+                    remedy=f'Write thousands = "{word}" and decimal_mark = "{other}" in {self.mapping.file.name}, or '
+                    'thousands = "none" if it is a decimal mark',
+                )
 
     def _head(self) -> int:
         """The index of the header, or of the first row of data where there is none."""
@@ -250,6 +284,18 @@ class _Reader:
                 return None
         return None
 
+    def _rows_above_again(self, i: int) -> int | None:
+        """The index of a test's first sample if rows like those above the first test, without a header, precede it."""
+        if self.header is not None or not self.parted or not (self.samples or self.missing) or self._is_sample(i):
+            return None
+        for j in range(i, min(i + self.mapping.skip_rows + 1, self.stop)):
+            if self._is_sample(j):
+                return j
+            cells = [] if self.rows.blank(j) else self.rows.cells(j)
+            if any(self._is_number(cells[place]) for q in self.wanted if (place := self.where[q]) < len(cells)):
+                return None
+        return None
+
     def _same_columns(self, i: int) -> int:
         """Refuse a header that begins like the first and names the columns in another order."""
         names = [same_text(name).strip() for name in self.rows.cells(i)]
@@ -277,7 +323,7 @@ class _Reader:
 
     def _is_number(self, cell: str) -> bool:
         try:
-            parse_number(cell, self.mapping.decimal_mark, self.mapping.thousands)
+            parse_number(cell, self.mapping.decimal_mark, self.mapping.thousands or "")
         except ValueError:
             return False
         return True
@@ -310,7 +356,8 @@ class _Reader:
         for quantity in self.wanted:
             cell = cells[self.where[quantity]]
             try:
-                found.append(parse_number(cell, mapping.decimal_mark, mapping.thousands))
+                found.append(parse_number(cell, mapping.decimal_mark, mapping.thousands or ""))
+                self.groupings[quantity].see(cell, (i + 1, self.where[quantity]))
             except ValueError as error:
                 raise InputError(
                     str(error),
@@ -328,7 +375,7 @@ class _Reader:
                 return True
             try:
                 number = parse_number(str(mark)) if isinstance(mark, str) else mark
-                if parse_number(cell, self.mapping.decimal_mark, self.mapping.thousands) == number:
+                if parse_number(cell, self.mapping.decimal_mark, self.mapping.thousands or "") == number:
                     return True
             except ValueError:
                 continue
@@ -337,6 +384,11 @@ class _Reader:
     def _number_remedy(self, cell: str, i: int) -> str:
         """What to do about a cell that is no number, by what it looks like."""
         name, mark = self.mapping.file.name, thousands_mark(cell, self.mapping.decimal_mark)
+        if _CLOCK.fullmatch(cell):
+            return (
+                "Write times as numbers, not as dates or hours and minutes (in a spreadsheet: the cells' number format "
+                f'"General", and unit = "day" in {name})'
+            )
         if mark is not None and not self.mapping.thousands:
             word = {".": "point", ",": "comma"}.get(mark, "apostrophe" if mark in APOSTROPHES else "space")
             other = ' (or decimal_mark = ",")' if mark == "," and cell.count(",") == 1 and "." not in cell else ""
@@ -355,9 +407,10 @@ class _Reader:
     def _is_footer(self, i: int) -> bool:
         """Whether a row that begins with text has samples above and, in its test, none below."""
         text = _first(self.rows.cells(i))
-        if self.parted or not (self.samples or self.missing) or self._is_number(text) or _is_no_reading(text):
+        if not (self.samples or self.missing) or self._is_number(text) or _is_no_reading(text):
             return False
-        return not any(self._is_sample(j) for j in range(i, self._end_of_test(i)))
+        stop = self.stop if self.parted else self._end_of_test(i)
+        return not any(self._is_sample(j) for j in range(i, stop))
 
     def _end_of_test(self, i: int) -> int:
         blank = (j for j in range(i, self.stop) if self.rows.blank(j))
@@ -415,7 +468,7 @@ class _Reader:
             if len(numbers) != 1:
                 problem = f"{name!r} holds {len(numbers) or 'no'} number{'s' if numbers else ''}"
                 raise InputError(problem, file=self.file, row=i + 1, remedy=_OWN_DIAMETER)
-            value = parse_number(numbers[0], self.mapping.decimal_mark, self.mapping.thousands)
+            value = parse_number(numbers[0], self.mapping.decimal_mark, self.mapping.thousands or "")
             try:
                 if asked.factor is None and not units:
                     raise ValueError("the unit is missing")  # noqa: TRY301
@@ -432,6 +485,9 @@ class _Reader:
             file=self.file,
             remedy=_OWN_DIAMETER,
         )
+
+
+_CLOCK = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}.*|(?:[0-9]+ days?,? )?[0-9]{1,2}:[0-9]{2}(?::[0-9.]+)?.*")
 
 
 def _filled(cells: list[str]) -> int:
@@ -485,20 +541,29 @@ def _index(column: str | int | None, header: list[str] | None, file: Path, row: 
     raise InputError(problem, file=file, row=row, remedy=remedy)
 
 
-def _curve(name: str, rows: list[tuple[int, list[float]]], mapping: MappingFile, file: Path) -> Curve:
+def _curve(name: str, rows: list[_Sample], mapping: MappingFile, file: Path, again: bool) -> Curve:
     wanted = [quantity for quantity in DIMENSIONS if quantity in mapping.columns]
-    raw = np.array([numbers for _, numbers in rows]).T
-    at = [row for row, _ in rows]
+    raw = np.array([numbers for _, _, numbers in rows]).T
+    at = [row for row, _, _ in rows]
     columns: dict[str, np.ndarray] = {}
     for quantity, values in zip(wanted, raw, strict=True):
         column = mapping.columns[quantity]
         columns[quantity] = column.sign * convert(np.ascontiguousarray(values), column.factor)
         check_magnitudes(columns[quantity], file, at, str(column.column))
     if mapping.pace is not None:
-        columns["time"] = paced(columns["displacement"], mapping.pace)
+        columns["time"] = paced(columns["displacement"], np.array([order for _, order, _ in rows]), mapping.pace)
         check_magnitudes(columns["time"], file, at, "time")
     time = columns["time"]
     back = np.flatnonzero(np.diff(time) < 0)
+    if len(back) and mapping.tests == "file":
+        before, here = at[int(back[0])], at[int(back[0]) + 1]
+        way = "header" if again else "blank line" if here > before + 1 else "column"
+        raise InputError(
+            f"the time of test {name!r} goes back",
+            file=file,
+            row=here,
+            remedy=f'If another test begins here, write tests = "{way}" in {mapping.file.name} or part the file',
+        )
     # Rows of one test need not follow each other, so the row of the first sample is no guide.
     first = at[int(back[0]) + 1] - int(back[0]) - 1 if len(back) else at[0]
     return checked_curve(time, columns["force"], columns["displacement"], file, first, name)

@@ -7,7 +7,8 @@ A mapping file has these keys; all but `columns` may be left out, and any other 
     sheet = "Data"             # of a workbook: the sheet's name, or its number, 1 for the first
     decimal_mark = "."         # "." or ","; the same as the delimiter where such numbers stand in double quotes
     thousands = "point"        # what parts groups of three digits: "point", "comma", "apostrophe", "space" (no-break,
-                               # narrow and thin ones, too), or the character; never guessed
+                               # narrow and thin ones, too), or the character; never guessed. "none": there is none,
+                               # though 1.500 stands beside 500, which is refused otherwise
     missing = ["NaN", "", -999]   # cells that mean "no reading"; rows with one are dropped, counted and told
     comment_prefix = "#"       # rows that begin so are passed over
     skip_rows = 0              # rows above the header, whatever they hold
@@ -41,7 +42,8 @@ A mapping file has these keys; all but `columns` may be left out, and any other 
     header = "Gage length"     # the row that begins so holds the diameter of a sphere; three names for D1, D2 and D3
     unit = "mm"                # of the number; where left out, the file tells it behind the number
 
-The header, with up to `skip_rows` rows above it, may come again anywhere and is passed over there. Empty cells behind
+The header, with up to `skip_rows` rows above it, may come again anywhere and is passed over there; without a header
+(`header_rows = 0`) so are up to `skip_rows` rows above each test that is parted by an empty row. Empty cells behind
 the last column that has a name, and rows of delimiters only, hold nothing.
 """
 
@@ -66,7 +68,7 @@ from ._diameters import Diameters, check_triple
 _DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
 DIMENSIONS = {"time": TIME, "force": FORCE, "displacement": LENGTH}
 Split = Literal["file", "blank line", "header", "column"]
-_THOUSANDS = {"point": ".", "comma": ",", "apostrophe": APOSTROPHES, "space": SPACES}
+_THOUSANDS = {"none": "", "point": ".", "comma": ",", "apostrophe": APOSTROPHES, "space": SPACES}
 _SAME = {**dict.fromkeys(SPACES, SPACES), **dict.fromkeys(APOSTROPHES, APOSTROPHES), ".": ".", ",": ","}
 
 
@@ -120,7 +122,7 @@ class MappingFile:
     delimiter: str = ","
     sheet: str | int | None = None
     decimal_mark: str = "."
-    thousands: str = ""
+    thousands: str | None = None
     missing: tuple[str | float, ...] = ()
     comment_prefix: str | None = None
     skip_rows: int = 0
@@ -155,7 +157,7 @@ def read_mapping(path: str | os.PathLike[str]) -> MappingFile:
         ("delimiter", str, '"comma", "semicolon", "tab", "space" or one character'),
         ("sheet", (str, int), "the sheet's name, or its number from 1 on"),
         ("decimal_mark", str, '"." or ","'),
-        ("thousands", str, '"point", "comma", "apostrophe", "space" or one of these characters'),
+        ("thousands", str, '"point", "comma", "apostrophe", "space", "none" or one of these characters'),
         ("missing", list, 'a list of texts and numbers such as ["NaN", "", -999]'),
         ("comment_prefix", str, 'text such as "#"'),
         ("skip_rows", int, "a whole number, 0 or more"),
@@ -176,7 +178,7 @@ def read_mapping(path: str | os.PathLike[str]) -> MappingFile:
     if "delimiter" in values:
         values["delimiter"] = _DELIMITERS.get(values["delimiter"], values["delimiter"])
     if "thousands" in values:
-        values["thousands"] = _THOUSANDS.get(values["thousands"]) or _SAME[values["thousands"]]
+        values["thousands"] = (_THOUSANDS | _SAME)[values["thousands"]]
     if "missing" in values:
         # TOML has a number nan, which equals nothing, itself included.
         values["missing"] = tuple(

@@ -17,7 +17,7 @@ from ._diameters import Diameters, diameters_for
 from ._mapped import read_mapped
 from ._mapping import read_mapping
 from ._text import Tests
-from .folder import read_folder
+from .folder import names_of, read_folder
 
 
 def read_tester_file(
@@ -67,7 +67,7 @@ def read_tester_file(
         if skip:
             raise InputError("is a file, so there is nothing to skip", file=place, remedy="Give --skip with a folder")
         tests = read(place, read_bytes(place, limits))
-        alone = (place.name, place.stem) if len(tests.curves) == 1 else ()
+        alone = names_of(place) if len(tests.curves) == 1 else ()
         keys = {name: (name, *alone) for name in tests.curves}
         origin = f"{place.name}, {tests.format}"
     if diameters_um is None and described is not None:

@@ -35,6 +35,13 @@ would outgrow the curves, and are still in the files."""
 _SHOWN = 6
 
 
+def names_of(file: Path) -> tuple[str, ...]:
+    """The names under which a table may hold a file: with its ending, in capitals or not, and without."""
+    return tuple(
+        dict.fromkeys((file.name, file.stem + file.suffix.lower(), file.stem + file.suffix.upper(), file.stem))
+    )
+
+
 def passed_over(name: str) -> bool:
     """Whether a file holds no tests by its name: hidden, a spreadsheet's lock, a README or licence, or of `NO_DATA`."""
     return name.startswith((".", "~$")) or _READ_ME.fullmatch(name) is not None or Path(name).suffix.lower() in NO_DATA
@@ -99,7 +106,7 @@ def read_folder(
                     remedy=f"Rename one of them, or leave one out with --skip {shlex.quote(file.name)}",
                 )
             curves[full], origin[full] = curve, file
-            keys[full] = (full, file.name, stem, *([name] if own[name] == 1 else []))
+            keys[full] = (full, *names_of(file), *([name] if own[name] == 1 else []))
             if (size := tests.diameters_um.get(name)) is not None:
                 told[full] = size if isinstance(size, list) else _or_skip(size, f"--skip {shlex.quote(file.name)}")
             if name in tests.missing:
@@ -126,7 +133,7 @@ def _files(folder: Path, skip: Sequence[str]) -> tuple[list[Path], list[Finding]
     skipped: list[Path] = []
     for pattern in skip:
         fitting = [entry for entry in rest if _fits(entry, pattern)]
-        if not fitting:
+        if not fitting and not any(_fits(entry, pattern) for entry in quiet):
             raise InputError(
                 f"--skip {shlex.quote(pattern)} fits no file",
                 file=folder,

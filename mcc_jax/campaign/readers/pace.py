@@ -9,8 +9,8 @@ import numpy as np
 from ._mapping import Pace
 
 
-def paced(displacement_um: np.ndarray, pace: Pace) -> np.ndarray:
-    """Times [s] of the samples, the first at 0, never decreasing.
+def paced(displacement_um: np.ndarray, order: np.ndarray, pace: Pace) -> np.ndarray:
+    """Times [s] of the samples, never decreasing; the first row of the test is at 0.
 
     With a speed v the time is the length of the path gone so far over v. The path runs from one turning point to the
     next; between two of them no time passes until the displacement exceeds what it had reached, so that noise adds
@@ -19,13 +19,14 @@ def paced(displacement_um: np.ndarray, pace: Pace) -> np.ndarray:
 
     Args:
         displacement_um: displacement [um], shape (n,).
+        order: number of each sample's row in its test, from 0; rows with missing readings count, shape (n,).
         pace: interval, or speed and the least reversal.
 
     Returns:
         Times [s], shape (n,).
     """
     if pace.interval_s is not None:
-        return pace.interval_s * np.arange(len(displacement_um))
+        return pace.interval_s * order
     assert pace.speed_um_per_s is not None
     path = np.zeros(len(displacement_um))
     turns = turning_points(displacement_um, pace.reversal_share * float(np.ptp(displacement_um)))
