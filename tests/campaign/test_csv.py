@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import datetime
+import os
 from pathlib import Path
 
 import numpy as np
@@ -255,10 +256,10 @@ def test_bad_folders(tmp_path):
 def test_unreadable_file(tmp_path, monkeypatch):
     folder = make(tmp_path / "c")
 
-    def refuse(self):
+    def refuse(*_):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(Path, "read_bytes", refuse)
+    monkeypatch.setattr(os, "open", refuse)
     text = message(folder)
     assert "particles.csv: cannot be read: Permission denied" in text
     assert "Check the permissions" in text
