@@ -30,8 +30,10 @@ KINDS = ("approach", "load", "hold", "unload", "reload")
 @click.option(
     "--mapping",
     type=Location(),
+    multiple=True,
     metavar="FILE",
-    help="TOML file that says what stands where, for any other text table or Excel workbook.",
+    help="TOML file that says what stands where, for any other text table or Excel workbook; repeatable, for a FOLDER "
+    "of several kinds of files: each is read by the one that fits.",
 )
 @click.option(
     "--skip",
@@ -41,7 +43,7 @@ KINDS = ("approach", "load", "hold", "unload", "reload")
 )
 @seed_option("Recorded in campaign.toml; converting itself draws no random number.")
 def convert(
-    file: Path, out: Path, diameters: str | None, mapping: Path | None, skip: tuple[str, ...], seed: int
+    file: Path, out: Path, diameters: str | None, mapping: tuple[Path, ...], skip: tuple[str, ...], seed: int
 ) -> None:
     """Turn FILE, a tester's export, or all exports of FOLDER into a campaign.
 
@@ -85,9 +87,9 @@ def convert(
 
         tell("reading")
         sizes = None if diameters is None else read_diameters(diameters)
-        given = [path for path in (mapping, None if diameters is None else Path(diameters)) if path is not None]
+        given = [*mapping, *([] if diameters is None else [Path(diameters)])]
         skip += tuple(path.name for path in given if _lies_in(path, file) and path.name not in skip)
-        campaign = read_tester_file(file, diameters_um=sizes, mapping=mapping, skip=skip)
+        campaign = read_tester_file(file, diameters_um=sizes, mapping=mapping or None, skip=skip)
         tell("finding the segments")
         segments = [Counter(part.kind for part in find_segments(curve)) for curve in campaign.curves]
         tell("writing")

@@ -160,3 +160,39 @@ def test_a_table_may_write_a_files_ending_in_small_or_capital_letters(tmp_path):
         convert(tmp_path, table())
         found = read_tester_file(tmp_path / "e.txt", mapping=tmp_path / "m.toml", diameters_um=read_diameters(sizes))
         assert found.diameters_um.tolist() == [[1, 2, 3]]
+
+
+# ---- a folder with files of two kinds --------------------------------------------------------------------------------
+
+GERMAN = 'delimiter = "semicolon"\ndecimal_mark = ","\n'
+
+
+def two_kinds(folder, first="", second=GERMAN, german="t;F;d\n0;0;0\n1;2,5;0,5\n"):
+    (folder / "in").mkdir(exist_ok=True)
+    (folder / "in" / "1.txt").write_text("t,F,d\n0,0,0\n1,2.5,0.5\n")
+    (folder / "in" / "2.txt").write_text(german)
+    mappings = [folder / "first.toml", folder / "second.toml"]
+    for file, keys in zip(mappings, (first, second), strict=True):
+        file.write_text(keys + COLUMNS)
+    return read_tester_file(folder / "in", mapping=mappings, diameters_um=[3.0, 2.0, 1.0])
+
+
+def test_each_file_of_a_folder_is_read_by_the_mapping_that_fits(tmp_path):
+    found = two_kinds(tmp_path)
+    assert [curve.force_mN.tolist() for curve in found.curves] == [[0, 2.5]] * 2
+    assert "mapped by first.toml and mapped by second.toml" in (found.metadata.provenance or "")
+
+
+def test_two_mappings_that_read_one_file_differently_are_refused(tmp_path):
+    with pytest.raises(
+        InputError, match=r"1\.txt: first\.toml and second\.toml both fit this file and read it differently"
+    ):
+        two_kinds(tmp_path, second='control = "load"\n')
+    assert len(two_kinds(tmp_path, second="", german="t,F,d\n0,0,0\n1,2.5,0.5\n1,3,0.5\n")) == 2  # the same twice
+
+
+def test_no_mapping_that_fits_and_diameters_in_one_of_two(tmp_path):
+    with pytest.raises(InputError, match=r"2\.txt.*by first\.toml, and no other mapping file fits.*--skip 2\.txt"):
+        two_kinds(tmp_path, german="x|y\n")
+    with pytest.raises(InputError, match=r"second\.toml, column 'diameters_um'.*Give --diameters"):
+        two_kinds(tmp_path, second=GERMAN + "diameters_um.all = [1, 2, 3]\n")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from ..._errors import InputError
 from ...files import LIMITS, FileLimits
@@ -15,7 +16,7 @@ from ..findings import Finding
 from ._detect import read_known
 from ._diameters import Diameters, diameters_for
 from ._mapped import read_mapped
-from ._mapping import read_mapping
+from ._mapping import MappingFile, read_mapping
 from ._text import Tests
 from .folder import names_of, read_folder
 
@@ -24,7 +25,7 @@ def read_tester_file(
     path: str | os.PathLike[str],
     *,
     diameters_um: Diameters | None = None,
-    mapping: str | os.PathLike[str] | None = None,
+    mapping: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | None = None,
     skip: Sequence[str] = (),
     limits: FileLimits = LIMITS,
 ) -> Campaign:
@@ -39,7 +40,8 @@ def read_tester_file(
             anything that a mapping file describes; or a folder of such files, see `readers.folder`.
         diameters_um: D1, D2, D3 [um] for all tests, or a mapping from tests, or names of files, to such triples; see
             `read_diameters`. It counts before what the mapping or the files say.
-        mapping: a TOML file that describes the table; see `mcc_jax.campaign.readers._mapping`.
+        mapping: a TOML file that describes the table, see `mcc_jax.campaign.readers._mapping`; or several, for a folder
+            with files of several kinds: each file is read by the one that fits it.
         skip: names of files in the folder that are left out; may hold "*", "?".
         limits: how large a file may be.
 
@@ -50,17 +52,19 @@ def read_tester_file(
         InputError: if the file is unknown or damaged, or diameters are missing.
     """
     place = Path(path)
-    described = None if mapping is None else read_mapping(mapping)
+    given = () if mapping is None else (mapping,) if isinstance(mapping, str | os.PathLike) else tuple(mapping)
+    described = [read_mapping(one) for one in given]
 
     def read(file: Path, data: bytes) -> Tests:
-        return read_known(data, file) if described is None else read_mapped(data, file, described)
+        return _read_by_one(data, file, described) if described else read_known(data, file)
 
     findings: list[Finding] = []
     if place.is_dir():
-        if described is not None and described.test_name is not None:
-            raise InputError(
-                "is for one file, not for a folder", file=described.file, column="test_name", remedy="Remove it"
-            )
+        for one in described:
+            if one.test_name is not None:
+                raise InputError(
+                    "is for one file, not for a folder", file=one.file, column="test_name", remedy="Remove it"
+                )
         tests, keys, findings = read_folder(place, read, skip, limits)
         origin = f"folder {place.resolve().name}, {tests.format}"
     else:
@@ -70,8 +74,12 @@ def read_tester_file(
         alone = names_of(place) if len(tests.curves) == 1 else ()
         keys = {name: (name, *alone) for name in tests.curves}
         origin = f"{place.name}, {tests.format}"
-    if diameters_um is None and described is not None:
-        diameters_um = described.diameters_um
+    for one in described:
+        if len(described) > 1 and one.diameters_um is not None:
+            raise InputError(
+                "cannot be told apart by mapping file", file=one.file, column="diameters_um", remedy="Give --diameters"
+            )
+        diameters_um = one.diameters_um if diameters_um is None else diameters_um
     sizes, unused = diameters_for(keys, diameters_um, tests.diameters_um, place)
     findings += [*_missing(tests.missing), *_unused(unused)]
     other = dict(tests.other)
@@ -87,6 +95,47 @@ def read_tester_file(
     )
     check_campaign(campaign, file=place)
     return campaign
+
+
+def _read_by_one(data: bytes, file: Path, mappings: Sequence[MappingFile]) -> Tests:
+    """The tests of a file by the one mapping that fits it.
+
+    Raises:
+        InputError: if none fits, or two fit and read it differently: which is right is not for a program to guess.
+    """
+    fitting: list[tuple[MappingFile, Tests]] = []
+    failed: list[InputError] = []
+    for one in mappings:
+        try:
+            fitting.append((one, read_mapped(data, file, one)))
+        except InputError as error:
+            failed.append(error)
+    if not fitting:
+        first = failed[0]
+        more = "" if len(failed) == 1 else f" by {mappings[0].file.name}, and no other mapping file fits"
+        raise InputError(first.problem + more, file=first.file, row=first.row, column=first.column, remedy=first.remedy)
+    (chosen, tests), *others = fitting
+    for other, again in others:
+        if not _same(tests, again):
+            raise InputError(
+                f"{chosen.file.name} and {other.file.name} both fit this file and read it differently",
+                file=file,
+                remedy="Give files of the two kinds in commands of their own",
+            )
+    return tests
+
+
+def _same(one: Tests, other: Tests) -> bool:
+    def readings(tests: Tests) -> list[tuple[Any, ...]]:
+        return [
+            (name, *(values.tobytes() for values in (curve.time_s, curve.force_mN, curve.displacement_um)))
+            for name, curve in tests.curves.items()
+        ]
+
+    def sizes(tests: Tests) -> dict[str, list[float] | None]:
+        return {name: size if isinstance(size, list) else None for name, size in tests.diameters_um.items()}
+
+    return (readings(one), sizes(one), one.control) == (readings(other), sizes(other), other.control)
 
 
 def _missing(missing: dict[str, int]) -> list[Finding]:
