@@ -206,10 +206,11 @@ def check_toml(text: str, file: str | Path, limits: FileLimits = LIMITS) -> None
 
 
 _TOKEN = re.compile(r'"""|\'\'\'|["\'#.\[\]{}=,\n]')
+# Text in double quotes ends where it must, closed or not: a pattern that fails is tried again from every character.
 _TEXT_ENDS = {
-    '"""': re.compile(r'(?:[^"\\]|\\[\s\S]|"(?!""))*+"""'),
+    '"""': re.compile(r'(?:[^"\\]|\\[\s\S]|"(?!""))*+(?:"""|\\|\Z)'),
     "'''": re.compile(r"'''"),
-    '"': re.compile(r'(?:[^"\\\n]|\\.)*+["\n]'),
+    '"': re.compile(r'(?:[^"\\\n]|\\.)*+(?:["\n\\]|\Z)'),
     "'": re.compile(r"['\n]"),
     "#": re.compile(r"(?=\n)|\Z"),
 }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import time
 import zipfile
 from pathlib import Path
 
@@ -98,6 +99,15 @@ def test_toml(tmp_path, text, words):
         assert read_priors(tmp_path / "p.toml").changed == ("a",)
     else:
         assert words in refused(read_priors, tmp_path / "p.toml")
+
+
+@pytest.mark.parametrize("text", ['x = "{}\\\n', 'x = """{}', 'x = """{}\\', 'x = "{}'])
+def test_open_quotes_before_a_long_text(tmp_path, text):
+    """Once the work went with the square of the length: hours for a mebibyte."""
+    (tmp_path / "p.toml").write_text(text.format("A" * 1_000_000), encoding="utf-8")
+    start = time.monotonic()
+    assert "not TOML" in refused(read_priors, tmp_path / "p.toml")
+    assert time.monotonic() - start < 20
 
 
 def test_three_long_numbers_are_no_file():
