@@ -18,6 +18,7 @@ from ..campaign import (
     adjust,
     of_each_particle,
     particle_batch,
+    refusal,
 )
 from ..geometry import plastic_shape_factor
 from ..law import MccLaw, StrainScaling, Unloading
@@ -187,7 +188,7 @@ class PaperCalibration:
                 "divergences": None,
                 "pareto_k_max": None,
                 "a_objective_value": finite(self._chosen.objective),
-                "a_objective_value_at_zero": self._chosen.objective_at_zero,
+                "a_objective_value_at_zero": finite(self._chosen.objective_at_zero),
                 "master_rms_MPa": self.plastic.rms_MPa,
                 "elastic_rms_strain": finite(self.elastic.rms_strain),
                 "elastic_branches": len(self.elastic.branches),
@@ -231,14 +232,14 @@ def calibrate_paper(
     tell("adjusting the curves")
     adjustment = adjust(campaign, threshold_MPa)
     if adjustment.kept.sum() < 2:
-        reasons = "; ".join(
-            f"particle {n!r} {r}" for n, r in zip(campaign.particles, adjustment.why_not, strict=True) if r is not None
-        )
-        raise InputError(
-            f"the calibration needs two usable particles or more, {int(adjustment.kept.sum())} can be used ({reasons})",
-            file=campaign.source or None,
-            remedy="Check the diameters (they turn force into stress), or lower the threshold.",
-        )
+        if len(campaign) == 1:
+            raise InputError(
+                "the paper's method compares particles and needs two or more, the campaign has one",
+                file=campaign.source or None,
+                remedy="Test a second particle, or use least squares or the posterior (methods least-squares, bayes).",
+            )
+        usable = int(adjustment.kept.sum())
+        raise refusal(campaign, f"two particles or more are needed, {usable} can be used", adjustment.why_not)
     table = strain_table(adjustment, campaign.diameters_um)
     tell("fitting the shape parameter")
     shape = fit_shape_parameter(table)

@@ -35,3 +35,9 @@ from ._validate import check_campaign as check_campaign
 from ._write import write_campaign as write_campaign
 from .readers import read_diameters as read_diameters
 from .readers import read_tester_file as read_tester_file
+from .reasons import below_threshold as below_threshold
+from .reasons import far_apart as far_apart
+from .reasons import no_climb as no_climb
+from .reasons import no_loading as no_loading
+from .reasons import refusal as refusal
+from .reasons import too_few as too_few

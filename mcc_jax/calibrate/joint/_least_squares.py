@@ -14,9 +14,9 @@ import numpy as np
 from ...campaign import THRESHOLD_MPA, Campaign
 from .._result import estimate, finite, misfit_note
 from ._arrow import Parameters, Solution
-from ._bayes import log_estimate
+from ._bayes import log_estimate, power_of_e
 from ._data import Selection, Tests, own_misfit
-from ._fit import population_at, prepare
+from ._fit import beyond_numbers, population_at, prepare
 from ._mode import FIRST_SPREAD, spread_slope
 from ._model import JointFit, JointModel
 from ._pooled import Pooled, fit_pooled, unpack
@@ -156,7 +156,7 @@ class LeastSquaresCalibration:
                 found["zero_um"] = _normal(float(zero[row]), float(np.sqrt(own[row, 3, 3])))
                 if self.model.modulus_scatter:
                     log_modulus = float(latent[row, 3] - self.model.shape_power * np.log(eta[row]))
-                    found["effective_modulus_MPa"] = estimate(float(np.exp(log_modulus)))
+                    found["effective_modulus_MPa"] = estimate(power_of_e(log_modulus))
             entries.append(
                 {
                     "particle": name,
@@ -193,7 +193,7 @@ class LeastSquaresCalibration:
                 for j, name in enumerate(COEFFICIENTS)
             },
             # The scatter of C1 is part of its mean.
-            "yield_stress_MPa": estimate(None if self._alone else float(np.exp(values[2] + tau[0] ** 2 / 2) / 17.16)),
+            "yield_stress_MPa": estimate(None if self._alone else power_of_e(values[2] + tau[0] ** 2 / 2) / 17.16),
             "noise": {
                 name: log_estimate(m, s) if np.isfinite(m) else estimate(0.0)
                 for name, m, s in zip(numbers, logs, log_sds, strict=True)
@@ -322,6 +322,8 @@ def calibrate_least_squares(
     found = [solve(fit, settings, tests, a, mu, log_modulus) for a in starts]
     losses = np.array([float(one.loss) for one in found])
     losses[~np.isfinite(losses)] = np.inf
+    if np.isinf(losses).all():
+        raise beyond_numbers(campaign, selection)
     count = len(selection.kept)
     fit, best = fit.first(count), found[int(np.argmin(losses))].first(count)
     settings = replace(settings, whitening=fit.filters)
