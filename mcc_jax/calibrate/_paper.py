@@ -234,12 +234,13 @@ def calibrate_paper(
     if adjustment.kept.sum() < 2:
         if len(campaign) == 1:
             raise InputError(
-                "the paper's method compares particles and needs two or more, the campaign has one",
+                "the calibration needs two usable particles or more, 1 can be used: the paper's method compares particles",
                 file=campaign.source or None,
-                remedy="Test a second particle, or use least squares or the posterior (methods least-squares, bayes).",
+                remedy="Test a second particle, or calibrate by another method (least-squares, bayes).",
             )
         usable = int(adjustment.kept.sum())
-        raise refusal(campaign, f"two particles or more are needed, {usable} can be used", adjustment.why_not)
+        problem = f"the calibration needs two usable particles or more, {usable} can be used"
+        raise refusal(campaign, problem, adjustment.why_not)
     table = strain_table(adjustment, campaign.diameters_um)
     tell("fitting the shape parameter")
     shape = fit_shape_parameter(table)

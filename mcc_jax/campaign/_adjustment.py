@@ -14,8 +14,8 @@ from .reasons import below_threshold, far_apart, no_climb, no_loading, too_few
 THRESHOLD_MPA = 0.2
 """Stress [MPa] below which surface irregularities, not the particle, deform (Bommireddy et al. 2018, section 3)."""
 
-LEAST_LEVELS = 4
-"""A loading curve of fewer points above the threshold cannot tell three coefficients."""
+LEAST_LEVELS = 2
+"""A loading curve of fewer points above the threshold has no course there."""
 
 TESTERS_ZERO = (-0.25, 1.0)
 """Where the first displacement of a record without approach may lie, as a share of the test's range of displacement,
