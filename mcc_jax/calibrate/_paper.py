@@ -234,7 +234,7 @@ def calibrate_paper(
     if adjustment.kept.sum() < 2:
         if len(campaign) == 1:
             raise InputError(
-                "the calibration needs two usable particles or more, 1 can be used: the paper's method compares particles",
+                "the calibration needs two usable particles or more, 1 can be used: this method compares particles",
                 file=campaign.source or None,
                 remedy="Test a second particle, or calibrate by another method (least-squares, bayes).",
             )

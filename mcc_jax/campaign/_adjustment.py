@@ -203,7 +203,7 @@ def _why_not(
 ) -> str | None:
     """Why a test cannot be used; None if it can."""
     if loading is None:
-        return no_loading(curve, segments)
+        return no_loading(curve, segments, stress_and_strain(curve, diameters_um, segments)[0], threshold_MPa)
     if loading.stress_max_MPa <= threshold_MPa:
         return below_threshold(loading.stress_max_MPa, threshold_MPa)
     strain = loading.strain[1:][loading.stress_MPa[1:] > threshold_MPa]

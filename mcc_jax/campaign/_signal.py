@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-
 LONG_BRANCH = 16
 """Samples between turning points from which on third differences tell noise: no more than a quarter of them straddle a
 turning point there, which shifts their median by less than half."""

@@ -21,10 +21,19 @@ SHOWN = 5
 """Most particles that an error names with their reasons."""
 
 
-def no_loading(curve: Curve, segments: tuple[Segment, ...]) -> str:
-    """Why a test has no virgin loading, or too little."""
+def no_loading(curve: Curve, segments: tuple[Segment, ...], stress_MPa: np.ndarray, threshold_MPa: float) -> str:
+    """Why a test has no virgin loading.
+
+    Args:
+        curve: the test.
+        segments: its segments.
+        stress_MPa: its stresses, shape (n,).
+        threshold_MPa: stress below which nothing counts.
+    """
     force = np.asarray(curve.force_mN, float)
     low, high = float(force.min()), float(force.max())
+    if np.abs(stress_MPa).max() <= threshold_MPa:
+        return below_threshold(float(stress_MPa.max()), threshold_MPa)
     if not high > low:
         return (
             f"has one force throughout, {high:.4g} mN, so it never loads; "

@@ -14,7 +14,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ from mcc_jax.calibrate import calibrate_bayes, calibrate_least_squares, calibrat
 METHODS: dict[str, Callable[[Campaign], Any]] = {
     "paper": calibrate_paper,
     "least-squares": calibrate_least_squares,
-    "bayes": lambda campaign: calibrate_bayes(campaign, chains=2, warmup=100, draws=200),
+    "bayes": lambda campaign: calibrate_bayes(campaign, draws=500),
 }
 COMMAND = {"command least-squares": "least-squares", "command paper": "paper"}
 DISCOVER = "discover"
@@ -77,17 +77,26 @@ def methods_of(kind: Kind, chosen: Sequence[str]) -> list[str]:
 
 
 def run_one(kind: Kind, seed: int, method: str) -> Outcome:
-    """Run one case by one method and judge how it ends."""
+    """Run one case by one method and judge how it ends; what took long runs once more, compiled."""
+    found = _run(kind, seed, method)
+    if not found.fault and found.seconds > SECONDS:
+        found = _run(kind, seed, method)
+        if found.seconds > SECONDS:
+            found = replace(found, fault=f"took {found.seconds:.1f} s")
+    return found
+
+
+def _run(kind: Kind, seed: int, method: str) -> Outcome:
     compiling = _Compiling.total
     base = _reset_peak()
-    began = time.perf_counter()
+    began, working = time.perf_counter(), time.process_time()
     content: dict[str, Any] | None = None
     how, text, fault = "failed", "", ""
     try:
         with _given_up(HANG_S), warnings.catch_warnings():
             warnings.simplefilter("error")
             campaign = campaign_of(kind, seed)
-            began = time.perf_counter()
+            began, working = time.perf_counter(), time.process_time()
             if method in COMMAND:
                 content, text = _command(kind, seed, campaign, COMMAND[method])
             elif method == DISCOVER:
@@ -101,7 +110,8 @@ def run_one(kind: Kind, seed: int, method: str) -> Outcome:
     except Exception as error:  # whatever it is, it is what is looked for
         where = traceback.extract_tb(error.__traceback__)[-1]
         fault = f"{type(error).__name__} at {Path(where.filename).name}:{where.lineno}: {error}"
-    took = time.perf_counter() - began
+    # Beside other work the clock on the wall counts that, too.
+    took = min(time.perf_counter() - began, time.process_time() - working)
     compiling = _Compiling.total - compiling
     peak = _peak() - base
     if content is None and not fault:
@@ -111,8 +121,6 @@ def run_one(kind: Kind, seed: int, method: str) -> Outcome:
         fault = _judge_result(kind, method, content, campaign)
         text = " | ".join(content["warnings"])
     seconds = max(took - compiling, 0.0)
-    if not fault and seconds > SECONDS:
-        fault = f"took {seconds:.1f} s"
     return Outcome(kind.name, seed, method, how, text, seconds, compiling, peak, fault)
 
 
@@ -294,11 +302,12 @@ def main() -> int:
                     flush=True,
                 )
         if number % 20 == 19:
-            jax.clear_caches()
+            jax.clear_caches()  # compiled functions of many shapes; they are kept on disk
         most = max(most, _status("VmRSS"))
     print(table(outcomes))
     faults = sum(bool(o.fault) for o in outcomes)
-    print(f"{len(cases[start::step])} cases of {len(kinds)} kinds, {len(outcomes)} runs, {faults} faults, RSS {most:.0f} MiB")
+    count = len(cases[start::step])
+    print(f"{count} cases of {len(kinds)} kinds, {len(outcomes)} runs, {faults} faults, RSS {most:.0f} MiB")
     return 1 if faults else 0
 
 

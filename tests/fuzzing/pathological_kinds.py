@@ -161,9 +161,7 @@ def _(rng):
 
 @kind("force in steps of a tenth of the peak", reads=True)
 def _(rng):
-    return each(
-        plain(rng), lambda c: replace(c, force_mN=np.round(c.force_mN / (s := c.force_mN.max() / 10.4)) * s)
-    )
+    return each(plain(rng), lambda c: replace(c, force_mN=np.round(c.force_mN / (s := c.force_mN.max() / 10.4)) * s))
 
 
 @kind("force in steps of 200 mN", reads=False)
@@ -261,9 +259,7 @@ def _(rng):
 def _(rng):
     one = plain(rng, count=2)
     two = plain(rng, Programme.cycles(control="displacement", rate=0.5, points=POINTS), count=2)
-    return Campaign(
-        ("a", "b", "c", "d"), np.concatenate([one.diameters_um, two.diameters_um]), one.curves + two.curves
-    )
+    return Campaign(("a", "b", "c", "d"), np.concatenate([one.diameters_um, two.diameters_um]), one.curves + two.curves)
 
 
 @kind("partial unloading only", reads=True)

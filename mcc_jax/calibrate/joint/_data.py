@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..._errors import InputError
 from ...campaign import (
     THRESHOLD_MPA,
     Campaign,
@@ -257,7 +256,7 @@ def _prepare(
     for part in segments:
         kind[part.start : part.stop] = part.kind
     if not (kind == "load").any():
-        return no_loading(curve, segments)
+        return no_loading(curve, segments, stress, threshold)
     first = segments[0]
     contact = float(curve.displacement_um[first.stop]) if first.kind == "approach" and len(segments) > 1 else None
     rows = rows_from_contact(curve, segments, most_points)

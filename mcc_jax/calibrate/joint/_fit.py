@@ -101,7 +101,7 @@ def beyond_numbers(campaign: Campaign, selection: Selection) -> InputError:
     tests = selection.tests
     mask = np.asarray(tests.mask)
     stress = 1e3 * np.asarray(tests.force) / (np.pi * np.asarray(tests.effective_diameter)[:, None] ** 2 / 4)
-    strain = (np.asarray(tests.displacement) - np.asarray(tests.contact)[:, None])
+    strain = np.asarray(tests.displacement) - np.asarray(tests.contact)[:, None]
     strain = np.abs(strain) / np.asarray(tests.effective_diameter)[:, None]
     top = np.where(mask, stress, 0.0).max(1)
     deepest = np.where(mask, strain, 0.0).max(1)
@@ -109,8 +109,9 @@ def beyond_numbers(campaign: Campaign, selection: Selection) -> InputError:
     most = int(np.argmax(top))
     deep = int(np.argmax(deepest))
     return InputError(
-        f"the law cannot be fitted to these tests: their numbers overflow; the largest stress is {top[most]:.3g} MPa "
-        f"(particle {names[most]}), the largest displacement {deepest[deep]:.3g} times the size (particle {names[deep]})",
+        "the law cannot be fitted to these tests: their numbers overflow; the largest stress is "
+        f"{top[most]:.3g} MPa (particle {names[most]}), the largest displacement {deepest[deep]:.3g} times the size "
+        f"(particle {names[deep]})",
         file=campaign.source or None,
         remedy="Check the units of force, displacement and diameters, or leave that particle out.",
     )

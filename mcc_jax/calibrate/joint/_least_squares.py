@@ -94,6 +94,13 @@ class LeastSquaresCalibration:
         """Why the fit must not be called converged; empty if it is."""
         if not bool(self.solution.converged):
             return f"the optimiser did not meet its tolerances within {int(self.solution.steps)} steps"
+        inside_out = np.flatnonzero(~(self._shape_factor > 0))
+        if len(inside_out):
+            return (
+                f"a = {float(self.solution.value.shared[0]):.3g} leaves particle {self.particles[inside_out[0]]!r} "
+                "without a positive shape factor: the curves do not come together under it; "
+                "check the units and the signs of the columns, and the diameters"
+            )
         for name, fine in zip(("the noise", "the spread of the particles"), self.fit.converged[1:], strict=True):
             if not fine:
                 return f"the optimiser for {name} did not meet its tolerances"
@@ -135,9 +142,10 @@ class LeastSquaresCalibration:
         sds = np.sqrt(np.diagonal(shared))
         known = [not (free and self._open_share(q) > 0.1) for q in range(5)]
         a = float(values[0])
-        flat = np.asarray(tests.flatness)
-        eta = 1 + a * flat
+        flat, eta = np.asarray(tests.flatness), self._shape_factor
         slope = flat / eta
+        # Where it is not positive, which the reason says, there is no logarithm, and no coefficient without it.
+        log_eta = np.log(np.where(eta > 0, eta, np.nan))
         mask = np.asarray(tests.mask)
         count = np.maximum(mask.sum(1), 1)
         rms = np.sqrt((np.asarray(self.residual()) ** 2).sum(1) / count)
@@ -151,11 +159,11 @@ class LeastSquaresCalibration:
                 found["eta_p"] = _normal(float(eta[row]), float(spread)) if known[0] else estimate(float(eta[row]))
                 for j, coefficient in enumerate(COEFFICIENTS):
                     variance = own[row, j, j] - 2 * slope[row] * between[row, j, 0] + slope[row] ** 2 * shared[0, 0]
-                    log = float(latent[row, j] - np.log(eta[row]))
+                    log = float(latent[row, j] - log_eta[row])
                     found[coefficient] = log_estimate(log, float(np.sqrt(max(variance, 0.0))) if known[0] else np.nan)
                 found["zero_um"] = _normal(float(zero[row]), float(np.sqrt(own[row, 3, 3])))
                 if self.model.modulus_scatter:
-                    log_modulus = float(latent[row, 3] - self.model.shape_power * np.log(eta[row]))
+                    log_modulus = float(latent[row, 3] - self.model.shape_power * log_eta[row])
                     found["effective_modulus_MPa"] = estimate(power_of_e(log_modulus))
             entries.append(
                 {
@@ -223,6 +231,11 @@ class LeastSquaresCalibration:
         return np.asarray(
             jax.jit(raw_residual, static_argnums=3)(latent, zero, self.selection.tests, self.model.unloading)
         )
+
+    @property
+    def _shape_factor(self) -> np.ndarray:
+        """eta_p of the particles that took part, shape (N,)."""
+        return 1 + float(self.solution.value.shared[0]) * np.asarray(self.selection.tests.flatness)
 
     @property
     def _alone(self) -> bool:
