@@ -101,7 +101,7 @@ def _check_text(text: str, what: str, fail: Callable[[str], InputError]) -> None
 
 
 def _check_curve(
-    name: str, time: np.ndarray, force: np.ndarray, displacement: np.ndarray, fail: Callable[[str], InputError]
+    name: str, time: np.ndarray, force: np.ndarray, displacement: np.ndarray, fail: Callable[..., InputError]
 ) -> None:
     parts = {"time": np.asarray(time), "force": np.asarray(force), "displacement": np.asarray(displacement)}
     for what, values in parts.items():
