@@ -164,8 +164,10 @@ def adjust(campaign: Campaign, threshold_MPa: float = THRESHOLD_MPA) -> Adjustme
     why_not = [
         _why_not(*one, threshold_MPa) for one in zip(raw, campaign.curves, campaign.diameters_um, segments, strict=True)
     ]
-    reached = [c.stress_max_MPa if c is not None and r is None else None for c, r in zip(raw, why_not, strict=True)]
-    why_not = [reason or apart for reason, apart in zip(why_not, far_apart(reached), strict=True)]
+    used = [c if r is None else None for c, r in zip(raw, why_not, strict=True)]
+    stress = [None if c is None else c.stress_max_MPa for c in used]
+    strain = [None if c is None else float(np.ptp(c.strain[1:])) for c in used]
+    why_not = [reason or apart for reason, apart in zip(why_not, far_apart(stress, strain), strict=True)]
     if threshold_MPa == 0:
         kept = tuple(c if r is None else None for c, r in zip(raw, why_not, strict=True))
         return Adjustment(kept, np.zeros(len(raw)), 0.0, 0.0, tuple(why_not), segments)

@@ -14,8 +14,8 @@ FEW_FORCES = 5
 """A record with no more different forces than this shows steps of its read-out, not a curve of three coefficients."""
 
 FAR_APART = 100.0
-"""Tests on one material end within this factor of each other in stress: the paper's end between 7 and 16 MPa, and the
-grid of stresses on which its method compares them has 801 points, of which a test so far below would see eight."""
+"""Tests on one material end within this factor of each other in stress and in strain: the paper's end between 7 and
+16 MPa, and of the 801 stresses at which its method compares them a test so far below would see eight."""
 
 SHOWN = 5
 """Most particles that an error names with their reasons."""
@@ -32,13 +32,13 @@ def no_loading(curve: Curve, segments: tuple[Segment, ...], stress_MPa: np.ndarr
     """
     force = np.asarray(curve.force_mN, float)
     low, high = float(force.min()), float(force.max())
-    if np.abs(stress_MPa).max() <= threshold_MPa:
-        return below_threshold(float(stress_MPa.max()), threshold_MPa)
     if not high > low:
         return (
             f"has one force throughout, {high:.4g} mN, so it never loads; "
             "check that the right column is taken as force, or export the test again"
         )
+    if np.abs(stress_MPa).max() <= threshold_MPa:
+        return below_threshold(float(stress_MPa.max()), threshold_MPa)
     if -low > high:
         return (
             f"is under load where its force is negative, down to {low:.4g} mN; "
@@ -96,24 +96,40 @@ def too_few(points: int, least: int) -> str:
     )
 
 
-def far_apart(stress_MPa: Sequence[float | None]) -> list[str | None]:
-    """Which tests are in other units than the rest: they reach stresses far from those of all others.
+def far_apart(stress_MPa: Sequence[float | None], strain: Sequence[float | None]) -> list[str | None]:
+    """Which tests are in other units than the rest: their stresses or strains are far from those of all others.
 
     Args:
-        stress_MPa: what each particle reaches; None for those that are not used anyway.
+        stress_MPa: the largest stress of each particle; None for those that are not used anyway.
+        strain: the range of displacement of each, in shares of its effective diameter; None likewise.
     """
-    found: list[str | None] = [None] * len(stress_MPa)
-    for i, own in enumerate(stress_MPa):
-        others = [s for k, s in enumerate(stress_MPa) if k != i and s is not None]
-        if own is None or not others:
-            continue
-        usual = float(np.median(others))
-        if not usual / FAR_APART <= own <= usual * FAR_APART:
-            found[i] = (
-                f"reaches {own:.3g} MPa where the others reach {usual:.3g} MPa; "
+    found: list[str | None] = []
+    for i in range(len(stress_MPa)):
+        stress, usual = _apart(stress_MPa, i)
+        if stress is not None:
+            found.append(
+                f"reaches {stress:.3g} MPa where the others reach {usual:.3g} MPa; "
                 "check its unit of force and its diameters (they turn force into stress), or leave the particle out"
             )
+            continue
+        share, usual = _apart(strain, i)
+        found.append(
+            None
+            if share is None
+            else f"is compressed by {share:.3g} of its size where the others are by {usual:.3g}; "
+            "check its unit of displacement and its diameters, or leave the particle out"
+        )
     return found
+
+
+def _apart(values: Sequence[float | None], i: int) -> tuple[float | None, float]:
+    """A particle's value if it is far from the median of the others', else None; and that median."""
+    own = values[i]
+    others = [v for k, v in enumerate(values) if k != i and v is not None]
+    if own is None or not others:
+        return None, 0.0
+    usual = float(np.median(others))
+    return None if usual / FAR_APART <= own <= usual * FAR_APART else own, usual
 
 
 def refusal(campaign: Campaign, problem: str, why_not: Sequence[str | None]) -> InputError:

@@ -419,12 +419,12 @@ for power in (-3, 3, 9):
         return replace(campaign, diameters_um=campaign.diameters_um * 10.0**power)
 
 
-@kind("force of the first particle times 1e6")
+@kind("force of the first particle times 1e6", says="where the others reach")
 def _(rng):
     return first_only(plain(rng), lambda c: force(c, lambda f: f * 1e6))
 
 
-@kind("displacement of the first particle times 1e6")
+@kind("displacement of the first particle times 1e6", says="of its size where the others")
 def _(rng):
     return first_only(plain(rng), lambda c: displacement(c, lambda d: d * 1e6))
 

@@ -160,8 +160,9 @@ def select_tests(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, mo
         _prepare(curve, diameters, parts, threshold_MPa, most_points)
         for curve, diameters, parts in zip(campaign.curves, campaign.diameters_um, segments, strict=True)
     ]
-    reached = [None if isinstance(one, str) else one.stress_max_MPa for one in prepared]
-    prepared = [apart or one for one, apart in zip(prepared, far_apart(reached), strict=True)]
+    stress = [None if isinstance(one, str) else one.stress_max_MPa for one in prepared]
+    strain = [None if isinstance(one, str) else one.strain_range for one in prepared]
+    prepared = [apart or one for one, apart in zip(prepared, far_apart(stress, strain), strict=True)]
     why_not = tuple(one if isinstance(one, str) else None for one in prepared)
     kept = tuple(i for i, one in enumerate(prepared) if not isinstance(one, str))
     if not kept:
@@ -204,6 +205,7 @@ class _Prepared:
     loading: np.ndarray
     contact: float
     stress_max_MPa: float
+    strain_range: float
 
 
 TURNS_SHARE = 4
@@ -251,7 +253,7 @@ def _prepare(
     curve: Curve, diameters: np.ndarray, segments: tuple[Segment, ...], threshold: float, most_points: int
 ) -> _Prepared | str:
     """The rows of one test that are used, or why there are none."""
-    stress, _ = stress_and_strain(curve, diameters, segments)
+    stress, strain = stress_and_strain(curve, diameters, segments)
     kind = np.empty(len(curve), dtype="<U8")
     for part in segments:
         kind[part.start : part.stop] = part.kind
@@ -274,7 +276,8 @@ def _prepare(
     if rise <= LEAST_CLIMB * noise / np.sqrt(third):
         return no_climb(float(rise) if rise >= 0 or -rise > LEAST_CLIMB * noise / np.sqrt(third) else 0.0)
     contact = float(curve.displacement_um[0]) if contact is None else contact
-    return _Prepared(rows, mask, loading, contact, float(stress[rows][mask].max()))
+    largest, reach = float(stress[rows][mask].max()), float(np.ptp(strain[rows][mask]))
+    return _Prepared(rows, mask, loading, contact, largest, reach)
 
 
 def own_misfit(tests: Tests, residual: Float[Array, "particles points"]) -> float:
