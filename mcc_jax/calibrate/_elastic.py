@@ -123,13 +123,11 @@ def recoverable_strain(
     shape_power: Float[Array, " branches"],
     unloading: Unloading,
 ) -> Float[Array, " branches"]:
-    """Recoverable strain from the *measured* peak of each branch, whatever the loading law; at most the peak's own."""
+    """Recoverable strain from the *measured* peak of each branch, whatever the loading law."""
     modulus = jnp.exp(log_modulus)
     if unloading is Unloading.PRINTED:
-        found = jnp.sqrt(stress_max / (unloading.constant * modulus * shape_power * strain_max))
-    else:
-        found = stress_max / (modulus * jnp.sqrt(unloading.constant * shape_power * strain_max))
-    return jnp.minimum(found, strain_max)
+        return jnp.sqrt(stress_max / (unloading.constant * modulus * shape_power * strain_max))
+    return stress_max / (modulus * jnp.sqrt(unloading.constant * shape_power * strain_max))
 
 
 @partial(jax.jit, static_argnames=("unloading", "count"))

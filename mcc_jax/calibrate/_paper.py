@@ -20,6 +20,7 @@ from ..campaign import (
     check_tests,
     of_each_particle,
     particle_batch,
+    refusal,
 )
 from ..geometry import plastic_shape_factor
 from ..law import MccLaw, StrainScaling, Unloading
@@ -29,7 +30,7 @@ from ._plastic import PlasticFit, fit_population
 from ._predict import ParticleFit, point_noise_um, predict_particles
 from ._result import estimate, finite, force_zero, misfit_note
 from ._shape import Objective, ShapeFit, fit_shape_parameter
-from .judgement import judged, none_usable, numbers_in_reach, unlike_others
+from .judgement import judged, numbers_in_reach, unlike_others
 
 PLAUSIBLE_SHAPE_FACTOR = 4.0
 """Shape factors beyond this, twice the paper's largest, come from curves that do not collapse, not from shape."""
@@ -195,7 +196,7 @@ class PaperCalibration:
                 "divergences": None,
                 "pareto_k_max": None,
                 "a_objective_value": finite(self._chosen.objective),
-                "a_objective_value_at_zero": self._chosen.objective_at_zero,
+                "a_objective_value_at_zero": finite(self._chosen.objective_at_zero),
                 "master_rms_MPa": self.plastic.rms_MPa,
                 "elastic_rms_strain": finite(self.elastic.rms_strain),
                 "elastic_branches": len(self.elastic.branches),
@@ -243,9 +244,15 @@ def calibrate_paper(
     tell("adjusting the curves")
     adjustment = adjust(campaign, threshold_MPa)
     if adjustment.kept.sum() < 2:
-        count = int(adjustment.kept.sum())
-        problem = f"the paper's method needs two usable particles or more, {count} can be used"
-        raise none_usable(campaign, adjustment.why_not, problem)
+        if len(campaign) == 1:
+            raise InputError(
+                "the calibration needs two usable particles or more, 1 can be used: this method compares particles",
+                file=campaign.source or None,
+                remedy="Test a second particle, or calibrate by another method (least-squares, bayes).",
+            )
+        usable = int(adjustment.kept.sum())
+        problem = f"the calibration needs two usable particles or more, {usable} can be used"
+        raise refusal(campaign, problem, adjustment.why_not)
     with numbers_in_reach(campaign):
         table = strain_table(adjustment, campaign.diameters_um)
         tell("fitting the shape parameter")

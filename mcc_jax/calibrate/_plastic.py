@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 
+from .._errors import InputError
 from ..law import LogNormal, PlasticPopulation
 from ._master import MasterCurve
 
@@ -82,7 +83,7 @@ def fit_population(master: MasterCurve, threshold_MPa: float = 0.0) -> PlasticFi
             step.
 
     Raises:
-        ValueError: if fewer than four points are left.
+        InputError: if fewer than four points are left.
 
     References:
         Bommireddy et al. (2018), eqs. 16 to 18 and Table 2.
@@ -92,7 +93,10 @@ def fit_population(master: MasterCurve, threshold_MPa: float = 0.0) -> PlasticFi
     use = (master.stress_MPa >= threshold_MPa) & (master.stress_MPa > 0) & (master.mean > 0)
     x, stress, sd, count = (v[use] for v in (master.mean, master.stress_MPa, master.sd, master.count))
     if len(x) < 4:
-        raise ValueError("the master curve has fewer than four points above the threshold")
+        raise InputError(
+            "the master curve has fewer than four points of positive strain above the threshold",
+            remedy="Check the sign of displacement (positive as the platens approach), or lower the threshold.",
+        )
     means = fit_polynomial(x, stress)
     K1, K3, K5 = means
     fitted = K1 * x - K3 * x**3 + K5 * x**5

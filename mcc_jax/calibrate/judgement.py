@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from .._errors import InputError
-from ..campaign import UNLOADING_ONLY, Campaign, Finding, campaign_findings, check_plausibility, named
+from ..campaign import Campaign, Finding, campaign_findings, check_plausibility, named
 
 
 @dataclass(frozen=True)
@@ -107,30 +107,6 @@ def judged(
             one = one if answer is None else replace(one, sentence=f"{one.sentence}; {answer}")
         told.append(one)
     return tuple(told)
-
-
-def none_usable(campaign: Campaign, why_not: Sequence[str | None], problem: str) -> InputError:
-    """The error where too few particles can be used: each reason once, with the particles it holds for.
-
-    Args:
-        campaign: the tests.
-        why_not: for each particle, why it cannot be used, None if it can.
-        problem: what cannot be done.
-    """
-    members: dict[str, list[str]] = {}
-    for name, reason in zip(campaign.particles, why_not, strict=True):
-        if reason is not None:
-            members.setdefault(reason, []).append(name)
-    told = [f"{_lower(named(tuple(names), len(campaign)))} {reason}" for reason, names in list(members.items())[:3]]
-    more = "; ..." if len(members) > 3 else ""
-    remedy = "Look at the curves, and check diameters, units and the threshold"
-    if members and all(reason.startswith(UNLOADING_ONLY) for reason in members):
-        remedy = "Join each test's loading in front of its unloading, in the order of time"
-    return no_answer(campaign, f"{problem} ({'; '.join(told)}{more})" if told else problem, remedy)
-
-
-def _lower(text: str) -> str:
-    return text[:1].lower() + text[1:]
 
 
 def no_answer(campaign: Campaign, problem: str, remedy: str) -> InputError:

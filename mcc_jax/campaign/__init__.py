@@ -1,7 +1,6 @@
 """Measured (or simulated) tests on single particles: reading, checking, converting and segmenting them."""
 
 from ._adjustment import THRESHOLD_MPA as THRESHOLD_MPA
-from ._adjustment import UNLOADING_ONLY as UNLOADING_ONLY
 from ._adjustment import Adjustment as Adjustment
 from ._adjustment import LoadingCurve as LoadingCurve
 from ._adjustment import adjust as adjust
@@ -9,7 +8,6 @@ from ._adjustment import campaign_segments as campaign_segments
 from ._adjustment import effective_diameter_um as effective_diameter_um
 from ._adjustment import loading_curve as loading_curve
 from ._adjustment import stress_and_strain as stress_and_strain
-from ._adjustment import without_loading as without_loading
 from ._batch import Batch as Batch
 from ._batch import batch as batch
 from ._batch import of_each_particle as of_each_particle
@@ -39,6 +37,7 @@ from ._write import write_campaign as write_campaign
 from .findings import Finding as Finding
 from .findings import worst as worst
 from .plausibility import PlausibilityOptions as PlausibilityOptions
+from .plausibility import SolidClass as SolidClass
 from .plausibility import check_plausibility as check_plausibility
 from .quality import QualityOptions as QualityOptions
 from .quality import campaign_findings as campaign_findings
@@ -46,3 +45,9 @@ from .quality import check_tests as check_tests
 from .quality import named as named
 from .readers import read_diameters as read_diameters
 from .readers import read_tester_file as read_tester_file
+from .reasons import below_threshold as below_threshold
+from .reasons import far_apart as far_apart
+from .reasons import no_climb as no_climb
+from .reasons import no_loading as no_loading
+from .reasons import refusal as refusal
+from .reasons import too_few as too_few

@@ -8,9 +8,19 @@ import numpy as np
 
 from ._schema import Campaign, Curve
 from ._segments import Segment, find_segments
+from ._validate import check_campaign
+from .reasons import below_threshold, far_apart, no_climb, no_loading, too_few
 
 THRESHOLD_MPA = 0.2
 """Stress [MPa] below which surface irregularities, not the particle, deform (Bommireddy et al. 2018, section 3)."""
+
+LEAST_LEVELS = 2
+"""A loading curve of fewer points above the threshold has no course there."""
+
+TESTERS_ZERO = (-0.25, 1.0)
+"""Where the first displacement of a record without approach may lie, as a share of the test's range of displacement,
+for the tester's zero to be the contact. Below, the platens would touch long before they meet; above, the test would
+have begun after more compression than it then shows. Beyond, the first reading is the contact."""
 
 
 @dataclass(frozen=True)
@@ -54,28 +64,23 @@ def stress_and_strain(
     .. math:: \sigma = F / (\pi R_e^2), \qquad \epsilon = (\gamma - \gamma_0) / D_e
 
     Strain counts from :math:`\gamma_0`, the platen's position at first contact: where the approach ends if the record
-    has one, the tester's own zero otherwise.
+    has one, the tester's own zero otherwise, or the first reading if that zero lies far from the test (`TESTERS_ZERO`).
 
     References:
         Bommireddy et al. (2018), eqs. 3 and 4.
     """
     diameter = effective_diameter_um(diameters_um)
-    zero = curve.displacement_um[segments[0].stop] if segments[0].kind == "approach" and len(segments) > 1 else 0.0
+    zero = _contact_um(curve, segments)
     return 1e3 * curve.force_mN / (np.pi * diameter**2 / 4), (curve.displacement_um - zero) / diameter
 
 
-UNLOADING_ONLY = "begins at its largest force"
-"""How the reason begins that `without_loading` gives for a record of the unloading alone."""
-
-
-def without_loading(curve: Curve) -> str:
-    """Why a test has no loading, for a reader of `particle ... <reason>`."""
-    force = np.asarray(curve.force_mN, float)
-    tenth = max(len(force) // 10, 1)
-    level, span = float(np.median(force[:tenth])), float(np.ptp(force))
-    if span > 0 and level > force.min() + 0.8 * span and float(np.median(force[-tenth:])) < force.min() + 0.8 * span:
-        return f"{UNLOADING_ONLY} (unloading only); the loading in front of it is missing"
-    return "has no loading: force never rises above its noise"
+def _contact_um(curve: Curve, segments: tuple[Segment, ...]) -> float:
+    """The displacement at first contact [um]."""
+    if segments[0].kind == "approach" and len(segments) > 1:
+        return float(curve.displacement_um[segments[0].stop])
+    first, reach = float(curve.displacement_um[0]), float(np.ptp(curve.displacement_um))
+    low, high = TESTERS_ZERO
+    return 0.0 if low * reach <= first <= high * reach else first
 
 
 def loading_curve(curve: Curve, diameters_um: np.ndarray, segments: tuple[Segment, ...]) -> LoadingCurve | None:
@@ -145,25 +150,27 @@ def adjust(campaign: Campaign, threshold_MPa: float = THRESHOLD_MPA) -> Adjustme
         threshold_MPa: stress [MPa], 0.2 in the paper.
 
     Raises:
+        InputError: if the campaign is none that files could hold: lengths that differ, values that are not finite, ...
         ValueError: if the threshold is negative or not finite.
 
     References:
         Bommireddy et al. (2018), section 3.
     """
+    check_campaign(campaign, file=campaign.source or "the campaign")
     if not (np.isfinite(threshold_MPa) and threshold_MPa >= 0):
         raise ValueError(f"the threshold must be a stress >= 0 MPa, got {threshold_MPa}")
     segments = campaign_segments(campaign)
     raw = [loading_curve(*one) for one in zip(campaign.curves, campaign.diameters_um, segments, strict=True)]
-    why_not: list[str | None] = []
-    for curve in raw:
-        if curve is None:
-            why_not.append(without_loading(campaign.curves[len(why_not)]))
-        elif curve.stress_max_MPa <= threshold_MPa:
-            why_not.append(f"reaches {curve.stress_max_MPa:.3g} MPa only, not the threshold of {threshold_MPa:g} MPa")
-        else:
-            why_not.append(None)
+    why_not = [
+        _why_not(*one, threshold_MPa) for one in zip(raw, campaign.curves, campaign.diameters_um, segments, strict=True)
+    ]
+    used = [c if r is None else None for c, r in zip(raw, why_not, strict=True)]
+    stress = [None if c is None else c.stress_max_MPa for c in used]
+    strain = [None if c is None else float(np.ptp(c.strain[1:])) for c in used]
+    why_not = [reason or apart for reason, apart in zip(why_not, far_apart(stress, strain), strict=True)]
     if threshold_MPa == 0:
-        return Adjustment(tuple(raw), np.zeros(len(raw)), 0.0, 0.0, tuple(why_not), segments)
+        kept = tuple(c if r is None else None for c, r in zip(raw, why_not, strict=True))
+        return Adjustment(kept, np.zeros(len(raw)), 0.0, 0.0, tuple(why_not), segments)
     at_threshold = np.array(
         [
             float(c.at(threshold_MPa)) if c is not None and r is None else np.nan
@@ -187,3 +194,23 @@ def adjust(campaign: Campaign, threshold_MPa: float = THRESHOLD_MPA) -> Adjustme
             )
         )
     return Adjustment(tuple(adjusted), shift, threshold_MPa, mean, tuple(why_not), segments)
+
+
+def _why_not(
+    loading: LoadingCurve | None,
+    curve: Curve,
+    diameters_um: np.ndarray,
+    segments: tuple[Segment, ...],
+    threshold_MPa: float,
+) -> str | None:
+    """Why a test cannot be used; None if it can."""
+    if loading is None:
+        return no_loading(curve, segments, stress_and_strain(curve, diameters_um, segments)[0], threshold_MPa)
+    if loading.stress_max_MPa <= threshold_MPa:
+        return below_threshold(loading.stress_max_MPa, threshold_MPa)
+    strain = loading.strain[1:][loading.stress_MPa[1:] > threshold_MPa]
+    if len(strain) < LEAST_LEVELS:
+        return too_few(len(strain), LEAST_LEVELS)
+    third = max(len(strain) // 3, 1)
+    rise = float(strain[-third:].mean() - strain[:third].mean())
+    return None if rise > 0 else no_climb(rise * effective_diameter_um(diameters_um))

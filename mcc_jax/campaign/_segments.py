@@ -41,6 +41,11 @@ class Segment:
         return self.stop - self.start
 
 
+BEGINS_LOADED = 0.05
+"""Share of the range of force from which on a record that begins by unloading begins under load: less is the dip by
+which adhesion pulls the platens together."""
+
+
 def find_segments(
     curve: Curve,
     *,
@@ -95,7 +100,7 @@ def find_segments(
                 2 * len(relaxing) > len(other_holds) and (not _covered(relaxing, holds) or _sags(holds, drive))
             ):
                 chosen, holds = other, other_holds
-    onset = _contact_onset(drive, displacement, clock, contact)
+    onset = 0 if _begins_loaded(drive) else _contact_onset(drive, displacement, clock, contact)
     return _assemble(chosen, holds, drive, onset)
 
 
@@ -126,6 +131,11 @@ def summarise_segments(curve: Curve, segments: tuple[Segment, ...]) -> list[dict
             }
         )
     return rows
+
+
+def _begins_loaded(force: Drive) -> bool:
+    """Whether the record begins under load and unloads first."""
+    return bool(force.signs and force.signs[0] < 0 and force.values[0] > BEGINS_LOADED * force.span)
 
 
 def _moves_away(hold: Hold, force: Drive, displacement: np.ndarray, clock: np.ndarray) -> bool:
@@ -227,10 +237,16 @@ def _assemble(drive: Drive, holds: list[Hold], force: Drive, onset: int) -> tupl
     """Kinds by direction, holds and the greatest force so far; neighbours of one kind become one."""
     count = len(drive.values)
     kinds = np.empty(count, dtype="U8")
-    reached, unloaded = -np.inf, False
+    reached, virgin, unloaded = -np.inf, -np.inf, False
+    if _begins_loaded(force):
+        # Up to the force at which the record begins to unload nothing is virgin any more.
+        reached = virgin = float(force.values[0]) - 2 * force.noise
+        unloaded = True
+    crossed = -1
     for a, b, sign in zip(drive.turns, drive.turns[1:], drive.signs, strict=False):
         if sign < 0:
-            kinds[a : b + 1] = "unload"
+            # The turning point belongs to what starts there, unless it is all that went beyond the peaks before.
+            kinds[a + (crossed == a and unloaded) : b + 1] = "unload"
             unloaded = unloaded or reached > -np.inf
             continue
         part = force.values[a : b + 1]
@@ -239,12 +255,14 @@ def _assemble(drive: Drive, holds: list[Hold], force: Drive, onset: int) -> tupl
         level = float(part[top]) - 2 * force.noise
         crossed = a
         if unloaded:
-            # A peak that only repeats the one before exceeds it by noise, at most.
-            beyond = level > reached + force.band + 2 * force.noise
+            # A peak that only repeats those before exceeds them by noise, at most; peaks that creep add up.
+            beyond = level > virgin + force.band + 2 * force.noise
             crossed = a + int(np.searchsorted(branch_envelope(part[: top + 1]), reached)) if beyond else b + 1
         kinds[a:crossed] = "reload"
         kinds[crossed : b + 1] = "load"
         reached = max(reached, level)
+        if crossed <= b:
+            virgin = reached
     for hold in holds:
         kinds[hold.start : hold.stop] = "hold"
         if onset > 0 and hold.start < onset < hold.stop:

@@ -4,9 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
+LONG_BRANCH = 16
+"""Samples between turning points from which on third differences tell noise: no more than a quarter of them straddle a
+turning point there, which shifts their median by less than half."""
+
+DEEP_TURN = 0.1
+"""Share of the signal's range that noise does not reach, for a first look at how quickly a signal turns."""
+
+SPREAD_OF_PEAKS = 1.5
+"""The extremes of white noise scatter by about two thirds of its standard deviation."""
+
 
 def noise_level(values: np.ndarray, span: float) -> float:
     """Standard deviation of the noise, from differences that a smooth course does not show, plus rounding.
+
+    A signal that turns every few samples, of hundreds of quick cycles, is not smooth: there the noise is no more than
+    what the differences between two turning points show, nor than what cycles that repeat do from one to the next.
 
     Args:
         values: the signal, shape (n,).
@@ -14,9 +27,12 @@ def noise_level(values: np.ndarray, span: float) -> float:
     """
     scatter = 0.0
     if len(values) >= 8:
-        # White noise of deviation 1 gives third differences of variance 1 + 9 + 9 + 1.
         third = np.diff(values, 3)
-        scatter = 1.4826 * float(np.median(np.abs(third))) / np.sqrt(20.0)
+        scatter = _scatter(third)
+        if scatter > 0:
+            turns = np.array(turning_points(values, DEEP_TURN * span))
+            if len(turns) > 8 and len(values) < LONG_BRANCH * (len(turns) - 1):
+                scatter = min([scatter, *_scatter_of_cycles(values, third, turns)])
     return float(np.hypot(scatter, _resolution(values, span) / 2))
 
 
@@ -26,6 +42,26 @@ def point_noise(values: np.ndarray) -> float:
         return 0.0
     second = np.diff(values, 2)
     return float(np.median(np.abs(second - np.median(second))) / 0.6745 / np.sqrt(6))
+
+
+def _scatter(third: np.ndarray) -> float:
+    """Standard deviation of white noise with such third differences; at 1 their variance is 1 + 9 + 9 + 1."""
+    return 1.4826 * float(np.median(np.abs(third))) / np.sqrt(20.0)
+
+
+def _scatter_of_cycles(values: np.ndarray, third: np.ndarray, turns: np.ndarray) -> list[float]:
+    """The same of a signal of quick cycles: between its turning points, and from peak to peak and valley to valley."""
+    found = []
+    away = np.ones(len(third), bool)
+    for back in range(4):
+        away[(turns - back)[(turns >= back) & (turns - back < len(third))]] = False
+    if away.sum() >= max(8, len(third) // 8):
+        found.append(_scatter(third[away]))
+    inner = values[turns[1:-1]]
+    if len(inner) >= 16:
+        ends = (np.diff(part, 3) for part in (inner[::2], inner[1::2]))
+        found.append(SPREAD_OF_PEAKS * max(_scatter(part) for part in ends))
+    return found
 
 
 def _resolution(values: np.ndarray, span: float) -> float:

@@ -101,7 +101,7 @@ def _check_text(text: str, what: str, fail: Callable[[str], InputError]) -> None
 
 
 def _check_curve(
-    name: str, time: np.ndarray, force: np.ndarray, displacement: np.ndarray, fail: Callable[[str], InputError]
+    name: str, time: np.ndarray, force: np.ndarray, displacement: np.ndarray, fail: Callable[..., InputError]
 ) -> None:
     parts = {"time": np.asarray(time), "force": np.asarray(force), "displacement": np.asarray(displacement)}
     for what, values in parts.items():
@@ -109,7 +109,10 @@ def _check_curve(
             raise fail(f"the {what} of particle {name!r} has the shape {values.shape}")
         if not (np.abs(values) <= LARGEST_MAGNITUDE).all():
             first = int(np.argmax(~(np.abs(values) <= LARGEST_MAGNITUDE)))
-            raise fail(f"the {what} of particle {name!r} is {values[first]} at sample {first + 1}")
+            raise fail(
+                f"the {what} of particle {name!r} is {values[first]} at sample {first + 1}",
+                "Leave that sample out, or check the unit if all are so large",
+            )
         if what != "time" and not values.any():
             raise fail(f"every {what} of particle {name!r} is zero, so the test holds no data")
     if len(time) < 2:

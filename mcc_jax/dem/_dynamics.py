@@ -19,6 +19,7 @@ from .._types import Scalar
 from ._edges import PADDING, Edges, carry_history, widened
 from ._forces import Forces, Interaction, Packing, Vector, contact_forces
 from ._measured import Sample, Trajectory, measured
+from ._pair import wall_force, wall_recovery
 from ._sharded import Contacts, Devices, at_home, divided
 from ._state import State, check_state, listed
 from ._walls import set_velocity
@@ -299,9 +300,7 @@ def stable_time_step(packing: Packing, safety: float = 0.3) -> float:
     """
 
     def steepest(side):
-        force = side.tested * (side.k1 - side.k3 * side.tested**2 + side.k5 * side.tested**4)
-        square = side.c * (force / side.tested) ** side.power * side.tested ** (side.power - 1)
-        return 4 / jnp.pi * force / (2 * jnp.sqrt(square))
+        return 4 / jnp.pi * wall_force(side, side.tested, side.tested) / (2 * wall_recovery(side, side.tested))
 
     stiffness = jax.vmap(steepest)(packing.sides)
     return safety * float(jnp.min(jnp.sqrt(packing.mass / stiffness)))

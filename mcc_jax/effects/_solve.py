@@ -8,10 +8,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from .._numerics import shared
 from .._types import Scalar, Values
 from ..geometry import Particle
-from ..law import MccLaw, Unloading, loading_strain, recoverable_share, work_per_square
+from ..law import MccLaw, Unloading, loading_strain, recovery_limit
 from ._effect import AbstractEffect, Factors
 from ._record import Record
 
@@ -98,7 +97,8 @@ def recoverable_displacement(
 ) -> Values:
     """Displacement [um] recovered on full release from a peak, with a factor on the effective modulus.
 
-    The law's own formulas (`MccLaw.recoverable_strain`), in terms of force and displacement at the peak.
+    The law's own formulas (`MccLaw.recoverable_strain`), in terms of force and displacement at the peak. Their limit
+    takes the slope of loading over its secant from the law without `loading` effects, so that it stays in closed form.
     """
     eta = law.shape_factor(particle)
     x = eta * particle.strain(peak_displacement)
@@ -111,7 +111,8 @@ def recoverable_displacement(
         square = shape * secant / (law.unloading.constant * modulus)
     else:
         square = shape * x * (secant / modulus) ** 2 / law.unloading.constant
-    most = shared(recoverable_share(secant, work_per_square(*law.plastic.polynomial, x)) * x / eta)
-    square = jnp.minimum(square, shared(most * most))
     carries = moved & (square > jnp.finfo(square.dtype).tiny)
-    return particle.displacement(jnp.where(carries, jnp.sqrt(jnp.where(carries, square, 1.0)), 0.0))
+    recoverable = jnp.sqrt(jnp.where(carries, square, 1.0))
+    limit, _ = recovery_limit(particle.strain(peak_displacement), law.plastic.secant(x), law.plastic.tangent(x))
+    recoverable = jnp.where(recoverable > limit, limit, recoverable)
+    return particle.displacement(jnp.where(carries, recoverable, 0.0))

@@ -25,6 +25,8 @@ else:
 
 RANDOM_PATHS = 8
 STEPS = 40
+SMALL = np.array([1e-6, 1e-4, 3e-3, 1e-2, 2e-2, 5e-2])
+"""Peaks of the last path over the largest displacement: there the recovered strain leaves its limit for its formula."""
 # Shares of the recoverable displacement on the way down; 1 itself is left out, where a tangent is all rounding.
 SHARES = np.array([1e-9, 1e-3, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.99, 0.9999, 1.001, 1.5])
 OTHER_SIZE = 0.6
@@ -44,7 +46,7 @@ def golden_table(law: MccLaw, particle: Particle, *, seed: int = 0, units: Liter
     """Paths of one particle between two platens with the law's force and tangent.
 
     The first path loads, releases, reloads and overtakes its peak, up to a scaled strain of 0.67, with points close to
-    every place where branches meet; the others are random.
+    every place where branches meet; the last unloads from small peaks; the others are random.
 
     Args:
         law: the law.
@@ -119,7 +121,7 @@ def _contact(side: HalfContact, other: HalfContact | None, peak: Scalar, overlap
 
 
 def _paths(scale: float, recovered: Callable[[np.ndarray], np.ndarray], seed: int) -> list[np.ndarray]:
-    """One path that meets every branch and some at random, the largest displacement being `scale`."""
+    """A path that meets every branch, some at random, one of small peaks; the largest displacement is `scale`."""
     loading = np.linspace(0.0, 0.6 * scale, 13)
     peak = loading[-1]
     down = peak - recovered(np.asarray(peak)) * SHARES
@@ -132,7 +134,9 @@ def _paths(scale: float, recovered: Callable[[np.ndarray], np.ndarray], seed: in
         peaks = np.maximum.accumulate(scale * rng.uniform(0.0, 1.0, STEPS) ** 2)
         depth = np.where(rng.uniform(size=STEPS) < 0.5, 0.0, rng.uniform(0.0, 1.2, STEPS))
         walks.append(peaks - depth * recovered(peaks))
-    return [first, *walks]
+    small = scale * SMALL
+    turns = small[:, None] - recovered(small)[:, None] * np.concatenate([[0.0], SHARES])
+    return [first, *walks, turns.ravel()]
 
 
 def _rows(

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._errors import InputError
-from ..law import TESTED_STRAIN, MccLaw, stress_ratio
+from ..law import TESTED_STRAIN, MccLaw, recovery_limit, stress_ratio
+from ..law.recovery_limit import SHARE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -21,6 +22,7 @@ else:
 
 FEWEST, MOST = 64, 65536
 BETWEEN = 8  # points at which an interval is checked
+CORNERS = 4096  # intervals in which a corner is looked for
 
 
 @dataclass(frozen=True)
@@ -28,9 +30,11 @@ class CurveTables:
     """The law as tables for linear interpolation.
 
     Attributes:
-        loading: `scaled_strain` (eta_p eps), `stress_MPa`, `tangent_MPa` (d stress / d scaled strain) and
-            `recovered_strain_at_eta_1`: the strain recovered from there, to be multiplied by eta_p^((1 - p)/2);
-            no more than the peak strain eps_P, nor than 3 pi W / (4 sigma_P) with W the integral of stress over strain.
+        loading: `scaled_strain` (eta_p eps), `stress_MPa`, `tangent_MPa` (d stress / d scaled strain),
+            `recovered_strain_at_eta_1`, the strain that a particle of shape factor 1 recovers from there, and
+            `recovered_strain_formula_at_eta_1`, the same without its limit. Of another shape factor a particle recovers
+            the latter times eta_p^((1 - p)/2), and at most the smaller of `scaled_strain` and (3 pi/8) `stress_MPa` /
+            `tangent_MPa` (where that is positive), over eta_p: so no unloading gains energy (`law.recovery_limit`).
         unloading: `recovered_share` s and `stress_share` g(s) of the peak stress.
         error: largest error of linear interpolation, as a share of each column's largest value.
     """
@@ -53,32 +57,67 @@ def curve_tables(law: MccLaw, *, strain_max: float = TESTED_STRAIN, tolerance: f
     """
     import pandas as pd
 
-    loading, one = _refine(lambda t: _loading(law, strain_max * t**3), tolerance)
+    loading, one = _refine(lambda t: _loading(law, strain_max * t**3), tolerance, _corners(law, strain_max))
     unloading, other = _refine(lambda t: _unloading(1 - (1 - t) ** 2), tolerance)
     return CurveTables(pd.DataFrame(loading), pd.DataFrame(unloading), max(one, other))
 
 
 def _loading(law: MccLaw, x: np.ndarray) -> dict[str, np.ndarray]:
-    K1, K3, K5 = (float(K) for K in law.plastic.polynomial)
-    secant = np.maximum(K1 - x**2 * (K3 - x**2 * K5), 0.0)
-    n, k, modulus = law.unloading.stress_power, law.unloading.constant, float(law.effective_modulus)
+    secant, tangent, formula, limit = _at(law, x)
     return {
         "scaled_strain": x,
         "stress_MPa": x * secant,
-        "tangent_MPa": np.where(secant > 0, K1 - x**2 * (3 * K3 - 5 * x**2 * K5), 0.0),
-        "recovered_strain_at_eta_1": np.sqrt((secant / modulus) ** n * x ** (n - 1) / k),
+        "tangent_MPa": np.where(secant > 0, tangent, 0.0),
+        "recovered_strain_at_eta_1": np.minimum(formula, limit),
+        "recovered_strain_formula_at_eta_1": formula,
     }
+
+
+def _at(law: MccLaw, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Secant and tangent [MPa] at scaled strains; strain recovered at eta_p = 1 by the formula, and its limit."""
+    K1, K3, K5 = (float(K) for K in law.plastic.polynomial)
+    secant = np.maximum(K1 - x**2 * (K3 - x**2 * K5), 0.0)
+    tangent = K1 - x**2 * (3 * K3 - 5 * x**2 * K5)
+    n, k, modulus = law.unloading.stress_power, law.unloading.constant, float(law.effective_modulus)
+    limit, _ = recovery_limit(*map(jnp.asarray, (x, secant, tangent)))
+    return secant, tangent, np.sqrt((secant / modulus) ** n * x ** (n - 1) / k), np.asarray(limit)
+
+
+def _corners(law: MccLaw, strain_max: float) -> np.ndarray:
+    """Where the recovered strain bends sharply, as t with x = strain_max t^3: its limit begins to hold, or ends to."""
+
+    from scipy.optimize import brentq
+
+    def excess(t: np.ndarray) -> np.ndarray:
+        _, _, formula, limit = _at(law, strain_max * t**3)
+        return formula - limit
+
+    def steepness(t: np.ndarray) -> np.ndarray:
+        secant, tangent, _, _ = _at(law, strain_max * t**3)
+        return tangent - SHARE * secant
+
+    t, found = np.linspace(0.0, 1.0, CORNERS + 1), []
+    for of in (excess, steepness):
+        sign = np.sign(of(t))
+        crossed = np.flatnonzero(sign[1:] * sign[:-1] < 0)
+        found += [brentq(lambda t, of=of: of(np.array([t]))[0], t[i], t[i + 1], xtol=1e-15) for i in crossed]
+    return np.asarray(found)
 
 
 def _unloading(s: np.ndarray) -> dict[str, np.ndarray]:
     return {"recovered_share": s, "stress_share": np.asarray(stress_ratio(jnp.asarray(s)))}
 
 
-def _refine(columns: Callable[[np.ndarray], dict[str, np.ndarray]], tolerance: float) -> tuple[dict, float]:
-    """Columns at as few points as the tolerance allows, the first being the abscissa, and their error."""
+def _refine(
+    columns: Callable[[np.ndarray], dict[str, np.ndarray]], tolerance: float, corners: np.ndarray | tuple[()] = ()
+) -> tuple[dict, float]:
+    """Columns at as few points as the tolerance allows, the first being the abscissa, and their error.
+
+    Points lie evenly from 0 to 1, and on the corners.
+    """
     count = FEWEST
     while count <= MOST:
-        table = columns(np.linspace(0.0, 1.0, count + 1))
+        table = columns(np.union1d(np.linspace(0.0, 1.0, count + 1), corners))
         finer = columns(np.linspace(0.0, 1.0, BETWEEN * count + 1))
         x, *_ = table
         error = max(

@@ -33,8 +33,9 @@ def _csv(law: MccLaw, particle: Particle, origin: Origin, folder: Path, seed: in
     use = {
         "loading": "stress from scaled strain eta_p eps, linearly between rows",
         "unloading": "stress = peak stress * stress_share at recovered_share = (eps_P - eps) / delta",
-        "delta": f"recovered_strain_at_eta_1 at eta_p eps_P, times eta_p^({(1 - p) / 2:g}), but no more than "
-        "eps_P and 3 pi W / (4 sigma_P), W the integral of stress over strain up to eps_P",
+        "delta": f"recovered_strain_formula_at_eta_1 at eta_p eps_P, times eta_p^({(1 - p) / 2:g}), "
+        "but at most the smaller of eps_P and (3 pi/8) stress_MPa / (eta_p tangent_MPa) there, so that no cycle gains "
+        "energy; the second only where tangent_MPa > 0. With eta_p = 1, a sphere's, it is recovered_strain_at_eta_1",
         "largest_error": tables.error,
         "error_of": "linear interpolation, as a share of each column's largest value",
     }

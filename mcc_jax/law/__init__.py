@@ -1,8 +1,6 @@
 """The contact law: loading, unloading, reloading, its inverse, its energy, its population, its references."""
 
 from ._base import AbstractContactLaw as AbstractContactLaw
-from ._branch import recoverable_share as recoverable_share
-from ._branch import work_per_square as work_per_square
 from ._loading_inverse import loading_strain as loading_strain
 from ._loading_inverse import tangent_modulus as tangent_modulus
 from ._mcc import TESTED_STRAIN as TESTED_STRAIN
@@ -23,3 +21,4 @@ from ._reference import similarity_stress as similarity_stress
 from ._unloading import PUNCH_AREA as PUNCH_AREA
 from ._unloading import StrainScaling as StrainScaling
 from ._unloading import Unloading as Unloading
+from .recovery_limit import recovery_limit as recovery_limit

@@ -12,6 +12,7 @@ from .._types import Scalar, Values
 from ._loading_inverse import secant_modulus, tangent_modulus
 from ._recovery import stress_ratio
 from ._unloading import StrainScaling, Unloading
+from .recovery_limit import recovery_limit
 
 AREA = 1e-3 * jnp.pi / 4
 """Effective area over the diameter squared, times what makes mN of MPa um^2."""
@@ -97,12 +98,15 @@ def branch_force(power: int, k1: Scalar, k3: Scalar, k5: Scalar, c: Scalar, peak
     .. math:: F = F_P f(d / \Delta), \quad F_P = k_P \gamma_P, \quad k_P = k_1 - k_3 \gamma_P^2 + k_5 \gamma_P^4, \quad
         \Delta^2 = c\, k_P^n \gamma_P^{n-1}
 
-    and :math:`\Delta` at most what `recoverable_share` allows. Derivatives are written out, because reverse mode then
-    stores half as many arrays along a path. With :math:`h = -\tfrac12 s f'`, where the formula holds:
+    and :math:`\Delta` no larger than `recovery_limit`.
+
+    Derivatives are written out, because reverse mode then stores half as many arrays along a path. With
+    :math:`h = -\tfrac12 s f'`:
 
     .. math:: dF = (f + n h)\, dF_P - h k_P\, d\gamma_P + h F_P\, dc/c + F_P f'\, d(d)/\Delta
 
-    and in general :math:`dF = f\, dF_P + 2 h F_P\, d\log\Delta + F_P f'\, d(d)/\Delta`.
+    where the formula holds. At the limit the terms in h are those of :math:`2 h F_P\, d\Delta/\Delta`, that is
+    :math:`2 h k_P\, d\gamma_P` or :math:`2 h\, (dF_P - F_P\, dT/T)` with T the slope of loading.
 
     Args:
         power: n, 1 (printed form) or 2 (punch forms).
@@ -124,7 +128,7 @@ def branch_force(power: int, k1: Scalar, k3: Scalar, k5: Scalar, c: Scalar, peak
 def _branch_force_jvp(power, primals, tangents):
     k1, k3, k5, c, peak, _ = primals
     dk1, dk3, dk5, dc, dpeak, ddrop = tangents
-    secant, span, s, ratio, all_strain, all_work = _branch(power, *primals)
+    secant, span, s, ratio, limited, steep = _branch(power, *primals)
     # The force and all derivatives need these: without a barrier XLA computes them again in the loop of each output.
     s, ratio = jax.lax.optimization_barrier((s, ratio))
     force = peak * secant
@@ -133,54 +137,30 @@ def _branch_force_jvp(power, primals, tangents):
     s = jnp.where(inside, s, 0.0)
     fall = jnp.where(inside, 4 / jnp.pi * shared(jnp.sqrt((1 - s) * (1 + s))), 0.0)
     h = 0.5 * s * fall
-    by_constants = peak * (dk1 - square * (dk3 - square * dk5))
-    dforce = by_constants + tangent_modulus(k1, k3, k5, peak) * dpeak
-    # The terms with h are 2 h F_P d(log Delta): by the formula, where all strain is recovered, and where all work is.
-    own = jnp.where(all_strain | all_work, 0.0, h)
-    share = shared(jnp.where(all_work, 2 * h * secant / work_per_square(k1, k3, k5, peak), 0.0))
-    factor = jnp.where(secant > 0, ratio + power * own - jnp.where(all_work, 2 * h, 0.0), 0.0)
-    by_peak = jnp.where(all_strain, 2 * h, -own) * secant + share * secant
-    by_work = share * peak * (dk1 / 2 - square * (dk3 / 4 - square * (dk5 / 6)))
-    change = factor * dforce + by_peak * dpeak + by_work + shared(own * force / c) * dc
-    change = change - shared(force * fall / span) * ddrop
+    slope = tangent_modulus(k1, k3, k5, peak)
+    dforce = peak * (dk1 - square * (dk3 - square * dk5)) + slope * dpeak
+    dslope = dk1 - square * (3 * dk3 - 5 * square * dk5) - peak * (6 * k3 - 20 * square * k5) * dpeak
+    with_force = jnp.where(limited, jnp.where(steep, 2.0, 0.0), float(power))
+    with_peak = jnp.where(limited, jnp.where(steep, 0.0, -2.0), 1.0)
+    with_slope = jnp.where(limited & steep, shared(2 * h * force / jnp.where(steep, slope, 1.0)), 0.0)
+    factor = jnp.where(secant > 0, ratio + with_force * h, 0.0)
+    change = factor * dforce - with_peak * h * secant * dpeak - with_slope * dslope
+    change = change + jnp.where(limited, 0.0, shared(h * force / c)) * dc - shared(force * fall / span) * ddrop
     # Transposed, this is a barrier for the cotangent, which otherwise would be computed again for each input.
     return force * ratio, jax.lax.optimization_barrier(change)
 
 
-def work_per_square(k1: Scalar, k3: Scalar, k5: Scalar, peak: Values) -> Values:
-    """Work of loading over the square of the displacement."""
-    square = peak * peak
-    return k1 / 2 - square * (k3 / 4 - square * (k5 / 6))
-
-
-MOST_RECOVERED = 0.75 * jnp.pi
-r"""Work over force, times this, is the recovered displacement that gives back all work: :math:`1/g(0)`."""
-
-
-def recoverable_share(secant: Values, work: Values) -> Values:
-    r"""Largest share of its displacement that a contact can recover and give back no more work than it took.
-
-    .. math:: \min\left(1,\ \tfrac{3 \pi}{4} \frac{W}{F_P \gamma_P}\right)
-
-    Args:
-        secant: peak force over peak displacement, or stress over strain.
-        work: work of loading over the square of the same.
-    """
-    positive = secant > 0
-    return jnp.minimum(1.0, MOST_RECOVERED * shared(work / jnp.where(positive, secant, 1.0)))
-
-
 def _branch(power, k1, k3, k5, c, peak, drop):
-    """Secant, recoverable displacement (1 if nothing was carried), its recovered share, share of peak force left, and
-    whether all strain or all work is recovered."""
+    """Secant, recoverable displacement (1 if nothing was carried), its recovered share, share of peak force left.
+
+    And whether the recoverable displacement is at its limit, and whether loading is steep there.
+    """
     secant = secant_modulus(k1, k3, k5, peak)
     square = c * secant if power == 1 else c * peak * secant * secant
-    share = recoverable_share(secant, work_per_square(k1, k3, k5, peak))
-    most = shared(share * peak) ** 2
-    bound = square > most
-    square = jnp.where(bound, most, square)
     carries = (peak > 0) & (square > 0)
     span = shared(jnp.sqrt(jnp.where(carries, square, 1.0)))
+    limit, steep = recovery_limit(peak, secant, tangent_modulus(k1, k3, k5, peak))
+    limited = carries & (span > limit)
+    span = jnp.where(limited, limit, span)
     s = jnp.where(carries, shared(drop / span), 1.0)
-    left = jnp.where(drop <= 0, 1.0, stress_ratio(s))
-    return secant, span, s, left, bound & (share >= 1), bound & (share < 1)
+    return secant, span, s, jnp.where(drop <= 0, 1.0, stress_ratio(s)), limited, steep

@@ -38,6 +38,24 @@ def tangent_modulus(K1: Scalar, K3: Scalar, K5: Scalar, x: Values) -> Values:
     return K1 - square * (3 * K3 - 5 * square * K5)
 
 
+def loading_work(K1: Scalar, K3: Scalar, K5: Scalar, x: Values) -> Values:
+    """Integral of x times `secant_modulus`: the work of loading, none where the quintic would be tensile.
+
+    Derivatives are exact: at the ends of that stretch, which are roots of the quintic, they do not depend on the ends.
+    """
+
+    def integral(square: Values) -> Values:
+        return square * (K1 / 2 - square * (K3 / 4 - square * K5 / 6))
+
+    square = x * x
+    discriminant = K3 * K3 - 4 * K1 * K5
+    pulls = discriminant > 0
+    larger = jnp.where(pulls, K3 + jnp.sqrt(jnp.where(pulls, discriminant, 1.0)), 1.0)
+    begin, end = jax.lax.stop_gradient((2 * K1 / larger, larger / jnp.where(pulls, 2 * K5, 1.0)))
+    before = integral(jnp.where(pulls & (square > begin), begin, square))
+    return before + jnp.where(pulls & (square > end), integral(square) - integral(end), 0.0)
+
+
 def quintic(K1: Scalar, K3: Scalar, K5: Scalar, x: Values) -> tuple[Values, Values, Values]:
     """Value, slope and half the curvature of K1 x - K3 x^3 + K5 x^5: what a step of Halley's method takes."""
     square = x * x

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from .._numerics import compiled_whole
 from .._types import Flag, Scalar, ScalarLike, scalar
-from ._loading_inverse import loading_strain, secant_modulus, tangent_modulus
+from ._loading_inverse import loading_strain, loading_work, secant_modulus, tangent_modulus
 
 
 class Plastic(eqx.Module):
@@ -54,8 +54,11 @@ class Plastic(eqx.Module):
 
     def stress(self, x: Float[Array, ...]) -> Float[Array, ...]:
         """Stress [MPa] at the scaled strain `x` = eta_p eps >= 0, never below zero."""
-        K1, K3, K5 = self.polynomial
-        return x * secant_modulus(K1, K3, K5, x)
+        return x * self.secant(x)
+
+    def secant(self, x: Float[Array, ...]) -> Float[Array, ...]:
+        """Stress over scaled strain [MPa], never below zero, and C1 at `x` = 0."""
+        return secant_modulus(*self.polynomial, x)
 
     def tangent(self, x: Float[Array, ...]) -> Float[Array, ...]:
         r"""Slope :math:`d\sigma/dx = C_1 - 3 C_3^3 x^2 + 5 C_5^5 x^4` [MPa]."""
@@ -72,7 +75,8 @@ class Plastic(eqx.Module):
         return loading_strain(*self.polynomial, stress, jnp.zeros_like(self.C1))
 
     def work(self, x: Scalar) -> Scalar:
-        r"""Integral of stress over scaled strain, :math:`C_1 x^2/2 - C_3^3 x^4/4 + C_5^5 x^6/6` [MPa]."""
-        K1, K3, K5 = self.polynomial
-        square = x * x
-        return square * (K1 / 2 - square * (K3 / 4 - square * K5 / 6))
+        r"""Integral of `stress` over scaled strain, :math:`C_1 x^2/2 - C_3^3 x^4/4 + C_5^5 x^6/6` [MPa].
+
+        Without the stretch in which the quintic is negative, where there is one.
+        """
+        return loading_work(*self.polynomial, x)

@@ -180,6 +180,39 @@ def test_reload_to_the_same_peak_stays_reload():
     ]
 
 
+@pytest.mark.parametrize("samples", [1, 3, 12, 40])
+@pytest.mark.parametrize("noise", [0.0, 0.0003])
+def test_hundreds_of_quick_cycles_are_found(samples, noise):
+    ramp = np.linspace(0, 1, samples + 1)[1:]
+    up, down = 0.1 + 0.9 * ramp, 1 - 0.9 * ramp
+    force = np.concatenate([np.linspace(0, 1, 50), *([down, up] * 300)])
+    force += noise * np.random.default_rng(0).normal(size=len(force))
+    found = kinds(find_segments(Curve(np.arange(float(len(force))), force, force), control="load"))
+    assert found == ["load", *["unload", "reload"] * 300]
+
+
+def test_peaks_that_creep_are_virgin_loading():
+    # Each cycle rises by less than the band that tells a peak from the one before.
+    levels = np.linspace(0.3, 1, 501)
+    force = np.concatenate([np.linspace(0, 0.3, 10), *([0.5 * level, level] for level in levels)])
+    segments = find_segments(Curve(np.arange(float(len(force))), force, force), control="load")
+    assert_tiles(segments, len(force))
+    virgin = np.concatenate([force[s.start : s.stop] for s in segments if s.kind == "load"])
+    assert len(virgin) > 100
+    assert virgin.max() > 0.99
+    assert np.diff(np.sort(virgin)[10:]).max() < 0.005
+
+
+def test_a_record_that_begins_under_load_has_no_virgin_loading_up_to_that_force():
+    force = np.concatenate([np.linspace(60, 10, 51), np.linspace(11, 59, 49), np.linspace(58, 0, 59)])
+    time_s = np.arange(float(len(force)))
+    assert kinds(find_segments(Curve(time_s, force, force))) == ["unload", "reload", "unload"]
+    beyond = np.concatenate([force[:100], np.linspace(60, 100, 41), np.linspace(99, 0, 100)])
+    segments = find_segments(Curve(np.arange(float(len(beyond))), beyond, beyond))
+    assert kinds(segments) == ["unload", "reload", "load", "unload"]
+    assert beyond[segments[2].start] == pytest.approx(60, abs=1)
+
+
 def test_relaxation_under_displacement_control_is_a_hold():
     depth = np.concatenate([np.linspace(0, 10, 101), np.full(80, 10.0), np.linspace(9.95, 8, 40)])
     force = depth**1.5

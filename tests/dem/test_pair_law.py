@@ -222,6 +222,28 @@ def test_derivatives_equal_differences(peak, overlap):
         assert abs(forward[k] - difference) * at[k] <= 1e-6 * value, k
 
 
+@pytest.mark.parametrize(
+    ("soft_i", "soft_j", "peak", "overlap"),
+    [(1, 1, 0.05, 0.03), (1e4, 1e4, 2.0, 1.5), (1e4, 1e4, 60.0, 55.0), (1e4, 1, 60.0, 58.0), (1e4, 1, 2.0, 1.8)],
+    ids=["small peak", "soft", "soft and steep", "one soft and steep", "one soft"],
+)
+def test_derivatives_equal_differences_where_the_recovery_is_limited(soft_i, soft_j, peak, overlap):
+    """Each side by its formula, or limited by its peak or by its slope of loading."""
+    at = vector_of(peak, overlap) * jnp.asarray([1.0, 1, 1, soft_i, 1, 1, 1, soft_j, 1, 1])
+    value = SUMMED(at)
+    assert value > 0
+    forward, reverse = JACOBIANS(at)
+    np.testing.assert_allclose(forward * at, reverse * at, rtol=1e-11, atol=1e-12 * float(value))
+    assert (forward[3] == 0) == (soft_i > 1 or peak < 1)  # a side at its limit no longer feels its modulus
+    for k in range(at.shape[0]):
+        step = 1e-5 * at[k]
+        difference = (
+            8 * (SUMMED(at.at[k].add(step)) - SUMMED(at.at[k].add(-step)))
+            - (SUMMED(at.at[k].add(2 * step)) - SUMMED(at.at[k].add(-2 * step)))
+        ) / (12 * step)
+        assert abs(forward[k] - difference) * at[k] <= 1e-6 * value, k
+
+
 @settings(max_examples=60, deadline=None)
 @given(peak=st.sampled_from([0.0, 1e-300, 1e-14, 1e-6, 1.0, 25.0, 60.0]), share=st.floats(-0.5, 1.2))
 def test_finite_everywhere(peak, share):
@@ -287,6 +309,19 @@ def test_energy_is_the_area_under_the_curve(unloading):
         work = np.sum(0.5 * (forces[1:] + forces[:-1]) * np.diff(overlaps))
         np.testing.assert_allclose(energy.recoverable + energy.dissipated, work, rtol=2e-5)
         assert energy.recoverable >= 0
+
+
+def test_a_contact_that_carries_nothing_for_a_while_does_no_work():
+    """Where the quintic would pull there is no force, and so no work: 0.08 % of the paper's draws."""
+    side = half_contact(law_of(C1=4.0, C3=3.9, C5=2.4), Particle(100.0, 100.0, 100.0))
+    overlaps = np.linspace(0, 60e-6, 60_001)
+    force = np.asarray(driven(on_wall(side), overlaps))
+    assert (force[20_000:40_000] == 0).any()
+    work = np.concatenate([[0.0], np.cumsum(0.5 * (force[1:] + force[:-1]) * np.diff(overlaps))])
+    at = np.array([10_000, 20_000, 30_000, 40_000, 60_000])
+    energy = jax.vmap(lambda o: wall_energy(side, o, o))(jnp.asarray(overlaps[at]))
+    np.testing.assert_allclose(energy.recoverable + energy.dissipated, work[at], rtol=1e-6)
+    assert np.all(np.diff(energy.dissipated) >= 0)
 
 
 # ---- what is refused, what is flagged --------------------------------------------------------------------------------

@@ -35,13 +35,11 @@ class _Half:
     def recovered(self, d: np.ndarray) -> np.ndarray:
         strain = np.where(d > 0, 2 * d / self.diameter, 1.0)
         square = (self.stress(d) / self.modulus) ** self.n / (self.k * self.eta**self.p * strain)
-        # No more than the strain itself, and no more than gives back the work of loading: W_rec = 4/(3 pi) sigma delta.
-        x = self.eta * strain
-        K1, K3, K5 = self.K
-        work = (K1 * x**2 / 2 - K3 * x**4 / 4 + K5 * x**6 / 6) / self.eta
-        stress = self.stress(d)
-        most = np.minimum(strain, 0.75 * np.pi * work / np.where(stress > 0, stress, np.inf))
-        return np.where(d > 0, self.diameter * np.minimum(np.sqrt(square), most) / 2, 0.0)
+        # No more than the peak itself, and no softer at the start of unloading than 32/(3 pi^2) times loading's end.
+        slope = self.slope(d)
+        steepest = 3 * np.pi / 8 * self.force(d) / np.where(slope > 0, slope, 1.0)
+        limit = np.where(slope > 0, np.minimum(d, steepest), d)
+        return np.where(d > 0, np.minimum(self.diameter * np.sqrt(square) / 2, limit), 0.0)
 
 
 def pair_force(

@@ -90,6 +90,38 @@ def test_equals_the_library_over_random_paths(program, kind):
         np.testing.assert_allclose(1e6 / share * got[2], np.maximum.accumulate(np.maximum(paths, 0), 1), rtol=1e-15)
 
 
+@eqx.filter_jit
+@eqx.filter_vmap
+def recovered_from(law, diameters, peaks):
+    """Displacement recovered on full release from peaks [um]."""
+    particle = Particle(*diameters)
+    return particle.displacement(law.recoverable_strain(particle, particle.strain(peaks)))
+
+
+@pytest.mark.parametrize("kind", [PLATES, PAIR], ids=["plates", "equal pair"])
+def test_equals_the_library_where_the_recovery_is_limited(program, kind):
+    """Peaks from 1e-9 to twice the tested range, moduli down to that of a rubber: formula, peak and slope as limits."""
+    rng = np.random.default_rng(7)
+    for unloading, scaling in FORMS:
+        count, turns = 60, 6
+        laws, diameters = random_laws(rng, count, unloading, scaling, monotone=True)
+        soft = laws.effective_modulus * 10 ** jnp.asarray(rng.uniform(-3, 0, count))
+        laws = eqx.tree_at(lambda law: law.effective_modulus, laws, soft)
+        reach, _ = (np.asarray(v) for v in scales(laws, jnp.asarray(diameters)))
+        peaks = np.sort(reach[:, None] * 10 ** rng.uniform(-9, 0.3, (count, turns)), axis=1)
+        recovered = np.asarray(recovered_from(laws, diameters, jnp.asarray(peaks)))
+        assert (recovered <= peaks * (1 + 1e-15)).all()
+        assert ((recovered == peaks).mean() > 0.1) & ((recovered < peaks).mean() > 0.1)
+        paths = peaks[..., None] - recovered[..., None] * np.array([0.0, 1e-3, 0.3, 0.7, 0.95, 1.1])
+        paths = paths.reshape(count, -1)
+        force, tangent = (np.asarray(v) for v in along(laws, diameters, paths, history(paths)))
+        got = run_driver(program, head(kind, paths.shape[1], laws, diameters), 1e-6 * paths)
+        at_peak = np.repeat(force.reshape(count, turns, -1)[..., 0], 6, axis=1)
+        stiffest = np.repeat(tangent.reshape(count, turns, -1).max(axis=2), 6, axis=1)
+        np.testing.assert_array_less(np.abs(1e3 * got[0] - force) / at_peak, 1e-12)
+        np.testing.assert_array_less(np.abs(1e-3 * got[1] - tangent) / stiffest, 1e-10)
+
+
 def test_pair_of_unlike_particles_equals_bisection(program):
     rng = np.random.default_rng(3)
     count, steps = 8, 20

@@ -39,6 +39,26 @@ def test_linear_interpolation_is_within_the_stated_error(drawn):
     assert np.abs(np.interp(x, at.index, at[column]) - want).max() <= TOLERANCE * at[column].max()
 
 
+@pytest.mark.parametrize(
+    ("form", "modulus"), [(FORMS[0], 16000.0), (FORMS[3], 1e4), (FORMS[6], 100.0), (FORMS[8], 3.0)]
+)
+@pytest.mark.parametrize("D3", [150.0, 230.0])
+def test_recovered_strain_of_any_shape(form, modulus, D3):
+    """From the formula's column and its limit, as `master_curve.json` says: flat and upright particles, any peak."""
+    law, particle = paper_law(*form), Particle(213.54, 196.07, D3)
+    law = MccLaw(law.plastic, law.a, modulus, *form)
+    eta, table = float(law.shape_factor(particle)), curve_tables(law).loading
+    peak = 0.67 / eta * np.random.default_rng(1).uniform(0, 1, 4000) ** 4
+    stress, tangent, formula = (
+        np.interp(eta * peak, table["scaled_strain"], table[name])
+        for name in ("stress_MPa", "tangent_MPa", "recovered_strain_formula_at_eta_1")
+    )
+    delta = np.minimum(formula * eta ** ((1 - form[1].power) / 2), peak)
+    delta = np.minimum(delta, 3 * np.pi / 8 * stress / (eta * tangent))
+    want = np.asarray(law.recoverable_strain(particle, jnp.asarray(peak)))
+    assert np.abs(delta - want).max() <= 3e-5 * want.max()
+
+
 def test_the_unloading_curve_is_the_arcsine_law():
     table = curve_tables(paper_law()).unloading
     s = np.random.default_rng(1).uniform(0, 1, 5000)
@@ -58,7 +78,8 @@ def test_the_law_rebuilt_from_the_tables_alone(form):
     def at(column, where):
         return np.interp(where, loading["scaled_strain"], loading[column])
 
-    delta = eta * eta ** ((1 - form[1].power) / 2) * at("recovered_strain_at_eta_1", peak)
+    delta = eta * eta ** ((1 - form[1].power) / 2) * at("recovered_strain_formula_at_eta_1", peak)
+    delta = np.minimum(delta, np.minimum(peak, 3 * np.pi / 8 * at("stress_MPa", peak) / at("tangent_MPa", peak)))
     with np.errstate(divide="ignore", invalid="ignore"):
         share = np.where(x < peak, (peak - x) / delta, 0.0)
     stress = at("stress_MPa", peak) * np.interp(share, unloading["recovered_share"], unloading["stress_share"])

@@ -21,7 +21,7 @@ from helpers import (
 )
 from hypothesis import given, settings
 
-from mcc_jax.law import Energy, History, Unloading
+from mcc_jax.law import Energy, History, Plastic, Unloading
 
 
 @eqx.filter_jit
@@ -136,3 +136,31 @@ def test_force_is_the_slope_of_the_stored_energy(x, share):
 @eqx.filter_jit
 def stored_slope(p, peak, d):
     return jax.grad(lambda d: paper_law().energy(p, History(peak), d).recoverable)(d)
+
+
+@pytest.mark.parametrize("C3", [3.0, 3.29, 3.3, 3.6, 4.2])
+def test_no_work_where_the_quintic_would_pull(C3):
+    """The force is zero there; the work is that of the force, and its slope is the force, also in the coefficients."""
+    p, plastic = paper_particle(4), Plastic(4.0, C3, 2.4)
+    law = paper_law(plastic=plastic)
+    scale = float(p.effective_diameter / law.shape_factor(p))
+    path = jnp.linspace(0.0, 1.2 * scale, 40_001)
+    F = np.asarray(force_along(law, p, path))
+    work = np.concatenate([[0.0], np.cumsum(0.5 * (F[1:] + F[:-1])) * float(path[1])])
+    peaks = path[::4000]
+    found = along_peaks(law, p, peaks)
+    close(found.work, work[::4000], rel=1e-6, scale=1e-12)
+    assert jnp.all(jnp.diff(found.dissipated) >= -1e-12)
+    slopes = jax.vmap(jax.grad(lambda d: law.loading_work(p, d)))(peaks)
+    close(slopes, F[::4000], scale=1e-11 * F.max())
+    x = jnp.asarray(1.1)
+    exact = np.asarray(jax.jacrev(lambda K: Plastic.from_polynomial(*K).work(x))(jnp.asarray(plastic.polynomial)))
+    for k in range(3):
+        up, down = (jnp.asarray(plastic.polynomial).at[k].multiply(1 + h) for h in (1e-6, -1e-6))
+        slope = (Plastic.from_polynomial(*up).work(x) - Plastic.from_polynomial(*down).work(x)) / (up[k] - down[k])
+        close(exact[k], slope, rel=2e-5)
+
+
+@eqx.filter_jit
+def along_peaks(law, particle, peaks):
+    return jax.vmap(lambda d: law.energy(particle, History(d), d))(peaks)

@@ -283,11 +283,19 @@ def summary(draws: np.ndarray) -> dict[str, Any]:
 
 def log_estimate(log: float, sd: float) -> dict[str, Any]:
     """An estimate from its logarithm's mean and standard deviation."""
-    value = math.exp(log)
+    value = power_of_e(log)
     if not math.isfinite(sd):
         return estimate(value)
     sd = min(sd, 5.0)
     return estimate(value, value * sd, (value * math.exp(-1.96 * sd), value * math.exp(1.96 * sd)))
+
+
+def power_of_e(log: float) -> float:
+    """The exponential, infinite where it overflows."""
+    try:
+        return math.exp(log)
+    except OverflowError:
+        return math.inf
 
 
 def calibrate_bayes(

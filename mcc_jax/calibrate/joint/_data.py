@@ -17,16 +17,21 @@ from ...campaign import (
     Campaign,
     Curve,
     Segment,
+    below_threshold,
     campaign_segments,
+    check_campaign,
     check_tests,
+    far_apart,
+    no_climb,
+    no_loading,
     particle_batch,
+    refusal,
     stress_and_strain,
-    without_loading,
+    too_few,
 )
 from ...geometry import Particle
 from .._elastic import LEAST_RATIO
-from .._predict import point_noise_um
-from ..judgement import none_usable
+from .._predict import READING_UM, point_noise_um
 
 LEAST_POINTS = 12
 """Fewer usable points than this cannot carry three coefficients, a zero and their noise."""
@@ -148,6 +153,7 @@ def select_tests(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, mo
         ValueError: for a threshold that is negative or not finite.
         RuntimeError: in single precision.
     """
+    check_campaign(campaign, file=campaign.source or "the campaign")
     if not (np.isfinite(threshold_MPa) and threshold_MPa >= 0):
         raise ValueError(f"the threshold must be a stress >= 0 MPa, got {threshold_MPa}")
     if not jax.config.read("jax_enable_x64"):
@@ -161,10 +167,13 @@ def select_tests(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, mo
         _prepare(curve, diameters, parts, threshold_MPa, most_points)
         for curve, diameters, parts in zip(campaign.curves, campaign.diameters_um, segments, strict=True)
     ]
+    stress = [None if isinstance(one, str) else one.stress_max_MPa for one in prepared]
+    strain = [None if isinstance(one, str) else one.strain_range for one in prepared]
+    prepared = [apart or one for one, apart in zip(prepared, far_apart(stress, strain), strict=True)]
     why_not = tuple(one if isinstance(one, str) else None for one in prepared)
     kept = tuple(i for i, one in enumerate(prepared) if not isinstance(one, str))
     if not kept:
-        raise none_usable(campaign, why_not, "no particle can be used")
+        raise refusal(campaign, "no particle can be used", why_not)
     used = [one for one in prepared if not isinstance(one, str)]
     longest = padded_length(max(len(one.rows) for one in used))
 
@@ -219,31 +228,61 @@ class _Prepared:
     mask: np.ndarray
     loading: np.ndarray
     contact: float
+    stress_max_MPa: float
+    strain_range: float
+
+
+TURNS_SHARE = 4
+"""Of records with more segments than one for so many rows that are kept, hundreds of cycles, whole cycles are left out:
+turning points that are always kept would be most of what is left."""
 
 
 def rows_from_contact(curve: Curve, segments: tuple[Segment, ...], most_points: int) -> np.ndarray:
-    """Rows of a test behind its approach; of longer records every n-th, turning points and the largest force always."""
+    """Rows of a test behind its approach; of longer records every n-th, turning points and the largest force always.
+
+    Of hundreds of cycles, whole unloadings and reloadings are left out of longer records, evenly; what they started
+    from stays, and so does the law's state, which knows the largest force only.
+    """
     first = segments[0]
     start = first.stop if first.kind == "approach" and len(segments) > 1 else 0
     rows = np.arange(start, len(curve))
-    stride = -(-len(rows) // most_points)
-    if stride <= 1:
+    if len(rows) <= most_points:
         return rows
-    turns = [part.start for part in segments] + [part.stop - 1 for part in segments]
-    turns.append(int(np.argmax(curve.force_mN)))
-    return np.unique(np.concatenate([rows[::stride], [t for t in turns if t >= start]]))
+    turns = [int(np.argmax(curve.force_mN))]
+    if len(segments) <= most_points // TURNS_SHARE:
+        turns += [part.start for part in segments] + [part.stop - 1 for part in segments]
+        thinned = [rows[:: -(-len(rows) // most_points)]]
+    else:
+        elastic = [k for k, part in enumerate(segments) if part.kind in ("hold", "unload", "reload")]
+        some = [segments[k] for k in elastic[:: -(-len(elastic) // (most_points // TURNS_SHARE))]]
+        turns += [part.start for part in some] + [part.stop - 1 for part in some]
+        force = np.asarray(curve.force_mN)
+        # The largest force before each, from which the law unloads.
+        highest = np.maximum.accumulate(np.where(force >= np.maximum.accumulate(force), np.arange(len(force)), 0))
+        turns += [int(highest[part.start]) for part in some]
+        virgin = np.zeros(len(curve), bool)
+        for part in segments:
+            if part.kind == "load":
+                virgin[part.start : part.stop] = True
+        kept = np.zeros(len(curve), bool)
+        for part in some:
+            kept[part.start : part.stop] = True
+        # Half of the rows for each: the one loading of many cycles is short.
+        parts = np.flatnonzero(virgin), np.flatnonzero(kept & ~virgin)
+        thinned = [part[part >= start][:: -(-len(part) * 2 // most_points) or 1] for part in parts]
+    return np.unique(np.concatenate([*thinned, [t for t in turns if t >= start]]).astype(int))
 
 
 def _prepare(
     curve: Curve, diameters: np.ndarray, segments: tuple[Segment, ...], threshold: float, most_points: int
 ) -> _Prepared | str:
     """The rows of one test that are used, or why there are none."""
-    stress, _ = stress_and_strain(curve, diameters, segments)
+    stress, strain = stress_and_strain(curve, diameters, segments)
     kind = np.empty(len(curve), dtype="<U8")
     for part in segments:
         kind[part.start : part.stop] = part.kind
     if not (kind == "load").any():
-        return without_loading(curve)
+        return no_loading(curve, segments, stress, threshold)
     first = segments[0]
     contact = float(curve.displacement_um[first.stop]) if first.kind == "approach" and len(segments) > 1 else None
     rows = rows_from_contact(curve, segments, most_points)
@@ -254,15 +293,17 @@ def _prepare(
     if curve.checked is not None:
         mask, loading = mask & curve.checked.compared[rows], loading & curve.checked.compared[rows]
     if stress.max() <= threshold:
-        return f"reaches {stress.max():.3g} MPa only, not the threshold of {threshold:g} MPa"
+        return below_threshold(float(stress.max()), threshold)
     if loading.sum() < LEAST_POINTS:
-        return f"has {int(loading.sum())} usable points on loading, fewer than {LEAST_POINTS}"
+        return too_few(int(loading.sum()), LEAST_POINTS)
     climb = curve.displacement_um[rows[loading]]
     third = max(len(climb) // 3, 1)
-    rise, noise = climb[-third:].mean() - climb[:third].mean(), point_noise_um(curve)
+    rise, noise = climb[-third:].mean() - climb[:third].mean(), max(point_noise_um(curve), READING_UM)
     if rise <= LEAST_CLIMB * noise / np.sqrt(third):
-        return "shows no loading curve: displacement does not grow with force beyond its noise"
-    return _Prepared(rows, mask, loading, float(curve.displacement_um[0] if contact is None else contact))
+        return no_climb(float(rise) if rise >= 0 or -rise > LEAST_CLIMB * noise / np.sqrt(third) else 0.0)
+    contact = float(curve.displacement_um[0]) if contact is None else contact
+    largest, reach = float(stress[rows][mask].max()), float(np.ptp(strain[rows][mask]))
+    return _Prepared(rows, mask, loading, contact, largest, reach)
 
 
 def ranges_um(tests: Tests) -> np.ndarray:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..._errors import InputError
 from ..._memory import make_room
 from ...campaign import Campaign
 from ...law import Unloading
@@ -70,7 +71,7 @@ def prepare(
         What was selected, the tests with copies that fill up, their fit, and the size of a block.
 
     Raises:
-        InputError: if no particle can be used, or processes were given different tests.
+        InputError: if no particle can be used, numbers overflow, or processes were given different tests.
         ValueError: for blocks of no particles.
     """
     if block is not None and block < 1:
@@ -90,7 +91,30 @@ def prepare(
     fit = fit_joint(tests, model, read_out, block=size, tell=tell, **settings)
     if aside is not None:
         aside.join()
+    if not all(np.isfinite(np.asarray(part)).all() for part in (fit.latent, fit.zero, fit.mode, fit.covariance)):
+        raise beyond_numbers(campaign, selection)
     return selection, tests, fit, size
+
+
+def beyond_numbers(campaign: Campaign, selection: Selection) -> InputError:
+    """The error of tests whose fit ends in no numbers, with the ranges that it was asked to describe."""
+    tests = selection.tests
+    mask = np.asarray(tests.mask)
+    stress = 1e3 * np.asarray(tests.force) / (np.pi * np.asarray(tests.effective_diameter)[:, None] ** 2 / 4)
+    strain = np.asarray(tests.displacement) - np.asarray(tests.contact)[:, None]
+    strain = np.abs(strain) / np.asarray(tests.effective_diameter)[:, None]
+    top = np.where(mask, stress, 0.0).max(1)
+    deepest = np.where(mask, strain, 0.0).max(1)
+    names = [repr(campaign.particles[i]) for i in selection.kept]
+    most = int(np.argmax(top))
+    deep = int(np.argmax(deepest))
+    return InputError(
+        "the law cannot be fitted to these tests: their numbers overflow; the largest stress is "
+        f"{top[most]:.3g} MPa (particle {names[most]}), the largest displacement {deepest[deep]:.3g} times the size "
+        f"(particle {names[deep]})",
+        file=campaign.source or None,
+        remedy="Check the units of force, displacement and diameters, or leave that particle out.",
+    )
 
 
 def fit_joint(

@@ -15,9 +15,9 @@ from ...campaign import THRESHOLD_MPA, Campaign, Finding, check_tests
 from .._result import estimate, finite, force_zero, misfit_note
 from ..judgement import judged, numbers_in_reach, unlike_others
 from ._arrow import Parameters, Solution
-from ._bayes import log_estimate
+from ._bayes import log_estimate, power_of_e
 from ._data import Selection, Tests, own_misfit, ranges_um
-from ._fit import population_at, prepare
+from ._fit import beyond_numbers, population_at, prepare
 from ._mode import FIRST_SPREAD, spread_slope
 from ._model import JointFit, JointModel
 from ._pooled import Pooled, fit_pooled, unpack
@@ -97,6 +97,13 @@ class LeastSquaresCalibration:
         """Why the fit must not be called converged; empty if it is."""
         if not bool(self.solution.converged):
             return f"the optimiser did not meet its tolerances within {int(self.solution.steps)} steps"
+        inside_out = np.flatnonzero(~(self._shape_factor > 0))
+        if len(inside_out):
+            return (
+                f"a = {float(self.solution.value.shared[0]):.3g} leaves particle {self.particles[inside_out[0]]!r} "
+                "without a positive shape factor: the curves do not come together under it; "
+                "check the units and the signs of the columns, and the diameters"
+            )
         for name, fine in zip(("the noise", "the spread of the particles"), self.fit.converged[1:], strict=True):
             if not fine:
                 return f"the optimiser for {name} did not meet its tolerances"
@@ -139,9 +146,10 @@ class LeastSquaresCalibration:
         sds = np.sqrt(np.diagonal(shared))
         known = [not (free and self._open_share(q) > 0.1) for q in range(5)]
         a = float(values[0])
-        flat = np.asarray(tests.flatness)
-        eta = 1 + a * flat
+        flat, eta = np.asarray(tests.flatness), self._shape_factor
         slope = flat / eta
+        # Where it is not positive, which the reason says, there is no logarithm, and no coefficient without it.
+        log_eta = np.log(np.where(eta > 0, eta, np.nan))
         rms = self.rms_um()
         position = {i: row for row, i in enumerate(self.selection.kept)}
         entries = []
@@ -153,12 +161,12 @@ class LeastSquaresCalibration:
                 found["eta_p"] = _normal(float(eta[row]), float(spread)) if known[0] else estimate(float(eta[row]))
                 for j, coefficient in enumerate(COEFFICIENTS):
                     variance = own[row, j, j] - 2 * slope[row] * between[row, j, 0] + slope[row] ** 2 * shared[0, 0]
-                    log = float(latent[row, j] - np.log(eta[row]))
+                    log = float(latent[row, j] - log_eta[row])
                     found[coefficient] = log_estimate(log, float(np.sqrt(max(variance, 0.0))) if known[0] else np.nan)
                 found["zero_um"] = _normal(float(zero[row]), float(np.sqrt(own[row, 3, 3])))
                 if self.model.modulus_scatter:
-                    log_modulus = float(latent[row, 3] - self.model.shape_power * np.log(eta[row]))
-                    found["effective_modulus_MPa"] = estimate(float(np.exp(log_modulus)))
+                    log_modulus = float(latent[row, 3] - self.model.shape_power * log_eta[row])
+                    found["effective_modulus_MPa"] = estimate(power_of_e(log_modulus))
             entries.append(
                 {
                     "particle": name,
@@ -196,7 +204,7 @@ class LeastSquaresCalibration:
                 for j, name in enumerate(COEFFICIENTS)
             },
             # The scatter of C1 is part of its mean.
-            "yield_stress_MPa": estimate(None if self._alone else float(np.exp(values[2] + tau[0] ** 2 / 2) / 17.16)),
+            "yield_stress_MPa": estimate(None if self._alone else power_of_e(values[2] + tau[0] ** 2 / 2) / 17.16),
             "noise": {
                 name: log_estimate(m, s) if np.isfinite(m) else estimate(0.0)
                 for name, m, s in zip(numbers, logs, log_sds, strict=True)
@@ -232,6 +240,11 @@ class LeastSquaresCalibration:
         """Root mean square residual of every particle [um], shape (N,)."""
         count = np.maximum(np.asarray(self.selection.tests.mask).sum(1), 1)
         return np.sqrt((np.asarray(self.residual()) ** 2).sum(1) / count)
+
+    @property
+    def _shape_factor(self) -> np.ndarray:
+        """eta_p of the particles that took part, shape (N,)."""
+        return 1 + float(self.solution.value.shared[0]) * np.asarray(self.selection.tests.flatness)
 
     @property
     def _alone(self) -> bool:
@@ -336,6 +349,8 @@ def calibrate_least_squares(
         found = [solve(fit, settings, tests, a, mu, log_modulus) for a in starts]
         losses = np.array([float(one.loss) for one in found])
         losses[~np.isfinite(losses)] = np.inf
+        if np.isinf(losses).all():
+            raise beyond_numbers(campaign, selection)
     count = len(selection.kept)
     fit, best = fit.first(count), found[int(np.argmin(losses))].first(count)
     settings = replace(settings, whitening=fit.filters)

@@ -229,9 +229,15 @@ def most_probable(start: Float[Array, " d"], target: Target) -> tuple[Float[Arra
     """Mode of the population in unbounded coordinates, covariance there, and whether the optimiser converged.
 
     Newton's method in a trust region (SciPy), in coordinates scaled by the curvature at the start. The curvature comes
-    from differences of exact gradients, which are quicker than second derivatives are to compile.
+    from differences of exact gradients, which are quicker than second derivatives are to compile. Where the density has
+    no curvature that is a number, even at the start, the covariance is not one either.
     """
-    origin = np.asarray(start)
+    # Steps may lead to where numbers overflow; they are refused.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _most_probable(np.asarray(start), target)
+
+
+def _most_probable(origin: np.ndarray, target: Target) -> tuple[Float[Array, " d"], Float[Array, "d d"], bool]:
     d = len(origin)
     width = np.full(d, 1e-5)
 
@@ -244,6 +250,8 @@ def most_probable(start: Float[Array, " d"], target: Target) -> tuple[Float[Arra
 
     # Where data are very exact the scales at the start are far from those at the mode: then once more from there.
     success = False
+    if not all(np.isfinite(part).all() for part in expand(origin)):
+        return jnp.asarray(origin), jnp.asarray(np.full((d, d), np.nan)), False
     for _ in range(ATTEMPTS):
         unit = 1 / np.sqrt(np.maximum(np.abs(np.diagonal(expand(origin)[2])), 1e-8))
         width = 1e-3 * np.minimum(unit, 1.0)

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..._types import Path, Scalar
+from .._predict import READING_UM
 from ._blocks import Blocks, Parts
 from ._compile import compiled
 from ._small import Cholesky
@@ -59,11 +60,6 @@ class Noise(eqx.Module):
         """From the logarithms of the four numbers."""
         displacement, force, correlated, length = jnp.exp(logs)
         return cls(displacement, force, correlated, length, scale)
-
-
-READING_UM = 2e-4
-"""What no record of displacement is better than [um]: counted as misfit at every point, so that the noise of a record
-without any, of a simulation say, is small but not nothing."""
 
 
 class Whitening(eqx.Module):
@@ -300,6 +296,8 @@ def estimate_noise(
         (value_and_gradient(found.x + width * e)[1] - value_and_gradient(found.x - width * e)[1]) / (2 * width)
         for e in np.eye(4)
     ]
+    if not np.isfinite(columns).all():
+        return noise, jnp.asarray(np.full(4, np.nan)), False
     values, vectors = np.linalg.eigh((np.array(columns) + np.array(columns).T) / 2)
     sd = np.sqrt(np.sum(vectors**2 / np.maximum(values, 1e-6), axis=1))
     return noise, jnp.asarray(sd), bool(found.success)

@@ -1,0 +1,202 @@
+"""What one test shows whatever its units and signs: peak, unloading slope, fullness of the loading curve."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ._segments import Segment
+
+
+@dataclass(frozen=True)
+class FeatureOptions:
+    """Where a test's features are read.
+
+    Attributes:
+        contact: share of the peak force at which contact counts as made. Low, because soft particles deform much under
+            little force: cellulose takes a quarter of its displacement below 3 % of its force.
+        contact_noise: the same in standard deviations of the force's noise, where that is more.
+        unloading: shares of the peak force between which unloading is taken as a line. Below one half, the unloading of
+            a plastic contact bends (Oliver and Pharr 1992); above nine tenths it still creeps.
+        least_retreat: share of the displacement that must be given back for the lost work to count.
+        correlation: the least correlation of force and displacement from contact to peak, over forces not reached
+            before; a record of the tester's idling has less, loading of any material more than 0.8.
+        most_samples: longer records are thinned to this many samples, enough for features of a curve's size.
+    """
+
+    contact: float = 0.005
+    contact_noise: float = 4.0
+    unloading: tuple[float, float] = (0.9, 0.5)
+    least_retreat: float = 0.2
+    correlation: float = 0.6
+    most_samples: int = 4000
+
+
+@dataclass(frozen=True)
+class CurveFeatures:
+    """One test with forces and displacements counted positive in compression; NaN where it does not show a feature.
+
+    Attributes:
+        force_sign: -1 where the forces are negative in compression, else 1.
+        displacement_sign: -1 where the displacements fall as the load rises, else 1.
+        force_mN: the largest force [mN].
+        displacement_um: displacement from contact to there [um].
+        slope_mN_per_um: slope at the beginning of unloading [mN/um].
+        fullness: area below the loading curve as a share of the box of its peak [-], 1 / (1 + n) for a power n of the
+            displacement; above one half where stiffness falls.
+        loss: share of the work of loading that unloading does not give back [-]; negative where more came back.
+        loading_s: time from a tenth to nine tenths of the peak force [s].
+        interval_s: median time between two samples [s].
+    """
+
+    force_sign: int
+    displacement_sign: int
+    force_mN: float
+    displacement_um: float
+    slope_mN_per_um: float
+    fullness: float
+    loss: float
+    loading_s: float
+    interval_s: float
+
+
+def curve_features(
+    time_s: np.ndarray,
+    force_mN: np.ndarray,
+    displacement_um: np.ndarray,
+    *,
+    segments: Sequence[Segment] = (),
+    options: FeatureOptions | None = None,
+) -> CurveFeatures | None:
+    """The features of one test.
+
+    Args:
+        time_s: time [s], shape (n,).
+        force_mN: force [mN], shape (n,).
+        displacement_um: displacement [um], shape (n,).
+        segments: what `find_segments` gave, if it is known; the end of an approach is then taken from there, unless
+            forces turn out negative.
+        options: where features are read.
+
+    Returns:
+        The features, or None for a record that shows no loading or holds values that are not finite.
+    """
+    options = options or FeatureOptions()
+    step = -(-len(time_s) // options.most_samples)
+    time, force, displacement = (np.asarray(v, float)[::step] for v in (time_s, force_mN, displacement_um))
+    if len(time) < 2 or not all(np.isfinite(v).all() for v in (time, force, displacement)):
+        return None
+    force, displacement = _without_spikes(force), _without_spikes(displacement)
+    with np.errstate(all="ignore"):
+        force_sign, rise = _compression_positive(force)
+        peak = int(np.argmax(rise))
+        if not (np.isfinite(rise[peak]) and rise[peak] > 0):
+            return None
+        begins_at_peak = peak < 0.05 * len(rise)
+        contact, base = (0, 0.0) if begins_at_peak else _contact(rise[: peak + 1], options)
+        if segments and segments[0].kind == "approach" and force_sign > 0 and not begins_at_peak:
+            contact = min(segments[0].stop // step, peak)
+        load = rise - base
+        part = slice(peak, None) if begins_at_peak else slice(contact, peak + 1)
+        together = _correlation(load[part], displacement[part])
+        if abs(together) < options.correlation:
+            return None
+        displacement_sign = 1 if together > 0 else -1
+        depth = displacement_sign * displacement
+        return _measure(time, load, depth, contact, peak, begins_at_peak, (force_sign, displacement_sign), options)
+
+
+def _measure(
+    time: np.ndarray,
+    load: np.ndarray,
+    depth: np.ndarray,
+    contact: int,
+    peak: int,
+    begins_at_peak: bool,
+    signs: tuple[int, int],
+    options: FeatureOptions,
+) -> CurveFeatures:
+    height = float(load[peak])
+    way = float(abs(depth[peak]) if begins_at_peak else depth[peak] - depth[contact])
+    fullness = loading_s = loss = np.nan
+    rows = slice(contact, peak + 1)
+    if not begins_at_peak and way > 0:
+        fullness = float(np.trapezoid(load[rows], depth[rows])) / (height * way)
+        first, last = (contact + int(np.argmax(load[rows] >= share * height)) for share in (0.1, 0.9))
+        loading_s = float(time[last] - time[first])
+        if depth[peak] - depth[peak:].min() > options.least_retreat * way and fullness > 0:
+            loss = 1 + float(np.trapezoid(load[peak:], depth[peak:])) / (fullness * height * way)
+    return CurveFeatures(
+        *signs,
+        force_mN=height,
+        displacement_um=way if way > 0 else np.nan,
+        slope_mN_per_um=_unloading_slope(load[peak:], depth[peak:], options),
+        fullness=fullness,
+        loss=loss,
+        loading_s=loading_s,
+        interval_s=float(np.median(np.diff(time))),
+    )
+
+
+def _without_spikes(values: np.ndarray) -> np.ndarray:
+    """Running median of five, so that one wild reading is no peak."""
+    if len(values) < 9:
+        return values
+    out = values.copy()
+    out[2:-2] = np.median(np.stack([values[i : len(values) - 4 + i] for i in range(5)]), axis=0)
+    out[:2], out[-2:] = np.median(values[:5]), np.median(values[-5:])
+    return out
+
+
+def _noise(values: np.ndarray) -> float:
+    """Standard deviation of white noise on a smooth course."""
+    if len(values) < 8:
+        return 0.0
+    # Second differences of white noise of deviation 1 have variance 1 + 4 + 1.
+    return 1.4826 * float(np.median(np.abs(np.diff(values, 2)))) / np.sqrt(6.0)
+
+
+def _compression_positive(force: np.ndarray) -> tuple[int, np.ndarray]:
+    """The sign of compression, and forces that count positive in it; zeros where the record shows no loading."""
+    low, high = float(force.min()), float(force.max())
+    if min(abs(low), abs(high)) > 0.5 * (high - low) and low * high > 0:
+        # Far from zero all the time: a large offset, or the tester idles under a preload.
+        return 1, np.zeros_like(force)
+    sign = 1 if high >= -low else -1
+    return sign, sign * force
+
+
+def _contact(rise: np.ndarray, options: FeatureOptions) -> tuple[int, float]:
+    """The last sample before the force rises for good, and the force there."""
+    noise = _noise(rise)
+    base = float(rise.min()) + 2 * noise  # the least of some hundred readings lies about two deviations below
+    level = max(options.contact * (float(rise[-1]) - base), options.contact_noise * noise)
+    below = np.flatnonzero(rise <= base + level)
+    return (int(below[-1]) if len(below) and below[-1] < len(rise) - 1 else 0), base
+
+
+def _correlation(load: np.ndarray, depth: np.ndarray) -> float:
+    """Of the samples whose load was not reached before (or is not again, where the record only unloads)."""
+    if load[0] <= load[-1]:
+        virgin = load >= np.maximum.accumulate(load)
+        load, depth = load[virgin], depth[virgin]
+    if not (np.ptp(load) > 0 and np.ptp(depth) > 0):
+        return 0.0
+    a, b = (load - load.mean()) / np.ptp(load), (depth - depth.mean()) / np.ptp(depth)
+    return float((a @ b) / np.sqrt((a @ a) * (b @ b)))
+
+
+def _unloading_slope(load: np.ndarray, depth: np.ndarray, options: FeatureOptions) -> float:
+    """Slope of the first unloading; NaN where none is seen, or the displacement goes on as the force falls."""
+    begin, end = (share * load[0] for share in options.unloading)
+    if not (load < begin).any():
+        return np.nan
+    first = int(np.argmax(load < begin))
+    deep = np.flatnonzero(load[first:] < end)
+    last = first + int(deep[0] if len(deep) else np.argmin(load[first:]))
+    fall, back = float(load[first] - load[last]), float(depth[first] - depth[last])
+    if last - first < 3 or fall < 0.1 * load[0] or back <= 3 * _noise(depth):
+        return np.nan
+    return fall / back

@@ -1,0 +1,317 @@
+"""Slips of unit, sign and column are named; honest campaigns of many solids are not accused."""
+
+import re
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers import SHARED
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mcc_jax.campaign import (
+    PAPER_DIAMETERS_UM,
+    Campaign,
+    Curve,
+    campaign_segments,
+    check_plausibility,
+    read_tester_file,
+)
+
+PEBBLES, TESTERS = SHARED / "data" / "pebbles", SHARED / "data" / "testers"
+
+
+def campaign(diameters, curves):
+    names = tuple(f"P{i + 1}" for i in range(len(curves)))
+    return Campaign(names, np.asarray(diameters, float), tuple(Curve(*curve) for curve in curves))
+
+
+def press(diameters, modulus_MPa, hardness_MPa, strain, *, unloads=True, seconds=60.0, samples=300):
+    """A sphere that is Hertz's at first and has a constant pressure in its contact later, unloaded elastically."""
+    D1, D2, D3 = diameters
+    diameter = D1 * D2 / D3
+    radius, way = diameter / 2, np.linspace(0, strain * diameter, samples)
+    elastic = 4 / 3 * modulus_MPa * 1e-3 * np.sqrt(radius) * (way[1:] / 2) ** 1.5
+    plastic = hardness_MPa * 1e-3 * np.pi * radius * way[1:]
+    force = np.concatenate([[0.0], (elastic**-3 + plastic**-3) ** (-1 / 3)])
+    if unloads:
+        back = min(1.5 * force[-1] / (modulus_MPa * 1e-3 * np.sqrt(radius * way[-1])), way[-1])
+        share = np.linspace(1, 0, samples // 2)[1:]
+        way, force = np.append(way, way[-1] - back * (1 - share)), np.append(force, force[-1] * share**1.5)
+    return np.linspace(0, seconds, len(way)), force, way
+
+
+def noisy(curve, rng, share=1e-3):
+    time_s, force, way = curve
+    return (
+        time_s,
+        force + share * force.max() * rng.standard_normal(len(force)),
+        way + share * way.max() * rng.standard_normal(len(way)),
+    )
+
+
+def cellulose(seed=0, count=20, *, unloads=True, stress_MPa=(7.0, 16.0)):
+    """The paper's particles under its mean law (eqs. 13 and 16), with a modulus of about 2 GPa in unloading."""
+    rng = np.random.default_rng(seed)
+    diameters = PAPER_DIAMETERS_UM[rng.permutation(20)[:count]]
+    curves = []
+    for D1, D2, D3 in diameters:
+        diameter, eta = D1 * D2 / D3, 1 + 1.43 * (1 - D3**2 / (D1 * D2))
+        x = np.linspace(0, 1.0, 2000)
+        stress = np.exp(0.2 * rng.standard_normal()) * (7.0 * x - 27.2 * x**3 + 144 * x**5)
+        stop = np.argmax(np.maximum.accumulate(stress) > rng.uniform(*stress_MPa))
+        kept = np.linspace(0, stop, 200).astype(int)
+        force, way = stress[kept] * np.pi * diameter**2 / 4 * 1e-3, x[kept] / eta * diameter
+        if unloads:
+            share = np.linspace(1, 0, 100)[1:]
+            way = np.append(way, way[-1] * (1 - 0.06 * (1 - share)))
+            force = np.append(force, force[-1] * share**1.5)
+        curves.append(noisy((np.linspace(0, 300, len(way)), force, way), rng))
+    return campaign(diameters, curves)
+
+
+def ceramic(seed=0, count=12, *, unloads=True, modulus_MPa=1e5, force_mN=(1e4, 1e5), diameter_um=1000.0):
+    """Elastic spheres of about one size, loaded to 10 to 100 N."""
+    rng = np.random.default_rng(seed)
+    diameters, curves = [], []
+    for _ in range(count):
+        size = diameter_um * np.exp(0.1 * rng.standard_normal()) * np.ones(3)
+        peak = np.exp(rng.uniform(*np.log(force_mN)))
+        own = modulus_MPa * np.exp(0.2 * rng.standard_normal())
+        strain = 2 * (0.75 * peak / (own * 1e-3 * np.sqrt(size[0] / 2))) ** (2 / 3) / size[0]
+        diameters.append(size)
+        curves.append(noisy(press(size, own, 0.1 * own, strain, unloads=unloads), rng))
+    return campaign(diameters, curves)
+
+
+def slip(
+    tests, *, force=1.0, displacement=1.0, seconds=1.0, diameters=(1.0, 1.0, 1.0), swap=False, order=(0, 1, 2), row=None
+):
+    """The campaign with a mistake, in all rows or in one."""
+    curves, sizes = list(tests.curves), tests.diameters_um.copy()
+    for i, curve in enumerate(tests.curves):
+        if row is not None and i != row:
+            continue
+        F, way = force * curve.force_mN, displacement * curve.displacement_um
+        curves[i] = Curve(seconds * curve.time_s, *((way, F) if swap else (F, way)))
+        sizes[i] = (sizes[i] * diameters)[list(order)]
+    return replace(tests, curves=tuple(curves), diameters_um=sizes)
+
+
+SLIPS = {
+    "uN as mN": ({"force": 1e3}, "The forces seem 1000 times too large", "force_uN"),
+    "N as mN": ({"force": 1e-3}, "The forces seem 1000 times too small", "force_N"),
+    "nm as um": ({"displacement": 1e3}, "The displacements seem 1000 times too large", "displacement_nm"),
+    "mm as um": ({"displacement": 1e-3}, "The displacements seem 1000 times too small", "displacement_mm"),
+    "diameters in mm": ({"diameters": (1e-3,) * 3}, "The diameters seem 1000 times too small", "D1_mm, D2_mm, D3_mm"),
+    "diameters in nm": ({"diameters": (1e3,) * 3}, "The diameters seem 1000 times too large", "D1_nm, D2_nm, D3_nm"),
+    "D3 in mm": ({"diameters": (1, 1, 1e-3)}, "The diameters D3 seem 1000 times too small", "D3_mm"),
+    "N and mm": (
+        {"force": 1e-3, "displacement": 1e-3, "diameters": (1e-3,) * 3},
+        "The forces seem 1000 times too small.*displacements.*diameters",
+        "force_N.*displacement_mm.*D1_mm",
+    ),
+    "swapped": ({"swap": True}, "Force and displacement seem to be swapped", "Exchange"),
+    "forces negated": ({"force": -1}, "The forces of all tests seem to have the wrong sign", "sign = -1 for force"),
+    "displacements negated": (
+        {"displacement": -1},
+        "The displacements of all tests .* wrong sign",
+        "-1 for displacement",
+    ),
+    "both negated": (
+        {"force": -1, "displacement": -1},
+        "The forces and displacements of .* wrong sign",
+        "force and disp",
+    ),
+    "times in ms": ({"seconds": 1e3}, "The times seem 1000 times too large", "time_ms"),
+}
+EACH_SLIP = pytest.mark.parametrize("kind", SLIPS)
+CAMPAIGNS = {
+    "cellulose": cellulose,
+    "cellulose, loading only": lambda seed: cellulose(seed, unloads=False),
+    "ceramic": ceramic,
+    "ceramic, loading only": lambda seed: ceramic(seed, unloads=False),
+    "small ceramic": lambda seed: ceramic(seed, diameter_um=60.0, force_mN=(30.0, 300.0), modulus_MPa=2e5),
+    "one ceramic sphere": lambda seed: ceramic(seed, count=1),
+    "one particle of cellulose": lambda seed: cellulose(seed, count=1),
+}
+
+
+def accusing(findings):
+    return [str(finding) for finding in findings if finding.level != "told"]
+
+
+def says(findings, kind):
+    _, sentence, remedy = SLIPS[kind]
+    first = findings[0]
+    return first.level == "bad" and re.match(sentence, first.sentence) and re.search(remedy, first.remedy)
+
+
+@pytest.mark.parametrize("name", CAMPAIGNS)
+def test_no_slip_no_accusation(name):
+    for seed in range(10):
+        assert not accusing(check_plausibility(CAMPAIGNS[name](seed)))
+
+
+@EACH_SLIP
+@pytest.mark.parametrize("name", CAMPAIGNS)
+def test_a_slip_is_named_with_its_column(name, kind):
+    for seed in range(4):
+        findings = check_plausibility(slip(CAMPAIGNS[name](seed), **SLIPS[kind][0]))
+        assert len(findings) == 1, [str(finding) for finding in findings]
+        assert says(findings, kind), str(findings[0])
+        assert findings[0].particles == ()
+        assert " or the " not in findings[0].sentence  # one slip only
+
+
+@pytest.mark.parametrize("kind", [k for k in SLIPS if k != "times in ms"])
+@pytest.mark.parametrize("make", [cellulose, ceramic])
+def test_a_slip_in_one_row_names_the_particle(make, kind):
+    findings = check_plausibility(slip(make(3), row=5, **SLIPS[kind][0]))
+    assert [finding.particles for finding in findings] == [("P6",)]
+    assert re.match(SLIPS[kind][1].replace("all tests", "particle P6"), findings[0].sentence)
+
+
+@pytest.mark.parametrize("stress", [(4.0, 7.0), (7.0, 16.0)])
+def test_radii_show_where_the_platens_would_have_touched(stress):
+    for seed in range(4):
+        findings = check_plausibility(slip(cellulose(seed, stress_MPa=stress), diameters=(0.5,) * 3))
+        assert findings[0].sentence.startswith("The diameters seem to be radii")
+        assert "twice" in findings[0].remedy
+
+
+def test_radii_of_hard_spheres_cannot_show():
+    """Half the size with 1.4 times the modulus is another honest sphere; nothing in the record contradicts it."""
+    assert not accusing(check_plausibility(slip(ceramic(), diameters=(0.5,) * 3)))
+
+
+@pytest.mark.parametrize(("order", "swapped"), [((2, 1, 0), "D1 and D3"), ((0, 2, 1), "D2 and D3")])
+def test_a_diameter_in_the_place_of_d3(order, swapped):
+    findings = check_plausibility(slip(cellulose(), order=order))
+    assert [finding.sentence[:39] for finding in findings] == [f"The diameters {swapped} seem to be swap"]
+
+
+def test_some_tests_of_another_tester_are_listed():
+    good, wrong = cellulose(1), slip(cellulose(1), force=1e3)
+    mixed = replace(good, curves=(*wrong.curves[:8], *good.curves[8:]))
+    (finding,) = check_plausibility(mixed)
+    assert finding.sentence.startswith("The forces seem 1000 times too large")
+    assert finding.particles == good.particles[:8]
+
+
+def test_sign_and_unit_are_both_said():
+    first, second = check_plausibility(slip(ceramic(), force=-1e3))
+    assert "wrong sign" in first.sentence
+    assert "1000 times too large" in second.sentence
+
+
+def test_another_material_is_told_without_accusing_units():
+    (finding,) = check_plausibility(ceramic())
+    assert finding.level == "told"
+    assert not re.search("unit|slip|wrong", str(finding))
+    assert not check_plausibility(cellulose())
+
+
+@pytest.mark.parametrize("modulus", [1.6e10, 1e-3, 0.0, -5.0, np.nan, np.inf])
+def test_a_fitted_modulus_of_no_solid_is_said(modulus):
+    assert [f.level for f in check_plausibility(cellulose(), modulus_MPa=modulus)] == ["bad"]
+    assert check_plausibility(cellulose(), modulus_MPa=16e3) == ()
+
+
+SOLIDS = st.one_of(  # modulus [MPa], hardness / modulus, strain at the peak
+    st.tuples(st.floats(6e2, 1e4), st.floats(0.02, 0.1), st.floats(0.035, 0.4)),
+    st.tuples(st.floats(6e2, 3e4), st.floats(0.006, 0.05), st.floats(0.035, 0.4)),
+    st.tuples(st.floats(2e4, 5e5), st.floats(0.04, 0.08), st.floats(0.002, 0.05)),
+    st.tuples(st.floats(1.5e4, 3e5), st.floats(0.003, 0.015), st.floats(0.003, 0.4)),
+)
+
+
+@settings(max_examples=150)
+@given(
+    SOLIDS,
+    st.floats(20, 5000),
+    st.floats(0.75, 1),
+    st.integers(1, 8),
+    st.booleans(),
+    st.floats(1, 3000),
+    st.integers(0, 99),
+)
+def test_honest_solids_of_many_kinds_and_sizes(solid, size, flatness, count, unloads, seconds, seed):
+    modulus, ratio, strain = solid
+    rng = np.random.default_rng(seed)
+    diameters, curves = [], []
+    for _ in range(count):
+        own = size * np.exp(0.1 * rng.standard_normal()) * np.array([1, 1, flatness])
+        diameters.append(own)
+        curve = press(own, modulus, modulus * ratio, strain, unloads=unloads, seconds=seconds)
+        curves.append(noisy(curve, rng))
+    assert not accusing(check_plausibility(campaign(diameters, curves)))
+
+
+NUMBERS = st.one_of(st.floats(-1e15, 1e15), st.sampled_from([0.0, 1e300, -1e300, 1e-300, np.nan, np.inf, -np.inf]))
+
+
+@settings(max_examples=200)
+@given(st.integers(2, 30), st.integers(1, 5), st.data())
+def test_nothing_makes_it_fail(samples, count, data):
+    draw = lambda: np.array(data.draw(st.lists(NUMBERS, min_size=samples, max_size=samples)))  # noqa: E731
+    curves = [(np.arange(samples) * 1.0, draw(), draw()) for _ in range(count)]
+    sizes = np.array(data.draw(st.lists(NUMBERS, min_size=3 * count, max_size=3 * count))).reshape(count, 3)
+    for finding in check_plausibility(campaign(sizes, curves)):
+        assert "nan" not in str(finding)
+        assert not finding.sentence.endswith(".")
+
+
+def test_it_takes_no_time():
+    tests = cellulose()
+    segments = campaign_segments(tests)
+    best = np.inf
+    for _ in range(5):
+        begin = time.process_time()
+        assert check_plausibility(tests, segments=segments) == ()
+        best = min(best, time.process_time() - begin)
+    assert best < 0.05
+
+
+# ---- measured records ------------------------------------------------------------------------------------------
+
+
+def read_pebble(file):
+    """Diameter [mm], and travel [mm] and force [N] of one record; None for a record without a diameter."""
+    diameter, rows = None, []
+    for line in file.read_text(encoding="latin-1").splitlines():
+        cells = [cell.strip(' "') for cell in line.split("\t" if "\t" in line else ",")]
+        if cells[0] == "Gage length":
+            diameter = float(cells[1].replace(",", "."))
+        elif len(cells) == 2 and re.match(r"-?[\d.,]+(e[-+]\d+)?$", cells[0]):
+            rows.append([float(cell.replace(",", ".")) for cell in cells])
+    return None if diameter is None or len(rows) < 10 else (diameter, np.array(rows))
+
+
+@pytest.mark.skipif(not PEBBLES.is_dir(), reason="needs the measured pebbles beside the checkout")
+@pytest.mark.parametrize(
+    "folder", ["FZK_RT", "IPR_1mm", "IPR_batch3", "NFRI_1.5mm_RT", "NFRI_1mm_0.05mms", "NFRI_1mm_0.1mms"]
+)
+def test_measured_pebbles_are_not_accused_and_their_slips_are_named(folder):
+    read = [read_pebble(file) for file in sorted((PEBBLES / folder).glob("*.TXT"))]
+    read = [one for one in read if one is not None]
+    tests = campaign(
+        [[1e3 * diameter] * 3 for diameter, _ in read],
+        [(1e-3 * np.arange(len(rows)), 1e3 * rows[:, 1], 1e3 * rows[:, 0]) for _, rows in read],
+    )
+    assert not accusing(check_plausibility(tests))
+    for i in range(len(tests)):
+        assert not accusing(check_plausibility(tests.select(np.arange(len(tests)) == i)))
+    for kind in ("uN as mN", "N as mN", "nm as um", "mm as um", "diameters in mm", "swapped"):
+        assert says(check_plausibility(slip(tests, **SLIPS[kind][0])), kind)
+
+
+@pytest.mark.skipif(not TESTERS.is_dir(), reason="needs the measured indentations beside the checkout")
+@pytest.mark.parametrize("name", ["Exp-50mN_0000.hld", "FS1.txt", "RobinSteel0000LC.txt", "multipleIndentations.zip"])
+@pytest.mark.parametrize("size", [(200.0, 190.0, 180.0), (100.0, 100.0, 100.0)])
+def test_indentations_with_a_made_up_diameter_are_not_accused(name, size):
+    tests = read_tester_file(TESTERS / name, diameters_um=size)
+    assert not accusing(check_plausibility(tests))
+    for i in range(len(tests)):
+        assert not accusing(check_plausibility(tests.select(np.arange(len(tests)) == i)))
