@@ -15,10 +15,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BufferedReader
 from pathlib import Path
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from ._errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
 
 _KINDS = (
     (stat.S_ISDIR, "this is a folder where a file is expected", "Give a file"),
@@ -146,14 +148,18 @@ class _Lines:
         self.row, self.in_row, self.in_cell = 1, 0, 0  # the row at the end of what was seen, and how long it is so far
 
     def check(self, chunk: bytes) -> None:
+        import numpy as np  # here, since the command opens files before it needs any number
+
         data = np.frombuffer(chunk, np.uint8)
         ends = np.flatnonzero((data == ord("\n")) | (data == ord("\r")))
         self.in_row = self._longest(ends, len(data), self.in_row, self.limits.line_bytes, "row", ends)
-        breaks = np.flatnonzero(_BREAKS[data])
+        breaks = np.flatnonzero(np.isin(data, list(BREAKS)))
         self.in_cell = self._longest(breaks, len(data), self.in_cell, self.limits.cell_bytes, "cell", ends)
         self.row += chunk.count(b"\n") or chunk.count(b"\r")
 
     def _longest(self, at: np.ndarray, length: int, before: int, most: int, what: str, ends: np.ndarray) -> int:
+        import numpy as np
+
         lengths = np.diff(at, prepend=-1 - before, append=length) - 1
         if lengths.max() > most:
             where = int(np.searchsorted(ends, np.append(at, length)[int(np.argmax(lengths > most))]))
@@ -166,8 +172,8 @@ class _Lines:
         return int(lengths[-1])
 
 
-_BREAKS = np.zeros(256, bool)
-_BREAKS[list(b"\n\r,;\t| ")] = True
+BREAKS = b"\n\r,;\t| "
+"""What may end a cell."""
 
 
 def check_toml(text: str, file: str | Path, limits: FileLimits = LIMITS) -> None:

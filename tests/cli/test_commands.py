@@ -246,8 +246,9 @@ def test_convert_then_calibrate_says_that_the_law_does_not_fit(run, tmp_path):
     for kind in ("load", "hold", "unload", "reload"):
         assert f"{counts[kind]} {kind}" in text
     assert counts["unload"] == 80  # 8 cycles each
-    text = done(run("calibrate", tests, "--out", fit, "--method", "paper", "--no-figures"))
-    assert "describes these tests badly" in text
+    result = run("calibrate", tests, "--out", fit, "--method", "paper", "--no-figures")
+    assert result.exit_code == (0 if json.loads((fit / "calibration.json").read_text())["converged"] else 3)
+    assert "describes these tests badly" in result.stdout
     assert snapshot(fit).keys() == {"calibration.json"}
 
 

@@ -145,6 +145,7 @@ def test_from_raw_tests_to_the_page_by_the_papers_method(run, folder, tmp_path):
     assert told["settings"] == {
         "command": "calibrate",
         "method": "paper",
+        "leave_out": [],
         "threshold_MPa": 0.5,
         "objective": "full",
         "reference": None,
