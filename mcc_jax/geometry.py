@@ -7,6 +7,12 @@ import jax.numpy as jnp
 
 from ._numerics import compiled_whole, positive_pow, shared
 from ._types import Scalar, ScalarLike, Values, scalar
+from .arguments import instance, positive
+
+
+def _diameter(value: ScalarLike) -> Scalar:
+    positive(value, "a particle's diameter [um]")
+    return scalar(value)
 
 
 class Particle(eqx.Module):
@@ -22,14 +28,17 @@ class Particle(eqx.Module):
         D2: the other diameter in that plane [um], > 0.
         D3: diameter along the direction of compression [um], > 0.
 
+    Raises:
+        InputError: for a diameter that is not positive and finite, where it can be looked at: not inside `jax.jit`.
+
     References:
         Bommireddy et al. (2018), text below eq. 1; the paper's nomenclature calls D1 the major diameter, yet in its
         Table 1 D1 < D2 for 12 of 20 particles.
     """
 
-    D1: Scalar = eqx.field(converter=scalar)
-    D2: Scalar = eqx.field(converter=scalar)
-    D3: Scalar = eqx.field(converter=scalar)
+    D1: Scalar = eqx.field(converter=_diameter)
+    D2: Scalar = eqx.field(converter=_diameter)
+    D3: Scalar = eqx.field(converter=_diameter)
 
     @property
     def effective_diameter(self) -> Scalar:
