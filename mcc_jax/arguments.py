@@ -9,8 +9,9 @@ from __future__ import annotations
 import enum
 import math
 import numbers
+import os
 from collections.abc import Collection, Iterable
-from pathlib import PurePath
+from pathlib import Path, PurePath
 from typing import Any, cast
 
 import jax
@@ -78,14 +79,22 @@ def instance[T](value: Any, kind: type[T] | tuple[type[T], ...], name: str, reme
     raise InputError(f"{name} must be a {wanted}, got {kind_of(value)}", remedy=remedy)
 
 
+def is_number(value: Any) -> bool:
+    """Whether a value is one real number, finite or not, of Python, numpy or JAX; no truth value."""
+    if isinstance(value, bool | np.bool_ | str | bytes | None) or is_traced(value):
+        return False
+    array = _array_of(value)
+    return array is not None and array.ndim == 0 and array.dtype.kind in "iuf"
+
+
 def number(
     value: Any,
     name: str,
     *,
-    least: float = -math.inf,
-    above: float = -math.inf,
-    most: float = math.inf,
-    below: float = math.inf,
+    least: float | int = -math.inf,
+    above: float | int = -math.inf,
+    most: float | int = math.inf,
+    below: float | int = math.inf,
     infinite: bool = False,
 ) -> float:
     """A number, finite and within bounds, as a Python float.
@@ -109,11 +118,11 @@ def number(
         *([f"< {below:g}"] if below < math.inf else []),
     ]
     must = f"{name} must be a {'' if infinite else 'finite '}number{' ' if bounds else ''}{' and '.join(bounds)}"
-    array = None if isinstance(value, str | bytes | bool | np.bool_ | None) else _array_of(value)
-    if array is None or array.ndim or array.dtype.kind not in "iuf":
-        raise InputError(f"{must}, got {kind_of(value) if array is None else shown(value)}")
-    found = float(array)
-    if not (found >= least and found > above and found <= most and found < below) or math.isnan(found):
+    if not is_number(value):
+        raise InputError(f"{must}, got {shown(value)}")
+    found = float(value)
+    inside = least <= found <= most and (found > above or above == -math.inf) and (found < below or below == math.inf)
+    if not inside:
         raise InputError(f"{must}, got {found:g}")
     if math.isinf(found) and not infinite:
         raise InputError(f"{must}, got {found:g}")
@@ -257,6 +266,20 @@ def diameters(value: Any, name: str = "diameters_um") -> np.ndarray:
     return array
 
 
+def one_particle(value: Any, name: str = "diameters_um") -> np.ndarray:
+    """D1, D2, D3 [um] of one particle as an array of shape (3,), all positive and finite.
+
+    Raises:
+        InputError: if they are not.
+    """
+    array = floats(value, name, shape="D1, D2, D3 [um] of one particle")
+    if array.shape != (3,) or not (np.isfinite(array) & (array > 0)).all():
+        raise InputError(
+            f"{name}: a particle has three positive diameters D1, D2, D3 [um], got {shown(array.tolist())}"
+        )
+    return array
+
+
 def positive(value: Any, name: str, *, zero: bool = False, plain: bool = False) -> None:
     """Refuse a size that is not positive and finite, where it can be looked at.
 
@@ -286,3 +309,14 @@ def finite(value: Any, name: str) -> None:
     """
     if isinstance(value, int | float | np.number | np.ndarray) and not np.isfinite(value).all():
         raise InputError(f"{name} must be a finite number, got {shown(value)}")
+
+
+def file_path(value: Any, name: str) -> Path:
+    """The path of a file or folder.
+
+    Raises:
+        InputError: if it is neither text nor a path, or empty.
+    """
+    if not isinstance(value, str | os.PathLike) or not str(value):
+        raise InputError(f"{name} must be the path of a file or folder, got {kind_of(value)}")
+    return Path(value)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from ._numerics import compiled_whole, positive_pow, shared
 from ._types import Scalar, ScalarLike, Values, scalar
-from .arguments import instance, positive
+from .arguments import positive
 
 
 def _diameter(value: ScalarLike) -> Scalar:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
+from .. import arguments
 from .._errors import InputError
 from ._csv import CURVES, METADATA
 from ._curves import PARTICLES
@@ -16,9 +17,10 @@ def file_checksums(folder: str | Path) -> dict[str, str]:
     Raises:
         InputError: if a file cannot be read.
     """
+    path = arguments.file_path(folder, "folder")
     found = {}
     for name in (PARTICLES, CURVES, METADATA):
-        file = Path(folder) / name
+        file = path / name
         if not file.is_file():
             continue
         try:

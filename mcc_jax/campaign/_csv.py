@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .. import arguments
 from .._errors import InputError
 from ._columns import LENGTH, convert, find_column
 from ._curves import PARTICLES, CurveRows, name_column, read_curves
@@ -35,7 +36,7 @@ def read_campaign(folder: str | os.PathLike[str]) -> Campaign:
     Raises:
         InputError: if anything is missing, damaged or contradictory; it names file, row and column.
     """
-    path = Path(folder)
+    path = arguments.file_path(folder, "folder")
     check_folder(path)
     table = read_table(path / PARTICLES)
     names, diameters, columns = _parse_particles(table)
@@ -56,12 +57,13 @@ def read_campaign(folder: str | os.PathLike[str]) -> Campaign:
     return campaign
 
 
-def check_folder(path: Path) -> None:
+def check_folder(path: str | Path) -> None:
     """Whether a folder has the files of a campaign.
 
     Raises:
         InputError: saying what was expected and what is there.
     """
+    path = arguments.file_path(path, "path")
     expected = f"a campaign is a folder with {PARTICLES} and {CURVES}"
     try:
         if not path.exists():
@@ -102,7 +104,7 @@ def read_particles(file: str | Path) -> tuple[tuple[str, ...], np.ndarray, dict[
     Raises:
         InputError: naming file, row and column.
     """
-    return _parse_particles(read_table(Path(file)))
+    return _parse_particles(read_table(arguments.file_path(file, "file")))
 
 
 def _parse_particles(table: Table) -> tuple[tuple[str, ...], np.ndarray, dict[str, tuple[str, ...]]]:

@@ -13,6 +13,7 @@ from typing import Any, get_args
 
 import numpy as np
 
+from .. import arguments
 from .._errors import InputError
 from ._columns import FORCE, LENGTH, convert, find_column
 from ._schema import Control, Metadata
@@ -77,7 +78,7 @@ def load_toml_file(path: str | Path, what: str) -> dict[str, Any]:
     Raises:
         InputError: if it cannot be read, is no UTF-8 text, or is not TOML.
     """
-    file = Path(path)
+    file = arguments.file_path(path, "path")
     try:
         text = file.read_text(encoding="utf-8-sig")
     except OSError as error:

@@ -10,7 +10,7 @@ import numpy as np
 
 from .._errors import InputError
 from ._columns import LARGEST_MAGNITUDE
-from ._schema import Campaign
+from ._schema import Campaign, usable_campaign
 
 SMALLEST_DIAMETER_UM = 1e-6
 _TAKEN = ("particle", "D1_um", "D2_um", "D3_um")
@@ -56,6 +56,9 @@ def check_campaign(campaign: Campaign, *, file: str | Path) -> None:
     Raises:
         InputError: if names, shapes or values are unfit.
     """
+
+    if not isinstance(campaign, Campaign):
+        usable_campaign(campaign)
 
     def fail(problem: str, remedy: str = "Mend the campaign before it is used") -> InputError:
         return InputError(problem, file=file, remedy=remedy)

@@ -12,8 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ... import arguments
 from ..._errors import InputError
 from ...campaign import THRESHOLD_MPA, Campaign, Curve, Segment, campaign_segments, particle_batch, stress_and_strain
+from ...campaign._schema import usable_campaign
 from ...geometry import Particle
 from .._elastic import LEAST_RATIO
 from .._predict import point_noise_um
@@ -130,11 +132,11 @@ def select_tests(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, mo
 
     Raises:
         InputError: if no particle can be used.
-        ValueError: for a threshold that is negative or not finite.
+        InputError: for a threshold that is negative or not finite.
         RuntimeError: in single precision.
     """
-    if not (np.isfinite(threshold_MPa) and threshold_MPa >= 0):
-        raise ValueError(f"the threshold must be a stress >= 0 MPa, got {threshold_MPa}")
+    usable_campaign(campaign)
+    threshold_MPa = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
     if not jax.config.read("jax_enable_x64"):
         raise RuntimeError(
             "the joint calibration needs double precision; "

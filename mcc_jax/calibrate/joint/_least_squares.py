@@ -5,20 +5,22 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ... import arguments
 from ...campaign import THRESHOLD_MPA, Campaign
+from ...campaign._schema import usable_campaign
 from .._result import estimate, finite, misfit_note
 from ._arrow import Parameters, Solution
 from ._bayes import log_estimate
 from ._data import Selection, Tests, own_misfit
 from ._fit import population_at, prepare
 from ._mode import FIRST_SPREAD, spread_slope
-from ._model import JointFit, JointModel
+from ._model import JointFit, JointModel, checked_settings
 from ._pooled import Pooled, fit_pooled, unpack
 from ._population import COEFFICIENTS
 
@@ -296,11 +298,13 @@ def calibrate_least_squares(
         progress: called with the name of each step.
 
     Raises:
-        InputError: if no particle can be used.
+        InputError: if no particle can be used; for an argument of the wrong kind or out of its range.
     """
     started = time.perf_counter()
-    tell = progress or (lambda _: None)
-    model = model or JointModel()
+    usable_campaign(campaign)
+    tell, model, threshold_MPa = checked_settings(progress, model, threshold_MPa, block)
+    seed = arguments.seed(seed)
+    arguments.choice(loss, get_args(Loss), "loss")
     selection, tests, fit, _ = prepare(
         campaign, model, threshold_MPa, block=block, tell=tell, correlated=loss == "linear", rounds=1
     )

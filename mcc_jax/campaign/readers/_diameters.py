@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ... import arguments
 from ..._errors import InputError
 from .._csv import read_particles
 from .._table import parse_number
@@ -31,6 +32,8 @@ def read_diameters(text: str | os.PathLike[str]) -> Diameters:
     Raises:
         InputError: if it is neither, or a diameter is not positive.
     """
+    if not isinstance(text, str):
+        text = arguments.file_path(text, "diameters")
     parts = str(text).split(",")
     if len(parts) == 3 and not _is_file(Path(text)):
         try:
@@ -60,6 +63,7 @@ def check_triple(triple: Triple, what: str, file: str | Path) -> None:
         values = np.asarray(triple, float)
     except (OverflowError, TypeError, ValueError):
         values = np.empty(0)
+        triple = triple if isinstance(triple, list | tuple) else [triple]
     if values.shape != (3,) or not ((values >= SMALLEST_DIAMETER_UM) & (values < 1e15)).all():
         raise InputError(
             f"the diameters of {what} are {list(triple)}, where three positive lengths in um are expected",

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
+from ... import arguments
 from .._schema import Campaign, Metadata
 from .._table import read_bytes
 from .._validate import check_campaign
@@ -37,7 +37,7 @@ def read_tester_file(
     Raises:
         InputError: if the file is unknown or damaged, or diameters are missing.
     """
-    file = Path(path)
+    file = arguments.file_path(path, "path")
     data = read_bytes(file)
     if mapping is None:
         tests = read_known(data, file)
