@@ -5,8 +5,8 @@ from __future__ import annotations
 import optimistix as optx
 
 _NO_THROW = (
-    "In a model of your own (jit, NUTS, a solver) pass throw=False: a proposal then only gets a likelihood of NaN, which "
-    "is rejected, and `result` says why."
+    "In a model of your own (jit, NUTS, a solver) pass throw=False: such a proposal then only gets a likelihood of NaN, "
+    "which is rejected, and `result` says why."
 )
 
 

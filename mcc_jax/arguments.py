@@ -17,6 +17,7 @@ from typing import Any, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from ._errors import InputError
 
@@ -27,7 +28,7 @@ def is_traced(value: Any) -> bool:
     """Whether a value, or one of a list of values, is known only when compiled code runs."""
     if isinstance(value, list | tuple):
         return any(is_traced(one) for one in value)
-    return isinstance(value, jax.core.Tracer)
+    return isinstance(value, Tracer)
 
 
 def shown(value: Any) -> str:
@@ -139,9 +140,10 @@ def whole(value: Any, name: str, *, least: int = 0, most: int | None = None) -> 
     plain = isinstance(value, numbers.Integral | float) and not isinstance(value, bool)
     if not plain and isinstance(value, jax.Array | np.ndarray) and not is_traced(value):
         plain = value.ndim == 0 and value.dtype.kind in "iu"
-    if not plain or not math.isfinite(value) or int(value) != value or value < least or (most and value > most):
+    found = int(value) if plain and math.isfinite(value) else least - 1
+    if found < least or found != value or (most is not None and found > most):
         raise InputError(f"{name} must be a whole number >= {least}{upper}, got {shown(value)}")
-    return int(value)
+    return found
 
 
 def seed(value: Any, name: str = "seed") -> int:
@@ -205,7 +207,7 @@ def values(value: Any, name: str, *, shape: str = "a number or an array of numbe
     Raises:
         InputError: if it is not numbers.
     """
-    if is_traced(value) or isinstance(value, jax.Array):
+    if is_traced(value) or isinstance(value, jax.Array) or type(value) in (int, float):
         array = jnp.asarray(value)
         if jnp.issubdtype(array.dtype, jnp.floating):
             return array

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from ._numerics import compiled_whole, positive_pow, shared
 from ._types import Scalar, ScalarLike, Values, scalar
-from .arguments import positive
+from .arguments import instance, positive
 
 
 def _diameter(value: ScalarLike) -> Scalar:
@@ -82,6 +82,10 @@ class Particle(eqx.Module):
         return stress * self.effective_area * 1e-3
 
 
+def _particle(value: Particle) -> Particle:
+    return instance(value, Particle, "particle", "Make one with mcc_jax.Particle(D1, D2, D3), diameters in um.")
+
+
 @compiled_whole
 def plastic_shape_factor(particle: Particle, a: ScalarLike) -> Scalar:
     r"""Shape factor of plastic loading.
@@ -99,7 +103,7 @@ def plastic_shape_factor(particle: Particle, a: ScalarLike) -> Scalar:
     References:
         Bommireddy et al. (2018), eq. 13.
     """
-    return 1 + scalar(a) * particle.flatness
+    return 1 + scalar(a) * _particle(particle).flatness
 
 
 @compiled_whole
@@ -118,5 +122,6 @@ def elastic_shape_factor(particle: Particle) -> Scalar:
         Bommireddy et al. (2018), eq. 2, after Zheng et al. (2013); made symmetric here.
     """
     # The modulus of a logarithm, not max/min: exactly symmetric, and at D1 = D2 no diameter wins the tie.
+    _particle(particle)
     log_ratio = jnp.abs(jnp.log(particle.D1) - jnp.log(particle.D2))
     return 1 / (1 - positive_pow(jnp.expm1(0.1368 * log_ratio), 1.531))

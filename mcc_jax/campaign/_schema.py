@@ -149,7 +149,9 @@ class Campaign:
             return self.particles.index(particle)
         except ValueError:
             known = ", ".join(self.particles)
-            raise InputError(f"there is no particle {arguments.shown(particle)}", remedy=f"There are: {known}.") from None
+            raise InputError(
+                f"there is no particle {arguments.shown(particle)}", remedy=f"There are: {known}."
+            ) from None
 
     def select(self, keep: np.ndarray) -> Campaign:
         """The campaign of those particles where `keep`, booleans of shape (N,), is true.

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING
 import jax.numpy as jnp
 import numpy as np
 
+from .. import arguments
 from .._errors import InputError
 from ..law import TESTED_STRAIN, MccLaw, stress_ratio
+from ._origin import checked
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -52,6 +54,9 @@ def curve_tables(law: MccLaw, *, strain_max: float = TESTED_STRAIN, tolerance: f
     """
     import pandas as pd
 
+    checked(law, None, needed=False)
+    strain_max = arguments.number(strain_max, "strain_max", above=0)
+    tolerance = arguments.number(tolerance, "tolerance", above=0)
     loading, one = _refine(lambda t: _loading(law, strain_max * t**3), tolerance)
     unloading, other = _refine(lambda t: _unloading(1 - (1 - t) ** 2), tolerance)
     return CurveTables(pd.DataFrame(loading), pd.DataFrame(unloading), max(one, other))

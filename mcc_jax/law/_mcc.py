@@ -249,7 +249,8 @@ class MccLaw(AbstractContactLaw[History]):
         law, eta, diameter, state, highest = jax.lax.optimization_barrier((self, eta, diameter, state, highest))
         scale, area = shared(diameter / eta), AREA * (diameter * diameter)
         stress = shared(jnp.where(highest < past, past, highest) / area)
-        reached = scale * loading_strain(*law.plastic.polynomial, stress, state.displacement_max / scale)
+        K1, K3, K5 = law.plastic.polynomial
+        reached = scale * loading_strain(K1, K3, K5, stress, state.displacement_max / scale)
         elastic = (highest < past) | (reached < state.displacement_max)
         peak = jax.lax.optimization_barrier(jnp.where(elastic, state.displacement_max, reached))
 

@@ -40,7 +40,7 @@ class HiddenEffect:
     nuisance: Mapping[str, float] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
-        arguments.instance(self.variant, Variant, "variant", "Take mcc_jax.effects.find_variant(\"creep\").")
+        arguments.instance(self.variant, Variant, "variant", 'Take mcc_jax.effects.find_variant("creep").')
         arguments.instance(self.nuisance, Mapping, "nuisance", "Give a dictionary of numbers by name.")
         variant, name = self.variant, f"{self.variant.mechanism}:{self.variant.name}"
         if self.amplitude is not None and not arguments.is_number(self.amplitude):

@@ -195,6 +195,12 @@ def read_programme(file: str | Path) -> Programme:
             )
         return float(value)
 
+    def made(kind: type[Ramp] | type[Hold], where: str, *values: float) -> Ramp | Hold:
+        try:
+            return kind(*values)
+        except InputError as error:
+            raise InputError(f"{where}: {error.problem}", file=file, remedy="Correct the number.") from None
+
     steps: list[Ramp | Hold] = []
     for i, entry in enumerate(content["step"], start=1):
         where = f"step {i}"
@@ -210,11 +216,10 @@ def read_programme(file: str | Path) -> Programme:
                 f"{where}: unknown entry {sorted(extra)[0]!r}", file=file, remedy="Known: ramp_to, rate, hold_s."
             )
         if "hold_s" in entry:
-            steps.append(Hold(number(entry, "hold_s", where)))
+            steps.append(made(Hold, where, number(entry, "hold_s", where)))
         elif "rate" in entry or "rate" in content:
-            steps.append(
-                Ramp(number(entry, "ramp_to", where), number(entry if "rate" in entry else content, "rate", where))
-            )
+            rate = number(entry if "rate" in entry else content, "rate", where)
+            steps.append(made(Ramp, where, number(entry, "ramp_to", where), rate))
         else:
             raise InputError(f"{where} has no rate", file=file, remedy="Give it one, or one for all at the top.")
     control = content.get("control", "load")

@@ -387,7 +387,10 @@ def test_unfit_campaign_is_not_written(tmp_path, changes, piece):
     ("changes", "piece"),
     [
         ({"particles": ("A", "B")}, r"shape \(1, 3\) where \(2, 3\)"),
-        ({"particles": "AB", "diameters_um": np.ones((2, 3)), "curves": (LINE, LINE)}, "list of texts, got the text 'AB'"),
+        (
+            {"particles": "AB", "diameters_um": np.ones((2, 3)), "curves": (LINE, LINE)},
+            "list of texts, got the text 'AB'",
+        ),
         ({"diameters_um": np.full((1, 2), 1.0)}, "shape"),
         ({"diameters_um": [["a", "b", "c"]]}, "D1, D2, D3"),
         ({"curves": ()}, "particles has 1 entries and curves has 0"),

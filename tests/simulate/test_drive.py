@@ -34,7 +34,7 @@ def test_a_path_can_be_continued_from_its_state():
 def test_numbers_that_are_not_finite_are_explained(control):
     path = jnp.array([0.0, 20.0, jnp.nan, 30.0])
     assert drive(paper_law(), PARTICLE, path, control=control, throw=False).result == RESULTS.nonfinite_response
-    with pytest.raises(eqx.EquinoxRuntimeError, match="an entry of the path that is not finite.*the law's own parameters.*throw=False"):
+    with pytest.raises(eqx.EquinoxRuntimeError, match=r"entry of the path.*law's own parameters.*throw=False"):
         drive(paper_law(), PARTICLE, path, control=control)
 
 

@@ -71,9 +71,9 @@ def calibrate_many(
         raise TypeError(f"{method} has no setting {', '.join(unknown)}; it has: {', '.join(sorted(names))}")
     calibrate = methods[method]
     queue = list(campaigns)
-    for i, one in enumerate(queue, start=1):
-        if not isinstance(one, Campaign):  # one that is damaged stands in its place with its error
-            usable_campaign(one, f"campaign {i}")
+    for i, item in enumerate(queue, start=1):
+        if not isinstance(item, Campaign):  # one that is damaged stands in its place with its error
+            usable_campaign(item, f"campaign {i}")
     results: list[Calibration | Exception] = [RuntimeError("was not calibrated") for _ in queue]
     tell = progress or (lambda _, __: None)
 

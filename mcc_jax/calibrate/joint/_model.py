@@ -181,7 +181,7 @@ def log_C3(priors: Priors) -> float:
 
 
 def checked_settings(
-    progress: Any, model: JointModel | None, threshold_MPa: Any, block: int | None
+    progress: Callable[[str], None] | None, model: JointModel | None, threshold_MPa: Any, block: int | None
 ) -> tuple[Callable[[str], None], JointModel, float]:
     """What all joint calibrations share, with the defaults filled in.
 

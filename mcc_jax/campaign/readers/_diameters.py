@@ -63,10 +63,10 @@ def check_triple(triple: Triple, what: str, file: str | Path) -> None:
         values = np.asarray(triple, float)
     except (OverflowError, TypeError, ValueError):
         values = np.empty(0)
-        triple = triple if isinstance(triple, list | tuple) else [triple]
     if values.shape != (3,) or not ((values >= SMALLEST_DIAMETER_UM) & (values < 1e15)).all():
+        shown = list(triple) if isinstance(triple, Sequence | np.ndarray) else triple
         raise InputError(
-            f"the diameters of {what} are {list(triple)}, where three positive lengths in um are expected",
+            f"the diameters of {what} are {shown}, where three positive lengths in um are expected",
             file=file,
             remedy="Give D1, D2 and D3",
         )
