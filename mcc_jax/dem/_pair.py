@@ -12,8 +12,8 @@ from jaxtyping import Array
 
 from .._errors import InputError
 from .._numerics import shared
-from .._types import Scalar
-from ..law import energy_ratio, stress_ratio
+from .._types import Flag, Scalar
+from ..law import energy_ratio, recovery_limit, stress_ratio
 from ..law._branch import branch_force
 from ..law._loading_inverse import quintic, secant_modulus, tangent_modulus
 from ._side import HalfContact
@@ -108,7 +108,7 @@ def pair_recovery(i: HalfContact, j: HalfContact, overlap_max: Scalar) -> Scalar
 def wall_recovery(side: HalfContact, overlap_max: Scalar) -> Scalar:
     r"""Overlap [m] that a rigid wall is given back, :math:`\Delta`; see `pair_recovery`."""
     force = overlap_max * secant_modulus(side.k1, side.k3, side.k5, overlap_max)
-    return _span(side.power, side.c, force, overlap_max)
+    return _span(side.power, side, force, overlap_max)[0]
 
 
 def pair_energy(i: HalfContact, j: HalfContact, overlap_max: Scalar, overlap: Scalar) -> ContactEnergy:
@@ -129,7 +129,7 @@ def wall_energy(side: HalfContact, overlap_max: Scalar, overlap: Scalar) -> Cont
     """Energy [J] of a contact with a rigid wall; see `pair_energy`."""
     peak = largest_overlap(overlap_max, overlap)
     force = peak * secant_modulus(side.k1, side.k3, side.k5, peak)
-    return _energy(_work(side, peak), force, _span(side.power, side.c, force, peak), peak - overlap)
+    return _energy(_work(side, peak), force, _span(side.power, side, force, peak)[0], peak - overlap)
 
 
 # ---- inside ----------------------------------------------------------------------------------------------------------
@@ -159,7 +159,7 @@ def _numbers(side: HalfContact) -> _Numbers:
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _series_force(power: int, i: _Numbers, j: _Numbers, peak: Scalar, drop: Scalar) -> Scalar:
     series = _solve(i, j, peak)
-    span = _span(power, i.c, series.force, series.d_i) + _span(power, j.c, series.force, series.d_j)
+    span = _span(power, i, series.force, series.d_i)[0] + _span(power, j, series.force, series.d_j)[0]
     return series.force * _ratio(span, drop)[1]
 
 
@@ -167,12 +167,12 @@ def _series_force(power: int, i: _Numbers, j: _Numbers, peak: Scalar, drop: Scal
 def _series_force_jvp(power, primals, tangents):
     # With the tangents t of the sides and their explicit changes dF_s at fixed compression,
     #   dF_P = (t_i t_j dpeak + t_j dF_i + t_i dF_j) / (t_i + t_j),   d(d_s) = (dF_P - dF_s) / t_s,
-    #   dF = (f + n h) dF_P + F_P f' d(drop) / W + (h / W) sum_s span_s (F_P dc_s / c_s - k_s d(d_s)),  h = -q f' / 2.
+    #   dF = f dF_P + F_P f' d(drop) / W + (h / W) sum_s 2 F_P d(span_s),  h = -q f' / 2.
     i, j, peak, drop = primals
     di, dj, dpeak, ddrop = tangents
     series = _series(i, j, peak)
-    span_i, span_j = (_span(power, s.c, series.force, d) for s, d in ((i, series.d_i), (j, series.d_j)))
-    span = span_i + span_j
+    span_i, span_j = (_span(power, s, series.force, d) for s, d in ((i, series.d_i), (j, series.d_j)))
+    span = span_i[0] + span_j[0]
     q, ratio = _ratio(span, drop)
     inside = (q > 0) & (q < 1)
     q = jnp.where(inside, q, 0.0)
@@ -185,18 +185,24 @@ def _series_force_jvp(power, primals, tangents):
     # d(d_i) + d(d_j) = d(peak); written without a division by a tangent that may be small.
     dd_i = flexibility * (t_j * dpeak + change_j - change_i)
     dd_j = flexibility * (t_i * dpeak + change_i - change_j)
-    widths = _widening(i, di, series.force, series.d_i, dd_i, span_i) + _widening(
-        j, dj, series.force, series.d_j, dd_j, span_j
-    )
+    force = series.force
+    widths = _widening(power, i, di, force, dforce, series.d_i, dd_i, span_i)
+    widths = widths + _widening(power, j, dj, force, dforce, series.d_j, dd_j, span_j)
     carried = series.force > 0
     per_span = shared(1 / jnp.where(carried, span, 1.0))
-    change = (ratio + power * h) * dforce + per_span * (h * widths - series.force * fall * ddrop)
-    return series.force * ratio, jnp.where(carried | (drop <= 0), change, 0.0)
+    change = ratio * dforce + per_span * (h * widths - force * fall * ddrop)
+    return force * ratio, jnp.where(carried | (drop <= 0), change, 0.0)
 
 
-def _widening(side, dside, force, d, dd, span):
-    """Twice the force times the change of a side's recovered compression, less the part that goes with the force."""
-    return span * (shared(force / side.c) * dside.c - secant_modulus(side.k1, side.k3, side.k5, d) * dd)
+def _widening(power, side, dside, force, dforce, d, dd, recovered):
+    """Twice the force times the change of a side's recovered compression, by the formula or at its limit."""
+    span, limited, steep = recovered
+    secant, square = secant_modulus(side.k1, side.k3, side.k5, d), d * d
+    slope = tangent_modulus(side.k1, side.k3, side.k5, d)
+    dslope = dside.k1 - square * (3 * dside.k3 - 5 * square * dside.k5) - d * (6 * side.k3 - 20 * square * side.k5) * dd
+    formula = shared(force / side.c) * dside.c + power * dforce - secant * dd
+    at_limit = jnp.where(steep, 2 * (dforce - shared(force / jnp.where(steep, slope, 1.0)) * dslope), 2 * secant * dd)
+    return span * jnp.where(limited, at_limit, formula)
 
 
 def _explicit(change: _Numbers, d: Scalar) -> Scalar:
@@ -211,16 +217,20 @@ def _tangent(side: _Numbers, d: Scalar) -> Scalar:
     return jnp.where(slope < floor, floor, slope)
 
 
-def _span(power: int, c: Scalar, force: Scalar, d: Scalar) -> Scalar:
-    """Compression recovered on full release, 1 where no force was carried."""
+def _span(power: int, side: _Numbers | HalfContact, force: Scalar, d: Scalar) -> tuple[Scalar, Flag, Flag]:
+    """Compression recovered on full release, 1 where no force was carried; whether at its limit, whether steep."""
     carries = (d > 0) & (force > 0)
     per_compression = shared(jnp.where(carries, force, 1.0) / jnp.where(carries, d, 1.0))
-    square = c * per_compression if power == 1 else c * force * per_compression
-    return shared(jnp.sqrt(jnp.where(carries & (square > 0), square, 1.0)))
+    square = side.c * per_compression if power == 1 else side.c * force * per_compression
+    carries = carries & (square > 0)
+    span = shared(jnp.sqrt(jnp.where(carries, square, 1.0)))
+    limit, steep = recovery_limit(d, jnp.where(carries, per_compression, 0.0), tangent_modulus(side.k1, side.k3, side.k5, d))
+    limited = carries & (span > limit)
+    return jnp.where(limited, limit, span), limited, steep
 
 
 def _both_spans(i: HalfContact, j: HalfContact, series: _Series) -> Scalar:
-    return _span(i.power, i.c, series.force, series.d_i) + _span(j.power, j.c, series.force, series.d_j)
+    return _span(i.power, i, series.force, series.d_i)[0] + _span(j.power, j, series.force, series.d_j)[0]
 
 
 def _ratio(span: Scalar, drop: Scalar) -> tuple[Scalar, Scalar]:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from .._types import Scalar, Values
 from ..geometry import Particle
-from ..law import MccLaw, Unloading, loading_strain
+from ..law import MccLaw, Unloading, loading_strain, recovery_limit
 from ._effect import AbstractEffect, Factors
 from ._record import Record
 
@@ -97,7 +97,8 @@ def recoverable_displacement(
 ) -> Values:
     """Displacement [um] recovered on full release from a peak, with a factor on the effective modulus.
 
-    The law's own formulas (`MccLaw.recoverable_strain`), in terms of force and displacement at the peak.
+    The law's own formulas (`MccLaw.recoverable_strain`), in terms of force and displacement at the peak. Their limit
+    takes the slope of loading over its secant from the law without `loading` effects, so that it stays in closed form.
     """
     eta = law.shape_factor(particle)
     x = eta * particle.strain(peak_displacement)
@@ -111,4 +112,7 @@ def recoverable_displacement(
     else:
         square = shape * x * (secant / modulus) ** 2 / law.unloading.constant
     carries = moved & (square > jnp.finfo(square.dtype).tiny)
-    return particle.displacement(jnp.where(carries, jnp.sqrt(jnp.where(carries, square, 1.0)), 0.0))
+    recoverable = jnp.sqrt(jnp.where(carries, square, 1.0))
+    limit, _ = recovery_limit(particle.strain(peak_displacement), law.plastic.secant(x), law.plastic.tangent(x))
+    recoverable = jnp.where(recoverable > limit, limit, recoverable)
+    return particle.displacement(jnp.where(carries, recoverable, 0.0))

@@ -19,14 +19,17 @@ FORMULAE = {
     "shape_factor": "eta_p = 1 + a (1 - D3^2 / (D1 D2))",
     "loading": "sigma / MPa = C1 x - (C3 x)^3 + (C5 x)^5 with x = eta_p eps, for eps >= eps_P",
     "history": "eps_P is the largest strain so far, sigma_P the loading stress there",
-    "recovered_strain": "delta^2 = (sigma_P / E)^n / (k eta_p^p eps_P)",
+    "recovered_strain": "delta^2 = (sigma_P / E)^n / (k eta_p^p eps_P), but delta no larger than recovery_limit",
+    "recovery_limit": "the smaller of eps_P and (3 pi/8) sigma_P / (d sigma/d eps at eps_P on loading): no cycle gains "
+    "energy; it holds where the formula would create some (printed form: peak strains below about 0.01), elsewhere the "
+    "formula is untouched",
     "unloading": "sigma = sigma_P g(s), g(s) = (2/pi) (acos s - s sqrt(1 - s^2)), s = (eps_P - eps) / delta, "
     "for eps < eps_P; 0 for s >= 1; reloading retraces it",
     "unloading_slope": "dg/ds = -(4/pi) sqrt(1 - s^2)",
     "monotone": "stress never falls on loading if 9 C3^6 <= 20 C1 C5^5",
     "pair_of_particles": "each of two half contacts takes a share d_i of the overlap, F_i = force of a platen test at "
     "displacement 2 d_i; F_1 = F_2 on loading; F = F_P g(q), q = (overlap_P - overlap) / (recovered_1 + recovered_2) "
-    "on unloading, recovered_i half that of the platen test",
+    "on unloading, recovered_i half that of the platen test, each with its own limit",
 }
 
 

@@ -12,6 +12,7 @@ from .._types import Scalar, Values
 from ._loading_inverse import secant_modulus, tangent_modulus
 from ._recovery import stress_ratio
 from ._unloading import StrainScaling, Unloading
+from .recovery_limit import recovery_limit
 
 AREA = 1e-3 * jnp.pi / 4
 """Effective area over the diameter squared, times what makes mN of MPa um^2."""
@@ -97,10 +98,15 @@ def branch_force(power: int, k1: Scalar, k3: Scalar, k5: Scalar, c: Scalar, peak
     .. math:: F = F_P f(d / \Delta), \quad F_P = k_P \gamma_P, \quad k_P = k_1 - k_3 \gamma_P^2 + k_5 \gamma_P^4, \quad
         \Delta^2 = c\, k_P^n \gamma_P^{n-1}
 
+    and :math:`\Delta` no larger than `recovery_limit`.
+
     Derivatives are written out, because reverse mode then stores half as many arrays along a path. With
     :math:`h = -\tfrac12 s f'`:
 
     .. math:: dF = (f + n h)\, dF_P - h k_P\, d\gamma_P + h F_P\, dc/c + F_P f'\, d(d)/\Delta
+
+    where the formula holds. At the limit the terms in h are those of :math:`2 h F_P\, d\Delta/\Delta`, that is
+    :math:`2 h k_P\, d\gamma_P` or :math:`2 h\, (dF_P - F_P\, dT/T)` with T the slope of loading.
 
     Args:
         power: n, 1 (printed form) or 2 (punch forms).
@@ -114,7 +120,7 @@ def branch_force(power: int, k1: Scalar, k3: Scalar, k5: Scalar, c: Scalar, peak
     Returns:
         Force; zero where no force was carried at the peak.
     """
-    secant, _, _, ratio = _branch(power, k1, k3, k5, c, peak, drop)
+    secant, _, _, ratio, _, _ = _branch(power, k1, k3, k5, c, peak, drop)
     return peak * secant * ratio
 
 
@@ -122,7 +128,7 @@ def branch_force(power: int, k1: Scalar, k3: Scalar, k5: Scalar, c: Scalar, peak
 def _branch_force_jvp(power, primals, tangents):
     k1, k3, k5, c, peak, _ = primals
     dk1, dk3, dk5, dc, dpeak, ddrop = tangents
-    secant, span, s, ratio = _branch(power, *primals)
+    secant, span, s, ratio, limited, steep = _branch(power, *primals)
     # The force and all derivatives need these: without a barrier XLA computes them again in the loop of each output.
     s, ratio = jax.lax.optimization_barrier((s, ratio))
     force = peak * secant
@@ -131,18 +137,30 @@ def _branch_force_jvp(power, primals, tangents):
     s = jnp.where(inside, s, 0.0)
     fall = jnp.where(inside, 4 / jnp.pi * shared(jnp.sqrt((1 - s) * (1 + s))), 0.0)
     h = 0.5 * s * fall
-    dforce = peak * (dk1 - square * (dk3 - square * dk5)) + tangent_modulus(k1, k3, k5, peak) * dpeak
-    factor = jnp.where(secant > 0, ratio + power * h, 0.0)
-    change = factor * dforce - h * secant * dpeak + shared(h * force / c) * dc - shared(force * fall / span) * ddrop
+    slope = tangent_modulus(k1, k3, k5, peak)
+    dforce = peak * (dk1 - square * (dk3 - square * dk5)) + slope * dpeak
+    dslope = dk1 - square * (3 * dk3 - 5 * square * dk5) - peak * (6 * k3 - 20 * square * k5) * dpeak
+    with_force = jnp.where(limited, jnp.where(steep, 2.0, 0.0), float(power))
+    with_peak = jnp.where(limited, jnp.where(steep, 0.0, -2.0), 1.0)
+    with_slope = jnp.where(limited & steep, shared(2 * h * force / jnp.where(steep, slope, 1.0)), 0.0)
+    factor = jnp.where(secant > 0, ratio + with_force * h, 0.0)
+    change = factor * dforce - with_peak * h * secant * dpeak - with_slope * dslope
+    change = change + jnp.where(limited, 0.0, shared(h * force / c)) * dc - shared(force * fall / span) * ddrop
     # Transposed, this is a barrier for the cotangent, which otherwise would be computed again for each input.
     return force * ratio, jax.lax.optimization_barrier(change)
 
 
 def _branch(power, k1, k3, k5, c, peak, drop):
-    """Secant, recoverable displacement (1 if nothing was carried), its recovered share, share of peak force left."""
+    """Secant, recoverable displacement (1 if nothing was carried), its recovered share, share of peak force left.
+
+    And whether the recoverable displacement is at its limit, and whether loading is steep there.
+    """
     secant = secant_modulus(k1, k3, k5, peak)
     square = c * secant if power == 1 else c * peak * secant * secant
     carries = (peak > 0) & (square > 0)
     span = shared(jnp.sqrt(jnp.where(carries, square, 1.0)))
+    limit, steep = recovery_limit(peak, secant, tangent_modulus(k1, k3, k5, peak))
+    limited = carries & (span > limit)
+    span = jnp.where(limited, limit, span)
     s = jnp.where(carries, shared(drop / span), 1.0)
-    return secant, span, s, jnp.where(drop <= 0, 1.0, stress_ratio(s))
+    return secant, span, s, jnp.where(drop <= 0, 1.0, stress_ratio(s)), limited, steep

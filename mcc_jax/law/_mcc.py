@@ -12,10 +12,11 @@ from .._types import Flag, Path, Scalar, scalar
 from ..geometry import Particle, plastic_shape_factor
 from ._base import AbstractContactLaw
 from ._branch import AREA, branch_coefficients, branch_force
-from ._loading_inverse import loading_strain, secant_modulus
+from ._loading_inverse import loading_strain, secant_modulus, tangent_modulus
 from ._plastic import Plastic
 from ._recovery import energy_ratio, recovery, stress_ratio
 from ._unloading import StrainScaling, Unloading
+from .recovery_limit import recovery_limit
 
 AnyShape = Float[Array, "..."]
 TESTED_STRAIN = 0.67
@@ -123,8 +124,13 @@ class MccLaw(AbstractContactLaw[History]):
             \delta^2 = \frac{\sigma_P}{4.12\, \bar E\, \eta_p^p\, \epsilon_P} \ (\text{printed}), \qquad
             \delta^2 = \frac{\sigma_P^2}{k\, \bar E^2\, \eta_p^p\, \epsilon_P} \ (\text{punch forms})
 
-        with p of the `StrainScaling`. The printed form does not vanish at zero strain: below a peak strain of about
-        0.01 (0.2 MPa) its residual strain is negative, and just below that its unloading creates energy.
+        with p of the `StrainScaling`, and never more than a contact can give back (`recovery_limit`),
+
+        .. math:: \delta \le \min\left(\epsilon_P,\ \tfrac{3\pi}{8}\, \sigma_P \Big/ \frac{d\sigma}{d\epsilon}\right).
+
+        The printed form does not vanish at zero strain: below a peak strain of about 0.01 (0.2 MPa) its residual strain
+        would be negative, and a little lower its unloading would create energy. There the limit holds; with the paper's
+        modulus, above it the formula is untouched up to far beyond the tested range.
         """
         eta = self.shape_factor(particle)
         _, _, recoverable = self._elastic(eta, eta * strain_max)
@@ -150,14 +156,17 @@ class MccLaw(AbstractContactLaw[History]):
 
     def _elastic(self, eta: Scalar, x: AnyShape) -> tuple[AnyShape, Bool[Array, ...], AnyShape]:
         """Peak stress, whether it is positive, and the recoverable strain, at the peak scaled strain `x`."""
-        secant = secant_modulus(*self.plastic.polynomial, x)
+        polynomial = self.plastic.polynomial
+        secant = secant_modulus(*polynomial, x)
         k, power = self.unloading.constant, self.strain_scaling.power
         if self.unloading is Unloading.PRINTED:
             square = shared(eta ** (1 - power) * secant / (k * self.effective_modulus))
         else:
             square = eta ** (1 - power) * x * shared(secant / self.effective_modulus) ** 2 / k
         carries = (x > 0) & (square > jnp.finfo(square.dtype).tiny)  # down to where the root still has a derivative
-        return x * secant, carries, shared(jnp.sqrt(jnp.where(carries, square, 1.0)))
+        recoverable = shared(jnp.sqrt(jnp.where(carries, square, 1.0)))
+        limit, _ = recovery_limit(shared(x / eta), secant, tangent_modulus(*polynomial, x))
+        return x * secant, carries, jnp.where(carries & (recoverable > limit), limit, recoverable)
 
     # ---- force and displacement --------------------------------------------------------------------------------------
 

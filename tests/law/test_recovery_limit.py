@@ -1,0 +1,196 @@
+"""No contact gives back more than it took: the limit of the recovered displacement, its derivatives, random paths."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import ALL_FORMS, FORMS, PAPER_THETA, SOME_FORMS, all_finite, close, paper_law, paper_particle, unpack
+
+from benchmarks import energy_paths
+from mcc_jax.law import History, MccLaw, Plastic, StrainScaling, Unloading, recovery_limit
+
+ROUNDING = 1e-13
+"""Of the energy put in: a few hundred pieces of work add up."""
+
+
+# ---- physics --------------------------------------------------------------------------------------------------------
+
+
+@eqx.filter_jit
+def balance(law, particle, strain):
+    """Dissipated energy and loading force at peaks, with the derivative of the one over the other."""
+
+    def dissipated(peak):
+        return law.energy(particle, History(peak), peak).dissipated
+
+    def one(strain):
+        peak = particle.displacement(strain)
+        lost, slope = jax.value_and_grad(dissipated)(peak)
+        force = law.step(particle, law.init(particle), peak)[1]
+        residual = law.residual_displacement(particle, History(peak))
+        return lost / (force * peak), slope / force, residual / peak
+
+    return jax.vmap(one)(strain)
+
+
+@ALL_FORMS
+@pytest.mark.parametrize("modulus", [1.0, 30.0, 400.0, 16000.0])
+def test_what_is_lost_never_falls_as_the_peak_grows(unloading, scaling, modulus):
+    """At every peak from 1e-9 to four times the tested range, for moduli down to a fraction of the stress itself."""
+    law = paper_law(unloading, scaling, modulus=modulus)
+    strain = jnp.geomspace(1e-9, 4 * 0.67, 2000)
+    for number in (1, 6):
+        lost, slope, residual = balance(law, paper_particle(number), strain)
+        assert jnp.all(lost > 0)
+        assert jnp.all(slope > -1e-12)
+        assert jnp.all(residual > -1e-15)
+
+
+@pytest.mark.parametrize("softening", [0.0, 0.5, 0.98, 1.0, 1.5])
+def test_so_it_is_for_any_softening(softening):
+    """9 C3^6 / (20 C1 C5^5) up to the loss of monotony and beyond, where force follows the curve down."""
+    C1, C5 = 7.0, 2.7
+    plastic = Plastic(C1, (softening * 20 / 9 * C1 * C5**5) ** (1 / 6), C5)
+    for form in Unloading:
+        for modulus in (0.3, 3.0, 30.0, 300.0):
+            law = paper_law(form, modulus=modulus, plastic=plastic)
+            lost, slope, residual = balance(law, paper_particle(3), jnp.geomspace(1e-9, 2.0, 2000))
+            # Where the curve falls, what is lost grows while force is given back.
+            assert jnp.all(lost > 0)
+            assert jnp.all(slope > -1e-12)
+            assert jnp.all(residual > -1e-15)
+
+
+@ALL_FORMS
+def test_random_paths_gain_nothing(unloading, scaling):
+    law, particle = energy_paths.draw(3, 1000, unloading, scaling)
+    whole, between = energy_paths.gains(*energy_paths.single(law, particle, *energy_paths.choices(3, 1000)))
+    assert whole.max() < 0
+    assert between.max() <= ROUNDING
+
+
+def test_the_paths_would_show_a_gain(monkeypatch):
+    """Without the limit the printed form gains on them, so the test above can fail."""
+    import mcc_jax.law._branch as branch
+    import mcc_jax.law._mcc as mcc
+
+    def none(peak, secant, tangent):
+        return jnp.full_like(peak, jnp.inf), tangent > secant
+
+    jax.clear_caches()
+    monkeypatch.setattr(branch, "recovery_limit", none)
+    monkeypatch.setattr(mcc, "recovery_limit", none)
+    law, particle = energy_paths.draw(3, 200, *FORMS[0])
+    whole, between = energy_paths.gains(*energy_paths.single(law, particle, *energy_paths.choices(3, 200)))
+    jax.clear_caches()
+    assert whole.max() > 0.1
+    assert between.max() > 0.1
+
+
+# ---- calculus -------------------------------------------------------------------------------------------------------
+
+
+def switch(law, particle):
+    """Peak displacement where the limit begins to hold at small strain."""
+    free = law.recoverable_strain(particle, jnp.array(0.02))  # of the printed form nearly constant there
+    low, high = 1e-9, 2 * float(free)
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        held = law.recoverable_strain(particle, jnp.array(middle)) >= middle
+        low, high = (middle, high) if held else (low, middle)
+    return float(particle.displacement(jnp.array(low)))
+
+
+@SOME_FORMS
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_finite_and_continuous_at_the_switch(unloading, scaling, mode, dtype):
+    theta = np.array(PAPER_THETA)
+    theta[4] = 300.0  # punch forms then switch at a strain that float32 resolves, all forms again at large strain
+    law, p = unpack(jnp.asarray(theta), unloading, scaling)
+    at = switch(law, p)
+    shares = np.array([0, 1e-12, 1e-3, 0.5, 1 - 1e-3, 1 - 1e-7, 1 - 1e-15, 1, 1 + 1e-15, 1 + 1e-7, 1 + 1e-3, 2, 30])
+    peaks = jnp.asarray(np.concatenate([shares * at, [150.0, 250.0, 350.0, 1e3]]), dtype)
+    releases = jnp.asarray([0.0, 1e-7, 0.3, 0.9, 1.0, 1.3], dtype)
+
+    @jax.jit
+    @jax.vmap
+    @jax.vmap
+    def both(peak, share):
+        def force(theta, peak, share):
+            law, p = unpack(theta, unloading, scaling)
+            recovered = p.displacement(law.recoverable_strain(p, p.strain(peak)))
+            now = peak - share * jnp.where(peak > 0, recovered, 1.0)
+            f = law.step(p, History(peak), now)[1]
+            return f, law.step_load(p, History(peak), 0.5 * f)[1], law.energy(p, History(peak), now).recoverable
+
+        return force(theta_, peak, share), mode(force, argnums=(0, 1, 2))(theta_, peak, share)
+
+    theta_ = jnp.asarray(theta, dtype)
+    values, slopes = both(*jnp.meshgrid(peaks, releases, indexing="ij"))
+    assert all_finite((values, slopes))
+    below, above = (int(np.flatnonzero(shares == s)[0]) for s in (1 - 1e-7, 1 + 1e-7))
+    for value in values[:2]:
+        close(value[below], value[above], rel=1e-5, scale=3e-6 * float(jnp.max(jnp.abs(value[above]))))
+
+
+@SOME_FORMS
+def test_derivatives_equal_differences_where_the_limit_holds(unloading, scaling):
+    """At small strain, where it is the peak, and at large strain, where it is the slope of loading."""
+    theta = np.array(PAPER_THETA)
+    theta[4] = 300.0 if unloading is not Unloading.PRINTED else 30.0
+
+    @jax.jit
+    def force(theta, share):
+        law, p = unpack(theta[:8], unloading, scaling)
+        recovered = jax.lax.stop_gradient(p.displacement(law.recoverable_strain(p, p.strain(theta[8]))))
+        return law.step(p, History(theta[8]), theta[9] - share * recovered)[1]
+
+    with_peak = jax.jit(jax.jacfwd(force))
+    reverse = jax.jit(jax.jacrev(force))
+    for peak in (1e-3, 250.0):
+        law, p = unpack(jnp.asarray(theta), unloading, scaling)
+        x = law.shape_factor(p) * p.strain(jnp.array(peak))
+        limit, steep = recovery_limit(jnp.array(peak), law.plastic.secant(x), law.plastic.tangent(x))
+        close(p.displacement(law.recoverable_strain(p, p.strain(jnp.array(peak)))), limit, rel=1e-12)
+        assert bool(steep) == (peak > 1)
+        point = jnp.asarray([*theta, peak, peak])
+        exact = np.asarray(with_peak(point, 0.0 + 0.4))
+        close(reverse(point, 0.4), exact, rel=1e-9, scale=1e-12 * np.abs(exact).max())
+        fixed = float(p.displacement(law.recoverable_strain(p, p.strain(jnp.array(peak)))))
+
+        @jax.jit
+        def moved(theta, now):
+            law, p = unpack(theta[:8], unloading, scaling)
+            return law.step(p, History(theta[8]), now)[1]
+
+        for k in range(9):
+            h = 1e-6 * float(point[k])
+            now = peak - 0.4 * fixed
+            difference = (moved(point.at[k].add(h), now) - moved(point.at[k].add(-h), now)) / (2 * h)
+            close(exact[k], difference, rel=2e-6, scale=1e-7 * float(force(point, 0.4)) / float(point[k]))
+
+
+# ---- machinery ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", Unloading)
+def test_the_inverse_follows_the_limit(form):
+    law, p = paper_law(form, modulus=30.0), paper_particle(6)
+    for peak in (1e-4, 1.0, 60.0):
+        state = History(peak)
+        recovered = p.displacement(law.recoverable_strain(p, p.strain(jnp.array(peak))))
+        now = peak - recovered * jnp.linspace(0.01, 0.99, 9)
+        force = jnp.stack([law.step(p, state, d)[1] for d in now])
+        back = jnp.stack([law.step_load(p, state, f)[1] for f in force])
+        close(back, now, scale=1e-13 * peak)
+
+
+def test_nothing_is_carried_without_force():
+    limit, steep = recovery_limit(jnp.array([0.0, 1.0, 1.0]), jnp.array([7.0, 0.0, 0.0]), jnp.array([7.0, 3.0, -3.0]))
+    assert jnp.all(limit == 0)
+    assert steep.tolist() == [False, True, False]
+    law = MccLaw(Plastic(4.0, 3.6, 2.4), 1.43, 16000.0, Unloading.PRINTED, StrainScaling.RAW)  # stress falls to zero
+    strain = jnp.linspace(0.0, 1.0, 200)
+    assert jnp.all(jnp.isfinite(law.recoverable_strain(paper_particle(1), strain)))
