@@ -22,6 +22,8 @@ class HalfContact(eqx.Module):
     .. math:: F = k_1 d - k_3 d^3 + k_5 d^5 \ (\text{loading}), \qquad
         \Delta^2 = c\, (F_P / d_P)^n\, d_P^{n-1} \ (\text{compression recovered on full release from } d_P)
 
+    and :math:`\Delta` no larger than `law.recovery_limit`, without which a release could give back more than it took.
+
     A particle between two plates is two of them in series, each compressed by half the platen displacement. It is one
     half contact: make many with ``jax.vmap(half_contact)`` and pick from them with `sides_of`.
 

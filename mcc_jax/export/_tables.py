@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._errors import InputError
-from ..law import TESTED_STRAIN, MccLaw, recovery_limit, stress_ratio
+from ..law import TESTED_STRAIN, MccLaw, stress_ratio
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -29,8 +29,9 @@ class CurveTables:
 
     Attributes:
         loading: `scaled_strain` (eta_p eps), `stress_MPa`, `tangent_MPa` (d stress / d scaled strain) and
-            `recovered_strain_at_eta_1`: the strain recovered from there, to be multiplied by eta_p^((1 - p)/2) and then
-            to be limited by `recovery_limit` (scaled strain) over eta_p, so that unloading gains no energy.
+            `recovered_strain_at_eta_1`: the strain recovered from there, to be multiplied by eta_p^((1 - p)/2), and at
+            most the smaller of `scaled_strain` and (3 pi/8) `stress_MPa` / `tangent_MPa` (where that is positive), over
+            eta_p: so no unloading gains energy (`law.recovery_limit`).
         unloading: `recovered_share` s and `stress_share` g(s) of the peak stress.
         error: largest error of linear interpolation, as a share of each column's largest value.
     """
@@ -62,13 +63,10 @@ def _loading(law: MccLaw, x: np.ndarray) -> dict[str, np.ndarray]:
     K1, K3, K5 = (float(K) for K in law.plastic.polynomial)
     secant = np.maximum(K1 - x**2 * (K3 - x**2 * K5), 0.0)
     n, k, modulus = law.unloading.stress_power, law.unloading.constant, float(law.effective_modulus)
-    tangent = np.where(secant > 0, K1 - x**2 * (3 * K3 - 5 * x**2 * K5), 0.0)
-    limit, _ = recovery_limit(*map(jnp.asarray, (x, secant, tangent)))
     return {
         "scaled_strain": x,
         "stress_MPa": x * secant,
-        "tangent_MPa": tangent,
-        "recovery_limit": np.asarray(limit),
+        "tangent_MPa": np.where(secant > 0, K1 - x**2 * (3 * K3 - 5 * x**2 * K5), 0.0),
         "recovered_strain_at_eta_1": np.sqrt((secant / modulus) ** n * x ** (n - 1) / k),
     }
 

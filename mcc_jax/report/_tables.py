@@ -79,7 +79,8 @@ def parameters(content: dict[str, Any]) -> list[dict[str, str]]:
             "sub": "",
             "name": "Effective modulus [GPa]",
             "meaning": f"How stiffly a particle springs back on unloading. It belongs to the form “{form}” of the law "
-            "only.",
+            "only. Where that form would return more energy than it took (printed: peak strains below about 0.01), the "
+            "recovered strain is limited.",
             **_told(content["effective_modulus_MPa"], 1e-3),
             "paper": f"{PAPER_EFFECTIVE_MODULUS_MPA / 1e3:g}" if form == "printed" else "other form",
         },
