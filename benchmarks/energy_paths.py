@@ -19,7 +19,7 @@ TURNS = 6
 """Times a path is unloaded; each time it is reloaded, in one case of three not up to its peak."""
 BEYOND = 2.0
 """Largest scaled strain of a path over that at which the paper's tests ended."""
-_NODES, _WEIGHTS = (jnp.asarray(x) for x in np.polynomial.legendre.leggauss(20))
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(20)
 _NODES, _WEIGHTS = 0.5 * (_NODES + 1), 0.5 * _WEIGHTS
 
 
@@ -62,7 +62,7 @@ def _walk(force, recovered, reach, peaks, partial, depth):
         span = recovered(peak)
         end = peak - span
         ends = [jnp.sqrt(jnp.clip((x - end) / span, 0.0, 1.0)) for x in (low, high)]
-        t = ends[0] + (ends[1] - ends[0]) * _NODES
+        t = ends[0] + (ends[1] - ends[0]) * jnp.asarray(_NODES)
         along = jax.vmap(lambda t: force(peak, end + span * t * t))(t)
         return (ends[1] - ends[0]) * 2 * span * jnp.sum(_WEIGHTS * t * along)
 

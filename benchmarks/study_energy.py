@@ -6,11 +6,12 @@ and reloads. Energies are integrals of the force, not the library's own.
 """
 
 import _report
-import energy_paths
 import jax
 import numpy as np
 
 jax.config.update("jax_enable_x64", True)
+
+import energy_paths  # noqa: E402
 
 from mcc_jax.law import StrainScaling, Unloading  # noqa: E402
 

@@ -36,7 +36,7 @@ def test_linear_interpolation_is_within_the_stated_error(drawn):
     sphere = Particle(200.0, 200.0, 200.0)
     column = "recovered_strain_at_eta_1"
     want = np.asarray(law.recoverable_strain(sphere, jnp.asarray(x)))
-    limit = np.minimum(x, 3 * np.pi / 8 * np.asarray(law.plastic.stress(x) / jnp.maximum(law.plastic.tangent(x), 1e-9)))
+    limit = np.minimum(x, 3 * np.pi / 8 * np.asarray(law.plastic.stress(jnp.asarray(x)) / jnp.maximum(law.plastic.tangent(jnp.asarray(x)), 1e-9)))
     free = want < limit * (1 - 1e-12)
     assert np.abs(np.interp(x, at.index, at[column]) - want)[free].max() <= TOLERANCE * at[column].max()
     np.testing.assert_allclose(want[~free], limit[~free], rtol=1e-12)
