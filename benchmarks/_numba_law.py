@@ -1,7 +1,7 @@
 """The contact law written by hand twice, as compiled loops and as plain NumPy: what `bench_law.py` measures against.
 
-Displacement control, printed form with its limit, raw strain scaling, with the library's own polynomial for the elastic branch. Every
-loop takes the branch it needs and no other, and holds the running maximum in a register.
+Displacement control, printed form with its limit, raw strain scaling, with the library's own polynomial for the elastic
+branch. Every loop takes the branch it needs and no other, and holds the running maximum in a register.
 """
 
 import math
@@ -13,7 +13,7 @@ from mcc_jax.law._recovery_coefficients import RATIO_64
 
 _RATIO = np.array(RATIO_64)
 _CONSTANT = 4.12
-_SHARE = 3 * math.pi / 8
+_HARDENING = 40 / (3 * math.pi)
 
 
 @numba.njit(inline="always")
@@ -38,8 +38,7 @@ def _force(K1, K3, K5, eta, modulus, diameter, displacement, peak):
         return 0.0
     stress = x * secant
     if displacement < peak:
-        tangent, least = K1 - square * (3 * K3 - 5 * square * K5), _SHARE * secant
-        limit = peak * least / max(tangent, least)
+        limit = peak * secant / (K1 + _HARDENING * square * square * K5)
         recoverable = min(diameter * math.sqrt(eta * secant / (_CONSTANT * modulus)), limit)
         stress *= _ratio((peak - displacement) / recoverable)
     return stress * (math.pi / 4e3) * diameter * diameter
@@ -87,15 +86,11 @@ def numpy_step(C1, C3, C5, a, modulus, D1, D2, D3, peak, displacement):
     square = x * x
     K5 = C5 * C5
     K5 = K5 * K5 * C5
-    K3 = C3 * C3 * C3
-    secant = C1 - square * (K3 - square * K5)
+    secant = C1 - square * (C3 * C3 * C3 - square * K5)
     secant = np.maximum(secant, 0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        least = _SHARE * secant
-        limit = highest * least / np.maximum(C1 - square * (3 * K3 - 5 * square * K5), least)
-        drop = (highest - displacement) / np.minimum(
-            diameter * np.sqrt(eta * secant / (_CONSTANT * modulus)), limit
-        )
+        limit = highest * secant / (C1 + _HARDENING * square * square * K5)
+        drop = (highest - displacement) / np.minimum(diameter * np.sqrt(eta * secant / (_CONSTANT * modulus)), limit)
     u = np.clip(1 - drop, 0, 1)
     z = 2 * u - 1
     ratio = np.full_like(z, RATIO_64[0])

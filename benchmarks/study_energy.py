@@ -1,8 +1,8 @@
 """Does any contact give back more energy than it took? Random load-unload-reload paths for each form, and for pairs.
 
-Run `uv run python benchmarks/study_energy.py --write`: it writes `benchmarks/results/energy.md`. Every path has a law and
-a particle of its own (pairs: two unlike ones), peaks from 1e-9 to twice the end of the tests, full and partial releases
-and reloads. Energies are integrals of the force, not the library's own.
+Run `uv run python benchmarks/study_energy.py --write` (a minute): it writes `benchmarks/results/energy.md`. Every path
+has a law and a particle of its own (pairs: two unlike ones), peaks from 1e-9 to twice the end of the tests, full and
+partial releases and reloads. Energies are integrals of the force, not the library's own.
 """
 
 import _report
@@ -41,13 +41,15 @@ def main():
             for scaling in StrainScaling:
                 whole, between = largest(kind, arguments.paths, unloading, scaling)
                 verdict = "none gains" if whole <= 0 and between <= ROUNDING else "GAINS"
-                rows.append(f"| {name} | {unloading.value} | {scaling.value} | {whole:.3g} | {between:.2g} | {verdict} |")
-                print(rows[-1], flush=True)  # noqa: T201
+                rows.append(
+                    f"| {name} | {unloading.value} | {scaling.value} | {whole:.3g} | {between:.2g} | {verdict} |"
+                )
+                print(rows[-1], flush=True)
     head = [
         "# Energy along random paths",
         "",
-        f"{arguments.paths} paths of {energy_paths.TURNS} releases for each row; a gain is a share of the energy put in, its",
-        f"largest value over the paths; negative is lost. Rounding: {ROUNDING:g}. Written by `benchmarks/study_energy.py`.",
+        f"{arguments.paths} paths of {energy_paths.TURNS} releases for each row. A gain is a share of the energy put in,",
+        f"the largest over the paths; negative is lost. Rounding: {ROUNDING:g}. Written by `benchmarks/study_energy.py`.",
         "",
         "| contact | form | scaling | gain of a whole path | gain from release to release | |",
         "|---|---|---|---|---|---|",

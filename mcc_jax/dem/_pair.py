@@ -13,9 +13,10 @@ from jaxtyping import Array
 from .._errors import InputError
 from .._numerics import shared
 from .._types import Flag, Scalar
-from ..law import energy_ratio, recovery_limit, stress_ratio
+from ..law import energy_ratio, least_stiffness, stress_ratio
 from ..law._branch import branch_force
 from ..law._loading_inverse import quintic, secant_modulus, tangent_modulus
+from ..law.recovery_limit import HARDENING
 from ._side import HalfContact
 
 SPLIT_STEPS = 8
@@ -53,8 +54,8 @@ def pair_force(i: HalfContact, j: HalfContact, overlap_max: Scalar, overlap: Sca
 
     with f of `law.stress_ratio`. The equal-force split is unique where both sides are monotone. Both sides peaked at
     the same force, so they unload by the same share of it, and the largest overlap is all there is to remember.
-    Particles that are alike share the overlap in halves. Each side recovers no more than its own
-    `law.recovery_limit`, so that no path of a pair gains energy; beside a side that does not give way on loading the
+    Particles that are alike share the overlap in halves. Each side recovers no more than its
+    own `law.recovery_limit`, so that no path of a pair gains energy; beside a side that does not give way on loading the
     other behaves as against a wall.
 
     Args:
@@ -196,13 +197,12 @@ def _series_force_jvp(power, primals, tangents):
 
 def _widening(power, side, dside, force, dforce, d, dd, recovered):
     """Twice the force times the change of a side's recovered compression, by the formula or at its limit."""
-    span, limited, steep = recovered
-    secant, square = secant_modulus(side.k1, side.k3, side.k5, d), d * d
-    slope = tangent_modulus(side.k1, side.k3, side.k5, d)
-    dslope = dside.k1 - square * (3 * dside.k3 - 5 * square * dside.k5) - d * (6 * side.k3 - 20 * square * side.k5) * dd
-    formula = shared(force / side.c) * dside.c + power * dforce - secant * dd
-    at_limit = jnp.where(steep, 2 * (dforce - shared(force / jnp.where(steep, slope, 1.0)) * dslope), 2 * secant * dd)
-    return span * jnp.where(limited, at_limit, formula)
+    span, limited = recovered
+    least = least_stiffness(side.k1, side.k5, d)
+    # What makes the least stiffness of the changes makes its change at a fixed compression, too.
+    dleast = least_stiffness(dside.k1, dside.k5, d) + 4 * HARDENING * d * d * d * side.k5 * dd
+    formula = shared(force / side.c) * dside.c + power * dforce - secant_modulus(side.k1, side.k3, side.k5, d) * dd
+    return span * jnp.where(limited, 2 * (dforce - shared(force / least) * dleast), formula)
 
 
 def _explicit(change: _Numbers, d: Scalar) -> Scalar:
@@ -217,16 +217,16 @@ def _tangent(side: _Numbers, d: Scalar) -> Scalar:
     return jnp.where(slope < floor, floor, slope)
 
 
-def _span(power: int, side: _Numbers | HalfContact, force: Scalar, d: Scalar) -> tuple[Scalar, Flag, Flag]:
-    """Compression recovered on full release, 1 where no force was carried; whether at its limit, whether steep."""
+def _span(power: int, side: _Numbers | HalfContact, force: Scalar, d: Scalar) -> tuple[Scalar, Flag]:
+    """Compression recovered on full release, 1 where no force was carried; and whether it is at its limit."""
     carries = (d > 0) & (force > 0)
     per_compression = shared(jnp.where(carries, force, 1.0) / jnp.where(carries, d, 1.0))
     square = side.c * per_compression if power == 1 else side.c * force * per_compression
     carries = carries & (square > 0)
     span = shared(jnp.sqrt(jnp.where(carries, square, 1.0)))
-    limit, steep = recovery_limit(d, jnp.where(carries, per_compression, 0.0), tangent_modulus(side.k1, side.k3, side.k5, d))
+    limit = shared(force / least_stiffness(side.k1, side.k5, d))
     limited = carries & (span > limit)
-    return jnp.where(limited, limit, span), limited, steep
+    return jnp.where(limited, limit, span), limited
 
 
 def _both_spans(i: HalfContact, j: HalfContact, series: _Series) -> Scalar:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from .._types import Scalar, Values
 from ..geometry import Particle
-from ..law import MccLaw, Unloading, loading_strain, recovery_limit
+from ..law import MccLaw, Unloading, least_stiffness, loading_strain
 from ._effect import AbstractEffect, Factors
 from ._record import Record
 
@@ -98,7 +98,7 @@ def recoverable_displacement(
     """Displacement [um] recovered on full release from a peak, with a factor on the effective modulus.
 
     The law's own formulas (`MccLaw.recoverable_strain`), in terms of force and displacement at the peak. Their limit
-    takes the slope of loading over its secant from the law without `loading` effects, so that it stays in closed form.
+    takes C1 and C5 of the law without `loading` effects, so that it stays in closed form.
     """
     eta = law.shape_factor(particle)
     x = eta * particle.strain(peak_displacement)
@@ -113,6 +113,7 @@ def recoverable_displacement(
         square = shape * x * (secant / modulus) ** 2 / law.unloading.constant
     carries = moved & (square > jnp.finfo(square.dtype).tiny)
     recoverable = jnp.sqrt(jnp.where(carries, square, 1.0))
-    limit, _ = recovery_limit(particle.strain(peak_displacement), law.plastic.secant(x), law.plastic.tangent(x))
+    K1, _, K5 = law.plastic.polynomial
+    limit = particle.stress(peak_force) / (eta * least_stiffness(K1, K5, x))
     recoverable = jnp.where(recoverable > limit, limit, recoverable)
     return particle.displacement(jnp.where(carries, recoverable, 0.0))

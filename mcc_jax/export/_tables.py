@@ -11,6 +11,7 @@ import numpy as np
 
 from .._errors import InputError
 from ..law import TESTED_STRAIN, MccLaw, stress_ratio
+from ..law.recovery_limit import HARDENING
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -29,9 +30,8 @@ class CurveTables:
 
     Attributes:
         loading: `scaled_strain` (eta_p eps), `stress_MPa`, `tangent_MPa` (d stress / d scaled strain) and
-            `recovered_strain_at_eta_1`: the strain recovered from there, to be multiplied by eta_p^((1 - p)/2), and at
-            most the smaller of `scaled_strain` and (3 pi/8) `stress_MPa` / `tangent_MPa` (where that is positive), over
-            eta_p: so no unloading gains energy (`law.recovery_limit`).
+            `recovered_strain_at_eta_1`: the strain recovered from there, to be multiplied by eta_p^((1 - p)/2), but no
+            more than `recovery_limit` (scaled strain) over eta_p, so that no unloading gains energy.
         unloading: `recovered_share` s and `stress_share` g(s) of the peak stress.
         error: largest error of linear interpolation, as a share of each column's largest value.
     """
@@ -67,6 +67,7 @@ def _loading(law: MccLaw, x: np.ndarray) -> dict[str, np.ndarray]:
         "scaled_strain": x,
         "stress_MPa": x * secant,
         "tangent_MPa": np.where(secant > 0, K1 - x**2 * (3 * K3 - 5 * x**2 * K5), 0.0),
+        "recovery_limit": x * secant / (K1 + HARDENING * x**4 * K5),
         "recovered_strain_at_eta_1": np.sqrt((secant / modulus) ** n * x ** (n - 1) / k),
     }
 

@@ -34,8 +34,7 @@ def _csv(law: MccLaw, particle: Particle, origin: Origin, folder: Path, seed: in
         "loading": "stress from scaled strain eta_p eps, linearly between rows",
         "unloading": "stress = peak stress * stress_share at recovered_share = (eps_P - eps) / delta",
         "delta": f"recovered_strain_at_eta_1 at eta_p eps_P, times eta_p^({(1 - p) / 2:g}), "
-        "but at most the smaller of eps_P and (3 pi/8) stress_MPa / (eta_p tangent_MPa) there, so that no cycle gains "
-        "energy; the second only where tangent_MPa > 0",
+        "but at most recovery_limit at eta_p eps_P, over eta_p, so that no cycle gains energy",
         "largest_error": tables.error,
         "error_of": "linear interpolation, as a share of each column's largest value",
     }

@@ -21,4 +21,4 @@ from ._reference import similarity_stress as similarity_stress
 from ._unloading import PUNCH_AREA as PUNCH_AREA
 from ._unloading import StrainScaling as StrainScaling
 from ._unloading import Unloading as Unloading
-from .recovery_limit import recovery_limit as recovery_limit
+from .recovery_limit import least_stiffness as least_stiffness

@@ -12,7 +12,7 @@ from .._types import Scalar, Values
 from ._loading_inverse import secant_modulus, tangent_modulus
 from ._recovery import stress_ratio
 from ._unloading import StrainScaling, Unloading
-from .recovery_limit import recovery_limit
+from .recovery_limit import HARDENING, least_stiffness
 
 AREA = 1e-3 * jnp.pi / 4
 """Effective area over the diameter squared, times what makes mN of MPa um^2."""
@@ -98,15 +98,15 @@ def branch_force(power: int, k1: Scalar, k3: Scalar, k5: Scalar, c: Scalar, peak
     .. math:: F = F_P f(d / \Delta), \quad F_P = k_P \gamma_P, \quad k_P = k_1 - k_3 \gamma_P^2 + k_5 \gamma_P^4, \quad
         \Delta^2 = c\, k_P^n \gamma_P^{n-1}
 
-    and :math:`\Delta` no larger than `recovery_limit`.
+    and :math:`\Delta` no larger than :math:`F_P` over `least_stiffness`.
 
     Derivatives are written out, because reverse mode then stores half as many arrays along a path. With
     :math:`h = -\tfrac12 s f'`:
 
     .. math:: dF = (f + n h)\, dF_P - h k_P\, d\gamma_P + h F_P\, dc/c + F_P f'\, d(d)/\Delta
 
-    where the formula holds. At the limit the terms in h are those of :math:`2 h F_P\, d\Delta/\Delta`, that is
-    :math:`2 h k_P\, d\gamma_P` or :math:`2 h\, (dF_P - F_P\, dT/T)` with T the slope of loading.
+    where the formula holds. At the limit, :math:`\Delta = F_P/v` with :math:`v = k_1 + \kappa k_5 \gamma_P^4`
+    (`least_stiffness`), it is :math:`(f + 2h)\, dF_P - 2h F_P\, dv/v + F_P f'\, d(d)/\Delta`.
 
     Args:
         power: n, 1 (printed form) or 2 (punch forms).
@@ -120,7 +120,10 @@ def branch_force(power: int, k1: Scalar, k3: Scalar, k5: Scalar, c: Scalar, peak
     Returns:
         Force; zero where no force was carried at the peak.
     """
-    secant, _, _, ratio, _, _ = _branch(power, k1, k3, k5, c, peak, drop)
+    secant = secant_modulus(k1, k3, k5, peak)
+    # Without force what is recoverable is 0, and the drop over it without bound, or there is no drop.
+    above, below, _ = _recoverable(k1, k5, peak, secant, _square(power, c, peak, secant))
+    ratio = jnp.where(drop <= 0, 1.0, stress_ratio(shared(drop * below / above)))
     return peak * secant * ratio
 
 
@@ -128,7 +131,7 @@ def branch_force(power: int, k1: Scalar, k3: Scalar, k5: Scalar, c: Scalar, peak
 def _branch_force_jvp(power, primals, tangents):
     k1, k3, k5, c, peak, _ = primals
     dk1, dk3, dk5, dc, dpeak, ddrop = tangents
-    secant, span, s, ratio, limited, steep = _branch(power, *primals)
+    secant, s, ratio, (above, below), limited = _branch(power, *primals)
     # The force and all derivatives need these: without a barrier XLA computes them again in the loop of each output.
     s, ratio = jax.lax.optimization_barrier((s, ratio))
     force = peak * secant
@@ -137,30 +140,41 @@ def _branch_force_jvp(power, primals, tangents):
     s = jnp.where(inside, s, 0.0)
     fall = jnp.where(inside, 4 / jnp.pi * shared(jnp.sqrt((1 - s) * (1 + s))), 0.0)
     h = 0.5 * s * fall
-    slope = tangent_modulus(k1, k3, k5, peak)
-    dforce = peak * (dk1 - square * (dk3 - square * dk5)) + slope * dpeak
-    dslope = dk1 - square * (3 * dk3 - 5 * square * dk5) - peak * (6 * k3 - 20 * square * k5) * dpeak
-    with_force = jnp.where(limited, jnp.where(steep, 2.0, 0.0), float(power))
-    with_peak = jnp.where(limited, jnp.where(steep, 0.0, -2.0), 1.0)
-    with_slope = jnp.where(limited & steep, shared(2 * h * force / jnp.where(steep, slope, 1.0)), 0.0)
-    factor = jnp.where(secant > 0, ratio + with_force * h, 0.0)
-    change = factor * dforce - with_peak * h * secant * dpeak - with_slope * dslope
-    change = change + jnp.where(limited, 0.0, shared(h * force / c)) * dc - shared(force * fall / span) * ddrop
+    dforce = peak * (dk1 - square * (dk3 - square * dk5)) + tangent_modulus(k1, k3, k5, peak) * dpeak
+    factor = jnp.where(secant > 0, ratio + power * h, 0.0)
+    share = shared(h * force / jnp.where(limited, least_stiffness(k1, k5, peak), c))
+    at_limit, by_formula = jnp.where(limited, 2 * share, 0.0), jnp.where(limited, 0.0, share)
+    if power == 1:
+        factor = factor + jnp.where(limited, h, 0.0)
+    dleast = dk1 + HARDENING * square * (square * dk5 + 4 * peak * k5 * dpeak)
+    change = factor * dforce - jnp.where(limited, 0.0, h * secant) * dpeak + by_formula * dc - at_limit * dleast
+    change = change - shared(force * fall * below / jnp.where(inside, above, 1.0)) * ddrop
     # Transposed, this is a barrier for the cotangent, which otherwise would be computed again for each input.
     return force * ratio, jax.lax.optimization_barrier(change)
 
 
 def _branch(power, k1, k3, k5, c, peak, drop):
-    """Secant, recoverable displacement (1 if nothing was carried), its recovered share, share of peak force left.
+    """Secant, recovered share (1 if nothing was carried), share of peak force left, recoverable displacement.
 
-    And whether the recoverable displacement is at its limit, and whether loading is steep there.
+    That as a fraction, and whether it is at its limit.
     """
     secant = secant_modulus(k1, k3, k5, peak)
-    square = c * secant if power == 1 else c * peak * secant * secant
+    square = _square(power, c, peak, secant)
     carries = (peak > 0) & (square > 0)
-    span = shared(jnp.sqrt(jnp.where(carries, square, 1.0)))
-    limit, steep = recovery_limit(peak, secant, tangent_modulus(k1, k3, k5, peak))
-    limited = carries & (span > limit)
-    span = jnp.where(limited, limit, span)
-    s = jnp.where(carries, shared(drop / span), 1.0)
-    return secant, span, s, jnp.where(drop <= 0, 1.0, stress_ratio(s)), limited, steep
+    above, below, limited = _recoverable(k1, k5, peak, secant, jnp.where(carries, square, 1.0))
+    # So that second derivatives are finite, too.
+    above = jnp.where(carries, above, 1.0)
+    s = jnp.where(carries, shared(drop * below / above), 1.0)
+    return secant, s, jnp.where(drop <= 0, 1.0, stress_ratio(s)), (above, below), limited
+
+
+def _square(power, c, peak, secant):
+    """The formula's recoverable displacement squared."""
+    return c * secant if power == 1 else c * peak * secant * secant
+
+
+def _recoverable(k1, k5, peak, secant, square):
+    """Recoverable displacement as a fraction, a second quotient being slow, and whether it is at its limit."""
+    span, force, least = shared(jnp.sqrt(square)), peak * secant, least_stiffness(k1, k5, peak)
+    limited = span * least > force
+    return jnp.where(limited, force, span), jnp.where(limited, least, 1.0), limited

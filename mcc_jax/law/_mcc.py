@@ -12,11 +12,11 @@ from .._types import Flag, Path, Scalar, scalar
 from ..geometry import Particle, plastic_shape_factor
 from ._base import AbstractContactLaw
 from ._branch import AREA, branch_coefficients, branch_force
-from ._loading_inverse import loading_strain, secant_modulus, tangent_modulus
+from ._loading_inverse import loading_strain, secant_modulus
 from ._plastic import Plastic
 from ._recovery import energy_ratio, recovery, stress_ratio
 from ._unloading import StrainScaling, Unloading
-from .recovery_limit import recovery_limit
+from .recovery_limit import least_stiffness
 
 AnyShape = Float[Array, "..."]
 TESTED_STRAIN = 0.67
@@ -124,9 +124,9 @@ class MccLaw(AbstractContactLaw[History]):
             \delta^2 = \frac{\sigma_P}{4.12\, \bar E\, \eta_p^p\, \epsilon_P} \ (\text{printed}), \qquad
             \delta^2 = \frac{\sigma_P^2}{k\, \bar E^2\, \eta_p^p\, \epsilon_P} \ (\text{punch forms})
 
-        with p of the `StrainScaling`, and never more than a contact can give back (`recovery_limit`),
+        with p of the `StrainScaling`, and never more than a contact can give back (`law.recovery_limit`),
 
-        .. math:: \delta \le \min\left(\epsilon_P,\ \tfrac{3\pi}{8}\, \sigma_P \Big/ \frac{d\sigma}{d\epsilon}\right).
+        .. math:: \delta \le \frac{\sigma_P}{\eta_p [C_1 + \tfrac{40}{3\pi} C_5^5 (\eta_p\epsilon_P)^4]} \le \epsilon_P.
 
         The printed form does not vanish at zero strain: below a peak strain of about 0.01 (0.2 MPa) its residual strain
         would be negative, and a little lower its unloading would create energy. There the limit holds; with the paper's
@@ -156,8 +156,8 @@ class MccLaw(AbstractContactLaw[History]):
 
     def _elastic(self, eta: Scalar, x: AnyShape) -> tuple[AnyShape, Bool[Array, ...], AnyShape]:
         """Peak stress, whether it is positive, and the recoverable strain, at the peak scaled strain `x`."""
-        polynomial = self.plastic.polynomial
-        secant = secant_modulus(*polynomial, x)
+        K1, K3, K5 = self.plastic.polynomial
+        secant = secant_modulus(K1, K3, K5, x)
         k, power = self.unloading.constant, self.strain_scaling.power
         if self.unloading is Unloading.PRINTED:
             square = shared(eta ** (1 - power) * secant / (k * self.effective_modulus))
@@ -165,7 +165,7 @@ class MccLaw(AbstractContactLaw[History]):
             square = eta ** (1 - power) * x * shared(secant / self.effective_modulus) ** 2 / k
         carries = (x > 0) & (square > jnp.finfo(square.dtype).tiny)  # down to where the root still has a derivative
         recoverable = shared(jnp.sqrt(jnp.where(carries, square, 1.0)))
-        limit, _ = recovery_limit(shared(x / eta), secant, tangent_modulus(*polynomial, x))
+        limit = shared(x * secant / (eta * least_stiffness(K1, K5, x)))
         return x * secant, carries, jnp.where(carries & (recoverable > limit), limit, recoverable)
 
     # ---- force and displacement --------------------------------------------------------------------------------------

@@ -54,11 +54,8 @@ class Plastic(eqx.Module):
 
     def stress(self, x: Float[Array, ...]) -> Float[Array, ...]:
         """Stress [MPa] at the scaled strain `x` = eta_p eps >= 0, never below zero."""
-        return x * self.secant(x)
-
-    def secant(self, x: Float[Array, ...]) -> Float[Array, ...]:
-        """Stress over scaled strain [MPa], never below zero, and C1 at `x` = 0."""
-        return secant_modulus(*self.polynomial, x)
+        K1, K3, K5 = self.polynomial
+        return x * secant_modulus(K1, K3, K5, x)
 
     def tangent(self, x: Float[Array, ...]) -> Float[Array, ...]:
         r"""Slope :math:`d\sigma/dx = C_1 - 3 C_3^3 x^2 + 5 C_5^5 x^4` [MPa]."""

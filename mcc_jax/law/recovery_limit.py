@@ -1,23 +1,25 @@
 r"""How much a contact can give back at most: the one remedy for all forms of the unloading law.
 
-The formula for the recovered strain is not bound to the work that was put in. The printed form does not vanish with
-strain, so that below a peak of about 0.01 the released particle would be larger than before and, a little lower, would
-return more work than it took; with a soft modulus every form does so again far beyond the tested range. The limit
+The formula for the recovered displacement is not bound to the work that was put in. The printed form does not vanish
+with strain, so that below a peak of about 0.01 the released particle would be larger than before and, a little lower,
+would return more work than it took; with a soft modulus every form does so again far beyond the tested range. The limit
+on the displacement :math:`\Delta` recovered from a peak at :math:`\gamma_P`,
 
-.. math:: \Delta \le \Delta_{lim} = \min\left(\gamma_P,\ \tfrac{3\pi}{8}\, F_P \Big/ \frac{dF}{d\gamma}\Big|_P\right)
+.. math:: \Delta \le \frac{F_P}{k_1 + \tfrac{40}{3\pi} k_5 \gamma_P^4} \le \gamma_P, \qquad
+    F = k_1 \gamma - k_3 \gamma^3 + k_5 \gamma^5 \ (\text{loading}),
 
-says that release ends at the start of loading at the latest, and that unloading begins at least
-:math:`32/(3\pi^2) = 1.08` times as stiff as loading ended. Where the formula gives less, it stays to the last bit.
+is the peak itself at small strain and :math:`\tfrac{3\pi}{40} \gamma_P` far beyond. Where the formula gives less, it
+stays to the last bit.
 
 With the elastic energy :math:`S = \tfrac{4}{3\pi} F_P \Delta` that is enough for what is dissipated,
 :math:`D = W - S`, never to fall while the peak grows, :math:`dS \le F_P\, d\gamma_P`. So no cycle of any path, from any
-state, gives back more than it took. With :math:`m = \gamma F'/F` at the peak:
+state, gives back more than it took. With the slope :math:`F'` at the peak, :math:`m = \gamma_P F'/F_P` and
+:math:`T = \tfrac{3\pi}{8} k_1 + 5 k_5 \gamma_P^4 \ge F'`,
 
-- formula, :math:`\Delta^2 \propto (F_P/\gamma_P)^n \gamma_P^{n-1}`: :math:`dS/d\gamma_P = \tfrac{4}{3\pi} F_P
-  (\Delta/\gamma_P) [(1 + n/2) m - 1/2]`, which the limit keeps below :math:`F_P` for n = 1 and 2;
-- :math:`\Delta = \gamma_P`, where :math:`m \le 3\pi/8`: :math:`dS/d\gamma_P = \tfrac{4}{3\pi} (1 + m) F_P < F_P`;
-- :math:`S = F^2/(2F')`, where m is larger: :math:`dS/d\gamma_P = F_P - F^2 F''/(2 F'^2)`, and where m > 1 the quintic is
-  convex: it begins concave, and a concave curve from the origin has :math:`m \le 1`.
+- at the limit :math:`S = F_P^2/(2T)`, so :math:`S' = F_P F'/T - F_P^2 T'/(2T^2) \le F_P`;
+- by the formula, :math:`\Delta^2 \propto (F_P/\gamma_P)^n \gamma_P^{n-1}`, so :math:`S' = \tfrac{4}{3\pi} F_P
+  (\Delta/\gamma_P) [(1 + n/2) m - 1/2]`; as :math:`\Delta/\gamma_P` is at most 1 and at most
+  :math:`\tfrac{3\pi}{8} F_P/(T \gamma_P) \le \tfrac{3\pi}{8}/m`, it is below :math:`F_P` for n = 1 and 2.
 
 In a pair each side has its own limit; the sides carry one force, so their energies add.
 """
@@ -26,28 +28,22 @@ from __future__ import annotations
 
 import math
 
-import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from .._types import Scalar, Values
 
-from .._numerics import shared
-from .._types import Values
-
-SHARE = 3 * math.pi / 8
-r"""Largest :math:`\Delta F'/F_P`. Elastic energy is :math:`\tfrac{4}{3\pi} F_P \Delta`; with it :math:`F^2/(2F')`."""
+HARDENING = 40 / (3 * math.pi)
+r"""Weight of the hardening term: 5, of the slope, over 3 pi/8, which makes :math:`\tfrac{4}{3\pi} F \Delta` half."""
 
 
-def recovery_limit(peak: Values, secant: Values, tangent: Values) -> tuple[Values, Bool[Array, ...]]:
-    r"""What a contact recovers at most from a peak, :math:`\Delta_{lim}`, and whether it is steep there.
+def least_stiffness(k1: Scalar, k5: Scalar, peak: Values) -> Values:
+    r"""Least force at a peak over what is recovered from it, :math:`k_1 + \tfrac{40}{3\pi} k_5 \gamma_P^4`.
+
+    With k1, k5 of stress over scaled strain [MPa] and the peak scaled strain it is a stress over scaled strain, with
+    those of force over displacement a stiffness.
 
     Args:
-        peak: displacement at the peak, >= 0, in any unit; the result has the same.
-        secant: loading force over displacement there, >= 0.
-        tangent: slope of loading there, of any sign.
-
-    Returns:
-        The limit, 0 where no force is carried; and whether the second of its two terms holds, not the peak itself.
+        k1: initial slope of loading.
+        k5: factor of the hardening term.
+        peak: where unloading begins.
     """
-    least = SHARE * secant
-    steep = tangent > least
-    top = jnp.where(steep, tangent, least)
-    return peak * shared(least / jnp.where(top > 0, top, 1.0)), steep
+    square = peak * peak
+    return k1 + square * (square * (HARDENING * k5))

@@ -35,10 +35,9 @@ class _Half:
     def recovered(self, d: np.ndarray) -> np.ndarray:
         strain = np.where(d > 0, 2 * d / self.diameter, 1.0)
         square = (self.stress(d) / self.modulus) ** self.n / (self.k * self.eta**self.p * strain)
-        # No more than the peak itself, and no softer at the start of unloading than 32/(3 pi^2) times loading's end.
-        slope = self.slope(d)
-        steepest = 3 * np.pi / 8 * self.force(d) / np.where(slope > 0, slope, 1.0)
-        limit = np.where(slope > 0, np.minimum(d, steepest), d)
+        K1, _, K5 = self.K
+        x = 2 * self.eta * d / self.diameter
+        limit = self.diameter / (2 * self.eta) * self.stress(d) / (K1 + 40 / (3 * np.pi) * K5 * x**4)
         return np.where(d > 0, np.minimum(self.diameter * np.sqrt(square) / 2, limit), 0.0)
 
 
