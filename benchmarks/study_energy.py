@@ -48,8 +48,8 @@ def main():
     head = [
         "# Energy along random paths",
         "",
-        f"{arguments.paths} paths of {energy_paths.TURNS} releases for each row. A gain is a share of the energy put in,",
-        f"the largest over the paths; negative is lost. Rounding: {ROUNDING:g}. Written by `benchmarks/study_energy.py`.",
+        f"{arguments.paths} paths of {energy_paths.TURNS} releases for each row. A gain is a share of the energy put",
+        f"in, the largest over the paths; negative is lost. Rounding: {ROUNDING:g}. By `benchmarks/study_energy.py`.",
         "",
         "| contact | form | scaling | gain of a whole path | gain from release to release | |",
         "|---|---|---|---|---|---|",

@@ -180,7 +180,7 @@ def law_options(command: Any) -> Any:
         type=click.Choice(UNLOADING),
         default=UNLOADING[0],
         show_default=True,
-        help="Form of the unloading law; the paper's 16 GPa belongs to 'printed' only. Where a form would return more energy "
-        "than it took ('printed': peak strains below about 0.01), the recovered strain is limited.",
+        help="Form of the unloading law; the paper's 16 GPa belongs to 'printed' only. Where a form would return more "
+        "energy than it took ('printed': peak strains below about 0.01), the recovered strain is limited.",
     )
     return unloading(scaling(command))

@@ -54,9 +54,9 @@ def pair_force(i: HalfContact, j: HalfContact, overlap_max: Scalar, overlap: Sca
 
     with f of `law.stress_ratio`. The equal-force split is unique where both sides are monotone. Both sides peaked at
     the same force, so they unload by the same share of it, and the largest overlap is all there is to remember.
-    Particles that are alike share the overlap in halves. Each side recovers no more than its
-    own `law.recovery_limit`, so that no path of a pair gains energy; beside a side that does not give way on loading the
-    other behaves as against a wall.
+    Particles that are alike share the overlap in halves. Each side recovers no more than its own `law.recovery_limit`,
+    so that no path of a pair gains energy; beside a side that does not give way on loading the other behaves as against
+    a wall.
 
     Args:
         i: one half contact.

@@ -20,8 +20,8 @@ FORMULAE = {
     "loading": "sigma / MPa = C1 x - (C3 x)^3 + (C5 x)^5 with x = eta_p eps, for eps >= eps_P",
     "history": "eps_P is the largest strain so far, sigma_P the loading stress there",
     "recovered_strain": "delta^2 = (sigma_P / E)^n / (k eta_p^p eps_P), but delta no larger than recovery_limit",
-    "recovery_limit": "sigma_P / (eta_p (K1 + 40/(3 pi) K5 (eta_p eps_P)^4)), never above eps_P: no cycle gains energy; "
-    "it holds where the formula would create some (printed form: peak strains below about 0.01), elsewhere the "
+    "recovery_limit": "sigma_P / (eta_p (K1 + 40/(3 pi) K5 (eta_p eps_P)^4)), never above eps_P: no cycle gains "
+    "energy; it holds where the formula would create some (printed form: peak strains below about 0.01), elsewhere the "
     "formula is untouched",
     "unloading": "sigma = sigma_P g(s), g(s) = (2/pi) (acos s - s sqrt(1 - s^2)), s = (eps_P - eps) / delta, "
     "for eps < eps_P; 0 for s >= 1; reloading retraces it",

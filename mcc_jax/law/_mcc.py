@@ -163,9 +163,11 @@ class MccLaw(AbstractContactLaw[History]):
             square = shared(eta ** (1 - power) * secant / (k * self.effective_modulus))
         else:
             square = eta ** (1 - power) * x * shared(secant / self.effective_modulus) ** 2 / k
-        carries = (x > 0) & (square > jnp.finfo(square.dtype).tiny)  # down to where the root still has a derivative
-        recoverable = shared(jnp.sqrt(jnp.where(carries, square, 1.0)))
         limit = shared(x * secant / (eta * least_stiffness(K1, K5, x)))
+        # Down to where the root, and a quotient by what is recoverable, still have derivatives.
+        tiny = jnp.finfo(square.dtype).tiny
+        carries = (x > 0) & (square > tiny) & (limit > tiny**0.5)
+        recoverable = shared(jnp.sqrt(jnp.where(carries, square, 1.0)))
         return x * secant, carries, jnp.where(carries & (recoverable > limit), limit, recoverable)
 
     # ---- force and displacement --------------------------------------------------------------------------------------

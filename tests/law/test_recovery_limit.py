@@ -93,12 +93,15 @@ def test_the_paths_would_show_a_gain(monkeypatch):
 
 def switch(law, particle):
     """Peak displacement where the limit begins to hold at small strain."""
-    free = law.recoverable_strain(particle, jnp.array(0.02))  # of the printed form nearly constant there
-    low, high = 1e-9, 2 * float(free)
+    n, shape = law.unloading.stress_power, float(law.shape_factor(particle)) ** law.strain_scaling.power
+    low, high = 1e-9, 0.2
     for _ in range(60):
         middle = 0.5 * (low + high)
-        held = law.recoverable_strain(particle, jnp.array(middle)) >= middle
+        ratio = float(law.loading_stress(particle, jnp.array(middle)) / law.effective_modulus)
+        formula = (ratio**n / (law.unloading.constant * shape * middle)) ** 0.5
+        held = law.recoverable_strain(particle, jnp.array(middle)) < formula * (1 - 1e-13)
         low, high = (middle, high) if held else (low, middle)
+    assert 2e-9 < low < 0.19
     return float(particle.displacement(jnp.array(low)))
 
 
