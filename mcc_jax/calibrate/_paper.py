@@ -140,6 +140,14 @@ class PaperCalibration:
         fits = [p for p in self.particles if p is not None and p.used.any()]
         return float(np.median([getattr(p, name) / max(np.ptp(p.measured_um[p.used]), 1e-300) for p in fits]))
 
+    def answer(self) -> dict[str, Any]:
+        """Whether it converged, a and the modulus, as in `calibration.json`."""
+        return {
+            "converged": self.converged,
+            "a": estimate(self.a),
+            "effective_modulus_MPa": estimate(self.elastic.effective_modulus_MPa),
+        }
+
     def to_json(self) -> dict[str, Any]:
         """The contents of `calibration.json`."""
         population = self.plastic.population
@@ -167,18 +175,16 @@ class PaperCalibration:
         return {
             "schema": 1,
             "method": "paper",
-            "converged": self.converged,
+            **self.answer(),
             "runtime_s": self.runtime_s,
             "seed": self.seed,
             "law": {"unloading": self.law.unloading.value, "strain_scaling": self.law.strain_scaling.value},
-            "a": estimate(self.a),
             "a_objective": self.objective,
             "a_full": estimate(self.shape.a),
             "a_reference": estimate(reference.a if reference else None),
             "reference_particle": None
             if reference is None or reference.reference is None
             else self.campaign.particles[reference.reference],
-            "effective_modulus_MPa": estimate(self.elastic.effective_modulus_MPa),
             **{
                 f"log_{name}": {"mean": estimate(float(c.mean)), "sd": estimate(float(c.sd))}
                 for name, c in (("C1", population.C1), ("C3", population.C3), ("C5", population.C5))
@@ -296,9 +302,9 @@ def calibrate_paper(
         settings: dict[str, Any] = {"threshold_MPa": threshold_MPa, "objective": objective, "seed": seed}
         form: dict[str, Any] = {"unloading": unloading, "strain_scaling": strain_scaling}
         chosen = None if reference not in some.particles else reference
-        return calibrate_paper(some, reference=chosen, without_flagged=False, **settings, **form).to_json()
+        return calibrate_paper(some, reference=chosen, without_flagged=False, **settings, **form).answer()
 
-    findings = judged(campaign, calibration.to_json(), outlying, again if without_flagged else None)
+    findings = judged(campaign, calibration.answer(), outlying, again if without_flagged else None)
     return replace(calibration, findings=findings, runtime_s=time.perf_counter() - started)
 
 

@@ -8,7 +8,15 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from ..campaign import Adjustment, Campaign, Curve, effective_diameter_um, particle_batch, stress_and_strain
+from ..campaign import (
+    Adjustment,
+    Campaign,
+    Curve,
+    effective_diameter_um,
+    particle_batch,
+    point_noise,
+    stress_and_strain,
+)
 from ..law import MccLaw, Plastic
 from ..simulate import simulate_batch
 from ._plastic import fit_polynomial
@@ -46,10 +54,7 @@ class ParticleFit:
 
 def point_noise_um(curve: Curve) -> float:
     """Standard deviation of displacement from point to point [um]: second differences cancel any smooth course."""
-    if len(curve) < 4:
-        return 0.0
-    second = np.diff(curve.displacement_um, 2)
-    return float(np.median(np.abs(second - np.median(second))) / 0.6745 / np.sqrt(6))
+    return point_noise(curve.displacement_um)
 
 
 def predict_particles(

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from .._errors import InputError
-from ..campaign import Campaign, Finding, campaign_findings, check_plausibility, named
+from ..campaign import Campaign, Finding, campaign_findings, check_plausibility, named, or_slip
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def _far(logs: np.ndarray, options: JudgementOptions) -> np.ndarray:
 
 def judged(
     campaign: Campaign,
-    content: Mapping[str, Any],
+    answer: Mapping[str, Any],
     outlying: Finding | None,
     again: Callable[[Campaign], Mapping[str, Any]] | None,
     options: JudgementOptions | None = None,
@@ -86,14 +86,14 @@ def judged(
 
     Args:
         campaign: the checked campaign.
-        content: a, modulus and their errors as in `calibration.json`.
+        answer: a, modulus and their errors as in `calibration.json`, and whether it converged.
         outlying: what `unlike_others` found.
         again: calibrates a campaign and gives the same numbers; None to leave the answers without them out.
         options: see `JudgementOptions`.
     """
     options = options or JudgementOptions()
     found = [*campaign_findings(campaign), *([] if outlying is None else [outlying])]
-    found += check_plausibility(campaign.raw or campaign, modulus_MPa=content["effective_modulus_MPa"]["value"])
+    found += check_plausibility(campaign.raw or campaign, modulus_MPa=answer["effective_modulus_MPa"]["value"])
     if again is None:
         return tuple(found)
     answers: dict[tuple[str, ...], str] = {}
@@ -102,19 +102,11 @@ def judged(
         few = 0 < len(one.particles) <= len(campaign) / 2 and len(campaign) - len(one.particles) >= options.left
         if one.level != "told" and few:
             if one.particles not in answers and len(answers) < options.answers:
-                answers[one.particles] = _without(campaign, content, one.particles, again)
-            answer = answers.get(one.particles)
-            one = one if answer is None else replace(one, sentence=f"{one.sentence}; {answer}")
+                answers[one.particles] = _without(campaign, answer, one.particles, again)
+            other = answers.get(one.particles)
+            one = one if other is None else replace(one, sentence=f"{one.sentence}; {other}")
         told.append(one)
     return tuple(told)
-
-
-def no_answer(campaign: Campaign, problem: str, remedy: str) -> InputError:
-    """The error for a campaign that cannot be calibrated: what is wrong, and the likely slip where there is one."""
-    slips = [one for one in check_plausibility(campaign.raw or campaign) if one.level == "bad"]
-    if slips:
-        problem, remedy = f"{problem}; {slips[0].sentence}", slips[0].remedy
-    return InputError(problem, file=campaign.source or None, remedy=remedy)
 
 
 @contextlib.contextmanager
@@ -135,11 +127,12 @@ def numbers_in_reach(campaign: Campaign) -> Iterator[None]:
         # A ValueError of ours is about an argument; those of NumPy and SciPy that are meant here speak of NaN.
         if isinstance(error, ValueError) and not isinstance(error, np.linalg.LinAlgError) and "infs or NaN" not in text:
             raise
-        raise no_answer(
+        problem, remedy = or_slip(
             campaign,
             f"the law cannot be fitted to these tests: their numbers are beyond what arithmetic can resolve ({text})",
             "Look at the curves, leave out the test that is unlike the others, and check the units",
-        ) from None
+        )
+        raise InputError(problem, file=campaign.source or None, remedy=remedy) from None
 
 
 def _without(

@@ -49,5 +49,6 @@ from .reasons import below_threshold as below_threshold
 from .reasons import far_apart as far_apart
 from .reasons import no_climb as no_climb
 from .reasons import no_loading as no_loading
+from .reasons import or_slip as or_slip
 from .reasons import refusal as refusal
 from .reasons import too_few as too_few

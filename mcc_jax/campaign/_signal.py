@@ -44,6 +44,12 @@ def point_noise(values: np.ndarray) -> float:
     return float(np.median(np.abs(second - np.median(second))) / 0.6745 / np.sqrt(6))
 
 
+def runs(values: np.ndarray) -> list[tuple[int, int]]:
+    """Stretches [start, stop) of readings that are equal to the last digit."""
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(values)) + 1, [len(values)]])
+    return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
+
+
 def _scatter(third: np.ndarray) -> float:
     """Standard deviation of white noise with such third differences; at 1 their variance is 1 + 9 + 9 + 1."""
     return 1.4826 * float(np.median(np.abs(third))) / np.sqrt(20.0)

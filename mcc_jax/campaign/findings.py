@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -40,6 +40,11 @@ class Finding:
             "remedy": self.remedy,
             "particles": list(self.particles),
         }
+
+    @classmethod
+    def from_json(cls, entry: Mapping[str, Any]) -> Finding:
+        """The finding of such an entry."""
+        return cls(**{**entry, "particles": tuple(entry["particles"])})
 
 
 def worst(findings: Iterable[Finding]) -> Level | None:

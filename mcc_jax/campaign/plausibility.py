@@ -192,7 +192,7 @@ def check_plausibility(
 def wrong_signs(campaign: Campaign) -> bool:
     """Whether force, displacement or both are counted the other way round in most tests of a campaign."""
     with np.errstate(all="ignore"):
-        tests = _Tests.of(campaign, None, PlausibilityOptions())
+        tests = _Tests.of(campaign, None, PlausibilityOptions(), swapped=False)
         if tests is None:
             return False
         turned = (tests.column("force_sign") < 0) | (tests.column("displacement_sign") < 0)
@@ -211,11 +211,17 @@ class _Tests:
 
     @classmethod
     def of(
-        cls, campaign: Campaign, segments: Sequence[Sequence[Segment]] | None, options: PlausibilityOptions
+        cls,
+        campaign: Campaign,
+        segments: Sequence[Sequence[Segment]] | None,
+        options: PlausibilityOptions,
+        *,
+        swapped: bool = True,
     ) -> _Tests | None:
+        """The tests of a campaign; without the features of swapped columns where nobody asks for them."""
         diameters = np.asarray(campaign.diameters_um, float)
         given: list[CurveFeatures] = []
-        swapped: list[CurveFeatures | None] = []
+        others: list[CurveFeatures | None] = []
         rows: list[int] = []
         for i, curve in enumerate(campaign.curves):
             parts = segments[i] if segments is not None and i < len(segments) else ()
@@ -226,13 +232,15 @@ class _Tests:
                 continue
             rows.append(i)
             given.append(one)
-            swapped.append(
+            others.append(
                 curve_features(curve.time_s, curve.displacement_um, curve.force_mN, options=options.features)
+                if swapped
+                else None
             )
         if not rows:
             return None
         names = tuple(campaign.particles[i] for i in rows)
-        return cls(names, len(campaign), diameters[rows], tuple(given), tuple(swapped))
+        return cls(names, len(campaign), diameters[rows], tuple(given), tuple(others))
 
     def some(self, chosen: np.ndarray) -> tuple[str, ...]:
         """Names of the chosen tests, none where all are."""

@@ -13,16 +13,17 @@ A test in which nothing is found stays what it is, to the last bit.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ._schema import Campaign, Checked, Control, Curve, Note
 from ._segments import find_segments
-from ._signal import point_noise, two_lines
+from ._signal import point_noise, runs, two_lines
+from ._validate import check_campaign
 from .findings import Finding
 from .plausibility import wrong_signs
-from .saturation import censor_displacement, censor_force
+from .saturation import SaturationOptions, censor_displacement, censor_force
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,7 @@ class QualityOptions:
         drift_said: a drift in the air is told from so many standard deviations of its slope on, and from `air_share`.
         drift_slower: a straight rise in front of the loading is a drift if it is so many times slower, at most; the
             first contact of asperities is not straight.
+        saturation: when a channel counts as saturated.
     """
 
     spike_noise: float = 15.0
@@ -63,6 +65,7 @@ class QualityOptions:
     air_share: float = 1e-3
     drift_said: float = 5.0
     drift_slower: float = 0.1
+    saturation: SaturationOptions = field(default_factory=SaturationOptions)
 
 
 def check_tests(campaign: Campaign, options: QualityOptions | None = None) -> Campaign:
@@ -75,9 +78,13 @@ def check_tests(campaign: Campaign, options: QualityOptions | None = None) -> Ca
     Returns:
         A campaign whose curves hold the readings that count, with the zero of force taken off; `raw` is the campaign
         that was given, and `campaign_findings` says what was found.
+
+    Raises:
+        InputError: if names, shapes or values of a campaign made in memory are unfit.
     """
     if campaign.raw is not None:
         return campaign
+    check_campaign(campaign, file=campaign.source or "the campaign")
     options = options or QualityOptions()
     if wrong_signs(campaign):
         return replace(campaign, raw=campaign)  # what looks like air or breakage is the test read backwards
@@ -110,13 +117,13 @@ def check_test(curve: Curve, control: Control | None, options: QualityOptions) -
     if zero is not None:
         notes += zero.notes
         clean = replace(clean, force_mN=clean.force_mN - zero.path)
-    seen = censor_force(clean)
+    seen = censor_force(clean, options.saturation)
     compared = np.ones(len(clean), bool)
     force_sd = np.zeros(len(clean))
     if seen is not None:
         clean, rows, compared, force_sd = seen.curve, rows[seen.rows], seen.compared, seen.force_sd_mN
         notes.append(seen.note)
-    hidden = censor_displacement(clean)
+    hidden = censor_displacement(clean, options.saturation)
     if hidden is not None:
         compared &= ~hidden.rows
         notes.append(hidden.note)
@@ -156,12 +163,6 @@ def spikes(values: np.ndarray, options: QualityOptions) -> np.ndarray:
         if stop - start > 2:
             far[start:stop] = False
     return far
-
-
-def runs(values: np.ndarray) -> list[tuple[int, int]]:
-    """Stretches [start, stop) of readings that are equal to the last digit."""
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(values)) + 1, [len(values)]])
-    return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
 
 
 def stuck(values: np.ndarray, options: QualityOptions) -> np.ndarray:

@@ -156,8 +156,12 @@ def refusal(campaign: Campaign, problem: str, why_not: Sequence[str | None]) -> 
     if len(names) > SHOWN:
         parts.append("...")
     said = ". ".join(remedy[:1].upper() + remedy[1:] for remedy in remedies if remedy)
+    problem, said = or_slip(campaign, f"{problem}: {'; '.join(parts)}", said)
+    return InputError(problem, file=campaign.source or None, remedy=f"{said}.")
+
+
+def or_slip(campaign: Campaign, problem: str, remedy: str) -> tuple[str, str]:
+    """A problem and its remedy; with the likely slip of unit, sign or column that explains it, where there is one."""
     slips = [one for one in check_plausibility(campaign.raw or campaign) if one.level == "bad"]
-    if slips:  # what a slip explains needs no other remedy
-        parts.append(slips[0].sentence)
-        said = slips[0].remedy
-    return InputError(f"{problem}: {'; '.join(parts)}", file=campaign.source or None, remedy=f"{said}.")
+    # What a slip explains needs no other remedy.
+    return (f"{problem}; {slips[0].sentence}", slips[0].remedy) if slips else (problem, remedy)

@@ -18,23 +18,29 @@ from dataclasses import dataclass
 import numpy as np
 
 from ._schema import Curve, Note
-from ._signal import point_noise
+from ._signal import point_noise, runs
 
-LEAST_REPEATS = 4
-"""Readings that repeat the extreme, at least. Two equal readings around a turning point are not rare."""
 
-COARSE = 3.0
-"""And so many times as many as the channel repeats elsewhere: a coarse read-out repeats every value."""
+@dataclass(frozen=True)
+class SaturationOptions:
+    """When a channel counts as saturated, and how its turning point is found.
 
-GOES_ON = 0.5
-"""Share of its pace before that the other channel keeps up, at least. In a hold it stands still, or creeps."""
+    Attributes:
+        repeats: readings that repeat the extreme, at least. Two equal readings around a turning point are not rare.
+        coarse: and so many times as many as the channel repeats elsewhere: a coarse read-out repeats every value.
+        goes_on: share of its pace before that the other channel keeps up, at least. In a hold it stands still, or
+            creeps.
+        fitted_from: share of the end of the range from which on loading is fitted: below it, asperities deform, not
+            the particle.
+        trusted: share of the end of the range by which the turning point may lie beyond it: of simulated tests clipped
+            at 98, 95, 90 and 85 % the intervals of the modulus hold the truth; farther on nobody has looked.
+    """
 
-FITTED_FROM = 0.25
-"""Share of the end of the range from which on loading is fitted: below it, asperities deform, not the particle."""
-
-TRUSTED = 0.25
-"""Share of the end of the range by which the turning point may lie beyond it: of simulated tests clipped at 98, 95, 90
-and 85 % the intervals of the modulus hold the truth; farther on nobody has looked."""
+    repeats: int = 4
+    coarse: float = 3.0
+    goes_on: float = 0.5
+    fitted_from: float = 0.25
+    trusted: float = 0.25
 
 
 @dataclass(frozen=True)
@@ -65,7 +71,9 @@ class CensoredDisplacement:
     note: Note
 
 
-def plateaus(values: np.ndarray, other: np.ndarray, time: np.ndarray, noise: float) -> list[tuple[int, int]]:
+def plateaus(
+    values: np.ndarray, other: np.ndarray, time: np.ndarray, noise: float, options: SaturationOptions
+) -> list[tuple[int, int]]:
     """Stretches [start, stop) at the largest value of a channel during which the other channel goes on.
 
     Args:
@@ -73,61 +81,58 @@ def plateaus(values: np.ndarray, other: np.ndarray, time: np.ndarray, noise: flo
         other: the other channel.
         time: when [s].
         noise: standard deviation of the other channel's readings.
+        options: what counts.
     """
     count = len(values)
     if count < 12:
         return []
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(values)) + 1, [count]])
-    lengths = np.diff(edges)
-    top = values[edges[:-1]] == values.max()
-    if not top.any() or np.all(top):
+    stretches = runs(values)
+    largest = values.max()
+    at_end = [(start, stop) for start, stop in stretches if values[start] == largest]
+    elsewhere = [stop - start for start, stop in stretches if values[start] != largest]
+    if not at_end or not elsewhere:
         return []
-    usual = float(np.quantile(lengths[~top], 0.9))
+    usual = float(np.quantile(elsewhere, 0.9))
     found = []
-    for start, length in zip(edges[:-1][top], lengths[top], strict=True):
-        stop = int(start + length)
-        start = int(start)
-        if length < max(LEAST_REPEATS, COARSE * usual) or start < 4:
+    for start, stop in at_end:
+        length = stop - start
+        if length < max(options.repeats, options.coarse * usual) or start < 4:
             continue
         before = np.arange(max(start - 12, 0), start)
         line = np.polynomial.Polynomial.fit(time[before], other[before], 1)
         pace = float(line.deriv()(time[start - 1]))
         # Halfway, or at the end where the record ends there: a ramp that turns has come farthest.
-        some = max(int(length) // 3, 1)
-        middle = (
-            np.arange(stop - some, stop) if stop == count else start + int(length) // 2 + np.arange(some) - some // 2
-        )
+        some = max(length // 3, 1)
+        middle = np.arange(stop - some, stop) if stop == count else start + length // 2 + np.arange(some) - some // 2
         elapsed = float(np.mean(time[middle]) - time[start - 1])
         advance = float(np.mean(other[middle]) - line(time[start - 1]))
         error = noise * np.sqrt(1 / some + 4 / len(before))
-        if pace > 0 and elapsed > 0 and advance > max(GOES_ON * pace * elapsed, 3 * error):
+        if pace > 0 and elapsed > 0 and advance > max(options.goes_on * pace * elapsed, 3 * error):
             found.append((start, stop))
     if not found:
         return []
     # Other stretches at the same end of the range are at it, too, however short.
-    return [
-        (int(a), int(a + n))
-        for a, n in zip(edges[:-1][top], lengths[top], strict=True)
-        if n >= 2 or (a, a + n) in found
-    ]
+    return [one for one in at_end if one[1] - one[0] >= 2 or one in found]
 
 
-def censor_force(curve: Curve) -> CensoredForce | None:
+def censor_force(curve: Curve, options: SaturationOptions | None = None) -> CensoredForce | None:
     """The test with the turning points that its force channel did not see; None if the channel did not saturate.
 
     Args:
         curve: the test, its zero of force taken off.
+        options: what counts.
     """
+    options = options or SaturationOptions()
     force, path = curve.force_mN, curve.displacement_um
     noise = point_noise(path)
-    found = plateaus(force, path, curve.time_s, noise)
+    found = plateaus(force, path, curve.time_s, noise, options)
     if not found:
         return None
     end = float(force.max())
     hidden = np.zeros(len(force), bool)
     for start, stop in found:
         hidden[start:stop] = True
-    fitted = _loading(force, path, hidden, found[0][0], end)
+    fitted = _loading(force, path, hidden, found[0][0], end, options.fitted_from)
     keep, turning = ~hidden, {}
     reached = -np.inf
     for start, stop in found:
@@ -149,16 +154,17 @@ def censor_force(curve: Curve) -> CensoredForce | None:
         new_force[row], new_path[row], sd[row] = value, top, error
         largest.append(value)
         sds.append(error)
-    note = _note(end, int(hidden.sum()), largest, sds)
+    note = _note(end, int(hidden.sum()), largest, sds, options.trusted)
     compared = np.ones(len(force), bool)
     compared[list(turning)] = False
     checked = Curve(curve.time_s[keep], new_force[keep], new_path[keep])
     return CensoredForce(checked, np.flatnonzero(keep), compared[keep], sd[keep], note)
 
 
-def censor_displacement(curve: Curve) -> CensoredDisplacement | None:
+def censor_displacement(curve: Curve, options: SaturationOptions | None = None) -> CensoredDisplacement | None:
     """Readings of displacement at the end of its range; None if there are none."""
-    found = plateaus(curve.displacement_um, curve.force_mN, curve.time_s, point_noise(curve.force_mN))
+    options = options or SaturationOptions()
+    found = plateaus(curve.displacement_um, curve.force_mN, curve.time_s, point_noise(curve.force_mN), options)
     if not found:
         return None
     rows = np.zeros(len(curve), bool)
@@ -175,7 +181,7 @@ def censor_displacement(curve: Curve) -> CensoredDisplacement | None:
     return CensoredDisplacement(rows, note)
 
 
-def _note(end: float, count: int, largest: list[float], sds: list[float]) -> Note:
+def _note(end: float, count: int, largest: list[float], sds: list[float], trusted: float) -> Note:
     remedy = "Measure with a load cell of a larger range"
     if not largest:
         sentence = "force stands at {} mN, the end of its range, for {} readings, which are left out"
@@ -185,7 +191,7 @@ def _note(end: float, count: int, largest: list[float], sds: list[float]) -> Not
         "force stands at {} mN, the end of its range, for {} readings while the platens go on; they are left out and "
         "the turning point is taken from the displacement ({} +- {} mN)"
     )
-    far = top > (1 + TRUSTED) * end or not sd < 0.5 * TRUSTED * end
+    far = top > (1 + trusted) * end or not sd < 0.5 * trusted * end
     if far:
         sentence += ", too far beyond the range to be relied on"
     return Note("saturation", "bad" if far else "look", sentence, (end, count, top, sd), remedy)
@@ -236,18 +242,20 @@ class _Loading:
         return value, float(np.sqrt(max(slope @ self.covariance @ slope, 0.0) + (along * noise) ** 2))
 
 
-def _loading(force: np.ndarray, path: np.ndarray, hidden: np.ndarray, start: int, end: float) -> _Loading | None:
+def _loading(
+    force: np.ndarray, path: np.ndarray, hidden: np.ndarray, start: int, end: float, fitted_from: float
+) -> _Loading | None:
     """The loading curve before the force channel saturates for the first time."""
     from scipy.optimize import least_squares
 
     rows = np.arange(start)
     virgin = rows[
-        (path[rows] >= np.maximum.accumulate(path[rows])) & (force[rows] >= FITTED_FROM * end) & ~hidden[rows]
+        (path[rows] >= np.maximum.accumulate(path[rows])) & (force[rows] >= fitted_from * end) & ~hidden[rows]
     ]
     if len(virgin) < 8:
         return None
     f, d = force[virgin], path[virgin]
-    scale = float(d[-1] - d[0]) / (1 - FITTED_FROM)
+    scale = float(d[-1] - d[0]) / (1 - fitted_from)
     if not scale > 0:
         return None
     unit = _Loading(np.zeros(4), np.zeros((4, 4)), scale)
@@ -257,7 +265,7 @@ def _loading(force: np.ndarray, path: np.ndarray, hidden: np.ndarray, start: int
         k1, k3, k5 = parameters[1:]
         return np.maximum((k1 - 3 * k3 * x**2 + 5 * k5 * x**4) / scale, 1e-3 * end / scale)
 
-    first = d[0] / scale - FITTED_FROM
+    first = d[0] / scale - fitted_from
     x = d / scale - first
     design = np.stack([x, -(x**3), x**5], 1)
     start_at = np.concatenate([[first], np.linalg.lstsq(design, f, rcond=None)[0]])

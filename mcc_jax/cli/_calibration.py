@@ -11,7 +11,7 @@ from typing import Any
 
 from .._errors import InputError
 from ..calibrate import BayesCalibration, JointModel, LeastSquaresCalibration, PaperCalibration
-from ..campaign import Campaign
+from ..campaign import Campaign, Finding
 from ..files import LIMITS, read_regular
 from ._figures import FIGURES, write_figures, write_result
 from ._output import Stage
@@ -160,9 +160,7 @@ def _state(content: dict[str, Any]) -> str:
 
 def say_warnings(content: dict[str, Any]) -> None:
     """Print what a reader of the numbers must know."""
-    bad = {
-        ". ".join(filter(None, (f["sentence"], f["remedy"]))) + "." for f in content["findings"] if f["level"] == "bad"
-    }
+    bad = {str(Finding.from_json(one)) for one in content["findings"] if one["level"] == "bad"}
     for warning in sorted(content["warnings"], key=lambda text: text not in bad):
         colour = "red" if warning in bad else "yellow"
         say(f"Warning: {warning[:1].upper()}{warning[1:].rstrip('.')}.", fg=colour, bold=warning in bad)

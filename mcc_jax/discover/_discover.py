@@ -11,7 +11,7 @@ import numpy as np
 
 from .._errors import InputError
 from ..calibrate import JointModel
-from ..calibrate.joint._data import ranges_um
+from ..calibrate.joint._data import ranges_um, root_mean_squares
 from ..calibrate.judgement import unlike_others
 from ..campaign import Campaign, Finding, campaign_findings, check_plausibility, check_tests, named
 from ..effects import LIBRARY, Mechanism, present
@@ -133,8 +133,7 @@ def _settled_fit(
         told.append(_left_out(unsafe, len(campaign), "cannot be relied on, as said above"))
         campaign = campaign.without(*unsafe)
     base = base_fit(campaign, model, threshold_MPa=threshold_MPa, tell=tell)
-    mask = np.asarray(base.tests.mask)
-    rms = np.sqrt((np.asarray(base.fit.residual) ** 2).sum(1) / np.maximum(mask.sum(1), 1))
+    rms = root_mean_squares(base.tests, base.fit.residual)
     names = [base.name_of(row) for row in range(len(base.tests))]
     outlying = unlike_others(names, rms, ranges_um(base.tests))
     if outlying is not None:

@@ -77,7 +77,7 @@ def tested(results: Results) -> tuple[Finding, ...]:
     told = [one for _, content in results.results for one in content.get("findings", [])]
     if told:
         unique = {(one["check"], tuple(one["particles"]), one["sentence"]): one for one in told}
-        return tuple(Finding(**{**one, "particles": tuple(one["particles"])}) for one in unique.values())
+        return tuple(Finding.from_json(one) for one in unique.values())
     if results.results or results.campaign is None:
         return ()
     return (

@@ -15,7 +15,7 @@ from ...campaign import THRESHOLD_MPA, Campaign, Finding, check_tests
 from .._result import estimate, finite, force_zero, misfit_note
 from ..judgement import judged, numbers_in_reach, unlike_others
 from ._ahead import compile_ahead
-from ._data import Selection, own_misfit, ranges_um
+from ._data import Selection, own_misfit, ranges_um, root_mean_squares
 from ._draws import Length, draw_fast, draw_joint
 from ._fit import prepare
 from ._model import JointFit, JointModel
@@ -182,8 +182,11 @@ class BayesCalibration:
 
     def rms_um(self) -> np.ndarray:
         """Root mean square residual of every particle at the most probable parameters [um]."""
-        mask = np.asarray(self.selection.tests.mask)
-        return np.sqrt((np.asarray(self.fit.residual) ** 2).sum(1) / np.maximum(mask.sum(1), 1))
+        return root_mean_squares(self.selection.tests, self.fit.residual)
+
+    def answer(self) -> dict[str, Any]:
+        """Whether it converged, a, the modulus and the population, as in `calibration.json`."""
+        return {"converged": self.converged, **population_json(self.population)}
 
     def to_json(self) -> dict[str, Any]:
         """The contents of `calibration.json`."""
@@ -220,11 +223,10 @@ class BayesCalibration:
             "schema": 1,
             "method": "bayes",
             "mode": self.mode,
-            "converged": self.converged,
+            **self.answer(),
             "runtime_s": self.runtime_s,
             "seed": self.seed,
             "law": {"unloading": self.model.unloading.value, "strain_scaling": self.model.strain_scaling.value},
-            **population_json(self.population),
             "modulus_scatter": summary(named["modulus_scatter"]) if self.model.modulus_scatter else None,
             "shape_scatter": summary(named["shape_scatter"]) if self.model.shape_scatter else None,
             "yield_stress_MPa": summary(self.yield_stress_MPa()),
@@ -372,7 +374,7 @@ def calibrate_bayes(
     def again(some: Campaign) -> dict[str, Any]:
         settings: dict[str, Any] = {"threshold_MPa": threshold_MPa, "mode": mode, "seed": seed, "block": block}
         few: dict[str, Any] = {"chains": chains, "warmup": warmup, "draws": draws}
-        return calibrate_bayes(some, model=model, without_flagged=False, **settings, **few).to_json()
+        return calibrate_bayes(some, model=model, without_flagged=False, **settings, **few).answer()
 
-    findings = judged(campaign, calibration.to_json(), outlying, again if without_flagged else None)
+    findings = judged(campaign, calibration.answer(), outlying, again if without_flagged else None)
     return replace(calibration, findings=findings, runtime_s=time.perf_counter() - started)

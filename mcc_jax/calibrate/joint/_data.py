@@ -19,7 +19,6 @@ from ...campaign import (
     Segment,
     below_threshold,
     campaign_segments,
-    check_campaign,
     check_tests,
     far_apart,
     no_climb,
@@ -153,7 +152,6 @@ def select_tests(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, mo
         ValueError: for a threshold that is negative or not finite.
         RuntimeError: in single precision.
     """
-    check_campaign(campaign, file=campaign.source or "the campaign")
     if not (np.isfinite(threshold_MPa) and threshold_MPa >= 0):
         raise ValueError(f"the threshold must be a stress >= 0 MPa, got {threshold_MPa}")
     if not jax.config.read("jax_enable_x64"):
@@ -312,11 +310,15 @@ def ranges_um(tests: Tests) -> np.ndarray:
     return np.where(mask, measured, -np.inf).max(1) - np.where(mask, measured, np.inf).min(1)
 
 
+def root_mean_squares(tests: Tests, residual: Array | np.ndarray) -> np.ndarray:
+    """Root mean square of every test's residuals [um], shape (N,); residuals are 0 where masked."""
+    count = np.maximum(np.asarray(tests.mask).sum(1), 1)
+    return np.sqrt((np.asarray(residual) ** 2).sum(1) / count)
+
+
 def own_misfit(tests: Tests, residual: Float[Array, "particles points"]) -> float:
     """Median over the particles of the root mean square residual, in shares of the range of displacement [-]."""
-    count = np.maximum(np.asarray(tests.mask).sum(1), 1)
-    rms = np.sqrt((np.asarray(residual) ** 2).sum(1) / count)
-    return float(np.median(rms / np.maximum(ranges_um(tests), 1e-300)))
+    return float(np.median(root_mean_squares(tests, residual) / np.maximum(ranges_um(tests), 1e-300)))
 
 
 def _notes(campaign: Campaign, kept: tuple[int, ...], used: Sequence[_Prepared], most_points: int):

@@ -16,7 +16,7 @@ from .._result import estimate, finite, force_zero, misfit_note
 from ..judgement import judged, numbers_in_reach, unlike_others
 from ._arrow import Parameters, Solution
 from ._bayes import log_estimate, power_of_e
-from ._data import Selection, Tests, own_misfit, ranges_um
+from ._data import Selection, Tests, own_misfit, ranges_um, root_mean_squares
 from ._fit import beyond_numbers, population_at, prepare
 from ._mode import FIRST_SPREAD, spread_slope
 from ._model import JointFit, JointModel
@@ -136,16 +136,22 @@ class LeastSquaresCalibration:
             notes.append(f"the spread of {', '.join(small)} cannot be told from zero")
         return notes
 
+    def answer(self) -> dict[str, Any]:
+        """Whether it converged, a and the modulus, as in `calibration.json`."""
+        values, sds, known = np.asarray(self.solution.value.shared), self._shared_sd, self._known
+        return {
+            "converged": self.converged,
+            "a": _normal(float(values[0]), float(sds[0])) if known[0] else estimate(float(values[0])),
+            "effective_modulus_MPa": log_estimate(float(values[1]), float(sds[1]) if known[1] else np.nan),
+        }
+
     def to_json(self) -> dict[str, Any]:
         """The contents of `calibration.json`."""
         tests = self.selection.tests
         latent, zero = (np.asarray(v) for v in unpack(self.solution.value, self.settings, tests))
         own, between, shared = (np.asarray(v) for v in self.solution.normal.covariance())
         values = np.asarray(self.solution.value.shared)
-        free = bool(self.identifiability.open)
-        sds = np.sqrt(np.diagonal(shared))
-        known = [not (free and self._open_share(q) > 0.1) for q in range(5)]
-        a = float(values[0])
+        sds, known = self._shared_sd, self._known
         flat, eta = np.asarray(tests.flatness), self._shape_factor
         slope = flat / eta
         # Where it is not positive, which the reason says, there is no logarithm, and no coefficient without it.
@@ -186,14 +192,12 @@ class LeastSquaresCalibration:
         return {
             "schema": 1,
             "method": "least-squares",
-            "converged": self.converged,
+            **self.answer(),
             "reason": self.reason or f"the tolerances were met after {steps} steps",
             "runtime_s": self.runtime_s,
             "seed": self.seed,
             "law": {"unloading": self.model.unloading.value, "strain_scaling": self.model.strain_scaling.value},
             "loss": self.loss,
-            "a": _normal(a, float(sds[0])) if known[0] else estimate(a),
-            "effective_modulus_MPa": log_estimate(float(values[1]), float(sds[1]) if known[1] else np.nan),
             **{
                 f"log_{name}": {
                     "mean": _normal(float(values[2 + j]), float(sds[2 + j]))
@@ -238,13 +242,23 @@ class LeastSquaresCalibration:
 
     def rms_um(self) -> np.ndarray:
         """Root mean square residual of every particle [um], shape (N,)."""
-        count = np.maximum(np.asarray(self.selection.tests.mask).sum(1), 1)
-        return np.sqrt((np.asarray(self.residual()) ** 2).sum(1) / count)
+        return root_mean_squares(self.selection.tests, self.residual())
 
     @property
     def _shape_factor(self) -> np.ndarray:
         """eta_p of the particles that took part, shape (N,)."""
         return 1 + float(self.solution.value.shared[0]) * np.asarray(self.selection.tests.flatness)
+
+    @property
+    def _shared_sd(self) -> np.ndarray:
+        """Standard deviations of the shared parameters."""
+        return np.sqrt(np.diagonal(np.asarray(self.solution.normal.covariance()[2])))
+
+    @property
+    def _known(self) -> list[bool]:
+        """Which of the shared parameters the data do not leave open."""
+        free = bool(self.identifiability.open)
+        return [not (free and self._open_share(q) > 0.1) for q in range(5)]
 
     @property
     def _alone(self) -> bool:
@@ -372,9 +386,9 @@ def calibrate_least_squares(
 
     def again(some: Campaign) -> dict[str, Any]:
         settings: dict[str, Any] = {"threshold_MPa": threshold_MPa, "loss": loss, "seed": seed, "block": block}
-        return calibrate_least_squares(some, model=model, without_flagged=False, **settings).to_json()
+        return calibrate_least_squares(some, model=model, without_flagged=False, **settings).answer()
 
-    findings = judged(campaign, calibration.to_json(), outlying, again if without_flagged else None)
+    findings = judged(campaign, calibration.answer(), outlying, again if without_flagged else None)
     return replace(calibration, findings=findings, runtime_s=time.perf_counter() - started)
 
 
