@@ -29,7 +29,7 @@ class Note:
     check: str
     level: Level
     sentence: str
-    numbers: tuple[float, ...] = ()
+    numbers: tuple[float | int, ...] = ()
     remedy: str = ""
 
 

@@ -367,7 +367,7 @@ def campaign_findings(campaign: Campaign) -> tuple[Finding, ...]:
     Args:
         campaign: what `check_tests` made.
     """
-    groups: dict[tuple[str, str, str, str], list[tuple[str, tuple[float, ...]]]] = {}
+    groups: dict[tuple[str, str, str, str], list[tuple[str, tuple[float | int, ...]]]] = {}
     for name, curve in zip(campaign.particles, campaign.curves, strict=True):
         for note in curve.checked.notes if curve.checked is not None else ():
             key = note.check, note.level, note.sentence, note.remedy
@@ -389,6 +389,6 @@ def named(names: tuple[str, ...], of: int, most: int = 5) -> str:
     return f"Particles {shown}" if len(names) <= most else f"Particles {shown}, ... ({len(names)} of {of})"
 
 
-def _range(values: tuple[float, ...]) -> str:
+def _range(values: tuple[float | int, ...]) -> str:
     low, high = f"{min(values):.4g}", f"{max(values):.4g}"
     return low if low == high else f"{low} to {high}"

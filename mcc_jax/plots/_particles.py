@@ -58,7 +58,7 @@ def _dropped_panel(ax: Axes, curve: Curve, reason: str) -> None:
     ax.set_ylim(low, high + 0.45 * (high - low))  # room for the reason
     ax.set_facecolor("#F6F6F6")
     ax.text(
-        0.04, 0.95, textwrap.fill(plain(reason, 140), 26), transform=ax.transAxes, ha="left", va="top", fontsize=7,
+        0.04, 0.95, textwrap.fill(plain(reason, 200), 26), transform=ax.transAxes, ha="left", va="top", fontsize=7,
         color=GREY,
     )  # fmt: skip
 

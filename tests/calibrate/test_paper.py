@@ -1,14 +1,12 @@
 """The paper's calibration as a whole: what it recovers, what it writes, what it says of data it does not fit."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import TESTERS
 
 from mcc_jax import InputError, Instrument, Programme, Ramp, calibrate_paper, paper_campaign, read_tester_file
-
-TESTERS = Path(__file__).parents[3] / "shared" / "data" / "testers"
 
 
 @pytest.fixture(scope="module")

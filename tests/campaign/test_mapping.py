@@ -114,7 +114,8 @@ def test_quotes_and_names(tmp_path):
 
 
 def test_fischer_through_a_mapping_equals_its_reader(tmp_path):
-    from test_readers import TESTERS, lines_of
+    from helpers import TESTERS
+    from test_readers import lines_of
 
     rows = "\n".join(lines_of("FS1.txt")[84:1285])
     mapping = """

@@ -4,10 +4,10 @@ import io
 import re
 import struct
 import zipfile
-from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import TESTERS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -15,7 +15,6 @@ from mcc_jax._errors import InputError
 from mcc_jax.campaign import read_campaign, read_diameters, read_tester_file, write_campaign
 from mcc_jax.campaign.readers import _micromaterials
 
-TESTERS = Path(__file__).parents[3] / "shared" / "data" / "testers"
 FILES = ("FS1.txt", "Exp-50mN_0000.hld", "RobinSteel0000LC.txt", "multipleIndentations.zip")
 SIZES = [200.0, 190.0, 180.0]
 

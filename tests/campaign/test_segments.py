@@ -2,17 +2,16 @@ from __future__ import annotations
 
 import time
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import TESTERS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from protocols import Protocol, make_protocol
 
 from mcc_jax.campaign import Curve, Segment, find_segments, read_tester_file, summarise_segments
 
-TESTERS = Path(__file__).parents[3] / "shared" / "data" / "testers"
 SIZES = [200.0, 190.0, 180.0]
 
 

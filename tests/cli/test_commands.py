@@ -2,11 +2,11 @@ import dataclasses
 import json
 import math
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
 import pytest
 from asserting import snapshot
+from helpers import TESTERS
 
 from mcc_jax.campaign import PAPER_DIAMETERS_UM, find_segments, read_campaign
 from mcc_jax.cli._main import cli
@@ -14,7 +14,6 @@ from mcc_jax.cli._types import STRAIN_SCALING, UNLOADING
 from mcc_jax.law import StrainScaling, Unloading
 from mcc_jax.simulate import Instrument, paper_campaign
 
-TESTERS = Path(__file__).parents[3] / "shared" / "data" / "testers"
 # What the contract promises; more may be there.
 KEYS = {
     *("schema", "method", "converged", "runtime_s", "law", "a", "effective_modulus_MPa"),

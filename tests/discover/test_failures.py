@@ -1,18 +1,17 @@
 """Campaigns about which little can be said: each gets an answer, none an exception, and no answer holds a NaN."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 from campaigns import SINGLE, cached, campaign, mixed, subset
+from helpers import TESTERS
 
 from mcc_jax import InputError
 from mcc_jax.campaign import Campaign, Curve, read_tester_file
 from mcc_jax.discover import discover
 from mcc_jax.effects import LIBRARY
 
-TESTERS = Path(__file__).parents[3] / "shared" / "data" / "testers"
 QUICK = {"confirm": False, "experiments": False, "posterior": False}
 NAMES = ("frame_compliance", "creep", "adhesion", "unloading_shape", "reload_hysteresis")
 FEW = {name: LIBRARY[name] for name in NAMES}
@@ -111,8 +110,6 @@ def test_nothing_left_to_look_for():
 @pytest.fixture(scope="module")
 def indentation():
     """Ten indentations of fused silica with a sharp tip: not cellulose, no platens, no particle."""
-    if not (TESTERS / "FS1.txt").exists():
-        pytest.skip("the testers' files are not here")
     return answer(read_tester_file(TESTERS / "FS1.txt", diameters_um=(60.0, 60.0, 60.0)), confirm=True)
 
 

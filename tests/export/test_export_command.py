@@ -74,7 +74,7 @@ def test_the_header_passes_its_own_golden_tables(run, tmp_path):
         for name, kind, other in (("equal", PAIR, size), ("smaller", PAIR, 0.6 * size), ("wall", WALL, size))
     ]
     for kind, table, other in cases:
-        assert len(np.unique(table["path"])) == 9
+        assert len(np.unique(table["path"])) == 10  # the last one of small peaks, where the recovery is limited
         for number in np.unique(table["path"]):
             rows = table[table["path"] == number]
             x = rows["displacement_m"][None]

@@ -117,7 +117,7 @@ def test_bad_programme_files_are_told_in_one_line(tmp_path, text, message):
 
 
 def test_missing_programme_file_is_told(tmp_path):
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="there is no such file"):
         read_programme(tmp_path / "none.toml")
     (tmp_path / "latin.toml").write_bytes(b"# \xe9\n")
     with pytest.raises(InputError, match=r"latin\.toml: is no text in UTF-8"):
