@@ -120,5 +120,5 @@ def test_missing_programme_file_is_told(tmp_path):
     with pytest.raises(InputError, match="there is no such file"):
         read_programme(tmp_path / "none.toml")
     (tmp_path / "latin.toml").write_bytes(b"# \xe9\n")
-    with pytest.raises(InputError, match=r"latin\.toml: is no text in UTF-8"):
+    with pytest.raises(InputError, match=r"latin\.toml, row 1: the byte 0xe9 is not UTF-8"):
         read_programme(tmp_path / "latin.toml")
