@@ -7,6 +7,12 @@ import jax.numpy as jnp
 
 from ._numerics import compiled_whole, positive_pow, shared
 from ._types import Scalar, ScalarLike, Values, scalar
+from .arguments import instance, positive
+
+
+def _diameter(value: ScalarLike) -> Scalar:
+    positive(value, "a particle's diameter [um]")
+    return scalar(value)
 
 
 class Particle(eqx.Module):
@@ -22,14 +28,17 @@ class Particle(eqx.Module):
         D2: the other diameter in that plane [um], > 0.
         D3: diameter along the direction of compression [um], > 0.
 
+    Raises:
+        InputError: for a diameter that is not positive and finite, where it can be looked at: not inside `jax.jit`.
+
     References:
         Bommireddy et al. (2018), text below eq. 1; the paper's nomenclature calls D1 the major diameter, yet in its
         Table 1 D1 < D2 for 12 of 20 particles.
     """
 
-    D1: Scalar = eqx.field(converter=scalar)
-    D2: Scalar = eqx.field(converter=scalar)
-    D3: Scalar = eqx.field(converter=scalar)
+    D1: Scalar = eqx.field(converter=_diameter)
+    D2: Scalar = eqx.field(converter=_diameter)
+    D3: Scalar = eqx.field(converter=_diameter)
 
     @property
     def effective_diameter(self) -> Scalar:
@@ -73,6 +82,10 @@ class Particle(eqx.Module):
         return stress * self.effective_area * 1e-3
 
 
+def _particle(value: Particle) -> Particle:
+    return instance(value, Particle, "particle", "Make one with mcc_jax.Particle(D1, D2, D3), diameters in um.")
+
+
 @compiled_whole
 def plastic_shape_factor(particle: Particle, a: ScalarLike) -> Scalar:
     r"""Shape factor of plastic loading.
@@ -90,7 +103,7 @@ def plastic_shape_factor(particle: Particle, a: ScalarLike) -> Scalar:
     References:
         Bommireddy et al. (2018), eq. 13.
     """
-    return 1 + scalar(a) * particle.flatness
+    return 1 + scalar(a) * _particle(particle).flatness
 
 
 @compiled_whole
@@ -109,5 +122,6 @@ def elastic_shape_factor(particle: Particle) -> Scalar:
         Bommireddy et al. (2018), eq. 2, after Zheng et al. (2013); made symmetric here.
     """
     # The modulus of a logarithm, not max/min: exactly symmetric, and at D1 = D2 no diameter wins the tie.
+    _particle(particle)
     log_ratio = jnp.abs(jnp.log(particle.D1) - jnp.log(particle.D2))
     return 1 / (1 - positive_pow(jnp.expm1(0.1368 * log_ratio), 1.531))

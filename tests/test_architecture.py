@@ -21,6 +21,7 @@ LAYERS = {
     "_numerics": LEAF,
     "_results": LEAF,
     "_version": LEAF,
+    "arguments": LEAF,
     "units": LEAF,
     "_blocks": 1,
     "_text": 1,

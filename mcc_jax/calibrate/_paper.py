@@ -5,11 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, get_args
 
 import equinox as eqx
 import numpy as np
 
+from .. import arguments
 from .._errors import InputError
 from ..campaign import (
     THRESHOLD_MPA,
@@ -22,6 +23,7 @@ from ..campaign import (
     particle_batch,
     refusal,
 )
+from ..campaign._validate import usable_campaign
 from ..geometry import plastic_shape_factor
 from ..law import MccLaw, StrainScaling, Unloading
 from ._elastic import ElasticFit, campaign_branches, fit_effective_modulus
@@ -218,8 +220,8 @@ def calibrate_paper(
     threshold_MPa: float = THRESHOLD_MPA,
     objective: Objective = "full",
     reference: str | None = None,
-    unloading: Unloading = Unloading.PRINTED,
-    strain_scaling: StrainScaling = StrainScaling.RAW,
+    unloading: Unloading | str = Unloading.PRINTED,
+    strain_scaling: StrainScaling | str = StrainScaling.RAW,
     seed: int = 0,
     without_flagged: bool = True,
     progress: Callable[[str], None] | None = None,
@@ -245,6 +247,13 @@ def calibrate_paper(
         Bommireddy et al. (2018), sections 3 to 6.
     """
     started = time.perf_counter()
+    usable_campaign(campaign)
+    arguments.choice(objective, get_args(Objective), "objective")
+    unloading = arguments.member(unloading, Unloading, "unloading")
+    strain_scaling = arguments.member(strain_scaling, StrainScaling, "strain_scaling")
+    seed = arguments.seed(seed)
+    if progress is not None and not callable(progress):
+        raise InputError(f"progress must be a function of the name of a step, got {arguments.kind_of(progress)}")
     tell = progress or (lambda _: None)
     campaign = check_tests(campaign)
     tell("adjusting the curves")

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from .. import arguments
 from ._schema import Campaign, Curve
 from ._segments import Segment, find_segments
-from ._validate import check_campaign
+from ._validate import usable_campaign
 from .reasons import below_threshold, far_apart, no_climb, no_loading, too_few
 
 THRESHOLD_MPA = 0.2
@@ -45,14 +47,19 @@ class LoadingCurve:
         return np.asarray(np.interp(stress_MPa, self.stress_MPa, self.strain, right=np.nan), dtype=float)
 
 
-def effective_diameter_um(diameters_um: np.ndarray) -> float:
-    """D_e = D1 D2 / D3 [um] of one particle's three diameters [um]."""
-    D1, D2, D3 = diameters_um
+def effective_diameter_um(diameters_um: Any) -> float:
+    """D_e = D1 D2 / D3 [um] of one particle's three diameters [um].
+
+    Raises:
+        InputError: if they are not three positive numbers.
+    """
+    D1, D2, D3 = arguments.one_particle(diameters_um)
     return float(D1 * D2 / D3)
 
 
 def campaign_segments(campaign: Campaign) -> tuple[tuple[Segment, ...], ...]:
     """The segments of every test, found with the campaign's own control if it is known."""
+    usable_campaign(campaign)
     return tuple(find_segments(curve, control=campaign.metadata.control) for curve in campaign.curves)
 
 
@@ -150,15 +157,13 @@ def adjust(campaign: Campaign, threshold_MPa: float = THRESHOLD_MPA) -> Adjustme
         threshold_MPa: stress [MPa], 0.2 in the paper.
 
     Raises:
-        InputError: if the campaign is none that files could hold: lengths that differ, values that are not finite, ...
-        ValueError: if the threshold is negative or not finite.
+        InputError: if the threshold is negative or not finite, or the campaign cannot be used.
 
     References:
         Bommireddy et al. (2018), section 3.
     """
-    check_campaign(campaign, file=campaign.source or "the campaign")
-    if not (np.isfinite(threshold_MPa) and threshold_MPa >= 0):
-        raise ValueError(f"the threshold must be a stress >= 0 MPa, got {threshold_MPa}")
+    usable_campaign(campaign)
+    threshold_MPa = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
     segments = campaign_segments(campaign)
     raw = [loading_curve(*one) for one in zip(campaign.curves, campaign.diameters_um, segments, strict=True)]
     why_not = [

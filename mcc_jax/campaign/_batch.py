@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,18 +11,25 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from .. import arguments
 from .._types import Scalar
 from ..geometry import Particle
 from ._schema import Campaign
+from ._validate import usable_campaign
 
 
-def particle_batch(diameters_um: np.ndarray) -> Particle:
-    """One `Particle` whose fields have a leading axis N, from diameters [um] of shape (N, 3)."""
-    D1, D2, D3 = jnp.asarray(diameters_um, dtype=float).T
+def particle_batch(diameters_um: Any) -> Particle:
+    """One `Particle` whose fields have a leading axis N, from diameters [um] of shape (N, 3).
+
+    Raises:
+        InputError: for another shape, or a diameter that is not positive and finite; traced ones pass.
+    """
+    sizes = diameters_um if arguments.is_traced(diameters_um) else arguments.diameters(diameters_um)
+    D1, D2, D3 = jnp.asarray(sizes, dtype=float).T
     return eqx.filter_vmap(Particle)(D1, D2, D3)
 
 
-def of_each_particle(diameters_um: np.ndarray, quantity: Callable[[Particle], Scalar]) -> np.ndarray:
+def of_each_particle(diameters_um: Any, quantity: Callable[[Particle], Scalar]) -> np.ndarray:
     """A quantity of every particle, shape (N,).
 
     Args:
@@ -61,6 +69,8 @@ def batch(campaign: Campaign, *, multiple: int = 1) -> Batch:
         campaign: at least one particle.
         multiple: round the length up to a multiple of this, so that campaigns of similar length share one compilation.
     """
+    usable_campaign(campaign)
+    multiple = arguments.whole(multiple, "multiple", least=1)
     longest = max(len(curve) for curve in campaign.curves)
     longest += -longest % multiple
 

@@ -6,6 +6,7 @@ import hashlib
 import os
 from pathlib import Path
 
+from .. import arguments
 from ..files import LIMITS, open_regular
 from ._csv import CURVES, METADATA
 from ._curves import PARTICLES
@@ -17,9 +18,10 @@ def file_checksums(folder: str | Path) -> dict[str, str]:
     Raises:
         InputError: if a file cannot be read.
     """
+    path = arguments.file_path(folder, "folder")
     found = {}
     for name in (PARTICLES, CURVES, METADATA):
-        file = Path(folder) / name
+        file = path / name
         if not os.path.lexists(file):
             continue
         with open_regular(file, LIMITS.table_bytes, "Split the campaign into several folders") as stream:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .. import arguments
 from .._errors import InputError
 from ..files import LIMITS, FileLimits
 from ._columns import LENGTH, convert, find_column
@@ -39,7 +40,7 @@ def read_campaign(folder: str | os.PathLike[str], *, limits: FileLimits = LIMITS
     Raises:
         InputError: if anything is missing, damaged or contradictory; it names file, row and column.
     """
-    path = Path(folder)
+    path = arguments.file_path(folder, "folder")
     check_folder(path)
     table = read_table(path / PARTICLES, limits)
     names, diameters, columns = parse_particles(table)
@@ -59,12 +60,13 @@ def read_campaign(folder: str | os.PathLike[str], *, limits: FileLimits = LIMITS
     return campaign
 
 
-def check_folder(path: Path) -> None:
+def check_folder(path: str | Path) -> None:
     """Whether a folder has the files of a campaign.
 
     Raises:
         InputError: saying what was expected and what is there.
     """
+    path = arguments.file_path(path, "path")
     expected = f"a campaign is a folder with {PARTICLES} and {CURVES}"
     try:
         if not path.exists():
@@ -124,7 +126,7 @@ def read_particles(
     Raises:
         InputError: naming file, row and column.
     """
-    path = Path(file)
+    path = arguments.file_path(file, "file")
     data = read_bytes(path)
     if is_workbook(data):
         return parse_particles(make_table(read_sheet(data, path, preferred=Path(PARTICLES).stem), path), named)

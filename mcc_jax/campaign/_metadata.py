@@ -13,6 +13,7 @@ from typing import Any, get_args
 
 import numpy as np
 
+from .. import arguments
 from .._errors import InputError
 from ..files import LIMITS, FileLimits, check_toml, read_regular
 from ._columns import FORCE, LENGTH, convert, find_column
@@ -80,7 +81,7 @@ def load_toml_file(path: str | Path, what: str) -> dict[str, Any]:
     Raises:
         InputError: if it cannot be read, is no UTF-8 text, or is not TOML.
     """
-    file = Path(path)
+    file = arguments.file_path(path, "path")
     try:
         text = read_settings(file)
     except InputError as error:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from pathlib import PurePath
+from typing import Any, Literal, get_args
 
 import numpy as np
 
+from .. import arguments
 from .._errors import InputError
 from .findings import Level
 
@@ -64,12 +66,27 @@ class Curve:
         force_mN: force on the particle [mN], shape (n,).
         displacement_um: relative displacement of the two platens [um], shape (n,).
         checked: what `check_tests` changed, of a curve that it made; None of a raw one.
+
+    Lists, Series and arrays of any kind become numpy arrays.
+
+    Raises:
+        InputError: if one of them is no 1-D array of numbers, or they differ in length.
     """
 
     time_s: np.ndarray
     force_mN: np.ndarray
     displacement_um: np.ndarray
-    checked: Checked | None = None
+    checked: Checked | None
+
+    def __init__(self, time_s: Any, force_mN: Any, displacement_um: Any, checked: Checked | None = None) -> None:
+        given = {"time_s": time_s, "force_mN": force_mN, "displacement_um": displacement_um}
+        for name, column in given.items():
+            values = arguments.floats(column, name, shape="a 1-D array of numbers")
+            if values.ndim != 1:
+                raise InputError(f"the {name} of a curve has the shape {values.shape} where a 1-D array is expected")
+            object.__setattr__(self, name, values)
+        arguments.same_length(time_s=self.time_s, force_mN=self.force_mN, displacement_um=self.displacement_um)
+        object.__setattr__(self, "checked", checked)
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -87,6 +104,9 @@ class Metadata:
         provenance: where the data come from, in words.
         corrections: names of corrections that were applied before the data got here.
         other: every further entry of the file, kept as it is.
+
+    Raises:
+        InputError: for a control that does not exist, or a resolution or diameter that is not positive.
     """
 
     control: Control | None = None
@@ -94,8 +114,19 @@ class Metadata:
     displacement_resolution_um: float | None = None
     punch_diameter_um: float | None = None
     provenance: str | None = None
-    corrections: tuple[str, ...] = ()
+    corrections: Sequence[str] = ()
     other: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.control is not None:
+            arguments.choice(self.control, get_args(Control), "control")
+        for name in ("force_resolution_mN", "displacement_resolution_um", "punch_diameter_um"):
+            if (value := getattr(self, name)) is not None:
+                object.__setattr__(self, name, arguments.number(value, name, above=0))
+        if self.provenance is not None:
+            arguments.instance(self.provenance, str, "provenance", "Say in words where the data come from.")
+        object.__setattr__(self, "corrections", _texts(self.corrections, "corrections"))
+        arguments.instance(self.other, Mapping, "other", "Give a dictionary.")
 
 
 @dataclass(frozen=True)
@@ -110,15 +141,48 @@ class Campaign:
         metadata: what is known about the test.
         source: the folder or file it was read from, for messages; empty when made in memory.
         raw: of a campaign that `check_tests` made, the one it was made from; None otherwise.
+
+    Lists and Series are converted.
+
+    Raises:
+        InputError: if names, diameters, curves or columns are of the wrong kind, or not as many as each other.
     """
 
     particles: tuple[str, ...]
     diameters_um: np.ndarray
     curves: tuple[Curve, ...]
-    columns: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    metadata: Metadata = field(default_factory=Metadata)
-    source: str = ""
-    raw: Campaign | None = None
+    columns: Mapping[str, tuple[str, ...]]
+    metadata: Metadata
+    source: str
+    raw: Campaign | None
+
+    def __init__(
+        self,
+        particles: Iterable[str | int],
+        diameters_um: Any,
+        curves: Iterable[Curve],
+        columns: Mapping[str, Iterable[Any]] | None = None,
+        metadata: Metadata | None = None,
+        source: str | PurePath = "",
+        raw: Campaign | None = None,
+    ) -> None:
+        names = _texts(particles, "particles")
+        sizes = arguments.floats(diameters_um, "diameters_um", shape=_SIZES)
+        sizes = sizes.reshape(0, 3) if sizes.size == 0 else sizes
+        if sizes.shape != (len(names), 3):
+            raise InputError(f"diameters_um has the shape {sizes.shape} where ({len(names)}, 3) is expected: {_SIZES}")
+        curves = arguments.instance(curves, Iterable, "curves", "Give a list with one Curve for every particle.")
+        tests = tuple(arguments.instance(one, Curve, "every one of curves", _A_CURVE) for one in curves)
+        arguments.same_length(particles=names, curves=tests)
+        given = arguments.instance(columns or {}, Mapping, "columns", "Give a dictionary of columns.")
+        further = {name: _texts(cells, f"the column {name!r}") for name, cells in given.items()}
+        for name, cells in further.items():
+            arguments.same_length(**{"particles": names, f"the column {name!r}": cells})
+        told = Metadata() if metadata is None else metadata
+        arguments.instance(told, Metadata, "metadata", "Give mcc_jax.Metadata(control=...).")
+        fields = {"particles": names, "diameters_um": sizes, "curves": tests, "columns": further, "metadata": told}
+        for name, value in (fields | {"source": str(source), "raw": raw}).items():
+            object.__setattr__(self, name, value)
 
     def __len__(self) -> int:
         return len(self.particles)
@@ -127,15 +191,25 @@ class Campaign:
         """Position of a particle by its name.
 
         Raises:
-            KeyError: if there is no such particle.
+            InputError: if there is no such particle.
         """
         try:
             return self.particles.index(particle)
         except ValueError:
-            raise KeyError(f"no particle {particle!r}; there are: {', '.join(self.particles)}") from None
+            known = ", ".join(self.particles)
+            raise InputError(
+                f"there is no particle {arguments.shown(particle)}", remedy=f"There are: {known}."
+            ) from None
 
     def select(self, keep: np.ndarray) -> Campaign:
-        """The campaign of those particles where `keep`, booleans of shape (N,), is true."""
+        """The campaign of those particles where `keep`, booleans of shape (N,), is true.
+
+        Raises:
+            InputError: if `keep` is anything else.
+        """
+        keep = np.asarray(keep)
+        if keep.dtype != bool or keep.shape != (len(self),):
+            raise InputError(f"keep must be {len(self)} booleans, one for every particle, got {arguments.shown(keep)}")
         chosen = np.flatnonzero(keep)
         return Campaign(
             tuple(self.particles[i] for i in chosen),
@@ -160,3 +234,18 @@ class Campaign:
                 "no particle would be left", file=self.source or None, remedy="Leave at least one particle in"
             )
         return self.select(np.array([i not in gone for i in range(len(self))]))
+
+
+_SIZES = "D1, D2, D3 [um] of every particle, shape (N, 3)"
+_A_CURVE = "Make one with mcc_jax.Curve(time_s, force_mN, displacement_um)."
+
+
+def _texts(values: Any, name: str) -> tuple[str, ...]:
+    """Several texts; numbers become texts, a single text is none of several."""
+    if isinstance(values, str | bytes | Mapping) or not isinstance(values, Iterable):
+        raise InputError(f"{name} must be a list of texts, got {arguments.kind_of(values)}")
+    found = list(values)
+    wrong = [one for one in found if not isinstance(one, str | int | float | np.number) or isinstance(one, bool)]
+    if wrong:
+        raise InputError(f"{name} must be a list of texts, got {arguments.shown(wrong[0])} among them")
+    return tuple(one if isinstance(one, str) else f"{one}" for one in found)

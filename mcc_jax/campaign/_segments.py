@@ -11,10 +11,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Literal, cast
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 
+from .. import arguments
+from .._errors import InputError
 from ._drive import Drive, DriveOptions, Hold
 from ._schema import Control, Curve
 from ._signal import branch_envelope, steady_clock, two_lines
@@ -80,7 +82,24 @@ def find_segments(
     Returns:
         The segments in order; the first starts at 0, each starts where the one before stops, the last stops at
         the number of samples.
+
+    Raises:
+        InputError: for a curve without a point or with one that is not finite, a control that does not exist, or a
+            threshold that is not positive.
     """
+    arguments.instance(curve, Curve, "curve", "Make one with mcc_jax.Curve(time_s, force_mN, displacement_um).")
+    if control is not None:
+        arguments.choice(control, get_args(Control), "control")
+    thresholds = {"smallest_turn": smallest_turn, "noise_multiple": noise_multiple, "band": band, "contact": contact}
+    for name, value in (thresholds | {"hold_slowness": hold_slowness}).items():
+        arguments.number(value, name, least=0)
+    arguments.whole(hold_samples, "hold_samples", least=1)
+    if not len(curve):
+        raise InputError("the curve has no point", remedy="Give a test with two points or more.")
+    for name in ("time_s", "force_mN", "displacement_um"):
+        bad = np.flatnonzero(~np.isfinite(getattr(curve, name)))
+        if bad.size:
+            raise InputError(f"the {name} of a curve is {getattr(curve, name)[bad[0]]} at sample {bad[0] + 1}")
     force, displacement = np.asarray(curve.force_mN, float), np.asarray(curve.displacement_um, float)
     options = DriveOptions(smallest_turn, noise_multiple, band, hold_slowness, hold_samples)
     clock = steady_clock(np.asarray(curve.time_s, float))

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
+from typing import Any
 
 import numpy as np
 
+from .. import arguments
 from .._errors import InputError
 from ._columns import LARGEST_MAGNITUDE
 from ._schema import Campaign
@@ -86,6 +88,26 @@ def check_campaign(campaign: Campaign, *, file: str | Path) -> None:
             raise fail(f"the column {column!r} has {len(cells)} cells for {count} particles")
         for text in (column, *cells):
             _check_text(text, f"the text {text!r} of column {column!r}", fail)
+
+
+def usable_campaign(campaign: Any, name: str = "campaign") -> Campaign:
+    """The campaign, if it is one that could have come from files.
+
+    Args:
+        campaign: what a function was given.
+        name: what the function calls it, for messages.
+
+    Raises:
+        InputError: saying what is wrong; for a path, how to read it.
+    """
+    if isinstance(campaign, str | PurePath):
+        raise InputError(
+            f"{name} must be a Campaign, got the path {str(campaign)!r}",
+            remedy=f"Read it first: mcc_jax.read_campaign({str(campaign)!r}).",
+        )
+    arguments.instance(campaign, Campaign, name, "Read one with mcc_jax.read_campaign(folder), or make one in memory.")
+    check_campaign(campaign, file=campaign.source or f"the {name}")
+    return campaign
 
 
 _DIAMETER = ("D1_", "D2_", "D3_")

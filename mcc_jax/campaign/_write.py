@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .. import arguments
 from .._errors import InputError
 from ._csv import CURVES, METADATA
 from ._curves import PARTICLES
@@ -29,7 +30,7 @@ def write_campaign(campaign: Campaign, folder: str | os.PathLike[str]) -> None:
     Raises:
         InputError: if the campaign could not be read back, or the folder cannot be written.
     """
-    path = Path(folder)
+    path = arguments.file_path(folder, "folder")
     check_campaign(campaign, file=path)
     texts = {
         PARTICLES: _format_particles(campaign),

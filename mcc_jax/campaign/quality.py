@@ -20,7 +20,7 @@ import numpy as np
 from ._schema import Campaign, Checked, Control, Curve, Note
 from ._segments import find_segments
 from ._signal import point_noise, runs, two_lines
-from ._validate import check_campaign
+from ._validate import usable_campaign
 from .findings import Finding
 from .plausibility import wrong_signs
 from .saturation import SaturationOptions, censor_displacement, censor_force
@@ -84,7 +84,7 @@ def check_tests(campaign: Campaign, options: QualityOptions | None = None) -> Ca
     """
     if campaign.raw is not None:
         return campaign
-    check_campaign(campaign, file=campaign.source or "the campaign")
+    usable_campaign(campaign)
     options = options or QualityOptions()
     if wrong_signs(campaign):
         return replace(campaign, raw=campaign)  # what looks like air or breakage is the test read backwards

@@ -23,7 +23,8 @@ from ..campaign import (
     particle_batch,
     read_particles,
 )
-from ..effects import HUMIDITY_COLUMN, Need, humidities
+from ..effects import HUMIDITY_COLUMN, Need
+from ..effects._record import humidity_column
 from ..geometry import Particle, plastic_shape_factor
 from ..law import MccLaw, StrainScaling, Unloading
 from ..simulate import (
@@ -204,8 +205,7 @@ def hidden_effects(texts: Sequence[str], sizes: Sizes) -> tuple[HiddenEffect, ..
 
 
 def _humidity(sizes: Sizes) -> np.ndarray | None:
-    table = Campaign(sizes.names, sizes.diameters_um, (), sizes.columns, source=str(sizes.file or ""))
-    return humidities(table)
+    return humidity_column(sizes.names, sizes.columns, str(sizes.file or ""))
 
 
 def simulate_particles(

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from statistics import NormalDist
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .. import arguments
 from .._errors import InputError
 from ..calibrate import BayesCalibration
 from ..law import MccLaw, Plastic
@@ -68,7 +69,7 @@ class Band(NamedTuple):
 
 def population_packing(
     calibration: BayesCalibration,
-    diameter: Float[np.ndarray, " particles"],
+    diameter: Any,
     *,
     seed: int = 0,
     density: float = MCC_DENSITY,
@@ -88,6 +89,12 @@ def population_packing(
     Raises:
         InputError: if the population hardly has a monotone law.
     """
+    remedy = "Make one with mcc_jax.calibrate_bayes(campaign)."
+    arguments.instance(calibration, BayesCalibration, "calibration", remedy)
+    diameter = arguments.path(diameter, "diameter", many="Give one diameter [um] for each sphere.")
+    arguments.positive(diameter, "diameter [um]")
+    seed = arguments.seed(seed)
+    density = arguments.number(density, "density [kg/m^3]", above=0)
     model, p = calibration.model, calibration.population
     columns = [p.a, p.log_modulus, *np.moveaxis(np.asarray(p.mu), -1, 0), *np.moveaxis(np.asarray(p.tau), -1, 0)]
     columns += [p.modulus_scatter, p.shape_scatter]
@@ -220,7 +227,7 @@ def _deviation(forces: np.ndarray) -> np.ndarray:
 
 
 def _checked(draws: np.ndarray, probability: Sequence[float]) -> np.ndarray:
-    draws = np.asarray(draws, float)
+    draws = arguments.floats(draws, "draws", shape="a table with one row for each draw")
     if draws.ndim != 2 or len(draws) < 2 or not np.isfinite(draws).all():
         raise InputError("draws that are not a table of two or more finite rows", remedy="One row for each draw.")
     if not all(0 < p < 1 for p in probability):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import equinox as eqx
 import jax
@@ -13,15 +13,16 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
+from .. import arguments
 from .._errors import InputError
 from .._numerics import shared
 from .._types import Scalar
 from ._edges import PADDING, Edges, carry_history, widened
-from ._forces import Forces, Interaction, Packing, Vector, contact_forces
+from ._forces import A_PACKING, Forces, Interaction, Packing, Vector, contact_forces
 from ._measured import Sample, Trajectory, measured
 from ._pair import wall_force, wall_recovery
 from ._sharded import Contacts, Devices, at_home, divided
-from ._state import State, check_state, listed
+from ._state import A_STATE, State, check_state, listed
 from ._walls import set_velocity
 
 
@@ -46,7 +47,7 @@ class Motion(eqx.Module):
         time_step: float,
         interaction: Interaction | None = None,
         drag: float = 0.0,
-        gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        gravity: Sequence[float] = (0.0, 0.0, 0.0),
         dtype: DTypeLike = jnp.float64,
     ) -> Motion:
         """From plain numbers.
@@ -54,10 +55,29 @@ class Motion(eqx.Module):
         Raises:
             InputError: if the time step is not positive.
         """
-        if not time_step > 0:
-            raise InputError(f"a time step of {time_step} s", remedy="Take that of `stable_time_step`.")
+        time_step = arguments.number(time_step, "the time step [s], see `stable_time_step`,", above=0)
+        drag = arguments.number(drag, "drag [1/s]", least=0)
+        acceleration = arguments.floats(gravity, "gravity", shape="three components [m/s^2]")
+        if acceleration.shape != (3,) or not np.isfinite(acceleration).all():
+            raise InputError(f"gravity must be three finite components [m/s^2], got {arguments.shown(gravity)}")
+        if interaction is not None:
+            arguments.instance(interaction, Interaction, "interaction", "Make one with mcc_jax.dem.Interaction().")
         given = jax.tree.map(lambda x: x.astype(dtype), interaction or Interaction())
-        return cls(jnp.asarray(time_step, dtype), given, jnp.asarray(drag, dtype), jnp.asarray(gravity, dtype))
+        return cls(jnp.asarray(time_step, dtype), given, jnp.asarray(drag, dtype), jnp.asarray(acceleration, dtype))
+
+
+Keep = Literal["steps", "lists"]
+
+
+def check_arguments(packing: Packing, motion: Motion, state: State) -> None:
+    """Refuse what is no packing, motion or state.
+
+    Raises:
+        InputError: saying how to make one.
+    """
+    arguments.instance(packing, Packing, "packing", A_PACKING)
+    arguments.instance(motion, Motion, "motion", "Make one with mcc_jax.dem.Motion.of(time_step).")
+    arguments.instance(state, State, "state", A_STATE)
 
 
 class Segment(NamedTuple):
@@ -74,6 +94,7 @@ def step(packing: Packing, motion: Motion, state: State, contacts: Contacts = co
 
     The list of edges is taken as it is; `advance` makes it anew in time. `contacts` computes the forces.
     """
+    check_arguments(packing, motion, state)
     forces, edges, history = contacts(
         packing,
         motion.interaction,
@@ -135,6 +156,9 @@ def run(
         devices: over which the contacts are divided (`jax.devices()`); not divided if None.
     """
 
+    check_arguments(packing, motion, state)
+    steps = arguments.whole(steps, "steps")
+
     def loop(contacts: Contacts, packing: Packing, motion: Motion, state: State, wanted: Array) -> tuple[State, tuple]:
         # Reverse mode keeps the state of each step and computes the step again: what is in between costs more to keep.
         @jax.checkpoint
@@ -177,7 +201,7 @@ def advance(
     packing: Packing,
     motion: Motion,
     state: State,
-    velocity: Float[Array, "walls 3"] | np.ndarray,
+    velocity: Any,
     rows: int,
     steps: int,
     skin: float,
@@ -205,7 +229,10 @@ def advance(
     Raises:
         InputError: if a particle left the walls, a position became NaN. The state passed in is untouched.
     """
-    state = eqx.tree_at(lambda s: s.walls, state, set_velocity(state.walls, jnp.asarray(velocity)))
+    check_arguments(packing, motion, state)
+    rows, steps = arguments.whole(rows, "rows"), arguments.whole(steps, "steps")
+    skin = arguments.number(skin, "skin [m]", least=0)
+    state = eqx.tree_at(lambda s: s.walls, state, set_velocity(state.walls, velocity))
     made = 0
     if skin > float(state.skin):  # the list at hand may not hold all the pairs that the caller relies on
         state, made = listed(packing, state, skin), 1
@@ -236,7 +263,7 @@ def replay(
     state: State,
     tape: Sequence[Segment],
     devices: Devices | None = None,
-    keep: Literal["steps", "lists"] = "steps",
+    keep: Keep = "steps",
 ) -> State:
     """The same motion again over the lists of edges that `advance` recorded, differentiable in both modes.
 
@@ -252,6 +279,8 @@ def replay(
         keep: what reverse mode keeps on its way: the states of all steps, or, for long motions, those between lists
             only; each step is then computed once more.
     """
+    check_arguments(packing, motion, state)
+    arguments.choice(keep, get_args(Keep), "keep")
     if not tape:
         return state
     room = max(segment.key.shape[0] for segment in tape)
@@ -298,6 +327,9 @@ def stable_time_step(packing: Packing, safety: float = 0.3) -> float:
         packing: the spheres.
         safety: s; 0.3 leaves room for several contacts a particle.
     """
+
+    arguments.instance(packing, Packing, "packing", A_PACKING)
+    safety = arguments.number(safety, "safety", above=0)
 
     def steepest(side):
         return 4 / jnp.pi * wall_force(side, side.tested, side.tested) / (2 * wall_recovery(side, side.tested))

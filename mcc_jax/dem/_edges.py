@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from .. import arguments
 from .._errors import InputError
 from .._types import Flag
 
@@ -67,9 +70,7 @@ class Edges(eqx.Module):
             )
 
 
-def list_edges(
-    pairs: Int[np.ndarray, "pairs 2"], particles: int, capacity: int, dtype: np.dtype | type = np.float64
-) -> Edges:
+def list_edges(pairs: Any, particles: int, capacity: int, dtype: np.dtype | type = np.float64) -> Edges:
     """Edges of virgin contacts from pairs in any order.
 
     Args:
@@ -87,6 +88,11 @@ def list_edges(
             "keys of contacts need 64 bits",
             remedy='jax.config.update("jax_enable_x64", True) first; positions and forces may still be float32.',
         )
+    particles = arguments.whole(particles, "particles")
+    capacity = arguments.whole(capacity, "capacity")
+    given = arguments.floats(pairs, "pairs", shape="pairs of indices, shape (pairs, 2)")
+    if given.size and (given.ndim != 2 or given.shape[1] != 2 or not (given == np.floor(given)).all()):
+        raise InputError(f"pairs must be pairs of whole numbers, shape (pairs, 2), got the shape {given.shape}")
     pairs = np.asarray(pairs, np.int64).reshape(-1, 2)
     low, high = pairs.min(axis=1), pairs.max(axis=1)
     wrong = np.flatnonzero((low < 0) | (high >= particles) | (low == high))

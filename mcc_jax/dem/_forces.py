@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
+from .. import arguments
 from .._numerics import shared
 from .._types import Flag, Scalar, ScalarLike, scalar
 from ._edges import Edges
@@ -38,7 +39,16 @@ class Packing(eqx.Module):
         return 4 / 3 * jnp.pi * jnp.sum(self.radius**3)
 
 
-def _maybe(value: ScalarLike | None) -> Scalar | None:
+A_PACKING = "Make one with mcc_jax.dem.spheres(law, diameter)."
+
+
+def _share(value: ScalarLike) -> Scalar:
+    arguments.positive(value, "damping or tangential_ratio [-]", zero=True, plain=True)
+    return scalar(value)
+
+
+def _friction(value: ScalarLike | None) -> Scalar | None:
+    arguments.positive(0.0 if value is None else value, "friction or wall_friction [-]", zero=True, plain=True)
     return None if value is None else scalar(value)
 
 
@@ -59,10 +69,10 @@ class Interaction(eqx.Module):
         tangential_ratio: r_t, tangential over initial normal stiffness [-].
     """
 
-    damping: Scalar = eqx.field(converter=scalar, default=0.0)
-    friction: Scalar | None = eqx.field(converter=_maybe, default=None)
-    wall_friction: Scalar | None = eqx.field(converter=_maybe, default=None)
-    tangential_ratio: Scalar = eqx.field(converter=scalar, default=0.8)
+    damping: Scalar = eqx.field(converter=_share, default=0.0)
+    friction: Scalar | None = eqx.field(converter=_friction, default=None)
+    wall_friction: Scalar | None = eqx.field(converter=_friction, default=None)
+    tangential_ratio: Scalar = eqx.field(converter=_share, default=0.8)
 
 
 class WallHistory(eqx.Module):

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
+from .. import arguments
 from .._errors import InputError
-from ._load_steps import TOP, LoadStep, Solver, replay_stacked, stacked
+from ._load_steps import TOP, LoadStep, Solver, checked_solver, replay_stacked, stacked
 from ._quasistatic import Compaction, compact
-from ._sensitivity import PackingOf, Parameters
-from ._state import State
+from ._sensitivity import PackingOf
+from ._state import A_STATE, State
 
 ROUNDS = 5
 
@@ -40,10 +40,10 @@ class CompactionFit(NamedTuple):
 
 def fit_compaction(
     packing_of: PackingOf,
-    start: Parameters,
+    start: Any,
     state: State,
-    heights: Float[np.ndarray, " rows"] | Sequence[float],
-    force: Float[np.ndarray, " measured"] | Sequence[float],
+    heights: Any,
+    force: Any,
     *,
     solver: Solver | None = None,
     tolerance: float = 1e-7,
@@ -69,11 +69,19 @@ def fit_compaction(
     Raises:
         InputError: as `compact`; if heights and forces are not equally many, or fewer than the parameters.
     """
-    solver = solver or Solver()
-    values, measured = jnp.asarray(start, float), np.asarray(force, float)
-    if measured.shape != np.shape(heights) or len(measured) < len(values) or not np.isfinite(measured).all():
+    solver = checked_solver(solver)
+    arguments.instance(state, State, "state", A_STATE)
+    tolerance = arguments.number(tolerance, "tolerance", above=0)
+    values = arguments.path(start, "start")
+    measured = arguments.floats(force, "force", shape="the force on the top punch [N] at every height")
+    if (
+        measured.ndim != 1
+        or measured.shape != np.shape(heights)
+        or len(measured) < len(values)
+        or not np.isfinite(measured).all()
+    ):
         raise InputError(
-            f"{len(measured)} forces for {len(np.atleast_1d(heights))} heights and {len(values)} parameters",
+            f"{measured.size} forces for {len(np.atleast_1d(heights))} heights and {len(values)} parameters",
             remedy="One finite force for each height, and no fewer than parameters.",
         )
     if not measured.max() > 0:

@@ -11,12 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from .. import arguments
 from .._errors import InputError
 from .._types import Scalar
 from ._edges import PADDING, Edges, carry_history
 from ._equilibrium import settle
-from ._forces import Packing, Vectors, WallHistory
-from ._state import State
+from ._forces import A_PACKING, Packing, Vectors, WallHistory
+from ._state import A_STATE, State
 from ._stiffness import Held, force_on_walls, net_force, remembered
 from ._walls import Cylinder, Plane, Walls
 
@@ -44,13 +45,23 @@ class Solver(eqx.Module):
     skin: float = eqx.field(static=True, default=0.5)
 
     def __check_init__(self) -> None:
-        positive = all(x > 0 for x in (*self.springs, self.rtol, self.max_steps, self.skin))
-        if not (self.springs and positive and self.halvings >= 0):
-            raise InputError(
-                f"a solver with springs {self.springs}, rtol {self.rtol}, {self.max_steps} steps, "
-                f"{self.halvings} halvings, skin {self.skin}",
-                remedy="All but the halvings must be positive.",
-            )
+        for spring in self.springs:
+            arguments.number(spring, "every one of springs", above=0)
+        arguments.number(self.rtol, "rtol", above=0)
+        arguments.whole(self.max_steps, "max_steps", least=1)
+        arguments.whole(self.halvings, "halvings")
+        arguments.number(self.skin, "skin", above=0)
+        if not self.springs:
+            raise InputError("a solver without springs", remedy="Give at least one.")
+
+
+def checked_solver(solver: Solver | None) -> Solver:
+    """The solver, or the default one.
+
+    Raises:
+        InputError: if it is none.
+    """
+    return Solver() if solver is None else arguments.instance(solver, Solver, "solver", "Make one with Solver().")
 
 
 class LoadStep(NamedTuple):
@@ -114,7 +125,9 @@ def replay_compaction(
     Raises:
         InputError: if the tape is empty.
     """
-    return _replay(packing, state, stacked(tape), solver or Solver())
+    arguments.instance(packing, Packing, "packing", A_PACKING)
+    arguments.instance(state, State, "state", A_STATE)
+    return _replay(packing, state, stacked(tape), checked_solver(solver))
 
 
 def stacked(tape: Sequence[LoadStep]) -> LoadStep:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import numpy as np
-from jaxtyping import Float, Int
+from typing import Any
 
+import numpy as np
+from jaxtyping import Int
+
+from .. import arguments
 from .._errors import InputError
 
 
-def close_pairs(
-    position: Float[np.ndarray, "particles 3"], radius: Float[np.ndarray, " particles"], skin: float
-) -> Int[np.ndarray, "pairs 2"]:
+def close_pairs(position: Any, radius: Any, skin: float) -> Int[np.ndarray, "pairs 2"]:
     r"""All pairs whose surfaces are closer than the skin, :math:`|x_i - x_j| < R_i + R_j + s`.
 
     By `vesin` if it is installed (``pip install mcc-jax[neighbours]``), else by SciPy's k-d tree; the same pairs.
@@ -23,7 +24,14 @@ def close_pairs(
     Raises:
         InputError: if a position is not finite; it names the particle.
     """
-    position, radius = np.asarray(position, float), np.asarray(radius, float)
+    position = arguments.floats(position, "position", shape="centres [m], shape (N, 3)")
+    radius = arguments.floats(radius, "radius", shape="radii [m], shape (N,)")
+    if position.ndim != 2 or position.shape[1] != 3 or radius.ndim != 1:
+        shapes = f"{position.shape} and {radius.shape}"
+        raise InputError(f"position and radius have the shapes {shapes} where (N, 3) and (N,) are expected")
+    arguments.same_length(position=position, radius=radius)
+    arguments.positive(radius, "radius [m]")
+    skin = arguments.number(skin, "skin [m]", least=0)
     lost = np.flatnonzero(~np.isfinite(position).all(axis=1))
     if lost.size:
         raise InputError(

@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from .. import arguments
 from .._errors import InputError
 from ..geometry import Particle
 from ..law import MccLaw
-from ._forces import Packing
+from ._forces import A_PACKING, Packing
 from ._side import half_contact
 
 MCC_DENSITY = 1540.0
 """True density of micro-crystalline cellulose, about [kg/m^3]."""
 
 
-def spheres(law: MccLaw, diameter: Float[Array, " particles"], density: float = MCC_DENSITY) -> Packing:
+def spheres(law: MccLaw, diameter: Any, density: float = MCC_DENSITY) -> Packing:
     """Spheres of given diameters, each with the law or with its own.
 
     Args:
@@ -31,9 +32,10 @@ def spheres(law: MccLaw, diameter: Float[Array, " particles"], density: float = 
     Raises:
         InputError: if a diameter or the density is not positive.
     """
-    known = not isinstance(diameter, Tracer)  # under `jax.jit` diameters of the caller still are, laws are not
-    if not (density > 0 and (not known or np.all(np.asarray(diameter) > 0))):
-        raise InputError("a diameter or density that is not positive", remedy="Diameters are in um.")
+    arguments.instance(law, MccLaw, "law", "Take mcc_jax.paper_law(), or the law of a calibration.")
+    diameter = arguments.path(diameter, "diameter", many="Give one diameter [um] for each sphere.")
+    arguments.positive(diameter, "diameter [um]")  # traced ones pass
+    density = arguments.number(density, "density [kg/m^3]", above=0)
     batched = law.a.ndim == 1 or law.plastic.C1.ndim == 1
     axes = jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, law) if batched else None
 
@@ -46,7 +48,7 @@ def spheres(law: MccLaw, diameter: Float[Array, " particles"], density: float = 
 
 
 def scattered(
-    key: PRNGKeyArray, radius: Float[Array, " particles"], die_radius: float, gap: float = 0.02
+    key: PRNGKeyArray, radius: Any, die_radius: float, gap: float = 0.02
 ) -> tuple[Float[Array, "particles 3"], float]:
     """Centres of spheres in a die, in random order on a jittered lattice, none touching.
 
@@ -60,8 +62,12 @@ def scattered(
         Centres [m] over z = 0, and the height of the die that holds them [m].
 
     Raises:
-        InputError: if the die is narrower than the largest sphere.
+        InputError: if a size is not positive, or the die is narrower than the largest sphere.
     """
+    radius = arguments.path(radius, "radius", many="Give one radius [m] for each sphere.")
+    arguments.positive(radius, "radius [m]")
+    die_radius = arguments.number(die_radius, "die_radius [m]", above=0)
+    gap = arguments.number(gap, "gap, a share of the largest radius,", least=0)
     largest = float(jnp.max(radius))
     pitch = (2 + 2 * gap) * largest
     inner = die_radius - (1 + gap) * largest
@@ -82,4 +88,8 @@ def scattered(
 
 def relative_density(packing: Packing, radius: float, bottom: float, top: float) -> float:
     """Volume of the spheres over that of the die between the punches [-]."""
+    arguments.instance(packing, Packing, "packing", A_PACKING)
+    radius = arguments.number(radius, "radius [m]", above=0)
+    bottom = arguments.number(bottom, "bottom [m]")
+    top = arguments.number(top, "top [m]", above=bottom)
     return float(packing.volume) / (math.pi * radius**2 * (top - bottom))

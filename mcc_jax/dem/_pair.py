@@ -10,9 +10,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .. import arguments
 from .._errors import InputError
 from .._numerics import shared
-from .._types import Flag, Scalar
+from .._types import Flag, Scalar, ScalarLike
 from ..law import energy_ratio, recovery_limit, stress_ratio
 from ..law._branch import branch_force
 from ..law._loading_inverse import loading_work, quintic, secant_modulus, tangent_modulus
@@ -44,7 +45,7 @@ def largest_overlap(overlap_max: Scalar, overlap: Scalar) -> Scalar:
     return jnp.where(overlap < overlap_max, overlap_max, overlap)
 
 
-def pair_force(i: HalfContact, j: HalfContact, overlap_max: Scalar, overlap: Scalar) -> Scalar:
+def pair_force(i: HalfContact, j: HalfContact, overlap_max: ScalarLike, overlap: ScalarLike) -> Scalar:
     r"""Repulsive force between two particles.
 
     .. math::
@@ -70,16 +71,18 @@ def pair_force(i: HalfContact, j: HalfContact, overlap_max: Scalar, overlap: Sca
     Raises:
         InputError: if one side unloads by the printed form and the other by a punch form.
     """
+    _check_sides(i, j)
     if i.power != j.power:
         raise InputError(
             "a pair whose sides unload by different forms shares no unloading curve",
             remedy="Give both particles the same `unloading` form.",
         )
+    overlap_max, overlap = _overlaps(i, overlap_max, overlap)
     peak = largest_overlap(overlap_max, overlap)
     return _series_force(i.power, _numbers(i), _numbers(j), peak, peak - overlap)
 
 
-def wall_force(side: HalfContact, overlap_max: Scalar, overlap: Scalar) -> Scalar:
+def wall_force(side: HalfContact, overlap_max: ScalarLike, overlap: ScalarLike) -> Scalar:
     r"""Force [N] of a rigid wall on a particle: the half contact alone, :math:`F = F_P f((d_P - d) / \Delta)`.
 
     Args:
@@ -87,31 +90,39 @@ def wall_force(side: HalfContact, overlap_max: Scalar, overlap: Scalar) -> Scala
         overlap_max: largest overlap before this one [m].
         overlap: overlap with the wall now [m].
     """
+    _check_sides(side)
+    overlap_max, overlap = _overlaps(side, overlap_max, overlap)
     peak = largest_overlap(overlap_max, overlap)
     return branch_force(side.power, side.k1, side.k3, side.k5, side.c, peak, peak - overlap)
 
 
-def pair_split(i: HalfContact, j: HalfContact, overlap: Scalar) -> tuple[Scalar, Scalar]:
+def pair_split(i: HalfContact, j: HalfContact, overlap: ScalarLike) -> tuple[Scalar, Scalar]:
     """Compressions [m] of the two sides while loading at an overlap [m], and so of the peak of any unloading."""
+    _check_sides(i, j)
+    (overlap,) = _overlaps(i, overlap)
     series = _series(_numbers(i), _numbers(j), overlap)
     return series.d_i, series.d_j
 
 
-def pair_recovery(i: HalfContact, j: HalfContact, overlap_max: Scalar) -> Scalar:
+def pair_recovery(i: HalfContact, j: HalfContact, overlap_max: ScalarLike) -> Scalar:
     r"""Overlap [m] given back on full release, :math:`\Delta_i + \Delta_j`; arguments as in `pair_force`.
 
     It is 1 where no force was carried.
     """
+    _check_sides(i, j)
+    (overlap_max,) = _overlaps(i, overlap_max)
     return _both_spans(i, j, _series(_numbers(i), _numbers(j), overlap_max))
 
 
-def wall_recovery(side: HalfContact, overlap_max: Scalar) -> Scalar:
+def wall_recovery(side: HalfContact, overlap_max: ScalarLike) -> Scalar:
     r"""Overlap [m] that a rigid wall is given back, :math:`\Delta`; see `pair_recovery`."""
+    _check_sides(side)
+    (overlap_max,) = _overlaps(side, overlap_max)
     force = overlap_max * secant_modulus(side.k1, side.k3, side.k5, overlap_max)
     return _span(side.power, side, force, overlap_max)[0]
 
 
-def pair_energy(i: HalfContact, j: HalfContact, overlap_max: Scalar, overlap: Scalar) -> ContactEnergy:
+def pair_energy(i: HalfContact, j: HalfContact, overlap_max: ScalarLike, overlap: ScalarLike) -> ContactEnergy:
     r"""Energy of a contact [J].
 
     .. math:: W = \sum_s \left(\tfrac12 k_1 d^2 - \tfrac14 k_3 d^4 + \tfrac16 k_5 d^6\right)_s, \quad
@@ -119,17 +130,34 @@ def pair_energy(i: HalfContact, j: HalfContact, overlap_max: Scalar, overlap: Sc
 
     with g of `law.energy_ratio`. Arguments as in `pair_force`.
     """
+    _check_sides(i, j)
+    overlap_max, overlap = _overlaps(i, overlap_max, overlap)
     peak = largest_overlap(overlap_max, overlap)
     series = _series(_numbers(i), _numbers(j), peak)
     span = _both_spans(i, j, series)
     return _energy(_work(i, series.d_i) + _work(j, series.d_j), series.force, span, peak - overlap)
 
 
-def wall_energy(side: HalfContact, overlap_max: Scalar, overlap: Scalar) -> ContactEnergy:
+def wall_energy(side: HalfContact, overlap_max: ScalarLike, overlap: ScalarLike) -> ContactEnergy:
     """Energy [J] of a contact with a rigid wall; see `pair_energy`."""
+    _check_sides(side)
+    overlap_max, overlap = _overlaps(side, overlap_max, overlap)
     peak = largest_overlap(overlap_max, overlap)
     force = peak * secant_modulus(side.k1, side.k3, side.k5, peak)
     return _energy(_work(side, peak), force, _span(side.power, side, force, peak)[0], peak - overlap)
+
+
+def _check_sides(*sides: HalfContact) -> None:
+    for side in sides:
+        arguments.instance(side, HalfContact, "a side", "Make one with mcc_jax.dem.half_contact(law, particle).")
+
+
+def _overlaps(side: HalfContact, *overlaps: ScalarLike) -> tuple[Scalar, ...]:
+    """Overlaps as arrays: plain numbers in the precision of the side."""
+    return tuple(
+        jnp.asarray(arguments.number(one, "an overlap [m]"), side.k1.dtype) if not isinstance(one, jax.Array) else one
+        for one in overlaps
+    )
 
 
 # ---- inside ----------------------------------------------------------------------------------------------------------

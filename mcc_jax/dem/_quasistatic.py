@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
+from .. import arguments
 from .._errors import InputError
 from .._types import Scalar
 from ._edges import Edges
 from ._equilibrium import Settled, settle
 from ._forces import Packing, Vectors, WallHistory
-from ._load_steps import BOTTOM, TOP, LoadStep, Solver, die_walls, lowered
+from ._load_steps import BOTTOM, TOP, LoadStep, Solver, checked_solver, die_walls, lowered
 from ._measured import measured
-from ._state import State, check_packing, check_state, listed, start
+from ._state import A_STATE, State, check_packing, check_state, listed, start
 from ._stiffness import Held, pair_geometry, remembered
 from ._walls import Walls
 
@@ -69,7 +68,7 @@ class _Attempt(NamedTuple):
     move: float
 
 
-def relaxed(packing: Packing, walls: Walls, position: Vectors, solver: Solver | None = None, passes: int = 40) -> State:
+def relaxed(packing: Packing, walls: Walls, position: Any, solver: Solver | None = None, passes: int = 40) -> State:
     """A state to start a compaction from: overlaps pushed apart, all contacts virgin.
 
     Steps of steepest descent on the contacts' energy, implicit and so of any length (a proximal spring of 0.3 of the
@@ -87,7 +86,9 @@ def relaxed(packing: Packing, walls: Walls, position: Vectors, solver: Solver | 
     Raises:
         InputError: as `start`.
     """
-    solver = solver or Solver()
+    solver = checked_solver(solver)
+    passes = arguments.whole(passes, "passes")
+    check_packing(packing)
     skin = solver.skin * float(jnp.mean(packing.radius))
     k = float(jnp.mean(packing.sides.k1))
     state = start(packing, walls, position, skin)
@@ -105,7 +106,7 @@ def relaxed(packing: Packing, walls: Walls, position: Vectors, solver: Solver | 
 def compact(
     packing: Packing,
     state: State,
-    heights: Float[np.ndarray, " rows"] | Sequence[float],
+    heights: Any,
     solver: Solver | None = None,
     tape: list[LoadStep] | None = None,
 ) -> tuple[State, Compaction]:
@@ -135,10 +136,11 @@ def compact(
         InputError: for walls that are not a die, a height that is not positive, or a particle outside the walls. The
             state passed in is untouched.
     """
-    solver = solver or Solver()
+    solver = checked_solver(solver)
     check_packing(packing)
+    arguments.instance(state, State, "state", A_STATE)
     die_walls(state.walls)
-    heights = np.asarray(heights, float)
+    heights = arguments.floats(heights, "heights", shape="heights of the top punch [m], shape (rows,)")
     if heights.ndim != 1 or not (np.isfinite(heights).all() and (heights > 0).all()):
         raise InputError("a height of the top punch that is not positive", remedy="Give the heights in metres.")
     still = jnp.zeros_like(state.position)

@@ -13,12 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .. import arguments
 from .._errors import InputError
 from ..files import LIMITS, open_regular
 from ._edges import Edges
-from ._forces import Packing, WallHistory
+from ._forces import A_PACKING, Packing, WallHistory
 from ._side import HalfContact
-from ._state import State
+from ._state import A_STATE, State
 from ._walls import Cylinder, Plane
 
 SCHEMA = 1
@@ -34,7 +35,11 @@ def save_state(path: str | Path, packing: Packing, state: State) -> None:
         packing: the spheres.
         state: all that moves or remembers.
     """
-    path = Path(path)
+    path = arguments.file_path(path, "path")
+    arguments.instance(packing, Packing, "packing", A_PACKING)
+    arguments.instance(state, State, "state", A_STATE)
+    if not path.parent.is_dir():
+        raise InputError("no such folder", file=path.parent, remedy="Make it first.")
     header = {
         "schema": SCHEMA,
         "walls": [type(wall).__name__ for wall in state.walls],
@@ -60,7 +65,7 @@ def load_state(path: str | Path) -> tuple[Packing, State]:
     Raises:
         InputError: if the file is missing, damaged, of another version, or of something else.
     """
-    path = Path(path)
+    path = arguments.file_path(path, "path")
     try:
         # Opened here: NumPy leaves the file open when the archive turns out to be damaged.
         with open_regular(path, LIMITS.posterior_bytes, "Name one that `save_state` wrote.") as stream:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from .. import arguments
 from .._numerics import shared
 from .._types import Flag, Scalar
 from ..geometry import Particle
@@ -89,6 +90,8 @@ def half_contact(law: MccLaw, particle: Particle, normal: Normal | None = None) 
     References:
         Bommireddy et al. (2018), eqs. 3 to 5, 13, 16 and 24, for e3.
     """
+    arguments.instance(law, MccLaw, "law", "Take mcc_jax.paper_law(), or the law of a calibration.")
+    arguments.instance(particle, Particle, "particle", "Make one with mcc_jax.Particle(D1, D2, D3), diameters in um.")
     semi = 0.5e-6 * jnp.stack([particle.D1, particle.D2, particle.D3])  # m
     square = semi[2] * semi[2] if normal is None else jnp.sum((semi * normal) ** 2)
     radius = shared(jnp.prod(semi) / square)

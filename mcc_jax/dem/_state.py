@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,13 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
+from .. import arguments
 from .._errors import InputError
 from .._types import Scalar
 from ._edges import Edges, carry_history, list_edges
-from ._forces import Packing, Vectors, WallHistory
+from ._forces import A_PACKING, Packing, Vectors, WallHistory
 from ._neighbours import close_pairs
-from ._walls import Walls
+from ._walls import Cylinder, Plane, Walls
 
+A_STATE = "Make one with mcc_jax.dem.start(packing, walls, position, skin)."
 SPARE = 1.25
 """Room in the list of edges beyond the pairs found when it was made."""
 
@@ -47,7 +50,7 @@ class State(eqx.Module):
     time: Scalar
 
 
-def start(packing: Packing, walls: Walls, position: Vectors, skin: float, capacity: int | None = None) -> State:
+def start(packing: Packing, walls: Walls, position: Any, skin: float, capacity: int | None = None) -> State:
     """A state at rest: virgin contacts, a fresh list of edges.
 
     Args:
@@ -62,6 +65,11 @@ def start(packing: Packing, walls: Walls, position: Vectors, skin: float, capaci
             the pairs do not fit the capacity.
     """
     check_packing(packing)
+    check_walls(walls)
+    position = arguments.values(position, "position", shape="centres [m], shape (N, 3)")
+    if position.shape != (len(packing.radius), 3):
+        raise InputError(f"position has the shape {position.shape} where ({len(packing.radius)}, 3) is expected")
+    skin = arguments.number(skin, "skin [m]", least=0)
     dtype = position.dtype
     state = State(
         position,
@@ -90,6 +98,11 @@ def listed(packing: Packing, state: State, skin: float, capacity: int | None = N
     Raises:
         InputError: as `close_pairs`, and if the pairs do not fit a capacity that was asked for.
     """
+    arguments.instance(packing, Packing, "packing", A_PACKING)
+    arguments.instance(state, State, "state", A_STATE)
+    skin = arguments.number(skin, "skin [m]", least=0)
+    if capacity is not None:
+        capacity = arguments.whole(capacity, "capacity")
     pairs = close_pairs(np.asarray(state.position, float), np.asarray(packing.radius, float), skin)
     room = state.edges.capacity if capacity is None else capacity
     if capacity is None and len(pairs) > room:
@@ -108,6 +121,7 @@ def check_packing(packing: Packing) -> None:
     Raises:
         InputError: naming the first such particle.
     """
+    arguments.instance(packing, Packing, "packing", A_PACKING)
     valid = np.asarray(jax.vmap(lambda side: side.is_valid)(packing.sides))
     valid = valid & np.asarray((packing.radius > 0) & (packing.mass > 0))
     if not valid.all():
@@ -117,8 +131,21 @@ def check_packing(packing: Packing) -> None:
         )
 
 
+def check_walls(walls: Walls) -> None:
+    """Refuse what are no walls.
+
+    Raises:
+        InputError: naming what was given.
+    """
+    remedy = "Make them with mcc_jax.dem.die(radius, height)."
+    arguments.instance(walls, tuple, "walls", remedy)
+    for wall in walls:
+        arguments.instance(wall, (Plane, Cylinder), "every one of walls", remedy)
+
+
 def not_monotone(packing: Packing) -> Bool[np.ndarray, " particles"]:
     """Which particles soften until their force falls; the split of their contacts is not unique. Draw them anew."""
+    arguments.instance(packing, Packing, "packing", A_PACKING)
     return ~np.asarray(jax.vmap(lambda side: side.is_monotone)(packing.sides))
 
 
@@ -128,6 +155,7 @@ def check_state(state: State) -> None:
     Raises:
         InputError: if a position is not finite or a particle's centre is behind a wall; it names particle and wall.
     """
+    arguments.instance(state, State, "state", A_STATE)
     lost, behind = (np.asarray(x) for x in _astray(state))
     if lost.any():
         raise InputError(

@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
+from .. import arguments
 from .._errors import InputError
 from .._numerics import shared
 from .._types import Scalar, scalar
 
 Vector = Float[Array, " 3"]
+
+
+def _vector(value: Any) -> Vector:
+    array = arguments.values(value, "a vector", shape="three numbers")
+    if array.shape[-1:] != (3,):
+        raise InputError(f"a vector has three components, got the shape {array.shape}")
+    return array
 
 
 class Plane(eqx.Module):
@@ -25,9 +33,9 @@ class Plane(eqx.Module):
         velocity: how fast it moves [m/s].
     """
 
-    point: Vector = eqx.field(converter=jnp.asarray)
-    normal: Vector = eqx.field(converter=jnp.asarray)
-    velocity: Vector = eqx.field(converter=jnp.asarray)
+    point: Vector = eqx.field(converter=_vector)
+    normal: Vector = eqx.field(converter=_vector)
+    velocity: Vector = eqx.field(converter=_vector)
 
     def distance(self, position: Vector) -> Scalar:
         """Distance [m] of a point from the wall, negative behind it."""
@@ -58,7 +66,7 @@ class Cylinder(eqx.Module):
     radius: Scalar = eqx.field(converter=scalar)
     rim: Scalar = eqx.field(converter=scalar)
     chamfer: Scalar = eqx.field(converter=scalar)
-    velocity: Vector = eqx.field(converter=jnp.asarray)
+    velocity: Vector = eqx.field(converter=_vector)
 
     def distance(self, position: Vector) -> Scalar:
         """Distance [m] of a point from the wall, negative outside."""
@@ -90,8 +98,8 @@ def die(radius: float, height: float, dtype: DTypeLike = jnp.float64) -> Walls:
     Raises:
         InputError: if a size is not positive.
     """
-    if not (radius > 0 and height > 0):
-        raise InputError(f"a die of radius {radius} m and height {height} m", remedy="Both must be positive.")
+    radius = arguments.number(radius, "the radius of a die [m]", above=0)
+    height = arguments.number(height, "the height of a die [m]", above=0)
 
     def along_z(z: float) -> Array:
         return jnp.asarray([0.0, 0.0, z], dtype)
@@ -104,8 +112,15 @@ def die(radius: float, height: float, dtype: DTypeLike = jnp.float64) -> Walls:
     )
 
 
-def set_velocity(walls: Walls, velocity: Float[Array, "walls 3"]) -> Walls:
-    """The walls with these velocities [m/s]."""
+def set_velocity(walls: Walls, velocity: Any) -> Walls:
+    """The walls with these velocities [m/s].
+
+    Raises:
+        InputError: if there are not three components for every wall.
+    """
+    velocity = arguments.values(velocity, "velocity", shape="three components [m/s] for every wall")
+    if velocity.shape != (len(walls), 3):
+        raise InputError(f"velocity has the shape {velocity.shape} where ({len(walls)}, 3) is expected")
     return tuple(
         eqx.tree_at(lambda w: w.velocity, wall, v.astype(wall.velocity.dtype))
         for wall, v in zip(walls, velocity, strict=True)

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from .. import arguments
 from .._errors import InputError
 from ..calibrate import JointModel
 from ..calibrate.joint._data import ranges_um, root_mean_squares
+from ..calibrate.joint._model import checked_settings
 from ..calibrate.judgement import unlike_others
 from ..campaign import Campaign, Finding, campaign_findings, check_plausibility, check_tests, named
+from ..campaign._validate import usable_campaign
 from ..effects import LIBRARY, Mechanism, present
+from ..effects._library import checked_library
 from ._candidates import untestable
 from ._closure import Closure, find_closure
 from ._confirm import held_out
@@ -48,7 +52,7 @@ def discover(
     campaign: Campaign,
     *,
     library: Mapping[str, Mechanism] | None = None,
-    exclude: tuple[str, ...] = (),
+    exclude: Sequence[str] = (),
     model: JointModel | None = None,
     threshold_MPa: float = 0.0,
     confirm: bool = True,
@@ -80,13 +84,21 @@ def discover(
         InputError: if no particle can be used, a name to exclude is not known, or no mechanism is left to look for.
     """
     started = time.perf_counter()
-    tell = progress or (lambda _: None)
+    usable_campaign(campaign)
+    tell, assumed, threshold_MPa = checked_settings(progress, model, threshold_MPa, None)
+    seed = arguments.seed(seed)
+    for name, value in (("confirm", confirm), ("experiments", experiments), ("posterior", posterior)):
+        arguments.flag(value, name)
+    if library is not None:
+        checked_library(library)
+    if isinstance(exclude, str) or not isinstance(exclude, Iterable):
+        remedy = f"Write exclude=({exclude!r},)." if isinstance(exclude, str) else None
+        raise InputError(f"exclude must be a list of names, got {arguments.kind_of(exclude)}", remedy=remedy)
     known = dict(LIBRARY if library is None else library)
     for name in exclude:
         if name not in known:
             raise InputError(f"there is no mechanism {name!r}", remedy=f"Known: {', '.join(known)}.")
         known.pop(name)
-    assumed = model or JointModel()
     assumed = JointModel(assumed.unloading, assumed.strain_scaling, True, assumed.shape_scatter, assumed.priors)
     campaign = check_tests(campaign)
     findings = campaign_findings(campaign)

@@ -10,20 +10,26 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from .. import arguments
+from .._errors import InputError
 from ..calibrate import JointModel
 from ..calibrate._result import finite
 from ..calibrate.joint._data import Tests, select_tests
 from ..calibrate.joint._forward import law_of
 from ..calibrate.joint._linearised import linear_data, summarise
+from ..calibrate.joint._model import checked_settings
 from ..calibrate.joint._noise import Noise
 from ..campaign import Campaign, Curve, Metadata
+from ..campaign._validate import usable_campaign
 from ..effects import LIBRARY, Mechanism, present
+from ..effects._library import checked_library
 from ..simulate import Programme, simulate_campaign
 from ._candidates import untestable
 from ._score import DETECTABLE, project
 from ._system import Base, System, base_fit, build_system, records_of, signals_of
 
 ALIKE = 0.9
+_A_PROGRAMME = "Take mcc_jax.Programme.cycles()."
 
 
 @dataclass(frozen=True)
@@ -33,10 +39,22 @@ class Plan:
     Attributes:
         name: what to do, in words.
         programmes: taken in turn by the particles.
+
+    Raises:
+        InputError: if there is none, or what is given is none.
     """
 
     name: str
-    programmes: tuple[Programme, ...]
+    programmes: Sequence[Programme]
+
+    def __post_init__(self) -> None:
+        arguments.instance(self.name, str, "name", "Say in words what is done.")
+        given = arguments.instance(self.programmes, Sequence, "programmes", _A_PROGRAMME)
+        if not given:
+            raise InputError("a plan needs at least one programme", remedy=_A_PROGRAMME)
+        for one in given:
+            arguments.instance(one, Programme, "every one of programmes", _A_PROGRAMME)
+        object.__setattr__(self, "programmes", tuple(given))
 
 
 def planned_campaign(laws, diameters_um: np.ndarray, peaks_mN: np.ndarray, plan: Plan) -> Campaign:
@@ -48,6 +66,8 @@ def planned_campaign(laws, diameters_um: np.ndarray, peaks_mN: np.ndarray, plan:
 
 def planned_base(base: Base, plan: Plan) -> Base:
     """A base fit as it would be if the same particles were tested by a plan, with the same noise."""
+    arguments.instance(base, Base, "base", "Take the base of a discovery.")
+    arguments.instance(plan, Plan, "plan", "Make one with mcc_jax.Plan(name, [programme]).")
     fit = base.fit
     kept = list(base.selection.kept)
     laws = eqx.filter_vmap(lambda w: law_of(w, base.model.unloading))(fit.latent)
@@ -152,8 +172,8 @@ def power_of(system: System, missing: Sequence[dict[str, str]]) -> Power:
 
 
 def power(
-    diameters_um: np.ndarray,
-    peaks_mN: np.ndarray,
+    diameters_um: Any,
+    peaks_mN: Any,
     plan: Plan,
     *,
     base: Base,
@@ -172,6 +192,13 @@ def power(
     from ..calibrate.joint._population import moments
     from ..campaign import particle_batch
 
+    diameters_um = arguments.diameters(diameters_um)
+    peaks_mN = arguments.floats(peaks_mN, "peaks_mN", shape="the largest force of every particle, shape (N,)")
+    arguments.same_length(diameters_um=diameters_um, peaks_mN=np.atleast_1d(peaks_mN))
+    arguments.positive(peaks_mN, "peaks_mN")
+    arguments.instance(plan, Plan, "plan", "Make one with mcc_jax.Plan(name, [programme]).")
+    arguments.instance(base, Base, "base", "Take the base of a discovery.")
+    checked_library(library)
     particles = particle_batch(diameters_um)
     flat = eqx.filter_vmap(lambda particle: particle.flatness)(particles)
     population = population_at(base.fit.mode, base.fit.numbers, base.model.scatter)
@@ -204,8 +231,10 @@ def power_of_campaign(
     Raises:
         InputError: if no particle can be used.
     """
-    tell = progress or (lambda _: None)
-    assumed = replace(model or JointModel(), modulus_scatter=True)
+    usable_campaign(campaign)
+    checked_library(library)
+    tell, assumed, threshold_MPa = checked_settings(progress, model, threshold_MPa, None)
+    assumed = replace(assumed, modulus_scatter=True)
     base = base_fit(campaign, assumed, threshold_MPa=threshold_MPa, tell=tell)
     tell("signatures of all effects")
     return power_of(*_testable(base, library))

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
+from .. import arguments
 from ..campaign import Campaign, Segment, campaign_segments
+from ..campaign._validate import usable_campaign
 from ._contact import MISALIGNMENT, POP_IN, TOE
 from ._creep import CREEP
 from ._flow import FRICTION, HARDENING, RATE
@@ -49,12 +52,27 @@ def default_library() -> dict[str, Mechanism]:
     return dict(LIBRARY)
 
 
+def checked_library(library: Any) -> Mapping[str, Mechanism]:
+    """A library of mechanisms, if it is one.
+
+    Raises:
+        InputError: if it is anything else.
+    """
+    remedy = "Take mcc_jax.effects.default_library() and add to it."
+    arguments.instance(library, Mapping, "library", remedy)
+    for name, mechanism in library.items():
+        arguments.instance(mechanism, Mechanism, f"the entry {name!r} of library", remedy)
+    return library
+
+
 def find_variant(name: str, library: Mapping[str, Mechanism] = LIBRARY) -> Variant:
     """The variant called `mechanism:variant`, or a mechanism's first variant by the mechanism's name alone.
 
     Raises:
         ValueError: naming the choices there are.
     """
+    arguments.instance(name, str, "the name of a formula", 'Write "mechanism" or "mechanism:variant".')
+    checked_library(library)
     mechanism, _, variant = name.partition(":")
     if mechanism not in library:
         raise ValueError(f"no mechanism {mechanism!r}; known are: {', '.join(library)}")
@@ -77,6 +95,7 @@ def present(campaign: Campaign, segments: tuple[tuple[Segment, ...], ...] | None
         campaign: the tests.
         segments: the segments of each; found anew if None.
     """
+    usable_campaign(campaign)
     found = campaign_segments(campaign) if segments is None else segments
     D1, D2, D3 = campaign.diameters_um.T
     kinds = [[segment.kind for segment in parts] for parts in found]

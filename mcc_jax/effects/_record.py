@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from .. import arguments
 from .._errors import InputError
-from .._types import Path, Scalar, Values
+from .._types import Scalar, ScalarLike, Values, scalar
 from ..campaign import Campaign, Curve, Segment, campaign_segments
+from ..campaign._validate import usable_campaign
 
 KINDS = ("approach", "load", "hold", "unload", "reload")
 APPROACH, LOAD, HOLD, UNLOAD, RELOAD = range(5)
@@ -107,10 +112,10 @@ def follow(before: Record, peak_force: Scalar, force: Scalar, time: Scalar) -> R
 
 
 def clean_record(
-    force: Path,
-    time: Path,
+    force: Any,
+    time: Any,
     *,
-    relative_humidity: Scalar | None = None,
+    relative_humidity: ScalarLike | None = None,
     before: Record | None = None,
     peak_force: Scalar | None = None,
 ) -> Record:
@@ -123,6 +128,10 @@ def clean_record(
         before: the point before the first, if the path continues another.
         peak_force: the largest force up to then [mN].
     """
+    force, time = arguments.path(force, "force"), arguments.path(time, "time")
+    arguments.same_length(force=force, time=time)
+    if relative_humidity is not None:
+        relative_humidity = scalar(relative_humidity)
     start = first_point(force.dtype, relative_humidity) if before is None else before
     if before is None:
         start = eqx.tree_at(lambda r: r.time, start, time[0])
@@ -154,6 +163,9 @@ def record_of(curve: Curve, segments: tuple[Segment, ...], *, relative_humidity_
     Raises:
         ValueError: if the segments do not cover the curve.
     """
+    arguments.instance(curve, Curve, "curve", "Make one with mcc_jax.Curve(time_s, force_mN, displacement_um).")
+    if relative_humidity_percent is not None:
+        arguments.number(relative_humidity_percent, "relative_humidity_percent", least=0, most=100)
     count = len(curve)
     if not segments or segments[0].start != 0 or segments[-1].stop != count:
         raise ValueError(f"the segments must cover all {count} points of the curve")
@@ -209,8 +221,10 @@ def record_batch(
         multiple: round the length up to a multiple of this, as in `mcc_jax.campaign.batch`.
 
     Raises:
-        InputError: if the column of humidities holds what is no number.
+        InputError: if the campaign cannot be used, or the column of humidities holds what is no number.
     """
+    usable_campaign(campaign)
+    multiple = arguments.whole(multiple, "multiple", least=1)
     found = campaign_segments(campaign) if segments is None else segments
     humidity = humidities(campaign)
     records = [
@@ -233,7 +247,15 @@ def humidities(campaign: Campaign) -> Float[np.ndarray, " particles"] | None:
     Raises:
         InputError: naming the particle whose entry is no number from 0 to 100.
     """
-    texts = campaign.columns.get(HUMIDITY_COLUMN)
+    usable_campaign(campaign)
+    return humidity_column(campaign.particles, campaign.columns, campaign.source)
+
+
+def humidity_column(
+    particles: Sequence[str], columns: Mapping[str, Sequence[str]], source: str = ""
+) -> Float[np.ndarray, " particles"] | None:
+    """The same from a table of particles alone; see `humidities`."""
+    texts = columns.get(HUMIDITY_COLUMN)
     if texts is None:
         return None
     values = np.empty(len(texts))
@@ -244,8 +266,8 @@ def humidities(campaign: Campaign) -> Float[np.ndarray, " particles"] | None:
             values[i] = np.nan
         if not 0 <= values[i] <= 100:
             raise InputError(
-                f"the relative humidity of particle {campaign.particles[i]!r} is {text!r}",
-                file=campaign.source or None,
+                f"the relative humidity of particle {particles[i]!r} is {text!r}",
+                file=source or None,
                 column=HUMIDITY_COLUMN,
                 remedy="Write a number from 0 to 100, in percent",
             )

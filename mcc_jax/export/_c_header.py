@@ -5,7 +5,7 @@ from __future__ import annotations
 from .._version import own_version
 from ..geometry import Particle
 from ..law import TESTED_STRAIN, MccLaw, StrainScaling, Unloading
-from ._origin import Origin, check, numbers
+from ._origin import Origin, checked, numbers
 from ._templates import quoted, render
 
 
@@ -24,9 +24,7 @@ def c_header(law: MccLaw, particle: Particle | None = None, *, origin: Origin | 
         InputError: if a parameter is out of its range or the particle carries no stress. A law that is not monotone is
             passed on; `read_calibration` refuses it, and so should you unless you know what a pair of them means.
     """
-    origin = origin or Origin()
-    if particle is not None:
-        check(law, particle, allow_not_monotone=True)
+    origin = checked(law, particle, origin, needed=False)
     values = numbers(law)
     return render(
         "mcc_law.h.j2",

@@ -12,6 +12,7 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
+from .. import arguments
 from .._errors import InputError
 from .._text import check_text
 from ..campaign import read_diameters
@@ -50,7 +51,10 @@ def read_calibration(
     Raises:
         InputError: naming the file, what is wrong with it and what to do.
     """
-    file = Path(folder) / CALIBRATION
+    folder = arguments.file_path(folder, "folder")
+    if particle is not None:
+        arguments.instance(particle, str, "particle", "Give the name of one.")
+    file = folder / CALIBRATION
     content, checksum = _read(file)
     form, scaling = _forms(content, file)
     entry = None if particle is None else _entry(content, particle, file)
@@ -71,14 +75,14 @@ def read_calibration(
             estimates["a"] = _own_shape(entry, sizes, estimates["a"], file)
         if content.get("modulus_scatter") is not None:
             notes.append("moduli scatter between particles in this calibration; this is the population's")
-    law = MccLaw(
-        Plastic(*(estimates[name]["value"] for name in COEFFICIENTS)),
-        estimates["a"]["value"],
-        estimates["effective_modulus_MPa"]["value"],
-        form,
-        scaling,
-    )
     try:
+        law = MccLaw(
+            Plastic(*(estimates[name]["value"] for name in COEFFICIENTS)),
+            estimates["a"]["value"],
+            estimates["effective_modulus_MPa"]["value"],
+            form,
+            scaling,
+        )
         notes += check(law, sizes, allow_not_monotone=allow_not_monotone)
     except InputError as error:
         raise InputError(error.problem, file=file, remedy=error.remedy) from error

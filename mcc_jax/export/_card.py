@@ -9,7 +9,7 @@ from typing import Any
 from .._version import own_version
 from ..geometry import Particle
 from ..law import TESTED_STRAIN, MccLaw
-from ._origin import Origin, numbers
+from ._origin import Origin, checked, numbers
 
 UNITS = {"C1": "1", "C3": "1", "C5": "1", "a": "1", "effective_modulus_MPa": "MPa"}
 FORMULAE = {
@@ -48,7 +48,7 @@ def card(law: MccLaw, particle: Particle | None = None, *, origin: Origin | None
     References:
         Bommireddy et al. (2018), eqs. 13, 16, 23, 24.
     """
-    origin = origin or Origin()
+    origin = checked(law, particle, origin, needed=False)
     values = numbers(law)
     form = {
         "unloading": law.unloading.value,

@@ -10,10 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .. import arguments
 from .._types import Scalar, Values
 from ..dem import HalfContact, half_contact, pair_force, pair_recovery, wall_force, wall_recovery
 from ..geometry import Particle
 from ..law import TESTED_STRAIN, MccLaw
+from ._origin import checked
 from ._respond import respond
 
 if TYPE_CHECKING:
@@ -30,6 +32,7 @@ SMALL = np.array([1e-6, 1e-4, 3e-3, 1e-2, 2e-2, 5e-2])
 # Shares of the recoverable displacement on the way down; 1 itself is left out, where a tangent is all rounding.
 SHARES = np.array([1e-9, 1e-3, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.99, 0.9999, 1.001, 1.5])
 OTHER_SIZE = 0.6
+UNITS: tuple[Literal["um_mN", "SI"], ...] = ("um_mN", "SI")
 _SI = {"displacement": ("um", "m", 1e-6), "force": ("mN", "N", 1e-3), "tangent": ("mN_per_um", "N_per_m", 1e3)}
 
 
@@ -58,6 +61,8 @@ def golden_table(law: MccLaw, particle: Particle, *, seed: int = 0, units: Liter
         A pandas table with a column `path`, 0 for the first, and displacement, largest displacement so far, force and
         tangent, the unit in the column's name. Every path starts from a virgin particle.
     """
+    checked(law, particle)
+    seed, units = arguments.seed(seed), arguments.choice(units, UNITS, "units")
     scale = TESTED_STRAIN * float(particle.effective_diameter / law.shape_factor(particle))
 
     def recovered(peak: np.ndarray) -> np.ndarray:
@@ -83,6 +88,8 @@ def golden_pair_table(
     """
     import pandas as pd
 
+    checked(law, particle)
+    seed, units = arguments.seed(seed), arguments.choice(units, UNITS, "units")
     smaller = jax.tree.map(lambda d: d * OTHER_SIZE, particle)
     side = half_contact(law, particle)
     tables = []

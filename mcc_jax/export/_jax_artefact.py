@@ -10,9 +10,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from .. import arguments
 from .._errors import InputError
 from ..geometry import Particle
 from ..law import History, MccLaw, Plastic
+from ._origin import checked
 from ._respond import respond
 
 Which = Literal["force", "step", "step_each"]
@@ -81,6 +83,13 @@ def jax_artefact(
     Raises:
         InputError: if float64 is wanted and JAX is in single precision.
     """
+    checked(law, particle)
+    arguments.choice(which, SIGNATURES, "which")
+    arguments.choice(dtype, ("float64", "float32"), "dtype")
+    if isinstance(platforms, str) or not platforms:
+        raise InputError(f"platforms must be a list of names, got {platforms!r}", remedy=f"Some of {PLATFORMS}.")
+    for name in platforms:
+        arguments.choice(name, PLATFORMS, "platform")
     if dtype == "float64" and not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise InputError(
             "JAX is in single precision", remedy='Call jax.config.update("jax_enable_x64", True) or take float32'
@@ -91,8 +100,8 @@ def jax_artefact(
     (batch,) = jax.export.symbolic_shape("b")
     one = jax.ShapeDtypeStruct((batch,), jnp.dtype(dtype))
     triple = jax.ShapeDtypeStruct((batch, 3), jnp.dtype(dtype))
-    arguments = (one, one, triple, triple) if which == "step_each" else (one, one)
-    exported = jax.export.export(jax.jit(_function(law, particle, which)), platforms=tuple(platforms))(*arguments)
+    inputs = (one, one, triple, triple) if which == "step_each" else (one, one)
+    exported = jax.export.export(jax.jit(_function(law, particle, which)), platforms=tuple(platforms))(*inputs)
     signature = {
         **SIGNATURES[which],
         "dtype": dtype,

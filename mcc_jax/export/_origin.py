@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from .. import arguments
 from .._errors import InputError
 from ..geometry import Particle
 from ..law import MccLaw
@@ -45,6 +46,30 @@ def numbers(law: MccLaw) -> dict[str, float]:
 
 HUGE = 1e44
 """Above every median that a log_C may have (exp 100), and small enough for C1 C5^5 and C3^6 to be finite."""
+
+
+def checked(law: Any, particle: Any, origin: Any = None, *, needed: bool = True) -> Origin:
+    """The origin, or an empty one, once law and particle are known to be what can be exported.
+
+    Args:
+        law: the law.
+        particle: a particle that it must carry, or None.
+        origin: where the law comes from, or None.
+        needed: whether there must be a particle.
+
+    Raises:
+        InputError: for one of another kind, a batch of laws, or a law or particle that is not usable.
+    """
+    arguments.instance(law, MccLaw, "law", "Take mcc_jax.paper_law(), or the law of a calibration.")
+    if particle is not None or needed:
+        arguments.instance(particle, Particle, "particle", "Make one with mcc_jax.Particle(D1, D2, D3), in um.")
+    if law.plastic.C1.ndim or law.a.ndim or (particle is not None and particle.D3.ndim):
+        raise InputError("a batch of laws or particles cannot be exported", remedy="Export one law.")
+    if origin is not None:
+        arguments.instance(origin, Origin, "origin", "Take what mcc_jax.export.read_calibration gives.")
+    sphere = Particle(1.0, 1.0, 1.0)  # every law carries it
+    check(law, sphere if particle is None else particle, allow_not_monotone=True)
+    return origin or Origin()
 
 
 def check(law: MccLaw, particle: Particle, *, allow_not_monotone: bool = False) -> tuple[str, ...]:

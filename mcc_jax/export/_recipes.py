@@ -6,7 +6,7 @@ from .._version import own_version
 from ..geometry import Particle
 from ..law import MccLaw
 from ._c_header import origin_lines
-from ._origin import Origin, check, numbers
+from ._origin import Origin, checked, numbers
 from ._templates import render
 
 
@@ -21,7 +21,7 @@ def lammps_recipe(law: MccLaw, particle: Particle, *, origin: Origin | None = No
     Raises:
         InputError: if the law or the particle is not usable.
     """
-    return _recipe("lammps.md.j2", law, particle, origin or Origin())
+    return _recipe("lammps.md.j2", law, particle, origin)
 
 
 def yade_recipe(law: MccLaw, particle: Particle, *, origin: Origin | None = None) -> str:
@@ -29,11 +29,11 @@ def yade_recipe(law: MccLaw, particle: Particle, *, origin: Origin | None = None
 
     Arguments and errors as of `lammps_recipe`.
     """
-    return _recipe("yade.md.j2", law, particle, origin or Origin())
+    return _recipe("yade.md.j2", law, particle, origin)
 
 
-def _recipe(name: str, law: MccLaw, particle: Particle, origin: Origin) -> str:
-    check(law, particle, allow_not_monotone=True)
+def _recipe(name: str, law: MccLaw, particle: Particle, origin: Origin | None) -> str:
+    origin = checked(law, particle, origin)
     values = numbers(law)
     return render(
         name,

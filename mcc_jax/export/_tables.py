@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING
 import jax.numpy as jnp
 import numpy as np
 
+from .. import arguments
 from .._errors import InputError
 from ..law import TESTED_STRAIN, MccLaw, recovery_limit, stress_ratio
 from ..law.recovery_limit import SHARE
+from ._origin import checked
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -57,6 +59,9 @@ def curve_tables(law: MccLaw, *, strain_max: float = TESTED_STRAIN, tolerance: f
     """
     import pandas as pd
 
+    checked(law, None, needed=False)
+    strain_max = arguments.number(strain_max, "strain_max", above=0)
+    tolerance = arguments.number(tolerance, "tolerance", above=0)
     loading, one = _refine(lambda t: _loading(law, strain_max * t**3), tolerance, _corners(law, strain_max))
     unloading, other = _refine(lambda t: _unloading(1 - (1 - t) ** 2), tolerance)
     return CurveTables(pd.DataFrame(loading), pd.DataFrame(unloading), max(one, other))

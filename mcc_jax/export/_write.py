@@ -7,13 +7,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from .. import arguments
+from .._errors import InputError
 from ..geometry import Particle
 from ..law import MccLaw
 from ._c_header import c_header
 from ._card import card
 from ._golden import golden_pair_table, golden_table
 from ._jax_artefact import jax_artefact
-from ._origin import Origin
+from ._origin import Origin, checked
 from ._recipes import lammps_recipe, yade_recipe
 from ._tables import curve_tables
 
@@ -105,8 +107,17 @@ def write_export(
 
     Returns:
         Names of the files.
+
+    Raises:
+        InputError: for a format that does not exist, a law or particle that is not usable, or a folder that is not
+            there.
     """
-    return _WRITERS[format](law, particle, origin or Origin(), Path(folder), seed)
+    arguments.choice(format, FORMATS, "format")
+    origin = checked(law, particle, origin)
+    place = arguments.file_path(folder, "folder")
+    if not place.is_dir():
+        raise InputError("no such folder", file=place, remedy="Make it first.")
+    return _WRITERS[format](law, particle, origin, place, arguments.seed(seed))
 
 
 def _golden(law: MccLaw, particle: Particle, folder: Path, seed: int, stem: str) -> list[str]:

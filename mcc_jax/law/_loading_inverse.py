@@ -13,11 +13,14 @@ monotonicity, peaks approached to 1e-14, stresses over 13 decades. The error is 
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
 from .._numerics import rough_power, shared
-from .._types import Scalar, Values
+from .._types import Scalar, ScalarLike, Values
+from ..arguments import values
 
 HALLEY_STEPS = 4
 
@@ -32,8 +35,9 @@ def secant_modulus(K1: Scalar, K3: Scalar, K5: Scalar, x: Values) -> Values:
     return jnp.where(value < 0, 0.0, value)  # this way round a parameter that is NaN shows
 
 
-def tangent_modulus(K1: Scalar, K3: Scalar, K5: Scalar, x: Values) -> Values:
+def tangent_modulus(K1: ScalarLike, K3: ScalarLike, K5: ScalarLike, x: Any) -> Values:
     """Slope of the quintic [MPa]."""
+    K1, K3, K5, x = (values(one, name) for one, name in ((K1, "K1"), (K3, "K3"), (K5, "K5"), (x, "x")))
     square = x * x
     return K1 - square * (3 * K3 - 5 * square * K5)
 
@@ -64,8 +68,7 @@ def quintic(K1: Scalar, K3: Scalar, K5: Scalar, x: Values) -> tuple[Values, Valu
     return value, K1 - square * (3 * K3 - 5 * hardening), x * (10 * hardening - 3 * K3)
 
 
-@jax.custom_jvp
-def loading_strain(K1: Scalar, K3: Scalar, K5: Scalar, stress: Values, floor: Scalar) -> Values:
+def loading_strain(K1: ScalarLike, K3: ScalarLike, K5: ScalarLike, stress: Any, floor: ScalarLike) -> Values:
     """Smallest scaled strain, not on a branch already left behind, at which loading reaches the stress.
 
     Args:
@@ -79,6 +82,15 @@ def loading_strain(K1: Scalar, K3: Scalar, K5: Scalar, stress: Values, floor: Sc
     Returns:
         Scaled strain [-]. Derivatives follow from the implicit-function rule, 0 out of contact.
     """
+    given = (values(x, name) for x, name in zip((K1, K3, K5, stress, floor), _NAMES, strict=True))
+    return _loading_strain(*given)
+
+
+_NAMES = ("K1", "K3", "K5", "stress", "floor")
+
+
+@jax.custom_jvp
+def _loading_strain(K1: Scalar, K3: Scalar, K5: Scalar, stress: Values, floor: Scalar) -> Values:
     target = jnp.maximum(stress, 0.0)
     # The barrier makes two loops over the data, which on a CPU take four fifths of the time of a single one.
     x = jax.lax.optimization_barrier(_start(K1, K3, K5, target, floor))
@@ -96,7 +108,7 @@ def loading_strain(K1: Scalar, K3: Scalar, K5: Scalar, stress: Values, floor: Sc
     return x
 
 
-@loading_strain.defjvp
+@_loading_strain.defjvp
 def _loading_strain_jvp(primals, tangents):
     K1, K3, K5, stress, _ = primals
     dK1, dK3, dK5, dstress, _ = tangents

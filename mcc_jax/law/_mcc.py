@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._numerics import compiled_whole, derivative_kept, running_max, shared
-from .._types import Flag, Path, Scalar, scalar
+from .._types import Flag, Path, Scalar, ScalarLike, scalar
+from ..arguments import finite, instance, member, positive
 from ..geometry import Particle, plastic_shape_factor
 from ._base import AbstractContactLaw
 from ._branch import AREA, branch_coefficients, branch_force
@@ -49,6 +50,28 @@ class Energy(eqx.Module):
     dissipated: Scalar
 
 
+def _coefficients(value: Plastic) -> Plastic:
+    return instance(value, Plastic, "plastic", "Give mcc_jax.Plastic(C1, C3, C5).")
+
+
+def _shape(value: ScalarLike) -> Scalar:
+    finite(value, "a, the geometric parameter [-],")
+    return scalar(value)
+
+
+def _modulus(value: ScalarLike) -> Scalar:
+    positive(value, "the effective modulus [MPa]", plain=True)
+    return scalar(value)
+
+
+def _unloading(value: Unloading | str) -> Unloading:
+    return member(value, Unloading, "unloading")
+
+
+def _strain_scaling(value: StrainScaling | str) -> StrainScaling:
+    return member(value, StrainScaling, "strain_scaling")
+
+
 class MccLaw(AbstractContactLaw[History]):
     r"""Plastic loading along a quintic, elastic unloading and reloading along an arcsine branch.
 
@@ -77,18 +100,21 @@ class MccLaw(AbstractContactLaw[History]):
         plastic: C1, C3, C5.
         a: geometric parameter of the shape factor [-].
         effective_modulus: :math:`\bar E = E/(1-\nu^2)` [MPa], > 0; its value belongs to the chosen `unloading` form.
-        unloading: form of the recovered strain.
-        strain_scaling: how the shape factor enters it.
+        unloading: form of the recovered strain, also as its text: "printed", "punch", "punch_exact".
+        strain_scaling: how the shape factor enters it, also as its text: "raw", "contact", "master".
+
+    Raises:
+        InputError: for a plain number out of its range, or an unknown form.
 
     References:
         Bommireddy et al. (2018), eqs. 16, 23 and 24.
     """
 
-    plastic: Plastic
-    a: Scalar = eqx.field(converter=scalar)
-    effective_modulus: Scalar = eqx.field(converter=scalar)
-    unloading: Unloading = eqx.field(static=True, default=Unloading.PRINTED)
-    strain_scaling: StrainScaling = eqx.field(static=True, default=StrainScaling.RAW)
+    plastic: Plastic = eqx.field(converter=_coefficients)
+    a: Scalar = eqx.field(converter=_shape)
+    effective_modulus: Scalar = eqx.field(converter=_modulus)
+    unloading: Unloading = eqx.field(static=True, converter=_unloading, default=Unloading.PRINTED)
+    strain_scaling: StrainScaling = eqx.field(static=True, converter=_strain_scaling, default=StrainScaling.RAW)
 
     @property
     def is_monotone(self) -> Flag:
@@ -232,7 +258,8 @@ class MccLaw(AbstractContactLaw[History]):
         law, eta, diameter, state, highest = jax.lax.optimization_barrier((self, eta, diameter, state, highest))
         scale, area = shared(diameter / eta), AREA * (diameter * diameter)
         stress = shared(jnp.where(highest < past, past, highest) / area)
-        reached = scale * loading_strain(*law.plastic.polynomial, stress, state.displacement_max / scale)
+        K1, K3, K5 = law.plastic.polynomial
+        reached = scale * loading_strain(K1, K3, K5, stress, state.displacement_max / scale)
         elastic = (highest < past) | (reached < state.displacement_max)
         peak = jax.lax.optimization_barrier(jnp.where(elastic, state.displacement_max, reached))
 

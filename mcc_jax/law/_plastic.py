@@ -8,7 +8,18 @@ from jaxtyping import Array, Float
 
 from .._numerics import compiled_whole
 from .._types import Flag, Scalar, ScalarLike, scalar
+from ..arguments import positive
 from ._loading_inverse import loading_strain, loading_work, secant_modulus, tangent_modulus
+
+
+def _coefficient(value: ScalarLike) -> Scalar:
+    positive(value, "a plastic coefficient", plain=True)
+    return scalar(value)
+
+
+def _softening(value: ScalarLike) -> Scalar:
+    positive(value, "the softening coefficient C3", zero=True, plain=True)
+    return scalar(value)
 
 
 class Plastic(eqx.Module):
@@ -21,18 +32,23 @@ class Plastic(eqx.Module):
         C3: coefficient of the softening term [-], >= 0.
         C5: coefficient of the hardening term [-], > 0.
 
+    Raises:
+        InputError: for a plain number out of its range. Computed ones pass: `MccLaw.is_valid` looks at them.
+
     References:
         Bommireddy et al. (2018), eq. 16. Its nomenclature lists them as C1, C2, C3 in MPa, MPa^-3, MPa^-5; the formula
         makes them pure numbers.
     """
 
-    C1: Scalar = eqx.field(converter=scalar)
-    C3: Scalar = eqx.field(converter=scalar)
-    C5: Scalar = eqx.field(converter=scalar)
+    C1: Scalar = eqx.field(converter=_coefficient)
+    C3: Scalar = eqx.field(converter=_softening)
+    C5: Scalar = eqx.field(converter=_coefficient)
 
     @classmethod
     def from_polynomial(cls, K1: ScalarLike, K3: ScalarLike, K5: ScalarLike) -> Plastic:
         r"""From the factors of :math:`\sigma = K_1 x - K_3 x^3 + K_5 x^5` [MPa], all positive."""
+        for name, value in (("K1", K1), ("K3", K3), ("K5", K5)):
+            positive(value, f"{name} [MPa]", zero=name == "K3", plain=True)
         return cls(scalar(K1), jnp.cbrt(scalar(K3)), scalar(K5) ** 0.2)
 
     @property

@@ -8,10 +8,21 @@ import jax.numpy as jnp
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from .._types import Scalar, scalar
+from .._types import Scalar, ScalarLike, scalar
+from ..arguments import finite, positive, whole
 from ._plastic import Plastic
 
 AnyShape = Float[Array, "..."]
+
+
+def _mean(value: ScalarLike) -> Scalar:
+    finite(value, "the mean of the logarithm")
+    return scalar(value)
+
+
+def _sd(value: ScalarLike) -> Scalar:
+    positive(value, "the standard deviation of the logarithm", zero=True, plain=True)
+    return scalar(value)
 
 
 class LogNormal(eqx.Module):
@@ -22,8 +33,8 @@ class LogNormal(eqx.Module):
         sd: tau >= 0, standard deviation of the logarithm.
     """
 
-    mean: Scalar = eqx.field(converter=scalar)
-    sd: Scalar = eqx.field(converter=scalar)
+    mean: Scalar = eqx.field(converter=_mean)
+    sd: Scalar = eqx.field(converter=_sd)
 
     def moment(self, order: int) -> Scalar:
         r""":math:`E[C^k] = \exp(k\mu + k^2\tau^2/2)`."""
@@ -100,6 +111,7 @@ class PlasticPopulation(eqx.Module):
 
     def sample(self, key: PRNGKeyArray, count: int) -> Plastic:
         """Draws for `count` particles as one batched `Plastic`; those not monotone are kept, and flagged by it."""
+        count = whole(count, "count")
         keys = jax.random.split(key, 3)
         draws = [c.sample(k, (count,)) for c, k in zip((self.C1, self.C3, self.C5), keys, strict=True)]
         return eqx.filter_vmap(Plastic)(*draws)

@@ -12,11 +12,14 @@ function, no iteration). Accuracy: 4e-16 of the peak in float64, 2e-7 in float32
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
 from .._numerics import horner, shared, two_thirds_power
 from .._types import Values
+from ..arguments import values
 from ._recovery_coefficients import ENERGY_64, RATIO_32, RATIO_64, RECOVERY_32, RECOVERY_64
 
 
@@ -24,8 +27,7 @@ def _is_double(x: Values) -> bool:
     return x.dtype == jnp.float64
 
 
-@jax.custom_jvp
-def stress_ratio(s: Values) -> Values:
+def stress_ratio(s: Any) -> Values:
     r"""Stress over peak stress on the elastic branch.
 
     Args:
@@ -38,11 +40,16 @@ def stress_ratio(s: Values) -> Values:
     References:
         Bommireddy et al. (2018), eq. 23, with phi^2 = 1 - s^2.
     """
+    return _stress_ratio(values(s, "s"))
+
+
+@jax.custom_jvp
+def _stress_ratio(s: Values) -> Values:
     u = jnp.clip(1 - s, 0, 1)
     return u * shared(jnp.sqrt(u)) * horner(RATIO_64 if _is_double(u) else RATIO_32, 2 * u - 1)
 
 
-@stress_ratio.defjvp
+@_stress_ratio.defjvp
 def _stress_ratio_jvp(primals, tangents):
     (s,), (ds,) = primals, tangents
     inside = (s >= 0) & (s < 1)
@@ -50,8 +57,7 @@ def _stress_ratio_jvp(primals, tangents):
     return stress_ratio(s), jnp.where(inside, -4 / jnp.pi * shared(jnp.sqrt(chord)), 0.0) * ds
 
 
-@jax.custom_jvp
-def recovery(ratio: Values) -> Values:
+def recovery(ratio: Any) -> Values:
     r"""Inverse of `stress_ratio`: the recovered share of strain at a share of the peak stress.
 
     Solves Kepler's equation of eccentricity 1, :math:`E - \sin E = \pi\,\sigma/\sigma_P` with :math:`s = \cos(E/2)`, in
@@ -64,13 +70,18 @@ def recovery(ratio: Values) -> Values:
         s [-], 1 for ratio <= 0 and 0 for ratio >= 1. Its derivative grows as ratio^(-1/3) towards full release and is 0
         beyond it, where the platen no longer touches.
     """
+    return _recovery(values(ratio, "ratio"))
+
+
+@jax.custom_jvp
+def _recovery(ratio: Values) -> Values:
     r = jnp.clip(ratio, 0, 1)
     w = two_thirds_power(r)
     rest = shared((1 - r) * (1 + r) / (1 + w * (1 + w)))  # 1 - w, all digits kept towards the peak
     return jnp.clip(rest * horner(RECOVERY_64 if _is_double(w) else RECOVERY_32, 2 * w - 1), 0, 1)
 
 
-@recovery.defjvp
+@_recovery.defjvp
 def _recovery_jvp(primals, tangents):
     (ratio,), (dratio,) = primals, tangents
     s = recovery(ratio)
@@ -79,8 +90,7 @@ def _recovery_jvp(primals, tangents):
     return s, jnp.where(inside, shared(-jnp.pi / 4 / jnp.sqrt(chord)), 0.0) * dratio
 
 
-@jax.custom_jvp
-def energy_ratio(s: Values) -> Values:
+def energy_ratio(s: Any) -> Values:
     r"""Elastic energy still stored, over :math:`\sigma_P \delta`.
 
     .. math:: g(s) = \int_s^1 f = \tfrac{2}{\pi}\left[\sqrt{1 - s^2} - s\arccos s - \tfrac13 (1 - s^2)^{3/2}\right]
@@ -91,11 +101,16 @@ def energy_ratio(s: Values) -> Values:
     Returns:
         g [-], 4/(3 pi) at the onset of unloading, 0 on full release.
     """
+    return _energy_ratio(values(s, "s"))
+
+
+@jax.custom_jvp
+def _energy_ratio(s: Values) -> Values:
     u = jnp.clip(1 - s, 0, 1)
     return u * u * jnp.sqrt(u) * horner(ENERGY_64, 2 * u - 1)
 
 
-@energy_ratio.defjvp
+@_energy_ratio.defjvp
 def _energy_ratio_jvp(primals, tangents):
     (s,), (ds,) = primals, tangents
     return energy_ratio(s), jnp.where((s >= 0) & (s < 1), -stress_ratio(s), 0.0) * ds

@@ -12,10 +12,14 @@ other solutions, so every stress here takes `contacts`:
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from .. import arguments
 from .._numerics import compiled_whole
 from .._types import Scalar, ScalarLike, scalar
 from ..geometry import Particle
@@ -65,7 +69,7 @@ def hertz_shape_factor(particle: Particle) -> Scalar:
 
 
 def hertz_stress(
-    strain: AnyShape, effective_modulus: ScalarLike, shape_factor: ScalarLike = 1.0, *, contacts: int = 1
+    strain: Any, effective_modulus: ScalarLike, shape_factor: ScalarLike = 1.0, *, contacts: int = 1
 ) -> AnyShape:
     r"""Stress [MPa] of the elastic contact at the strain [-].
 
@@ -83,12 +87,14 @@ def hertz_stress(
         Effective stress [MPa].
 
     Raises:
-        ValueError: if `contacts` is neither 1 nor 2.
+        ValueError: if `contacts` is neither 1 nor 2, or a plain number is out of its range.
 
     References:
         Hertz (1882); Bommireddy et al. (arXiv 1812.06173), eq. 5.
     """
-    share = _displacement_share(contacts)
+    share, strain = _displacement_share(contacts), arguments.values(strain, "strain")
+    arguments.positive(effective_modulus, "effective_modulus [MPa]", plain=True)
+    arguments.positive(shape_factor, "shape_factor", plain=True)
     stretched = scalar(shape_factor) * share * strain
     return 8 * 2**0.5 / (3 * jnp.pi) * scalar(effective_modulus) * _positive_power(stretched, 1.5)
 
@@ -107,11 +113,14 @@ def similarity_strength(yield_stress: ScalarLike, youngs_modulus: ScalarLike, ex
     References:
         Mesarovic and Fleck (1999); Bommireddy et al. (arXiv 1812.06173), eq. 20.
     """
+    arguments.positive(yield_stress, "yield_stress [MPa]", plain=True)
+    arguments.positive(youngs_modulus, "youngs_modulus [MPa]", plain=True)
+    _check_exponent(exponent)
     hardening = 1 / scalar(exponent)
     return scalar(yield_stress) ** (1 - hardening) * scalar(youngs_modulus) ** hardening
 
 
-def similarity_stress(strain: AnyShape, strength: ScalarLike, exponent: ScalarLike, *, contacts: int = 1) -> AnyShape:
+def similarity_stress(strain: Any, strength: ScalarLike, exponent: ScalarLike, *, contacts: int = 1) -> AnyShape:
     r"""Stress [MPa] of the similarity solution for a rigid-plastic, power-law hardening sphere.
 
     .. math::
@@ -133,20 +142,22 @@ def similarity_stress(strain: AnyShape, strength: ScalarLike, exponent: ScalarLi
         Effective stress [MPa].
 
     Raises:
-        ValueError: if `contacts` is neither 1 nor 2.
+        ValueError: if `contacts` is neither 1 nor 2, or a plain number is out of its range.
 
     References:
         Biwa and Storakers (1995); Storakers and Larsson (1994) for c^2; Bommireddy et al. (arXiv 1812.06173), eqs. 19
         and 21.
     """
-    share = _displacement_share(contacts)
+    share, strain = _displacement_share(contacts), arguments.values(strain, "strain")
+    arguments.positive(strength, "strength [MPa]", plain=True)
+    _check_exponent(exponent)
     hardening = 1 / scalar(exponent)
     power = 1 + hardening / 2
     area = SELF_SIMILAR_AREA * jnp.exp(-0.97 * hardening)
     return 4 * 3 ** (1 - hardening) * scalar(strength) * _positive_power(area * share * strain, power)
 
 
-def ideal_plastic_stress(strain: AnyShape, yield_stress: ScalarLike, *, contacts: int = 1) -> AnyShape:
+def ideal_plastic_stress(strain: Any, yield_stress: ScalarLike, *, contacts: int = 1) -> AnyShape:
     r"""Stress [MPa] of a perfectly plastic sphere, the similarity solution for :math:`m \to \infty`.
 
     .. math:: \sigma = 12 c^2 \sigma_y\, \epsilon = 17.16\, \sigma_y\, \epsilon
@@ -163,18 +174,24 @@ def ideal_plastic_stress(strain: AnyShape, yield_stress: ScalarLike, *, contacts
         Effective stress [MPa].
 
     Raises:
-        ValueError: if `contacts` is neither 1 nor 2.
+        ValueError: if `contacts` is neither 1 nor 2, or a plain number is out of its range.
 
     References:
         Biwa and Storakers (1995); Bommireddy et al. (arXiv 1812.06173), eq. 22.
     """
-    share = _displacement_share(contacts)
+    share, strain = _displacement_share(contacts), arguments.values(strain, "strain")
+    arguments.positive(yield_stress, "yield_stress [MPa]", plain=True)
     return 12 * SELF_SIMILAR_AREA * share * scalar(yield_stress) * jnp.where(strain > 0, strain, 0.0)
+
+
+def _check_exponent(exponent: ScalarLike) -> None:
+    if isinstance(exponent, int | float | np.number):
+        arguments.number(exponent, "exponent, of hardening,", least=1, infinite=True)
 
 
 def _displacement_share(contacts: int) -> float:
     """Part of the platen displacement that one contact takes."""
-    if contacts not in (1, 2):
+    if isinstance(contacts, bool) or not isinstance(contacts, int | np.integer) or contacts not in (1, 2):
         raise ValueError(
             f"contacts={contacts!r}: pass contacts=1 if the whole platen displacement deforms one contact (the paper's "
             "convention) or contacts=2 if the particle's two contacts share it."

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from .._errors import InputError
 from ..calibrate import PaperCalibration
 from ..campaign import stress_and_strain
 from ._style import (
@@ -71,7 +72,7 @@ def plot_curves(calibration: PaperCalibration, particles: Sequence[str] | None =
             kept have no dashed line. More than seven are coloured by shape factor in place of a legend.
 
     Raises:
-        KeyError: for a name that is not in the campaign.
+        InputError: for a name that is not in the campaign.
     """
     campaign, adjustment = calibration.campaign, calibration.adjustment
     eta = shape_factors(calibration)
@@ -80,6 +81,8 @@ def plot_curves(calibration: PaperCalibration, particles: Sequence[str] | None =
         by_shape = kept[np.argsort(eta[kept], kind="stable")]
         chosen = list(dict.fromkeys(by_shape[[0, len(kept) // 2, -1]].tolist()))
     else:
+        if isinstance(particles, str) or not particles:
+            raise InputError(f"particles must be a list of names, got {particles!r}")
         chosen = [campaign.index(name) for name in particles]
     labels = particle_labels(campaign.particles)
     many = len(chosen) > len(_CYCLE)

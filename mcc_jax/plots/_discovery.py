@@ -12,7 +12,7 @@ from ..discover._features import KINDS, LEVELS
 from ..discover._score import project
 from ._before_after import plot_before_after
 from ._ranking import plain_name, plot_ranking, plot_similarity
-from ._style import BLACK, BLUE, VERMILION, empty, finish, new_figure, note, sequential, styled
+from ._style import BLACK, BLUE, VERMILION, empty, finish, new_figure, note, of_its_kind, sequential, styled
 
 FADED = 1e-4
 """Of a place whose information survives the projection by less, the law takes up everything: nothing can be said."""
@@ -166,6 +166,7 @@ def plot_shifts(found: Discovery) -> Figure:
     return finish(figure, found.base.campaign.metadata, title=title, handles=handles)
 
 
+@of_its_kind
 def discovery_figures(found: Discovery) -> dict[str, Figure]:
     """Every figure of a discovery, by the stem of its file's name.
 

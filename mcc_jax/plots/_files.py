@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+from matplotlib import rc_context
 from matplotlib.figure import Figure
 
+from .. import arguments
+from .._errors import InputError
 from ..calibrate import PaperCalibration
 from ._collapse import plot_collapse
 from ._curves import plot_curves
@@ -16,9 +19,10 @@ from ._law import plot_law
 from ._master import plot_master
 from ._particles import particle_pages, plot_particles
 from ._residuals import plot_residuals
-from ._style import styled
+from ._style import RC, of_its_kind
 
 
+@of_its_kind
 def paper_figures(calibration: PaperCalibration) -> dict[str, Figure]:
     """Every figure of the calibration, by the stem of its file's name.
 
@@ -40,7 +44,7 @@ def paper_figures(calibration: PaperCalibration) -> dict[str, Figure]:
     return figures
 
 
-@styled
+@rc_context(RC)
 def save_figures(figures: Mapping[str, Figure], directory: str | Path, *, dpi: int = 150) -> list[Path]:
     """Write figures as `<stem>.png` into a directory that exists.
 
@@ -52,9 +56,17 @@ def save_figures(figures: Mapping[str, Figure], directory: str | Path, *, dpi: i
     Returns:
         The files, in the order of the figures.
     """
+    remedy = "Give a dictionary of figures by stem, as mcc_jax.plots.paper_figures makes it."
+    arguments.instance(figures, Mapping, "figures", remedy)
+    for stem, figure in figures.items():
+        arguments.instance(figure, Figure, f"the figure {stem!r}", remedy)
+    folder = arguments.file_path(directory, "directory")
+    dpi = arguments.whole(dpi, "dpi", least=1)
+    if not folder.is_dir():
+        raise InputError("no such folder", file=folder, remedy="Make it first.")
     files = []
     for stem, figure in figures.items():
-        file = Path(directory) / f"{stem}.png"
+        file = folder / f"{stem}.png"
         figure.savefig(file, format="png", dpi=dpi)
         files.append(file)
     return files

@@ -10,7 +10,7 @@ from ..calibrate import LeastSquaresCalibration
 from ._bands import plot_fits
 from ._forest import plot_estimates
 from ._joint import cautions, flatness
-from ._style import BLACK, GREY, ORANGE, PALE, SHAPE_FACTOR, finish, new_figure, note, sequential, styled
+from ._style import BLACK, GREY, ORANGE, PALE, SHAPE_FACTOR, finish, new_figure, note, of_its_kind, sequential, styled
 
 MOST_POINTS = 20_000
 """No more residuals than these are drawn as points; the histogram counts them all."""
@@ -79,6 +79,7 @@ def _histogram(ax: Axes, values: np.ndarray, reach: float) -> None:
     ax.legend(loc="upper right", handlelength=1.2)
 
 
+@of_its_kind
 def least_squares_figures(calibration: LeastSquaresCalibration) -> dict[str, Figure]:
     """Every figure of the joint least squares, by the stem of its file's name.
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from .. import arguments
 from ..calibrate import BayesCalibration, predict_new_particle
 from ..campaign import PAPER_DIAMETERS_UM, effective_diameter_um, of_each_particle
 from ..geometry import plastic_shape_factor
@@ -30,7 +31,7 @@ def _usual_force(calibration: BayesCalibration, diameters_um: np.ndarray) -> flo
 
 
 @styled
-def plot_new_particle(calibration: BayesCalibration, diameters_um: Sequence[float] | None = None) -> Figure:
+def plot_new_particle(calibration: BayesCalibration, diameters_um: Any = None) -> Figure:
     """Force [mN] over displacement [um] of a particle that was never measured, loading and unloading.
 
     Bands: central 50 % and 95 % of the posterior's curves at each force, scatter of the particles and uncertainty of
@@ -42,11 +43,9 @@ def plot_new_particle(calibration: BayesCalibration, diameters_um: Sequence[floa
         diameters_um: its D1, D2, D3 [um]; by default the medians of the paper's Table 1.
 
     Raises:
-        ValueError: for diameters that are not three positive numbers.
+        InputError: for diameters that are not three positive numbers.
     """
-    sizes = np.median(PAPER_DIAMETERS_UM, axis=0) if diameters_um is None else np.asarray(diameters_um, float)
-    if sizes.shape != (3,) or not (np.isfinite(sizes).all() and (sizes > 0).all()):
-        raise ValueError(f"a particle has three positive diameters D1, D2, D3 [um], got {diameters_um}")
+    sizes = np.median(PAPER_DIAMETERS_UM, axis=0) if diameters_um is None else arguments.one_particle(diameters_um)
     up = np.linspace(0.0, _usual_force(calibration, sizes), 101)
     curves = predict_new_particle(calibration, sizes.tolist(), np.concatenate([up, up[-2::-1]]), count=DRAWS)
     figure = new_figure(7.8, 4.1)

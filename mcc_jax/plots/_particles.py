@@ -22,6 +22,7 @@ from ._style import (
     VERMILION,
     finish,
     new_figure,
+    of_its_kind,
     shape_factors,
     styled,
 )
@@ -31,6 +32,7 @@ PER_PAGE = 20
 _COLUMNS = 4
 
 
+@of_its_kind
 def particle_pages(calibration: PaperCalibration) -> int:
     """Number of pages that `plot_particles` needs for all particles."""
     return -(-len(calibration.campaign) // PER_PAGE)
@@ -82,7 +84,7 @@ def plot_particles(calibration: PaperCalibration, page: int | None = None) -> Fi
     """
     pages = particle_pages(calibration)
     number = 1 if page is None else page
-    if not 1 <= number <= pages:
+    if number not in range(1, pages + 1):
         raise ValueError(f"there is no page {number}; there are {pages}, counted from 1")
     campaign = calibration.campaign
     chosen = range((number - 1) * PER_PAGE, min(number * PER_PAGE, len(campaign)))

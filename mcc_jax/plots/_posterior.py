@@ -16,7 +16,7 @@ from ._bands import plot_bands
 from ._forest import plot_forest, plot_shrinkage
 from ._joint import cautions, density, flat_draws, with_sd
 from ._new_particle import plot_new_particle
-from ._style import BLACK, BLUE, GREY, PALE, SKY, VERMILION, finish, new_figure, note, styled
+from ._style import BLACK, BLUE, GREY, PALE, SKY, VERMILION, finish, new_figure, note, of_its_kind, styled
 
 MOST_DOTS = 800
 PRIOR_DRAWS = 2000
@@ -244,6 +244,7 @@ def enlarged_prior(
     return np.interp(close, far, everywhere)
 
 
+@of_its_kind
 def posterior_figures(calibration: BayesCalibration) -> dict[str, Figure]:
     """Every figure of the posterior, by the stem of its file's name.
 

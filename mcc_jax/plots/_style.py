@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+import functools
+import inspect
+from collections.abc import Callable, Sequence
+from typing import Any, get_type_hints
 
 import numpy as np
 from matplotlib import colormaps, rc_context
@@ -13,8 +15,10 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 
+from .. import arguments
 from ..calibrate import PaperCalibration, ShapeFit
-from ..campaign import Metadata, of_each_particle
+from ..campaign import Campaign, Metadata, of_each_particle
+from ..campaign._validate import usable_campaign
 from ..geometry import plastic_shape_factor
 from ._text import FONT, is_simulated
 
@@ -56,8 +60,40 @@ RC: dict[Any, Any] = {
     "savefig.bbox": None,
     "figure.facecolor": "white",
 }
-styled = rc_context(RC)
-"""Decorator: the function runs under these settings and leaves the caller's as they were."""
+_MADE_BY = {
+    "PaperCalibration": "mcc_jax.calibrate_paper(campaign)",
+    "LeastSquaresCalibration": "mcc_jax.calibrate_least_squares(campaign)",
+    "BayesCalibration": "mcc_jax.calibrate_bayes(campaign)",
+    "Discovery": "mcc_jax.discover.discover(campaign)",
+}
+
+
+def of_its_kind[**P, R](function: Callable[P, R]) -> Callable[P, R]:
+    """Decorator: what is not of the kind of the function's first argument is refused in words, before anything else."""
+
+    @functools.cache
+    def wanted() -> tuple[str, Any]:
+        bare = inspect.unwrap(function)
+        name = next(iter(inspect.signature(bare).parameters))
+        return name, get_type_hints(bare)[name]
+
+    @functools.wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        name, kind = wanted()
+        given = args[0] if args else kwargs.get(name)
+        if kind is Campaign:
+            usable_campaign(given, name)
+        else:
+            arguments.instance(given, kind, name, f"Make one with {_MADE_BY[kind.__name__]}.")
+        return function(*args, **kwargs)
+
+    return call
+
+
+def styled[**P, R](function: Callable[P, R]) -> Callable[P, R]:
+    """Decorator: the function runs under these settings, leaves the caller's as they were, and checks what it draws."""
+    return of_its_kind(rc_context(RC)(function))
+
 
 _NOTE_IN, _LEGEND_IN, _TITLE_IN, _LINE_IN = 0.2, 0.3, 0.3, 0.19
 

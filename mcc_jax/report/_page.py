@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from .. import arguments
 from .._version import own_version
 from ..campaign import worst
 from ..plots._text import particle_labels
@@ -77,6 +78,8 @@ def report_page(results: Results, *, seed: int = 0, progress: Callable[[str], No
     Raises:
         RuntimeError: in single precision.
     """
+    arguments.instance(results, Results, "results", "Read them with mcc_jax.report.read_results(folder).")
+    seed = arguments.seed(seed)
     _require_double()
     tell = progress or (lambda _: None)
     tell("predicting every particle")

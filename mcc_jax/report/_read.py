@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from .. import arguments
 from .._errors import InputError
 from ..campaign import Campaign, check_tests, file_checksums, read_campaign
 from ..files import read_regular
@@ -85,7 +86,9 @@ def read_results(folder: str | Path, campaign: str | Path | None = None, *, name
     Raises:
         InputError: if a file is damaged, of another schema, or there is nothing to report.
     """
-    path = Path(folder)
+    path = arguments.file_path(folder, "folder")
+    if campaign is not None:
+        campaign = arguments.file_path(campaign, "campaign")
     there = _listed(path)
     calibration = read_result(path / CALIBRATION, "mcc-jax calibrate") if CALIBRATION in there else None
     discovery = read_result(path / DISCOVERY, "mcc-jax discover") if DISCOVERY in there else None

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .. import arguments
+from .._errors import InputError
 from .._results import RESULTS
+from .._types import ScalarLike
 from ..campaign import (
     PAPER_DIAMETERS_UM,
     PAPER_EFFECTIVE_MODULUS_MPA,
@@ -24,8 +28,8 @@ from ..campaign import (
 from ..effects import HUMIDITY_COLUMN, REFERENCE_HUMIDITY_PERCENT, AbstractEffect, ExtendedLaw, Need
 from ..geometry import Particle
 from ..law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainScaling, Unloading
-from ._drive import Response, simulate_batch
-from ._effects import HiddenEffect, batched_humidity
+from ._drive import A_LAW, Response, simulate_batch
+from ._effects import HiddenEffect, batched_humidity, hidden_effects, humidities_of
 from ._instrument import Instrument
 from ._programme import Programme
 
@@ -38,7 +42,9 @@ def paper_population() -> PlasticPopulation:
     return PlasticPopulation(*(LogNormal(*PAPER_LOG_C[name]) for name in ("C1", "C3", "C5")))
 
 
-def paper_law(unloading: Unloading = Unloading.PRINTED, strain_scaling: StrainScaling = StrainScaling.RAW) -> MccLaw:
+def paper_law(
+    unloading: Unloading | str = Unloading.PRINTED, strain_scaling: StrainScaling | str = StrainScaling.RAW
+) -> MccLaw:
     """The paper's mean law: a = 1.43, effective modulus 16 GPa (which belongs to the printed form)."""
     return MccLaw(
         paper_population().mean_law, PAPER_SHAPE_PARAMETER, PAPER_EFFECTIVE_MODULUS_MPA, unloading, strain_scaling
@@ -47,25 +53,32 @@ def paper_law(unloading: Unloading = Unloading.PRINTED, strain_scaling: StrainSc
 
 def law_for_each(
     plastic: Plastic,
-    a: float,
-    effective_modulus_MPa: float,
-    unloading: Unloading = Unloading.PRINTED,
-    strain_scaling: StrainScaling = StrainScaling.RAW,
+    a: ScalarLike,
+    effective_modulus_MPa: ScalarLike,
+    unloading: Unloading | str = Unloading.PRINTED,
+    strain_scaling: StrainScaling | str = StrainScaling.RAW,
 ) -> MccLaw:
-    """One law per particle: its own plastic coefficients (leading axis N), a and modulus shared."""
+    """One law per particle: its own plastic coefficients (leading axis N), a and modulus shared.
+
+    Raises:
+        InputError: for coefficients without a leading axis, a number out of its range, or an unknown form.
+    """
+    arguments.instance(plastic, Plastic, "plastic", "Draw some with mcc_jax.paper_population().sample(key, count).")
+    if jnp.ndim(plastic.C1) != 1:
+        raise InputError("plastic has no leading axis", remedy="For one particle make a MccLaw.")
     return eqx.filter_vmap(lambda one: MccLaw(one, a, effective_modulus_MPa, unloading, strain_scaling))(plastic)
 
 
 def simulate_campaign(
     laws: MccLaw,
-    diameters_um: np.ndarray,
-    peaks: np.ndarray,
+    diameters_um: Any,
+    peaks: Any,
     programme: Programme,
     *,
     instrument: Instrument | None = None,
     particles: Sequence[str] | None = None,
     effects: Sequence[HiddenEffect] = (),
-    relative_humidity_percent: np.ndarray | None = None,
+    relative_humidity_percent: Any = None,
     seed: int = 0,
     provenance: str = "simulated",
 ) -> Campaign:
@@ -89,10 +102,28 @@ def simulate_campaign(
         A campaign; the true coefficients, and whether each law is monotone, are in its `columns`.
 
     Raises:
+        InputError: for sizes or peaks that are not positive, or arguments of the wrong kind.
         ValueError: if lengths disagree, an effect of humidity gets no humidities, or the law refuses a particle
             (`RESULTS` says why).
     """
+    arguments.instance(laws, MccLaw, "laws", A_LAW)
+    if jnp.ndim(laws.plastic.C1) != 1:
+        raise InputError("laws has no leading axis", remedy="Make one law for each with mcc_jax.law_for_each.")
+    arguments.instance(programme, Programme, "programme", "Take mcc_jax.Programme.cycles().")
+    if instrument is not None:
+        arguments.instance(instrument, Instrument, "instrument", "Make one with mcc_jax.Instrument().")
+    seed = arguments.seed(seed)
+    effects = hidden_effects(effects)
+    diameters_um = arguments.diameters(diameters_um)
+    peaks = arguments.floats(peaks, "peaks", shape="the peak of every particle, shape (N,)")
+    if peaks.ndim != 1 or not peaks.size:
+        raise InputError(f"peaks must be the peak of every particle, shape (N,), got the shape {peaks.shape}")
+    arguments.positive(peaks, "peaks [mN or um]")
+    if relative_humidity_percent is not None:
+        relative_humidity_percent = humidities_of(relative_humidity_percent, len(diameters_um))
     count = len(diameters_um)
+    if isinstance(particles, str):
+        raise InputError(f"particles must be a list of names, got the text {particles!r}")
     names = tuple(str(i + 1) for i in range(count)) if particles is None else tuple(particles)
     if not (len(names) == len(peaks) == count == laws.plastic.C1.shape[0]):
         raise ValueError(
@@ -180,11 +211,11 @@ def paper_campaign(
     shared_material: bool = False,
     instrument: Instrument | None = None,
     programme: Programme | None = None,
-    unloading: Unloading = Unloading.PRINTED,
-    strain_scaling: StrainScaling = StrainScaling.RAW,
-    peak_stress_MPa: tuple[float, float] = PAPER_PEAK_STRESS_MPA,
+    unloading: Unloading | str = Unloading.PRINTED,
+    strain_scaling: StrainScaling | str = StrainScaling.RAW,
+    peak_stress_MPa: Sequence[float] = PAPER_PEAK_STRESS_MPA,
     effects: Sequence[HiddenEffect] = (),
-    relative_humidity_percent: np.ndarray | None = None,
+    relative_humidity_percent: Any = None,
 ) -> Campaign:
     """A campaign drawn from the paper: Table 1's particles, Table 2's coefficients, its protocol.
 
@@ -202,7 +233,22 @@ def paper_campaign(
         peak_stress_MPa: range of the maximum stress [MPa].
         effects: what else acts, besides the law.
         relative_humidity_percent: of the room during each test [%], shape (20,).
+
+    Raises:
+        InputError: for an argument of the wrong kind or out of its range.
     """
+    seed = arguments.seed(seed)
+    shared_material = arguments.flag(shared_material, "shared_material")
+    if programme is not None:
+        arguments.instance(programme, Programme, "programme", "Take mcc_jax.Programme.cycles().")
+    if instrument is not None:
+        arguments.instance(instrument, Instrument, "instrument", "Make one with mcc_jax.Instrument().")
+    effects = hidden_effects(effects)
+    unloading = arguments.member(unloading, Unloading, "unloading")
+    strain_scaling = arguments.member(strain_scaling, StrainScaling, "strain_scaling")
+    between = arguments.floats(peak_stress_MPa, "peak_stress_MPa", shape="two stresses [MPa], the smaller first")
+    if between.shape != (2,) or not (0 < between[0] <= between[1] < np.inf):
+        raise InputError(f"peak_stress_MPa must be two stresses > 0, the smaller first, got {between.tolist()}")
     count = len(PAPER_DIAMETERS_UM)
     population = paper_population()
     if shared_material:
@@ -212,7 +258,7 @@ def paper_campaign(
     laws = law_for_each(plastic, PAPER_SHAPE_PARAMETER, PAPER_EFFECTIVE_MODULUS_MPA, unloading, strain_scaling)
     programme = programme or Programme.cycles(rate=PAPER_LOAD_RATE_MN_PER_S)
     rng = np.random.default_rng(np.random.SeedSequence(seed).generate_state(4))
-    stress = rng.uniform(*peak_stress_MPa, count)
+    stress = rng.uniform(between[0], between[1], count)
     particles = particle_batch(PAPER_DIAMETERS_UM)
     peaks = np.asarray(eqx.filter_vmap(Particle.force)(particles, jnp.asarray(stress)))
     if programme.control == "displacement":

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, get_args
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from .. import arguments
+from .._errors import InputError
 from .._results import RESULTS
 from .._types import Path
 from ..campaign import Control
 from ..effects import ExtendedLaw
 from ..geometry import Particle
 from ..law import AbstractContactLaw
+
+CONTROLS: tuple[Control, ...] = get_args(Control)
+A_LAW = "Take mcc_jax.paper_law(), or the law of a calibration."
+A_PARTICLE = "Make one with mcc_jax.Particle(D1, D2, D3), diameters in um."
 
 
 class Response(eqx.Module):
@@ -34,13 +41,12 @@ class Response(eqx.Module):
     result: RESULTS
 
 
-@eqx.filter_jit
 def drive(
     law: AbstractContactLaw | ExtendedLaw,
     particle: Particle,
-    path: Path,
+    path: Any,
     *,
-    time: Path | None = None,
+    time: Any = None,
     control: Control = "displacement",
     state: Any = None,
     throw: bool = True,
@@ -52,38 +58,59 @@ def drive(
     Args:
         law: any contact law, also one extended by effects.
         particle: size and shape.
-        path: what the tester imposes, displacements [um] or forces [mN]; negative values are out of contact.
+        path: what the tester imposes, displacements [um] or forces [mN]; negative values are out of contact. A list, a
+            Series or an array with one axis.
         time: times [s] of the path, for an extended law; other laws know no time.
         control: which of the two `path` is, "displacement" or "load".
         state: the state to start from; a virgin particle if None.
-        throw: raise if the result is not successful; otherwise hand the reason back in `result`.
+        throw: raise if the result is not successful; otherwise hand the reason back in `result`. Pass False inside a
+            sampler's model or a solver, which may propose parameters without sense: raised there, it ends the run.
 
     Returns:
         The response; its numbers are differentiable with respect to law, particle, path and state.
 
     Raises:
-        ValueError: if an extended law gets no times, or another law gets some.
+        InputError: for a control that does not exist, a path that is none, times that are not as many as its points; if
+            an extended law gets no times, or another law gets some.
         EquinoxRuntimeError: with `throw`, if anything in the response is not finite or the particle can carry no
             stress.
     """
+    arguments.instance(law, (AbstractContactLaw, ExtendedLaw), "law", A_LAW)
+    arguments.instance(particle, Particle, "particle", A_PARTICLE)
+    arguments.choice(control, CONTROLS, "control")
+    arguments.flag(throw, "throw")
+    path = arguments.path(path, "path", many="Several particles at once: simulate_batch, or equinox.filter_vmap.")
+    if jnp.ndim(particle.D3):
+        raise InputError("the particle has a batch axis", remedy="Several at once: simulate_batch.")
+    if time is not None:
+        time = arguments.path(time, "time")
+        arguments.same_length(path=path, time=time)
+    if isinstance(law, ExtendedLaw) and time is None:
+        raise InputError("an extended law needs the times of the path", remedy="Pass time=[...] in seconds.")
+    if not isinstance(law, ExtendedLaw) and time is not None:
+        raise InputError("only a law extended by effects knows times", remedy="Leave out time.")
+    return _drive(law, particle, path, time, control, state, throw)
+
+
+@eqx.filter_jit
+def _drive(
+    law: AbstractContactLaw | ExtendedLaw,
+    particle: Particle,
+    path: Path,
+    time: Path | None,
+    control: Control,
+    state: Any,
+    throw: bool,
+) -> Response:
+    """The compiled part of `drive`, its arguments checked."""
     start = law.init(particle) if state is None else state
-    if isinstance(law, ExtendedLaw):
-        if time is None:
-            raise ValueError("an extended law needs the times of the path")
-        if control == "load":
-            force = path
-            end, displacement = law.path_load(particle, start, path, time)
-        else:
-            displacement = path
-            end, force = law.path(particle, start, path, time)
-    elif time is not None:
-        raise ValueError("only a law extended by effects knows times")
-    elif control == "load":
+    times = () if time is None else (time,)
+    if control == "load":
         force = path
-        end, displacement = law.path_load(particle, start, path)
+        end, displacement = law.path_load(particle, start, path, *times)
     else:
         displacement = path
-        end, force = law.path(particle, start, path)
+        end, force = law.path(particle, start, path, *times)
     finite = jnp.all(jnp.isfinite(displacement)) & jnp.all(jnp.isfinite(force))
     result = RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite_response)
     result = RESULTS.where(law.carries_stress(particle), result, RESULTS.no_stress)
@@ -92,14 +119,13 @@ def drive(
     return result.error_if(response, result != RESULTS.successful) if throw else response
 
 
-@eqx.filter_jit
 def simulate_batch(
     laws: AbstractContactLaw | ExtendedLaw,
     particles: Particle,
-    paths: Array,
+    paths: Any,
     *,
-    times: Array | None = None,
-    relative_humidity: Array | None = None,
+    times: Any = None,
+    relative_humidity: Any = None,
     control: Control = "displacement",
 ) -> Response:
     """`drive` for N particles at once, each with its own law.
@@ -113,11 +139,61 @@ def simulate_batch(
         control: "displacement" or "load".
 
     Returns:
-        A response with a leading axis N in every field; it never raises, look at `result` and `monotone`.
+        A response with a leading axis N in every field; what the law makes of its parameters never raises,
+        look at `result` and `monotone`.
+
+    Raises:
+        InputError: for a control that does not exist, or laws, particles, paths, times and humidities that are not as
+            many.
     """
+    arguments.instance(laws, (AbstractContactLaw, ExtendedLaw), "laws", A_LAW)
+    arguments.instance(particles, Particle, "particles", A_PARTICLE)
+    arguments.choice(control, CONTROLS, "control")
+    if not isinstance(laws, ExtendedLaw) and (times is not None or relative_humidity is not None):
+        raise InputError("only laws extended by effects know times and humidities", remedy="Leave them out.")
+    paths = _rows(paths, "paths", 2)
+    if isinstance(laws, ExtendedLaw) and times is None:
+        raise InputError("extended laws need the times of the paths", remedy="Pass times of the shape of the paths.")
+    if times is not None:
+        times = _rows(times, "times", 2)
+        if times.shape != paths.shape:
+            raise InputError(f"times have the shape {times.shape} and paths {paths.shape}: they must be as many")
+    if relative_humidity is not None:
+        relative_humidity = _rows(relative_humidity, "relative_humidity", 1)
+    _check_count(len(paths), laws=laws, particles=particles, relative_humidity=relative_humidity)
+    return _simulate_batch(laws, particles, paths, times, relative_humidity, control)
+
+
+def _rows(values: Any, name: str, axes: int) -> Array:
+    shape = "shape (N, steps), N and steps at least 1" if axes == 2 else "shape (N,)"
+    array = arguments.values(values, name, shape=shape)
+    if array.ndim != axes or array.size == 0:
+        remedy = "For one particle take drive." if array.ndim < axes else None
+        raise InputError(f"{name} must have the {shape}, got {array.shape}", remedy=remedy)
+    return array
+
+
+def _check_count(count: int, **batches: Any) -> None:
+    """Refuse batches whose leading axis is another."""
+    for name, batch in batches.items():
+        for leaf in jax.tree.leaves(batch):
+            if eqx.is_array(leaf) and jnp.shape(leaf)[:1] != (count,):
+                has = f"{leaf.shape[0]} entries" if leaf.ndim else "no leading axis"
+                remedy = "Make a batch with equinox.filter_vmap, for instance mcc_jax.law_for_each."
+                raise InputError(f"there are {count} paths and {name} with {has}: they must be as many", remedy=remedy)
+
+
+@eqx.filter_jit
+def _simulate_batch(
+    laws: AbstractContactLaw | ExtendedLaw,
+    particles: Particle,
+    paths: Array,
+    times: Array | None,
+    relative_humidity: Array | None,
+    control: Control,
+) -> Response:
+    """The compiled part of `simulate_batch`, its arguments checked."""
     if not isinstance(laws, ExtendedLaw):
-        if times is not None or relative_humidity is not None:
-            raise ValueError("only laws extended by effects know times and humidities")
         return eqx.filter_vmap(lambda law, particle, path: drive(law, particle, path, control=control, throw=False))(
             laws, particles, paths
         )

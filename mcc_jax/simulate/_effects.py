@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .. import arguments
+from .._errors import InputError
 from ..effects import LIBRARY, AbstractEffect, Mechanism, Variant, find_variant
 
 _STREAM = 0x0EFF_EC75
@@ -38,7 +40,11 @@ class HiddenEffect:
     nuisance: Mapping[str, float] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
+        arguments.instance(self.variant, Variant, "variant", 'Take mcc_jax.effects.find_variant("creep").')
+        arguments.instance(self.nuisance, Mapping, "nuisance", "Give a dictionary of numbers by name.")
         variant, name = self.variant, f"{self.variant.mechanism}:{self.variant.name}"
+        if self.amplitude is not None and not arguments.is_number(self.amplitude):
+            raise InputError(f"{name}: {variant.parameter} must be a number, got {arguments.shown(self.amplitude)}")
         if not math.isfinite(self.strength) or abs(self.strength) > 1e9:
             raise ValueError(f"{name}: {variant.parameter} must be a number of sensible size, got {self.strength:g}")
         if self.strength * variant.sign < 0:
@@ -49,6 +55,8 @@ class HiddenEffect:
             if key not in known:
                 names = ", ".join([variant.parameter, *known])
                 raise ValueError(f"{name} has no parameter {key!r}; it has: {names}")
+            if not arguments.is_number(value):
+                raise InputError(f"{name}: {key} must be a number, got {arguments.shown(value)}")
             least = known[key].plausible[0]
             if not math.isfinite(value) or abs(value) > 1e9 or (least > 0 and value <= 0):
                 raise ValueError(f"{name}: {key} must be {'above 0' if least > 0 else 'finite'}, got {value:g}")
@@ -117,6 +125,7 @@ def read_effect(text: str, library: Mapping[str, Mechanism] = LIBRARY) -> Hidden
     Raises:
         ValueError: in words, naming the valid choices.
     """
+    arguments.instance(text, str, "an effect as text", 'Write for instance "creep:logarithmic=0.02".')
     head, *rest = text.split(",")
     name, equals, value = head.partition("=")
     variant = find_variant(name.strip(), library)
@@ -147,3 +156,32 @@ def _number(name: str, text: str) -> float:
 def batched_humidity(values: np.ndarray | None, count: int, reference: float) -> jax.Array:
     """Relative humidity of every test [%], the reference where none is known."""
     return jnp.full(count, reference) if values is None else jnp.asarray(values, dtype=float)
+
+
+def hidden_effects(effects: Any) -> tuple[HiddenEffect, ...]:
+    """Several hidden effects; one alone is a tuple of one.
+
+    Raises:
+        InputError: if one of them is none.
+    """
+    if isinstance(effects, HiddenEffect):
+        return (effects,)
+    remedy = 'Make each with mcc_jax.simulate.read_effect("creep").'
+    if isinstance(effects, str | Variant) or not isinstance(effects, Iterable):
+        raise InputError(f"effects must be a list of HiddenEffect, got {arguments.kind_of(effects)}", remedy=remedy)
+    return tuple(arguments.instance(one, HiddenEffect, "every one of effects", remedy) for one in effects)
+
+
+def humidities_of(values: Any, count: int) -> np.ndarray:
+    """Relative humidity of every test [%], shape (N,).
+
+    Raises:
+        InputError: if there are not as many as tests, or one is not between 0 and 100.
+    """
+    found = arguments.floats(values, "relative_humidity_percent", shape="one number from 0 to 100 for every test")
+    if found.shape != (count,) or not ((found >= 0) & (found <= 100)).all():
+        raise InputError(
+            f"relative_humidity_percent must be {count} numbers from 0 to 100, one for every test, "
+            f"got {arguments.shown(found.tolist())}"
+        )
+    return found

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .. import arguments
+
 
 @dataclass(frozen=True)
 class Instrument:
@@ -19,7 +21,7 @@ class Instrument:
         zero_um: standard deviation of each test's zero of displacement [um]: where the tester believed to touch.
 
     Raises:
-        ValueError: for a negative value.
+        InputError: for a value that is negative or not finite.
     """
 
     displacement_noise_um: float = 0.0
@@ -29,9 +31,8 @@ class Instrument:
     zero_um: float = 0.0
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not (value >= 0 and np.isfinite(value)):
-                raise ValueError(f"{name} must be zero or positive, got {value}")
+        for name, value in list(vars(self).items()):
+            object.__setattr__(self, name, arguments.number(value, name, least=0))
 
     def read(
         self, rng: np.random.Generator, force_mN: np.ndarray, displacement_um: np.ndarray

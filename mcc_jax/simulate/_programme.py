@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 
+from .. import arguments
 from .._errors import InputError
 from ..campaign import Control, load_toml_file
 
@@ -19,10 +21,18 @@ class Ramp:
     Attributes:
         to: level as a share of the particle's peak; 1 is the peak, 0 full release.
         rate: magnitude of the rate, mN/s under load control, um/s under displacement control, > 0.
+
+    Raises:
+        InputError: for a rate that is not positive, or a negative level.
     """
 
     to: float
     rate: float
+
+    def __post_init__(self) -> None:
+        to = arguments.number(self.to, "the level that a ramp goes to, a share of the peak,", least=0)
+        object.__setattr__(self, "to", to)
+        object.__setattr__(self, "rate", arguments.number(self.rate, "the rate of a ramp", above=0))
 
 
 @dataclass(frozen=True)
@@ -31,9 +41,15 @@ class Hold:
 
     Attributes:
         seconds: how long [s], > 0.
+
+    Raises:
+        InputError: for a duration that is not positive.
     """
 
     seconds: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "seconds", arguments.number(self.seconds, "the duration of a hold [s]", above=0))
 
 
 @dataclass(frozen=True)
@@ -49,33 +65,28 @@ class Programme:
         points: number of samples, evenly spread over the time of the test (the turning points come on top).
 
     Raises:
-        ValueError: for a rate or duration that is not positive, a negative level, or no steps.
+        InputError: for a control that does not exist, a sampling that is not positive, or no steps.
     """
 
     control: Control
-    steps: tuple[Ramp | Hold, ...]
+    steps: Sequence[Ramp | Hold]
     interval_s: float | None = None
     points: int | None = None
 
     def __post_init__(self) -> None:
         if (self.interval_s is None) == (self.points is None):
-            raise ValueError("give exactly one of interval_s and points")
-        if self.interval_s is not None and not self.interval_s > 0:
-            raise ValueError(f"interval_s must be positive, got {self.interval_s}")
-        if self.points is not None and self.points < 2:
-            raise ValueError(f"points must be at least 2, got {self.points}")
-        if self.control not in ("load", "displacement"):
-            raise ValueError(f"control must be 'load' or 'displacement', got {self.control!r}")
-        if not self.steps:
-            raise ValueError("a programme needs at least one step")
-        for step in self.steps:
-            if isinstance(step, Ramp):
-                if not (step.rate > 0 and np.isfinite(step.rate)):
-                    raise ValueError(f"the rate of a ramp must be positive, got {step.rate}")
-                if not (step.to >= 0 and np.isfinite(step.to)):
-                    raise ValueError(f"a ramp goes to a level >= 0, a share of the peak, got {step.to}")
-            elif not (step.seconds > 0 and np.isfinite(step.seconds)):
-                raise ValueError(f"a hold lasts longer than 0 s, got {step.seconds}")
+            raise InputError("give exactly one of interval_s and points")
+        if self.interval_s is not None:
+            object.__setattr__(self, "interval_s", arguments.number(self.interval_s, "interval_s", above=0))
+        if self.points is not None:
+            object.__setattr__(self, "points", arguments.whole(self.points, "points", least=2))
+        arguments.choice(self.control, get_args(Control), "control")
+        given = arguments.instance(self.steps, Sequence, "steps", "Give a list of Ramp and Hold.")
+        if not given:
+            raise InputError("a programme needs at least one step")
+        for step in given:
+            arguments.instance(step, (Ramp, Hold), "every one of steps", "Give mcc_jax.Ramp or mcc_jax.Hold.")
+        object.__setattr__(self, "steps", tuple(given))
 
     @classmethod
     def cycles(
@@ -102,6 +113,8 @@ class Programme:
             interval_s: time between two samples [s].
             points: number of samples; 300 if neither is given.
         """
+        levels = arguments.floats(levels, "levels", shape="a list of shares of the peak").ravel().tolist()
+        hold_s = arguments.number(hold_s, "hold_s", least=0)
         back = rate if unload_rate is None else unload_rate
         steps: list[Ramp | Hold] = []
         for i, level in enumerate(levels):
@@ -118,7 +131,11 @@ class Programme:
 
         Returns:
             Two arrays of one length; times increase strictly.
+
+        Raises:
+            InputError: for a peak that is not positive, or a programme that never leaves zero.
         """
+        peak = arguments.number(peak, "the peak of a particle [mN or um]", above=0)
         times, values = [0.0], [0.0]
         for step in self.steps:
             if isinstance(step, Hold):
@@ -132,7 +149,7 @@ class Programme:
                 times.append(times[-1] + duration)
                 values.append(value)
         if len(times) < 2:
-            raise ValueError("the programme never leaves zero")
+            raise InputError("the programme never leaves zero")
         interval = self.interval_s if self.interval_s is not None else times[-1] / ((self.points or 2) - 1)
         grid = np.arange(0.0, times[-1], interval)
         # A grid point that falls onto a turning point but for rounding would make two samples of one.
@@ -160,7 +177,7 @@ def read_programme(file: str | Path) -> Programme:
     Raises:
         InputError: naming the file and the entry.
     """
-    file = Path(file)
+    file = arguments.file_path(file, "file")
     content = load_toml_file(file, "a TOML file with the programme")
     unknown = set(content) - {"control", "rate", "points", "interval_s", "step"}
     if unknown:
@@ -178,6 +195,12 @@ def read_programme(file: str | Path) -> Programme:
             )
         return float(value)
 
+    def made(kind: type[Ramp] | type[Hold], where: str, *values: float) -> Ramp | Hold:
+        try:
+            return kind(*values)
+        except InputError as error:
+            raise InputError(f"{where}: {error.problem}", file=file, remedy="Correct the number.") from None
+
     steps: list[Ramp | Hold] = []
     for i, entry in enumerate(content["step"], start=1):
         where = f"step {i}"
@@ -193,11 +216,10 @@ def read_programme(file: str | Path) -> Programme:
                 f"{where}: unknown entry {sorted(extra)[0]!r}", file=file, remedy="Known: ramp_to, rate, hold_s."
             )
         if "hold_s" in entry:
-            steps.append(Hold(number(entry, "hold_s", where)))
+            steps.append(made(Hold, where, number(entry, "hold_s", where)))
         elif "rate" in entry or "rate" in content:
-            steps.append(
-                Ramp(number(entry, "ramp_to", where), number(entry if "rate" in entry else content, "rate", where))
-            )
+            rate = number(entry if "rate" in entry else content, "rate", where)
+            steps.append(made(Ramp, where, number(entry, "ramp_to", where), rate))
         else:
             raise InputError(f"{where} has no rate", file=file, remedy="Give it one, or one for all at the top.")
     control = content.get("control", "load")

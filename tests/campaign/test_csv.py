@@ -355,6 +355,9 @@ def test_fast_and_strict_parser_agree(tmp_path, monkeypatch):
     assert_same(fast, campaign)
 
 
+LINE = Curve(np.array([0.0, 1]), np.array([0.0, 1]), np.array([0.0, 1]))
+
+
 def simple(**changes) -> Campaign:
     curve = Curve(np.array([0.0, 1]), np.array([0.0, 1]), np.array([0.0, 1]))
     parts = {"particles": ("A",), "diameters_um": np.full((1, 3), 100.0), "curves": (curve,)}
@@ -365,10 +368,8 @@ def simple(**changes) -> Campaign:
     ("changes", "piece"),
     [
         ({"particles": (), "diameters_um": np.empty((0, 3)), "curves": ()}, "no particle"),
-        ({"particles": ("A", "A")}, "shape"),
+        ({"particles": ("A", "A"), "diameters_um": np.ones((2, 3)), "curves": (LINE, LINE)}, "stands there 2 times"),
         ({"diameters_um": np.full((1, 3), np.nan)}, "not all positive"),
-        ({"diameters_um": np.full((1, 2), 1.0)}, "shape"),
-        ({"curves": ()}, "0 curves"),
         ({"particles": ("\0",)}, "NUL"),
         ({"particles": ("\ud800",)}, "Unicode"),
         ({"particles": ("  ",)}, "empty"),
@@ -376,9 +377,7 @@ def simple(**changes) -> Campaign:
         ({"curves": (Curve(np.array([1.0, 0]), np.ones(2), np.ones(2)),)}, "goes back at sample 2"),
         ({"curves": (Curve(np.zeros(1), np.ones(1), np.ones(1)),)}, "one row only"),
         ({"curves": (Curve(np.zeros(2), np.zeros(2), np.ones(2)),)}, "every force"),
-        ({"curves": (Curve(np.zeros(2), np.ones(3), np.ones(2)),)}, "shape"),
         ({"columns": {"D1_um": ("x",)}}, "name of a further column"),
-        ({"columns": {"x": ("x", "y")}}, "2 cells"),
         ({"metadata": Metadata(other={"control": 1})}, "cannot be a key"),
         ({"metadata": Metadata(other={"x": None})}, "no form in TOML"),
         ({"metadata": Metadata(other={"force_resolution_N": 1})}, "would not read back"),
@@ -388,6 +387,48 @@ def test_unfit_campaign_is_not_written(tmp_path, changes, piece):
     with pytest.raises(InputError, match=piece):
         write_campaign(simple(**changes), tmp_path / "c")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "piece"),
+    [
+        ({"particles": ("A", "B")}, r"shape \(1, 3\) where \(2, 3\)"),
+        (
+            {"particles": "AB", "diameters_um": np.ones((2, 3)), "curves": (LINE, LINE)},
+            "list of texts, got the text 'AB'",
+        ),
+        ({"diameters_um": np.full((1, 2), 1.0)}, "shape"),
+        ({"diameters_um": [["a", "b", "c"]]}, "D1, D2, D3"),
+        ({"curves": ()}, "particles has 1 entries and curves has 0"),
+        ({"columns": {"x": ("x", "y")}}, "particles has 1 entries and the column 'x' has 2"),
+    ],
+)
+def test_what_is_no_campaign_cannot_be_made(changes, piece):
+    with pytest.raises(InputError, match=piece):
+        simple(**changes)
+
+
+def test_a_campaign_takes_lists_and_series():
+    import pandas as pd
+
+    table = pd.DataFrame({"t": [0, 1, 2], "F": [0.0, 10.0, 20.0], "d": [0.0, 3.0, 5.0]}, index=[7, 8, 9])
+    curve = Curve(table["t"], table["F"], table["d"])
+    campaign = Campaign(["x"], [[200, 190, 180]], [curve], {"batch": pd.Series([3])})
+    assert campaign.particles == ("x",)
+    assert campaign.columns == {"batch": ("3",)}
+    assert campaign.diameters_um.dtype == float
+    for values in (curve.time_s, curve.force_mN, curve.displacement_um):
+        assert type(values) is np.ndarray
+        assert values.dtype == float
+    same = Curve([0, 1, 2], (0.0, 10.0, 20.0), table["d"].to_numpy())
+    np.testing.assert_array_equal(same.force_mN, curve.force_mN)
+
+
+def test_a_curve_of_unequal_lengths_names_both():
+    with pytest.raises(InputError, match="time_s has 2 entries and force_mN has 3"):
+        Curve(np.zeros(2), np.ones(3), np.ones(2))
+    with pytest.raises(InputError, match="1-D"):
+        Curve(np.zeros((2, 1)), np.ones(2), np.ones(2))
 
 
 def test_write_replaces_whole_and_keeps_other_files(tmp_path):

@@ -169,7 +169,7 @@ def test_curves_of_chosen_particles(calibrations):
     figure = plot_curves(r, ["a_b^c", "$x_1$ <script>"])
     assert len(panels(figure)[0].lines) == 1 + 2 + 1  # not used: no dashed line
     assert any(t.startswith("a_b^c, not used") for t in texts(figure))
-    with pytest.raises(KeyError, match="no particle 'nobody'"):
+    with pytest.raises(ValueError, match="no particle 'nobody'"):
         plot_curves(r, ["nobody"])
 
 

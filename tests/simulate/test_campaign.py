@@ -117,7 +117,10 @@ def test_mismatched_lengths_are_told():
 
 
 def test_parameters_without_sense_are_told():
-    laws = eqx.filter_vmap(lambda p: MccLaw(p, 1.43, -5.0))(eqx.filter_vmap(Plastic)(*jnp.array([[7.0], [3.0], [2.7]])))
+    negative = jnp.asarray(-5.0)
+    laws = eqx.filter_vmap(lambda p: MccLaw(p, 1.43, negative))(
+        eqx.filter_vmap(Plastic)(*jnp.array([[7.0], [3.0], [2.7]]))
+    )
     with pytest.raises(ValueError, match="must be positive"):
         simulate_campaign(laws, np.full((1, 3), 100.0), np.ones(1) * 20, Programme.cycles())
 

@@ -34,20 +34,21 @@ def test_a_path_can_be_continued_from_its_state():
 def test_numbers_that_are_not_finite_are_explained(control):
     path = jnp.array([0.0, 20.0, jnp.nan, 30.0])
     assert drive(paper_law(), PARTICLE, path, control=control, throw=False).result == RESULTS.nonfinite_response
-    with pytest.raises(eqx.EquinoxRuntimeError, match="every entry of the path finite"):
+    with pytest.raises(eqx.EquinoxRuntimeError, match=r"entry of the path.*law's own parameters.*throw=False"):
         drive(paper_law(), PARTICLE, path, control=control)
 
 
 @pytest.mark.parametrize("bad", [("C1", 0.0), ("C5", -2.0), ("C3", -1.0), ("C1", float("nan")), ("E", -1.0)])
 def test_a_parameter_out_of_range_is_explained(bad):
     values = {"C1": 7.0, "C3": 3.0, "C5": 2.6, "E": 16e3} | dict([bad])
-    law = MccLaw(Plastic(values["C1"], values["C3"], values["C5"]), 1.43, values["E"])
+    law = MccLaw(Plastic(*(jnp.asarray(values[name]) for name in ("C1", "C3", "C5"))), 1.43, jnp.asarray(values["E"]))
     with pytest.raises(eqx.EquinoxRuntimeError, match="C1, C5 and the effective modulus must be positive"):
         drive(law, PARTICLE, jnp.linspace(0, 50, 5))
 
 
 def test_nan_parameters_never_pass_silently():
-    for plastic in (Plastic(jnp.nan, 3.0, 2.6), Plastic(7.0, jnp.nan, 2.6), Plastic(7.0, 3.0, jnp.nan)):
+    nan = jnp.asarray(jnp.nan)
+    for plastic in (Plastic(nan, 3.0, 2.6), Plastic(7.0, nan, 2.6), Plastic(7.0, 3.0, nan)):
         law = MccLaw(plastic, 1.43, 16e3)
         for control in ("displacement", "load"):
             response = drive(law, PARTICLE, jnp.array([10.0, 30.0, 29.9]), control=control, throw=False)

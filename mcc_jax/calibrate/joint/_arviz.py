@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
+from ... import arguments
 from ._bayes import BayesCalibration
 from ._population import COEFFICIENTS
-from ._predictive import predict_measured
+from ._predictive import A_CALIBRATION, predict_measured
 from ._priors import LogNormalPrior, NakagamiPrior, NormalPrior, Priors
 
 if TYPE_CHECKING:
@@ -90,6 +91,9 @@ def to_arviz(calibration: BayesCalibration, *, prior_count: int = 500, seed: int
     """
     from arviz_base import from_dict
 
+    arguments.instance(calibration, BayesCalibration, "calibration", A_CALIBRATION)
+    prior_count = arguments.whole(prior_count, "prior_count", least=1)
+    seed = arguments.seed(seed)
     c = calibration
     named = c.named_population()
     chains, draws = named["a"].shape
@@ -224,5 +228,7 @@ def write_posterior(calibration: BayesCalibration, file: str | Path) -> None:
 
     Of several processes, which all have the same posterior, only the first one writes.
     """
+    arguments.instance(calibration, BayesCalibration, "calibration", A_CALIBRATION)
+    file = arguments.file_path(file, "file")
     if jax.process_index() == 0:
         to_arviz(calibration, seed=calibration.seed).to_netcdf(file, engine="h5netcdf")

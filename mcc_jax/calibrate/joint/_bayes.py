@@ -6,11 +6,12 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import numpy as np
 
+from ... import arguments
 from ...campaign import THRESHOLD_MPA, Campaign, Finding, check_tests
 from .._result import estimate, finite, force_zero, misfit_note
 from ..judgement import judged, numbers_in_reach, unlike_others
@@ -18,7 +19,7 @@ from ._ahead import compile_ahead
 from ._data import Selection, own_misfit, ranges_um, root_mean_squares
 from ._draws import Length, draw_fast, draw_joint
 from ._fit import prepare
-from ._model import JointFit, JointModel
+from ._model import JointFit, JointModel, checked_settings
 from ._population import COEFFICIENTS, Population
 from ._weights import PARETO_K_MOST
 
@@ -340,14 +341,16 @@ def calibrate_bayes(
         progress: called with the name of each step.
 
     Raises:
-        InputError: if no particle can be used, or processes were given different campaigns.
-        ValueError: for blocks of no particles.
+        InputError: if no particle can be used, or processes were given different campaigns; for an argument of the
+            wrong kind or out of its range.
     """
     started = time.perf_counter()
-    tell = progress or (lambda _: None)
-    model = model or JointModel()
     campaign = check_tests(campaign)
-    length = Length(chains, warmup, draws)
+    tell, model, threshold_MPa = checked_settings(progress, model, threshold_MPa, block)
+    seed = arguments.seed(seed)
+    arguments.choice(mode, get_args(Mode), "mode")
+    chains, draws = (arguments.whole(n, name, least=1) for n, name in ((chains, "chains"), (draws, "draws")))
+    length = Length(chains, arguments.whole(warmup, "warmup", least=1), draws)
     fast = mode == "fast"
     ahead = (lambda tests, size: compile_ahead(tests, size, model, length)) if fast else None
     with numbers_in_reach(campaign):

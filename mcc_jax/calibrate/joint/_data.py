@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ... import arguments
 from ...campaign import (
     THRESHOLD_MPA,
     Campaign,
@@ -28,6 +29,7 @@ from ...campaign import (
     stress_and_strain,
     too_few,
 )
+from ...campaign._validate import usable_campaign
 from ...geometry import Particle
 from .._elastic import LEAST_RATIO
 from .._predict import READING_UM, point_noise_um
@@ -149,11 +151,11 @@ def select_tests(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, mo
 
     Raises:
         InputError: if no particle can be used.
-        ValueError: for a threshold that is negative or not finite.
+        InputError: for a threshold that is negative or not finite.
         RuntimeError: in single precision.
     """
-    if not (np.isfinite(threshold_MPa) and threshold_MPa >= 0):
-        raise ValueError(f"the threshold must be a stress >= 0 MPa, got {threshold_MPa}")
+    usable_campaign(campaign)
+    threshold_MPa = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
     if not jax.config.read("jax_enable_x64"):
         raise RuntimeError(
             "the joint calibration needs double precision; "

@@ -5,12 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ... import arguments
 from ...campaign import THRESHOLD_MPA, Campaign, Finding, check_tests
 from .._result import estimate, finite, force_zero, misfit_note
 from ..judgement import judged, numbers_in_reach, unlike_others
@@ -19,7 +20,7 @@ from ._bayes import log_estimate, power_of_e
 from ._data import Selection, Tests, own_misfit, ranges_um, root_mean_squares
 from ._fit import beyond_numbers, population_at, prepare
 from ._mode import FIRST_SPREAD, spread_slope
-from ._model import JointFit, JointModel
+from ._model import JointFit, JointModel, checked_settings
 from ._pooled import Pooled, fit_pooled, unpack
 from ._population import COEFFICIENTS
 
@@ -335,12 +336,13 @@ def calibrate_least_squares(
         progress: called with the name of each step.
 
     Raises:
-        InputError: if no particle can be used.
+        InputError: if no particle can be used; for an argument of the wrong kind or out of its range.
     """
     started = time.perf_counter()
-    tell = progress or (lambda _: None)
-    model = model or JointModel()
     campaign = check_tests(campaign)
+    tell, model, threshold_MPa = checked_settings(progress, model, threshold_MPa, block)
+    seed = arguments.seed(seed)
+    arguments.choice(loss, get_args(Loss), "loss")
     with numbers_in_reach(campaign):
         selection, tests, fit, _ = prepare(
             campaign, model, threshold_MPa, block=block, tell=tell, correlated=loss == "linear", rounds=1

@@ -5,11 +5,15 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import jax
 
+from ... import arguments
+from ..._errors import InputError
 from ...campaign import THRESHOLD_MPA, Campaign
+from ...campaign._validate import usable_campaign
 from ._bayes import BayesCalibration, calibrate_bayes
 from ._blocks import block_size
 from ._data import select_tests
@@ -49,23 +53,27 @@ def calibrate_many(
         Results in the order of the campaigns; in place of one that fails, its exception.
 
     Raises:
-        ValueError: if the method is unknown or there is no worker.
+        InputError: if the method is unknown, there is no worker, or one of the campaigns is none.
         TypeError: for settings that the method does not have.
     """
     methods: dict[str, Callable[..., Calibration]] = {
         "bayes": calibrate_bayes,
         "least-squares": calibrate_least_squares,
     }
-    if method not in methods:
-        raise ValueError(f"the method must be one of {', '.join(methods)}, got {method!r}")
-    if workers < 1:
-        raise ValueError(f"there must be at least one worker, got {workers}")
+    arguments.choice(method, methods, "method")
+    workers = arguments.whole(workers, "workers", least=1)
+    threshold_MPa = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
+    if isinstance(campaigns, str | Path | Campaign) or not isinstance(campaigns, Iterable):
+        raise InputError(f"campaigns must be a list of campaigns, got {arguments.kind_of(campaigns)}")
     names = set(inspect.signature(methods[method]).parameters) - {"campaign", "progress", "threshold_MPa"}
     unknown = sorted(set(settings) - names)
     if unknown:
         raise TypeError(f"{method} has no setting {', '.join(unknown)}; it has: {', '.join(sorted(names))}")
     calibrate = methods[method]
     queue = list(campaigns)
+    for i, item in enumerate(queue, start=1):
+        if not isinstance(item, Campaign):  # one that is damaged stands in its place with its error
+            usable_campaign(item, f"campaign {i}")
     results: list[Calibration | Exception] = [RuntimeError("was not calibrated") for _ in queue]
     tell = progress or (lambda _, __: None)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ... import arguments
 from ..._errors import InputError
 from ...law import StrainScaling, Unloading
 from ._individual import Particles
@@ -36,13 +38,36 @@ class JointModel:
         modulus_scatter: let the modulus differ from particle to particle.
         shape_scatter: let `a` differ from particle to particle.
         priors: what is believed beforehand.
+
+    Raises:
+        InputError: for an unknown form (which may be given as its text), or what is no `Priors`.
     """
 
-    unloading: Unloading = Unloading.PRINTED
-    strain_scaling: StrainScaling = StrainScaling.RAW
-    modulus_scatter: bool = False
-    shape_scatter: bool = False
-    priors: Priors | None = None
+    unloading: Unloading
+    strain_scaling: StrainScaling
+    modulus_scatter: bool
+    shape_scatter: bool
+    priors: Priors | None
+
+    def __init__(
+        self,
+        unloading: Unloading | str = Unloading.PRINTED,
+        strain_scaling: StrainScaling | str = StrainScaling.RAW,
+        modulus_scatter: bool = False,
+        shape_scatter: bool = False,
+        priors: Priors | None = None,
+    ) -> None:
+        if priors is not None:
+            arguments.instance(priors, Priors, "priors", "Read them with mcc_jax.read_priors(file).")
+        fields = {
+            "unloading": arguments.member(unloading, Unloading, "unloading"),
+            "strain_scaling": arguments.member(strain_scaling, StrainScaling, "strain_scaling"),
+            "modulus_scatter": arguments.flag(modulus_scatter, "modulus_scatter"),
+            "shape_scatter": arguments.flag(shape_scatter, "shape_scatter"),
+            "priors": priors,
+        }
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
 
     @property
     def scatter(self) -> Scatter:
@@ -153,3 +178,21 @@ def log_C3(priors: Priors) -> float:
     """The prior's log C3 at the medians of the others."""
     log_C1, log_C5 = np.log(priors.C1.median), np.log(priors.C5.median)
     return float((np.log(20 / 9) + log_C1 + 5 * log_C5 + np.log(priors.softening.median)) / 6)
+
+
+def checked_settings(
+    progress: Callable[[str], None] | None, model: JointModel | None, threshold_MPa: Any, block: int | None
+) -> tuple[Callable[[str], None], JointModel, float]:
+    """What all joint calibrations share, with the defaults filled in.
+
+    Raises:
+        InputError: for one of the wrong kind or out of its range.
+    """
+    if progress is not None and not callable(progress):
+        raise InputError(f"progress must be a function of the name of a step, got {arguments.kind_of(progress)}")
+    if model is not None:
+        arguments.instance(model, JointModel, "model", "Make one with mcc_jax.JointModel().")
+    if block is not None:
+        arguments.whole(block, "block", least=1)
+    threshold = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
+    return progress or (lambda _: None), model or JointModel(), threshold

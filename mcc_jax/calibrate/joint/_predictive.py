@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,11 +10,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ... import arguments
+from ..._errors import InputError
 from ...campaign import PAPER_EFFECTIVE_MODULUS_MPA, PAPER_LOG_C, PAPER_SHAPE_PARAMETER, particle_batch
 from ...law import MccLaw, Plastic
 from ._bayes import BayesCalibration, summary
 from ._compile import compiled
 from ._population import COEFFICIENTS
+
+A_CALIBRATION = "Make one with mcc_jax.calibrate_bayes(campaign)."
 
 
 @dataclass(frozen=True)
@@ -40,8 +43,7 @@ class PredictedCurves:
         Raises:
             ValueError: if the share is not between 0 and 1, or noise was asked for but not drawn.
         """
-        if not 0 < share < 1:
-            raise ValueError(f"the share must lie between 0 and 1, got {share}")
+        share = arguments.number(share, "the share", above=0, below=1)
         draws = self.observed_um if observed else self.displacement_um
         if draws is None:
             raise ValueError("these curves were drawn without noise")
@@ -77,7 +79,9 @@ def new_laws(calibration: BayesCalibration, count: int, *, seed: int = 0) -> Mcc
     Returns:
         A batched law, every array field with a leading axis.
     """
-    rng = np.random.default_rng(seed)
+    arguments.instance(calibration, BayesCalibration, "calibration", A_CALIBRATION)
+    count = arguments.whole(count, "count", least=1)
+    rng = np.random.default_rng(arguments.seed(seed))
     p = jax.tree.map(lambda x: np.asarray(x).reshape(-1, *np.asarray(x).shape[2:]), calibration.population)
     pick = rng.integers(len(p.a), size=count)
     C = np.exp(p.mu[pick] + p.tau[pick] * rng.standard_normal((count, 3)))
@@ -88,8 +92,8 @@ def new_laws(calibration: BayesCalibration, count: int, *, seed: int = 0) -> Mcc
 
 def predict_new_particle(
     calibration: BayesCalibration,
-    diameters_um: Sequence[float],
-    force_mN: np.ndarray,
+    diameters_um: Any,
+    force_mN: Any,
     *,
     count: int = 500,
     seed: int = 0,
@@ -104,11 +108,13 @@ def predict_new_particle(
         seed: random seed.
 
     Raises:
-        ValueError: for diameters that are not positive.
+        InputError: for diameters that are not positive, or a path that is none.
     """
-    sizes = np.asarray(diameters_um, float)
-    if sizes.shape != (3,) or not (np.isfinite(sizes).all() and (sizes > 0).all()):
-        raise ValueError(f"a particle has three positive diameters D1, D2, D3 [um], got {diameters_um}")
+    arguments.instance(calibration, BayesCalibration, "calibration", A_CALIBRATION)
+    sizes = arguments.one_particle(diameters_um)
+    force_mN = np.asarray(arguments.path(force_mN, "force_mN"))
+    if not np.isfinite(force_mN).all():
+        raise InputError(f"force_mN is {force_mN[~np.isfinite(force_mN)][0]} at one point", remedy="Leave it out.")
     laws = new_laws(calibration, count, seed=seed)
     paths = np.broadcast_to(np.asarray(force_mN, float), (count, len(force_mN)))
     particles = particle_batch(np.broadcast_to(sizes, (count, 3)))
@@ -129,10 +135,14 @@ def predict_measured(
         seed: random seed.
 
     Raises:
-        KeyError: if the particle did not take part.
+        InputError: if the particle did not take part.
     """
+    arguments.instance(calibration, BayesCalibration, "calibration", A_CALIBRATION)
+    count = arguments.whole(count, "count", least=1)
+    seed = arguments.seed(seed)
     if particle not in calibration.particles:
-        raise KeyError(f"particle {particle!r} did not take part; there are: {', '.join(calibration.particles)}")
+        known = ", ".join(calibration.particles)
+        raise InputError(f"particle {arguments.shown(particle)} did not take part", remedy=f"There are: {known}.")
     row = calibration.particles.index(particle)
     tests = calibration.selection.tests
     length = len(calibration.selection.rows[row])
@@ -181,6 +191,7 @@ def _wander(rng: np.random.Generator, step: np.ndarray, sd: float, length: float
 
 def beside_paper(calibration: BayesCalibration) -> list[dict[str, Any]]:
     """The paper's Table 2, a and modulus beside ours: one row per quantity, with mean, sd and 95 % interval of ours."""
+    arguments.instance(calibration, BayesCalibration, "calibration", A_CALIBRATION)
     named = calibration.named_population()
     paper: dict[str, float | None] = {"a": PAPER_SHAPE_PARAMETER}
     printed = calibration.model.unloading.value == "printed"

@@ -10,6 +10,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from ... import arguments
 from ..._errors import InputError
 from ...campaign import load_toml_file
 from ...law import Unloading
@@ -18,18 +19,36 @@ from ._noise import NoisePrior
 
 @dataclass(frozen=True)
 class NormalPrior:
-    """A normal distribution."""
+    """A normal distribution.
+
+    Raises:
+        InputError: if the mean is not finite or the standard deviation not positive.
+    """
 
     mean: float
     sd: float
 
+    def __post_init__(self) -> None:
+        """Refuse what is no normal distribution."""
+        object.__setattr__(self, "mean", arguments.number(self.mean, "the mean of a prior"))
+        object.__setattr__(self, "sd", arguments.number(self.sd, "the sd of a prior", above=0))
+
 
 @dataclass(frozen=True)
 class LogNormalPrior:
-    """A log-normal distribution: its median, and the standard deviation of the logarithm."""
+    """A log-normal distribution: its median, and the standard deviation of the logarithm.
+
+    Raises:
+        InputError: if one of them is not positive.
+    """
 
     median: float
     log_sd: float
+
+    def __post_init__(self) -> None:
+        """Refuse what is no log-normal distribution."""
+        object.__setattr__(self, "median", arguments.number(self.median, "the median of a prior", above=0))
+        object.__setattr__(self, "log_sd", arguments.number(self.log_sd, "the log_sd of a prior", above=0))
 
 
 @dataclass(frozen=True)
@@ -54,10 +73,9 @@ class NakagamiPrior:
 
     def __post_init__(self) -> None:
         """Refuse what is no distribution of a spread."""
-        if not self.sd > 0:
-            raise InputError(f"the scale of a spread must be positive, not {self.sd!r}", remedy="Correct sd.")
-        if not 0 < self.shape <= MOST_SHAPE:
-            raise InputError(f"the shape of a spread's prior {_OF_SHAPE}, not {self.shape!r}", remedy="Correct shape.")
+        object.__setattr__(self, "sd", arguments.number(self.sd, "the scale sd of a spread", above=0))
+        shape = arguments.number(self.shape, "the shape of a spread's prior", above=0, most=MOST_SHAPE)
+        object.__setattr__(self, "shape", shape)
 
 
 MOST_SHAPE = 0.5
@@ -105,9 +123,17 @@ class Priors:
     noise_factor: LogNormalPrior = LogNormalPrior(1.0, 0.5)
     changed: tuple[str, ...] = field(default=(), compare=False)
 
+    def __post_init__(self) -> None:
+        for f in dataclasses.fields(self):
+            if f.name != "changed":
+                kind = type(f.default)
+                remedy = f"Give mcc_jax.{kind.__name__}({', '.join(g.name for g in dataclasses.fields(kind))})."  # pyright: ignore[reportArgumentType]
+                arguments.instance(getattr(self, f.name), kind, f"the prior {f.name}", remedy)
+
     @classmethod
-    def default(cls, unloading: Unloading = Unloading.PRINTED) -> Priors:
+    def default(cls, unloading: Unloading | str = Unloading.PRINTED) -> Priors:
         """The defaults; the modulus of a punch form is some twenty times smaller than that of the printed one."""
+        unloading = arguments.member(unloading, Unloading, "unloading")
         if unloading is Unloading.PRINTED:
             return cls()
         return cls(effective_modulus_MPa=LogNormalPrior(500.0, 1.0))
@@ -137,7 +163,7 @@ _NAMES = {
 _POSITIVE = {"sd", "log_sd", "median", "shape"}
 
 
-def read_priors(file: str | Path, unloading: Unloading = Unloading.PRINTED) -> Priors:
+def read_priors(file: str | Path, unloading: Unloading | str = Unloading.PRINTED) -> Priors:
     """Read priors from a TOML file; what it does not name keeps its default.
 
     The file holds one table per prior, with the fields of its distribution::
@@ -149,7 +175,7 @@ def read_priors(file: str | Path, unloading: Unloading = Unloading.PRINTED) -> P
     Raises:
         InputError: naming table, entry and what is allowed.
     """
-    file = Path(file)
+    file = arguments.file_path(file, "file")
     priors = Priors.default(unloading)
     known = dict(priors._entries())
     changes: dict[str, Any] = {}

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ... import arguments
 from ..._errors import InputError
 from .._csv import read_particles
 from .._table import parse_number, same_text
@@ -34,6 +35,8 @@ def read_diameters(text: str | os.PathLike[str]) -> Diameters:
     Raises:
         InputError: if it is neither, or a diameter is not positive.
     """
+    if not isinstance(text, str):
+        text = arguments.file_path(text, "diameters")
     parts = str(text).split(",")
     if len(parts) == 3 and not _is_file(Path(text)):
         try:
@@ -64,8 +67,9 @@ def check_triple(triple: Triple, what: str, file: str | Path) -> None:
     except (OverflowError, TypeError, ValueError):
         values = np.empty(0)
     if values.shape != (3,) or not ((values >= SMALLEST_DIAMETER_UM) & (values < 1e15)).all():
+        shown = list(triple) if isinstance(triple, Sequence | np.ndarray) else triple
         raise InputError(
-            f"the diameters of {what} are {list(triple)}, where three positive lengths in um are expected",
+            f"the diameters of {what} are {shown}, where three positive lengths in um are expected",
             file=file,
             remedy="Give D1, D2 and D3",
         )

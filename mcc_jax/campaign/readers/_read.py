@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from ... import arguments
 from ..._errors import InputError
 from ...files import LIMITS, FileLimits
 from .._schema import Campaign, Metadata
@@ -51,7 +52,7 @@ def read_tester_file(
     Raises:
         InputError: if the file is unknown or damaged, or diameters are missing.
     """
-    place = Path(path)
+    place = arguments.file_path(path, "path")
     given = () if mapping is None else (mapping,) if isinstance(mapping, str | os.PathLike) else tuple(mapping)
     described = [read_mapping(one) for one in given]
 

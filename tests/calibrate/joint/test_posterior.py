@@ -168,7 +168,7 @@ def test_a_particle_never_measured_is_predicted_with_the_scatter_of_the_populati
         predict_new_particle(result, (200.0, 0.0, 160.0), force)
     with pytest.raises(ValueError, match="without noise"):
         curves.band(0.95, observed=True)
-    with pytest.raises(KeyError, match="99"):
+    with pytest.raises(ValueError, match="99"):
         predict_measured(result, "99")
 
 

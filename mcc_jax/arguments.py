@@ -1,0 +1,324 @@
+"""Arguments of public functions: what is obviously meant is converted, the rest refused in one line that names it.
+
+Only what can be looked at is checked. A tracer (inside `jax.jit`, `vmap` or `grad`) passes, so nothing here is part of
+what is compiled; in plain Python a check takes microseconds.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+import numbers
+import os
+from collections.abc import Collection, Iterable
+from pathlib import Path, PurePath
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from ._errors import InputError
+
+A_PATH = "a path is a 1-D array of at least one point"
+
+
+def is_traced(value: Any) -> bool:
+    """Whether a value, or one of a list of values, is known only when compiled code runs."""
+    if isinstance(value, list | tuple):
+        return any(is_traced(one) for one in value)
+    return isinstance(value, Tracer)
+
+
+def shown(value: Any) -> str:
+    """A value as it stands in a message: its text, cut short."""
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def kind_of(value: Any) -> str:
+    """What kind of thing a value is, for a message: texts and paths with what they say."""
+    if isinstance(value, str | PurePath):
+        return f"the text {shown(str(value))}"
+    return "None" if value is None else f"a {type(value).__name__}"
+
+
+def choice[T](value: Any, choices: Collection[T], name: str) -> T:
+    """The value, if it is one of the choices.
+
+    Raises:
+        InputError: naming the option and its choices.
+    """
+    if isinstance(value, str | int | float) and value in choices:
+        return cast(T, value)
+    raise InputError(f"there is no {name} {shown(value)}", remedy=f"Choices: {', '.join(map(str, choices))}.")
+
+
+def member[E: enum.Enum](value: E | str, choices: type[E], name: str) -> E:
+    """The member of an enumeration, given itself or as its text.
+
+    Raises:
+        InputError: naming the option and its choices.
+    """
+    if isinstance(value, choices):
+        return value
+    texts = {one.value: one for one in choices}
+    return texts[choice(value, texts, name)]
+
+
+def instance[T](value: Any, kind: type[T] | tuple[type[T], ...], name: str, remedy: str) -> T:
+    """The value, if it is of a kind.
+
+    Raises:
+        InputError: saying what was given and how to make what is wanted.
+    """
+    if isinstance(value, kind):
+        return value
+    kinds = kind if isinstance(kind, tuple) else (kind,)
+    wanted = " or ".join(one.__name__.removeprefix("Abstract") for one in kinds)
+    raise InputError(f"{name} must be a {wanted}, got {kind_of(value)}", remedy=remedy)
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value is one real number, finite or not, of Python, numpy or JAX; no truth value."""
+    if isinstance(value, bool | np.bool_ | str | bytes | None) or is_traced(value):
+        return False
+    array = _array_of(value)
+    return array is not None and array.ndim == 0 and array.dtype.kind in "iuf"
+
+
+def number(
+    value: Any,
+    name: str,
+    *,
+    least: float | int = -math.inf,
+    above: float | int = -math.inf,
+    most: float | int = math.inf,
+    below: float | int = math.inf,
+    infinite: bool = False,
+) -> float:
+    """A number, finite and within bounds, as a Python float.
+
+    Args:
+        value: anything that is one number: also of numpy, JAX or pandas.
+        name: for messages, with its unit.
+        least: it must not be smaller.
+        above: it must be larger.
+        most: it must not be larger.
+        below: it must be smaller.
+        infinite: whether infinity is allowed.
+
+    Raises:
+        InputError: naming it and what it must be.
+    """
+    bounds = [
+        *([f">= {least:g}"] if least > -math.inf else []),
+        *([f"> {above:g}"] if above > -math.inf else []),
+        *([f"<= {most:g}"] if most < math.inf else []),
+        *([f"< {below:g}"] if below < math.inf else []),
+    ]
+    must = f"{name} must be a {'' if infinite else 'finite '}number{' ' if bounds else ''}{' and '.join(bounds)}"
+    if not is_number(value):
+        raise InputError(f"{must}, got {shown(value)}")
+    found = float(value)
+    inside = least <= found <= most and (found > above or above == -math.inf) and (found < below or below == math.inf)
+    if not inside:
+        raise InputError(f"{must}, got {found:g}")
+    if math.isinf(found) and not infinite:
+        raise InputError(f"{must}, got {found:g}")
+    return found
+
+
+def whole(value: Any, name: str, *, least: int = 0, most: int | None = None) -> int:
+    """A whole number within bounds, as a Python integer: a count, a seed.
+
+    Raises:
+        InputError: naming it and what it must be.
+    """
+    upper = "" if most is None else f" and <= {most}"
+    plain = isinstance(value, numbers.Integral | float) and not isinstance(value, bool)
+    if not plain and isinstance(value, jax.Array | np.ndarray) and not is_traced(value):
+        plain = value.ndim == 0 and value.dtype.kind in "iu"
+    found = int(value) if plain and math.isfinite(value) else least - 1
+    if found < least or found != value or (most is not None and found > most):
+        raise InputError(f"{name} must be a whole number >= {least}{upper}, got {shown(value)}")
+    return found
+
+
+def seed(value: Any, name: str = "seed") -> int:
+    """A seed of random numbers: a whole number from 0 to 2^63 - 1.
+
+    Raises:
+        InputError: if it is anything else.
+    """
+    return whole(value, name, most=2**63 - 1)
+
+
+def flag(value: Any, name: str) -> bool:
+    """True or False, and nothing that only counts as such: the text "no" would count as true.
+
+    Raises:
+        InputError: if it is anything else.
+    """
+    if not isinstance(value, bool | np.bool_):
+        raise InputError(f"{name} must be True or False, got {shown(value)}")
+    return bool(value)
+
+
+def _array_of(value: Any) -> np.ndarray | None:
+    """Anything as a numpy array, or None where it is none."""
+    try:
+        return np.asarray(value)
+    except (TypeError, ValueError, RuntimeError):
+        return None
+
+
+def floats(value: Any, name: str, *, shape: str = "an array of numbers") -> np.ndarray:
+    """Numbers as a numpy array of floating-point numbers: from a list, a Series, an array of any kind.
+
+    An array that is one already is handed back itself.
+
+    Args:
+        value: what was given; not traced.
+        name: for messages.
+        shape: what it should be, in words.
+
+    Raises:
+        InputError: if it is not numbers, or lists of unequal length.
+    """
+    if isinstance(value, Iterable) and not isinstance(value, str | bytes) and not hasattr(value, "__array__"):
+        value = list(value)
+    array = None if isinstance(value, str | bytes | dict | set) else _array_of(value)
+    if array is not None and array.dtype.kind == "f":
+        return array
+    if array is not None and array.dtype.kind in "iu":
+        return array.astype(float)
+    if array is not None and array.size == 0 and array.dtype.kind == "O":
+        return array.astype(float)
+    if array is not None and array.dtype.kind == "O" and all(isinstance(x, numbers.Real) for x in array.ravel()):
+        return array.astype(float)  # a Series of mixed numbers
+    raise InputError(f"{name} must be {shape}, got {kind_of(value) if array is None else shown(value)}")
+
+
+def values(value: Any, name: str, *, shape: str = "a number or an array of numbers") -> jax.Array:
+    """Numbers of any shape as a JAX array of floating-point numbers; tracers pass.
+
+    Raises:
+        InputError: if it is not numbers.
+    """
+    if is_traced(value) or isinstance(value, jax.Array) or type(value) in (int, float):
+        array = jnp.asarray(value)
+        if jnp.issubdtype(array.dtype, jnp.floating):
+            return array
+        if jnp.issubdtype(array.dtype, jnp.integer):
+            return array.astype(float)
+        raise InputError(f"{name} must be {shape}, got {array.dtype} values")
+    # As with JAX's own: Python numbers take the default precision, arrays keep theirs.
+    found = floats(value, name, shape=shape)
+    return jnp.asarray(found) if hasattr(value, "dtype") else jnp.asarray(found, float)
+
+
+def path(value: Any, name: str, *, many: str = "") -> jax.Array:
+    """A path: a 1-D array of at least one point, from a list, a Series, an array of any kind.
+
+    Args:
+        value: what was given; it may be traced.
+        name: for messages.
+        many: what to do with several paths at once, in words.
+
+    Raises:
+        InputError: if it is none.
+    """
+    array = values(value, name, shape="a 1-D array of at least one point")
+    if array.ndim == 1 and array.shape[0] > 0:
+        return array
+    problem = "an empty one" if array.size == 0 else "one number" if array.ndim == 0 else f"the shape {array.shape}"
+    remedy = many if array.ndim > 1 and many else f"For one point write [{shown(value)}]." if array.ndim == 0 else None
+    raise InputError(f"{name}: {A_PATH}, got {problem}", remedy=remedy)
+
+
+def same_length(**arrays: Any) -> int:
+    """The length that all arrays share.
+
+    Raises:
+        InputError: naming two that differ, with both lengths.
+    """
+    (first, one), *others = arrays.items()
+    for name, other in others:
+        if len(other) != len(one):
+            raise InputError(f"{first} has {len(one)} entries and {name} has {len(other)}: they must be as many")
+    return len(one)
+
+
+def diameters(value: Any, name: str = "diameters_um") -> np.ndarray:
+    """D1, D2, D3 [um] of N particles as an array of shape (N, 3), all positive and finite.
+
+    Raises:
+        InputError: naming the first particle whose are not.
+    """
+    array = floats(value, name, shape="D1, D2, D3 [um] of every particle, shape (N, 3)")
+    if array.ndim != 2 or array.shape[1] != 3:
+        remedy = "For one particle write [[D1, D2, D3]]." if array.shape == (3,) else None
+        raise InputError(f"{name} has the shape {array.shape} where (N, 3) is expected: D1, D2, D3 [um]", remedy=remedy)
+    wrong = np.flatnonzero(~(np.isfinite(array) & (array > 0)).all(axis=1))
+    if wrong.size:
+        i = int(wrong[0])
+        raise InputError(f"{name}: the diameters {array[i].tolist()} um of particle {i + 1} are not positive numbers")
+    return array
+
+
+def one_particle(value: Any, name: str = "diameters_um") -> np.ndarray:
+    """D1, D2, D3 [um] of one particle as an array of shape (3,), all positive and finite.
+
+    Raises:
+        InputError: if they are not.
+    """
+    array = floats(value, name, shape="D1, D2, D3 [um] of one particle")
+    if array.shape != (3,) or not (np.isfinite(array) & (array > 0)).all():
+        raise InputError(
+            f"{name}: a particle has three positive diameters D1, D2, D3 [um], got {shown(array.tolist())}"
+        )
+    return array
+
+
+def positive(value: Any, name: str, *, zero: bool = False, plain: bool = False) -> None:
+    """Refuse a size that is not positive and finite, where it can be looked at.
+
+    Args:
+        value: a number or an array, which may be traced.
+        name: for messages, with its unit.
+        zero: whether 0 is allowed.
+        plain: look at numbers of Python and numpy only, not at results of a computation.
+
+    Raises:
+        InputError: naming it.
+    """
+    checked = not is_traced(value) and not (plain and isinstance(value, jax.Array))
+    array = np.asarray(value) if checked else None
+    if array is None or array.dtype.kind not in "iuf":
+        return  # what is no number at all is refused where it is converted
+    if not (np.isfinite(array) & (array >= 0 if zero else array > 0)).all():
+        must = "zero or positive" if zero else "positive"
+        raise InputError(f"{name} must be {must} and finite, got {shown(array.tolist())}")
+
+
+def finite(value: Any, name: str) -> None:
+    """Refuse a plain number that is NaN or infinite; what is computed or traced passes.
+
+    Raises:
+        InputError: naming it.
+    """
+    if isinstance(value, int | float | np.number | np.ndarray) and not np.isfinite(value).all():
+        raise InputError(f"{name} must be a finite number, got {shown(value)}")
+
+
+def file_path(value: Any, name: str) -> Path:
+    """The path of a file or folder.
+
+    Raises:
+        InputError: if it is neither text nor a path, or empty.
+    """
+    if not isinstance(value, str | os.PathLike) or not str(value):
+        raise InputError(f"{name} must be the path of a file or folder, got {kind_of(value)}")
+    return Path(value)
