@@ -28,8 +28,12 @@ class SaturationOptions:
     Attributes:
         repeats: readings that repeat the extreme, at least. Two equal readings around a turning point are not rare.
         coarse: and so many times as many as the channel repeats elsewhere: a coarse read-out repeats every value.
-        goes_on: share of its pace before that the other channel keeps up, at least. In a hold it stands still, or
-            creeps.
+        goes_on: share of its pace before that the other channel keeps up to where it comes farthest, at least. In a
+            hold it stands still, or creeps. One that comes farther and then back while the readings repeat has passed a
+            turning point: in a hold it would not, so there its pace does not matter.
+        before: readings before the stretch that tell the pace. Fewer do not, more reach into another part of the ramp.
+        errors: standard deviations of the noise by which it must come farther. Of the largest of 100 means of three
+            readings of noise none does.
         fitted_from: share of the end of the range from which on loading is fitted: below it, asperities deform, not
             the particle.
         trusted: share of the end of the range by which the turning point may lie beyond it: of simulated tests clipped
@@ -39,6 +43,8 @@ class SaturationOptions:
     repeats: int = 4
     coarse: float = 3.0
     goes_on: float = 0.5
+    before: int = 12
+    errors: float = 4.0
     fitted_from: float = 0.25
     trusted: float = 0.25
 
@@ -98,16 +104,17 @@ def plateaus(
         length = stop - start
         if length < max(options.repeats, options.coarse * usual) or start < 4:
             continue
-        before = np.arange(max(start - 12, 0), start)
+        before = np.arange(max(start - options.before, 0), start)
         line = np.polynomial.Polynomial.fit(time[before], other[before], 1)
         pace = float(line.deriv()(time[start - 1]))
-        # Halfway, or at the end where the record ends there: a ramp that turns has come farthest.
-        some = max(length // 3, 1)
-        middle = np.arange(stop - some, stop) if stop == count else start + length // 2 + np.arange(some) - some // 2
-        elapsed = float(np.mean(time[middle]) - time[start - 1])
-        advance = float(np.mean(other[middle]) - line(time[start - 1]))
-        error = noise * np.sqrt(1 / some + 4 / len(before))
-        if pace > 0 and elapsed > 0 and advance > max(options.goes_on * pace * elapsed, 3 * error):
+        # How far the other channel comes, and by how much it comes back, as means of three readings.
+        part, when = (np.convolve(x[start:stop], np.ones(3) / 3, "valid") for x in (other, time))
+        top = int(np.argmax(part))
+        elapsed, advance = float(when[top] - time[start - 1]), float(part[top] - line(time[start - 1]))
+        error = noise * np.sqrt(1 / 3 + 4 / len(before))
+        turned = float(part[top] - part[-1]) > options.errors * error
+        goes_on = advance > options.goes_on * pace * elapsed
+        if pace > 0 and elapsed > 0 and advance > options.errors * error and (goes_on or turned):
             found.append((start, stop))
     if not found:
         return []
