@@ -84,10 +84,14 @@ def elastic_branches(
     def close() -> None:
         if peak is None or not rows:
             return
-        # The samples on both sides of the turning point: noise would make their maximum alone too large.
-        around = slice(max(peak - 1, 0), peak + 1)
+        # The samples on both sides of the turning point: noise would make their maximum alone too large. One whose force
+        # was worked out has no such neighbour.
+        around = np.arange(max(peak - 1, 0), peak + 1)
+        if curve.worked_out[around].any():
+            around = around[curve.worked_out[around]]
         top, deepest = float(stress[around].mean()), float(strain[around].max())
         points = np.concatenate(rows)
+        points = points[curve.compared[points]]
         points = points[(stress[points] > LEAST_RATIO * top) & (stress[points] <= top)]
         if len(points) >= 5 and deepest > 0 and top > 0:
             branches.append(ElasticBranch(particle, deepest, top, strain[points], stress[points]))

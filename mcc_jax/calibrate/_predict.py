@@ -37,7 +37,7 @@ class ParticleFit:
         predicted_um: displacement under the measured force by the mean law, scaled by this particle's size and shape
             [um].
         own_um: the same with the particle's own C1, C3, C5.
-        used: which points enter `rms_um`: those after contact and above the threshold.
+        used: which points enter `rms_um`: those after contact and above the threshold that may be compared.
         rms_um: root mean square of measured less predicted [um].
         own_rms_um: the same with its own coefficients [um].
     """
@@ -100,7 +100,7 @@ def predict_particles(
         for segment in adjustment.segments[i]:
             if segment.kind == "approach":
                 touching[segment.start : segment.stop] = False
-        used = touching & (stress > max(adjustment.threshold_MPa, 0.02 * stress.max()))
+        used = touching & (stress > max(adjustment.threshold_MPa, 0.02 * stress.max())) & curve.compared
         predicted, with_own = by_mean[row, : len(curve)], by_own[row, : len(curve)]
         fits[i] = ParticleFit(
             (float(plastic.C1[row]), float(plastic.C3[row]), float(plastic.C5[row])),

@@ -30,6 +30,8 @@ class JudgementOptions:
         least: particles, at least, to know what is usual.
         answers: so many sets of flagged particles are left out in turn to tell the answer without them, at most.
         left: particles, at least, that an answer without the flagged ones rests on.
+        unknown: the modulus counts as unknown if its standard deviation is at least this share of it: the 95 % interval
+            then spans a factor of seven, nearly that of the prior (50), in which most solids lie.
     """
 
     outlying: float = 5.0
@@ -38,6 +40,11 @@ class JudgementOptions:
     least: int = 5
     answers: int = 4
     left: int = 3
+    unknown: float = 0.5
+
+
+MODULUS_OPEN = "unknown modulus"
+"""The `check` of the finding that the tests leave the modulus open."""
 
 
 def unlike_others(
@@ -69,6 +76,35 @@ def unlike_others(
     )
 
 
+def unknown_modulus(
+    campaign: Campaign, modulus: Mapping[str, Any], options: JudgementOptions | None = None
+) -> Finding | None:
+    """That the tests leave the modulus open, and why; None if they tell it, or the method gives no error.
+
+    Args:
+        campaign: the checked campaign.
+        modulus: value, sd and interval_95 [MPa].
+        options: see `JudgementOptions`.
+    """
+    options = options or JudgementOptions()
+    value, sd, interval = modulus["value"], modulus["sd"], modulus["interval_95"]
+    if value is None or sd is None or sd < options.unknown * abs(value):
+        return None
+    between = "" if interval is None else f" (between {1e-3 * interval[0]:.2g} and {1e-3 * interval[1]:.2g} GPa)"
+    # Of several channels at the end of their range it is that of the displacement which hides unloading.
+    ends = [note for curve in campaign.curves if curve.checked for note in curve.checked.notes if note.check == "saturation"]
+    ends.sort(key=lambda note: not note.sentence.startswith("displacement"))
+    if ends:
+        channel = ends[0].sentence.split()[0]
+        why, remedy = f": {channel} stands at the end of its range where they unload", ends[0].remedy
+    else:
+        why, remedy = ": too little of their unloading can be compared with the law", UNLOAD
+    return Finding(MODULUS_OPEN, "look", f"The tests do not tell the modulus{between}{why}", remedy)
+
+
+UNLOAD = "Unload the particles before the test ends, and record the unloading with as many readings as the loading"
+
+
 def _far(logs: np.ndarray, options: JudgementOptions) -> np.ndarray:
     away = logs - np.median(logs)
     spread = 1.4826 * float(np.median(np.abs(away)))
@@ -93,7 +129,11 @@ def judged(
     """
     options = options or JudgementOptions()
     found = [*campaign_findings(campaign), *([] if outlying is None else [outlying])]
-    found += check_plausibility(campaign.raw or campaign, modulus_MPa=answer["effective_modulus_MPa"]["value"])
+    modulus = answer["effective_modulus_MPa"]
+    unknown = unknown_modulus(campaign, modulus, options)
+    value = modulus["value"] if unknown is None else None  # what is not known cannot be implausible
+    found += [] if unknown is None else [unknown]
+    found += check_plausibility(campaign.raw or campaign, modulus_MPa=value)
     if again is None:
         return tuple(found)
     answers: dict[tuple[str, ...], str] = {}

@@ -94,7 +94,7 @@ def loading_curve(curve: Curve, diameters_um: np.ndarray, segments: tuple[Segmen
     """The virgin loading of a test, over all its cycles, as strain over stress.
 
     Force is made monotone by isotonic regression, which, unlike a running maximum, is not lifted by noise; points that
-    share one force are averaged.
+    share one force are averaged. Readings that may not be compared with a law do not count.
 
     Returns:
         The curve, or None if the test never loads.
@@ -105,6 +105,9 @@ def loading_curve(curve: Curve, diameters_um: np.ndarray, segments: tuple[Segmen
     if not virgin:
         return None
     rows = np.concatenate(virgin)
+    rows = rows[curve.compared[rows]]
+    if not len(rows):
+        return None
     stress, strain = stress_and_strain(curve, diameters_um, segments)
     fit = isotonic_regression(stress[rows])
     starts = fit.blocks[:-1]

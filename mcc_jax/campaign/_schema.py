@@ -91,6 +91,16 @@ class Curve:
     def __len__(self) -> int:
         return len(self.time_s)
 
+    @property
+    def compared(self) -> np.ndarray:
+        """Which readings may be compared with a law, booleans of shape (n,); all of a raw test."""
+        return np.ones(len(self), bool) if self.checked is None else self.checked.compared
+
+    @property
+    def worked_out(self) -> np.ndarray:
+        """Which readings are turning points whose force was worked out, booleans of shape (n,); none of a raw test."""
+        return np.zeros(len(self), bool) if self.checked is None else self.checked.force_sd_mN > 0
+
 
 @dataclass(frozen=True)
 class Metadata:

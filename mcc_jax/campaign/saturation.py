@@ -34,6 +34,8 @@ class SaturationOptions:
         before: readings before the stretch that tell the pace. Fewer do not, more reach into another part of the ramp.
         errors: standard deviations of the noise by which it must come farther. Of the largest of 100 means of three
             readings of noise none does.
+        near_end: standard deviations of a channel's noise below the end of its range within which its readings are
+            a choice of the low ones; beyond, one in 700 of them is hidden.
         fitted_from: share of the end of the range from which on loading is fitted: below it, asperities deform, not
             the particle.
         trusted: share of the end of the range by which the turning point may lie beyond it: of simulated tests clipped
@@ -45,6 +47,7 @@ class SaturationOptions:
     goes_on: float = 0.5
     before: int = 12
     errors: float = 4.0
+    near_end: float = 3.0
     fitted_from: float = 0.25
     trusted: float = 0.25
 
@@ -174,7 +177,9 @@ def censor_displacement(curve: Curve, options: SaturationOptions | None = None) 
     found = plateaus(curve.displacement_um, curve.force_mN, curve.time_s, point_noise(curve.force_mN), options)
     if not found:
         return None
-    rows = np.zeros(len(curve), bool)
+    path = curve.displacement_um
+    # Of the readings within the noise of the end only those that the noise brought below it are left: they lie too low.
+    rows = path > float(path.max()) - options.near_end * point_noise(path)
     for start, stop in found:
         rows[start:stop] = True
     note = Note(
@@ -182,7 +187,7 @@ def censor_displacement(curve: Curve, options: SaturationOptions | None = None) 
         "look",
         "displacement stands at {} um, the end of its range, for {} readings while the force goes on; they are not "
         "compared with the law",
-        (float(curve.displacement_um.max()), int(rows.sum())),
+        (float(path.max()), int(rows.sum())),
         "Measure with a larger range of displacement",
     )
     return CensoredDisplacement(rows, note)

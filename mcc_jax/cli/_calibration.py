@@ -11,6 +11,7 @@ from typing import Any
 
 from .._errors import InputError
 from ..calibrate import BayesCalibration, JointModel, LeastSquaresCalibration, PaperCalibration
+from ..calibrate.judgement import MODULUS_OPEN
 from ..campaign import Campaign, Finding
 from ..files import LIMITS, read_regular
 from ._figures import FIGURES, write_figures, write_result
@@ -95,7 +96,7 @@ def main_numbers(content: dict[str, Any]) -> list[tuple[str, str]]:
         ("shape parameter a", _estimate(content["a"])),
         (
             "effective modulus",
-            "unknown (no unloading)" if modulus["value"] is None else f"{_estimate(modulus, 1e-3)} GPa",
+            "unknown" if modulus["value"] is None or _modulus_open(content) else f"{_estimate(modulus, 1e-3)} GPa",
         ),
     ]
     for name in ("C1", "C3", "C5"):
@@ -106,6 +107,10 @@ def main_numbers(content: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append((f"{name}, sd of its logarithm", _estimate(content[f"log_{name}"]["sd"])))
     rows.append(("yield stress sigma_y", f"{_estimate(content['yield_stress_MPa'])} MPa"))
     return rows
+
+
+def _modulus_open(content: dict[str, Any]) -> bool:
+    return any(one["check"] == MODULUS_OPEN for one in content.get("findings", []))
 
 
 def _estimate(estimate: dict[str, Any], factor: float = 1.0) -> str:

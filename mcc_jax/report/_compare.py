@@ -115,12 +115,11 @@ def _compared(curve: Any, diameters: np.ndarray, segments: Any, kind: np.ndarray
         return touching
     if calibration["method"] == "paper":
         threshold = calibration.get("adjustment", {}).get("threshold_MPa", THRESHOLD_MPA)
-        return touching & (stress > max(threshold, 0.02 * stress.max()))
+        return touching & (stress > max(threshold, 0.02 * stress.max())) & curve.compared
     told = calibration["provenance"]["settings"].get("threshold_MPa")
     threshold = told if isinstance(told, int | float) else THRESHOLD_MPA
     elastic = (kind == KINDS.index("load")) | (stress >= LEAST_RATIO * np.maximum.accumulate(stress))
-    seen = np.ones(len(curve), bool) if curve.checked is None else curve.checked.compared
-    return touching & elastic & (stress >= threshold) & seen
+    return touching & elastic & (stress >= threshold) & curve.compared
 
 
 def _predicted(campaign: Campaign, shown: list[Shown], entries: dict[str, Any], calibration: dict[str, Any]):

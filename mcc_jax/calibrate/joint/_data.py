@@ -30,6 +30,7 @@ from ...campaign import (
     too_few,
 )
 from ...campaign._validate import usable_campaign
+from ...campaign.reasons import SHOWN
 from ...geometry import Particle
 from .._elastic import LEAST_RATIO
 from .._predict import READING_UM, point_noise_um
@@ -230,6 +231,7 @@ class _Prepared:
     contact: float
     stress_max_MPa: float
     strain_range: float
+    unloading_hidden: bool
 
 
 TURNS_SHARE = 4
@@ -290,8 +292,9 @@ def _prepare(
     loading = (kind[rows] == "load") & (stress[rows] >= threshold) & (stress[rows] > 0)
     elastic = np.isin(kind[rows], ("hold", "unload", "reload")) & (stress[rows] >= LEAST_RATIO * peak)
     mask = loading | (elastic & (stress[rows] >= threshold) & (peak > 0))
-    if curve.checked is not None:
-        mask, loading = mask & curve.checked.compared[rows], loading & curve.checked.compared[rows]
+    hidden = bool((mask & ~loading).any())
+    mask, loading = mask & curve.compared[rows], loading & curve.compared[rows]
+    hidden &= not (mask & ~loading).any()
     if stress.max() <= threshold:
         return below_threshold(float(stress.max()), threshold)
     if loading.sum() < LEAST_POINTS:
@@ -303,7 +306,7 @@ def _prepare(
         return no_climb(float(rise) if rise >= 0 or -rise > LEAST_CLIMB * noise / np.sqrt(third) else 0.0)
     contact = float(curve.displacement_um[0]) if contact is None else contact
     largest, reach = float(stress[rows][mask].max()), float(np.ptp(strain[rows][mask]))
-    return _Prepared(rows, mask, loading, contact, largest, reach)
+    return _Prepared(rows, mask, loading, contact, largest, reach, hidden)
 
 
 def ranges_um(tests: Tests) -> np.ndarray:
@@ -327,9 +330,15 @@ def _notes(campaign: Campaign, kept: tuple[int, ...], used: Sequence[_Prepared],
     thinned = sum(len(one.rows) < len(campaign.curves[i]) - 1 for i, one in zip(kept, used, strict=True))
     if any(len(campaign.curves[i]) > most_points for i in kept):
         yield f"{thinned} records were thinned to about {most_points} rows"
-    for i, one in zip(kept, used, strict=True):
-        if not (one.mask & ~one.loading).any():
-            yield f"particle {campaign.particles[i]!r} was never unloaded: it says nothing about the modulus"
+    pairs = zip(kept, used, strict=True)
+    silent = [(campaign.particles[i], one) for i, one in pairs if not (one.mask & ~one.loading).any()]
+    for hidden, what in ((False, "never unloaded"), (True, "without unloading that can be compared with the law")):
+        names = [repr(name) for name, one in silent if one.unloading_hidden is hidden]
+        more = f", ... ({len(names)} of {len(kept)})" if len(names) > SHOWN else ""
+        if len(names) == 1:
+            yield f"particle {names[0]} is {what}: it says nothing about the modulus"
+        elif names:
+            yield f"particles {', '.join(names[:SHOWN])}{more} are {what}: they say nothing about the modulus"
     seen: dict[bytes, int] = {}
     for i in kept:
         curve = campaign.curves[i]
