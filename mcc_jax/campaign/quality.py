@@ -47,8 +47,12 @@ class QualityOptions:
         air_said: an offset is told from so many standard deviations on,
         air_share: and from this share of the largest force on: below it no answer moves by a tenth of its error.
         drift_said: a drift in the air is told from so many standard deviations of its slope on, and from `air_share`.
-        drift_slower: a straight rise in front of the loading is a drift if it is so many times slower, at most; the
-            first contact of asperities is not straight.
+        drift_slower: a straight rise in front of the loading is a drift if its slope is this share of the loading's, at
+            most, as is any straight fall; the first contact of asperities is not straight.
+        drift_like: up to this share it may be one, and is told.
+        other_stiffness: if force over displacement is not another one there, by this factor, only the tester's speed
+            was.
+        start_share: of the largest force, in front of which such a rise is looked for: farther on loading itself bends.
         saturation: when a channel counts as saturated.
     """
 
@@ -65,6 +69,9 @@ class QualityOptions:
     air_share: float = 1e-3
     drift_said: float = 5.0
     drift_slower: float = 0.1
+    drift_like: float = 0.7
+    other_stiffness: float = 1.5
+    start_share: float = 0.1
     saturation: SaturationOptions = field(default_factory=SaturationOptions)
 
 
@@ -257,7 +264,7 @@ def zero_of_force(curve: Curve, control: Control | None, options: QualityOptions
     """
     contact = air_until(curve, control, options)
     if contact is None:
-        return None
+        return _perhaps_drift(curve, options)
     # The last readings before the platens touch may already feel the first asperities.
     stop = max(options.air_readings, int(0.9 * contact))
     air, when = curve.force_mN[:stop], curve.time_s[:stop]
@@ -289,6 +296,22 @@ def zero_of_force(curve: Curve, control: Control | None, options: QualityOptions
     return ZeroOfForce(flat, mean, float(error), _offset_notes(mean, error, largest, options))
 
 
+def _perhaps_drift(curve: Curve, options: QualityOptions) -> ZeroOfForce | None:
+    """A rise in front of the loading which is too quick to be taken for a drift, and too straight for a contact."""
+    ahead = slow_start(curve, options)
+    if ahead is None or abs(ahead.change) <= options.air_share * float(np.ptp(curve.force_mN)):
+        return None
+    note = Note(
+        "zero of force",
+        "look",
+        "force goes straight by {} mN in front of the loading; it is counted as contact, but would be a drift of the "
+        "load cell if the platens did not touch yet",
+        (ahead.change,),
+        "Cut these readings off if the platens did not touch yet, and let the load cell settle before a test",
+    )
+    return ZeroOfForce(np.zeros(len(curve)), 0.0, 0.0, (note,))
+
+
 def _inflation(scatter: np.ndarray) -> float:
     """How much larger the error of a mean is since readings hang together, by their lag-1 correlation."""
     lag = float(np.sum(scatter[1:] * scatter[:-1]) / max(np.sum(scatter**2), 1e-300))
@@ -318,8 +341,37 @@ def air_until(curve: Curve, control: Control | None, options: QualityOptions) ->
     contact = found(curve)
     if contact is not None:
         return contact
-    force, time = curve.force_mN, curve.time_s
-    first = int(np.argmax(force > force[0] + 0.1 * (force.max() - force[0])))
+    ahead = slow_start(curve, options)
+    if ahead is None or ahead.share > options.drift_slower:
+        return None
+    time = np.minimum(curve.time_s, curve.time_s[ahead.stop - 1])
+    return found(replace(curve, force_mN=curve.force_mN - ahead.line(time)))
+
+
+@dataclass(frozen=True)
+class SlowStart:
+    """A straight course of force over time in front of the loading.
+
+    Attributes:
+        line: the force over time [mN].
+        stop: how many readings it has.
+        change: of force along it [mN].
+        share: its slope as a share of the loading's; negative where it falls.
+    """
+
+    line: np.polynomial.Polynomial
+    stop: int
+    change: float
+    share: float
+
+
+def slow_start(curve: Curve, options: QualityOptions) -> SlowStart | None:
+    """A straight and slower course of force in front of the loading, of a load cell that drifts; None without one.
+
+    A slower speed of the tester alone bends force and displacement alike: it is none.
+    """
+    force, time, path = curve.force_mN, curve.time_s, curve.displacement_um
+    first = int(np.argmax(force > force[0] + options.start_share * (force.max() - force[0])))
     if first < 2 * options.air_readings + 4:
         return None
     kink = two_lines(time[: first + 1], force[: first + 1])
@@ -328,13 +380,18 @@ def air_until(curve: Curve, control: Control | None, options: QualityOptions) ->
     ahead, behind = np.arange(kink), np.arange(kink, first + 1)
     if not (time[kink - 1] > time[0] and time[first] > time[kink]):
         return None
-    slow = np.polynomial.Polynomial.fit(time[ahead], force[ahead], 1)
-    fast = np.polynomial.Polynomial.fit(time[behind], force[behind], 1)
+    slow, fast, way, on = (
+        np.polynomial.Polynomial.fit(time[rows], values[rows], 1)
+        for rows, values in ((ahead, force), (behind, force), (ahead, path), (behind, path))
+    )
     left = force[ahead] - slow(time[ahead])
     straight = np.std(left) <= 2 * point_noise(force[ahead]) + 1e-12 * float(np.ptp(force))
-    if not straight or abs(slow.deriv()(0.0)) > options.drift_slower * abs(fast.deriv()(0.0)):
+    share, pace = (float(a.deriv()(0.0) / max(b.deriv()(0.0), 1e-300)) for a, b in ((slow, fast), (way, on)))
+    if not straight or share > options.drift_like:
         return None
-    return found(replace(curve, force_mN=force - slow(np.minimum(time, time[kink - 1]))))
+    if pace > 0 and share > 0 and 1 / options.other_stiffness < share / pace < options.other_stiffness:
+        return None
+    return SlowStart(slow, kink, float(slow(time[kink - 1]) - slow(time[0])), share)
 
 
 # ---- words -----------------------------------------------------------------------------------------------------------
@@ -342,7 +399,7 @@ def air_until(curve: Curve, control: Control | None, options: QualityOptions) ->
 
 def _spike_note(name: str, count: int) -> Note:
     return Note(
-        "spikes", "told", f"{{}} single readings of {name} lie far from their neighbours and are left out", (count,)
+        "spikes", "told", f"single readings of {name} ({{}}) lie far from their neighbours and are left out", (count,)
     )
 
 
