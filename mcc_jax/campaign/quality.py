@@ -34,11 +34,15 @@ class QualityOptions:
         spike_noise: a reading is a spike from so many standard deviations of the noise on. Of 1e6 normal readings the
             farthest lies at 5; the rest is for noise that is not normal.
         spike_steps: and from so many times the step between neighbouring readings on: a turning point of a ramp lies
-            within 3 steps of the median of the seven readings around it.
+            within 3 steps of the median of the seven readings around it, and every half of a cycle has some readings.
+        spike_read_out: and from so many of the smallest steps of the read-out on.
         spike_range: and from this share of the channel's range (5 to 95 %) on.
         stuck_readings: readings that repeat, at least; also three times as many as the channel repeats elsewhere, which
             is what a coarse read-out does.
         stuck_catch_up: share of the ramp's progress in that time which the jump behind them makes up for, at least.
+        begins_at: a record begins at its largest force if its first readings reach this share of it.
+        stuck_jump: and this jump is so many times larger than any step near it, at least: a coarse read-out jumps by one
+            step at a time.
         loss_of_force: share of the largest force that a breaking particle loses, at least. Settling and rotation of
             ceramic pebbles lose up to a tenth at once.
         loss_readings: within so many readings, at most.
@@ -57,10 +61,13 @@ class QualityOptions:
     """
 
     spike_noise: float = 15.0
-    spike_steps: float = 10.0
+    spike_steps: float = 5.0
+    spike_read_out: float = 2.5
     spike_range: float = 0.02
     stuck_readings: int = 6
     stuck_catch_up: float = 0.5
+    stuck_jump: float = 2.5
+    begins_at: float = 0.95
     loss_of_force: float = 0.25
     loss_readings: int = 3
     loss_pace: float = 5.0
@@ -114,7 +121,10 @@ def check_test(curve: Curve, control: Control | None, options: QualityOptions) -
         if repeated.any():
             notes.append(_stuck_note(name, int(repeated.sum())))
             rows = rows[~repeated]
-    broke = breakage(_taken(curve, rows), options)
+    clean = _taken(curve, rows)
+    if begins_at_peak(clean, options):
+        notes.append(_begins_note(float(clean.force_mN[0])))
+    broke = breakage(clean, options)
     if broke is not None:
         last, lost = broke
         notes.append(_breakage_note(float(curve.force_mN[rows[last]]), lost))
@@ -158,12 +168,17 @@ def spikes(values: np.ndarray, options: QualityOptions) -> np.ndarray:
     middle = np.median(around, axis=1)
     low, high = np.quantile(values, [0.05, 0.95])
     step = float(np.median(np.abs(np.diff(values))))
-    nearby = np.pad(np.abs(np.diff(middle)), (10, 11), mode="edge")
-    local = np.lib.stride_tricks.sliding_window_view(nearby, 21).max(axis=1)[:count]
+    # The pace nearby, but not so near that the reading itself shifts the median.
+    pace = np.pad(np.abs(np.diff(middle)), (10, 11), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(pace, 21)[:count]
+    local = np.maximum(windows[:, :6].max(axis=1), windows[:, 15:].max(axis=1))
     least = max(options.spike_noise * point_noise(values), options.spike_range * float(high - low))
     least = np.maximum(least, options.spike_steps * np.maximum(step, local))
     far = np.abs(values - middle) > np.maximum(least, 1e-300)
     far[[0, 1, -2, -1]] = False  # at the ends the median of the neighbours is no middle
+    moves = np.abs(np.diff(values))
+    if moves.any():  # one step of a coarse read-out is none
+        far &= np.abs(values - middle) > options.spike_read_out * float(moves[moves > 0].min())
     # Three or more in a row are no slip of the read-out but something that happened.
     edges = np.flatnonzero(np.diff(np.concatenate([[0], far.astype(int), [0]])))
     for start, stop in zip(edges[::2], edges[1::2], strict=True):
@@ -191,9 +206,17 @@ def stuck(values: np.ndarray, options: QualityOptions) -> np.ndarray:
             continue
         pace = float(np.median(near))
         jump = steps[stop - 1]
-        if jump > options.stuck_catch_up * (stop - start) * pace and jump > 4 * max(typical, float(np.max(near))):
+        if jump > options.stuck_catch_up * (stop - start) * pace and jump > options.stuck_jump * max(typical, float(np.max(near))):
             found[start + 1 : stop] = True
     return found
+
+
+def begins_at_peak(curve: Curve, options: QualityOptions) -> bool:
+    """Whether a record has lost its loading: it begins at its largest force and unloads."""
+    force = curve.force_mN
+    largest, first = float(force.max()), float(np.median(force[:3]))
+    # One that ends there as well never unloads; one with the sign of its force reversed has no largest force.
+    return first > 0.5 * float(-force.min()) and first >= options.begins_at * largest > 2 * float(np.median(force[-3:]))
 
 
 def breakage(curve: Curve, options: QualityOptions) -> tuple[int, float] | None:
@@ -386,8 +409,10 @@ def slow_start(curve: Curve, options: QualityOptions) -> SlowStart | None:
     )
     left = force[ahead] - slow(time[ahead])
     straight = np.std(left) <= 2 * point_noise(force[ahead]) + 1e-12 * float(np.ptp(force))
+    errors = [point_noise(force) / np.sqrt(max(np.sum((time[r] - time[r].mean()) ** 2), 1e-300)) for r in (ahead, behind)]
+    bends = fast.deriv()(0.0) - slow.deriv()(0.0) > options.drift_said * np.hypot(*errors)
     share, pace = (float(a.deriv()(0.0) / max(b.deriv()(0.0), 1e-300)) for a, b in ((slow, fast), (way, on)))
-    if not straight or share > options.drift_like:
+    if not straight or not bends or share > options.drift_like:
         return None
     if pace > 0 and share > 0 and 1 / options.other_stiffness < share / pace < options.other_stiffness:
         return None
@@ -406,6 +431,16 @@ def _spike_note(name: str, count: int) -> Note:
 def _stuck_note(name: str, count: int) -> Note:
     sentence = f"{{}} readings of {name} repeat the one before while the test goes on, and are left out"
     return Note("stuck readings", "told", sentence, (count,), "Look for a loose cable or a full buffer of the logger")
+
+
+def _begins_note(force_mN: float) -> Note:
+    return Note(
+        "loading",
+        "look",
+        "the record begins at its largest force ({} mN), so its loading is missing",
+        (force_mN,),
+        "Join the loading part of the test to it: some testers store the two apart",
+    )
 
 
 def _breakage_note(force_mN: float, share: float) -> Note:

@@ -28,6 +28,7 @@ class SaturationOptions:
     Attributes:
         repeats: readings that repeat the extreme, at least. Two equal readings around a turning point are not rare.
         coarse: and so many times as many as the channel repeats elsewhere: a coarse read-out repeats every value.
+        steps: of its read-out that the channel itself would have gone on by, at least, at its pace before.
         goes_on: share of its pace before that the other channel keeps up to where it comes farthest, at least. In a
             hold it stands still, or creeps. One that comes farther and then back while the readings repeat has passed a
             turning point: in a hold it would not, so there its pace does not matter.
@@ -44,6 +45,7 @@ class SaturationOptions:
 
     repeats: int = 4
     coarse: float = 3.0
+    steps: float = 2.0
     goes_on: float = 0.5
     before: int = 12
     errors: float = 4.0
@@ -102,6 +104,7 @@ def plateaus(
     if not at_end or not elsewhere:
         return []
     usual = float(np.quantile(elsewhere, 0.9))
+    step = float(largest - values[values < largest].max())
     found = []
     for start, stop in at_end:
         length = stop - start
@@ -117,6 +120,10 @@ def plateaus(
         error = noise * np.sqrt(1 / 3 + 4 / len(before))
         turned = float(part[top] - part[-1]) > options.errors * error
         goes_on = advance > options.goes_on * pace * elapsed
+        # A coarse read-out rests at its last step while the true value stays below the next one.
+        own = float(np.polynomial.Polynomial.fit(time[before], values[before], 1).deriv()(time[start - 1]))
+        if own * elapsed < options.steps * step:
+            continue
         if pace > 0 and elapsed > 0 and advance > options.errors * error and (goes_on or turned):
             found.append((start, stop))
     if not found:
@@ -237,7 +244,7 @@ class _Loading:
 
     def force(self, parameters: np.ndarray, path: np.ndarray | float) -> np.ndarray:
         x = (np.asarray(path, float) - parameters[0] * self.scale_um) / self.scale_um
-        return parameters[1] * x - parameters[2] * x**3 + parameters[3] * x**5
+        return np.asarray(parameters[1] * x - parameters[2] * x**3 + parameters[3] * x**5)
 
     def at(self, path: float, noise: float) -> tuple[float, float]:
         """Force at a displacement, and its standard deviation [mN]."""
