@@ -186,9 +186,10 @@ def censor_displacement(curve: Curve, options: SaturationOptions | None = None) 
         return None
     path = curve.displacement_um
     # Of the readings within the noise of the end only those that the noise brought below it are left: they lie too low.
-    rows = path > float(path.max()) - options.near_end * point_noise(path)
+    rows = np.zeros(len(curve), bool)
     for start, stop in found:
         rows[start:stop] = True
+    rows |= path >= float(path.max()) - options.near_end * point_noise(path[~rows])
     note = Note(
         "saturation",
         "look",
