@@ -83,7 +83,7 @@ def of_its_kind[**P, R](function: Callable[P, R]) -> Callable[P, R]:
         given = args[0] if args else kwargs.get(name)
         if kind is Campaign:
             usable_campaign(given, name)
-        elif kind.__name__ in _MADE_BY:
+        else:
             arguments.instance(given, kind, name, f"Make one with {_MADE_BY[kind.__name__]}.")
         return function(*args, **kwargs)
 
