@@ -21,6 +21,7 @@ import numpy as np
 from ._paper import PAPER_LOG_C, PAPER_SHAPE_PARAMETER
 from ._schema import Campaign
 from ._segments import Segment
+from ._validate import check_campaign
 from .curve_features import CurveFeatures, FeatureOptions, curve_features
 from .findings import Finding
 
@@ -172,6 +173,7 @@ def check_plausibility(
         where the material is not like micro-crystalline cellulose, which is no fault. Empty where nothing is to be
         said. `Finding.particles` names the particles where not all are concerned.
     """
+    check_campaign(campaign)
     options = options or PlausibilityOptions()
     with np.errstate(all="ignore"):
         tests = _Tests.of(campaign, segments, options)
