@@ -26,7 +26,7 @@ from ._paper import PAPER_LOG_C, PAPER_SHAPE_PARAMETER
 from ._schema import Campaign
 from ._segments import Segment
 from .curve_features import CurveFeatures, curve_features
-from .findings import Finding
+from .findings import Finding, worst
 from .plausible_ranges import PlausibilityOptions, Range
 from .slips import (
     Apparent,
@@ -75,12 +75,15 @@ def check_plausibility(
         if tests is None:
             return ()
         found = list(_signs(tests))
-        found += _scales(tests, options) or _outside(tests, options)
+        scales = _scales(tests, options)
+        found += scales or _outside(tests, options)
         found += _clock(tests, options)
-        found += _order_of_diameters(tests, options)
-        if not found:
+        if not scales:  # one diameter in another unit is out of order, too
+            found += _order_of_diameters(tests, options)
+        material = [] if found else _another_material(tests, options)
+        if worst(found) != "bad":
             found += _fitted_modulus(tests, modulus_MPa, options)
-            found += _another_material(tests, options)
+        found += material
     return tuple(found)
 
 

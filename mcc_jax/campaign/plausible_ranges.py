@@ -48,14 +48,13 @@ class PlausibilityOptions:
         solids: the classes of solids; a test is plausible where one of them holds it. Stresses begin at 0.2 MPa for
             soft solids: below, only surface irregularities deform (Bommireddy et al. 2018, section 3), so no test
             ends there. Their strains begin at 3 %: polymers yield at 1 to 5 % (Ashby), and a test that tells of
-            plasticity goes beyond. Pressures of hard solids begin at half the hardness of lead (40 MPa), and end at
-            that of ductile metals, 4 GPa, of hardened steel and hard metal, 20 GPa, or of ceramics, 40 GPa; their least
-            stresses and strains are those of pressing to 150 nm per millimetre. Metals are ductile, with moduli to
-            that of molybdenum (330 GPa), or hard, and then they break: a yield strength above 1.3 GPa leaves less than
-            10 % of elongation (Ashby, strength against ductility). Metals between platens are rarer than cellulose and
-            ceramics for which the law and its testers are made, one in eight by assumption. Measured pebbles of lithium
-            ceramics have loading moduli of 0.8 to 180 GPa, strains of 0.7 to 17 % and pressures of 0.2 to 3.2 GPa;
-            indentations with a made-up diameter lie within the ranges, too.
+            plasticity goes beyond. Pressures of hard solids begin at the hardness of lead, 30 MPa, and end at that of
+            ductile metals, 4 GPa, of hardened steel and cemented carbides, 20 GPa, or of ceramics, 40 GPa. Metals are
+            ductile, with moduli to that of molybdenum (330 GPa), or hard, and then they break: a yield strength above
+            1.3 GPa leaves less than 10 % of elongation (Ashby, strength against ductility). Metals between platens are
+            rarer than the cellulose and the ceramics for which law and testers are made, one in eight by assumption.
+            Measured pebbles of lithium ceramics have loading moduli of 0.8 to 180 GPa, strains of 0.7 to 17 % and
+            pressures of 0.2 to 3.2 GPa; indentations with a made-up diameter of up to 500 um lie within, too.
         diameter_um: sizes that testers of single particles take between their platens.
         force_mN: peak forces, from a nanoindenter's least to a universal tester's largest (100 kN).
         displacement_um: displacements at the peak; below 10 nm nobody resolves a curve.
@@ -90,9 +89,9 @@ class PlausibilityOptions:
 
     solids: tuple[SolidClass, ...] = (
         SolidClass("soft", (50.0, 6e4), (5.0, 3e4), (0.2, 2e3), (0.03, 1.2), (0.3, 2e3)),
-        SolidClass("ceramic", (5e3, 9e5), (8e2, 9e5), (0.004, 3e3), (1.5e-4, 0.15), (20.0, 4e4)),
-        SolidClass("ductile metal", (5e3, 3.5e5), (3e2, 3.5e5), (0.004, 3e3), (1.5e-4, 0.9), (20.0, 4e3), -2.0),
-        SolidClass("hard metal", (5e3, 7e5), (3e2, 7e5), (0.004, 3e3), (1.5e-4, 0.15), (20.0, 2e4), -2.0),
+        SolidClass("ceramic", (5e3, 9e5), (8e2, 9e5), (0.02, 3e3), (3e-4, 0.15), (30.0, 4e4)),
+        SolidClass("ductile metal", (5e3, 3.5e5), (3e2, 3.5e5), (0.02, 3e3), (3e-4, 0.9), (30.0, 4e3), -2.0),
+        SolidClass("hard metal", (5e3, 7e5), (3e2, 7e5), (0.02, 3e3), (3e-4, 0.15), (30.0, 2e4), -2.0),
     )
     diameter_um: Range = (3.0, 2e4)
     force_mN: Range = (1e-3, 1e8)
