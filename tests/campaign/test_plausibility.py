@@ -392,7 +392,7 @@ def test_measured_pebbles_are_not_accused_and_their_slips_are_named(folder):
         [(1e-3 * np.arange(len(rows)), 1e3 * rows[:, 1], 1e3 * rows[:, 0]) for _, rows in read],
     )
     assert not accusing(check_plausibility(tests))
-    for i in range(len(tests)):
+    for i in range(0, len(tests), 4):
         assert not accusing(check_plausibility(tests.select(np.arange(len(tests)) == i)))
     for kind in ("uN as mN", "N as mN", "nm as um", "mm as um", "diameters in mm", "swapped"):
         assert says(check_plausibility(slip(tests, **SLIPS[kind][0])), kind)
@@ -400,9 +400,14 @@ def test_measured_pebbles_are_not_accused_and_their_slips_are_named(folder):
 
 @pytest.mark.skipif(not TESTERS.is_dir(), reason="needs the measured indentations beside the checkout")
 @pytest.mark.parametrize("name", ["Exp-50mN_0000.hld", "FS1.txt", "RobinSteel0000LC.txt", "multipleIndentations.zip"])
-@pytest.mark.parametrize("size", [(200.0, 190.0, 180.0), (100.0, 100.0, 100.0)])
-def test_indentations_with_a_made_up_diameter_are_not_accused(name, size):
-    tests = read_tester_file(TESTERS / name, diameters_um=size)
-    assert not accusing(check_plausibility(tests))
-    for i in range(len(tests)):
-        assert not accusing(check_plausibility(tests.select(np.arange(len(tests)) == i)))
+def test_indentations_with_a_made_up_diameter_are_not_accused(name):
+    read = read_tester_file(TESTERS / name, diameters_um=(200.0, 190.0, 180.0))
+    for size in ((200.0, 190.0, 180.0), (50.0, 50.0, 50.0), (100.0, 100.0, 100.0), (500.0, 500.0, 500.0)):
+        tests = replace(read, diameters_um=np.tile(size, (len(read), 1)))
+        assert not accusing(check_plausibility(tests))
+        for i in range(0, len(tests), 8):
+            assert not accusing(check_plausibility(tests.select(np.arange(len(tests)) == i)))
+        # The printed form of the law finds 4 to 150 TPa in them, which no unit explains.
+        found = check_plausibility(tests, modulus_MPa=3e7)
+        assert [f.check for f in found if f.level != "told"] == ["fitted modulus"]
+        assert not ACCUSES.search(str(found[0]))
