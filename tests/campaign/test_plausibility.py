@@ -256,6 +256,16 @@ def test_radii_show_where_the_platens_would_have_touched(stress):
         assert "twice" in findings[0].remedy
 
 
+@pytest.mark.parametrize("unloads", [True, False])
+def test_forces_of_soft_tests_show_where_no_ductile_metal_is_so_strong(unloads):
+    """3 to 4 GPa at a strain of 0.3 are beyond every metal that bears such a strain."""
+    for seed in range(4):
+        tests = cellulose(seed, unloads=unloads, stress_MPa=(3.0, 4.0))
+        assert not accusing(check_plausibility(tests))
+        (finding,) = check_plausibility(slip(tests, force=1e3))
+        assert finding.sentence.startswith("The forces seem 1000 times too large, as uN taken for mN")
+
+
 def test_radii_of_hard_spheres_cannot_show():
     """Half the size with 1.4 times the modulus is another honest sphere; nothing in the record contradicts it."""
     assert not accusing(check_plausibility(slip(ceramic(), diameters=(0.5,) * 3)))
