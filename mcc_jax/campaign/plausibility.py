@@ -8,7 +8,8 @@ against "as given" are the difference of the log densities plus the slip's prior
 What cannot be seen: a factor that leaves everything within the ranges. Loading, unloading and their ratio say the same
 of a sphere of half the size with a modulus 1.4 times as large; radii given for diameters show only where the platens
 would have come closer than the particle allows, in tests of cellulose to 5 MPa and more. Forces of cellulose in uN
-taken for mN are those of a strong metal where tests end below 3 MPa. Times show only where they are far from any test's.
+taken for mN are those of a strong metal where tests end below 3 MPa. Times show only where they are far from any
+test's.
 
 A fitted modulus accuses no unit: a wrong one moves it and the records' own stiffness by the same factor (both go as
 force / (displacement^1.5 diameter^0.5)), so where the records are ordinary, the form of the law is at fault.

@@ -206,10 +206,10 @@ def written(tests, folder, units, numbers):
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: cellulose(7, count=8, retreat=0.13),
-        lambda: cellulose(8, count=8, retreat=0.04),
-        lambda: ceramic(7, count=8),
-        lambda: ceramic(8, count=8, modulus_MPa=3e5, unloads=False),
+        lambda: cellulose(7, count=5, retreat=0.13),
+        lambda: cellulose(8, count=5, retreat=0.04),
+        lambda: ceramic(7, count=5),
+        lambda: ceramic(8, count=5, modulus_MPa=3e5, unloads=False),
     ],
     ids=["cellulose, 5 GPa", "cellulose, 16 GPa", "ceramic, 100 GPa", "ceramic, 300 GPa, broken"],
 )
