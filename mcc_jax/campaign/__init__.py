@@ -34,9 +34,9 @@ from ._segments import summarise_segments as summarise_segments
 from ._validate import check_campaign as check_campaign
 from ._write import write_campaign as write_campaign
 from .findings import Finding as Finding
-from .plausibility import PlausibilityOptions as PlausibilityOptions
-from .plausibility import SolidClass as SolidClass
 from .plausibility import check_plausibility as check_plausibility
+from .plausible_ranges import PlausibilityOptions as PlausibilityOptions
+from .plausible_ranges import SolidClass as SolidClass
 from .quality import QualityOptions as QualityOptions
 from .quality import campaign_findings as campaign_findings
 from .quality import check_tests as check_tests
