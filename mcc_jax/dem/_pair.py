@@ -154,7 +154,9 @@ def _check_sides(*sides: HalfContact) -> None:
         arguments.instance(side, HalfContact, "a side", "Make one with mcc_jax.dem.half_contact(law, particle).")
 
 
-def _overlap(side: HalfContact, overlap: ScalarLike, name: str = "overlap [m]", least: float = -math.inf) -> Scalar:
+def _overlap(
+    side: HalfContact, overlap: ScalarLike, name: str = "overlap [m]", least: float | int = -math.inf
+) -> Scalar:
     """An overlap as an array: a plain number in the precision of the side."""
     if isinstance(overlap, jax.Array):
         return overlap
