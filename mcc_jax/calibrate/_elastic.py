@@ -196,8 +196,7 @@ def fit_effective_modulus(
     """
     for one in arguments.instance(branches, Sequence, "branches", BRANCHES):
         arguments.instance(one, ElasticBranch, "every one of branches", BRANCHES)
-    shape_factor = arguments.floats(shape_factor, "shape_factor", shape="a shape factor for every branch")
-    arguments.same_length(branches=branches, shape_factor=shape_factor)
+    shape_factor = arguments.floats(shape_factor, "shape_factor", shape="a shape factor for every particle")
     branches = tuple(branches)
     if not branches:
         return ElasticFit(None, np.nan, np.empty(0), (), False, "no unloading branch was measured")
