@@ -71,7 +71,8 @@ def check_plausibility(
         said. What is said of a fitted modulus is of the check "fitted modulus" and accuses no unit; all else is of
         the check "plausibility". `Finding.particles` names the particles where not all are concerned.
     """
-    check_campaign(campaign)
+    if not isinstance(campaign, Campaign):
+        check_campaign(campaign)  # what is no campaign; one with wrong values is still looked at, to name their cause
     options = options or PlausibilityOptions()
     with np.errstate(all="ignore"):
         tests = _Tests.of(campaign, segments, options)

@@ -21,6 +21,7 @@ from mcc_jax.campaign import (
     read_campaign,
     read_tester_file,
 )
+from mcc_jax.simulate import Instrument, Programme, paper_campaign
 
 PEBBLES, TESTERS = SHARED / "data" / "pebbles", SHARED / "data" / "testers"
 
@@ -348,6 +349,20 @@ def test_honest_solids_of_many_kinds_and_sizes(solid, size, flatness, count, unl
         curve = press(own, modulus, modulus * ratio, strain, unloads=unloads, seconds=seconds)
         curves.append(noisy(curve, rng))
     assert not accusing(check_plausibility(campaign(diameters, curves)))
+
+
+@settings(max_examples=8)
+@given(
+    st.lists(st.floats(0.03, 1.0), min_size=1, max_size=12),
+    st.floats(0, 0.8),
+    st.sampled_from([0.0, 20.0]),
+    st.integers(0, 9),
+)
+def test_the_paper_s_material_is_itself_however_often_it_is_unloaded(levels, unload_to, hold_s, seed):
+    programme = Programme.cycles(levels=(*levels, 1.0), unload_to=unload_to, hold_s=hold_s, points=600)
+    instrument = Instrument(displacement_noise_um=0.05, force_noise_mN=0.05)
+    tests = paper_campaign(seed, programme=programme, instrument=instrument)
+    assert not check_plausibility(tests.select(np.arange(20) < 4))
 
 
 NUMBERS = st.one_of(st.floats(-1e15, 1e15), st.sampled_from([0.0, 1e300, -1e300, 1e-300, np.nan, np.inf, -np.inf]))
