@@ -250,7 +250,9 @@ def same_length(**arrays: Any) -> int:
     (first, one), *others = arrays.items()
     for name, other in others:
         if len(other) != len(one):
-            raise InputError(f"{first} has {len(one)} entries and {name} has {len(other)}: they must be as many")
+            raise InputError(
+                f"{first} has {len(one)} entries and {name} has {len(other)}", remedy="Give as many of each."
+            )
     return len(one)
 
 
