@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
+from . import arguments
 from ._errors import InputError
 
 CONTACTS = 2048
@@ -44,8 +45,10 @@ def in_blocks[**P, R](
     Raises:
         InputError: if the arrays differ in length, have no axis to divide, or cannot be shared out equally.
     """
-    if block is not None and block < 1:
-        raise InputError(f"a block of {block} contacts", remedy="Give at least 1.")
+    if not callable(function):
+        raise InputError(f"function must be a function, got {arguments.kind_of(function)}")
+    if block is not None:
+        block = arguments.whole(block, "block, a number of contacts,", least=1)
     one = jax.checkpoint(jax.vmap(function))
 
     def share(*arguments: Any) -> Any:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 from jaxtyping import ScalarLike as ScalarLike
 
+from ._errors import InputError
 from .arguments import is_traced
 from .arguments import values as values_of
 
@@ -22,10 +23,10 @@ def scalar(value: ScalarLike) -> Scalar:
     """Convert a field's value to a floating-point scalar array, keeping the precision of arrays.
 
     Raises:
-        ValueError: if it is no number, or has a batch axis; modules describe one contact and are batched by `vmap`.
+        InputError: if it is no number, or has a batch axis; modules describe one contact and are batched by `vmap`.
     """
     plain = isinstance(value, int | float) or is_traced(value)
     array = jnp.asarray(value) if plain else values_of(value, "a parameter", shape="a number")
     if array.ndim:
-        raise ValueError(f"Expected a scalar, got shape {array.shape}; batch with equinox.filter_vmap(Class).")
+        raise InputError(f"Expected a scalar, got shape {array.shape}; batch with equinox.filter_vmap(Class).")
     return array if jnp.issubdtype(array.dtype, jnp.inexact) else array.astype(float)

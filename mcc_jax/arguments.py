@@ -10,7 +10,7 @@ import enum
 import math
 import numbers
 import os
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sized
 from pathlib import Path, PurePath
 from typing import Any, cast
 
@@ -242,12 +242,17 @@ def same_length(**arrays: Any) -> int:
     """The length that all arrays share.
 
     Raises:
-        InputError: naming two that differ, with both lengths.
+        InputError: naming two that differ, with both lengths, or one that is a single number.
     """
+    for name, array in arrays.items():
+        if not isinstance(array, Sized) or (isinstance(array, np.ndarray | jax.Array) and array.ndim == 0):
+            raise InputError(f"{name} must be a list of numbers, got {shown(array)}")
     (first, one), *others = arrays.items()
     for name, other in others:
         if len(other) != len(one):
-            raise InputError(f"{first} has {len(one)} entries and {name} has {len(other)}: they must be as many")
+            raise InputError(
+                f"{first} has {len(one)} entries and {name} has {len(other)}", remedy="Give as many of each."
+            )
     return len(one)
 
 

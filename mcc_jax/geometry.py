@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from ._numerics import compiled_whole, positive_pow, shared
 from ._types import Scalar, ScalarLike, Values, scalar
-from .arguments import instance, positive
+from .arguments import finite, instance, positive
 
 
 def _diameter(value: ScalarLike) -> Scalar:
@@ -86,7 +86,6 @@ def _particle(value: Particle) -> Particle:
     return instance(value, Particle, "particle", "Make one with mcc_jax.Particle(D1, D2, D3), diameters in um.")
 
 
-@compiled_whole
 def plastic_shape_factor(particle: Particle, a: ScalarLike) -> Scalar:
     r"""Shape factor of plastic loading.
 
@@ -103,7 +102,13 @@ def plastic_shape_factor(particle: Particle, a: ScalarLike) -> Scalar:
     References:
         Bommireddy et al. (2018), eq. 13.
     """
-    return 1 + scalar(a) * _particle(particle).flatness
+    finite(a, "the geometric parameter a")
+    return _plastic_shape_factor(_particle(particle), scalar(a))
+
+
+@compiled_whole
+def _plastic_shape_factor(particle: Particle, a: Scalar) -> Scalar:
+    return 1 + a * particle.flatness
 
 
 @compiled_whole

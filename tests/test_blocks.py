@@ -73,7 +73,7 @@ def test_a_gradient_needs_little_memory():
 def test_what_is_not_one_batch_is_refused(arguments, words):
     with pytest.raises(InputError, match=words):
         in_blocks(lambda x, y: x + y)(*arguments)
-    with pytest.raises(InputError, match="at least 1"):
+    with pytest.raises(InputError, match="must be a whole number >= 1"):
         in_blocks(lambda x: x, block=0)
 
 

@@ -12,12 +12,16 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
+from .. import arguments
 from .._types import Scalar
-from ..campaign import Adjustment, Campaign, Curve, Segment, stress_and_strain
+from ..campaign import Adjustment, Campaign, Curve, Segment, check_campaign, stress_and_strain
 from ..law import StrainScaling, Unloading, recovery
 
 LEAST_RATIO = 0.05
 """Points below this share of the peak stress are left out: strain there depends on stress with an infinite slope."""
+
+
+BRANCHES = "Take those of mcc_jax.calibrate.campaign_branches(campaign, adjustment)."
 
 
 @dataclass(frozen=True)
@@ -111,6 +115,8 @@ def elastic_branches(
 
 def campaign_branches(campaign: Campaign, adjustment: Adjustment) -> list[ElasticBranch]:
     """The elastic branches of every particle that the offset step kept, in its adjusted strain."""
+    check_campaign(campaign)
+    arguments.instance(adjustment, Adjustment, "adjustment", "Take mcc_jax.adjust(campaign).")
     return [
         branch
         for i in np.flatnonzero(adjustment.kept)
@@ -192,6 +198,9 @@ def fit_effective_modulus(
     References:
         Bommireddy et al. (2018), section 6, eqs. 23 and 24.
     """
+    for one in arguments.instance(branches, Sequence, "branches", BRANCHES):
+        arguments.instance(one, ElasticBranch, "every one of branches", BRANCHES)
+    shape_factor = arguments.floats(shape_factor, "shape_factor", shape="a shape factor for every particle")
     branches = tuple(branches)
     if not branches:
         return ElasticFit(None, np.nan, np.empty(0), (), False, "no unloading branch was measured")

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .. import arguments
+from .._errors import InputError
 from ..campaign import Adjustment, of_each_particle
 
 
@@ -43,9 +45,12 @@ def strain_table(adjustment: Adjustment, diameters_um: np.ndarray, points: int =
     Raises:
         ValueError: if no particle is kept.
     """
+    arguments.instance(adjustment, Adjustment, "adjustment", "Take mcc_jax.adjust(campaign).")
+    diameters_um = arguments.diameters(diameters_um)
+    points = arguments.whole(points, "points", least=2)
     index = np.flatnonzero(adjustment.kept)
     if not len(index):
-        raise ValueError("no particle can be used: " + "; ".join(sorted({r for r in adjustment.why_not if r})))
+        raise InputError("no particle can be used: " + "; ".join(sorted({r for r in adjustment.why_not if r})))
     curves = [c for c in adjustment.curves if c is not None and c.stress_max_MPa > adjustment.threshold_MPa]
     grid = np.linspace(0.0, max(c.stress_max_MPa for c in curves), points)
     strain = np.stack([c.at(grid) for c in curves])
@@ -86,6 +91,8 @@ def enough(table: StrainTable) -> np.ndarray:
 
 def master_curve(table: StrainTable, a: float) -> MasterCurve:
     """Mean and standard deviation of the master strain for a shape parameter `a`."""
+    arguments.instance(table, StrainTable, "table", "Take mcc_jax.calibrate.strain_table(adjustment, diameters_um).")
+    a = arguments.number(a, "the shape parameter a")
     use = enough(table)
     reached = table.reached[:, use]
     scaled = table.shape_factor(a)[:, None] * table.strain[:, use]

@@ -21,9 +21,8 @@ from ..campaign import (
     check_tests,
     of_each_particle,
     particle_batch,
-    refusal,
 )
-from ..campaign._validate import usable_campaign
+from ..campaign.reasons import refusal
 from ..geometry import plastic_shape_factor
 from ..law import MccLaw, StrainScaling, Unloading
 from ._elastic import ElasticFit, campaign_branches, fit_effective_modulus
@@ -247,7 +246,7 @@ def calibrate_paper(
         Bommireddy et al. (2018), sections 3 to 6.
     """
     started = time.perf_counter()
-    usable_campaign(campaign)
+    campaign = check_tests(campaign)
     arguments.choice(objective, get_args(Objective), "objective")
     unloading = arguments.member(unloading, Unloading, "unloading")
     strain_scaling = arguments.member(strain_scaling, StrainScaling, "strain_scaling")
@@ -255,7 +254,6 @@ def calibrate_paper(
     if progress is not None and not callable(progress):
         raise InputError(f"progress must be a function of the name of a step, got {arguments.kind_of(progress)}")
     tell = progress or (lambda _: None)
-    campaign = check_tests(campaign)
     tell("adjusting the curves")
     adjustment = adjust(campaign, threshold_MPa)
     if adjustment.kept.sum() < 2:

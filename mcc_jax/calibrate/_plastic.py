@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 
+from .. import arguments
 from .._errors import InputError
 from ..law import LogNormal, PlasticPopulation
 from ._master import MasterCurve
@@ -51,6 +52,9 @@ def fit_polynomial(strain: np.ndarray, stress_MPa: np.ndarray) -> np.ndarray:
     Returns:
         The three factors [MPa]. One that would be negative is put at `SMALLEST_SHARE` of the largest stress.
     """
+    strain = arguments.floats(strain, "strain", shape="a 1-D array of strains")
+    stress_MPa = arguments.floats(stress_MPa, "stress_MPa", shape="a 1-D array of stresses [MPa]")
+    arguments.same_length(strain=strain, stress_MPa=stress_MPa)
     from scipy.optimize import nnls  # half a second to import, so only where it is used
 
     design = np.stack([strain, -(strain**3), strain**5], axis=1) / stress_MPa[:, None]
@@ -88,6 +92,8 @@ def fit_population(master: MasterCurve, threshold_MPa: float = 0.0) -> PlasticFi
     References:
         Bommireddy et al. (2018), eqs. 16 to 18 and Table 2.
     """
+    arguments.instance(master, MasterCurve, "master", "Take mcc_jax.calibrate.master_curve(table, a).")
+    threshold_MPa = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
     from scipy.optimize import nnls
 
     use = (master.stress_MPa >= threshold_MPa) & (master.stress_MPa > 0) & (master.mean > 0)

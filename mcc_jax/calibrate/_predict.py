@@ -8,15 +8,17 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from .. import arguments
 from ..campaign import (
     Adjustment,
     Campaign,
     Curve,
+    check_campaign,
     effective_diameter_um,
     particle_batch,
-    point_noise,
     stress_and_strain,
 )
+from ..campaign._signal import point_noise
 from ..law import MccLaw, Plastic
 from ..simulate import simulate_batch
 from ._plastic import fit_polynomial
@@ -54,6 +56,7 @@ class ParticleFit:
 
 def point_noise_um(curve: Curve) -> float:
     """Standard deviation of displacement from point to point [um]: second differences cancel any smooth course."""
+    arguments.instance(curve, Curve, "curve", "Make one with mcc_jax.Curve(time_s, force_mN, displacement_um).")
     return point_noise(curve.displacement_um)
 
 
@@ -71,6 +74,9 @@ def predict_particles(
     Returns:
         One entry per particle of the campaign, None where it was not kept.
     """
+    check_campaign(campaign)
+    arguments.instance(adjustment, Adjustment, "adjustment", "Take mcc_jax.adjust(campaign).")
+    arguments.instance(law, MccLaw, "law", "Take mcc_jax.paper_law(), or the law of a calibration.")
     kept = np.flatnonzero(adjustment.kept)
     own = []
     for i in kept:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,8 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
+from .. import arguments
+from .._errors import InputError
 from .._types import Scalar
 from ._master import StrainTable, enough
 
@@ -105,6 +107,7 @@ def choose_reference(table: StrainTable) -> int:
     Returns:
         Row of the table (not position in the campaign).
     """
+    arguments.instance(table, StrainTable, "table", "Take mcc_jax.calibrate.strain_table(adjustment, diameters_um).")
     top = table.reached.sum(axis=1)
     high = top >= np.median(top)
     return int(np.argmin(np.where(high, np.abs(table.flatness), np.inf)))
@@ -145,8 +148,10 @@ def fit_shape_parameter(table: StrainTable, objective: Objective = "full", refer
     References:
         Bommireddy et al. (2018), eqs. 13 to 15.
     """
+    arguments.instance(table, StrainTable, "table", "Take mcc_jax.calibrate.strain_table(adjustment, diameters_um).")
+    arguments.choice(objective, get_args(Objective), "objective")
     if len(table.index) < 2:
-        raise ValueError("the shape parameter needs at least two particles")
+        raise InputError("the shape parameter needs at least two particles")
     use = enough(table)
     stress, strain, reached = table.stress_MPa[use], table.strain[:, use], table.reached[:, use]
     starts = jnp.asarray(STARTS, dtype=float)
@@ -160,7 +165,7 @@ def fit_shape_parameter(table: StrainTable, objective: Objective = "full", refer
         elif reference in table.index:
             row = int(np.flatnonzero(table.index == reference)[0])
         else:
-            raise ValueError("the reference particle was not kept")
+            raise InputError("the reference particle was not kept")
         others = np.arange(len(table.index)) != row
         reached = reached[others] & reached[row]
         data = (

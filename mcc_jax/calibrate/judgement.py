@@ -15,7 +15,9 @@ from typing import Any
 import numpy as np
 
 from .._errors import InputError
-from ..campaign import Campaign, Finding, campaign_findings, check_plausibility, named, or_slip
+from ..campaign import Campaign, Finding, campaign_findings, check_plausibility
+from ..campaign.quality import named
+from ..campaign.reasons import or_slip
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ import numpy as np
 
 from .. import arguments
 from ._schema import Campaign, Curve
-from ._segments import Segment, find_segments
-from ._validate import usable_campaign
+from ._segments import Segment, check_segmented, find_segments
+from ._validate import check_campaign
 from .reasons import below_threshold, far_apart, no_climb, no_loading, too_few
 
 THRESHOLD_MPA = 0.2
@@ -59,7 +59,7 @@ def effective_diameter_um(diameters_um: Any) -> float:
 
 def campaign_segments(campaign: Campaign) -> tuple[tuple[Segment, ...], ...]:
     """The segments of every test, found with the campaign's own control if it is known."""
-    usable_campaign(campaign)
+    check_campaign(campaign)
     return tuple(find_segments(curve, control=campaign.metadata.control) for curve in campaign.curves)
 
 
@@ -76,6 +76,8 @@ def stress_and_strain(
     References:
         Bommireddy et al. (2018), eqs. 3 and 4.
     """
+    check_segmented(curve, segments)
+    diameters_um = arguments.one_particle(diameters_um)
     diameter = effective_diameter_um(diameters_um)
     zero = _contact_um(curve, segments)
     return 1e3 * curve.force_mN / (np.pi * diameter**2 / 4), (curve.displacement_um - zero) / diameter
@@ -99,6 +101,8 @@ def loading_curve(curve: Curve, diameters_um: np.ndarray, segments: tuple[Segmen
     Returns:
         The curve, or None if the test never loads.
     """
+    check_segmented(curve, segments)
+    diameters_um = arguments.one_particle(diameters_um)
     from scipy.optimize import isotonic_regression  # half a second to import, so only where it is used
 
     virgin = [np.arange(s.start, s.stop) for s in segments if s.kind == "load"]
@@ -165,7 +169,7 @@ def adjust(campaign: Campaign, threshold_MPa: float = THRESHOLD_MPA) -> Adjustme
     References:
         Bommireddy et al. (2018), section 3.
     """
-    usable_campaign(campaign)
+    check_campaign(campaign)
     threshold_MPa = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
     segments = campaign_segments(campaign)
     raw = [loading_curve(*one) for one in zip(campaign.curves, campaign.diameters_um, segments, strict=True)]

@@ -15,7 +15,7 @@ from .. import arguments
 from .._types import Scalar
 from ..geometry import Particle
 from ._schema import Campaign
-from ._validate import usable_campaign
+from ._validate import check_campaign
 
 
 def particle_batch(diameters_um: Any) -> Particle:
@@ -69,7 +69,7 @@ def batch(campaign: Campaign, *, multiple: int = 1) -> Batch:
         campaign: at least one particle.
         multiple: round the length up to a multiple of this, so that campaigns of similar length share one compilation.
     """
-    usable_campaign(campaign)
+    check_campaign(campaign)
     multiple = arguments.whole(multiple, "multiple", least=1)
     longest = max(len(curve) for curve in campaign.curves)
     longest += -longest % multiple

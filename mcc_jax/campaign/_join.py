@@ -9,7 +9,7 @@ import numpy as np
 
 from .._errors import InputError
 from ._schema import Campaign, Metadata
-from ._validate import usable_campaign
+from ._validate import check_campaign
 
 _ALIKE = ("control", "punch_diameter_um", "corrections")
 _COARSEST = ("force_resolution_mN", "displacement_resolution_um")
@@ -30,7 +30,7 @@ def join_campaigns(first: Campaign, *further: Campaign) -> Campaign:
         InputError: if two particles have the same name, a column is not in all campaigns, or control, punch or
             corrections differ.
     """
-    campaigns = tuple(usable_campaign(one, f"campaign {i}") for i, one in enumerate((first, *further), start=1))
+    campaigns = tuple(check_campaign(one, f"campaign {i}") for i, one in enumerate((first, *further), start=1))
     for other in further:
         _check_alike(first, other)
     names = [name for campaign in campaigns for name in campaign.particles]

@@ -182,7 +182,7 @@ class Campaign:
         if sizes.shape != (len(names), 3):
             raise InputError(f"diameters_um has the shape {sizes.shape} where ({len(names)}, 3) is expected: {_SIZES}")
         curves = arguments.instance(curves, Iterable, "curves", "Give a list with one Curve for every particle.")
-        tests = tuple(arguments.instance(one, Curve, "every one of curves", _A_CURVE) for one in curves)
+        tests = tuple(arguments.instance(one, Curve, "every one of curves", A_CURVE) for one in curves)
         arguments.same_length(particles=names, curves=tests)
         given = arguments.instance(columns or {}, Mapping, "columns", "Give a dictionary of columns.")
         further = {name: _texts(cells, f"the column {name!r}") for name, cells in given.items()}
@@ -247,7 +247,7 @@ class Campaign:
 
 
 _SIZES = "D1, D2, D3 [um] of every particle, shape (N, 3)"
-_A_CURVE = "Make one with mcc_jax.Curve(time_s, force_mN, displacement_um)."
+A_CURVE = "Make one with mcc_jax.Curve(time_s, force_mN, displacement_um)."
 
 
 def _texts(values: Any, name: str) -> tuple[str, ...]:

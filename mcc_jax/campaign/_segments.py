@@ -9,6 +9,7 @@ approach. All thresholds are shares of the curve's own range, or multiples of it
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal, cast, get_args
@@ -18,10 +19,13 @@ import numpy as np
 from .. import arguments
 from .._errors import InputError
 from ._drive import Drive, DriveOptions, Hold
-from ._schema import Control, Curve
+from ._schema import A_CURVE, Control, Curve
 from ._signal import branch_envelope, steady_clock, two_lines
 
 SegmentKind = Literal["approach", "load", "hold", "unload", "reload"]
+
+
+SEGMENTS = "Take those of mcc_jax.find_segments(curve)."
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,13 @@ class Segment:
     kind: SegmentKind
     start: int
     stop: int
+
+    def __post_init__(self) -> None:
+        arguments.choice(self.kind, get_args(SegmentKind), "kind")
+        for name in ("start", "stop"):
+            object.__setattr__(self, name, arguments.whole(getattr(self, name), name))
+        if self.stop < self.start:
+            raise InputError(f"a segment from sample {self.start} stops at {self.stop}, before it starts")
 
     def __len__(self) -> int:
         return self.stop - self.start
@@ -87,7 +98,7 @@ def find_segments(
         InputError: for a curve without a point or with one that is not finite, a control that does not exist, or a
             threshold that is not positive.
     """
-    arguments.instance(curve, Curve, "curve", "Make one with mcc_jax.Curve(time_s, force_mN, displacement_um).")
+    arguments.instance(curve, Curve, "curve", A_CURVE)
     if control is not None:
         arguments.choice(control, get_args(Control), "control")
     thresholds = {"smallest_turn": smallest_turn, "noise_multiple": noise_multiple, "band": band, "contact": contact}
@@ -134,6 +145,7 @@ def summarise_segments(curve: Curve, segments: tuple[Segment, ...]) -> list[dict
         Rows with `kind`, `samples`, `start_s`, `stop_s`, `force_from_mN`, `force_to_mN`, `displacement_from_um` and
         `displacement_to_um`; times, forces and displacements are those of the first and the last sample.
     """
+    check_segmented(curve, segments)
     rows: list[dict[str, Any]] = []
     for segment in segments:
         first, last = segment.start, segment.stop - 1
@@ -290,3 +302,10 @@ def _assemble(drive: Drive, holds: list[Hold], force: Drive, onset: int) -> tupl
     cuts = np.flatnonzero(kinds[1:] != kinds[:-1]) + 1
     edges = [0, *cuts.tolist(), count]
     return tuple(Segment(cast(SegmentKind, str(kinds[a])), a, b) for a, b in pairwise(edges))
+
+
+def check_segmented(curve: Any, segments: Any) -> None:
+    """Refuse what is no curve, or no segments of one."""
+    arguments.instance(curve, Curve, "curve", A_CURVE)
+    for one in arguments.instance(segments, Sequence, "segments", SEGMENTS):
+        arguments.instance(one, Segment, "every one of segments", SEGMENTS)

@@ -48,32 +48,34 @@ def check_magnitudes(
     raise InputError(problem, file=file, row=rows[i], column=column, remedy=remedy)
 
 
-def check_campaign(campaign: Campaign, *, file: str | Path) -> None:
-    """Check a campaign made in memory as strictly as one from files.
+def check_campaign(campaign: Any, name: str = "campaign", *, file: str | Path = "") -> Campaign:
+    """The campaign, if it is one that could have come from files: checked as strictly as one that did.
 
     Args:
-        campaign: what to check.
-        file: what messages name as the place, for instance the tester's file.
+        campaign: what a function was given.
+        name: what the function calls it, for messages.
+        file: what messages name as the place; where the campaign was read, if empty.
 
     Raises:
-        InputError: if names, shapes or values are unfit.
+        InputError: if names, shapes or values are unfit; for a path, how to read it.
     """
+    if isinstance(campaign, str | PurePath):
+        raise InputError(
+            f"{name} must be a Campaign, got the path {str(campaign)!r}",
+            remedy=f"Read it first: mcc_jax.read_campaign({str(campaign)!r}).",
+        )
+    arguments.instance(campaign, Campaign, name, "Read one with mcc_jax.read_campaign(folder), or make one in memory.")
+    place = file or campaign.source or f"the {name}"
 
     def fail(problem: str, remedy: str = "Mend the campaign before it is used") -> InputError:
-        return InputError(problem, file=file, remedy=remedy)
+        return InputError(problem, file=place, remedy=remedy)
 
-    count = len(campaign.particles)
-    if count == 0:
+    if not len(campaign):
         raise fail("there is no particle")
-    diameters = np.asarray(campaign.diameters_um, float)
-    if diameters.shape != (count, 3):
-        raise fail(f"diameters have the shape {diameters.shape} where ({count}, 3) is expected")
-    if len(campaign.curves) != count:
-        raise fail(f"{count} particles have {len(campaign.curves)} curves")
     name, times = Counter(campaign.particles).most_common(1)[0]
     if times > 1:
         raise fail(f"the particle {name!r} stands there {times} times")
-    for name, triple in zip(campaign.particles, diameters, strict=True):
+    for name, triple in zip(campaign.particles, campaign.diameters_um, strict=True):
         _check_text(name, f"the particle's name {name!r}", fail)
         if not name.strip():
             raise fail("a particle's name is empty")
@@ -84,29 +86,8 @@ def check_campaign(campaign: Campaign, *, file: str | Path) -> None:
     for column, cells in campaign.columns.items():
         if not column or column != column.strip() or "\ufeff" in column or column in _TAKEN or column[:3] in _DIAMETER:
             raise fail(f"{column!r} cannot be the name of a further column")
-        if len(cells) != count:
-            raise fail(f"the column {column!r} has {len(cells)} cells for {count} particles")
         for text in (column, *cells):
             _check_text(text, f"the text {text!r} of column {column!r}", fail)
-
-
-def usable_campaign(campaign: Any, name: str = "campaign") -> Campaign:
-    """The campaign, if it is one that could have come from files.
-
-    Args:
-        campaign: what a function was given.
-        name: what the function calls it, for messages.
-
-    Raises:
-        InputError: saying what is wrong; for a path, how to read it.
-    """
-    if isinstance(campaign, str | PurePath):
-        raise InputError(
-            f"{name} must be a Campaign, got the path {str(campaign)!r}",
-            remedy=f"Read it first: mcc_jax.read_campaign({str(campaign)!r}).",
-        )
-    arguments.instance(campaign, Campaign, name, "Read one with mcc_jax.read_campaign(folder), or make one in memory.")
-    check_campaign(campaign, file=campaign.source or f"the {name}")
     return campaign
 
 
@@ -125,10 +106,8 @@ def _check_text(text: str, what: str, fail: Callable[[str], InputError]) -> None
 def _check_curve(
     name: str, time: np.ndarray, force: np.ndarray, displacement: np.ndarray, fail: Callable[..., InputError]
 ) -> None:
-    parts = {"time": np.asarray(time), "force": np.asarray(force), "displacement": np.asarray(displacement)}
+    parts = {"time": time, "force": force, "displacement": displacement}
     for what, values in parts.items():
-        if values.ndim != 1 or len(values) != len(time):
-            raise fail(f"the {what} of particle {name!r} has the shape {values.shape}")
         if not (np.abs(values) <= LARGEST_MAGNITUDE).all():
             first = int(np.argmax(~(np.abs(values) <= LARGEST_MAGNITUDE)))
             raise fail(

@@ -18,6 +18,8 @@ class FeatureOptions:
         contact: share of the peak force at which contact counts as made. Low, because soft particles deform much under
             little force: cellulose takes a quarter of its displacement below 3 % of its force.
         contact_noise: the same in standard deviations of the force's noise, where that is more.
+        loaded: multiple of the force at which contact counts as made that no reading before contact reaches. Unloadings
+            after it are part of the test; a first cycle below it, 2 % of the peak, is taken for part of the approach.
         unloading: shares of the peak force between which unloading is taken as a line. Below one half, the unloading of
             a plastic contact bends (Oliver and Pharr 1992); above nine tenths it still creeps.
         least_retreat: share of the displacement that must be given back for the lost work to count.
@@ -28,6 +30,7 @@ class FeatureOptions:
 
     contact: float = 0.005
     contact_noise: float = 4.0
+    loaded: float = 4.0
     unloading: tuple[float, float] = (0.9, 0.5)
     least_retreat: float = 0.2
     correlation: float = 0.6
@@ -121,10 +124,10 @@ def _measure(
     height = float(load[peak])
     way = float(abs(depth[peak]) if begins_at_peak else depth[peak] - depth[contact])
     fullness = loading_s = loss = np.nan
-    rows = slice(contact, peak + 1)
+    rows = contact + np.flatnonzero(load[contact : peak + 1] >= np.maximum.accumulate(load[contact : peak + 1]))
     if not begins_at_peak and way > 0:
         fullness = float(np.trapezoid(load[rows], depth[rows])) / (height * way)
-        first, last = (contact + int(np.argmax(load[rows] >= share * height)) for share in (0.1, 0.9))
+        first, last = (rows[np.argmax(load[rows] >= share * height)] for share in (0.1, 0.9))
         loading_s = float(time[last] - time[first])
         if depth[peak] - depth[peak:].min() > options.least_retreat * way and fullness > 0:
             loss = 1 + float(np.trapezoid(load[peak:], depth[peak:])) / (fullness * height * way)
@@ -169,11 +172,12 @@ def _compression_positive(force: np.ndarray) -> tuple[int, np.ndarray]:
 
 
 def _contact(rise: np.ndarray, options: FeatureOptions) -> tuple[int, float]:
-    """The last sample before the force rises for good, and the force there."""
+    """The last sample before the force first rises for good, and the force there; later unloadings do not count."""
     noise = _noise(rise)
     base = float(rise.min()) + 2 * noise  # the least of some hundred readings lies about two deviations below
     level = max(options.contact * (float(rise[-1]) - base), options.contact_noise * noise)
-    below = np.flatnonzero(rise <= base + level)
+    first_rise = int(np.argmax(rise - base >= options.loaded * level))
+    below = np.flatnonzero(rise[:first_rise] <= base + level)
     return (int(below[-1]) if len(below) and below[-1] < len(rise) - 1 else 0), base
 
 

@@ -14,7 +14,8 @@ class Finding:
     """One thing that a reader of the numbers must know.
 
     Attributes:
-        check: what was checked, in two or three words: "zero of force", "saturation", "breakage", "plausibility".
+        check: what was checked, in two or three words: "zero of force", "saturation", "breakage", "plausibility",
+            "fitted modulus".
         level: "told" where the data allowed it to be settled (corrected, or readings left out), "look" where the
             numbers are to be used with care, "bad" where they are not to be trusted before it is settled.
         sentence: what was found and what was done about it; one sentence, without its full stop.

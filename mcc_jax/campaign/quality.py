@@ -20,7 +20,7 @@ import numpy as np
 from ._schema import Campaign, Checked, Control, Curve, Note
 from ._segments import find_segments
 from ._signal import point_noise, runs, two_lines
-from ._validate import usable_campaign
+from ._validate import check_campaign
 from .findings import Finding
 from .plausibility import wrong_signs
 from .saturation import SaturationOptions, censor_displacement, censor_force
@@ -96,9 +96,9 @@ def check_tests(campaign: Campaign, options: QualityOptions | None = None) -> Ca
     Raises:
         InputError: if names, shapes or values of a campaign made in memory are unfit.
     """
+    check_campaign(campaign)
     if campaign.raw is not None:
         return campaign
-    usable_campaign(campaign)
     options = options or QualityOptions()
     if wrong_signs(campaign):
         return replace(campaign, raw=campaign)  # what looks like air or breakage is the test read backwards
@@ -459,6 +459,7 @@ def campaign_findings(campaign: Campaign) -> tuple[Finding, ...]:
     Args:
         campaign: what `check_tests` made.
     """
+    check_campaign(campaign)
     groups: dict[tuple[str, str, str, str], list[tuple[str, tuple[float | int, ...]]]] = {}
     for name, curve in zip(campaign.particles, campaign.curves, strict=True):
         for note in curve.checked.notes if curve.checked is not None else ():

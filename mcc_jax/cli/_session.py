@@ -55,7 +55,7 @@ def require_device() -> None:
         jax.devices()
     except (RuntimeError, AssertionError) as error:  # of a platform that is not installed it says either
         asked = os.environ.get("JAX_PLATFORMS") or jax.config.read("jax_platforms") or "the default"
-        why = " ".join(str(error).split())[:160]
+        why = " ".join(str(error).split()).split(" (set JAX_PLATFORMS")[0][:160]  # its hint is in the remedy
         raise InputError(
             f"JAX finds no device for JAX_PLATFORMS={asked}" + (f" ({why})" if why else ""),
             remedy="Unset JAX_PLATFORMS to compute on the processor, or install JAX for your accelerator",
@@ -91,7 +91,8 @@ def _keep_compiled(config: Any) -> None:
 def _private(folder: Path) -> bool:
     """Whether a folder is there, no link, ours, and open to nobody else; made so where it can be."""
     try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        for one in (*reversed(folder.parents), folder):  # mkdir(parents=True) would leave those above to the umask
+            one.mkdir(mode=0o700, exist_ok=True)
         found = folder.lstat()
         if not stat.S_ISDIR(found.st_mode):
             return False

@@ -172,6 +172,9 @@ def contact_forces(
         history: of the contacts with walls.
         time_step: over which slip adds up [s].
     """
+    arguments.instance(packing, Packing, "packing", A_PACKING)
+    arguments.instance(interaction, Interaction, "interaction", "Make one with mcc_jax.dem.Interaction().")
+    arguments.instance(edges, Edges, "edges", "Take those of a state.")
     bodies = bodies_of(packing, position, velocity, spin)
     load, edges = pair_loads(interaction, bodies, edges, time_step)
     at_walls, on_wall, history = wall_loads(interaction, walls, bodies, history, time_step)

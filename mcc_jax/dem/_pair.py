@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -40,8 +41,9 @@ class ContactEnergy(eqx.Module):
     dissipated: Scalar
 
 
-def largest_overlap(overlap_max: Scalar, overlap: Scalar) -> Scalar:
+def largest_overlap(overlap_max: ScalarLike, overlap: ScalarLike) -> Scalar:
     """The history after this overlap [m]: the larger of both; an overlap that is NaN shows."""
+    overlap_max, overlap = (arguments.values(x, "an overlap [m]") for x in (overlap_max, overlap))
     return jnp.where(overlap < overlap_max, overlap_max, overlap)
 
 
@@ -77,7 +79,7 @@ def pair_force(i: HalfContact, j: HalfContact, overlap_max: ScalarLike, overlap:
             "a pair whose sides unload by different forms shares no unloading curve",
             remedy="Give both particles the same `unloading` form.",
         )
-    overlap_max, overlap = _overlaps(i, overlap_max, overlap)
+    overlap_max, overlap = _largest(i, overlap_max), _overlap(i, overlap)
     peak = largest_overlap(overlap_max, overlap)
     return _series_force(i.power, _numbers(i), _numbers(j), peak, peak - overlap)
 
@@ -91,7 +93,7 @@ def wall_force(side: HalfContact, overlap_max: ScalarLike, overlap: ScalarLike) 
         overlap: overlap with the wall now [m].
     """
     _check_sides(side)
-    overlap_max, overlap = _overlaps(side, overlap_max, overlap)
+    overlap_max, overlap = _largest(side, overlap_max), _overlap(side, overlap)
     peak = largest_overlap(overlap_max, overlap)
     return branch_force(side.power, side.k1, side.k3, side.k5, side.c, peak, peak - overlap)
 
@@ -99,7 +101,7 @@ def wall_force(side: HalfContact, overlap_max: ScalarLike, overlap: ScalarLike) 
 def pair_split(i: HalfContact, j: HalfContact, overlap: ScalarLike) -> tuple[Scalar, Scalar]:
     """Compressions [m] of the two sides while loading at an overlap [m], and so of the peak of any unloading."""
     _check_sides(i, j)
-    (overlap,) = _overlaps(i, overlap)
+    overlap = _overlap(i, overlap)
     series = _series(_numbers(i), _numbers(j), overlap)
     return series.d_i, series.d_j
 
@@ -110,14 +112,14 @@ def pair_recovery(i: HalfContact, j: HalfContact, overlap_max: ScalarLike) -> Sc
     It is 1 where no force was carried.
     """
     _check_sides(i, j)
-    (overlap_max,) = _overlaps(i, overlap_max)
+    overlap_max = _largest(i, overlap_max)
     return _both_spans(i, j, _series(_numbers(i), _numbers(j), overlap_max))
 
 
 def wall_recovery(side: HalfContact, overlap_max: ScalarLike) -> Scalar:
     r"""Overlap [m] that a rigid wall is given back, :math:`\Delta`; see `pair_recovery`."""
     _check_sides(side)
-    (overlap_max,) = _overlaps(side, overlap_max)
+    overlap_max = _largest(side, overlap_max)
     force = overlap_max * secant_modulus(side.k1, side.k3, side.k5, overlap_max)
     return _span(side.power, side, force, overlap_max)[0]
 
@@ -131,7 +133,7 @@ def pair_energy(i: HalfContact, j: HalfContact, overlap_max: ScalarLike, overlap
     with g of `law.energy_ratio`. Arguments as in `pair_force`.
     """
     _check_sides(i, j)
-    overlap_max, overlap = _overlaps(i, overlap_max, overlap)
+    overlap_max, overlap = _largest(i, overlap_max), _overlap(i, overlap)
     peak = largest_overlap(overlap_max, overlap)
     series = _series(_numbers(i), _numbers(j), peak)
     span = _both_spans(i, j, series)
@@ -141,7 +143,7 @@ def pair_energy(i: HalfContact, j: HalfContact, overlap_max: ScalarLike, overlap
 def wall_energy(side: HalfContact, overlap_max: ScalarLike, overlap: ScalarLike) -> ContactEnergy:
     """Energy [J] of a contact with a rigid wall; see `pair_energy`."""
     _check_sides(side)
-    overlap_max, overlap = _overlaps(side, overlap_max, overlap)
+    overlap_max, overlap = _largest(side, overlap_max), _overlap(side, overlap)
     peak = largest_overlap(overlap_max, overlap)
     force = peak * secant_modulus(side.k1, side.k3, side.k5, peak)
     return _energy(_work(side, peak), force, _span(side.power, side, force, peak)[0], peak - overlap)
@@ -152,12 +154,17 @@ def _check_sides(*sides: HalfContact) -> None:
         arguments.instance(side, HalfContact, "a side", "Make one with mcc_jax.dem.half_contact(law, particle).")
 
 
-def _overlaps(side: HalfContact, *overlaps: ScalarLike) -> tuple[Scalar, ...]:
-    """Overlaps as arrays: plain numbers in the precision of the side."""
-    return tuple(
-        jnp.asarray(arguments.number(one, "an overlap [m]"), side.k1.dtype) if not isinstance(one, jax.Array) else one
-        for one in overlaps
-    )
+def _overlap(
+    side: HalfContact, overlap: ScalarLike, name: str = "overlap [m]", least: float | int = -math.inf
+) -> Scalar:
+    """An overlap as an array: a plain number in the precision of the side."""
+    if isinstance(overlap, jax.Array):
+        return overlap
+    return jnp.asarray(arguments.number(overlap, name, least=least), side.k1.dtype)
+
+
+def _largest(side: HalfContact, overlap_max: ScalarLike) -> Scalar:
+    return _overlap(side, overlap_max, "overlap_max [m]", least=0)
 
 
 # ---- inside ----------------------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ._dynamics import Motion
+from ._dynamics import Motion, check_arguments
 from ._forces import Packing
 from ._state import State
 
@@ -26,6 +26,7 @@ def in_single(packing: Packing, motion: Motion, state: State) -> tuple[Packing, 
         motion: time step, damping, friction.
         state: where to start; what it remembers is rounded.
     """
+    check_arguments(packing, motion, state)
 
     def fields(state: State) -> tuple[Any, ...]:
         return state.velocity, state.spin, state.edges, state.wall_history

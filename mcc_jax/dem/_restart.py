@@ -118,7 +118,7 @@ def _skeleton(header: dict, file: Path) -> tuple[Packing, State]:
     one, vector, number, point = empty(_PARTICLES), empty(_PARTICLES, 3), empty(), empty(3)
     side = HalfContact(number, number, number, number, number, power)
     sides = jax.tree.map(lambda _: one, side)  # one for each particle, as `jax.vmap(half_contact)` gives them
-    made = {"Plane": Plane(point, point, point), "Cylinder": Cylinder(number, number, number, point)}
+    made = {"Plane": Plane(point, point, point), "Cylinder": Cylinder(number + 1, number, number, point)}
     index, edge = empty(_EDGES, kind=int), empty(_EDGES)
     edges = Edges(index, index, index, edge, empty(_EDGES, 3), empty(kind=int), particles)
     history = WallHistory.virgin(_PARTICLES, len(walls))

@@ -63,6 +63,7 @@ class HalfContact(eqx.Module):
 
 def sides_of(sides: HalfContact, index: Int[Array | np.ndarray, " contacts"]) -> HalfContact:
     """The half contacts of the particles at an index, from a batch with one for each particle."""
+    arguments.instance(sides, HalfContact, "sides", "Make them with jax.vmap(mcc_jax.dem.half_contact).")
     return jax.tree.map(lambda x: x[index], sides)
 
 

@@ -68,6 +68,12 @@ class Cylinder(eqx.Module):
     chamfer: Scalar = eqx.field(converter=scalar)
     velocity: Vector = eqx.field(converter=_vector)
 
+    def __check_init__(self) -> None:
+        arguments.positive(self.radius, "the radius of a cylinder [m]")
+        arguments.positive(self.chamfer, "chamfer", zero=True)
+        if not (arguments.is_traced(self.rim) or self.rim > -jnp.inf):
+            raise InputError(f"rim must be a height [m], or infinite for none; got {float(self.rim):g}")
+
     def distance(self, position: Vector) -> Scalar:
         """Distance [m] of a point from the wall, negative outside."""
         above = jnp.maximum(position[2] - self.rim, 0.0)

@@ -15,8 +15,8 @@ from ..calibrate import JointModel
 from ..calibrate.joint._data import ranges_um, root_mean_squares
 from ..calibrate.joint._model import checked_settings
 from ..calibrate.judgement import unlike_others
-from ..campaign import Campaign, Finding, campaign_findings, check_plausibility, check_tests, named
-from ..campaign._validate import usable_campaign
+from ..campaign import Campaign, Finding, campaign_findings, check_plausibility, check_tests
+from ..campaign.quality import named
 from ..effects import LIBRARY, Mechanism, present
 from ..effects._library import checked_library
 from ._candidates import untestable
@@ -84,7 +84,7 @@ def discover(
         InputError: if no particle can be used, a name to exclude is not known, or no mechanism is left to look for.
     """
     started = time.perf_counter()
-    usable_campaign(campaign)
+    campaign = check_tests(campaign)
     tell, assumed, threshold_MPa = checked_settings(progress, model, threshold_MPa, None)
     seed = arguments.seed(seed)
     for name, value in (("confirm", confirm), ("experiments", experiments), ("posterior", posterior)):
@@ -100,7 +100,6 @@ def discover(
             raise InputError(f"there is no mechanism {name!r}", remedy=f"Known: {', '.join(known)}.")
         known.pop(name)
     assumed = JointModel(assumed.unloading, assumed.strain_scaling, True, assumed.shape_scatter, assumed.priors)
-    campaign = check_tests(campaign)
     findings = campaign_findings(campaign)
     wrong = [one for one in check_plausibility(campaign.raw or campaign) if one.level == "bad"]
     if wrong:

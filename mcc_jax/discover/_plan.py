@@ -19,8 +19,7 @@ from ..calibrate.joint._forward import law_of
 from ..calibrate.joint._linearised import linear_data, summarise
 from ..calibrate.joint._model import checked_settings
 from ..calibrate.joint._noise import Noise
-from ..campaign import Campaign, Curve, Metadata
-from ..campaign._validate import usable_campaign
+from ..campaign import Campaign, Curve, Metadata, check_campaign
 from ..effects import LIBRARY, Mechanism, present
 from ..effects._library import checked_library
 from ..simulate import Programme, simulate_campaign
@@ -231,7 +230,7 @@ def power_of_campaign(
     Raises:
         InputError: if no particle can be used.
     """
-    usable_campaign(campaign)
+    check_campaign(campaign)
     checked_library(library)
     tell, assumed, threshold_MPa = checked_settings(progress, model, threshold_MPa, None)
     assumed = replace(assumed, modulus_scatter=True)

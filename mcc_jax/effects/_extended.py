@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from .. import arguments
 from .._numerics import running_max
 from .._types import Flag, Path, Scalar, Values
 from ..geometry import Particle
@@ -60,6 +61,12 @@ class ExtendedLaw(eqx.Module):
 
     base: MccLaw
     effects: tuple[AbstractEffect, ...]
+
+    def __init__(self, base: Any, effects: Any) -> None:
+        self.base = arguments.instance(base, MccLaw, "base", "Take mcc_jax.paper_law(), or the law of a calibration.")
+        remedy = 'Make one with mcc_jax.effects.find_variant("creep").build(0.02).'
+        given = arguments.instance(effects, Sequence, "effects", f"Give a list of effects. {remedy}")
+        self.effects = tuple(arguments.instance(one, AbstractEffect, "every one of effects", remedy) for one in given)
 
     @property
     def is_monotone(self) -> Flag:

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from .. import arguments
-from ..campaign import Campaign, Segment, campaign_segments
-from ..campaign._validate import usable_campaign
+from .._errors import InputError
+from ..campaign import Campaign, Segment, campaign_segments, check_campaign
 from ._contact import MISALIGNMENT, POP_IN, TOE
 from ._creep import CREEP
 from ._flow import FRICTION, HARDENING, RATE
@@ -75,14 +75,14 @@ def find_variant(name: str, library: Mapping[str, Mechanism] = LIBRARY) -> Varia
     checked_library(library)
     mechanism, _, variant = name.partition(":")
     if mechanism not in library:
-        raise ValueError(f"no mechanism {mechanism!r}; known are: {', '.join(library)}")
+        raise InputError(f"there is no mechanism {mechanism!r}", remedy=f"Known: {', '.join(library)}.")
     known = library[mechanism]
     if not variant:
         return known.variants[0]
     try:
         return known[variant]
     except KeyError as error:
-        raise ValueError(error.args[0]) from None
+        raise InputError(error.args[0]) from None
 
 
 def present(campaign: Campaign, segments: tuple[tuple[Segment, ...], ...] | None = None) -> frozenset[Need]:
@@ -95,7 +95,7 @@ def present(campaign: Campaign, segments: tuple[tuple[Segment, ...], ...] | None
         campaign: the tests.
         segments: the segments of each; found anew if None.
     """
-    usable_campaign(campaign)
+    check_campaign(campaign)
     found = campaign_segments(campaign) if segments is None else segments
     D1, D2, D3 = campaign.diameters_um.T
     kinds = [[segment.kind for segment in parts] for parts in found]

@@ -14,8 +14,7 @@ from jaxtyping import Array, Float, Int
 from .. import arguments
 from .._errors import InputError
 from .._types import Scalar, ScalarLike, Values, scalar
-from ..campaign import Campaign, Curve, Segment, campaign_segments
-from ..campaign._validate import usable_campaign
+from ..campaign import Campaign, Curve, Segment, campaign_segments, check_campaign
 
 KINDS = ("approach", "load", "hold", "unload", "reload")
 APPROACH, LOAD, HOLD, UNLOAD, RELOAD = range(5)
@@ -168,7 +167,7 @@ def record_of(curve: Curve, segments: tuple[Segment, ...], *, relative_humidity_
         arguments.number(relative_humidity_percent, "relative_humidity_percent", least=0, most=100)
     count = len(curve)
     if not segments or segments[0].start != 0 or segments[-1].stop != count:
-        raise ValueError(f"the segments must cover all {count} points of the curve")
+        raise InputError(f"the segments must cover all {count} points of the curve")
     force = np.asarray(curve.force_mN, float)
     time = np.asarray(curve.time_s, float) - float(curve.time_s[0])
     columns: dict[str, np.ndarray] = {
@@ -223,7 +222,7 @@ def record_batch(
     Raises:
         InputError: if the campaign cannot be used, or the column of humidities holds what is no number.
     """
-    usable_campaign(campaign)
+    check_campaign(campaign)
     multiple = arguments.whole(multiple, "multiple", least=1)
     found = campaign_segments(campaign) if segments is None else segments
     humidity = humidities(campaign)
@@ -247,7 +246,7 @@ def humidities(campaign: Campaign) -> Float[np.ndarray, " particles"] | None:
     Raises:
         InputError: naming the particle whose entry is no number from 0 to 100.
     """
-    usable_campaign(campaign)
+    check_campaign(campaign)
     return humidity_column(campaign.particles, campaign.columns, campaign.source)
 
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .. import arguments
 from .._numerics import running_max
 from .._types import Path, Scalar
 from ..geometry import Particle
@@ -44,6 +45,9 @@ def signatures(
     Returns:
         Derivatives [um per unit of amplitude].
     """
+    arguments.instance(base, MccLaw, "base", "Take mcc_jax.paper_law(), or the law of a calibration.")
+    arguments.instance(particle, Particle, "particle", "Make one with mcc_jax.Particle(D1, D2, D3), in um.")
+    arguments.instance(record, Record, "record", "Make one with mcc_jax.effects.record_of(curve).")
     context = ExtendedLaw(base, ()).context(particle, record)
     strain = _virgin_strain(base, context)
     x = base.shape_factor(particle) * strain

@@ -5,12 +5,14 @@ from __future__ import annotations
 import enum
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import jax.numpy as jnp
 
+from .. import arguments
+from .._errors import InputError
 from .._types import ScalarLike, scalar
 from ._effect import AbstractEffect
 
@@ -97,15 +99,14 @@ class Variant:
     fixed: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
-        low, high = self.plausible
-        if not 0 < low < high:
-            raise ValueError(f"{self.mechanism}:{self.name}: plausible must be two magnitudes, the smaller first")
-        if self.sign not in (-1, 0, 1):
-            raise ValueError(f"{self.mechanism}:{self.name}: sign must be -1, 0 or 1, got {self.sign}")
+        plausible = arguments.floats(self.plausible, "plausible", shape="two magnitudes, the smaller first")
+        if plausible.shape != (2,) or not 0 < plausible[0] < plausible[1] < math.inf:
+            raise InputError(f"{self.mechanism}:{self.name}: plausible must be two magnitudes, the smaller first")
+        arguments.choice(self.sign, (-1, 0, 1), f"sign of {self.mechanism}:{self.name}")
         for nuisance in self.nuisances:
             least, most = nuisance.plausible
             if not (nuisance.grid and all(least <= value <= most for value in nuisance.grid)):
-                raise ValueError(
+                raise InputError(
                     f"{self.mechanism}:{self.name}: the grid of {nuisance.name} leaves its plausible range"
                 )
 
@@ -128,7 +129,7 @@ class Variant:
         known = {n.name: n.middle for n in self.nuisances}
         unknown = sorted(set(nuisance) - set(known))
         if unknown:
-            raise ValueError(
+            raise InputError(
                 f"{self.mechanism}:{self.name} has no parameter {unknown[0]!r}; "
                 f"it has: {', '.join([self.parameter, *known])}"
             )
@@ -166,12 +167,15 @@ class Mechanism:
     check: str = ""
 
     def __post_init__(self) -> None:
+        remedy = "Give a list of mcc_jax.effects.Variant."
+        for one in arguments.instance(self.variants, Sequence, "variants", remedy):
+            arguments.instance(one, Variant, "every one of variants", remedy)
         names = [variant.name for variant in self.variants]
         if len(set(names)) < len(names):
-            raise ValueError(f"{self.name} has two variants of one name")
+            raise InputError(f"{self.name} has two variants of one name")
         strangers = [v.name for v in self.variants if v.mechanism != self.name]
         if strangers:
-            raise ValueError(f"the variant {strangers[0]!r} is not one of {self.name}")
+            raise InputError(f"the variant {strangers[0]!r} is not one of {self.name}")
 
     def __iter__(self) -> Iterator[Variant]:
         return iter(self.variants)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from .. import arguments
 from .._types import Scalar, ScalarLike, scalar
 from ..arguments import finite, positive, whole
 from ._plastic import Plastic
@@ -68,6 +69,10 @@ class PlasticPopulation(eqx.Module):
     C1: LogNormal
     C3: LogNormal
     C5: LogNormal
+
+    def __check_init__(self) -> None:
+        for name in ("C1", "C3", "C5"):
+            arguments.instance(getattr(self, name), LogNormal, name, "Make one with mcc_jax.LogNormal(mean, sd).")
 
     @property
     def mean_law(self) -> Plastic:

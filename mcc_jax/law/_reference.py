@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .. import arguments
+from .._errors import InputError
 from .._numerics import compiled_whole
 from .._types import Scalar, ScalarLike, scalar
 from ..geometry import Particle
@@ -192,7 +193,7 @@ def _check_exponent(exponent: ScalarLike) -> None:
 def _displacement_share(contacts: int) -> float:
     """Part of the platen displacement that one contact takes."""
     if isinstance(contacts, bool) or not isinstance(contacts, int | np.integer) or contacts not in (1, 2):
-        raise ValueError(
+        raise InputError(
             f"contacts={contacts!r}: pass contacts=1 if the whole platen displacement deforms one contact (the paper's "
             "convention) or contacts=2 if the particle's two contacts share it."
         )

@@ -25,10 +25,12 @@ In a pair each side has its own limit; the sides carry one force, so their energ
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from .. import arguments
 from .._numerics import shared
 from .._types import Values
 
@@ -36,7 +38,7 @@ SHARE = 3 * math.pi / 8
 r"""Largest :math:`\Delta F'/F_P`. Elastic energy is :math:`\tfrac{4}{3\pi} F_P \Delta`; with it :math:`F^2/(2F')`."""
 
 
-def recovery_limit(peak: Values, secant: Values, tangent: Values) -> tuple[Values, Bool[Array, ...]]:
+def recovery_limit(peak: Any, secant: Any, tangent: Any) -> tuple[Values, Bool[Array, ...]]:
     r"""What a contact recovers at most from a peak, :math:`\Delta_{lim}`, and whether it is steep there.
 
     Args:
@@ -47,6 +49,8 @@ def recovery_limit(peak: Values, secant: Values, tangent: Values) -> tuple[Value
     Returns:
         The limit, 0 where no force is carried; and whether the second of its two terms holds, not the peak itself.
     """
+    given = {"peak": peak, "secant": secant, "tangent": tangent}
+    peak, secant, tangent = (arguments.values(value, name) for name, value in given.items())
     least = SHARE * secant
     steep = tangent > least
     top = jnp.where(steep, tangent, least)

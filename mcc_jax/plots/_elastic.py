@@ -8,7 +8,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatterSciNotation, ScalarFormatter
 
-from ..calibrate import LEAST_RATIO, PaperCalibration, recoverable_strain
+from ..calibrate import LEAST_RATIO, PaperCalibration
+from ..calibrate._elastic import recoverable_strain
 from ..law import recovery, stress_ratio
 from ._style import (
     BLACK,

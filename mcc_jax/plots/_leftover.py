@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._errors import InputError
 from ..calibrate.joint._fit import population_at
 from ..calibrate.joint._linearised import linear_data
 from ..calibrate.joint._population import moments
@@ -74,7 +75,7 @@ def leftover(found: Discovery) -> Leftover:
     """
     base, system = found.base, found.system
     if base is None or system is None:
-        raise ValueError("the base law was not fitted well enough; there is nothing to compare")
+        raise InputError("the base law was not fitted well enough; there is nothing to compare")
     system, inside, changes = _as_found(base, system, found)
     before = project(system, np.array([], int))
     after = project(system, np.array([], int), inside=inside)

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from .._errors import InputError
 from ..calibrate import PaperCalibration, ParticleFit
 from ..campaign import Curve
 from ._style import (
@@ -85,7 +86,7 @@ def plot_particles(calibration: PaperCalibration, page: int | None = None) -> Fi
     pages = particle_pages(calibration)
     number = 1 if page is None else page
     if number not in range(1, pages + 1):
-        raise ValueError(f"there is no page {number}; there are {pages}, counted from 1")
+        raise InputError(f"there is no page {number}; there are {pages}, counted from 1")
     campaign = calibration.campaign
     chosen = range((number - 1) * PER_PAGE, min(number * PER_PAGE, len(campaign)))
     columns = min(_COLUMNS, len(chosen)) if len(campaign) <= PER_PAGE else _COLUMNS

@@ -17,8 +17,7 @@ from matplotlib.figure import Figure
 
 from .. import arguments
 from ..calibrate import PaperCalibration, ShapeFit
-from ..campaign import Campaign, Metadata, of_each_particle
-from ..campaign._validate import usable_campaign
+from ..campaign import Campaign, Metadata, check_campaign, of_each_particle
 from ..geometry import plastic_shape_factor
 from ._text import FONT, is_simulated
 
@@ -82,7 +81,7 @@ def of_its_kind[**P, R](function: Callable[P, R]) -> Callable[P, R]:
         name, kind = wanted()
         given = args[0] if args else kwargs.get(name)
         if kind is Campaign:
-            usable_campaign(given, name)
+            check_campaign(given, name)
         else:
             arguments.instance(given, kind, name, f"Make one with {_MADE_BY[kind.__name__]}.")
         return function(*args, **kwargs)

@@ -11,7 +11,8 @@ import numpy as np
 from ..calibrate._result import BAD_MISFIT
 from ..calibrate.joint._bayes import ESS_LEAST, RHAT_MOST
 from ..calibrate.joint._weights import PARETO_K_MOST
-from ..campaign import Finding, campaign_findings, check_plausibility, check_tests, worst
+from ..campaign import Finding, campaign_findings, check_plausibility, check_tests
+from ..campaign.findings import worst
 from ._compare import Shown
 from ._numbers import number, percent
 from ._read import Results, checksums_told

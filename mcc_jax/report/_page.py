@@ -11,7 +11,7 @@ from typing import Any
 
 from .. import arguments
 from .._version import own_version
-from ..campaign import worst
+from ..campaign.findings import worst
 from ..plots._text import particle_labels
 from . import _pictures as pictures
 from ._chart import LOOKS, chart_data, chart_items, chart_scripts

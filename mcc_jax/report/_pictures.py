@@ -8,8 +8,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from matplotlib import rc_context
 
-from ..plots._style import BLACK, BLUE, GREY, ORANGE, PALE, SKY, VERMILION, new_figure, styled
+from ..plots._style import BLACK, BLUE, GREY, ORANGE, PALE, RC, SKY, VERMILION, new_figure
 from ..plots._text import particle_labels
 from ._compare import Shown
 
@@ -45,7 +46,7 @@ def _svg(figure: Any) -> str:
     return data_uri(stream.getvalue(), "svg+xml")
 
 
-@styled
+@rc_context(RC)
 def marginals(draws: Mapping[str, np.ndarray]) -> list[tuple[str, str, str]]:
     """For each number of the population: a picture of its posterior, its name, and what the picture shows in words."""
     found = []
@@ -72,7 +73,7 @@ def marginals(draws: Mapping[str, np.ndarray]) -> list[tuple[str, str, str]]:
     return found
 
 
-@styled
+@rc_context(RC)
 def grid(shown: list[Shown]) -> tuple[str, int] | None:
     """Force over displacement of every particle, measured and predicted; and how many stand in it."""
     if not shown:
@@ -105,7 +106,7 @@ def grid(shown: list[Shown]) -> tuple[str, int] | None:
     return _svg(figure), len(chosen)
 
 
-@styled
+@rc_context(RC)
 def shifts(before: dict[str, Any], after: dict[str, Any]) -> list[tuple[str, str]]:
     """Each parameter before and after what was added, with 95 % intervals; and the same in words."""
     names = [

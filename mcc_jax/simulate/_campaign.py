@@ -126,7 +126,7 @@ def simulate_campaign(
         raise InputError(f"particles must be a list of names, got the text {particles!r}")
     names = tuple(str(i + 1) for i in range(count)) if particles is None else tuple(particles)
     if not (len(names) == len(peaks) == count == laws.plastic.C1.shape[0]):
-        raise ValueError(
+        raise InputError(
             f"{count} particles need as many names ({len(names)}), peaks ({len(peaks)}) "
             f"and laws ({laws.plastic.C1.shape[0]})"
         )
@@ -145,7 +145,7 @@ def simulate_campaign(
     bad = np.flatnonzero(np.asarray(response.result != RESULTS.successful))
     if len(bad):
         reason = RESULTS[jax.tree.map(lambda x: x[bad[0]], response.result)]
-        raise ValueError(f"particle {names[bad[0]]!r}: {reason}")
+        raise InputError(f"particle {names[bad[0]]!r}: {reason}")
     streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(count)]
     curves = []
     for i, (time, _) in enumerate(samples):
@@ -194,7 +194,7 @@ def _with_effects(
 ) -> Response:
     wet = [e.variant.mechanism for e in effects if Need.HUMIDITY_COLUMN in e.variant.needs]
     if wet and humidity is None:
-        raise ValueError(f"the effect {wet[0]} needs the relative humidity of every test ({HUMIDITY_COLUMN})")
+        raise InputError(f"the effect {wet[0]} needs the relative humidity of every test ({HUMIDITY_COLUMN})")
     return simulate_batch(
         ExtendedLaw(laws, tuple(effect for effect, _ in drawn)),
         particle_batch(diameters_um),

@@ -46,20 +46,20 @@ class HiddenEffect:
         if self.amplitude is not None and not arguments.is_number(self.amplitude):
             raise InputError(f"{name}: {variant.parameter} must be a number, got {arguments.shown(self.amplitude)}")
         if not math.isfinite(self.strength) or abs(self.strength) > 1e9:
-            raise ValueError(f"{name}: {variant.parameter} must be a number of sensible size, got {self.strength:g}")
+            raise InputError(f"{name}: {variant.parameter} must be a number of sensible size, got {self.strength:g}")
         if self.strength * variant.sign < 0:
             sign = "zero or positive" if variant.sign > 0 else "zero or negative"
-            raise ValueError(f"{name}: {variant.parameter} must be {sign} to be physical, got {self.strength:g}")
+            raise InputError(f"{name}: {variant.parameter} must be {sign} to be physical, got {self.strength:g}")
         known = {n.name: n for n in variant.nuisances}
         for key, value in self.nuisance.items():
             if key not in known:
                 names = ", ".join([variant.parameter, *known])
-                raise ValueError(f"{name} has no parameter {key!r}; it has: {names}")
+                raise InputError(f"{name} has no parameter {key!r}; it has: {names}")
             if not arguments.is_number(value):
                 raise InputError(f"{name}: {key} must be a number, got {arguments.shown(value)}")
             least = known[key].plausible[0]
             if not math.isfinite(value) or abs(value) > 1e9 or (least > 0 and value <= 0):
-                raise ValueError(f"{name}: {key} must be {'above 0' if least > 0 else 'finite'}, got {value:g}")
+                raise InputError(f"{name}: {key} must be {'above 0' if least > 0 else 'finite'}, got {value:g}")
 
     @property
     def strength(self) -> float:
@@ -134,13 +134,13 @@ def read_effect(text: str, library: Mapping[str, Mechanism] = LIBRARY) -> Hidden
     for part in rest:
         key, equals, value = (piece.strip() for piece in part.partition("="))
         if not equals:
-            raise ValueError(f"{part!r} is no parameter=value")
+            raise InputError(f"{part!r} is no parameter=value")
         if key == variant.parameter:
             if amplitude is not None:
-                raise ValueError(f"{key} is given twice")
+                raise InputError(f"{key} is given twice")
             amplitude = _number(key, value)
         elif key in nuisance:
-            raise ValueError(f"{key} is given twice")
+            raise InputError(f"{key} is given twice")
         else:
             nuisance[key] = _number(key, value)
     return HiddenEffect(variant, amplitude, nuisance)
@@ -150,7 +150,7 @@ def _number(name: str, text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise ValueError(f"{name} must be a number, got {text!r}") from None
+        raise InputError(f"{name} must be a number, got {text!r}") from None
 
 
 def batched_humidity(values: np.ndarray | None, count: int, reference: float) -> jax.Array:

@@ -115,6 +115,7 @@ class Programme:
         """
         levels = arguments.floats(levels, "levels", shape="a list of shares of the peak").ravel().tolist()
         hold_s = arguments.number(hold_s, "hold_s", least=0)
+        unload_to = arguments.number(unload_to, "unload_to, a share of the peak,", least=0)
         back = rate if unload_rate is None else unload_rate
         steps: list[Ramp | Hold] = []
         for i, level in enumerate(levels):

@@ -284,7 +284,10 @@ def test_what_the_base_law_can_take_up_has_no_strength():
     assert projection.refit(rounder, rounds=8) < 0.1
 
 
-@pytest.mark.parametrize("name", effects.MECHANISMS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.long if i % 4 else ()) for i, name in enumerate(effects.MECHANISMS)],
+)
 def test_lambda_is_hit(name):
     case = tiers.Case(f"hit-{name}", "T1", name, "P1", count=10, effects=((name, "exact", 8.0),), humidity=True)
     if name == "size_effect":

@@ -77,7 +77,7 @@ def tests(tmp_path_factory):
 def found(tests, tmp_path_factory):
     """What the command finds in the tests with the frame: its words, and where its files are."""
     out = tmp_path_factory.mktemp("found") / "new"
-    return done(call("discover", tests / "frame", "--out", out, "--no-experiments")), out
+    return done(call("discover", tests / "frame", "--out", out, "--no-experiments", "--no-posterior")), out
 
 
 def test_the_frame_is_found_and_its_size(found):

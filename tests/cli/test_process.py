@@ -48,6 +48,17 @@ def test_bad_input_is_one_line(tmp_path):
     assert result.stderr.count("\n") == 1
 
 
+def test_a_missing_accelerator_is_one_line(tmp_path):
+    """JAX itself says it in a traceback of a hundred lines, or not before it computes."""
+    wanted = os.environ | {"JAX_PLATFORMS": "tpu"}  # a machine may have a graphics card, but hardly one of these
+    result = call("simulate", "--out", tmp_path / "simulated", env=wanted)
+    assert (result.returncode, result.stdout) == (2, "")
+    assert result.stderr.startswith("mcc-jax: error: JAX finds no device for JAX_PLATFORMS=tpu")
+    assert result.stderr.count("\n") == 1
+    assert "Unset JAX_PLATFORMS" in result.stderr
+    assert not (tmp_path / "simulated").exists()
+
+
 def test_shell_completion():
     source = call(env=os.environ | {"_MCC_JAX_COMPLETE": "bash_source"})
     assert "mcc-jax" in source.stdout

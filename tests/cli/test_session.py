@@ -1,11 +1,113 @@
-"""Work that goes on in a thread beside a command."""
+"""What a command does around its work: the folder of what is compiled, and work in a thread beside it."""
 
 import contextlib
+import os
+import stat
 import threading
+from pathlib import Path
+from types import SimpleNamespace
 
+import platformdirs
 import pytest
 
-from mcc_jax.cli._session import beside
+from mcc_jax.cli._session import _keep_compiled, beside
+
+posix = pytest.mark.skipif(os.name != "posix", reason="permissions of POSIX")
+
+
+@pytest.fixture
+def kept(tmp_path, monkeypatch):
+    """A function that sets JAX up as a command does, and gives the folder that it was told, None if none."""
+    above = tmp_path / "home" / ".cache" / "mcc_jax"
+    monkeypatch.setattr(platformdirs, "user_cache_path", lambda name: above)
+
+    def keep(**settings):
+        told = {"jax_compilation_cache_dir": None, "jax_enable_compilation_cache": True} | settings
+        config = SimpleNamespace(**told)
+        config.update = lambda name, value: setattr(config, name, value)
+        _keep_compiled(config)
+        told = config.jax_compilation_cache_dir
+        return None if told is None else Path(told)
+
+    keep.above = above
+    return keep
+
+
+def mode(folder):
+    return stat.S_IMODE(folder.stat().st_mode)
+
+
+@posix
+@pytest.mark.parametrize("umask", [0o000, 0o002, 0o077])
+def test_the_folder_of_what_is_compiled_is_ours_alone_whatever_the_umask(kept, umask):
+    before = os.umask(umask)
+    try:
+        folder = kept()
+    finally:
+        os.umask(before)
+    assert folder.parent == kept.above
+    for one in (folder, *folder.parents[:3]):  # those above that were missing, too
+        assert mode(one) == 0o700
+
+
+@posix
+@pytest.mark.parametrize("open_to", [0o020, 0o002, 0o022])
+@pytest.mark.parametrize("which", ["above", "folder"])
+def test_what_others_could_write_is_not_run(kept, which, open_to):
+    """Compiled code is run, so what lies in a folder that was open to others is not kept."""
+    folder = kept()
+    planted = folder / "planted"
+    planted.touch()
+    assert kept() == folder  # ours: kept
+    assert planted.exists()
+    opened = kept.above if which == "above" else folder
+    opened.chmod(0o700 | open_to)
+    assert kept() == folder
+    assert not planted.exists()
+    assert (mode(kept.above), mode(folder)) == (0o700, 0o700)
+
+
+@posix
+def test_what_others_could_read_is_closed_and_kept(kept):
+    folder = kept()
+    (folder / "ours").touch()
+    folder.chmod(0o755)
+    assert kept() == folder
+    assert mode(folder) == 0o700
+    assert (folder / "ours").exists()
+
+
+@posix
+def test_a_folder_of_somebody_else_is_not_used(kept, monkeypatch):
+    folder = kept()
+    (folder / "theirs").touch()
+    folder.chmod(0o777)
+    monkeypatch.setattr(os, "geteuid", lambda: folder.stat().st_uid + 1)
+    assert kept() is None
+    assert mode(folder) == 0o777
+    assert (folder / "theirs").exists()  # nor touched
+
+
+@posix
+@pytest.mark.parametrize("level", ["above", "folder"])
+@pytest.mark.parametrize("kind", ["link", "file", "pipe"])
+def test_what_is_no_folder_is_not_used(kept, tmp_path, level, kind):
+    place = kept()
+    place.rmdir()
+    if level == "above":
+        place = kept.above
+        place.rmdir()
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir(mode=0o700)
+    {"link": lambda: place.symlink_to(elsewhere), "file": place.touch, "pipe": lambda: os.mkfifo(place)}[kind]()
+    assert kept() is None
+    assert list(elsewhere.iterdir()) == []
+
+
+def test_settings_of_ones_own_come_first(kept):
+    assert kept(jax_compilation_cache_dir="mine") == Path("mine")
+    assert kept(jax_enable_compilation_cache=False) is None
+    assert not kept.above.exists()
 
 
 def test_the_result_is_there_when_it_is_asked_for():

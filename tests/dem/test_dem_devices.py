@@ -100,6 +100,7 @@ def check(result):
     assert result["reductions"] == 1
 
 
+@pytest.mark.long
 def test_four_devices_give_the_numbers_of_one():
     result = finished(begun(4))
     assert (result["devices"], result["processes"]) == (4, 1)

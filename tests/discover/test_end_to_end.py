@@ -97,6 +97,7 @@ def test_what_was_added_is_an_ordinary_part_of_the_law(named):
     assert np.median(effect.by_particle) == pytest.approx(effect.amplitude, rel=0.3)
 
 
+@pytest.mark.long
 def test_the_same_seed_gives_the_same_answer(named):
     again = discover(cached(f"frame_compliance={COMPLIANCE}"), experiments=False)
     one, other = content(named), content(again)
@@ -105,7 +106,7 @@ def test_the_same_seed_gives_the_same_answer(named):
     assert json.dumps(one) == json.dumps(other)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.long)])
 def test_nothing_hidden_nothing_found(seed):
     told = content(discover(campaign(seed=seed), **QUICK))
     assert told["verdict"] == "NO_GAP"

@@ -66,6 +66,7 @@ def test_every_form_has_as_many_numbers_as_ranges_and_starts_within():
             assert low <= number <= high, word.text
 
 
+@pytest.mark.long
 def test_derivatives_by_the_numbers_are_differences(tuner):
     """One word of each form, where it is smooth."""
     for form in {word.form: word for word in (*words.words(), *words.further_words())}.values():
@@ -102,6 +103,7 @@ def test_a_planted_bump_is_found_with_its_place_and_width(tuner, disturbed):
     assert both[0, 0] == pytest.approx(1.0)
 
 
+@pytest.mark.long
 def test_gains_are_those_of_the_linear_system(tuner, disturbed, found):
     """Compared in another space, the formula explains as much."""
     closure, system = found
@@ -180,6 +182,7 @@ def test_words_add_up_to_what_the_law_adds(tuner):
     np.testing.assert_allclose(values, np.where(np.asarray(mask), expected, 0.0), rtol=1e-9)
 
 
+@pytest.mark.long
 def test_powers_are_finite_where_there_is_no_load():
     """With derivatives, of all forms, at the start of a test."""
     from helpers import paper_law, paper_particle

@@ -108,7 +108,8 @@ def scattering(seed, count=60):
     )
 
 
-@pytest.mark.parametrize("seeds", [(0,), pytest.param(tuple(range(1, 9)), marks=pytest.mark.long)], ids=["one", "more"])
+@pytest.mark.long
+@pytest.mark.parametrize("seeds", [(0,), tuple(range(1, 9))], ids=["one", "more"])
 def test_stiffness_that_scatters_is_no_word(seeds):
     """A displacement of one size would make particles more alike: without curvature, that looks like a missing word."""
     plain, curved = [], []

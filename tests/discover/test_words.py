@@ -104,13 +104,13 @@ def disturbed(added):
     return Campaign(plain.particles, plain.diameters_um, curves, plain.columns, plain.metadata)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("added", "pattern", "period"),
     [
-        pytest.param(
-            lambda c: 0.08 * np.sin(2 * np.pi * c.time_s / 41.0), r"pi t/([\d.]+) s", 41.0, marks=pytest.mark.long
-        ),
-        (lambda c: 0.08 * np.cos(2 * np.pi * c.displacement_um / 7.9), r"pi gamma/([\d.]+) um", 7.9),  # none is listed
+        (lambda c: 0.08 * np.sin(2 * np.pi * c.time_s / 41.0), r"pi t/([\d.]+) s", 41.0),
+        # None is listed.
+        (lambda c: 0.08 * np.cos(2 * np.pi * c.displacement_um / 7.9), r"pi gamma/([\d.]+) um", 7.9),
     ],
     ids=["air conditioning", "interpolation of the gauge"],
 )

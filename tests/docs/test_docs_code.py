@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import click
+import jax
 import pytest
 from click.testing import CliRunner
 
@@ -62,6 +63,12 @@ RUN = [page for page, text in ALL.items() if any(b.language in ("python", "sh") 
 def test_page_does_what_it_shows(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = {"__name__": "page"}
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # as at a reader's
+        follow(page, names, tmp_path)
+
+
+def follow(page, names, folder):
+    """Carry out every block of a page in its order."""
     for number, block in enumerate(blocks(ALL[page]), start=1):
         if block.language == "python":
             exec(compile(block.text, f"{page}, block {number}", "exec"), names)
@@ -69,7 +76,7 @@ def test_page_does_what_it_shows(page, tmp_path, monkeypatch):
             for arguments in block.commands:
                 run_command(arguments)
         elif block.title:
-            write(block, tmp_path)
+            write(block, folder)
 
 
 def parse(arguments):

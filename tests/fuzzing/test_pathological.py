@@ -34,13 +34,21 @@ REFUSED = (
 FILES = ("a force that is text", "cut off in the middle of a row", "a diameter of zero", "rows of two tests mixed up")
 
 
-@pytest.mark.parametrize("name", FITTED)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.long if i > 1 else ()) for i, name in enumerate(FITTED)]
+)
 def test_ends_in_a_result(name):
     found = run_one(BY_NAME[name], 1, "least-squares")
     assert (found.how, found.fault) in [("converged", ""), ("not converged", "")], found
 
 
-@pytest.mark.parametrize("name", [kind.name for kind in KINDS if " cycles" in kind.name])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.long if i else ())
+        for i, name in enumerate(kind.name for kind in KINDS if " cycles" in kind.name)
+    ],
+)
 def test_hundreds_of_cycles_are_selected(name):
     campaign = campaign_of(BY_NAME[name], 0)
     chosen = select_tests(campaign)

@@ -103,8 +103,8 @@ def switch(law, particle):
 
 
 @SOME_FORMS
-@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("mode", [pytest.param(jax.jacfwd, marks=pytest.mark.long), jax.jacrev])
+@pytest.mark.parametrize("dtype", [pytest.param(jnp.float32, marks=pytest.mark.long), jnp.float64])
 def test_finite_and_continuous_at_the_switch(unloading, scaling, mode, dtype):
     theta = np.array(PAPER_THETA)
     theta[4] = 300.0  # punch forms then switch at a strain that float32 resolves, all forms again at large strain

@@ -3,6 +3,8 @@
 import dataclasses
 import json
 import math
+import re
+from importlib.resources import files
 
 import numpy as np
 import pytest
@@ -191,6 +193,35 @@ def test_nothing_is_loaded_from_anywhere(page):
     policy = next(a["content"] for tag, a in read.tags if tag == "meta" and "http-equiv" in a)
     assert "default-src 'none'" in policy
     assert "url(" not in page[: page.index("</style>")]
+    for tag, attributes in read.tags:
+        assert tag not in ("base", "link", "iframe", "frame", "object", "embed", "audio", "video", "source", "form")
+        loads = [v for k, v in attributes.items() if k in LOADING and not (tag == "a" and k == "href")]
+        assert all(value.startswith(("data:image/", "#")) for value in loads), (tag, attributes)
+        assert "url(" not in attributes.get("style", "")
+    assert not others(page)
+
+
+LOADING = ("src", "srcset", "href", "xlink:href", "data", "poster", "background", "action", "formaction", "ping")
+# Addresses that a page may hold since nothing loads them: names of languages of markup, licences in comments of Bokeh's
+# script, and links that a reader may click.
+HARMLESS = re.compile(
+    r"https?://(www\.w3\.org/(2000/svg|1999/xhtml|1999/xlink|1998/Math/MathML)|arxiv\.org/abs/1812\.06173"
+    r"|github\.com/(mourner/flatbush|tabler/tabler-icons/blob/master/LICENSE)|tabler\.io|jquery\.org/license"
+    r"|www\.foretagsplatsen\.se|bokeh\.org/|docs\.bokeh\.org/en/latest/docs/user_guide/interaction/tools\.html(#[\w-]+)?"
+    r"|developers\.google\.com/maps/documentation/javascript/get-api-key)?"
+)
+
+
+def others(text):
+    """Addresses in other places than this machine that a text holds, but for the harmless ones."""
+    found = re.findall(r"""(?:https?|wss?|ftp):\\?/\\?/[^"'`\s<>)\\]*""", text)
+    return {a.rstrip(".,") for a in found if not re.fullmatch(HARMLESS, a.rstrip(".,")) and "//localhost:" not in a}
+
+
+def test_a_loader_would_be_seen():
+    """Bokeh's script as it is shipped loads fonts of formulas and maps."""
+    assert len(others(files("bokeh").joinpath("server", "static", "js", "bokeh.min.js").read_text("utf-8"))) >= 2
+    assert others("import('https://shown.invalid/a.js')") == {"https://shown.invalid/a.js"}
 
 
 @pytest.mark.parametrize(

@@ -80,7 +80,7 @@ def test_text_becomes_an_effect():
     assert read_effect("creep").strength == LIBRARY["creep"].variants[0].typical
     assert read_effect("creep,creep_compliance_per_MPa=1e-4").amplitude == 1e-4
     bad = {
-        "wobble": "no mechanism 'wobble'; known are: frame",
+        "wobble": "no mechanism 'wobble'. Known: frame",
         "creep:x": "it has: kelvin_voigt",
         "creep=x": "must be a number",
         "creep=nan": "sensible size",

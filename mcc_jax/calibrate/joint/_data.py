@@ -18,19 +18,12 @@ from ...campaign import (
     Campaign,
     Curve,
     Segment,
-    below_threshold,
     campaign_segments,
     check_tests,
-    far_apart,
-    no_climb,
-    no_loading,
     particle_batch,
-    refusal,
     stress_and_strain,
-    too_few,
 )
-from ...campaign._validate import usable_campaign
-from ...campaign.reasons import SHOWN
+from ...campaign.reasons import SHOWN, below_threshold, far_apart, no_climb, no_loading, refusal, too_few
 from ...geometry import Particle
 from .._elastic import LEAST_RATIO
 from .._predict import READING_UM, point_noise_um
@@ -155,14 +148,13 @@ def select_tests(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, mo
         InputError: for a threshold that is negative or not finite.
         RuntimeError: in single precision.
     """
-    usable_campaign(campaign)
+    campaign = check_tests(campaign)
     threshold_MPa = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
     if not jax.config.read("jax_enable_x64"):
         raise RuntimeError(
             "the joint calibration needs double precision; "
             'call jax.config.update("jax_enable_x64", True) before anything else'
         )
-    campaign = check_tests(campaign)
     segments = campaign_segments(campaign)
     prepared = [
         _prepare(curve, diameters, parts, threshold_MPa, most_points)

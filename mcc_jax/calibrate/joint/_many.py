@@ -12,8 +12,7 @@ import jax
 
 from ... import arguments
 from ..._errors import InputError
-from ...campaign import THRESHOLD_MPA, Campaign
-from ...campaign._validate import usable_campaign
+from ...campaign import THRESHOLD_MPA, Campaign, check_campaign
 from ._bayes import BayesCalibration, calibrate_bayes
 from ._blocks import block_size
 from ._data import select_tests
@@ -73,7 +72,7 @@ def calibrate_many(
     queue = list(campaigns)
     for i, item in enumerate(queue, start=1):
         if not isinstance(item, Campaign):  # one that is damaged stands in its place with its error
-            usable_campaign(item, f"campaign {i}")
+            check_campaign(item, f"campaign {i}")
     results: list[Calibration | Exception] = [RuntimeError("was not calibrated") for _ in queue]
     tell = progress or (lambda _, __: None)
 

@@ -46,7 +46,7 @@ class PredictedCurves:
         share = arguments.number(share, "the share", above=0, below=1)
         draws = self.observed_um if observed else self.displacement_um
         if draws is None:
-            raise ValueError("these curves were drawn without noise")
+            raise InputError("these curves were drawn without noise")
         low, high = np.quantile(draws, [(1 - share) / 2, (1 + share) / 2], axis=0)
         return low, high
 

@@ -172,7 +172,7 @@ def test_blocks_that_do_not_come_out_even_are_told():
     with pytest.raises(ValueError, match="whole number of blocks"):
         Blocks(5, 2)
     campaign = simulated(instrument=NOISE, programme=Programme.cycles(points=40))
-    with pytest.raises(ValueError, match="at least one particle"):
+    with pytest.raises(ValueError, match="block must be a whole number >= 1"):
         calibrate_bayes(campaign, block=0)
 
 

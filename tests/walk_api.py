@@ -1,0 +1,338 @@
+"""Calls everything public with what people mistype, and writes what came of it as JSON to standard output.
+
+Run by `tests/test_public_api.py` in a process of its own, in which the annotations are not enforced: what refuses a
+wrong argument there is the library, as at a user's.
+"""
+
+import dataclasses
+import importlib
+import inspect
+import json
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pandas as pd
+
+jax.config.update("jax_enable_x64", True)
+import mcc_jax as mcc  # noqa: E402
+from mcc_jax import calibrate, campaign, dem, discover, effects, export, law, simulate  # noqa: E402
+
+PARTS = ("law", "campaign", "effects", "simulate", "calibrate", "discover", "dem", "export", "plots", "report")
+NONSENSE = ("nonsense", None, object())
+
+
+def public() -> dict[str, Any]:
+    """Every public function and class by its name, each once."""
+    found: dict[int, tuple[str, Any]] = {}
+    for module in (mcc, *(importlib.import_module(f"mcc_jax.{part}") for part in PARTS)):
+        for name in getattr(module, "__all__", None) or [name for name in dir(module) if name[0] != "_"]:
+            thing = getattr(module, name)
+            ours = str(getattr(thing, "__module__", "")).startswith("mcc_jax")
+            if ours and (inspect.isfunction(thing) or inspect.isclass(thing)):
+                found.setdefault(id(thing), (f"{module.__name__}.{name}", thing))
+    return dict(found.values())
+
+
+def outcome(call, *args, **kwargs) -> str:
+    """ "refused: " and the message, "accepted", or the error that should have been an `InputError`."""
+    try:
+        call(*args, **kwargs)
+    except mcc.InputError as error:
+        return f"refused: {error}"
+    except Exception as error:  # noqa: BLE001: whatever else a user would see is what is looked for
+        return f"{type(error).__name__}: {error}"
+    return "accepted"
+
+
+def with_nonsense(function) -> list[str]:
+    """What comes of a text, None and an object for everything that must be given."""
+    needed = [p for p in inspect.signature(function).parameters.values() if p.default is p.empty]
+    by_place = [p for p in needed if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    by_name = [p for p in needed if p.kind is p.KEYWORD_ONLY]
+    if not by_place and not by_name:
+        return []
+    return [outcome(function, *[bad] * len(by_place), **{p.name: bad for p in by_name}) for bad in NONSENSE]
+
+
+class Example:
+    """A valid call, and what of it may be negative or is too costly to carry out.
+
+    Attributes:
+        call: the function or class.
+        given: its arguments by name.
+        signed: numbers that may be negative.
+        run: whether the valid call is carried out, to compare lists and Series with arrays.
+        elementwise: whether one number is as good as an array of them.
+    """
+
+    def __init__(self, call, *, signed=(), run=True, elementwise=False, **given):
+        self.call, self.given, self.signed, self.run, self.elementwise = call, given, set(signed), run, elementwise
+
+    def changed(self, **values):
+        return self.call, {**self.given, **values}
+
+
+def examples(folder: Path) -> dict[str, Example]:
+    """One call of everything that takes numbers, options or arrays."""
+    the_law, particle = mcc.paper_law(), mcc.Particle(150.0, 130.0, 120.0)
+    path = np.linspace(0.0, 20.0, 8)
+    force = the_law.path_load(particle, the_law.init(particle), jax.numpy.linspace(0.0, 80.0, 8))[1]
+    curve = mcc.Curve(np.linspace(0.0, 7.0, 8), np.linspace(0.0, 80.0, 8), np.asarray(force))
+    tests = mcc.paper_campaign(0).select(np.arange(20) < 3)
+    adjustment = mcc.adjust(tests)
+    table = calibrate.strain_table(adjustment, tests.diameters_um, 50)
+    sizes, peaks = tests.diameters_um, np.array([400.0, 300.0, 350.0])
+    laws = jax.vmap(lambda _: the_law)(np.arange(3.0))
+    programme = mcc.Programme.cycles()
+    heights = np.linspace(2e-4, 1.9e-4, 3)
+    packing = dem.spheres(the_law, [1e-4, 1.2e-4])
+    side = dem.half_contact(the_law, particle)
+    ramp = np.linspace(0.0, 0.1, 4)
+    return {
+        "Particle": Example(mcc.Particle, D1=150.0, D2=130.0, D3=120.0),
+        "Plastic": Example(mcc.Plastic, C1=7.0, C3=27.0, C5=140.0, signed=("C3",)),
+        "LogNormal": Example(mcc.LogNormal, mean=2.0, sd=0.3, signed=("mean",)),
+        "MccLaw": Example(
+            mcc.MccLaw,
+            plastic=mcc.Plastic(7.0, 27.0, 140.0),
+            a=1.4,
+            effective_modulus=1.6e4,
+            signed=("a",),
+            unloading="printed",
+            strain_scaling="raw",
+        ),
+        "paper_law": Example(mcc.paper_law, unloading="printed", strain_scaling="raw"),
+        "hertz_stress": Example(law.hertz_stress, strain=ramp, elementwise=True, effective_modulus=1e4, contacts=2),
+        "similarity_stress": Example(
+            law.similarity_stress,
+            strain=ramp,
+            elementwise=True,
+            strength=100.0,
+            exponent=3.0,
+            contacts=1,
+        ),
+        "ideal_plastic_stress": Example(law.ideal_plastic_stress, strain=ramp, elementwise=True, yield_stress=50.0),
+        "similarity_strength": Example(law.similarity_strength, yield_stress=50.0, youngs_modulus=1e4, exponent=3.0),
+        "drive": Example(mcc.drive, law=the_law, particle=particle, path=path, control="displacement"),
+        "simulate_batch": Example(
+            mcc.simulate_batch,
+            laws=laws,
+            particles=campaign.particle_batch(sizes),
+            paths=np.stack([path] * 3),
+            control="displacement",
+        ),
+        "simulate_campaign": Example(
+            mcc.simulate_campaign, laws=laws, diameters_um=sizes, peaks=peaks, programme=programme, seed=1, run=False
+        ),
+        "paper_campaign": Example(mcc.paper_campaign, seed=0, unloading="printed", strain_scaling="raw", run=False),
+        "Ramp": Example(mcc.Ramp, to=1.0, rate=20.0, signed=("to",)),
+        "Hold": Example(mcc.Hold, seconds=20.0),
+        "Programme": Example(mcc.Programme, control="load", steps=[mcc.Ramp(1.0, 20.0)], interval_s=0.1),
+        "Programme.cycles": Example(
+            mcc.Programme.cycles, control="load", rate=2.0, unload_to=0.0, hold_s=1.0, unload_rate=1.0, interval_s=0.1
+        ),
+        "Instrument": Example(
+            mcc.Instrument,
+            displacement_noise_um=0.1,
+            force_noise_mN=0.1,
+            displacement_resolution_um=0.1,
+            force_resolution_mN=0.1,
+            zero_um=0.1,
+            signed=("zero_um",),
+        ),
+        "read_effect": Example(simulate.read_effect, text="creep:logarithmic=0.02"),
+        "find_variant": Example(effects.find_variant, name="creep"),
+        "Curve": Example(
+            mcc.Curve, time_s=curve.time_s, force_mN=curve.force_mN, displacement_um=curve.displacement_um
+        ),
+        "Campaign": Example(mcc.Campaign, particles=["a"], diameters_um=np.full((1, 3), 100.0), curves=[curve]),
+        "Metadata": Example(mcc.Metadata, control="load", force_resolution_mN=0.1, punch_diameter_um=500.0),
+        "Segment": Example(mcc.Segment, kind="load", start=0, stop=4),
+        "find_segments": Example(
+            mcc.find_segments,
+            curve=tests.curves[0],
+            control="load",
+            smallest_turn=0.005,
+            noise_multiple=8.0,
+            band=0.0025,
+            hold_slowness=6.0,
+            hold_samples=4,
+            contact=0.01,
+        ),
+        "adjust": Example(mcc.adjust, campaign=tests, threshold_MPa=0.2),
+        "batch": Example(mcc.batch, campaign=tests, multiple=1),
+        "strain_table": Example(calibrate.strain_table, adjustment=adjustment, diameters_um=sizes, points=50),
+        "fit_shape_parameter": Example(calibrate.fit_shape_parameter, table=table, objective="full"),
+        "fit_polynomial": Example(
+            calibrate.fit_polynomial, strain=np.linspace(0.01, 0.3, 9), stress_MPa=np.linspace(0.1, 3.0, 9)
+        ),
+        "JointModel": Example(
+            mcc.JointModel, unloading="printed", strain_scaling="raw", modulus_scatter=False, shape_scatter=False
+        ),
+        "LogNormalPrior": Example(mcc.LogNormalPrior, median=6.0, log_sd=0.5),
+        "NormalPrior": Example(mcc.NormalPrior, mean=1.0, sd=1.0, signed=("mean",)),
+        "NakagamiPrior": Example(mcc.NakagamiPrior, sd=0.3, shape=0.5),
+        "calibrate_paper": Example(
+            mcc.calibrate_paper,
+            campaign=tests,
+            threshold_MPa=0.2,
+            objective="full",
+            unloading="printed",
+            strain_scaling="raw",
+            seed=0,
+            run=False,
+        ),
+        "calibrate_least_squares": Example(
+            mcc.calibrate_least_squares, campaign=tests, threshold_MPa=0.2, loss="linear", seed=0, block=1, run=False
+        ),
+        "calibrate_bayes": Example(
+            mcc.calibrate_bayes,
+            campaign=tests,
+            threshold_MPa=0.2,
+            mode="fast",
+            chains=4,
+            warmup=300,
+            draws=1000,
+            seed=0,
+            run=False,
+        ),
+        "calibrate_many": Example(
+            mcc.calibrate_many, campaigns=[tests], method="least_squares", threshold_MPa=0.2, workers=1, run=False
+        ),
+        "discover": Example(
+            discover.discover, campaign=tests, exclude=[], threshold_MPa=0.2, confirm=True, seed=0, run=False
+        ),
+        "law_for_each": Example(
+            mcc.law_for_each,
+            plastic=mcc.paper_population().sample(jax.random.key(0), 3),
+            a=1.4,
+            effective_modulus_MPa=1e4,
+            unloading="printed",
+            strain_scaling="raw",
+            signed=("a",),
+        ),
+        "plastic_shape_factor": Example(mcc.plastic_shape_factor, particle=particle, a=1.4, signed=("a",)),
+        "spheres": Example(dem.spheres, law=the_law, diameter=np.array([1e-4, 1.2e-4]), density=1540.0),
+        "die": Example(dem.die, radius=1e-3, height=2e-3),
+        "scattered": Example(
+            dem.scattered, key=jax.random.key(0), radius=np.array([5e-5, 6e-5]), die_radius=1e-3, gap=0.02
+        ),
+        "Interaction": Example(dem.Interaction, damping=0.1, friction=0.3, wall_friction=0.2, tangential_ratio=0.8),
+        "Motion.of": Example(dem.Motion.of, time_step=1e-8, drag=0.0),
+        "stable_time_step": Example(dem.stable_time_step, packing=packing, safety=0.3),
+        "relative_density": Example(
+            dem.relative_density, packing=packing, radius=1e-3, bottom=0.0, top=1e-3, signed=("bottom", "top")
+        ),
+        "close_pairs": Example(
+            dem.close_pairs, position=np.array([[0, 0, 0], [0, 0, 1e-4]]), radius=np.array([5e-5, 6e-5]), skin=1e-5
+        ),
+        "start": Example(
+            dem.start,
+            packing=packing,
+            walls=dem.die(1e-3, 2e-3),
+            position=np.array([[0, 0, 5e-4], [0, 0, 9e-4]]),
+            skin=1e-5,
+            capacity=16,
+            run=False,
+        ),
+        "Plane": Example(dem.Plane, point=np.zeros(3), normal=np.array([0.0, 0.0, 1.0]), velocity=np.zeros(3)),
+        "Cylinder": Example(dem.Cylinder, radius=1e-3, rim=2e-3, chamfer=1e-4, velocity=np.zeros(3), signed=("rim",)),
+        "Solver": Example(dem.Solver, rtol=1e-10, max_steps=150, halvings=4, skin=0.5),
+        "pair_force": Example(dem.pair_force, i=side, j=side, overlap_max=1e-5, overlap=1e-5, signed=("overlap",)),
+        "wall_force": Example(dem.wall_force, side=side, overlap_max=1e-5, overlap=1e-5, signed=("overlap",)),
+        "fit_compaction": Example(
+            dem.fit_compaction,
+            packing_of=lambda _: packing,
+            start=np.ones(2),
+            state=None,
+            heights=heights,
+            force=heights,
+            run=False,
+        ),
+        "curve_tables": Example(export.curve_tables, law=the_law, strain_max=0.67, tolerance=1e-5, run=False),
+        "golden_table": Example(export.golden_table, law=the_law, particle=particle, seed=0, units="SI", run=False),
+        "jax_artefact": Example(
+            export.jax_artefact, law=the_law, particle=particle, which="step", dtype="float64", run=False
+        ),
+        "write_export": Example(
+            export.write_export, format="c", law=the_law, particle=particle, folder=folder, seed=0, run=False
+        ),
+        "in_blocks": Example(mcc.in_blocks, function=lambda x: x, block=4),
+    }
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two results hold the same numbers."""
+    first, second = jax.tree.leaves(_open(one)), jax.tree.leaves(_open(other))
+    return len(first) == len(second) and all(
+        np.array_equal(a, b, equal_nan=True)
+        for a, b in zip(first, second, strict=True)
+        if isinstance(a, np.ndarray | jax.Array | float)
+    )
+
+
+def _open(result: Any) -> Any:
+    fields = dataclasses.is_dataclass(result) and not isinstance(result, type)
+    return {f.name: getattr(result, f.name, None) for f in dataclasses.fields(result)} if fields else result
+
+
+def walk(example: Example) -> dict[str, str]:
+    """What comes of each of the mistakes that an example's arguments allow."""
+    found: dict[str, str] = {}
+    reference = None
+    if example.run:
+        try:
+            reference = example.call(**example.given)
+        except Exception as error:  # noqa: BLE001: reported by the test
+            return {"as it should be": f"{type(error).__name__}: {error}"}
+    arrays = {n: v for n, v in example.given.items() if isinstance(v, np.ndarray)}
+    for name, value in example.given.items():
+        trials: dict[str, Any] = {}
+        if isinstance(value, bool):
+            trials = {"a text": "no"}
+        elif isinstance(value, str):
+            trials = {"misspelt": "mispelt"}
+        elif isinstance(value, int | float):
+            trials = {"NaN": float("nan"), "a text": "nonsense", "infinity": -np.inf}
+            if name not in example.signed:
+                trials["negative"] = -abs(value) or -1
+        elif isinstance(value, np.ndarray):
+            trials = {"a text": "nonsense", "texts": ["a"] * len(value)}
+            if value.ndim == 1 and len(value) > 3 and not example.elementwise:
+                trials["a scalar"] = 1.0
+        for kind, trial in trials.items():
+            call, given = example.changed(**{name: trial})
+            found[f"{name} = {kind}"] = outcome(call, **given)
+        if not isinstance(value, np.ndarray):
+            continue
+        others = [n for n, v in arrays.items() if n != name and len(v) == len(value)]
+        if others and value.shape[0] > 1:
+            call, given = example.changed(**{name: value[:-1]})
+            found[f"{name} = one too few"] = outcome(call, **given)
+        if example.run:
+            as_given = {"a list": value.tolist()} | ({"a Series": pd.Series(value)} if value.ndim == 1 else {})
+            for kind, trial in as_given.items():
+                call, given = example.changed(**{name: trial})
+                try:
+                    found[f"{name} = {kind}"] = "same" if same(call(**given), reference) else "another answer"
+                except Exception as error:  # noqa: BLE001: reported by the test
+                    found[f"{name} = {kind}"] = f"{type(error).__name__}: {error}"
+    return found
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        cases = examples(Path(folder))
+        report = {
+            "nonsense": {name: with_nonsense(thing) for name, thing in public().items()},
+            "mistakes": {name: walk(example) for name, example in cases.items()},
+        }
+    json.dump(report, sys.stdout)
+
+
+if __name__ == "__main__":
+    main()
