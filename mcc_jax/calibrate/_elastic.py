@@ -88,8 +88,8 @@ def elastic_branches(
     def close() -> None:
         if peak is None or not rows:
             return
-        # The samples on both sides of the turning point: noise would make their maximum alone too large. One whose force
-        # was worked out has no such neighbour.
+        # The samples on both sides of the turning point: noise would make their maximum alone too large. One whose
+        # force was worked out has no such neighbour.
         around = np.arange(max(peak - 1, 0), peak + 1)
         if curve.worked_out[around].any():
             around = around[curve.worked_out[around]]

@@ -94,7 +94,9 @@ def unknown_modulus(
         return None
     between = "" if interval is None else f" (between {1e-3 * interval[0]:.2g} and {1e-3 * interval[1]:.2g} GPa)"
     # Of several channels at the end of their range it is that of the displacement which hides unloading.
-    ends = [note for curve in campaign.curves if curve.checked for note in curve.checked.notes if note.check == "saturation"]
+    ends = [
+        note for curve in campaign.curves if curve.checked for note in curve.checked.notes if note.check == "saturation"
+    ]
     ends.sort(key=lambda note: not note.sentence.startswith("displacement"))
     if ends:
         channel = ends[0].sentence.split()[0]

@@ -11,18 +11,29 @@ from .. import arguments
 from ._schema import Campaign, Curve
 from ._segments import Segment, check_segmented, find_segments
 from ._validate import check_campaign
-from .reasons import below_threshold, far_apart, no_climb, no_loading, too_few
+from .reasons import USABLE, below_threshold, far_apart, no_climb, no_loading, too_few
 
-THRESHOLD_MPA = 0.2
-"""Stress [MPa] below which surface irregularities, not the particle, deform (Bommireddy et al. 2018, section 3)."""
 
-LEAST_LEVELS = 2
-"""A loading curve of fewer points above the threshold has no course there."""
+@dataclass(frozen=True)
+class AdjustmentOptions:
+    """The offset step, and where a test's displacement counts from.
 
-TESTERS_ZERO = (-0.25, 1.0)
-"""Where the first displacement of a record without approach may lie, as a share of the test's range of displacement,
-for the tester's zero to be the contact. Below, the platens would touch long before they meet; above, the test would
-have begun after more compression than it then shows. Beyond, the first reading is the contact."""
+    Attributes:
+        threshold_MPa: stress below which surface irregularities, not the particle, deform [MPa] (Bommireddy et al.
+            2018, section 3).
+        testers_zero: where the first displacement of a record without approach may lie, as a share of the test's range
+            of displacement, for the tester's zero to be the contact. Below, the platens would touch long before they
+            meet; above, the test would have begun after more compression than it then shows. Beyond, the first reading
+            is the contact.
+    """
+
+    threshold_MPa: float = 0.2
+    testers_zero: tuple[float, float] = (-0.25, 1.0)
+
+
+ADJUSTMENT = AdjustmentOptions()
+THRESHOLD_MPA = ADJUSTMENT.threshold_MPa
+"""Stress [MPa] from which on tests count; see `AdjustmentOptions`."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +82,8 @@ def stress_and_strain(
     .. math:: \sigma = F / (\pi R_e^2), \qquad \epsilon = (\gamma - \gamma_0) / D_e
 
     Strain counts from :math:`\gamma_0`, the platen's position at first contact: where the approach ends if the record
-    has one, the tester's own zero otherwise, or the first reading if that zero lies far from the test (`TESTERS_ZERO`).
+    has one, the tester's own zero otherwise, or the first reading if that zero lies far from the test
+    (`AdjustmentOptions`).
 
     References:
         Bommireddy et al. (2018), eqs. 3 and 4.
@@ -88,7 +100,7 @@ def _contact_um(curve: Curve, segments: tuple[Segment, ...]) -> float:
     if segments[0].kind == "approach" and len(segments) > 1:
         return float(curve.displacement_um[segments[0].stop])
     first, reach = float(curve.displacement_um[0]), float(np.ptp(curve.displacement_um))
-    low, high = TESTERS_ZERO
+    low, high = ADJUSTMENT.testers_zero
     return 0.0 if low * reach <= first <= high * reach else first
 
 
@@ -221,8 +233,8 @@ def _why_not(
     if loading.stress_max_MPa <= threshold_MPa:
         return below_threshold(loading.stress_max_MPa, threshold_MPa)
     strain = loading.strain[1:][loading.stress_MPa[1:] > threshold_MPa]
-    if len(strain) < LEAST_LEVELS:
-        return too_few(len(strain), LEAST_LEVELS)
+    if len(strain) < USABLE.least_levels:
+        return too_few(len(strain), USABLE.least_levels)
     third = max(len(strain) // 3, 1)
     rise = float(strain[-third:].mean() - strain[:third].mean())
     return None if rise > 0 else no_climb(rise * effective_diameter_um(diameters_um))

@@ -2,17 +2,48 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-LONG_BRANCH = 16
-"""Samples between turning points from which on third differences tell noise: no more than a quarter of them straddle a
-turning point there, which shifts their median by less than half."""
 
-DEEP_TURN = 0.1
-"""Share of the signal's range that noise does not reach, for a first look at how quickly a signal turns."""
+@dataclass(frozen=True)
+class SignalOptions:
+    """By what noise, steps of a read-out and gaps of a clock are recognised.
 
-SPREAD_OF_PEAKS = 1.5
-"""The extremes of white noise scatter by about two thirds of its standard deviation."""
+    Attributes:
+        long_branch: samples between turning points from which on third differences tell noise: no more than a quarter
+            of them straddle a turning point there, which shifts their median by less than half.
+        deep_turn: share of the signal's range that noise does not reach, for a first look at how quickly it turns.
+        many_turns: turning points, more than which make a signal one of quick cycles.
+        spread_of_peaks: the extremes of white noise scatter by about two thirds of its standard deviation.
+        least_samples: fewer do not tell noise by third differences.
+        least_peaks: fewer turning points do not tell it by how peaks repeat.
+        smallest_step: share of the range below which a difference of two readings is rounding of the arithmetic.
+        whole_step: a difference counts as a whole number of smallest steps if it is so close to one.
+        whole_share: more than this share of the differences must, for the smallest one to be the read-out's step: in
+            continuous readings a share of twice `whole_step` is by chance.
+        jumps: share of those differences that begin anew after a rest, from which on a read-out is coarse; an even
+            ramp that starts out of a hold jumps once.
+        longest_gap: in typical intervals, what a gap of the clock counts for at most: nothing was seen in it.
+        shortest_gap: and a repeated time, at least: two readings are two.
+    """
+
+    long_branch: int = 16
+    deep_turn: float = 0.1
+    many_turns: int = 8
+    spread_of_peaks: float = 1.5
+    least_samples: int = 8
+    least_peaks: int = 16
+    smallest_step: float = 1e-9
+    whole_step: float = 0.01
+    whole_share: float = 0.95
+    jumps: float = 0.1
+    longest_gap: float = 5.0
+    shortest_gap: float = 0.2
+
+
+SIGNAL = SignalOptions()
 
 
 def noise_level(values: np.ndarray, span: float) -> float:
@@ -26,12 +57,12 @@ def noise_level(values: np.ndarray, span: float) -> float:
         span: its range.
     """
     scatter = 0.0
-    if len(values) >= 8:
+    if len(values) >= SIGNAL.least_samples:
         third = np.diff(values, 3)
         scatter = _scatter(third)
         if scatter > 0:
-            turns = np.array(turning_points(values, DEEP_TURN * span))
-            if len(turns) > 8 and len(values) < LONG_BRANCH * (len(turns) - 1):
+            turns = np.array(turning_points(values, SIGNAL.deep_turn * span))
+            if len(turns) > SIGNAL.many_turns and len(values) < SIGNAL.long_branch * (len(turns) - 1):
                 scatter = min([scatter, *_scatter_of_cycles(values, third, turns)])
     return float(np.hypot(scatter, _resolution(values, span) / 2))
 
@@ -61,29 +92,29 @@ def _scatter_of_cycles(values: np.ndarray, third: np.ndarray, turns: np.ndarray)
     away = np.ones(len(third), bool)
     for back in range(4):
         away[(turns - back)[(turns >= back) & (turns - back < len(third))]] = False
-    if away.sum() >= max(8, len(third) // 8):
+    if away.sum() >= max(SIGNAL.least_samples, len(third) // 8):
         found.append(_scatter(third[away]))
     inner = values[turns[1:-1]]
-    if len(inner) >= 16:
+    if len(inner) >= SIGNAL.least_peaks:
         ends = (np.diff(part, 3) for part in (inner[::2], inner[1::2]))
-        found.append(SPREAD_OF_PEAKS * max(_scatter(part) for part in ends))
+        found.append(SIGNAL.spread_of_peaks * max(_scatter(part) for part in ends))
     return found
 
 
 def _resolution(values: np.ndarray, span: float) -> float:
     """The step of a read-out that is rounded so coarsely that it stays and jumps; else 0."""
     steps = np.abs(np.diff(values))
-    moves = steps > 1e-9 * span
+    moves = steps > SIGNAL.smallest_step * span
     if not moves.any():
         return 0.0
     smallest = float(steps[moves].min())
     multiples = steps[moves] / smallest
     whole = np.round(multiples)
-    if np.mean(np.abs(multiples - whole) < 0.01) <= 0.95:
+    if np.mean(np.abs(multiples - whole) < SIGNAL.whole_step) <= SIGNAL.whole_share:
         return 0.0
     # Even ramps also have few steps; but one that starts out of a hold jumps once, a rounded one again and again.
     jumps = np.count_nonzero(moves[1:] & ~moves[:-1])
-    return smallest if jumps > 0.1 * len(multiples) or len(np.unique(whole)) > 2 else 0.0
+    return smallest if jumps > SIGNAL.jumps * len(multiples) or len(np.unique(whole)) > 2 else 0.0
 
 
 def steady_clock(time: np.ndarray) -> np.ndarray:
@@ -100,7 +131,7 @@ def steady_clock(time: np.ndarray) -> np.ndarray:
     if not len(positive):
         return np.arange(len(time), dtype=float)
     typical = float(np.median(positive))
-    intervals = np.maximum(np.minimum(steps, 5 * typical) / typical, 0.2)
+    intervals = np.maximum(np.minimum(steps, SIGNAL.longest_gap * typical) / typical, SIGNAL.shortest_gap)
     return np.concatenate(([0.0], np.cumsum(intervals)))
 
 

@@ -41,12 +41,14 @@ class QualityOptions:
             is what a coarse read-out does.
         stuck_catch_up: share of the ramp's progress in that time which the jump behind them makes up for, at least.
         begins_at: a record begins at its largest force if its first readings reach this share of it.
-        stuck_jump: and this jump is so many times larger than any step near it, at least: a coarse read-out jumps by one
-            step at a time.
+        stuck_jump: and this jump is so many times larger than any step near it, at least: a coarse read-out jumps by
+            one step at a time.
         loss_of_force: share of the largest force that a breaking particle loses, at least. Settling and rotation of
             ceramic pebbles lose up to a tenth at once.
         loss_readings: within so many readings, at most.
         loss_pace: and so many times faster than the force changes elsewhere, at least.
+        loss_from: and from this share of the largest force on: below it, the platens bounce on asperities.
+        loss_noise: and so many standard deviations of the noise, at least.
         air_readings: readings in the air, at least: fewer do not give the zero's error.
         air_said: an offset is told from so many standard deviations on,
         air_share: and from this share of the largest force on: below it no answer moves by a tenth of its error.
@@ -71,6 +73,8 @@ class QualityOptions:
     loss_of_force: float = 0.25
     loss_readings: int = 3
     loss_pace: float = 5.0
+    loss_from: float = 0.05
+    loss_noise: float = 10.0
     air_readings: int = 5
     air_said: float = 3.0
     air_share: float = 1e-3
@@ -206,7 +210,9 @@ def stuck(values: np.ndarray, options: QualityOptions) -> np.ndarray:
             continue
         pace = float(np.median(near))
         jump = steps[stop - 1]
-        if jump > options.stuck_catch_up * (stop - start) * pace and jump > options.stuck_jump * max(typical, float(np.max(near))):
+        if jump > options.stuck_catch_up * (stop - start) * pace and jump > options.stuck_jump * max(
+            typical, float(np.max(near))
+        ):
             found[start + 1 : stop] = True
     return found
 
@@ -245,7 +251,9 @@ def breakage(curve: Curve, options: QualityOptions) -> tuple[int, float] | None:
         share = drop / np.maximum(reached[:-width], 1e-300)
         fast = drop > options.loss_pace * pace * (time[width:] - time[:-width])
         sudden = (share > options.loss_of_force) & fast & (path[width:] - path[:-width] > -back)
-        sudden &= (reached[:-width] > 0.05 * reached[-1]) & (drop > 10 * point_noise(force))
+        sudden &= (reached[:-width] > options.loss_from * reached[-1]) & (
+            drop > options.loss_noise * point_noise(force)
+        )
         for i in np.flatnonzero(sudden):
             if first is not None and i >= first[0]:
                 break
@@ -409,7 +417,9 @@ def slow_start(curve: Curve, options: QualityOptions) -> SlowStart | None:
     )
     left = force[ahead] - slow(time[ahead])
     straight = np.std(left) <= 2 * point_noise(force[ahead]) + 1e-12 * float(np.ptp(force))
-    errors = [point_noise(force) / np.sqrt(max(np.sum((time[r] - time[r].mean()) ** 2), 1e-300)) for r in (ahead, behind)]
+    errors = [
+        point_noise(force) / np.sqrt(max(np.sum((time[r] - time[r].mean()) ** 2), 1e-300)) for r in (ahead, behind)
+    ]
     bends = fast.deriv()(0.0) - slow.deriv()(0.0) > options.drift_said * np.hypot(*errors)
     share, pace = (float(a.deriv()(0.0) / max(b.deriv()(0.0), 1e-300)) for a, b in ((slow, fast), (way, on)))
     if not straight or not bends or share > options.drift_like:

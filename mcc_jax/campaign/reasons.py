@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,12 +12,26 @@ from ._schema import Campaign, Curve
 from ._segments import Segment
 from .plausibility import check_plausibility
 
-FEW_FORCES = 5
-"""A record with no more different forces than this shows steps of its read-out, not a curve of three coefficients."""
 
-FAR_APART = 100.0
-"""Tests on one material end within this factor of each other in stress and in strain: the paper's end between 7 and
-16 MPa, and of the 801 stresses at which its method compares them a test so far below would see eight."""
+@dataclass(frozen=True)
+class UsableOptions:
+    """When a test cannot be used.
+
+    Attributes:
+        few_forces: a record with no more different forces than this shows steps of its read-out, not a curve of three
+            coefficients.
+        far_apart: tests on one material end within this factor of each other in stress and in strain: the paper's end
+            between 7 and 16 MPa, and of the 801 stresses at which its method compares them a test so far below would
+            see eight.
+        least_levels: a loading curve of fewer points above the threshold has no course there.
+    """
+
+    few_forces: int = 5
+    far_apart: float = 100.0
+    least_levels: int = 2
+
+
+USABLE = UsableOptions()
 
 SHOWN = 5
 """Most particles that an error names with their reasons."""
@@ -52,7 +67,7 @@ def no_loading(curve: Curve, segments: tuple[Segment, ...], stress_MPa: np.ndarr
             "join the loading part of the test to it: some testers store the two apart"
         )
     levels = np.unique(force)
-    if len(levels) <= FEW_FORCES:
+    if len(levels) <= USABLE.few_forces:
         return (
             f"has {len(levels)} different forces only, in steps of {np.diff(levels).min():.4g} mN; "
             "export the force with more digits, or test with a finer load cell"
@@ -130,7 +145,7 @@ def _apart(values: Sequence[float | None], i: int) -> tuple[float | None, float]
     if own is None or not others:
         return None, 0.0
     usual = float(np.median(others))
-    return None if usual / FAR_APART <= own <= usual * FAR_APART else own, usual
+    return None if usual / USABLE.far_apart <= own <= usual * USABLE.far_apart else own, usual
 
 
 def refusal(campaign: Campaign, problem: str, why_not: Sequence[str | None]) -> InputError:

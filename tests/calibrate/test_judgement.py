@@ -59,7 +59,10 @@ def test_a_clean_campaign_has_nothing_to_tell():
 
 def test_what_was_found_and_taken_off_stands_in_the_result():
     content = calibrated("offset and force").to_json()
-    assert {one["check"]: one["level"] for one in content["findings"]} == {"zero of force": "told", "saturation": "look"}
+    assert {one["check"]: one["level"] for one in content["findings"]} == {
+        "zero of force": "told",
+        "saturation": "look",
+    }
     for told in content["findings"]:
         assert any(told["sentence"] in warning for warning in content["warnings"])
     for particle in content["particles"]:

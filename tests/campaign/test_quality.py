@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcc_jax.campaign import Curve, Finding, campaign_findings, check_tests, worst
+from mcc_jax.campaign import Curve, Finding, campaign_findings, check_tests
+from mcc_jax.campaign.findings import worst
 
 SEEDS = st.integers(0, 2**31 - 1)
 quickly = settings(max_examples=15)

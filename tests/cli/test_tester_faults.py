@@ -92,7 +92,10 @@ def test_convert_tells_what_it_finds(run, tmp_path):
         'time = { column = "t", unit = "s" }\nforce = { column = "F", unit = "mN" }\n'
         'displacement = { column = "d", unit = "um" }\n'
     )
-    for name, rows, words in (("air", slice(None), "mN in the air"), ("back", slice(top, None), "its loading is missing")):
+    for name, rows, words in (
+        ("air", slice(None), "mN in the air"),
+        ("back", slice(top, None), "its loading is missing"),
+    ):
         columns = zip(curve.time_s[rows], curve.force_mN[rows], curve.displacement_um[rows], strict=True)
         text = "t,F,d\n" + "".join(f"{t},{f},{d}\n" for t, f, d in columns)
         (tmp_path / f"{name}.csv").write_text(text)
