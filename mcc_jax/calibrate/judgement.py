@@ -89,7 +89,7 @@ def unknown_modulus(
         options: see `JudgementOptions`.
     """
     options = options or JudgementOptions()
-    value, sd, interval = modulus["value"], modulus["sd"], modulus["interval_95"]
+    value, sd, interval = modulus["value"], modulus["sd"], modulus.get("interval_95")
     if value is None or sd is None or sd < options.unknown * abs(value):
         return None
     between = "" if interval is None else f" (between {1e-3 * interval[0]:.2g} and {1e-3 * interval[1]:.2g} GPa)"

@@ -33,8 +33,8 @@ class SaturationOptions:
             hold it stands still, or creeps. One that comes farther and then back while the readings repeat has passed a
             turning point: in a hold it would not, so there its pace does not matter.
         before: readings before the stretch that tell the pace. Fewer do not, more reach into another part of the ramp.
-        errors: standard deviations of the noise by which it must come farther. Of the largest of 100 means of three
-            readings of noise none does.
+        errors: standard deviations of the noise by which it must come farther. Of 1000 stretches without any advance
+            one does, and its pace must agree as well.
         near_end: standard deviations of a channel's noise below the end of its range within which its readings are
             a choice of the low ones; beyond, one in 700 of them is hidden.
         fitted_from: share of the end of the range from which on loading is fitted: below it, asperities deform, not
@@ -48,7 +48,7 @@ class SaturationOptions:
     steps: float = 2.0
     goes_on: float = 0.5
     before: int = 12
-    errors: float = 4.0
+    errors: float = 3.0
     near_end: float = 3.0
     fitted_from: float = 0.25
     trusted: float = 0.25
@@ -104,7 +104,8 @@ def plateaus(
     if not at_end or not elsewhere:
         return []
     usual = float(np.quantile(elsewhere, 0.9))
-    step = float(largest - values[values < largest].max())
+    moves = np.abs(np.diff(values))
+    step = float(moves[moves > 0].min())
     found = []
     for start, stop in at_end:
         length = stop - start
@@ -115,7 +116,7 @@ def plateaus(
         pace = float(line.deriv()(time[start - 1]))
         # How far the other channel comes, and by how much it comes back, as means of three readings.
         part, when = (np.convolve(x[start:stop], np.ones(3) / 3, "valid") for x in (other, time))
-        top = int(np.argmax(part))
+        top = int(np.argmax(part >= part.max() - noise / np.sqrt(3)))  # around a turn it hardly moves
         elapsed, advance = float(when[top] - time[start - 1]), float(part[top] - line(time[start - 1]))
         error = noise * np.sqrt(1 / 3 + 4 / len(before))
         turned = float(part[top] - part[-1]) > options.errors * error
