@@ -266,12 +266,11 @@ def _listed(names: Sequence[str], most: int = 6) -> str:
 
 
 def _number(decades: float | np.ndarray) -> str:
-    return f"{float(f'{10.0 ** float(decades):.2g}'):g}"
+    return f"{float(f'{10.0 ** min(float(decades), 300.0):.2g}'):g}"
 
 
 def _modulus(decades: float | np.ndarray) -> str:
-    value = 10.0 ** float(decades)
-    return f"{_number(decades - 3)} GPa" if value >= 1e3 else f"{_number(decades)} MPa"
+    return f"{_number(decades - 3)} GPa" if float(decades) >= 3 else f"{_number(decades)} MPa"
 
 
 # ---- signs -----------------------------------------------------------------------------------------------------------

@@ -718,7 +718,7 @@ def _(rng):
     return replace(plain(rng), particles=("a", "a", "b", "c"))
 
 
-@kind("force and displacement of unlike lengths", refused=True, says="shape")
+@kind("force and displacement of unlike lengths", refused=True, says="entries")
 def _(rng):
     return force(plain(rng), lambda f: f[:-3])
 
