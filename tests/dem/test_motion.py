@@ -245,7 +245,7 @@ def test_particles_that_resist_nothing_are_named():
         Motion.of(0.0)
     with pytest.raises(InputError, match="narrower"):
         scattered(jax.random.key(0), pack.radius, 1e-5)
-    with pytest.raises(InputError, match="positive"):
+    with pytest.raises(InputError, match="> 0"):
         die(1e-3, 0.0)
 
 
