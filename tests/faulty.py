@@ -1,5 +1,6 @@
 """Simulated campaigns, and what testers do to them: an offset, a clipped channel, breakage, a stuck logger."""
 
+import functools
 from dataclasses import replace
 
 import numpy as np
@@ -88,3 +89,23 @@ def spiked(campaign, *, height=1e6, channel="displacement", at=77, only=None):
         return time, force, path
 
     return changed(campaign, change, only=only)
+
+
+@functools.cache
+def exact():
+    """Four particles without noise; `noisy` adds it."""
+    return campaign(4, noise_um=0.0, noise_mN=0.0)
+
+
+def noisy(tests, seed, noise_um=0.05, noise_mN=0.05):
+    """White noise on both channels of every curve."""
+    rng = np.random.default_rng(seed)
+
+    def change(time, force, path):
+        return (
+            time,
+            force + noise_mN * rng.standard_normal(len(force)),
+            path + noise_um * rng.standard_normal(len(path)),
+        )
+
+    return changed(tests, change)

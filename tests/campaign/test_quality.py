@@ -1,11 +1,11 @@
 """What testers do to tests is found, corrected where the record allows, and told; honest tests stay as they are."""
 
-import functools
 from dataclasses import replace
 
 import faulty
 import numpy as np
 import pytest
+from faulty import exact, noisy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -14,25 +14,6 @@ from mcc_jax.campaign.findings import worst
 
 SEEDS = st.integers(0, 2**31 - 1)
 quickly = settings(max_examples=15)
-
-
-@functools.cache
-def exact():
-    """Four particles without noise; the noise is added by each test."""
-    return faulty.campaign(4, noise_um=0.0, noise_mN=0.0)
-
-
-def noisy(campaign, seed, noise_um=0.05, noise_mN=0.05):
-    rng = np.random.default_rng(seed)
-
-    def change(time, force, path):
-        return (
-            time,
-            force + noise_mN * rng.standard_normal(len(force)),
-            path + noise_um * rng.standard_normal(len(path)),
-        )
-
-    return faulty.changed(campaign, change)
 
 
 def only(campaign, check):

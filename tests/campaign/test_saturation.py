@@ -1,10 +1,9 @@
 """Channels at the end of their range are found, their readings censored, and the turning point is worked out."""
 
-import functools
-
 import faulty
 import numpy as np
 import pytest
+from faulty import exact, noisy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -15,28 +14,10 @@ SEEDS = st.integers(0, 2**31 - 1)
 quickly = settings(max_examples=15)
 
 
-@functools.cache
-def exact():
-    return faulty.campaign(4, noise_um=0.0, noise_mN=0.0)
-
-
-def noisy(seed, noise_um=0.05, noise_mN=0.05):
-    rng = np.random.default_rng(seed)
-
-    def change(time, force, path):
-        return (
-            time,
-            force + noise_mN * rng.standard_normal(len(force)),
-            path + noise_um * rng.standard_normal(len(path)),
-        )
-
-    return faulty.changed(exact(), change)
-
-
 @quickly
 @given(SEEDS, st.floats(0.85, 0.98))
 def test_the_turning_point_that_the_force_channel_did_not_see_is_worked_out(seed, share):
-    campaign = noisy(seed)
+    campaign = noisy(exact(), seed)
     checked = check_tests(faulty.clipped(campaign, share))
     (found,) = campaign_findings(checked)
     assert (found.check, found.level, found.particles) == ("saturation", "look", campaign.particles)
@@ -60,7 +41,7 @@ def test_the_turning_point_that_the_force_channel_did_not_see_is_worked_out(seed
 
 
 def test_far_beyond_the_range_the_turning_point_is_not_relied_on():
-    (found,) = campaign_findings(check_tests(faulty.clipped(noisy(0), 0.6)))
+    (found,) = campaign_findings(check_tests(faulty.clipped(noisy(exact(), 0), 0.6)))
     assert found.level == "bad"
     assert "too far beyond the range" in found.sentence
 
@@ -68,7 +49,7 @@ def test_far_beyond_the_range_the_turning_point_is_not_relied_on():
 @quickly
 @given(SEEDS, st.floats(0.8, 0.985))
 def test_a_displacement_at_the_end_of_its_range_is_not_compared(seed, share):
-    campaign = noisy(seed)
+    campaign = noisy(exact(), seed)
     checked = check_tests(faulty.clipped(campaign, share, channel="displacement"))
     (found,) = campaign_findings(checked)
     assert (found.check, found.level, found.particles) == ("saturation", "look", campaign.particles)
