@@ -10,7 +10,7 @@ import enum
 import math
 import numbers
 import os
-from collections.abc import Collection, Iterable, Sized
+from collections.abc import Callable, Collection, Iterable, Sized
 from pathlib import Path, PurePath
 from typing import Any, cast
 
@@ -327,3 +327,14 @@ def file_path(value: Any, name: str) -> Path:
     if not isinstance(value, str | os.PathLike) or not str(value):
         raise InputError(f"{name} must be the path of a file or folder, got {kind_of(value)}")
     return Path(value)
+
+
+def teller(progress: Any, name: str = "progress") -> Callable[[str], None]:
+    """The function that is told the name of each step; one that does nothing for None.
+
+    Raises:
+        InputError: if it is no function.
+    """
+    if progress is not None and not callable(progress):
+        raise InputError(f"{name} must be a function of the name of a step, got {kind_of(progress)}")
+    return (lambda _: None) if progress is None else cast(Callable[[str], None], progress)

@@ -251,9 +251,7 @@ def calibrate_paper(
     unloading = arguments.member(unloading, Unloading, "unloading")
     strain_scaling = arguments.member(strain_scaling, StrainScaling, "strain_scaling")
     seed = arguments.seed(seed)
-    if progress is not None and not callable(progress):
-        raise InputError(f"progress must be a function of the name of a step, got {arguments.kind_of(progress)}")
-    tell = progress or (lambda _: None)
+    tell = arguments.teller(progress)
     tell("adjusting the curves")
     adjustment = adjust(campaign, threshold_MPa)
     if adjustment.kept.sum() < 2:

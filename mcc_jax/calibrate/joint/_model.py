@@ -188,11 +188,10 @@ def checked_settings(
     Raises:
         InputError: for one of the wrong kind or out of its range.
     """
-    if progress is not None and not callable(progress):
-        raise InputError(f"progress must be a function of the name of a step, got {arguments.kind_of(progress)}")
+    tell = arguments.teller(progress)
     if model is not None:
         arguments.instance(model, JointModel, "model", "Make one with mcc_jax.JointModel().")
     if block is not None:
         arguments.whole(block, "block", least=1)
     threshold = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
-    return progress or (lambda _: None), model or JointModel(), threshold
+    return tell, model or JointModel(), threshold
