@@ -19,7 +19,7 @@ import numpy as np
 import mcc_jax as mcc
 from mcc_jax.discover import discover
 from mcc_jax.effects import find_variant
-from mcc_jax.plots._leftover import leftover
+from mcc_jax.plots.remaining_gap import leftover
 
 FOLDER = Path(__file__).parent / "pages" / "images"
 BLUE, VERMILION, ORANGE, GREY = "#0072B2", "#D55E00", "#E69F00", "0.45"

@@ -26,8 +26,8 @@ POPULATION = ("a", "Ebar", "mu_1", "mu_3", "mu_5", "tau_1", "tau_3", "tau_5", "n
 COEFFICIENTS = ("C1", "C3", "C5")
 """What each particle has of its own."""
 
-LEAST_STRESS_MPA = 0.2
-LEAST_SHARE_OF_PEAK = 0.05
+MIN_STRESS_MPA = 0.2
+MIN_SHARE_OF_PEAK = 0.05
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def data_from_campaign(campaign: Campaign, *, points: int = 180, zero_um: np.nda
         elastic = np.zeros(len(curve), bool)
         for segment in segments:
             elastic[segment.start : segment.stop] = segment.kind in ("unload", "reload")
-        fit = np.flatnonzero(stress > np.where(elastic, LEAST_SHARE_OF_PEAK * stress.max(), LEAST_STRESS_MPA))
+        fit = np.flatnonzero(stress > np.where(elastic, MIN_SHARE_OF_PEAK * stress.max(), MIN_STRESS_MPA))
         kept = fit[np.linspace(0, len(fit) - 1, min(points, len(fit))).round().astype(int)]
         rows.append((strain[kept], np.maximum.accumulate(strain)[kept], stress[kept]))
     lengths = np.array([len(strain) for strain, _, _ in rows])

@@ -22,7 +22,7 @@ import numpy as np
 from _numpy_residual import numpy_residual
 
 from mcc_jax.calibrate import calibrate_bayes, calibrate_least_squares
-from mcc_jax.calibrate.joint._least_squares import solve
+from mcc_jax.calibrate.least_squares import solve
 from mcc_jax.campaign import write_campaign
 from mcc_jax.simulate import paper_campaign
 

@@ -27,7 +27,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from mcc_jax import paper_law
-from mcc_jax.dem import Solver, compact, die, punch_sensitivity, relaxed, replay_compaction, scattered, spheres
+from mcc_jax.dem import (
+    Solver,
+    compact,
+    die,
+    punch_sensitivity,
+    relaxed,
+    replay_compaction,
+    scattered,
+    spheres,
+)
 
 STEP = 1e-7
 TARGETS = {"converged": 0.95, "Euler identity": 1e-8, "finite differences": 1e-5}

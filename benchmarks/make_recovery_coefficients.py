@@ -1,4 +1,4 @@
-"""Write `mcc_jax/law/_recovery_coefficients.py`.
+"""Write `mcc_jax/law/recovery_coefficients.py`.
 
 Run `uv run --group test python benchmarks/make_recovery_coefficients.py`.
 
@@ -15,7 +15,7 @@ from pathlib import Path
 from mpmath import mp, mpf
 
 mp.dps = 60
-TARGET = Path(__file__).parents[1] / "mcc_jax" / "law" / "_recovery_coefficients.py"
+TARGET = Path(__file__).parents[1] / "mcc_jax" / "law" / "recovery_coefficients.py"
 
 
 def ratio(u):

@@ -29,16 +29,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mcc_jax.calibrate import (
-    JointModel,
-    LogNormalPrior,
-    NakagamiPrior,
-    NormalPrior,
-    Priors,
-    calibrate_bayes,
-)
-from mcc_jax.calibrate.joint._arviz import prior_draws
-from mcc_jax.calibrate.joint._model import prior_numbers
+from mcc_jax.calibrate import JointModel, LogNormalPrior, NakagamiPrior, NormalPrior, Priors, calibrate_bayes
+from mcc_jax.calibrate.arviz import prior_draws
+from mcc_jax.calibrate.model import prior_numbers
 from mcc_jax.campaign import PAPER_DIAMETERS_UM, particle_batch
 from mcc_jax.geometry import Particle
 from mcc_jax.law import Plastic
@@ -69,8 +62,8 @@ def draw_truth(seed: int, count: int, collapsed: bool, model: JointModel):
     chosen = np.sort(rng.choice(len(PAPER_DIAMETERS_UM), size=count, replace=False))
     diameters = PAPER_DIAMETERS_UM[chosen]
     particles = particle_batch(diameters)
-    low, high = np.asarray(prior_numbers(model.beliefs, eqx.filter_vmap(lambda p: p.flatness)(particles)).a)[2:]
-    truth = {k: v[0, 0] for k, v in prior_draws(model.beliefs, low, high, (1, 1), seed).items()}
+    low, high = np.asarray(prior_numbers(model.chosen_priors, eqx.filter_vmap(lambda p: p.flatness)(particles)).a)[2:]
+    truth = {k: v[0, 0] for k, v in prior_draws(model.chosen_priors, low, high, (1, 1), seed).items()}
     if collapsed:
         truth["tau"] = np.array([truth["tau"][0], COLLAPSED, truth["tau"][2]])
     C = np.exp(truth["mu"] + truth["tau"] * rng.standard_normal((count, 3)))

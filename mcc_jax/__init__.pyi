@@ -11,15 +11,15 @@ from .calibrate import NormalPrior as NormalPrior
 from .calibrate import PaperCalibration as PaperCalibration
 from .calibrate import PredictedCurves as PredictedCurves
 from .calibrate import Priors as Priors
-from .calibrate import beside_paper as beside_paper
 from .calibrate import calibrate_bayes as calibrate_bayes
 from .calibrate import calibrate_least_squares as calibrate_least_squares
 from .calibrate import calibrate_many as calibrate_many
 from .calibrate import calibrate_paper as calibrate_paper
-from .calibrate import new_laws as new_laws
+from .calibrate import compare_with_paper as compare_with_paper
 from .calibrate import predict_measured as predict_measured
 from .calibrate import predict_new_particle as predict_new_particle
 from .calibrate import read_priors as read_priors
+from .calibrate import sample_laws as sample_laws
 from .calibrate import to_arviz as to_arviz
 from .calibrate import write_posterior as write_posterior
 from .campaign import Campaign as Campaign

@@ -7,7 +7,7 @@ from pathlib import Path
 import jax
 
 MAPS = Path("/proc/self/maps")
-MOST_MAPS = Path("/proc/sys/vm/max_map_count")
+MAX_MAPS = Path("/proc/sys/vm/max_map_count")
 FULL = 0.6
 """Share of the memory maps a process may have at which compiled functions are forgotten."""
 
@@ -23,7 +23,7 @@ def make_room() -> None:
     try:
         with MAPS.open("rb") as lines:
             used = sum(1 for _ in lines)
-        most = int(MOST_MAPS.read_text())
+        most = int(MAX_MAPS.read_text())
     except (OSError, ValueError):
         return
     if used > FULL * most:

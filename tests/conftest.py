@@ -51,15 +51,15 @@ def _keep_everything():
 
 GROUPS = {
     "discover": ("tests/discover/", "tests/cli/test_discover", "tests/plots/test_discovery_figures"),
-    "posterior": ("tests/calibrate/joint/test_posterior", "tests/plots/test_joint_figures", "tests/plots/test_figures"),
-    "joint": ("tests/calibrate/joint/",),
+    "posterior": ("tests/calibrate/test_posterior", "tests/plots/test_joint_figures", "tests/plots/test_figures"),
+    "calibrate": ("tests/calibrate/",),
     "effects": ("tests/effects/",),
     "law": ("tests/law/",),
     "dem": ("tests/dem/",),
 }
 """Files that run on one worker, one after the other, since they compile the same functions."""
 
-FIRST = ("discover", "joint", "posterior", "tests/cli/", "tests/plots/")
+FIRST = ("discover", "calibrate", "posterior", "tests/cli/", "tests/plots/")
 """The longest first: begun last, they would keep one worker busy while the other waits."""
 
 

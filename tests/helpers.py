@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mcc_jax.campaign._paper import PAPER_DIAMETERS_UM, PAPER_LOG_C
+from mcc_jax.campaign.paper import PAPER_DIAMETERS_UM, PAPER_LOG_C
 from mcc_jax.geometry import Particle
 from mcc_jax.law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainScaling, Unloading
 

@@ -9,7 +9,7 @@ import pytest
 from helpers import A, between, check, close, paper_particle, sphere
 from hypothesis import given, settings
 
-from mcc_jax.campaign._paper import PAPER_DIAMETERS_UM
+from mcc_jax.campaign.paper import PAPER_DIAMETERS_UM
 from mcc_jax.geometry import Particle, elastic_shape_factor, plastic_shape_factor
 from mcc_jax.law import hertz_shape_factor
 

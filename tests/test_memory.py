@@ -25,7 +25,7 @@ def traced():
 def limit(monkeypatch, tmp_path, text):
     file = tmp_path / "max_map_count"
     file.write_text(text)
-    monkeypatch.setattr(_memory, "MOST_MAPS", file)
+    monkeypatch.setattr(_memory, "MAX_MAPS", file)
 
 
 @pytest.mark.skipif(not _memory.MAPS.exists(), reason="only Linux limits memory maps, and shows them")

@@ -56,7 +56,7 @@ def exports(folder: Path, campaign: Campaign) -> None:
 @pytest.mark.notebook
 @pytest.mark.parametrize("block", [b for b in blocks("") if b.startswith("uv run mcc-jax")], ids=lambda b: b.split()[3])
 def test_commands_run_as_printed(block, tmp_path, monkeypatch):
-    from mcc_jax.cli._main import cli
+    from mcc_jax.cli.main import cli
 
     monkeypatch.chdir(tmp_path)
     tests = paper_campaign(0, instrument=Instrument(displacement_noise_um=0.02, force_noise_mN=0.05))
@@ -82,7 +82,7 @@ def test_the_script_for_several_processes_runs_as_printed(tmp_path):
 
 
 def test_every_command_shown_exists():
-    from mcc_jax.cli._main import cli
+    from mcc_jax.cli.main import cli
 
     shown = set(re.findall(r"mcc-jax ([a-z]+)", README))
     assert {"demo", "convert", "calibrate", "simulate", "discover"} <= shown

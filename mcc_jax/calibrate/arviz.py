@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from ... import arguments
-from ._bayes import BayesCalibration
-from ._population import COEFFICIENTS
-from ._predictive import A_CALIBRATION, predict_measured
-from ._priors import LogNormalPrior, NakagamiPrior, NormalPrior, Priors
+from .. import arguments
+from .population import COEFFICIENTS
+from .posterior import BayesCalibration
+from .predict import A_CALIBRATION, predict_measured
+from .priors import LogNormalPrior, NakagamiPrior, NormalPrior, Priors
 
 if TYPE_CHECKING:
     from xarray import DataTree
@@ -41,7 +41,7 @@ UNITS = {
 PREDICTIVE_DRAWS = 50
 """Curves per chain and particle kept in the predictive groups."""
 
-MOST_PREDICTIVE = 2_000_000
+MAX_PREDICTIVE = 2_000_000
 """At most as many predicted points are kept: of large campaigns the first particles only."""
 
 
@@ -115,13 +115,13 @@ def to_arviz(calibration: BayesCalibration, *, prior_count: int = 500, seed: int
     if c.model.modulus_scatter:
         posterior["particle_modulus_MPa"] = c.modulus_MPa
     low, high = np.asarray(c.fit.numbers.a)[2:]
-    prior = prior_draws(c.model.beliefs, float(low), float(high), (1, prior_count), seed)
+    prior = prior_draws(c.model.chosen_priors, float(low), float(high), (1, prior_count), seed)
     prior = {name: values for name, values in prior.items() if name in posterior}
 
     tests = c.selection.tests
     points = tests.force.shape[1]
     mask = np.asarray(tests.mask)
-    shown = max(1, min(len(particles), MOST_PREDICTIVE // (chains * PREDICTIVE_DRAWS * points)))
+    shown = max(1, min(len(particles), MAX_PREDICTIVE // (chains * PREDICTIVE_DRAWS * points)))
     some = min(PREDICTIVE_DRAWS, draws)
     predicted = np.full((chains, some, shown, points), np.nan, np.float32)
     before = np.full((1, some, shown, points), np.nan, np.float32)
@@ -208,8 +208,8 @@ def _prior_curves(c: BayesCalibration, prior: dict[str, np.ndarray], row: int, c
     """Curves of the row-th particle from the prior, around its recorded contact."""
     import jax.numpy as jnp
 
-    from ...campaign import particle_batch
-    from ._predictive import _laws, _paths
+    from ..campaign import particle_batch
+    from .predict import _laws, _paths
 
     rng = np.random.default_rng([seed, row])
     pick = rng.integers(prior["a"].shape[1], size=count)
@@ -219,7 +219,7 @@ def _prior_curves(c: BayesCalibration, prior: dict[str, np.ndarray], row: int, c
     sizes = particle_batch(np.broadcast_to(c.campaign.diameters_um[c.selection.kept[row]], (count, 3)))
     force = np.asarray(tests.force[row])
     clean = np.asarray(_paths(laws, sizes, jnp.asarray(np.broadcast_to(force, (count, len(force))))))
-    zero = float(tests.contact[row]) + c.model.beliefs.zero_um.sd * rng.standard_normal((count, 1))
+    zero = float(tests.contact[row]) + c.model.chosen_priors.zero_um.sd * rng.standard_normal((count, 1))
     return clean + zero
 
 

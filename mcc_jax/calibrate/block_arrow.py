@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from ._small import Cholesky
+from .small_matrices import Cholesky
 
 
 class Parameters(NamedTuple):
@@ -113,15 +113,18 @@ class ArrowDescent(optx.AbstractDescent[Parameters, optx.FunctionInfo.ResidualJa
     """The damped Gauss-Newton step of an arrow problem, each parameter damped on its own scale."""
 
     def init(self, y: Parameters, f_info_struct: Any) -> _State:
+        """Normal equations of the right shapes, all zero."""
         count, P = y.local.shape
         Q = y.shared.shape[0]
         zeros = (jnp.zeros(s) for s in ((count, P, P), (count, P, Q), (Q, Q), (count, P), (Q,)))
         return _State(Normal(*zeros))
 
     def query(self, y: Parameters, f_info: Any, state: _State) -> _State:
+        """The normal equations at `y`."""
         return _State(normal_equations(f_info.jac.mv, f_info.residual, y))
 
     def step(self, step_size: Float[Array, ""], state: _State) -> tuple[Parameters, optx.RESULTS]:
+        """The step whose damping is one over the step size."""
         return state.normal.solve(1 / step_size), optx.RESULTS.successful
 
 

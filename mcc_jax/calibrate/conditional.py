@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ._blocks import Blocks, count_of
-from ._large import PROBES, correction, evenly
-from ._nuts import PAIR, Length, side_by_side
-from ._population import Population
-from ._sampling import Exact, ParticleDraws, draw_particles
-from ._weights import PARETO_K_MOST, ordered_resample, pareto_k, smoothed_weights, unrest
+from .nuts import PAIR, Length, side_by_side
+from .population import Population
+from .reweighting import PROBES, correction, evenly
+from .sampling import ExactLikelihood, ParticleDraws, draw_particles
+from .sharding import Blocks, count_of
+from .weights import PARETO_K_MOST, ordered_resample, pareto_k, smoothed_weights, unrest
 
 RESTLESS = 0.3
 """A particle whose weight scatters by more than this share of its mean gets several candidates per draw."""
@@ -26,10 +26,10 @@ FEW = 4
 GROUP = 64
 """Most restless particles drawn at once."""
 
-MOST_CHECKED = 400_000
+MAX_CHECKED = 400_000
 """Up to as many draws of single particles, every one is compared with the exact likelihood and the weights are applied;
 of larger campaigns some draws are compared, to know how good each particle's summary is, and the population is
-corrected by regression (`_large`)."""
+corrected by regression (`reweighting`)."""
 
 CANDIDATES, CANDIDATES_OF_MANY = (16, 64), (2, 16)
 """How many a restless particle gets: first, and the few that scatter most even then."""
@@ -48,13 +48,13 @@ LOWEST = -1e3
 UNSURE = 0.3
 """Standard error of the correction, in standard deviations of the posterior, from which on a reader is told."""
 
-MOST_PARTICLE_DRAWS = 4_000_000
+MAX_PARTICLE_DRAWS = 4_000_000
 """At most as many draws of single particles are kept; of very large campaigns every n-th draw."""
 
 
 def stride_of(count: int, total: int) -> int:
     """Every how many-th draw is compared with the exact likelihood: all of them for few particles."""
-    return max(1, -(-total * count // MOST_CHECKED))
+    return max(1, -(-total * count // MAX_CHECKED))
 
 
 def chunk_of(total: int) -> int | None:
@@ -75,7 +75,7 @@ class Drawer:
         count: number of particles.
     """
 
-    def __init__(self, exact: Exact, block: int, chunk: int | None = None) -> None:
+    def __init__(self, exact: ExactLikelihood, block: int, chunk: int | None = None) -> None:
         """Cut the tests into blocks.
 
         Args:
@@ -131,7 +131,9 @@ class Drawer:
             padded = jnp.asarray(np.pad(group, (0, size - len(group)), constant_values=group[0]))
             exact, count = self._exact.some(padded), len(group)
 
-            def draw(key: Array, population: Population, exact: Exact = exact, count: int = count) -> list[np.ndarray]:
+            def draw(
+                key: Array, population: Population, exact: ExactLikelihood = exact, count: int = count
+            ) -> list[np.ndarray]:
                 same = jnp.asarray(np.asarray(common))
                 drawn = draw_particles(key[None], population, exact, candidates, same)
                 return [np.asarray(v)[:, :count] for v in drawn]
@@ -216,7 +218,7 @@ def corrected(
     Of each particle some draws are compared with the exact likelihood. Those whose weights scatter are drawn from
     several candidates; of the others the draws are left as they are.
     """
-    checks = PROBES * max(2, MOST_CHECKED // (PROBES * drawer.count))
+    checks = PROBES * max(2, MAX_CHECKED // (PROBES * drawer.count))
     ratio = np.asarray(drawer.all(check_key, every(population, evenly(length.total, checks))).log_ratio)
     scatter, k = unrest(ratio), pareto_k(ratio)
     wild: set[int] = set()
@@ -240,7 +242,7 @@ def corrected(
     if wild:
         notes.append(f"{len(wild)} particles act on the population through their quadratic summary alone")
     chosen, k_joint = _resampled(log_weight, length)
-    keep = max(1, -(-length.total * drawer.count // MOST_PARTICLE_DRAWS))
+    keep = max(1, -(-length.total * drawer.count // MAX_PARTICLE_DRAWS))
     some = every(every(population, chosen), keep)
     particles = drawer.all(particle_key, some, 0)
     restless = np.flatnonzero((scatter > RESTLESS_OF_MANY) | (k > PARETO_K_MOST))

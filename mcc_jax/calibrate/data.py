@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ... import arguments
-from ...campaign import (
+from .. import arguments
+from ..campaign import (
     THRESHOLD_MPA,
     Campaign,
     Curve,
@@ -23,15 +23,15 @@ from ...campaign import (
     particle_batch,
     stress_and_strain,
 )
-from ...campaign.reasons import SHOWN, below_threshold, far_apart, no_climb, no_loading, refusal, too_few
-from ...geometry import Particle
-from .._elastic import LEAST_RATIO
-from .._predict import READING_UM, point_noise_um
+from ..campaign.reasons import SHOWN, below_threshold, far_apart, no_climb, no_loading, refusal, too_few
+from ..geometry import Particle
+from .paper.modulus import MIN_RATIO
+from .paper.prediction import READING_UM, point_noise_um
 
-LEAST_POINTS = 12
+MIN_POINTS = 12
 """Fewer usable points than this cannot carry three coefficients, a zero and their noise."""
 
-LEAST_CLIMB = 8.0
+MIN_CLIMB = 8.0
 """Displacement must grow over loading by this many times its noise, or there is no curve to fit."""
 
 
@@ -135,7 +135,7 @@ def select_tests(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, mo
     """Choose what the joint calibration uses.
 
     Points count from the threshold stress on, below which surface asperities and not the particle deform. On unloading
-    and reloading they count from `LEAST_RATIO` of the peak, below which displacement depends on force with an infinite
+    and reloading they count from `MIN_RATIO` of the peak, below which displacement depends on force with an infinite
     slope. The approach never counts. Of longer records every n-th row is used, turning points always.
 
     Args:
@@ -282,20 +282,20 @@ def _prepare(
     rows = rows_from_contact(curve, segments, most_points)
     peak = np.maximum.accumulate(stress[rows])
     loading = (kind[rows] == "load") & (stress[rows] >= threshold) & (stress[rows] > 0)
-    elastic = np.isin(kind[rows], ("hold", "unload", "reload")) & (stress[rows] >= LEAST_RATIO * peak)
+    elastic = np.isin(kind[rows], ("hold", "unload", "reload")) & (stress[rows] >= MIN_RATIO * peak)
     mask = loading | (elastic & (stress[rows] >= threshold) & (peak > 0))
     hidden = bool((mask & ~loading).any())
     mask, loading = mask & curve.compared[rows], loading & curve.compared[rows]
     hidden &= not (mask & ~loading).any()
     if stress.max() <= threshold:
         return below_threshold(float(stress.max()), threshold)
-    if loading.sum() < LEAST_POINTS:
-        return too_few(int(loading.sum()), LEAST_POINTS)
+    if loading.sum() < MIN_POINTS:
+        return too_few(int(loading.sum()), MIN_POINTS)
     climb = curve.displacement_um[rows[loading]]
     third = max(len(climb) // 3, 1)
     rise, noise = climb[-third:].mean() - climb[:third].mean(), max(point_noise_um(curve), READING_UM)
-    if rise <= LEAST_CLIMB * noise / np.sqrt(third):
-        return no_climb(float(rise) if rise >= 0 or -rise > LEAST_CLIMB * noise / np.sqrt(third) else 0.0)
+    if rise <= MIN_CLIMB * noise / np.sqrt(third):
+        return no_climb(float(rise) if rise >= 0 or -rise > MIN_CLIMB * noise / np.sqrt(third) else 0.0)
     contact = float(curve.displacement_um[0]) if contact is None else contact
     largest, reach = float(stress[rows][mask].max()), float(np.ptp(strain[rows][mask]))
     return _Prepared(rows, mask, loading, contact, largest, reach, hidden)

@@ -10,19 +10,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ._blocks import count_of
-from ._data import Tests
-from ._drawer import Drawer, chunk_of, corrected, every, stride_of, weighted
-from ._fit import populations
-from ._importance import sample_weighted
-from ._large import PROBES
-from ._linearised import careful_enough
-from ._mode import Target
-from ._model import JointFit, JointModel
-from ._nuts import Chains, Length, by_chains
-from ._population import COEFFICIENTS, Population, Scatter
-from ._sampling import Exact, sample_joint, sample_population
-from ._weights import diagnostics
+from .conditional import Drawer, chunk_of, corrected, every, stride_of, weighted
+from .data import Tests
+from .fit import populations
+from .importance import sample_weighted
+from .linearise import careful_enough
+from .model import JointFit, JointModel
+from .nuts import Chains, Length, by_chains
+from .population import COEFFICIENTS, Population, Scatter
+from .reweighting import PROBES
+from .sampling import ExactLikelihood, sample_joint, sample_population
+from .sharding import count_of
+from .transforms import LogPosterior
+from .weights import diagnostics
 
 ACCEPT = (0.8, 0.95, 0.99)
 """Acceptance that the sampler aims at: after divergences once more, and once more, with smaller steps."""
@@ -30,9 +30,9 @@ ACCEPT = (0.8, 0.95, 0.99)
 
 def draw_fast(key: Array, tests: Tests, model: JointModel, fit: JointFit, length: Length, block: int) -> dict[str, Any]:
     """The population sampled, the particles drawn back and corrected by exact weights: fields of the result."""
-    scatter = careful_enough(fit.mode, Target(fit.numbers, fit.summary, model.scatter), count_of(tests))
-    exact = Exact(tests, fit.filters, fit.summary, scatter, model.zero_sd, model.unloading)
-    target = Target(fit.numbers, fit.summary, scatter)
+    scatter = careful_enough(fit.mode, LogPosterior(fit.numbers, fit.summary, model.scatter), count_of(tests))
+    exact = ExactLikelihood(tests, fit.filters, fit.summary, scatter, model.zero_sd, model.unloading)
+    target = LogPosterior(fit.numbers, fit.summary, scatter)
     return draw_around(key, fit.mode, fit.covariance, target, exact, model, length, block)
 
 
@@ -40,8 +40,8 @@ def draw_around(
     key: Array,
     mode: Array,
     covariance: Array,
-    target: Target,
-    exact: Exact,
+    target: LogPosterior,
+    exact: ExactLikelihood,
     model: JointModel,
     length: Length,
     block: int = 0,
@@ -73,7 +73,7 @@ def draw_around(
 
 
 def _sampled(
-    key: Array, mode: Array, covariance: Array, target: Target, length: Length, many: bool
+    key: Array, mode: Array, covariance: Array, target: LogPosterior, length: Length, many: bool
 ) -> tuple[Chains, Population]:
     """Draws of the population: independent ones, weighted, if the weights are good enough, else the sampler's."""
     found = sample_weighted(key, mode, covariance, target, chains=length.chains, draws=length.draws, many=many)
@@ -97,8 +97,8 @@ def _patient[*Ts](run: Callable[[Array], tuple[Chains, *Ts]]) -> tuple[Chains, *
 
 def draw_joint(key: Array, tests: Tests, model: JointModel, fit: JointFit, length: Length) -> dict[str, Any]:
     """Population and particles sampled together under the exact likelihood: fields of the result."""
-    scatter = careful_enough(fit.mode, Target(fit.numbers, fit.summary, model.scatter), count_of(tests))
-    exact = Exact(tests, fit.filters, fit.summary, scatter, model.zero_sd, model.unloading)
+    scatter = careful_enough(fit.mode, LogPosterior(fit.numbers, fit.summary, model.scatter), count_of(tests))
+    exact = ExactLikelihood(tests, fit.filters, fit.summary, scatter, model.zero_sd, model.unloading)
     run, free, *particles = _patient(
         lambda aim: by_chains(sample_joint, key, length, fit.mode, fit.covariance, fit.numbers, exact, aim)
     )

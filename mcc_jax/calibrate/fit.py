@@ -13,27 +13,27 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..._errors import InputError
-from ..._memory import make_room
-from ...campaign import Campaign
-from ...law import Unloading
-from .._predict import point_noise_um
-from ._blocks import Blocks, Parts, block_size, count_of, filled_up, require_same
-from ._compile import compiled
-from ._data import Selection, Tests, select_tests
-from ._individual import FIRST_STEPS, MOST_STEPS, Particles, fit_particles, linear_starts
-from ._linearised import careful_enough, expected_latent, linear_data, summarise
-from ._mode import PriorNumbers, Target, from_free, most_probable, recentred, to_free
-from ._model import JointFit, JointModel, log_C3, prior_numbers
-from ._noise import Noise, estimate_noise, particle_scales
-from ._population import Population, Scatter, Summary
-from ._priors import Priors
+from .._errors import InputError
+from .._memory import make_room
+from ..campaign import Campaign
+from ..law import Unloading
+from .compiling import compiled
+from .data import Selection, Tests, select_tests
+from .linearise import careful_enough, expected_latent, linear_data, summarise
+from .model import JointFit, JointModel, log_C3, prior_numbers
+from .noise import Noise, estimate_noise, particle_scales
+from .paper.prediction import point_noise_um
+from .particle_fit import FIRST_STEPS, MAX_STEPS, Particles, fit_particles, linear_starts
+from .population import Population, Scatter, Summary
+from .priors import Priors
+from .sharding import Blocks, Parts, block_size, count_of, filled_up, require_same
+from .transforms import LogPosterior, PriorNumbers, constrain, most_probable, recentred, unconstrain
 
 WIDE = 1.5
 """Standard deviation of the logarithms that a particle by itself is allowed, around the prior's centre: no more than
 what keeps a coefficient finite about which its curve says nothing."""
 
-LEAST_WIDTH = 1e-3
+MIN_WIDTH = 1e-3
 """Least such standard deviation under the population: any smaller and the problem is badly scaled."""
 
 NOISE_BLOCKS = 4
@@ -142,7 +142,7 @@ def fit_joint(
         block: particles of a block (`Blocks`), of which there is a whole number; 0 for all in one.
         tell: called with the name of each step.
     """
-    zero_sd, priors = model.zero_sd, model.beliefs
+    zero_sd, priors = model.zero_sd, model.chosen_priors
     flatness = tests.flatness
     numbers = prior_numbers(priors, flatness, tests.weight)
     read_out = max(read_out_um, 1e-4)
@@ -203,7 +203,7 @@ def fit_joint(
         tell("fitting the population")
         if turn:
             numbers, free = recentred(numbers, free)
-        target = Target(numbers, summary, model.scatter)
+        target = LogPosterior(numbers, summary, model.scatter)
         target = replace(target, scatter=careful_enough(free, target, count))
         free, covariance, mode_converged = most_probable(free, target)
         if turn == rounds:
@@ -214,7 +214,7 @@ def fit_joint(
         several = (latent, zero), (expected.latent, expected.zero), (expected.mean, zero)
         # By NumPy, here and wherever a handful of numbers is put together once: JAX would compile every operation.
         starts = jnp.asarray(np.stack([np.column_stack([np.asarray(w), np.asarray(z)]) for w, z in several]))
-        width = np.maximum(np.asarray(expected.sd), LEAST_WIDTH)
+        width = np.maximum(np.asarray(expected.sd), MIN_WIDTH)
         found = fitted(white, expected.mean, width, blocks.cut(starts, axis=1))
         latent, zero = found.latent, found.zero
     converged = np.asarray([bool(np.all(np.asarray(individual.converged)[:count])), noise_converged, mode_converged])
@@ -255,7 +255,7 @@ def _fitted(
         return blocks.whole(blocks.each(fit_particles, own, *cut, zero_sd, starts, unloading, steps))
 
     if blocks.whole_here:
-        return fit(blocks, own, arrays, starts, MOST_STEPS)
+        return fit(blocks, own, arrays, starts, MAX_STEPS)
     found = fit(blocks, own, arrays, starts, FIRST_STEPS)
     late = np.flatnonzero(~np.asarray(found.settled))
     if not len(late):
@@ -263,7 +263,7 @@ def _fitted(
     rows = np.pad(late, (0, -len(late) % blocks.size), mode="edge")
     few = Blocks(len(rows), blocks.size)
     ends = few.cut(np.moveaxis(np.asarray(found.ends)[rows], 1, 0), axis=1)
-    again = fit(few, few.cut(_rows(tests, rows)), _rows(arrays, rows), ends, MOST_STEPS)
+    again = fit(few, few.cut(_rows(tests, rows)), _rows(arrays, rows), ends, MAX_STEPS)
     return jax.tree.map(lambda x, y: x.at[late].set(y[: len(late)]), found, again)
 
 
@@ -277,13 +277,13 @@ def _centre(priors: Priors) -> np.ndarray:
 @compiled
 def population_at(free: Float[Array, " d"], numbers: PriorNumbers, scatter: Scatter) -> Population:
     """The population at unbounded coordinates."""
-    return from_free(free, numbers, scatter)[0]
+    return constrain(free, numbers, scatter)[0]
 
 
 @compiled
 def populations(free: Float[Array, "draws d"], numbers: PriorNumbers, scatter: Scatter) -> Population:
     """Populations of many unbounded coordinates, every field with a leading axis."""
-    return jax.vmap(lambda f: from_free(f, numbers, scatter)[0])(free)
+    return jax.vmap(lambda f: constrain(f, numbers, scatter)[0])(free)
 
 
 def _start(
@@ -291,7 +291,7 @@ def _start(
 ) -> tuple[PriorNumbers, Float[Array, " d"]]:
     """Where to look for the population, the prior's a and the particles' own median and scatter under it; and the
     coordinates centred there."""
-    priors = model.beliefs
+    priors = model.chosen_priors
     low, high = np.asarray(numbers.a)[2:]
     a = float(np.clip(priors.a.mean, 0.9 * low, 0.9 * high))
     log_eta = np.log(1 + a * flatness)
@@ -300,4 +300,4 @@ def _start(
     scales = np.array([priors.tau_C1.sd, priors.tau_C3.sd, priors.tau_C5.sd])
     tau = np.clip(np.std(b, axis=0), 0.05 * scales, 2 * scales)
     numbers = eqx.tree_at(lambda n: n.centre, numbers, jnp.asarray(np.median(latent[:, :3], axis=0)))
-    return numbers, to_free(a, log_modulus, np.median(b, axis=0), tau, numbers, model.scatter)
+    return numbers, unconstrain(a, log_modulus, np.median(b, axis=0), tau, numbers, model.scatter)

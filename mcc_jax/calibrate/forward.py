@@ -8,7 +8,7 @@ with its zero z, and the law's displacement under load control. The law knows th
 with the shape factor: :math:`b_j = \log(C_j \eta_p)`, and the modulus through :math:`e = \log(\bar E \eta_p^p)` with
 the power p of the strain scaling (half of it in the punch forms, where the modulus is squared). So the data of one
 particle never contain the shape parameter `a`: it enters through what particles of different shapes have in common
-(`_population`).
+(`population`).
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..._numerics import running_max
-from ..._types import Path, Scalar
-from ...geometry import Particle
-from ...law import MccLaw, Plastic, Unloading
-from ._data import Tests
+from .._numerics import running_max
+from .._types import Path, Scalar
+from ..geometry import Particle
+from ..law import MccLaw, Plastic, Unloading
+from .data import Tests
 
 Latent = Float[Array, " 4"]
 """b1, b3, b5 and e of one particle."""

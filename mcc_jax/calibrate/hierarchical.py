@@ -9,17 +9,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..._types import Scalar, Values
-from ...law import Unloading
-from ._arrow import Parameters, Solution, minimise
-from ._compile import compiled
-from ._data import Tests
-from ._forward import raw_residual
-from ._noise import Whitening
-from ._population import Population, Scatter, moments
-from ._small import Cholesky
+from .._types import Scalar, Values
+from ..law import Unloading
+from .block_arrow import Parameters, Solution, minimise
+from .compiling import compiled
+from .data import Tests
+from .forward import raw_residual
+from .noise import Whitening
+from .population import Population, Scatter, moments
+from .small_matrices import Cholesky
 
-LEAST_SPREAD = 1e-4
+MIN_SPREAD = 1e-4
 """Least standard deviation of log C in the pooled residuals; any smaller and the problem is badly scaled."""
 
 
@@ -78,7 +78,7 @@ def pooled_residual(settings: Pooled, tests: Tests) -> Callable[[Parameters], tu
     shared are a, log Ebar, mu1, mu3, mu5.
     """
     size = 4 if settings.scatter.modulus else 3
-    tau = jnp.maximum(settings.tau, LEAST_SPREAD)
+    tau = jnp.maximum(settings.tau, MIN_SPREAD)
 
     def residual(y: Parameters):
         latent, zero = unpack(y, settings, tests)
@@ -88,7 +88,7 @@ def pooled_residual(settings: Pooled, tests: Tests) -> Callable[[Parameters], tu
             y.shared[1],
             y.shared[2:],
             tau,
-            jnp.maximum(settings.modulus_scatter, LEAST_SPREAD),
+            jnp.maximum(settings.modulus_scatter, MIN_SPREAD),
             settings.shape_scatter,
             jnp.zeros(()),
         )

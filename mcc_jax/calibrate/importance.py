@@ -7,7 +7,7 @@ distribution around the mode are weighted,
 .. math:: w_s \propto p(\theta_s \mid \text{tests}) / q(\theta_s)
 
 and the proposal is fitted to its own weighted draws until the weights' Pareto k and effective size say that it is good
-enough (Cappe et al. 2004; Vehtari et al. 2024). If they never do, the sampler has to run (`_nuts`). The density by
+enough (Cappe et al. 2004; Vehtari et al. 2024). If they never do, the sampler has to run (`nuts`). The density by
 itself takes a quarter of the sampler's time to compile, and all draws are worked on side by side.
 """
 
@@ -22,11 +22,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ._compile import compiled, even_batch
-from ._mode import FIRST_SPREAD, ROWS, Target, gradients
-from ._nuts import Chains, side_by_side
-from ._population import Population
-from ._weights import PARETO_K_MOST, effective_share, ordered_resample, smoothed_weights
+from .compiling import compiled, even_batch
+from .nuts import Chains, side_by_side
+from .population import Population
+from .transforms import FIRST_SPREAD, ROWS, LogPosterior, gradients
+from .weights import PARETO_K_MOST, effective_share, ordered_resample, smoothed_weights
 
 FREEDOM = 10
 """Degrees of freedom of the Student proposal: its tails are wider than the posterior's."""
@@ -41,7 +41,7 @@ GOOD_SHARE = 0.5
 """Effective share of the proposed draws from which on the proposal need not be fitted any better, beside the gate of
 Pareto k."""
 
-LEAST_SHARE = 0.1
+MIN_SHARE = 0.1
 """Least effective share with which the proposed draws are used: less, and the sampler is the safer choice."""
 
 EFFECTIVE = 2.0
@@ -56,18 +56,18 @@ AT_ONCE = 4096
 
 
 @compiled
-def log_densities(free: Float[Array, "many d"], target: Target) -> Float[Array, " many"]:
+def log_densities(free: Float[Array, "many d"], target: LogPosterior) -> Float[Array, " many"]:
     """Log density of the population at many coordinates."""
     return jax.lax.map(target.log_density, free, batch_size=even_batch(len(free), AT_ONCE // len(target.flatness)))
 
 
 @compiled
-def _populations(free: Float[Array, "many d"], target: Target) -> Population:
+def _populations(free: Float[Array, "many d"], target: LogPosterior) -> Population:
     return jax.vmap(target.population)(free)
 
 
 def sample_weighted(
-    key: Array, mode: Array, covariance: Array, target: Target, *, chains: int, draws: int, many: bool = False
+    key: Array, mode: Array, covariance: Array, target: LogPosterior, *, chains: int, draws: int, many: bool = False
 ) -> tuple[Chains, Population] | None:
     """Draws of the population by importance resampling, in the sampler's form; None if the weights are not good enough.
 
@@ -113,7 +113,7 @@ def sample_weighted(
     unit = multivariate_t(np.zeros(len(mode)), shape, FREEDOM)
     kept = chains * draws
     trial = min(TRIAL // 4, kept) if many else TRIAL
-    least = GOOD_SHARE if many else LEAST_SHARE
+    least = GOOD_SHARE if many else MIN_SHARE
     centre, width = folded(np.array(mode)), np.asarray(covariance)
     for turn in range(ROUNDS):
         free, log_weight = proposed(trial)
@@ -137,7 +137,7 @@ def sample_weighted(
 
 
 def _resampled(
-    free: np.ndarray, weight: np.ndarray, target: Target, chains: int, draws: int
+    free: np.ndarray, weight: np.ndarray, target: LogPosterior, chains: int, draws: int
 ) -> tuple[Chains, Population]:
     """Weighted draws as equally weighted ones, each chain from draws of its own."""
     several = zip(np.split(free, chains), np.split(weight, chains), strict=True)

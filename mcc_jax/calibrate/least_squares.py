@@ -11,18 +11,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ... import arguments
-from ...campaign import THRESHOLD_MPA, Campaign, Finding, check_tests
-from .._result import estimate, finite, force_zero, misfit_note
-from ..judgement import judged, numbers_in_reach, unlike_others
-from ._arrow import Parameters, Solution
-from ._bayes import log_estimate, power_of_e
-from ._data import Selection, Tests, own_misfit, ranges_um, root_mean_squares
-from ._fit import beyond_numbers, population_at, prepare
-from ._mode import FIRST_SPREAD, spread_slope
-from ._model import JointFit, JointModel, checked_settings
-from ._pooled import Pooled, fit_pooled, unpack
-from ._population import COEFFICIENTS
+from .. import arguments
+from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_tests
+from .block_arrow import Parameters, Solution
+from .data import Selection, Tests, own_misfit, ranges_um, root_mean_squares
+from .fit import beyond_numbers, population_at, prepare
+from .hierarchical import Pooled, fit_pooled, unpack
+from .judgement import judged, numbers_in_reach, unlike_others
+from .model import JointFit, JointModel, checked_settings
+from .paper.result import estimate, finite, force_zero, misfit_note
+from .population import COEFFICIENTS
+from .posterior import log_estimate, power_of_e
+from .transforms import FIRST_SPREAD, spread_slope
 
 Loss = Literal["linear", "soft_l1", "cauchy"]
 SHARED = ("a", "log effective modulus", "mu_C1", "mu_C3", "mu_C5")
@@ -214,7 +214,7 @@ class LeastSquaresCalibration:
                 name: log_estimate(m, s) if np.isfinite(m) else estimate(0.0)
                 for name, m, s in zip(numbers, logs, log_sds, strict=True)
             },
-            "priors": self.model.beliefs.to_json(),
+            "priors": self.model.chosen_priors.to_json(),
             "particles": entries,
             "warnings": self.warnings(),
             "findings": [one.to_json() for one in self.findings],
@@ -234,7 +234,7 @@ class LeastSquaresCalibration:
 
     def residual(self) -> np.ndarray:
         """Measured less predicted displacement [um], shape (N, points), 0 where masked."""
-        from ._forward import raw_residual
+        from .forward import raw_residual
 
         latent, zero = unpack(self.solution.value, self.settings, self.selection.tests)
         return np.asarray(

@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..._types import Scalar
-from ...law import Unloading
-from ._compile import compiled
-from ._data import Tests
-from ._forward import linearise_with_force, snap
-from ._mode import Target
-from ._noise import Linear, Noise, Whitening, whitening
-from ._population import Scatter, Summary, laplace, straighten
+from .._types import Scalar
+from ..law import Unloading
+from .compiling import compiled
+from .data import Tests
+from .forward import linearise_with_force, snap
+from .noise import Linear, Noise, Whitening, whitening
+from .population import Scatter, Summary, laplace, straighten
+from .transforms import LogPosterior
 
 
 @compiled
@@ -126,7 +126,7 @@ class Expected(NamedTuple):
 
 
 @compiled
-def expected_latent(free: Float[Array, " d"], target: Target) -> Expected:
+def expected_latent(free: Float[Array, " d"], target: LogPosterior) -> Expected:
     """The particles under the population at unbounded coordinates."""
     summary = target.summary
     at = laplace(target.population(free), summary, target.flatness, target.scatter)
@@ -140,7 +140,7 @@ SHARP = 0.03
 """Posterior standard deviation of the logarithm of a polynomial's coefficient below which one Newton step is enough."""
 
 
-def careful_enough(free: Float[Array, " d"], target: Target, count: int) -> Scatter:
+def careful_enough(free: Float[Array, " d"], target: LogPosterior, count: int) -> Scatter:
     """`target.scatter` with as many Newton steps as the integration over the particles needs: none if every coefficient
     is known sharply.
 

@@ -10,13 +10,13 @@ from typing import Any
 
 import jax
 
-from ... import arguments
-from ..._errors import InputError
-from ...campaign import THRESHOLD_MPA, Campaign, check_campaign
-from ._bayes import BayesCalibration, calibrate_bayes
-from ._blocks import block_size
-from ._data import select_tests
-from ._least_squares import LeastSquaresCalibration, calibrate_least_squares
+from .. import arguments
+from .._errors import InputError
+from ..campaign import THRESHOLD_MPA, Campaign, check_campaign
+from .data import select_tests
+from .least_squares import LeastSquaresCalibration, calibrate_least_squares
+from .posterior import BayesCalibration, calibrate_bayes
+from .sharding import block_size
 
 Calibration = BayesCalibration | LeastSquaresCalibration
 

@@ -12,14 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ... import arguments
-from ..._errors import InputError
-from ...law import StrainScaling, Unloading
-from ._individual import Particles
-from ._mode import PriorNumbers
-from ._noise import Noise, Whitening
-from ._population import Scatter, Summary
-from ._priors import Priors
+from .. import arguments
+from .._errors import InputError
+from ..law import StrainScaling, Unloading
+from .noise import Noise, Whitening
+from .particle_fit import Particles
+from .population import Scatter, Summary
+from .priors import Priors
+from .transforms import PriorNumbers
 
 BLUR = 0.01
 """Width of a population's mean where nothing scatters, about: only a coordinate's scale."""
@@ -80,14 +80,14 @@ class JointModel:
         return self.strain_scaling.power / self.unloading.stress_power
 
     @property
-    def beliefs(self) -> Priors:
+    def chosen_priors(self) -> Priors:
         """The priors given, or the defaults for the form of unloading."""
         return self.priors or Priors.default(self.unloading)
 
     @property
     def zero_sd(self) -> Array:
         """Standard deviation of the zeros [um]."""
-        return jnp.asarray(self.beliefs.zero_um.sd)
+        return jnp.asarray(self.chosen_priors.zero_um.sd)
 
 
 class JointFit(eqx.Module):

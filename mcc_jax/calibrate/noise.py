@@ -20,11 +20,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..._types import Path, Scalar
-from .._predict import READING_UM
-from ._blocks import Blocks, Parts
-from ._compile import compiled
-from ._small import Cholesky
+from .._types import Path, Scalar
+from .compiling import compiled
+from .paper.prediction import READING_UM
+from .sharding import Blocks, Parts
+from .small_matrices import Cholesky
 
 
 class Noise(eqx.Module):

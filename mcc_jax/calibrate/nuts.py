@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
 
-from ..._types import Scalar, ScalarLike
+from .._types import Scalar, ScalarLike
 
 PAIR = 2
 

@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..._types import Path, Scalar
-from ...geometry import Particle
-from ...law import Unloading
-from ._compile import compiled
-from ._data import Tests
-from ._forward import linearise, snap
-from ._small import Cholesky
+from .._types import Path, Scalar
+from ..geometry import Particle
+from ..law import Unloading
+from .compiling import compiled
+from .data import Tests
+from .forward import linearise, snap
+from .small_matrices import Cholesky
 
 SHIFTS = 21
 SPREAD = 0.04
@@ -22,7 +22,7 @@ SPREAD = 0.04
 VARIATIONS = ((0.0, 0.0, 0.0), (0.05, -0.1, 0.03), (-0.05, 0.06, -0.02))
 """What is added to the linear start's b1, b3, b5 for further starts."""
 
-MOST_STEPS, FIRST_STEPS = 200, 10
+MAX_STEPS, FIRST_STEPS = 200, 10
 """Most steps of a fit, and how many all particles of many blocks take before the late ones go on by themselves."""
 
 FAR = 4.0
@@ -115,7 +115,7 @@ def fit_particles(
     zero_sd: Scalar,
     starts: Float[Array, "starts particles 5"],
     unloading: Unloading,
-    most_steps: int | Int[Array, ""] = MOST_STEPS,
+    most_steps: int | Int[Array, ""] = MAX_STEPS,
 ) -> Particles:
     """Fit every particle by itself, its modulus included, from several starts.
 

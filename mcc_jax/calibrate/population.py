@@ -1,6 +1,6 @@
 r"""The population behind the particles, and how likely the tests are under it with every particle integrated out.
 
-Particle i's latent vector :math:`w = (b_1, b_3, b_5, e)` (see `_forward`) has, given the population,
+Particle i's latent vector :math:`w = (b_1, b_3, b_5, e)` (see `forward`) has, given the population,
 
 .. math:: w_i = m_i + S_i \xi_i, \quad \xi_i \sim N(0, 1), \qquad
     m_i = (\mu_1 + \log\eta_i,\ \mu_3 + \log\eta_i,\ \mu_5 + \log\eta_i,\ \log\bar E + p \log\eta_i)
@@ -20,8 +20,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..._types import Scalar
-from ._small import Cholesky
+from .._types import Scalar
+from .small_matrices import Cholesky
 
 COEFFICIENTS = ("C1", "C3", "C5")
 
@@ -229,7 +229,7 @@ class Draw(eqx.Module):
     log_likelihood: Float[Array, " particles"]
 
 
-LEAST_SHARE = 0.05
+MIN_SHARE = 0.05
 """A coefficient of the polynomial is not drawn below this share of its most probable value."""
 
 
@@ -246,7 +246,7 @@ def draw_latent(
     inner = Cholesky(at.hessian)
     nu = inner.backward(normal)
     y = at.stretch[None] * nu
-    inside = y > LEAST_SHARE - 1
+    inside = y > MIN_SHARE - 1
     y = jnp.where(inside, y, 0.0)
     small = jnp.abs(y) < 1e-5
     safe = jnp.where(small, 1.0, y)

@@ -11,17 +11,17 @@ from typing import Any, Literal, NamedTuple, get_args
 import jax
 import numpy as np
 
-from ... import arguments
-from ...campaign import THRESHOLD_MPA, Campaign, Finding, check_tests
-from .._result import estimate, finite, force_zero, misfit_note
-from ..judgement import judged, numbers_in_reach, unlike_others
-from ._ahead import compile_ahead
-from ._data import Selection, own_misfit, ranges_um, root_mean_squares
-from ._draws import Length, draw_fast, draw_joint
-from ._fit import prepare
-from ._model import JointFit, JointModel, checked_settings
-from ._population import COEFFICIENTS, Population
-from ._weights import PARETO_K_MOST
+from .. import arguments
+from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_tests
+from .data import Selection, own_misfit, ranges_um, root_mean_squares
+from .draws import Length, draw_fast, draw_joint
+from .fit import prepare
+from .judgement import judged, numbers_in_reach, unlike_others
+from .model import JointFit, JointModel, checked_settings
+from .paper.result import estimate, finite, force_zero, misfit_note
+from .population import COEFFICIENTS, Population
+from .precompile import compile_ahead
+from .weights import PARETO_K_MOST
 
 RHAT_MOST = 1.01
 ESS_LEAST = 400.0
@@ -236,7 +236,7 @@ class BayesCalibration:
                 **{name: log_estimate(m, s) for name, m, s in zip(numbers, logs, sds, strict=True)},
                 "factor": summary(named["noise_factor"]),
             },
-            "priors": self.model.beliefs.to_json(),
+            "priors": self.model.chosen_priors.to_json(),
             "particles": entries,
             "warnings": self.warnings(),
             "findings": [one.to_json() for one in self.findings],

@@ -11,18 +11,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ._blocks import Blocks, count_of
-from ._data import Tests
-from ._drawer import chunk_of, stride_of
-from ._importance import log_densities
-from ._large import PROBES
-from ._linearised import expected_latent, summarise
-from ._mode import FIRST_SPREAD, ROWS, Target, gradients
-from ._model import JointModel, prior_numbers
-from ._noise import DIFFERENCES, Linear, Noise, Whitening, likelihoods
-from ._nuts import Length, side_by_side
-from ._population import Population, Scatter, Summary
-from ._sampling import Exact, draw_particles
+from .conditional import chunk_of, stride_of
+from .data import Tests
+from .importance import log_densities
+from .linearise import expected_latent, summarise
+from .model import JointModel, prior_numbers
+from .noise import DIFFERENCES, Linear, Noise, Whitening, likelihoods
+from .nuts import Length, side_by_side
+from .population import Population, Scatter, Summary
+from .reweighting import PROBES
+from .sampling import ExactLikelihood, draw_particles
+from .sharding import Blocks, count_of
+from .transforms import FIRST_SPREAD, ROWS, LogPosterior, gradients
 
 
 def compile_ahead(tests: Tests, block: int, model: JointModel, length: Length) -> None:
@@ -45,8 +45,8 @@ def compile_ahead(tests: Tests, block: int, model: JointModel, length: Length) -
 def _population(tests: Tests, model: JointModel, sharp: Scatter, many: bool) -> None:
     """What finds the population's mode, and draws around it; the sampler proper is hardly ever called for."""
     d = FIRST_SPREAD + sharp.size
-    numbers = prior_numbers(model.beliefs, tests.flatness, tests.weight)
-    target = Target(numbers, _quadratic(len(tests)), sharp)
+    numbers = prior_numbers(model.chosen_priors, tests.flatness, tests.weight)
+    target = LogPosterior(numbers, _quadratic(len(tests)), sharp)
     cast(Any, expected_latent).lower(_dummy(d), target).compile()
     gradients(np.zeros((0, d)), target)
     if many:
@@ -73,7 +73,7 @@ def _particles(tests: Tests, model: JointModel, sharp: Scatter, draws: int) -> N
     count, points = tests.force.shape
     common = None if tests.force_zero_sd is None else _dummy(count, points)
     filters = eqx.filter_vmap(Whitening)(*(_dummy(count, points) for _ in range(4)), tests.branch, common)
-    exact = Exact(tests, filters, _quadratic(count), sharp, model.zero_sd, model.unloading)
+    exact = ExactLikelihood(tests, filters, _quadratic(count), sharp, model.zero_sd, model.unloading)
     several, triple = _dummy(draws), _dummy(draws, 3)
     some = eqx.filter_vmap(Population)(several, several, triple, triple, several, several, several)
     cast(Any, draw_particles).lower(jax.random.key(0)[None], some, exact, 1, _dummy() > 2).compile()

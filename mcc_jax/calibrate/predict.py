@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ... import arguments
-from ..._errors import InputError
-from ...campaign import PAPER_EFFECTIVE_MODULUS_MPA, PAPER_LOG_C, PAPER_SHAPE_PARAMETER, particle_batch
-from ...law import MccLaw, Plastic
-from ._bayes import BayesCalibration, summary
-from ._compile import compiled
-from ._population import COEFFICIENTS
+from .. import arguments
+from .._errors import InputError
+from ..campaign import PAPER_EFFECTIVE_MODULUS_MPA, PAPER_LOG_C, PAPER_SHAPE_PARAMETER, particle_batch
+from ..law import MccLaw, Plastic
+from .compiling import compiled
+from .population import COEFFICIENTS
+from .posterior import BayesCalibration, summary
 
 A_CALIBRATION = "Make one with mcc_jax.calibrate_bayes(campaign)."
 
@@ -65,7 +65,7 @@ def _laws(calibration: BayesCalibration, C: np.ndarray, a: np.ndarray, modulus: 
     return eqx.filter_vmap(one)(jnp.asarray(C), jnp.asarray(a), jnp.asarray(modulus))
 
 
-def new_laws(calibration: BayesCalibration, count: int, *, seed: int = 0) -> MccLaw:
+def sample_laws(calibration: BayesCalibration, count: int, *, seed: int = 0) -> MccLaw:
     """Laws of particles never measured, for DEM or any other use: one posterior draw of the population each.
 
     They carry both the scatter of the particles and the uncertainty of the population. Laws that are not monotone are
@@ -115,7 +115,7 @@ def predict_new_particle(
     force_mN = np.asarray(arguments.path(force_mN, "force_mN"))
     if not np.isfinite(force_mN).all():
         raise InputError(f"force_mN is {force_mN[~np.isfinite(force_mN)][0]} at one point", remedy="Leave it out.")
-    laws = new_laws(calibration, count, seed=seed)
+    laws = sample_laws(calibration, count, seed=seed)
     paths = np.broadcast_to(np.asarray(force_mN, float), (count, len(force_mN)))
     particles = particle_batch(np.broadcast_to(sizes, (count, 3)))
     return PredictedCurves(
@@ -189,7 +189,7 @@ def _wander(rng: np.random.Generator, step: np.ndarray, sd: float, length: float
     return values
 
 
-def beside_paper(calibration: BayesCalibration) -> list[dict[str, Any]]:
+def compare_with_paper(calibration: BayesCalibration) -> list[dict[str, Any]]:
     """The paper's Table 2, a and modulus beside ours: one row per quantity, with mean, sd and 95 % interval of ours."""
     arguments.instance(calibration, BayesCalibration, "calibration", A_CALIBRATION)
     named = calibration.named_population()

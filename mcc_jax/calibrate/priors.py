@@ -10,11 +10,11 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from ... import arguments
-from ..._errors import InputError
-from ...campaign import load_toml_file
-from ...law import Unloading
-from ._noise import NoisePrior
+from .. import arguments
+from .._errors import InputError
+from ..campaign import load_toml_file
+from ..law import Unloading
+from .noise import NoisePrior
 
 
 @dataclass(frozen=True)
@@ -74,11 +74,11 @@ class NakagamiPrior:
     def __post_init__(self) -> None:
         """Refuse what is no distribution of a spread."""
         object.__setattr__(self, "sd", arguments.number(self.sd, "the scale sd of a spread", above=0))
-        shape = arguments.number(self.shape, "the shape of a spread's prior", above=0, most=MOST_SHAPE)
+        shape = arguments.number(self.shape, "the shape of a spread's prior", above=0, most=MAX_SHAPE)
         object.__setattr__(self, "shape", shape)
 
 
-MOST_SHAPE = 0.5
+MAX_SHAPE = 0.5
 _OF_SHAPE = "must be above 0 and at most 1/2"
 
 
@@ -196,7 +196,7 @@ def read_priors(file: str | Path, unloading: Unloading | str = Unloading.PRINTED
                     f"prior {name!r} has no entry {key!r}", file=str(file), remedy=f"Its entries: {', '.join(fields)}."
                 )
             number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-            if not number or (key in _POSITIVE and value <= 0) or (key == "shape" and value > MOST_SHAPE):
+            if not number or (key in _POSITIVE and value <= 0) or (key == "shape" and value > MAX_SHAPE):
                 must = _OF_SHAPE if key == "shape" else f"must be a {'positive ' if key in _POSITIVE else ''}number"
                 raise InputError(f"{name}.{key} {must}, not {value!r}", file=str(file), remedy="Correct the entry.")
         changes[name] = dataclasses.replace(known[name], **{k: float(v) for k, v in entry.items()})

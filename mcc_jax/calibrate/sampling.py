@@ -1,6 +1,6 @@
 """The posterior: the population sampled with all particles integrated out, the particles drawn back, and exact weights.
 
-1. Given the summaries (`_population`), nothing but the population is left to sample: seven to eleven numbers.
+1. Given the summaries (`population`), nothing but the population is left to sample: seven to eleven numbers.
 2. Given a draw of the population, every particle's parameters are normal and independent: drawn directly.
 3. A summary is a quadratic; the true likelihood of a test is not. Their ratio at the drawn parameters is the draw's
    importance weight, which makes the result exact whatever the summary's quality, and shows that quality (Pareto k).
@@ -19,15 +19,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from ..._types import Scalar
-from ...law import Unloading
-from ._compile import compiled, even_batch
-from ._data import Tests
-from ._forward import displacement
-from ._mode import PriorNumbers, Target, from_free
-from ._noise import Whitening
-from ._nuts import Chains, sample
-from ._population import Draw, Population, Scatter, Summary, draw_latent
+from .._types import Scalar
+from ..law import Unloading
+from .compiling import compiled, even_batch
+from .data import Tests
+from .forward import displacement
+from .noise import Whitening
+from .nuts import Chains, sample
+from .population import Draw, Population, Scatter, Summary, draw_latent
+from .transforms import LogPosterior, PriorNumbers, constrain
 
 
 class ParticleDraws(NamedTuple):
@@ -51,7 +51,7 @@ def sample_population(
     keys: Key[Array, " chains"],
     mode: Float[Array, " d"],
     covariance: Float[Array, "d d"],
-    target: Target,
+    target: LogPosterior,
     accept: Scalar,
     *,
     warmup: int,
@@ -73,7 +73,7 @@ def sample_population(
     return run, jax.vmap(target.population)(run.position.reshape(-1, mode.shape[0]))
 
 
-class Exact(eqx.Module):
+class ExactLikelihood(eqx.Module):
     """Tests with their exact likelihood, and what particles are drawn by.
 
     Attributes:
@@ -99,7 +99,7 @@ class Exact(eqx.Module):
         summary = self.summary_at(population)
         return draw_latent(population, summary, self.tests.flatness, self.scatter, normal, normal_zero)
 
-    def some(self, which: Int[Array, " chosen"]) -> Exact:
+    def some(self, which: Int[Array, " chosen"]) -> ExactLikelihood:
         """Some of the tests."""
         chosen = [jax.tree.map(lambda x: x[which], part) for part in self.by_test()]
         return eqx.tree_at(lambda exact: exact.by_test(), self, tuple(chosen))
@@ -148,7 +148,7 @@ ROWS, ROWS_OF_ACCELERATORS = 640, 40_000
 def draw_particles(
     keys: Key[Array, " 1"],
     population: Population,
-    exact: Exact,
+    exact: ExactLikelihood,
     candidates: int = 1,
     common: bool | Bool[Array, ""] = False,
 ) -> ParticleDraws:
@@ -212,7 +212,7 @@ def sample_joint(
     mode: Float[Array, " d"],
     covariance: Float[Array, "d d"],
     numbers: PriorNumbers,
-    exact: Exact,
+    exact: ExactLikelihood,
     accept: Scalar,
     *,
     warmup: int,
@@ -235,7 +235,7 @@ def sample_joint(
 
     def place(position):
         free, rest = position[:d], position[d:].reshape(count, k + 1)
-        population, prior = from_free(free, numbers, exact.scatter)
+        population, prior = constrain(free, numbers, exact.scatter)
         return population, prior, exact.draw(population, rest[:, :k], rest[:, k])
 
     def log_density(position):

@@ -23,9 +23,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from ..._errors import InputError
-from ._compile import compiled
-from ._data import Tests, enlarged
+from .._errors import InputError
+from .compiling import compiled
+from .data import Tests, enlarged
 
 AXIS = "particles"
 """Name of the only axis of the mesh of a process's devices."""

@@ -11,9 +11,9 @@ import numpy as np
 from jax.scipy.special import log_ndtr
 from jaxtyping import Array, Float, Int
 
-from ..._types import Scalar
-from ._compile import compiled
-from ._population import Population, Scatter, Summary, marginal_likelihood
+from .._types import Scalar
+from .compiling import compiled
+from .population import Population, Scatter, Summary, marginal_likelihood
 
 
 class PriorNumbers(eqx.Module):
@@ -97,7 +97,7 @@ def given_mu_3(mu_1: Scalar, mu_5: Scalar, softening: Float[Array, " 2"]) -> tup
     return (jnp.log(20 / 9) + mu_1 + 5 * mu_5 + softening[0]) / 6, softening[1] / 6
 
 
-def from_free(free: Float[Array, " d"], numbers: PriorNumbers, scatter: Scatter) -> tuple[Population, Scalar]:
+def constrain(free: Float[Array, " d"], numbers: PriorNumbers, scatter: Scatter) -> tuple[Population, Scalar]:
     """The population at unbounded coordinates, and the log density of its prior in those coordinates."""
     mean, sd, low, high = numbers.a
     unit = jax.nn.sigmoid(free[0])
@@ -139,7 +139,7 @@ def from_free(free: Float[Array, " d"], numbers: PriorNumbers, scatter: Scatter)
     return population, density
 
 
-def to_free(
+def unconstrain(
     a: float, log_modulus: float, mu: np.ndarray, tau: np.ndarray, numbers: PriorNumbers, scatter: Scatter
 ) -> Float[Array, " d"]:
     """Unbounded coordinates of a population, kept away from the bounds of `a`; further scatter begins at a tenth."""
@@ -166,7 +166,7 @@ def recentred(numbers: PriorNumbers, free: Float[Array, " d"]) -> tuple[PriorNum
     return eqx.tree_at(lambda n: n.centre, numbers, jnp.asarray(centre)), jnp.asarray(here)
 
 
-class Target(eqx.Module):
+class LogPosterior(eqx.Module):
     """The density of the population given all tests, in unbounded coordinates.
 
     Attributes:
@@ -186,11 +186,11 @@ class Target(eqx.Module):
 
     def population(self, free: Float[Array, " d"]) -> Population:
         """The population at unbounded coordinates."""
-        return from_free(free, self.numbers, self.scatter)[0]
+        return constrain(free, self.numbers, self.scatter)[0]
 
     def log_density(self, free: Float[Array, " d"]) -> Scalar:
         """Log density of the population given all tests, up to a constant."""
-        population, prior = from_free(free, self.numbers, self.scatter)
+        population, prior = constrain(free, self.numbers, self.scatter)
         return prior + self.numbers.total(marginal_likelihood(population, self.summary, self.flatness, self.scatter))
 
 
@@ -205,7 +205,7 @@ ATTEMPTS = 4
 
 @compiled
 def _gradients(
-    free: Float[Array, "rows d"], count: Int[Array, ""], target: Target
+    free: Float[Array, "rows d"], count: Int[Array, ""], target: LogPosterior
 ) -> tuple[Float[Array, " rows"], Float[Array, "rows d"]]:
     expand = jax.value_and_grad(lambda one: -target.log_density(one))
 
@@ -215,7 +215,7 @@ def _gradients(
     return jax.lax.fori_loop(0, count, add, (jnp.zeros_like(free[:, 0]), jnp.zeros_like(free)))
 
 
-def gradients(free: np.ndarray, target: Target) -> tuple[np.ndarray, np.ndarray]:
+def gradients(free: np.ndarray, target: LogPosterior) -> tuple[np.ndarray, np.ndarray]:
     """Minus the log density at up to `ROWS` coordinates, shape (many, d), and its gradients.
 
     Always compiled for `ROWS`, so that few and many of them share their compilation.
@@ -225,7 +225,9 @@ def gradients(free: np.ndarray, target: Target) -> tuple[np.ndarray, np.ndarray]
     return np.asarray(value)[: len(free)], np.asarray(slope)[: len(free)]
 
 
-def most_probable(start: Float[Array, " d"], target: Target) -> tuple[Float[Array, " d"], Float[Array, "d d"], bool]:
+def most_probable(
+    start: Float[Array, " d"], target: LogPosterior
+) -> tuple[Float[Array, " d"], Float[Array, "d d"], bool]:
     """Mode of the population in unbounded coordinates, covariance there, and whether the optimiser converged.
 
     Newton's method in a trust region (SciPy), in coordinates scaled by the curvature at the start. The curvature comes
@@ -237,7 +239,7 @@ def most_probable(start: Float[Array, " d"], target: Target) -> tuple[Float[Arra
         return _most_probable(np.asarray(start), target)
 
 
-def _most_probable(origin: np.ndarray, target: Target) -> tuple[Float[Array, " d"], Float[Array, "d d"], bool]:
+def _most_probable(origin: np.ndarray, target: LogPosterior) -> tuple[Float[Array, " d"], Float[Array, "d d"], bool]:
     d = len(origin)
     width = np.full(d, 1e-5)
 

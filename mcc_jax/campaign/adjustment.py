@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from .. import arguments
-from ._schema import Campaign, Curve
-from ._segments import Segment, check_segmented, find_segments
-from ._validate import check_campaign
 from .reasons import USABLE, below_threshold, far_apart, no_climb, no_loading, too_few
+from .schema import Campaign, Curve
+from .segments import Segment, check_segmented, find_segments
+from .validate import check_campaign
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from jaxtyping import Array, Bool, Float
 from .. import arguments
 from .._types import Scalar
 from ..geometry import Particle
-from ._schema import Campaign
-from ._validate import check_campaign
+from .schema import Campaign
+from .validate import check_campaign
 
 
 def particle_batch(diameters_um: Any) -> Particle:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from .. import arguments
 from ..files import LIMITS, open_regular
-from ._csv import CURVES, METADATA
-from ._curves import PARTICLES
+from .csv import CURVES, METADATA
+from .curves import PARTICLES
 
 
 def file_checksums(folder: str | Path) -> dict[str, str]:

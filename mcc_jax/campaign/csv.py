@@ -13,12 +13,12 @@ import numpy as np
 from .. import arguments
 from .._errors import InputError
 from ..files import LIMITS, FileLimits
-from ._columns import LENGTH, convert, find_column
-from ._curves import PARTICLES, CurveRows, name_column, read_curves
-from ._metadata import parse_metadata, read_settings
-from ._schema import Campaign
-from ._table import Table, decode, make_table, parse_table, read_bytes, read_table
-from ._validate import check_magnitudes
+from .columns import LENGTH, convert, find_column
+from .curves import PARTICLES, CurveRows, name_column, read_curves
+from .metadata import parse_metadata, read_settings
+from .schema import Campaign
+from .table import Table, decode, make_table, parse_table, read_bytes, read_table
+from .validate import check_magnitudes
 from .workbook import is_workbook, read_sheet
 
 CURVES, METADATA = "curves.csv", "campaign.toml"

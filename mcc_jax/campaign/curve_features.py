@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ._segments import Segment
+from .segments import Segment
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,10 @@ import numpy as np
 
 from .._errors import InputError
 from ..files import LIMITS, FileLimits
-from ._columns import FORCE, LARGEST_MAGNITUDE, LENGTH, TIME, convert, find_column, missing_column
-from ._schema import Curve
-from ._table import decode, parse_table, read_bytes, same_text
-from ._validate import check_magnitudes
+from .columns import FORCE, LARGEST_MAGNITUDE, LENGTH, TIME, convert, find_column, missing_column
+from .schema import Curve
+from .table import decode, parse_table, read_bytes, same_text
+from .validate import check_magnitudes
 
 PARTICLES = "particles.csv"
 _QUANTITIES = (("time", TIME), ("force", FORCE), ("displacement", LENGTH))
@@ -46,13 +46,16 @@ class CurveRows:
         return replace(self, groups=groups)
 
     def curve(self, name: str) -> Curve:
+        """The test of one particle, its rows in the file's order."""
         time, force, displacement = (np.ascontiguousarray(column[self.groups[name]]) for column in self.values)
         return Curve(time, force, displacement)
 
     def row(self, record: int) -> int:
+        """The line of the file that a record stands in, the first being 1."""
         return parse_table(self.text, self.file).rows[record]
 
     def check(self, name: str, curve: Curve) -> None:
+        """Refuse a test that cannot be one, naming file, row and column."""
         records = self.groups[name]
         if len(curve) < 2:
             raise InputError(
@@ -87,6 +90,7 @@ class CurveRows:
 
 
 def read_curves(file: Path, limits: FileLimits = LIMITS) -> CurveRows:
+    """The rows of a file of curves, grouped by particle."""
     data = read_bytes(file, limits)
     text = decode(data, file)
     first = re.split(r"[\r\n]", text, maxsplit=1)[0]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ._signal import branch_envelope, noise_level, turning_points
+from .signal import branch_envelope, noise_level, turning_points
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from .._errors import InputError
-from ._schema import Campaign, Metadata
-from ._validate import check_campaign
+from .schema import Campaign, Metadata
+from .validate import check_campaign
 
 _ALIKE = ("control", "punch_diameter_um", "corrections")
 _COARSEST = ("force_resolution_mN", "displacement_resolution_um")

@@ -16,9 +16,9 @@ import numpy as np
 from .. import arguments
 from .._errors import InputError
 from ..files import LIMITS, FileLimits, check_toml, read_regular
-from ._columns import FORCE, LENGTH, convert, find_column
-from ._schema import Control, Metadata
-from ._table import decode
+from .columns import FORCE, LENGTH, convert, find_column
+from .schema import Control, Metadata
+from .table import decode
 
 _QUANTITIES = {"force_resolution": FORCE, "displacement_resolution": LENGTH, "punch_diameter": LENGTH}
 _WORDS = ("control", "provenance", "corrections")

@@ -23,13 +23,12 @@ from typing import Literal
 
 import numpy as np
 
-from ._paper import PAPER_LOG_C, PAPER_SHAPE_PARAMETER
-from ._schema import Campaign
-from ._segments import Segment
-from ._validate import check_campaign
 from .curve_features import CurveFeatures, curve_features
 from .findings import Finding, worst
+from .paper import PAPER_LOG_C, PAPER_SHAPE_PARAMETER
 from .plausible_ranges import PlausibilityOptions, Range
+from .schema import Campaign
+from .segments import Segment
 from .slips import (
     Apparent,
     Slip,
@@ -43,6 +42,7 @@ from .slips import (
     remedy_of,
     undo,
 )
+from .validate import check_campaign
 
 CHECK = "plausibility"
 

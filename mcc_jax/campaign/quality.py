@@ -17,13 +17,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ._schema import Campaign, Checked, Control, Curve, Note
-from ._segments import find_segments
-from ._signal import point_noise, runs, two_lines
-from ._validate import check_campaign
 from .findings import Finding
 from .plausibility import wrong_signs
 from .saturation import SaturationOptions, censor_displacement, censor_force
+from .schema import Campaign, Checked, Control, Curve, Note
+from .segments import find_segments
+from .signal import point_noise, runs, two_lines
+from .validate import check_campaign
 
 
 @dataclass(frozen=True)

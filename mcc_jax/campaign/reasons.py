@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from .._errors import InputError
-from ._schema import Campaign, Curve
-from ._segments import Segment
 from .plausibility import check_plausibility
+from .schema import Campaign, Curve
+from .segments import Segment
 
 
 @dataclass(frozen=True)

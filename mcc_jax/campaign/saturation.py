@@ -17,8 +17,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ._schema import Curve, Note
-from ._signal import point_noise, runs
+from .schema import Curve, Note
+from .signal import point_noise, runs
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,9 @@ import numpy as np
 
 from .. import arguments
 from .._errors import InputError
-from ._drive import Drive, DriveOptions, Hold
-from ._schema import A_CURVE, Control, Curve
-from ._signal import branch_envelope, steady_clock, two_lines
+from .excursions import Drive, DriveOptions, Hold
+from .schema import A_CURVE, Control, Curve
+from .signal import branch_envelope, steady_clock, two_lines
 
 SegmentKind = Literal["approach", "load", "hold", "unload", "reload"]
 

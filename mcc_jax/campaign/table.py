@@ -22,7 +22,7 @@ import numpy as np
 
 from .._errors import InputError
 from ..files import LIMITS, FileLimits, read_table_bytes
-from ._columns import LARGEST_MAGNITUDE
+from .columns import LARGEST_MAGNITUDE
 
 SPACES = " \u00a0\u2007\u2009\u202f"
 """Blank, no-break, figure, thin and narrow no-break space: nobody sees which of them parts the thousands."""

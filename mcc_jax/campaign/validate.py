@@ -11,8 +11,8 @@ import numpy as np
 
 from .. import arguments
 from .._errors import InputError
-from ._columns import LARGEST_MAGNITUDE
-from ._schema import Campaign
+from .columns import LARGEST_MAGNITUDE
+from .schema import Campaign
 
 SMALLEST_DIAMETER_UM = 1e-6
 _TAKEN = ("particle", "D1_um", "D2_um", "D3_um")

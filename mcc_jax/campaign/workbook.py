@@ -14,7 +14,7 @@ from .._errors import InputError
 _BOOK = "xl/workbook.xml"
 LARGEST_UNPACKED = 512 * 2**20
 """Bytes that a workbook may unpack to: what a zip archive of tests may, see `readers._micromaterials`."""
-MOST_CELLS = 40_000_000
+MAX_CELLS = 40_000_000
 """Cells of a sheet's rectangle, empty ones included, since the engine makes room for all (32 bytes each): a full
 sheet of 1,048,576 rows has 38 columns then; a cell alone in the last row and column would ask for 17e9."""
 _LAST = re.compile(rb'<c\b[^>]*?\br="([A-Z]{1,3})([0-9]{1,7})"')
@@ -130,7 +130,7 @@ def _check_size(data: bytes, file: Path) -> None:
                     for letter in letters:
                         column = 26 * column + letter - 64
                     last = [max(last[0], int(digits)), max(last[1], column)]
-                if last[0] * last[1] > MOST_CELLS:
+                if last[0] * last[1] > MAX_CELLS:
                     raise InputError(
                         f"a sheet reaches to row {last[0]} and column {last[1]}, which is too large",
                         file=file,

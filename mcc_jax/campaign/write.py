@@ -11,11 +11,11 @@ import numpy as np
 
 from .. import arguments
 from .._errors import InputError
-from ._csv import CURVES, METADATA
-from ._curves import PARTICLES
-from ._metadata import format_metadata
-from ._schema import Campaign
-from ._validate import check_campaign
+from .csv import CURVES, METADATA
+from .curves import PARTICLES
+from .metadata import format_metadata
+from .schema import Campaign
+from .validate import check_campaign
 
 
 def write_campaign(campaign: Campaign, folder: str | os.PathLike[str]) -> None:

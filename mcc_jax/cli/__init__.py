@@ -1,3 +1,3 @@
 """The command line, `mcc-jax`: everything heavy is imported inside the commands, so that help comes at once."""
 
-from ._main import main as main
+from .main import main as main

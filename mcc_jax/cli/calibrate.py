@@ -9,10 +9,8 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from ._group import NOT_CONVERGED
-from ._output import json_text, results
-from ._session import beside, import_writers, say, say_table, session
-from ._types import (
+from .group import NOT_CONVERGED
+from .options import (
     CampaignFolder,
     law_options,
     leave_out_option,
@@ -21,6 +19,8 @@ from ._types import (
     seed_option,
     threshold_option,
 )
+from .output import json_text, results
+from .session import beside, import_writers, say, say_table, session
 
 METHODS = ("paper", "least-squares", "bayes")
 # Which methods an option belongs to; given with another one it would be ignored, so it is refused.
@@ -135,7 +135,7 @@ def calibrate(
             raise click.UsageError(f"{option} belongs to --method {' or '.join(methods)}, not to {method}.")
     with session(12) as tell:
         from ..campaign import read_campaign
-        from ._calibration import (
+        from .calibration import (
             left_out,
             main_numbers,
             require_particle,
@@ -144,7 +144,7 @@ def calibrate(
             say_warnings,
             write_calibration,
         )
-        from ._provenance import provenance
+        from .provenance import provenance
 
         tell("reading the campaign")
         data = left_out(read_campaign(campaign), leave_out)
@@ -167,7 +167,7 @@ def calibrate(
                 )
             else:
                 from ..calibrate import calibrate_bayes, calibrate_least_squares
-                from ._calibration import joint_model
+                from .calibration import joint_model
 
                 model = joint_model(unloading, strain_scaling, modulus_scatter, shape_scatter, priors)
                 if method == "bayes":

@@ -14,9 +14,9 @@ from ..calibrate import BayesCalibration, JointModel, LeastSquaresCalibration, P
 from ..calibrate.judgement import MODULUS_OPEN
 from ..campaign import Campaign, Finding
 from ..files import LIMITS, read_regular
-from ._figures import FIGURES, write_figures, write_result
-from ._output import Stage
-from ._session import Tell, say
+from .figures import FIGURES, write_figures, write_result
+from .output import Stage
+from .session import Tell, say
 
 RESULT, POSTERIOR = "calibration.json", "posterior.nc"
 Calibration = PaperCalibration | LeastSquaresCalibration | BayesCalibration
@@ -77,8 +77,8 @@ def joint_model(
     from ..law import StrainScaling, Unloading
 
     form = Unloading(unloading)
-    beliefs = None if priors is None else read_priors(priors, form)
-    return JointModel(form, StrainScaling(strain_scaling), modulus_scatter, shape_scatter, beliefs)
+    priors_given = None if priors is None else read_priors(priors, form)
+    return JointModel(form, StrainScaling(strain_scaling), modulus_scatter, shape_scatter, priors_given)
 
 
 def _is_ours(file: Path) -> bool:

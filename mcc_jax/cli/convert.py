@@ -9,9 +9,9 @@ from pathlib import Path
 
 import click
 
-from ._output import results
-from ._session import say, say_table, session
-from ._types import Location, out_option, seed_option
+from .options import Location, out_option, seed_option
+from .output import results
+from .session import say, say_table, session
 
 SHOWN = 12
 """Rows of the table of tests; a folder may hold hundreds."""

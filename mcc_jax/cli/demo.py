@@ -8,9 +8,9 @@ from pathlib import Path
 
 import click
 
-from ._output import results
-from ._session import beside, import_writers, say, say_table, session
-from ._types import out_option, seed_option
+from .options import out_option, seed_option
+from .output import results
+from .session import beside, import_writers, say, say_table, session
 
 CAMPAIGN_FILES = ("particles.csv", "curves.csv", "campaign.toml")
 
@@ -33,8 +33,8 @@ def demo(out: Path, seed: int) -> None:
         from ..calibrate import calibrate_bayes
         from ..campaign import write_campaign
         from ..simulate import paper_campaign
-        from ._calibration import main_numbers, say_files, say_state, say_warnings, write_calibration
-        from ._provenance import provenance
+        from .calibration import main_numbers, say_files, say_state, say_warnings, write_calibration
+        from .provenance import provenance
 
         with results(out) as stage:
             tell("simulating the campaign")
@@ -45,8 +45,8 @@ def demo(out: Path, seed: int) -> None:
                 calibration = calibrate_bayes(campaign, seed=seed, progress=tell)
             from ..discover import discover
             from ..report import read_results, report_page
-            from ._discovery import DISCOVERY, main_finding, write_discovery
-            from ._report import REPORT
+            from .discovery import DISCOVERY, main_finding, write_discovery
+            from .report import REPORT
 
             # One core draws while the others compile.
             with beside(lambda: discover(campaign, experiments=False, seed=seed, progress=tell)) as found:
@@ -94,8 +94,7 @@ def demo(out: Path, seed: int) -> None:
 
 def _import_the_rest() -> None:
     """What the demo needs after calibrating, seconds to import: discovery, drawing, the page, the posterior's file."""
-    from .. import report  # noqa: F401
-    from . import _discovery, _report  # noqa: F401
+    from . import discovery, report  # noqa: F401  (the command `report` loads the package of that name)
 
     import_writers(figures=True, posterior=True)
 

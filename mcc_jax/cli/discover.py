@@ -7,9 +7,7 @@ from pathlib import Path
 
 import click
 
-from ._output import json_text, results
-from ._session import beside, import_writers, say, session
-from ._types import (
+from .options import (
     CampaignFolder,
     exclude_option,
     law_options,
@@ -19,6 +17,8 @@ from ._types import (
     seed_option,
     threshold_option,
 )
+from .output import json_text, results
+from .session import beside, import_writers, say, session
 
 
 @click.command(short_help="Find, name and add what the law misses.")
@@ -76,9 +76,9 @@ def discover(
     with session(20) as tell:
         from ..campaign import read_campaign
         from ..discover import discover as find
-        from ._calibration import joint_model, left_out, say_files
-        from ._discovery import require_mechanisms, say_discovery, write_discovery
-        from ._provenance import provenance
+        from .calibration import joint_model, left_out, say_files
+        from .discovery import require_mechanisms, say_discovery, write_discovery
+        from .provenance import provenance
 
         require_mechanisms(exclude)
         tell("reading the campaign")

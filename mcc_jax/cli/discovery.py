@@ -11,9 +11,9 @@ from typing import Any
 from .._errors import InputError
 from ..discover import Discovery
 from ..effects import LIBRARY
-from ._figures import write_figures, write_result
-from ._output import Stage
-from ._session import Tell, say, say_table
+from .figures import write_figures, write_result
+from .output import Stage
+from .session import Tell, say, say_table
 
 DISCOVERY = "discovery.json"
 ROWS = 6

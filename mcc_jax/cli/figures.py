@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from ..files import LIMITS, read_regular
-from ._output import Stage, json_text
-from ._session import Tell
+from .output import Stage, json_text
+from .session import Tell
 
 FIGURES = "figures"
 _FIGURE = re.compile(rf"{FIGURES}/[A-Za-z0-9_-]+\.png")

@@ -13,15 +13,15 @@ from typing import Any
 
 import click
 
-from ._calibrate import calibrate
-from ._convert import convert
-from ._demo import demo
-from ._discover import discover
-from ._export import export
-from ._group import INTERRUPTED, PROGRAM, OneLineGroup
-from ._power import power
-from ._report import report
-from ._simulate import simulate
+from .calibrate import calibrate
+from .convert import convert
+from .demo import demo
+from .discover import discover
+from .export import export
+from .group import INTERRUPTED, PROGRAM, OneLineGroup
+from .power import power
+from .report import report
+from .simulate import simulate
 
 EPILOG = """\b
 Examples:

@@ -18,7 +18,7 @@ from typing import Any
 
 from .._errors import InputError
 from ..files import LIMITS, read_regular
-from ._lock import locked
+from .lock import locked
 
 WORK = ".mcc-jax-work-"
 MOVES = "moves.json"

@@ -7,9 +7,7 @@ from typing import Any
 
 import click
 
-from ._output import json_text, results
-from ._session import say, say_table, session
-from ._types import (
+from .options import (
     CampaignFolder,
     exclude_option,
     law_options,
@@ -18,6 +16,8 @@ from ._types import (
     seed_option,
     threshold_option,
 )
+from .output import json_text, results
+from .session import say, say_table, session
 
 POWER = "power.json"
 
@@ -56,9 +56,9 @@ def power(
         from ..campaign import read_campaign
         from ..discover import power_of_campaign
         from ..effects import LIBRARY
-        from ._calibration import joint_model, say_files
-        from ._discovery import require_mechanisms
-        from ._figures import write_result
+        from .calibration import joint_model, say_files
+        from .discovery import require_mechanisms
+        from .figures import write_result
 
         require_mechanisms(exclude)
         tell("reading the campaign")

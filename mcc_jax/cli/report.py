@@ -6,9 +6,9 @@ from pathlib import Path
 
 import click
 
-from ._output import results
-from ._session import say, session
-from ._types import Location, out_option, seed_option
+from .options import Location, out_option, seed_option
+from .output import results
+from .session import say, session
 
 REPORT = "report.html"
 

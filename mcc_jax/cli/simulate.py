@@ -8,9 +8,9 @@ from typing import Any
 
 import click
 
-from ._output import results
-from ._session import say, session
-from ._types import Interval, Levels, Location, Number, law_options, out_option, seed_option
+from .options import Interval, Levels, Location, Number, law_options, out_option, seed_option
+from .output import results
+from .session import say, session
 
 POSITIVE, NOT_NEGATIVE = {"least": 0, "above": True}, {"least": 0}
 
@@ -102,7 +102,13 @@ def simulate(out: Path, particles: Path | None, unloading: str, strain_scaling: 
     with session(3) as tell:
         from ..campaign import write_campaign
         from ..law import StrainScaling, Unloading
-        from ._simulation import Material, hidden_effects, particle_sizes, peaks_and_programme, simulate_particles
+        from .simulation import (
+            Material,
+            hidden_effects,
+            particle_sizes,
+            peaks_and_programme,
+            simulate_particles,
+        )
 
         tell("reading the input")
         sizes = particle_sizes(particles)

@@ -24,7 +24,7 @@ from ..campaign import (
     read_particles,
 )
 from ..effects import HUMIDITY_COLUMN, Need
-from ..effects._record import humidity_column
+from ..effects.record import humidity_column
 from ..geometry import Particle, plastic_shape_factor
 from ..law import MccLaw, StrainScaling, Unloading
 from ..simulate import (
@@ -40,7 +40,7 @@ from ..simulate import (
     simulate_campaign,
 )
 
-MOST_ROWS = 10_000_000
+MAX_ROWS = 10_000_000
 LONGEST_S = 1e12
 
 
@@ -174,9 +174,9 @@ def _check_size(programme: Programme, peaks: np.ndarray, file: Path | None) -> N
             raise InputError(f"a test would take {duration:.4g} s", file=file, remedy="Give a higher rate")
         samples = programme.points or math.ceil(duration / (programme.interval_s or 1.0))
         rows += samples + len(programme.steps)
-        if rows > MOST_ROWS or samples * len(programme.steps) > 10 * MOST_ROWS:
+        if rows > MAX_ROWS or samples * len(programme.steps) > 10 * MAX_ROWS:
             raise InputError(
-                f"the campaign would have more than {MOST_ROWS} rows, or too many steps for its points",
+                f"the campaign would have more than {MAX_ROWS} rows, or too many steps for its points",
                 file=file,
                 remedy="Take fewer points, a longer interval or a higher rate",
             )

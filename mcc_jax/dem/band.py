@@ -15,12 +15,12 @@ from .. import arguments
 from .._errors import InputError
 from ..calibrate import BayesCalibration
 from ..law import MccLaw, Plastic
-from ._forces import Packing
-from ._load_steps import LoadStep, Solver
-from ._packings import MCC_DENSITY, spheres
-from ._quasistatic import Compaction, compact
-from ._sensitivity import PackingOf, Sensitivity, punch_sensitivity
-from ._state import State, not_monotone
+from .forces import Packing
+from .load_steps import LoadStep, Solver
+from .packings import MCC_DENSITY, spheres
+from .quasistatic import Compaction, compact
+from .sensitivity import PackingOf, Sensitivity, punch_sensitivity
+from .state import State, not_monotone
 
 PROBABILITY = (0.05, 0.5, 0.95)
 REDRAWS = 100

@@ -17,13 +17,13 @@ from .. import arguments
 from .._errors import InputError
 from .._numerics import shared
 from .._types import Scalar
-from ._edges import PADDING, Edges, carry_history, widened
-from ._forces import A_PACKING, Forces, Interaction, Packing, Vector, contact_forces
-from ._measured import Sample, Trajectory, measured
-from ._pair import wall_force, wall_recovery
-from ._sharded import Contacts, Devices, at_home, divided
-from ._state import A_STATE, State, check_state, listed
-from ._walls import set_velocity
+from .edges import PADDING, Edges, carry_history, widened
+from .forces import A_PACKING, Forces, Interaction, Packing, Vector, contact_forces
+from .measured import Sample, Trajectory, measured
+from .pair import wall_force, wall_recovery
+from .sharded import Contacts, Devices, at_home, divided
+from .state import A_STATE, State, check_state, listed
+from .walls import set_velocity
 
 
 class Motion(eqx.Module):

@@ -11,8 +11,8 @@ import optimistix as optx
 from jaxtyping import Array, Int
 
 from .._types import Flag, Scalar
-from ._forces import Vectors
-from ._stiffness import Balance, Held, Stiffness, balance, net_force
+from .forces import Vectors
+from .stiffness import Balance, Held, Stiffness, balance, net_force
 
 SUFFICIENT = 1e-4
 """Share of the decrease the slope promises that a step must bring (Armijo)."""
@@ -47,7 +47,8 @@ class ContactNewton(optx.AbstractMinimiser[Vectors, Balance, _State]):
     atol: Scalar  # pyright: ignore[reportIncompatibleVariableOverride]
     reach: Scalar
 
-    def norm(self, y: Any) -> Scalar:  # an attribute that Optimistix asks for
+    def norm(self, y: Any) -> Scalar:
+        """The largest absolute entry; an attribute that Optimistix asks for."""
         return jnp.max(jnp.abs(y))
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:

@@ -11,10 +11,10 @@ from jaxtyping import Array, Float
 from .. import arguments
 from .._numerics import shared
 from .._types import Flag, Scalar, ScalarLike, scalar
-from ._edges import Edges
-from ._pair import largest_overlap, pair_force, wall_force
-from ._side import HalfContact
-from ._walls import Wall, Walls
+from .edges import Edges
+from .pair import largest_overlap, pair_force, wall_force
+from .side import HalfContact
+from .walls import Wall, Walls
 
 Vectors = Float[Array, "particles 3"]
 Vector = Float[Array, " 3"]

@@ -12,10 +12,10 @@ from jaxtyping import Array
 
 from .. import arguments
 from .._errors import InputError
-from ._load_steps import TOP, LoadStep, Solver, checked_solver, replay_stacked, stacked
-from ._quasistatic import Compaction, compact
-from ._sensitivity import PackingOf
-from ._state import A_STATE, State
+from .load_steps import TOP, LoadStep, Solver, checked_solver, replay_stacked, stacked
+from .quasistatic import Compaction, compact
+from .sensitivity import PackingOf
+from .state import A_STATE, State
 
 ROUNDS = 5
 

@@ -14,12 +14,12 @@ from jaxtyping import Array, Bool, Float, Int
 from .. import arguments
 from .._errors import InputError
 from .._types import Scalar
-from ._edges import PADDING, Edges, carry_history
-from ._equilibrium import settle
-from ._forces import A_PACKING, Packing, Vectors, WallHistory
-from ._state import A_STATE, State
-from ._stiffness import Held, force_on_walls, net_force, remembered
-from ._walls import Cylinder, Plane, Walls
+from .edges import PADDING, Edges, carry_history
+from .equilibrium import settle
+from .forces import A_PACKING, Packing, Vectors, WallHistory
+from .state import A_STATE, State
+from .stiffness import Held, force_on_walls, net_force, remembered
+from .walls import Cylinder, Plane, Walls
 
 BOTTOM, TOP = 0, 1
 

@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._types import Scalar
-from ._forces import Packing, overlap_and_normal
-from ._pair import pair_split
-from ._side import sides_of
-from ._state import State
-from ._walls import Walls
+from .forces import Packing, overlap_and_normal
+from .pair import pair_split
+from .side import sides_of
+from .state import State
+from .walls import Walls
 
 
 class Trajectory(NamedTuple):

@@ -14,8 +14,8 @@ from .. import arguments
 from .._errors import InputError
 from ..geometry import Particle
 from ..law import MccLaw
-from ._forces import A_PACKING, Packing
-from ._side import half_contact
+from .forces import A_PACKING, Packing
+from .side import half_contact
 
 MCC_DENSITY = 1540.0
 """True density of micro-crystalline cellulose, about [kg/m^3]."""

@@ -16,9 +16,9 @@ from .._errors import InputError
 from .._numerics import shared
 from .._types import Flag, Scalar, ScalarLike
 from ..law import energy_ratio, recovery_limit, stress_ratio
-from ..law._branch import branch_force
-from ..law._loading_inverse import loading_work, quintic, secant_modulus, tangent_modulus
-from ._side import HalfContact
+from ..law.branch import branch_force
+from ..law.loading_inverse import loading_work, quintic, secant_modulus, tangent_modulus
+from .side import HalfContact
 
 SPLIT_STEPS = 8
 """Enough for radii from 20 to 150 um and the paper's scatter, to the last digit (with one more step on both sides).

@@ -8,9 +8,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ._dynamics import Motion, check_arguments
-from ._forces import Packing
-from ._state import State
+from .dynamics import Motion, check_arguments
+from .forces import Packing
+from .state import State
 
 
 def in_single(packing: Packing, motion: Motion, state: State) -> tuple[Packing, Motion, State]:

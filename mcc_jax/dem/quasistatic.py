@@ -12,14 +12,14 @@ import numpy as np
 from .. import arguments
 from .._errors import InputError
 from .._types import Scalar
-from ._edges import Edges
-from ._equilibrium import Settled, settle
-from ._forces import Packing, Vectors, WallHistory
-from ._load_steps import BOTTOM, TOP, LoadStep, Solver, checked_solver, die_walls, lowered
-from ._measured import measured
-from ._state import A_STATE, State, check_packing, check_state, listed, start
-from ._stiffness import Held, pair_geometry, remembered
-from ._walls import Walls
+from .edges import Edges
+from .equilibrium import Settled, settle
+from .forces import Packing, Vectors, WallHistory
+from .load_steps import BOTTOM, TOP, LoadStep, Solver, checked_solver, die_walls, lowered
+from .measured import measured
+from .state import A_STATE, State, check_packing, check_state, listed, start
+from .stiffness import Held, pair_geometry, remembered
+from .walls import Walls
 
 
 class Compaction(NamedTuple):

@@ -16,11 +16,11 @@ import numpy as np
 from .. import arguments
 from .._errors import InputError
 from ..files import LIMITS, open_regular
-from ._edges import Edges
-from ._forces import A_PACKING, Packing, WallHistory
-from ._side import HalfContact
-from ._state import A_STATE, State
-from ._walls import Cylinder, Plane
+from .edges import Edges
+from .forces import A_PACKING, Packing, WallHistory
+from .side import HalfContact
+from .state import A_STATE, State
+from .walls import Cylinder, Plane
 
 SCHEMA = 1
 # Lengths that stand for those of a file, which no number of walls or dimensions equals.

@@ -13,9 +13,9 @@ from jaxtyping import Array, Float
 
 from .. import arguments
 from .._errors import InputError
-from ._forces import A_PACKING, Packing
-from ._load_steps import TOP, LoadStep, Replayed, Solver, replay_stacked, stacked
-from ._state import A_STATE, State
+from .forces import A_PACKING, Packing
+from .load_steps import TOP, LoadStep, Replayed, Solver, replay_stacked, stacked
+from .state import A_STATE, State
 
 STRESSES = ("K1", "K3", "K5", "Ebar", "springs")
 """What has the dimension of a stress: K1 = C1, K3 = C3^3, K5 = C5^5, the effective modulus, the proximal springs."""

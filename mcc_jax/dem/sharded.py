@@ -14,8 +14,8 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from .._types import Scalar
-from ._edges import Edges, widened
-from ._forces import (
+from .edges import Edges, widened
+from .forces import (
     Forces,
     Interaction,
     Packing,
@@ -26,7 +26,7 @@ from ._forces import (
     pair_loads,
     wall_loads,
 )
-from ._walls import Walls
+from .walls import Walls
 
 AXIS = "shares"
 

@@ -14,10 +14,10 @@ from jaxtyping import Array, Bool
 from .. import arguments
 from .._errors import InputError
 from .._types import Scalar
-from ._edges import Edges, carry_history, list_edges
-from ._forces import A_PACKING, Packing, Vectors, WallHistory
-from ._neighbours import close_pairs
-from ._walls import Cylinder, Plane, Walls
+from .edges import Edges, carry_history, list_edges
+from .forces import A_PACKING, Packing, Vectors, WallHistory
+from .neighbours import close_pairs
+from .walls import Cylinder, Plane, Walls
 
 A_STATE = "Make one with mcc_jax.dem.start(packing, walls, position, skin)."
 SPARE = 1.25

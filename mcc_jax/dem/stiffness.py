@@ -13,11 +13,11 @@ from jaxtyping import Array, Float, Int
 
 from .._numerics import shared
 from .._types import Scalar
-from ._edges import Edges
-from ._forces import Packing, Vectors, WallHistory, overlap_and_normal
-from ._pair import largest_overlap, pair_energy, pair_force, wall_energy, wall_force
-from ._side import HalfContact, sides_of
-from ._walls import Walls
+from .edges import Edges
+from .forces import Packing, Vectors, WallHistory, overlap_and_normal
+from .pair import largest_overlap, pair_energy, pair_force, wall_energy, wall_force
+from .side import HalfContact, sides_of
+from .walls import Walls
 
 DENSE = 1200
 """Unknowns up to which stiffness matrices are factorised; above, conjugate gradients."""

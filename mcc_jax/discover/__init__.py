@@ -1,12 +1,12 @@
 """Discovery: where law and data disagree, the name of what is missing, and whether adding it closes the gap."""
 
-from ._closure import Closure as Closure
-from ._discover import discover as discover
-from ._plan import Plan as Plan
-from ._plan import Power as Power
-from ._plan import planned_base as planned_base
-from ._plan import power as power
-from ._plan import power_of_campaign as power_of_campaign
-from ._posterior import ExtendedPosterior as ExtendedPosterior
-from ._result import Discovery as Discovery
-from ._result import Effect as Effect
+from .discover import discover as discover
+from .discrepancy import Closure as Closure
+from .plan import Plan as Plan
+from .plan import Power as Power
+from .plan import planned_base as planned_base
+from .plan import power as power
+from .plan import power_of_campaign as power_of_campaign
+from .posterior import ExtendedPosterior as ExtendedPosterior
+from .result import Discovery as Discovery
+from .result import Effect as Effect

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..effects import Mechanism, Nuisance, Variant
 from ..law import PUNCH_AREA
-from ._system import Base
+from .linear_model import Base
 
 PUNCH = "punch_radius_um"
 

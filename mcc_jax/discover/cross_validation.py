@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ._score import project
-from ._system import System
+from .linear_model import System
+from .score import project
 
 Choose = Callable[[np.ndarray], list[np.ndarray]]
 """From the particles of a fold, the columns inside the law at each step, the base law first."""

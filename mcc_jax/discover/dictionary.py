@@ -21,7 +21,7 @@ import numpy as np
 
 from .._types import Values
 from ..effects import Context
-from ..effects._record import HOLD, LOAD, RELOAD, UNLOAD
+from ..effects.record import HOLD, LOAD, RELOAD, UNLOAD
 
 STRESS = 10.0
 """Unit of stress in formulas [MPa]."""

@@ -12,30 +12,30 @@ import numpy as np
 from .. import arguments
 from .._errors import InputError
 from ..calibrate import JointModel
-from ..calibrate.joint._data import ranges_um, root_mean_squares
-from ..calibrate.joint._model import checked_settings
+from ..calibrate.data import ranges_um, root_mean_squares
 from ..calibrate.judgement import unlike_others
+from ..calibrate.model import checked_settings
 from ..campaign import Campaign, Finding, campaign_findings, check_plausibility, check_tests
 from ..campaign.quality import named
-from ..effects import LIBRARY, Mechanism, present
-from ..effects._library import checked_library
-from ._candidates import untestable
-from ._closure import Closure, find_closure
-from ._confirm import held_out
-from ._estimates import detection_limits, estimated_effects, population_parameters, with_draws
-from ._experiments import next_experiments
-from ._extensions import Extensions, serious
-from ._naming import chooser, name_missing, span_of
-from ._posterior import extended_posterior
-from ._punch import without_punch
-from ._refine import refined
-from ._result import Discovery, Verdict
-from ._score import project
-from ._search import Ranking, random_probability, rank
-from ._significance import FEWEST, p_nothing_left
-from ._system import Base, Signals, System, base_fit, build_system, signals_of
-from ._where import where
-from ._words import summary_of
+from ..effects import LIBRARY, Mechanism, available_data
+from ..effects.library import checked_library
+from .applicability import without_punch
+from .candidates import untestable
+from .cross_validation import held_out
+from .discrepancy import Closure, find_closure
+from .estimates import detection_limits, estimated_effects, population_parameters, with_draws
+from .evidence import Ranking, random_probability, rank
+from .experiments import next_experiments
+from .extensions import Extensions, serious
+from .linear_model import Base, Signals, System, base_fit, build_system, signals_of
+from .model_selection import chooser, name_missing, span_of
+from .noise_estimation import refined
+from .omnibus import MIN_PARTICLES, p_nothing_left
+from .posterior import extended_posterior
+from .residual_map import where
+from .result import Discovery, Verdict
+from .score import project
+from .sentences import summary_of
 
 LEVEL = 0.045
 LEVEL_AT_RANDOM = 0.005
@@ -106,7 +106,7 @@ def discover(
         return _not_settled((*wrong, *findings), seed, started)
     base, left_out = _settled_fit(campaign, findings, assumed, threshold_MPa, tell)
     findings = (*findings, *left_out)
-    testable, missing = untestable(without_punch(known, base), present(campaign))
+    testable, missing = untestable(without_punch(known, base), available_data(campaign))
     if not testable:
         raise InputError("no mechanism is left to look for", remedy="Exclude fewer, or measure what the others need.")
     if not bool(np.all(np.asarray(base.fit.converged)[1:])) or not _mostly_converged(base):
@@ -339,7 +339,7 @@ def _notes(base: Base, system: System) -> list[str]:
     for name, reason in zip(base.campaign.particles, base.selection.why_not, strict=True):
         if reason is not None:
             notes.append(f"particle {name!r} {reason}")
-    if int(system.usable.sum()) < FEWEST:
+    if int(system.usable.sum()) < MIN_PARTICLES:
         notes.append(
             f"{int(system.usable.sum())} usable particles: their scatter says nothing, so significance rests on the "
             "noise model"

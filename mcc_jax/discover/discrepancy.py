@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from ._pursuit import pursue
-from ._score import project
-from ._system import Base, Signals, System, build_system
-from ._tuning import Tuner, Words
+from .forward_selection import pursue
+from .linear_model import Base, Signals, System, build_system
+from .score import project
+from .variable_projection import Tuner, Words
 
 RESAMPLES = 10
 """Random two thirds of the particles for which the formula is looked for once more."""

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from ..calibrate.joint._bayes import summary
-from ._candidates import Candidate
-from ._refit import Refit
-from ._result import Effect
-from ._score import DETECTABLE, Projection, project
-from ._search import Ranking, jumps
-from ._steps import Jump, is_step
-from ._system import GLOBALS, Base, System
+from ..calibrate.posterior import summary
+from .candidates import Candidate
+from .evidence import Ranking, jumps
+from .gauss_newton import Refit
+from .linear_model import GLOBALS, Base, System
+from .pop_in import Jump, is_step
+from .result import Effect
+from .score import DETECTABLE, Projection, project
 
 
 def estimated_effects(
@@ -102,7 +102,7 @@ def detection_limits(system: System, view: Projection, ranking: Ranking) -> dict
 
 def population_parameters(base: Base, view: Projection | None, shift: np.ndarray | None = None) -> dict[str, Any]:
     """The population's parameters, moved as a linear system says, which itself may stand a shift away."""
-    from ..calibrate.joint._fit import population_at
+    from ..calibrate.fit import population_at
 
     population = population_at(base.fit.mode, base.fit.numbers, base.model.scatter)
     values = np.array([float(population.a), float(population.log_modulus), *np.asarray(population.mu)])

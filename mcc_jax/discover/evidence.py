@@ -20,9 +20,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import logsumexp
 
-from ._candidates import located
-from ._score import Projection, Statistic
-from ._steps import (
+from .candidates import located
+from .linear_model import System
+from .pop_in import (
     ODD,
     ODD_STEP,
     SCALES,
@@ -35,7 +35,7 @@ from ._steps import (
     root_of,
     tamed,
 )
-from ._system import System
+from .score import Projection, Statistic
 
 LOOSENESS = 0.005
 """No family of formulas contains nature's own: of the explained chi2 so much may be missed by the true mechanism.
@@ -242,8 +242,8 @@ def rank(system: System, projection: Projection, *, refitted: Mapping[int, float
     Args:
         system: the system.
         projection: scores and information of all candidates.
-        refitted: drop of -2 log likelihood by those candidates that were fitted as they are (`_refit`). It replaces the
-            linear one, and no formula of the same mechanism counts for more than the best of these.
+        refitted: drop of -2 log likelihood by those candidates that were fitted as they are (`gauss_newton`). It replaces
+            the linear one, and no formula of the same mechanism counts for more than the best of these.
     """
     sign = system.signs
     U, total = projection.scores.sum(0), projection.total

@@ -10,12 +10,12 @@ import numpy as np
 
 from ..effects import Mechanism
 from ..simulate import Programme
-from ._naming import LIKE_THE_BEST
-from ._plan import Plan, planned_system
-from ._score import Projection, project
-from ._search import Ranking, formula_weights, rank, weights
-from ._steps import root_of
-from ._system import Base, System
+from .evidence import Ranking, formula_weights, rank, weights
+from .linear_model import Base, System
+from .model_selection import LIKE_THE_BEST
+from .plan import Plan, planned_system
+from .pop_in import root_of
+from .score import Projection, project
 
 ENOUGH = 0.9
 """Probability of a verdict of one name from which on an experiment is worth it."""
@@ -26,7 +26,7 @@ EVEN = 0.5
 COPIES = (0.5, 1, 2, 3, 5, 10)
 """Further particles that are tried, over those of the campaign."""
 
-MOST_PARTICLES = 200
+MAX_PARTICLES = 200
 """Further ones that are asked for at most."""
 
 CAMPAIGNS = 24
@@ -184,7 +184,7 @@ class _Trial:
     def fewest(self, seed: int) -> tuple[int, float]:
         """The smallest number of further particles that is enough, or else the largest, and its power."""
         count = len(self.system.points)
-        tried = [n for n in (round(c * count) for c in COPIES) if 0 < n <= MOST_PARTICLES] or [count]
+        tried = [n for n in (round(c * count) for c in COPIES) if 0 < n <= MAX_PARTICLES] or [count]
         most = self.power(tried[-1], seed)
         if most < ENOUGH:
             return tried[-1], most

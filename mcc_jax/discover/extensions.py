@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ._refit import Refit, refit, system_at
-from ._search import Ranking
-from ._system import Base, Signals, System
+from .evidence import Ranking
+from .gauss_newton import Refit, refit, system_at
+from .linear_model import Base, Signals, System
 
-SERIOUS, LEAST_GAIN, MOST_REFITS = 0.1, 9.0, 12
+SERIOUS, MIN_GAIN, MAX_REFITS = 0.1, 9.0, 12
 """Mechanisms whose log evidence is at least this share of the best one's are serious, if their best formula takes away
 so much chi2; so many formulas at most. The share is small: where the base law has moved far to take up an effect, or
 the effect grows faster than its amplitude, first order may see a tenth of it."""
@@ -48,15 +48,15 @@ def serious(system: System, ranking: Ranking) -> list[int]:
     best = ranking.log_evidence[0]
     found = zip(ranking.names, ranking.log_evidence, ranking.gain, ranking.at_random, strict=True)
     for name, value, gain, at_random in found:
-        if value < SERIOUS * best or len(chosen) >= MOST_REFITS:
+        if value < SERIOUS * best or len(chosen) >= MAX_REFITS:
             break
-        if at_random or gain < LEAST_GAIN:
+        if at_random or gain < MIN_GAIN:
             continue
         members = np.array([k for k, c in enumerate(system.candidates) if c.mechanism == name])
         chosen += dict.fromkeys(
             k for worth in (ranking.favour, ranking.evidence) for k in _best_formulas(system, members, worth)
         )
-    return chosen[:MOST_REFITS]
+    return chosen[:MAX_REFITS]
 
 
 def _best_formulas(system: System, members: np.ndarray, worth: np.ndarray) -> list[int]:

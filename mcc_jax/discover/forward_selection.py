@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ._score import project_summed
-from ._system import System
+from .linear_model import System
+from .score import project_summed
 
-MOST_WORDS = 3
+MAX_WORDS = 3
 WORTH = 14.0
 """Least drop of chi2 for which another word is taken: about log of the number of words, twice, and one parameter."""
 
@@ -15,7 +15,7 @@ WORTH_OF_WAVE = 18.0
 """The same for sine and cosine of a wave together: less than both alone, since there are a hundred frequencies only."""
 
 
-def pursue(system: System, *, particles: np.ndarray | None = None, most: int = MOST_WORDS) -> tuple[list[int], float]:
+def pursue(system: System, *, particles: np.ndarray | None = None, most: int = MAX_WORDS) -> tuple[list[int], float]:
     """Words one after the other, each time the one that takes away most together with those before; where no single
     one is worth it, sine and cosine of a wave may be.
 

@@ -1,7 +1,7 @@
 r"""Effects fitted as they are, not to first order: Gauss-Newton's method through the extended law.
 
-The linear system (`_system`) holds what an effect would add if it were small. A large one is not: its signature at the
-strength it has differs from the one at zero, and so does what the base law can still take up. So the few formulas that
+The linear system (`linear_model`) holds what an effect would add if it were small. A large one is not: its signature at
+the strength it has differs from the one at zero, and so does what the base law can still take up. So the few formulas that
 matter are fitted in the extended law itself, with the population, every particle's deviations and zero, the effects'
 amplitudes and their further numbers free together,
 
@@ -9,8 +9,8 @@ amplitudes and their further numbers free together,
     + (z_i - z_{i0})^2/s_z^2 + \beta^T P \beta + \phi^T Q \phi + 2 c^T (\beta, \theta),
     \qquad w_i = m_i(\beta) + S \xi_i
 
-with the noise filters W of the refined fit and c what curvature adds (`_turning`, taken at the base law). Every step is
-the linear system once more, around the latest values.
+with the noise filters W of the refined fit and c what curvature adds (`laplace_correction`, taken at the base law). Every step
+is the linear system once more, around the latest values.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..calibrate.joint._compile import compiled
-from ..calibrate.joint._fit import population_at
-from ..calibrate.joint._forward import law_of
-from ..calibrate.joint._noise import Whitening
-from ..calibrate.joint._population import Population, Scatter, moments
+from ..calibrate.compiling import compiled
+from ..calibrate.fit import population_at
+from ..calibrate.forward import law_of
+from ..calibrate.noise import Whitening
+from ..calibrate.population import Population, Scatter, moments
 from ..effects import AbstractEffect, ExtendedLaw, Nuisance, Record, Variant
 from ..geometry import Particle
 from ..law import Unloading
-from ._candidates import Candidate
-from ._gram import gram_matrices, in_batches
-from ._system import Base, Signals, System, first_loaded, mean_by_globals, steps_of, turning_of
+from .candidates import Candidate
+from .linear_model import Base, Signals, System, first_loaded, mean_by_globals, steps_of, turning_of
+from .normal_equations import gram_matrices, in_batches
 
 STEPS = 12
 ENOUGH = 0.02

@@ -24,8 +24,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..calibrate.joint._compile import compiled
-from ._gram import in_batches, own_rows
+from ..calibrate.compiling import compiled
+from .normal_equations import in_batches, own_rows
 
 
 @dataclass(frozen=True)

@@ -25,24 +25,24 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..calibrate import JointModel
-from ..calibrate.joint._blocks import Blocks, block_size, filled_up
-from ..calibrate.joint._compile import compiled
-from ..calibrate.joint._data import Selection, Tests, longer
-from ..calibrate.joint._fit import population_at, prepare
-from ..calibrate.joint._forward import law_of, snap
-from ..calibrate.joint._linearised import linear_data
-from ..calibrate.joint._model import JointFit
-from ..calibrate.joint._noise import Linear, Whitening
-from ..calibrate.joint._population import Population, Scatter, moments
+from ..calibrate.compiling import compiled
+from ..calibrate.data import Selection, Tests, longer
+from ..calibrate.fit import population_at, prepare
+from ..calibrate.forward import law_of, snap
+from ..calibrate.linearise import linear_data
+from ..calibrate.model import JointFit
+from ..calibrate.noise import Linear, Whitening
+from ..calibrate.population import Population, Scatter, moments
+from ..calibrate.sharding import Blocks, block_size, filled_up
 from ..campaign import Campaign, campaign_segments
 from ..effects import LIBRARY, Context, ExtendedLaw, Mechanism, Record, record_batch, signatures
 from ..geometry import Particle
 from ..law import Unloading
-from ._candidates import Candidate, candidates_of
-from ._features import GAUGE, ROOM, Feature, map_features, values_of, words
-from ._gram import gram_matrices, in_batches
-from ._steps import Steps, is_step
-from ._turning import Turned, by_latent, turning
+from .candidates import Candidate, candidates_of
+from .dictionary import GAUGE, ROOM, Feature, map_features, values_of, words
+from .laplace_correction import Turned, by_latent, turning
+from .normal_equations import gram_matrices, in_batches
+from .pop_in import Steps, is_step
 
 GLOBALS = ("a", "log modulus", "mu C1", "mu C3", "mu C5")
 
@@ -62,9 +62,10 @@ class System:
         prior: precision of the population's parameters.
         usable: which particles are close enough to linear to take part.
         at: amplitudes around which the candidates' columns are taken, in their units: zero but where the law has been
-            extended (`_refit`).
+            extended (`gauss_newton`).
         shift: of the population's parameters from the base fit's, likewise.
-        turned: what curvature has added to every column's product with the residual, shape (N, Q) (`_turning`).
+        turned: what curvature has added to every column's product with the residual, shape (N, Q)
+            (`laplace_correction`).
         tails: degrees of freedom of Student's distribution whose tails are those of the noise; infinite where it is
             normal.
         formula: words with fitted numbers, of the formula that was found and of those without some particles.
@@ -397,7 +398,7 @@ def build_system(base: Base, signals: Signals) -> System:
 
 
 def turning_of(base: Base, signals: Signals, jacobian: Array, by_globals: Array, factor: Array) -> np.ndarray:
-    """What curvature adds to every column's product with the residual (`_turning`); zero where nobody looks at it."""
+    """What curvature adds to every column's product with the residual; zero where nobody looks at it."""
     count = factor.shape[-1] + 1 + 1 + by_globals.shape[-1] + signals.added.shape[1] + signals.seen.shape[1]
     if signals.turned is None:
         return np.zeros((len(base.tests), count))
@@ -435,12 +436,12 @@ def tails_of(white: np.ndarray) -> float:
     def excess(freedom: float) -> float:
         return float(student.ppf((1 + OFTEN) / 2, freedom) / student.ppf(0.75, freedom)) * size - far
 
-    if excess(MOST_TAILS) >= 0:
+    if excess(MAX_TAILS) >= 0:
         return np.inf
-    return cast(float, brentq(excess, LEAST_TAILS, MOST_TAILS)) if excess(LEAST_TAILS) > 0 else LEAST_TAILS
+    return cast(float, brentq(excess, MIN_TAILS, MAX_TAILS)) if excess(MIN_TAILS) > 0 else MIN_TAILS
 
 
-LEAST_TAILS, MOST_TAILS = 2.5, 100.0
+MIN_TAILS, MAX_TAILS = 2.5, 100.0
 
 
 @compiled

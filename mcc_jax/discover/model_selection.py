@@ -6,14 +6,14 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ._closure import Closure
-from ._extensions import Extensions
-from ._pursuit import pursue
-from ._result import Verdict
-from ._score import Projection, project
-from ._search import Pair, Ranking, family_columns, other_formulas, pairs, rank
-from ._significance import p_nothing_left
-from ._system import Base, System
+from .discrepancy import Closure
+from .evidence import Pair, Ranking, family_columns, other_formulas, pairs, rank
+from .extensions import Extensions
+from .forward_selection import pursue
+from .linear_model import Base, System
+from .omnibus import p_nothing_left
+from .result import Verdict
+from .score import Projection, project
 
 LEVEL_OF_MORE = 0.01
 """Level at which something is missing besides the whole family of formulas of what was added."""
@@ -33,11 +33,11 @@ BETTER, SHARE = 12.0, 0.04
 """Words do so much better than any listed mechanism by chance and because no listed formula is nature's own, in
 addition this share of what the mechanism takes away. Beyond, it is not listed."""
 
-LEAST_OF_TWO = 30.0
+MIN_OF_TWO = 30.0
 """Least drop of chi2 by two names where no single one is evident: of so many pairs one takes away half of that by
 chance."""
 
-CLOSE, MOST_PAIRS = 4.0, 4
+CLOSE, MAX_PAIRS = 4.0, 4
 """Pairs of which the log evidence is so close to the best one's are fitted as they are, so many at most."""
 
 LOST, OTHERS = 0.1, 3
@@ -79,7 +79,7 @@ def name_missing(
     if ranking.at_random[0]:
         if ranking.gain[0] > gain_of_words:
             return single
-    elif chosen := _two_names(system, view, extensions, 0.0 if evident else LEAST_OF_TWO, by_words, seed):
+    elif chosen := _two_names(system, view, extensions, 0.0 if evident else MIN_OF_TWO, by_words, seed):
         steps = [_beside(system, other) for other in reversed(chosen)]  # each is judged with the other one in the law
         both = [system.candidates[k].mechanism for k in chosen]
         sets = [_led_by(name, step.members(LIKE_THE_BEST)) for name, step in zip(both, steps, strict=True)]
@@ -135,7 +135,7 @@ def _best_pair(system: System, view: Projection, extensions: Extensions | None) 
     if not found or extensions is None:
         return found[0] if found else None
     fitted = []
-    for pair in found[:MOST_PAIRS]:
+    for pair in found[:MAX_PAIRS]:
         if pair.log_evidence <= found[0].log_evidence - CLOSE:
             continue
         fitted.append(pair.fitted(extensions.drop(pair.both)))

@@ -13,14 +13,14 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 
-from ..calibrate.joint._blocks import Parts
-from ..calibrate.joint._data import longer
-from ..calibrate.joint._linearised import linear_data, summarise
-from ..calibrate.joint._mode import Target, most_probable
-from ..calibrate.joint._noise import Noise, Whitening, estimate_noise, particle_scales
-from ..calibrate.joint._population import Summary
-from ._score import project
-from ._system import Base, Signals, System
+from ..calibrate.data import longer
+from ..calibrate.linearise import linear_data, summarise
+from ..calibrate.noise import Noise, Whitening, estimate_noise, particle_scales
+from ..calibrate.population import Summary
+from ..calibrate.sharding import Parts
+from ..calibrate.transforms import LogPosterior, most_probable
+from .linear_model import Base, Signals, System
+from .score import project
 
 STRONG = 3.5
 """Estimate over standard error from which on a column is taken off."""
@@ -107,7 +107,7 @@ def refined(base: Base, system: System, signals: Signals) -> tuple[Base, bool]:
         return summary, filters
 
     start = replace(fit.noise, scale=scale)
-    noise, _, fine = estimate_noise(data, model.beliefs.noise, start, uncertainty=False, blocks=blocks)
+    noise, _, fine = estimate_noise(data, model.chosen_priors.noise, start, uncertainty=False, blocks=blocks)
     summary, filters = summarised(noise)
     old = np.asarray(noise.scale)
     parts = (old, _least_squares(summary), np.asarray(summary.count) - 4)
@@ -116,7 +116,7 @@ def refined(base: Base, system: System, signals: Signals) -> tuple[Base, bool]:
         noise = replace(noise, scale=jnp.asarray(some))
         summary, filters = summarised(noise)
     numbers = replace(fit.numbers, flatness=tests.flatness, weight=tests.weight)
-    mode, covariance, reached = most_probable(fit.mode, Target(numbers, summary, model.scatter))
+    mode, covariance, reached = most_probable(fit.mode, LogPosterior(numbers, summary, model.scatter))
     new = replace(
         fit,
         noise=noise,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ._score import DRAWS, project, smallest_of_families
-from ._search import evidence_of_any
-from ._system import System
+from .evidence import evidence_of_any
+from .linear_model import System
+from .score import DRAWS, project, smallest_of_families
 
 FREEDOM = 0.3
 """How far nature's formula may differ from the best one of its family: by so much of it in every other one."""
@@ -21,7 +21,7 @@ BESIDE_NAMES = (0.4375, 0.4375, 0.125)
 """The same where names are in the law already: the common formulas of all mechanisms come first there, and another
 formula, or a place, is as likely to be what they leave."""
 
-FEWEST = 4
+MIN_PARTICLES = 4
 """Below so many particles their scatter says nothing; the noise model has to do."""
 
 
@@ -48,7 +48,7 @@ def p_nothing_left(system: System, seed: int, chosen: list[int]) -> float:
         [evidence_of_any(system, own) if any_mechanism else common, ~common & ~wave, wave],
         shares=BESIDE_NAMES if chosen else BESIDE_NOTHING,
         pairs=_places(system.quadratures, columns),
-        few=len(view.particles) < FEWEST,
+        few=len(view.particles) < MIN_PARTICLES,
         # The smallest share must be able to reach the least level that is asked for (`LEVEL_OF_UNLISTED`).
         draws=3 * DRAWS,
     )

@@ -13,19 +13,19 @@ import numpy as np
 from .. import arguments
 from .._errors import InputError
 from ..calibrate import JointModel
-from ..calibrate._result import finite
-from ..calibrate.joint._data import Tests, select_tests
-from ..calibrate.joint._forward import law_of
-from ..calibrate.joint._linearised import linear_data, summarise
-from ..calibrate.joint._model import checked_settings
-from ..calibrate.joint._noise import Noise
+from ..calibrate.data import Tests, select_tests
+from ..calibrate.forward import law_of
+from ..calibrate.linearise import linear_data, summarise
+from ..calibrate.model import checked_settings
+from ..calibrate.noise import Noise
+from ..calibrate.paper.result import finite
 from ..campaign import Campaign, Curve, Metadata, check_campaign
-from ..effects import LIBRARY, Mechanism, present
-from ..effects._library import checked_library
+from ..effects import LIBRARY, Mechanism, available_data
+from ..effects.library import checked_library
 from ..simulate import Programme, simulate_campaign
-from ._candidates import untestable
-from ._score import DETECTABLE, project
-from ._system import Base, System, base_fit, build_system, records_of, signals_of
+from .candidates import untestable
+from .linear_model import Base, System, base_fit, build_system, records_of, signals_of
+from .score import DETECTABLE, project
 
 ALIKE = 0.9
 _A_PROGRAMME = "Take mcc_jax.Programme.cycles()."
@@ -187,8 +187,8 @@ def power(
         base: a fitted campaign, of which material and noise are taken.
         library: the mechanisms.
     """
-    from ..calibrate.joint._fit import population_at
-    from ..calibrate.joint._population import moments
+    from ..calibrate.fit import population_at
+    from ..calibrate.population import moments
     from ..campaign import particle_batch
 
     diameters_um = arguments.diameters(diameters_um)
@@ -241,5 +241,5 @@ def power_of_campaign(
 
 def _testable(base: Base, library: Mapping[str, Mechanism]) -> tuple[System, Sequence[dict[str, str]]]:
     """The linear system with all formulas that the campaign can be searched for, and what the others need."""
-    testable, missing = untestable(library, present(base.campaign))
+    testable, missing = untestable(library, available_data(base.campaign))
     return build_system(base, signals_of(base, testable)), missing

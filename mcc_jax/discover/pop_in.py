@@ -2,7 +2,7 @@ r"""Sudden steps: one at any point of a test's first loading.
 
 Once correlated noise is whitened, a step shows in a point or two. Places on a grid, however fine, fall between them; so
 every point of first loading is a place of its own. With :math:`d_j` the step at point j, the particle's own parameters
-integrated out (M, as in `_system`), kept are :math:`d_j^T M x` for every column x of the system, and
+integrated out (M, as in `linear_model`), kept are :math:`d_j^T M x` for every column x of the system, and
 :math:`d_j^T M d_l`.
 """
 
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import log_ndtr, logsumexp
 
-from ._candidates import Candidate
+from .candidates import Candidate
 
 SCALES = (0.01, 0.03, 0.1, 0.3, 1.0)
 """Scales of an amplitude's prior in units of the largest believable amplitude."""

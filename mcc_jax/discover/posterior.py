@@ -1,14 +1,14 @@
 r"""The posterior of the extended law: the joint calibration once more, with what was found missing as part of the law.
 
-Around the fit of the extended law (`_refit`) the tests are linear in the effects' free numbers :math:`\theta`. In the
-quadratic summary of test i, whose zero is integrated out by :math:`M_i`, they move nothing but score and squares,
+Around the fit of the extended law (`gauss_newton`) the tests are linear in the effects' free numbers :math:`\theta`. In
+the quadratic summary of test i, whose zero is integrated out by :math:`M_i`, they move nothing but score and squares,
 
 .. math:: g_i(\theta) = g_i - J_i^T M_i C_i \delta, \qquad
     R_i(\theta) = R_i + 2 \delta^T C_i^T M_i r_i + \delta^T C_i^T M_i C_i \delta, \qquad
     \delta = \theta - \hat\theta
 
 so the population and :math:`\theta` are sampled together with the particles integrated out, as without effects
-(`calibrate.joint._sampling`); the particles are drawn back, and the weights that make the draws exact come from the
+(`calibrate.sampling`); the particles are drawn back, and the weights that make the draws exact come from the
 extended law itself.
 """
 
@@ -24,22 +24,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from ..calibrate._result import finite
-from ..calibrate.joint._bayes import ESS_LEAST, RHAT_MOST, population_json, unmixed
-from ..calibrate.joint._blocks import count_of
-from ..calibrate.joint._compile import compiled
-from ..calibrate.joint._draws import Length, draw_around
-from ..calibrate.joint._fit import population_at
-from ..calibrate.joint._forward import law_of
-from ..calibrate.joint._linearised import careful_enough, linear_data, summarise
-from ..calibrate.joint._mode import Target, from_free, most_probable, to_free
-from ..calibrate.joint._noise import Whitening
-from ..calibrate.joint._population import Population, Summary, marginal_likelihood
-from ..calibrate.joint._sampling import Exact
-from ..calibrate.joint._weights import PARETO_K_MOST
+from ..calibrate.compiling import compiled
+from ..calibrate.draws import Length, draw_around
+from ..calibrate.fit import population_at
+from ..calibrate.forward import law_of
+from ..calibrate.linearise import careful_enough, linear_data, summarise
+from ..calibrate.noise import Whitening
+from ..calibrate.paper.result import finite
+from ..calibrate.population import Population, Summary, marginal_likelihood
+from ..calibrate.posterior import ESS_LEAST, RHAT_MOST, population_json, unmixed
+from ..calibrate.sampling import ExactLikelihood
+from ..calibrate.sharding import count_of
+from ..calibrate.transforms import LogPosterior, constrain, most_probable, unconstrain
+from ..calibrate.weights import PARETO_K_MOST
 from ..effects import ExtendedLaw, Record
-from ._refit import Formula, Refit, effects_of, slices
-from ._system import Base
+from .gauss_newton import Formula, Refit, effects_of, slices
+from .linear_model import Base
 
 LENGTH = Length(4, 300, 1000)
 
@@ -88,7 +88,7 @@ class ExtendedPopulation(Population):
         return {f"theta_{i}": jnp.asarray(self.theta)[..., i] for i in range(self.theta.shape[-1])}
 
 
-class ExtendedTarget(Target):
+class ExtendedTarget(LogPosterior):
     """The density of population and effects given all tests; the last coordinates are the free numbers.
 
     Attributes:
@@ -114,12 +114,12 @@ class ExtendedTarget(Target):
 
     def _split(self, free: Float[Array, " d"]) -> tuple[ExtendedPopulation, Float[Array, ""]]:
         size = len(self.scale)
-        base, prior = from_free(free[:-size], self.numbers, self.scatter)
+        base, prior = constrain(free[:-size], self.numbers, self.scatter)
         theta = self.movable.theta + self.scale * free[-size:]
         return ExtendedPopulation(**vars(base), theta=theta), prior
 
 
-class ExtendedExact(Exact):
+class ExtendedExact(ExactLikelihood):
     """Tests with their exact likelihood under the extended law.
 
     Attributes:
@@ -245,13 +245,13 @@ def extended_posterior(base: Base, found: Refit, *, length: Length = LENGTH, see
     at, filters, _ = summarise(state.latent, state.zero, tests, data, fit.noise, zero_sd)
     away = state.zero - tests.contact
     movable = _movable(at, state.theta, found.residual, found.jacobian, found.columns, filters, away, zero_sd)
-    scatter = careful_enough(fit.mode, Target(fit.numbers, fit.summary, model.scatter), count_of(tests))
+    scatter = careful_enough(fit.mode, LogPosterior(fit.numbers, fit.summary, model.scatter), count_of(tests))
     precision = np.concatenate([f.precision for f in found.formulas])
     width = np.sqrt(np.maximum(np.diagonal(found.covariance), 1e-300))
     target = ExtendedTarget(fit.numbers, at, scatter, movable, jnp.asarray(precision), jnp.asarray(width))
     # Where the fit ended, with the spreads of the base fit.
     there, shift = population_at(fit.mode, fit.numbers, model.scatter), np.asarray(state.shift)
-    start = to_free(
+    start = unconstrain(
         float(there.a) + shift[0],
         float(there.log_modulus) + shift[1],
         np.asarray(there.mu) + shift[2:],

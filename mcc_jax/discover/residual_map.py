@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from ._score import project
-from ._system import Base, System
+from .linear_model import Base, System
+from .score import project
 
 WORTH_TELLING = 0.05
 

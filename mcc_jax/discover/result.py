@@ -7,16 +7,16 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..calibrate._result import finite
+from ..calibrate.paper.result import finite
 from ..campaign import Finding
 from ..effects import EQUIVALENCES, AbstractEffect, Variant
-from ._closure import Closure
-from ._confirm import HeldOut
-from ._posterior import ExtendedPosterior
-from ._score import project
-from ._search import Ranking
-from ._steps import Jump
-from ._system import Base, System, feature_values
+from .cross_validation import HeldOut
+from .discrepancy import Closure
+from .evidence import Ranking
+from .linear_model import Base, System, feature_values
+from .pop_in import Jump
+from .posterior import ExtendedPosterior
+from .score import project
 
 Verdict = Literal["NO_GAP", "NAMED", "SET", "UNLISTED", "FIT_NOT_CONVERGED"]
 

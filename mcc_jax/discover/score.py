@@ -20,7 +20,7 @@ from typing import cast
 import numpy as np
 from scipy.special import digamma, polygamma
 
-from ._system import System
+from .linear_model import System
 
 DETECTABLE = 4.6
 """Estimate over standard error that is found with 95 % probability at the family-wise level."""
@@ -81,7 +81,7 @@ class Projection:
     @property
     def alive(self) -> np.ndarray:
         """Which columns the base law cannot make itself."""
-        return self.survival > LEAST_SURVIVAL
+        return self.survival > MIN_SURVIVAL
 
     def similarity(self) -> np.ndarray:
         """Correlation of the projected columns, shape (K, K)."""
@@ -104,7 +104,7 @@ class Projection:
         return vectors[:, :count] / np.sqrt(values[:count]) / scale[:, None]
 
 
-LEAST_SURVIVAL = 1e-6
+MIN_SURVIVAL = 1e-6
 """A column of whose information less survives is one that the base law can make itself."""
 
 SHARE = 0.9
@@ -181,7 +181,7 @@ class Summed:
 
 NO_PAIRS = np.zeros((0, 2), int)
 
-LEAST_APART = 1e-3
+MIN_APART = 1e-3
 """Least 1 - rho^2 of two columns that are judged together."""
 
 
@@ -226,8 +226,8 @@ def _of_both(t: np.ndarray, pairs: np.ndarray, rho: np.ndarray) -> np.ndarray:
     """
     apart = 1 - rho**2
     one, other = t[..., pairs[:, 0]], t[..., pairs[:, 1]]
-    squared = (one**2 - 2 * rho * one * other + other**2) / np.maximum(apart, LEAST_APART)
-    return np.where(apart > LEAST_APART, np.sqrt(np.maximum(squared, 0.0)), 0.0)
+    squared = (one**2 - 2 * rho * one * other + other**2) / np.maximum(apart, MIN_APART)
+    return np.where(apart > MIN_APART, np.sqrt(np.maximum(squared, 0.0)), 0.0)
 
 
 DRAWS = 4000
@@ -293,7 +293,7 @@ def smallest_of_families(
     """
     t, null = _estimates(projection, seed, few, draws)
     rho = projection.similarity()[pairs[:, 0], pairs[:, 1]]
-    fine = 1 - rho**2 > LEAST_APART
+    fine = 1 - rho**2 > MIN_APART
     one, drawn = (_by_pairs(x, _sided(x, sign), pairs[fine], rho[fine]) for x in (t, null))
     found, other = np.inf, np.full(draws, np.inf)
     for family, share in zip(families, shares or [1.0] * len(families), strict=True):
@@ -326,7 +326,7 @@ def _estimates(projection: Projection, seed: int, few: bool, draws: int) -> tupl
     """Every column's estimate over its standard error, and draws of it if nothing is missing, shape (draws, K)."""
     scores, each = projection.scores, np.einsum("nkk->nk", projection.information)
     total = np.maximum(projection.total, 1e-300)
-    prior, freedom = (1.0, MOST_FREEDOM) if few else common_scatter(projection)
+    prior, freedom = (1.0, MAX_FREEDOM) if few else common_scatter(projection)
     scatter, own = _scatter(scores, each)
     if few:
         own = np.zeros_like(own)
@@ -342,7 +342,7 @@ def _estimates(projection: Projection, seed: int, few: bool, draws: int) -> tupl
     return scores.sum(0) / np.sqrt(total) / width, drawn / chi
 
 
-MOST_FREEDOM = 100.0
+MAX_FREEDOM = 100.0
 """Degrees of freedom beyond which the noise model's word is not taken."""
 
 
@@ -355,13 +355,13 @@ def common_scatter(projection: Projection) -> tuple[float, float]:
     scatter, own = _scatter(projection.scores @ turn, each)
     fine = (own > 0.5) & (scatter > 0)
     if fine.sum() < 3:
-        return 1.0, MOST_FREEDOM
+        return 1.0, MAX_FREEDOM
     own = own[fine]
     logs = np.log(scatter[fine]) - digamma(own / 2) + np.log(own / 2)
     excess = float(np.var(logs, ddof=1) - np.mean(polygamma(1, own / 2)))
-    freedom = MOST_FREEDOM
-    if excess > polygamma(1, MOST_FREEDOM / 2):
-        freedom = 2 * cast(float, brentq(lambda x: polygamma(1, x) - excess, 1e-3, MOST_FREEDOM / 2))
+    freedom = MAX_FREEDOM
+    if excess > polygamma(1, MAX_FREEDOM / 2):
+        freedom = 2 * cast(float, brentq(lambda x: polygamma(1, x) - excess, 1e-3, MAX_FREEDOM / 2))
     return float(np.exp(np.mean(logs) + digamma(freedom / 2) - np.log(freedom / 2))), freedom
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ._experiments import ENOUGH
+from .experiments import ENOUGH
 
 if TYPE_CHECKING:
-    from ._result import Discovery, Effect
+    from .result import Discovery, Effect
 
 
 SHOWN = 5

@@ -22,18 +22,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..calibrate.joint._compile import compiled
-from ..calibrate.joint._fit import population_at
-from ..calibrate.joint._noise import Whitening
-from ..calibrate.joint._population import moments
+from ..calibrate.compiling import compiled
+from ..calibrate.fit import population_at
+from ..calibrate.noise import Whitening
+from ..calibrate.population import moments
 from ..effects import Context, ExtendedLaw
 from ..law import Unloading
-from ._features import Feature, Form, further_words
-from ._gram import common_rows, in_batches, own_rows
-from ._pursuit import MOST_WORDS
-from ._system import Base, Signals, System, feature_values, law_of, mean_by_globals
+from .dictionary import Feature, Form, further_words
+from .forward_selection import MAX_WORDS
+from .linear_model import Base, Signals, System, feature_values, law_of, mean_by_globals
+from .normal_equations import common_rows, in_batches, own_rows
 
-MOST_NUMBERS = 3
+MAX_NUMBERS = 3
 """Most numbers that a form has."""
 
 NUMBER_WORTH = 2.0
@@ -49,13 +49,13 @@ STARTS = (10, 5, 5)
 OF_A_FORM = 2
 """How many of these may differ in their numbers alone: fitted, they often become the same."""
 
-MOST_PARTICLES = 100
+MAX_PARTICLES = 100
 """Of larger campaigns so many particles, evenly spread, tell the numbers."""
 
 MODEST = 1e-3
 """What the base law takes up of a formula is not seen, so that nothing keeps it small: this share of its chi2 does."""
 
-LEAST_LEFT = 1e-4
+MIN_LEFT = 1e-4
 """Share of a word that the words before it must leave."""
 
 EXACT, STEPS = 1e-5, 25
@@ -125,7 +125,7 @@ class Tuner:
 
     def search(self, particles: np.ndarray) -> Fitted:
         """The formula for the gap of some particles: words one after the other, each time with all numbers fitted."""
-        some = particles[np.linspace(0, len(particles) - 1, min(len(particles), MOST_PARTICLES)).astype(int)]
+        some = particles[np.linspace(0, len(particles) - 1, min(len(particles), MAX_PARTICLES)).astype(int)]
         gap = self._gap(some)
         listed = gap.off(self._values[some])
         found = Fitted()
@@ -133,7 +133,7 @@ class Tuner:
             left, basis = gap.beside(found.words)
             free = listed - basis @ (basis.T @ listed)
             size = np.sum(free**2, 0)
-            alive = size > LEAST_LEFT * np.sum(listed**2, 0)
+            alive = size > MIN_LEFT * np.sum(listed**2, 0)
             drop = np.where(alive, (left @ free) ** 2 / np.maximum(size, 1e-300), 0.0)
             best = [self._listed[i] for i in np.argsort(-drop, kind="stable")]
             forms = [word.form for word in best]
@@ -280,7 +280,7 @@ class _Gap:
         return left, slopes - basis @ (basis.T @ slopes), basis
 
 
-WIDTH = MOST_WORDS * (1 + MOST_NUMBERS)
+WIDTH = MAX_WORDS * (1 + MAX_NUMBERS)
 
 
 def _with(words: Words, numbers: np.ndarray) -> Words:
@@ -303,7 +303,7 @@ def _contexts(latent, particles, records, unloading: Unloading) -> Context:
 
 @compiled
 def _fixed(residual, jacobian, offset, zero_away, by_globals) -> Float[Array, "particles columns points"]:
-    """The residual and the population's columns, as in `_system`."""
+    """The residual and the population's columns, as in `linear_model`."""
     return jax.vmap(common_rows)(residual, jacobian, offset, zero_away, by_globals)
 
 

@@ -8,9 +8,9 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._types import Scalar, Values, scalar
-from ._context import Context, positive
-from ._effect import AbstractEffect
-from ._variant import Mechanism, Need, Nuisance, Variant
+from .context import Context, positive
+from .effect import AbstractEffect
+from .variant import Mechanism, Need, Nuisance, Variant
 
 
 class AbstractToe(AbstractEffect):

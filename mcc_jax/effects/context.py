@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from .._types import Values
 from ..geometry import Particle
 from ..law import PUNCH_AREA, MccLaw, recovery
-from ._record import RELOAD, UNLOAD, Record, reload_progress
+from .record import RELOAD, UNLOAD, Record, reload_progress
 
 SMALL = 1e-8
 

@@ -12,9 +12,9 @@ from jax.scipy.special import gammaln
 from jaxtyping import Array, Float
 
 from .._types import Scalar, Values, scalar
-from ._context import Context
-from ._effect import AbstractEffect
-from ._variant import Mechanism, Need, Nuisance, Variant
+from .context import Context
+from .effect import AbstractEffect
+from .variant import Mechanism, Need, Nuisance, Variant
 
 REFERENCE_TIME_S = 100.0
 ELEMENTS_PER_DECADE = 2

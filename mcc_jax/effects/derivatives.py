@@ -15,11 +15,11 @@ from .._numerics import running_max
 from .._types import Path, Scalar
 from ..geometry import Particle
 from ..law import MccLaw, recovery, tangent_modulus
-from ._context import Context
-from ._effect import AbstractEffect
-from ._extended import ExtendedLaw
-from ._record import Record
-from ._solve import recoverable_displacement
+from .context import Context
+from .effect import AbstractEffect
+from .extended import ExtendedLaw
+from .record import Record
+from .solve import recoverable_displacement
 
 
 def signatures(

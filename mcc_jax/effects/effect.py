@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from .._types import Scalar, Values, scalar
 from ..geometry import Particle
 from ..law import MccLaw
-from ._context import Context
-from ._record import Record
+from .context import Context
+from .record import Record
 
 Factors = tuple[Values, Values, Values]
 

@@ -14,11 +14,11 @@ from .._numerics import running_max
 from .._types import Flag, Path, Scalar, Values
 from ..geometry import Particle
 from ..law import History, MccLaw, recovery
-from ._context import Context
-from ._effect import AbstractEffect, overrides
-from ._record import Record, clean_record, first_point, follow
-from ._root import increasing_root
-from ._solve import recoverable_displacement, strain_under
+from .context import Context
+from .effect import AbstractEffect, overrides
+from .record import Record, clean_record, first_point, follow
+from .root import increasing_root
+from .solve import recoverable_displacement, strain_under
 
 
 class ExtendedState(eqx.Module):

@@ -11,14 +11,14 @@ import numpy as np
 from .. import arguments
 from .._errors import InputError
 from ..campaign import Campaign, Segment, campaign_segments, check_campaign
-from ._contact import MISALIGNMENT, POP_IN, TOE
-from ._creep import CREEP
-from ._flow import FRICTION, HARDENING, RATE
-from ._material import DAMAGE, DENSIFICATION, HUMIDITY, SHAPE, SIZE
-from ._observed import DRIFT, FRAME, SINK_IN
-from ._record import humidities, record_of
-from ._release import ADHESION, HYSTERESIS, RATCHETING, REVERSAL, SHAPE_OF_UNLOADING
-from ._variant import Mechanism, Need, Variant
+from .contact import MISALIGNMENT, POP_IN, TOE
+from .creep import CREEP
+from .loading import FRICTION, HARDENING, RATE
+from .material import DAMAGE, DENSIFICATION, HUMIDITY, SHAPE, SIZE
+from .record import humidities, record_of
+from .tester import DRIFT, FRAME, SINK_IN
+from .unloading import ADHESION, HYSTERESIS, RATCHETING, REVERSAL, SHAPE_OF_UNLOADING
+from .variant import Mechanism, Need, Variant
 
 _ALL = (
     FRAME,
@@ -85,7 +85,7 @@ def find_variant(name: str, library: Mapping[str, Mechanism] = LIBRARY) -> Varia
         raise InputError(error.args[0]) from None
 
 
-def present(campaign: Campaign, segments: tuple[tuple[Segment, ...], ...] | None = None) -> frozenset[Need]:
+def available_data(campaign: Campaign, segments: tuple[tuple[Segment, ...], ...] | None = None) -> frozenset[Need]:
     """What a campaign holds of what effects need.
 
     A kind of segment counts as present when at least one test in five has it; sizes and shapes when they differ by a

@@ -10,16 +10,16 @@ import jax.numpy as jnp
 from .._types import Scalar, Values, scalar
 from ..geometry import Particle
 from ..law import PUNCH_AREA, MccLaw, recovery, tangent_modulus
-from ._context import Context, root
-from ._effect import AbstractEffect, Factors, at_least
-from ._record import Record
-from ._variant import Mechanism, Need, Nuisance, Variant
+from .context import Context, root
+from .effect import AbstractEffect, Factors, at_least
+from .record import Record
+from .variant import Mechanism, Need, Nuisance, Variant
 
 REFERENCE_FORCE_RATE = 2.0  # mN/s
 REFERENCE_STRESS_RATE = 0.05  # MPa/s
 REFERENCE_STRAIN_RATE = 2e-3  # 1/s
 REFERENCE_STRAIN = 0.2
-LEAST_FACTOR = 0.05
+MIN_FACTOR = 0.05
 
 
 # ---- rate ------------------------------------------------------------------------------------------------------------
@@ -42,7 +42,7 @@ class AbstractRateEffect(AbstractEffect):
         """The factor on the chosen terms."""
         rate = self.relative_rate(law, particle, record, strain)
         known = rate > 0
-        factor = jnp.where(known, at_least(self.factor(jnp.where(known, rate, 1.0)), LEAST_FACTOR), 1.0)
+        factor = jnp.where(known, at_least(self.factor(jnp.where(known, rate, 1.0)), MIN_FACTOR), 1.0)
         one = jnp.ones_like(factor)
         first, third, fifth = (factor if term else one for term in self.terms)
         return first, third, fifth
@@ -126,7 +126,7 @@ class LogForceRateStiffness(LogForceRate):
         """1 + m ln(rate of the latest ramp)."""
         rate = context.record.rate / REFERENCE_FORCE_RATE
         known = rate > 0
-        factor = at_least(self.factor(jnp.where(known, rate, 1.0)), LEAST_FACTOR)
+        factor = at_least(self.factor(jnp.where(known, rate, 1.0)), MIN_FACTOR)
         return jnp.where(known, factor, 1.0) + jnp.zeros_like(context.peak_strain)
 
 
@@ -183,7 +183,7 @@ class AbstractLoadingFactor(AbstractEffect):
 
     def loading(self, law: MccLaw, particle: Particle, record: Record, strain: Values) -> Factors:
         """The factor on all three terms."""
-        factor = at_least(self.factor(particle, strain), LEAST_FACTOR)
+        factor = at_least(self.factor(particle, strain), MIN_FACTOR)
         return factor, factor, factor
 
 

@@ -10,14 +10,14 @@ import jax.numpy as jnp
 from .._types import Scalar, Values, scalar
 from ..geometry import Particle
 from ..law import MccLaw, Plastic
-from ._context import Context, positive
-from ._effect import AbstractEffect, at_least
-from ._record import REFERENCE_HUMIDITY_PERCENT, Record
-from ._variant import Mechanism, Need, Nuisance, Variant
+from .context import Context, positive
+from .effect import AbstractEffect, at_least
+from .record import REFERENCE_HUMIDITY_PERCENT, Record
+from .variant import Mechanism, Need, Nuisance, Variant
 
 REFERENCE_DIAMETER_UM = 200.0
 REFERENCE_STRESS_MPA = 10.0
-LEAST_FACTOR = 0.05
+MIN_FACTOR = 0.05
 
 
 def scaled(law: MccLaw, first: Scalar, others: Scalar | None = None, modulus: Scalar | None = None) -> MccLaw:
@@ -40,7 +40,7 @@ class AbstractStrength(AbstractEffect):
 
     def modify(self, law: MccLaw, particle: Particle, record: Record) -> MccLaw:
         """The law with the factor on the chosen parameters."""
-        factor = at_least(self.factor(particle, record), LEAST_FACTOR)
+        factor = at_least(self.factor(particle, record), MIN_FACTOR)
         one = jnp.ones_like(factor)
         first, others, modulus = (factor if term else one for term in self.terms)
         return scaled(law, first, others, modulus)
@@ -73,8 +73,8 @@ class SizeGradient(AbstractStrength):
 
     def factor(self, particle: Particle, record: Record) -> Scalar:
         """sqrt(1 + 2n 200 um / D) / sqrt(1 + 2n)."""
-        grown = at_least(1 + 2 * self.amplitude * REFERENCE_DIAMETER_UM / particle.effective_diameter, LEAST_FACTOR)
-        return jnp.sqrt(grown / at_least(1 + 2 * self.amplitude, LEAST_FACTOR))
+        grown = at_least(1 + 2 * self.amplitude * REFERENCE_DIAMETER_UM / particle.effective_diameter, MIN_FACTOR)
+        return jnp.sqrt(grown / at_least(1 + 2 * self.amplitude, MIN_FACTOR))
 
 
 def _size(name: str, make: type[AbstractEffect], equation: str, explanation: str, source: str, **fixed: Any) -> Variant:
@@ -128,7 +128,7 @@ class AbstractShape(AbstractEffect):
 
     def modify(self, law: MccLaw, particle: Particle, record: Record) -> MccLaw:
         """Coefficients and modulus with the factor."""
-        g = at_least(self.factor(particle), LEAST_FACTOR)
+        g = at_least(self.factor(particle), MIN_FACTOR)
         power = law.strain_scaling.power / law.unloading.stress_power
         plastic = Plastic(law.plastic.C1 * g, law.plastic.C3 * g, law.plastic.C5 * g)
         return MccLaw(plastic, law.a, law.effective_modulus * g**power, law.unloading, law.strain_scaling)
@@ -217,7 +217,7 @@ class TwoRateHumidity(Humidity):
 
     def modify(self, law: MccLaw, particle: Particle, record: Record) -> MccLaw:
         """C1 exp(-k (RH - 45 %)) and E exp(-r k (RH - 45 %))."""
-        first = at_least(self.factor(particle, record), LEAST_FACTOR)
+        first = at_least(self.factor(particle, record), MIN_FACTOR)
         return scaled(law, first, jnp.ones_like(first), first**self.modulus_share)
 
 
@@ -287,11 +287,11 @@ class ModulusStrain(AbstractEffect):
         }.get(self.form, context.peak_strain)
         x = self.direction * self.amplitude * variable
         if self.form == "linear":
-            return at_least(1 + x, LEAST_FACTOR)
+            return at_least(1 + x, MIN_FACTOR)
         if self.form == "rational":
-            return 1 / at_least(1 - x, LEAST_FACTOR)
+            return 1 / at_least(1 - x, MIN_FACTOR)
         if self.form == "squared":
-            return at_least(1 + x / 2, LEAST_FACTOR) ** 2
+            return at_least(1 + x / 2, MIN_FACTOR) ** 2
         return jnp.exp(x)
 
 
@@ -310,7 +310,7 @@ class CyclicDamage(AbstractEffect):
 
     def stiffness(self, context: Context) -> Values:
         """1 / (1 + kappa N)."""
-        return 1 / at_least(1 + self.amplitude * context.cycles, LEAST_FACTOR)
+        return 1 / at_least(1 + self.amplitude * context.cycles, MIN_FACTOR)
 
 
 class PorosityStiffening(AbstractEffect):
@@ -328,7 +328,7 @@ class RelativeDensity(AbstractEffect):
 
     def stiffness(self, context: Context) -> Values:
         """(1 - eps_P / 2)^-b."""
-        return jnp.exp(-self.amplitude * jnp.log(at_least(1 - context.peak_strain / 2, LEAST_FACTOR)))
+        return jnp.exp(-self.amplitude * jnp.log(at_least(1 - context.peak_strain / 2, MIN_FACTOR)))
 
 
 def _damage(name: str, make: type[AbstractEffect], equation: str, explanation: str, **more: Any) -> Variant:

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 
 from .._types import Flag, Scalar
 
-MOST_DOUBLINGS = 60
-MOST_STEPS = 100
+MAX_DOUBLINGS = 60
+MAX_STEPS = 100
 
 
 def increasing_root(function: Callable[[Scalar], Scalar], start: Scalar) -> Scalar:
@@ -38,7 +38,7 @@ def increasing_root(function: Callable[[Scalar], Scalar], start: Scalar) -> Scal
         return high, f_high, up, function(up), steps + 1
 
     low, f_low, high, f_high, _ = jax.lax.while_loop(
-        lambda c: (c[3] < 0) & (c[4] < MOST_DOUBLINGS), wider, (zero, below, zero, below, 0)
+        lambda c: (c[3] < 0) & (c[4] < MAX_DOUBLINGS), wider, (zero, below, zero, below, 0)
     )
     eps = jnp.finfo(start.dtype).eps
 
@@ -49,7 +49,7 @@ def increasing_root(function: Callable[[Scalar], Scalar], start: Scalar) -> Scal
         a, fa, b, fb, *_, steps = carry
         best = jnp.where(jnp.abs(fa) < jnp.abs(fb), a, b)
         exact = (fa == 0) | (fb == 0)
-        return ~exact & (width(carry) > 2 * eps * jnp.abs(best) + jnp.finfo(start.dtype).tiny) & (steps < MOST_STEPS)
+        return ~exact & (width(carry) > 2 * eps * jnp.abs(best) + jnp.finfo(start.dtype).tiny) & (steps < MAX_STEPS)
 
     def closer(carry: tuple) -> tuple:
         a, fa, b, fb, share, steps = carry

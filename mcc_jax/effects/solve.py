@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from .._types import Scalar, Values
 from ..geometry import Particle
 from ..law import MccLaw, Unloading, loading_strain, recovery_limit
-from ._effect import AbstractEffect, Factors
-from ._record import Record
+from .effect import AbstractEffect, Factors
+from .record import Record
 
 NEWTON_STEPS = 6
 Effects = tuple[AbstractEffect, ...]

@@ -8,9 +8,9 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._types import Scalar, Values, scalar
-from ._context import Context, contact_radius
-from ._effect import AbstractEffect
-from ._variant import Mechanism, Need, Nuisance, Variant
+from .context import Context, contact_radius
+from .effect import AbstractEffect
+from .variant import Mechanism, Need, Nuisance, Variant
 
 REFERENCE_FORCE_MN = 100.0
 REFERENCE_TIME_S = 100.0

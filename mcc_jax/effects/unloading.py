@@ -10,10 +10,10 @@ import jax.numpy as jnp
 
 from .._types import Scalar, Values, scalar
 from ..law import PUNCH_AREA, recovery
-from ._context import Context, contact_of, positive
-from ._effect import AbstractEffect
-from ._record import RELOAD, UNLOAD, reload_progress
-from ._variant import Mechanism, Need, Nuisance, Variant
+from .context import Context, contact_of, positive
+from .effect import AbstractEffect
+from .record import RELOAD, UNLOAD, reload_progress
+from .variant import Mechanism, Need, Nuisance, Variant
 
 _NORM = 27 / 4
 BISECTIONS = 50

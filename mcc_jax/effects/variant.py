@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from .. import arguments
 from .._errors import InputError
 from .._types import ScalarLike, scalar
-from ._effect import AbstractEffect
+from .effect import AbstractEffect
 
 
 class Need(enum.Enum):

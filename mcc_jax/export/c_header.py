@@ -5,8 +5,8 @@ from __future__ import annotations
 from .._version import own_version
 from ..geometry import Particle
 from ..law import TESTED_STRAIN, MccLaw, StrainScaling, Unloading
-from ._origin import Origin, checked, numbers
-from ._templates import quoted, render
+from .origin import Origin, checked, numbers
+from .templates import quoted, render
 
 
 def c_header(law: MccLaw, particle: Particle | None = None, *, origin: Origin | None = None) -> str:

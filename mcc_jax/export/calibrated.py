@@ -19,7 +19,7 @@ from ..campaign import read_diameters
 from ..files import LIMITS, read_regular
 from ..geometry import Particle
 from ..law import MccLaw, Plastic, StrainScaling, Unloading
-from ._origin import Origin, check
+from .origin import Origin, check
 
 CALIBRATION, PARTICLES = "calibration.json", "particles.csv"
 SPHERE_UM = 200.0

@@ -9,7 +9,7 @@ from typing import Any
 from .._version import own_version
 from ..geometry import Particle
 from ..law import TESTED_STRAIN, MccLaw
-from ._origin import Origin, checked, numbers
+from .origin import Origin, checked, numbers
 
 UNITS = {"C1": "1", "C3": "1", "C5": "1", "a": "1", "effective_modulus_MPa": "MPa"}
 FORMULAE = {

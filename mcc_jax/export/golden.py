@@ -15,8 +15,8 @@ from .._types import Scalar, Values
 from ..dem import HalfContact, half_contact, pair_force, pair_recovery, wall_force, wall_recovery
 from ..geometry import Particle
 from ..law import TESTED_STRAIN, MccLaw
-from ._origin import checked
-from ._respond import respond
+from .origin import checked
+from .respond import respond
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -14,8 +14,8 @@ from .. import arguments
 from .._errors import InputError
 from ..geometry import Particle
 from ..law import History, MccLaw, Plastic
-from ._origin import checked
-from ._respond import respond
+from .origin import checked
+from .respond import respond
 
 Which = Literal["force", "step", "step_each"]
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")

@@ -13,7 +13,7 @@ from .. import arguments
 from .._errors import InputError
 from ..law import TESTED_STRAIN, MccLaw, recovery_limit, stress_ratio
 from ..law.recovery_limit import SHARE
-from ._origin import checked
+from .origin import checked
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 else:
     Table = object
 
-FEWEST, MOST = 64, 65536
+MIN_ROWS, MAX_ROWS = 64, 65536
 BETWEEN = 8  # points at which an interval is checked
 CORNERS = 4096  # intervals in which a corner is looked for
 
@@ -120,8 +120,8 @@ def _refine(
 
     Points lie evenly from 0 to 1, and on the corners.
     """
-    count = FEWEST
-    while count <= MOST:
+    count = MIN_ROWS
+    while count <= MAX_ROWS:
         table = columns(np.union1d(np.linspace(0.0, 1.0, count + 1), corners))
         finer = columns(np.linspace(0.0, 1.0, BETWEEN * count + 1))
         x, *_ = table
@@ -133,6 +133,6 @@ def _refine(
             return table, float(error)
         count *= 2
     raise InputError(
-        f"{MOST} points do not describe the curve to {tolerance:g}: it has a corner",
+        f"{MAX_ROWS} points do not describe the curve to {tolerance:g}: it has a corner",
         remedy="Export this law in another format",
     )

@@ -11,13 +11,13 @@ from .. import arguments
 from .._errors import InputError
 from ..geometry import Particle
 from ..law import MccLaw
-from ._c_header import c_header
-from ._card import card
-from ._golden import golden_pair_table, golden_table
-from ._jax_artefact import jax_artefact
-from ._origin import Origin, checked
-from ._recipes import lammps_recipe, yade_recipe
-from ._tables import curve_tables
+from .c_header import c_header
+from .card import card
+from .golden import golden_pair_table, golden_table
+from .jax_artefact import jax_artefact
+from .origin import Origin, checked
+from .recipes import lammps_recipe, yade_recipe
+from .tables import curve_tables
 
 Write = Callable[[MccLaw, Particle, Origin, Path, int], list[str]]
 

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 
 from .._numerics import shared
 from .._types import Scalar, Values
-from ._loading_inverse import secant_modulus, tangent_modulus
-from ._recovery import stress_ratio
-from ._unloading import StrainScaling, Unloading
+from .loading_inverse import secant_modulus, tangent_modulus
+from .recovery import stress_ratio
 from .recovery_limit import recovery_limit
+from .unloading import StrainScaling, Unloading
 
 AREA = 1e-3 * jnp.pi / 4
 """Effective area over the diameter squared, times what makes mN of MPa um^2."""

@@ -11,13 +11,13 @@ from .._numerics import compiled_whole, derivative_kept, running_max, shared
 from .._types import Flag, Path, Scalar, ScalarLike, scalar
 from ..arguments import finite, instance, member, positive
 from ..geometry import Particle, plastic_shape_factor
-from ._base import AbstractContactLaw
-from ._branch import AREA, branch_coefficients, branch_force
-from ._loading_inverse import loading_strain, secant_modulus, tangent_modulus
-from ._plastic import Plastic
-from ._recovery import energy_ratio, recovery, stress_ratio
-from ._unloading import StrainScaling, Unloading
+from .base import AbstractContactLaw
+from .branch import AREA, branch_coefficients, branch_force
+from .loading_inverse import loading_strain, secant_modulus, tangent_modulus
+from .plastic import Plastic
+from .recovery import energy_ratio, recovery, stress_ratio
 from .recovery_limit import recovery_limit
+from .unloading import StrainScaling, Unloading
 
 AnyShape = Float[Array, "..."]
 TESTED_STRAIN = 0.67

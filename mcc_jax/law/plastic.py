@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from .._numerics import compiled_whole
 from .._types import Flag, Scalar, ScalarLike, scalar
 from ..arguments import positive
-from ._loading_inverse import loading_strain, loading_work, secant_modulus, tangent_modulus
+from .loading_inverse import loading_strain, loading_work, secant_modulus, tangent_modulus
 
 
 def _coefficient(value: ScalarLike) -> Scalar:

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from .._numerics import horner, shared, two_thirds_power
 from .._types import Values
 from ..arguments import values
-from ._recovery_coefficients import ENERGY_64, RATIO_32, RATIO_64, RECOVERY_32, RECOVERY_64
+from .recovery_coefficients import ENERGY_64, RATIO_32, RATIO_64, RECOVERY_32, RECOVERY_64
 
 
 def _is_double(x: Values) -> bool:

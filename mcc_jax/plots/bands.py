@@ -13,8 +13,8 @@ from matplotlib.patches import Patch
 
 from ..calibrate import BayesCalibration, LeastSquaresCalibration, predict_measured
 from ..campaign import campaign_segments
-from ._joint import cautions, flatness, kept_labels, spread_over
-from ._style import (
+from .joint import cautions, flatness, kept_labels, spread_over
+from .style import (
     BLACK,
     BLUE,
     DISPLACEMENT,
@@ -27,7 +27,7 @@ from ._style import (
     styled,
 )
 
-MOST_CELLS = 12
+MAX_CELLS = 12
 COLUMNS = 3
 BAND_DRAWS = 1000
 LOADING, UNLOADING = BLUE, VERMILION
@@ -166,7 +166,7 @@ def plot_bands(calibration: BayesCalibration) -> Figure:
     for. The title counts the points inside.
     """
     labels, tests = kept_labels(calibration), calibration.selection.tests
-    chosen = spread_over(len(labels), MOST_CELLS)
+    chosen = spread_over(len(labels), MAX_CELLS)
     eta = np.asarray(calibration.shape_factor).mean(axis=(0, 1))
     cells = []
     for row, branches in zip(chosen, branches_of(calibration, chosen), strict=True):
@@ -199,7 +199,7 @@ def plot_fits(calibration: LeastSquaresCalibration) -> Figure:
     is the residual, measured less fitted [um]; the title gives its root mean square.
     """
     labels, tests = kept_labels(calibration), calibration.selection.tests
-    chosen = spread_over(len(labels), MOST_CELLS)
+    chosen = spread_over(len(labels), MAX_CELLS)
     eta = 1 + float(calibration.solution.value.shared[0]) * flatness(calibration)
     residual = calibration.residual()
     cells = []

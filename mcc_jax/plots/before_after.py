@@ -9,12 +9,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from ..discover import Discovery
-from ..effects._record import HOLD, RELOAD, UNLOAD
-from ._leftover import Leftover, added_columns, leftover
-from ._style import BLUE, GREY, ORANGE, VERMILION, finish, new_figure, note, styled
-from ._text import particle_labels
+from ..effects.record import HOLD, RELOAD, UNLOAD
+from .remaining_gap import Leftover, added_columns, leftover
+from .style import BLUE, GREY, ORANGE, VERMILION, finish, new_figure, note, styled
+from .text import particle_labels
 
-MOST_PANELS = 6
+MAX_PANELS = 6
 SHADES = {HOLD: "#FBEFD0", UNLOAD: "#DFECF6", RELOAD: "#E2F1E8"}
 WORDS = {HOLD: "hold", UNLOAD: "unloading", RELOAD: "reloading"}
 
@@ -37,7 +37,7 @@ def _most_affected(left: Leftover) -> np.ndarray:
     before, after = (np.sum(white**2, 1) for white in (left.white_before, left.white_after))
     gain = before - after
     worth = gain if np.any(np.abs(gain) > 1e-9) else before / np.maximum(left.used.sum(1), 1)
-    return np.sort(np.argsort(-worth, kind="stable")[:MOST_PANELS])
+    return np.sort(np.argsort(-worth, kind="stable")[:MAX_PANELS])
 
 
 @styled

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..calibrate import PaperCalibration
-from ._style import (
+from .style import (
     BLACK,
     SCALED_STRAIN,
     SHAPE_FACTOR,

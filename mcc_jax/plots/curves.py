@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from .._errors import InputError
 from ..calibrate import PaperCalibration
 from ..campaign import stress_and_strain
-from ._style import (
+from .style import (
     BLACK,
     BLUE,
     GREEN,
@@ -30,7 +30,7 @@ from ._style import (
     shape_factors,
     styled,
 )
-from ._text import particle_labels
+from .text import particle_labels
 
 _CYCLE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK)
 

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..campaign import Campaign
-from ._style import BLACK, GREY, VERMILION, finish, new_figure, note, sequential, styled
+from .style import BLACK, GREY, VERMILION, finish, new_figure, note, sequential, styled
 
 
 @dataclass(frozen=True)

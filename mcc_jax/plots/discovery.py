@@ -8,11 +8,22 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from ..discover import Discovery
-from ..discover._features import KINDS, LEVELS
-from ..discover._score import project
-from ._before_after import plot_before_after
-from ._ranking import plain_name, plot_ranking, plot_similarity
-from ._style import BLACK, BLUE, VERMILION, empty, finish, new_figure, note, of_its_kind, sequential, styled
+from ..discover.dictionary import KINDS, LEVELS
+from ..discover.score import project
+from .before_after import plot_before_after
+from .ranking import plain_name, plot_ranking, plot_similarity
+from .style import (
+    BLACK,
+    BLUE,
+    VERMILION,
+    empty,
+    finish,
+    new_figure,
+    note,
+    of_its_kind,
+    sequential,
+    styled,
+)
 
 FADED = 1e-4
 """Of a place whose information survives the projection by less, the law takes up everything: nothing can be said."""

@@ -8,10 +8,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatterSciNotation, ScalarFormatter
 
-from ..calibrate import LEAST_RATIO, PaperCalibration
-from ..calibrate._elastic import recoverable_strain
+from ..calibrate import MIN_RATIO, PaperCalibration
+from ..calibrate.paper.modulus import recoverable_strain
 from ..law import recovery, stress_ratio
-from ._style import (
+from .style import (
     BLACK,
     GREY,
     SHAPE_FACTOR,
@@ -84,10 +84,10 @@ def plot_elastic(calibration: PaperCalibration) -> Figure:
         )  # fmt: skip
     s = np.linspace(0.0, 1.0, 201)
     left.plot(s, np.asarray(jax.jit(stress_ratio)(jnp.asarray(s))), color=BLACK, linewidth=1.0, label="law, $f(s)$")
-    left.axhline(LEAST_RATIO, color=GREY, linewidth=0.8, dashes=(1, 1.5))
+    left.axhline(MIN_RATIO, color=GREY, linewidth=0.8, dashes=(1, 1.5))
     left.text(
         0.02,
-        LEAST_RATIO,
+        MIN_RATIO,
         "each branch has a zero of its own;\nnot used below",
         transform=left.get_yaxis_transform(),
         va="bottom",

@@ -11,15 +11,15 @@ from matplotlib.figure import Figure
 from .. import arguments
 from .._errors import InputError
 from ..calibrate import PaperCalibration
-from ._collapse import plot_collapse
-from ._curves import plot_curves
-from ._dimensions import plot_dimensions
-from ._elastic import plot_elastic
-from ._law import plot_law
-from ._master import plot_master
-from ._particles import particle_pages, plot_particles
-from ._residuals import plot_residuals
-from ._style import RC, of_its_kind
+from .collapse import plot_collapse
+from .curves import plot_curves
+from .dimensions import plot_dimensions
+from .elastic import plot_elastic
+from .law import plot_law
+from .master import plot_master
+from .particles import particle_pages, plot_particles
+from .residuals import plot_residuals
+from .style import RC, of_its_kind
 
 
 @of_its_kind

@@ -11,13 +11,20 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse, Patch
 
 from ..calibrate import BayesCalibration, LeastSquaresCalibration
-from ._joint import COEFFICIENT_NAMES, COEFFICIENT_SYMBOLS, cautions, flatness, kept_labels, spread_over
-from ._style import BLACK, BLUE, GREY, ORANGE, SKY, VERMILION, finish, new_figure, styled
+from .joint import (
+    COEFFICIENT_NAMES,
+    COEFFICIENT_SYMBOLS,
+    cautions,
+    flatness,
+    kept_labels,
+    spread_over,
+)
+from .style import BLACK, BLUE, GREY, ORANGE, SKY, VERMILION, finish, new_figure, styled
 
-MOST_LABELS = 40
+MAX_LABELS = 40
 """So many particles have a labelled row each; of more, an ordered sample is shown without labels."""
 
-MOST_ROWS = 200
+MAX_ROWS = 200
 
 
 @dataclass(frozen=True)
@@ -67,7 +74,7 @@ def least_squares_table(calibration: LeastSquaresCalibration) -> CoefficientTabl
 
 
 def _rows(ax: Axes, table: CoefficientTable, j: int, chosen: np.ndarray, y: np.ndarray) -> None:
-    labelled = len(chosen) <= MOST_LABELS
+    labelled = len(chosen) <= MAX_LABELS
     thick, size = (3.2, 4.0) if labelled else (1.2, 1.5)
     ax.axvspan(*table.spread[:, j], color=ORANGE, alpha=0.22, linewidth=0, zorder=0)
     ax.axvline(table.median[j], color=VERMILION, linewidth=1.1, zorder=1)
@@ -87,7 +94,7 @@ def _typical(wide: np.ndarray, centre: np.ndarray) -> str:
 def draw_forest(table: CoefficientTable, labels: list[str]) -> tuple[Figure, list[Line2D | Patch]]:
     """Three panels of intervals, and the handles of their legend."""
     count = len(labels)
-    labelled = count <= MOST_LABELS
+    labelled = count <= MAX_LABELS
     figure = new_figure(8.2, max(2.4, 0.19 * count + 1.3) if labelled else 6.0)
     panels = figure.subplots(1, 3, sharey=True)
     for j, ax in enumerate(panels):
@@ -95,7 +102,7 @@ def draw_forest(table: CoefficientTable, labels: list[str]) -> tuple[Figure, lis
             chosen = np.arange(count)
             y = chosen.astype(float)
         else:
-            chosen = np.argsort(table.centre[:, j], kind="stable")[spread_over(count, MOST_ROWS)]
+            chosen = np.argsort(table.centre[:, j], kind="stable")[spread_over(count, MAX_ROWS)]
             y = np.linspace(0, 1, len(chosen))
         _rows(ax, table, j, chosen, y)
         ax.set_xlabel(f"{COEFFICIENT_SYMBOLS[j]} [-]")
@@ -124,9 +131,9 @@ def draw_forest(table: CoefficientTable, labels: list[str]) -> tuple[Figure, lis
 
 
 def _title(count: int, what: str) -> str:
-    if count <= MOST_LABELS:
+    if count <= MAX_LABELS:
         return what
-    shown = f"{MOST_ROWS} of {count}" if count > MOST_ROWS else f"{count}"
+    shown = f"{MAX_ROWS} of {count}" if count > MAX_ROWS else f"{count}"
     return f"{what}, {shown} particles, each panel in its own order"
 
 
@@ -163,7 +170,7 @@ def plot_estimates(calibration: LeastSquaresCalibration) -> Figure:
 
 def shrinkage(calibration: BayesCalibration) -> tuple[np.ndarray, np.ndarray]:
     """log C1, C3, C5 of each particle alone, under the most probable a, and posterior means, both of shape (N, 3)."""
-    from ..calibrate.joint._fit import population_at
+    from ..calibrate.fit import population_at
 
     fit = calibration.fit
     a = float(population_at(fit.mode, fit.numbers, calibration.model.scatter).a)

@@ -9,13 +9,13 @@ from matplotlib.figure import Figure
 
 from ..calibrate import BayesCalibration, LeastSquaresCalibration
 from ..campaign import of_each_particle
-from ._text import particle_labels, plain
+from .text import particle_labels, plain
 
 COEFFICIENT_SYMBOLS = ("$C_1$", "$C_3$", "$C_5$")
 COEFFICIENT_NAMES = ("C1", "C3", "C5")
 """As in files."""
 
-MOST_DRAWS = 2000
+MAX_DRAWS = 2000
 """No more draws than these go into one density."""
 
 
@@ -51,9 +51,9 @@ def cautions(figure: Figure, calibration: BayesCalibration | LeastSquaresCalibra
 
 
 def flat_draws(draws: np.ndarray) -> np.ndarray:
-    """Draws of all chains in one row, thinned to at most `MOST_DRAWS`."""
+    """Draws of all chains in one row, thinned to at most `MAX_DRAWS`."""
     row = np.asarray(draws, float).ravel()
-    return row[:: max(1, -(-len(row) // MOST_DRAWS))]
+    return row[:: max(1, -(-len(row) // MAX_DRAWS))]
 
 
 def density(draws: np.ndarray, x: np.ndarray, *, positive: bool = False, log: bool = False) -> np.ndarray:

@@ -8,7 +8,18 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..calibrate import PaperCalibration
-from ._style import BLUE, GREY, ORANGE, SCALED_STRAIN, STRESS, VERMILION, finish, new_figure, note, styled
+from .style import (
+    BLUE,
+    GREY,
+    ORANGE,
+    SCALED_STRAIN,
+    STRESS,
+    VERMILION,
+    finish,
+    new_figure,
+    note,
+    styled,
+)
 
 
 def law_strain(calibration: PaperCalibration) -> np.ndarray:

@@ -7,12 +7,24 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..calibrate import LeastSquaresCalibration
-from ._bands import plot_fits
-from ._forest import plot_estimates
-from ._joint import cautions, flatness
-from ._style import BLACK, GREY, ORANGE, PALE, SHAPE_FACTOR, finish, new_figure, note, of_its_kind, sequential, styled
+from .bands import plot_fits
+from .forest import plot_estimates
+from .joint import cautions, flatness
+from .style import (
+    BLACK,
+    GREY,
+    ORANGE,
+    PALE,
+    SHAPE_FACTOR,
+    finish,
+    new_figure,
+    note,
+    of_its_kind,
+    sequential,
+    styled,
+)
 
-MOST_POINTS = 20_000
+MAX_POINTS = 20_000
 """No more residuals than these are drawn as points; the histogram counts them all."""
 
 
@@ -42,7 +54,7 @@ def plot_whitened(calibration: LeastSquaresCalibration) -> Figure:
         (panels[1], mask & ~loading, "unloading, reloading"),
     ):
         picked = np.flatnonzero(rows)
-        picked = picked[:: max(1, -(-len(picked) // MOST_POINTS))]
+        picked = picked[:: max(1, -(-len(picked) // MAX_POINTS))]
         ax.axhspan(-1.96, 1.96, color=ORANGE, alpha=0.25, linewidth=0, zorder=0)
         ax.axhline(0.0, color=GREY, linewidth=0.8)
         ax.scatter(

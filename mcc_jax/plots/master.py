@@ -6,7 +6,18 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..calibrate import PaperCalibration
-from ._style import BLUE, GREY, PALE, SCALED_STRAIN, STRESS, faintness, finish, new_figure, note, styled
+from .style import (
+    BLUE,
+    GREY,
+    PALE,
+    SCALED_STRAIN,
+    STRESS,
+    faintness,
+    finish,
+    new_figure,
+    note,
+    styled,
+)
 
 
 @styled

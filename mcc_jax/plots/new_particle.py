@@ -13,9 +13,9 @@ from .. import arguments
 from ..calibrate import BayesCalibration, predict_new_particle
 from ..campaign import PAPER_DIAMETERS_UM, effective_diameter_um, of_each_particle
 from ..geometry import plastic_shape_factor
-from ._bands import LOADING, UNLOADING
-from ._joint import cautions
-from ._style import BLACK, DISPLACEMENT, FORCE, GREY, finish, new_figure, styled
+from .bands import LOADING, UNLOADING
+from .joint import cautions
+from .style import BLACK, DISPLACEMENT, FORCE, GREY, finish, new_figure, styled
 
 DRAWS, SINGLE = 1000, 6
 

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from .._errors import InputError
 from ..calibrate import PaperCalibration, ParticleFit
 from ..campaign import Curve
-from ._style import (
+from .style import (
     BLACK,
     BLUE,
     DISPLACEMENT,
@@ -27,7 +27,7 @@ from ._style import (
     shape_factors,
     styled,
 )
-from ._text import particle_labels, plain
+from .text import particle_labels, plain
 
 PER_PAGE = 20
 _COLUMNS = 4

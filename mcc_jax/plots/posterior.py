@@ -11,14 +11,26 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from ..calibrate import BayesCalibration, beside_paper
-from ._bands import plot_bands
-from ._forest import plot_forest, plot_shrinkage
-from ._joint import cautions, density, flat_draws, with_sd
-from ._new_particle import plot_new_particle
-from ._style import BLACK, BLUE, GREY, PALE, SKY, VERMILION, finish, new_figure, note, of_its_kind, styled
+from ..calibrate import BayesCalibration, compare_with_paper
+from .bands import plot_bands
+from .forest import plot_forest, plot_shrinkage
+from .joint import cautions, density, flat_draws, with_sd
+from .new_particle import plot_new_particle
+from .style import (
+    BLACK,
+    BLUE,
+    GREY,
+    PALE,
+    SKY,
+    VERMILION,
+    finish,
+    new_figure,
+    note,
+    of_its_kind,
+    styled,
+)
 
-MOST_DOTS = 800
+MAX_DOTS = 800
 PRIOR_DRAWS = 2000
 
 
@@ -84,7 +96,7 @@ def plot_pairs(calibration: BayesCalibration) -> Figure:
     figure = new_figure(1.05 * size + 1.0, 1.0 * size + 1.0)
     grid = figure.subplots(size, size, squeeze=False, sharex="col")
     total = draws["a"].size
-    shown = np.arange(0, total, max(1, -(-total // MOST_DOTS)))
+    shown = np.arange(0, total, max(1, -(-total // MAX_DOTS)))
     for i, name in enumerate(names):
         values = draws[name].ravel()
         for j, ax in enumerate(grid[i]):
@@ -143,10 +155,10 @@ def _span(values: np.ndarray, parameter: Parameter, points: int = 200) -> np.nda
 
 def prior_of(calibration: BayesCalibration) -> dict[str, np.ndarray]:
     """Draws of the population's prior, by the names and in the units of the figures."""
-    from ..calibrate.joint._arviz import prior_draws
+    from ..calibrate.arviz import prior_draws
 
     low, high = np.asarray(calibration.fit.numbers.a)[2:]
-    found = prior_draws(calibration.model.beliefs, float(low), float(high), (1, PRIOR_DRAWS), 0)
+    found = prior_draws(calibration.model.chosen_priors, float(low), float(high), (1, PRIOR_DRAWS), 0)
     for vector in ("mu", "tau"):
         found |= {f"{vector}_{name}": found[vector][..., j] for j, name in enumerate(("C1", "C3", "C5"))}
     return {name: found[name] * p.scale for name, p in PARAMETERS.items() if name in found}
@@ -161,7 +173,7 @@ def plot_prior_posterior(calibration: BayesCalibration) -> Figure:
     The paper has no value for the noise, the scatter of modulus and `a`, and for other forms of unloading no modulus.
     """
     posterior, prior = _population(calibration), prior_of(calibration)
-    paper = {row["quantity"]: row["paper"] for row in beside_paper(calibration)}
+    paper = {row["quantity"]: row["paper"] for row in compare_with_paper(calibration)}
     rows = -(-len(posterior) // 2)
     figure = new_figure(9.6, 1.5 * rows + 1.0)
     grid = figure.subplots(rows, 4, squeeze=False)

@@ -11,10 +11,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from ..discover import Discovery
-from ..discover._score import DETECTABLE, project
-from ._style import BLACK, BLUE, GREY, PALE, SKY, finish, new_figure, styled
+from ..discover.score import DETECTABLE, project
+from .style import BLACK, BLUE, GREY, PALE, SKY, finish, new_figure, styled
 
-MOST_ALIKE = 10
+MAX_ALIKE = 10
 """Where the detection limit lies on the axis of statistics; `Discovery.limits` is made with the same number."""
 
 
@@ -106,7 +106,7 @@ def likeness(found: Discovery) -> tuple[list[str], np.ndarray]:
     assert found.system is not None
     ranking, system = found.ranking, found.system
     members = dict.fromkeys(name for names in found.candidate_set for name in names)
-    names = [*members, *(n for n in ranking.names if n not in members)][: max(MOST_ALIKE, len(members))]
+    names = [*members, *(n for n in ranking.names if n not in members)][: max(MAX_ALIKE, len(members))]
     best = dict(zip(ranking.names, ranking.best, strict=True))
     for effect in found.effects:
         for k, candidate in enumerate(system.candidates):

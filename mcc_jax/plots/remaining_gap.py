@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._errors import InputError
-from ..calibrate.joint._fit import population_at
-from ..calibrate.joint._linearised import linear_data
-from ..calibrate.joint._population import moments
+from ..calibrate.fit import population_at
+from ..calibrate.linearise import linear_data
+from ..calibrate.population import moments
 from ..discover import Discovery
-from ..discover._score import project
-from ..discover._system import Base, Candidate, System, build_system, feature_values, signals_of
+from ..discover.linear_model import Base, Candidate, System, build_system, feature_values, signals_of
+from ..discover.score import project
 from ..effects import Mechanism, Variant
 
 

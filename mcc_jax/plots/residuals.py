@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import ScalarFormatter
 
 from ..calibrate import PaperCalibration
-from ._style import (
+from .style import (
     FORCE,
     GREY,
     ORANGE,

@@ -19,7 +19,7 @@ from .. import arguments
 from ..calibrate import PaperCalibration, ShapeFit
 from ..campaign import Campaign, Metadata, check_campaign, of_each_particle
 from ..geometry import plastic_shape_factor
-from ._text import FONT, is_simulated
+from .text import FONT, is_simulated
 
 BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILION, PURPLE = (
     "#000000", "#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7",

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ..plots._style import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION
-from ._compare import KINDS, Shown
+from ..plots.style import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION
+from .compare import KINDS, Shown
 
 ROOTS = ("chart-curve", "chart-residual")
 LOOKS = {

@@ -7,17 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from ..calibrate.joint._data import rows_from_contact
+from ..calibrate.data import rows_from_contact
 from ..campaign import THRESHOLD_MPA, Campaign, campaign_segments, particle_batch, stress_and_strain
-from ._posterior import Band
-from ._read import Results
+from .posterior import Band
+from .read import Results
 
 KINDS = ("load", "hold", "unload", "reload")
 POINTS = 40_000
 """About so many points stand in the page, shared among its particles."""
 
-MOST_POINTS, LEAST_POINTS = 400, 40
-MOST_PARTICLES = POINTS // LEAST_POINTS
+MAX_POINTS, MIN_POINTS = 400, 40
+MAX_PARTICLES = POINTS // MIN_POINTS
 RIGID_MPA = 1e9
 """Where no test was unloaded the modulus cannot matter; a stiff one keeps the law defined."""
 
@@ -58,7 +58,7 @@ class Shown:
 
 
 def compare(results: Results) -> list[Shown]:
-    """Every particle of the campaign, at most `MOST_PARTICLES`: then those that the law misses by most.
+    """Every particle of the campaign, at most `MAX_PARTICLES`: then those that the law misses by most.
 
     Needs double precision, as calibration does. Empty without a campaign.
     """
@@ -69,7 +69,7 @@ def compare(results: Results) -> list[Shown]:
     chosen = _chosen(campaign, entries)
     campaign = campaign.select(chosen)
     shown = [_measured(campaign, i, parts, results) for i, parts in enumerate(campaign_segments(campaign))]
-    most = min(max(POINTS // len(shown), LEAST_POINTS), MOST_POINTS)
+    most = min(max(POINTS // len(shown), MIN_POINTS), MAX_POINTS)
     if results.calibration is not None:
         shown = _predicted(campaign, shown, entries, results.calibration)
     return [_thinned(one, most) for one in shown]
@@ -78,7 +78,7 @@ def compare(results: Results) -> list[Shown]:
 def _chosen(campaign: Campaign, entries: dict[str, Any]) -> np.ndarray:
     rms = np.array([entries.get(name, {}).get("rms_um") or 0.0 for name in campaign.particles])
     chosen = np.zeros(len(campaign), bool)
-    chosen[np.argsort(-rms, kind="stable")[:MOST_PARTICLES]] = True
+    chosen[np.argsort(-rms, kind="stable")[:MAX_PARTICLES]] = True
     return chosen
 
 
@@ -87,7 +87,7 @@ def _measured(campaign: Campaign, i: int, segments: Any, results: Results) -> Sh
     kind = np.zeros(len(curve), int)
     for part in segments:
         kind[part.start : part.stop] = KINDS.index(part.kind) if part.kind in KINDS else 0
-    rows = rows_from_contact(curve, segments, MOST_POINTS)
+    rows = rows_from_contact(curve, segments, MAX_POINTS)
     used = _compared(curve, campaign.diameters_um[i], segments, kind, results.calibration)[rows]
     force = curve.force_mN[rows]
     middle = low = high = nothing = np.full(len(rows), np.nan)
@@ -105,7 +105,7 @@ def _fits(band: Band, force: np.ndarray) -> bool:
 
 def _compared(curve: Any, diameters: np.ndarray, segments: Any, kind: np.ndarray, calibration: dict | None):
     """The points that a calibration compares: see `select_tests`, and `predict_particles` for the paper's method."""
-    from ..calibrate import LEAST_RATIO
+    from ..calibrate import MIN_RATIO
 
     stress, _ = stress_and_strain(curve, diameters, segments)
     touching = np.ones(len(curve), bool)
@@ -118,7 +118,7 @@ def _compared(curve: Any, diameters: np.ndarray, segments: Any, kind: np.ndarray
         return touching & (stress > max(threshold, 0.02 * stress.max())) & curve.compared
     told = calibration["provenance"]["settings"].get("threshold_MPa")
     threshold = told if isinstance(told, int | float) else THRESHOLD_MPA
-    elastic = (kind == KINDS.index("load")) | (stress >= LEAST_RATIO * np.maximum.accumulate(stress))
+    elastic = (kind == KINDS.index("load")) | (stress >= MIN_RATIO * np.maximum.accumulate(stress))
     return touching & elastic & (stress >= threshold) & curve.compared
 
 

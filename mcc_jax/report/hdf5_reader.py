@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 COEFFICIENTS = ("C1", "C3", "C5")
-MOST_VALUES = 2**24
+MAX_VALUES = 2**24
 """In one array; a damaged shape may ask for any memory, and a kilobyte of chunks may fill it."""
 MEMORY = 2**31
 """Of the process [bytes], beside what a whole file would take."""
@@ -72,7 +72,7 @@ def _bands(tree: Any) -> dict[str, np.ndarray]:
 def _values(dataset: Any, *where: Any, kind: type | None = float) -> np.ndarray:
     """A part of a stored array, unless it is too large to be what we wrote."""
     lengths = [n for i, n in enumerate(dataset.shape) if i >= len(where) or isinstance(where[i], slice)]
-    if math.prod(lengths) > MOST_VALUES:
+    if math.prod(lengths) > MAX_VALUES:
         raise ValueError(f"{dataset.name} has the shape {dataset.shape}")
     return np.asarray(dataset[where], kind)
 

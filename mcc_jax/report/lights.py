@@ -8,14 +8,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..calibrate._result import BAD_MISFIT
-from ..calibrate.joint._bayes import ESS_LEAST, RHAT_MOST
-from ..calibrate.joint._weights import PARETO_K_MOST
+from ..calibrate.paper.result import BAD_MISFIT
+from ..calibrate.posterior import ESS_LEAST, RHAT_MOST
+from ..calibrate.weights import PARETO_K_MOST
 from ..campaign import Finding, campaign_findings, check_plausibility, check_tests
 from ..campaign.findings import worst
-from ._compare import Shown
-from ._numbers import number, percent
-from ._read import Results, checksums_told
+from .compare import Shown
+from .numbers import number, percent
+from .read import Results, checksums_told
 
 Level = Literal["good", "look", "bad", "unknown"]
 RHAT_BAD, ESS_BAD, PARETO_K_BAD = 1.05, 100.0, 1.0

@@ -12,15 +12,14 @@ from typing import Any
 from .. import arguments
 from .._version import own_version
 from ..campaign.findings import worst
-from ..plots._text import particle_labels
-from . import _pictures as pictures
-from ._chart import LOOKS, chart_data, chart_items, chart_scripts
-from ._compare import KINDS, Shown, compare
-from ._lights import lights, tested
-from ._numbers import interval, number, percent, probability, with_sd
-from ._read import Results
-from ._tables import measured, parameters, particle_facts, particle_rows
-from ._words import (
+from ..plots.text import particle_labels
+from . import pictures as pictures
+from .chart import LOOKS, chart_data, chart_items, chart_scripts
+from .compare import KINDS, Shown, compare
+from .lights import lights, tested
+from .numbers import interval, number, percent, probability, with_sd
+from .read import Results
+from .sentences import (
     METHODS,
     calibration_sentences,
     discovery_sentence,
@@ -30,6 +29,7 @@ from ._words import (
     quantity,
     simulated,
 )
+from .tables import measured, parameters, particle_facts, particle_rows
 
 CAPTIONS = {
     "bands": ("compare", "Measured curves and the central 95 % of what the posterior expects"),

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from matplotlib import rc_context
 
-from ..plots._style import BLACK, BLUE, GREY, ORANGE, PALE, RC, SKY, VERMILION, new_figure
-from ..plots._text import particle_labels
-from ._compare import Shown
+from ..plots.style import BLACK, BLUE, GREY, ORANGE, PALE, RC, SKY, VERMILION, new_figure
+from ..plots.text import particle_labels
+from .compare import Shown
 
 GRID = 30
 """At most so many particles stand in the grid; of more, those with the largest misfit."""

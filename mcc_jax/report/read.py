@@ -15,8 +15,8 @@ from .. import arguments
 from .._errors import InputError
 from ..campaign import Campaign, check_tests, file_checksums, read_campaign
 from ..files import read_regular
-from ._json import read_result
-from ._posterior import Posterior, read_posterior
+from .json import read_result
+from .posterior import Posterior, read_posterior
 
 CALIBRATION, DISCOVERY, POSTERIOR, CAMPAIGN = "calibration.json", "discovery.json", "posterior.nc", "campaign"
 DATA = ("particles.csv", "curves.csv")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..plots._text import is_simulated
-from ._numbers import interval, number, percent, probability
-from ._read import Results
+from ..plots.text import is_simulated
+from .numbers import interval, number, percent, probability
+from .read import Results
 
 METHODS = {
     "bayes": "the joint posterior of all tests at once",

@@ -16,9 +16,9 @@ from ..campaign import (
     campaign_segments,
     effective_diameter_um,
 )
-from ._numbers import interval, number, span, with_sd
-from ._read import Results
-from ._words import plain
+from .numbers import interval, number, span, with_sd
+from .read import Results
+from .sentences import plain
 
 KINDS = {"approach": "approach", "load": "loading", "hold": "hold", "unload": "unloading", "reload": "reloading"}
 

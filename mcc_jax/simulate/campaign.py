@@ -28,10 +28,10 @@ from ..campaign import (
 from ..effects import HUMIDITY_COLUMN, REFERENCE_HUMIDITY_PERCENT, AbstractEffect, ExtendedLaw, Need
 from ..geometry import Particle
 from ..law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainScaling, Unloading
-from ._drive import A_LAW, Response, simulate_batch
-from ._effects import HiddenEffect, batched_humidity, hidden_effects, humidities_of
-from ._instrument import Instrument
-from ._programme import Programme
+from .drive import A_LAW, Response, simulate_batch
+from .effects import HiddenEffect, batched_humidity, hidden_effects, humidities_of
+from .instrument import Instrument
+from .programme import Programme
 
 PAPER_PEAK_STRESS_MPA = (7.0, 16.0)
 """Range of the maximum stress of the paper's tests [MPa]; the value of each particle is not published."""

@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from helpers import TESTERS
 
-from mcc_jax import InputError, Instrument, Programme, Ramp, calibrate_paper, paper_campaign, read_tester_file
+from mcc_jax import (
+    InputError,
+    Instrument,
+    Programme,
+    Ramp,
+    calibrate_paper,
+    paper_campaign,
+    read_tester_file,
+)
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import trapezoid
 
-from mcc_jax import Instrument, LogNormal, Plastic, Programme, StrainScaling, Unloading, paper_campaign, paper_law
+from mcc_jax import (
+    Instrument,
+    LogNormal,
+    Plastic,
+    Programme,
+    StrainScaling,
+    Unloading,
+    paper_campaign,
+    paper_law,
+)
 from mcc_jax.calibrate import (
     campaign_branches,
     choose_reference,
@@ -19,8 +28,8 @@ from mcc_jax.calibrate import (
     master_curve,
     strain_table,
 )
-from mcc_jax.calibrate._master import MasterCurve, StrainTable
-from mcc_jax.calibrate._shape import _weights, full_residuals, reference_residuals
+from mcc_jax.calibrate.paper.master_curve import MasterCurve, StrainTable
+from mcc_jax.calibrate.paper.shape import _weights, full_residuals, reference_residuals
 from mcc_jax.campaign import adjust, find_segments, loading_curve
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from mcc_jax._errors import InputError
 from mcc_jax.campaign import Campaign, Curve, Metadata, read_campaign, write_campaign
-from mcc_jax.campaign import _curves as curves_module
+from mcc_jax.campaign import curves as curves_module
 
 PARTICLES = "particle,D1_um,D2_um,D3_um,batch\nA,200,190,180,x\n01,150,140,130,\n"
 CURVES = (

@@ -10,7 +10,7 @@ from test_csv import CURVES, PARTICLES, assert_same, make
 
 from mcc_jax._errors import InputError
 from mcc_jax.campaign import Campaign, read_campaign
-from mcc_jax.campaign import _curves as curves_module
+from mcc_jax.campaign import curves as curves_module
 
 TOML = 'control = "load"\nforce_resolution_mN = 0.1\n[other]\nx = [1, 2]\n'
 PIECES = st.sampled_from(

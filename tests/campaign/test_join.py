@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from mcc_jax import InputError
-from mcc_jax.campaign import Campaign, Curve, Metadata, check_campaign, join_campaigns, read_campaign, write_campaign
+from mcc_jax.campaign import (
+    Campaign,
+    Curve,
+    Metadata,
+    check_campaign,
+    join_campaigns,
+    read_campaign,
+    write_campaign,
+)
 
 
 def campaign(names, seed, **metadata):

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from mcc_jax._errors import InputError
 from mcc_jax.campaign import Campaign, read_campaign, read_diameters, read_tester_file
-from mcc_jax.campaign._table import parse_number
+from mcc_jax.campaign.table import parse_number
 
 COLUMNS = """
 [columns]
@@ -457,7 +457,7 @@ def test_time_from_a_speed(tmp_path):
 @settings(max_examples=100, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), cycles=st.integers(1, 4), noise=st.floats(0, 2e-3))
 def test_noise_of_the_displacement_adds_no_time(seed, cycles, noise):
-    from mcc_jax.campaign.readers._mapping import Pace
+    from mcc_jax.campaign.readers.mapping import Pace
     from mcc_jax.campaign.readers.pace import paced
 
     rng = np.random.default_rng(seed)

@@ -3,7 +3,7 @@ import shutil
 import pytest
 from click.testing import CliRunner
 
-from mcc_jax.cli._main import cli
+from mcc_jax.cli.main import cli
 
 PARTICLES = (
     "particle,D1_um,D2_um,D3_um,batch\nA,213.54,196.07,186.33,x\nB,155.32,217.51,136.87,y\nC,97.56,100.98,69.09,y\n"

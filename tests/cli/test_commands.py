@@ -9,8 +9,8 @@ from asserting import snapshot
 from helpers import TESTERS
 
 from mcc_jax.campaign import PAPER_DIAMETERS_UM, find_segments, read_campaign
-from mcc_jax.cli._main import cli
-from mcc_jax.cli._types import STRAIN_SCALING, UNLOADING
+from mcc_jax.cli.main import cli
+from mcc_jax.cli.options import STRAIN_SCALING, UNLOADING
 from mcc_jax.law import StrainScaling, Unloading
 from mcc_jax.simulate import Instrument, paper_campaign
 

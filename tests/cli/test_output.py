@@ -7,8 +7,8 @@ import pytest
 from asserting import snapshot
 
 from mcc_jax import InputError
-from mcc_jax.cli._lock import LOCK, locked
-from mcc_jax.cli._output import MOVES, WORK, json_text, results
+from mcc_jax.cli.lock import LOCK, locked
+from mcc_jax.cli.output import MOVES, WORK, json_text, results
 
 
 def test_results_appear_together(tmp_path):
@@ -184,9 +184,9 @@ def test_a_move_that_fails_leaves_nothing_to_finish(tmp_path):
 
 
 def test_a_lock_that_vanishes_is_taken_anew(tmp_path, monkeypatch):
-    from mcc_jax.cli import _lock
+    from mcc_jax.cli import lock
 
-    attempts, try_lock = [], _lock._try_lock
+    attempts, try_lock = [], lock._try_lock
 
     def racing(handle: int) -> bool:
         if not attempts:  # the run before removes its file just now
@@ -194,7 +194,7 @@ def test_a_lock_that_vanishes_is_taken_anew(tmp_path, monkeypatch):
         attempts.append(handle)
         return try_lock(handle)
 
-    monkeypatch.setattr(_lock, "_try_lock", racing)
+    monkeypatch.setattr(lock, "_try_lock", racing)
     with locked(tmp_path):
         assert len(attempts) == 2
         assert (tmp_path / LOCK).exists()

@@ -29,7 +29,7 @@ def call(*arguments, **settings):
 def test_help_loads_nothing_heavy():
     code = (
         "import sys, time; start = time.process_time()\n"
-        "from mcc_jax.cli._main import cli\n"
+        "from mcc_jax.cli.main import cli\n"
         "try: cli.main([], prog_name='mcc-jax')\n"
         "except SystemExit as end: status = end.code\n"
         "took = time.process_time() - start  # of this process, whatever else runs\n"
@@ -157,7 +157,7 @@ def test_a_signal_within_a_destructor_is_not_lost(number, status, line):
 @posix
 def test_two_at_once_and_the_lock_of_a_dead_one(tmp_path):
     holder = (
-        "import sys, time; from pathlib import Path; from mcc_jax.cli._output import results\n"
+        "import sys, time; from pathlib import Path; from mcc_jax.cli.output import results\n"
         "with results(Path(sys.argv[1])): print('in', flush=True); time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", holder, str(tmp_path)], stdout=subprocess.PIPE) as process:

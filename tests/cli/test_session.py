@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import platformdirs
 import pytest
 
-from mcc_jax.cli._session import _keep_compiled, beside
+from mcc_jax.cli.session import _keep_compiled, beside
 
 posix = pytest.mark.skipif(os.name != "posix", reason="permissions of POSIX")
 

@@ -26,7 +26,7 @@ def fitted(tests, tmp_path_factory):
     """`calibrate`, then `report`: what was printed, and the folder."""
     from click.testing import CliRunner
 
-    from mcc_jax.cli._main import cli
+    from mcc_jax.cli.main import cli
 
     out = tmp_path_factory.mktemp("fitted") / "out"
     result = CliRunner().invoke(cli, ["calibrate", str(tests), "--out", str(out), *FIT], prog_name="mcc-jax")

@@ -6,7 +6,16 @@ import jax
 import numpy as np
 
 from mcc_jax import paper_law
-from mcc_jax.dem import Interaction, Motion, contact_forces, die, scattered, spheres, stable_time_step, start
+from mcc_jax.dem import (
+    Interaction,
+    Motion,
+    contact_forces,
+    die,
+    scattered,
+    spheres,
+    stable_time_step,
+    start,
+)
 
 DIE_RADIUS = 2.2e-4
 SKIN = 2e-5

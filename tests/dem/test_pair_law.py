@@ -12,7 +12,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from two_scalars import bisected_path
 
-from mcc_jax import InputError, MccLaw, Particle, Plastic, StrainScaling, Unloading, paper_law, paper_population
+from mcc_jax import (
+    InputError,
+    MccLaw,
+    Particle,
+    Plastic,
+    StrainScaling,
+    Unloading,
+    paper_law,
+    paper_population,
+)
 from mcc_jax.dem import (
     HalfContact,
     half_contact,

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from mcc_jax import InputError, MccLaw, Plastic, paper_law
-from mcc_jax.calibrate import BayesCalibration
-from mcc_jax.calibrate.joint import Population
+from mcc_jax.calibrate import BayesCalibration, Population
 from mcc_jax.dem import (
     Solver,
     band_by_draws,
@@ -29,9 +28,9 @@ from mcc_jax.dem import (
     start,
     wall_force,
 )
-from mcc_jax.dem import _quasistatic as quasistatic
-from mcc_jax.dem._load_steps import BOTTOM, TOP
-from mcc_jax.dem._stiffness import Held, balance, net_force
+from mcc_jax.dem import quasistatic as quasistatic
+from mcc_jax.dem.load_steps import BOTTOM, TOP
+from mcc_jax.dem.stiffness import Held, balance, net_force
 from mcc_jax.geometry import Particle
 
 LAW = paper_law()

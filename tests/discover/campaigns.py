@@ -7,9 +7,16 @@ import numpy as np
 
 from mcc_jax.calibrate import JointModel
 from mcc_jax.campaign import PAPER_DIAMETERS_UM, THRESHOLD_MPA, Campaign
-from mcc_jax.discover._refine import refined
-from mcc_jax.discover._system import base_fit, build_system, signals_of
-from mcc_jax.simulate import Instrument, Programme, law_for_each, paper_population, read_effect, simulate_campaign
+from mcc_jax.discover.linear_model import base_fit, build_system, signals_of
+from mcc_jax.discover.noise_estimation import refined
+from mcc_jax.simulate import (
+    Instrument,
+    Programme,
+    law_for_each,
+    paper_population,
+    read_effect,
+    simulate_campaign,
+)
 
 N, POINTS = 10, 150
 INSTRUMENT = Instrument(displacement_noise_um=0.05, force_noise_mN=0.02, zero_um=0.5)

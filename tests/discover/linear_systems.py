@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mcc_jax.discover._candidates import Candidate
-from mcc_jax.discover._features import map_features, words
-from mcc_jax.discover._system import GLOBALS, System
+from mcc_jax.discover.candidates import Candidate
+from mcc_jax.discover.dictionary import map_features, words
+from mcc_jax.discover.linear_model import GLOBALS, System
 from mcc_jax.effects import LIBRARY
 
 G = len(GLOBALS)
@@ -87,7 +87,7 @@ def planted(seed, amounts, *, particles=20, points=60, own=4):
     """
     system, dense = random_campaign(seed, particles=particles, points=points, own=own)
     names = [c.mechanism for c in system.candidates]
-    from mcc_jax.discover._score import project
+    from mcc_jax.discover.score import project
 
     view = project(system, system.candidate_columns)
     X = dense.columns.copy()

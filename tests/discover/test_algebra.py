@@ -11,12 +11,8 @@ from linear_systems import FORMULAS, G, random_campaign
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from mcc_jax.discover._confirm import held_out
-from mcc_jax.discover._score import (
-    project,
-    project_summed,
-)
-from mcc_jax.discover._search import (
+from mcc_jax.discover.cross_validation import held_out
+from mcc_jax.discover.evidence import (
     Pair,
     formula_weights,
     log_evidence,
@@ -26,7 +22,8 @@ from mcc_jax.discover._search import (
     rank,
     weights,
 )
-from mcc_jax.discover._steps import ODD, SCALES
+from mcc_jax.discover.pop_in import ODD, SCALES
+from mcc_jax.discover.score import project, project_summed
 
 seeds = st.integers(0, 10_000)
 

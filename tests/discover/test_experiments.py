@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from linear_systems import Dense, random_campaign, system_of
 
-from mcc_jax.discover._experiments import COPIES, ENOUGH, MOST_PARTICLES, _Trial, _Truth
-from mcc_jax.discover._extensions import serious
-from mcc_jax.discover._naming import LIKE_THE_BEST
-from mcc_jax.discover._score import project
-from mcc_jax.discover._search import rank
+from mcc_jax.discover.evidence import rank
+from mcc_jax.discover.experiments import COPIES, ENOUGH, MAX_PARTICLES, _Trial, _Truth
+from mcc_jax.discover.extensions import serious
+from mcc_jax.discover.model_selection import LIKE_THE_BEST
+from mcc_jax.discover.score import project
 
 PARTICLES, POINTS = 10, 60
 TRUE, TWIN = "creep", "unloading_shape"
@@ -116,7 +116,7 @@ def test_what_cannot_be_told_apart_is_said_so():
     ranking = ranking_of(system)
     assert set(ranking.members(LIKE_THE_BEST)) == {TRUE, TWIN}
     particles, power = trial_of(system, ranking).fewest(0)
-    assert particles <= MOST_PARTICLES
+    assert particles <= MAX_PARTICLES
     assert power < 0.1
 
 

@@ -1,6 +1,7 @@
 """The posterior of the extended law: its summaries are those of the shifted tests, and it holds the truth."""
 
 import json
+import sys
 from dataclasses import replace
 
 import equinox as eqx
@@ -9,11 +10,11 @@ import numpy as np
 import pytest
 from campaigns import cached, refined_system
 
-from mcc_jax.calibrate.joint._draws import Length
-from mcc_jax.calibrate.joint._linearised import linear_data, summarise
-from mcc_jax.discover import _discover, discover
-from mcc_jax.discover._extensions import Extensions
-from mcc_jax.discover._posterior import _movable, extended_posterior
+from mcc_jax.calibrate.draws import Length
+from mcc_jax.calibrate.linearise import linear_data, summarise
+from mcc_jax.discover import discover
+from mcc_jax.discover.extensions import Extensions
+from mcc_jax.discover.posterior import _movable, extended_posterior
 from mcc_jax.effects import LIBRARY
 
 HIDDEN = 0.004
@@ -90,7 +91,9 @@ def test_an_impossible_sign_is_not_sampled_but_told(monkeypatch):
         found = fit(self, chosen)
         return replace(found, state=eqx.tree_at(lambda s: s.theta, found.state, -found.state.theta))
 
-    monkeypatch.setattr(_discover, "LARGE", np.inf)  # named to first order; the fit as it is comes with the posterior
+    monkeypatch.setattr(
+        sys.modules[discover.__module__], "LARGE", np.inf
+    )  # named to first order; the fit as it is comes with the posterior
     monkeypatch.setattr(Extensions, "fit", turned)
     found = discover(cached(f"frame_compliance={HIDDEN}"), library=FRAME, confirm=False, experiments=False)
     assert [effect.mechanism for effect in found.effects] == ["frame_compliance"]

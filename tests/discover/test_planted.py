@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from linear_systems import FORMULAS, Dense, planted, random_campaign, system_of
 
-from mcc_jax.discover._candidates import candidates_of, located
-from mcc_jax.discover._features import waves, words
-from mcc_jax.discover._naming import name_missing
-from mcc_jax.discover._pursuit import WORTH, WORTH_OF_WAVE, pursue
-from mcc_jax.discover._refine import systematic, unbounded
-from mcc_jax.discover._score import project, smallest_of_families
-from mcc_jax.discover._search import evidence_of_any, log_evidence, pairs, random_probability, rank
-from mcc_jax.discover._significance import p_nothing_left
+from mcc_jax.discover.candidates import candidates_of, located
+from mcc_jax.discover.dictionary import waves, words
+from mcc_jax.discover.evidence import evidence_of_any, log_evidence, pairs, random_probability, rank
+from mcc_jax.discover.forward_selection import WORTH, WORTH_OF_WAVE, pursue
+from mcc_jax.discover.model_selection import name_missing
+from mcc_jax.discover.noise_estimation import systematic, unbounded
+from mcc_jax.discover.omnibus import p_nothing_left
+from mcc_jax.discover.score import project, smallest_of_families
 from mcc_jax.effects import LIBRARY
 
 NOTHING = np.array([], int)

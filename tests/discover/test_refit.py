@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from campaigns import campaign, refined_system
 
-from mcc_jax.discover._refit import refit, system_at
-from mcc_jax.discover._score import project
-from mcc_jax.discover._search import rank
+from mcc_jax.discover.evidence import rank
+from mcc_jax.discover.gauss_newton import refit, system_at
+from mcc_jax.discover.score import project
 from mcc_jax.effects import LIBRARY, Mechanism
 
 COMPLIANCE, CREEP, TAU = 0.03, 0.001, 11.0

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import kstest, norm
 
-from mcc_jax.discover._score import Projection, common_scatter, family_wise, smallest_of_families
-from mcc_jax.discover._search import log_evidence_at_random
+from mcc_jax.discover.evidence import log_evidence_at_random
+from mcc_jax.discover.score import Projection, common_scatter, family_wise, smallest_of_families
 
 
 def simulated(rng, *, particles=20, columns=12, scale=1.0, effect=0.0):

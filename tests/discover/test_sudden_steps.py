@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 from scipy.stats import norm
 from scipy.stats import t as student
 
-from mcc_jax.calibrate.joint._fit import population_at
-from mcc_jax.calibrate.joint._population import moments
+from mcc_jax.calibrate.fit import population_at
+from mcc_jax.calibrate.population import moments
 from mcc_jax.campaign import Campaign
 from mcc_jax.discover import discover
-from mcc_jax.discover._score import project
-from mcc_jax.discover._search import evidence_of_steps, jumps, random_probability
-from mcc_jax.discover._steps import ODD, over_tests, tamed
-from mcc_jax.discover._system import base_fit, build_system, first_loaded, signals_of
+from mcc_jax.discover.evidence import evidence_of_steps, jumps, random_probability
+from mcc_jax.discover.linear_model import base_fit, build_system, first_loaded, signals_of
+from mcc_jax.discover.pop_in import ODD, over_tests, tamed
+from mcc_jax.discover.score import project
 from mcc_jax.effects import LIBRARY
 
 BREAKING = {name: LIBRARY[name] for name in ("pop_in", "frame_compliance")}

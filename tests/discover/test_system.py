@@ -10,16 +10,16 @@ import pytest
 from campaigns import campaign
 
 from mcc_jax.calibrate import JointModel
-from mcc_jax.calibrate.joint._fit import population_at
-from mcc_jax.calibrate.joint._forward import law_of, raw_residual
-from mcc_jax.calibrate.joint._population import moments
+from mcc_jax.calibrate.fit import population_at
+from mcc_jax.calibrate.forward import law_of, raw_residual
+from mcc_jax.calibrate.population import moments
 from mcc_jax.campaign import THRESHOLD_MPA
-from mcc_jax.discover._closure import Closure
-from mcc_jax.discover._gram import BATCH, in_batches
-from mcc_jax.discover._refine import refined, systematic
-from mcc_jax.discover._result import Discovery
-from mcc_jax.discover._score import project
-from mcc_jax.discover._system import base_fit, build_system, signals_of, tails_of
+from mcc_jax.discover.discrepancy import Closure
+from mcc_jax.discover.linear_model import base_fit, build_system, signals_of, tails_of
+from mcc_jax.discover.noise_estimation import refined, systematic
+from mcc_jax.discover.normal_equations import BATCH, in_batches
+from mcc_jax.discover.result import Discovery
+from mcc_jax.discover.score import project
 from mcc_jax.effects import LIBRARY, ExtendedLaw, Mechanism
 
 MODEL = JointModel(modulus_scatter=True)

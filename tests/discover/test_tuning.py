@@ -8,13 +8,13 @@ from campaigns import campaign
 
 from mcc_jax.calibrate import JointModel
 from mcc_jax.campaign import Campaign, Curve
-from mcc_jax.discover import _features as words
-from mcc_jax.discover._closure import FOLDS, find_closure
-from mcc_jax.discover._naming import chooser
-from mcc_jax.discover._pursuit import pursue
-from mcc_jax.discover._score import project
-from mcc_jax.discover._system import base_fit, build_system, feature_values, signals_of
-from mcc_jax.discover._tuning import MOST_NUMBERS, Fitted, Tuner
+from mcc_jax.discover import dictionary as words
+from mcc_jax.discover.discrepancy import FOLDS, find_closure
+from mcc_jax.discover.forward_selection import pursue
+from mcc_jax.discover.linear_model import base_fit, build_system, feature_values, signals_of
+from mcc_jax.discover.model_selection import chooser
+from mcc_jax.discover.score import project
+from mcc_jax.discover.variable_projection import MAX_NUMBERS, Fitted, Tuner
 from mcc_jax.effects import LIBRARY, Mechanism
 
 LISTED = {"frame_compliance": Mechanism("frame_compliance", "", LIBRARY["frame_compliance"].variants[:1])}
@@ -61,7 +61,7 @@ def found(disturbed):
 
 def test_every_form_has_as_many_numbers_as_ranges_and_starts_within():
     for word in (*words.words(), *words.further_words()):
-        assert len(word.numbers) == len(word.form.low) == len(word.form.high) <= MOST_NUMBERS
+        assert len(word.numbers) == len(word.form.low) == len(word.form.high) <= MAX_NUMBERS
         for low, number, high in zip(word.form.low, word.numbers, word.form.high, strict=True):
             assert low <= number <= high, word.text
 

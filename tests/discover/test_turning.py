@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from campaigns import MODEL, SINGLE, campaign, monotone_draws, peaks_at
 
-from mcc_jax.calibrate.joint._fit import population_at
-from mcc_jax.calibrate.joint._population import moments
+from mcc_jax.calibrate.fit import population_at
+from mcc_jax.calibrate.population import moments
 from mcc_jax.campaign import PAPER_DIAMETERS_UM
-from mcc_jax.discover._gram import own_rows
-from mcc_jax.discover._score import project
-from mcc_jax.discover._system import base_fit, build_system, signals_of
+from mcc_jax.discover.linear_model import base_fit, build_system, signals_of
+from mcc_jax.discover.normal_equations import own_rows
+from mcc_jax.discover.score import project
 from mcc_jax.effects import LIBRARY, Mechanism
 from mcc_jax.simulate import Instrument, law_for_each, simulate_campaign
 

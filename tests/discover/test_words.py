@@ -13,12 +13,12 @@ from helpers import paper_law, paper_particle
 
 from mcc_jax.campaign import Campaign, Curve
 from mcc_jax.discover import discover
-from mcc_jax.discover._closure import meanings
-from mcc_jax.discover._features import _since_turn, further_words, map_features, values_of, waves, words
-from mcc_jax.discover._system import GLOBALS, System
+from mcc_jax.discover.dictionary import _since_turn, further_words, map_features, values_of, waves, words
+from mcc_jax.discover.discrepancy import meanings
+from mcc_jax.discover.linear_model import GLOBALS, System
 from mcc_jax.effects import ExtendedLaw, clean_record, signatures
 from mcc_jax.plots import discovery_figures, save_figures
-from mcc_jax.plots._leftover import leftover
+from mcc_jax.plots.remaining_gap import leftover
 
 TIME = jnp.linspace(0.0, 260.0, 131)
 FORCE = jnp.interp(TIME, jnp.asarray([0.0, 80, 110, 160, 230, 260]), jnp.asarray([0.0, 160, 160, 40, 180, 90]))

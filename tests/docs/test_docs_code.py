@@ -10,7 +10,7 @@ import jax
 import pytest
 from click.testing import CliRunner
 
-from mcc_jax.cli._main import cli
+from mcc_jax.cli.main import cli
 
 PAGES = Path(__file__).parents[2] / ".docs" / "pages"
 EXPENSIVE = re.compile(r"\A---\n(?:.*\n)*?expensive: true\n(?:.*\n)*?---\n")

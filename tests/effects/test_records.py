@@ -12,9 +12,9 @@ from mcc_jax.effects import (
     LIBRARY,
     ExtendedLaw,
     Need,
+    available_data,
     clean_record,
     humidities,
-    present,
     record_batch,
     record_of,
 )
@@ -86,7 +86,7 @@ def test_humidity_comes_from_its_column():
     assert humidities(tests) is None
     wet = dataclasses.replace(tests, columns={"relative_humidity_percent": tuple(str(30 + i) for i in range(20))})
     np.testing.assert_array_equal(record_batch(wet).relative_humidity, 30 + np.arange(20))
-    assert Need.HUMIDITY_COLUMN in present(wet)
+    assert Need.HUMIDITY_COLUMN in available_data(wet)
     for text in ("x", "-1", "101", "nan"):
         bad = dataclasses.replace(tests, columns={"relative_humidity_percent": (text,) * 20})
         with pytest.raises(InputError, match="relative humidity of particle '1'"):
@@ -95,9 +95,9 @@ def test_humidity_comes_from_its_column():
 
 def test_what_a_campaign_holds():
     simple = paper_campaign(1, programme=Programme.cycles(points=150))
-    assert {Need.UNLOADING, Need.SEVERAL_SIZES, Need.SEVERAL_SHAPES, Need.SEVERAL_PEAKS} <= present(simple)
-    assert not {Need.RELOAD, Need.HOLD, Need.TWO_RATES, Need.HUMIDITY_COLUMN} & present(simple)
-    assert {Need.RELOAD, Need.SECOND_RELOAD, Need.HOLD, Need.TWO_RATES} <= present(campaign())
+    assert {Need.UNLOADING, Need.SEVERAL_SIZES, Need.SEVERAL_SHAPES, Need.SEVERAL_PEAKS} <= available_data(simple)
+    assert not {Need.RELOAD, Need.HOLD, Need.TWO_RATES, Need.HUMIDITY_COLUMN} & available_data(simple)
+    assert {Need.RELOAD, Need.SECOND_RELOAD, Need.HOLD, Need.TWO_RATES} <= available_data(campaign())
 
 
 def test_segments_must_cover_the_curve():

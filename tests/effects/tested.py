@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from helpers import paper_law, paper_particle, with_dtype
 
-from mcc_jax.calibrate.joint._forward import law_of
+from mcc_jax.calibrate.forward import law_of
 from mcc_jax.effects import LIBRARY, ExtendedLaw, clean_record, signatures
 from mcc_jax.law import Unloading
 

@@ -10,7 +10,16 @@ import pytest
 from bisecting import pair_force
 from compiling import LANGUAGES, PAIR, PLATES, WALL, build_driver, compile_with, head, run_driver
 
-from mcc_jax import History, InputError, MccLaw, Particle, Plastic, StrainScaling, Unloading, paper_law
+from mcc_jax import (
+    History,
+    InputError,
+    MccLaw,
+    Particle,
+    Plastic,
+    StrainScaling,
+    Unloading,
+    paper_law,
+)
 from mcc_jax.export import Origin, c_header
 
 FORMS = list(itertools.product(Unloading, StrainScaling))

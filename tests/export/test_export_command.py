@@ -8,8 +8,8 @@ from calibrations import content, estimate, write
 from click.testing import CliRunner
 from compiling import PAIR, PLATES, WALL, build_driver, head, run_driver
 
-from mcc_jax.cli._export import FORMATS as OFFERED
-from mcc_jax.cli._main import cli
+from mcc_jax.cli.export import FORMATS as OFFERED
+from mcc_jax.cli.main import cli
 from mcc_jax.export import FORMATS, read_calibration
 
 FILES = {

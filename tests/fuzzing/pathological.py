@@ -177,7 +177,7 @@ def _command(kind: Kind, seed: int, campaign: Campaign, method: str) -> tuple[di
     """`mcc-jax calibrate` on the campaign's files: the result, or the one line of the error."""
     from click.testing import CliRunner
 
-    from mcc_jax.cli._main import cli
+    from mcc_jax.cli.main import cli
 
     with tempfile.TemporaryDirectory() as folder:
         place, out = Path(folder) / "campaign", Path(folder) / "out"

@@ -17,7 +17,8 @@ from mcc_jax.calibrate import read_priors
 from mcc_jax.campaign import read_diameters, read_tester_file
 from mcc_jax.dem import load_state
 from mcc_jax.export import read_calibration
-from mcc_jax.report import _posterior, read_results
+from mcc_jax.report import posterior as page
+from mcc_jax.report import read_results
 
 SAMPLES = Path(__file__).parent / "samples"
 SIZES = [200.0, 190.0, 180.0]
@@ -193,7 +194,7 @@ def test_a_posterior_that_would_fill_the_memory(tmp_path, name):
 
 def test_a_posterior_that_the_library_reads_for_ever(tmp_path, monkeypatch):
     """libhdf5 does not come back from this damage."""
-    monkeypatch.setattr(_posterior, "SECONDS", 2.0)
+    monkeypatch.setattr(page, "SECONDS", 2.0)
     (tmp_path / "posterior.nc").write_bytes((SAMPLES.with_name("damaged") / "endless.nc").read_bytes())
     assert "no end after 2 s" in refused(read_results, tmp_path)
 

@@ -6,7 +6,7 @@ import pytest
 from pathological import campaign_of, run_one
 from pathological_kinds import KINDS
 
-from mcc_jax.calibrate.joint._data import select_tests
+from mcc_jax.calibrate.data import select_tests
 
 BY_NAME = {kind.name: kind for kind in KINDS}
 FITTED = (

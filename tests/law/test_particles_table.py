@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers import A, check, close, paper_law, paper_population
 
-from mcc_jax.campaign._paper import PAPER_DIAMETERS_UM, PAPER_LOAD_RATE_MN_PER_S
+from mcc_jax.campaign.paper import PAPER_DIAMETERS_UM, PAPER_LOAD_RATE_MN_PER_S
 from mcc_jax.geometry import Particle, elastic_shape_factor, plastic_shape_factor
 from mcc_jax.law import History, StrainScaling, Unloading, hertz_shape_factor
 

@@ -8,7 +8,7 @@ import pytest
 from helpers import K1, K3, K5, check, close, paper_population
 from scipy.stats import norm
 
-from mcc_jax.campaign._paper import PAPER_LOG_C
+from mcc_jax.campaign.paper import PAPER_LOG_C
 from mcc_jax.law import LogNormal, Plastic, PlasticPopulation, ideal_plastic_stress
 
 POPULATION = paper_population()

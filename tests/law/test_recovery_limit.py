@@ -72,8 +72,8 @@ def test_random_paths_gain_nothing(unloading, scaling):
 
 def test_the_paths_would_show_a_gain(monkeypatch):
     """Without the limit the printed form gains on them, so the test above can fail."""
-    import mcc_jax.law._branch as branch
-    import mcc_jax.law._mcc as mcc
+    import mcc_jax.law.branch as branch
+    import mcc_jax.law.mcc as mcc
 
     def none(peak, secant, tangent):
         return jnp.full_like(peak, jnp.inf), tangent > secant

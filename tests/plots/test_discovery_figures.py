@@ -11,10 +11,17 @@ from mcc_jax.campaign import PAPER_DIAMETERS_UM
 from mcc_jax.discover import discover
 from mcc_jax.effects import LIBRARY, find_variant
 from mcc_jax.plots import discovery_figures, plot_gap, plot_ranking, save_figures
-from mcc_jax.plots._discovery import where_map
-from mcc_jax.plots._leftover import added_columns, leftover
-from mcc_jax.plots._ranking import likeness
-from mcc_jax.simulate import HiddenEffect, Instrument, Programme, law_for_each, paper_population, simulate_campaign
+from mcc_jax.plots.discovery import where_map
+from mcc_jax.plots.ranking import likeness
+from mcc_jax.plots.remaining_gap import added_columns, leftover
+from mcc_jax.simulate import (
+    HiddenEffect,
+    Instrument,
+    Programme,
+    law_for_each,
+    paper_population,
+    simulate_campaign,
+)
 
 COUNT = 10
 

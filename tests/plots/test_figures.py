@@ -28,10 +28,10 @@ from mcc_jax.plots import (
     plot_residuals,
     save_figures,
 )
-from mcc_jax.plots._curves import adjusted_curve
-from mcc_jax.plots._dimensions import dimension_statistics
-from mcc_jax.plots._elastic import collapsed_branches
-from mcc_jax.plots._law import law_strain, stretches_outside
+from mcc_jax.plots.curves import adjusted_curve
+from mcc_jax.plots.dimensions import dimension_statistics
+from mcc_jax.plots.elastic import collapsed_branches
+from mcc_jax.plots.law import law_strain, stretches_outside
 
 KINDS = ("paper", "cycles", "two", "dropped", "many")
 QUICK = [pytest.param(kind, marks=pytest.mark.long if kind in ("two", "many", "dropped") else ()) for kind in KINDS]

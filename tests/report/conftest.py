@@ -4,7 +4,7 @@ import pytest
 from click.testing import CliRunner
 from results_folder import write_results
 
-from mcc_jax.cli._main import cli
+from mcc_jax.cli.main import cli
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,7 @@ import h5py
 import jax.numpy as jnp
 import numpy as np
 
-from mcc_jax.calibrate.joint._data import rows_from_contact
+from mcc_jax.calibrate.data import rows_from_contact
 from mcc_jax.campaign import campaign_segments, file_checksums, write_campaign
 from mcc_jax.law import MccLaw, Plastic
 from mcc_jax.simulate import Hold, Programme, Ramp, simulate_campaign

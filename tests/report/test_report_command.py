@@ -13,9 +13,9 @@ from results_folder import calibration, discovery
 from mcc_jax import InputError
 from mcc_jax.campaign import file_checksums
 from mcc_jax.report import read_results
-from mcc_jax.report._compare import compare
-from mcc_jax.report._lights import lights
-from mcc_jax.report._page import _environment, context
+from mcc_jax.report.compare import compare
+from mcc_jax.report.lights import lights
+from mcc_jax.report.page import _environment, context
 
 
 def refused(result):

@@ -15,13 +15,13 @@ from results_folder import MODULUS, NAMES, NOISE, SIZES, calibration, campaign, 
 from results_folder import C as COEFFICIENTS
 
 from mcc_jax.campaign import write_campaign
-from mcc_jax.report import _compare as compare_module
+from mcc_jax.report import compare as compare_module
 from mcc_jax.report import read_results, report_page
-from mcc_jax.report._chart import chart_data, chart_items
-from mcc_jax.report._compare import KINDS, compare
-from mcc_jax.report._lights import lights
-from mcc_jax.report._numbers import interval, number, with_sd
-from mcc_jax.report._words import calibration_sentences, next_steps
+from mcc_jax.report.chart import chart_data, chart_items
+from mcc_jax.report.compare import KINDS, compare
+from mcc_jax.report.lights import lights
+from mcc_jax.report.numbers import interval, number, with_sd
+from mcc_jax.report.sentences import calibration_sentences, next_steps
 
 SECTIONS = {"summary", "measured", "law", "compare", "posterior", "diagnostics", "discovery", "settings", "cite"}
 PARTS = {
@@ -148,13 +148,13 @@ def test_points_below_the_threshold_do_not_count(folder, shown):
 
 def test_of_many_points_turns_stay_and_of_many_particles_the_worst(results, shown, monkeypatch):
     monkeypatch.setattr(compare_module, "POINTS", 80)
-    monkeypatch.setattr(compare_module, "LEAST_POINTS", 20)
+    monkeypatch.setattr(compare_module, "MIN_POINTS", 20)
     few = compare(results)
     for one, all_of_it in zip(few, shown, strict=True):
         assert len(one.force_mN) < 45 < len(all_of_it.force_mN)
         assert one.force_mN.max() == all_of_it.force_mN.max()
         assert one.force_mN[-1] == all_of_it.force_mN[-1]
-    monkeypatch.setattr(compare_module, "MOST_PARTICLES", 1)
+    monkeypatch.setattr(compare_module, "MAX_PARTICLES", 1)
     calibration = {**results.calibration, "particles": [dict(e) for e in results.calibration["particles"]]}
     calibration["particles"][1]["rms_um"] = 9.0
     assert [one.name for one in compare(dataclasses.replace(results, calibration=calibration))] == [NAMES[1]]

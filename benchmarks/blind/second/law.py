@@ -14,7 +14,7 @@ import numpy as np
 
 CONTACT_AREA = 1.43  # Storakers' largest c^2 of the contact radius; not the shape parameter
 PUNCH = 4.12
-LEAST_RISE = 0.06  # of a changed loading curve, over C1 eta_p
+MIN_RISE = 0.06  # of a changed loading curve, over C1 eta_p
 
 _ANGLE = np.linspace(0, np.pi / 2, 40001)
 # For small angles the closed form loses its digits to cancellation.
@@ -116,7 +116,7 @@ def is_monotone(campaign, effects, points=400):
     stress = loading(campaign, effects, values, owner)(eps).reshape(count, points)
     slope = np.diff(stress, axis=1) / np.diff(eps.reshape(count, points), axis=1)
     below = stress[:, 1:] < campaign.path.largest_stress[:, None]
-    return bool(np.all((slope / (values.C1 * values.eta)[:, None])[below] > LEAST_RISE))
+    return bool(np.all((slope / (values.C1 * values.eta)[:, None])[below] > MIN_RISE))
 
 
 def simulate(campaign, effects=(), shift=NO_SHIFT):

@@ -26,11 +26,11 @@ SHAPE_PARAMETER, SHAPE_SPREAD = 1.43, 0.06
 MODULUS_MPA, MODULUS_SPREAD = 16000.0, 0.07
 """Effective modulus and the standard deviation of its logarithm between campaigns."""
 
-LEAST_SLOPE = 0.2
+MIN_SLOPE = 0.2
 """The least slope of a drawn loading curve, over its initial slope."""
 
 MN_PER_MPA_UM2, MPA_UM2_PER_MN = 1e-3, 1e3
-MOST_BURSTS = 12
+MAX_BURSTS = 12
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ def draw(rng, count, wide=False, modulus_scatter=0.0, humidity=None):
 def _coefficients(rng):
     while True:
         C = np.exp(LOG_C_MEAN + LOG_C_SD * rng.standard_normal(3))
-        if least_slope(*C) > LEAST_SLOPE:
+        if least_slope(*C) > MIN_SLOPE:
             return C
 
 
@@ -117,5 +117,5 @@ def _sizes(rng, i, count, wide):
 
 def _bursts(rng):
     number = 1 + rng.poisson(2.0)
-    rng.random(MOST_BURSTS)  # no effect uses these, but later draws follow them
-    return number, rng.exponential(1.0, MOST_BURSTS), rng.weibull(4.0, MOST_BURSTS)
+    rng.random(MAX_BURSTS)  # no effect uses these, but later draws follow them
+    return number, rng.exponential(1.0, MAX_BURSTS), rng.weibull(4.0, MAX_BURSTS)

@@ -10,9 +10,9 @@ from typing import Any, get_args
 import equinox as eqx
 import numpy as np
 
-from .. import arguments
-from .._errors import InputError
-from ..campaign import (
+from ... import arguments
+from ..._errors import InputError
+from ...campaign import (
     THRESHOLD_MPA,
     Adjustment,
     Campaign,
@@ -22,16 +22,16 @@ from ..campaign import (
     of_each_particle,
     particle_batch,
 )
-from ..campaign.reasons import refusal
-from ..geometry import plastic_shape_factor
-from ..law import MccLaw, StrainScaling, Unloading
-from ._elastic import ElasticFit, campaign_branches, fit_effective_modulus
-from ._master import MasterCurve, StrainTable, master_curve, strain_table
-from ._plastic import PlasticFit, fit_population
-from ._predict import ParticleFit, point_noise_um, predict_particles
-from ._result import estimate, finite, force_zero, misfit_note
-from ._shape import Objective, ShapeFit, fit_shape_parameter
-from .judgement import judged, numbers_in_reach, unlike_others
+from ...campaign.reasons import refusal
+from ...geometry import plastic_shape_factor
+from ...law import MccLaw, StrainScaling, Unloading
+from ..judgement import judged, numbers_in_reach, unlike_others
+from .loading import PlasticFit, fit_population
+from .master_curve import MasterCurve, StrainTable, master_curve, strain_table
+from .modulus import ElasticFit, campaign_branches, fit_effective_modulus
+from .prediction import ParticleFit, point_noise_um, predict_particles
+from .result import estimate, finite, force_zero, misfit_note
+from .shape import Objective, ShapeFit, fit_shape_parameter
 
 PLAUSIBLE_SHAPE_FACTOR = 4.0
 """Shape factors beyond this, twice the paper's largest, come from curves that do not collapse, not from shape."""

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 
-from .. import arguments
-from .._errors import InputError
-from ..law import LogNormal, PlasticPopulation
-from ._master import MasterCurve
+from ... import arguments
+from ..._errors import InputError
+from ...law import LogNormal, PlasticPopulation
+from .master_curve import MasterCurve
 
 SMALLEST_SHARE = 1e-6
 """A factor of the quintic is kept at least this share of the largest stress, so that its logarithm exists."""

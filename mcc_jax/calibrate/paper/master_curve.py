@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .. import arguments
-from .._errors import InputError
-from ..campaign import Adjustment, of_each_particle
+from ... import arguments
+from ..._errors import InputError
+from ...campaign import Adjustment, of_each_particle
 
 
 @dataclass(frozen=True)

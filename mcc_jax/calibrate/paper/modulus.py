@@ -12,12 +12,12 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
-from .. import arguments
-from .._types import Scalar
-from ..campaign import Adjustment, Campaign, Curve, Segment, check_campaign, stress_and_strain
-from ..law import StrainScaling, Unloading, recovery
+from ... import arguments
+from ..._types import Scalar
+from ...campaign import Adjustment, Campaign, Curve, Segment, check_campaign, stress_and_strain
+from ...law import StrainScaling, Unloading, recovery
 
-LEAST_RATIO = 0.05
+MIN_RATIO = 0.05
 """Points below this share of the peak stress are left out: strain there depends on stress with an infinite slope."""
 
 
@@ -77,7 +77,7 @@ def elastic_branches(
         shift: offset of strain from the offset step [-].
 
     Returns:
-        Branches with at least five points between `LEAST_RATIO` and the peak.
+        Branches with at least five points between `MIN_RATIO` and the peak.
     """
     stress, strain = stress_and_strain(curve, diameters_um, segments)
     strain = strain + shift
@@ -96,7 +96,7 @@ def elastic_branches(
         top, deepest = float(stress[around].mean()), float(strain[around].max())
         points = np.concatenate(rows)
         points = points[curve.compared[points]]
-        points = points[(stress[points] > LEAST_RATIO * top) & (stress[points] <= top)]
+        points = points[(stress[points] > MIN_RATIO * top) & (stress[points] <= top)]
         if len(points) >= 5 and deepest > 0 and top > 0:
             branches.append(ElasticBranch(particle, deepest, top, strain[points], stress[points]))
 

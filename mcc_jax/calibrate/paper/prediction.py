@@ -8,8 +8,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .. import arguments
-from ..campaign import (
+from ... import arguments
+from ...campaign import (
     Adjustment,
     Campaign,
     Curve,
@@ -18,10 +18,10 @@ from ..campaign import (
     particle_batch,
     stress_and_strain,
 )
-from ..campaign._signal import point_noise
-from ..law import MccLaw, Plastic
-from ..simulate import simulate_batch
-from ._plastic import fit_polynomial
+from ...campaign.signal import point_noise
+from ...law import MccLaw, Plastic
+from ...simulate import simulate_batch
+from .loading import fit_polynomial
 
 READING_UM = 2e-4
 """What no record of displacement is better than [um]: counted as misfit at every point, so that the noise of a record

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from ..campaign import Curve
+from ...campaign import Curve
 
 BAD_MISFIT = 0.05
 """Share of the range of displacement; with the law's own data and a tester's noise it stays below 0.01."""

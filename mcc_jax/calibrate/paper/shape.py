@@ -12,10 +12,10 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from .. import arguments
-from .._errors import InputError
-from .._types import Scalar
-from ._master import StrainTable, enough
+from ... import arguments
+from ..._errors import InputError
+from ..._types import Scalar
+from .master_curve import StrainTable, enough
 
 Objective = Literal["full", "reference"]
 STARTS = (-0.5, 0.0, 1.0, 3.0)

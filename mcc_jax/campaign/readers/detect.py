@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..._errors import InputError
-from .._table import binary_kind
+from ..table import binary_kind
 from ..workbook import is_workbook
-from . import _fischer, _hysitron_hld, _hysitron_lc, _micromaterials
-from ._text import Tests, decode_lines
+from . import fischer, hysitron_hld, hysitron_lc, micromaterials
+from .text import Tests, decode_lines
 
 FORMATS = (
     "Fischer HM export",
@@ -39,14 +39,14 @@ def read_known(data: bytes, file: Path) -> Tests:
             remedy=f"Write a TOML mapping file and give it with --mapping; for example {_EXAMPLE}",
         )
     if data.startswith((b"PK\x03\x04", b"PK\x05\x06")):
-        return _micromaterials.read_zip(data, file)
+        return micromaterials.read_zip(data, file)
     kind = binary_kind(data)
     if kind is not None:
         raise InputError(
             f"the file is {kind}; no reader knows it", file=file, remedy="Export it from the tester as text"
         )
     lines = decode_lines(data)
-    for reader in (_hysitron_hld, _hysitron_lc, _fischer, _micromaterials):
+    for reader in (hysitron_hld, hysitron_lc, fischer, micromaterials):
         if reader.matches(lines):
             return reader.read(lines, file)
     raise InputError(

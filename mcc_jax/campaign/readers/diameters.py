@@ -10,9 +10,9 @@ import numpy as np
 
 from ... import arguments
 from ..._errors import InputError
-from .._csv import read_particles
-from .._table import parse_number, same_text
-from .._validate import SMALLEST_DIAMETER_UM
+from ..csv import read_particles
+from ..table import parse_number, same_text
+from ..validate import SMALLEST_DIAMETER_UM
 
 Triple = Sequence[float | int] | np.ndarray
 Diameters = Mapping[str, Triple] | Triple

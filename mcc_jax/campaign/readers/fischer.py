@@ -9,8 +9,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from .._schema import Curve
-from ._text import Tests, checked_curve, cut_off, number_block
+from ..schema import Curve
+from .text import Tests, checked_curve, cut_off, number_block
 
 _TEST = re.compile(r"Block\s*:\s*(\d+)\s+Value\s*:\s*(\d+)")
 _COUNT = re.compile(r"(\d{1,9})\tn\tStatistics of block")

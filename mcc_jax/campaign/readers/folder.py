@@ -18,10 +18,10 @@ from typing import Any
 
 from ..._errors import InputError
 from ...files import LIMITS, FileLimits
-from .._schema import Control, Curve
-from .._table import read_bytes, same_text
 from ..findings import Finding
-from ._text import Tests
+from ..schema import Control, Curve
+from ..table import read_bytes, same_text
+from .text import Tests
 
 NO_DATA = frozenset(
     f".{ending}"

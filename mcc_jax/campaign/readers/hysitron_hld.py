@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from .._schema import Control
-from ._text import Tests, checked_curve, cut_off, leading_number, number_block, refuse_twice
+from ..schema import Control
+from .text import Tests, checked_curve, cut_off, leading_number, number_block, refuse_twice
 
 _BLOCK = re.compile(r"(Sample Approach|Drift Measurement|Test) Data Points: *(\d{1,9})\s*")
 _FORCES = ("Force_µN", "Force_uN", "Force_μN")

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ._text import Tests, checked_curve, cut_off, number_block, refuse_twice
+from .text import Tests, checked_curve, cut_off, number_block, refuse_twice
 
 _COUNT = re.compile(r"Number of Points *= *(\d{1,9})\s*")
 _TIME, _DEPTH, _LOAD = "Time (s)", "Depth (nm)", "Load (µN)"

@@ -12,15 +12,23 @@ from pathlib import Path
 import numpy as np
 
 from ..._errors import InputError
-from .._columns import LARGEST_MAGNITUDE, LENGTH, convert, unit_factor
-from .._schema import Curve
-from .._table import APOSTROPHES, Grouping, binary_kind, number_of_cells, parse_number, same_text, thousands_mark
-from .._validate import check_magnitudes
+from ..columns import LARGEST_MAGNITUDE, LENGTH, convert, unit_factor
+from ..schema import Curve
+from ..table import (
+    APOSTROPHES,
+    Grouping,
+    binary_kind,
+    number_of_cells,
+    parse_number,
+    same_text,
+    thousands_mark,
+)
+from ..validate import check_magnitudes
 from ..workbook import is_workbook, read_sheet
-from ._diameters import check_triple
-from ._mapping import DIMENSIONS, InHeader, MappingFile
-from ._text import Tests, checked_curve, decode_lines
+from .diameters import check_triple
+from .mapping import DIMENSIONS, InHeader, MappingFile
 from .pace import paced
+from .text import Tests, checked_curve, decode_lines
 
 _FURTHEST = 200
 """Rows above a header found by `begin`, within which it is looked for again; a tester's preamble has a few dozen."""

@@ -59,11 +59,11 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from ..._errors import InputError
-from .._columns import EXAMPLES, FORCE, LENGTH, TIME, unit_factor
-from .._metadata import load_toml_file
-from .._schema import Control
-from .._table import APOSTROPHES, SPACES, same_text
-from ._diameters import Diameters, check_triple
+from ..columns import EXAMPLES, FORCE, LENGTH, TIME, unit_factor
+from ..metadata import load_toml_file
+from ..schema import Control
+from ..table import APOSTROPHES, SPACES, same_text
+from .diameters import Diameters, check_triple
 
 _DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
 DIMENSIONS = {"time": TIME, "force": FORCE, "displacement": LENGTH}

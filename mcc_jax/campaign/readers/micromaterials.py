@@ -14,8 +14,8 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 from ..._errors import InputError
-from .._schema import Curve
-from ._text import Tests, checked_curve, decode_lines, number_block
+from ..schema import Curve
+from .text import Tests, checked_curve, decode_lines, number_block
 
 _ROW = re.compile(r"-?\d+\.\d{6}\t-?\d+\.\d{6}\t-?\d+\.\d{6}\s*")
 _NAMES = ("t", "h", "F")
@@ -23,7 +23,7 @@ LARGEST_TOTAL = 512 * 1024**2
 # Measured numbers as text deflate to a fifth or so; what shrinks to a hundredth is no measurement.
 LARGEST_SWELLING = 100
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-MOST_ENTRIES = 10_000
+MAX_ENTRIES = 10_000
 
 
 def matches(lines: list[str]) -> bool:
@@ -81,7 +81,7 @@ def _entries(data: bytes, file: Path) -> Iterator[tuple[str, bytes]]:
         raise broken from None
     with archive:
         whole = sum(entry.file_size for entry in entries)
-        if len(entries) > MOST_ENTRIES or whole > LARGEST_TOTAL or whole > LARGEST_SWELLING * max(len(data), 10_000):
+        if len(entries) > MAX_ENTRIES or whole > LARGEST_TOTAL or whole > LARGEST_SWELLING * max(len(data), 10_000):
             raise InputError("the archive is too large for a tester's export", file=file, remedy="Split it")
         total = 0
         for entry in entries:

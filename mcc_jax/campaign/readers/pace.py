@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ._mapping import Pace
+from .mapping import Pace
 
 
 def paced(displacement_um: np.ndarray, order: np.ndarray, pace: Pace) -> np.ndarray:

@@ -10,16 +10,16 @@ from typing import Any
 from ... import arguments
 from ..._errors import InputError
 from ...files import LIMITS, FileLimits
-from .._schema import Campaign, Metadata
-from .._table import read_bytes
-from .._validate import check_campaign
 from ..findings import Finding
-from ._detect import read_known
-from ._diameters import Diameters, diameters_for
-from ._mapped import read_mapped
-from ._mapping import MappingFile, read_mapping
-from ._text import Tests
+from ..schema import Campaign, Metadata
+from ..table import read_bytes
+from ..validate import check_campaign
+from .detect import read_known
+from .diameters import Diameters, diameters_for
 from .folder import names_of, read_folder
+from .mapped import read_mapped
+from .mapping import MappingFile, read_mapping
+from .text import Tests
 
 
 def read_tester_file(
@@ -41,7 +41,7 @@ def read_tester_file(
             anything that a mapping file describes; or a folder of such files, see `readers.folder`.
         diameters_um: D1, D2, D3 [um] for all tests, or a mapping from tests, or names of files, to such triples; see
             `read_diameters`. It counts before what the mapping or the files say.
-        mapping: a TOML file that describes the table, see `mcc_jax.campaign.readers._mapping`; or several, for a folder
+        mapping: a TOML file that describes the table, see `mcc_jax.campaign.readers.mapping`; or several, for a folder
             with files of several kinds: each file is read by the one that fits it.
         skip: names of files in the folder that are left out; may hold "*", "?".
         limits: how large a file may be.

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from ..._errors import InputError
-from .._schema import Control, Curve
-from .._table import number_of_cells, parse_number
+from ..schema import Control, Curve
+from ..table import number_of_cells, parse_number
 
 _NUMBER = re.compile(r"[-+]?[0-9]+(?:\.[0-9]*)?(?:[eE][-+]?[0-9]+)?")
 

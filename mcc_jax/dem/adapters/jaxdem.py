@@ -11,8 +11,8 @@ from jaxtyping import Array
 
 from ..._errors import InputError
 from ..._numerics import shared
-from .._pair import largest_overlap, pair_energy, pair_force
-from .._side import HalfContact, sides_of
+from ..pair import largest_overlap, pair_energy, pair_force
+from ..side import HalfContact, sides_of
 
 
 def jaxdem_force_model(sides: HalfContact) -> Any:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..._errors import InputError
-from .._edges import Edges, list_edges
+from ..edges import Edges, list_edges
 
 
 def edges_from_jaxmd(neighbours: Any, capacity: int | None = None, dtype: np.dtype | type = np.float64) -> Edges:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..particles import MOST_BURSTS
+from ..particles import MAX_BURSTS
 from ._effect import Effect, log_uniform
 
 
@@ -37,7 +37,7 @@ class PopInSeveral(_PopIn):
         out = np.zeros(len(c.path))
         for i, samples in enumerate(c.path.slices):
             number, sizes, strengths = c.particles.bursts[i]
-            for k in range(min(number, MOST_BURSTS)):
+            for k in range(min(number, MAX_BURSTS)):
                 passed = c.path.peak[samples] >= self.drawn.s0 * strengths[k]
                 out[samples] += theta * c.particles.De[i] / 200 * sizes[k] * passed
         return out

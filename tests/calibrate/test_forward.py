@@ -8,9 +8,9 @@ import pytest
 from joint_cases import COEFFICIENTS, DIAMETERS, SNAPPING, effective_diameter, flatness, simulated, true_latent
 
 from mcc_jax import Instrument, Programme, StrainScaling, Unloading
-from mcc_jax.calibrate.joint._data import select_tests
-from mcc_jax.calibrate.joint._forward import displacement, linearise, linearise_with_force, raw_residual
-from mcc_jax.calibrate.joint._individual import linear_start
+from mcc_jax.calibrate.data import select_tests
+from mcc_jax.calibrate.forward import displacement, linearise, linearise_with_force, raw_residual
+from mcc_jax.calibrate.particle_fit import linear_start
 
 FORMS = [(u, s) for u in Unloading for s in StrainScaling]
 FORM_NAMES = [f"{u.value}-{s.value}" for u, s in FORMS]

@@ -8,13 +8,13 @@ from jaxtyping import Array
 from joint_cases import random_summary
 
 from mcc_jax import calibrate_bayes, paper_campaign
-from mcc_jax.calibrate.joint import _draws
-from mcc_jax.calibrate.joint._importance import sample_weighted
-from mcc_jax.calibrate.joint._mode import Target, most_probable, to_free
-from mcc_jax.calibrate.joint._model import prior_numbers
-from mcc_jax.calibrate.joint._population import Scatter
-from mcc_jax.calibrate.joint._priors import Priors
-from mcc_jax.calibrate.joint._sampling import sample_population
+from mcc_jax.calibrate import draws as drawing
+from mcc_jax.calibrate.importance import sample_weighted
+from mcc_jax.calibrate.model import prior_numbers
+from mcc_jax.calibrate.population import Scatter
+from mcc_jax.calibrate.priors import Priors
+from mcc_jax.calibrate.sampling import sample_population
+from mcc_jax.calibrate.transforms import LogPosterior, most_probable, unconstrain
 
 COUNT = 200
 
@@ -30,10 +30,10 @@ def target():
     point += np.einsum("nij,nj->ni", spread, rng.standard_normal((COUNT, 4)))
     summary = jax.tree.map(jnp.asarray, summary)
     summary = type(summary)(**{**vars(summary), "point": jnp.asarray(point), "score": jnp.zeros((COUNT, 4))})
-    return Target(prior_numbers(Priors(), jnp.asarray(flat)), summary, Scatter(newton=0))
+    return LogPosterior(prior_numbers(Priors(), jnp.asarray(flat)), summary, Scatter(newton=0))
 
 
-class Normal(Target):
+class Normal(LogPosterior):
     """A density whose draws are known: normal, and even in the spreads' coordinates."""
 
     centre: Array
@@ -79,7 +79,7 @@ def test_a_hopeless_proposal_is_refused(normal):
 
 @pytest.mark.long
 def test_weighted_draws_are_those_of_the_sampler(target):
-    start = to_free(1.0, 9.6, np.log([6.5, 3.0, 2.7]), np.array([0.3, 0.02, 0.1]), target.numbers, target.scatter)
+    start = unconstrain(1.0, 9.6, np.log([6.5, 3.0, 2.7]), np.array([0.3, 0.02, 0.1]), target.numbers, target.scatter)
     *mode, converged = most_probable(start, target)
     assert converged
     _, weighted = sample_weighted(jax.random.key(3), *mode, target, chains=2, draws=2000)
@@ -107,7 +107,7 @@ def named(population):
 @pytest.mark.long
 def test_nuts_takes_over_where_weights_are_not_good_enough(paper_posterior, monkeypatch):
     assert paper_posterior.leapfrogs == 0
-    monkeypatch.setattr(_draws, "sample_weighted", lambda *_, **__: None)
+    monkeypatch.setattr(drawing, "sample_weighted", lambda *_, **__: None)
     sampled = calibrate_bayes(paper_campaign(0))
     assert sampled.leapfrogs > 1
     assert sampled.converged, sampled.failures()

@@ -11,13 +11,7 @@ from joint_cases import random_population, random_summary
 from scipy.special import roots_hermitenorm
 
 from mcc_jax import JointModel, StrainScaling
-from mcc_jax.calibrate.joint._population import (
-    Summary,
-    draw_latent,
-    laplace,
-    marginal_likelihood,
-    moments,
-)
+from mcc_jax.calibrate.population import Summary, draw_latent, laplace, marginal_likelihood, moments
 
 FLAT = np.array([0.15, 0.45, -0.1])
 PLAIN = JointModel().scatter

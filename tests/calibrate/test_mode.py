@@ -11,20 +11,20 @@ from hypothesis import strategies as st
 from joint_cases import random_summary
 
 from mcc_jax import InputError, JointModel
-from mcc_jax.calibrate.joint import NormalPrior, Priors
-from mcc_jax.calibrate.joint._fit import population_at
-from mcc_jax.calibrate.joint._mode import (
+from mcc_jax.calibrate import NormalPrior, Priors
+from mcc_jax.calibrate.fit import population_at
+from mcc_jax.calibrate.model import prior_numbers
+from mcc_jax.calibrate.population import Population
+from mcc_jax.calibrate.transforms import (
+    LogPosterior,
     PriorNumbers,
-    Target,
-    from_free,
+    constrain,
     most_probable,
     recentred,
     spread_of,
     spread_slope,
-    to_free,
+    unconstrain,
 )
-from mcc_jax.calibrate.joint._model import prior_numbers
-from mcc_jax.calibrate.joint._population import Population
 
 PLAIN = JointModel().scatter
 MODULUS, BOTH = JointModel(modulus_scatter=True).scatter, JointModel(modulus_scatter=True, shape_scatter=True).scatter
@@ -73,13 +73,13 @@ def test_the_prior_is_numpyro_s_up_to_a_constant(scatter):
     @jax.jit
     def both(free):
         def place(f):
-            return as_vector(from_free(f, NUMBERS, scatter)[0], scatter)
+            return as_vector(constrain(f, NUMBERS, scatter)[0], scatter)
 
         population, volume = place(free), jnp.linalg.slogdet(jax.jacfwd(place)(free))[1]
         # tau^2 is a Gamma variable, of which d(tau^2)/d(tau) = 2 tau
         tau = population[6:]
         spreads = jnp.sum(dist.Gamma(1 / (2 * power), 1 / (2 * scale**2)).log_prob(tau**2) + jnp.log(2 * tau))
-        return from_free(free, NUMBERS, scatter)[1], model_log_density(population) + spreads + volume
+        return constrain(free, NUMBERS, scatter)[1], model_log_density(population) + spreads + volume
 
     centre = np.array([0.0, 9.0, 0.0, 0.0, 0.0, 0.0, *[0.0] * scatter.size])
     draws = centre + rng.standard_normal((20, 6 + scatter.size)) * np.array([3, 1, 2, 2, 2, 1, *[1.0] * scatter.size])
@@ -117,14 +117,14 @@ def test_recentred_coordinates_describe_the_same_population():
     free = jnp.asarray([0.3, 9.0, 2.0, -1.0, 0.5, -0.2, -0.4, 0.1, -0.2])
     numbers, moved = recentred(NUMBERS, free)
     np.testing.assert_array_equal(moved[2:5], 0.0)
-    before, after = (as_vector(from_free(f, n, PLAIN)[0], PLAIN) for f, n in ((free, NUMBERS), (moved, numbers)))
+    before, after = (as_vector(constrain(f, n, PLAIN)[0], PLAIN) for f, n in ((free, NUMBERS), (moved, numbers)))
     np.testing.assert_allclose(after, before, rtol=1e-13)
 
 
 @pytest.mark.parametrize("a", [-1.4, 0.0, 1.43, 3.9])
 def test_to_free_and_back(a):
     mu, tau = np.array([1.8, 1.1, 1.0]), np.array([0.3, 0.05, 0.1])
-    free = to_free(a, 9.5, mu, tau, NUMBERS, MODULUS)
+    free = unconstrain(a, 9.5, mu, tau, NUMBERS, MODULUS)
     population = population_at(free, NUMBERS, MODULUS)
     np.testing.assert_allclose(float(population.a), a, rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(float(population.log_modulus), 9.5)
@@ -147,7 +147,7 @@ def summary():
 
 @pytest.fixture(scope="module")
 def posterior(summary):
-    return jax.jit(jax.value_and_grad(Target(NUMBERS, summary, PLAIN).log_density))
+    return jax.jit(jax.value_and_grad(LogPosterior(NUMBERS, summary, PLAIN).log_density))
 
 
 @settings(max_examples=60)
@@ -180,14 +180,14 @@ def test_a_prior_of_a_that_contradicts_the_shapes_is_told_or_survived(mean, flat
         return  # to refuse it is as good
     _, _, low, high = np.asarray(numbers.a)
     assert low < high
-    assert np.isfinite(float(from_free(jnp.zeros(9), numbers, PLAIN)[1]))
+    assert np.isfinite(float(constrain(jnp.zeros(9), numbers, PLAIN)[1]))
 
 
 @pytest.fixture(scope="module")
 def mode(summary):
     numbers = NUMBERS
-    start = to_free(1.0, 9.2, np.array([1.8, 1.1, 1.0]), np.array([0.3, 0.1, 0.2]), numbers, PLAIN)
-    return start, most_probable(start, Target(numbers, summary, PLAIN))
+    start = unconstrain(1.0, 9.2, np.array([1.8, 1.1, 1.0]), np.array([0.3, 0.1, 0.2]), numbers, PLAIN)
+    return start, most_probable(start, LogPosterior(numbers, summary, PLAIN))
 
 
 def test_the_mode_is_one(posterior, mode):
@@ -220,8 +220,8 @@ def test_the_start_does_not_matter(summary, mode, seed):
     rng = np.random.default_rng(seed)
     mu = np.array([1.8, 1.1, 1.0]) + rng.uniform(-0.5, 0.5, 3)
     tau = np.exp(rng.uniform(np.log(0.03), np.log(0.6), 3))
-    elsewhere = to_free(rng.uniform(-1.0, 3.5), rng.uniform(8.5, 10.5), mu, tau, NUMBERS, PLAIN)
-    again, _, converged = most_probable(elsewhere, Target(NUMBERS, summary, PLAIN))
+    elsewhere = unconstrain(rng.uniform(-1.0, 3.5), rng.uniform(8.5, 10.5), mu, tau, NUMBERS, PLAIN)
+    again, _, converged = most_probable(elsewhere, LogPosterior(NUMBERS, summary, PLAIN))
     assert converged
     expected, found = np.asarray(free).copy(), np.asarray(again).copy()
     expected[6:], found[6:] = np.abs(expected[6:]), np.abs(found[6:])

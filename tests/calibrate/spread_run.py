@@ -12,8 +12,8 @@ def blocks_only(folder: Path, process: int) -> None:
     """One cheap function of five particles in blocks of two, and the random numbers of every block."""
     from joint_cases import five_tests
 
-    from mcc_jax.calibrate.joint._blocks import Blocks, filled_up, require_same
-    from mcc_jax.calibrate.joint._individual import linear_starts
+    from mcc_jax.calibrate.particle_fit import linear_starts
+    from mcc_jax.calibrate.sharding import Blocks, filled_up, require_same
 
     tests = filled_up(five_tests(), 2)
     require_same(tests)

@@ -8,8 +8,8 @@ import pytest
 from scipy.stats import halfnorm, nakagami
 
 from mcc_jax import InputError, JointModel, Priors, Unloading, read_priors
-from mcc_jax.calibrate.joint import LogNormalPrior, NakagamiPrior, NormalPrior
-from mcc_jax.calibrate.joint._arviz import prior_draws
+from mcc_jax.calibrate import LogNormalPrior, NakagamiPrior, NormalPrior
+from mcc_jax.calibrate.arviz import prior_draws
 
 
 @pytest.fixture
@@ -56,7 +56,7 @@ def test_what_is_not_named_is_the_default_of_the_form(read, unloading):
     found = read("[a]\nsd = 0.3\n", unloading)
     assert found.effective_modulus_MPa == Priors.default(unloading).effective_modulus_MPa
     assert found.effective_modulus_MPa.median < 0.1 * Priors().effective_modulus_MPa.median
-    assert JointModel(unloading).beliefs == Priors.default(unloading)
+    assert JointModel(unloading).chosen_priors == Priors.default(unloading)
     assert JointModel(unloading, priors=found).beliefs == found
 
 

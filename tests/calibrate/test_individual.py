@@ -9,12 +9,13 @@ import pytest
 from joint_cases import COEFFICIENTS, DIAMETERS, NOISE, SNAPPING, modulus_of, simulated, true_latent
 
 from mcc_jax import Instrument, StrainScaling, Unloading
-from mcc_jax.calibrate.joint import JointModel, _fit
-from mcc_jax.calibrate.joint._blocks import Blocks
-from mcc_jax.calibrate.joint._data import select_tests
-from mcc_jax.calibrate.joint._fit import WIDE, _centre
-from mcc_jax.calibrate.joint._forward import raw_residual, snap
-from mcc_jax.calibrate.joint._individual import fit_particles, linear_starts
+from mcc_jax.calibrate import JointModel
+from mcc_jax.calibrate import fit as fitting
+from mcc_jax.calibrate.data import select_tests
+from mcc_jax.calibrate.fit import WIDE, _centre
+from mcc_jax.calibrate.forward import raw_residual, snap
+from mcc_jax.calibrate.particle_fit import fit_particles, linear_starts
+from mcc_jax.calibrate.sharding import Blocks
 
 SNAPS = np.stack([COEFFICIENTS[0], SNAPPING, COEFFICIENTS[2], SNAPPING * np.array([1.0, 1.01, 0.99])])
 
@@ -25,7 +26,7 @@ def fitted(campaign, noise, unloading=Unloading.PRINTED, zero_sd=5.0):
 
 
 def fit(tests, noise, unloading=Unloading.PRINTED, zero_sd=5.0, starts=None):
-    centre = np.broadcast_to(_centre(JointModel(unloading).beliefs), (len(tests), 4))
+    centre = np.broadcast_to(_centre(JointModel(unloading).chosen_priors), (len(tests), 4))
     return fit_particles(
         tests,
         jnp.full(len(tests), noise),
@@ -87,13 +88,13 @@ def test_coefficients_of_a_curve_that_snaps_are_near_the_truth(snapping):
 @pytest.mark.long
 def test_late_fits_go_on_in_blocks_of_their_own(snapping, monkeypatch):
     _, tests, wanted = snapping
-    monkeypatch.setattr(_fit, "FIRST_STEPS", 3)  # nobody is done by then
+    monkeypatch.setattr(fitting, "FIRST_STEPS", 3)  # nobody is done by then
     blocks = Blocks(4, 2)
     own, zero_sd = blocks.cut(tests), jnp.asarray(5.0)
-    centre = jnp.asarray(np.broadcast_to(_centre(JointModel().beliefs), (4, 4)))
+    centre = jnp.asarray(np.broadcast_to(_centre(JointModel().chosen_priors), (4, 4)))
     arrays = jnp.full(4, 0.03), centre, jnp.full((4, 4), WIDE)
     starts = blocks.cut(linear_starts(tests, centre[0, 3]), axis=1)
-    found = _fit._fitted(blocks, tests, own, arrays, zero_sd, starts, Unloading.PRINTED)
+    found = fitting._fitted(blocks, tests, own, arrays, zero_sd, starts, Unloading.PRINTED)
     assert np.all(np.asarray(found.converged))
     np.testing.assert_allclose(found.latent, wanted.latent, atol=1e-4)
     np.testing.assert_allclose(found.rms, wanted.rms, rtol=1e-4)
@@ -110,7 +111,7 @@ def test_coefficients_are_within_their_noise():
 def test_without_unloading_the_modulus_stays_at_its_prior():
     tests = select_tests(simulated(instrument=NOISE)).tests
     loading_only = replace(tests, mask=tests.loading)
-    centre = _centre(JointModel().beliefs)
+    centre = _centre(JointModel().chosen_priors)
     found = fit(loading_only, 0.02)
     np.testing.assert_allclose(found.latent[:, 3], centre[3], rtol=1e-6)
     assert np.all(np.abs(np.asarray(found.latent)[:, :3] - true_latent()[:, :3]) < 0.05)

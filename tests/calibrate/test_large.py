@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from mcc_jax import calibrate_bayes, paper_campaign
-from mcc_jax.calibrate.joint import _drawer, _draws
-from mcc_jax.calibrate.joint._large import correction
+from mcc_jax.calibrate import conditional
+from mcc_jax.calibrate import draws as drawing
+from mcc_jax.calibrate.reweighting import correction
 
 
 def test_a_slope_is_found_through_any_rotation_of_the_parameters():
@@ -31,7 +32,7 @@ def test_the_error_is_that_of_the_random_numbers():
 
 @pytest.mark.long
 def test_the_shortcuts_agree_with_exact_weights(paper_posterior, monkeypatch):
-    monkeypatch.setattr(_drawer, "MOST_CHECKED", 40_000)  # so that twenty particles count as many
+    monkeypatch.setattr(conditional, "MAX_CHECKED", 40_000)  # so that twenty particles count as many
     many = calibrate_bayes(paper_campaign(0))
     assert many.leapfrogs == 0
     assert not many.weights_applied
@@ -51,13 +52,13 @@ def test_the_shortcuts_agree_with_exact_weights(paper_posterior, monkeypatch):
 def test_the_exact_likelihood_corrects_summaries_that_are_off(paper_posterior, monkeypatch):
     """Summaries of all particles that pull the same way move the population; the regression moves it back."""
     fit, selection, model = paper_posterior.fit, paper_posterior.selection, paper_posterior.model
-    length = _draws.Length(4, 300, 1000)
+    length = drawing.Length(4, 300, 1000)
     pulled = fit.summary.score.at[:, 0].add(0.15 * jnp.sqrt(fit.summary.precision[:, 0, 0]))
     off = type(fit)(**{**vars(fit), "summary": type(fit.summary)(**{**vars(fit.summary), "score": pulled})})
-    monkeypatch.setattr(_drawer, "MOST_CHECKED", 40_000)
-    corrected = _draws.draw_fast(jax.random.key(0), selection.tests, model, off, length, 0)["population"].mu[..., 0]
-    monkeypatch.setattr(_drawer, "correction", lambda _, draws: (np.zeros(len(draws)), 0.0))
-    raw = _draws.draw_fast(jax.random.key(0), selection.tests, model, off, length, 0)["population"].mu[..., 0]
+    monkeypatch.setattr(conditional, "MAX_CHECKED", 40_000)
+    corrected = drawing.draw_fast(jax.random.key(0), selection.tests, model, off, length, 0)["population"].mu[..., 0]
+    monkeypatch.setattr(conditional, "correction", lambda _, draws: (np.zeros(len(draws)), 0.0))
+    raw = drawing.draw_fast(jax.random.key(0), selection.tests, model, off, length, 0)["population"].mu[..., 0]
     truth = np.asarray(paper_posterior.population.mu)[..., 0]
     moved, left = abs(raw.mean() - truth.mean()), abs(corrected.mean() - truth.mean())
     assert left < max(0.3 * moved, 0.1 * truth.std())

@@ -11,8 +11,8 @@ from joint_cases import NOISE, flatness, simulated, true_coefficients
 from scipy.optimize import least_squares
 
 from mcc_jax import Curve, Instrument, Programme, calibrate_least_squares, paper_campaign
-from mcc_jax.calibrate.joint._arrow import Parameters
-from mcc_jax.calibrate.joint._pooled import pooled_residual, robust
+from mcc_jax.calibrate.block_arrow import Parameters
+from mcc_jax.calibrate.hierarchical import pooled_residual, robust
 
 # Eight particles in every test: one compilation.
 KEEP = np.arange(20) < 8

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from joint_cases import random_precision
 
-from mcc_jax.calibrate.joint._small import Cholesky
+from mcc_jax.calibrate.small_matrices import Cholesky
 
 SIZES = st.integers(1, 5)
 BATCHES = st.sampled_from([(), (3,), (2, 3)])

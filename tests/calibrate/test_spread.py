@@ -14,9 +14,9 @@ import pytest
 from joint_cases import NOISE, Programme, five_tests, simulated
 
 from mcc_jax import calibrate_bayes
-from mcc_jax.calibrate.joint._blocks import MOST, SIZES, Blocks, Parts, block_size, count_of, filled_up
-from mcc_jax.calibrate.joint._data import select_tests
-from mcc_jax.calibrate.joint._individual import linear_starts
+from mcc_jax.calibrate.data import select_tests
+from mcc_jax.calibrate.particle_fit import linear_starts
+from mcc_jax.calibrate.sharding import MOST, SIZES, Blocks, Parts, block_size, count_of, filled_up
 
 LIMIT_S = 400
 HERE = Path(__file__).parent

@@ -4,9 +4,17 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mcc_jax import Instrument, Plastic, Programme, StrainScaling, Unloading, law_for_each, simulate_campaign
-from mcc_jax.calibrate.joint._data import select_tests
-from mcc_jax.calibrate.joint._population import Population, Summary
+from mcc_jax import (
+    Instrument,
+    Plastic,
+    Programme,
+    StrainScaling,
+    Unloading,
+    law_for_each,
+    simulate_campaign,
+)
+from mcc_jax.calibrate.data import select_tests
+from mcc_jax.calibrate.population import Population, Summary
 
 A, EBAR = 1.43, 16_000.0
 NOISE = Instrument(displacement_noise_um=0.02, force_noise_mN=0.05)

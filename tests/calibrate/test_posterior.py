@@ -9,16 +9,16 @@ import pytest
 from joint_cases import NOISE, Programme, flatness, simulated, true_coefficients
 
 from mcc_jax import (
-    beside_paper,
     calibrate_bayes,
-    new_laws,
+    compare_with_paper,
     paper_campaign,
     predict_measured,
     predict_new_particle,
+    sample_laws,
     to_arviz,
     write_posterior,
 )
-from mcc_jax.calibrate.joint._weights import ordered_resample, pareto_k, smoothed_weights
+from mcc_jax.calibrate.weights import ordered_resample, pareto_k, smoothed_weights
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +135,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_nearly_the_same_num
 
 
 def test_probability_not_monotone_is_that_of_draws_from_the_population(result):
-    laws = new_laws(result, 4000, seed=3)
+    laws = sample_laws(result, 4000, seed=3)
     share = 1 - np.mean(np.asarray(eqx.filter_vmap(lambda law: law.is_monotone)(laws)))
     expected = result.probability_not_monotone().mean()
     assert share == pytest.approx(expected, abs=4 * np.sqrt(expected * (1 - expected) / 4000) + 0.002)
@@ -173,7 +173,7 @@ def test_a_particle_never_measured_is_predicted_with_the_scatter_of_the_populati
 
 
 def test_the_paper_s_table_stands_beside_ours(result):
-    rows = {row["quantity"]: row for row in beside_paper(result)}
+    rows = {row["quantity"]: row for row in compare_with_paper(result)}
     assert rows["a"]["paper"] == 1.43
     assert rows["effective_modulus_MPa"]["paper"] == 16_000.0
     assert rows["mu_C1"]["paper"] == 1.9027
@@ -217,7 +217,7 @@ def test_padded_points_are_nan_and_no_others(result, tree):
 
 
 def test_prior_draws_have_the_prior_s_quantiles(result, tree):
-    prior = result.model.beliefs
+    prior = result.model.chosen_priors
     a = tree["prior"]["a"].values.ravel()
     assert abs(a.mean() - prior.a.mean) < 5 * prior.a.sd / np.sqrt(len(a)) + 0.1
     modulus = np.log(tree["prior"]["effective_modulus_MPa"].values)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from scipy.stats import multivariate_normal
 
-from mcc_jax.calibrate.joint._noise import (
+from mcc_jax.calibrate.noise import (
     Linear,
     Noise,
     NoisePrior,
@@ -35,7 +35,7 @@ ONE_BRANCH = np.repeat([0, 1], POINTS // 2)
 
 
 def dense_covariance(four, scale, step, compliance, peak=None, branch=None):
-    """The covariance in the docstring of `_noise`, written out."""
+    """The covariance in the docstring of `noise`, written out."""
     white, force, correlated, length = four
     path = np.cumsum(step)
     wander = correlated**2 * np.exp(-np.abs(path[:, None] - path) / length)
@@ -133,7 +133,7 @@ def test_without_correlation_it_only_divides():
 
 
 def linear_problem(four, scale, *, points=POINTS, count=1, seed=0, masked=0.1):
-    """Tests that are linear in three parameters of their own, with noise as the docstring of `_noise` has it."""
+    """Tests that are linear in three parameters of their own, with noise as the docstring of `noise` has it."""
     rng = np.random.default_rng(seed)
     path = np.linspace(0, 1.6, points)
     residual = np.empty((count, points))

@@ -9,9 +9,17 @@ import numpy as np
 import pytest
 from joint_cases import COEFFICIENTS, DIAMETERS, NOISE, simulated, true_coefficients
 
-from mcc_jax import Campaign, Curve, InputError, Programme, Ramp, calibrate_bayes, calibrate_least_squares
-from mcc_jax.calibrate.joint import _fit
-from mcc_jax.calibrate.joint._data import select_tests
+from mcc_jax import (
+    Campaign,
+    Curve,
+    InputError,
+    Programme,
+    Ramp,
+    calibrate_bayes,
+    calibrate_least_squares,
+)
+from mcc_jax.calibrate import fit as fitting
+from mcc_jax.calibrate.data import select_tests
 
 METHODS = {
     "bayes": lambda campaign: calibrate_bayes(campaign, draws=200, chains=2),
@@ -243,9 +251,9 @@ def test_an_interrupted_fit_does_not_wait_for_what_runs_meanwhile(monkeypatch):
         assert begun.wait(60)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(_fit, "fit_joint", interrupted)
+    monkeypatch.setattr(fitting, "fit_joint", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        _fit.prepare(one("A", 0), _fit.JointModel(), 0.2, meanwhile=meanwhile)
+        fitting.prepare(one("A", 0), fitting.JointModel(), 0.2, meanwhile=meanwhile)
     assert not end.is_set()
     aside = [thread for thread in threading.enumerate() if meanwhile.__name__ in thread.name]
     end.set()

@@ -9,8 +9,8 @@ import pytest
 from joint_cases import COEFFICIENTS, DIAMETERS, NOISE, Programme, simulated
 
 from mcc_jax import InputError, calibrate_bayes, calibrate_least_squares, calibrate_many
-from mcc_jax.calibrate.joint._data import LENGTHS, padded_length
-from mcc_jax.calibrate.joint._drawer import CANDIDATES
+from mcc_jax.calibrate.conditional import CANDIDATES
+from mcc_jax.calibrate.data import LENGTHS, padded_length
 
 SETTINGS = {"chains": 2, "warmup": 150, "draws": 100, "seed": 3}
 FUNCTIONS = (
