@@ -242,8 +242,8 @@ def rank(system: System, projection: Projection, *, refitted: Mapping[int, float
     Args:
         system: the system.
         projection: scores and information of all candidates.
-        refitted: drop of -2 log likelihood by those candidates that were fitted as they are (`gauss_newton`). It replaces
-            the linear one, and no formula of the same mechanism counts for more than the best of these.
+        refitted: drop of -2 log likelihood by those candidates that were fitted as they are (`gauss_newton`). It
+            replaces the linear one, and no formula of the same mechanism counts for more than the best of these.
     """
     sign = system.signs
     U, total = projection.scores.sum(0), projection.total

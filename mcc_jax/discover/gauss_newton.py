@@ -1,16 +1,16 @@
 r"""Effects fitted as they are, not to first order: Gauss-Newton's method through the extended law.
 
 The linear system (`linear_model`) holds what an effect would add if it were small. A large one is not: its signature at
-the strength it has differs from the one at zero, and so does what the base law can still take up. So the few formulas that
-matter are fitted in the extended law itself, with the population, every particle's deviations and zero, the effects'
+the strength it has differs from the one at zero, and so does what the base law can still take up. So the few formulas
+that matter are fitted in the extended law itself, with the population, every particle's deviations and zero, the effects'
 amplitudes and their further numbers free together,
 
 .. math:: D = \sum_i \lVert W_i (d_i - z_i - \gamma(F_i; w_i, \theta)) \rVert^2 + \lVert\xi_i\rVert^2
     + (z_i - z_{i0})^2/s_z^2 + \beta^T P \beta + \phi^T Q \phi + 2 c^T (\beta, \theta),
     \qquad w_i = m_i(\beta) + S \xi_i
 
-with the noise filters W of the refined fit and c what curvature adds (`laplace_correction`, taken at the base law). Every step
-is the linear system once more, around the latest values.
+with the noise filters W of the refined fit and c what curvature adds (`laplace_correction`, taken at the base law).
+Every step is the linear system once more, around the latest values.
 """
 
 from __future__ import annotations
