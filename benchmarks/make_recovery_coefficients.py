@@ -1,4 +1,4 @@
-"""Write `mcc_jax/law/recovery_coefficients.py`.
+"""Write `mcc_jax/formulas/recovery_coefficients.py`.
 
 Run `uv run --group test python benchmarks/make_recovery_coefficients.py`.
 

@@ -36,7 +36,6 @@ from .discover import Discovery as Discovery
 from .discover import Plan as Plan
 from .discover import Power as Power
 from .effects import LIBRARY as LIBRARY
-from .effects import ExtendedLaw as ExtendedLaw
 from .effects import Record as Record
 from .effects import Variant as Variant
 from .geometry import Particle as Particle

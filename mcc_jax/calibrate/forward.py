@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 
 from .._numerics import running_max
 from .._types import Path, Scalar
+from ..effects import AbstractEffect
 from ..geometry import Particle
 from ..law import MccLaw, Plastic, Unloading
 from .data import Tests
@@ -27,10 +28,11 @@ Latent = Float[Array, " 4"]
 """b1, b3, b5 and e of one particle."""
 
 
-def law_of(latent: Latent, unloading: Unloading) -> MccLaw:
+def law_of(latent: Latent, unloading: Unloading, effects: tuple[AbstractEffect, ...] = ()) -> MccLaw:
     """The law that has taken in its particle's shape: a = 0, coefficients times the shape factor."""
     b1, b3, b5, e = latent
-    return MccLaw(Plastic(jnp.exp(b1), jnp.exp(b3), jnp.exp(b5)), 0.0, jnp.exp(e), unloading)
+    plastic = Plastic(jnp.exp(b1), jnp.exp(b3), jnp.exp(b5))
+    return MccLaw(plastic, 0.0, jnp.exp(e), unloading, effects=effects)
 
 
 def displacement(latent: Latent, particle: Particle, force: Path, unloading: Unloading) -> Path:

@@ -32,6 +32,10 @@ from .quality import campaign_findings as campaign_findings
 from .quality import check_tests as check_tests
 from .readers import read_diameters as read_diameters
 from .readers import read_tester_file as read_tester_file
+from .record import available_data as available_data
+from .record import humidities as humidities
+from .record import record_batch as record_batch
+from .record import record_of as record_of
 from .schema import Campaign as Campaign
 from .schema import Control as Control
 from .schema import Curve as Curve

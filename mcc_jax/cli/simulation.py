@@ -23,8 +23,8 @@ from ..campaign import (
     particle_batch,
     read_particles,
 )
+from ..campaign.record import humidity_column
 from ..effects import HUMIDITY_COLUMN, Need
-from ..effects.record import humidity_column
 from ..geometry import Particle, plastic_shape_factor
 from ..law import MccLaw, StrainScaling, Unloading
 from ..simulate import (

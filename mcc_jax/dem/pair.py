@@ -15,9 +15,10 @@ from .. import arguments
 from .._errors import InputError
 from .._numerics import shared
 from .._types import Flag, Scalar, ScalarLike
-from ..law import energy_ratio, recovery_limit, stress_ratio
-from ..law.branch import branch_force
-from ..law.loading_inverse import loading_work, quintic, secant_modulus, tangent_modulus
+from ..formulas import recovery_limit
+from ..formulas.branch import branch_force
+from ..formulas.loading_inverse import loading_work, quintic, secant_modulus, tangent_modulus
+from ..law import energy_ratio, stress_ratio
 from .side import HalfContact
 
 SPLIT_STEPS = 8

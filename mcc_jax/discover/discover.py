@@ -15,9 +15,9 @@ from ..calibrate import JointModel
 from ..calibrate.data import ranges_um, root_mean_squares
 from ..calibrate.judgement import unlike_others
 from ..calibrate.model import checked_settings
-from ..campaign import Campaign, Finding, campaign_findings, check_plausibility, check_tests
+from ..campaign import Campaign, Finding, available_data, campaign_findings, check_plausibility, check_tests
 from ..campaign.quality import named
-from ..effects import LIBRARY, Mechanism, available_data
+from ..effects import LIBRARY, Mechanism
 from ..effects.library import checked_library
 from .applicability import without_punch
 from .candidates import untestable

@@ -2,8 +2,8 @@ r"""Effects fitted as they are, not to first order: Gauss-Newton's method throug
 
 The linear system (`linear_model`) holds what an effect would add if it were small. A large one is not: its signature at
 the strength it has differs from the one at zero, and so does what the base law can still take up. So the few formulas
-that matter are fitted in the extended law itself, with the population, every particle's deviations and zero, the effects'
-amplitudes and their further numbers free together,
+that matter are fitted in the law with effects itself, with the population, every particle's deviations and zero, the
+effects' amplitudes and their further numbers free together,
 
 .. math:: D = \sum_i \lVert W_i (d_i - z_i - \gamma(F_i; w_i, \theta)) \rVert^2 + \lVert\xi_i\rVert^2
     + (z_i - z_{i0})^2/s_z^2 + \beta^T P \beta + \phi^T Q \phi + 2 c^T (\beta, \theta),
@@ -31,7 +31,7 @@ from ..calibrate.fit import population_at
 from ..calibrate.forward import law_of
 from ..calibrate.noise import Whitening
 from ..calibrate.population import Population, Scatter, moments
-from ..effects import AbstractEffect, ExtendedLaw, Nuisance, Record, Variant
+from ..effects import AbstractEffect, Nuisance, Record, Variant
 from ..geometry import Particle
 from ..law import Unloading
 from .candidates import Candidate
@@ -381,7 +381,7 @@ def _linearise(
 ) -> tuple[Array, Array, Array]:
     def one(w, z, particle, record, measured, mask):
         def predicted(w, theta):
-            return ExtendedLaw(law_of(w, unloading), effects_of(formulas, theta)).respond(particle, record)
+            return law_of(w, unloading, effects_of(formulas, theta)).respond(particle, record)
 
         value, push = jax.linearize(predicted, w, theta)
         by_latent = jax.vmap(lambda d: push(d, jnp.zeros_like(theta)))(jnp.eye(4))

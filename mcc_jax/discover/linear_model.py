@@ -34,10 +34,10 @@ from ..calibrate.model import JointFit
 from ..calibrate.noise import Linear, Whitening
 from ..calibrate.population import Population, Scatter, moments
 from ..calibrate.sharding import Blocks, block_size, filled_up
-from ..campaign import Campaign, campaign_segments
-from ..effects import LIBRARY, Context, ExtendedLaw, Mechanism, Record, record_batch, signatures
+from ..campaign import Campaign, campaign_segments, record_batch
+from ..effects import LIBRARY, Context, Mechanism, Record
 from ..geometry import Particle
-from ..law import Unloading
+from ..law import Unloading, signatures
 from .candidates import Candidate, candidates_of
 from .dictionary import GAUGE, ROOM, Feature, map_features, values_of, words
 from .laplace_correction import Turned, by_latent, turning
@@ -485,7 +485,7 @@ def _features(
     latent, particles: Particle, records: Record, unloading: Unloading, features
 ) -> Float[Array, "particles f points"]:
     def one(w, particle, record):
-        context: Context = ExtendedLaw(law_of(w, unloading), ()).context(particle, record)
+        context: Context = law_of(w, unloading).context(particle, record)
         return particle.effective_diameter * values_of(features, context)
 
     return eqx.filter_vmap(one)(latent, particles, records)

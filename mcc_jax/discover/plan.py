@@ -19,8 +19,8 @@ from ..calibrate.linearise import linear_data, summarise
 from ..calibrate.model import checked_settings
 from ..calibrate.noise import Noise
 from ..calibrate.paper.result import finite
-from ..campaign import Campaign, Curve, Metadata, check_campaign
-from ..effects import LIBRARY, Mechanism, available_data
+from ..campaign import Campaign, Curve, Metadata, available_data, check_campaign
+from ..effects import LIBRARY, Mechanism
 from ..effects.library import checked_library
 from ..simulate import Programme, simulate_campaign
 from .candidates import untestable

@@ -37,7 +37,7 @@ from ..calibrate.sampling import ExactLikelihood
 from ..calibrate.sharding import count_of
 from ..calibrate.transforms import LogPosterior, constrain, most_probable, unconstrain
 from ..calibrate.weights import PARETO_K_MOST
-from ..effects import ExtendedLaw, Record
+from ..effects import Record
 from .gauss_newton import Formula, Refit, effects_of, slices
 from .linear_model import Base
 
@@ -149,7 +149,7 @@ class ExtendedExact(ExactLikelihood):
         """Displacement [um] of every particle from its own zero."""
         assert isinstance(population, ExtendedPopulation)
         effects = effects_of(self.formulas, population.theta)
-        return jax.vmap(lambda w, p, r: ExtendedLaw(law_of(w, self.unloading), effects).respond(p, r))(
+        return jax.vmap(lambda w, p, r: law_of(w, self.unloading, effects).respond(p, r))(
             latent, self.tests.particle, self.records
         )
 

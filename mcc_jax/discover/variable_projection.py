@@ -26,7 +26,7 @@ from ..calibrate.compiling import compiled
 from ..calibrate.fit import population_at
 from ..calibrate.noise import Whitening
 from ..calibrate.population import moments
-from ..effects import Context, ExtendedLaw
+from ..effects import Context
 from ..law import Unloading
 from .dictionary import Feature, Form, further_words
 from .forward_selection import MAX_WORDS
@@ -296,7 +296,7 @@ def _stacked(columns: np.ndarray) -> np.ndarray:
 @compiled
 def _contexts(latent, particles, records, unloading: Unloading) -> Context:
     def one(w, particle, record):
-        return ExtendedLaw(law_of(w, unloading), ()).context(particle, record)
+        return law_of(w, unloading).context(particle, record)
 
     return eqx.filter_vmap(one)(latent, particles, records)
 

@@ -8,8 +8,8 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._types import Values
+from ..formulas import PUNCH_AREA, recovery
 from ..geometry import Particle
-from ..law import PUNCH_AREA, MccLaw, recovery
 from .record import RELOAD, UNLOAD, Record, reload_progress
 
 SMALL = 1e-8
@@ -41,7 +41,7 @@ class Context(eqx.Module):
     """
 
     particle: Particle
-    law: MccLaw
+    law: Formulas
     record: Record
     peak_force: Values
     peak_displacement: Values

@@ -8,8 +8,8 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._types import Scalar, Values, scalar
+from ..formulas import Formulas
 from ..geometry import Particle
-from ..law import MccLaw
 from .context import Context
 from .record import Record
 
@@ -32,19 +32,36 @@ class AbstractEffect(eqx.Module):
 
     Hooks are plain arithmetic on scalars or arrays over points, so that `vmap`, `jvp` and `grad` pass through. They
     must be finite with finite derivatives at zero force, on full release, at repeated points and at amplitude zero,
-    where they must change nothing; `ExtendedLaw` makes sure that the law is then the base law to the last bit.
+    where they must change nothing.
 
     Attributes:
         amplitude: strength of the effect, 0 for none; its unit is that of the `Variant`.
+        label: "mechanism:variant" where a `Variant` built it; by it results and messages name the effect.
     """
 
     amplitude: Scalar = eqx.field(converter=scalar)
+    label: str = eqx.field(static=True, default="", kw_only=True)
 
-    def modify(self, law: MccLaw, particle: Particle, record: Record) -> MccLaw:
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return self.label or type(self).__name__
+
+    @property
+    def of_tester(self) -> bool:
+        """Whether it belongs to what lies between particle and read-out, not to the particle."""
+        return self.overrides("observe")
+
+    @classmethod
+    def overrides(cls, *hooks: str) -> bool:
+        """Whether it has any of these hooks of its own."""
+        return any(getattr(cls, hook) is not getattr(AbstractEffect, hook) for hook in hooks)
+
+    def modify(self, law: Formulas, particle: Particle, record: Record) -> Formulas:
         """The law with other parameters for this particle."""
         return law
 
-    def loading(self, law: MccLaw, particle: Particle, record: Record, strain: Values) -> Factors:
+    def loading(self, law: Formulas, particle: Particle, record: Record, strain: Values) -> Factors:
         """Factors on the linear, cubic and quintic term of loading at a strain [-] >= 0."""
         one = jnp.ones_like(strain)
         return one, one, one
@@ -72,11 +89,6 @@ class AbstractEffect(eqx.Module):
     def evolve(self, memory: Any, before: Scalar, now: Scalar, seconds: Scalar) -> tuple[Any, Any]:
         """Memory after a step during which the driver went from `before` to `now`, and what `inside` gets to see."""
         return memory, None
-
-
-def overrides(effect: AbstractEffect, *hooks: str) -> bool:
-    """Whether the effect has any of these hooks of its own."""
-    return any(getattr(type(effect), hook) is not getattr(AbstractEffect, hook) for hook in hooks)
 
 
 def at_least(x: Values, least: float) -> Values:

@@ -1,4 +1,4 @@
-"""All mechanisms by name, and what a campaign must hold to show them."""
+"""All mechanisms by name."""
 
 from __future__ import annotations
 
@@ -6,19 +6,15 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
-import numpy as np
-
 from .. import arguments
 from .._errors import InputError
-from ..campaign import Campaign, Segment, campaign_segments, check_campaign
 from .contact import MISALIGNMENT, POP_IN, TOE
 from .creep import CREEP
 from .loading import FRICTION, HARDENING, RATE
 from .material import DAMAGE, DENSIFICATION, HUMIDITY, SHAPE, SIZE
-from .record import humidities, record_of
 from .tester import DRIFT, FRAME, SINK_IN
 from .unloading import ADHESION, HYSTERESIS, RATCHETING, REVERSAL, SHAPE_OF_UNLOADING
-from .variant import Mechanism, Need, Variant
+from .variant import Mechanism, Variant
 
 _ALL = (
     FRAME,
@@ -83,56 +79,3 @@ def find_variant(name: str, library: Mapping[str, Mechanism] = LIBRARY) -> Varia
         return known[variant]
     except KeyError as error:
         raise InputError(error.args[0]) from None
-
-
-def available_data(campaign: Campaign, segments: tuple[tuple[Segment, ...], ...] | None = None) -> frozenset[Need]:
-    """What a campaign holds of what effects need.
-
-    A kind of segment counts as present when at least one test in five has it; sizes and shapes when they differ by a
-    tenth; peaks and rates when the largest is 1.3 times the smallest.
-
-    Args:
-        campaign: the tests.
-        segments: the segments of each; found anew if None.
-    """
-    check_campaign(campaign)
-    found = campaign_segments(campaign) if segments is None else segments
-    D1, D2, D3 = campaign.diameters_um.T
-    kinds = [[segment.kind for segment in parts] for parts in found]
-    least = max(1.0, 0.2 * len(campaign))
-
-    def often(kind: str, times: int = 1) -> bool:
-        return sum(parts.count(kind) >= times for parts in kinds) >= least
-
-    rates, peaks, durations, low = [], [], [], 0
-    for curve, parts, diameter in zip(campaign.curves, found, D1 * D2 / D3, strict=True):
-        record = record_of(curve, parts)
-        loading = np.isin(np.asarray(record.kind), (1, 4))
-        rates.extend(np.unique(np.asarray(record.loading_rate)[loading]).tolist())
-        area = np.pi * diameter**2 / 4 * 1e-3
-        peaks.append(float(curve.force_mN.max() / area))
-        peaks.extend(
-            float(curve.force_mN[: part.start].max() / area) for part in parts if part.kind == "unload" and part.start
-        )
-        durations.append(float(curve.time_s[-1] - curve.time_s[0]))
-        low += int(np.sum(curve.force_mN < 0.1 * curve.force_mN.max()) >= 5)
-    humidity = humidities(campaign)
-    conditions = {
-        Need.LOW_LOAD: low >= least,
-        Need.UNLOADING: often("unload"),
-        Need.HOLD: often("hold"),
-        Need.RELOAD: often("reload"),
-        Need.SECOND_RELOAD: often("reload", 2),
-        Need.LONG_TIME: float(np.median(durations)) > 200,
-        Need.TWO_RATES: _apart(rates, 1.3),
-        Need.SEVERAL_SIZES: _apart((D1 * D2 / D3).tolist(), 1.1),
-        Need.SEVERAL_SHAPES: bool(np.ptp(1 - D3**2 / (D1 * D2)) > 0.1),
-        Need.SEVERAL_PEAKS: _apart(peaks, 1.3),
-        Need.HUMIDITY_COLUMN: humidity is not None and bool(np.ptp(humidity) > 1),
-    }
-    return frozenset(need for need, there in conditions.items() if there)
-
-
-def _apart(values: list[float], ratio: float) -> bool:
-    some = [value for value in values if value > 0]
-    return bool(some and max(some) > ratio * min(some))

@@ -8,8 +8,8 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._types import Scalar, Values, scalar
+from ..formulas import PUNCH_AREA, recovery, tangent_modulus
 from ..geometry import Particle
-from ..law import PUNCH_AREA, MccLaw, recovery, tangent_modulus
 from .context import Context, root
 from .effect import AbstractEffect, Factors, at_least
 from .record import Record
@@ -30,7 +30,7 @@ class AbstractRateEffect(AbstractEffect):
 
     terms: tuple[bool, bool, bool] = eqx.field(static=True, default=(True, True, True))
 
-    def relative_rate(self, law: MccLaw, particle: Particle, record: Record, strain: Values) -> Values:
+    def relative_rate(self, law: Formulas, particle: Particle, record: Record, strain: Values) -> Values:
         """Rate of the latest loading ramp over the reference."""
         raise NotImplementedError
 
@@ -38,7 +38,7 @@ class AbstractRateEffect(AbstractEffect):
         """Factor on flow stress at a relative rate > 0."""
         raise NotImplementedError
 
-    def loading(self, law: MccLaw, particle: Particle, record: Record, strain: Values) -> Factors:
+    def loading(self, law: Formulas, particle: Particle, record: Record, strain: Values) -> Factors:
         """The factor on the chosen terms."""
         rate = self.relative_rate(law, particle, record, strain)
         known = rate > 0
@@ -51,7 +51,7 @@ class AbstractRateEffect(AbstractEffect):
 class AbstractForceRate(AbstractRateEffect):
     """Rate of force."""
 
-    def relative_rate(self, law: MccLaw, particle: Particle, record: Record, strain: Values) -> Values:
+    def relative_rate(self, law: Formulas, particle: Particle, record: Record, strain: Values) -> Values:
         """F' / (2 mN/s)."""
         return record.loading_rate / REFERENCE_FORCE_RATE + jnp.zeros_like(strain)
 
@@ -59,7 +59,7 @@ class AbstractForceRate(AbstractRateEffect):
 class AbstractStressRate(AbstractRateEffect):
     """Rate of stress."""
 
-    def relative_rate(self, law: MccLaw, particle: Particle, record: Record, strain: Values) -> Values:
+    def relative_rate(self, law: Formulas, particle: Particle, record: Record, strain: Values) -> Values:
         """sigma' / (0.05 MPa/s)."""
         return particle.stress(record.loading_rate) / REFERENCE_STRESS_RATE + jnp.zeros_like(strain)
 
@@ -67,7 +67,7 @@ class AbstractStressRate(AbstractRateEffect):
 class AbstractStrainRate(AbstractRateEffect):
     """Rate of strain, from the rate of stress and the base law's tangent at that strain."""
 
-    def relative_rate(self, law: MccLaw, particle: Particle, record: Record, strain: Values) -> Values:
+    def relative_rate(self, law: Formulas, particle: Particle, record: Record, strain: Values) -> Values:
         """eps' / (2e-3 1/s), eps' = sigma' / (d sigma / d eps)."""
         K1, K3, K5 = law.plastic.polynomial
         eta = law.shape_factor(particle)
@@ -181,7 +181,7 @@ class AbstractLoadingFactor(AbstractEffect):
         """The factor at a strain."""
         raise NotImplementedError
 
-    def loading(self, law: MccLaw, particle: Particle, record: Record, strain: Values) -> Factors:
+    def loading(self, law: Formulas, particle: Particle, record: Record, strain: Values) -> Factors:
         """The factor on all three terms."""
         factor = at_least(self.factor(particle, strain), MIN_FACTOR)
         return factor, factor, factor
@@ -270,7 +270,7 @@ class FiniteHardening(AbstractEffect):
 
     terms: tuple[bool, bool, bool] = eqx.field(static=True, default=(True, False, False))
 
-    def loading(self, law: MccLaw, particle: Particle, record: Record, strain: Values) -> Factors:
+    def loading(self, law: Formulas, particle: Particle, record: Record, strain: Values) -> Factors:
         """(eps / 0.2)^(1 / 2m) on the chosen terms."""
         safe = jnp.where(strain > 1e-9, strain, 1e-9)
         factor = jnp.exp(0.5 * self.amplitude * jnp.log(safe / REFERENCE_STRAIN))
@@ -297,7 +297,7 @@ class LudwikHardening(AbstractEffect):
 
     yield_strain: Scalar = eqx.field(converter=scalar)
 
-    def loading(self, law: MccLaw, particle: Particle, record: Record, strain: Values) -> Factors:
+    def loading(self, law: Formulas, particle: Particle, record: Record, strain: Values) -> Factors:
         """(1 + eps / eps_y)^(1 / 2m) over its value at eps = 0.2, on all terms."""
         grown = jnp.log1p(strain / self.yield_strain) - jnp.log1p(REFERENCE_STRAIN / self.yield_strain)
         factor = jnp.exp(0.5 * self.amplitude * grown)

@@ -8,8 +8,8 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._types import Scalar, Values, scalar
+from ..formulas import Formulas, Plastic
 from ..geometry import Particle
-from ..law import MccLaw, Plastic
 from .context import Context, positive
 from .effect import AbstractEffect, at_least
 from .record import REFERENCE_HUMIDITY_PERCENT, Record
@@ -20,13 +20,13 @@ REFERENCE_STRESS_MPA = 10.0
 MIN_FACTOR = 0.05
 
 
-def scaled(law: MccLaw, first: Scalar, others: Scalar | None = None, modulus: Scalar | None = None) -> MccLaw:
+def scaled(law: Formulas, first: Scalar, others: Scalar | None = None, modulus: Scalar | None = None) -> Formulas:
     """The law with its linear term, its cubic and quintic terms, and its modulus multiplied by factors > 0."""
     C1, C3, C5 = law.plastic.C1 * first, law.plastic.C3, law.plastic.C5
     if others is not None:
         C3, C5 = C3 * jnp.cbrt(others), C5 * others**0.2
     E = law.effective_modulus if modulus is None else law.effective_modulus * modulus
-    return MccLaw(Plastic(C1, C3, C5), law.a, E, law.unloading, law.strain_scaling)
+    return Formulas(Plastic(C1, C3, C5), law.a, E, law.unloading, law.strain_scaling)
 
 
 class AbstractStrength(AbstractEffect):
@@ -38,7 +38,7 @@ class AbstractStrength(AbstractEffect):
         """The factor."""
         raise NotImplementedError
 
-    def modify(self, law: MccLaw, particle: Particle, record: Record) -> MccLaw:
+    def modify(self, law: Formulas, particle: Particle, record: Record) -> Formulas:
         """The law with the factor on the chosen parameters."""
         factor = at_least(self.factor(particle, record), MIN_FACTOR)
         one = jnp.ones_like(factor)
@@ -126,12 +126,12 @@ class AbstractShape(AbstractEffect):
         """The factor on the shape factor."""
         raise NotImplementedError
 
-    def modify(self, law: MccLaw, particle: Particle, record: Record) -> MccLaw:
+    def modify(self, law: Formulas, particle: Particle, record: Record) -> Formulas:
         """Coefficients and modulus with the factor."""
         g = at_least(self.factor(particle), MIN_FACTOR)
         power = law.strain_scaling.power / law.unloading.stress_power
         plastic = Plastic(law.plastic.C1 * g, law.plastic.C3 * g, law.plastic.C5 * g)
-        return MccLaw(plastic, law.a, law.effective_modulus * g**power, law.unloading, law.strain_scaling)
+        return Formulas(plastic, law.a, law.effective_modulus * g**power, law.unloading, law.strain_scaling)
 
 
 class SquaredFlatness(AbstractShape):
@@ -215,7 +215,7 @@ class TwoRateHumidity(Humidity):
 
     modulus_share: Scalar = eqx.field(converter=scalar, kw_only=True)
 
-    def modify(self, law: MccLaw, particle: Particle, record: Record) -> MccLaw:
+    def modify(self, law: Formulas, particle: Particle, record: Record) -> Formulas:
         """C1 exp(-k (RH - 45 %)) and E exp(-r k (RH - 45 %))."""
         first = at_least(self.factor(particle, record), MIN_FACTOR)
         return scaled(law, first, jnp.ones_like(first), first**self.modulus_share)

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
 from .. import arguments
-from .._errors import InputError
 from .._types import Scalar, ScalarLike, Values, scalar
-from ..campaign import Campaign, Curve, Segment, campaign_segments, check_campaign
 
 KINDS = ("approach", "load", "hold", "unload", "reload")
 APPROACH, LOAD, HOLD, UNLOAD, RELOAD = range(5)
@@ -29,8 +25,8 @@ class Record(eqx.Module):
     """One test as an effect sees it; the same class holds one point of it (scalars) and many tests (a leading axis).
 
     Real forces are noisy. So everything that follows from differences of force stands here as data, found by the
-    segmentation of a campaign (`record_of`) or, for a clean path, by its turning points (`clean_record`). A point that
-    repeats the one before, time included, changes nothing: padding is harmless.
+    segmentation of a campaign (`mcc_jax.campaign.record_of`) or, for a clean path, by its turning points
+    (`clean_record`). A point that repeats the one before, time included, changes nothing: padding is harmless.
 
     Attributes:
         force: force [mN].
@@ -145,146 +141,3 @@ def clean_record(
     # The tester's programme is data: derivatives by force act through the law, not through where the branches begin.
     points = eqx.tree_at(lambda r: (r.force, r.time), jax.lax.stop_gradient(points), (force, time))
     return eqx.tree_at(lambda r: r.relative_humidity, points, start.relative_humidity)
-
-
-def record_of(curve: Curve, segments: tuple[Segment, ...], *, relative_humidity_percent: float | None = None) -> Record:
-    """The record of a measured test.
-
-    Rates are the slopes of straight lines through whole segments. The forces where branches begin come from straight
-    lines through their first points.
-
-    Args:
-        curve: the test, raw.
-        segments: its segments, from `mcc_jax.campaign.find_segments` or `campaign_segments`.
-        relative_humidity_percent: of the room during the test; the reference, where no effect of humidity acts, if
-            None.
-
-    Raises:
-        ValueError: if the segments do not cover the curve.
-    """
-    arguments.instance(curve, Curve, "curve", "Make one with mcc_jax.Curve(time_s, force_mN, displacement_um).")
-    if relative_humidity_percent is not None:
-        arguments.number(relative_humidity_percent, "relative_humidity_percent", least=0, most=100)
-    count = len(curve)
-    if not segments or segments[0].start != 0 or segments[-1].stop != count:
-        raise InputError(f"the segments must cover all {count} points of the curve")
-    force = np.asarray(curve.force_mN, float)
-    time = np.asarray(curve.time_s, float) - float(curve.time_s[0])
-    columns: dict[str, np.ndarray] = {
-        name: np.zeros(count, np.int32 if name in ("kind", "branch", "reloads") else float)
-        for name in ("kind", "branch", "reloads", "progress", "unload_from", "reload_from", "rate", "loading_rate")
-    }
-    branch, reloads, progress, unload_from, reload_from, rate, loading_rate = LOAD, 0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for segment in segments:
-        kind = KINDS.index(segment.kind)
-        part = slice(segment.start, segment.stop)
-        if kind not in (HOLD, APPROACH):
-            begins = _first_value(time[part], force[part])
-            if kind == UNLOAD and branch != UNLOAD:
-                unload_from = begins
-            if kind != UNLOAD and branch == UNLOAD:
-                if reloads:
-                    peak = float(force[: segment.start].max())
-                    way = peak - reload_from
-                    done = (unload_from - reload_from) / way if way > 1e-6 * peak else 1.0
-                    progress += min(max(done, 0.0), 1.0)
-                reloads, reload_from = reloads + 1, max(begins, 0.0)
-            branch = LOAD if branch == LOAD and kind != UNLOAD else kind
-            rate = _slope(time[part], force[part], rate)
-            loading_rate = loading_rate if branch == UNLOAD else rate
-        values = (kind, branch, reloads, progress, unload_from, reload_from, rate, loading_rate)
-        for column, value in zip(columns.values(), values, strict=True):
-            column[part] = value
-    # What comes before the first ramp goes at its rate.
-    known = np.flatnonzero(columns["loading_rate"] > 0)
-    if len(known):
-        columns["loading_rate"][: known[0]] = columns["loading_rate"][known[0]]
-        columns["rate"][: known[0]] = columns["loading_rate"][known[0]]
-    humidity = REFERENCE_HUMIDITY_PERCENT if relative_humidity_percent is None else float(relative_humidity_percent)
-    return Record(
-        jnp.asarray(force),
-        jnp.asarray(time),
-        **{name: jnp.asarray(values) for name, values in columns.items()},
-        relative_humidity=jnp.asarray(humidity, dtype=float),
-    )
-
-
-def record_batch(
-    campaign: Campaign, segments: tuple[tuple[Segment, ...], ...] | None = None, *, multiple: int = 1
-) -> Record:
-    """The records of all tests of a campaign with a leading axis N, shorter ones padded with their last point.
-
-    Args:
-        campaign: the tests.
-        segments: the segments of each; found anew if None.
-        multiple: round the length up to a multiple of this, as in `mcc_jax.campaign.batch`.
-
-    Raises:
-        InputError: if the campaign cannot be used, or the column of humidities holds what is no number.
-    """
-    check_campaign(campaign)
-    multiple = arguments.whole(multiple, "multiple", least=1)
-    found = campaign_segments(campaign) if segments is None else segments
-    humidity = humidities(campaign)
-    records = [
-        record_of(curve, parts, relative_humidity_percent=None if humidity is None else float(humidity[i]))
-        for i, (curve, parts) in enumerate(zip(campaign.curves, found, strict=True))
-    ]
-    longest = max(len(curve) for curve in campaign.curves)
-    longest += -longest % multiple
-
-    def together(*leaves: Array) -> Array:
-        rows = [np.asarray(leaf) for leaf in leaves]
-        return jnp.asarray(np.stack([np.pad(r, (0, longest - len(r)), mode="edge") if r.ndim else r for r in rows]))
-
-    return jax.tree.map(together, *records)
-
-
-def humidities(campaign: Campaign) -> Float[np.ndarray, " particles"] | None:
-    """Relative humidity [%] of every test from the column `relative_humidity_percent`; None without that column.
-
-    Raises:
-        InputError: naming the particle whose entry is no number from 0 to 100.
-    """
-    check_campaign(campaign)
-    return humidity_column(campaign.particles, campaign.columns, campaign.source)
-
-
-def humidity_column(
-    particles: Sequence[str], columns: Mapping[str, Sequence[str]], source: str = ""
-) -> Float[np.ndarray, " particles"] | None:
-    """The same from a table of particles alone; see `humidities`."""
-    texts = columns.get(HUMIDITY_COLUMN)
-    if texts is None:
-        return None
-    values = np.empty(len(texts))
-    for i, text in enumerate(texts):
-        try:
-            values[i] = float(text)
-        except ValueError:
-            values[i] = np.nan
-        if not 0 <= values[i] <= 100:
-            raise InputError(
-                f"the relative humidity of particle {particles[i]!r} is {text!r}",
-                file=source or None,
-                column=HUMIDITY_COLUMN,
-                remedy="Write a number from 0 to 100, in percent",
-            )
-    return values
-
-
-def _first_value(time: np.ndarray, force: np.ndarray) -> float:
-    n = min(len(force), 9)
-    if n < 3 or np.ptp(time[:n]) <= 0:
-        return float(force[0])
-    slope, level = np.polyfit(time[:n] - time[0], force[:n], 1)
-    del slope
-    return float(level)
-
-
-def _slope(time: np.ndarray, force: np.ndarray, before: float) -> float:
-    """Magnitude of the slope of a straight line; what it was before, if the segment has no duration."""
-    if len(time) < 2 or np.ptp(time) <= 0:
-        return before
-    centred = time - time.mean()
-    return float(abs(centred @ force) / (centred @ centred))

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from .._types import Scalar, Values, scalar
-from ..law import PUNCH_AREA, recovery
+from ..formulas import PUNCH_AREA, recovery
 from .context import Context, contact_of, positive
 from .effect import AbstractEffect
 from .record import RELOAD, UNLOAD, reload_progress

@@ -6,7 +6,7 @@ import enum
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax.numpy as jnp
@@ -138,7 +138,7 @@ class Variant:
             name: jnp.asarray(value, strength.dtype) if isinstance(value, int | float) else value
             for name, value in {**known, **nuisance}.items()
         }
-        return self.make(strength, **others, **self.fixed)
+        return replace(self.make(strength, **others, **self.fixed), label=f"{self.mechanism}:{self.name}")
 
     def grid(self) -> list[dict[str, float]]:
         """All combinations of the nuisance parameters' values; one empty dictionary if there are none."""

@@ -11,8 +11,9 @@ import numpy as np
 
 from .. import arguments
 from .._errors import InputError
-from ..law import TESTED_STRAIN, MccLaw, recovery_limit, stress_ratio
-from ..law.recovery_limit import SHARE
+from ..formulas import recovery_limit
+from ..formulas.recovery_limit import SHARE
+from ..law import TESTED_STRAIN, MccLaw, stress_ratio
 from .origin import checked
 
 if TYPE_CHECKING:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import abc
+from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -39,17 +41,29 @@ class AbstractContactLaw[State](eqx.Module):
         """State of a particle that was never loaded."""
 
     @abc.abstractmethod
-    def step(self, particle: Particle, state: State, displacement: Scalar) -> tuple[State, Scalar]:
-        """Force [mN] at the platen displacement [um], and the state after it."""
+    def step(
+        self, particle: Particle, state: State, displacement: Scalar, time: Scalar | None = None
+    ) -> tuple[State, Scalar]:
+        """Force [mN] at the platen displacement [um] at the time [s], and the state after it."""
 
     @abc.abstractmethod
-    def step_load(self, particle: Particle, state: State, force: Scalar) -> tuple[State, Scalar]:
-        """Platen displacement [um] under the force [mN], and the state after it."""
+    def step_load(
+        self, particle: Particle, state: State, force: Scalar, time: Scalar | None = None
+    ) -> tuple[State, Scalar]:
+        """Platen displacement [um] under the force [mN] at the time [s], and the state after it."""
 
-    def path(self, particle: Particle, state: State, displacement: Path) -> tuple[State, Path]:
-        """Forces [mN] along a path of displacements [um], by `lax.scan` of `step`."""
-        return jax.lax.scan(lambda past, value: self.step(particle, past, value), state, displacement)
+    def path(
+        self, particle: Particle, state: State, displacement: Path, time: Path | None = None
+    ) -> tuple[State, Path]:
+        """Forces [mN] along a path of displacements [um] at times [s], by `lax.scan` of `step`."""
+        return _scan(self.step, particle, state, displacement, time)
 
-    def path_load(self, particle: Particle, state: State, force: Path) -> tuple[State, Path]:
-        """Displacements [um] along a path of forces [mN], by `lax.scan` of `step_load`."""
-        return jax.lax.scan(lambda past, value: self.step_load(particle, past, value), state, force)
+    def path_load(self, particle: Particle, state: State, force: Path, time: Path | None = None) -> tuple[State, Path]:
+        """Displacements [um] along a path of forces [mN] at times [s], by `lax.scan` of `step_load`."""
+        return _scan(self.step_load, particle, state, force, time)
+
+
+def _scan(step: Callable[..., Any], particle: Particle, state: Any, path: Path, time: Path | None) -> Any:
+    """A law that knows no time need not have it among its arguments."""
+    along = (path,) if time is None else (path, time)
+    return jax.lax.scan(lambda past, now: step(particle, past, *now), state, along)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from .. import arguments
 from .._types import Scalar, ScalarLike, scalar
 from ..arguments import finite, positive, whole
-from .plastic import Plastic
+from ..formulas.plastic import Plastic
 
 AnyShape = Float[Array, "..."]
 

@@ -10,7 +10,8 @@ from matplotlib.ticker import LogFormatterSciNotation, ScalarFormatter
 
 from ..calibrate import MIN_RATIO, PaperCalibration
 from ..calibrate.paper.modulus import recoverable_strain
-from ..law import recovery, stress_ratio
+from ..formulas import recovery
+from ..law import stress_ratio
 from .style import (
     BLACK,
     GREY,

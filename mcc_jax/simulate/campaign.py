@@ -25,10 +25,10 @@ from ..campaign import (
     Metadata,
     particle_batch,
 )
-from ..effects import HUMIDITY_COLUMN, REFERENCE_HUMIDITY_PERCENT, AbstractEffect, ExtendedLaw, Need
+from ..effects import HUMIDITY_COLUMN, REFERENCE_HUMIDITY_PERCENT, Need
 from ..geometry import Particle
 from ..law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainScaling, Unloading
-from .drive import A_LAW, Response, simulate_batch
+from .drive import A_LAW, simulate_batch
 from .effects import HiddenEffect, batched_humidity, hidden_effects, humidities_of
 from .instrument import Instrument
 from .programme import Programme
@@ -85,7 +85,7 @@ def simulate_campaign(
     """Test N particles in the computer.
 
     Args:
-        laws: one law per particle, every array field with a leading axis N (`law_for_each`).
+        laws: one law per particle, every array field with a leading axis N (`law_for_each`), with or without effects.
         diameters_um: D1, D2, D3 [um], shape (N, 3).
         peaks: each particle's peak, force [mN] under load control or displacement [um], shape (N,), > 0.
         programme: what the tester does, relative to the peak.
@@ -136,11 +136,22 @@ def simulate_campaign(
     # Padding repeats the last value: a valid path whose further points change nothing.
     paths = np.stack([np.pad(target, (0, longest - len(target)), mode="edge") for _, target in samples])
     drawn = [effect.draw(seed, i, count) for i, effect in enumerate(effects)]
-    if drawn:
-        times = np.stack([np.pad(time, (0, longest - len(time)), mode="edge") for time, _ in samples])
-        response = _with_effects(laws, diameters_um, paths, times, effects, drawn, relative_humidity_percent, programme)
-    else:
-        response = simulate_batch(laws, particle_batch(diameters_um), jnp.asarray(paths), control=programme.control)
+    wet = [e.variant.mechanism for e in effects if Need.HUMIDITY_COLUMN in e.variant.needs]
+    if wet and relative_humidity_percent is None:
+        raise InputError(f"the effect {wet[0]} needs the relative humidity of every test ({HUMIDITY_COLUMN})")
+    times = humidity = None
+    acting = laws.with_effects(*(effect for effect, _ in drawn))
+    if acting.effects:
+        times = jnp.asarray([np.pad(time, (0, longest - len(time)), mode="edge") for time, _ in samples])
+        humidity = batched_humidity(relative_humidity_percent, count, REFERENCE_HUMIDITY_PERCENT)
+    response = simulate_batch(
+        acting,
+        particle_batch(diameters_um),
+        jnp.asarray(paths),
+        times=times,
+        relative_humidity=humidity,
+        control=programme.control,
+    )
     force, displacement = np.asarray(response.force, float), np.asarray(response.displacement, float)
     bad = np.flatnonzero(np.asarray(response.result != RESULTS.successful))
     if len(bad):
@@ -180,29 +191,6 @@ def simulate_campaign(
         },
     )
     return Campaign(names, np.asarray(diameters_um, float), tuple(curves), columns, metadata)
-
-
-def _with_effects(
-    laws: MccLaw,
-    diameters_um: np.ndarray,
-    paths: np.ndarray,
-    times: np.ndarray,
-    effects: Sequence[HiddenEffect],
-    drawn: Sequence[tuple[AbstractEffect, dict[str, np.ndarray]]],
-    humidity: np.ndarray | None,
-    programme: Programme,
-) -> Response:
-    wet = [e.variant.mechanism for e in effects if Need.HUMIDITY_COLUMN in e.variant.needs]
-    if wet and humidity is None:
-        raise InputError(f"the effect {wet[0]} needs the relative humidity of every test ({HUMIDITY_COLUMN})")
-    return simulate_batch(
-        ExtendedLaw(laws, tuple(effect for effect, _ in drawn)),
-        particle_batch(diameters_um),
-        jnp.asarray(paths),
-        times=jnp.asarray(times),
-        relative_humidity=batched_humidity(humidity, len(diameters_um), REFERENCE_HUMIDITY_PERCENT),
-        control=programme.control,
-    )
 
 
 def paper_campaign(

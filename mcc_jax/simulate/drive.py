@@ -14,9 +14,8 @@ from .._errors import InputError
 from .._results import RESULTS
 from .._types import Path
 from ..campaign import Control
-from ..effects import ExtendedLaw
 from ..geometry import Particle
-from ..law import AbstractContactLaw
+from ..law import AbstractContactLaw, MccLaw
 
 CONTROLS: tuple[Control, ...] = get_args(Control)
 A_LAW = "Take mcc_jax.paper_law(), or the law of a calibration."
@@ -42,7 +41,7 @@ class Response(eqx.Module):
 
 
 def drive(
-    law: AbstractContactLaw | ExtendedLaw,
+    law: AbstractContactLaw,
     particle: Particle,
     path: Any,
     *,
@@ -56,11 +55,11 @@ def drive(
     Batch it with `equinox.filter_vmap` over law, particle and path, or use `simulate_batch`.
 
     Args:
-        law: any contact law, also one extended by effects.
+        law: any contact law, with or without effects.
         particle: size and shape.
         path: what the tester imposes, displacements [um] or forces [mN]; negative values are out of contact. A list, a
             Series or an array with one axis.
-        time: times [s] of the path, for an extended law; other laws know no time.
+        time: times [s] of the path; a law with effects needs them, others know no time.
         control: which of the two `path` is, "displacement" or "load".
         state: the state to start from; a virgin particle if None.
         throw: raise if the result is not successful; otherwise hand the reason back in `result`. Pass False inside a
@@ -71,11 +70,11 @@ def drive(
 
     Raises:
         InputError: for a control that does not exist, a path that is none, times that are not as many as its points; if
-            an extended law gets no times, or another law gets some.
+            a law with effects gets no times, or one without effects gets some.
         EquinoxRuntimeError: with `throw`, if anything in the response is not finite or the particle can carry no
             stress.
     """
-    arguments.instance(law, (AbstractContactLaw, ExtendedLaw), "law", A_LAW)
+    arguments.instance(law, AbstractContactLaw, "law", A_LAW)
     arguments.instance(particle, Particle, "particle", A_PARTICLE)
     arguments.choice(control, CONTROLS, "control")
     arguments.flag(throw, "throw")
@@ -85,16 +84,13 @@ def drive(
     if time is not None:
         time = arguments.path(time, "time")
         arguments.same_length(path=path, time=time)
-    if isinstance(law, ExtendedLaw) and time is None:
-        raise InputError("an extended law needs the times of the path", remedy="Pass time=[...] in seconds.")
-    if not isinstance(law, ExtendedLaw) and time is not None:
-        raise InputError("only a law extended by effects knows times", remedy="Leave out time.")
+    _check_times(law, time is not None, "time")
     return _drive(law, particle, path, time, control, state, throw)
 
 
 @eqx.filter_jit
 def _drive(
-    law: AbstractContactLaw | ExtendedLaw,
+    law: AbstractContactLaw,
     particle: Particle,
     path: Path,
     time: Path | None,
@@ -120,7 +116,7 @@ def _drive(
 
 
 def simulate_batch(
-    laws: AbstractContactLaw | ExtendedLaw,
+    laws: AbstractContactLaw,
     particles: Particle,
     paths: Any,
     *,
@@ -134,8 +130,8 @@ def simulate_batch(
         laws: a law whose every array field has a leading axis N.
         particles: a particle, likewise.
         paths: displacements [um] or forces [mN], shape (N, steps); pad shorter paths by repeating their last value.
-        times: times [s], likewise, for laws extended by effects.
-        relative_humidity: of every test [%], shape (N,), for laws extended by effects; the reference if None.
+        times: times [s], likewise, for laws with effects.
+        relative_humidity: of every test [%], shape (N,), for laws with effects; the reference if None.
         control: "displacement" or "load".
 
     Returns:
@@ -146,14 +142,13 @@ def simulate_batch(
         InputError: for a control that does not exist, or laws, particles, paths, times and humidities that are not as
             many.
     """
-    arguments.instance(laws, (AbstractContactLaw, ExtendedLaw), "laws", A_LAW)
+    arguments.instance(laws, AbstractContactLaw, "laws", A_LAW)
     arguments.instance(particles, Particle, "particles", A_PARTICLE)
     arguments.choice(control, CONTROLS, "control")
-    if not isinstance(laws, ExtendedLaw) and (times is not None or relative_humidity is not None):
-        raise InputError("only laws extended by effects know times and humidities", remedy="Leave them out.")
+    _check_times(laws, times is not None, "times")
+    if relative_humidity is not None and not getattr(laws, "effects", ()):
+        raise InputError("only laws with effects know humidities", remedy="Leave out relative_humidity.")
     paths = _rows(paths, "paths", 2)
-    if isinstance(laws, ExtendedLaw) and times is None:
-        raise InputError("extended laws need the times of the paths", remedy="Pass times of the shape of the paths.")
     if times is not None:
         times = _rows(times, "times", 2)
         if times.shape != paths.shape:
@@ -162,6 +157,15 @@ def simulate_batch(
         relative_humidity = _rows(relative_humidity, "relative_humidity", 1)
     _check_count(len(paths), laws=laws, particles=particles, relative_humidity=relative_humidity)
     return _simulate_batch(laws, particles, paths, times, relative_humidity, control)
+
+
+def _check_times(law: AbstractContactLaw, given: bool, name: str) -> None:
+    """A law with effects needs times; one without does not know them. Laws of one's own may have either."""
+    if not isinstance(law, MccLaw) or given == bool(law.effects):
+        return
+    if given:
+        raise InputError("only a law with effects knows times", remedy=f"Leave out {name}.")
+    raise InputError("a law with effects needs the times of its path", remedy=f"Pass {name}=[...] in seconds.")
 
 
 def _rows(values: Any, name: str, axes: int) -> Array:
@@ -185,7 +189,7 @@ def _check_count(count: int, **batches: Any) -> None:
 
 @eqx.filter_jit
 def _simulate_batch(
-    laws: AbstractContactLaw | ExtendedLaw,
+    laws: AbstractContactLaw,
     particles: Particle,
     paths: Array,
     times: Array | None,
@@ -193,13 +197,9 @@ def _simulate_batch(
     control: Control,
 ) -> Response:
     """The compiled part of `simulate_batch`, its arguments checked."""
-    if not isinstance(laws, ExtendedLaw):
-        return eqx.filter_vmap(lambda law, particle, path: drive(law, particle, path, control=control, throw=False))(
-            laws, particles, paths
-        )
 
-    def one(law: ExtendedLaw, particle: Particle, path: Array, time: Array | None, humidity: Array | None) -> Response:
-        start = law.init(particle, humidity)
+    def one(law: Any, particle: Particle, path: Array, time: Array | None, humidity: Array | None) -> Response:
+        start = law.init(particle) if humidity is None else law.init(particle, humidity)
         return drive(law, particle, path, time=time, control=control, state=start, throw=False)
 
     return eqx.filter_vmap(one)(laws, particles, paths, times, relative_humidity)

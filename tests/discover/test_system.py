@@ -20,7 +20,7 @@ from mcc_jax.discover.noise_estimation import refined, systematic
 from mcc_jax.discover.normal_equations import BATCH, in_batches
 from mcc_jax.discover.result import Discovery
 from mcc_jax.discover.score import project
-from mcc_jax.effects import LIBRARY, ExtendedLaw, Mechanism
+from mcc_jax.effects import LIBRARY, Mechanism
 
 MODEL = JointModel(modulus_scatter=True)
 CHOSEN = {"frame_compliance": "linear", "rate_dependence": "flow_log_strain_rate", "damage": "exponential"}
@@ -73,7 +73,7 @@ def whitened(fitted):
 
     def with_effect(effect, amplitude):
         strong = eqx.tree_at(lambda e: e.amplitude, effect, amplitude)
-        one = lambda w, p, r: ExtendedLaw(law_of(w, base.model.unloading), (strong,)).respond(p, r)  # noqa: E731
+        one = lambda w, p, r: law_of(w, base.model.unloading).with_effects(strong).respond(p, r)  # noqa: E731
         return jax.vmap(one)(fit.latent, tests.particle, base.records)
 
     formulas = []

@@ -187,10 +187,10 @@ def test_powers_are_finite_where_there_is_no_load():
     """With derivatives, of all forms, at the start of a test."""
     from helpers import paper_law, paper_particle
 
-    from mcc_jax.effects import ExtendedLaw, clean_record
+    from mcc_jax.effects import clean_record
 
     record = clean_record(jnp.asarray([0.0, 0.0, 10.0, 0.0, 5.0]), jnp.arange(5.0))
-    context = ExtendedLaw(paper_law(), ()).context(paper_particle(2), record)
+    context = paper_law().context(paper_particle(2), record)
     for word in {word.form: word for word in (*words.words(), *words.further_words())}.values():
         numbers = jnp.asarray(word.numbers, float)
         slope = jax.jacfwd(lambda n, word=word: word.form.value(context, n) * jnp.ones(5))(numbers)

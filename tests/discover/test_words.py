@@ -16,7 +16,8 @@ from mcc_jax.discover import discover
 from mcc_jax.discover.dictionary import _since_turn, further_words, map_features, values_of, waves, words
 from mcc_jax.discover.discrepancy import meanings
 from mcc_jax.discover.linear_model import GLOBALS, System
-from mcc_jax.effects import ExtendedLaw, clean_record, signatures
+from mcc_jax.effects import clean_record
+from mcc_jax.law import signatures
 from mcc_jax.plots import discovery_figures, save_figures
 from mcc_jax.plots.remaining_gap import leftover
 
@@ -26,7 +27,7 @@ FORCE = jnp.interp(TIME, jnp.asarray([0.0, 80, 110, 160, 230, 260]), jnp.asarray
 
 
 def context_of(particle):
-    return ExtendedLaw(paper_law(), ()).context(particle, clean_record(FORCE, TIME))
+    return paper_law().context(particle, clean_record(FORCE, TIME))
 
 
 @eqx.filter_jit

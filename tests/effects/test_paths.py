@@ -7,7 +7,7 @@ import numpy as np
 from helpers import paper_particle
 from tested import FORCE, HUMIDITY, LAW, PARTICLE, RECORD, TIME, VARIANTS
 
-from mcc_jax.effects import LIBRARY, ExtendedLaw, Record, clean_record
+from mcc_jax.effects import LIBRARY, Record, clean_record
 
 ADDITIVE = ("creep", "adhesion", "reload_hysteresis", "ratcheting", "unloading_shape", "pop_in", "toe_asperity")
 OBSERVED = ("frame_compliance", "thermal_drift", "platen_sink_in", "misalignment", "reverse_plasticity")
@@ -20,7 +20,7 @@ def law_with(*mechanisms, share=0.3, first_only=False):
     variants = [v for v in VARIANTS if v.mechanism in mechanisms]
     if first_only:
         variants = [LIBRARY[m].variants[0] for m in mechanisms]
-    return ExtendedLaw(LAW, tuple(v.build(share * v.typical) for v in variants))
+    return LAW.with_effects(*(v.build(share * v.typical) for v in variants))
 
 
 # What differs between path and step is the framework and the memories; formulas are the same code in both.
@@ -124,7 +124,7 @@ def test_derivatives_under_displacement_control():
 
     def force(inputs):
         effects = tuple(LIBRARY[n].variants[0].build(a) for n, a in zip(names, inputs[:3], strict=True))
-        law = ExtendedLaw(LAW, effects)
+        law = LAW.with_effects(*effects)
         return law.path(PARTICLE, law.init(PARTICLE), points + inputs[3], time)[1]
 
     @jax.jit
@@ -163,10 +163,10 @@ def test_two_effects_that_only_add_are_their_sum():
 def test_effects_act_through_each_other():
     """Humidity softens the particle whose damage then shows: not the sum, but the same in either order."""
     humidity, damage = (LIBRARY[n].variants[0].build(LIBRARY[n].variants[0].typical) for n in ("humidity", "damage"))
-    one, other = (ExtendedLaw(LAW, e).respond(PARTICLE, RECORD) for e in ((humidity, damage), (damage, humidity)))
+    one, other = (LAW.with_effects(*e).respond(PARTICLE, RECORD) for e in ((humidity, damage), (damage, humidity)))
     np.testing.assert_allclose(one, other, rtol=1e-12)
     base = LAW.path_load(PARTICLE, LAW.init(PARTICLE), FORCE)[1]
-    alone = [ExtendedLaw(LAW, (e,)).respond(PARTICLE, RECORD) - base for e in (humidity, damage)]
+    alone = [LAW.with_effects(e).respond(PARTICLE, RECORD) - base for e in (humidity, damage)]
     assert jnp.max(jnp.abs(one - base - alone[0] - alone[1])) > 1e-3
 
 
@@ -184,4 +184,4 @@ def test_new_numbers_do_not_recompile():
     for factor in (0.0, 0.5, 1.0):
         variant = LIBRARY["toe_asperity"].variants[0]
         effect = variant.build(factor * variant.typical, stress_scale_MPa=0.3 + factor)
-        run(ExtendedLaw(LAW, (effect,)), PARTICLE, RECORD)
+        run(LAW.with_effects(effect), PARTICLE, RECORD)

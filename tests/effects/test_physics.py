@@ -10,9 +10,9 @@ import pytest
 from helpers import paper_particle, sphere
 from tested import FORCE, LAW, PARTICLE, RECORD, TIME, VARIANTS, lanes, respond
 
-from mcc_jax.effects import LIBRARY, ExtendedLaw, clean_record, signatures
+from mcc_jax.effects import LIBRARY, clean_record
 from mcc_jax.geometry import Particle
-from mcc_jax.law import MccLaw, Plastic
+from mcc_jax.law import MccLaw, Plastic, signatures
 
 
 def family(*names):
@@ -205,7 +205,7 @@ def test_the_whole_of_a_power_law_unloads_by_it():
     record = clean_record(jnp.asarray(force), jnp.asarray(np.linspace(0.0, 200.0, len(force))))
     left = {}
     for m in (1.2, 1.5, 2.0):
-        response = np.asarray(ExtendedLaw(LAW, (variant.build(1.0, exponent=m),)).respond(PARTICLE, record))[49:]
+        response = np.asarray(LAW.with_effects(variant.build(1.0, exponent=m)).respond(PARTICLE, record))[49:]
         recovering = (response - response[-1]) / (response[0] - response[-1])
         np.testing.assert_allclose(recovering[:-1] ** m, force[49:-1] / force.max(), rtol=1e-9)
         left[m] = np.abs(response - np.asarray(base(record))[49:]).max() / (response[0] - response[-1])
@@ -307,6 +307,6 @@ def test_particles_whose_law_is_not_monotone_stay_finite():
     record = clean_record(0.5 * FORCE, TIME)
     for names in (("platen_friction", "rate_dependence"), ("size_effect", "damage", "creep")):
         effects = tuple(LIBRARY[n].variants[0].build(LIBRARY[n].variants[0].typical) for n in names)
-        displacement = ExtendedLaw(law, effects).respond(particle, record)
+        displacement = law.with_effects(*effects).respond(particle, record)
         assert jnp.all(jnp.isfinite(displacement))
         assert 0.5 < float(displacement.max() / law.path_load(particle, law.init(particle), 0.5 * FORCE)[1].max()) < 1.5

@@ -8,16 +8,8 @@ import pytest
 from tested import FORCE, LAW, PARTICLE, RECORD, TIME, VARIANTS, signature_rows
 
 from mcc_jax import Hold, InputError, Instrument, Programme, Ramp, find_segments, paper_campaign
-from mcc_jax.effects import (
-    LIBRARY,
-    ExtendedLaw,
-    Need,
-    available_data,
-    clean_record,
-    humidities,
-    record_batch,
-    record_of,
-)
+from mcc_jax.campaign import available_data, humidities, record_batch, record_of
+from mcc_jax.effects import Need, clean_record
 
 STEPS = (Ramp(0.6, 2.0), Ramp(0.2, 4.0), Ramp(1.0, 1.0), Hold(40.0), Ramp(0.3, 2.0), Ramp(0.9, 2.0), Ramp(0.0, 2.0))
 
@@ -109,6 +101,6 @@ def test_segments_must_cover_the_curve():
 
 def test_times_may_begin_anywhere():
     later = clean_record(FORCE, TIME + 1e4)
-    law = ExtendedLaw(LAW, tuple(LIBRARY[n].variants[0].build(1e-3) for n in ("creep", "damage")))
+    law = LAW.with_effects("creep", "damage")
     one, other = law.respond(PARTICLE, RECORD), law.respond(PARTICLE, later)
     np.testing.assert_allclose(one, other, rtol=1e-9)

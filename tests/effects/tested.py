@@ -9,8 +9,8 @@ import numpy as np
 from helpers import paper_law, paper_particle, with_dtype
 
 from mcc_jax.calibrate.forward import law_of
-from mcc_jax.effects import LIBRARY, ExtendedLaw, clean_record, signatures
-from mcc_jax.law import Unloading
+from mcc_jax.effects import LIBRARY, clean_record
+from mcc_jax.law import Unloading, signatures
 
 MECHANISMS = tuple(LIBRARY)
 VARIANTS = tuple(variant for mechanism in LIBRARY.values() for variant in mechanism)
@@ -49,7 +49,7 @@ def latent_law():
 
 
 def respond(variant, amplitude, law=LAW, record=RECORD, particle=PARTICLE, **nuisance):
-    return ExtendedLaw(law, (variant.build(amplitude, **nuisance),)).respond(particle, record)
+    return law.with_effects(variant.build(amplitude, **nuisance)).respond(particle, record)
 
 
 @functools.cache

@@ -100,8 +100,7 @@ def diameters(rng: Random, whole: Case) -> Case:
 
 
 def read_campaign(folder: Path) -> None:
-    from mcc_jax.campaign import check_campaign, read_campaign
-    from mcc_jax.effects import humidities
+    from mcc_jax.campaign import check_campaign, humidities, read_campaign
 
     campaign = read_campaign(folder)
     check_campaign(campaign, file=folder)

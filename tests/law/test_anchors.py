@@ -24,8 +24,9 @@ from helpers import (
     unpack,
 )
 
+from mcc_jax.formulas import recovery
 from mcc_jax.geometry import Particle, elastic_shape_factor, plastic_shape_factor
-from mcc_jax.law import History, MccLaw, Plastic, StrainScaling, Unloading, recovery, stress_ratio
+from mcc_jax.law import History, MccLaw, Plastic, StrainScaling, Unloading, stress_ratio
 
 CASES = {
     # stress, eps_P, delta, eps_f, loading tangent, onset tangent, w_load, w_rec, w_diss, F_P, E_diss

@@ -11,7 +11,8 @@ from helpers import EPS, check, close
 from hypothesis import given, settings
 from scipy.integrate import quad
 
-from mcc_jax.law import energy_ratio, recovery, stress_ratio
+from mcc_jax.formulas import recovery
+from mcc_jax.law import energy_ratio, stress_ratio
 
 f = eqx.filter_jit(eqx.filter_vmap(stress_ratio))
 f_inverse = eqx.filter_jit(eqx.filter_vmap(recovery))

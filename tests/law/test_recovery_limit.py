@@ -8,7 +8,8 @@ import pytest
 from helpers import ALL_FORMS, FORMS, PAPER_THETA, SOME_FORMS, all_finite, close, paper_law, paper_particle, unpack
 
 from benchmarks import energy_paths
-from mcc_jax.law import History, MccLaw, Plastic, StrainScaling, Unloading, recovery_limit
+from mcc_jax.formulas import recovery_limit
+from mcc_jax.law import History, MccLaw, Plastic, StrainScaling, Unloading
 
 ROUNDING = 1e-13
 """Of the energy put in: a few hundred pieces of work add up."""
@@ -72,7 +73,7 @@ def test_random_paths_gain_nothing(unloading, scaling):
 
 def test_the_paths_would_show_a_gain(monkeypatch):
     """Without the limit the printed form gains on them, so the test above can fail."""
-    import mcc_jax.law.branch as branch
+    import mcc_jax.formulas.branch as branch
     import mcc_jax.law.mcc as mcc
 
     def none(peak, secant, tangent):

@@ -15,7 +15,8 @@ from jaxtyping import Array, Float, Int
 from ... import arguments
 from ..._types import Scalar
 from ...campaign import Adjustment, Campaign, Curve, Segment, check_campaign, stress_and_strain
-from ...law import StrainScaling, Unloading, recovery
+from ...formulas import recovery
+from ...law import StrainScaling, Unloading
 
 MIN_RATIO = 0.05
 """Points below this share of the peak stress are left out: strain there depends on stress with an infinite slope."""

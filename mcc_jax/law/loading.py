@@ -1,4 +1,4 @@
-"""Loading and recovery of a law whose terms and modulus carry factors that depend on strain, rate and peak."""
+"""Virgin loading of a law whose three terms carry factors that depend on strain and rate."""
 
 from __future__ import annotations
 
@@ -8,17 +8,16 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from .._types import Scalar, Values
+from .._types import Values
+from ..effects import AbstractEffect, Factors, Record
+from ..formulas import Formulas, loading_strain
 from ..geometry import Particle
-from ..law import MccLaw, Unloading, loading_strain, recovery_limit
-from .effect import AbstractEffect, Factors
-from .record import Record
 
-NEWTON_STEPS = 6
 Effects = tuple[AbstractEffect, ...]
+NEWTON_STEPS = 6  # from a start within a few per cent, to rounding: tests/effects/test_physics.py
 
 
-def strain_under(effects: Effects, law: MccLaw, particle: Particle, record: Record, stress: Values) -> Values:
+def strain_under(effects: Effects, law: Formulas, particle: Particle, record: Record, stress: Values) -> Values:
     r"""Strain of virgin loading at a stress when effects change the loading curve.
 
     Solves :math:`f_1 K_1 x - f_3 K_3 x^3 + f_5 K_5 x^5 = \sigma`, :math:`x = \eta_p \epsilon`, with factors
@@ -43,7 +42,17 @@ def strain_under(effects: Effects, law: MccLaw, particle: Particle, record: Reco
     return root - residual(root) / slope
 
 
-def _root(effects: Effects, law: MccLaw, particle: Particle, record: Record, target: Values) -> Values:
+def loading_factors(effects: Effects, law: Formulas, particle: Particle, record: Record, strain: Values) -> Factors:
+    """Product of the factors of all effects on the three terms of loading."""
+    one = jnp.ones_like(strain)
+    product = (one, one, one)
+    for effect in effects:
+        f1, f3, f5 = effect.loading(law, particle, record, strain)
+        product = (product[0] * f1, product[1] * f3, product[2] * f5)
+    return product
+
+
+def _root(effects: Effects, law: Formulas, particle: Particle, record: Record, target: Values) -> Values:
     eta = law.shape_factor(particle)
     K1, K3, K5 = (jnp.broadcast_to(k, target.shape) for k in law.plastic.polynomial)
     strain = _inverse(K1, K3, K5, target) / eta
@@ -67,52 +76,16 @@ def _inverse(K1: Values, K3: Values, K5: Values, stress: Values) -> Values:
     return (jax.vmap(loading_strain) if stress.ndim else loading_strain)(K1, K3, K5, stress, zero)
 
 
-def _slope(stress: Callable[[Values], Values], strain: Values, law: MccLaw, particle: Particle) -> Values:
+def _slope(stress: Callable[[Values], Values], strain: Values, law: Formulas, particle: Particle) -> Values:
     """Slope of stress over strain, kept above a thousandth of the initial one, where a curve stops being monotone."""
     slope = jax.jvp(stress, (strain,), (jnp.ones_like(strain),))[1]
     least = 1e-3 * law.plastic.C1 * law.shape_factor(particle)
     return jnp.where(slope > least, slope, least)
 
 
-def _stress(effects: Effects, law: MccLaw, particle: Particle, record: Record, strain: Values) -> Values:
+def _stress(effects: Effects, law: Formulas, particle: Particle, record: Record, strain: Values) -> Values:
     K1, K3, K5 = law.plastic.polynomial
     f1, f3, f5 = loading_factors(effects, law, particle, record, strain)
     x = law.shape_factor(particle) * strain
     square = x * x
     return x * (K1 * f1 - square * (K3 * f3 - square * (K5 * f5)))
-
-
-def loading_factors(effects: Effects, law: MccLaw, particle: Particle, record: Record, strain: Values) -> Factors:
-    """Product of the factors of all effects on the three terms of loading."""
-    one = jnp.ones_like(strain)
-    product = (one, one, one)
-    for effect in effects:
-        f1, f3, f5 = effect.loading(law, particle, record, strain)
-        product = (product[0] * f1, product[1] * f3, product[2] * f5)
-    return product
-
-
-def recoverable_displacement(
-    law: MccLaw, particle: Particle, peak_displacement: Values, peak_force: Values, factor: Values | Scalar
-) -> Values:
-    """Displacement [um] recovered on full release from a peak, with a factor on the effective modulus.
-
-    The law's own formulas (`MccLaw.recoverable_strain`), in terms of force and displacement at the peak. Their limit
-    takes the slope of loading over its secant from the law without `loading` effects, so that it stays in closed form.
-    """
-    eta = law.shape_factor(particle)
-    x = eta * particle.strain(peak_displacement)
-    tiny = jnp.finfo(x.dtype).tiny ** 0.5
-    moved = x > tiny
-    secant = jnp.where(moved, particle.stress(peak_force), law.plastic.C1) / jnp.where(moved, x, 1.0)
-    modulus = law.effective_modulus * factor
-    shape = eta ** (1 - law.strain_scaling.power)
-    if law.unloading is Unloading.PRINTED:
-        square = shape * secant / (law.unloading.constant * modulus)
-    else:
-        square = shape * x * (secant / modulus) ** 2 / law.unloading.constant
-    carries = moved & (square > jnp.finfo(square.dtype).tiny)
-    recoverable = jnp.sqrt(jnp.where(carries, square, 1.0))
-    limit, _ = recovery_limit(particle.strain(peak_displacement), law.plastic.secant(x), law.plastic.tangent(x))
-    recoverable = jnp.where(recoverable > limit, limit, recoverable)
-    return particle.displacement(jnp.where(carries, recoverable, 0.0))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -13,13 +14,11 @@ from jaxtyping import Array, Float
 from .. import arguments
 from .._numerics import running_max
 from .._types import Path, Scalar
+from ..effects import AbstractEffect, Context, Record
+from ..formulas import Formulas, recovery, tangent_modulus
 from ..geometry import Particle
-from ..law import MccLaw, recovery, tangent_modulus
-from .context import Context
-from .effect import AbstractEffect
-from .extended import ExtendedLaw
-from .record import Record
-from .solve import recoverable_displacement
+from .mcc import MccLaw
+from .response import additions, no_memory
 
 
 def signatures(
@@ -27,7 +26,7 @@ def signatures(
 ) -> Float[Array, "effects steps"]:
     r"""Derivatives of the displacement by the amplitude of each effect, all amplitudes being zero.
 
-    The same as one `jax.jvp` of `ExtendedLaw(base, (effect,)).respond` per effect, at a fraction of what that takes to
+    The same as one `jax.jvp` of `base.with_effects(effect).respond` per effect, at a fraction of what that takes to
     compile: at the null every effect acts through its own first-order change of parameters, loading strain, modulus and
     displacement, and all share one pass through the law,
 
@@ -48,9 +47,10 @@ def signatures(
     arguments.instance(base, MccLaw, "base", "Take mcc_jax.paper_law(), or the law of a calibration.")
     arguments.instance(particle, Particle, "particle", "Make one with mcc_jax.Particle(D1, D2, D3), in um.")
     arguments.instance(record, Record, "record", "Make one with mcc_jax.effects.record_of(curve).")
-    context = ExtendedLaw(base, ()).context(particle, record)
+    context = replace(base, effects=()).context(particle, record)
+    base = base.formulas
     strain = _virgin_strain(base, context)
-    x = base.shape_factor(particle) * strain
+    x, zero_um = base.shape_factor(particle) * strain, jnp.zeros_like(particle.D3)
     K1, K3, K5 = base.plastic.polynomial
     slope = tangent_modulus(K1, K3, K5, x) * base.shape_factor(particle)
     least = 1e-3 * K1 * base.shape_factor(particle)
@@ -62,9 +62,8 @@ def signatures(
         def act(amplitude: Scalar) -> tuple[Any, Any, Path, Path]:
             own = eqx.tree_at(lambda e: e.amplitude, effect, amplitude)
             law = eqx.filter(own.modify(base, particle, record), eqx.is_inexact_array)
-            extended = ExtendedLaw(base, (own,))
-            start = eqx.tree_at(lambda s: s.point.time, extended.init(particle), record.time[0])
-            added = extended.add(start, context)[1]
+            start = eqx.tree_at(lambda m: m.point.time, no_memory((own,), zero_um), record.time[0])
+            added = additions((own,), start, context)[1]
             return law, own.loading(base, particle, record, strain), own.stiffness(context), added
 
         zero = jnp.zeros_like(effect.amplitude)
@@ -76,6 +75,7 @@ def signatures(
     if not effects:
         return jnp.zeros((0, *record.force.shape), record.force.dtype)
     groups: dict[object, list[int]] = {}
+    effects = [replace(effect, label="") for effect in effects]  # which would keep apart what is compiled at once
     for i, effect in enumerate(effects):
         groups.setdefault((type(effect), jax.tree.structure(effect)), []).append(i)
     order, parts = [], []
@@ -95,17 +95,17 @@ def signatures(
     return rows[jnp.argsort(jnp.asarray(order))]
 
 
-def _virgin_strain(law: MccLaw, context: Context) -> Path:
+def _virgin_strain(law: Formulas, context: Context) -> Path:
     """Strain of virgin loading at every force, whatever was before."""
     particle = context.particle
     return law.plastic.strain(particle.stress(context.record.force)) / law.shape_factor(particle)
 
 
-def _response(law: MccLaw, context: Context, shift: Path, stiffness: Path) -> Path:
+def _response(law: Formulas, context: Context, shift: Path, stiffness: Path) -> Path:
     """Displacement of a virgin particle whose loading strain is shifted and whose modulus has a factor."""
     particle, record = context.particle, context.record
     virgin = record.force >= context.peak_force
     strain = _virgin_strain(law, context) + shift
     peak = running_max(jnp.where(virgin, particle.displacement(strain), 0.0))
-    recoverable = recoverable_displacement(law, particle, peak, context.peak_force, stiffness)
+    recoverable = law.recoverable_displacement(particle, peak, context.peak_force, stiffness)
     return peak - jnp.where(record.force < context.peak_force, recoverable * recovery(context.load_share), 0.0)

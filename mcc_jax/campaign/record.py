@@ -1,0 +1,215 @@
+"""Measured tests as effects see them, and what a campaign holds of what effects need."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .. import arguments
+from .._errors import InputError
+from ..effects import HUMIDITY_COLUMN, REFERENCE_HUMIDITY_PERCENT, Need, Record
+from ..effects.record import APPROACH, HOLD, KINDS, LOAD, UNLOAD
+from .adjustment import campaign_segments
+from .schema import Campaign, Curve
+from .segments import Segment
+from .validate import check_campaign
+
+
+def record_of(curve: Curve, segments: tuple[Segment, ...], *, relative_humidity_percent: float | None = None) -> Record:
+    """The record of a measured test.
+
+    Rates are the slopes of straight lines through whole segments. The forces where branches begin come from straight
+    lines through their first points.
+
+    Args:
+        curve: the test, raw.
+        segments: its segments, from `find_segments` or `campaign_segments`.
+        relative_humidity_percent: of the room during the test; the reference, where no effect of humidity acts, if
+            None.
+
+    Raises:
+        ValueError: if the segments do not cover the curve.
+    """
+    arguments.instance(curve, Curve, "curve", "Make one with mcc_jax.Curve(time_s, force_mN, displacement_um).")
+    if relative_humidity_percent is not None:
+        arguments.number(relative_humidity_percent, "relative_humidity_percent", least=0, most=100)
+    count = len(curve)
+    if not segments or segments[0].start != 0 or segments[-1].stop != count:
+        raise InputError(f"the segments must cover all {count} points of the curve")
+    force = np.asarray(curve.force_mN, float)
+    time = np.asarray(curve.time_s, float) - float(curve.time_s[0])
+    columns: dict[str, np.ndarray] = {
+        name: np.zeros(count, np.int32 if name in ("kind", "branch", "reloads") else float)
+        for name in ("kind", "branch", "reloads", "progress", "unload_from", "reload_from", "rate", "loading_rate")
+    }
+    branch, reloads, progress, unload_from, reload_from, rate, loading_rate = LOAD, 0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for segment in segments:
+        kind = KINDS.index(segment.kind)
+        part = slice(segment.start, segment.stop)
+        if kind not in (HOLD, APPROACH):
+            begins = _first_value(time[part], force[part])
+            if kind == UNLOAD and branch != UNLOAD:
+                unload_from = begins
+            if kind != UNLOAD and branch == UNLOAD:
+                if reloads:
+                    peak = float(force[: segment.start].max())
+                    way = peak - reload_from
+                    done = (unload_from - reload_from) / way if way > 1e-6 * peak else 1.0
+                    progress += min(max(done, 0.0), 1.0)
+                reloads, reload_from = reloads + 1, max(begins, 0.0)
+            branch = LOAD if branch == LOAD and kind != UNLOAD else kind
+            rate = _slope(time[part], force[part], rate)
+            loading_rate = loading_rate if branch == UNLOAD else rate
+        values = (kind, branch, reloads, progress, unload_from, reload_from, rate, loading_rate)
+        for column, value in zip(columns.values(), values, strict=True):
+            column[part] = value
+    # What comes before the first ramp goes at its rate.
+    known = np.flatnonzero(columns["loading_rate"] > 0)
+    if len(known):
+        columns["loading_rate"][: known[0]] = columns["loading_rate"][known[0]]
+        columns["rate"][: known[0]] = columns["loading_rate"][known[0]]
+    humidity = REFERENCE_HUMIDITY_PERCENT if relative_humidity_percent is None else float(relative_humidity_percent)
+    return Record(
+        jnp.asarray(force),
+        jnp.asarray(time),
+        **{name: jnp.asarray(values) for name, values in columns.items()},
+        relative_humidity=jnp.asarray(humidity, dtype=float),
+    )
+
+
+def record_batch(
+    campaign: Campaign, segments: tuple[tuple[Segment, ...], ...] | None = None, *, multiple: int = 1
+) -> Record:
+    """The records of all tests of a campaign with a leading axis N, shorter ones padded with their last point.
+
+    Args:
+        campaign: the tests.
+        segments: the segments of each; found anew if None.
+        multiple: round the length up to a multiple of this, as in `mcc_jax.campaign.batch`.
+
+    Raises:
+        InputError: if the campaign cannot be used, or the column of humidities holds what is no number.
+    """
+    check_campaign(campaign)
+    multiple = arguments.whole(multiple, "multiple", least=1)
+    found = campaign_segments(campaign) if segments is None else segments
+    humidity = humidities(campaign)
+    records = [
+        record_of(curve, parts, relative_humidity_percent=None if humidity is None else float(humidity[i]))
+        for i, (curve, parts) in enumerate(zip(campaign.curves, found, strict=True))
+    ]
+    longest = max(len(curve) for curve in campaign.curves)
+    longest += -longest % multiple
+
+    def together(*leaves: Array) -> Array:
+        rows = [np.asarray(leaf) for leaf in leaves]
+        return jnp.asarray(np.stack([np.pad(r, (0, longest - len(r)), mode="edge") if r.ndim else r for r in rows]))
+
+    return jax.tree.map(together, *records)
+
+
+def humidities(campaign: Campaign) -> Float[np.ndarray, " particles"] | None:
+    """Relative humidity [%] of every test from the column `relative_humidity_percent`; None without that column.
+
+    Raises:
+        InputError: naming the particle whose entry is no number from 0 to 100.
+    """
+    check_campaign(campaign)
+    return humidity_column(campaign.particles, campaign.columns, campaign.source)
+
+
+def humidity_column(
+    particles: Sequence[str], columns: Mapping[str, Sequence[str]], source: str = ""
+) -> Float[np.ndarray, " particles"] | None:
+    """The same from a table of particles alone; see `humidities`."""
+    texts = columns.get(HUMIDITY_COLUMN)
+    if texts is None:
+        return None
+    values = np.empty(len(texts))
+    for i, text in enumerate(texts):
+        try:
+            values[i] = float(text)
+        except ValueError:
+            values[i] = np.nan
+        if not 0 <= values[i] <= 100:
+            raise InputError(
+                f"the relative humidity of particle {particles[i]!r} is {text!r}",
+                file=source or None,
+                column=HUMIDITY_COLUMN,
+                remedy="Write a number from 0 to 100, in percent",
+            )
+    return values
+
+
+def _first_value(time: np.ndarray, force: np.ndarray) -> float:
+    n = min(len(force), 9)
+    if n < 3 or np.ptp(time[:n]) <= 0:
+        return float(force[0])
+    slope, level = np.polyfit(time[:n] - time[0], force[:n], 1)
+    del slope
+    return float(level)
+
+
+def _slope(time: np.ndarray, force: np.ndarray, before: float) -> float:
+    """Magnitude of the slope of a straight line; what it was before, if the segment has no duration."""
+    if len(time) < 2 or np.ptp(time) <= 0:
+        return before
+    centred = time - time.mean()
+    return float(abs(centred @ force) / (centred @ centred))
+
+
+def available_data(campaign: Campaign, segments: tuple[tuple[Segment, ...], ...] | None = None) -> frozenset[Need]:
+    """What a campaign holds of what effects need.
+
+    A kind of segment counts as present when at least one test in five has it; sizes and shapes when they differ by a
+    tenth; peaks and rates when the largest is 1.3 times the smallest.
+
+    Args:
+        campaign: the tests.
+        segments: the segments of each; found anew if None.
+    """
+    check_campaign(campaign)
+    found = campaign_segments(campaign) if segments is None else segments
+    D1, D2, D3 = campaign.diameters_um.T
+    kinds = [[segment.kind for segment in parts] for parts in found]
+    least = max(1.0, 0.2 * len(campaign))
+
+    def often(kind: str, times: int = 1) -> bool:
+        return sum(parts.count(kind) >= times for parts in kinds) >= least
+
+    rates, peaks, durations, low = [], [], [], 0
+    for curve, parts, diameter in zip(campaign.curves, found, D1 * D2 / D3, strict=True):
+        record = record_of(curve, parts)
+        loading = np.isin(np.asarray(record.kind), (1, 4))
+        rates.extend(np.unique(np.asarray(record.loading_rate)[loading]).tolist())
+        area = np.pi * diameter**2 / 4 * 1e-3
+        peaks.append(float(curve.force_mN.max() / area))
+        peaks.extend(
+            float(curve.force_mN[: part.start].max() / area) for part in parts if part.kind == "unload" and part.start
+        )
+        durations.append(float(curve.time_s[-1] - curve.time_s[0]))
+        low += int(np.sum(curve.force_mN < 0.1 * curve.force_mN.max()) >= 5)
+    humidity = humidities(campaign)
+    conditions = {
+        Need.LOW_LOAD: low >= least,
+        Need.UNLOADING: often("unload"),
+        Need.HOLD: often("hold"),
+        Need.RELOAD: often("reload"),
+        Need.SECOND_RELOAD: often("reload", 2),
+        Need.LONG_TIME: float(np.median(durations)) > 200,
+        Need.TWO_RATES: _apart(rates, 1.3),
+        Need.SEVERAL_SIZES: _apart((D1 * D2 / D3).tolist(), 1.1),
+        Need.SEVERAL_SHAPES: bool(np.ptp(1 - D3**2 / (D1 * D2)) > 0.1),
+        Need.SEVERAL_PEAKS: _apart(peaks, 1.3),
+        Need.HUMIDITY_COLUMN: humidity is not None and bool(np.ptp(humidity) > 1),
+    }
+    return frozenset(need for need, there in conditions.items() if there)
+
+
+def _apart(values: list[float], ratio: float) -> bool:
+    some = [value for value in values if value > 0]
+    return bool(some and max(some) > ratio * min(some))

@@ -1,0 +1,246 @@
+"""How a law with effects moves: parameters, loading, modulus, then what is added inside the law and by the tester."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+
+from .._errors import InputError
+from .._numerics import running_max
+from .._types import Path, Scalar, Values
+from ..effects import AbstractEffect, Context, Record, first_point, follow
+from ..formulas import Formulas, recovery
+from ..geometry import Particle
+from .loading import strain_under
+
+Effects = tuple[AbstractEffect, ...]
+HALVINGS = 64  # from the width of the bracket to below the rounding of a double
+
+
+class Memory(eqx.Module):
+    """What effects and tester remember of a test.
+
+    Attributes:
+        point: the latest point of the test.
+        peak_force: largest force so far [mN].
+        of_effects: one entry per effect, None for those without a memory.
+        drivers: what drove each memory at the latest point.
+    """
+
+    point: Record
+    peak_force: Scalar
+    of_effects: tuple[Any, ...]
+    drivers: tuple[Any, ...]
+
+
+def no_memory(effects: Effects, zero: Scalar, relative_humidity: Scalar | None = None) -> Memory:
+    """The memory of a test that has not begun; `zero` gives the precision."""
+    own = tuple(effect.start(zero) for effect in effects)
+    drivers = tuple(None if memory is None else zero for memory in own)
+    return Memory(first_point(zero.dtype, relative_humidity), zero, own, drivers)
+
+
+def peak_forces(record: Record, before: Scalar) -> Path:
+    """Largest force so far [mN] at every point of a record."""
+    highest = running_max(record.force)
+    return jnp.where(highest > before, highest, before)
+
+
+def one_point(
+    law: Formulas,
+    effects: Effects,
+    particle: Particle,
+    displacement_max: Scalar,
+    memory: Memory,
+    force: Scalar,
+    time: Scalar,
+) -> tuple[Scalar, Memory, Scalar]:
+    """Largest displacement of the law [um], memory and displacement [um] after one more point; for `lax.scan`."""
+    before = memory.point
+    now = jax.lax.stop_gradient(follow(before, memory.peak_force, force, time))
+    record = eqx.tree_at(lambda r: (r.force, r.time, r.relative_humidity), now, (force, time, before.relative_humidity))
+    highest = jnp.where(force > memory.peak_force, force, memory.peak_force)
+    context = modified(law, effects, particle, displacement_max, record, highest, lambda x: x)
+
+    def remember(effect: AbstractEffect, own: Any, driven: Scalar) -> tuple[Any, Any, Scalar]:
+        driver = effect.driver(context)
+        return *effect.evolve(own, driven, driver, time - before.time), driver
+
+    after, values = _remember(effects, memory, record, highest, remember)
+    return context.peak_displacement, after, _with_additions(effects, context, values)
+
+
+def whole_path(
+    law: Formulas, effects: Effects, particle: Particle, displacement_max: Scalar, memory: Memory, record: Record
+) -> tuple[Scalar, Memory, Path]:
+    """The same after all points of a record, closed form but for the memories."""
+    highest = peak_forces(record, memory.peak_force)
+    context = modified(law, effects, particle, displacement_max, record, highest, running_max)
+    after, displacement = additions(effects, memory, context)
+    return context.peak_displacement[-1], after, displacement
+
+
+def modified(
+    law: Formulas,
+    effects: Effects,
+    particle: Particle,
+    displacement_max: Scalar,
+    record: Record,
+    highest: Values,
+    along: Callable[[Values], Values],
+) -> Context:
+    """The law with modified parameters, loading and modulus: what effects are told.
+
+    Args:
+        law: the law without effects.
+        effects: what acts on it.
+        particle: the particle.
+        displacement_max: its largest displacement before [um].
+        record: one point or all of them.
+        highest: the largest force so far [mN].
+        along: the running maximum, or nothing for a single point.
+    """
+    force = record.force
+    for effect in effects:
+        law = effect.modify(law, particle, record)
+    loading = tuple(e for e in effects if e.overrides("loading"))
+    stiffening = tuple(e for e in effects if e.overrides("stiffness"))
+    if loading:
+        strain = strain_under(loading, law, particle, record, particle.stress(force))
+        new = along(jnp.where(force >= highest, particle.displacement(strain), 0.0))
+        reached = moved = jnp.where(new > displacement_max, new, displacement_max)
+    else:
+        reached, moved = law.peak_and_displacement(particle, displacement_max, force, highest)
+    recoverable = law.recoverable_displacement(particle, reached, highest, jnp.ones_like(reached))
+    context = Context(particle, law, record, highest, reached, recoverable, moved)
+    if stiffening:
+        recoverable = law.recoverable_displacement(particle, reached, highest, modulus_factor(stiffening, context))
+        context = eqx.tree_at(lambda c: c.recoverable, context, recoverable)
+    if loading or stiffening:
+        released = jnp.where(force < highest, recoverable * recovery(context.load_share), 0.0)
+        context = eqx.tree_at(lambda c: c.displacement, context, reached - released)
+    return context
+
+
+def modulus_factor(effects: Effects, context: Context) -> Values:
+    """Product of the factors of all effects on the effective modulus."""
+    factor = jnp.ones_like(context.peak_displacement)
+    for effect in effects:
+        factor = factor * effect.stiffness(context)
+    return factor
+
+
+def additions(effects: Effects, memory: Memory, context: Context) -> tuple[Memory, Path]:
+    """The second half of a path under load control: memories, additions inside the law, additions by the tester.
+
+    Args:
+        effects: what acts.
+        memory: what they remember before the path.
+        context: the law along the path (`modified`).
+    """
+    record = context.record
+    seconds = jnp.diff(record.time, prepend=memory.point.time)
+
+    def remember(effect: AbstractEffect, own: Any, driven: Scalar) -> tuple[Any, Any, Scalar]:
+        along = effect.driver(context)
+        earlier = jnp.concatenate([jnp.broadcast_to(driven, (1,)), along[:-1]])
+        own, value = jax.lax.scan(lambda past, now: effect.evolve(past, *now), own, (earlier, along, seconds))
+        return own, value, along[-1]
+
+    point, highest = jax.tree.map(lambda x: x[-1], (record.at_points, context.peak_force))
+    after, values = _remember(effects, memory, point, highest, remember)
+    return after, _with_additions(effects, context, values)
+
+
+def force_at(
+    displacement_under: Callable[[Any, Scalar], Scalar], given: Any, displacement: Scalar, scale: Scalar
+) -> Scalar:
+    """Force [mN] at which a displacement [um] that grows with force is met; 0 where the platen does not touch.
+
+    Bisection in a bracket that grows as it has to. Derivatives follow from the implicit-function rule.
+
+    Args:
+        displacement_under: displacement [um] that what is given has under a force.
+        given: law, particle and state.
+        displacement: what is to be met.
+        scale: a force [mN] of the right size, > 0.
+    """
+    still, target = jax.tree.map(jax.lax.stop_gradient, (given, displacement))
+
+    def gap(force: Scalar, _: Any = None) -> Scalar:
+        return displacement_under(still, force) - target
+
+    zero = jnp.zeros_like(scale)
+    below = gap(zero) < 0
+    solver = optx.Bisection(rtol=4 * jnp.finfo(scale.dtype).eps, atol=0.0, expand_if_necessary=True)
+    bracket = {"lower": zero, "upper": jax.lax.stop_gradient(scale)}
+
+    def sought(force: Scalar, _: Any) -> Scalar:
+        met = gap(force)
+        # Where no force is enough, the bracket would grow for ever once the displacement is not a number.
+        return jnp.where(below, jnp.where(jnp.isnan(met), 1.0, met), force - 0.5 * bracket["upper"])
+
+    found = optx.root_find(sought, solver, scale, options=bracket, max_steps=HALVINGS, throw=False).value
+    root = jax.lax.stop_gradient(jnp.where(below, found, 0.0))
+    slope = jax.jvp(gap, (root,), (jnp.ones_like(root),))[1]
+    touches = (root > 0) & (slope > 0)
+    off = displacement_under(given, root) - displacement
+    # One Newton step from the frozen root carries the derivatives; its own length is rounding, which is not wanted.
+    change = -(off - jax.lax.stop_gradient(off)) / jnp.where(touches, slope, 1.0)
+    return root + jnp.where(touches, change, 0.0)
+
+
+def folded(
+    law: Formulas, effects: Effects, particle: Particle, peak: Scalar, what: str
+) -> tuple[Formulas, Scalar | None]:
+    """The law and the factor on its modulus that effects make of it at a peak displacement [um].
+
+    Raises:
+        InputError: naming an effect that acts by more than parameters and modulus.
+    """
+    for effect in effects:
+        hooks = [hook for hook in ("loading", "inside", "observe") if effect.overrides(hook)]
+        if hooks:
+            raise InputError(
+                f"{what} of a law with {effect.name} is not known in closed form",
+                remedy="Leave that effect out, or integrate force over displacement along a path of mcc_jax.drive.",
+            )
+    record = first_point(peak.dtype)
+    for effect in effects:
+        law = effect.modify(law, particle, record)
+    stiffening = tuple(e for e in effects if e.overrides("stiffness"))
+    if not stiffening:
+        return law, None
+    force = particle.force(law.loading_stress(particle, particle.strain(peak)))
+    recoverable = law.recoverable_displacement(particle, peak, force, jnp.ones_like(peak))
+    return law, modulus_factor(stiffening, Context(particle, law, record, force, peak, recoverable, peak))
+
+
+def _remember(
+    effects: Effects,
+    memory: Memory,
+    point: Record,
+    highest: Scalar,
+    remember: Callable[[AbstractEffect, Any, Scalar], tuple[Any, Any, Scalar]],
+) -> tuple[Memory, list[Any]]:
+    """The memory after the last point, and what each effect's own tells it."""
+    own, values, drivers = [], [], []
+    for effect, mine, before in zip(effects, memory.of_effects, memory.drivers, strict=True):
+        told = (None, None, None) if mine is None else remember(effect, mine, before)
+        for entries, entry in zip((own, values, drivers), told, strict=True):
+            entries.append(entry)
+    return Memory(point, highest, tuple(own), tuple(drivers)), values
+
+
+def _with_additions(effects: Effects, context: Context, values: list[Any]) -> Values:
+    total = context.displacement
+    for effect, value in zip(effects, values, strict=True):
+        if effect.overrides("inside", "observe"):
+            own = eqx.tree_at(lambda c: c.memory, context, value, is_leaf=lambda x: x is None)
+            total = total + effect.inside(own) + effect.observe(own)
+    return total
