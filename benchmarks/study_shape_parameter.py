@@ -12,7 +12,7 @@ import numpy as np
 jax.config.update("jax_enable_x64", True)
 
 from mcc_jax import Instrument, adjust, paper_campaign  # noqa: E402
-from mcc_jax.calibrate import (
+from mcc_jax.calibrate import (  # noqa: E402
     campaign_branches,
     fit_effective_modulus,
     fit_population,

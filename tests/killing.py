@@ -17,7 +17,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from mcc_jax.cli.output import MOVES, WORK, results
+from mcc_jax._store import MOVES, WORK, results
 
 COMMAND = [sys.executable, "-m", "mcc_jax"]
 NOTE = "notes of the user.txt"

@@ -195,6 +195,13 @@ def select_tests(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, mo
     )
 
 
+def compared_rows(selection: Selection) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    """Rows of every kept particle's curve, and which of them are compared, by its place in the campaign."""
+    mask = np.asarray(selection.tests.mask)
+    both = zip(selection.kept, selection.rows, mask, strict=True)
+    return {place: (rows, used[: len(rows)]) for place, rows, used in both}
+
+
 def _errors_of_force(
     curves: Sequence[Curve], used: Sequence[_Prepared], branch: np.ndarray
 ) -> tuple[Array | None, Array | None]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
@@ -14,14 +14,14 @@ import numpy as np
 from .. import arguments
 from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_tests
 from .block_arrow import Parameters, Solution
-from .data import Selection, Tests, own_misfit, ranges_um, root_mean_squares
+from .data import Selection, Tests, compared_rows, own_misfit, ranges_um, root_mean_squares
+from .estimates import estimate, finite, force_zero, log_estimate, misfit_note, power_of_e
 from .fit import beyond_numbers, population_at, prepare
 from .hierarchical import Pooled, fit_pooled, unpack
 from .judgement import judged, numbers_in_reach, unlike_others
 from .model import JointFit, JointModel, checked_settings
-from .paper.result import estimate, finite, force_zero, misfit_note
 from .population import COEFFICIENTS
-from .posterior import log_estimate, power_of_e
+from .results import Calibration
 from .transforms import FIRST_SPREAD, spread_slope
 
 Loss = Literal["linear", "soft_l1", "cauchy"]
@@ -58,7 +58,7 @@ class Identifiability:
 
 
 @dataclass(frozen=True)
-class LeastSquaresCalibration:
+class LeastSquaresCalibration(Calibration):
     """The joint least-squares fit of a campaign.
 
     Attributes:
@@ -87,6 +87,10 @@ class LeastSquaresCalibration:
     seed: int
     runtime_s: float
     findings: tuple[Finding, ...] = ()
+
+    def compared(self) -> Mapping[int, tuple[np.ndarray, np.ndarray]]:
+        """Rows of every particle's curve that stand in the tests, and which of them are compared."""
+        return compared_rows(self.selection)
 
     @property
     def particles(self) -> tuple[str, ...]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -13,14 +12,16 @@ import numpy as np
 
 from .. import arguments
 from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_tests
-from .data import Selection, own_misfit, ranges_um, root_mean_squares
+from .data import Selection, compared_rows, own_misfit, ranges_um, root_mean_squares
 from .draws import Length, draw_fast, draw_joint
+from .estimates import estimate, finite, force_zero, log_estimate, misfit_note, summary
 from .fit import prepare
 from .judgement import judged, numbers_in_reach, unlike_others
 from .model import JointFit, JointModel, checked_settings
-from .paper.result import estimate, finite, force_zero, misfit_note
 from .population import COEFFICIENTS, Population
 from .precompile import compile_ahead
+from .predict import predict_measured
+from .results import PosteriorDraws
 from .weights import PARETO_K_MOST
 
 RHAT_MOST = 1.01
@@ -39,7 +40,7 @@ class Worst(NamedTuple):
 
 
 @dataclass(frozen=True)
-class BayesCalibration:
+class BayesCalibration(PosteriorDraws):
     """The posterior of a campaign.
 
     Draws have the axes (chain, draw, ...); where importance weights were needed they have been applied, in order within
@@ -93,6 +94,14 @@ class BayesCalibration:
     runtime_s: float
     notes: tuple[str, ...] = field(default=())
     findings: tuple[Finding, ...] = field(default=())
+
+    def compared(self) -> Mapping[int, tuple[np.ndarray, np.ndarray]]:
+        """Rows of every particle's curve that stand in the tests, and which of them are compared."""
+        return compared_rows(self.selection)
+
+    def predictions(self, particle: str) -> np.ndarray | None:
+        """Draws of what may be measured of a particle at its rows [um], shape (draws, rows)."""
+        return predict_measured(self, particle, seed=self.seed).observed_um
 
     @property
     def particles(self) -> tuple[str, ...]:
@@ -276,29 +285,6 @@ def unmixed(rhat: Mapping[str, float], ess_bulk: Mapping[str, float]) -> tuple[W
         None if rhat[slowest] <= RHAT_MOST else Worst(slowest, rhat[slowest]),
         None if ess_bulk[fewest] >= ESS_LEAST else Worst(fewest, ess_bulk[fewest]),
     )
-
-
-def summary(draws: np.ndarray) -> dict[str, Any]:
-    """Mean, standard deviation and central 95 % interval of draws."""
-    low, high = np.quantile(draws, [0.025, 0.975])
-    return estimate(float(np.mean(draws)), float(np.std(draws)), (float(low), float(high)))
-
-
-def log_estimate(log: float, sd: float) -> dict[str, Any]:
-    """An estimate from its logarithm's mean and standard deviation."""
-    value = power_of_e(log)
-    if not math.isfinite(sd):
-        return estimate(value)
-    sd = min(sd, 5.0)
-    return estimate(value, value * sd, (value * math.exp(-1.96 * sd), value * math.exp(1.96 * sd)))
-
-
-def power_of_e(log: float) -> float:
-    """The exponential, infinite where it overflows."""
-    try:
-        return math.exp(log)
-    except OverflowError:
-        return math.inf
 
 
 def calibrate_bayes(

@@ -15,8 +15,9 @@ from .._errors import InputError
 from ..campaign import PAPER_EFFECTIVE_MODULUS_MPA, PAPER_LOG_C, PAPER_SHAPE_PARAMETER, particle_batch
 from ..law import MccLaw, Plastic
 from .compiling import compiled
+from .estimates import summary
 from .population import COEFFICIENTS
-from .posterior import BayesCalibration, summary
+from .results import PosteriorDraws
 
 A_CALIBRATION = "Make one with mcc_jax.calibrate_bayes(campaign)."
 
@@ -56,7 +57,7 @@ def _paths(laws: MccLaw, particles: Any, forces: Any):
     return jax.lax.map(lambda one: one[0].path_load(one[1], one[0].init(one[1]), one[2])[1], (laws, particles, forces))
 
 
-def _laws(calibration: BayesCalibration, C: np.ndarray, a: np.ndarray, modulus: np.ndarray) -> MccLaw:
+def _laws(calibration: PosteriorDraws, C: np.ndarray, a: np.ndarray, modulus: np.ndarray) -> MccLaw:
     model = calibration.model
 
     def one(C: Any, a: Any, E: Any) -> MccLaw:
@@ -65,7 +66,7 @@ def _laws(calibration: BayesCalibration, C: np.ndarray, a: np.ndarray, modulus: 
     return eqx.filter_vmap(one)(jnp.asarray(C), jnp.asarray(a), jnp.asarray(modulus))
 
 
-def sample_laws(calibration: BayesCalibration, count: int, *, seed: int = 0) -> MccLaw:
+def sample_laws(calibration: PosteriorDraws, count: int, *, seed: int = 0) -> MccLaw:
     """Laws of particles never measured, for DEM or any other use: one posterior draw of the population each.
 
     They carry both the scatter of the particles and the uncertainty of the population. Laws that are not monotone are
@@ -79,7 +80,7 @@ def sample_laws(calibration: BayesCalibration, count: int, *, seed: int = 0) -> 
     Returns:
         A batched law, every array field with a leading axis.
     """
-    arguments.instance(calibration, BayesCalibration, "calibration", A_CALIBRATION)
+    arguments.instance(calibration, PosteriorDraws, "calibration", A_CALIBRATION)
     count = arguments.whole(count, "count", least=1)
     rng = np.random.default_rng(arguments.seed(seed))
     p = jax.tree.map(lambda x: np.asarray(x).reshape(-1, *np.asarray(x).shape[2:]), calibration.population)
@@ -91,7 +92,7 @@ def sample_laws(calibration: BayesCalibration, count: int, *, seed: int = 0) -> 
 
 
 def predict_new_particle(
-    calibration: BayesCalibration,
+    calibration: PosteriorDraws,
     diameters_um: Any,
     force_mN: Any,
     *,
@@ -110,7 +111,7 @@ def predict_new_particle(
     Raises:
         InputError: for diameters that are not positive, or a path that is none.
     """
-    arguments.instance(calibration, BayesCalibration, "calibration", A_CALIBRATION)
+    arguments.instance(calibration, PosteriorDraws, "calibration", A_CALIBRATION)
     sizes = arguments.one_particle(diameters_um)
     force_mN = np.asarray(arguments.path(force_mN, "force_mN"))
     if not np.isfinite(force_mN).all():
@@ -123,9 +124,7 @@ def predict_new_particle(
     )
 
 
-def predict_measured(
-    calibration: BayesCalibration, particle: str, *, count: int = 200, seed: int = 0
-) -> PredictedCurves:
+def predict_measured(calibration: PosteriorDraws, particle: str, *, count: int = 200, seed: int = 0) -> PredictedCurves:
     """Draws of a measured particle's curve at its measured forces, its zero included, without and with noise.
 
     Args:
@@ -137,7 +136,7 @@ def predict_measured(
     Raises:
         InputError: if the particle did not take part.
     """
-    arguments.instance(calibration, BayesCalibration, "calibration", A_CALIBRATION)
+    arguments.instance(calibration, PosteriorDraws, "calibration", A_CALIBRATION)
     count = arguments.whole(count, "count", least=1)
     seed = arguments.seed(seed)
     if particle not in calibration.particles:
@@ -189,9 +188,9 @@ def _wander(rng: np.random.Generator, step: np.ndarray, sd: float, length: float
     return values
 
 
-def compare_with_paper(calibration: BayesCalibration) -> list[dict[str, Any]]:
+def compare_with_paper(calibration: PosteriorDraws) -> list[dict[str, Any]]:
     """The paper's Table 2, a and modulus beside ours: one row per quantity, with mean, sd and 95 % interval of ours."""
-    arguments.instance(calibration, BayesCalibration, "calibration", A_CALIBRATION)
+    arguments.instance(calibration, PosteriorDraws, "calibration", A_CALIBRATION)
     named = calibration.named_population()
     paper: dict[str, float | None] = {"a": PAPER_SHAPE_PARAMETER}
     printed = calibration.model.unloading.value == "printed"

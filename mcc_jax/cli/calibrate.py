@@ -9,6 +9,7 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
+from .._store import json_text, results
 from .group import NOT_CONVERGED
 from .options import (
     CampaignFolder,
@@ -19,7 +20,6 @@ from .options import (
     seed_option,
     threshold_option,
 )
-from .output import json_text, results
 from .session import beside, import_writers, say, say_table, session
 
 METHODS = ("paper", "least-squares", "bayes")

@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from .._errors import InputError
+from .._store import Stage
 from ..calibrate import BayesCalibration, JointModel, LeastSquaresCalibration, PaperCalibration
 from ..calibrate.judgement import MODULUS_OPEN
 from ..campaign import Campaign, Finding
 from ..files import LIMITS, read_regular
 from .figures import FIGURES, write_figures, write_result
-from .output import Stage
 from .session import Tell, say
 
 RESULT, POSTERIOR = "calibration.json", "posterior.nc"

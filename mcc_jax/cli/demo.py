@@ -8,8 +8,8 @@ from pathlib import Path
 
 import click
 
+from .._store import results
 from .options import out_option, seed_option
-from .output import results
 from .session import beside, import_writers, say, say_table, session
 
 CAMPAIGN_FILES = ("particles.csv", "curves.csv", "campaign.toml")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import click
 
+from .._store import json_text, results
 from .options import (
     CampaignFolder,
     exclude_option,
@@ -17,7 +18,6 @@ from .options import (
     seed_option,
     threshold_option,
 )
-from .output import json_text, results
 from .session import beside, import_writers, say, session
 
 

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from .._errors import InputError
+from .._store import Stage
 from ..discover import Discovery
 from ..effects import LIBRARY
 from .figures import write_figures, write_result
-from .output import Stage
 from .session import Tell, say, say_table
 
 DISCOVERY = "discovery.json"

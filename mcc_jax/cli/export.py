@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
+from .._store import results
 from .options import Location, out_option, seed_option
-from .output import results
 from .session import say, session
 
 FORMATS = ("json", "csv", "jax", "c", "lammps", "yade")

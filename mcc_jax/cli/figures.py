@@ -8,8 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from .._store import Stage, json_text
 from ..files import LIMITS, read_regular
-from .output import Stage, json_text
 from .session import Tell
 
 FIGURES = "figures"

@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from .._store import json_text, results
 from .options import (
     CampaignFolder,
     exclude_option,
@@ -16,7 +17,6 @@ from .options import (
     seed_option,
     threshold_option,
 )
-from .output import json_text, results
 from .session import say, say_table, session
 
 POWER = "power.json"

@@ -8,8 +8,8 @@ from typing import Any
 
 import click
 
+from .._store import results
 from .options import Interval, Levels, Location, Number, law_options, out_option, seed_option
-from .output import results
 from .session import say, session
 
 POSITIVE, NOT_NEGATIVE = {"least": 0, "above": True}, {"least": 0}

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..calibrate.posterior import summary
+from ..calibrate.estimates import summary
 from .candidates import Candidate
 from .evidence import Ranking, jumps
 from .gauss_newton import Refit

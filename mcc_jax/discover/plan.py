@@ -14,11 +14,11 @@ from .. import arguments
 from .._errors import InputError
 from ..calibrate import JointModel
 from ..calibrate.data import Tests, select_tests
+from ..calibrate.estimates import finite
 from ..calibrate.forward import law_of
 from ..calibrate.linearise import linear_data, summarise
 from ..calibrate.model import checked_settings
 from ..calibrate.noise import Noise
-from ..calibrate.paper.result import finite
 from ..campaign import Campaign, Curve, Metadata, available_data, check_campaign
 from ..effects import LIBRARY, Mechanism
 from ..effects.library import checked_library

@@ -26,11 +26,11 @@ from jaxtyping import Array, Float, PyTree
 
 from ..calibrate.compiling import compiled
 from ..calibrate.draws import Length, draw_around
+from ..calibrate.estimates import finite
 from ..calibrate.fit import population_at
 from ..calibrate.forward import law_of
 from ..calibrate.linearise import careful_enough, linear_data, summarise
 from ..calibrate.noise import Whitening
-from ..calibrate.paper.result import finite
 from ..calibrate.population import Population, Summary, marginal_likelihood
 from ..calibrate.posterior import ESS_LEAST, RHAT_MOST, population_json, unmixed
 from ..calibrate.sampling import ExactLikelihood

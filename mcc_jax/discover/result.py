@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..calibrate.paper.result import finite
+from ..calibrate.estimates import finite
 from ..campaign import Finding
 from ..effects import EQUIVALENCES, AbstractEffect, Variant
 from .cross_validation import HeldOut

@@ -32,7 +32,11 @@ def collapsed_branches(calibration: PaperCalibration) -> list[tuple[np.ndarray, 
 
     The zero of each branch is the one that the fit leaves free.
     """
-    modulus, law, branches = calibration.elastic.effective_modulus_MPa, calibration.law, calibration.elastic.branches
+    modulus, law, branches = (
+        calibration.elastic.effective_modulus_MPa,
+        calibration.mean_law,
+        calibration.elastic.branches,
+    )
     if modulus is None:
         return []
     eta = shape_factors(calibration)[[b.particle for b in branches]]
@@ -66,7 +70,7 @@ def plot_elastic(calibration: PaperCalibration) -> Figure:
     belongs to the form of unloading. Colour is the shape factor. The paper shows unloading only within its figures of
     single particles.
     """
-    fit, law = calibration.elastic, calibration.law
+    fit, law = calibration.elastic, calibration.mean_law
     figure = new_figure(7.8, 3.7)
     left, right = figure.subplots(1, 2)
     modulus = fit.effective_modulus_MPa

@@ -24,7 +24,7 @@ from .style import (
 
 def law_strain(calibration: PaperCalibration) -> np.ndarray:
     """Scaled strain of the mean law at the stresses of the master curve [-], shape (G,)."""
-    plastic = calibration.law.plastic
+    plastic = calibration.mean_law.plastic
     return np.asarray(jax.jit(lambda stress: plastic.strain(stress))(jnp.asarray(calibration.master.stress_MPa)))
 
 
@@ -60,7 +60,7 @@ def plot_law(calibration: PaperCalibration) -> Figure:
     paper's figure of the master law as stress over strain.
     """
     master, table = calibration.master, calibration.table
-    population, plastic = calibration.plastic.population, calibration.law.plastic
+    population, plastic = calibration.plastic.population, calibration.mean_law.plastic
     last = np.where(table.reached, table.strain, 0.0).max(axis=1) * table.shape_factor(calibration.a)
     tested, right = float(last.max()), 1.08 * float(last.max())
     x = np.linspace(0.0, right, 400)

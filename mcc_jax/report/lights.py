@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..calibrate.paper.result import BAD_MISFIT
+from ..calibrate.estimates import BAD_MISFIT
 from ..calibrate.posterior import ESS_LEAST, RHAT_MOST
 from ..calibrate.weights import PARETO_K_MOST
 from ..campaign import Finding, campaign_findings, check_plausibility, check_tests

@@ -7,8 +7,8 @@ import pytest
 from asserting import snapshot
 
 from mcc_jax import InputError
-from mcc_jax.cli.lock import LOCK, locked
-from mcc_jax.cli.output import MOVES, WORK, json_text, results
+from mcc_jax._lock import LOCK, locked
+from mcc_jax._store import MOVES, WORK, json_text, results
 
 
 def test_results_appear_together(tmp_path):
@@ -184,7 +184,7 @@ def test_a_move_that_fails_leaves_nothing_to_finish(tmp_path):
 
 
 def test_a_lock_that_vanishes_is_taken_anew(tmp_path, monkeypatch):
-    from mcc_jax.cli import lock
+    from mcc_jax import _lock as lock
 
     attempts, try_lock = [], lock._try_lock
 

@@ -157,7 +157,7 @@ def test_a_signal_within_a_destructor_is_not_lost(number, status, line):
 @posix
 def test_two_at_once_and_the_lock_of_a_dead_one(tmp_path):
     holder = (
-        "import sys, time; from pathlib import Path; from mcc_jax.cli.output import results\n"
+        "import sys, time; from pathlib import Path; from mcc_jax._store import results\n"
         "with results(Path(sys.argv[1])): print('in', flush=True); time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", holder, str(tmp_path)], stdout=subprocess.PIPE) as process:

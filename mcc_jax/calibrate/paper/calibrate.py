@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, get_args
 
@@ -25,12 +25,15 @@ from ...campaign import (
 from ...campaign.reasons import refusal
 from ...geometry import plastic_shape_factor
 from ...law import MccLaw, StrainScaling, Unloading
+from ..curves import MAX_POINTS
+from ..data import rows_from_contact
+from ..estimates import estimate, finite, force_zero, misfit_note
 from ..judgement import judged, numbers_in_reach, unlike_others
+from ..results import Calibration
 from .loading import PlasticFit, fit_population
 from .master_curve import MasterCurve, StrainTable, master_curve, strain_table
 from .modulus import ElasticFit, campaign_branches, fit_effective_modulus
 from .prediction import ParticleFit, point_noise_um, predict_particles
-from .result import estimate, finite, force_zero, misfit_note
 from .shape import Objective, ShapeFit, fit_shape_parameter
 
 PLAUSIBLE_SHAPE_FACTOR = 4.0
@@ -38,7 +41,7 @@ PLAUSIBLE_SHAPE_FACTOR = 4.0
 
 
 @dataclass(frozen=True)
-class PaperCalibration:
+class PaperCalibration(Calibration):
     """Everything that the paper's calibration finds, with what it was made from.
 
     Attributes:
@@ -51,7 +54,7 @@ class PaperCalibration:
         master: the master curve under that `a`.
         plastic: log-normal C1, C3, C5.
         elastic: the effective modulus.
-        law: the mean law.
+        mean_law: the law of the expected stress.
         particles: one entry per particle of the campaign, None where it was not kept.
         displacement_noise_um: standard deviation of displacement from point to point [um], for comparison with the
             residuals.
@@ -69,17 +72,27 @@ class PaperCalibration:
     master: MasterCurve
     plastic: PlasticFit
     elastic: ElasticFit
-    law: MccLaw
+    mean_law: MccLaw
     particles: tuple[ParticleFit | None, ...]
     displacement_noise_um: float
     seed: int
     runtime_s: float
     findings: tuple[Finding, ...] = ()
 
+    def compared(self) -> Mapping[int, tuple[np.ndarray, np.ndarray]]:
+        """Every row from contact on of every kept particle's curve, and which of them are compared."""
+        segments = self.adjustment.segments
+        rows = {
+            i: rows_from_contact(self.campaign.curves[i], segments[i], MAX_POINTS)
+            for i, fit in enumerate(self.particles)
+            if fit is not None
+        }
+        return {i: (some, self.particles[i].used[some]) for i, some in rows.items()}
+
     @property
     def a(self) -> float:
         """The shape parameter in use [-]."""
-        return float(self.law.a)
+        return float(self.mean_law.a)
 
     @property
     def converged(self) -> bool:
@@ -98,7 +111,7 @@ class PaperCalibration:
             notes.append(
                 f"{', '.join(self.plastic.at_bound)} ended at the lower bound: a collapsed estimate, not a measurement"
             )
-        if not bool(self.law.is_monotone):
+        if not bool(self.mean_law.is_monotone):
             notes.append("the mean law is not monotone: under load control it snaps through")
         share = float(self.plastic.population.probability_not_monotone)
         if share > 0.05:
@@ -152,7 +165,7 @@ class PaperCalibration:
     def to_json(self) -> dict[str, Any]:
         """The contents of `calibration.json`."""
         population = self.plastic.population
-        eta = np.asarray(eqx.filter_vmap(self.law.shape_factor)(particle_batch(self.campaign.diameters_um)))
+        eta = np.asarray(eqx.filter_vmap(self.mean_law.shape_factor)(particle_batch(self.campaign.diameters_um)))
         entries = []
         for i, name in enumerate(self.campaign.particles):
             fit = self.particles[i]
@@ -179,7 +192,7 @@ class PaperCalibration:
             **self.answer(),
             "runtime_s": self.runtime_s,
             "seed": self.seed,
-            "law": {"unloading": self.law.unloading.value, "strain_scaling": self.law.strain_scaling.value},
+            "law": {"unloading": self.mean_law.unloading.value, "strain_scaling": self.mean_law.strain_scaling.value},
             "a_objective": self.objective,
             "a_full": estimate(self.shape.a),
             "a_reference": estimate(reference.a if reference else None),

@@ -16,9 +16,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from .._errors import InputError
-from ..files import LIMITS, read_regular
-from .lock import locked
+from ._errors import InputError
+from ._lock import locked
+from .files import LIMITS, read_regular
 
 WORK = ".mcc-jax-work-"
 MOVES = "moves.json"

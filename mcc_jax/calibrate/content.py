@@ -21,7 +21,7 @@ LONGEST = 160
 def _validator(stem: str) -> Any:
     from jsonschema import Draft202012Validator
 
-    text = files("mcc_jax.report").joinpath("schemas", f"{stem}.json").read_text(encoding="utf-8")
+    text = files("mcc_jax.calibrate").joinpath("schemas", f"{stem}.json").read_text(encoding="utf-8")
     return Draft202012Validator(json.loads(text))
 
 

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from .._errors import InputError
+from ._errors import InputError
 
 LOCK = ".mcc-jax.lock"
 

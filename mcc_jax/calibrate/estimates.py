@@ -1,11 +1,13 @@
-"""`calibration.json`: the same for every method."""
+"""Estimates as result files hold them: value, standard deviation, interval; the same for every method."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
 
-from ...campaign import Curve
+import numpy as np
+
+from ..campaign import Curve
 
 BAD_MISFIT = 0.05
 """Share of the range of displacement; with the law's own data and a tester's noise it stays below 0.01."""
@@ -46,3 +48,26 @@ def force_zero(curve: Curve) -> dict[str, Any]:
         return estimate(None)
     value, sd = checked.force_zero_mN, checked.force_zero_sd_mN
     return estimate(value, sd, (value - 1.96 * sd, value + 1.96 * sd))
+
+
+def summary(draws: np.ndarray) -> dict[str, Any]:
+    """Mean, standard deviation and central 95 % interval of draws."""
+    low, high = np.quantile(draws, [0.025, 0.975])
+    return estimate(float(np.mean(draws)), float(np.std(draws)), (float(low), float(high)))
+
+
+def log_estimate(log: float, sd: float) -> dict[str, Any]:
+    """An estimate from its logarithm's mean and standard deviation."""
+    value = power_of_e(log)
+    if not math.isfinite(sd):
+        return estimate(value)
+    sd = min(sd, 5.0)
+    return estimate(value, value * sd, (value * math.exp(-1.96 * sd), value * math.exp(1.96 * sd)))
+
+
+def power_of_e(log: float) -> float:
+    """The exponential, infinite where it overflows."""
+    try:
+        return math.exp(log)
+    except OverflowError:
+        return math.inf

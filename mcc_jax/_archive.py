@@ -1,0 +1,174 @@
+"""Typed values as bytes and back, to the last bit: dataclasses, modules, arrays, enums; never code (no pickle).
+
+A value is written as MessagePack. Arrays keep dtype, shape and bytes; an object is the name of its class, its fields and
+the cached properties that its class lists in `archived`, and is built again without running any of its code. Only
+classes of this package are built.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import hashlib
+import importlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import msgspec
+import numpy as np
+
+from ._errors import InputError
+from ._version import own_version
+from .files import LIMITS, read_regular
+
+FORMAT, VERSION = "mcc_jax result", 1
+AGAIN = "Write it again with the command or function that made it, or move it away."
+_PLAIN = (bool, int, float, str, bytes, type(None))
+
+
+class _Archive(msgspec.Struct):
+    """What stands in a file."""
+
+    format: str
+    version: int
+    written_by: str
+    sha256: str
+    content: bytes
+
+
+def encode(value: Any) -> bytes:
+    """The bytes of a file that holds a value.
+
+    Raises:
+        InputError: naming a part that cannot be written, such as an effect of a class of one's own.
+    """
+    content = msgspec.msgpack.encode(_plain(value, "result"))
+    digest = hashlib.sha256(content).hexdigest()
+    return msgspec.msgpack.encode(_Archive(FORMAT, VERSION, own_version(), digest, content))
+
+
+def read_archive(file: Path) -> Any:
+    """The value that a file holds.
+
+    Raises:
+        InputError: if it is missing, cut off, changed, of a newer version, or something else.
+    """
+    raw = read_regular(file, LIMITS.posterior_bytes, AGAIN)
+    try:
+        archive = msgspec.msgpack.decode(raw, type=_Archive)
+        known = archive.format == FORMAT
+    except msgspec.DecodeError as error:
+        raise InputError(f"is no result of mcc_jax, or is cut off: {error}", file=file, remedy=AGAIN) from None
+    if not known:
+        raise InputError(f"is something else, {archive.format[:60]!r}", file=file, remedy=AGAIN)
+    if archive.version > VERSION:
+        remedy = f"Install mcc_jax {archive.written_by[:40]} or newer."
+        raise InputError(f"was written by a newer version, {archive.written_by[:40]}", file=file, remedy=remedy)
+    if hashlib.sha256(archive.content).hexdigest() != archive.sha256:
+        raise InputError("is damaged: its checksum is another", file=file, remedy=AGAIN)
+    try:
+        return _built(msgspec.msgpack.decode(archive.content))
+    except (AttributeError, KeyError, TypeError, ValueError, ImportError) as error:
+        raise InputError(f"was written by another version: {error}", file=file, remedy=AGAIN) from error
+
+
+# ---- values as MessagePack knows them --------------------------------------------------------------------------------
+
+
+def _plain(value: Any, where: str) -> Any:
+    if isinstance(value, enum.Enum):
+        return {"enum": _name(type(value), where), "name": value.name}
+    if isinstance(value, _PLAIN):
+        return value
+    if isinstance(value, jax.Array | np.ndarray | np.generic):
+        return _array(value, where)
+    if isinstance(value, list):
+        return [_plain(item, f"{where}[{i}]") for i, item in enumerate(value)]
+    if isinstance(value, tuple):
+        items = [_plain(item, f"{where}[{i}]") for i, item in enumerate(value)]
+        return {"named": _name(type(value), where), "items": items} if hasattr(value, "_fields") else {"tuple": items}
+    if isinstance(value, Mapping):
+        pairs = [[_plain(k, where), _plain(item, f"{where}[{k!r}]")] for k, item in value.items()]
+        return {"mapping": pairs}
+    if isinstance(value, type):
+        return {"class": _name(value, where)}
+    if dataclasses.is_dataclass(value):
+        names = [f.name for f in dataclasses.fields(value)] + list(getattr(value, "archived", ()))
+        fields = {name: _plain(getattr(value, name), f"{where}.{name}") for name in names if hasattr(value, name)}
+        return {"object": _name(type(value), where), "fields": fields}
+    raise InputError(f"{where} is of a kind that cannot be written, {type(value).__name__}")
+
+
+def _array(value: jax.Array | np.ndarray | np.generic, where: str) -> dict[str, Any]:
+    kind = "jax" if isinstance(value, jax.Array) else "numpy" if isinstance(value, np.ndarray) else "scalar"
+    array = np.asarray(value)
+    if array.dtype.kind not in "biufcU":
+        raise InputError(f"{where} is an array of {array.dtype}, which cannot be written")
+    return {"array": kind, "dtype": array.dtype.str, "shape": list(array.shape), "bytes": array.tobytes()}
+
+
+def _name(kind: type, where: str) -> str:
+    if kind.__module__.split(".")[0] != __name__.split(".")[0] or "<" in kind.__qualname__:
+        raise InputError(
+            f"{where} is of the class {kind.__module__}.{kind.__qualname__}, which is not of mcc_jax",
+            remedy="Such results cannot be read back; keep the script that makes them.",
+        )
+    return f"{kind.__module__}:{kind.__qualname__}"
+
+
+# ---- and back --------------------------------------------------------------------------------------------------------
+
+
+def _built(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_built(item) for item in value]
+    if not isinstance(value, dict):
+        return value
+    if "array" in value:
+        array = np.frombuffer(value["bytes"], np.dtype(value["dtype"])).reshape(value["shape"])
+        if value["array"] == "scalar":
+            return array[()]
+        return jnp.asarray(array) if value["array"] == "jax" else array.copy()
+    if "mapping" in value:
+        return {_built(key): _built(item) for key, item in value["mapping"]}
+    if "tuple" in value:
+        return tuple(_built(item) for item in value["tuple"])
+    if "named" in value:
+        return _class(value["named"], tuple)(*(_built(item) for item in value["items"]))
+    if "enum" in value:
+        return _class(value["enum"], enum.Enum)[value["name"]]
+    if "class" in value:
+        return _class(value["class"], object)
+    kind = _class(value["object"], object)
+    if not dataclasses.is_dataclass(kind):
+        raise TypeError(f"{value['object']} is no dataclass")
+    known = {f.name for f in dataclasses.fields(kind)} | set(getattr(kind, "archived", ()))
+    strangers = sorted(set(value["fields"]) - known)
+    if strangers:
+        raise TypeError(f"{kind.__name__} has no field {strangers[0]!r}")
+    made = object.__new__(kind)
+    for name in set(value["fields"]) & set(getattr(kind, "archived", ())):  # worked out once, by a cached property
+        made.__dict__[name] = _built(value["fields"][name])
+    for f in dataclasses.fields(kind):
+        if f.name in value["fields"]:
+            object.__setattr__(made, f.name, _built(value["fields"][f.name]))
+        elif f.default is not dataclasses.MISSING:
+            object.__setattr__(made, f.name, f.default)
+        elif f.default_factory is not dataclasses.MISSING:
+            object.__setattr__(made, f.name, f.default_factory())
+    return made
+
+
+def _class(name: str, base: type) -> Any:
+    module, _, path = name.partition(":")
+    if module.split(".")[0] != __name__.split(".")[0]:
+        raise TypeError(f"{module} is not of mcc_jax")
+    found: Any = importlib.import_module(module)
+    for part in path.split("."):
+        found = getattr(found, part)
+    if not isinstance(found, type) or not issubclass(found, base):
+        raise TypeError(f"{name} is no class")
+    return found

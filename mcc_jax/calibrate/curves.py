@@ -1,0 +1,135 @@
+"""Every test of a campaign beside its calibrated law: what report and figures show, worked out once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..campaign import Campaign, Segment, campaign_segments, particle_batch
+from ..simulate import simulate_batch
+from .data import rows_from_contact
+from .laws import laws_of
+
+KINDS = ("load", "hold", "unload", "reload")
+MAX_POINTS = 400
+"""Points of a longer record that are kept, as many as calibrations compare."""
+
+
+@dataclass(frozen=True)
+class FittedCurve:
+    """One particle's test from contact on, and what the law says of it; every array of shape (n,).
+
+    Attributes:
+        name: of the particle.
+        why_not: why it took no part in the calibration; None if it did, or nobody asked.
+        time_s, force_mN, displacement_um: measured, raw.
+        kind: index into `KINDS`.
+        used: which points the calibration compared with the law.
+        own_um: displacement by the law with this particle's own coefficients and zero, the mean of the posterior's
+            predictions where there are some; NaN where there is none.
+        typical_um: with those of the population's middle.
+        low_um, high_um: central 95 % of what may be measured; NaN where there is no posterior.
+    """
+
+    name: str
+    why_not: str | None
+    time_s: np.ndarray
+    force_mN: np.ndarray
+    displacement_um: np.ndarray
+    kind: np.ndarray
+    used: np.ndarray
+    own_um: np.ndarray
+    typical_um: np.ndarray
+    low_um: np.ndarray
+    high_um: np.ndarray
+
+    @property
+    def rms_um(self) -> float | None:
+        """Root mean square of measured less predicted at the compared points [um]; None without a prediction."""
+        away = (self.displacement_um - self.own_um)[self.used]
+        return float(np.sqrt(np.mean(away**2))) if len(away) and np.isfinite(away).all() else None
+
+
+def measured_curves(campaign: Campaign) -> tuple[FittedCurve, ...]:
+    """The tests of a campaign that nobody calibrated."""
+    return tuple(_measured(campaign, i, parts, None) for i, parts in enumerate(campaign_segments(campaign)))
+
+
+def fitted_curves(
+    content: Mapping[str, Any],
+    campaign: Campaign,
+    compared: Mapping[int, tuple[np.ndarray, np.ndarray]],
+    predictions: Callable[[str], np.ndarray | None],
+) -> tuple[FittedCurve, ...]:
+    """The tests of a campaign beside its calibrated law. Needs double precision, as calibration does.
+
+    Args:
+        content: the contents of its `calibration.json`.
+        campaign: the tests.
+        compared: see `Calibration.compared`.
+        predictions: see `Calibration.predictions`.
+    """
+    segments = campaign_segments(campaign)
+    shown = [_measured(campaign, i, parts, compared.get(i)) for i, parts in enumerate(segments)]
+    entries = {entry["particle"]: entry for entry in content["particles"]}
+    told = [replace(one, why_not=entries[one.name]["why_not"]) for one in shown]
+    rows = [i for i, one in enumerate(told) if _known(entries[one.name])]
+    if not rows:
+        return tuple(told)
+    for row, um in zip(rows, _displacements(content, campaign, [told[i] for i in rows], rows), strict=True):
+        zero = entries[told[row].name]["zero_um"]["value"] or 0.0
+        told[row] = replace(told[row], own_um=um[0] + zero, typical_um=um[1] + zero)
+        if row in compared:
+            told[row] = _with_band(told[row], predictions(told[row].name))
+    return tuple(told)
+
+
+def _known(entry: Mapping[str, Any]) -> bool:
+    return entry["kept"] and all(entry[name]["value"] is not None for name in ("C1", "C3", "C5"))
+
+
+def _measured(
+    campaign: Campaign, i: int, segments: tuple[Segment, ...], compared: tuple[np.ndarray, np.ndarray] | None
+) -> FittedCurve:
+    curve = campaign.curves[i]
+    kind = np.zeros(len(curve), int)
+    for part in segments:
+        kind[part.start : part.stop] = KINDS.index(part.kind) if part.kind in KINDS else 0
+    if compared is None:
+        rows = rows_from_contact(curve, segments, MAX_POINTS)
+        compared = rows, np.ones(len(rows), bool)
+    rows, used = compared
+    nothing = np.full(len(rows), np.nan)
+    measured = curve.time_s[rows], curve.force_mN[rows], curve.displacement_um[rows]
+    return FittedCurve(campaign.particles[i], None, *measured, kind[rows], used, nothing, nothing, nothing, nothing)
+
+
+def _displacements(
+    content: Mapping[str, Any], campaign: Campaign, shown: list[FittedCurve], rows: list[int]
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Displacement [um] of every test under its measured force, by its own law and by the typical one."""
+    longest = max(len(one.force_mN) for one in shown)
+    longest += -longest % 64  # campaigns of similar length then share one compilation
+    force = jnp.asarray([np.pad(one.force_mN, (0, longest - len(one.force_mN)), mode="edge") for one in shown])
+    sizes = campaign.diameters_um[rows]
+    particles = particle_batch(sizes)
+    own, typical = (
+        np.asarray(simulate_batch(laws, particles, force, control="load").displacement)
+        for laws in laws_of(content, [one.name for one in shown], sizes)
+    )
+    return [(o[: len(one.kind)], t[: len(one.kind)]) for one, o, t in zip(shown, own, typical, strict=True)]
+
+
+def _with_band(one: FittedCurve, draws: np.ndarray | None) -> FittedCurve:
+    """The central 95 % of what may be measured, and the middle of it, where points are compared."""
+    if draws is None:
+        return one
+    # Of two hundred draws mean and standard deviation say the ends of a near-normal band better than quantiles.
+    centre, half = draws.mean(0), 1.96 * draws.std(0)
+    middle = np.where(one.used, centre, one.own_um)  # means of coefficients are not the coefficients of the mean
+    low, high = (np.where(one.used, centre + sign * half, np.nan) for sign in (-1, 1))
+    return replace(one, own_um=middle, low_um=low, high_um=high)

@@ -1,0 +1,114 @@
+"""From the numbers in a `calibration.json` to laws: of the median particle, of one particle, of many."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from .._errors import InputError
+from ..campaign import Campaign
+from ..law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainScaling, Unloading
+
+COEFFICIENTS = ("C1", "C3", "C5")
+RIGID_MPA = 1e9
+"""Where no test was unloaded the modulus cannot matter; a stiff one keeps the law defined."""
+
+
+def law_of(content: Mapping[str, Any], particle: str | None = None, campaign: Campaign | None = None) -> MccLaw:
+    """The law that the contents of a `calibration.json` describe; see `Calibration.law`."""
+    entry = None if particle is None else entry_of(content, particle)
+    if entry is None:
+        C = [math.exp(_number(content[f"log_{name}"]["mean"], f"log_{name}")) for name in COEFFICIENTS]
+    else:
+        C = [_number(entry[name], name) for name in COEFFICIENTS]
+    a = _number(content["a"], "a")
+    modulus = _number(content["effective_modulus_MPa"], "effective_modulus_MPa")
+    if entry is not None:
+        sizes = None if campaign is None else campaign.diameters_um[campaign.index(str(particle))]
+        a, modulus = _own_shape(content, entry, sizes, a), _own_modulus(entry, modulus)
+    return MccLaw(Plastic(*C), a, modulus, *_forms(content))
+
+
+def laws_of(content: Mapping[str, Any], names: list[str], diameters_um: np.ndarray) -> tuple[MccLaw, MccLaw]:
+    """Laws of particles that took part, each with its own numbers, and as many times that of the typical particle.
+
+    The typical law has the medians of the coefficients; of the paper's method it is the law of the expected stress.
+    """
+    entries = [entry_of(content, name) for name in names]
+    a = content["a"]["value"] or 0.0
+    modulus = content["effective_modulus_MPa"]["value"] or RIGID_MPA
+    own = np.array([[entry[name]["value"] for name in COEFFICIENTS] for entry in entries], float)
+    shapes = [_own_shape(content, entry, size, a) for entry, size in zip(entries, diameters_um, strict=True)]
+    moduli = [_own_modulus(entry, modulus) for entry in entries]
+    form, scaling = _forms(content)
+
+    def law(C: Any, a: Any, modulus: Any) -> MccLaw:
+        return MccLaw(Plastic(C[0], C[1], C[2]), a, modulus, form, scaling)
+
+    count = len(names)
+    typical = np.broadcast_to(_typical(content), own.shape)
+    make = eqx.filter_vmap(law)
+    return (
+        make(jnp.asarray(own), jnp.asarray(shapes), jnp.asarray(moduli)),
+        make(jnp.asarray(typical), jnp.full(count, a), jnp.full(count, modulus)),
+    )
+
+
+def entry_of(content: Mapping[str, Any], particle: str) -> Mapping[str, Any]:
+    """What the contents say of one particle.
+
+    Raises:
+        InputError: if it is not there or took no part, naming those that did.
+    """
+    entries = {str(entry["particle"]): entry for entry in content["particles"]}
+    if particle not in entries:
+        shown = ", ".join(list(entries)[:12]) + (", ..." if len(entries) > 12 else "")
+        raise InputError(f"there is no particle {particle!r}", remedy=f"There are: {shown}.")
+    if not entries[particle]["kept"]:
+        raise InputError(
+            f"particle {particle!r} took no part in the calibration: {entries[particle]['why_not']}",
+            remedy="Take another particle or, without one, the population.",
+        )
+    return entries[particle]
+
+
+def _forms(content: Mapping[str, Any]) -> tuple[Unloading, StrainScaling]:
+    return Unloading(content["law"]["unloading"]), StrainScaling(content["law"]["strain_scaling"])
+
+
+def _number(estimate: Mapping[str, Any], name: str) -> float:
+    value = estimate["value"]
+    if value is None and name == "effective_modulus_MPa":
+        raise InputError("holds no effective modulus", remedy="Calibrate on tests that unload.")
+    if value is None or (name.startswith("log_") and abs(value) > 100):
+        raise InputError(f"{name} has no sensible value", remedy="Calibrate again on tests that tell it.")
+    return float(value)
+
+
+def _own_modulus(entry: Mapping[str, Any], modulus: float) -> float:
+    return (entry.get("effective_modulus_MPa") or {}).get("value") or modulus
+
+
+def _own_shape(content: Mapping[str, Any], entry: Mapping[str, Any], size: np.ndarray | None, a: float) -> float:
+    """This particle's own a, where it differs from particle to particle: eta_p = 1 + a (1 - D3^2/(D1 D2))."""
+    eta = entry["eta_p"]["value"]
+    if content.get("shape_scatter") is None or eta is None or size is None:
+        return a
+    flatness = 1 - size[2] ** 2 / (size[0] * size[1])
+    return a if abs(flatness) < 1e-6 else (eta - 1) / flatness
+
+
+def _typical(content: Mapping[str, Any]) -> np.ndarray:
+    pairs = [content[f"log_{name}"] for name in COEFFICIENTS]
+    means = [pair["mean"]["value"] for pair in pairs]
+    if any(mean is None for mean in means):
+        return np.full(3, np.nan)
+    parts = [LogNormal(m, pair["sd"]["value"] or 0.0) for m, pair in zip(means, pairs, strict=True)]
+    population = PlasticPopulation(*parts)
+    law = population.mean_law if content["method"] == "paper" else population.median_law
+    return np.array([float(law.C1), float(law.C3), float(law.C5)])

@@ -1,0 +1,123 @@
+"""What every calibration can do once it is made: give its law, its curves, be saved and be read again."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from .. import arguments
+from .._archive import encode
+from .._store import json_text, results
+from ..campaign import Campaign
+from ..law import MccLaw
+from .curves import FittedCurve, fitted_curves
+from .data import Selection
+from .laws import law_of
+from .model import JointFit, JointModel
+from .population import Population
+
+ARCHIVE, CONTENT = "calibration.msgpack", "calibration.json"
+
+
+class Calibration(abc.ABC):
+    """A calibration of any method: `law`, `curves`, `save`; `mcc_jax.load` reads what was saved."""
+
+    archived: ClassVar[tuple[str, ...]] = ("curves",)  # kept with the fields: nobody works them out again
+    campaign: Campaign | None
+
+    @abc.abstractmethod
+    def to_json(self) -> dict[str, Any]:
+        """The contents of `calibration.json`."""
+
+    def law(self, particle: str | None = None) -> MccLaw:
+        """The calibrated law.
+
+        Args:
+            particle: take this particle's own coefficients; if None those of the median particle, exp(mean of log C).
+
+        Raises:
+            InputError: for a particle that took no part, or numbers that the calibration does not have.
+        """
+        return law_of(self.to_json(), particle, self.campaign)
+
+    @cached_property
+    def curves(self) -> tuple[FittedCurve, ...]:
+        """Every test of the campaign from contact on: measured, compared, and as the law has it."""
+        if self.campaign is None:
+            return ()
+        return fitted_curves(self.to_json(), self.campaign, self.compared(), self.predictions)
+
+    def compared(self) -> Mapping[int, tuple[np.ndarray, np.ndarray]]:
+        """Of each particle that took part, by its place in the campaign: rows of its curve, and which are compared."""
+        return {}
+
+    def predictions(self, particle: str) -> np.ndarray | None:
+        """Draws of what may be measured of a particle at its rows [um], shape (draws, rows); None without draws."""
+        return None
+
+    def save(self, folder: str | Path) -> None:
+        """Write `calibration.json` and what `mcc_jax.load` reads into a folder: both or nothing.
+
+        Raises:
+            InputError: if the folder cannot be written, or a part cannot be read back.
+        """
+        with results(arguments.file_path(folder, "folder")) as stage:
+            self.write(stage.folder)
+
+    def write(self, folder: Path, **more: Any) -> dict[str, Any]:
+        """Write the files of `save` into a folder that appears as a whole; returns the contents of the JSON.
+
+        Args:
+            folder: an existing folder.
+            more: further entries of the JSON, such as provenance.
+        """
+        content = self.to_json() | more
+        (folder / CONTENT).write_text(json_text(content), encoding="utf-8")
+        (folder / ARCHIVE).write_bytes(encode(self))
+        return content
+
+
+class PosteriorDraws(Calibration):
+    """A calibration by draws of a posterior, as predictions need it; see `BayesCalibration` for its attributes."""
+
+    campaign: Campaign
+    selection: Selection
+    model: JointModel
+    fit: JointFit
+    population: Population
+    C: np.ndarray
+    modulus_MPa: np.ndarray
+    zero_um: np.ndarray
+    seed: int
+
+    @property
+    @abc.abstractmethod
+    def particles(self) -> tuple[str, ...]:
+        """Names of the particles that took part."""
+
+    @abc.abstractmethod
+    def named_population(self) -> dict[str, np.ndarray]:
+        """Draws of the population by the names used in files, shape (chains, draws)."""
+
+
+@dataclass(frozen=True)
+class OldCalibration(Calibration):
+    """A calibration of which nothing but `calibration.json` (schema 1) is left: numbers, but neither fit nor curves.
+
+    Attributes:
+        content: the contents of the file.
+        campaign: its tests, where they are known.
+    """
+
+    content: dict[str, Any]
+    campaign: Campaign | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """The contents of `calibration.json`."""
+        return self.content
