@@ -16,6 +16,7 @@ from .calibrate import calibrate_least_squares as calibrate_least_squares
 from .calibrate import calibrate_many as calibrate_many
 from .calibrate import calibrate_paper as calibrate_paper
 from .calibrate import compare_with_paper as compare_with_paper
+from .calibrate import load as load
 from .calibrate import predict_measured as predict_measured
 from .calibrate import predict_new_particle as predict_new_particle
 from .calibrate import read_priors as read_priors

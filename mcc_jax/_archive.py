@@ -1,6 +1,7 @@
 """Typed values as bytes and back, to the last bit: dataclasses, modules, arrays, enums; never code (no pickle).
 
-A value is written as MessagePack. Arrays keep dtype, shape and bytes; an object is the name of its class, its fields and
+A value is written as MessagePack. Arrays keep dtype, shape and bytes; an object is the name of its class, its fields
+(but for those whose metadata say `archived=False`: working arrays, which are None when read) and
 the cached properties that its class lists in `archived`, and is built again without running any of its code. Only
 classes of this package are built.
 """
@@ -60,7 +61,7 @@ def read_archive(file: Path) -> Any:
     try:
         archive = msgspec.msgpack.decode(raw, type=_Archive)
         known = archive.format == FORMAT
-    except msgspec.DecodeError as error:
+    except (msgspec.DecodeError, RecursionError) as error:
         raise InputError(f"is no result of mcc_jax, or is cut off: {error}", file=file, remedy=AGAIN) from None
     if not known:
         raise InputError(f"is something else, {archive.format[:60]!r}", file=file, remedy=AGAIN)
@@ -71,7 +72,7 @@ def read_archive(file: Path) -> Any:
         raise InputError("is damaged: its checksum is another", file=file, remedy=AGAIN)
     try:
         return _built(msgspec.msgpack.decode(archive.content))
-    except (AttributeError, KeyError, TypeError, ValueError, ImportError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError, ImportError, RecursionError) as error:
         raise InputError(f"was written by another version: {error}", file=file, remedy=AGAIN) from error
 
 
@@ -81,7 +82,7 @@ def read_archive(file: Path) -> Any:
 def _plain(value: Any, where: str) -> Any:
     if isinstance(value, enum.Enum):
         return {"enum": _name(type(value), where), "name": value.name}
-    if isinstance(value, _PLAIN):
+    if type(value) in _PLAIN:
         return value
     if isinstance(value, jax.Array | np.ndarray | np.generic):
         return _array(value, where)
@@ -96,7 +97,8 @@ def _plain(value: Any, where: str) -> Any:
     if isinstance(value, type):
         return {"class": _name(value, where)}
     if dataclasses.is_dataclass(value):
-        names = [f.name for f in dataclasses.fields(value)] + list(getattr(value, "archived", ()))
+        names = [f.name for f in dataclasses.fields(value) if f.metadata.get("archived", True)]
+        names += getattr(value, "archived", ())
         fields = {name: _plain(getattr(value, name), f"{where}.{name}") for name in names if hasattr(value, name)}
         return {"object": _name(type(value), where), "fields": fields}
     raise InputError(f"{where} is of a kind that cannot be written, {type(value).__name__}")
@@ -155,6 +157,8 @@ def _built(value: Any) -> Any:
     for f in dataclasses.fields(kind):
         if f.name in value["fields"]:
             object.__setattr__(made, f.name, _built(value["fields"][f.name]))
+        elif not f.metadata.get("archived", True):
+            object.__setattr__(made, f.name, None)
         elif f.default is not dataclasses.MISSING:
             object.__setattr__(made, f.name, f.default)
         elif f.default_factory is not dataclasses.MISSING:

@@ -2,6 +2,7 @@
 
 from .arviz import to_arviz as to_arviz
 from .arviz import write_posterior as write_posterior
+from .curves import FittedCurve as FittedCurve
 from .least_squares import Identifiability as Identifiability
 from .least_squares import LeastSquaresCalibration as LeastSquaresCalibration
 from .least_squares import calibrate_least_squares as calibrate_least_squares
@@ -43,3 +44,6 @@ from .priors import NakagamiPrior as NakagamiPrior
 from .priors import NormalPrior as NormalPrior
 from .priors import Priors as Priors
 from .priors import read_priors as read_priors
+from .results import Calibration as Calibration
+from .results import OldCalibration as OldCalibration
+from .results import load as load

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._errors import InputError
-from ..campaign import Campaign
 from ..law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainScaling, Unloading
 
 COEFFICIENTS = ("C1", "C3", "C5")
@@ -19,8 +18,8 @@ RIGID_MPA = 1e9
 """Where no test was unloaded the modulus cannot matter; a stiff one keeps the law defined."""
 
 
-def law_of(content: Mapping[str, Any], particle: str | None = None, campaign: Campaign | None = None) -> MccLaw:
-    """The law that the contents of a `calibration.json` describe; see `Calibration.law`."""
+def law_of(content: Mapping[str, Any], particle: str | None = None, diameters_um: np.ndarray | None = None) -> MccLaw:
+    """The law that a `calibration.json` describes, of the median particle or of one of these diameters [um]."""
     entry = None if particle is None else entry_of(content, particle)
     if entry is None:
         C = [math.exp(_number(content[f"log_{name}"]["mean"], f"log_{name}")) for name in COEFFICIENTS]
@@ -29,8 +28,7 @@ def law_of(content: Mapping[str, Any], particle: str | None = None, campaign: Ca
     a = _number(content["a"], "a")
     modulus = _number(content["effective_modulus_MPa"], "effective_modulus_MPa")
     if entry is not None:
-        sizes = None if campaign is None else campaign.diameters_um[campaign.index(str(particle))]
-        a, modulus = _own_shape(content, entry, sizes, a), _own_modulus(entry, modulus)
+        a, modulus = _own_shape(content, entry, diameters_um, a), _own_modulus(entry, modulus)
     return MccLaw(Plastic(*C), a, modulus, *_forms(content))
 
 

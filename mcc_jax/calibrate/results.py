@@ -12,17 +12,20 @@ from typing import Any, ClassVar
 import numpy as np
 
 from .. import arguments
-from .._archive import encode
+from .._archive import encode, read_archive
+from .._errors import InputError
 from .._store import json_text, results
-from ..campaign import Campaign
+from ..campaign import Campaign, read_campaign
 from ..law import MccLaw
+from .content import read_result
 from .curves import FittedCurve, fitted_curves
 from .data import Selection
 from .laws import law_of
 from .model import JointFit, JointModel
 from .population import Population
 
-ARCHIVE, CONTENT = "calibration.msgpack", "calibration.json"
+ARCHIVE, CONTENT, DISCOVERY_ARCHIVE = "calibration.msgpack", "calibration.json", "discovery.msgpack"
+A_FOLDER = "Give a folder that a result's save, mcc-jax calibrate or mcc-jax discover wrote into."
 
 
 class Calibration(abc.ABC):
@@ -44,7 +47,9 @@ class Calibration(abc.ABC):
         Raises:
             InputError: for a particle that took no part, or numbers that the calibration does not have.
         """
-        return law_of(self.to_json(), particle, self.campaign)
+        known = self.campaign is not None and particle in self.campaign.particles
+        sizes = self.campaign.diameters_um[self.campaign.index(str(particle))] if known else None
+        return law_of(self.to_json(), particle, sizes)
 
     @cached_property
     def curves(self) -> tuple[FittedCurve, ...]:
@@ -121,3 +126,36 @@ class OldCalibration(Calibration):
     def to_json(self) -> dict[str, Any]:
         """The contents of `calibration.json`."""
         return self.content
+
+
+def load(folder: str | Path) -> Any:
+    """What a folder holds: a discovery, else a calibration, else a campaign, as it was saved.
+
+    A calibration of an older version, of which only `calibration.json` is there, gives its numbers and its law.
+
+    Args:
+        folder: where `save`, `mcc-jax calibrate` or `mcc-jax discover` wrote.
+
+    Returns:
+        A `Discovery`, a `PaperCalibration`, `LeastSquaresCalibration`, `BayesCalibration` or `OldCalibration`, or a
+        `Campaign`.
+
+    Raises:
+        InputError: if the folder holds none, or a file is damaged, foreign or of a newer version.
+    """
+    path = arguments.file_path(folder, "folder")
+    if not path.is_dir():
+        raise InputError("there is no such folder", file=path, remedy=A_FOLDER)
+    there = {entry.name for entry in path.iterdir()}
+    for archive, kind in ((DISCOVERY_ARCHIVE, object), (ARCHIVE, Calibration)):
+        if archive in there:
+            found = read_archive(path / archive)
+            if not isinstance(found, kind):
+                raise InputError(f"holds a {type(found).__name__}", file=path / archive, remedy=A_FOLDER)
+            return found
+    tests = {"particles.csv", "curves.csv"} <= there
+    if CONTENT in there:
+        return OldCalibration(read_result(path / CONTENT, "mcc-jax calibrate"), read_campaign(path) if tests else None)
+    if tests:
+        return read_campaign(path)
+    raise InputError(f"{CONTENT} is missing: holds no result and no campaign", file=path, remedy=A_FOLDER)

@@ -15,7 +15,7 @@ from ..calibrate import BayesCalibration, JointModel, LeastSquaresCalibration, P
 from ..calibrate.judgement import MODULUS_OPEN
 from ..campaign import Campaign, Finding
 from ..files import LIMITS, read_regular
-from .figures import FIGURES, write_figures, write_result
+from .figures import FIGURES, write_figures
 from .session import Tell, say
 
 RESULT, POSTERIOR = "calibration.json", "posterior.nc"
@@ -50,9 +50,7 @@ def write_calibration(
         files = [POSTERIOR]
     elif _is_ours(stage.directory / RESULT):
         stage.stale.append(POSTERIOR)  # of an earlier run: it would contradict what lies beside it now
-    content = calibration.to_json() | {"figures": names, "files": files, "provenance": dict(origin)}
-    write_result(stage, RESULT, content)
-    return content
+    return calibration.write(stage.folder, figures=names, files=files, provenance=dict(origin))
 
 
 def _save(calibration: Calibration, folder: Path) -> list[Path]:

@@ -12,7 +12,7 @@ from .._errors import InputError
 from .._store import Stage
 from ..discover import Discovery
 from ..effects import LIBRARY
-from .figures import write_figures, write_result
+from .figures import write_figures
 from .session import Tell, say, say_table
 
 DISCOVERY = "discovery.json"
@@ -52,9 +52,7 @@ def write_discovery(
     """
     draw = functools.partial(_save, found) if figures else None
     figures_drawn = write_figures(stage, DISCOVERY, draw, tell)
-    content = found.to_json() | {"figures": figures_drawn, "provenance": dict(origin)}
-    write_result(stage, DISCOVERY, content)
-    return content
+    return found.write(stage.folder, figures=figures_drawn, provenance=dict(origin))
 
 
 def _save(found: Discovery, folder: Path) -> list[Path]:

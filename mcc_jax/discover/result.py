@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from .. import arguments
+from .._archive import encode
+from .._errors import InputError
+from .._store import json_text, results
 from ..calibrate.estimates import finite
+from ..calibrate.laws import law_of
+from ..calibrate.results import DISCOVERY_ARCHIVE
 from ..campaign import Finding
 from ..effects import EQUIVALENCES, AbstractEffect, Variant
+from ..law import MccLaw
 from .cross_validation import HeldOut
 from .discrepancy import Closure
 from .evidence import Ranking
@@ -86,7 +95,7 @@ class Discovery:
         verdict: NO_GAP, NAMED, SET, UNLISTED or FIT_NOT_CONVERGED.
         summary: the answer in one paragraph.
         base: the base fit.
-        system: its linear system.
+        system: its linear system; a working array of the search, which files do not hold.
         effects: what was added, in order.
         candidate_set: for each effect, the mechanisms that explain it as well, best first.
         ranking: all mechanisms against the base law.
@@ -105,10 +114,12 @@ class Discovery:
         findings: what the checks of the tests found, and which particles took no part for it.
     """
 
+    archived: ClassVar[tuple[str, ...]] = ("content",)  # kept with the fields: the system it needs is not
+
     verdict: Verdict
     summary: str
     base: Base | None
-    system: System | None
+    system: System | None = field(metadata={"archived": False})
     effects: tuple[Effect, ...]
     candidate_set: tuple[tuple[str, ...], ...]
     ranking: Ranking | None
@@ -128,6 +139,38 @@ class Discovery:
     posterior: ExtendedPosterior | None = None
     notes: tuple[str, ...] = field(default=())
     findings: tuple[Finding, ...] = field(default=())
+
+    def law(self, particle: str | None = None) -> MccLaw:
+        """The calibrated law with the effects that were added.
+
+        Raises:
+            InputError: if there was no fit, or the gap is closed by a formula that no listed mechanism has.
+        """
+        if self.closure is not None:
+            remedy = "Draw or tabulate it: its terms stand in discovery.json."
+            raise InputError("the formula of this discovery is no effect of the library", remedy=remedy)
+        if self.base is None:
+            raise InputError("this discovery has no law: its fit did not converge", remedy="Calibrate first.")
+        model = self.base.model
+        numbers = {"method": "bayes", "law": {"unloading": model.unloading, "strain_scaling": model.strain_scaling}}
+        law = law_of(numbers | (self.after or self.before), particle)
+        return law.with_effects(*(effect.build() for effect in self.effects))
+
+    def save(self, folder: str | Path) -> None:
+        """Write `discovery.json` and what `mcc_jax.load` reads into a folder: both or nothing.
+
+        Raises:
+            InputError: if the folder cannot be written, or a part cannot be read back.
+        """
+        with results(arguments.file_path(folder, "folder")) as stage:
+            self.write(stage.folder)
+
+    def write(self, folder: Path, **more: Any) -> dict[str, Any]:
+        """Write the files of `save` into a folder that appears as a whole; returns the contents of the JSON."""
+        content = self.to_json() | more
+        (folder / "discovery.json").write_text(json_text(content), encoding="utf-8")
+        (folder / DISCOVERY_ARCHIVE).write_bytes(encode(self))
+        return content
 
     def gap(self) -> dict[str, Any]:
         """The gap at every step, on held-out particles."""
@@ -211,6 +254,11 @@ class Discovery:
 
     def to_json(self) -> dict[str, Any]:
         """The contents of `discovery.json`."""
+        return self.content
+
+    @cached_property
+    def content(self) -> dict[str, Any]:
+        """The contents of `discovery.json`, worked out once."""
         ranking = []
         if self.ranking is not None and self.system is not None:
             r = self.ranking

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from ..calibrate.curves import KINDS, FittedCurve
 from ..plots.style import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION
-from .compare import KINDS, Shown
 
 ROOTS = ("chart-curve", "chart-residual")
 LOOKS = {
@@ -121,7 +121,7 @@ def _ids(value: Any):
             yield from _ids(item)
 
 
-def chart_data(shown: list[Shown], labels: list[str], facts: list[str]) -> dict[str, Any]:
+def chart_data(shown: list[FittedCurve], labels: list[str], facts: list[str]) -> dict[str, Any]:
     """What the script shows: every particle's columns, and how kinds of segments look."""
     return {
         "kinds": [

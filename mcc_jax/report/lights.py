@@ -8,12 +8,12 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ..calibrate.curves import FittedCurve
 from ..calibrate.estimates import BAD_MISFIT
 from ..calibrate.posterior import ESS_LEAST, RHAT_MOST
 from ..calibrate.weights import PARETO_K_MOST
 from ..campaign import Finding, campaign_findings, check_plausibility, check_tests
 from ..campaign.findings import worst
-from .compare import Shown
 from .numbers import number, percent
 from .read import Results, checksums_told
 
@@ -47,7 +47,7 @@ class Light:
     meaning: str
 
 
-def lights(results: Results, shown: Sequence[Shown] = ()) -> list[Light]:
+def lights(results: Results, shown: Sequence[FittedCurve] = ()) -> list[Light]:
     """All checks that these results allow, the convergence of the calibration first.
 
     Args:
@@ -61,8 +61,9 @@ def lights(results: Results, shown: Sequence[Shown] = ()) -> list[Light]:
         if results.calibration["method"] == "bayes":
             found += _sampler(results.calibration["diagnostics"])
         found += _fit(results.calibration, shown)
-    if results.posterior is not None and results.posterior.inside is not None:
-        found.append(_coverage(results.posterior.inside))
+    inside = share_inside(shown)
+    if inside is not None:
+        found.append(_coverage(inside))
     if results.calibration is not None:
         found.append(_data(results))
     if results.discovery is not None:
@@ -152,13 +153,13 @@ def _sampler(d: dict[str, Any]) -> list[Light]:
     ]
 
 
-def _own_misfit(shown: Sequence[Shown]) -> float:
+def _own_misfit(shown: Sequence[FittedCurve]) -> float:
     """Median over the particles of the root mean square misfit, in shares of the range of displacement."""
     own = [(one.rms_um, float(np.ptp(one.displacement_um[one.used]))) for one in shown if one.rms_um is not None]
     return float(np.median([rms / reach for rms, reach in own if rms is not None and reach > 0] or [np.nan]))
 
 
-def _fit(content: dict[str, Any], shown: Sequence[Shown]) -> list[Light]:
+def _fit(content: dict[str, Any], shown: Sequence[FittedCurve]) -> list[Light]:
     d = content["diagnostics"]
     misfit, share = d.get("own_misfit"), (content.get("probability_not_monotone") or {}).get("value")
     if misfit is None and shown:
@@ -188,6 +189,13 @@ def _fit(content: dict[str, Any], shown: Sequence[Shown]) -> list[Light]:
     gaps = d.get("open_combinations", [])
     name = "Data determine the parameters"
     return found + [Light("bad", name, "not all", "all", f"The data leave open: {text}.") for text in gaps]
+
+
+def share_inside(shown: Sequence[FittedCurve]) -> float | None:
+    """Share of all compared points inside their band [-]; None without bands."""
+    pairs = [(one.displacement_um, one.low_um, one.high_um, one.used & np.isfinite(one.low_um)) for one in shown]
+    inside = [((um >= low) & (um <= high))[some] for um, low, high, some in pairs]
+    return float(np.mean(np.concatenate(inside))) if sum(map(len, inside)) else None
 
 
 def _coverage(inside: float) -> Light:

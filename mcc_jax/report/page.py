@@ -11,12 +11,13 @@ from typing import Any
 
 from .. import arguments
 from .._version import own_version
+from ..calibrate.curves import KINDS, FittedCurve
 from ..campaign.findings import worst
 from ..plots.text import particle_labels
 from . import pictures as pictures
 from .chart import LOOKS, chart_data, chart_items, chart_scripts
-from .compare import KINDS, Shown, compare
-from .lights import lights, tested
+from .compare import compare
+from .lights import lights, share_inside, tested
 from .numbers import interval, number, percent, probability, with_sd
 from .read import Results
 from .sentences import (
@@ -124,7 +125,7 @@ def _environment() -> Any:
     return found
 
 
-def context(results: Results, shown: list[Shown]) -> dict[str, Any]:
+def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
     """What the templates show."""
     from markupsafe import Markup
 
@@ -144,13 +145,14 @@ def context(results: Results, shown: list[Shown]) -> dict[str, Any]:
         "sentences": [] if results.calibration is None else calibration_sentences(results.calibration),
         "methods": METHODS,
         "shown": shown,
+        "bands": share_inside(shown) is not None,
         "labels": labels,
         "looks": {word: (marker, colour) for marker, colour, word in (LOOKS[kind] for kind in KINDS)},
         "seen": sorted({LOOKS[KINDS[k]][2] for one in shown for k in set(one.kind.tolist())}),
         "chart": _chart(results, shown, labels) if shown else None,
         "bokeh": Markup(_closed(chart_scripts())) if shown else "",
         "grid": pictures.grid(shown),
-        "marginals": [] if results.posterior is None else pictures.marginals(results.posterior.draws),
+        "marginals": [] if results.posterior is None else pictures.marginals(results.posterior),
         "lights": checks,
         "verdicts": VERDICTS,
         "steps": [] if results.discovery is None else _steps(results.discovery["gap"]),
@@ -175,7 +177,7 @@ def _closed(script: str) -> str:
     return re.sub(r"</(script)", r"<\\/\1", script, flags=re.IGNORECASE)
 
 
-def _chart(results: Results, shown: list[Shown], labels: list[str]) -> dict[str, Any]:
+def _chart(results: Results, shown: list[FittedCurve], labels: list[str]) -> dict[str, Any]:
     facts = particle_facts(results, [s.name for s in shown], [s.rms_um for s in shown], [s.why_not for s in shown])
     return {"bokeh": chart_items(), "data": chart_data(shown, labels, facts)}
 

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
 
+from ..calibrate.curves import FittedCurve
+from ..calibrate.results import PosteriorDraws
 from ..plots.style import BLACK, BLUE, GREY, ORANGE, PALE, RC, SKY, VERMILION, new_figure
 from ..plots.text import particle_labels
-from .compare import Shown
 
 GRID = 30
 """At most so many particles stand in the grid; of more, those with the largest misfit."""
@@ -47,8 +47,12 @@ def _svg(figure: Any) -> str:
 
 
 @rc_context(RC)
-def marginals(draws: Mapping[str, np.ndarray]) -> list[tuple[str, str, str]]:
+def marginals(posterior: PosteriorDraws) -> list[tuple[str, str, str]]:
     """For each number of the population: a picture of its posterior, its name, and what the picture shows in words."""
+    named = {name: values.ravel() for name, values in posterior.named_population().items()}
+    medians = {f"{name[3:]}_median": np.exp(values) for name, values in named.items() if name.startswith("mu_")}
+    spreads = {f"{name[4:]}_spread": values for name, values in named.items() if name.startswith("tau_")}
+    draws = named | medians | spreads
     found = []
     for name, (label, factor) in PANELS.items():
         values = draws[name] * factor
@@ -74,7 +78,7 @@ def marginals(draws: Mapping[str, np.ndarray]) -> list[tuple[str, str, str]]:
 
 
 @rc_context(RC)
-def grid(shown: list[Shown]) -> tuple[str, int] | None:
+def grid(shown: list[FittedCurve]) -> tuple[str, int] | None:
     """Force over displacement of every particle, measured and predicted; and how many stand in it."""
     if not shown:
         return None

@@ -9,16 +9,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from .. import arguments
+from .._archive import read_archive
 from .._errors import InputError
+from ..calibrate.content import read_result
+from ..calibrate.results import ARCHIVE, Calibration, OldCalibration, PosteriorDraws
 from ..campaign import Campaign, check_tests, file_checksums, read_campaign
 from ..files import read_regular
-from .json import read_result
-from .posterior import Posterior, read_posterior
 
-CALIBRATION, DISCOVERY, POSTERIOR, CAMPAIGN = "calibration.json", "discovery.json", "posterior.nc", "campaign"
+CALIBRATION, DISCOVERY, CAMPAIGN = "calibration.json", "discovery.json", "campaign"
 DATA = ("particles.csv", "curves.csv")
 FIGURE = re.compile(r"figures/([A-Za-z0-9_-]+)\.png")
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -36,7 +35,7 @@ class Results:
         checksums: of their files, SHA-256 by name.
         calibration: contents of `calibration.json`.
         discovery: contents of `discovery.json`.
-        posterior: draws and bands of `posterior.nc`.
+        saved: the calibration itself, as `mcc_jax.load` gives it, or its numbers alone where nothing else is left.
         figures: files of `figures/` that the two results name as theirs, by stem.
         written: the day of the newest result.
         cautions: where parts contradict each other.
@@ -48,11 +47,16 @@ class Results:
     checksums: Mapping[str, str]
     calibration: dict[str, Any] | None
     discovery: dict[str, Any] | None
-    posterior: Posterior | None
+    saved: Calibration | None
     figures: Mapping[str, bytes]
     written: datetime.date | None
     cautions: tuple[str, ...]
     missing_campaign: str
+
+    @property
+    def posterior(self) -> PosteriorDraws | None:
+        """The calibration, if it is one by draws of a posterior."""
+        return self.saved if isinstance(self.saved, PosteriorDraws) else None
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -96,8 +100,7 @@ def read_results(folder: str | Path, campaign: str | Path | None = None, *, name
     where, why = _find(path, there, campaign, [content for _, content in results])
     data = None if where is None else check_tests(read_campaign(where))
     checksums = {} if where is None else file_checksums(where)
-    posterior = read_posterior(path / POSTERIOR) if POSTERIOR in there else None
-    if data is None and posterior is None and not results:
+    if data is None and not results:
         found = ", ".join(sorted(there)[:8]) or "nothing"
         raise InputError(
             "there is nothing to report",
@@ -105,16 +108,20 @@ def read_results(folder: str | Path, campaign: str | Path | None = None, *, name
             remedy=f"Give a folder that mcc-jax demo, calibrate or discover wrote into; found there: {found}",
         )
     cautions = list(_cautions(data, checksums, calibration, discovery))
-    if posterior is not None and calibration is not None and not _belongs(posterior, calibration):
-        cautions.append(f"{POSTERIOR} is not of the calibration beside it, and is left out")
-        posterior = None
+    saved = None if calibration is None else OldCalibration(calibration, data)
+    if calibration is not None and ARCHIVE in there:
+        found = read_archive(path / ARCHIVE)
+        if isinstance(found, Calibration) and _belongs(found, calibration):
+            saved, data = found, found.campaign if data is None else data
+        else:
+            cautions.append(f"{ARCHIVE} is not of the {CALIBRATION} beside it, and is left out")
     return Results(
         name or path.resolve().name or str(path),
         data,
         checksums,
         calibration,
         discovery,
-        posterior,
+        saved,
         _figures(path, [content for _, content in results]),
         _newest([path / n for n, _ in results]),
         tuple(cautions),
@@ -182,12 +189,9 @@ def checksums_told(content: dict[str, Any]) -> dict[str, str]:
     return (content["provenance"]["campaign"] or {}).get("sha256", {})
 
 
-def _belongs(posterior: Posterior, calibration: dict[str, Any]) -> bool:
-    if calibration["method"] != "bayes":
-        return False
-    pairs = [(posterior.draws["a"], calibration["a"]["value"])]
-    pairs.append((posterior.draws["effective_modulus_MPa"], calibration["effective_modulus_MPa"]["value"]))
-    return all(value is not None and np.isclose(np.mean(draws), value, rtol=1e-6) for draws, value in pairs)
+def _belongs(saved: Calibration, content: dict[str, Any]) -> bool:
+    told = saved.to_json()
+    return all(told[name] == content[name] for name in ("method", "a", "effective_modulus_MPa", "log_C1"))
 
 
 def _figures(path: Path, results: list[dict[str, Any]]) -> dict[str, bytes]:

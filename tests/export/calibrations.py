@@ -17,6 +17,8 @@ def entry(name, C1, C3, C5, kept=True):
         "particle": name,
         "eta_p": estimate(1.3 if kept else None),
         **{k: estimate(v if kept else None, 0.1 if kept else None) for k, v in values},
+        "zero_um": estimate(0.0 if kept else None),
+        "rms_um": 0.02 if kept else None,
         "kept": kept,
         "why_not": None if kept else "burst at 3 mN",
     }
@@ -41,6 +43,8 @@ def content(**changes):
             entry("out", None, None, None, kept=False),
         ],
         "warnings": [],
+        "noise": {},
+        "diagnostics": {"rhat_max": None, "ess_bulk_min": None, "divergences": None, "pareto_k_max": None},
     } | changes
 
 

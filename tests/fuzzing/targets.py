@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import shutil
 import zipfile
 from collections.abc import Callable
@@ -184,6 +185,22 @@ TESTERS = (
     ("Hysitron text", "hysitron_lc.txt"),
     ("Micro Materials", "micromaterials.txt"),
 )
+SAVED = "calibration.msgpack"
+
+
+def saved_calibration() -> bytes:
+    from mcc_jax._archive import encode
+    from mcc_jax.calibrate import OldCalibration
+
+    return encode(OldCalibration(json.loads(RESULTS["calibration.json"])))
+
+
+def load_result(folder: Path) -> object:
+    from mcc_jax import load
+
+    return load(folder)
+
+
 READERS = (
     *(Reader(name, 4, FOLDER, bytes_of(name), read_campaign) for name in FOLDER),
     Reader("diameters", 2, {"particles.csv": FOLDER["particles.csv"]}, diameters, read_diameters),
@@ -196,8 +213,7 @@ READERS = (
     Reader("priors", 2, {"priors.toml": sample("priors.toml")}, bytes_of("priors.toml"), read_priors),
     Reader("programme", 2, {"programme.toml": sample("programme.toml")}, bytes_of("programme.toml"), read_programme),
     *(Reader(name, 2, CAMPAIGN | {name: RESULTS[name]}, values_of(name), read_results) for name in BOTH),
-    # Few, since each is read in a process of its own.
-    Reader("posterior.nc", 0.1, {"posterior.nc": RESULTS["posterior.nc"]}, bytes_of("posterior.nc"), read_results),
+    Reader("saved calibration", 2, {SAVED: saved_calibration()}, bytes_of(SAVED), load_result),
     Reader("saved state", 1, {"state.npz": sample("state.npz")}, state, read_state),
     Reader("export", 0.2, CAMPAIGN | RESULTS, values_of("calibration.json"), export),
     Reader("report page", 0.05, CAMPAIGN | RESULTS, values_of(*BOTH), report),

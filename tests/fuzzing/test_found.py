@@ -8,7 +8,6 @@ import time
 import zipfile
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 
@@ -17,7 +16,6 @@ from mcc_jax.calibrate import read_priors
 from mcc_jax.campaign import read_diameters, read_tester_file
 from mcc_jax.dem import load_state
 from mcc_jax.export import read_calibration
-from mcc_jax.report import posterior as page
 from mcc_jax.report import read_results
 
 SAMPLES = Path(__file__).parent / "samples"
@@ -176,38 +174,6 @@ def test_saved_states_with_damaged_headers(tmp_path, name):
             content = old.read(entry)
             new.writestr(entry, content.replace(b"(", b"((", 1) if entry == name else content)
     assert "is not a saved state" in refused(load_state, tmp_path / "state.npz")
-
-
-@pytest.mark.parametrize(
-    "name", ["posterior/mu", "posterior_predictive/displacement_um", "observed_data/displacement_um"]
-)
-def test_a_posterior_that_would_fill_the_memory(tmp_path, name):
-    """Terabytes of fill value, in a file of some kilobytes."""
-    file = tmp_path / "posterior.nc"
-    file.write_bytes((SAMPLES / "results" / "posterior.nc").read_bytes())
-    with h5py.File(file, "r+") as tree:
-        shape = (10**4,) * 3 if name == "posterior/mu" else (10**4,) * 4 if "predictive" in name else (2, 10**12)
-        del tree[name]
-        tree.create_dataset(name, shape, "f8", chunks=True)
-    assert "shape" in refused(read_results, tmp_path)
-
-
-def test_a_posterior_that_the_library_reads_for_ever(tmp_path, monkeypatch):
-    """libhdf5 does not come back from this damage."""
-    monkeypatch.setattr(page, "SECONDS", 2.0)
-    (tmp_path / "posterior.nc").write_bytes((SAMPLES.with_name("damaged") / "endless.nc").read_bytes())
-    assert "no end after 2 s" in refused(read_results, tmp_path)
-
-
-@pytest.mark.parametrize("huge", ["mu", "displacement_um"])
-def test_numbers_of_a_posterior_that_overflow(tmp_path, huge):
-    file = tmp_path / "posterior.nc"
-    file.write_bytes((SAMPLES / "results" / "posterior.nc").read_bytes())
-    with h5py.File(file, "r+") as tree:
-        values = (tree["posterior"] if huge == "mu" else tree["posterior_predictive"])[huge]
-        values[...] = 1e300
-        values[0] = -1e300
-    assert "finite" in refused(read_results, tmp_path)
 
 
 @pytest.mark.parametrize("read", [read_results, read_calibration])

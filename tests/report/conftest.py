@@ -2,9 +2,17 @@ import shutil
 
 import pytest
 from click.testing import CliRunner
-from results_folder import write_results
+from results_folder import stand_in, write_results
 
 from mcc_jax.cli.main import cli
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _saved_calibrations_are_stand_ins():
+    """What is saved in these tests is the truth and not the result of a calibration, which takes long."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mcc_jax.report.read.read_archive", stand_in)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -3,15 +3,16 @@
 import base64
 import json
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import equinox as eqx
-import h5py
 import jax.numpy as jnp
 import numpy as np
 
+from mcc_jax._archive import read_archive
 from mcc_jax.calibrate.data import rows_from_contact
-from mcc_jax.campaign import campaign_segments, file_checksums, write_campaign
+from mcc_jax.calibrate.results import PosteriorDraws
+from mcc_jax.campaign import Campaign, campaign_segments, file_checksums, write_campaign
 from mcc_jax.law import MccLaw, Plastic
 from mcc_jax.simulate import Hold, Programme, Ramp, simulate_campaign
 
@@ -156,33 +157,51 @@ def discovery(**changes):
     } | changes
 
 
-def write_posterior(file, tests, names=NAMES, a=A):
-    """A posterior around the truth, with bands of the noise that these tests do not have."""
+@dataclass(frozen=True)
+class Draws(PosteriorDraws):
+    """Stands in for a saved posterior: draws around the truth, and bands of noise that these tests do not have."""
+
+    campaign: Campaign
+    content: dict
+    of_a: np.ndarray
+    seed: int = 0
+
+    def to_json(self):
+        return self.content
+
+    @property
+    def particles(self):
+        return tuple(self.campaign.particles[:-1])
+
+    def named_population(self):
+        rng = np.random.default_rng(0)
+        named = {"a": self.of_a, "effective_modulus_MPa": MODULUS + 10 * rng.standard_normal((4, 100))}
+        for k, mu in ((1, 1.9), (3, 1.09), (5, 0.98)):
+            named[f"mu_C{k}"] = mu + 0.01 * rng.standard_normal((4, 100))
+            named[f"tau_C{k}"] = np.abs(0.1 + 0.01 * rng.standard_normal((4, 100)))
+        return named
+
+    def compared(self):
+        segments = campaign_segments(self.campaign)
+        rows = [rows_from_contact(c, s, 400) for c, s in zip(self.campaign.curves, segments, strict=True)][:-1]
+        return {i: (some, np.ones(len(some), bool)) for i, some in enumerate(rows)}
+
+    def predictions(self, particle):
+        i = self.campaign.index(particle)
+        um = self.campaign.curves[i].displacement_um[self.compared()[i][0]]
+        return um + NOISE * np.random.default_rng(i).standard_normal((500, len(um)))
+
+
+ARCHIVE = "calibration.msgpack"
+
+
+def stand_in(file):
+    """What `read_archive` gives in these tests: the draws that belong to the folder of a file."""
+    if not file.read_bytes().startswith(b"["):
+        return read_archive(file)
+    content = calibration(json.loads(file.read_text()))
     rng = np.random.default_rng(0)
-    kept = len(names) - 1
-    rows = [rows_from_contact(c, s, 400) for c, s in zip(tests.curves, campaign_segments(tests), strict=True)][:kept]
-    points = -(-max(map(len, rows)) // 64) * 64
-
-    def padded(values):
-        return np.stack([np.pad(v[r], (0, points - len(r)), mode="edge") for v, r in zip(values, rows, strict=False)])
-
-    um = padded([c.displacement_um for c in tests.curves])
-    mask = np.stack([np.arange(points) < len(r) for r in rows])
-    with h5py.File(file, "w") as tree:
-        posterior = tree.create_group("posterior")
-        draws = a + 0.01 * rng.standard_normal((4, 100))
-        posterior["a"] = draws - draws.mean() + a
-        draws = 10 * rng.standard_normal((4, 100))
-        posterior["effective_modulus_MPa"] = draws - draws.mean() + MODULUS
-        posterior["mu"] = np.array([1.9, 1.09, 0.98]) + 0.01 * rng.standard_normal((4, 100, 3))
-        posterior["tau"] = np.abs(0.1 + 0.01 * rng.standard_normal((4, 100, 3)))
-        predictive = tree.create_group("posterior_predictive")
-        predictive["particle"] = list(names[:kept])
-        predictive["displacement_um"] = um + NOISE * rng.standard_normal((4, 500, kept, points))
-        constant = tree.create_group("constant_data")
-        constant["force_mN"] = padded([c.force_mN for c in tests.curves])
-        constant["mask"] = mask.astype(np.int8)
-        tree.create_group("observed_data")["displacement_um"] = um
+    return Draws(campaign(json.loads(file.read_text())), content, A + 0.01 * rng.standard_normal((4, 100)))
 
 
 def write_results(folder, names=NAMES):
@@ -199,7 +218,7 @@ def write_results(folder, names=NAMES):
         ("discovery.json", discovery(provenance=origin)),
     ):
         (folder / name).write_text(json.dumps(content), encoding="utf-8")
-    write_posterior(folder / "posterior.nc", tests, names)
+    (folder / ARCHIVE).write_text(json.dumps(list(names)))
     (folder / "figures").mkdir()
     for stem in ("forest", "discovery_before_after"):
         (folder / "figures" / f"{stem}.png").write_bytes(PNG)

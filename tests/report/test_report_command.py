@@ -3,7 +3,6 @@
 import json
 import shutil
 
-import h5py
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -43,7 +42,6 @@ DAMAGE = {
     "too deep": ("calibration.json", b"[" * 100_000, "is no JSON"),
     "a list": ("discovery.json", b"[]", "does not hold what it should"),
     "another schema": ("calibration.json", b'{"schema": 2}', "schema 2, this mcc-jax knows 1"),
-    "no posterior": ("posterior.nc", b"nonsense", "is no posterior"),
     "a bad campaign": ("particles.csv", b"particle,D1_um\n1,2\n", "D2"),
 }
 
@@ -57,15 +55,6 @@ def test_damage_is_told_in_one_line_and_nothing_is_lost(run, folder, name):
     assert file in line
     assert words in line
     assert (folder / "report.html").read_text() == "the old page"
-
-
-def test_a_posterior_without_its_parts_is_none(run, folder):
-    with h5py.File(folder / "posterior.nc", "a") as tree:
-        del tree["posterior"]["mu"]
-    assert "is no posterior that mcc-jax wrote" in refused(run("report", folder))
-    whole = (folder / "posterior.nc").read_bytes()
-    (folder / "posterior.nc").write_bytes(whole[: len(whole) // 2])
-    assert "posterior.nc" in refused(run("report", folder))
 
 
 def test_a_wrong_value_is_told_with_its_place(run, folder):

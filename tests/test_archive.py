@@ -1,0 +1,125 @@
+"""Results as bytes: what is read is what was written to the last bit; what we did not write is one clear line."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from mcc_jax import InputError, load, paper_law
+from mcc_jax._archive import encode, read_archive
+from mcc_jax.calibrate import OldCalibration
+from mcc_jax.effects import AbstractEffect
+from mcc_jax.law import Unloading
+
+PLAIN = st.none() | st.booleans() | st.integers(-(2**63), 2**63 - 1) | st.floats() | st.text() | st.binary()
+ARRAYS = arrays(st.sampled_from([np.float64, np.float32, np.int32, np.bool_]), st.integers(0, 4))
+VALUES = st.recursive(
+    PLAIN | ARRAYS,
+    lambda inner: st.lists(inner) | st.tuples(inner, inner) | st.dictionaries(st.text(), inner),
+    max_leaves=8,
+)
+
+
+def again(value, folder):
+    file = folder / "calibration.msgpack"
+    file.write_bytes(encode(value))
+    return read_archive(file)
+
+
+def bits(value):
+    """Value, kinds and bits: NaN is itself, and -0.0 is not 0.0."""
+    if isinstance(value, np.ndarray):
+        return value.dtype.str, value.shape, value.tobytes()
+    if isinstance(value, float):
+        return np.float64(value).tobytes()
+    if isinstance(value, dict):
+        return {key: bits(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return type(value), [bits(item) for item in value]
+    return type(value), value
+
+
+@given(VALUES)
+def test_what_is_read_is_what_was_written(tmp_path_factory, value):
+    assert bits(again(value, tmp_path_factory.getbasetemp())) == bits(value)
+
+
+def test_laws_with_effects_and_memory(tmp_path):
+    law = paper_law(Unloading.PUNCH).with_effects("creep:logarithmic", "damage")
+    found = again(law, tmp_path)
+    assert type(found) is type(law)
+    assert found.unloading is Unloading.PUNCH
+    assert [effect.name for effect in found.effects] == ["creep:logarithmic", "damage:exponential"]
+    assert float(found.effects[0].amplitude) == float(law.effects[0].amplitude)
+    assert isinstance(found.plastic.C1, jnp.ndarray)
+
+
+def damaged(file, change):
+    archive = msgspec.msgpack.decode(file.read_bytes())
+    file.write_bytes(msgspec.msgpack.encode(archive | change))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda file: file.write_bytes(file.read_bytes()[:-100]), "cut off"),
+        (lambda file: file.write_bytes(b"\x89HDF\r\n\x1a\n and so on"), "no result of mcc_jax"),
+        (lambda file: file.write_bytes(b""), "cut off"),
+        (lambda file: damaged(file, {"version": 2, "written_by": "9.1.0"}), "newer version, 9.1.0"),
+        (lambda file: damaged(file, {"format": "another"}), "something else"),
+        (lambda file: damaged(file, {"content": b"\x90"}), "checksum"),
+    ],
+    ids=["truncated", "foreign", "empty", "newer", "another format", "changed"],
+)
+def test_a_damaged_foreign_or_newer_file_is_one_line(tmp_path, change, words):
+    file = tmp_path / "calibration.msgpack"
+    file.write_bytes(encode(OldCalibration({"schema": 1})))
+    change(file)
+    with pytest.raises(InputError) as caught:
+        load(tmp_path)
+    assert words in str(caught.value)
+    assert str(file) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+class Mine(AbstractEffect):
+    """An effect of one's own."""
+
+
+def test_what_cannot_be_read_back_is_refused_when_it_is_written():
+    with pytest.raises(InputError, match=r"test_archive.Mine, which is not of mcc_jax"):
+        encode(paper_law().with_effects(Mine(0.1)))
+    with pytest.raises(InputError, match="cannot be written"):
+        encode({"f": lambda: None})
+
+
+@pytest.mark.parametrize("name", ["os:system", "mcc_jax._archive:os", "mcc_jax.law.mcc:TESTED_STRAIN", "builtins:eval"])
+def test_only_classes_of_the_package_are_built(tmp_path, name):
+    file = tmp_path / "calibration.msgpack"
+    content = msgspec.msgpack.encode({"object": name, "fields": {}})
+    whole = msgspec.msgpack.decode(encode(None))
+    import hashlib
+
+    file.write_bytes(
+        msgspec.msgpack.encode(whole | {"content": content, "sha256": hashlib.sha256(content).hexdigest()})
+    )
+    with pytest.raises(InputError, match="another version"):
+        read_archive(file)
+
+
+def test_a_field_that_nobody_knows_is_another_version(tmp_path):
+    @dataclasses.dataclass
+    class Stranger:
+        content: dict
+        more: int = 0
+
+    Stranger.__module__, Stranger.__qualname__ = OldCalibration.__module__, OldCalibration.__qualname__
+    file = tmp_path / "calibration.msgpack"
+    file.write_bytes(encode(Stranger({})))
+    with pytest.raises(InputError, match="no field 'more'"):
+        load(tmp_path)
