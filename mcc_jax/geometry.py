@@ -5,6 +5,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax.numpy as jnp
 
+from ._format import value_of
 from ._numerics import compiled_whole, positive_pow, shared
 from ._types import Scalar, ScalarLike, Values, scalar
 from .arguments import finite, instance, positive
@@ -39,6 +40,9 @@ class Particle(eqx.Module):
     D1: Scalar = eqx.field(converter=_diameter)
     D2: Scalar = eqx.field(converter=_diameter)
     D3: Scalar = eqx.field(converter=_diameter)
+
+    def __repr__(self) -> str:
+        return f"Particle(D1={value_of(self.D1)}, D2={value_of(self.D2)}, D3={value_of(self.D3)} um)"
 
     @property
     def effective_diameter(self) -> Scalar:

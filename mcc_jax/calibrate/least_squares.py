@@ -57,7 +57,7 @@ class Identifiability:
         return found
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class LeastSquaresCalibration(Calibration):
     """The joint least-squares fit of a campaign.
 

@@ -39,7 +39,7 @@ class Worst(NamedTuple):
     value: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class BayesCalibration(PosteriorDraws):
     """The posterior of a campaign.
 

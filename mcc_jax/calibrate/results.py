@@ -14,6 +14,7 @@ import numpy as np
 from .. import arguments
 from .._archive import encode, read_archive
 from .._errors import InputError
+from .._format import table, with_sd
 from .._store import json_text, results
 from ..campaign import Campaign, read_campaign
 from ..law import MccLaw
@@ -37,6 +38,21 @@ class Calibration(abc.ABC):
     @abc.abstractmethod
     def to_json(self) -> dict[str, Any]:
         """The contents of `calibration.json`."""
+
+    def __repr__(self) -> str:
+        content = self.to_json()
+        used = sum(entry["kept"] for entry in content["particles"])
+        title = f"{type(self).__name__} of {used} of {len(content['particles'])} particles, "
+        title += "converged" if content["converged"] else "NOT converged"
+        rows = [("shape parameter a", with_sd(content["a"]))]
+        rows.append(("effective modulus", f"{with_sd(content['effective_modulus_MPa'], 1e-3)} GPa"))
+        for name in ("C1", "C3", "C5"):
+            log = content[f"log_{name}"]
+            rows.append((f"log {name}", f"mean {with_sd(log['mean'])}, sd between particles {with_sd(log['sd'])}"))
+        law = content["law"]
+        rows.append(("law", f"unloading {law['unloading']}, strain scaling {law['strain_scaling']}"))
+        rows += [("warning", text[:100]) for text in content.get("warnings", [])]
+        return table(title, rows)
 
     def law(self, particle: str | None = None) -> MccLaw:
         """The calibrated law.
@@ -111,7 +127,7 @@ class PosteriorDraws(Calibration):
         """Draws of the population by the names used in files, shape (chains, draws)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class OldCalibration(Calibration):
     """A calibration of which nothing but `calibration.json` (schema 1) is left: numbers, but neither fit nor curves.
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from .. import arguments
 from .._errors import InputError
+from .._format import number, span, table
 from .findings import Level
 
 Control = Literal["load", "displacement"]
@@ -57,7 +58,7 @@ class Checked:
     notes: tuple[Note, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Curve:
     """One particle's test, raw as the tester recorded it: nothing shifted, smoothed or sorted.
 
@@ -90,6 +91,12 @@ class Curve:
 
     def __len__(self) -> int:
         return len(self.time_s)
+
+    def __repr__(self) -> str:
+        if not len(self):
+            return "Curve without readings"
+        force, path = span([self.force_mN.min(), self.force_mN.max()], "mN"), self.displacement_um
+        return f"Curve of {len(self)} readings, {force}, {span([path.min(), path.max()], 'um')}"
 
     @property
     def compared(self) -> np.ndarray:
@@ -139,7 +146,7 @@ class Metadata:
         arguments.instance(self.other, Mapping, "other", "Give a dictionary.")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Campaign:
     """Measured (or simulated) tests on single particles.
 
@@ -196,6 +203,14 @@ class Campaign:
 
     def __len__(self) -> int:
         return len(self.particles)
+
+    def __repr__(self) -> str:
+        title = f"Campaign of {len(self)} particles" + (f" from {self.source}" if self.source else "")
+        rows = [
+            (name, f"{' x '.join(number(d) for d in sizes)} um, {curve!r}"[:100])
+            for name, sizes, curve in zip(self.particles, self.diameters_um.tolist(), self.curves, strict=True)
+        ]
+        return table(title, rows)
 
     def index(self, particle: str) -> int:
         """Position of a particle by its name.

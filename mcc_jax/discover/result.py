@@ -12,6 +12,7 @@ import numpy as np
 from .. import arguments
 from .._archive import encode
 from .._errors import InputError
+from .._format import table
 from .._store import json_text, results
 from ..calibrate.estimates import finite
 from ..calibrate.laws import law_of
@@ -87,7 +88,7 @@ class Effect:
         }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Discovery:
     """What is missing in the law, how sure that is, and what would tell more.
 
@@ -139,6 +140,10 @@ class Discovery:
     posterior: ExtendedPosterior | None = None
     notes: tuple[str, ...] = field(default=())
     findings: tuple[Finding, ...] = field(default=())
+
+    def __repr__(self) -> str:
+        rows = [("added", repr(effect.build())) for effect in self.effects]
+        return table(f"Discovery: {self.verdict}. {self.summary[:200]}", rows + [("note", n[:100]) for n in self.notes])
 
     def law(self, particle: str | None = None) -> MccLaw:
         """The calibrated law with the effects that were added.

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 
+from .._format import value_of
 from .._types import Scalar, Values, scalar
 from ..formulas import Formulas
 from ..geometry import Particle
@@ -41,6 +43,11 @@ class AbstractEffect(eqx.Module):
 
     amplitude: Scalar = eqx.field(converter=scalar)
     label: str = eqx.field(static=True, default="", kw_only=True)
+
+    def __repr__(self) -> str:
+        names = [f.name for f in fields(self) if f.name not in ("label", "amplitude")]
+        numbers = [f"{name} {value_of(getattr(self, name))}" for name in names if hasattr(getattr(self, name), "shape")]
+        return ", ".join([f"{self.name} of amplitude {value_of(self.amplitude)}", *numbers])
 
     @property
     def name(self) -> str:

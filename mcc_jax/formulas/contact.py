@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from .._format import table, value_of
 from .._numerics import compiled_whole, derivative_kept, shared
 from .._types import Flag, Scalar, ScalarLike, Values, scalar
 from ..arguments import finite, instance, member, positive
@@ -55,6 +56,17 @@ class Formulas(eqx.Module):
     effective_modulus: Scalar = eqx.field(converter=_modulus)
     unloading: Unloading = eqx.field(static=True, converter=_unloading, default=Unloading.PRINTED)
     strain_scaling: StrainScaling = eqx.field(static=True, converter=_strain_scaling, default=StrainScaling.RAW)
+
+    def __repr__(self) -> str:
+        return table(type(self).__name__, self._rows())
+
+    def _rows(self) -> list[tuple[str, str]]:
+        return [
+            *((name, value_of(getattr(self.plastic, name))) for name in ("C1", "C3", "C5")),
+            ("shape parameter a", value_of(self.a)),
+            ("effective modulus", value_of(self.effective_modulus, "MPa")),
+            ("unloading", f"{self.unloading.value}, strain scaling {self.strain_scaling.value}"),
+        ]
 
     @property
     def is_monotone(self) -> Flag:

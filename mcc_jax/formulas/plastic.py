@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._format import value_of
 from .._numerics import compiled_whole
 from .._types import Flag, Scalar, ScalarLike, scalar
 from ..arguments import positive
@@ -43,6 +44,9 @@ class Plastic(eqx.Module):
     C1: Scalar = eqx.field(converter=_coefficient)
     C3: Scalar = eqx.field(converter=_softening)
     C5: Scalar = eqx.field(converter=_coefficient)
+
+    def __repr__(self) -> str:
+        return f"Plastic(C1={value_of(self.C1)}, C3={value_of(self.C3)}, C5={value_of(self.C5)})"
 
     @classmethod
     def from_polynomial(cls, K1: ScalarLike, K3: ScalarLike, K5: ScalarLike) -> Plastic:

@@ -107,6 +107,9 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
 
     effects: tuple[AbstractEffect, ...] = eqx.field(converter=_effects, default=())
 
+    def _rows(self) -> list[tuple[str, str]]:
+        return [*super()._rows(), *(("effect", repr(effect)) for effect in self.effects)]
+
     @property
     def is_valid(self) -> Flag:
         """Whether C1, C5 and the modulus are positive, C3 is not negative, and every number is finite."""

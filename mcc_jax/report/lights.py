@@ -8,13 +8,13 @@ from typing import Any, Literal
 
 import numpy as np
 
+from .._format import number, percent
 from ..calibrate.curves import FittedCurve
 from ..calibrate.estimates import BAD_MISFIT
 from ..calibrate.posterior import ESS_LEAST, RHAT_MOST
 from ..calibrate.weights import PARETO_K_MOST
 from ..campaign import Finding, campaign_findings, check_plausibility, check_tests
 from ..campaign.findings import worst
-from .numbers import number, percent
 from .read import Results, checksums_told
 
 Level = Literal["good", "look", "bad", "unknown"]

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from .. import arguments
+from .._format import interval, number, percent, probability, with_sd
 from .._version import own_version
 from ..calibrate.curves import KINDS, FittedCurve
 from ..campaign.findings import worst
@@ -18,7 +19,6 @@ from . import pictures as pictures
 from .chart import LOOKS, chart_data, chart_items, chart_scripts
 from .compare import compare
 from .lights import lights, share_inside, tested
-from .numbers import interval, number, percent, probability, with_sd
 from .read import Results
 from .sentences import (
     METHODS,

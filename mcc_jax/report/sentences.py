@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from .._format import interval, number, percent, probability
 from ..plots.text import is_simulated
-from .numbers import interval, number, percent, probability
 from .read import Results
 
 METHODS = {

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from .._format import interval, number, span, with_sd
 from ..campaign import (
     PAPER_EFFECTIVE_MODULUS_MPA,
     PAPER_LOG_C,
@@ -16,7 +17,6 @@ from ..campaign import (
     campaign_segments,
     effective_diameter_um,
 )
-from .numbers import interval, number, span, with_sd
 from .read import Results
 from .sentences import plain
 

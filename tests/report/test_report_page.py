@@ -14,12 +14,12 @@ from reading_html import Page
 from results_folder import ARCHIVE, MODULUS, NAMES, NOISE, calibration
 from results_folder import C as COEFFICIENTS
 
+from mcc_jax._format import interval, number, with_sd
 from mcc_jax.calibrate.curves import KINDS
 from mcc_jax.report import read_results, report_page
 from mcc_jax.report.chart import chart_data, chart_items
 from mcc_jax.report.compare import PageOptions, compare
 from mcc_jax.report.lights import lights, share_inside
-from mcc_jax.report.numbers import interval, number, with_sd
 from mcc_jax.report.sentences import calibration_sentences, next_steps
 
 SECTIONS = {"summary", "measured", "law", "compare", "posterior", "diagnostics", "discovery", "settings", "cite"}

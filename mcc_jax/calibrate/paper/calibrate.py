@@ -40,7 +40,7 @@ PLAUSIBLE_SHAPE_FACTOR = 4.0
 """Shape factors beyond this, twice the paper's largest, come from curves that do not collapse, not from shape."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class PaperCalibration(Calibration):
     """Everything that the paper's calibration finds, with what it was made from.
 

@@ -1,9 +1,13 @@
-"""Numbers as a person writes them."""
+"""Numbers as a person writes them, for command, pages, figures and `repr`."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
+
+import numpy as np
+
+from .arguments import is_traced
 
 
 def number(value: float | int | None, digits: int = 4) -> str:
@@ -73,3 +77,21 @@ def span(values: Any, unit: str, digits: int = 4) -> str:
     """Smallest and largest, or the one value."""
     low, high = number(float(min(values)), digits), number(float(max(values)), digits)
     return f"{low} {unit}" if low == high else f"{low} to {high} {unit}"
+
+
+def value_of(value: Any, unit: str = "") -> str:
+    """A parameter of a module in words: its value, the range of a batch, or what stands for it while JAX traces."""
+    mark = f" {unit}" if unit else ""
+    if is_traced(value) or not hasattr(value, "shape"):
+        return f"{value}{mark}"
+    array = np.asarray(value, float)
+    if array.size <= 1:
+        return f"{number(float(array.ravel()[0]))}{mark}" if array.size else "none"
+    return f"{number(float(array.min()))} to {number(float(array.max()))}{mark} ({array.shape[0]} of them)"
+
+
+def table(title: str, rows: list[tuple[str, str]], most: int = 20) -> str:
+    """A title and rows of name and value, at most so many lines."""
+    width = max((len(name) for name, _ in rows), default=0)
+    lines = [title, *(f"  {name:<{width}}  {text}" for name, text in rows)]
+    return "\n".join(lines if len(lines) <= most else [*lines[: most - 1], f"  ... and {len(lines) - most + 1} more"])
