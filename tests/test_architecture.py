@@ -169,7 +169,7 @@ def test_public_names_are_re_exported_one_by_one(name):
             assert ast.unparse(node.target) == "__version__"
             continue
         assert isinstance(node, ast.ImportFrom), f"mcc_jax.{name}, line {node.lineno}: only re-exports belong here"
-        assert node.level == 1
+        assert node.level in (1, 2)  # what a package below has may be offered by name, too
         for alias in node.names:
             assert alias.asname == alias.name, f"mcc_jax.{name}: write `import {alias.name} as {alias.name}`"
 

@@ -125,7 +125,7 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
 
     # ---- effects -----------------------------------------------------------------------------------------------------
 
-    def with_effects(self, *effects: str | Variant | AbstractEffect) -> MccLaw:
+    def with_effects(self, *effects: Any) -> MccLaw:
         """The law with further effects.
 
         Args:

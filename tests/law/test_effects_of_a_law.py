@@ -1,0 +1,144 @@
+"""A law with effects is a law: by hand, driven, differentiated, by name, without what is the tester's."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import close, paper_law, paper_particle
+
+from mcc_jax import InputError, MccLaw, drive, simulate_batch
+from mcc_jax.effects import LIBRARY, AbstractEffect, Need, Variant
+from mcc_jax.geometry import Particle
+from mcc_jax.law import Plastic
+
+LAW, PARTICLE = paper_law(), paper_particle(3)
+COMPLIANCE, RATE, TAU = 0.0015, 0.01, 10.0
+# Load, hold, unload: one force a second.
+FORCE = jnp.concatenate([jnp.linspace(0.0, 150.0, 61), jnp.full(120, 150.0), jnp.linspace(147.5, 0.0, 60)])
+TIME = jnp.arange(len(FORCE), dtype=float)
+
+
+def creeping(amplitude=RATE, compliance=COMPLIANCE):
+    creep = LIBRARY["creep"]["logarithmic"].build(amplitude, tau_s=TAU)
+    return LAW.with_effects(creep, LIBRARY["frame_compliance"]["linear"].build(compliance))
+
+
+def test_a_frame_adds_compliance_times_force_and_nothing_else():
+    base = drive(LAW, PARTICLE, FORCE, control="load").displacement
+    frame = drive(creeping(amplitude=0.0), PARTICLE, FORCE, time=TIME, control="load").displacement
+    close(frame - base, COMPLIANCE * FORCE, rel=1e-12, scale=1e-12 * float(base.max()))
+
+
+def test_creep_is_the_solution_of_its_equation_by_hand():
+    r"""Kelvin-Voigt: tau y' + y = sigma. On the ramp sigma = r t, in the hold exponentially towards the peak."""
+    law = LAW.with_effects(LIBRARY["creep"]["kelvin_voigt"].build(RATE, tau_s=TAU))
+    base = drive(LAW, PARTICLE, FORCE, control="load").displacement
+    added = np.asarray(drive(law, PARTICLE, FORCE, time=TIME, control="load").displacement - base)
+    time, stress = np.asarray(TIME), np.asarray(PARTICLE.stress(FORCE))
+    rate = stress[60] / time[60]
+    ramp = rate * (time - TAU * -np.expm1(-time / TAU))
+    hold = stress[60] + (ramp[60] - stress[60]) * np.exp(-(time - time[60]) / TAU)
+    by_hand = float(PARTICLE.effective_diameter) * RATE * np.where(time <= time[60], ramp, hold)
+    np.testing.assert_allclose(added[:181], by_hand[:181], rtol=1e-9, atol=1e-12)
+
+
+def test_amplitude_zero_is_the_base_law():
+    null = creeping(0.0, 0.0).with_effects(*(v.build(0.0) for m in LIBRARY.values() for v in list(m)[:1]))
+    base = drive(LAW, PARTICLE, FORCE, control="load").displacement
+    found = drive(null, PARTICLE, FORCE, time=TIME, control="load").displacement
+    np.testing.assert_allclose(found, base, rtol=1e-12)
+
+
+def test_a_law_without_effects_is_the_base_law_to_the_last_bit():
+    emptied = creeping().of_particle().with_effects()
+    assert [effect.name for effect in emptied.effects] == ["creep:logarithmic"]
+    none = eqx.tree_at(lambda law: law.effects, emptied, ())
+    np.testing.assert_array_equal(
+        drive(none, PARTICLE, FORCE, control="load").displacement,
+        drive(LAW, PARTICLE, FORCE, control="load").displacement,
+    )
+
+
+def test_displacement_control_is_the_inverse_and_has_its_derivatives():
+    law = creeping()
+    path = drive(law, PARTICLE, FORCE, time=TIME, control="load").displacement
+    np.testing.assert_allclose(drive(law, PARTICLE, path, time=TIME).force, FORCE, atol=1e-8)
+
+    def force(compliance):
+        return drive(creeping(compliance=compliance), PARTICLE, path, time=TIME).force[40]
+
+    slope, h = jax.grad(force)(COMPLIANCE), 1e-6
+    close(slope, (force(COMPLIANCE + h) - force(COMPLIANCE - h)) / (2 * h), rel=1e-5)
+
+
+def test_batches_and_the_state_that_is_carried_on():
+    law = creeping()
+    laws = jax.tree.map(lambda x: jnp.stack([x, x]), law)
+    two = jax.tree.map(lambda x: jnp.stack([x, x]), PARTICLE)
+    both = simulate_batch(laws, two, jnp.stack([FORCE, 0.5 * FORCE]), times=jnp.stack([TIME, TIME]), control="load")
+    whole = drive(law, PARTICLE, FORCE, time=TIME, control="load")
+    np.testing.assert_allclose(both.displacement[0], whole.displacement, rtol=1e-13)
+    first = drive(law, PARTICLE, FORCE[:90], time=TIME[:90], control="load")
+    rest = drive(law, PARTICLE, FORCE[90:], time=TIME[90:], control="load", state=first.state)
+    np.testing.assert_allclose(rest.displacement, whole.displacement[90:], rtol=1e-10)
+
+
+def test_what_belongs_to_the_tester_is_left_out():
+    law = LAW.with_effects("frame_compliance", "thermal_drift", "platen_sink_in", "damage", "size_effect", "creep")
+    assert [effect.name.split(":")[0] for effect in law.of_particle().effects] == ["damage", "size_effect", "creep"]
+
+
+def test_a_variant_of_ones_own_goes_the_same_way():
+    class Glue(AbstractEffect):
+        """Displacement lost to a layer of glue."""
+
+        def observe(self, context):
+            return self.amplitude * context.force
+
+    glue = Variant(
+        "glue", "linear", Glue, "c_um_per_mN", "um/mN", 1, (1e-4, 1e-2), "d = c F", "", "", needs=(Need.HOLD,)
+    )
+    law = LAW.with_effects(glue)
+    assert law.effects[0].name == "glue:linear"
+    added = drive(law, PARTICLE, FORCE, time=TIME, control="load").displacement
+    added = added - drive(LAW, PARTICLE, FORCE, control="load").displacement
+    close(added, glue.typical * FORCE, rel=1e-9, scale=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("effects", "words"),
+    [
+        (("rust",), "there is no mechanism 'rust'"),
+        (("creep:cubic",), "creep has no variant 'cubic'"),
+        ((3.0,), "an effect must be"),
+    ],
+)
+def test_what_is_no_effect_is_refused_by_name(effects, words):
+    with pytest.raises(InputError, match=words):
+        LAW.with_effects(*effects)
+    with pytest.raises(InputError, match="effects must be a list"):
+        MccLaw(Plastic(7.0, 3.0, 2.7), 1.4, 16000.0, effects="creep")
+
+
+def test_energy_with_damage_is_the_work_of_the_path():
+    """What a damaged particle gives back is the integral of its force over its own unloading."""
+    law = LAW.with_effects("damage", "size_effect")
+    top = 60.0
+    path = jnp.concatenate([jnp.linspace(0.0, top, 2001), jnp.linspace(top, 0.0, 4001)])
+    force = drive(law, PARTICLE, path, time=jnp.arange(len(path), dtype=float)).force
+    work = jnp.concatenate([jnp.zeros(1), jnp.cumsum(0.5 * (force[1:] + force[:-1]) * jnp.diff(path))])
+    state = eqx.tree_at(lambda s: s.displacement_max, law.init(PARTICLE), jnp.asarray(top))
+    found = law.energy(PARTICLE, state, jnp.asarray(top))
+    close(found.work, work[2000], rel=1e-5)
+    close(found.recoverable, work[2000] - work[-1], rel=1e-4)
+    undamaged = LAW.with_effects("size_effect").energy(PARTICLE, state, jnp.asarray(top)).recoverable
+    assert float(found.recoverable) > float(undamaged)
+
+
+def test_energy_that_is_not_known_is_refused_by_name():
+    sphere = Particle(200.0, 200.0, 200.0)
+    for effect in ("creep", "frame_compliance", "finite_hardening_exponent"):
+        law = LAW.with_effects(effect)
+        with pytest.raises(InputError, match=f"the energy of a law with {effect}"):
+            law.energy(sphere, law.init(sphere), jnp.asarray(1.0))
