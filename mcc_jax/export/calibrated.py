@@ -63,11 +63,15 @@ def read_calibration(
         sizes, geometry = _sizes(found, path, particle, diameters)
         three = np.array([float(d) for d in (sizes.D1, sizes.D2, sizes.D3)])
         law = law_of(content, particle, three) if isinstance(found, OldCalibration) else found.law(particle)
+        testers = [effect.name for effect in law.effects if effect.of_tester]
+        law = law.of_particle()
         notes = check(law, sizes, allow_not_monotone=allow_not_monotone)
     except InputError as error:
         if error.file is not None:
             raise
         raise InputError(error.problem, file=file, remedy=error.remedy) from error
+    if testers:
+        notes = (*notes, f"{', '.join(testers)} belong to the tester, not to the particle, and are left out")
     return law, sizes, _origin(content, entry, law, file, particle, geometry, notes)
 
 
