@@ -34,7 +34,7 @@ from .session import beside, import_writers, say, session
 )
 @click.option("--no-experiments", is_flag=True, help="Do not work out which further test would tell more.")
 @click.option(
-    "--no-posterior", is_flag=True, help="Do not sample the extended law: standard errors of its fit instead."
+    "--no-posterior", is_flag=True, help="Do not sample the law with effects: standard errors of its fit instead."
 )
 @click.option("--no-figures", is_flag=True, help="Draw no figures.")
 @seed_option("Seed of the bootstrap.")

@@ -278,17 +278,17 @@ def _judge(
         after = population_parameters(base, project(extended, inside[:0], inside=with_all), extended.shift)
     sampled = None
     if posterior and chosen and not any(effect.at_random for effect in effects):
-        tell("posterior of the extended law")
+        tell("posterior of the law with effects")
         last = extensions.fit(tuple(chosen))
         sampled = extended_posterior(base, last, seed=seed) if last.physical else None
         if sampled is None:
             notes.append(
-                "the posterior of the extended law is not sampled: fitted as it is, an amplitude has a sign that it "
-                "cannot have; amplitudes and parameters are those of the linear system"
+                "the posterior of the law with effects is not sampled: fitted as it is, an amplitude has a sign that "
+                "it cannot have; amplitudes and parameters are those of the linear system"
             )
         elif failures := sampled.failures():
             notes.append(
-                f"the posterior of the extended law has not converged ({'; '.join(failures)}); amplitudes and "
+                f"the posterior of the law with effects has not converged ({'; '.join(failures)}); amplitudes and "
                 "parameters are those of its fit"
             )
         else:

@@ -38,7 +38,7 @@ class Extensions:
         return max(self.fit(()).deviance - found.deviance, 0.0) if found.physical else 0.0
 
     def system_of(self, chosen: tuple[int, ...]) -> System:
-        """The linear system around the extended law."""
+        """The linear system around the law with effects."""
         return system_at(self.base, self.system, self.signals, list(chosen), self.fit(chosen))
 
 

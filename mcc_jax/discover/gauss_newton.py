@@ -1,4 +1,4 @@
-r"""Effects fitted as they are, not to first order: Gauss-Newton's method through the extended law.
+r"""Effects fitted as they are, not to first order: Gauss-Newton's method through the law with effects.
 
 The linear system (`linear_model`) holds what an effect would add if it were small. A large one is not: its signature at
 the strength it has differs from the one at zero, and so does what the base law can still take up. So the few formulas
@@ -139,7 +139,7 @@ class State(eqx.Module):
 
 @dataclass(frozen=True)
 class Refit:
-    """An extended law fitted to a campaign.
+    """A law with effects fitted to a campaign.
 
     Attributes:
         formulas: the effects.
@@ -236,7 +236,7 @@ def refit(base: Base, candidates: tuple[Candidate, ...], prior: np.ndarray, curv
 
 
 def system_at(base: Base, system: System, signals: Signals, chosen: list[int], found: Refit) -> System:
-    """The linear system around an extended law: its residuals, its derivatives, its effects' further numbers."""
+    """The linear system around a law with effects: its residuals, its derivatives, its effects' further numbers."""
     amplitudes = np.array([own.start for own in slices(found.formulas)], int)
     added = signals.added.at[:, np.array(chosen)].set(found.columns[:, amplitudes])
     tests, state = base.tests, found.state
@@ -274,7 +274,7 @@ class _Step(eqx.Module):
 
 
 class _Problem:
-    """The equations of one extended law and one campaign."""
+    """The equations of one law with effects and one campaign."""
 
     def __init__(
         self, base: Base, formulas: tuple[Formula, ...], prior: np.ndarray, own: np.ndarray, push: np.ndarray

@@ -62,7 +62,7 @@ def name_missing(
         system: the linear system of the campaign.
         view: the candidates in it.
         ranking: theirs.
-        extensions: fits of the extended law; None where first order does.
+        extensions: fits of the law with effects; None where first order does.
         seed: of the bootstrap.
         tell: called with the name of each step.
     """

@@ -1,7 +1,8 @@
-r"""The posterior of the extended law: the joint calibration once more, with what was found missing as part of the law.
+r"""The posterior of the law with effects: the joint calibration once more, with what was found missing in the law.
 
-Around the fit of the extended law (`gauss_newton`) the tests are linear in the effects' free numbers :math:`\theta`. In
-the quadratic summary of test i, whose zero is integrated out by :math:`M_i`, they move nothing but score and squares,
+Around the fit of the law with effects (`gauss_newton`) the tests are linear in the effects' free numbers
+:math:`\theta`. In the quadratic summary of test i, whose zero is integrated out by :math:`M_i`, they move nothing but
+score and squares,
 
 .. math:: g_i(\theta) = g_i - J_i^T M_i C_i \delta, \qquad
     R_i(\theta) = R_i + 2 \delta^T C_i^T M_i r_i + \delta^T C_i^T M_i C_i \delta, \qquad
@@ -120,7 +121,7 @@ class ExtendedTarget(LogPosterior):
 
 
 class ExtendedExact(ExactLikelihood):
-    """Tests with their exact likelihood under the extended law.
+    """Tests with their exact likelihood under the law with effects.
 
     Attributes:
         records: what the tester did.
@@ -234,7 +235,7 @@ def extended_posterior(base: Base, found: Refit, *, length: Length = LENGTH, see
 
     Args:
         base: the base fit, of which noise and priors are taken.
-        found: the fit of the extended law.
+        found: the fit of the law with effects.
         length: chains, warm-up and draws.
         seed: random seed.
     """

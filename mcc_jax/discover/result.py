@@ -109,7 +109,7 @@ class Discovery:
         before, after: the population's parameters without and with the effects.
         next_experiments: further tests that would probably tell the members of a set apart.
         checks: for every member of a set with rivals, what would show it by itself: `mechanism`, `check`.
-        posterior: of the extended law; None where nothing was added, its fit has an impossible sign, or it was not
+        posterior: of the law with effects; None where nothing was added, its fit has an impossible sign, or it was not
             asked for.
         notes: what a reader must know.
         findings: what the checks of the tests found, and which particles took no part for it.
