@@ -80,6 +80,7 @@ def found(tests, tmp_path_factory):
     return done(call("discover", tests / "frame", "--out", out, "--no-experiments", "--no-posterior")), out
 
 
+@pytest.mark.long
 def test_the_frame_is_found_and_its_size(found):
     _, out = found
     content = json.loads((out / "discovery.json").read_text(encoding="utf-8"))

@@ -25,6 +25,7 @@ def content(found):
     return json.loads(json.dumps(found.to_json(), allow_nan=False))
 
 
+@pytest.mark.long
 def test_a_hidden_effect_is_named_and_its_amplitude_found(named):
     told = content(named)
     assert told["verdict"] in ("NAMED", "SET")

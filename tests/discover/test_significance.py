@@ -9,6 +9,8 @@ from scipy.stats import kstest, norm
 from mcc_jax.discover._score import Projection, common_scatter, family_wise, smallest_of_families
 from mcc_jax.discover._search import log_evidence_at_random
 
+pytestmark = pytest.mark.long  # compiles for long, and this engine is to be replaced
+
 
 def simulated(rng, *, particles=20, columns=12, scale=1.0, effect=0.0):
     """Scores of correlated columns under the noise model, times `scale`; the first column's estimate over its standard
