@@ -10,7 +10,7 @@ from benchmarks import _report
 from benchmarks.blind import adapter, run, score, sealing
 from benchmarks.blind.generator import tiers
 
-pytestmark = pytest.mark.long  # compiles for long, and this engine is to be replaced
+pytestmark = pytest.mark.long  # compiles for long
 
 
 def small(folder, count):

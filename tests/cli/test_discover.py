@@ -12,6 +12,8 @@ from mcc_jax.cli._discovery import main_finding
 from mcc_jax.cli._main import cli
 from mcc_jax.effects import LIBRARY
 
+pytestmark = pytest.mark.long  # searches for effects for minutes; `.ci/run` does so once, as its users do
+
 # What the contract promises; more may be there.
 KEYS = {
     *("schema", "verdict", "summary", "effects", "candidate_set", "ranking", "untestable", "where", "closure", "gap"),

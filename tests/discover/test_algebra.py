@@ -28,7 +28,7 @@ from mcc_jax.discover._search import (
 )
 from mcc_jax.discover._steps import ODD, SCALES
 
-pytestmark = pytest.mark.long  # compiles for long, and this engine is to be replaced
+pytestmark = pytest.mark.long  # compiles for long
 
 seeds = st.integers(0, 10_000)
 

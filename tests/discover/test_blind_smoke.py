@@ -8,7 +8,7 @@ import pytest
 from benchmarks.blind import adapter, smoke
 from benchmarks.blind.generator import campaigns
 
-pytestmark = pytest.mark.long  # compiles for long, and this engine is to be replaced
+pytestmark = pytest.mark.long  # compiles for long
 
 CASES = {case.id: case for case in smoke.cases()}
 FEW = (

@@ -11,6 +11,8 @@ from mcc_jax.campaign import Campaign, Curve
 from mcc_jax.discover import discover
 from mcc_jax.effects import EQUIVALENCES, LIBRARY
 
+pytestmark = pytest.mark.long  # searches for effects for minutes; `.ci/run` does so once, as its users do
+
 QUICK = {"confirm": False, "experiments": False, "posterior": False}
 COMPLIANCE = 0.004
 

@@ -12,7 +12,7 @@ from mcc_jax.discover._naming import LIKE_THE_BEST
 from mcc_jax.discover._score import project
 from mcc_jax.discover._search import rank
 
-pytestmark = pytest.mark.long  # compiles for long, and this engine is to be replaced
+pytestmark = pytest.mark.long  # compiles for long
 
 PARTICLES, POINTS = 10, 60
 TRUE, TWIN = "creep", "unloading_shape"

@@ -16,7 +16,7 @@ from mcc_jax.discover._extensions import Extensions
 from mcc_jax.discover._posterior import _movable, extended_posterior
 from mcc_jax.effects import LIBRARY
 
-pytestmark = pytest.mark.long  # compiles for long, and this engine is to be replaced
+pytestmark = pytest.mark.long  # compiles for long
 
 HIDDEN = 0.004
 FRAME = {"frame_compliance": LIBRARY["frame_compliance"]}

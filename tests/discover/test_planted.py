@@ -16,7 +16,7 @@ from mcc_jax.discover._search import evidence_of_any, log_evidence, pairs, rando
 from mcc_jax.discover._significance import p_nothing_left
 from mcc_jax.effects import LIBRARY
 
-pytestmark = pytest.mark.long  # compiles for long, and this engine is to be replaced
+pytestmark = pytest.mark.long  # compiles for long
 
 NOTHING = np.array([], int)
 

@@ -9,7 +9,7 @@ from mcc_jax.discover._score import project
 from mcc_jax.discover._search import rank
 from mcc_jax.effects import LIBRARY, Mechanism
 
-pytestmark = pytest.mark.long  # compiles for long, and this engine is to be replaced
+pytestmark = pytest.mark.long  # compiles for long
 
 COMPLIANCE, CREEP, TAU = 0.03, 0.001, 11.0
 """A frame softer than any first-order formula bears, and a creep whose time lies between the grid's values."""

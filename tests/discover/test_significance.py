@@ -9,7 +9,7 @@ from scipy.stats import kstest, norm
 from mcc_jax.discover._score import Projection, common_scatter, family_wise, smallest_of_families
 from mcc_jax.discover._search import log_evidence_at_random
 
-pytestmark = pytest.mark.long  # compiles for long, and this engine is to be replaced
+pytestmark = pytest.mark.long  # compiles for long
 
 
 def simulated(rng, *, particles=20, columns=12, scale=1.0, effect=0.0):

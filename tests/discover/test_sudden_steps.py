@@ -22,7 +22,7 @@ from mcc_jax.discover._steps import ODD, over_tests, tamed
 from mcc_jax.discover._system import base_fit, build_system, first_loaded, signals_of
 from mcc_jax.effects import LIBRARY
 
-pytestmark = pytest.mark.long  # compiles for long, and this engine is to be replaced
+pytestmark = pytest.mark.long  # compiles for long
 
 BREAKING = {name: LIBRARY[name] for name in ("pop_in", "frame_compliance")}
 BROKEN = {2: (0.8, 0.8), 7: (0.65, 0.6)}

@@ -17,7 +17,7 @@ from mcc_jax.discover._system import base_fit, build_system, feature_values, sig
 from mcc_jax.discover._tuning import MOST_NUMBERS, Fitted, Tuner
 from mcc_jax.effects import LIBRARY, Mechanism
 
-pytestmark = pytest.mark.long  # compiles for long, and this engine is to be replaced
+pytestmark = pytest.mark.long  # compiles for long
 
 LISTED = {"frame_compliance": Mechanism("frame_compliance", "", LIBRARY["frame_compliance"].variants[:1])}
 PLANTED = words.STRAIN_BUMP.at(0.123, 0.021)

@@ -20,7 +20,7 @@ from mcc_jax.effects import ExtendedLaw, clean_record, signatures
 from mcc_jax.plots import discovery_figures, save_figures
 from mcc_jax.plots._leftover import leftover
 
-pytestmark = pytest.mark.long  # compiles for long, and this engine is to be replaced
+pytestmark = pytest.mark.long  # compiles for long
 
 TIME = jnp.linspace(0.0, 260.0, 131)
 FORCE = jnp.interp(TIME, jnp.asarray([0.0, 80, 110, 160, 230, 260]), jnp.asarray([0.0, 160, 160, 40, 180, 90]))

@@ -16,6 +16,8 @@ from mcc_jax.plots._leftover import added_columns, leftover
 from mcc_jax.plots._ranking import likeness
 from mcc_jax.simulate import HiddenEffect, Instrument, Programme, law_for_each, paper_population, simulate_campaign
 
+pytestmark = pytest.mark.long  # searches for effects for minutes; `.ci/run` does so once, as its users do
+
 COUNT = 10
 
 
