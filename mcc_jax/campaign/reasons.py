@@ -33,7 +33,7 @@ class UsableOptions:
 
 USABLE = UsableOptions()
 
-SHOWN = 5
+SHOWN = 3
 """Most particles that an error names with their reasons."""
 
 

@@ -10,6 +10,8 @@ from benchmarks import _report
 from benchmarks.blind import adapter, run, score, sealing
 from benchmarks.blind.generator import tiers
 
+pytestmark = pytest.mark.long  # compiles for long
+
 
 def small(folder, count):
     cases = [tiers.Case(f"r{k}", "T0", "clean", "P0", count=2, resample=True) for k in range(count)]

@@ -177,6 +177,7 @@ def test_a_threshold_must_be_a_stress(campaign):
             select_tests(campaign, threshold_MPa=threshold)
 
 
+@pytest.mark.long
 @few
 def test_one_particle_alone(method):
     campaign = one("alone", 1)

@@ -5,15 +5,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import ALL_IN_TIME
 from joint_cases import COEFFICIENTS, DIAMETERS, SNAPPING, effective_diameter, flatness, simulated, true_latent
 
-from mcc_jax import Instrument, Programme, StrainScaling, Unloading
+from mcc_jax import Instrument, Programme, Unloading
 from mcc_jax.calibrate.data import select_tests
 from mcc_jax.calibrate.forward import displacement, linearise, linearise_with_force, raw_residual
 from mcc_jax.calibrate.particle_fit import linear_start
 
-FORMS = [(u, s) for u in Unloading for s in StrainScaling]
-FORM_NAMES = [f"{u.value}-{s.value}" for u, s in FORMS]
 forms = pytest.mark.parametrize("unloading", list(Unloading), ids=lambda u: u.value)
 CYCLES = Programme.cycles(levels=(0.5, 1.0), unload_to=0.3, points=60)
 
@@ -27,7 +26,7 @@ def measured_with(unloading, **options):
     return select_tests(simulated(unloading=unloading, programme=CYCLES, **options)).tests
 
 
-@pytest.mark.parametrize(("unloading", "scaling"), FORMS, ids=FORM_NAMES)
+@ALL_IN_TIME
 def test_noise_free_tests_leave_no_residual(unloading, scaling):
     """b = log(C eta) and e = log Ebar + p log eta (half of p in the punch forms) are all that a law knows of shape."""
     tests = measured_with(unloading, scaling=scaling)

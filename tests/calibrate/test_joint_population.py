@@ -112,7 +112,7 @@ def integral(population, summary, scatter, i):
     return np.logaddexp.reduce(log_weight + inside) + np.linalg.slogdet(turn)[1]
 
 
-@scatters
+@extremes
 @pytest.mark.parametrize(("scale", "tolerance"), [(1e-3, 2e-4), (0.01, 2e-3), (0.05, 0.05)])
 def test_marginal_likelihood_is_the_integral_over_the_particle(scatter, scale, tolerance):
     """Laplace's method: the better, the sharper the tests; measured ones know a coefficient to 0.01 or less."""
@@ -251,6 +251,7 @@ def affine(population, summary, scatter, step):
     return at(still, jnp.zeros(3)), np.stack(columns, -1) / (2 * step)
 
 
+@pytest.mark.long
 @extremes
 def test_draws_have_the_mean_and_covariance_of_the_conditional_gaussian(scatter):
     """Where tests are sharp, see above."""

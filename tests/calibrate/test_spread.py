@@ -91,6 +91,7 @@ def assert_same(found, wanted):
             np.testing.assert_allclose(found[name].std((0, 1)), values.std((0, 1)), rtol=1e-8)
 
 
+@pytest.mark.long
 def test_blocks_of_two_processes_with_two_devices_are_those_of_one(tmp_path):
     port = free_port()
     finish(tmp_path, [start(tmp_path, 2, 2, i, port, everything=False) for i in range(2)])

@@ -4,20 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import ALL_IN_TIME
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import trapezoid
 
-from mcc_jax import (
-    Instrument,
-    LogNormal,
-    Plastic,
-    Programme,
-    StrainScaling,
-    Unloading,
-    paper_campaign,
-    paper_law,
-)
+from mcc_jax import Instrument, LogNormal, Plastic, Programme, paper_campaign, paper_law
 from mcc_jax.calibrate import (
     campaign_branches,
     choose_reference,
@@ -327,8 +319,7 @@ def _eta(campaign):
     return 1 + 1.43 * (1 - D3**2 / (D1 * D2))
 
 
-@pytest.mark.parametrize("unloading", list(Unloading))
-@pytest.mark.parametrize("scaling", list(StrainScaling))
+@ALL_IN_TIME
 def test_modulus_of_exact_branches_is_recovered_in_every_form(unloading, scaling):
     campaign = paper_campaign(
         2, shared_material=True, instrument=Instrument(), unloading=unloading, strain_scaling=scaling

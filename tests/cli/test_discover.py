@@ -12,6 +12,8 @@ from mcc_jax.cli.discovery import main_finding
 from mcc_jax.cli.main import cli
 from mcc_jax.effects import LIBRARY
 
+pytestmark = pytest.mark.long  # searches for effects for minutes; `.ci/run` does so once, as its users do
+
 # What the contract promises; more may be there.
 KEYS = {
     *("schema", "verdict", "summary", "effects", "candidate_set", "ranking", "untestable", "where", "closure", "gap"),
@@ -80,6 +82,7 @@ def found(tests, tmp_path_factory):
     return done(call("discover", tests / "frame", "--out", out, "--no-experiments", "--no-posterior")), out
 
 
+@pytest.mark.long
 def test_the_frame_is_found_and_its_size(found):
     _, out = found
     content = json.loads((out / "discovery.json").read_text(encoding="utf-8"))

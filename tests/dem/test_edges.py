@@ -134,6 +134,7 @@ def unloading():
     return advance(packing(), motion(), state, -PRESSING, 1, 30, SKIN)[0]
 
 
+@pytest.mark.long
 def test_a_new_list_in_the_middle_of_unloading_changes_nothing():
     """T5: rebuilt, permuted and with more room; history bitwise, forces of edges and sums over particles."""
     state = unloading()

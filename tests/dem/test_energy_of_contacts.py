@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import ALL_IN_TIME
 
 from benchmarks import energy_paths
 from mcc_jax import MccLaw, Plastic, StrainScaling, Unloading
@@ -22,13 +23,10 @@ from mcc_jax.dem import (
 )
 from mcc_jax.geometry import Particle
 
-FORMS = [(u, s) for u in Unloading for s in StrainScaling]
-NAMES = [f"{u.value}-{s.value}" for u, s in FORMS]
-ALL_FORMS = pytest.mark.parametrize(("unloading", "scaling"), FORMS, ids=NAMES)
 ROUNDING = 1e-13
 
 
-@ALL_FORMS
+@ALL_IN_TIME
 def test_random_paths_of_unlike_pairs_gain_nothing(unloading, scaling):
     law, particle = energy_paths.draw(5, 1000, unloading, scaling)
     whole, between = energy_paths.gains(*energy_paths.pair(law, particle, *energy_paths.choices(5, 1000)))
@@ -77,7 +75,7 @@ DIAMETER = 100.0
 REST = np.zeros((2, 3))
 
 
-@ALL_FORMS
+@ALL_IN_TIME
 @pytest.mark.parametrize("softened", [1.0, 0.02])
 def test_a_bouncing_sphere_never_gains(unloading, scaling, softened):
     """Between two plates, from very slow to fast enough to leave the tested range: each bounce is at most as fast."""

@@ -285,6 +285,7 @@ def mean_height(log_c1, keep="steps"):
     return jnp.mean(replay(harder(packing(), log_c1), motion(), moving, tape, keep=keep).position[:, 2] * 1e6)
 
 
+@pytest.mark.long
 def test_replay_is_the_motion_and_has_its_derivative():
     """T7 on a trajectory: replayed over recorded lists, reverse mode equals differences."""
     _, end, tape = recorded()

@@ -25,6 +25,8 @@ from mcc_jax.discover.evidence import (
 from mcc_jax.discover.pop_in import ODD, SCALES
 from mcc_jax.discover.score import project, project_summed
 
+pytestmark = pytest.mark.long  # compiles for long
+
 seeds = st.integers(0, 10_000)
 
 

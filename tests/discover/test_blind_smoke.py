@@ -8,6 +8,8 @@ import pytest
 from benchmarks.blind import adapter, smoke
 from benchmarks.blind.generator import campaigns
 
+pytestmark = pytest.mark.long  # compiles for long
+
 CASES = {case.id: case for case in smoke.cases()}
 FEW = (
     pytest.param("T0-clean-1", marks=pytest.mark.long),

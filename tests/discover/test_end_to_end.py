@@ -11,6 +11,8 @@ from mcc_jax.campaign import Campaign, Curve
 from mcc_jax.discover import discover
 from mcc_jax.effects import EQUIVALENCES, LIBRARY
 
+pytestmark = pytest.mark.long  # searches for effects for minutes; `.ci/run` does so once, as its users do
+
 QUICK = {"confirm": False, "experiments": False, "posterior": False}
 COMPLIANCE = 0.004
 
@@ -25,6 +27,7 @@ def content(found):
     return json.loads(json.dumps(found.to_json(), allow_nan=False))
 
 
+@pytest.mark.long
 def test_a_hidden_effect_is_named_and_its_amplitude_found(named):
     told = content(named)
     assert told["verdict"] in ("NAMED", "SET")

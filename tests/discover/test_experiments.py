@@ -12,6 +12,8 @@ from mcc_jax.discover.extensions import serious
 from mcc_jax.discover.model_selection import LIKE_THE_BEST
 from mcc_jax.discover.score import project
 
+pytestmark = pytest.mark.long  # compiles for long
+
 PARTICLES, POINTS = 10, 60
 TRUE, TWIN = "creep", "unloading_shape"
 NAMES = ("creep", "kelvin_voigt"), ("unloading_shape", "symmetric_bow")

@@ -17,6 +17,8 @@ from mcc_jax.discover.extensions import Extensions
 from mcc_jax.discover.posterior import _movable, extended_posterior
 from mcc_jax.effects import LIBRARY
 
+pytestmark = pytest.mark.long  # compiles for long
+
 HIDDEN = 0.004
 FRAME = {"frame_compliance": LIBRARY["frame_compliance"]}
 

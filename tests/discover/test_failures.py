@@ -12,6 +12,8 @@ from mcc_jax.campaign import Campaign, Curve, read_tester_file
 from mcc_jax.discover import discover
 from mcc_jax.effects import LIBRARY
 
+pytestmark = pytest.mark.long  # compiles for long
+
 QUICK = {"confirm": False, "experiments": False, "posterior": False}
 NAMES = ("frame_compliance", "creep", "adhesion", "unloading_shape", "reload_hysteresis")
 FEW = {name: LIBRARY[name] for name in NAMES}

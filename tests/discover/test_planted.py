@@ -16,6 +16,8 @@ from mcc_jax.discover.omnibus import p_nothing_left
 from mcc_jax.discover.score import project, smallest_of_families
 from mcc_jax.effects import LIBRARY
 
+pytestmark = pytest.mark.long  # compiles for long
+
 NOTHING = np.array([], int)
 
 

@@ -9,6 +9,8 @@ from mcc_jax.discover.gauss_newton import refit, system_at
 from mcc_jax.discover.score import project
 from mcc_jax.effects import LIBRARY, Mechanism
 
+pytestmark = pytest.mark.long  # compiles for long
+
 COMPLIANCE, CREEP, TAU = 0.03, 0.001, 11.0
 """A frame softer than any first-order formula bears, and a creep whose time lies between the grid's values."""
 

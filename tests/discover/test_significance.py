@@ -9,6 +9,8 @@ from scipy.stats import kstest, norm
 from mcc_jax.discover.evidence import log_evidence_at_random
 from mcc_jax.discover.score import Projection, common_scatter, family_wise, smallest_of_families
 
+pytestmark = pytest.mark.long  # compiles for long
+
 
 def simulated(rng, *, particles=20, columns=12, scale=1.0, effect=0.0):
     """Scores of correlated columns under the noise model, times `scale`; the first column's estimate over its standard

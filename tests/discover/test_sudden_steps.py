@@ -22,6 +22,8 @@ from mcc_jax.discover.pop_in import ODD, over_tests, tamed
 from mcc_jax.discover.score import project
 from mcc_jax.effects import LIBRARY
 
+pytestmark = pytest.mark.long  # compiles for long
+
 BREAKING = {name: LIBRARY[name] for name in ("pop_in", "frame_compliance")}
 BROKEN = {2: (0.8, 0.8), 7: (0.65, 0.6)}
 """Test: share of the largest force at which it jumps, by how much [um]."""

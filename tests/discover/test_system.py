@@ -22,6 +22,8 @@ from mcc_jax.discover.result import Discovery
 from mcc_jax.discover.score import project
 from mcc_jax.effects import LIBRARY, Mechanism
 
+pytestmark = pytest.mark.long  # searches for effects for minutes; `.ci/run` does so once, as its users do
+
 MODEL = JointModel(modulus_scatter=True)
 CHOSEN = {"frame_compliance": "linear", "rate_dependence": "flow_log_strain_rate", "damage": "exponential"}
 SMALL = {

@@ -17,6 +17,8 @@ from mcc_jax.discover.score import project
 from mcc_jax.discover.variable_projection import MAX_NUMBERS, Fitted, Tuner
 from mcc_jax.effects import LIBRARY, Mechanism
 
+pytestmark = pytest.mark.long  # compiles for long
+
 LISTED = {"frame_compliance": Mechanism("frame_compliance", "", LIBRARY["frame_compliance"].variants[:1])}
 PLANTED = words.STRAIN_BUMP.at(0.123, 0.021)
 """Between the places and narrower than any of the list."""

@@ -16,6 +16,8 @@ from mcc_jax.discover.score import project
 from mcc_jax.effects import LIBRARY, Mechanism
 from mcc_jax.simulate import Instrument, law_for_each, simulate_campaign
 
+pytestmark = pytest.mark.long  # compiles for long
+
 CHOSEN = {"frame_compliance": "linear", "misalignment": "edge", "damage": "exponential", "unloading_shape": "tail_bow"}
 SMALL = {n: Mechanism(n, LIBRARY[n].explanation, (LIBRARY[n][v],)) for n, v in CHOSEN.items()}
 

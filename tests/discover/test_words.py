@@ -21,6 +21,8 @@ from mcc_jax.law import signatures
 from mcc_jax.plots import discovery_figures, save_figures
 from mcc_jax.plots.remaining_gap import leftover
 
+pytestmark = pytest.mark.long  # compiles for long
+
 TIME = jnp.linspace(0.0, 260.0, 131)
 FORCE = jnp.interp(TIME, jnp.asarray([0.0, 80, 110, 160, 230, 260]), jnp.asarray([0.0, 160, 160, 40, 180, 90]))
 """Loading to 80 s, a hold of 30 s, unloading to 160 s, reloading to 230 s, unloading."""

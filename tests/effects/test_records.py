@@ -51,6 +51,7 @@ def test_segments_and_clean_path_tell_the_same():
             assert np.quantile(difference, 0.97) < 0.02 * scale, name
 
 
+@pytest.mark.long
 def test_noise_of_force_does_not_change_what_an_effect_adds():
     """To first order, for every variant: what noise of force makes of its signature is small beside it."""
     records = []

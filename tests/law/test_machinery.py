@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from helpers import (
     ALL_FORMS,
+    ALL_IN_TIME,
     PAPER_THETA,
     between,
     close,
@@ -92,7 +93,7 @@ def test_load_control_undoes_displacement_control(unloading, scaling, theta, x, 
     close(again, force, scale=10 * rounding * max(float(force.max()), 1e-3))
 
 
-@ALL_FORMS
+@ALL_IN_TIME
 def test_loading_inverse_meets_the_force(unloading, scaling):
     """Residual of the force under load control: at most 1e-14 of it, from 1e-9 to 1e4 mN."""
     law, p = paper_law(unloading, scaling), paper_particle(4)
@@ -209,7 +210,7 @@ def test_single_precision(number):
     close(displacement[loaded], path[loaded], scale=2e-6 * float(path.max()))
 
 
-@ALL_FORMS
+@ALL_IN_TIME
 def test_every_form_runs_in_single_precision(unloading, scaling):
     law, p = (with_dtype(t, jnp.float32) for t in (paper_law(unloading, scaling, modulus=1000.0), paper_particle(5)))
     path = jnp.concatenate([jnp.linspace(0, 120, 50), jnp.linspace(120, 90, 50)]).astype(jnp.float32)

@@ -5,7 +5,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ALL_FORMS, FORMS, PAPER_THETA, SOME_FORMS, all_finite, close, paper_law, paper_particle, unpack
+from helpers import (
+    ALL_FORMS,
+    ALL_IN_TIME,
+    FORMS,
+    PAPER_THETA,
+    SOME_FORMS,
+    all_finite,
+    close,
+    paper_law,
+    paper_particle,
+    unpack,
+)
 
 from benchmarks import energy_paths
 from mcc_jax.formulas import recovery_limit
@@ -63,7 +74,7 @@ def test_so_it_is_for_any_softening(softening):
             assert jnp.all(residual > -1e-15)
 
 
-@ALL_FORMS
+@ALL_IN_TIME
 def test_random_paths_gain_nothing(unloading, scaling):
     law, particle = energy_paths.draw(3, 1000, unloading, scaling)
     whole, between = energy_paths.gains(*energy_paths.single(law, particle, *energy_paths.choices(3, 1000)))
