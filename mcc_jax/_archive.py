@@ -145,7 +145,7 @@ def _built(value: Any) -> Any:
     if "class" in value:
         return _class(value["class"], object)
     kind = _class(value["object"], object)
-    if not dataclasses.is_dataclass(kind):
+    if not hasattr(kind, "__dataclass_fields__"):
         raise TypeError(f"{value['object']} is no dataclass")
     known = {f.name for f in dataclasses.fields(kind)} | set(getattr(kind, "archived", ()))
     strangers = sorted(set(value["fields"]) - known)

@@ -323,7 +323,7 @@ def calibrate_least_squares(
     .. math:: \min \sum_i \left\| L^{-1} (d_i - z_i - \gamma_i) \right\|^2
         + \sum_{ij} \left(\frac{\log C_{ij} - \mu_j}{\tau_j}\right)^2 + \sum_i \left(\frac{z_i - z_{i0}}{s_z}\right)^2
 
-    The first term alone does not contain `a` (see `joint._forward`): the second one does, which says that particles of
+    The first term alone does not contain `a` (see `forward`): the second one does, which says that particles of
     different shapes are of one material. The noise in L and the spreads tau are estimated first, by restricted maximum
     likelihood and as the mode of their posterior.
 

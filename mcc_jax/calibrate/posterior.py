@@ -60,13 +60,13 @@ class BayesCalibration(PosteriorDraws):
             what leave-one-particle-out needs.
         mode: "fast" or "joint".
         pareto_k: of every particle's importance weights.
-        pareto_k_joint: of the weights of all particles together, of many particles as the regression of `joint._large`
+        pareto_k_joint: of the weights of all particles together, of many particles as the regression of `reweighting`
             has them; None where they were not formed.
         weights_applied: whether the draws were resampled by the particles' own weights. Of many particles those of the
             population were by `pareto_k_joint`'s, and only particles whose weights scatter were drawn by theirs.
         divergences: number of divergent trajectories.
         rhat, ess_bulk, ess_tail: by parameter of the population, before any thinning.
-        leapfrogs: mean number of leapfrog steps of a draw; 0 of independent draws (`joint._importance`).
+        leapfrogs: mean number of leapfrog steps of a draw; 0 of independent draws (`importance`).
         seed, runtime_s: for the record.
         findings: what a reader must know of the tests and of the plausibility of the answer.
     """
@@ -304,8 +304,8 @@ def calibrate_bayes(
     """The joint posterior of everything: a, modulus, population, noise, and every particle's C1, C3, C5 and zero.
 
     The population is drawn around its mode and weighted, or sampled by NUTS where the weights are not good enough: see
-    `joint._importance`. Of many particles (more than 400,000 draws of single ones) the exact likelihood enters by
-    regression, and at most four million draws of single particles are kept: see `joint._large`.
+    `importance`. Of many particles (more than 400,000 draws of single ones) the exact likelihood enters by
+    regression, and at most four million draws of single particles are kept: see `reweighting`.
 
     The particles are worked on in blocks, which spread over all devices of the process and, once
     `jax.distributed.initialize` has been called, over all processes: every one of them then calls this function with

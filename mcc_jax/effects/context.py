@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._types import Values
-from ..formulas import PUNCH_AREA, recovery
+from ..formulas import PUNCH_AREA, Formulas, recovery
 from ..geometry import Particle
 from .record import RELOAD, UNLOAD, Record, reload_progress
 

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._types import Scalar, Values, scalar
-from ..formulas import PUNCH_AREA, recovery, tangent_modulus
+from ..formulas import PUNCH_AREA, Formulas, recovery, tangent_modulus
 from ..geometry import Particle
 from .context import Context, root
 from .effect import AbstractEffect, Factors, at_least

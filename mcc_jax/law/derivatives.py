@@ -48,12 +48,12 @@ def signatures(
     arguments.instance(particle, Particle, "particle", "Make one with mcc_jax.Particle(D1, D2, D3), in um.")
     arguments.instance(record, Record, "record", "Make one with mcc_jax.effects.record_of(curve).")
     context = replace(base, effects=()).context(particle, record)
-    base = base.formulas
-    strain = _virgin_strain(base, context)
-    x, zero_um = base.shape_factor(particle) * strain, jnp.zeros_like(particle.D3)
-    K1, K3, K5 = base.plastic.polynomial
-    slope = tangent_modulus(K1, K3, K5, x) * base.shape_factor(particle)
-    least = 1e-3 * K1 * base.shape_factor(particle)
+    formulas = base.formulas
+    strain = _virgin_strain(formulas, context)
+    x, zero_um = formulas.shape_factor(particle) * strain, jnp.zeros_like(particle.D3)
+    K1, K3, K5 = formulas.plastic.polynomial
+    slope = tangent_modulus(K1, K3, K5, x) * formulas.shape_factor(particle)
+    least = 1e-3 * K1 * formulas.shape_factor(particle)
     slope = jnp.where(slope > least, slope, least)
 
     def changes(effect: AbstractEffect) -> tuple[Any, Path, Path, Path]:
@@ -61,10 +61,10 @@ def signatures(
 
         def act(amplitude: Scalar) -> tuple[Any, Any, Path, Path]:
             own = eqx.tree_at(lambda e: e.amplitude, effect, amplitude)
-            law = eqx.filter(own.modify(base, particle, record), eqx.is_inexact_array)
+            law = eqx.filter(own.modify(formulas, particle, record), eqx.is_inexact_array)
             start = eqx.tree_at(lambda m: m.point.time, no_memory((own,), zero_um), record.time[0])
             added = additions((own,), start, context)[1]
-            return law, own.loading(base, particle, record, strain), own.stiffness(context), added
+            return law, own.loading(formulas, particle, record, strain), own.stiffness(context), added
 
         zero = jnp.zeros_like(effect.amplitude)
         law, (f1, f3, f5), stiffness, added = jax.jvp(act, (zero,), (jnp.ones_like(zero),))[1]
@@ -84,7 +84,7 @@ def signatures(
         parts.append(jax.vmap(changes)(jax.tree.map(lambda *leaves: jnp.stack(leaves), *alike)))
         order.extend(members)
     law, shift, stiffness, added = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
-    parameters, rest = eqx.partition(base, eqx.is_inexact_array)
+    parameters, rest = eqx.partition(formulas, eqx.is_inexact_array)
     still, one = jnp.zeros_like(strain), jnp.ones_like(strain)
 
     def response(parameters: Any, shift: Path, stiffness: Path) -> Path:

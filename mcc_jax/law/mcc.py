@@ -17,7 +17,7 @@ from ..effects import AbstractEffect, Context, Record, Variant, clean_record, fi
 from ..formulas import Formulas
 from ..geometry import Particle
 from .base import AbstractContactLaw
-from .response import Memory, folded, force_at, modified, no_memory, one_point, peak_forces, whole_path
+from .response import folded, force_at, modified, no_memory, one_point, peak_forces, whole_path
 
 TESTED_STRAIN = 0.67
 """Scaled strain eta_p eps at which the paper's tests ended, on its mean curve (peaks of 7 to 16 MPa)."""
@@ -31,11 +31,11 @@ class History(eqx.Module):
     Attributes:
         displacement_max: largest displacement so far [um]; 0 for a virgin particle, never decreases. With effects that
             of the law itself, without what they add.
-        memory: what effects and tester remember; None for a law without effects.
+        memory: what effects and tester remember (`Memory`); None for a law without effects.
     """
 
     displacement_max: Scalar = eqx.field(converter=scalar)
-    memory: Memory | None = None
+    memory: Any = None
 
 
 class Energy(eqx.Module):
@@ -184,7 +184,7 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
             # What one MPa takes is a scale for a particle that was never loaded.
             scale = jnp.maximum(state.memory.peak_force, particle.force(jnp.ones_like(displacement)))
             arguments = (self, particle, state, time)
-            force = force_at(lambda given, f: _moved(*given, f), arguments, displacement, scale)
+            force = force_at(_moved, arguments, displacement, scale)
             return self.step_load(particle, state, force, time)[0], force
         # Asked this way round, a displacement that is NaN shows; so it is below.
         peak = jnp.where(displacement < state.displacement_max, state.displacement_max, displacement)
@@ -199,9 +199,9 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
         A force <= 0 means out of contact: the displacement stays where the platen left the particle.
         """
         if self.effects:
-            time = state.memory.point.time if time is None else time
+            now: Scalar = state.memory.point.time if time is None else time
             peak, memory, displacement = one_point(
-                self.formulas, self.effects, particle, state.displacement_max, state.memory, force, time
+                self.formulas, self.effects, particle, state.displacement_max, state.memory, force, now
             )
             return History(peak, memory), displacement
         peak, displacement = self.peak_and_displacement(particle, state.displacement_max, force, force)
@@ -285,7 +285,8 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
         return Energy(dissipated + now, now, dissipated)
 
 
-def _moved(law: MccLaw, particle: Particle, state: History, time: Scalar | None, force: Scalar) -> Scalar:
+def _moved(given: tuple[Any, Particle, History, Scalar | None], force: Scalar) -> Scalar:
+    law, particle, state, time = given
     return law.step_load(particle, state, force, time)[1]
 
 

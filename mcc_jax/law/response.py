@@ -177,7 +177,7 @@ def force_at(
 
     zero = jnp.zeros_like(scale)
     below = gap(zero) < 0
-    solver = optx.Bisection(rtol=4 * jnp.finfo(scale.dtype).eps, atol=0.0, expand_if_necessary=True)
+    solver = optx.Bisection(rtol=float(4 * jnp.finfo(scale.dtype).eps), atol=0.0, expand_if_necessary=True)
     bracket = {"lower": zero, "upper": jax.lax.stop_gradient(scale)}
 
     def sought(force: Scalar, _: Any) -> Scalar:

@@ -82,12 +82,12 @@ class PaperCalibration(Calibration):
     def compared(self) -> Mapping[int, tuple[np.ndarray, np.ndarray]]:
         """Every row from contact on of every kept particle's curve, and which of them are compared."""
         segments = self.adjustment.segments
-        rows = {
-            i: rows_from_contact(self.campaign.curves[i], segments[i], MAX_POINTS)
-            for i, fit in enumerate(self.particles)
-            if fit is not None
-        }
-        return {i: (some, self.particles[i].used[some]) for i, some in rows.items()}
+        found = {}
+        for i, fit in enumerate(self.particles):
+            if fit is not None:
+                rows = rows_from_contact(self.campaign.curves[i], segments[i], MAX_POINTS)
+                found[i] = rows, fit.used[rows]
+        return found
 
     @property
     def a(self) -> float:
