@@ -28,12 +28,14 @@ ACCEPT = (0.8, 0.95, 0.99)
 """Acceptance that the sampler aims at: after divergences once more, and once more, with smaller steps."""
 
 
-def draw_fast(key: Array, tests: Tests, model: JointModel, fit: JointFit, length: Length, block: int) -> dict[str, Any]:
+def draw_fast(
+    key: Array, tests: Tests, model: JointModel, fit: JointFit, length: Length, block: int, *, patient: bool = True
+) -> dict[str, Any]:
     """The population sampled, the particles drawn back and corrected by exact weights: fields of the result."""
     scatter = careful_enough(fit.mode, LogPosterior(fit.numbers, fit.summary, model.scatter), count_of(tests))
     exact = ExactLikelihood(tests, fit.filters, fit.summary, scatter, model.zero_sd, model.unloading)
     target = LogPosterior(fit.numbers, fit.summary, scatter)
-    return draw_around(key, fit.mode, fit.covariance, target, exact, model, length, block)
+    return draw_around(key, fit.mode, fit.covariance, target, exact, model, length, block, patient=patient)
 
 
 def draw_around(
@@ -45,15 +47,18 @@ def draw_around(
     model: JointModel,
     length: Length,
     block: int = 0,
+    *,
+    patient: bool = True,
 ) -> dict[str, Any]:
     """The same for any density of the population, around its mode, and any exact likelihood of the tests.
 
-    More than one block (0 for a single one) takes tests whose every array has one row per particle.
+    More than one block (0 for a single one) takes tests whose every array has one row per particle. Without patience
+    the sampler never runs, which takes minutes where numbers cannot be true: the draws are then those of the proposal.
     """
     tests, scatter = exact.tests, exact.scatter
     population_key, particle_key, check_key, pick_key = jax.random.split(key, 4)
     few = stride_of(count_of(tests), length.total) == 1
-    run, population = _sampled(population_key, mode, covariance, target, length, not few)
+    run, population, good = _sampled(population_key, mode, covariance, target, length, not few, patient)
     names, stacked = _stack(population, scatter, length)
     flat = stacked.reshape(length.total, -1)
     if few:
@@ -66,21 +71,29 @@ def draw_around(
     return {
         **_fields(run, population, names, stacked, particles, tests, model, length, found.keep),
         "pareto_k": found.k,
-        "pareto_k_joint": found.k_joint,
+        "pareto_k_joint": found.k_joint if good else np.inf,
         "weights_applied": few,
         "notes": found.notes,
     }
 
 
 def _sampled(
-    key: Array, mode: Array, covariance: Array, target: LogPosterior, length: Length, many: bool
-) -> tuple[Chains, Population]:
-    """Draws of the population: independent ones, weighted, if the weights are good enough, else the sampler's."""
-    found = sample_weighted(key, mode, covariance, target, chains=length.chains, draws=length.draws, many=many)
-    if found is not None:
-        return found
+    key: Array, mode: Array, covariance: Array, target: LogPosterior, length: Length, many: bool, patient: bool
+) -> tuple[Chains, Population, bool]:
+    """Draws of the population: independent ones, weighted, if the weights are good enough, else the sampler's.
 
-    return _patient(lambda aim: by_chains(sample_population, key, length, mode, covariance, target, aim))
+    And whether they are good: without patience the sampler does not run.
+    """
+    shape: dict[str, Any] = {"chains": length.chains, "draws": length.draws, "many": many}
+    found = sample_weighted(key, mode, covariance, target, **shape)
+    if found is not None:
+        return *found, True
+    if not patient:
+        bad = sample_weighted(key, mode, covariance, target, **shape, however_bad=True)
+        assert bad is not None
+        return *bad, False
+
+    return *_patient(lambda aim: by_chains(sample_population, key, length, mode, covariance, target, aim)), True
 
 
 def _patient[*Ts](run: Callable[[Array], tuple[Chains, *Ts]]) -> tuple[Chains, *Ts]:

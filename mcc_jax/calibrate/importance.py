@@ -67,7 +67,15 @@ def _populations(free: Float[Array, "many d"], target: LogPosterior) -> Populati
 
 
 def sample_weighted(
-    key: Array, mode: Array, covariance: Array, target: LogPosterior, *, chains: int, draws: int, many: bool = False
+    key: Array,
+    mode: Array,
+    covariance: Array,
+    target: LogPosterior,
+    *,
+    chains: int,
+    draws: int,
+    many: bool = False,
+    however_bad: bool = False,
 ) -> tuple[Chains, Population] | None:
     """Draws of the population by importance resampling, in the sampler's form; None if the weights are not good enough.
 
@@ -79,6 +87,7 @@ def sample_weighted(
         target: its density.
         chains, draws: shape of what is returned; each chain is resampled from proposals of its own.
         many: propose no more than is kept: a density is dear.
+        however_bad: give the draws of the first round whatever their weights.
     """
     from scipy.linalg import solve_triangular
     from scipy.special import logsumexp
@@ -117,6 +126,10 @@ def sample_weighted(
     centre, width = folded(np.array(mode)), np.asarray(covariance)
     for turn in range(ROUNDS):
         free, log_weight = proposed(trial)
+        if however_bad:
+            finite = np.where(np.isfinite(log_weight), log_weight, -np.inf)
+            weight = np.exp(finite - finite.max()) if np.isfinite(finite).any() else np.ones(len(finite))
+            return _resampled(free, weight / weight.sum(), target, chains, draws)
         weight, k = smoothed_weights(log_weight)
         share = effective_share(weight)
         if k <= PARETO_K_MOST and share >= (GOOD_SHARE if turn < ROUNDS - 1 else least):

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from .. import arguments
-from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_tests
+from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_plausibility, check_tests
 from .data import Selection, compared_rows, own_misfit, ranges_um, root_mean_squares
 from .draws import Length, draw_fast, draw_joint
 from .estimates import estimate, finite, force_zero, log_estimate, misfit_note, summary
@@ -345,7 +345,11 @@ def calibrate_bayes(
         )
         tell("sampling the population" if fast else "sampling everything")
         key = jax.random.key(seed)
-        parts = draw_fast(key, tests, model, fit, length, size) if fast else draw_joint(key, tests, model, fit, length)
+        likely = not any(one.level == "bad" for one in check_plausibility(campaign.raw or campaign))
+        if fast:
+            parts = draw_fast(key, tests, model, fit, length, size, patient=likely)
+        else:
+            parts = draw_joint(key, tests, model, fit, length)
     tell("diagnosing")
     calibration = BayesCalibration(
         campaign=campaign,

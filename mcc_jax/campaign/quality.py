@@ -248,7 +248,8 @@ def breakage(curve: Curve, options: QualityOptions) -> tuple[int, float] | None:
     first: tuple[int, float] | None = None
     for width in range(1, options.loss_readings + 1):
         drop = force[:-width] - force[width:]
-        share = drop / np.maximum(reached[:-width], 1e-300)
+        with np.errstate(over="ignore"):  # at the first readings, which are not judged
+            share = drop / np.maximum(reached[:-width], 1e-300)
         fast = drop > options.loss_pace * pace * (time[width:] - time[:-width])
         sudden = (share > options.loss_of_force) & fast & (path[width:] - path[:-width] > -back)
         sudden &= (reached[:-width] > options.loss_from * reached[-1]) & (
