@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from collections import Counter
 from dataclasses import dataclass, field
@@ -17,18 +16,17 @@ from ..schema import Curve
 from ..table import (
     APOSTROPHES,
     Grouping,
-    binary_kind,
     number_of_cells,
     parse_number,
     same_text,
     thousands_mark,
 )
 from ..validate import check_magnitudes
-from ..workbook import is_workbook, read_sheet
 from .diameters import check_triple
+from .mapped_rows import Rows, read_rows
 from .mapping import DIMENSIONS, InHeader, MappingFile
 from .pace import paced
-from .text import Tests, checked_curve, decode_lines
+from .text import Tests, checked_curve
 
 _FURTHEST = 200
 """Rows above a header found by `begin`, within which it is looked for again; a tester's preamble has a few dozen."""
@@ -46,7 +44,7 @@ def read_mapped(data: bytes, file: Path, mapping: MappingFile) -> Tests:
     Raises:
         InputError: if the file does not hold what the mapping says, or a cell is damaged.
     """
-    reader = _Reader(_rows(data, file, mapping), file, mapping)
+    reader = _Reader(read_rows(data, file, mapping), file, mapping)
     reader.run()
     if not reader.samples:
         remedy = f"Check skip_rows, header_rows and {'end' if mapping.end else 'skip_footer'} in {mapping.file.name}"
@@ -67,86 +65,6 @@ def read_mapped(data: bytes, file: Path, mapping: MappingFile) -> Tests:
     return Tests(curves, form, mapping.control, other, reader.diameters_um, dict(reader.missing))
 
 
-class _Rows:
-    """Lines of text, split when they are asked for."""
-
-    def __init__(self, lines: list[str], file: Path, mapping: MappingFile) -> None:
-        self.lines, self.file, self.delimiter, self.mapping = lines, file, mapping.delimiter, mapping.file.name
-        self.nothing = '" \t' if mapping.delimiter == " " else mapping.delimiter + '" \t'
-
-    def __len__(self) -> int:
-        return len(self.lines)
-
-    def blank(self, i: int) -> bool:
-        """Whether a row holds nothing but delimiters."""
-        return not self.lines[i].strip(self.nothing)
-
-    def begins(self, i: int, text: str) -> bool:
-        """Whether a row, or the first thing that it holds, begins with a text."""
-        line, text = same_text(self.lines[i].lstrip()), same_text(text)
-        return line.startswith(text) or line.lstrip(self.nothing).startswith(text)
-
-    def cells(self, i: int) -> list[str]:
-        """The cells of a row."""
-        line = self.lines[i]
-        if self.delimiter == " ":
-            return line.split()
-        if '"' not in line:
-            return line.split(self.delimiter)
-        try:
-            return next(csv.reader([line], delimiter=self.delimiter, strict=True))
-        except (csv.Error, StopIteration) as error:
-            raise InputError(
-                f"quotes are damaged ({error})",
-                file=self.file,
-                row=i + 1,
-                remedy=f"Close every double quote, or correct delimiter in {self.mapping}",
-            ) from None
-
-
-class _Sheet(_Rows):
-    """Rows of a workbook's sheet, as they are."""
-
-    def __init__(self, rows: list[list[str]], file: Path, mapping: MappingFile) -> None:
-        super().__init__([], file, mapping)
-        self.rows = rows
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    def blank(self, i: int) -> bool:
-        return not any(cell.strip() for cell in self.rows[i])
-
-    def begins(self, i: int, text: str) -> bool:
-        first = next((cell for cell in self.rows[i] if cell.strip()), "")
-        return same_text(first.lstrip()).startswith(same_text(text))
-
-    def cells(self, i: int) -> list[str]:
-        return self.rows[i]
-
-
-def _rows(data: bytes, file: Path, mapping: MappingFile) -> _Rows:
-    if is_workbook(data):
-        how = f'Write sheet = "..." in {mapping.file.name}'
-        rows = read_sheet(data, file, mapping.sheet, decimal_mark=mapping.decimal_mark, how=how)
-        return _Sheet([cells for _, cells in rows], file, mapping)
-    if mapping.sheet is not None:
-        raise InputError(
-            f"is no Excel workbook (xlsx), though {mapping.file.name} names a sheet",
-            file=file,
-            remedy="Remove the key sheet, or save the file as xlsx",
-        )
-    kind = binary_kind(data)
-    if kind is not None and not mapping.encoding.lower().replace("_", "-").startswith(("utf-16", "utf-32")):
-        raise InputError(
-            f"the file is {kind}", file=file, remedy="Unpack it, save it as xlsx or text, or name its encoding"
-        )
-    lines = decode_lines(data, mapping.encoding, file)
-    if lines and lines[0].startswith("\ufeff"):
-        lines[0] = lines[0][1:]
-    return _Rows(lines, file, mapping)
-
-
 _Sample = tuple[int, int, list[float]]  # its row in the file, the row's number in the test, and the readings
 
 
@@ -154,7 +72,7 @@ _Sample = tuple[int, int, list[float]]  # its row in the file, the row's number 
 class _Reader:
     """Goes through the rows once and keeps what belongs to each test."""
 
-    rows: _Rows
+    rows: Rows
     file: Path
     mapping: MappingFile
     samples: dict[str, list[_Sample]] = field(default_factory=dict)
