@@ -23,7 +23,7 @@ from ..table import (
 )
 from ..validate import check_magnitudes
 from .diameters import check_triple
-from .mapped_rows import Rows, read_rows
+from .mapped_rows import Rows, Sheet, read_rows
 from .mapping import DIMENSIONS, InHeader, MappingFile
 from .pace import paced
 from .text import Tests, checked_curve
@@ -148,7 +148,7 @@ class _Reader:
 
     def _refuse_groups(self) -> None:
         """Refuse a column of text whose decimal mark looks like one between thousands, unless the mapping says none."""
-        if self.mapping.thousands is not None or isinstance(self.rows, _Sheet):
+        if self.mapping.thousands is not None or isinstance(self.rows, Sheet):
             return
         for quantity, grouping in self.groupings.items():
             if (found := grouping.found()) is not None:
