@@ -202,6 +202,7 @@ class LeastSquaresCalibration(Calibration):
             "runtime_s": self.runtime_s,
             "seed": self.seed,
             "law": {"unloading": self.model.unloading.value, "strain_scaling": self.model.strain_scaling.value},
+            "effects": [],
             "loss": self.loss,
             **{
                 f"log_{name}": {

@@ -237,6 +237,7 @@ class BayesCalibration(PosteriorDraws):
             "runtime_s": self.runtime_s,
             "seed": self.seed,
             "law": {"unloading": self.model.unloading.value, "strain_scaling": self.model.strain_scaling.value},
+            "effects": [],
             "modulus_scatter": summary(named["modulus_scatter"]) if self.model.modulus_scatter else None,
             "shape_scatter": summary(named["shape_scatter"]) if self.model.shape_scatter else None,
             "yield_stress_MPa": summary(self.yield_stress_MPa()),

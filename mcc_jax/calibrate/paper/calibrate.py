@@ -193,6 +193,7 @@ class PaperCalibration(Calibration):
             "runtime_s": self.runtime_s,
             "seed": self.seed,
             "law": {"unloading": self.mean_law.unloading.value, "strain_scaling": self.mean_law.strain_scaling.value},
+            "effects": [],
             "a_objective": self.objective,
             "a_full": estimate(self.shape.a),
             "a_reference": estimate(reference.a if reference else None),
