@@ -8,7 +8,6 @@ from .least_squares import LeastSquaresCalibration as LeastSquaresCalibration
 from .least_squares import calibrate_least_squares as calibrate_least_squares
 from .many_campaigns import calibrate_many as calibrate_many
 from .model import JointModel as JointModel
-from .noise import Noise as Noise
 from .paper.calibrate import PaperCalibration as PaperCalibration
 from .paper.calibrate import calibrate_paper as calibrate_paper
 from .paper.loading import PlasticFit as PlasticFit
@@ -31,7 +30,6 @@ from .paper.shape import Objective as Objective
 from .paper.shape import ShapeFit as ShapeFit
 from .paper.shape import choose_reference as choose_reference
 from .paper.shape import fit_shape_parameter as fit_shape_parameter
-from .population import Population as Population
 from .posterior import BayesCalibration as BayesCalibration
 from .posterior import calibrate_bayes as calibrate_bayes
 from .predict import PredictedCurves as PredictedCurves

@@ -10,8 +10,6 @@ from .record import HUMIDITY_COLUMN as HUMIDITY_COLUMN
 from .record import REFERENCE_HUMIDITY_PERCENT as REFERENCE_HUMIDITY_PERCENT
 from .record import Record as Record
 from .record import clean_record as clean_record
-from .record import first_point as first_point
-from .record import follow as follow
 from .variant import EQUIVALENCES as EQUIVALENCES
 from .variant import Equivalence as Equivalence
 from .variant import Mechanism as Mechanism

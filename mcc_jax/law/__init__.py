@@ -24,4 +24,3 @@ from .reference import hertz_stress as hertz_stress
 from .reference import ideal_plastic_stress as ideal_plastic_stress
 from .reference import similarity_strength as similarity_strength
 from .reference import similarity_stress as similarity_stress
-from .response import Memory as Memory

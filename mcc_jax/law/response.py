@@ -13,7 +13,8 @@ import optimistix as optx
 from .._errors import InputError
 from .._numerics import running_max
 from .._types import Path, Scalar, Values
-from ..effects import AbstractEffect, Context, Record, first_point, follow
+from ..effects import AbstractEffect, Context, Record
+from ..effects.record import first_point, follow
 from ..formulas import Formulas, recovery
 from ..geometry import Particle
 from .loading import strain_under

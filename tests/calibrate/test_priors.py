@@ -57,7 +57,7 @@ def test_what_is_not_named_is_the_default_of_the_form(read, unloading):
     assert found.effective_modulus_MPa == Priors.default(unloading).effective_modulus_MPa
     assert found.effective_modulus_MPa.median < 0.1 * Priors().effective_modulus_MPa.median
     assert JointModel(unloading).chosen_priors == Priors.default(unloading)
-    assert JointModel(unloading, priors=found).beliefs == found
+    assert JointModel(unloading, priors=found).chosen_priors == found
 
 
 @pytest.mark.parametrize(
