@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from mcc_jax import InputError, MccLaw, Plastic, paper_law
-from mcc_jax.calibrate import BayesCalibration, Population
+from mcc_jax.calibrate import BayesCalibration
+from mcc_jax.calibrate.population import Population
 from mcc_jax.dem import (
     Solver,
     band_by_draws,
