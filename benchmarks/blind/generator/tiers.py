@@ -155,7 +155,7 @@ def t0(seeds=SEEDS):
 
 
 def t1(seeds=SEEDS):
-    """ExactLikelihood formulas at lambda 5, 10 and 20 in P0 and P1; fewer at 3, and in P2."""
+    """Exact formulas at lambda 5, 10 and 20 in P0 and P1; fewer at 3, and in P2."""
     cases = []
     for name in MECHANISMS:
         cells = [(p, v, seeds) for p in ("P0", "P1") for v in (5.0, 10.0, 20.0)]

@@ -43,7 +43,7 @@ def pictures(found, place, prefix):
         axes.set(
             xlabel="named first",
             ylabel="hidden (campaigns)",
-            title="ExactLikelihood formulas, lambda 10 and 20: per cent of campaigns",
+            title="Exact formulas, lambda 10 and 20: per cent of campaigns",
         )
         for i, j in zip(*np.nonzero(matrix), strict=True):
             axes.text(
