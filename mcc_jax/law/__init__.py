@@ -25,3 +25,5 @@ from .reference import ideal_plastic_stress as ideal_plastic_stress
 from .reference import similarity_strength as similarity_strength
 from .reference import similarity_stress as similarity_stress
 from .response import Memory as Memory
+from .response import factor_at_peak as factor_at_peak
+from .response import folded as folded
