@@ -5,6 +5,7 @@ from __future__ import annotations
 from .._version import own_version
 from ..geometry import Particle
 from ..law import TESTED_STRAIN, MccLaw, StrainScaling, Unloading
+from .effects import factor_in_c, in_words, parameters_in_c
 from .origin import Origin, checked, numbers
 from .templates import quoted, render
 
@@ -14,6 +15,7 @@ def c_header(law: MccLaw, particle: Particle | None = None, *, origin: Origin | 
 
     It holds force, tangent and history of one particle between platens, and of a pair of half contacts, for all forms
     of unloading and strain scaling. Coefficients are passed as a struct, so that every particle can have its own.
+    Effects that are closed formulas are part of it (`AbstractEffect.closed`), with their numbers as constants.
 
     Args:
         law: the law.
@@ -21,13 +23,17 @@ def c_header(law: MccLaw, particle: Particle | None = None, *, origin: Origin | 
         origin: where the law comes from, for the comment on top.
 
     Raises:
-        InputError: if a parameter is out of its range or the particle carries no stress. A law that is not monotone is
+        InputError: if a parameter is out of its range, the particle carries no stress, or an effect is no closed
+            formula or makes a contact gain energy. A law that is not monotone is
             passed on; `read_calibration` refuses it, and so should you unless you know what a pair of them means.
     """
     origin = checked(law, particle, origin, needed=False)
     values = numbers(law)
     return render(
         "mcc_law.h.j2",
+        parameters=parameters_in_c(law),
+        factor=factor_in_c(law, particle),
+        effects=quoted(", ".join(effect.name for effect in law.effects))[1:-1],
         version=own_version(),
         origin=origin_lines(law, particle, origin),
         strain_max=TESTED_STRAIN,
@@ -50,6 +56,7 @@ def c_header(law: MccLaw, particle: Particle | None = None, *, origin: Origin | 
 def origin_lines(law: MccLaw, particle: Particle | None, origin: Origin) -> list[str]:
     """Where the values come from, a fact a line."""
     lines = [f"Unloading {law.unloading.value}, strain scaling {law.strain_scaling.value}."]
+    lines += [quoted(line)[1:-1] for line in in_words(law)]
     if origin.calibration is not None:
         c = origin.calibration
         lines.append(

@@ -11,13 +11,12 @@ from ..law import History, MccLaw
 
 
 def respond(
-    law: MccLaw, particle: Particle, displacement: Scalar, displacement_max: Scalar
-) -> tuple[Scalar, Scalar, Scalar]:
-    """Force [mN], its derivative with respect to the displacement [mN/um], and the history [um] after the step."""
+    law: MccLaw, particle: Particle, state: History, displacement: Scalar, time: Scalar | None = None
+) -> tuple[Scalar, Scalar, History]:
+    """Force [mN], its derivative with respect to the displacement [mN/um], and the state after the step."""
 
-    def step(x: Scalar) -> tuple[Scalar, Scalar]:
-        history, force = law.step(particle, History(displacement_max), x)
-        return force, history.displacement_max
+    def step(x: Scalar) -> tuple[Scalar, History]:
+        after, force = law.step(particle, state, x, time)
+        return force, after
 
-    force, tangent, peak = jax.jvp(step, (displacement,), (jnp.ones_like(displacement),), has_aux=True)
-    return force, tangent, peak
+    return jax.jvp(step, (displacement,), (jnp.ones_like(displacement),), has_aux=True)

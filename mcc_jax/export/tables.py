@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from .. import arguments
 from .._errors import InputError
-from ..formulas import recovery_limit
+from ..dem import HalfContact, half_contact
+from ..formulas import Formulas, recovery_limit
 from ..formulas.recovery_limit import SHARE
-from ..law import TESTED_STRAIN, MccLaw, stress_ratio
+from ..geometry import Particle
+from ..law import TESTED_STRAIN, MccLaw, folded, stress_ratio
 from .origin import checked
 
 if TYPE_CHECKING:
@@ -47,60 +49,80 @@ class CurveTables:
     error: float
 
 
-def curve_tables(law: MccLaw, *, strain_max: float = TESTED_STRAIN, tolerance: float = 1e-5) -> CurveTables:
+def curve_tables(
+    law: MccLaw, particle: Particle | None = None, *, strain_max: float = TESTED_STRAIN, tolerance: float = 1e-5
+) -> CurveTables:
     """Tables of the master curves of a law; sizes and shapes come in through the scaled strain.
 
     Args:
         law: the law.
+        particle: whose tables these are if the law has effects; without effects they are every particle's.
         strain_max: where the loading table ends [-].
         tolerance: largest error of linear interpolation, as a share of each column's largest value.
 
     Raises:
-        InputError: if 65536 points do not suffice.
+        InputError: if 65536 points do not suffice, or naming an effect that is no closed formula.
     """
     import pandas as pd
 
-    checked(law, None, needed=False)
+    checked(law, particle, needed=bool(law.effects))
     strain_max = arguments.number(strain_max, "strain_max", above=0)
     tolerance = arguments.number(tolerance, "tolerance", above=0)
-    loading, one = _refine(lambda t: _loading(law, strain_max * t**3), tolerance, _corners(law, strain_max))
+    formulas, side = law.formulas, None
+    if law.effects and particle is not None:
+        side = half_contact(law, particle)
+        formulas, _ = folded(formulas, law.effects, particle, "the tables")
+
+    def at(t: np.ndarray) -> _Curves:
+        return _at(formulas, side, strain_max * t**3)
+
+    loading, one = _refine(lambda t: _loading(at(t)), tolerance, _corners(at))
     unloading, other = _refine(lambda t: _unloading(1 - (1 - t) ** 2), tolerance)
     return CurveTables(pd.DataFrame(loading), pd.DataFrame(unloading), max(one, other))
 
 
-def _loading(law: MccLaw, x: np.ndarray) -> dict[str, np.ndarray]:
-    secant, tangent, formula, limit = _at(law, x)
+class _Curves(NamedTuple):
+    """At scaled strains: secant and tangent [MPa], strain recovered at eta_p = 1 by the formula, and its limit."""
+
+    x: np.ndarray
+    secant: np.ndarray
+    tangent: np.ndarray
+    formula: np.ndarray
+    limit: np.ndarray
+
+
+def _loading(at: _Curves) -> dict[str, np.ndarray]:
     return {
-        "scaled_strain": x,
-        "stress_MPa": x * secant,
-        "tangent_MPa": np.where(secant > 0, tangent, 0.0),
-        "recovered_strain_at_eta_1": np.minimum(formula, limit),
-        "recovered_strain_formula_at_eta_1": formula,
+        "scaled_strain": at.x,
+        "stress_MPa": at.x * at.secant,
+        "tangent_MPa": np.where(at.secant > 0, at.tangent, 0.0),
+        "recovered_strain_at_eta_1": np.minimum(at.formula, at.limit),
+        "recovered_strain_formula_at_eta_1": at.formula,
     }
 
 
-def _at(law: MccLaw, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Secant and tangent [MPa] at scaled strains; strain recovered at eta_p = 1 by the formula, and its limit."""
+def _at(law: Formulas, side: HalfContact | None, x: np.ndarray) -> _Curves:
     K1, K3, K5 = (float(K) for K in law.plastic.polynomial)
     secant = np.maximum(K1 - x**2 * (K3 - x**2 * K5), 0.0)
     tangent = K1 - x**2 * (3 * K3 - 5 * x**2 * K5)
     n, k, modulus = law.unloading.stress_power, law.unloading.constant, float(law.effective_modulus)
+    square = (secant / modulus) ** n * x ** (n - 1) / k
+    if side is not None:
+        square *= np.asarray(side.numbers(side.tested / TESTED_STRAIN * x).c / side.c)
     limit, _ = recovery_limit(*map(jnp.asarray, (x, secant, tangent)))
-    return secant, tangent, np.sqrt((secant / modulus) ** n * x ** (n - 1) / k), np.asarray(limit)
+    return _Curves(x, secant, tangent, np.sqrt(square), np.asarray(limit))
 
 
-def _corners(law: MccLaw, strain_max: float) -> np.ndarray:
-    """Where the recovered strain bends sharply, as t with x = strain_max t^3: its limit begins to hold, or ends to."""
+def _corners(at: Callable[[np.ndarray], _Curves]) -> np.ndarray:
+    """Where the recovered strain bends sharply, as t: its limit begins to hold, or ends to."""
 
     from scipy.optimize import brentq
 
     def excess(t: np.ndarray) -> np.ndarray:
-        _, _, formula, limit = _at(law, strain_max * t**3)
-        return formula - limit
+        return at(t).formula - at(t).limit
 
     def steepness(t: np.ndarray) -> np.ndarray:
-        secant, tangent, _, _ = _at(law, strain_max * t**3)
-        return tangent - SHARE * secant
+        return at(t).tangent - SHARE * at(t).secant
 
     t, found = np.linspace(0.0, 1.0, CORNERS + 1), []
     for of in (excess, steepness):
