@@ -81,9 +81,11 @@ def pair_force(i: HalfContact, j: HalfContact, overlap_max: ScalarLike, overlap:
         )
     overlap_max, overlap = _largest(i, overlap_max), _overlap(i, overlap)
     peak = largest_overlap(overlap_max, overlap)
-    if i.effects or j.effects:
-        return _force_with_effects(i, j, peak, peak - overlap)
-    return _series_force(i.power, _numbers(i), _numbers(j), peak, peak - overlap)
+    one, other = _numbers(i), _numbers(j)
+    if i.effects or j.effects:  # XLA solves the split once, for here and for the force
+        at_peak = _series(one, other, peak)
+        one, other = i.numbers(at_peak.d_i), j.numbers(at_peak.d_j)
+    return _series_force(i.power, one, other, peak, peak - overlap)
 
 
 def wall_force(side: HalfContact, overlap_max: ScalarLike, overlap: ScalarLike) -> Scalar:
@@ -182,13 +184,6 @@ class _Series(NamedTuple):
 
 def _numbers(side: HalfContact) -> Numbers:
     return Numbers(side.k1, side.k3, side.k5, side.c)
-
-
-def _force_with_effects(i: HalfContact, j: HalfContact, peak: Scalar, drop: Scalar) -> Scalar:
-    """The force where the peak changes the modulus; derivatives follow those of the split, `_Series`."""
-    series = _series(_numbers(i), _numbers(j), peak)
-    force = series.force * _ratio(_both_spans(i, j, series), drop)[1]
-    return jnp.where((series.force > 0) | (drop <= 0), force, 0.0)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
