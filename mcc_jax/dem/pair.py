@@ -14,7 +14,7 @@ from jaxtyping import Array
 from .. import arguments
 from .._errors import InputError
 from .._numerics import shared
-from .._types import Flag, Scalar, ScalarLike
+from .._types import Scalar, ScalarLike
 from ..formulas.branch import branch_force
 from ..formulas.loading_inverse import loading_work, quintic, secant_modulus, tangent_modulus
 from ..law import energy_ratio, stress_ratio

@@ -74,7 +74,7 @@ class HalfContact(eqx.Module):
         keeps a contact from gaining energy.
         """
         c = self.c
-        if self.effects:
+        if self.radius is not None:
             d = jnp.where(d < self.tested, jnp.where(d > 0, d, 0.0), self.tested)
             stress = 1e-6 * d * secant_modulus(self.k1, self.k3, self.k5, d) / (jnp.pi * self.radius * self.radius)
             c = c / factor_at_peak(self.effects, d / self.radius, stress) ** self.power
@@ -139,14 +139,18 @@ def passive(sides: HalfContact) -> HalfContact:
         InputError: naming the effects by which one would gain.
     """
     if sides.effects and not any(map(arguments.is_traced, jax.tree.leaves(sides))):
-        check = HalfContact.is_passive.fget  # pyright: ignore[reportAttributeAccessIssue]
-        if not bool(jnp.all(jax.vmap(check)(sides) if sides.k1.ndim else check(sides))):
+        good = jax.vmap(_is_passive)(sides) if sides.k1.ndim else sides.is_passive
+        if not bool(jnp.all(good)):
+            names = ", ".join(effect.name for effect in sides.effects)
             raise InputError(
-                f"with {', '.join(effect.name for effect in sides.effects)} a contact would give back more "
-                "energy than it took",
+                f"with {names} a contact would give back more energy than it took",
                 remedy="Take a smaller amplitude, or a stiffer effective modulus.",
             )
     return sides
+
+
+def _is_passive(side: HalfContact) -> Flag:
+    return side.is_passive
 
 
 def half_contact(law: MccLaw, particle: Particle, normal: Normal | None = None) -> HalfContact:

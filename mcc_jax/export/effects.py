@@ -84,10 +84,27 @@ def factor_in_c(law: MccLaw, particle: Particle | None) -> str | None:
 
 
 _OPERATIONS = {
-    **{"add": "{} + {}", "sub": "{} - {}", "mul": "{} * {}", "div": "{} / {}", "neg": "-{}", "square": "{0} * {0}"},
-    **{"gt": "{} > {}", "lt": "{} < {}", "ge": "{} >= {}", "le": "{} <= {}", "eq": "{} == {}", "ne": "{} != {}"},
-    **{"and": "{} && {}", "or": "{} || {}", "not": "!{}", "select_n": "{0} ? {2} : {1}", "abs": "fabs({})"},
-    **{"max": "{0} > {1} ? {0} : {1}", "min": "{0} < {1} ? {0} : {1}", "pow": "pow({}, {})", "rsqrt": "1.0 / sqrt({})"},
+    "add": "{} + {}",
+    "sub": "{} - {}",
+    "mul": "{} * {}",
+    "div": "{} / {}",
+    "neg": "-{}",
+    "square": "{0} * {0}",
+    "gt": "{} > {}",
+    "lt": "{} < {}",
+    "ge": "{} >= {}",
+    "le": "{} <= {}",
+    "eq": "{} == {}",
+    "ne": "{} != {}",
+    "and": "{} && {}",
+    "or": "{} || {}",
+    "not": "!{}",
+    "select_n": "{0} ? {2} : {1}",
+    "abs": "fabs({})",
+    "max": "{0} > {1} ? {0} : {1}",
+    "min": "{0} < {1} ? {0} : {1}",
+    "pow": "pow({}, {})",
+    "rsqrt": "1.0 / sqrt({})",
     **{name: f"{name}({{}})" for name in ("exp", "log", "log1p", "expm1", "sqrt", "cbrt", "sin", "cos", "tan", "tanh")},
 }
 """What JAX calls an operation on numbers, and how C writes it."""
@@ -95,9 +112,7 @@ _THE_SAME = ("broadcast_in_dim", "convert_element_type", "copy", "reduce_precisi
 """Operations that leave numbers as they are."""
 
 
-def in_c(
-    function: Callable[..., tuple[Scalar, ...]], names: Sequence[str]
-) -> tuple[list[str], list[str]]:
+def in_c(function: Callable[..., tuple[Scalar, ...]], names: Sequence[str]) -> tuple[list[str], list[str]]:
     """A function of scalars as C: the statements, and what to write for each result.
 
     JAX traces the function; so C computes what the library computes, of an effect of the user's own, too.

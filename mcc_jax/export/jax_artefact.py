@@ -25,7 +25,7 @@ _EACH = ["diameters_um D1, D2, D3 (b, 3)", "coefficients C1, C3, C5 (b, 3)"]
 _OWN = "the particle of this export"
 _ALL = "particles of any size, each with coefficients of its own; a and the modulus are those of this export"
 _MEMORY = "what `memory` lists, one by one"
-SIGNATURES: dict[str, dict[str, Any]] = {
+SIGNATURES: dict[Which, dict[str, Any]] = {
     "force": {"arguments": [_DISPLACEMENT, _MAX], "results": [_FORCE], "of": _OWN},
     "step": {"arguments": [_DISPLACEMENT, _MAX], "results": [_FORCE, _TANGENT, f"{_MAX} after the step"], "of": _OWN},
     "step_each": {
@@ -34,7 +34,7 @@ SIGNATURES: dict[str, dict[str, Any]] = {
         "of": _ALL,
     },
 }
-SIGNATURES_WITH_EFFECTS: dict[str, dict[str, Any]] = {
+SIGNATURES_WITH_EFFECTS: dict[Which, dict[str, Any]] = {
     "step": {"arguments": [_DISPLACEMENT, _TIME, _MEMORY], "results": [_FORCE, _TANGENT, _MEMORY], "of": _OWN},
     "step_load": {"arguments": [_FORCE, _TIME, _MEMORY], "results": [_DISPLACEMENT, _MEMORY], "of": _OWN},
     "step_each": {
@@ -45,7 +45,7 @@ SIGNATURES_WITH_EFFECTS: dict[str, dict[str, Any]] = {
 }
 
 
-def signatures(law: MccLaw) -> dict[str, dict[str, Any]]:
+def signatures(law: MccLaw) -> dict[Which, dict[str, Any]]:
     """The functions there are of a law, with arguments and results: effects need time and a memory."""
     return SIGNATURES_WITH_EFFECTS if law.effects else SIGNATURES
 

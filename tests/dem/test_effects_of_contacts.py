@@ -35,7 +35,12 @@ def named(variant):
 
 
 def with_all(unloading, scaling=StrainScaling.CONTACT):
-    names = ("damage:threshold", "densification_stiffening:heckel", "size_effect:flow_and_modulus", "shape_second_order")
+    names = (
+        "damage:threshold",
+        "densification_stiffening:heckel",
+        "size_effect:flow_and_modulus",
+        "shape_second_order",
+    )
     return law_of(unloading, scaling).with_effects(*names)
 
 
@@ -86,7 +91,9 @@ def test_an_amplitude_of_zero_changes_nothing():
     plain, other = half_contact(law, PARTICLE), half_contact(law_of(C1=11.0), Particle(60.0, 62.0, 50.0))
     for partner in (plain, other):
         without = driven(functools.partial(ON_PATH, plain, partner), overlaps)
-        assert np.abs(driven(functools.partial(ON_PATH, none, partner), overlaps) - without).max() <= 1e-12 * max(without)
+        assert np.abs(driven(functools.partial(ON_PATH, none, partner), overlaps) - without).max() <= 1e-12 * max(
+            without
+        )
     assert len(jax.tree.leaves(plain)) == 5  # a law without effects carries nothing of them
 
 
