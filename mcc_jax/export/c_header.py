@@ -1,13 +1,15 @@
-"""The law as a C99 header."""
+"""The law as a C99 header, and text from the templates beside it."""
 
 from __future__ import annotations
+
+import json
+from typing import Any
 
 from .._version import own_version
 from ..geometry import Particle
 from ..law import TESTED_STRAIN, MccLaw, StrainScaling, Unloading
 from .effects import factor_in_c, in_words, parameters_in_c
 from .origin import Origin, checked, numbers
-from .templates import quoted, render
 
 
 def c_header(law: MccLaw, particle: Particle | None = None, *, origin: Origin | None = None) -> str:
@@ -72,3 +74,23 @@ def origin_lines(law: MccLaw, particle: Particle | None, origin: Origin) -> list
     if not bool(law.is_monotone):
         lines.append("WARNING: the loading curve is not monotone; a pair of such contacts has several solutions.")
     return lines
+
+
+def render(name: str, **values: Any) -> str:
+    """The template of that name with the values put in; a value it wants and does not get is an error."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("mcc_jax.export"),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        autoescape=False,  # C and Markdown, not HTML
+    )
+    return environment.get_template(name).render(**values)
+
+
+def quoted(text: str) -> str:
+    """Any text in one line of ASCII that ends no comment, string or code block, wherever it is put."""
+    return json.dumps(text, ensure_ascii=True).replace("*", "\\u002a").replace("`", "\\u0060").replace("?", "\\u003f")

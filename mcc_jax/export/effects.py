@@ -16,7 +16,7 @@ import numpy as np
 from .._errors import InputError
 from .._types import Scalar
 from ..dem import half_contact
-from ..effects import LIBRARY, AbstractEffect, Variant
+from ..effects import LIBRARY
 from ..formulas import Formulas, Plastic
 from ..geometry import Particle
 from ..law import MccLaw, factor_at_peak, folded
@@ -26,28 +26,26 @@ SPHERE_UM = 200.0
 
 
 def described(law: MccLaw) -> list[dict[str, Any]]:
-    """The effects of a law: name, equation, the amplitude's unit, and its numbers by name."""
-    return [_described(effect) for effect in law.effects]
+    """The effects of a law: name, equation, the amplitude's unit where it is known, and numbers by name."""
+    told = []
+    for effect in law.effects:
+        mechanism, _, name = effect.name.partition(":")
+        known = next((v for v in LIBRARY.get(mechanism, ()) if v.name == name), None)
+        numbers = {field.name: getattr(effect, field.name) for field in dataclasses.fields(effect)}
+        numbers = {name: float(value) for name, value in numbers.items() if eqx.is_inexact_array(value)}
+        if known is None:
+            more = {"equation": (inspect.getdoc(effect) or "").partition("\n")[0]}
+        else:
+            more = {"equation": known.equation, "unit": known.unit}
+            numbers = {known.parameter if name == "amplitude" else name: value for name, value in numbers.items()}
+        told.append({"name": effect.name, **more, "numbers": numbers})
+    return told
 
 
 def in_words(law: MccLaw) -> list[str]:
-    """A line for each effect of a law, in ASCII."""
-    lines = []
-    for effect in described(law):
-        numbers = ", ".join(f"{name} = {value:.6g}" for name, value in effect["numbers"].items())
-        lines.append(f"Effect {effect['name']}: {effect['equation']}; {numbers}.")
-    return lines
-
-
-def _described(effect: AbstractEffect) -> dict[str, Any]:
-    mechanism, _, name = effect.name.partition(":")
-    known: Variant | None = next((v for v in LIBRARY.get(mechanism, ()) if v.name == name), None)
-    named = {f.name: getattr(effect, f.name) for f in dataclasses.fields(effect)}
-    numbers = {key: float(value) for key, value in named.items() if eqx.is_inexact_array(value)}
-    if known is None:
-        return {"name": effect.name, "equation": (inspect.getdoc(effect) or "").partition("\n")[0], "numbers": numbers}
-    numbers = {known.parameter if key == "amplitude" else key: value for key, value in numbers.items()}
-    return {"name": effect.name, "equation": known.equation, "unit": known.unit, "numbers": numbers}
+    """A line for each effect of a law."""
+    numbers = [", ".join(f"{name} = {v:.6g}" for name, v in effect["numbers"].items()) for effect in described(law)]
+    return [f"Effect {e['name']}: {e['equation']}; {n}." for e, n in zip(described(law), numbers, strict=True)]
 
 
 def parameters_in_c(law: MccLaw) -> str | None:
@@ -84,42 +82,21 @@ def factor_in_c(law: MccLaw, particle: Particle | None) -> str | None:
 
 
 _OPERATIONS = {
-    "add": "{} + {}",
-    "sub": "{} - {}",
-    "mul": "{} * {}",
-    "div": "{} / {}",
-    "neg": "-{}",
-    "square": "{0} * {0}",
-    "gt": "{} > {}",
-    "lt": "{} < {}",
-    "ge": "{} >= {}",
-    "le": "{} <= {}",
-    "eq": "{} == {}",
-    "ne": "{} != {}",
-    "and": "{} && {}",
-    "or": "{} || {}",
-    "not": "!{}",
-    "select_n": "{0} ? {2} : {1}",
-    "abs": "fabs({})",
-    "max": "{0} > {1} ? {0} : {1}",
-    "min": "{0} < {1} ? {0} : {1}",
-    "pow": "pow({}, {})",
-    "rsqrt": "1.0 / sqrt({})",
+    "add": "{} + {}", "sub": "{} - {}", "mul": "{} * {}", "div": "{} / {}", "neg": "-{}", "square": "{0} * {0}",
+    "gt": "{} > {}", "lt": "{} < {}", "ge": "{} >= {}", "le": "{} <= {}", "eq": "{} == {}", "ne": "{} != {}",
+    "and": "{} && {}", "or": "{} || {}", "not": "!{}", "select_n": "{0} ? {2} : {1}", "abs": "fabs({})",
+    "max": "{0} > {1} ? {0} : {1}", "min": "{0} < {1} ? {0} : {1}", "pow": "pow({}, {})", "rsqrt": "1.0 / sqrt({})",
     **{name: f"{name}({{}})" for name in ("exp", "log", "log1p", "expm1", "sqrt", "cbrt", "sin", "cos", "tan", "tanh")},
-}
+}  # fmt: skip
 """What JAX calls an operation on numbers, and how C writes it."""
 _THE_SAME = ("broadcast_in_dim", "convert_element_type", "copy", "reduce_precision", "optimization_barrier")
-"""Operations that leave numbers as they are."""
+_CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call")
 
 
 def in_c(function: Callable[..., tuple[Scalar, ...]], names: Sequence[str]) -> tuple[list[str], list[str]]:
-    """A function of scalars as C: the statements, and what to write for each result.
+    """A function of as many scalars as names as C: the statements, and what to write for each result.
 
-    JAX traces the function; so C computes what the library computes, of an effect of the user's own, too.
-
-    Args:
-        function: of as many scalars as there are names, without loops.
-        names: what its arguments are called in C.
+    JAX traces it; so C computes what the library computes, of an effect of the user's own, too.
 
     Raises:
         InputError: for an operation that has no counterpart in C.
@@ -129,34 +106,30 @@ def in_c(function: Callable[..., tuple[Scalar, ...]], names: Sequence[str]) -> t
 
     def written(value: Any) -> str:
         number = np.asarray(value)
-        text = repr(number.item()) if number.dtype.kind == "f" else str(int(number))
+        text = repr(number.item() if number.dtype.kind == "f" else int(number))
         return f"({text})" if text.startswith("-") else text
 
     def follow(jaxpr: Any, constants: Sequence[Any], given: Sequence[str]) -> list[str]:
-        known = dict(zip(jaxpr.constvars, map(written, constants), strict=True))
-        known |= dict(zip(jaxpr.invars, given, strict=True))
+        known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*map(written, constants), *given], strict=True))
 
         def read(atom: Any) -> str:
             return written(atom.val) if hasattr(atom, "val") else known[atom]
 
         for equation in jaxpr.eqns:
-            inputs = list(map(read, equation.invars))
-            inner = next((p for p in equation.params.values() if hasattr(p, "jaxpr")), None)
-            if inner is not None:
-                results = follow(inner.jaxpr, inner.consts, inputs)
-            elif equation.primitive.name in _THE_SAME and not any(v.aval.ndim for v in equation.outvars):
-                results = inputs
-            else:
-                name = f"t{len(statements)}"
+            results = list(map(read, equation.invars))
+            if equation.primitive.name in _CALLS:
+                inner = next(p for p in equation.params.values() if hasattr(p, "jaxpr"))
+                results = follow(inner.jaxpr, inner.consts, results)
+            elif equation.primitive.name not in _THE_SAME or equation.outvars[0].aval.ndim:
                 kind = "int" if equation.outvars[0].aval.dtype.kind == "b" else "double"
-                statements.append((kind, name, _operation(equation, inputs)))
-                results = [name]
+                statements.append((kind, f"t{len(statements)}", _operation(equation, results)))
+                results = [statements[-1][1]]
             known.update(zip(equation.outvars, results, strict=True))
         return list(map(read, jaxpr.outvars))
 
     results = follow(traced.jaxpr, traced.consts, names)
     needed, lines = set(results), []
-    for kind, name, expression in reversed(statements):
+    for kind, name, expression in reversed(statements):  # a compiler would warn of what is not used
         if name in needed:
             needed.update(re.findall(r"\bt\d+\b", expression))
             lines.insert(0, f"const {kind} {name} = {expression};")
@@ -166,10 +139,9 @@ def in_c(function: Callable[..., tuple[Scalar, ...]], names: Sequence[str]) -> t
 def _operation(equation: Any, inputs: Sequence[str]) -> str:
     name = equation.primitive.name
     if name == "integer_pow":
-        power = equation.params["y"]
-        product = " * ".join([inputs[0]] * abs(power))
-        return product if power > 0 else f"1.0 / ({product})"
-    if name not in _OPERATIONS or any(v.aval.ndim for v in equation.outvars):
+        product = " * ".join([inputs[0]] * abs(equation.params["y"]))
+        return product if equation.params["y"] > 0 else f"1.0 / ({product})"
+    if name not in _OPERATIONS or equation.outvars[0].aval.ndim:
         raise InputError(
             f"an effect of this law takes the operation {name}, which has no counterpart in C",
             remedy="Export the law as a JAX artefact (--format jax), or leave that effect out.",

@@ -12,12 +12,11 @@ import numpy as np
 
 from .. import arguments
 from .._errors import InputError
-from .._types import Scalar, Values
+from .._types import Scalar
 from ..dem import HalfContact, half_contact, pair_force, pair_recovery, wall_force, wall_recovery
 from ..geometry import Particle
-from ..law import TESTED_STRAIN, History, MccLaw
+from ..law import TESTED_STRAIN, MccLaw
 from .origin import checked
-from .respond import respond
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -51,8 +50,8 @@ def golden_table(law: MccLaw, particle: Particle, *, seed: int = 0, units: Liter
 
     Returns:
         A pandas table with a column `path`, 0 for the first, and displacement, largest displacement so far, force and
-        tangent, the unit in the column's name. Every path starts from a virgin particle. A law with effects that are no
-        closed formula has a column `time_s`, too, a second from point to point.
+        tangent, the unit in the column's name. Every path starts from a virgin particle. Of a law with effects that are
+        no closed formula: path, time (a second from point to point), displacement and force.
     """
     checked(law, particle)
     seed, units = arguments.seed(seed), arguments.choice(units, UNITS, "units")
@@ -60,8 +59,10 @@ def golden_table(law: MccLaw, particle: Particle, *, seed: int = 0, units: Liter
         side = half_contact(law, particle)
     except InputError:  # no closed formula: point by point, as `mcc_jax.drive`
         return _in_units(_driven(law, particle, seed), units)
-    rows = _contact_rows(side, None, seed)  # half the displacement; tangents at the kinks are those of one branch
-    return _in_units(rows.assign(**{n: f * rows[n] for n, f in zip(rows, (1, 2, 2, 1, 0.5), strict=True)}), units)
+    rows = _contact_rows(side, None, seed)
+    rows[["displacement", "displacement_max"]] *= 2  # half of it at each platen
+    rows["tangent"] *= 0.5
+    return _in_units(rows, units)
 
 
 def golden_pair_table(
@@ -99,6 +100,8 @@ def _contact_rows(side: HalfContact, other: HalfContact | None, seed: int) -> Ta
 
 def _driven(law: MccLaw, particle: Particle, seed: int) -> Table:
     """Paths of a law whose effects have a memory, a second from point to point."""
+    import pandas as pd
+
     scale = TESTED_STRAIN * float(particle.effective_diameter / law.shape_factor(particle))
 
     def recovered(peak: np.ndarray) -> np.ndarray:
@@ -106,24 +109,12 @@ def _driven(law: MccLaw, particle: Particle, seed: int) -> Table:
 
     paths = _paths(scale, recovered, seed)
     length = np.array([len(path) for path in paths])
-    time = np.arange(float(length.max()))
-    padded = np.array([np.pad(path, (0, length.max() - len(path)), "edge") for path in paths])  # so it compiles once
-    force, tangent, peak = (np.asarray(v) for v in _points(law, particle, jnp.asarray(padded), jnp.asarray(time)))
-    number, point = np.nonzero(np.arange(length.max()) < length[:, None])
-    values = (of[number, point] for of in (padded, peak, force, tangent))
-    return _rows(number, *values).assign(time_s=time[point])
-
-
-@eqx.filter_jit
-@eqx.filter_vmap(in_axes=(None, None, 0, None))
-def _points(law: MccLaw, particle: Particle, path: Values, time: Values) -> tuple[Values, Values, Values]:
-    """Force, tangent and largest displacement of the law along a path from a virgin particle."""
-
-    def one(state: History, now: tuple[Scalar, Scalar]) -> tuple[History, tuple[Scalar, Scalar, Scalar]]:
-        force, tangent, state = respond(law, particle, state, *now)
-        return state, (force, tangent, state.displacement_max)
-
-    return jax.lax.scan(one, law.init(particle), (path, time))[1]
+    number, second = np.nonzero(np.arange(length.max()) < length[:, None])
+    x = np.array([np.pad(path, (0, length.max() - len(path)), "edge") for path in paths])  # so it compiles once
+    along = eqx.filter_vmap(lambda x, time: law.path(particle, law.init(particle), x, time)[1], in_axes=(0, None))
+    force = np.asarray(eqx.filter_jit(along)(jnp.asarray(x), jnp.arange(float(length.max()))))
+    columns = {"path": number, "time_s": second, "displacement": x[number, second], "force": force[number, second]}
+    return pd.DataFrame(columns)
 
 
 @eqx.filter_jit

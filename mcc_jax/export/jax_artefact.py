@@ -12,42 +12,32 @@ import jax.numpy as jnp
 
 from .. import arguments
 from .._errors import InputError
+from .._types import Scalar
 from ..geometry import Particle
 from ..law import History, MccLaw, Plastic
 from .origin import checked
-from .respond import respond
 
 Which = Literal["force", "step", "step_each", "step_load"]
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
-_DISPLACEMENT, _MAX = "displacement_um (b,)", "displacement_max_um (b,)"
-_FORCE, _TANGENT, _TIME = "force_mN (b,)", "tangent_mN_per_um (b,)", "time_s (b,)"
-_EACH = ["diameters_um D1, D2, D3 (b, 3)", "coefficients C1, C3, C5 (b, 3)"]
 _OWN = "the particle of this export"
 _ALL = "particles of any size, each with coefficients of its own; a and the modulus are those of this export"
-_MEMORY = "what `memory` lists, one by one"
-SIGNATURES: dict[Which, dict[str, Any]] = {
-    "force": {"arguments": [_DISPLACEMENT, _MAX], "results": [_FORCE], "of": _OWN},
-    "step": {"arguments": [_DISPLACEMENT, _MAX], "results": [_FORCE, _TANGENT, f"{_MAX} after the step"], "of": _OWN},
-    "step_each": {
-        "arguments": [_DISPLACEMENT, _MAX, *_EACH],
-        "results": [_FORCE, _TANGENT, f"{_MAX} after the step"],
-        "of": _ALL,
-    },
-}
-SIGNATURES_WITH_EFFECTS: dict[Which, dict[str, Any]] = {
-    "step": {"arguments": [_DISPLACEMENT, _TIME, _MEMORY], "results": [_FORCE, _TANGENT, _MEMORY], "of": _OWN},
-    "step_load": {"arguments": [_FORCE, _TIME, _MEMORY], "results": [_DISPLACEMENT, _MEMORY], "of": _OWN},
-    "step_each": {
-        "arguments": [_DISPLACEMENT, _TIME, *_EACH, _MEMORY],
-        "results": [_FORCE, _TANGENT, _MEMORY],
-        "of": _ALL,
-    },
-}
 
 
 def signatures(law: MccLaw) -> dict[Which, dict[str, Any]]:
-    """The functions there are of a law, with arguments and results: effects need time and a memory."""
-    return SIGNATURES_WITH_EFFECTS if law.effects else SIGNATURES
+    """The functions there are of a law, with arguments and results; effects need time and a memory."""
+    x, past, F = "displacement_um (b,)", "displacement_max_um (b,)", "force_mN (b,)"
+    memory = ["what `memory` lists, one by one"] if law.effects else []
+    second = "time_s (b,)" if law.effects else past
+    results = [F, "tangent_mN_per_um (b,)", *(memory or [f"{past} after the step"])]
+    each = ["diameters_um D1, D2, D3 (b, 3)", "coefficients C1, C3, C5 (b, 3)"]
+    one: dict[Which, dict[str, Any]] = {"force": {"arguments": [x, past], "results": [F], "of": _OWN}}
+    if law.effects:
+        one = {"step_load": {"arguments": [F, second, *memory], "results": [x, *memory], "of": _OWN}}
+    return {
+        **one,
+        "step": {"arguments": [x, second, *memory], "results": results, "of": _OWN},
+        "step_each": {"arguments": [x, second, *each, *memory], "results": results, "of": _ALL},
+    }
 
 
 @dataclass(frozen=True)
@@ -136,7 +126,6 @@ def jax_artefact(
 
 def _memory(law: MccLaw, particle: Particle) -> list[dict[str, Any]]:
     """The memory of a virgin particle, array by array."""
-    leaves, _ = jax.tree_util.tree_flatten_with_path(law.init(particle))
     return [
         {
             "name": jax.tree_util.keystr(path).removeprefix("."),
@@ -144,18 +133,28 @@ def _memory(law: MccLaw, particle: Particle) -> list[dict[str, Any]]:
             "dtype": str(leaf.dtype),
             "start": leaf.tolist(),
         }
-        for path, leaf in leaves
+        for path, leaf in jax.tree_util.tree_flatten_with_path(law.init(particle))[0]
     ]
+
+
+def respond(
+    law: MccLaw, particle: Particle, state: History, displacement: Scalar, time: Scalar | None = None
+) -> tuple[Scalar, Scalar, History]:
+    """Force [mN], its derivative with respect to the displacement [mN/um], and the state after the step."""
+
+    def step(x: Scalar) -> tuple[Scalar, History]:
+        after, force = law.step(particle, state, x, time)
+        return force, after
+
+    return jax.jvp(step, (displacement,), (jnp.ones_like(displacement),), has_aux=True)
 
 
 def _function(law: MccLaw, particle: Particle, which: Which, structure: Any) -> Callable[..., Any]:
     """One step of one contact on plain arrays."""
 
     def step(x: jax.Array, second: jax.Array, *memory: jax.Array, law: MccLaw = law, body: Particle = particle) -> Any:
-        if not law.effects:
-            force, tangent, after = respond(law, body, History(second), x)
-        else:
-            force, tangent, after = respond(law, body, jax.tree.unflatten(structure, memory), x, second)
+        state, time = (jax.tree.unflatten(structure, memory), second) if law.effects else (History(second), None)
+        force, tangent, after = respond(law, body, state, x, time)
         return force, tangent, *jax.tree.leaves(after)
 
     def force(x: jax.Array, past: jax.Array) -> jax.Array:

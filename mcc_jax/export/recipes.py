@@ -5,10 +5,9 @@ from __future__ import annotations
 from .._version import own_version
 from ..geometry import Particle
 from ..law import MccLaw
-from .c_header import origin_lines
+from .c_header import origin_lines, render
 from .effects import factor_in_c
 from .origin import Origin, checked, numbers
-from .templates import render
 
 
 def lammps_recipe(law: MccLaw, particle: Particle, *, origin: Origin | None = None) -> str:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from functools import partial
+from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 else:
     Table = object
 
+Curves = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 MIN_ROWS, MAX_ROWS = 64, 65536
 BETWEEN = 8  # points at which an interval is checked
 CORNERS = 4096  # intervals in which a corner is looked for
@@ -73,35 +75,26 @@ def curve_tables(
         side = half_contact(law, particle)
         formulas, _ = folded(formulas, law.effects, particle, "the tables")
 
-    def at(t: np.ndarray) -> _Curves:
-        return _at(formulas, side, strain_max * t**3)
-
-    loading, one = _refine(lambda t: _loading(at(t)), tolerance, _corners(at))
+    at = partial(_at, formulas, side)
+    corners = _corners(lambda t: at(strain_max * t**3))
+    loading, one = _refine(lambda t: _loading(x := strain_max * t**3, at(x)), tolerance, corners)
     unloading, other = _refine(lambda t: _unloading(1 - (1 - t) ** 2), tolerance)
     return CurveTables(pd.DataFrame(loading), pd.DataFrame(unloading), max(one, other))
 
 
-class _Curves(NamedTuple):
-    """At scaled strains: secant and tangent [MPa], strain recovered at eta_p = 1 by the formula, and its limit."""
-
-    x: np.ndarray
-    secant: np.ndarray
-    tangent: np.ndarray
-    formula: np.ndarray
-    limit: np.ndarray
-
-
-def _loading(at: _Curves) -> dict[str, np.ndarray]:
+def _loading(x: np.ndarray, curves: Curves) -> dict[str, np.ndarray]:
+    secant, tangent, formula, limit = curves
     return {
-        "scaled_strain": at.x,
-        "stress_MPa": at.x * at.secant,
-        "tangent_MPa": np.where(at.secant > 0, at.tangent, 0.0),
-        "recovered_strain_at_eta_1": np.minimum(at.formula, at.limit),
-        "recovered_strain_formula_at_eta_1": at.formula,
+        "scaled_strain": x,
+        "stress_MPa": x * secant,
+        "tangent_MPa": np.where(secant > 0, tangent, 0.0),
+        "recovered_strain_at_eta_1": np.minimum(formula, limit),
+        "recovered_strain_formula_at_eta_1": formula,
     }
 
 
-def _at(law: Formulas, side: HalfContact | None, x: np.ndarray) -> _Curves:
+def _at(law: Formulas, side: HalfContact | None, x: np.ndarray) -> Curves:
+    """Secant and tangent [MPa] at scaled strains; strain recovered at eta_p = 1 by the formula, and its limit."""
     K1, K3, K5 = (float(K) for K in law.plastic.polynomial)
     secant = np.maximum(K1 - x**2 * (K3 - x**2 * K5), 0.0)
     tangent = K1 - x**2 * (3 * K3 - 5 * x**2 * K5)
@@ -110,19 +103,21 @@ def _at(law: Formulas, side: HalfContact | None, x: np.ndarray) -> _Curves:
     if side is not None:
         square *= np.asarray(side.numbers(side.tested / TESTED_STRAIN * x).c / side.c)
     limit, _ = recovery_limit(*map(jnp.asarray, (x, secant, tangent)))
-    return _Curves(x, secant, tangent, np.sqrt(square), np.asarray(limit))
+    return secant, tangent, np.sqrt(square), np.asarray(limit)
 
 
-def _corners(at: Callable[[np.ndarray], _Curves]) -> np.ndarray:
+def _corners(at: Callable[[np.ndarray], Curves]) -> np.ndarray:
     """Where the recovered strain bends sharply, as t: its limit begins to hold, or ends to."""
 
     from scipy.optimize import brentq
 
     def excess(t: np.ndarray) -> np.ndarray:
-        return at(t).formula - at(t).limit
+        _, _, formula, limit = at(t)
+        return formula - limit
 
     def steepness(t: np.ndarray) -> np.ndarray:
-        return at(t).tangent - SHARE * at(t).secant
+        secant, tangent, _, _ = at(t)
+        return tangent - SHARE * secant
 
     t, found = np.linspace(0.0, 1.0, CORNERS + 1), []
     for of in (excess, steepness):

@@ -71,14 +71,12 @@ def _c(law: MccLaw, particle: Particle, origin: Origin, folder: Path, seed: int)
     return ["mcc_law.h", "mcc_law_golden.csv", "mcc_law_pair_golden.csv"]
 
 
-def _lammps(law: MccLaw, particle: Particle, origin: Origin, folder: Path, seed: int) -> list[str]:
-    (folder / "lammps.md").write_text(lammps_recipe(law, particle, origin=origin), encoding="utf-8")
-    return ["lammps.md", *_c(law, particle, origin, folder, seed)]
+def _recipe(recipe: Callable[..., str], name: str) -> Write:
+    def write(law: MccLaw, particle: Particle, origin: Origin, folder: Path, seed: int) -> list[str]:
+        (folder / name).write_text(recipe(law, particle, origin=origin), encoding="utf-8")
+        return [name, *_c(law, particle, origin, folder, seed)]
 
-
-def _yade(law: MccLaw, particle: Particle, origin: Origin, folder: Path, seed: int) -> list[str]:
-    (folder / "yade.md").write_text(yade_recipe(law, particle, origin=origin), encoding="utf-8")
-    return ["yade.md", *_c(law, particle, origin, folder, seed)]
+    return write
 
 
 _WRITERS: dict[str, Write] = {
@@ -86,8 +84,8 @@ _WRITERS: dict[str, Write] = {
     "csv": _csv,
     "jax": _jax,
     "c": _c,
-    "lammps": _lammps,
-    "yade": _yade,
+    "lammps": _recipe(lammps_recipe, "lammps.md"),
+    "yade": _recipe(yade_recipe, "yade.md"),
 }
 FORMATS = tuple(_WRITERS)
 """What `write_export` writes: parameter card, tables, JAX artefacts, C header, recipes for LAMMPS and Yade."""

@@ -49,7 +49,7 @@ def with_all(unloading, scaling=StrainScaling.CONTACT):
 
 @pytest.mark.parametrize("unloading", [Unloading.PRINTED, Unloading.PUNCH])
 def test_two_halves_are_the_plate_test(unloading):
-    """T1 and T2 with effects: two walls, and two equal particles, give what `drive` gives under displacement control."""
+    """T1 and T2 with effects: two walls, and two equal particles, give what `drive` gives."""
     law, displacement = with_all(unloading), cycle(45.0)
     expected = 1e-3 * drive(law, PARTICLE, displacement, time=np.arange(len(displacement))).force
     side = half_contact(law, PARTICLE)
@@ -90,10 +90,8 @@ def test_an_amplitude_of_zero_changes_nothing():
     overlaps = cycle(45.0) * UM
     plain, other = half_contact(law, PARTICLE), half_contact(law_of(C1=11.0), Particle(60.0, 62.0, 50.0))
     for partner in (plain, other):
-        without = driven(functools.partial(ON_PATH, plain, partner), overlaps)
-        assert np.abs(driven(functools.partial(ON_PATH, none, partner), overlaps) - without).max() <= 1e-12 * max(
-            without
-        )
+        without, again = (driven(functools.partial(ON_PATH, side, partner), overlaps) for side in (plain, none))
+        assert np.abs(again - without).max() <= 1e-12 * max(without)
     assert len(jax.tree.leaves(plain)) == 5  # a law without effects carries nothing of them
 
 

@@ -1,5 +1,6 @@
 """Effects in every export: C against the library, tables, card, JAX artefacts with memory, and what is refused."""
 
+import itertools
 import json
 import os
 import subprocess
@@ -174,7 +175,8 @@ def run(which, first, *more):
         return results[count:], results[0]
     memory, answer = jax.lax.scan(step, memory, (jnp.asarray(first), jnp.asarray(given["time"])))
     slope = jax.grad(lambda x: call(x, jnp.ones(2), *more, *memory)[0].sum())(jnp.full(2, first[-1]))
-    return dict(answer=np.asarray(answer[:, 1]), slope=np.asarray(slope[1]), **{f"m{k}": np.asarray(m[1]) for k, m in enumerate(memory)})
+    after = {f"m{k}": np.asarray(m[1]) for k, m in enumerate(memory)}
+    return dict(answer=np.asarray(answer[:, 1]), slope=np.asarray(slope[1]), **after)
 
 np.savez(folder / "step.npz", **run("step", given["displacement"]))
 np.savez(folder / "step_load.npz", **run("step_load", given["force"]))
@@ -189,7 +191,7 @@ def test_a_fresh_process_with_jax_alone_follows_memory_and_time(tmp_path):
         "creep:logarithmic", "frame_compliance", "thermal_drift", "damage:cyclic", "size_effect"
     )
     turns = [0.0, 40.0, 37.0, 60.0, 58.0, 58.5]
-    x = np.concatenate([np.linspace(a, b, 9) for a, b in zip(turns, turns[1:], strict=False)])
+    x = np.concatenate([np.linspace(a, b, 9) for a, b in itertools.pairwise(turns)])
     time = np.cumsum(np.random.default_rng(0).uniform(0.1, 5.0, len(x)))
     by_displacement = drive(law, PARTICLE, x, time=time)
     force = np.array(by_displacement.force)
@@ -243,17 +245,26 @@ def test_what_would_gain_energy_goes_to_no_particle_code():
     assert "time_s" in golden_table(law, PARTICLE)  # the library itself drives it
 
 
-def test_an_operation_that_c_does_not_know():
-    class Odd(AbstractModulusAtPeak):
-        """Uses a function that no C compiler has."""
+class Bessel(AbstractModulusAtPeak):
+    """Uses a function that no C compiler has."""
 
-        def factor(self, strain, stress):
-            return 1 + self.amplitude * jax.scipy.special.i0e(strain)
+    def factor(self, strain, stress):
+        return 1 + self.amplitude * jax.scipy.special.i0e(strain)
 
-    with pytest.raises(InputError, match="bessel_i0e, which has no counterpart in C"):
-        c_header(paper_law().with_effects(Odd(0.1)))
+
+class Loop(AbstractModulusAtPeak):
+    """Goes on until it is done."""
+
+    def factor(self, strain, stress):
+        return jax.lax.fori_loop(0, 3, lambda _, x: x / (1 + self.amplitude * strain), jnp.ones_like(strain))
+
+
+@pytest.mark.parametrize(("effect", "operation"), [(Bessel(0.1), "bessel_i0e"), (Loop(0.1), "scan")])
+def test_an_operation_that_c_does_not_know(effect, operation):
+    with pytest.raises(InputError, match=f"{operation}, which has no counterpart in C"):
+        c_header(paper_law().with_effects(effect))
 
 
 def test_force_without_memory_is_not_offered():
-    with pytest.raises(InputError, match="Choices: step, step_load, step_each"):
+    with pytest.raises(InputError, match="Choices: step_load, step, step_each"):
         jax_artefact(paper_law().with_effects("creep"), PARTICLE, "force")
