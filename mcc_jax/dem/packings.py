@@ -15,7 +15,7 @@ from .._errors import InputError
 from ..geometry import Particle
 from ..law import MccLaw
 from .forces import A_PACKING, Packing
-from .side import half_contact
+from .side import half_contact, passive
 
 MCC_DENSITY = 1540.0
 """True density of micro-crystalline cellulose, about [kg/m^3]."""
@@ -44,7 +44,7 @@ def spheres(law: MccLaw, diameter: Any, density: float = MCC_DENSITY) -> Packing
 
     radius = 0.5e-6 * diameter
     sides = jax.vmap(one, (axes, 0))(law, diameter)
-    return Packing(radius, density * 4 / 3 * jnp.pi * radius**3, sides)
+    return Packing(radius, density * 4 / 3 * jnp.pi * radius**3, passive(sides))
 
 
 def scattered(

@@ -14,12 +14,11 @@ from jaxtyping import Array
 from .. import arguments
 from .._errors import InputError
 from .._numerics import shared
-from .._types import Flag, Scalar, ScalarLike
-from ..formulas import recovery_limit
+from .._types import Scalar, ScalarLike
 from ..formulas.branch import branch_force
 from ..formulas.loading_inverse import loading_work, quintic, secant_modulus, tangent_modulus
 from ..law import energy_ratio, stress_ratio
-from .side import HalfContact
+from .side import HalfContact, Numbers, recovered
 
 SPLIT_STEPS = 8
 """Enough for radii from 20 to 150 um and the paper's scatter, to the last digit (with one more step on both sides).
@@ -82,7 +81,11 @@ def pair_force(i: HalfContact, j: HalfContact, overlap_max: ScalarLike, overlap:
         )
     overlap_max, overlap = _largest(i, overlap_max), _overlap(i, overlap)
     peak = largest_overlap(overlap_max, overlap)
-    return _series_force(i.power, _numbers(i), _numbers(j), peak, peak - overlap)
+    one, other = _numbers(i), _numbers(j)
+    if i.effects or j.effects:  # XLA solves the split once, for here and for the force
+        at_peak = _series(one, other, peak)
+        one, other = i.numbers(at_peak.d_i), j.numbers(at_peak.d_j)
+    return _series_force(i.power, one, other, peak, peak - overlap)
 
 
 def wall_force(side: HalfContact, overlap_max: ScalarLike, overlap: ScalarLike) -> Scalar:
@@ -96,7 +99,7 @@ def wall_force(side: HalfContact, overlap_max: ScalarLike, overlap: ScalarLike) 
     _check_sides(side)
     overlap_max, overlap = _largest(side, overlap_max), _overlap(side, overlap)
     peak = largest_overlap(overlap_max, overlap)
-    return branch_force(side.power, side.k1, side.k3, side.k5, side.c, peak, peak - overlap)
+    return branch_force(side.power, *side.numbers(peak), peak, peak - overlap)
 
 
 def pair_split(i: HalfContact, j: HalfContact, overlap: ScalarLike) -> tuple[Scalar, Scalar]:
@@ -122,7 +125,7 @@ def wall_recovery(side: HalfContact, overlap_max: ScalarLike) -> Scalar:
     _check_sides(side)
     overlap_max = _largest(side, overlap_max)
     force = overlap_max * secant_modulus(side.k1, side.k3, side.k5, overlap_max)
-    return _span(side.power, side, force, overlap_max)[0]
+    return _span(side, force, overlap_max)
 
 
 def pair_energy(i: HalfContact, j: HalfContact, overlap_max: ScalarLike, overlap: ScalarLike) -> ContactEnergy:
@@ -147,7 +150,7 @@ def wall_energy(side: HalfContact, overlap_max: ScalarLike, overlap: ScalarLike)
     overlap_max, overlap = _largest(side, overlap_max), _overlap(side, overlap)
     peak = largest_overlap(overlap_max, overlap)
     force = peak * secant_modulus(side.k1, side.k3, side.k5, peak)
-    return _energy(_work(side, peak), force, _span(side.power, side, force, peak)[0], peak - overlap)
+    return _energy(_work(side, peak), force, _span(side, force, peak), peak - overlap)
 
 
 def _check_sides(*sides: HalfContact) -> None:
@@ -171,15 +174,6 @@ def _largest(side: HalfContact, overlap_max: ScalarLike) -> Scalar:
 # ---- inside ----------------------------------------------------------------------------------------------------------
 
 
-class _Numbers(NamedTuple):
-    """The numbers of one side that its force depends on."""
-
-    k1: Scalar
-    k3: Scalar
-    k5: Scalar
-    c: Scalar
-
-
 class _Series(NamedTuple):
     """Loading of the two sides: compressions, common force."""
 
@@ -188,14 +182,14 @@ class _Series(NamedTuple):
     force: Scalar
 
 
-def _numbers(side: HalfContact) -> _Numbers:
-    return _Numbers(side.k1, side.k3, side.k5, side.c)
+def _numbers(side: HalfContact) -> Numbers:
+    return Numbers(side.k1, side.k3, side.k5, side.c)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _series_force(power: int, i: _Numbers, j: _Numbers, peak: Scalar, drop: Scalar) -> Scalar:
+def _series_force(power: int, i: Numbers, j: Numbers, peak: Scalar, drop: Scalar) -> Scalar:
     series = _solve(i, j, peak)
-    span = _span(power, i, series.force, series.d_i)[0] + _span(power, j, series.force, series.d_j)[0]
+    span = recovered(power, i, series.force, series.d_i)[0] + recovered(power, j, series.force, series.d_j)[0]
     return series.force * _ratio(span, drop)[1]
 
 
@@ -207,7 +201,7 @@ def _series_force_jvp(power, primals, tangents):
     i, j, peak, drop = primals
     di, dj, dpeak, ddrop = tangents
     series = _series(i, j, peak)
-    span_i, span_j = (_span(power, s, series.force, d) for s, d in ((i, series.d_i), (j, series.d_j)))
+    span_i, span_j = (recovered(power, s, series.force, d) for s, d in ((i, series.d_i), (j, series.d_j)))
     span = span_i[0] + span_j[0]
     q, ratio = _ratio(span, drop)
     inside = (q > 0) & (q < 1)
@@ -241,34 +235,24 @@ def _widening(power, side, dside, force, dforce, d, dd, recovered):
     return span * jnp.where(limited, at_limit, formula)
 
 
-def _explicit(change: _Numbers, d: Scalar) -> Scalar:
+def _explicit(change: Numbers, d: Scalar) -> Scalar:
     square = d * d
     return d * (change.k1 - square * (change.k3 - square * change.k5))
 
 
-def _tangent(side: _Numbers, d: Scalar) -> Scalar:
+def _tangent(side: Numbers, d: Scalar) -> Scalar:
     """Slope of a side; where it vanishes (on the verge of not being monotone) a small positive number."""
     floor = jnp.sqrt(jnp.finfo(d.dtype).eps) * side.k1
     slope = tangent_modulus(side.k1, side.k3, side.k5, d)
     return jnp.where(slope < floor, floor, slope)
 
 
-def _span(power: int, side: _Numbers | HalfContact, force: Scalar, d: Scalar) -> tuple[Scalar, Flag, Flag]:
-    """Compression recovered on full release, 1 where no force was carried; whether at its limit, whether steep."""
-    carries = (d > 0) & (force > 0)
-    per_compression = shared(jnp.where(carries, force, 1.0) / jnp.where(carries, d, 1.0))
-    square = side.c * per_compression if power == 1 else side.c * force * per_compression
-    carries = carries & (square > 0)
-    span = shared(jnp.sqrt(jnp.where(carries, square, 1.0)))
-    limit, steep = recovery_limit(
-        d, jnp.where(carries, per_compression, 0.0), tangent_modulus(side.k1, side.k3, side.k5, d)
-    )
-    limited = carries & (span > limit)
-    return jnp.where(limited, limit, span), limited, steep
+def _span(side: HalfContact, force: Scalar, d: Scalar) -> Scalar:
+    return recovered(side.power, side.numbers(d), force, d)[0]
 
 
 def _both_spans(i: HalfContact, j: HalfContact, series: _Series) -> Scalar:
-    return _span(i.power, i, series.force, series.d_i)[0] + _span(j.power, j, series.force, series.d_j)[0]
+    return _span(i, series.force, series.d_i) + _span(j, series.force, series.d_j)
 
 
 def _ratio(span: Scalar, drop: Scalar) -> tuple[Scalar, Scalar]:
@@ -290,7 +274,7 @@ def _energy(work: Scalar, force: Scalar, span: Scalar, drop: Scalar) -> ContactE
 
 
 @jax.custom_jvp
-def _series(i: _Numbers, j: _Numbers, overlap: Scalar) -> _Series:
+def _series(i: Numbers, j: Numbers, overlap: Scalar) -> _Series:
     return _solve(i, j, overlap)
 
 
@@ -307,7 +291,7 @@ def _series_jvp(primals, tangents):
     return series, _Series(dd_i, dd_j, flexibility * (t_i * t_j * doverlap + t_j * change_i + t_i * change_j))
 
 
-def _solve(i: _Numbers, j: _Numbers, overlap: Scalar) -> _Series:
+def _solve(i: Numbers, j: Numbers, overlap: Scalar) -> _Series:
     whole = jnp.where(overlap > 0, overlap, 0.0)
     # A barrier closes the iteration, here and within: without, XLA iterates again for each use.
     d = jax.lax.optimization_barrier(_split(i, j, whole))
@@ -320,7 +304,7 @@ def _solve(i: _Numbers, j: _Numbers, overlap: Scalar) -> _Series:
     return _Series(d - change, rest + change, flexibility * (t_j * force_i + t_i * force_j))
 
 
-def _split(i: _Numbers, j: _Numbers, whole: Scalar) -> Scalar:
+def _split(i: Numbers, j: Numbers, whole: Scalar) -> Scalar:
     """Compression of i at equal force, by Newton's method with the curvature (Halley), kept between bounds.
 
     Most contacts are done after a fixed number of steps, which compile to one loop over the data with one result. A
@@ -352,7 +336,7 @@ class _Bracket(NamedTuple):
     high: Scalar
 
 
-def _narrowed(i: _Numbers, j: _Numbers, whole: Scalar, bracket: _Bracket) -> _Bracket:
+def _narrowed(i: Numbers, j: Numbers, whole: Scalar, bracket: _Bracket) -> _Bracket:
     """One step. A split that meets the force but for rounding stays: asked again, the bounds would throw it out."""
     d, low, high = jnp.abs(bracket.d), bracket.low, bracket.high
     force_i, slope_i, bend_i = quintic(i.k1, i.k3, i.k5, d)

@@ -38,6 +38,9 @@ def save_state(path: str | Path, packing: Packing, state: State) -> None:
     path = arguments.file_path(path, "path")
     arguments.instance(packing, Packing, "packing", A_PACKING)
     arguments.instance(state, State, "state", A_STATE)
+    if packing.sides.effects:
+        names = ", ".join(effect.name for effect in packing.sides.effects)
+        raise InputError(f"a packing with {names} cannot be saved", remedy="Save one whose law has no effect at peaks.")
     if not path.parent.is_dir():
         raise InputError("no such folder", file=path.parent, remedy="Make it first.")
     header = {

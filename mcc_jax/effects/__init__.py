@@ -2,6 +2,7 @@
 
 from .context import Context as Context
 from .effect import AbstractEffect as AbstractEffect
+from .effect import AbstractModulusAtPeak as AbstractModulusAtPeak
 from .effect import Factors as Factors
 from .library import LIBRARY as LIBRARY
 from .library import default_library as default_library

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -37,9 +37,14 @@ class AbstractEffect(eqx.Module):
     where they must change nothing.
 
     Attributes:
+        closed: whether all it does is a formula of particle and peak, without time, cycles or the room: `modify` of the
+            particle alone, or the `AbstractModulusAtPeak`. Energy, particle codes and exports to other engines take
+            those only. Set it on the class.
         amplitude: strength of the effect, 0 for none; its unit is that of the `Variant`.
         label: "mechanism:variant" where a `Variant` built it; by it results and messages name the effect.
     """
+
+    closed: ClassVar[bool] = False
 
     amplitude: Scalar = eqx.field(converter=scalar)
     label: str = eqx.field(static=True, default="", kw_only=True)
@@ -96,6 +101,20 @@ class AbstractEffect(eqx.Module):
     def evolve(self, memory: Any, before: Scalar, now: Scalar, seconds: Scalar) -> tuple[Any, Any]:
         """Memory after a step during which the driver went from `before` to `now`, and what `inside` gets to see."""
         return memory, None
+
+
+class AbstractModulusAtPeak(AbstractEffect):
+    """An effect on the modulus whose factor depends on the largest strain and the stress there, and on nothing else."""
+
+    closed: ClassVar[bool] = True
+
+    def factor(self, strain: Values, stress: Values) -> Values:
+        """The factor, > 0, at a peak strain [-] and a peak stress [MPa]."""
+        raise NotImplementedError
+
+    def stiffness(self, context: Context) -> Values:
+        """The factor at the peak so far."""
+        return self.factor(context.peak_strain, context.peak_stress)
 
 
 def at_least(x: Values, least: float) -> Values:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from .._types import Scalar, Values, scalar
 from ..formulas import Formulas, Plastic
 from ..geometry import Particle
 from .context import Context, positive
-from .effect import AbstractEffect, at_least
+from .effect import AbstractEffect, AbstractModulusAtPeak, at_least
 from .record import REFERENCE_HUMIDITY_PERCENT, Record
 from .variant import Mechanism, Need, Nuisance, Variant
 
@@ -52,6 +52,7 @@ class AbstractStrength(AbstractEffect):
 class SizePower(AbstractStrength):
     """Strength as a power of size."""
 
+    closed: ClassVar[bool] = True
     mean_size: bool = eqx.field(static=True, default=False)
 
     def factor(self, particle: Particle, record: Record) -> Scalar:
@@ -63,6 +64,8 @@ class SizePower(AbstractStrength):
 class SizeLogarithm(AbstractStrength):
     """Strength that falls with the logarithm of size."""
 
+    closed: ClassVar[bool] = True
+
     def factor(self, particle: Particle, record: Record) -> Scalar:
         """1 - n ln(D / 200 um)."""
         return 1 - self.amplitude * jnp.log(particle.effective_diameter / REFERENCE_DIAMETER_UM)
@@ -70,6 +73,8 @@ class SizeLogarithm(AbstractStrength):
 
 class SizeGradient(AbstractStrength):
     """Strain-gradient hardening: more the smaller the particle."""
+
+    closed: ClassVar[bool] = True
 
     def factor(self, particle: Particle, record: Record) -> Scalar:
         """sqrt(1 + 2n 200 um / D) / sqrt(1 + 2n)."""
@@ -121,6 +126,8 @@ class AbstractShape(AbstractEffect):
     of p in the punch forms) with p of the `StrainScaling`; so it acts in the same way on the law of a fit, whose
     coefficients have taken in the shape factor and whose `a` is 0.
     """
+
+    closed: ClassVar[bool] = True
 
     def factor(self, particle: Particle) -> Scalar:
         """The factor on the shape factor."""
@@ -273,18 +280,15 @@ HUMIDITY = Mechanism(
 # ---- modulus against peak --------------------------------------------------------------------------------------------
 
 
-class ModulusStrain(AbstractEffect):
+class ModulusStrain(AbstractModulusAtPeak):
     """Modulus that changes with the largest strain; `direction` is -1 for damage, +1 for densification."""
 
     direction: float = eqx.field(static=True, default=-1.0)
     form: str = eqx.field(static=True, default="exponential")
 
-    def stiffness(self, context: Context) -> Values:
+    def factor(self, strain: Values, stress: Values) -> Values:
         """The factor of the form at x = eps_P (or 2 eps_P^2, or sigma_P / 10 MPa)."""
-        variable = {
-            "square": 2 * context.peak_strain * context.peak_strain,
-            "stress": context.peak_stress / REFERENCE_STRESS_MPA,
-        }.get(self.form, context.peak_strain)
+        variable = {"square": 2 * strain * strain, "stress": stress / REFERENCE_STRESS_MPA}.get(self.form, strain)
         x = self.direction * self.amplitude * variable
         if self.form == "linear":
             return at_least(1 + x, MIN_FACTOR)
@@ -295,14 +299,14 @@ class ModulusStrain(AbstractEffect):
         return jnp.exp(x)
 
 
-class ThresholdDamage(AbstractEffect):
+class ThresholdDamage(AbstractModulusAtPeak):
     """Damage that begins at a strain."""
 
     threshold_strain: Scalar = eqx.field(converter=scalar)
 
-    def stiffness(self, context: Context) -> Values:
+    def factor(self, strain: Values, stress: Values) -> Values:
         """exp(-kappa (eps_P - eps_0)), 1 below eps_0."""
-        return jnp.exp(-self.amplitude * positive(context.peak_strain - self.threshold_strain))
+        return jnp.exp(-self.amplitude * positive(strain - self.threshold_strain))
 
 
 class CyclicDamage(AbstractEffect):
@@ -313,22 +317,22 @@ class CyclicDamage(AbstractEffect):
         return 1 / at_least(1 + self.amplitude * context.cycles, MIN_FACTOR)
 
 
-class PorosityStiffening(AbstractEffect):
+class PorosityStiffening(AbstractModulusAtPeak):
     """Pores that close as stress grows; the amplitude multiplies the porosity lost."""
 
     heckel_stress_MPa: Scalar = eqx.field(converter=scalar)
 
-    def stiffness(self, context: Context) -> Values:
+    def factor(self, strain: Values, stress: Values) -> Values:
         """exp(b (1 - exp(-sigma_P / sigma_H)))."""
-        return jnp.exp(-self.amplitude * jnp.expm1(-context.peak_stress / self.heckel_stress_MPa))
+        return jnp.exp(-self.amplitude * jnp.expm1(-stress / self.heckel_stress_MPa))
 
 
-class RelativeDensity(AbstractEffect):
+class RelativeDensity(AbstractModulusAtPeak):
     """A power of relative density, which grows as the particle is squeezed."""
 
-    def stiffness(self, context: Context) -> Values:
+    def factor(self, strain: Values, stress: Values) -> Values:
         """(1 - eps_P / 2)^-b."""
-        return jnp.exp(-self.amplitude * jnp.log(at_least(1 - context.peak_strain / 2, MIN_FACTOR)))
+        return jnp.exp(-self.amplitude * jnp.log(at_least(1 - strain / 2, MIN_FACTOR)))
 
 
 def _damage(name: str, make: type[AbstractEffect], equation: str, explanation: str, **more: Any) -> Variant:

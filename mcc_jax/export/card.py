@@ -9,6 +9,7 @@ from typing import Any
 from .._version import own_version
 from ..geometry import Particle
 from ..law import TESTED_STRAIN, MccLaw
+from .effects import described
 from .origin import Origin, checked, numbers
 
 UNITS = {"C1": "1", "C3": "1", "C5": "1", "a": "1", "effective_modulus_MPa": "MPa"}
@@ -42,8 +43,8 @@ def card(law: MccLaw, particle: Particle | None = None, *, origin: Origin | None
         origin: estimates with their uncertainty, and where they are from; nothing is claimed without.
 
     Returns:
-        Parameters with unit and uncertainty, form of the law, validity, formulae in words, provenance, warnings and
-        a checksum (SHA-256) over the law and its numbers; ready for `json.dump`.
+        Parameters with unit and uncertainty, form of the law, its effects with equation and numbers, validity, formulae
+        in words, provenance, warnings and a checksum (SHA-256) over the law and its numbers; ready for `json.dump`.
 
     References:
         Bommireddy et al. (2018), eqs. 13, 16, 23, 24.
@@ -63,12 +64,14 @@ def card(law: MccLaw, particle: Particle | None = None, *, origin: Origin | None
         for name, value in values.items()
     }
     K1, K3, K5 = (float(K) for K in law.plastic.polynomial)
+    effects = {"effects": described(law)} if law.effects else {}
     return {
         "schema": 1,
         "what": "loading-unloading contact law of micro-crystalline cellulose particles",
         "coefficients_of": "the population: exp(mean of log C)" if origin.particle is None else origin.particle,
         "law": form,
         "parameters": parameters,
+        **effects,
         "uncertainty": "sd and interval_95 are those of the estimate; scatter between particles is in population.sd",
         "polynomial_MPa": {"K1": K1, "K3": K3, "K5": K5, "formula": "sigma = K1 x - K3 x^3 + K5 x^5"},
         "population": None if origin.population is None else dict(origin.population),
@@ -78,7 +81,8 @@ def card(law: MccLaw, particle: Particle | None = None, *, origin: Origin | None
             "scaled_strain_max": TESTED_STRAIN,
             "stress_there_MPa": TESTED_STRAIN * (K1 - TESTED_STRAIN**2 * (K3 - TESTED_STRAIN**2 * K5)),
             "words": f"single particles between platens, along D3, eta_p eps up to {TESTED_STRAIN}; rate independent, "
-            "no adhesion, no friction; contacts of one particle do not know of each other",
+            "no adhesion, no friction; contacts of one particle do not know of each other"
+            + ("; all but what the effects say, which act on the numbers given here" if law.effects else ""),
         },
         "formulae": FORMULAE,
         "units": {"stress": "MPa", "length": "um", "force": "mN"},
@@ -89,7 +93,7 @@ def card(law: MccLaw, particle: Particle | None = None, *, origin: Origin | None
             "reference": "Bommireddy, Agarwal, Yettella, Tomar, Gonzalez (2018), arXiv:1812.06173",
         },
         "warnings": list(origin.warnings),
-        "sha256": checksum({"law": form, "values": values}),
+        "sha256": checksum({"law": form, "values": values, **effects}),
     }
 
 

@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import arguments
-from .._types import Scalar, Values
+from .._errors import InputError
+from .._types import Scalar
 from ..dem import HalfContact, half_contact, pair_force, pair_recovery, wall_force, wall_recovery
 from ..geometry import Particle
 from ..law import TESTED_STRAIN, MccLaw
 from .origin import checked
-from .respond import respond
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -36,15 +36,6 @@ UNITS: tuple[Literal["um_mN", "SI"], ...] = ("um_mN", "SI")
 _SI = {"displacement": ("um", "m", 1e-6), "force": ("mN", "N", 1e-3), "tangent": ("mN_per_um", "N_per_m", 1e3)}
 
 
-@eqx.filter_jit
-def _recovered(law: MccLaw, particle: Particle, peak: Values) -> Values:
-    """Displacement recovered on full release [um]."""
-    return particle.displacement(law.recoverable_strain(particle, particle.strain(peak)))
-
-
-_each = eqx.filter_jit(eqx.filter_vmap(respond, in_axes=(None, None, 0, 0)))
-
-
 def golden_table(law: MccLaw, particle: Particle, *, seed: int = 0, units: Literal["um_mN", "SI"] = "um_mN") -> Table:
     """Paths of one particle between two platens with the law's force and tangent.
 
@@ -59,23 +50,19 @@ def golden_table(law: MccLaw, particle: Particle, *, seed: int = 0, units: Liter
 
     Returns:
         A pandas table with a column `path`, 0 for the first, and displacement, largest displacement so far, force and
-        tangent, the unit in the column's name. Every path starts from a virgin particle.
+        tangent, the unit in the column's name. Every path starts from a virgin particle. Of a law with effects that are
+        no closed formula: path, time (a second from point to point), displacement and force.
     """
     checked(law, particle)
     seed, units = arguments.seed(seed), arguments.choice(units, UNITS, "units")
-    scale = TESTED_STRAIN * float(particle.effective_diameter / law.shape_factor(particle))
-
-    def recovered(peak: np.ndarray) -> np.ndarray:
-        return np.asarray(_recovered(law, particle, jnp.asarray(peak)))
-
-    paths = _paths(scale, recovered, seed)
-    pasts = [np.concatenate([[0.0], np.maximum.accumulate(np.maximum(path, 0.0))[:-1]]) for path in paths]
-    x = np.concatenate(paths)  # in one call, which compiles once
-    force, tangent, peak = (
-        np.asarray(v) for v in _each(law, particle, jnp.asarray(x), jnp.asarray(np.concatenate(pasts)))
-    )
-    number = np.repeat(np.arange(len(paths)), [len(path) for path in paths])
-    return _in_units(_rows(number, x, peak, force, tangent), units)
+    try:
+        side = half_contact(law, particle)
+    except InputError:  # no closed formula: point by point, as `mcc_jax.drive`
+        return _in_units(_driven(law, particle, seed), units)
+    rows = _contact_rows(side, None, seed)
+    rows[["displacement", "displacement_max"]] *= 2  # half of it at each platen
+    rows["tangent"] *= 0.5
+    return _in_units(rows, units)
 
 
 def golden_pair_table(
@@ -92,21 +79,42 @@ def golden_pair_table(
     seed, units = arguments.seed(seed), arguments.choice(units, UNITS, "units")
     smaller = jax.tree.map(lambda d: d * OTHER_SIZE, particle)
     side = half_contact(law, particle)
-    tables = []
-    for partner, other in (("equal", side), ("smaller", half_contact(law, smaller)), ("wall", None)):
-        scale = float(side.tested) if other is None else 2 * min(float(side.tested), float(other.tested))
-
-        def recovered(peak: np.ndarray, other: HalfContact | None = other) -> np.ndarray:
-            return np.asarray(_recovered_overlap(side, other, jnp.atleast_1d(peak))).reshape(np.shape(peak))
-
-        paths = _paths(scale, recovered, seed)
-        pasts = [np.maximum.accumulate(np.maximum(path, 0.0)) for path in paths]
-        number = np.repeat(np.arange(len(paths)), [len(path) for path in paths])
-        x, past = np.concatenate(paths), np.concatenate(pasts)
-        force, tangent = (np.asarray(v) for v in _contact(side, other, jnp.asarray(past), jnp.asarray(x)))
-        rows = _rows(number, 1e6 * x, 1e6 * past, 1e3 * force, 1e-3 * tangent)
-        tables.append(rows.assign(partner=partner))
+    partners = {"equal": side, "smaller": half_contact(law, smaller), "wall": None}
+    tables = [_contact_rows(side, other, seed).assign(partner=name) for name, other in partners.items()]
     return _in_units(pd.concat(tables, ignore_index=True), units)
+
+
+def _contact_rows(side: HalfContact, other: HalfContact | None, seed: int) -> Table:
+    """Paths of the overlap of a pair, or with a rigid wall [um, mN]."""
+    scale = float(side.tested) if other is None else 2 * min(float(side.tested), float(other.tested))
+
+    def recovered(peak: np.ndarray) -> np.ndarray:
+        return np.asarray(_recovered_overlap(side, other, jnp.atleast_1d(peak))).reshape(np.shape(peak))
+
+    paths = _paths(scale, recovered, seed)
+    number = np.repeat(np.arange(len(paths)), [len(path) for path in paths])
+    x, past = np.concatenate(paths), np.concatenate([np.maximum.accumulate(np.maximum(path, 0.0)) for path in paths])
+    force, tangent = (np.asarray(v) for v in _contact(side, other, jnp.asarray(past), jnp.asarray(x)))
+    return _rows(number, 1e6 * x, 1e6 * past, 1e3 * force, 1e-3 * tangent)
+
+
+def _driven(law: MccLaw, particle: Particle, seed: int) -> Table:
+    """Paths of a law whose effects have a memory, a second from point to point."""
+    import pandas as pd
+
+    scale = TESTED_STRAIN * float(particle.effective_diameter / law.shape_factor(particle))
+
+    def recovered(peak: np.ndarray) -> np.ndarray:
+        return np.asarray(particle.displacement(law.recoverable_strain(particle, particle.strain(jnp.asarray(peak)))))
+
+    paths = _paths(scale, recovered, seed)
+    length = np.array([len(path) for path in paths])
+    number, second = np.nonzero(np.arange(length.max()) < length[:, None])
+    x = np.array([np.pad(path, (0, length.max() - len(path)), "edge") for path in paths])  # so it compiles once
+    along = eqx.filter_vmap(lambda x, time: law.path(particle, law.init(particle), x, time)[1], in_axes=(0, None))
+    force = np.asarray(eqx.filter_jit(along)(jnp.asarray(x), jnp.arange(float(length.max()))))
+    columns = {"path": number, "time_s": second, "displacement": x[number, second], "force": force[number, second]}
+    return pd.DataFrame(columns)
 
 
 @eqx.filter_jit
@@ -165,5 +173,5 @@ def _in_units(table: Table, units: str) -> Table:
         columns[name] = f"{name}_{si if units == 'SI' else ours}"
         if units == "SI":
             table[name] *= factor
-    front = ["path"] if "partner" not in table else ["partner", "path"]
+    front = [name for name in ("partner", "path", "time_s") if name in table]
     return table.rename(columns=columns).reindex(columns=front + list(columns.values()))

@@ -12,35 +12,32 @@ import jax.numpy as jnp
 
 from .. import arguments
 from .._errors import InputError
+from .._types import Scalar
 from ..geometry import Particle
 from ..law import History, MccLaw, Plastic
 from .origin import checked
-from .respond import respond
 
-Which = Literal["force", "step", "step_each"]
+Which = Literal["force", "step", "step_each", "step_load"]
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
-SIGNATURES: dict[str, dict[str, Any]] = {
-    "force": {
-        "arguments": ["displacement_um (b,)", "displacement_max_um (b,)"],
-        "results": ["force_mN (b,)"],
-        "of": "the particle of this export",
-    },
-    "step": {
-        "arguments": ["displacement_um (b,)", "displacement_max_um (b,)"],
-        "results": ["force_mN (b,)", "tangent_mN_per_um (b,)", "displacement_max_um after the step (b,)"],
-        "of": "the particle of this export",
-    },
-    "step_each": {
-        "arguments": [
-            "displacement_um (b,)",
-            "displacement_max_um (b,)",
-            "diameters_um D1, D2, D3 (b, 3)",
-            "coefficients C1, C3, C5 (b, 3)",
-        ],
-        "results": ["force_mN (b,)", "tangent_mN_per_um (b,)", "displacement_max_um after the step (b,)"],
-        "of": "particles of any size, each with coefficients of its own; a and the modulus are those of this export",
-    },
-}
+_OWN = "the particle of this export"
+_ALL = "particles of any size, each with coefficients of its own; a and the modulus are those of this export"
+
+
+def signatures(law: MccLaw) -> dict[Which, dict[str, Any]]:
+    """The functions there are of a law, with arguments and results; effects need time and a memory."""
+    x, past, F = "displacement_um (b,)", "displacement_max_um (b,)", "force_mN (b,)"
+    memory = ["what `memory` lists, one by one"] if law.effects else []
+    second = "time_s (b,)" if law.effects else past
+    results = [F, "tangent_mN_per_um (b,)", *(memory or [f"{past} after the step"])]
+    each = ["diameters_um D1, D2, D3 (b, 3)", "coefficients C1, C3, C5 (b, 3)"]
+    one: dict[Which, dict[str, Any]] = {"force": {"arguments": [x, past], "results": [F], "of": _OWN}}
+    if law.effects:
+        one = {"step_load": {"arguments": [F, second, *memory], "results": [x, *memory], "of": _OWN}}
+    return {
+        **one,
+        "step": {"arguments": [x, second, *memory], "results": results, "of": _OWN},
+        "step_each": {"arguments": [x, second, *each, *memory], "results": results, "of": _ALL},
+    }
 
 
 @dataclass(frozen=True)
@@ -73,10 +70,17 @@ def jax_artefact(
         step = jax.export.deserialize(bytearray(Path(file).read_bytes())).call
         force, tangent, displacement_max = step(displacement, displacement_max)
 
+    The memory of effects is a list of arrays, in and out of every step; `signature["memory"]` names them with what they
+    are for a virgin particle:
+
+        memory = [jnp.full((b, *m["shape"]), m["start"], m["dtype"]) for m in signature["memory"]]
+        force, tangent, *memory = step(displacement, time, *memory)
+
     Args:
         law: the law, whose numbers become constants.
         particle: its size, likewise (not for `step_each`).
-        which: `force`, `step` (force, tangent, history) or `step_each` (the same, sizes and C1, C3, C5 as arguments).
+        which: `force`, `step` (force, tangent, history) or `step_each` (the same, sizes and C1, C3, C5 as arguments);
+            of a law with effects `step`, `step_each` or `step_load` (displacement under a force).
         dtype: precision of arguments, results and constants; float64 needs `jax_enable_x64` here and where it runs.
         platforms: for which JAX lowers it.
 
@@ -84,7 +88,8 @@ def jax_artefact(
         InputError: if float64 is wanted and JAX is in single precision.
     """
     checked(law, particle)
-    arguments.choice(which, SIGNATURES, "which")
+    functions = signatures(law)
+    arguments.choice(which, functions, "which")
     arguments.choice(dtype, ("float64", "float32"), "dtype")
     if isinstance(platforms, str) or not platforms:
         raise InputError(f"platforms must be a list of names, got {platforms!r}", remedy=f"Some of {PLATFORMS}.")
@@ -98,12 +103,17 @@ def jax_artefact(
         jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, tree) for tree in (law, particle)
     )
     (batch,) = jax.export.symbolic_shape("b")
+    start, structure = jax.tree.flatten(law.init(particle))
     one = jax.ShapeDtypeStruct((batch,), jnp.dtype(dtype))
     triple = jax.ShapeDtypeStruct((batch, 3), jnp.dtype(dtype))
-    inputs = (one, one, triple, triple) if which == "step_each" else (one, one)
-    exported = jax.export.export(jax.jit(_function(law, particle, which)), platforms=tuple(platforms))(*inputs)
+    inputs = [one, one, triple, triple] if which == "step_each" else [one, one]
+    if law.effects:
+        inputs += [jax.ShapeDtypeStruct((batch, *leaf.shape), leaf.dtype) for leaf in start]
+    function = jax.jit(jax.vmap(_function(law, particle, which, structure)))
+    exported = jax.export.export(function, platforms=tuple(platforms))(*inputs)
     signature = {
-        **SIGNATURES[which],
+        **functions[which],
+        **({"memory": _memory(law, particle)} if law.effects else {}),
         "dtype": dtype,
         "batch_size": "symbolic",
         "reverse_mode": "one order",
@@ -114,18 +124,48 @@ def jax_artefact(
     return Artefact(f"{which}_{dtype}", bytes(exported.serialize(vjp_order=1)), signature)
 
 
-def _function(law: MccLaw, particle: Particle, which: Which) -> Callable[..., Any]:
-    def step(displacement: jax.Array, displacement_max: jax.Array) -> Any:
-        return jax.vmap(lambda x, past: respond(law, particle, x, past))(displacement, displacement_max)
+def _memory(law: MccLaw, particle: Particle) -> list[dict[str, Any]]:
+    """The memory of a virgin particle, array by array."""
+    return [
+        {
+            "name": jax.tree_util.keystr(path).removeprefix("."),
+            "shape": list(leaf.shape),
+            "dtype": str(leaf.dtype),
+            "start": leaf.tolist(),
+        }
+        for path, leaf in jax.tree_util.tree_flatten_with_path(law.init(particle))[0]
+    ]
 
-    def force(displacement: jax.Array, displacement_max: jax.Array) -> Any:
-        def one(x: jax.Array, past: jax.Array) -> jax.Array:
-            return law.step(particle, History(past), x)[1]
 
-        return jax.vmap(one)(displacement, displacement_max)
+def respond(
+    law: MccLaw, particle: Particle, state: History, displacement: Scalar, time: Scalar | None = None
+) -> tuple[Scalar, Scalar, History]:
+    """Force [mN], its derivative with respect to the displacement [mN/um], and the state after the step."""
 
-    def each(x: jax.Array, past: jax.Array, diameters: jax.Array, coefficients: jax.Array) -> Any:
+    def step(x: Scalar) -> tuple[Scalar, History]:
+        after, force = law.step(particle, state, x, time)
+        return force, after
+
+    return jax.jvp(step, (displacement,), (jnp.ones_like(displacement),), has_aux=True)
+
+
+def _function(law: MccLaw, particle: Particle, which: Which, structure: Any) -> Callable[..., Any]:
+    """One step of one contact on plain arrays."""
+
+    def step(x: jax.Array, second: jax.Array, *memory: jax.Array, law: MccLaw = law, body: Particle = particle) -> Any:
+        state, time = (jax.tree.unflatten(structure, memory), second) if law.effects else (History(second), None)
+        force, tangent, after = respond(law, body, state, x, time)
+        return force, tangent, *jax.tree.leaves(after)
+
+    def force(x: jax.Array, past: jax.Array) -> jax.Array:
+        return law.step(particle, History(past), x)[1]
+
+    def step_load(force: jax.Array, time: jax.Array, *memory: jax.Array) -> Any:
+        after, displacement = law.step_load(particle, jax.tree.unflatten(structure, memory), force, time)
+        return displacement, *jax.tree.leaves(after)
+
+    def each(x: jax.Array, second: jax.Array, diameters: jax.Array, coefficients: jax.Array, *memory: jax.Array) -> Any:
         own = eqx.tree_at(lambda tree: tree.plastic, law, Plastic(*coefficients))
-        return respond(own, Particle(*diameters), x, past)
+        return step(x, second, *memory, law=own, body=Particle(*diameters))
 
-    return {"force": force, "step": step, "step_each": jax.vmap(each)}[which]
+    return {"force": force, "step": step, "step_each": each, "step_load": step_load}[which]

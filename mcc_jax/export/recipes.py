@@ -5,9 +5,9 @@ from __future__ import annotations
 from .._version import own_version
 from ..geometry import Particle
 from ..law import MccLaw
-from .c_header import origin_lines
+from .c_header import origin_lines, render
+from .effects import factor_in_c
 from .origin import Origin, checked, numbers
-from .templates import render
 
 
 def lammps_recipe(law: MccLaw, particle: Particle, *, origin: Origin | None = None) -> str:
@@ -19,7 +19,7 @@ def lammps_recipe(law: MccLaw, particle: Particle, *, origin: Origin | None = No
         origin: where the law comes from.
 
     Raises:
-        InputError: if the law or the particle is not usable.
+        InputError: if the law or the particle is not usable, or the law has an effect that `c_header` refuses.
     """
     return _recipe("lammps.md.j2", law, particle, origin)
 
@@ -38,6 +38,7 @@ def _recipe(name: str, law: MccLaw, particle: Particle, origin: Origin | None) -
     return render(
         name,
         version=own_version(),
+        factor=factor_in_c(law, particle),
         origin=[f"- {line}" for line in origin_lines(law, particle, origin)],
         modulus=repr(values["effective_modulus_MPa"] * 1e6),
         **{key: repr(values[key]) for key in ("C1", "C3", "C5", "a")},

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
@@ -11,9 +12,12 @@ import numpy as np
 
 from .. import arguments
 from .._errors import InputError
-from ..formulas import recovery_limit
+from ..dem import HalfContact, half_contact
+from ..formulas import Formulas, recovery_limit
 from ..formulas.recovery_limit import SHARE
+from ..geometry import Particle
 from ..law import TESTED_STRAIN, MccLaw, stress_ratio
+from ..law.response import folded
 from .origin import checked
 
 if TYPE_CHECKING:
@@ -23,6 +27,7 @@ if TYPE_CHECKING:
 else:
     Table = object
 
+Curves = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 MIN_ROWS, MAX_ROWS = 64, 65536
 BETWEEN = 8  # points at which an interval is checked
 CORNERS = 4096  # intervals in which a corner is looked for
@@ -47,29 +52,39 @@ class CurveTables:
     error: float
 
 
-def curve_tables(law: MccLaw, *, strain_max: float = TESTED_STRAIN, tolerance: float = 1e-5) -> CurveTables:
+def curve_tables(
+    law: MccLaw, particle: Particle | None = None, *, strain_max: float = TESTED_STRAIN, tolerance: float = 1e-5
+) -> CurveTables:
     """Tables of the master curves of a law; sizes and shapes come in through the scaled strain.
 
     Args:
         law: the law.
+        particle: whose tables these are if the law has effects; without effects they are every particle's.
         strain_max: where the loading table ends [-].
         tolerance: largest error of linear interpolation, as a share of each column's largest value.
 
     Raises:
-        InputError: if 65536 points do not suffice.
+        InputError: if 65536 points do not suffice, or naming an effect that is no closed formula.
     """
     import pandas as pd
 
-    checked(law, None, needed=False)
+    checked(law, particle, needed=bool(law.effects))
     strain_max = arguments.number(strain_max, "strain_max", above=0)
     tolerance = arguments.number(tolerance, "tolerance", above=0)
-    loading, one = _refine(lambda t: _loading(law, strain_max * t**3), tolerance, _corners(law, strain_max))
+    formulas, side = law.formulas, None
+    if law.effects and particle is not None:
+        side = half_contact(law, particle)
+        formulas, _ = folded(formulas, law.effects, particle, "the tables")
+
+    at = partial(_at, formulas, side)
+    corners = _corners(lambda t: at(strain_max * t**3))
+    loading, one = _refine(lambda t: _loading(x := strain_max * t**3, at(x)), tolerance, corners)
     unloading, other = _refine(lambda t: _unloading(1 - (1 - t) ** 2), tolerance)
     return CurveTables(pd.DataFrame(loading), pd.DataFrame(unloading), max(one, other))
 
 
-def _loading(law: MccLaw, x: np.ndarray) -> dict[str, np.ndarray]:
-    secant, tangent, formula, limit = _at(law, x)
+def _loading(x: np.ndarray, curves: Curves) -> dict[str, np.ndarray]:
+    secant, tangent, formula, limit = curves
     return {
         "scaled_strain": x,
         "stress_MPa": x * secant,
@@ -79,27 +94,30 @@ def _loading(law: MccLaw, x: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
-def _at(law: MccLaw, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _at(law: Formulas, side: HalfContact | None, x: np.ndarray) -> Curves:
     """Secant and tangent [MPa] at scaled strains; strain recovered at eta_p = 1 by the formula, and its limit."""
     K1, K3, K5 = (float(K) for K in law.plastic.polynomial)
     secant = np.maximum(K1 - x**2 * (K3 - x**2 * K5), 0.0)
     tangent = K1 - x**2 * (3 * K3 - 5 * x**2 * K5)
     n, k, modulus = law.unloading.stress_power, law.unloading.constant, float(law.effective_modulus)
+    square = (secant / modulus) ** n * x ** (n - 1) / k
+    if side is not None:
+        square *= np.asarray(side.numbers(side.tested / TESTED_STRAIN * x).c / side.c)
     limit, _ = recovery_limit(*map(jnp.asarray, (x, secant, tangent)))
-    return secant, tangent, np.sqrt((secant / modulus) ** n * x ** (n - 1) / k), np.asarray(limit)
+    return secant, tangent, np.sqrt(square), np.asarray(limit)
 
 
-def _corners(law: MccLaw, strain_max: float) -> np.ndarray:
-    """Where the recovered strain bends sharply, as t with x = strain_max t^3: its limit begins to hold, or ends to."""
+def _corners(at: Callable[[np.ndarray], Curves]) -> np.ndarray:
+    """Where the recovered strain bends sharply, as t: its limit begins to hold, or ends to."""
 
     from scipy.optimize import brentq
 
     def excess(t: np.ndarray) -> np.ndarray:
-        _, _, formula, limit = _at(law, strain_max * t**3)
+        _, _, formula, limit = at(t)
         return formula - limit
 
     def steepness(t: np.ndarray) -> np.ndarray:
-        secant, tangent, _, _ = _at(law, strain_max * t**3)
+        secant, tangent, _, _ = at(t)
         return tangent - SHARE * secant
 
     t, found = np.linspace(0.0, 1.0, CORNERS + 1), []

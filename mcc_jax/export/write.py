@@ -14,7 +14,7 @@ from ..law import MccLaw
 from .c_header import c_header
 from .card import card
 from .golden import golden_pair_table, golden_table
-from .jax_artefact import jax_artefact
+from .jax_artefact import jax_artefact, signatures
 from .origin import Origin, checked
 from .recipes import lammps_recipe, yade_recipe
 from .tables import curve_tables
@@ -28,7 +28,7 @@ def _json(law: MccLaw, particle: Particle, origin: Origin, folder: Path, seed: i
 
 
 def _csv(law: MccLaw, particle: Particle, origin: Origin, folder: Path, seed: int) -> list[str]:
-    tables = curve_tables(law)
+    tables = curve_tables(law, particle)
     _table(folder / "master_curve.csv", tables.loading)
     _table(folder / "unloading_curve.csv", tables.unloading)
     p = law.strain_scaling.power
@@ -38,6 +38,7 @@ def _csv(law: MccLaw, particle: Particle, origin: Origin, folder: Path, seed: in
         "delta": f"recovered_strain_formula_at_eta_1 at eta_p eps_P, times eta_p^({(1 - p) / 2:g}), "
         "but at most the smaller of eps_P and (3 pi/8) stress_MPa / (eta_p tangent_MPa) there, so that no cycle gains "
         "energy; the second only where tangent_MPa > 0. With eta_p = 1, a sphere's, it is recovered_strain_at_eta_1",
+        **({"effects": "these tables hold for the particle of this file alone"} if law.effects else {}),
         "largest_error": tables.error,
         "error_of": "linear interpolation, as a share of each column's largest value",
     }
@@ -47,18 +48,18 @@ def _csv(law: MccLaw, particle: Particle, origin: Origin, folder: Path, seed: in
 
 
 def _jax(law: MccLaw, particle: Particle, origin: Origin, folder: Path, seed: int) -> list[str]:
-    names, signatures = [], {}
+    names, told = [], {}
     for dtype in ("float64", "float32"):
-        for which in ("force", "step", "step_each"):
+        for which in signatures(law):
             artefact = jax_artefact(law, particle, which, dtype=dtype)
             name = f"mcc_{artefact.name}.jax_export"
             (folder / name).write_bytes(artefact.content)
-            signatures[name] = artefact.signature
+            told[name] = artefact.signature
             names.append(name)
     use = "jax.export.deserialize(bytearray(Path(file).read_bytes())).call(...), with the packages jax and flatbuffers"
     _dump(
         folder / "mcc_jax_export.json",
-        {**card(law, particle, origin=origin), "artefacts": {"use": use, "files": signatures}},
+        {**card(law, particle, origin=origin), "artefacts": {"use": use, "files": told}},
     )
     return [*names, "mcc_jax_export.json", *_golden(law, particle, folder, seed, "mcc_jax_export")]
 
@@ -70,14 +71,12 @@ def _c(law: MccLaw, particle: Particle, origin: Origin, folder: Path, seed: int)
     return ["mcc_law.h", "mcc_law_golden.csv", "mcc_law_pair_golden.csv"]
 
 
-def _lammps(law: MccLaw, particle: Particle, origin: Origin, folder: Path, seed: int) -> list[str]:
-    (folder / "lammps.md").write_text(lammps_recipe(law, particle, origin=origin), encoding="utf-8")
-    return ["lammps.md", *_c(law, particle, origin, folder, seed)]
+def _recipe(recipe: Callable[..., str], name: str) -> Write:
+    def write(law: MccLaw, particle: Particle, origin: Origin, folder: Path, seed: int) -> list[str]:
+        (folder / name).write_text(recipe(law, particle, origin=origin), encoding="utf-8")
+        return [name, *_c(law, particle, origin, folder, seed)]
 
-
-def _yade(law: MccLaw, particle: Particle, origin: Origin, folder: Path, seed: int) -> list[str]:
-    (folder / "yade.md").write_text(yade_recipe(law, particle, origin=origin), encoding="utf-8")
-    return ["yade.md", *_c(law, particle, origin, folder, seed)]
+    return write
 
 
 _WRITERS: dict[str, Write] = {
@@ -85,8 +84,8 @@ _WRITERS: dict[str, Write] = {
     "csv": _csv,
     "jax": _jax,
     "c": _c,
-    "lammps": _lammps,
-    "yade": _yade,
+    "lammps": _recipe(lammps_recipe, "lammps.md"),
+    "yade": _recipe(yade_recipe, "yade.md"),
 }
 FORMATS = tuple(_WRITERS)
 """What `write_export` writes: parameter card, tables, JAX artefacts, C header, recipes for LAMMPS and Yade."""

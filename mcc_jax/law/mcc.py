@@ -17,7 +17,7 @@ from ..effects import AbstractEffect, Context, Record, Variant, clean_record, fi
 from ..formulas import Formulas
 from ..geometry import Particle
 from .base import AbstractContactLaw
-from .response import folded, force_at, modified, no_memory, one_point, peak_forces, whole_path
+from .response import factor_at_peak, folded, force_at, modified, no_memory, one_point, peak_forces, whole_path
 
 TESTED_STRAIN = 0.67
 """Scaled strain eta_p eps at which the paper's tests ended, on its mean curve (peaks of 7 to 16 MPa)."""
@@ -140,6 +140,16 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
     def of_particle(self) -> MccLaw:
         """The law without what belongs to the tester (frame, drift, platens): what the particle does elsewhere."""
         return self._with(tuple(effect for effect in self.effects if not effect.of_tester))
+
+    def without_effects(self, *names: str) -> MccLaw:
+        """The law without the effects of these names, as `effect.name` gives them; without names, without any.
+
+        Raises:
+            InputError: for a name that no effect has, naming those there are.
+        """
+        for name in names:
+            arguments.choice(name, [effect.name for effect in self.effects], "the name of an effect of the law")
+        return self._with(tuple(e for e in self.effects if names and e.name not in names))
 
     def _with(self, effects: tuple[AbstractEffect, ...]) -> MccLaw:
         # Not by the constructor, which takes one law's numbers only and not those of a batch of laws.
@@ -279,9 +289,11 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
             InputError: naming an effect whose energy is not known.
         """
         peak = jnp.where(displacement >= history.displacement_max, displacement, history.displacement_max)
-        formulas, factor = folded(self.formulas, self.effects, particle, peak, "the energy")
-        at_peak, now = formulas.recoverable_work(particle, peak, displacement, factor)
-        dissipated = formulas.loading_work(particle, peak) - at_peak
+        formulas, at_peak = folded(self.formulas, self.effects, particle, "the energy")
+        strain = particle.strain(peak)
+        factor = factor_at_peak(at_peak, strain, formulas.loading_stress(particle, strain)) if at_peak else None
+        whole, now = formulas.recoverable_work(particle, peak, displacement, factor)
+        dissipated = formulas.loading_work(particle, peak) - whole
         return Energy(dissipated + now, now, dissipated)
 
 

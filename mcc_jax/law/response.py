@@ -13,7 +13,7 @@ import optimistix as optx
 from .._errors import InputError
 from .._numerics import running_max
 from .._types import Path, Scalar, Values
-from ..effects import AbstractEffect, Context, Record
+from ..effects import AbstractEffect, AbstractModulusAtPeak, Context, Record
 from ..effects.record import first_point, follow
 from ..formulas import Formulas, recovery
 from ..geometry import Particle
@@ -197,29 +197,41 @@ def force_at(
 
 
 def folded(
-    law: Formulas, effects: Effects, particle: Particle, peak: Scalar, what: str
-) -> tuple[Formulas, Scalar | None]:
-    """The law and the factor on its modulus that effects make of it at a peak displacement [um].
+    law: Formulas, effects: Effects, particle: Particle, what: str
+) -> tuple[Formulas, tuple[AbstractModulusAtPeak, ...]]:
+    """The law with the parameters that effects make of it for a particle, and the effects on the modulus at a peak.
+
+    Args:
+        law: the law without effects.
+        effects: what acts on it.
+        particle: the particle.
+        what: what is wanted of the law, for the message.
 
     Raises:
-        InputError: naming an effect that acts by more than parameters and modulus.
+        InputError: naming an effect that is not a closed formula of particle and peak.
     """
+    at_peak = tuple(e for e in effects if isinstance(e, AbstractModulusAtPeak))
     for effect in effects:
-        hooks = [hook for hook in ("loading", "inside", "observe") if effect.overrides(hook)]
-        if hooks:
+        other = effect.overrides("stiffness") and not isinstance(effect, AbstractModulusAtPeak)
+        if not effect.closed or other or effect.overrides("loading", "inside", "observe"):
+            leave = "of_particle() leaves out what belongs to the tester"
+            leave = leave if effect.of_tester else f'without_effects("{effect.name}") leaves it out'
             raise InputError(
                 f"{what} of a law with {effect.name} is not known in closed form",
-                remedy="Leave that effect out, or integrate force over displacement along a path of mcc_jax.drive.",
+                remedy=f"law.{leave}; mcc_jax.drive and the JAX artefact (export --format jax) take every effect.",
             )
-    record = first_point(peak.dtype)
+    record = first_point(particle.D3.dtype)
     for effect in effects:
         law = effect.modify(law, particle, record)
-    stiffening = tuple(e for e in effects if e.overrides("stiffness"))
-    if not stiffening:
-        return law, None
-    force = particle.force(law.loading_stress(particle, particle.strain(peak)))
-    recoverable = law.recoverable_displacement(particle, peak, force, jnp.ones_like(peak))
-    return law, modulus_factor(stiffening, Context(particle, law, record, force, peak, recoverable, peak))
+    return law, at_peak
+
+
+def factor_at_peak(effects: tuple[AbstractModulusAtPeak, ...], strain: Values, stress: Values) -> Values:
+    """Product of the factors of effects on the effective modulus at a peak strain [-] and a peak stress [MPa]."""
+    factor = jnp.ones_like(strain)
+    for effect in effects:
+        factor = factor * effect.factor(strain, stress)
+    return factor
 
 
 def _remember(
