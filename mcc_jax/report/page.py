@@ -12,7 +12,7 @@ from typing import Any
 from .. import arguments
 from .._version import own_version
 from ..campaign.findings import worst
-from ..plots.text import particle_labels
+from ..plots.style import particle_labels
 from . import pictures as pictures
 from .chart import LOOKS, chart_data, chart_items, chart_scripts
 from .compare import KINDS, Shown, compare

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib import rc_context
 
-from ..plots.style import BLACK, BLUE, GREY, ORANGE, PALE, RC, SKY, VERMILION, new_figure
-from ..plots.text import particle_labels
+from ..plots.style import BLACK, BLUE, GREY, ORANGE, PALE, RC, SKY, VERMILION, new_figure, particle_labels
 from .compare import Shown
 
 GRID = 30

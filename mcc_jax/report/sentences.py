@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..plots.text import is_simulated
+from ..plots.style import is_simulated
 from .numbers import interval, number, percent, probability
 from .read import Results
 
