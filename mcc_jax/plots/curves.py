@@ -26,37 +26,10 @@ from ..campaign import PAPER_DIAMETERS_UM, Curve, effective_diameter_um
 from ..discover import Discovery
 from ..effects.record import HOLD, RELOAD, UNLOAD
 from ..geometry import Particle
-from .style import (
-    BLACK,
-    BLUE,
-    DISPLACEMENT,
-    FORCE,
-    GREY,
-    ORANGE,
-    PALE,
-    SETTINGS,
-    SHAPE_FACTOR,
-    SKY,
-    VERMILION,
-    Look,
-    cautions,
-    every,
-    finish,
-    headroom,
-    new_figure,
-    note,
-    of_its_kind,
-    particle_labels,
-    plain,
-    sequential,
-    shape_factors,
-    spread_over,
-    styled,
-    wrapped,
-)
+from . import style
 
-LOADING, UNLOADING = BLUE, VERMILION
-_DOT: Look = {"marker": "o", "linestyle": "", "markersize": 3.5, "markeredgewidth": 0}
+LOADING, UNLOADING = style.BLUE, style.VERMILION
+_DOT: style.Look = {"marker": "o", "linestyle": "", "markersize": 3.5, "markeredgewidth": 0}
 
 
 # ---- the joint calibrations ------------------------------------------------------------------------------------------
@@ -74,11 +47,11 @@ def _fill(
 
 def _draw_curve(ax: Axes, strip: Axes, curve: FittedCurve) -> None:
     measured, force, used = curve.displacement_um, curve.force_mN, curve.used
-    ax.plot(measured[~used], force[~used], ".", color=PALE, markersize=2.5, markeredgewidth=0)
-    strip.axvline(0.0, color=GREY, linewidth=0.7)
-    away, apart = measured - curve.own_um, every(len(force), SETTINGS.curve_points)
+    ax.plot(measured[~used], force[~used], ".", color=style.PALE, markersize=2.5, markeredgewidth=0)
+    strip.axvline(0.0, color=style.GREY, linewidth=0.7)
+    away, apart = measured - curve.own_um, style.every(len(force), style.SETTINGS.curve_points)
     segments = np.split(np.arange(len(force)), np.flatnonzero(np.diff(curve.kind)) + 1)
-    small: Look = _DOT | {"markersize": 3, "alpha": 0.7}
+    small: style.Look = _DOT | {"markersize": 3, "alpha": 0.7}
     for loading, colour in ((True, LOADING), (False, UNLOADING)):
         parts = [rows[used[rows]] for rows in segments if (curve.kind[rows[0]] == 0) == loading]
         for rows in parts:
@@ -86,11 +59,11 @@ def _draw_curve(ax: Axes, strip: Axes, curve: FittedCurve) -> None:
             ax.plot(measured[shown], force[shown], color=colour, **small)
             _fill(ax, curve, rows, 0.0, colour, 0.35)
         together = np.concatenate([np.empty(0, int), *parts])
-        dots: Look = {"markersize": 2.5, "markeredgewidth": 0, "alpha": 0.8}
+        dots: style.Look = {"markersize": 2.5, "markeredgewidth": 0, "alpha": 0.8}
         strip.plot(away[together], force[together], ".", color=colour, **dots)
         _fill(strip, curve, together, curve.own_um, colour, 0.25)
     # A gap where points do not count; from one segment to the next the line goes on.
-    ax.plot(np.where(used, curve.own_um, np.nan), force, color=BLACK, linewidth=0.8)
+    ax.plot(np.where(used, curve.own_um, np.nan), force, color=style.BLACK, linewidth=0.8)
     ax.locator_params(nbins=5)
     if force.min() > -0.02 * force.max():
         ax.set_ylim(bottom=0)
@@ -103,10 +76,10 @@ def _draw_curve(ax: Axes, strip: Axes, curve: FittedCurve) -> None:
 
 def _draw_grid(curves: Sequence[FittedCurve], titles: Sequence[str]) -> Figure:
     """Force over displacement of some particles, with a strip of residuals beside each."""
-    columns = min(SETTINGS.columns, len(curves))
+    columns = min(style.SETTINGS.columns, len(curves))
     rows = -(-len(curves) // columns)
-    scale = 1.0 if columns == SETTINGS.columns else 1.5
-    figure = new_figure(max(scale * 3.2 * columns, 6.4), max(scale * 2.05 * rows + 1.0, 3.4))
+    scale = 1.0 if columns == style.SETTINGS.columns else 1.5
+    figure = style.new_figure(max(scale * 3.2 * columns, 6.4), max(scale * 2.05 * rows + 1.0, 3.4))
     grid = figure.subplots(rows, 2 * columns, squeeze=False, width_ratios=[1.9, 1.0] * columns)
     for ax in grid.ravel()[2 * len(curves) :]:
         ax.set_axis_off()
@@ -115,9 +88,9 @@ def _draw_grid(curves: Sequence[FittedCurve], titles: Sequence[str]) -> Figure:
         strip.sharey(ax)
         _draw_curve(ax, strip, curve)
         ax.set_title(title, fontsize=8, linespacing=1.15)
-        ax.set_ylabel(FORCE if rank % columns == 0 else "")
+        ax.set_ylabel(style.FORCE if rank % columns == 0 else "")
         if rank + columns >= len(curves):
-            ax.set_xlabel(DISPLACEMENT)
+            ax.set_xlabel(style.DISPLACEMENT)
             strip.set_xlabel("residual [µm]")
     figure.align_ylabels(list(grid[:, 0]))
     return figure
@@ -128,8 +101,8 @@ def _beside(
 ) -> Figure:
     """At most so many particles that took part, spread over the campaign, measured and as the calibration has them."""
     kept = calibration.selection.kept
-    chosen = [kept[row] for row in spread_over(len(kept), SETTINGS.panels)]
-    labels, eta = particle_labels(calibration.campaign.particles), shape_factors(calibration)
+    chosen = [kept[row] for row in style.spread_over(len(kept), style.SETTINGS.panels)]
+    labels, eta = style.particle_labels(calibration.campaign.particles), style.shape_factors(calibration)
     curves = [calibration.curves[i] for i in chosen]
     titles = [f"{labels[i]}\n$\\eta_p$ = {eta[i]:.2f}{_told(c)}" for i, c in zip(chosen, curves, strict=True)]
     figure = _draw_grid(curves, titles)
@@ -138,11 +111,11 @@ def _beside(
         Line2D([], [], color=UNLOADING, label="unloading, reloading", **_DOT),
     ]
     if any((~curve.used).any() for curve in curves):
-        handles.append(Line2D([], [], color=PALE, label="not used", **_DOT))
-    handles += [Line2D([], [], color=BLACK, linewidth=0.8, label=line), *extra]
+        handles.append(Line2D([], [], color=style.PALE, label="not used", **_DOT))
+    handles += [Line2D([], [], color=style.BLACK, linewidth=0.8, label=line), *extra]
     title = what if len(chosen) == len(kept) else f"{what}, {len(chosen)} of {len(kept)} particles"
-    lines = cautions(figure, calibration)
-    return finish(figure, calibration.campaign.metadata, title=title, lines=lines, handles=handles)
+    lines = style.cautions(figure, calibration)
+    return style.finish(figure, calibration.campaign.metadata, title=title, lines=lines, handles=handles)
 
 
 def _told(curve: FittedCurve) -> str:
@@ -154,7 +127,7 @@ def _told(curve: FittedCurve) -> str:
     return "" if curve.rms_um is None else f", rms {curve.rms_um:.2g} µm"
 
 
-@styled
+@style.styled
 def plot_bands(calibration: BayesCalibration) -> Figure:
     """Force [mN] over displacement [um] of at most 12 particles, and what the posterior expects of each.
 
@@ -163,11 +136,11 @@ def plot_bands(calibration: BayesCalibration) -> Figure:
     each panel is the residual, measured less mean [um], with the same band: it shows what the panel is too coarse for.
     The title counts the points inside.
     """
-    band = Patch(color=GREY, alpha=0.35, linewidth=0, label="95 %")
+    band = Patch(color=style.GREY, alpha=0.35, linewidth=0, label="95 %")
     return _beside(calibration, "Measured and predicted", "predicted", [band])
 
 
-@styled
+@style.styled
 def plot_fits(calibration: LeastSquaresCalibration) -> Figure:
     """Force [mN] over displacement [um] of at most 12 particles, spread over the campaign, measured and fitted.
 
@@ -177,7 +150,7 @@ def plot_fits(calibration: LeastSquaresCalibration) -> Figure:
     return _beside(calibration, "Measured and fitted", "fitted")
 
 
-@styled
+@style.styled
 def plot_whitened(calibration: LeastSquaresCalibration) -> Figure:
     """Residuals of all particles over load, each divided by its noise and freed from correlation [-].
 
@@ -190,23 +163,23 @@ def plot_whitened(calibration: LeastSquaresCalibration) -> Figure:
     residual, mask = np.asarray(calibration.solution.residual[0]), np.asarray(tests.mask)
     force, loading = np.asarray(tests.force), np.asarray(tests.loading)
     share = force / force.max(axis=1, keepdims=True)
-    eta = shape_factors(calibration)[list(calibration.selection.kept)]
-    colours = sequential(eta)
+    eta = style.shape_factors(calibration)[list(calibration.selection.kept)]
+    colours = style.sequential(eta)
     rgba = colours.to_rgba(eta)
     values = residual[mask]
     reach = max(4.0, 1.1 * float(np.quantile(np.abs(values), 0.999)))
-    figure = new_figure(8.6, 4.0)
+    figure = style.new_figure(8.6, 4.0)
     panels = figure.subplots(1, 3, sharey=True, width_ratios=[2, 2, 1])
-    few = len(values) <= SETTINGS.small_points
-    dots: Look = {"s": 4 if few else 2, "alpha": 0.7 if few else 0.4, "linewidths": 0, "rasterized": True}
+    few = len(values) <= style.SETTINGS.small_points
+    dots: style.Look = {"s": 4 if few else 2, "alpha": 0.7 if few else 0.4, "linewidths": 0, "rasterized": True}
     for ax, rows, title in (
         (panels[0], loading & mask, "loading"),
         (panels[1], mask & ~loading, "unloading, reloading"),
     ):
         picked = np.flatnonzero(rows)
-        picked = picked[every(len(picked), SETTINGS.points)]
-        ax.axhspan(-1.96, 1.96, color=ORANGE, alpha=0.25, linewidth=0, zorder=0)
-        ax.axhline(0.0, color=GREY, linewidth=0.8)
+        picked = picked[style.every(len(picked), style.SETTINGS.points)]
+        ax.axhspan(-1.96, 1.96, color=style.ORANGE, alpha=0.25, linewidth=0, zorder=0)
+        ax.axhline(0.0, color=style.GREY, linewidth=0.8)
         ax.scatter(share.ravel()[picked], residual.ravel()[picked], c=rgba[picked // force.shape[1]], **dots)
         ax.set_xlim(0, 1.02)
         ax.set_title(title)
@@ -216,20 +189,20 @@ def plot_whitened(calibration: LeastSquaresCalibration) -> Figure:
     _histogram(panels[2], values, reach)
     beyond = int(np.sum(np.abs(values) > reach))
     if beyond:
-        note(panels[0], f"{beyond} beyond the axis", place="upper left")
-    figure.colorbar(colours, ax=panels.tolist(), label=SHAPE_FACTOR)
+        style.note(panels[0], f"{beyond} beyond the axis", place="upper left")
+    figure.colorbar(colours, ax=panels.tolist(), label=style.SHAPE_FACTOR)
     loss = "" if calibration.loss == "linear" else f", {calibration.loss} loss"
     count = f"{len(residual)} particles" if len(residual) > 1 else "one particle"
     title = f"Residuals of {count}{loss}: rms {np.sqrt(np.mean(values**2)):.2f}"
-    return finish(figure, calibration.campaign.metadata, title=title, lines=cautions(figure, calibration))
+    return style.finish(figure, calibration.campaign.metadata, title=title, lines=style.cautions(figure, calibration))
 
 
 def _histogram(ax: Axes, values: np.ndarray, reach: float) -> None:
     edges = np.linspace(-reach, reach, 41)
     counts = np.histogram(values, edges)[0] / (max(len(values), 1) * np.diff(edges))
-    ax.stairs(counts, edges, orientation="horizontal", fill=True, color=PALE, label="residuals")
+    ax.stairs(counts, edges, orientation="horizontal", fill=True, color=style.PALE, label="residuals")
     x = np.linspace(-reach, reach, 201)
-    ax.plot(np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi), x, color=BLACK, linewidth=1.0, label="normal")
+    ax.plot(np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi), x, color=style.BLACK, linewidth=1.0, label="normal")
     ax.set_xlabel("density [-]")
     ax.set_xlim(left=0)
     ax.legend(loc="upper right", handlelength=1.2)
@@ -245,7 +218,7 @@ def _usual_force(calibration: BayesCalibration, diameters_um: np.ndarray) -> flo
     return float(np.median(ratios)) * effective_diameter_um(diameters_um) ** 2
 
 
-@styled
+@style.styled
 def plot_new_particle(calibration: BayesCalibration, diameters_um: Any = None) -> Figure:
     """Force [mN] over displacement [um] of a particle that was never measured, loading and unloading.
 
@@ -263,8 +236,8 @@ def plot_new_particle(calibration: BayesCalibration, diameters_um: Any = None) -
     sizes = np.median(PAPER_DIAMETERS_UM, axis=0) if diameters_um is None else arguments.one_particle(diameters_um)
     up = np.linspace(0.0, _usual_force(calibration, sizes), 101)
     path = np.concatenate([up, up[-2::-1]])
-    curves = predict_new_particle(calibration, sizes.tolist(), path, count=SETTINGS.new_draws)
-    figure = new_figure(7.8, 4.1)
+    curves = predict_new_particle(calibration, sizes.tolist(), path, count=style.SETTINGS.new_draws)
+    figure = style.new_figure(7.8, 4.1)
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
     branches = (slice(0, len(up)), slice(len(up) - 1, None))
     for ax, rows, colour, title in zip(panels, branches, (LOADING, UNLOADING), ("loading", "unloading"), strict=True):
@@ -272,56 +245,56 @@ def plot_new_particle(calibration: BayesCalibration, diameters_um: Any = None) -
         for share, opacity in ((0.95, 0.2), (0.5, 0.35)):
             low, high = curves.band(share)
             ax.fill_betweenx(force, low[rows], high[rows], color=colour, alpha=opacity, linewidth=0)
-        for draw in curves.displacement_um[: SETTINGS.single_draws, rows]:
-            ax.plot(draw, force, color=GREY, linewidth=0.6)
-        ax.plot(np.median(curves.displacement_um, axis=0)[rows], force, color=BLACK, linewidth=1.3)
+        for draw in curves.displacement_um[: style.SETTINGS.single_draws, rows]:
+            ax.plot(draw, force, color=style.GREY, linewidth=0.6)
+        ax.plot(np.median(curves.displacement_um, axis=0)[rows], force, color=style.BLACK, linewidth=1.3)
         ax.set_title(title)
-        ax.set_xlabel(DISPLACEMENT)
-    panels[0].set_ylabel(FORCE)
+        ax.set_xlabel(style.DISPLACEMENT)
+    panels[0].set_ylabel(style.FORCE)
     panels[0].set_xlim(left=0)
     panels[0].set_ylim(0, 1.02 * up[-1])
     D1, D2, D3 = sizes.tolist()
     eta = float(calibration.law().shape_factor(Particle(D1, D2, D3)))
     title = f"A new particle of {D1:.0f} × {D2:.0f} × {D3:.0f} µm, $\\eta_p$ = {eta:.2f}"
     handles = [
-        Line2D([], [], color=BLACK, linewidth=1.3, label="median"),
-        Patch(color=GREY, alpha=0.6, linewidth=0, label="50 %"),
-        Patch(color=GREY, alpha=0.25, linewidth=0, label="95 %"),
-        Line2D([], [], color=GREY, linewidth=0.6, label="single draws"),
+        Line2D([], [], color=style.BLACK, linewidth=1.3, label="median"),
+        Patch(color=style.GREY, alpha=0.6, linewidth=0, label="50 %"),
+        Patch(color=style.GREY, alpha=0.25, linewidth=0, label="95 %"),
+        Line2D([], [], color=style.GREY, linewidth=0.6, label="single draws"),
     ]
-    lines = cautions(figure, calibration)
-    return finish(figure, calibration.campaign.metadata, title=title, lines=lines, handles=handles)
+    lines = style.cautions(figure, calibration)
+    return style.finish(figure, calibration.campaign.metadata, title=title, lines=lines, handles=handles)
 
 
 # ---- the paper's calibration -----------------------------------------------------------------------------------------
 
 
-@of_its_kind
+@style.of_its_kind
 def particle_pages(calibration: PaperCalibration) -> int:
     """Number of pages that `plot_particles` needs for all particles."""
-    return -(-len(calibration.campaign) // SETTINGS.page)
+    return -(-len(calibration.campaign) // style.SETTINGS.page)
 
 
 def _kept_panel(ax: Axes, curve: Curve, fit: ParticleFit) -> None:
-    dots: Look = {"markersize": 3, "markeredgewidth": 0, "alpha": 0.8}
-    for rows, colour in ((~fit.used, SKY), (fit.used, BLUE)):
-        shown = np.flatnonzero(rows)[every(len(curve), SETTINGS.curve_points)]
+    dots: style.Look = {"markersize": 3, "markeredgewidth": 0, "alpha": 0.8}
+    for rows, colour in ((~fit.used, style.SKY), (fit.used, style.BLUE)):
+        shown = np.flatnonzero(rows)[style.every(len(curve), style.SETTINGS.curve_points)]
         ax.plot(fit.measured_um[shown], curve.force_mN[shown], "o", color=colour, **dots)
-    ax.plot(fit.predicted_um, curve.force_mN, color=VERMILION, linewidth=1.3)
-    ax.plot(fit.own_um, curve.force_mN, color=BLACK, linewidth=0.7)
+    ax.plot(fit.predicted_um, curve.force_mN, color=style.VERMILION, linewidth=1.3)
+    ax.plot(fit.own_um, curve.force_mN, color=style.BLACK, linewidth=0.7)
     if curve.force_mN.min() > -0.02 * curve.force_mN.max():
         ax.set_ylim(bottom=0)
 
 
 def _dropped_panel(ax: Axes, curve: Curve, reason: str) -> None:
-    ax.plot(curve.displacement_um, curve.force_mN, color=PALE, linewidth=1.0)
-    headroom(ax, 0.45)  # for the reason
+    ax.plot(curve.displacement_um, curve.force_mN, color=style.PALE, linewidth=1.0)
+    style.headroom(ax, 0.45)  # for the reason
     ax.set_facecolor("#F6F6F6")
-    words = textwrap.fill(plain(reason, 200), 26)
-    ax.text(0.04, 0.95, words, transform=ax.transAxes, ha="left", va="top", fontsize=7, color=GREY)
+    words = textwrap.fill(style.plain(reason, 200), 26)
+    ax.text(0.04, 0.95, words, transform=ax.transAxes, ha="left", va="top", fontsize=7, color=style.GREY)
 
 
-@styled
+@style.styled
 def plot_particles(calibration: PaperCalibration, page: int | None = None) -> Figure:
     """Force [mN] over displacement [um], loading and unloading, one panel per particle, measured and predicted.
 
@@ -338,18 +311,18 @@ def plot_particles(calibration: PaperCalibration, page: int | None = None) -> Fi
     Raises:
         ValueError: if there is no such page.
     """
-    pages, most = particle_pages(calibration), SETTINGS.page
+    pages, most = particle_pages(calibration), style.SETTINGS.page
     number = 1 if page is None else page
     if number not in range(1, pages + 1):
         raise InputError(f"there is no page {number}; there are {pages}, counted from 1")
     campaign = calibration.campaign
     chosen = range((number - 1) * most, min(number * most, len(campaign)))
-    columns = SETTINGS.page_columns if pages > 1 else min(SETTINGS.page_columns, len(chosen))
+    columns = style.SETTINGS.page_columns if pages > 1 else min(style.SETTINGS.page_columns, len(chosen))
     rows = -(-len(chosen) // columns)
     scale = 1.5 if columns < 3 else 1.0
-    figure = new_figure(max(scale * 2.35 * columns, 6.4), scale * 2.05 * rows + 0.9)
+    figure = style.new_figure(max(scale * 2.35 * columns, 6.4), scale * 2.05 * rows + 0.9)
     grid = figure.subplots(rows, columns, squeeze=False)
-    labels, eta = particle_labels(campaign.particles), shape_factors(calibration)
+    labels, eta = style.particle_labels(campaign.particles), style.shape_factors(calibration)
     for ax in grid.ravel()[len(chosen) :]:
         ax.set_axis_off()
     for rank, (i, ax) in enumerate(zip(chosen, grid.ravel(), strict=False)):
@@ -361,21 +334,21 @@ def plot_particles(calibration: PaperCalibration, page: int | None = None) -> Fi
             _kept_panel(ax, campaign.curves[i], fit)
             detail = f"rms {fit.rms_um:.1f} µm" if fit.rms_um >= 1 else f"rms {fit.rms_um:.2g} µm"
         title = f"{labels[i]}\n$\\eta_p$ = {eta[i]:.2f}, {detail}"
-        ax.set_title(title, fontsize=8, color=GREY if fit is None else BLACK, linespacing=1.15)
+        ax.set_title(title, fontsize=8, color=style.GREY if fit is None else style.BLACK, linespacing=1.15)
         ax.locator_params(nbins=5)
-        ax.set_ylabel(FORCE if rank % columns == 0 else "")
-        ax.set_xlabel(DISPLACEMENT if rank + columns >= len(chosen) else "")
+        ax.set_ylabel(style.FORCE if rank % columns == 0 else "")
+        ax.set_xlabel(style.DISPLACEMENT if rank + columns >= len(chosen) else "")
     figure.align_ylabels(list(grid[:, 0]))
     handles = [
-        Line2D([], [], color=BLUE, marker="o", linestyle="", markersize=3.5, label="measured, adjusted"),
-        Line2D([], [], color=VERMILION, linewidth=1.3, label="mean law"),
-        Line2D([], [], color=BLACK, linewidth=0.7, label="own coefficients"),
+        Line2D([], [], color=style.BLUE, marker="o", linestyle="", markersize=3.5, label="measured, adjusted"),
+        Line2D([], [], color=style.VERMILION, linewidth=1.3, label="mean law"),
+        Line2D([], [], color=style.BLACK, linewidth=0.7, label="own coefficients"),
     ]
     if any(calibration.particles[i] is None for i in chosen):
-        handles.append(Line2D([], [], color=PALE, label="not used"))
+        handles.append(Line2D([], [], color=style.PALE, label="not used"))
     title = "Measured and predicted" + (f", page {number} of {pages}" if pages > 1 else "")
-    lines = wrapped(plain(calibration.misfit_note or "", 400), figure)
-    return finish(figure, campaign.metadata, title=title, lines=lines, handles=handles)
+    lines = style.wrapped(style.plain(calibration.misfit_note or "", 400), figure)
+    return style.finish(figure, campaign.metadata, title=title, lines=lines, handles=handles)
 
 
 # ---- a discovery -----------------------------------------------------------------------------------------------------
@@ -395,7 +368,7 @@ def _shade(ax: Axes, time: np.ndarray, kind: np.ndarray) -> set[int]:
     return seen
 
 
-@styled
+@style.styled
 def plot_before_after(found: Discovery) -> Figure:
     """Measured less predicted displacement [um] over time [s] without and with what was added, and the noise floor.
 
@@ -414,27 +387,27 @@ def plot_before_after(found: Discovery) -> Figure:
     points = np.maximum(left.used.sum(1), 1)
     before, after = (np.sum(white**2, 1) for white in (left.white_before, left.white_after))
     worth = before - after if added else before / points
-    rows = np.sort(np.argsort(-worth, kind="stable")[: SETTINGS.gap_panels])
-    columns = min(SETTINGS.columns, len(rows))
+    rows = np.sort(np.argsort(-worth, kind="stable")[: style.SETTINGS.gap_panels])
+    columns = min(style.SETTINGS.columns, len(rows))
     lines = -(-len(rows) // columns)
-    figure = new_figure(8.6, 1.0 + 2.15 * lines)
+    figure = style.new_figure(8.6, 1.0 + 2.15 * lines)
     panels = figure.subplots(lines, columns, squeeze=False)
-    labels = particle_labels(base.campaign.particles)
+    labels = style.particle_labels(base.campaign.particles)
     kinds: set[int] = set()
     for ax, i in zip(panels.flat, rows, strict=False):
         time, used = left.time_s[i], left.used[i]
         real = np.concatenate([[True], np.diff(time) > 0])
         kinds |= _shade(ax, time[real], left.kind[i][real])
         floor, one, two = (np.where(used, values[i], np.nan) for values in (left.noise, left.before, left.after))
-        ax.fill_between(time, -floor, floor, color=ORANGE, alpha=0.55, linewidth=0, zorder=2)
-        ax.axhline(0.0, color=GREY, linewidth=0.7, zorder=1)
-        ax.plot(time, one, color=VERMILION, linewidth=0.9, zorder=3)
+        ax.fill_between(time, -floor, floor, color=style.ORANGE, alpha=0.55, linewidth=0, zorder=2)
+        ax.axhline(0.0, color=style.GREY, linewidth=0.7, zorder=1)
+        ax.plot(time, one, color=style.VERMILION, linewidth=0.9, zorder=3)
         if added:
-            ax.plot(time, two, color=BLUE, linewidth=0.9, zorder=4)
+            ax.plot(time, two, color=style.BLUE, linewidth=0.9, zorder=4)
         rms = [f"{np.sqrt(total[i] / points[i]):.2f}" for total in (before, after)]
         ax.set_title(labels[left.particles[i]], fontsize=8)
-        headroom(ax, 0.22)
-        note(ax, f"{' → '.join(rms) if added else rms[0]} × noise", place="upper left")
+        style.headroom(ax, 0.22)
+        style.note(ax, f"{' → '.join(rms) if added else rms[0]} × noise", place="upper left")
         ax.margins(x=0.01)
     for ax in panels.flat[len(rows) :]:
         ax.set_visible(False)
@@ -442,10 +415,10 @@ def plot_before_after(found: Discovery) -> Figure:
         ax.set_xlabel("time [s]")
     for ax in panels[:, 0]:
         ax.set_ylabel("measured − predicted [µm]")
-    handles: list[Line2D | Patch] = [Line2D([], [], color=VERMILION, label="law alone")]
+    handles: list[Line2D | Patch] = [Line2D([], [], color=style.VERMILION, label="law alone")]
     if added:
-        handles.append(Line2D([], [], color=BLUE, label="with what was added"))
-    handles.append(Patch(color=ORANGE, alpha=0.55, linewidth=0, label="± noise"))
+        handles.append(Line2D([], [], color=style.BLUE, label="with what was added"))
+    handles.append(Patch(color=style.ORANGE, alpha=0.55, linewidth=0, label="± noise"))
     handles += [Patch(color=_SHADES[k], linewidth=0, label=_WORDS[k]) for k in _SHADES if k in kinds]
     title = "What the law leaves, before and after" if added else "What the law leaves: nothing was added"
-    return finish(figure, base.campaign.metadata, title=title, handles=handles)
+    return style.finish(figure, base.campaign.metadata, title=title, handles=handles)

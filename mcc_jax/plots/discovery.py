@@ -17,30 +17,13 @@ from .._errors import InputError
 from ..discover import Discovery
 from ..discover.residual_map import Place
 from ..discover.score import DETECTABLE
+from . import style
 from .curves import plot_before_after
-from .style import (
-    BLACK,
-    BLUE,
-    GREY,
-    PALE,
-    SETTINGS,
-    SKY,
-    SMALL,
-    VERMILION,
-    Look,
-    empty,
-    finish,
-    new_figure,
-    note,
-    of_its_kind,
-    sequential,
-    styled,
-)
 
-_FLOOR: Look = {"color": BLACK, "linestyle": "--", "linewidth": 1.0}
+_FLOOR: style.Look = {"color": style.BLACK, "linestyle": "--", "linewidth": 1.0}
 
 
-@of_its_kind
+@style.of_its_kind
 def discovery_figures(found: Discovery) -> dict[str, Figure]:
     """Every figure of a discovery, by the stem of its file's name.
 
@@ -66,7 +49,7 @@ def discovery_figures(found: Discovery) -> dict[str, Figure]:
 def _finished(figure: Figure, found: Discovery, **more: Any) -> Figure:
     if found.base is None:
         raise InputError("the base law was not fitted; there is nothing to draw")
-    return finish(figure, found.base.campaign.metadata, **more)
+    return style.finish(figure, found.base.campaign.metadata, **more)
 
 
 def plain_name(name: str) -> str:
@@ -74,7 +57,7 @@ def plain_name(name: str) -> str:
     return name.replace("_", " ")
 
 
-@styled
+@style.styled
 def plot_where(found: Discovery) -> Figure:
     """Where law and tests disagree: kind of segment, share of the test's largest force, share of the gap [-].
 
@@ -84,10 +67,10 @@ def plot_where(found: Discovery) -> Figure:
     kinds = list(dict.fromkeys(place.segment for place in found.places))
     energy = np.array([np.fmax(place.statistic**2 - 1, 0.0) for place in found.places])
     shares = energy / max(float(energy.sum()), 1e-300)
-    figure = new_figure(7.6, 3.1)
+    figure = style.new_figure(7.6, 3.1)
     ax = figure.subplots()
     largest = max(1e-3, float(shares.max(initial=0.0)))
-    colours = sequential(np.array([0.0, largest]))
+    colours = style.sequential(np.array([0.0, largest]))
     colours.set_cmap("YlOrBr")
     for place, share in zip(found.places, shares, strict=True):
         _box(ax, kinds.index(place.segment), place, float(share), largest, colours)
@@ -107,22 +90,22 @@ def plot_where(found: Discovery) -> Figure:
 
 def _box(ax: Axes, row: int, place: Place, share: float, largest: float, colours: ScalarMappable) -> None:
     low, high = place.load_fraction
-    bar: Look = {"width": high - low, "left": low, "height": 0.86}
+    bar: style.Look = {"width": high - low, "left": low, "height": 0.86}
     if not np.isfinite(place.statistic):
         ax.barh(row, color="white", edgecolor="#D0D0D0", hatch="////", linewidth=0, **bar)
         return
     ax.barh(row, color=colours.to_rgba(np.array(share)), edgecolor="white", linewidth=1, **bar)
     if share >= 0.01:
         words = f"{100 * share:.0f} % {'↑' if place.statistic > 0 else '↓'}"
-        ink = "white" if 0.6 * largest < share else BLACK
-        ax.text((low + high) / 2, row, words, ha="center", va="center", fontsize=SMALL, color=ink)
+        ink = "white" if 0.6 * largest < share else style.BLACK
+        ax.text((low + high) / 2, row, words, ha="center", va="center", fontsize=style.SMALL, color=ink)
 
 
 def _with_unit(value: float, unit: str) -> str:
     return f"{value:.2g}" if unit == "-" else f"{value:.2g} {unit}"
 
 
-@styled
+@style.styled
 def plot_ranking(found: Discovery) -> Figure:
     """Every mechanism's statistic [-]: the estimate of its best formula alone over its standard error.
 
@@ -136,51 +119,53 @@ def plot_ranking(found: Discovery) -> Figure:
     members = {name for names in found.candidate_set for name in names}
     named = {effect.mechanism for effect in found.effects}
     count = len(entries) + len(found.untestable)
-    figure = new_figure(9.4, 1.3 + 0.235 * count)
+    figure = style.new_figure(9.4, 1.3 + 0.235 * count)
     ax = figure.subplots()
-    beside: Look = {"transform": ax.get_yaxis_transform(), "va": "center", "fontsize": SMALL}
+    beside: style.Look = {"transform": ax.get_yaxis_transform(), "va": "center", "fontsize": style.SMALL}
     scale = max([1.6 * DETECTABLE, *(abs(e["statistic"]) for e in entries)])
     any_impossible = False
     for row, entry in enumerate(entries):
         name, unit = entry["mechanism"], entry["unit"]
         impossible = entry["sign"] * entry["statistic"] < 0
         any_impossible = any_impossible or impossible
-        colour = PALE if impossible else BLUE if name in named else SKY if name in members else PALE
-        look: Look = {"color": "white" if impossible else colour, "edgecolor": colour, "linewidth": 0.9}
+        colour = (
+            style.PALE if impossible else style.BLUE if name in named else style.SKY if name in members else style.PALE
+        )
+        look: style.Look = {"color": "white" if impossible else colour, "edgecolor": colour, "linewidth": 0.9}
         ax.barh(row, abs(entry["statistic"]), height=0.66, **look)
         chance = f"{entry['probability']:.2f}" if entry["probability"] >= 0.005 else "< 0.01"
         ax.text(1.1, row, chance, ha="right", **beside)
         limit = _with_unit(entry["detection_limit"], unit)
         ax.text(1.13, row, f"{_with_unit(entry['estimate'], unit)}  (limit {limit})", **beside)
-    patch: Look = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
+    patch: style.Look = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
     for row, missing in enumerate(found.untestable, start=len(entries)):
         needs = f"needs {missing['needs']}"
-        ax.text(0.012 * scale, row, needs, va="center", fontsize=SMALL, color=GREY, zorder=5, bbox=patch)
+        ax.text(0.012 * scale, row, needs, va="center", fontsize=style.SMALL, color=style.GREY, zorder=5, bbox=patch)
     ax.axvline(DETECTABLE, **_FLOOR)
     ax.set_yticks(range(count), [plain_name(e["mechanism"]) for e in (*entries, *found.untestable)])
     for tick in ax.get_yticklabels()[len(entries) :]:
-        tick.set_color(GREY)
+        tick.set_color(style.GREY)
     ax.set_ylim(count - 0.4, -0.6)
     ax.set_xlim(0, 1.05 * scale)
     ax.tick_params(axis="y", length=0)
     ax.set_xlabel("|estimate| / standard error, each mechanism alone [-]")
-    header: Look = {"transform": ax.transAxes, "va": "bottom", "fontsize": 8, "color": GREY}
+    header: style.Look = {"transform": ax.transAxes, "va": "bottom", "fontsize": 8, "color": style.GREY}
     ax.text(1.1, 1.0, "probability", ha="right", **header)
     ax.text(1.13, 1.0, "estimate and detection limit", **header)
     handles: list[Line2D | Patch] = []
     if named:
-        handles.append(Patch(color=BLUE, label="added to the law"))
+        handles.append(Patch(color=style.BLUE, label="added to the law"))
     if members - named:
-        handles.append(Patch(color=SKY, label="explains it as well"))
-    handles.append(Patch(color=PALE, label="others"))
+        handles.append(Patch(color=style.SKY, label="explains it as well"))
+    handles.append(Patch(color=style.PALE, label="others"))
     if any_impossible:
-        handles.append(Patch(facecolor="white", edgecolor=PALE, label="impossible sign"))
+        handles.append(Patch(facecolor="white", edgecolor=style.PALE, label="impossible sign"))
     handles.append(Line2D([], [], label="detection limit", **_FLOOR))
     title = "What could be missing: no gap was found" if found.verdict == "NO_GAP" else "What explains the gap"
     return _finished(figure, found, title=title, handles=handles)
 
 
-@styled
+@style.styled
 def plot_similarity(found: Discovery) -> Figure:
     """Correlation [-] of what mechanisms would leave in the tests once the law has taken up what it can.
 
@@ -189,14 +174,14 @@ def plot_similarity(found: Discovery) -> Figure:
     if found.likeness is None:
         raise InputError("the base law was not fitted well enough; there is nothing to compare")
     members = {name for group in found.candidate_set for name in group}
-    count = min(max(SETTINGS.alike, len(members)), len(found.likeness.names))
+    count = min(max(style.SETTINGS.alike, len(members)), len(found.likeness.names))
     names, both = found.likeness.names[:count], found.likeness.correlation[:count, :count]
-    figure = new_figure(3.6 + 0.42 * count, 2.6 + 0.36 * count)
+    figure = style.new_figure(3.6 + 0.42 * count, 2.6 + 0.36 * count)
     ax = figure.subplots()
     colours = ScalarMappable(Normalize(-1, 1), colormaps["PuOr_r"])
     ax.imshow(both, cmap=colours.cmap, vmin=-1, vmax=1, aspect="auto")
     for (i, j), value in np.ndenumerate(both):
-        ink, words = "white" if abs(value) > 0.65 else BLACK, f"{value:.2f}".replace("-0.00", "0.00")
+        ink, words = "white" if abs(value) > 0.65 else style.BLACK, f"{value:.2f}".replace("-0.00", "0.00")
         ax.text(j, i, words, ha="center", va="center", fontsize=7, color=ink)
     words = [plain_name(name) for name in names]
     ax.set_xticks(range(count), words, rotation=45, ha="right", rotation_mode="anchor")
@@ -209,7 +194,7 @@ def plot_similarity(found: Discovery) -> Figure:
     return _finished(figure, found, title="Which mechanisms look alike in these data")
 
 
-@styled
+@style.styled
 def plot_gap(found: Discovery) -> Figure:
     """The gap on particles that took no part in finding and fitting, step by step, down to the floor of the noise.
 
@@ -217,15 +202,15 @@ def plot_gap(found: Discovery) -> Figure:
     """
     gap = found.gap()
     steps = gap["steps"]
-    figure = new_figure(7.6, 3.2)
+    figure = style.new_figure(7.6, 3.2)
     left, right = figure.subplots(1, 2)
     if not steps:
         reason = "no gap was found" if found.verdict == "NO_GAP" else "held-out particles were not asked for"
         for ax in (left, right):
-            empty(ax, reason)
+            style.empty(ax, reason)
         return _finished(figure, found, title="The gap on held-out particles")
     labels = ["law alone", *(f"+ {plain_name(s['added'])}" for s in steps[1:])]
-    colours = [VERMILION, *([BLUE] * (len(steps) - 1))]
+    colours = [style.VERMILION, *([style.BLUE] * (len(steps) - 1))]
     for ax, key, label, form, floor in (
         (left, "chi2_per_dof", "χ² per point [-]", ".2f", 1.0),
         (right, "systematic_um", "systematic gap [µm]", ".2g", 0.0),
@@ -240,17 +225,17 @@ def plot_gap(found: Discovery) -> Figure:
         ax.margins(y=0.14)
         ax.axhline(floor, **_FLOOR)
     if gap["closed_fraction"] is not None:
-        note(right, f"{100 * gap['closed_fraction']:.0f} % of the gap closed", place="upper right")
+        style.note(right, f"{100 * gap['closed_fraction']:.0f} % of the gap closed", place="upper right")
     handles = [Line2D([], [], label="floor: noise alone", **_FLOOR)]
     return _finished(figure, found, title="The gap on held-out particles, each left out in turn", handles=handles)
 
 
-@styled
+@style.styled
 def plot_shifts(found: Discovery) -> Figure:
     """What the missing effect had done to the law: its parameters before and after, with 95 % intervals."""
-    figure = new_figure(9.0, 2.6)
+    figure = style.new_figure(9.0, 2.6)
     names = ("$a$ [-]", r"$\bar E$ [GPa]", "mean log $C_1$ [-]", "mean log $C_3$ [-]", "mean log $C_5$ [-]")
-    both = ((0, VERMILION, found.before), (1, BLUE, found.after))
+    both = ((0, style.VERMILION, found.before), (1, style.BLUE, found.after))
     for j, (ax, name) in enumerate(zip(figure.subplots(1, 5), names, strict=True)):
         for x, colour, p in ((x, colour, p) for x, colour, p in both if p):
             estimates = (p["a"], p["effective_modulus_MPa"], *(p[f"log_{c}"]["mean"] for c in ("C1", "C3", "C5")))
@@ -266,7 +251,7 @@ def plot_shifts(found: Discovery) -> Figure:
         ax.grid(axis="y", color="#E6E6E6", linewidth=0.6)
     moved = found.after and (found.effects or found.closure)
     title = "What the missing effect had done to the law" if moved else "Parameters of the law"
-    handles = [Line2D([], [], color=VERMILION, marker="o", label="law alone, 95 %")]
+    handles = [Line2D([], [], color=style.VERMILION, marker="o", label="law alone, 95 %")]
     if found.after:
-        handles.append(Line2D([], [], color=BLUE, marker="o", label="with what was added, 95 %"))
+        handles.append(Line2D([], [], color=style.BLUE, marker="o", label="with what was added, 95 %"))
     return _finished(figure, found, title=title, handles=handles)

@@ -17,46 +17,23 @@ from ..calibrate import MIN_RATIO, PaperCalibration
 from ..calibrate.paper.modulus import collapsed_branches
 from ..campaign import Campaign, stress_and_strain
 from ..law import stress_ratio
+from . import style
 from .curves import particle_pages, plot_particles
-from .style import (
-    BLACK,
-    BLUE,
-    FORCE,
-    GREEN,
-    GREY,
-    ORANGE,
-    PALE,
-    PURPLE,
-    SCALED_STRAIN,
-    SETTINGS,
-    SHAPE_FACTOR,
-    SKY,
-    STRAIN,
-    STRESS,
-    VERMILION,
-    Look,
-    empty,
-    every,
-    faintness,
-    finish,
-    headroom,
-    new_figure,
-    note,
-    of_its_kind,
-    particle_labels,
-    sequential,
-    shape_factors,
-    styled,
-)
 
-_CYCLE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK)
-_DOTTED: Look = {"color": GREY, "linewidth": 0.8, "dashes": (1, 1.5)}
-_DASHED: Look = {"dashes": (3.5, 1.8)}
-_MEAN: Look = {"color": BLUE, "marker": "o", "linestyle": "", "markeredgecolor": "white", "markeredgewidth": 0.4}
-_BAND: Look = {"color": BLUE, "alpha": 0.25, "linewidth": 0}
+_CYCLE = (style.BLUE, style.VERMILION, style.GREEN, style.PURPLE, style.ORANGE, style.SKY, style.BLACK)
+_DOTTED: style.Look = {"color": style.GREY, "linewidth": 0.8, "dashes": (1, 1.5)}
+_DASHED: style.Look = {"dashes": (3.5, 1.8)}
+_MEAN: style.Look = {
+    "color": style.BLUE,
+    "marker": "o",
+    "linestyle": "",
+    "markeredgecolor": "white",
+    "markeredgewidth": 0.4,
+}
+_BAND: style.Look = {"color": style.BLUE, "alpha": 0.25, "linewidth": 0}
 
 
-@of_its_kind
+@style.of_its_kind
 def paper_figures(calibration: PaperCalibration) -> dict[str, Figure]:
     """Every figure of the calibration, by the stem of its file's name.
 
@@ -110,7 +87,7 @@ def _chosen(calibration: PaperCalibration, particles: Sequence[str] | None, eta:
     return [calibration.campaign.index(name) for name in particles]
 
 
-@styled
+@style.styled
 def plot_curves(calibration: PaperCalibration, particles: Sequence[str] | None = None) -> Figure:
     """Stress [MPa] over strain [-] of some tests, loading and unloading, before and after the offset step.
 
@@ -127,15 +104,15 @@ def plot_curves(calibration: PaperCalibration, particles: Sequence[str] | None =
     Raises:
         InputError: for a name that is not in the campaign.
     """
-    campaign, adjustment, eta = calibration.campaign, calibration.adjustment, shape_factors(calibration)
+    campaign, adjustment, eta = calibration.campaign, calibration.adjustment, style.shape_factors(calibration)
     threshold = adjustment.threshold_MPa
-    chosen, labels = _chosen(calibration, particles, eta), particle_labels(campaign.particles)
+    chosen, labels = _chosen(calibration, particles, eta), style.particle_labels(campaign.particles)
     many = len(chosen) > len(_CYCLE)
-    colours = sequential(eta[chosen])
-    figure = new_figure(7.6, 3.9)
+    colours = style.sequential(eta[chosen])
+    figure = style.new_figure(7.6, 3.9)
     whole, toe = figure.subplots(1, 2, width_ratios=[1.45, 1])
     handles: list[Line2D] = []
-    ends, highest, width = [0.0, 4 * adjustment.strain], 0.0, faintness(len(chosen))
+    ends, highest, width = [0.0, 4 * adjustment.strain], 0.0, style.faintness(len(chosen))
     for i, colour in zip(chosen, colours.to_rgba(eta[chosen]) if many else _CYCLE, strict=False):
         stress, strain = stress_and_strain(campaign.curves[i], campaign.diameters_um[i], adjustment.segments[i])
         adjusted = adjusted_curve(calibration, i) if adjustment.kept[i] and threshold > 0 else None
@@ -149,11 +126,11 @@ def plot_curves(calibration: PaperCalibration, particles: Sequence[str] | None =
         first = strain[:passed][stress[:passed] > threshold / 4]
         ends += [float(first.min()), float(first.max())] if len(first) else []
         handles.append(Line2D([], [], color=colour, label=f"{labels[i]}{suffix} ($\\eta_p$ = {eta[i]:.2f})"))
-    styles = [Line2D([], [], color=GREY, label="as measured")]
+    styles = [Line2D([], [], color=style.GREY, label="as measured")]
     if threshold > 0:
-        styles.append(Line2D([], [], color=GREY, label="adjusted", **_DASHED))
+        styles.append(Line2D([], [], color=style.GREY, label="adjusted", **_DASHED))
     if many:
-        figure.colorbar(colours, ax=toe, label=SHAPE_FACTOR)
+        figure.colorbar(colours, ax=toe, label=style.SHAPE_FACTOR)
     whole.legend(handles=styles if many else handles + styles, loc="upper left")
     if threshold > 0:
         for ax in (whole, toe):
@@ -170,8 +147,8 @@ def plot_curves(calibration: PaperCalibration, particles: Sequence[str] | None =
     if whole.dataLim.ymin > -0.02 * highest:
         whole.set_ylim(bottom=0)
     for ax in (whole, toe):
-        ax.set(xlabel=STRAIN, ylabel=STRESS)
-    return finish(figure, campaign.metadata)
+        ax.set(xlabel=style.STRAIN, ylabel=style.STRESS)
+    return style.finish(figure, campaign.metadata)
 
 
 # ---- dimensions ------------------------------------------------------------------------------------------------------
@@ -214,7 +191,7 @@ def dimension_statistics(campaign: Campaign) -> DimensionStatistics:
     return DimensionStatistics(average, effective, slope, *ratios, correlation)
 
 
-@styled
+@style.styled
 def plot_dimensions(campaign: Campaign) -> Figure:
     """Effective diameter D_e = D1 D2 / D3 over average diameter (D1 + D2 + D3)/3 [um], one point per particle.
 
@@ -224,15 +201,17 @@ def plot_dimensions(campaign: Campaign) -> Figure:
     """
     s = dimension_statistics(campaign)
     flat = campaign.diameters_um[:, 2] / np.sqrt(campaign.diameters_um[:, 0] * campaign.diameters_um[:, 1])
-    colours = sequential(flat)
-    figure = new_figure(5.2, 4.4)
+    colours = style.sequential(flat)
+    figure = style.new_figure(5.2, 4.4)
     ax = figure.subplots()
     right = 1.08 * float(s.average_um.max())
     ends = np.array([0.0, right])
-    ax.plot(ends, ends, color=GREY, linewidth=1.0, dashes=(4, 2), label="1:1")
-    ax.plot(ends, s.slope * ends, color=VERMILION, label=f"fit through the origin, $D_e$ = {s.slope:.3f} × average")
+    ax.plot(ends, ends, color=style.GREY, linewidth=1.0, dashes=(4, 2), label="1:1")
+    ax.plot(
+        ends, s.slope * ends, color=style.VERMILION, label=f"fit through the origin, $D_e$ = {s.slope:.3f} × average"
+    )
     ax.scatter(
-        s.average_um, s.effective_um, c=colours.to_rgba(flat), s=28, edgecolors=BLACK,
+        s.average_um, s.effective_um, c=colours.to_rgba(flat), s=28, edgecolors=style.BLACK,
         linewidths=0.5, alpha=0.9, zorder=3, label=f"particles ({len(campaign)})",
     )  # fmt: skip
     figure.colorbar(colours, ax=ax, label="$D_3/\\sqrt{D_1 D_2}$ [-]")
@@ -246,14 +225,14 @@ def plot_dimensions(campaign: Campaign) -> Figure:
         lines.append(f"mean of {name}: {mean:.2f}" + (f" ± {sd:.2f}" if np.isfinite(sd) else ""))
     if np.isfinite(s.correlation):
         lines.append(f"correlation: {s.correlation:.2f}")
-    note(ax, "\n".join(lines), place="lower right")
-    return finish(figure, campaign.metadata)
+    style.note(ax, "\n".join(lines), place="lower right")
+    return style.finish(figure, campaign.metadata)
 
 
 # ---- shape factor, master curve, law ---------------------------------------------------------------------------------
 
 
-@styled
+@style.styled
 def plot_collapse(calibration: PaperCalibration) -> Figure:
     """Stress [MPa] of all kept loading curves over strain [-] and over strain scaled by the shape factor [-].
 
@@ -264,33 +243,33 @@ def plot_collapse(calibration: PaperCalibration) -> Figure:
     """
     table, fit = calibration.table, calibration.chosen_shape
     eta = table.shape_factor(calibration.a)
-    colours = sequential(eta)
-    figure = new_figure(7.8, 3.9)
+    colours = style.sequential(eta)
+    figure = style.new_figure(7.8, 3.9)
     panels = figure.subplots(1, 2, sharey=True)
     curves = [c for c in calibration.adjustment.curves if c is not None]
     # Further up the mean would jump wherever a particle's test ends.
     everyone = table.reached.all(axis=0)
     for ax, factors, title, value, label in (
-        (panels[0], np.ones_like(eta), "not scaled, a = 0", fit.objective_at_zero, STRAIN),
-        (panels[1], eta, f"scaled, a = {calibration.a:.2f}", fit.objective, SCALED_STRAIN),
+        (panels[0], np.ones_like(eta), "not scaled, a = 0", fit.objective_at_zero, style.STRAIN),
+        (panels[1], eta, f"scaled, a = {calibration.a:.2f}", fit.objective, style.SCALED_STRAIN),
     ):
         for curve, factor, colour in zip(curves, factors, colours.to_rgba(eta), strict=True):
-            ax.plot(factor * curve.strain, curve.stress_MPa, color=colour, **faintness(len(eta)))
+            ax.plot(factor * curve.strain, curve.stress_MPa, color=colour, **style.faintness(len(eta)))
         mean = (factors[:, None] * table.strain[:, everyone]).mean(axis=0)
-        dashes: Look = {"linewidth": 1.8, "dashes": (2.5, 1.2)}
-        ax.plot(mean, table.stress_MPa[everyone], color=BLACK, label="mean of all particles", **dashes)
+        dashes: style.Look = {"linewidth": 1.8, "dashes": (2.5, 1.2)}
+        ax.plot(mean, table.stress_MPa[everyone], color=style.BLACK, label="mean of all particles", **dashes)
         ax.set_xlim(left=0)
         ax.set_xlabel(label)
         ax.set_title(title)
         ax.legend(loc="upper left", title=f"objective {value:.4g}", alignment="left", title_fontsize=8)
     panels[0].set_ylim(bottom=0)
-    panels[0].set_ylabel(STRESS)
-    figure.colorbar(colours, ax=panels.tolist(), label=SHAPE_FACTOR)
+    panels[0].set_ylabel(style.STRESS)
+    figure.colorbar(colours, ax=panels.tolist(), label=style.SHAPE_FACTOR)
     lines = [f"the fit of a did not succeed: {fit.reason}"] if fit.reason else []
-    return finish(figure, calibration.campaign.metadata, lines=lines)
+    return style.finish(figure, calibration.campaign.metadata, lines=lines)
 
 
-@styled
+@style.styled
 def plot_master(calibration: PaperCalibration) -> Figure:
     """Mean (symbols) and one standard deviation (band) of the scaled strain [-] over stress [MPa].
 
@@ -300,32 +279,34 @@ def plot_master(calibration: PaperCalibration) -> Figure:
     """
     master, table = calibration.master, calibration.table
     eta = table.shape_factor(calibration.a)
-    figure = new_figure(5.6, 4.9)
+    figure = style.new_figure(5.6, 4.9)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3.4, 1])
-    thin = faintness(len(eta)) | {"linewidth": 0.6}
+    thin = style.faintness(len(eta)) | {"linewidth": 0.6}
     for row, factor in enumerate(eta):
         reached = table.reached[row]
-        line = upper.plot(table.stress_MPa[reached], factor * table.strain[row, reached], color=PALE, **thin)[0]
+        line = upper.plot(table.stress_MPa[reached], factor * table.strain[row, reached], color=style.PALE, **thin)[0]
         line.set_label("single particles" if row == 0 else "_")
     known = np.isfinite(master.sd)
     low, high = ((master.mean + sign * master.sd)[known] for sign in (-1, 1))
     upper.fill_between(master.stress_MPa[known], low, high, label="mean ± 1 sd", **_BAND)
-    step = every(len(master.mean), SETTINGS.mean_markers).step
+    step = style.every(len(master.mean), style.SETTINGS.mean_markers).step
     upper.plot(master.stress_MPa, master.mean, markevery=step, label="mean", **_MEAN)
-    upper.set_ylabel(SCALED_STRAIN)
+    upper.set_ylabel(style.SCALED_STRAIN)
     upper.set_ylim(bottom=0)
     upper.legend(loc="lower right")
-    note(upper, f"a = {calibration.a:.2f}, {len(eta)} particles")
-    lower.fill_between(table.stress_MPa, table.reached.sum(axis=0), step="mid", color=PALE, linewidth=0)
-    lower.plot(master.stress_MPa, master.count, color=BLUE, drawstyle="steps-mid")
+    style.note(upper, f"a = {calibration.a:.2f}, {len(eta)} particles")
+    lower.fill_between(table.stress_MPa, table.reached.sum(axis=0), step="mid", color=style.PALE, linewidth=0)
+    lower.plot(master.stress_MPa, master.count, color=style.BLUE, drawstyle="steps-mid")
     fifth = len(eta) / 5
     lower.axhline(fifth, **_DOTTED)
     lower.set_ylim(0, 1.12 * len(eta))
     lower.set_xlim(0, 1.02 * table.stress_MPa[-1])
     lower.yaxis.get_major_locator().set_params(integer=True)
-    lower.set(xlabel=STRESS, ylabel="particles [-]")
-    lower.text(0.01, fifth, "one fifth", transform=lower.get_yaxis_transform(), va="bottom", fontsize=7, color=GREY)
-    return finish(figure, calibration.campaign.metadata)
+    lower.set(xlabel=style.STRESS, ylabel="particles [-]")
+    lower.text(
+        0.01, fifth, "one fifth", transform=lower.get_yaxis_transform(), va="bottom", fontsize=7, color=style.GREY
+    )
+    return style.finish(figure, calibration.campaign.metadata)
 
 
 def law_strain(calibration: PaperCalibration) -> np.ndarray:
@@ -356,7 +337,7 @@ def _where(stress: np.ndarray, stretches: list[tuple[int, int]]) -> str:
     return f"mean law more than 1 sd off the sample at {shown} MPa{more}"
 
 
-@styled
+@style.styled
 def plot_law(calibration: PaperCalibration) -> Figure:
     """Stress [MPa] over scaled strain [-] of plastic loading: the calibrated law and the sample it was fitted to.
 
@@ -371,39 +352,39 @@ def plot_law(calibration: PaperCalibration) -> Figure:
     tested, right = float(last.max()), 1.08 * float(last.max())
     x = np.linspace(0.0, right, 400)
     mean, sd = np.asarray(plastic.stress(jnp.asarray(x))), np.asarray(population.stress_sd(jnp.asarray(x)))
-    figure = new_figure(5.6, 4.3)
+    figure = style.new_figure(5.6, 4.3)
     ax = figure.subplots()
     ax.axvspan(tested, right, color="#ECECEC", linewidth=0, label="beyond the tests")
     known = np.isfinite(master.sd)
     low, high = ((master.mean + sign * master.sd)[known] for sign in (-1, 1))
     ax.fill_betweenx(master.stress_MPa[known], low, high, label="sample mean ± 1 sd of strain", **_BAND)
-    step = every(len(master.mean), SETTINGS.mean_markers).step
+    step = style.every(len(master.mean), style.SETTINGS.mean_markers).step
     ax.plot(master.mean, master.stress_MPa, markevery=step, label="sample mean", **_MEAN)
-    ax.plot(x, mean, color=VERMILION, linewidth=1.6, label="mean law")
-    ax.plot(x, mean + sd, color=VERMILION, linewidth=1.0, dashes=(4, 2), label="± 1 sd of stress")
-    ax.plot(x, np.maximum(mean - sd, 0.0), color=VERMILION, linewidth=1.0, dashes=(4, 2))
-    ax.plot(x, float(plastic.C1) * x, color=GREY, linewidth=1.1, dashes=(5, 1.5, 1, 1.5), label="first term only")
+    ax.plot(x, mean, color=style.VERMILION, linewidth=1.6, label="mean law")
+    ax.plot(x, mean + sd, color=style.VERMILION, linewidth=1.0, dashes=(4, 2), label="± 1 sd of stress")
+    ax.plot(x, np.maximum(mean - sd, 0.0), color=style.VERMILION, linewidth=1.0, dashes=(4, 2))
+    ax.plot(x, float(plastic.C1) * x, color=style.GREY, linewidth=1.1, dashes=(5, 1.5, 1, 1.5), label="first term only")
     stretches = stretches_outside(calibration)
     if stretches:
         shown = np.concatenate([np.arange(a, b + 1, max(1, step // 2)) for a, b in stretches])
-        at, cross = law_strain(calibration)[shown], {"color": ORANGE, "markersize": 5, "markeredgewidth": 1.3}
+        at, cross = law_strain(calibration)[shown], {"color": style.ORANGE, "markersize": 5, "markeredgewidth": 1.3}
         ax.plot(at, master.stress_MPa[shown], "x", label="law off by > 1 sd", **cross)
     ax.set_xlim(0, right)
     ax.set_ylim(0, 1.25 * float(table.stress_MPa[-1]))
-    ax.set(xlabel=SCALED_STRAIN, ylabel=STRESS)
+    ax.set(xlabel=style.SCALED_STRAIN, ylabel=style.STRESS)
     factors = [f"{float(f'{K:.3g}'):.6g}" for K in calibration.plastic.polynomial]
     text = "$\\sigma$/MPa = {} $x$ − {} $x^3$ + {} $x^5$,  $x = \\eta_p\\,\\varepsilon$".format(*factors)
     ax.set_title(text + "\n" + _where(master.stress_MPa, stretches), fontsize=8.5)
     ax.legend(loc="upper left")
     if calibration.plastic.at_bound:
-        note(ax, "at its lower bound:\n" + "\n".join(calibration.plastic.at_bound), place="lower right")
-    return finish(figure, calibration.campaign.metadata)
+        style.note(ax, "at its lower bound:\n" + "\n".join(calibration.plastic.at_bound), place="lower right")
+    return style.finish(figure, calibration.campaign.metadata)
 
 
 # ---- unloading, residuals --------------------------------------------------------------------------------------------
 
 
-@styled
+@style.styled
 def plot_elastic(calibration: PaperCalibration) -> Figure:
     """The elastic branches, unloading and reloading, collapsed on one curve, and how well one modulus serves all.
 
@@ -413,26 +394,28 @@ def plot_elastic(calibration: PaperCalibration) -> Figure:
     single particles.
     """
     fit, law = calibration.elastic, calibration.mean_law
-    figure = new_figure(7.8, 3.7)
+    figure = style.new_figure(7.8, 3.7)
     left, right = figure.subplots(1, 2)
     modulus = fit.effective_modulus_MPa
     if modulus is None:
         for ax in (left, right):
-            empty(ax, fit.reason or "no effective modulus")
-        return finish(figure, calibration.campaign.metadata)
-    every_eta = shape_factors(calibration)
+            style.empty(ax, fit.reason or "no effective modulus")
+        return style.finish(figure, calibration.campaign.metadata)
+    every_eta = style.shape_factors(calibration)
     eta = every_eta[[b.particle for b in fit.branches]]
-    colours = sequential(eta)
+    colours = style.sequential(eta)
     rgba = colours.to_rgba(eta)
-    few = len(fit.branches) <= SETTINGS.thin_curves
-    dots: Look = {"markersize": 3 if few else 1.8, "alpha": 0.7 if few else 0.35, "markeredgewidth": 0}
+    few = len(fit.branches) <= style.SETTINGS.thin_curves
+    dots: style.Look = {"markersize": 3 if few else 1.8, "alpha": 0.7 if few else 0.35, "markeredgewidth": 0}
     branches = collapsed_branches(fit, every_eta, law.unloading, law.strain_scaling)
     for (recovered, ratio), colour in zip(branches, rgba, strict=True):
         left.plot(recovered, ratio, ".", color=colour, **dots)
     s = np.linspace(0.0, 1.0, 201)
-    left.plot(s, np.asarray(jax.jit(stress_ratio)(jnp.asarray(s))), color=BLACK, linewidth=1.0, label="law, $f(s)$")
+    left.plot(
+        s, np.asarray(jax.jit(stress_ratio)(jnp.asarray(s))), color=style.BLACK, linewidth=1.0, label="law, $f(s)$"
+    )
     left.axhline(MIN_RATIO, **_DOTTED)
-    told: Look = {"transform": left.get_yaxis_transform(), "va": "bottom", "fontsize": 7, "color": GREY}
+    told: style.Look = {"transform": left.get_yaxis_transform(), "va": "bottom", "fontsize": 7, "color": style.GREY}
     left.text(0.02, MIN_RATIO, "each branch has a zero of its own;\nnot used below", **told)
     left.set_xlabel("recovered strain over recoverable strain $s$ [-]")
     left.set_ylabel("stress over peak stress $\\sigma/\\sigma_P$ [-]")
@@ -442,9 +425,9 @@ def plot_elastic(calibration: PaperCalibration) -> Figure:
     single = fit.per_branch_MPa / 1e3
     known = np.isfinite(single) & (single > 0)
     peaks = np.array([b.stress_max_MPa for b in fit.branches])
-    rings: Look = {"s": 22, "edgecolors": BLACK, "linewidths": 0.4, "zorder": 3}
+    rings: style.Look = {"s": 22, "edgecolors": style.BLACK, "linewidths": 0.4, "zorder": 3}
     right.scatter(peaks[known], single[known], c=rgba[known], label="one branch alone", **rings)
-    right.axhline(modulus / 1e3, color=VERMILION, label=f"all branches, {modulus / 1e3:.3g} GPa", zorder=2)
+    right.axhline(modulus / 1e3, color=style.VERMILION, label=f"all branches, {modulus / 1e3:.3g} GPa", zorder=2)
     if known.any() and single[known].max() > 5 * single[known].min():
         right.set_yscale("log")
         wide = single[known].max() > 100 * single[known].min()
@@ -456,16 +439,16 @@ def plot_elastic(calibration: PaperCalibration) -> Figure:
         right.set_ylim(span.min() - margin, span.max() + 2.5 * margin)
     missing = int((~known).sum())
     if missing:
-        note(right, f"{missing} {'branch gives' if missing == 1 else 'branches give'} no modulus alone",
+        style.note(right, f"{missing} {'branch gives' if missing == 1 else 'branches give'} no modulus alone",
              place="lower right")  # fmt: skip
     right.set(xlabel="peak stress $\\sigma_P$ [MPa]", ylabel="effective modulus [GPa]")
     right.set_title(f"form of unloading: {law.unloading.value.replace('_', ' ')}")
     right.legend(loc="best" if right.get_yscale() == "log" else "upper left")
-    figure.colorbar(colours, ax=[left, right], label=SHAPE_FACTOR)
-    return finish(figure, calibration.campaign.metadata)
+    figure.colorbar(colours, ax=[left, right], label=style.SHAPE_FACTOR)
+    return style.finish(figure, calibration.campaign.metadata)
 
 
-@styled
+@style.styled
 def plot_residuals(calibration: PaperCalibration) -> Figure:
     """Measured less predicted displacement [um] over force [mN, logarithmic], one line per kept particle.
 
@@ -476,9 +459,9 @@ def plot_residuals(calibration: PaperCalibration) -> Figure:
     """
     campaign, noise = calibration.campaign, calibration.displacement_noise_um
     fits = [(i, fit) for i, fit in enumerate(calibration.particles) if fit is not None]
-    eta = shape_factors(calibration)[[i for i, _ in fits]]
-    colours = sequential(eta)
-    figure = new_figure(6.4, 5.2)
+    eta = style.shape_factors(calibration)[[i for i, _ in fits]]
+    colours = style.sequential(eta)
+    figure = style.new_figure(6.4, 5.2)
     panels = figure.subplots(2, 1, sharex=True)
     for ax, name, title, rms in (
         (panels[0], "predicted_um", "mean law", "rms_um"),
@@ -487,16 +470,21 @@ def plot_residuals(calibration: PaperCalibration) -> Figure:
         for (i, fit), colour in zip(fits, colours.to_rgba(eta), strict=True):
             # A gap, not a line, where points do not count.
             deviation = np.where(fit.used, fit.measured_um - getattr(fit, name), np.nan)
-            ax.plot(campaign.curves[i].force_mN, deviation, color=colour, **(faintness(len(fits)) | {"linewidth": 0.8}))
-        ax.axhline(0.0, color=GREY, linewidth=0.8)
-        ax.axhspan(-noise, noise, color=ORANGE, alpha=0.6, linewidth=0, zorder=3)
+            ax.plot(
+                campaign.curves[i].force_mN,
+                deviation,
+                color=colour,
+                **(style.faintness(len(fits)) | {"linewidth": 0.8}),
+            )
+        ax.axhline(0.0, color=style.GREY, linewidth=0.8)
+        ax.axhspan(-noise, noise, color=style.ORANGE, alpha=0.6, linewidth=0, zorder=3)
         ax.set_ylabel("measured − predicted [µm]")
         ax.set_title(title)
         typical, point = np.nanmedian([getattr(fit, rms) for _, fit in fits]), f"{noise:.2g}" if noise > 1e-9 else "0"
-        note(ax, f"median rms {typical:.2g} µm; point noise (orange) ± {point} µm", place="upper right")
-        headroom(ax, 0.14)
-    panels[1].set_xlabel(FORCE)
+        style.note(ax, f"median rms {typical:.2g} µm; point noise (orange) ± {point} µm", place="upper right")
+        style.headroom(ax, 0.14)
+    panels[1].set_xlabel(style.FORCE)
     panels[1].set_xscale("log")
     panels[1].xaxis.set_major_formatter(ScalarFormatter())
-    figure.colorbar(colours, ax=panels.tolist(), label=SHAPE_FACTOR)
-    return finish(figure, campaign.metadata)
+    figure.colorbar(colours, ax=panels.tolist(), label=style.SHAPE_FACTOR)
+    return style.finish(figure, campaign.metadata)

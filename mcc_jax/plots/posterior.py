@@ -16,30 +16,11 @@ from ..calibrate import BayesCalibration, LeastSquaresCalibration, compare_with_
 from ..calibrate.arviz import prior_draws
 from ..calibrate.fit import population_at
 from ..calibrate.population import COEFFICIENTS
+from . import style
 from .curves import plot_bands, plot_fits, plot_new_particle, plot_whitened
-from .style import (
-    BLACK,
-    BLUE,
-    GREY,
-    ORANGE,
-    PALE,
-    SETTINGS,
-    SKY,
-    VERMILION,
-    Look,
-    cautions,
-    every,
-    finish,
-    new_figure,
-    note,
-    of_its_kind,
-    particle_labels,
-    spread_over,
-    styled,
-)
 
 _SYMBOLS = ("$C_1$", "$C_3$", "$C_5$")
-_PAPER: Look = {"color": VERMILION, "dashes": (3, 1.5)}
+_PAPER: style.Look = {"color": style.VERMILION, "dashes": (3, 1.5)}
 
 
 @dataclass(frozen=True)
@@ -77,7 +58,7 @@ PARAMETERS = {
 """In the order in which they are drawn."""
 
 
-@of_its_kind
+@style.of_its_kind
 def posterior_figures(calibration: BayesCalibration) -> dict[str, Figure]:
     """Every figure of the posterior, by the stem of its file's name.
 
@@ -94,7 +75,7 @@ def posterior_figures(calibration: BayesCalibration) -> dict[str, Figure]:
     }
 
 
-@of_its_kind
+@style.of_its_kind
 def least_squares_figures(calibration: LeastSquaresCalibration) -> dict[str, Figure]:
     """Every figure of the joint least squares, by the stem of its file's name.
 
@@ -140,7 +121,7 @@ def density(draws: np.ndarray, x: np.ndarray, *, positive: bool = False, log: bo
 def _row(draws: np.ndarray) -> np.ndarray:
     """Draws of all chains in one row, thinned."""
     row = np.asarray(draws, float).ravel()
-    return row[every(len(row), SETTINGS.density_draws)]
+    return row[style.every(len(row), style.SETTINGS.density_draws)]
 
 
 def _span(values: np.ndarray, parameter: Parameter, points: int = 200) -> np.ndarray:
@@ -165,7 +146,7 @@ def with_sd(value: float, sd: float) -> str:
     return f"{value:.{max(digits, 0)}f} ± {sd:.{max(digits, 0)}f}"
 
 
-@styled
+@style.styled
 def plot_pairs(calibration: BayesCalibration) -> Figure:
     """Every pair of the population's parameters, one dot per draw; on the diagonal each alone, with mean and sd.
 
@@ -177,10 +158,10 @@ def plot_pairs(calibration: BayesCalibration) -> Figure:
     draws.pop("noise_factor", None)
     names = list(draws)
     size = len(names)
-    figure = new_figure(1.05 * size + 1.0, 1.0 * size + 1.0)
+    figure = style.new_figure(1.05 * size + 1.0, 1.0 * size + 1.0)
     grid = figure.subplots(size, size, squeeze=False, sharex="col")
-    shown = every(draws["a"].size, SETTINGS.dots)
-    dots: Look = {"color": BLUE, "markersize": 2.5, "markeredgewidth": 0, "alpha": 0.45}
+    shown = style.every(draws["a"].size, style.SETTINGS.dots)
+    dots: style.Look = {"color": style.BLUE, "markersize": 2.5, "markeredgewidth": 0, "alpha": 0.45}
     for i, name in enumerate(names):
         values, parameter = draws[name].ravel(), PARAMETERS[name]
         for j, ax in enumerate(grid[i]):
@@ -189,7 +170,7 @@ def plot_pairs(calibration: BayesCalibration) -> Figure:
                 continue
             if j == i:
                 x = _span(values, parameter)
-                _area(ax, x, density(values, x, positive=parameter.positive, log=parameter.log), SKY, BLUE)
+                _area(ax, x, density(values, x, positive=parameter.positive, log=parameter.log), style.SKY, style.BLUE)
                 ax.set_ylim(0, 1.08)
                 ax.set_yticks([])
                 ax.spines["left"].set_visible(False)
@@ -206,23 +187,23 @@ def plot_pairs(calibration: BayesCalibration) -> Figure:
     corner = grid[0, -1]
     for rank, meaning in enumerate(filter(None, (PARAMETERS[name].meaning for name in names))):
         # Below each other in the empty corner, which shall not grow for them.
-        place: Look = {"transform": corner.transAxes, "ha": "right", "va": "top", "fontsize": 8.5}
+        place: style.Look = {"transform": corner.transAxes, "ha": "right", "va": "top", "fontsize": 8.5}
         corner.text(1, 1 - 0.25 * rank, meaning, **place).set_in_layout(False)
     chains, each = draws["a"].shape
-    title, lines = f"Population, {chains} × {each} draws", cautions(figure, calibration)
-    return finish(figure, calibration.campaign.metadata, title=title, lines=lines)
+    title, lines = f"Population, {chains} × {each} draws", style.cautions(figure, calibration)
+    return style.finish(figure, calibration.campaign.metadata, title=title, lines=lines)
 
 
 def prior_of(calibration: BayesCalibration) -> dict[str, np.ndarray]:
     """Draws of the population's prior, by the names and in the units of the figures."""
     low, high = np.asarray(calibration.fit.numbers.a)[2:].tolist()
-    found = prior_draws(calibration.model.chosen_priors, low, high, (1, SETTINGS.density_draws), 0)
+    found = prior_draws(calibration.model.chosen_priors, low, high, (1, style.SETTINGS.density_draws), 0)
     for vector in ("mu", "tau"):
         found |= {f"{vector}_{name}": found[vector][..., j] for j, name in enumerate(COEFFICIENTS)}
     return _scaled(found)
 
 
-@styled
+@style.styled
 def plot_prior_posterior(calibration: BayesCalibration) -> Figure:
     """Prior and posterior density of every parameter of the population, with the paper's value.
 
@@ -233,7 +214,7 @@ def plot_prior_posterior(calibration: BayesCalibration) -> Figure:
     posterior, prior = _scaled(calibration.named_population()), prior_of(calibration)
     paper = {row["quantity"]: row["paper"] for row in compare_with_paper(calibration)}
     rows = -(-len(posterior) // 2)
-    figure = new_figure(9.6, 1.5 * rows + 1.0)
+    figure = style.new_figure(9.6, 1.5 * rows + 1.0)
     grid = figure.subplots(rows, 4, squeeze=False)
     for ax in grid.ravel()[2 * len(posterior) :]:
         ax.set_axis_off()
@@ -243,12 +224,12 @@ def plot_prior_posterior(calibration: BayesCalibration) -> Figure:
         _prior_posterior(whole, near, prior[name], values, mark, PARAMETERS[name])
         whole.set_ylabel("density / peak [-]" if rank % 2 == 0 else "")
     handles = [
-        Patch(color=PALE, alpha=0.7, linewidth=0, label="prior"),
-        Patch(color=SKY, alpha=0.7, linewidth=0, label="posterior"),
+        Patch(color=style.PALE, alpha=0.7, linewidth=0, label="prior"),
+        Patch(color=style.SKY, alpha=0.7, linewidth=0, label="posterior"),
         Line2D([], [], label="paper", **_PAPER),
     ]
-    title, lines = "What the data added: over the prior's range, and enlarged", cautions(figure, calibration)
-    return finish(figure, calibration.campaign.metadata, title=title, lines=lines, handles=handles)
+    title, lines = "What the data added: over the prior's range, and enlarged", style.cautions(figure, calibration)
+    return style.finish(figure, calibration.campaign.metadata, title=title, lines=lines, handles=handles)
 
 
 def _prior_posterior(
@@ -262,12 +243,12 @@ def _prior_posterior(
     inside = paper is not None and close[0] - reach <= paper <= close[-1] + reach
     if inside and not close[0] <= paper <= close[-1]:
         close = np.linspace(min(close[0], paper - 0.1 * reach), max(close[-1], paper + 0.1 * reach), 300)
-    options: Look = {"positive": parameter.positive, "log": parameter.log}
+    options: style.Look = {"positive": parameter.positive, "log": parameter.log}
     everywhere = density(prior, far, **options)
     enlarged = enlarged_prior(prior, far, everywhere, close, parameter)
     for ax, x, before in ((whole, far, everywhere), (near, close, enlarged)):
-        _area(ax, x, before, PALE, GREY)
-        _area(ax, x, density(posterior, x, **options), SKY, BLUE)
+        _area(ax, x, before, style.PALE, style.GREY)
+        _area(ax, x, density(posterior, x, **options), style.SKY, style.BLUE)
         margin = 0.02 * (x[-1] - x[0])
         ax.set_xlim(x[0] - margin, x[-1] + margin)
         ax.set_ylim(0, 1.1)
@@ -277,9 +258,9 @@ def _prior_posterior(
         if paper is not None and x[0] <= paper <= x[-1]:
             ax.axvline(paper, linewidth=1.3, **_PAPER)
     near.set_yticks([])
-    near.set_title(with_sd(float(posterior.mean()), float(posterior.std())), fontsize=8, color=BLACK)
+    near.set_title(with_sd(float(posterior.mean()), float(posterior.std())), fontsize=8, color=style.BLACK)
     if paper is not None and not inside:
-        note(near, f"paper {paper:.4g}", place="upper left" if paper < close[0] else "upper right")
+        style.note(near, f"paper {paper:.4g}", place="upper left" if paper < close[0] else "upper right")
 
 
 def enlarged_prior(
@@ -292,7 +273,7 @@ def enlarged_prior(
     """
     row = _row(prior)
     beside = row[row <= 2 * close[-1]]
-    if parameter.positive and len(beside) >= SETTINGS.near_draws:
+    if parameter.positive and len(beside) >= style.SETTINGS.near_draws:
         return density(beside, close, positive=True)
     return np.interp(close, far, everywhere)
 
@@ -340,12 +321,14 @@ def least_squares_table(calibration: LeastSquaresCalibration) -> CoefficientTabl
 
 def _rows(ax: Axes, table: CoefficientTable, j: int, chosen: np.ndarray, y: np.ndarray, *, labelled: bool) -> None:
     thick, size = (3.2, 4.0) if labelled else (1.2, 1.5)
-    ax.axvspan(*table.spread[:, j], color=ORANGE, alpha=0.22, linewidth=0, zorder=0)
-    ax.axvline(table.median[j], color=VERMILION, linewidth=1.1, zorder=1)
-    ax.hlines(y, *table.wide[:, chosen, j], color=BLUE if table.narrow is None else SKY, linewidth=1.1, zorder=2)
+    ax.axvspan(*table.spread[:, j], color=style.ORANGE, alpha=0.22, linewidth=0, zorder=0)
+    ax.axvline(table.median[j], color=style.VERMILION, linewidth=1.1, zorder=1)
+    ax.hlines(
+        y, *table.wide[:, chosen, j], color=style.BLUE if table.narrow is None else style.SKY, linewidth=1.1, zorder=2
+    )
     if table.narrow is not None:
-        ax.hlines(y, *table.narrow[:, chosen, j], color=BLUE, linewidth=thick, zorder=3)
-    ax.plot(table.centre[chosen, j], y, "o", color=BLACK, markersize=size, markeredgewidth=0, zorder=4)
+        ax.hlines(y, *table.narrow[:, chosen, j], color=style.BLUE, linewidth=thick, zorder=3)
+    ax.plot(table.centre[chosen, j], y, "o", color=style.BLACK, markersize=size, markeredgewidth=0, zorder=4)
     ax.set_xlabel(f"{_SYMBOLS[j]} [-]")
     ax.locator_params(axis="x", nbins=5)
     ax.use_sticky_edges = False  # the band's ends are no limits of the axis
@@ -360,13 +343,13 @@ def _rows(ax: Axes, table: CoefficientTable, j: int, chosen: np.ndarray, y: np.n
 def draw_forest(table: CoefficientTable, labels: Sequence[str]) -> tuple[Figure, list[Line2D | Patch]]:
     """Three panels of intervals, and the handles of their legend."""
     count = len(labels)
-    labelled = count <= SETTINGS.labelled
-    figure = new_figure(8.2, max(2.4, 0.19 * count + 1.3) if labelled else 6.0)
+    labelled = count <= style.SETTINGS.labelled
+    figure = style.new_figure(8.2, max(2.4, 0.19 * count + 1.3) if labelled else 6.0)
     panels = figure.subplots(1, 3, sharey=True)
     for j, ax in enumerate(panels):
         chosen, y = np.arange(count), np.arange(float(count))
         if not labelled:
-            chosen = np.argsort(table.centre[:, j], kind="stable")[spread_over(count, SETTINGS.rows)]
+            chosen = np.argsort(table.centre[:, j], kind="stable")[style.spread_over(count, style.SETTINGS.rows)]
             y = np.linspace(0, 1, len(chosen))
         _rows(ax, table, j, chosen, y, labelled=labelled)
     if labelled:
@@ -377,28 +360,28 @@ def draw_forest(table: CoefficientTable, labels: Sequence[str]) -> tuple[Figure,
         panels[0].set_ylabel("share of particles with a smaller value [-]")
     alone = table.narrow is None
     handles: list[Line2D | Patch] = [
-        Line2D([], [], color=BLACK, marker="o", linestyle="", label="estimate" if alone else "median"),
-        *([] if alone else [Line2D([], [], color=BLUE, linewidth=3.2, label="50 %")]),
-        Line2D([], [], color=BLUE if alone else SKY, label="95 %"),
-        Line2D([], [], color=VERMILION, label="population median"),
-        Patch(color=ORANGE, alpha=0.22, linewidth=0, label="95 % of the population"),
+        Line2D([], [], color=style.BLACK, marker="o", linestyle="", label="estimate" if alone else "median"),
+        *([] if alone else [Line2D([], [], color=style.BLUE, linewidth=3.2, label="50 %")]),
+        Line2D([], [], color=style.BLUE if alone else style.SKY, label="95 %"),
+        Line2D([], [], color=style.VERMILION, label="population median"),
+        Patch(color=style.ORANGE, alpha=0.22, linewidth=0, label="95 % of the population"),
     ]
     return figure, handles
 
 
 def _forest(calibration: BayesCalibration | LeastSquaresCalibration, table: CoefficientTable) -> Figure:
-    names = particle_labels(calibration.campaign.particles)
+    names = style.particle_labels(calibration.campaign.particles)
     labels = [names[i] for i in calibration.selection.kept]
     figure, handles = draw_forest(table, labels)
     title, count = "Coefficients of the particles", len(labels)
-    if count > SETTINGS.labelled:
-        shown = f"{SETTINGS.rows} of {count}" if count > SETTINGS.rows else f"{count}"
+    if count > style.SETTINGS.labelled:
+        shown = f"{style.SETTINGS.rows} of {count}" if count > style.SETTINGS.rows else f"{count}"
         title += f", {shown} particles, each panel in its own order"
-    lines = cautions(figure, calibration)
-    return finish(figure, calibration.campaign.metadata, title=title, lines=lines, handles=handles)
+    lines = style.cautions(figure, calibration)
+    return style.finish(figure, calibration.campaign.metadata, title=title, lines=lines, handles=handles)
 
 
-@styled
+@style.styled
 def plot_forest(calibration: BayesCalibration) -> Figure:
     """C1, C3, C5 [-] of every particle: median, 50 % and 95 % interval of the posterior.
 
@@ -409,7 +392,7 @@ def plot_forest(calibration: BayesCalibration) -> Figure:
     return _forest(calibration, posterior_table(calibration))
 
 
-@styled
+@style.styled
 def plot_estimates(calibration: LeastSquaresCalibration) -> Figure:
     """C1, C3, C5 [-] of every particle by joint least squares, with 95 % error bars.
 
@@ -428,7 +411,7 @@ def shrinkage(calibration: BayesCalibration) -> tuple[np.ndarray, np.ndarray]:
     return alone, np.log(np.asarray(calibration.C)).mean(axis=(0, 1))
 
 
-@styled
+@style.styled
 def plot_shrinkage(calibration: BayesCalibration) -> Figure:
     """What each particle gains from the others: log C1, C3, C5 [-] fitted alone, and in the posterior.
 
@@ -439,17 +422,17 @@ def plot_shrinkage(calibration: BayesCalibration) -> Figure:
     alone, together = shrinkage(calibration)
     mu = np.asarray(calibration.population.mu).reshape(-1, 3).mean(axis=0)
     tau = np.asarray(calibration.population.tau).reshape(-1, 3).mean(axis=0)
-    many, move = len(alone) > SETTINGS.many_arrows, together - alone
-    ring: Look = {"color": SKY, "markerfacecolor": "white", "marker": "o", "linestyle": ""}
-    dot: Look = {"color": BLUE, "marker": "o", "linestyle": ""}
-    cross: Look = {"color": VERMILION, "marker": "+", "linestyle": ""}
-    shade: Look = {"color": ORANGE, "alpha": 0.22, "linewidth": 0}
-    figure = new_figure(9.6, 3.7)
+    many, move = len(alone) > style.SETTINGS.many_arrows, together - alone
+    ring: style.Look = {"color": style.SKY, "markerfacecolor": "white", "marker": "o", "linestyle": ""}
+    dot: style.Look = {"color": style.BLUE, "marker": "o", "linestyle": ""}
+    cross: style.Look = {"color": style.VERMILION, "marker": "+", "linestyle": ""}
+    shade: style.Look = {"color": style.ORANGE, "alpha": 0.22, "linewidth": 0}
+    figure = style.new_figure(9.6, 3.7)
     for ax, (i, j) in zip(figure.subplots(1, 3), ((0, 1), (2, 1), (0, 2)), strict=True):
         # Of two normal numbers 95 % lie within 2.45 standard deviations.
         ax.add_patch(Ellipse((mu[i], mu[j]), 2 * 2.45 * tau[i], 2 * 2.45 * tau[j], **shade))
         ax.quiver(
-            alone[:, i], alone[:, j], move[:, i], move[:, j], angles="xy", scale_units="xy", scale=1, color=GREY,
+            alone[:, i], alone[:, j], move[:, i], move[:, j], angles="xy", scale_units="xy", scale=1, color=style.GREY,
             width=0.0035, headwidth=5, headlength=6, headaxislength=5.5, alpha=0.4 if many else 0.8, zorder=2,
         )  # fmt: skip
         ax.plot(alone[:, i], alone[:, j], markersize=2.5 if many else 4.5, zorder=3, **ring)
@@ -465,5 +448,5 @@ def plot_shrinkage(calibration: BayesCalibration) -> Figure:
         Line2D([], [], markersize=9, label="population mean", **cross),
         Patch(label="95 % of the population", **shade),
     ]
-    title, lines = "Each particle alone, and among the others", cautions(figure, calibration)
-    return finish(figure, calibration.campaign.metadata, title=title, lines=lines, handles=handles)
+    title, lines = "Each particle alone, and among the others", style.cautions(figure, calibration)
+    return style.finish(figure, calibration.campaign.metadata, title=title, lines=lines, handles=handles)
