@@ -19,7 +19,6 @@ import numpy as np
 import mcc_jax as mcc
 from mcc_jax.discover import discover
 from mcc_jax.effects import find_variant
-from mcc_jax.plots.remaining_gap import leftover
 
 FOLDER = Path(__file__).parent / "pages" / "images"
 BLUE, VERMILION, ORANGE, GREY = "#0072B2", "#D55E00", "#E69F00", "0.45"
@@ -68,7 +67,7 @@ def discovery():
     campaign = mcc.paper_campaign(seed=0, instrument=NOISE, programme=programme, effects=(hidden,))
     found = discover(campaign, confirm=False, experiments=False, posterior=False)
     print(found.summary)
-    left = leftover(found)
+    left = found.residuals
     gain = np.sum(left.white_before**2 - left.white_after**2, axis=1)
     i = int(np.argsort(gain)[len(gain) // 2])  # the particle in the middle, not the best one
     used, time = left.used[i], left.time_s[i]

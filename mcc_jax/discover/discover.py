@@ -32,7 +32,8 @@ from .model_selection import chooser, name_missing, span_of
 from .noise_estimation import refined
 from .omnibus import MIN_PARTICLES, p_nothing_left
 from .posterior import extended_posterior
-from .residual_map import where
+from .remaining import likeness, residuals
+from .residual_map import places, where
 from .result import Discovery, Verdict
 from .score import project
 from .sentences import summary_of
@@ -246,13 +247,13 @@ def _judge(
     sets: list[tuple[str, ...]] = []
     closure: Closure | None = None
     steps: list[Ranking] = []
-    places: list[dict[str, Any]] = []
+    disagree: list[dict[str, Any]] = []
     extensions = Extensions(base, system, signals)
     extended, last, around = system, None, {}
     drops: dict[int, float] = {}
     if gap:
         tell("where")
-        places = where(base, system)
+        disagree = where(base, system)
         tell("what")
         large = ranking.gain[0] >= LARGE
         if large:
@@ -269,6 +270,7 @@ def _judge(
             if last.physical:
                 extended = extensions.system_of(tuple(chosen))
                 around[frozenset(system.column(k) for k in chosen)] = extended
+    fits = None if last is None or extended is system else (extensions.fit(()), last)
     effects = estimated_effects(extended, last, chosen, steps, p_any)
     inside = np.array([system.column(k) for k in chosen], int)
     words = closure.words if closure is not None else np.array([], int)
@@ -314,7 +316,7 @@ def _judge(
         candidate_set=tuple(sets),
         ranking=ranking,
         untestable=tuple(missing),
-        where=tuple(places),
+        where=tuple(disagree),
         closure=closure,
         held_out=ladder,
         labels=labels,
@@ -327,6 +329,9 @@ def _judge(
         seed=seed,
         runtime_s=0.0,
         notes=tuple(notes),
+        residuals=residuals(base, system, signals, inside, words, fits),
+        places=places(system),
+        likeness=likeness(system, ranking, sets, chosen),
     )
 
 

@@ -379,7 +379,7 @@ def build_system(base: Base, signals: Signals) -> System:
     width = np.array([numbers.a[1], numbers.log_modulus[1], numbers.mu_1[1], 0.5, numbers.mu_5[1]])
     points = np.asarray(jnp.sum(tests.mask, 1))
     still, none = np.zeros(len(GLOBALS)), np.zeros(len(candidates))
-    white = np.asarray(in_batches(_whitened, (data.residual, fit.filters)))[np.asarray(tests.mask)]
+    white = np.asarray(in_batches(whitened, (data.residual, fit.filters)))[np.asarray(tests.mask)]
     return System(
         gram,
         points,
@@ -445,7 +445,8 @@ MIN_TAILS, MAX_TAILS = 2.5, 100.0
 
 
 @compiled
-def _whitened(residual: Float[Array, "particles points"], filters: Whitening) -> Float[Array, "particles points"]:
+def whitened(residual: Float[Array, "particles points"], filters: Whitening) -> Float[Array, "particles points"]:
+    """Residuals in units of the noise, independent from point to point."""
     return jax.vmap(lambda white, r: white(r))(filters, residual)
 
 

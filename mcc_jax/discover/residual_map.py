@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,12 +11,40 @@ from .linear_model import Base, System
 from .score import project
 
 WORTH_TELLING = 0.05
+FADED = 1e-4
+"""Of a place whose information survives the projection by less, the law takes up everything: nothing can be said."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """A place of the map of disagreement.
+
+    Attributes:
+        segment: kind of segment.
+        load_fraction: range of force over the test's largest force [-].
+        statistic: estimate of an addition there over its standard error [-], positive where more displacement is
+            measured than the law says; NaN where there are no points, or where the law's own parameters take up
+            whatever is added.
+    """
+
+    segment: str
+    load_fraction: tuple[float, float]
+    statistic: float
+
+
+def places(system: System) -> tuple[Place, ...]:
+    """The whole map of disagreement."""
+    view = project(system, system.place_columns)
+    columns = system.gram[np.ix_(np.flatnonzero(system.usable), system.place_columns, system.place_columns)]
+    said = (view.survival > FADED) & (np.einsum("nkk->k", columns) > 0)
+    values = np.where(said, view.gaussian, np.nan)
+    return tuple(Place(p.kind, p.share, float(t)) for p, t in zip(system.places, values, strict=True))
 
 
 def where(base: Base, system: System) -> list[dict[str, Any]]:
     """Places of the map by their share of the systematic gap, largest first."""
     view = project(system, system.place_columns)
-    energy = np.where(view.survival > 1e-4, view.gaussian**2 - 1, 0.0)
+    energy = np.where(view.survival > FADED, view.gaussian**2 - 1, 0.0)
     energy = np.maximum(energy, 0.0)
     if energy.sum() <= 0:
         return []

@@ -26,6 +26,8 @@ from .evidence import Ranking
 from .linear_model import Base, System, feature_values
 from .pop_in import Jump
 from .posterior import ExtendedPosterior
+from .remaining import Likeness, Residuals
+from .residual_map import Place
 from .score import project
 
 Verdict = Literal["NO_GAP", "NAMED", "SET", "UNLISTED", "FIT_NOT_CONVERGED"]
@@ -113,6 +115,9 @@ class Discovery:
             asked for.
         notes: what a reader must know.
         findings: what the checks of the tests found, and which particles took no part for it.
+        residuals: of every test, without and with what was added; None where the base law was not fitted.
+        places: the whole map of disagreement.
+        likeness: which mechanisms look alike.
     """
 
     archived: ClassVar[tuple[str, ...]] = ("content",)  # kept with the fields: the system it needs is not
@@ -140,6 +145,9 @@ class Discovery:
     posterior: ExtendedPosterior | None = None
     notes: tuple[str, ...] = field(default=())
     findings: tuple[Finding, ...] = field(default=())
+    residuals: Residuals | None = None
+    places: tuple[Place, ...] = ()
+    likeness: Likeness | None = None
 
     def __repr__(self) -> str:
         rows = [("added", repr(effect.build())) for effect in self.effects]
@@ -280,6 +288,7 @@ class Discovery:
                         "unit": variant.unit,
                         "parameter": variant.parameter,
                         "probability": finite(float(r.probability[i])),
+                        "sign": variant.sign,
                     }
                 )
         return {

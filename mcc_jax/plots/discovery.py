@@ -1,183 +1,29 @@
-"""Pictures of a discovery: where law and tests disagree, what closes the gap, what that moves; and all of them."""
+"""Figures of a discovery: where law and tests disagree, what explains the gap, and what it had done to the law."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
+from .._errors import InputError
 from ..discover import Discovery
-from ..discover.dictionary import KINDS, LEVELS
-from ..discover.score import project
-from .before_after import plot_before_after
-from .ranking import plain_name, plot_ranking, plot_similarity
-from .style import (
-    BLACK,
-    BLUE,
-    VERMILION,
-    empty,
-    finish,
-    new_figure,
-    note,
-    of_its_kind,
-    sequential,
-    styled,
-)
+from ..discover.residual_map import Place
+from ..discover.score import DETECTABLE
+from . import style
+from .curves import plot_before_after
 
-FADED = 1e-4
-"""Of a place whose information survives the projection by less, the law takes up everything: nothing can be said."""
+_FLOOR: style.Look = {"color": style.BLACK, "linestyle": "--", "linewidth": 1.0}
 
 
-def where_map(found: Discovery) -> dict[str, np.ndarray]:
-    """Statistic [-] of every place, by kind of segment: estimate of an addition there over its standard error.
-
-    Positive where more displacement is measured than the law says; NaN where there are no points, or where the law's
-    own parameters take up whatever is added.
-    """
-    assert found.system is not None
-    system = found.system
-    view = project(system, system.place_columns)
-    values = np.where(view.survival > FADED, view.gaussian, np.nan)
-    raw = np.einsum("nkk->k", system.gram[system.usable][:, system.place_columns][:, :, system.place_columns])
-    values = np.where(raw > 0, values, np.nan)
-    return {
-        kind: np.array([v for v, place in zip(values, system.places, strict=True) if place.kind == kind])
-        for kind in KINDS
-    }
-
-
-@styled
-def plot_where(found: Discovery) -> Figure:
-    """Where law and tests disagree: kind of segment, share of the test's largest force, share of the gap [-].
-
-    Colour and number are the place's share of the systematic gap; the arrow says whether more (up) or less displacement
-    is measured than the law predicts. A hold is one place. Hatched: no points, or nothing the law could not take up.
-    """
-    assert found.base is not None
-    values = where_map(found)
-    every = np.concatenate(list(values.values()))
-    energy = np.maximum(np.nan_to_num(every) ** 2 - 1, 0.0)
-    total = float(energy.sum())
-    figure = new_figure(7.6, 3.1)
-    ax = figure.subplots()
-    colours = sequential(np.array([0.0, max(1e-3, float(energy.max()) / total if total else 1.0)]))
-    colours.set_cmap("YlOrBr")
-    edges = np.clip(np.array([[c - 0.1, c + 0.1] for c in LEVELS]), 0, 1)
-    for row, (kind, numbers) in enumerate(values.items()):
-        boxes = [(0.0, 1.0)] if kind == "hold" else [(float(a), float(b)) for a, b in edges]
-        for (low, high), t in zip(boxes, numbers, strict=True):
-            _box(ax, row, low, high, float(t), total, colours)
-    ax.set_yticks(range(len(values)), list(values))
-    ax.set_ylim(len(values) - 0.45, -0.55)
-    ax.set_xlim(0, 1)
-    ax.set_xlabel("force over the test's largest force [-]")
-    ax.tick_params(axis="y", length=0)
-    ax.spines[:].set_visible(False)
-    what = "share of what noise leaves [-]" if found.verdict == "NO_GAP" else "share of the systematic gap [-]"
-    figure.colorbar(colours, ax=ax, label=what)
-    title = "Where law and tests disagree"
-    if found.verdict == "NO_GAP":
-        title += ": nowhere beyond noise"
-    lines = ["These are shares of what noise alone leaves: no gap was found."] if found.verdict == "NO_GAP" else []
-    return finish(figure, found.base.campaign.metadata, title=title, lines=lines)
-
-
-def _box(ax: Axes, row: int, low: float, high: float, t: float, total: float, colours) -> None:
-    if not np.isfinite(t):
-        ax.barh(row, high - low, left=low, height=0.86, color="white", edgecolor="#D0D0D0", hatch="////", linewidth=0)
-        return
-    share = max(t**2 - 1, 0.0) / total if total else 0.0
-    ax.barh(row, high - low, left=low, height=0.86, color=colours.to_rgba(share), edgecolor="white", linewidth=1)
-    if share >= 0.01:
-        dark = share > 0.6 * colours.norm.vmax
-        ax.text(
-            (low + high) / 2, row, f"{100 * share:.0f} % {'↑' if t > 0 else '↓'}", ha="center", va="center",
-            fontsize=7.5, color="white" if dark else BLACK,
-        )  # fmt: skip
-
-
-@styled
-def plot_gap(found: Discovery) -> Figure:
-    """The gap on particles that took no part in finding and fitting, step by step, down to the floor of the noise.
-
-    Left chi2 per point (the floor is 1), right the systematic displacement [um] that is left once noise is taken off.
-    """
-    assert found.base is not None
-    gap = found.gap()
-    steps = gap["steps"]
-    figure = new_figure(7.6, 3.2)
-    left, right = figure.subplots(1, 2)
-    if not steps:
-        reason = "no gap was found" if found.verdict == "NO_GAP" else "held-out particles were not asked for"
-        for ax in (left, right):
-            empty(ax, reason)
-        return finish(figure, found.base.campaign.metadata, title="The gap on held-out particles")
-    labels = ["law alone", *(f"+ {plain_name(s['added'])}" for s in steps[1:])]
-    x = np.arange(len(steps))
-    colours = [VERMILION, *([BLUE] * (len(steps) - 1))]
-    for ax, key, label, form in (
-        (left, "chi2_per_dof", "χ² per point [-]", ".2f"),
-        (right, "systematic_um", "systematic gap [µm]", ".2g"),
-    ):
-        values = np.array([np.nan if s[key] is None else s[key] for s in steps])
-        ax.bar(x, values, width=0.55, color=colours)
-        for i, value in enumerate(values):
-            ax.text(i, value, f" {value:{form}}", ha="center", va="bottom", fontsize=8)
-        ax.set_xticks(x, labels)
-        ax.set_xlim(-0.6, len(steps) - 0.4)
-        ax.set_ylabel(label)
-        ax.margins(y=0.14)
-    left.axhline(1.0, color=BLACK, linestyle="--", linewidth=1.0)
-    right.axhline(0.0, color=BLACK, linestyle="--", linewidth=1.0)
-    closed = gap["closed_fraction"]
-    if closed is not None:
-        note(right, f"{100 * closed:.0f} % of the gap closed", place="upper right")
-    handles = [Line2D([], [], color=BLACK, linestyle="--", label="floor: noise alone")]
-    return finish(
-        figure,
-        found.base.campaign.metadata,
-        title="The gap on held-out particles, each left out in turn",
-        handles=handles,
-    )
-
-
-@styled
-def plot_shifts(found: Discovery) -> Figure:
-    """What the missing effect had done to the law: its parameters before and after, with 95 % intervals."""
-    assert found.base is not None
-    figure = new_figure(9.0, 2.6)
-    panels = figure.subplots(1, 5)
-    names = ("$a$ [-]", r"$\bar E$ [GPa]", "mean log $C_1$ [-]", "mean log $C_3$ [-]", "mean log $C_5$ [-]")
-    for j, (ax, name) in enumerate(zip(panels, names, strict=True)):
-        for x, colour, parameters in ((0, VERMILION, found.before), (1, BLUE, found.after)):
-            if not parameters:
-                continue
-            if j < 2:
-                estimate = parameters[("a", "effective_modulus_MPa")[j]]
-            else:
-                estimate = parameters[f"log_{('C1', 'C3', 'C5')[j - 2]}"]["mean"]
-            factor = 1e-3 if j == 1 else 1.0
-            value = estimate["value"] * factor
-            ax.plot(x, value, "o", color=colour, markersize=5)
-            if estimate["interval_95"] is not None:
-                low, high = (end * factor for end in estimate["interval_95"])
-                ax.vlines(x, low, high, color=colour, linewidth=1.8)
-        ax.set_xlim(-0.6, 1.6 if found.after else 0.6)
-        ax.set_xticks([0, 1] if found.after else [0], ["before", "after"] if found.after else ["law alone"])
-        ax.set_title(name, fontsize=8.5)
-        ax.margins(y=0.15)
-        ax.locator_params(axis="y", nbins=5)
-        ax.grid(axis="y", color="#E6E6E6", linewidth=0.6)
-    moved = found.after and (found.effects or found.closure)
-    title = "What the missing effect had done to the law" if moved else "Parameters of the law"
-    handles = [Line2D([], [], color=VERMILION, marker="o", label="law alone, 95 %")]
-    if found.after:
-        handles.append(Line2D([], [], color=BLUE, marker="o", label="with what was added, 95 %"))
-    return finish(figure, found.base.campaign.metadata, title=title, handles=handles)
-
-
-@of_its_kind
+@style.of_its_kind
 def discovery_figures(found: Discovery) -> dict[str, Figure]:
     """Every figure of a discovery, by the stem of its file's name.
 
@@ -185,7 +31,7 @@ def discovery_figures(found: Discovery) -> dict[str, Figure]:
         `discovery_where`, `discovery_before_after`, `discovery_ranking`, `discovery_gap`, `discovery_similarity`,
         `discovery_shifts`; none if the base law could not be fitted; no gap and no shifts if nothing was added.
     """
-    if found.system is None:
+    if found.residuals is None:
         return {}
     figures = {
         "discovery_where": plot_where(found),
@@ -198,3 +44,214 @@ def discovery_figures(found: Discovery) -> dict[str, Figure]:
     if found.effects or found.closure is not None:
         figures["discovery_shifts"] = plot_shifts(found)
     return figures
+
+
+def _finished(figure: Figure, found: Discovery, **more: Any) -> Figure:
+    if found.base is None:
+        raise InputError("the base law was not fitted; there is nothing to draw")
+    return style.finish(figure, found.base.campaign.metadata, **more)
+
+
+def plain_name(name: str) -> str:
+    """A mechanism's name in words."""
+    return name.replace("_", " ")
+
+
+@style.styled
+def plot_where(found: Discovery) -> Figure:
+    """Where law and tests disagree: kind of segment, share of the test's largest force, share of the gap [-].
+
+    Colour and number are the place's share of the systematic gap; the arrow says whether more (up) or less displacement
+    is measured than the law predicts. A hold is one place. Hatched: no points, or nothing the law could not take up.
+    """
+    kinds = list(dict.fromkeys(place.segment for place in found.places))
+    energy = np.array([np.fmax(place.statistic**2 - 1, 0.0) for place in found.places])
+    shares = energy / max(float(energy.sum()), 1e-300)
+    figure = style.new_figure(7.6, 3.1)
+    ax = figure.subplots()
+    largest = max(1e-3, float(shares.max(initial=0.0)))
+    colours = style.sequential(np.array([0.0, largest]))
+    colours.set_cmap("YlOrBr")
+    for place, share in zip(found.places, shares, strict=True):
+        _box(ax, kinds.index(place.segment), place, float(share), largest, colours)
+    ax.set_yticks(range(len(kinds)), kinds)
+    ax.set_ylim(len(kinds) - 0.45, -0.55)
+    ax.set_xlim(0, 1)
+    ax.set_xlabel("force over the test's largest force [-]")
+    ax.tick_params(axis="y", length=0)
+    ax.spines[:].set_visible(False)
+    nothing = found.verdict == "NO_GAP"
+    what = "share of what noise leaves [-]" if nothing else "share of the systematic gap [-]"
+    figure.colorbar(colours, ax=ax, label=what)
+    title = "Where law and tests disagree" + (": nowhere beyond noise" if nothing else "")
+    lines = ["These are shares of what noise alone leaves: no gap was found."] if nothing else []
+    return _finished(figure, found, title=title, lines=lines)
+
+
+def _box(ax: Axes, row: int, place: Place, share: float, largest: float, colours: ScalarMappable) -> None:
+    low, high = place.load_fraction
+    bar: style.Look = {"width": high - low, "left": low, "height": 0.86}
+    if not np.isfinite(place.statistic):
+        ax.barh(row, color="white", edgecolor="#D0D0D0", hatch="////", linewidth=0, **bar)
+        return
+    ax.barh(row, color=colours.to_rgba(np.array(share)), edgecolor="white", linewidth=1, **bar)
+    if share >= 0.01:
+        words = f"{100 * share:.0f} % {'↑' if place.statistic > 0 else '↓'}"
+        ink = "white" if 0.6 * largest < share else style.BLACK
+        ax.text((low + high) / 2, row, words, ha="center", va="center", fontsize=style.SMALL, color=ink)
+
+
+def _with_unit(value: float, unit: str) -> str:
+    return f"{value:.2g}" if unit == "-" else f"{value:.2g} {unit}"
+
+
+@style.styled
+def plot_ranking(found: Discovery) -> Figure:
+    """Every mechanism's statistic [-]: the estimate of its best formula alone over its standard error.
+
+    The dashed line is the detection limit: a mechanism whose true strength reaches it is found with 95 % probability.
+    Beside each bar stand its probability among all, the estimate, and the limit in the mechanism's own unit. Bars of
+    the set (what explains the gap as well as the best) are blue. An empty bar is an estimate of the physically
+    impossible sign, which explains nothing. Mechanisms that these data cannot show stand below, grey, with what they
+    need.
+    """
+    entries = found.to_json()["ranking"]
+    members = {name for names in found.candidate_set for name in names}
+    named = {effect.mechanism for effect in found.effects}
+    count = len(entries) + len(found.untestable)
+    figure = style.new_figure(9.4, 1.3 + 0.235 * count)
+    ax = figure.subplots()
+    beside: style.Look = {"transform": ax.get_yaxis_transform(), "va": "center", "fontsize": style.SMALL}
+    scale = max([1.6 * DETECTABLE, *(abs(e["statistic"]) for e in entries)])
+    any_impossible = False
+    for row, entry in enumerate(entries):
+        name, unit = entry["mechanism"], entry["unit"]
+        impossible = entry["sign"] * entry["statistic"] < 0
+        any_impossible = any_impossible or impossible
+        colour = (
+            style.PALE if impossible else style.BLUE if name in named else style.SKY if name in members else style.PALE
+        )
+        look: style.Look = {"color": "white" if impossible else colour, "edgecolor": colour, "linewidth": 0.9}
+        ax.barh(row, abs(entry["statistic"]), height=0.66, **look)
+        chance = f"{entry['probability']:.2f}" if entry["probability"] >= 0.005 else "< 0.01"
+        ax.text(1.1, row, chance, ha="right", **beside)
+        limit = _with_unit(entry["detection_limit"], unit)
+        ax.text(1.13, row, f"{_with_unit(entry['estimate'], unit)}  (limit {limit})", **beside)
+    patch: style.Look = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
+    for row, missing in enumerate(found.untestable, start=len(entries)):
+        needs = f"needs {missing['needs']}"
+        ax.text(0.012 * scale, row, needs, va="center", fontsize=style.SMALL, color=style.GREY, zorder=5, bbox=patch)
+    ax.axvline(DETECTABLE, **_FLOOR)
+    ax.set_yticks(range(count), [plain_name(e["mechanism"]) for e in (*entries, *found.untestable)])
+    for tick in ax.get_yticklabels()[len(entries) :]:
+        tick.set_color(style.GREY)
+    ax.set_ylim(count - 0.4, -0.6)
+    ax.set_xlim(0, 1.05 * scale)
+    ax.tick_params(axis="y", length=0)
+    ax.set_xlabel("|estimate| / standard error, each mechanism alone [-]")
+    header: style.Look = {"transform": ax.transAxes, "va": "bottom", "fontsize": 8, "color": style.GREY}
+    ax.text(1.1, 1.0, "probability", ha="right", **header)
+    ax.text(1.13, 1.0, "estimate and detection limit", **header)
+    handles: list[Line2D | Patch] = []
+    if named:
+        handles.append(Patch(color=style.BLUE, label="added to the law"))
+    if members - named:
+        handles.append(Patch(color=style.SKY, label="explains it as well"))
+    handles.append(Patch(color=style.PALE, label="others"))
+    if any_impossible:
+        handles.append(Patch(facecolor="white", edgecolor=style.PALE, label="impossible sign"))
+    handles.append(Line2D([], [], label="detection limit", **_FLOOR))
+    title = "What could be missing: no gap was found" if found.verdict == "NO_GAP" else "What explains the gap"
+    return _finished(figure, found, title=title, handles=handles)
+
+
+@style.styled
+def plot_similarity(found: Discovery) -> Figure:
+    """Correlation [-] of what mechanisms would leave in the tests once the law has taken up what it can.
+
+    Members of the set first (bold). Above 0.9 no analysis of these data tells two mechanisms apart; other data may.
+    """
+    if found.likeness is None:
+        raise InputError("the base law was not fitted well enough; there is nothing to compare")
+    members = {name for group in found.candidate_set for name in group}
+    count = min(max(style.SETTINGS.alike, len(members)), len(found.likeness.names))
+    names, both = found.likeness.names[:count], found.likeness.correlation[:count, :count]
+    figure = style.new_figure(3.6 + 0.42 * count, 2.6 + 0.36 * count)
+    ax = figure.subplots()
+    colours = ScalarMappable(Normalize(-1, 1), colormaps["PuOr_r"])
+    ax.imshow(both, cmap=colours.cmap, vmin=-1, vmax=1, aspect="auto")
+    for (i, j), value in np.ndenumerate(both):
+        ink, words = "white" if abs(value) > 0.65 else style.BLACK, f"{value:.2f}".replace("-0.00", "0.00")
+        ax.text(j, i, words, ha="center", va="center", fontsize=7, color=ink)
+    words = [plain_name(name) for name in names]
+    ax.set_xticks(range(count), words, rotation=45, ha="right", rotation_mode="anchor")
+    ax.set_yticks(range(count), words)
+    for axis in (ax.get_xticklabels(), ax.get_yticklabels()):
+        for tick, name in zip(axis, names, strict=True):
+            tick.set_fontweight("bold" if name in members else "normal")
+    ax.spines[:].set_visible(False)
+    figure.colorbar(colours, ax=ax, label="correlation of projected signatures [-]", shrink=0.8)
+    return _finished(figure, found, title="Which mechanisms look alike in these data")
+
+
+@style.styled
+def plot_gap(found: Discovery) -> Figure:
+    """The gap on particles that took no part in finding and fitting, step by step, down to the floor of the noise.
+
+    Left chi2 per point (the floor is 1), right the systematic displacement [um] that is left once noise is taken off.
+    """
+    gap = found.gap()
+    steps = gap["steps"]
+    figure = style.new_figure(7.6, 3.2)
+    left, right = figure.subplots(1, 2)
+    if not steps:
+        reason = "no gap was found" if found.verdict == "NO_GAP" else "held-out particles were not asked for"
+        for ax in (left, right):
+            style.empty(ax, reason)
+        return _finished(figure, found, title="The gap on held-out particles")
+    labels = ["law alone", *(f"+ {plain_name(s['added'])}" for s in steps[1:])]
+    colours = [style.VERMILION, *([style.BLUE] * (len(steps) - 1))]
+    for ax, key, label, form, floor in (
+        (left, "chi2_per_dof", "χ² per point [-]", ".2f", 1.0),
+        (right, "systematic_um", "systematic gap [µm]", ".2g", 0.0),
+    ):
+        values = np.array([s[key] for s in steps], float)
+        ax.bar(range(len(steps)), values, width=0.55, color=colours)
+        for i, value in enumerate(values):
+            ax.text(i, value, f" {value:{form}}", ha="center", va="bottom", fontsize=8)
+        ax.set_xticks(range(len(steps)), labels)
+        ax.set_xlim(-0.6, len(steps) - 0.4)
+        ax.set_ylabel(label)
+        ax.margins(y=0.14)
+        ax.axhline(floor, **_FLOOR)
+    if gap["closed_fraction"] is not None:
+        style.note(right, f"{100 * gap['closed_fraction']:.0f} % of the gap closed", place="upper right")
+    handles = [Line2D([], [], label="floor: noise alone", **_FLOOR)]
+    return _finished(figure, found, title="The gap on held-out particles, each left out in turn", handles=handles)
+
+
+@style.styled
+def plot_shifts(found: Discovery) -> Figure:
+    """What the missing effect had done to the law: its parameters before and after, with 95 % intervals."""
+    figure = style.new_figure(9.0, 2.6)
+    names = ("$a$ [-]", r"$\bar E$ [GPa]", "mean log $C_1$ [-]", "mean log $C_3$ [-]", "mean log $C_5$ [-]")
+    both = ((0, style.VERMILION, found.before), (1, style.BLUE, found.after))
+    for j, (ax, name) in enumerate(zip(figure.subplots(1, 5), names, strict=True)):
+        for x, colour, p in ((x, colour, p) for x, colour, p in both if p):
+            estimates = (p["a"], p["effective_modulus_MPa"], *(p[f"log_{c}"]["mean"] for c in ("C1", "C3", "C5")))
+            factor = 1e-3 if j == 1 else 1.0
+            ax.plot(x, estimates[j]["value"] * factor, "o", color=colour, markersize=5)
+            if estimates[j]["interval_95"] is not None:
+                ax.vlines(x, *(end * factor for end in estimates[j]["interval_95"]), color=colour, linewidth=1.8)
+        ax.set_xlim(-0.6, 1.6 if found.after else 0.6)
+        ax.set_xticks([0, 1] if found.after else [0], ["before", "after"] if found.after else ["law alone"])
+        ax.set_title(name, fontsize=8.5)
+        ax.margins(y=0.15)
+        ax.locator_params(axis="y", nbins=5)
+        ax.grid(axis="y", color="#E6E6E6", linewidth=0.6)
+    moved = found.after and (found.effects or found.closure)
+    title = "What the missing effect had done to the law" if moved else "Parameters of the law"
+    handles = [Line2D([], [], color=style.VERMILION, marker="o", label="law alone, 95 %")]
+    if found.after:
+        handles.append(Line2D([], [], color=style.BLUE, marker="o", label="with what was added, 95 %"))
+    return _finished(figure, found, title=title, handles=handles)

@@ -1,37 +1,26 @@
-"""The population's posterior: how its parameters hang together, and what the data added to the prior."""
+"""The population's posterior, what the data added to the prior, and every particle's coefficients."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
+from matplotlib.patches import Ellipse, Patch
 from matplotlib.ticker import MaxNLocator
 
-from ..calibrate import BayesCalibration, compare_with_paper
-from .bands import plot_bands
-from .forest import plot_forest, plot_shrinkage
-from .joint import cautions, density, flat_draws, with_sd
-from .new_particle import plot_new_particle
-from .style import (
-    BLACK,
-    BLUE,
-    GREY,
-    PALE,
-    SKY,
-    VERMILION,
-    finish,
-    new_figure,
-    note,
-    of_its_kind,
-    styled,
-)
+from ..calibrate import BayesCalibration, LeastSquaresCalibration, compare_with_paper
+from ..calibrate.arviz import prior_draws
+from ..calibrate.fit import population_at
+from ..calibrate.population import COEFFICIENTS
+from . import style
+from .curves import plot_bands, plot_fits, plot_new_particle, plot_whitened
 
-MAX_DOTS = 800
-PRIOR_DRAWS = 2000
+_SYMBOLS = ("$C_1$", "$C_3$", "$C_5$")
+_PAPER: style.Look = {"color": style.VERMILION, "dashes": (3, 1.5)}
 
 
 @dataclass(frozen=True)
@@ -40,223 +29,36 @@ class Parameter:
 
     Attributes:
         label: symbol and unit.
+        meaning: in words, told once for those that are alike.
         scale: what its numbers are multiplied with.
         positive: it may pile up at 0.
         log: it is positive and skewed.
     """
 
     label: str
+    meaning: str = ""
     scale: float = 1.0
     positive: bool = False
     log: bool = False
 
 
 PARAMETERS = {
-    "a": Parameter("$a$ [-]"),
-    "effective_modulus_MPa": Parameter("$\\bar{E}$ [GPa]", scale=1e-3, log=True),
-    "mu_C1": Parameter("$\\mu_1$ [-]"),
-    "tau_C1": Parameter("$\\tau_1$ [-]", positive=True),
+    "a": Parameter("$a$ [-]", "$a$: shape parameter"),
+    "effective_modulus_MPa": Parameter("$\\bar{E}$ [GPa]", "$\\bar{E}$: effective modulus", scale=1e-3, log=True),
+    "mu_C1": Parameter("$\\mu_1$ [-]", "$\\mu_j$: mean of log $C_j$"),
+    "tau_C1": Parameter("$\\tau_1$ [-]", "$\\tau_j$: its standard deviation over the particles", positive=True),
     "mu_C3": Parameter("$\\mu_3$ [-]"),
     "tau_C3": Parameter("$\\tau_3$ [-]", positive=True),
     "mu_C5": Parameter("$\\mu_5$ [-]"),
     "tau_C5": Parameter("$\\tau_5$ [-]", positive=True),
-    "modulus_scatter": Parameter("$s_E$ [-]", positive=True),
-    "shape_scatter": Parameter("$s_a$ [-]", positive=True),
+    "modulus_scatter": Parameter("$s_E$ [-]", "$s_E$: standard deviation of log modulus", positive=True),
+    "shape_scatter": Parameter("$s_a$ [-]", "$s_a$: standard deviation of $a$", positive=True),
     "noise_factor": Parameter("noise factor [-]", log=True),
 }
 """In the order in which they are drawn."""
 
-SYMBOLS = {
-    "a": "$a$: shape parameter",
-    "effective_modulus_MPa": "$\\bar{E}$: effective modulus",
-    "mu_C1": "$\\mu_j$: mean of log $C_j$",
-    "tau_C1": "$\\tau_j$: its standard deviation over the particles",
-    "modulus_scatter": "$s_E$: standard deviation of log modulus",
-    "shape_scatter": "$s_a$: standard deviation of $a$",
-}
 
-
-def _population(calibration: BayesCalibration) -> dict[str, np.ndarray]:
-    """Draws by name, in the order and the units of the figures."""
-    named = calibration.named_population()
-    return {name: named[name] * p.scale for name, p in PARAMETERS.items() if name in named}
-
-
-@styled
-def plot_pairs(calibration: BayesCalibration) -> Figure:
-    """Every pair of the population's parameters, one dot per draw; on the diagonal each alone, with mean and sd.
-
-    Shape parameter `a` [-], effective modulus [GPa], and mean and standard deviation of log C1, C3, C5 [-], with the
-    scatter of modulus and `a` where they may scatter. A slanting cloud is a combination that the data know better than
-    its parts.
-    """
-    draws = {name: values for name, values in _population(calibration).items() if name != "noise_factor"}
-    names = list(draws)
-    size = len(names)
-    figure = new_figure(1.05 * size + 1.0, 1.0 * size + 1.0)
-    grid = figure.subplots(size, size, squeeze=False, sharex="col")
-    total = draws["a"].size
-    shown = np.arange(0, total, max(1, -(-total // MAX_DOTS)))
-    for i, name in enumerate(names):
-        values = draws[name].ravel()
-        for j, ax in enumerate(grid[i]):
-            if j > i:
-                ax.set_axis_off()
-                continue
-            if j == i:
-                _marginal(ax, values, PARAMETERS[name])
-            else:
-                ax.plot(
-                    draws[names[j]].ravel()[shown], values[shown], ".", color=BLUE, markersize=2.5, markeredgewidth=0,
-                    alpha=0.45,
-                )  # fmt: skip
-                ax.yaxis.set_major_locator(MaxNLocator(3))
-            ax.xaxis.set_major_locator(MaxNLocator(3))
-            ax.tick_params(axis="x", labelrotation=90)
-            if i == size - 1:
-                ax.set_xlabel(PARAMETERS[names[j]].label)
-            if j == 0 and i > 0:
-                ax.set_ylabel(PARAMETERS[name].label)
-            elif j < i:
-                ax.tick_params(labelleft=False)
-    figure.align_labels(list(grid.ravel()))
-    chains, each = draws["a"].shape
-    for rank, name in enumerate(name for name in SYMBOLS if name in draws):
-        # Below each other in the empty corner, which shall not grow for them.
-        words = grid[0, -1].text(
-            1, 1 - 0.25 * rank, SYMBOLS[name], transform=grid[0, -1].transAxes, ha="right", va="top", fontsize=8.5
-        )
-        words.set_in_layout(False)
-    return finish(
-        figure,
-        calibration.campaign.metadata,
-        title=f"Population, {chains} × {each} draws",
-        lines=cautions(figure, calibration),
-    )
-
-
-def _marginal(ax: Axes, values: np.ndarray, parameter: Parameter) -> None:
-    x = _span(values, parameter)
-    y = density(values, x, positive=parameter.positive, log=parameter.log)
-    ax.fill_between(x, y, color=SKY, alpha=0.5, linewidth=0)
-    ax.plot(x, y, color=BLUE, linewidth=1.0)
-    ax.set_ylim(0, 1.08)
-    ax.set_yticks([])
-    ax.spines["left"].set_visible(False)
-    ax.set_title(with_sd(float(values.mean()), float(values.std())), fontsize=7, loc="center")
-
-
-def _span(values: np.ndarray, parameter: Parameter, points: int = 200) -> np.ndarray:
-    """Where the density of draws is drawn."""
-    low, high = np.quantile(values, [0.001, 0.999])
-    margin = 0.15 * (high - low)
-    return np.linspace(0.0 if parameter.positive else low - margin, high + margin, points)
-
-
-def prior_of(calibration: BayesCalibration) -> dict[str, np.ndarray]:
-    """Draws of the population's prior, by the names and in the units of the figures."""
-    from ..calibrate.arviz import prior_draws
-
-    low, high = np.asarray(calibration.fit.numbers.a)[2:]
-    found = prior_draws(calibration.model.chosen_priors, float(low), float(high), (1, PRIOR_DRAWS), 0)
-    for vector in ("mu", "tau"):
-        found |= {f"{vector}_{name}": found[vector][..., j] for j, name in enumerate(("C1", "C3", "C5"))}
-    return {name: found[name] * p.scale for name, p in PARAMETERS.items() if name in found}
-
-
-@styled
-def plot_prior_posterior(calibration: BayesCalibration) -> Figure:
-    """Prior and posterior density of every parameter of the population, with the paper's value.
-
-    Two panels per parameter: over the range of the prior, where a narrow posterior is what the data added, and
-    enlarged to the posterior, where a level prior is one that says nothing there. Each density is divided by its peak.
-    The paper has no value for the noise, the scatter of modulus and `a`, and for other forms of unloading no modulus.
-    """
-    posterior, prior = _population(calibration), prior_of(calibration)
-    paper = {row["quantity"]: row["paper"] for row in compare_with_paper(calibration)}
-    rows = -(-len(posterior) // 2)
-    figure = new_figure(9.6, 1.5 * rows + 1.0)
-    grid = figure.subplots(rows, 4, squeeze=False)
-    for ax in grid.ravel()[2 * len(posterior) :]:
-        ax.set_axis_off()
-    for rank, (name, values) in enumerate(posterior.items()):
-        parameter = PARAMETERS[name]
-        whole, near = grid[rank // 2, 2 * (rank % 2) : 2 * (rank % 2) + 2]
-        said = paper.get(name)
-        mark = None if said is None else said * parameter.scale
-        _prior_posterior(whole, near, prior[name], values, mark, parameter)
-        if rank % 2 == 0:
-            whole.set_ylabel("density / peak [-]")
-    handles = [
-        Patch(color=PALE, alpha=0.7, linewidth=0, label="prior"),
-        Patch(color=SKY, alpha=0.7, linewidth=0, label="posterior"),
-        Line2D([], [], color=VERMILION, dashes=(3, 1.5), label="paper"),
-    ]
-    return finish(
-        figure,
-        calibration.campaign.metadata,
-        title="What the data added: over the prior's range, and enlarged",
-        lines=cautions(figure, calibration),
-        handles=handles,
-    )
-
-
-def _prior_posterior(
-    whole: Axes, near: Axes, prior: np.ndarray, posterior: np.ndarray, paper: float | None, parameter: Parameter
-) -> None:
-    close = _span(posterior, parameter)
-    far = _span(flat_draws(prior), parameter)
-    ends = [far[0], far[-1], close[0], close[-1], *([] if paper is None else [paper])]
-    # The posterior's own points as well: on the prior's range it may be narrower than one step.
-    far = np.unique(np.concatenate([np.linspace(min(ends), max(ends), 300), close]))
-    reach = close[-1] - close[0]
-    inside = paper is not None and close[0] - reach <= paper <= close[-1] + reach
-    if inside and not close[0] <= paper <= close[-1]:
-        close = np.linspace(min(close[0], paper - 0.1 * reach), max(close[-1], paper + 0.1 * reach), 300)
-    options = {"positive": parameter.positive, "log": parameter.log}
-    everywhere = density(prior, far, **options)
-    for ax, x, before in (
-        (whole, far, everywhere),
-        (near, close, enlarged_prior(prior, far, everywhere, close, parameter)),
-    ):
-        ax.fill_between(x, before, color=PALE, alpha=0.5, linewidth=0)
-        ax.plot(x, before, color=GREY, linewidth=1.0)
-        after = density(posterior, x, **options)
-        ax.fill_between(x, after, color=SKY, alpha=0.5, linewidth=0)
-        ax.plot(x, after, color=BLUE, linewidth=1.1)
-        margin = 0.02 * (x[-1] - x[0])
-        ax.set_xlim(x[0] - margin, x[-1] + margin)
-        ax.set_ylim(0, 1.1)
-        ax.set_yticks([0, 1])
-        ax.xaxis.set_major_locator(MaxNLocator(3))
-        ax.set_xlabel(parameter.label)
-        if paper is not None and x[0] <= paper <= x[-1]:
-            ax.axvline(paper, color=VERMILION, dashes=(3, 1.5), linewidth=1.3)
-    near.set_yticks([])
-    near.set_title(with_sd(float(posterior.mean()), float(posterior.std())), fontsize=8, color=BLACK)
-    if paper is not None and not inside:
-        note(near, f"paper {paper:.4g}", place="upper left" if paper < close[0] else "upper right")
-
-
-ENOUGH_DRAWS = 100
-
-
-def enlarged_prior(
-    prior: np.ndarray, far: np.ndarray, everywhere: np.ndarray, close: np.ndarray, parameter: Parameter
-) -> np.ndarray:
-    """The prior's density where the posterior is.
-
-    That of a spread may pile up at 0 far within one kernel of all draws: then from those near by alone, over the
-    largest value there.
-    """
-    row = flat_draws(prior)
-    beside = row[row <= 2 * close[-1]]
-    if parameter.positive and len(beside) >= ENOUGH_DRAWS:
-        return density(beside, close, positive=True)
-    return np.interp(close, far, everywhere)
-
-
-@of_its_kind
+@style.of_its_kind
 def posterior_figures(calibration: BayesCalibration) -> dict[str, Figure]:
     """Every figure of the posterior, by the stem of its file's name.
 
@@ -271,3 +73,380 @@ def posterior_figures(calibration: BayesCalibration) -> dict[str, Figure]:
         "bands": plot_bands(calibration),
         "new_particle": plot_new_particle(calibration),
     }
+
+
+@style.of_its_kind
+def least_squares_figures(calibration: LeastSquaresCalibration) -> dict[str, Figure]:
+    """Every figure of the joint least squares, by the stem of its file's name.
+
+    Returns:
+        `whitened`, `fits`, `estimates`.
+    """
+    return {
+        "whitened": plot_whitened(calibration),
+        "fits": plot_fits(calibration),
+        "estimates": plot_estimates(calibration),
+    }
+
+
+# ---- the population --------------------------------------------------------------------------------------------------
+
+
+def _scaled(named: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Draws in the order and the units of the figures."""
+    return {name: named[name] * p.scale for name, p in PARAMETERS.items() if name in named}
+
+
+def density(draws: np.ndarray, x: np.ndarray, *, positive: bool = False, log: bool = False) -> np.ndarray:
+    """Kernel density of draws at x, over its largest value there.
+
+    Args:
+        draws: any shape.
+        x: where, in order.
+        positive: draws cannot be negative and may pile up at 0, where the kernel is reflected.
+        log: draws are positive and skewed: the kernel is even in the logarithm.
+    """
+    from scipy.stats import gaussian_kde
+
+    row = _row(draws)
+    kernel = gaussian_kde(np.log(row) if log else row)
+    if log:
+        at = np.maximum(x, 1e-300)
+        values = np.where(x > 0, kernel(np.log(at)) / at, 0.0)
+    else:
+        values = np.where(x >= 0, kernel(x) + kernel(-x), 0.0) if positive else kernel(x)
+    return values / max(float(values.max()), 1e-300)
+
+
+def _row(draws: np.ndarray) -> np.ndarray:
+    """Draws of all chains in one row, thinned."""
+    row = np.asarray(draws, float).ravel()
+    return row[style.every(len(row), style.SETTINGS.density_draws)]
+
+
+def _span(values: np.ndarray, parameter: Parameter, points: int = 200) -> np.ndarray:
+    """Where the density of draws is drawn."""
+    low, high = np.quantile(values, [0.001, 0.999])
+    margin = 0.15 * (high - low)
+    return np.linspace(0.0 if parameter.positive else low - margin, high + margin, points)
+
+
+def _area(ax: Axes, x: np.ndarray, y: np.ndarray, fill: str, edge: str) -> None:
+    ax.fill_between(x, y, color=fill, alpha=0.5, linewidth=0)
+    ax.plot(x, y, color=edge, linewidth=1.0)
+
+
+def with_sd(value: float, sd: float) -> str:
+    """A number and its standard deviation, to two digits of the latter."""
+    if not (np.isfinite(sd) and sd > 0):
+        return f"{value:.4g}"
+    digits = 1 - int(np.floor(np.log10(sd)))
+    if digits > 6:
+        return f"{value:.2g} ± {sd:.1g}"
+    return f"{value:.{max(digits, 0)}f} ± {sd:.{max(digits, 0)}f}"
+
+
+@style.styled
+def plot_pairs(calibration: BayesCalibration) -> Figure:
+    """Every pair of the population's parameters, one dot per draw; on the diagonal each alone, with mean and sd.
+
+    Shape parameter `a` [-], effective modulus [GPa], and mean and standard deviation of log C1, C3, C5 [-], with the
+    scatter of modulus and `a` where they may scatter. A slanting cloud is a combination that the data know better than
+    its parts.
+    """
+    draws = _scaled(calibration.named_population())
+    draws.pop("noise_factor", None)
+    names = list(draws)
+    size = len(names)
+    figure = style.new_figure(1.05 * size + 1.0, 1.0 * size + 1.0)
+    grid = figure.subplots(size, size, squeeze=False, sharex="col")
+    shown = style.every(draws["a"].size, style.SETTINGS.dots)
+    dots: style.Look = {"color": style.BLUE, "markersize": 2.5, "markeredgewidth": 0, "alpha": 0.45}
+    for i, name in enumerate(names):
+        values, parameter = draws[name].ravel(), PARAMETERS[name]
+        for j, ax in enumerate(grid[i]):
+            if j > i:
+                ax.set_axis_off()
+                continue
+            if j == i:
+                x = _span(values, parameter)
+                _area(ax, x, density(values, x, positive=parameter.positive, log=parameter.log), style.SKY, style.BLUE)
+                ax.set_ylim(0, 1.08)
+                ax.set_yticks([])
+                ax.spines["left"].set_visible(False)
+                ax.set_title(with_sd(float(values.mean()), float(values.std())), fontsize=7, loc="center")
+            else:
+                ax.plot(draws[names[j]].ravel()[shown], values[shown], ".", **dots)
+                ax.yaxis.set_major_locator(MaxNLocator(3))
+                ax.tick_params(labelleft=j == 0)
+                ax.set_ylabel(parameter.label if j == 0 else "")
+            ax.xaxis.set_major_locator(MaxNLocator(3))
+            ax.tick_params(axis="x", labelrotation=90)
+            ax.set_xlabel(PARAMETERS[names[j]].label if i == size - 1 else "")
+    figure.align_labels(list(grid.ravel()))
+    corner = grid[0, -1]
+    for rank, meaning in enumerate(filter(None, (PARAMETERS[name].meaning for name in names))):
+        # Below each other in the empty corner, which shall not grow for them.
+        place: style.Look = {"transform": corner.transAxes, "ha": "right", "va": "top", "fontsize": 8.5}
+        corner.text(1, 1 - 0.25 * rank, meaning, **place).set_in_layout(False)
+    chains, each = draws["a"].shape
+    title, lines = f"Population, {chains} × {each} draws", style.cautions(figure, calibration)
+    return style.finish(figure, calibration.campaign.metadata, title=title, lines=lines)
+
+
+def prior_of(calibration: BayesCalibration) -> dict[str, np.ndarray]:
+    """Draws of the population's prior, by the names and in the units of the figures."""
+    low, high = np.asarray(calibration.fit.numbers.a)[2:].tolist()
+    found = prior_draws(calibration.model.chosen_priors, low, high, (1, style.SETTINGS.density_draws), 0)
+    for vector in ("mu", "tau"):
+        found |= {f"{vector}_{name}": found[vector][..., j] for j, name in enumerate(COEFFICIENTS)}
+    return _scaled(found)
+
+
+@style.styled
+def plot_prior_posterior(calibration: BayesCalibration) -> Figure:
+    """Prior and posterior density of every parameter of the population, with the paper's value.
+
+    Two panels per parameter: over the range of the prior, where a narrow posterior is what the data added, and
+    enlarged to the posterior, where a level prior is one that says nothing there. Each density is divided by its peak.
+    The paper has no value for the noise, the scatter of modulus and `a`, and for other forms of unloading no modulus.
+    """
+    posterior, prior = _scaled(calibration.named_population()), prior_of(calibration)
+    paper = {row["quantity"]: row["paper"] for row in compare_with_paper(calibration)}
+    rows = -(-len(posterior) // 2)
+    figure = style.new_figure(9.6, 1.5 * rows + 1.0)
+    grid = figure.subplots(rows, 4, squeeze=False)
+    for ax in grid.ravel()[2 * len(posterior) :]:
+        ax.set_axis_off()
+    for rank, ((name, values), (whole, near)) in enumerate(zip(posterior.items(), grid.reshape(-1, 2), strict=False)):
+        said = paper.get(name)
+        mark = None if said is None else said * PARAMETERS[name].scale
+        _prior_posterior(whole, near, prior[name], values, mark, PARAMETERS[name])
+        whole.set_ylabel("density / peak [-]" if rank % 2 == 0 else "")
+    handles = [
+        Patch(color=style.PALE, alpha=0.7, linewidth=0, label="prior"),
+        Patch(color=style.SKY, alpha=0.7, linewidth=0, label="posterior"),
+        Line2D([], [], label="paper", **_PAPER),
+    ]
+    title, lines = "What the data added: over the prior's range, and enlarged", style.cautions(figure, calibration)
+    return style.finish(figure, calibration.campaign.metadata, title=title, lines=lines, handles=handles)
+
+
+def _prior_posterior(
+    whole: Axes, near: Axes, prior: np.ndarray, posterior: np.ndarray, paper: float | None, parameter: Parameter
+) -> None:
+    close, far = _span(posterior, parameter), _span(_row(prior), parameter)
+    ends = [far[0], far[-1], close[0], close[-1], *([] if paper is None else [paper])]
+    # The posterior's own points as well: on the prior's range it may be narrower than one step.
+    far = np.unique(np.concatenate([np.linspace(min(ends), max(ends), 300), close]))
+    reach = close[-1] - close[0]
+    inside = paper is not None and close[0] - reach <= paper <= close[-1] + reach
+    if inside and not close[0] <= paper <= close[-1]:
+        close = np.linspace(min(close[0], paper - 0.1 * reach), max(close[-1], paper + 0.1 * reach), 300)
+    options: style.Look = {"positive": parameter.positive, "log": parameter.log}
+    everywhere = density(prior, far, **options)
+    enlarged = enlarged_prior(prior, far, everywhere, close, parameter)
+    for ax, x, before in ((whole, far, everywhere), (near, close, enlarged)):
+        _area(ax, x, before, style.PALE, style.GREY)
+        _area(ax, x, density(posterior, x, **options), style.SKY, style.BLUE)
+        margin = 0.02 * (x[-1] - x[0])
+        ax.set_xlim(x[0] - margin, x[-1] + margin)
+        ax.set_ylim(0, 1.1)
+        ax.set_yticks([0, 1])
+        ax.xaxis.set_major_locator(MaxNLocator(3))
+        ax.set_xlabel(parameter.label)
+        if paper is not None and x[0] <= paper <= x[-1]:
+            ax.axvline(paper, linewidth=1.3, **_PAPER)
+    near.set_yticks([])
+    near.set_title(with_sd(float(posterior.mean()), float(posterior.std())), fontsize=8, color=style.BLACK)
+    if paper is not None and not inside:
+        style.note(near, f"paper {paper:.4g}", place="upper left" if paper < close[0] else "upper right")
+
+
+def enlarged_prior(
+    prior: np.ndarray, far: np.ndarray, everywhere: np.ndarray, close: np.ndarray, parameter: Parameter
+) -> np.ndarray:
+    """The prior's density where the posterior is.
+
+    That of a spread may pile up at 0 far within one kernel of all draws: then from those near by alone, over the
+    largest value there.
+    """
+    row = _row(prior)
+    beside = row[row <= 2 * close[-1]]
+    if parameter.positive and len(beside) >= style.SETTINGS.near_draws:
+        return density(beside, close, positive=True)
+    return np.interp(close, far, everywhere)
+
+
+# ---- the particles ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class CoefficientTable:
+    """C1, C3, C5 of N particles [-], and of the population.
+
+    Attributes:
+        centre: best value or median, shape (N, 3).
+        wide: ends of the 95 % interval, shape (2, N, 3); NaN where there is none.
+        narrow: ends of the 50 % interval, or None.
+        median: of the population, shape (3,).
+        spread: interval of 95 % of the particles, shape (2, 3).
+    """
+
+    centre: np.ndarray
+    wide: np.ndarray
+    narrow: np.ndarray | None
+    median: np.ndarray
+    spread: np.ndarray
+
+
+def posterior_table(calibration: BayesCalibration) -> CoefficientTable:
+    """Medians and intervals of the posterior; the spread includes what is not known of the population."""
+    q = np.quantile(np.asarray(calibration.C), [0.025, 0.25, 0.5, 0.75, 0.975], axis=(0, 1))
+    mu, tau = (np.asarray(v).reshape(-1, 3) for v in (calibration.population.mu, calibration.population.tau))
+    new = mu[None] + tau[None] * np.random.default_rng(0).standard_normal((10, *mu.shape))
+    spread = np.exp(np.quantile(new.reshape(-1, 3), [0.025, 0.975], axis=0))
+    return CoefficientTable(q[2], q[[0, 4]], q[[1, 3]], np.exp(np.median(mu, axis=0)), spread)
+
+
+def least_squares_table(calibration: LeastSquaresCalibration) -> CoefficientTable:
+    """Estimates and 95 % intervals of the joint least squares."""
+    found = [[entry[n] for n in COEFFICIENTS] for entry in calibration.to_json()["particles"] if entry["kept"]]
+    centre = np.array([[one["value"] for one in row] for row in found], float)
+    wide = np.array([[one["interval_95"] or [np.nan, np.nan] for one in row] for row in found], float)
+    mu, tau = np.asarray(calibration.solution.value.shared)[2:], np.asarray(calibration.settings.tau)
+    spread = np.exp(mu + 1.96 * np.array([[-1.0], [1.0]]) * tau)
+    return CoefficientTable(centre, np.moveaxis(wide, -1, 0), None, np.exp(mu), spread)
+
+
+def _rows(ax: Axes, table: CoefficientTable, j: int, chosen: np.ndarray, y: np.ndarray, *, labelled: bool) -> None:
+    thick, size = (3.2, 4.0) if labelled else (1.2, 1.5)
+    ax.axvspan(*table.spread[:, j], color=style.ORANGE, alpha=0.22, linewidth=0, zorder=0)
+    ax.axvline(table.median[j], color=style.VERMILION, linewidth=1.1, zorder=1)
+    ax.hlines(
+        y, *table.wide[:, chosen, j], color=style.BLUE if table.narrow is None else style.SKY, linewidth=1.1, zorder=2
+    )
+    if table.narrow is not None:
+        ax.hlines(y, *table.narrow[:, chosen, j], color=style.BLUE, linewidth=thick, zorder=3)
+    ax.plot(table.centre[chosen, j], y, "o", color=style.BLACK, markersize=size, markeredgewidth=0, zorder=4)
+    ax.set_xlabel(f"{_SYMBOLS[j]} [-]")
+    ax.locator_params(axis="x", nbins=5)
+    ax.use_sticky_edges = False  # the band's ends are no limits of the axis
+    ax.margins(x=0.04)
+    # How wide intervals usually are: they may be narrower than their dots.
+    half = (table.wide[1] - table.wide[0])[:, j] / (2 * table.centre[:, j])
+    half = half[np.isfinite(half)]
+    typical = f"typical 95 % interval: ± {100 * np.median(half):.2g} %" if len(half) else "no intervals"
+    ax.set_title(typical, fontsize=8)
+
+
+def draw_forest(table: CoefficientTable, labels: Sequence[str]) -> tuple[Figure, list[Line2D | Patch]]:
+    """Three panels of intervals, and the handles of their legend."""
+    count = len(labels)
+    labelled = count <= style.SETTINGS.labelled
+    figure = style.new_figure(8.2, max(2.4, 0.19 * count + 1.3) if labelled else 6.0)
+    panels = figure.subplots(1, 3, sharey=True)
+    for j, ax in enumerate(panels):
+        chosen, y = np.arange(count), np.arange(float(count))
+        if not labelled:
+            chosen = np.argsort(table.centre[:, j], kind="stable")[style.spread_over(count, style.SETTINGS.rows)]
+            y = np.linspace(0, 1, len(chosen))
+        _rows(ax, table, j, chosen, y, labelled=labelled)
+    if labelled:
+        panels[0].set_yticks(np.arange(count), labels)
+        panels[0].set_ylim(count - 0.4, -0.6)
+    else:
+        panels[0].set_ylim(-0.02, 1.02)
+        panels[0].set_ylabel("share of particles with a smaller value [-]")
+    alone = table.narrow is None
+    handles: list[Line2D | Patch] = [
+        Line2D([], [], color=style.BLACK, marker="o", linestyle="", label="estimate" if alone else "median"),
+        *([] if alone else [Line2D([], [], color=style.BLUE, linewidth=3.2, label="50 %")]),
+        Line2D([], [], color=style.BLUE if alone else style.SKY, label="95 %"),
+        Line2D([], [], color=style.VERMILION, label="population median"),
+        Patch(color=style.ORANGE, alpha=0.22, linewidth=0, label="95 % of the population"),
+    ]
+    return figure, handles
+
+
+def _forest(calibration: BayesCalibration | LeastSquaresCalibration, table: CoefficientTable) -> Figure:
+    names = style.particle_labels(calibration.campaign.particles)
+    labels = [names[i] for i in calibration.selection.kept]
+    figure, handles = draw_forest(table, labels)
+    title, count = "Coefficients of the particles", len(labels)
+    if count > style.SETTINGS.labelled:
+        shown = f"{style.SETTINGS.rows} of {count}" if count > style.SETTINGS.rows else f"{count}"
+        title += f", {shown} particles, each panel in its own order"
+    lines = style.cautions(figure, calibration)
+    return style.finish(figure, calibration.campaign.metadata, title=title, lines=lines, handles=handles)
+
+
+@style.styled
+def plot_forest(calibration: BayesCalibration) -> Figure:
+    """C1, C3, C5 [-] of every particle: median, 50 % and 95 % interval of the posterior.
+
+    The line is the population's median, the band holds 95 % of its particles (uncertainty of the population included).
+    Up to 40 particles have a row each, in the campaign's order. Of more, at most 200 are shown, in each panel from the
+    smallest to the largest, so that the dots also draw the distribution function of the coefficient.
+    """
+    return _forest(calibration, posterior_table(calibration))
+
+
+@style.styled
+def plot_estimates(calibration: LeastSquaresCalibration) -> Figure:
+    """C1, C3, C5 [-] of every particle by joint least squares, with 95 % error bars.
+
+    Line and band are the population's median and the interval of 95 % of its particles. Particles stand as in
+    `plot_forest`. Without error bars where the data leave the coefficients open.
+    """
+    return _forest(calibration, least_squares_table(calibration))
+
+
+def shrinkage(calibration: BayesCalibration) -> tuple[np.ndarray, np.ndarray]:
+    """log C1, C3, C5 of each particle alone, under the most probable a, and posterior means, both of shape (N, 3)."""
+    fit = calibration.fit
+    a = float(population_at(fit.mode, fit.numbers, calibration.model.scatter).a)
+    eta = 1 + a * np.asarray(calibration.selection.tests.flatness)
+    alone = np.asarray(fit.individual.latent)[:, :3] - np.log(eta)[:, None]
+    return alone, np.log(np.asarray(calibration.C)).mean(axis=(0, 1))
+
+
+@style.styled
+def plot_shrinkage(calibration: BayesCalibration) -> Figure:
+    """What each particle gains from the others: log C1, C3, C5 [-] fitted alone, and in the posterior.
+
+    An arrow leads from the best fit of the particle's own curve (circle; its shape factor under the most probable `a`)
+    to its posterior mean (dot). The cross is the mean of the population, the ellipse holds 95 % of it. What a curve
+    says badly moves far towards the cross, what it says well stays.
+    """
+    alone, together = shrinkage(calibration)
+    mu = np.asarray(calibration.population.mu).reshape(-1, 3).mean(axis=0)
+    tau = np.asarray(calibration.population.tau).reshape(-1, 3).mean(axis=0)
+    many, move = len(alone) > style.SETTINGS.many_arrows, together - alone
+    ring: style.Look = {"color": style.SKY, "markerfacecolor": "white", "marker": "o", "linestyle": ""}
+    dot: style.Look = {"color": style.BLUE, "marker": "o", "linestyle": ""}
+    cross: style.Look = {"color": style.VERMILION, "marker": "+", "linestyle": ""}
+    shade: style.Look = {"color": style.ORANGE, "alpha": 0.22, "linewidth": 0}
+    figure = style.new_figure(9.6, 3.7)
+    for ax, (i, j) in zip(figure.subplots(1, 3), ((0, 1), (2, 1), (0, 2)), strict=True):
+        # Of two normal numbers 95 % lie within 2.45 standard deviations.
+        ax.add_patch(Ellipse((mu[i], mu[j]), 2 * 2.45 * tau[i], 2 * 2.45 * tau[j], **shade))
+        ax.quiver(
+            alone[:, i], alone[:, j], move[:, i], move[:, j], angles="xy", scale_units="xy", scale=1, color=style.GREY,
+            width=0.0035, headwidth=5, headlength=6, headaxislength=5.5, alpha=0.4 if many else 0.8, zorder=2,
+        )  # fmt: skip
+        ax.plot(alone[:, i], alone[:, j], markersize=2.5 if many else 4.5, zorder=3, **ring)
+        ax.plot(together[:, i], together[:, j], markersize=2 if many else 3.5, zorder=4, **dot)
+        ax.plot(mu[i], mu[j], markersize=11, markeredgewidth=1.8, zorder=5, **cross)
+        ax.set_xlabel(f"log {_SYMBOLS[i]} [-]")
+        ax.set_ylabel(f"log {_SYMBOLS[j]} [-]")
+        ax.locator_params(nbins=5)
+        ax.margins(0.06)
+    handles: list[Line2D | Patch] = [
+        Line2D([], [], label="particle alone", **ring),
+        Line2D([], [], markersize=3.5, label="posterior mean", **dot),
+        Line2D([], [], markersize=9, label="population mean", **cross),
+        Patch(label="95 % of the population", **shade),
+    ]
+    title, lines = "Each particle alone, and among the others", style.cautions(figure, calibration)
+    return style.finish(figure, calibration.campaign.metadata, title=title, lines=lines, handles=handles)

@@ -1,10 +1,13 @@
-"""The look that all figures share: colours, font sizes, layout, the note on simulated data."""
+"""What all figures share: settings, colours, layout, text from outside made fit to be drawn, and writing the files."""
 
 from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable, Sequence
+import textwrap
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, get_type_hints
 
 import numpy as np
@@ -14,12 +17,59 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
+from matplotlib.font_manager import findfont, get_font
 
 from .. import arguments
-from ..calibrate import PaperCalibration, ShapeFit
-from ..campaign import Campaign, Metadata, check_campaign, of_each_particle
-from ..geometry import plastic_shape_factor
-from .text import FONT, is_simulated
+from .._errors import InputError
+from ..calibrate import BayesCalibration, LeastSquaresCalibration, PaperCalibration
+from ..campaign import Campaign, Metadata, check_campaign
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How much a figure draws.
+
+    Attributes:
+        panels, columns: most particles in a grid of curves, and how many stand in a row.
+        page, page_columns: the same on a page of all particles.
+        gap_panels: most tests whose residuals are shown over time.
+        curve_points: about so many points of a curve are drawn, so that dots stay apart.
+        mean_markers: about so many symbols on a mean curve.
+        thin_curves: of more curves in one panel, lines are thin and faint.
+        points: no more residuals than these are drawn; a histogram beside counts them all.
+        small_points: of more points in a panel, dots are small and faint.
+        labelled: so many particles have a labelled row each; of more an ordered sample is shown without labels.
+        rows: size of that sample.
+        many_arrows: of more particles, arrows and dots are small and faint.
+        dots: draws in a cloud of dots.
+        density_draws: no more draws go into one density.
+        near_draws: from so many draws near a posterior on, the prior's density there is made from these alone.
+        new_draws, single_draws: curves of a new particle in its band, and of these drawn as lines.
+        alike: mechanisms in the table of those that look alike, members of the sets aside.
+    """
+
+    panels: int = 12
+    columns: int = 3
+    page: int = 20
+    page_columns: int = 4
+    gap_panels: int = 6
+    curve_points: int = 100
+    mean_markers: int = 32
+    thin_curves: int = 30
+    points: int = 20_000
+    small_points: int = 8000
+    labelled: int = 40
+    rows: int = 200
+    many_arrows: int = 100
+    dots: int = 800
+    density_draws: int = 2000
+    near_draws: int = 100
+    new_draws: int = 1000
+    single_draws: int = 6
+    alike: int = 10
+
+
+SETTINGS = Settings()
 
 BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILION, PURPLE = (
     "#000000", "#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7",
@@ -34,6 +84,8 @@ SHAPE_FACTOR = "shape factor $\\eta_p$ [-]"
 FORCE = "force $F$ [mN]"
 DISPLACEMENT = "displacement $\\gamma$ [µm]"
 
+FONT = "DejaVu Sans"
+"""Comes with matplotlib, so that a figure looks the same everywhere."""
 SMALL = 7.5
 RC: dict[Any, Any] = {
     "font.family": FONT,
@@ -67,6 +119,10 @@ _MADE_BY = {
 }
 
 
+type Look = dict[str, Any]
+"""Keywords of what is drawn."""
+
+
 def of_its_kind[**P, R](function: Callable[P, R]) -> Callable[P, R]:
     """Decorator: what is not of the kind of the function's first argument is refused in words, before anything else."""
 
@@ -93,6 +149,94 @@ def styled[**P, R](function: Callable[P, R]) -> Callable[P, R]:
     """Decorator: the function runs under these settings, leaves the caller's as they were, and checks what it draws."""
     return of_its_kind(rc_context(RC)(function))
 
+
+@rc_context(RC)
+def save_figures(figures: Mapping[str, Figure], directory: str | Path, *, dpi: int = 150) -> list[Path]:
+    """Write figures as `<stem>.png` into a directory that exists.
+
+    Args:
+        figures: figures by stem, as `paper_figures` gives them.
+        directory: where to; files of these names are overwritten.
+        dpi: resolution [dots per inch].
+
+    Returns:
+        The files, in the order of the figures.
+    """
+    remedy = "Give a dictionary of figures by stem, as mcc_jax.plots.paper_figures makes it."
+    arguments.instance(figures, Mapping, "figures", remedy)
+    for stem, figure in figures.items():
+        arguments.instance(figure, Figure, f"the figure {stem!r}", remedy)
+    folder = arguments.file_path(directory, "directory")
+    dpi = arguments.whole(dpi, "dpi", least=1)
+    if not folder.is_dir():
+        raise InputError("no such folder", file=folder, remedy="Make it first.")
+    files = []
+    for stem, figure in figures.items():
+        files.append(folder / f"{stem}.png")
+        figure.savefig(files[-1], format="png", dpi=dpi)
+    return files
+
+
+# ---- text from outside -----------------------------------------------------------------------------------------------
+
+
+def plain(text: str, longest: int = 24) -> str:
+    """Any text as one short line that matplotlib draws as it stands.
+
+    White space and characters that do not print become single blanks, characters that the font lacks the replacement
+    character, a long text loses its middle, and `$` is escaped, which would begin mathematics.
+    """
+    font = get_font(findfont(FONT))
+    visible = "".join(c if c.isprintable() else " " for c in text)
+    drawn = "".join(
+        c if font.get_char_index(ord(c)) else "\N{REPLACEMENT CHARACTER}" for c in " ".join(visible.split())
+    )
+    if len(drawn) > longest:
+        head = longest // 2
+        drawn = drawn[:head].rstrip() + "…" + drawn[len(drawn) - (longest - head - 1) :].lstrip()
+    return drawn.replace("$", r"\$")
+
+
+def particle_labels(names: Sequence[str], longest: int = 24) -> list[str]:
+    """Names of particles for a figure, all different.
+
+    A bare number becomes "particle 7"; where two look the same, or part cannot be drawn, the position in the campaign
+    is added.
+    """
+    labels = [f"particle {name}" if name.isdecimal() and len(name) < 8 else plain(name, longest) for name in names]
+    repeated = {label for label in labels if labels.count(label) > 1} if len(set(labels)) < len(labels) else set()
+    return [
+        f"{label} (no. {i})".strip()
+        if not label or label in repeated or "\N{REPLACEMENT CHARACTER}" in label
+        else label
+        for i, label in enumerate(labels, start=1)
+    ]
+
+
+def is_simulated(metadata: Metadata) -> bool:
+    """Whether the metadata say that nobody measured these data."""
+    return "simulation" in metadata.other or "not a measurement" in (metadata.provenance or "")
+
+
+def wrapped(text: str, figure: Figure) -> list[str]:
+    """A warning as lines below the title of a figure; none for an empty one."""
+    return textwrap.wrap(text[:1].upper() + text[1:], int(figure.get_size_inches()[0] * 14))
+
+
+def cautions(figure: Figure, calibration: BayesCalibration | LeastSquaresCalibration) -> list[str]:
+    """Lines below the title that say why the numbers must not be relied on; none if they may be."""
+    if isinstance(calibration, BayesCalibration):
+        reasons = calibration.failures()
+    else:
+        reasons = [calibration.reason] if calibration.reason else []
+        reasons += [f"the data leave this combination open: {text}" for text in calibration.identifiability.open]
+    if not reasons:
+        return []
+    further = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
+    return wrapped(f"{'' if calibration.converged else 'not converged: '}{plain(reasons[0], 300)}{further}", figure)
+
+
+# ---- layout ----------------------------------------------------------------------------------------------------------
 
 _NOTE_IN, _LEGEND_IN, _TITLE_IN, _LINE_IN = 0.2, 0.3, 0.3, 0.19
 
@@ -164,6 +308,12 @@ def empty(ax: Axes, text: str) -> None:
     ax.set_yticks([])
 
 
+def headroom(ax: Axes, share: float) -> None:
+    """Room above what is drawn for words."""
+    low, high = ax.get_ylim()
+    ax.set_ylim(low, high + share * (high - low))
+
+
 def sequential(values: np.ndarray) -> ScalarMappable:
     """Perceptually uniform colours over the range of the values, short of the brightest, which white would swallow."""
     finite = values[np.isfinite(values)]
@@ -173,17 +323,22 @@ def sequential(values: np.ndarray) -> ScalarMappable:
     return ScalarMappable(Normalize(low, high), ListedColormap(colormaps["viridis"](np.linspace(0, 0.9, 256))))
 
 
-def shape_factors(calibration: PaperCalibration) -> np.ndarray:
-    """eta_p of every particle of the campaign under the calibrated `a` [-], shape (N,)."""
-    return of_each_particle(calibration.campaign.diameters_um, lambda p: plastic_shape_factor(p, calibration.a))
-
-
-def shape_fit(calibration: PaperCalibration) -> ShapeFit:
-    """The fit whose `a` is in the law."""
-    reference = calibration.shape_reference
-    return reference if calibration.objective == "reference" and reference is not None else calibration.shape
-
-
 def faintness(count: int) -> dict[str, float]:
     """Line width and opacity for so many curves in one panel."""
-    return {"linewidth": 1.1, "alpha": 0.9} if count <= 30 else {"linewidth": 0.7, "alpha": 0.55}
+    few = count <= SETTINGS.thin_curves
+    return {"linewidth": 1.1, "alpha": 0.9} if few else {"linewidth": 0.7, "alpha": 0.55}
+
+
+def spread_over(count: int, most: int) -> np.ndarray:
+    """Positions of at most so many of `count` things, spread evenly over them, first and last included."""
+    return np.unique(np.round(np.linspace(0, count - 1, min(most, count))).astype(int))
+
+
+def every(count: int, most: int) -> slice:
+    """Every so manieth of `count` things, so that at most `most` are left."""
+    return slice(None, None, max(1, -(-count // most)))
+
+
+def shape_factors(calibration: PaperCalibration | BayesCalibration | LeastSquaresCalibration) -> np.ndarray:
+    """eta_p of every particle of the campaign as the calibration states it [-], shape (N,); NaN where it does not."""
+    return np.array([entry["eta_p"]["value"] for entry in calibration.to_json()["particles"]], float)

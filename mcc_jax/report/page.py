@@ -14,7 +14,7 @@ from .._format import interval, number, percent, probability, with_sd
 from .._version import own_version
 from ..calibrate.curves import KINDS, FittedCurve
 from ..campaign.findings import worst
-from ..plots.text import particle_labels
+from ..plots.style import particle_labels
 from . import pictures as pictures
 from .chart import LOOKS, chart_data, chart_items, chart_scripts
 from .compare import compare

@@ -11,8 +11,7 @@ from matplotlib import rc_context
 
 from ..calibrate.curves import FittedCurve
 from ..calibrate.results import PosteriorDraws
-from ..plots.style import BLACK, BLUE, GREY, ORANGE, PALE, RC, SKY, VERMILION, new_figure
-from ..plots.text import particle_labels
+from ..plots.style import BLACK, BLUE, GREY, ORANGE, PALE, RC, SKY, VERMILION, new_figure, particle_labels
 
 GRID = 30
 """At most so many particles stand in the grid; of more, those with the largest misfit."""

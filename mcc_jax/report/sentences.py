@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from .._format import interval, number, percent, probability
-from ..plots.text import is_simulated
+from ..plots.style import is_simulated
 from .read import Results
 
 METHODS = {

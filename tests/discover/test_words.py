@@ -19,7 +19,6 @@ from mcc_jax.discover.linear_model import GLOBALS, System
 from mcc_jax.effects import clean_record
 from mcc_jax.law import signatures
 from mcc_jax.plots import discovery_figures, save_figures
-from mcc_jax.plots.remaining_gap import leftover
 
 pytestmark = pytest.mark.long  # compiles for long
 
@@ -129,7 +128,7 @@ def test_a_wave_of_the_instrument_is_a_formula_with_its_period(added, pattern, p
     assert told["closure"]["formula"] in told["summary"]
     assert [step["added"] for step in told["gap"]["steps"]] == [None, "formula"]
     assert told["gap"]["closed_fraction"] > 0.8
-    left = leftover(found)
+    left = found.residuals
     assert np.sum(left.white_after**2) < 0.9 * np.sum(left.white_before**2)
     files = save_figures(discovery_figures(found), tmp_path, dpi=80)
     assert {file.stem for file in files} >= {"discovery_before_after", "discovery_gap", "discovery_where"}

@@ -10,10 +10,7 @@ import pytest
 from mcc_jax.campaign import PAPER_DIAMETERS_UM
 from mcc_jax.discover import discover
 from mcc_jax.effects import LIBRARY, find_variant
-from mcc_jax.plots import discovery_figures, plot_gap, plot_ranking, save_figures
-from mcc_jax.plots.discovery import where_map
-from mcc_jax.plots.ranking import likeness
-from mcc_jax.plots.remaining_gap import added_columns, leftover
+from mcc_jax.plots import discovery_figures, plot_before_after, plot_gap, plot_ranking, save_figures
 from mcc_jax.simulate import (
     HiddenEffect,
     Instrument,
@@ -71,49 +68,34 @@ def test_figures_are_drawn_and_settings_stay(found, kind, tmp_path):
 
 
 def test_without_a_base_fit_there_are_no_figures(found):
-    assert discovery_figures(dataclasses.replace(found["frame"], system=None, verdict="FIT_NOT_CONVERGED")) == {}
+    failed = dataclasses.replace(found["frame"], residuals=None, verdict="FIT_NOT_CONVERGED")
+    assert discovery_figures(failed) == {}
     with pytest.raises(ValueError, match="not fitted well enough"):
-        leftover(dataclasses.replace(found["frame"], system=None))
+        plot_before_after(failed)
 
 
 def test_what_is_left_is_less_with_the_effect_and_the_same_without(found):
-    left = leftover(found["frame"])
+    left = found["frame"].residuals
     before, after = (np.sum(white**2) for white in (left.white_before, left.white_after))
     assert after < 0.7 * before
-    assert len(added_columns(found["frame"])) == len(found["frame"].effects)
     for values in (left.before, left.after, left.white_before, left.white_after):
         assert np.isfinite(values).all()
-    # The same chi2 as the linear system finds by its Gram matrices, less what particles and zeros pay to their prior.
     assert after / left.used.sum() < 1.5
-    nothing = leftover(found["null"])
+    nothing = found["null"].residuals
     np.testing.assert_array_equal(nothing.before, nothing.after)
     assert np.sum(nothing.white_before**2) / nothing.used.sum() == pytest.approx(1.0, abs=0.15)
 
 
-def test_an_effect_whose_time_was_fitted_counts_with_that_time(found):
-    """What a refit moved off the grid is no column of the system; the residuals must not leave it out for that."""
-    frame = found["frame"]
-    variant = find_variant("creep")
-    name, middle = variant.nuisances[0].name, variant.nuisances[0].middle
-    numbers = {n.name: n.middle for n in variant.nuisances}
-    creep = dataclasses.replace(frame.effects[0], variant=variant, nuisance=numbers)
-    moved = dataclasses.replace(creep, nuisance=numbers | {name: middle * (1 + 1e-9)})
-    on, off = (leftover(dataclasses.replace(frame, effects=(effect,))) for effect in (creep, moved))
-    assert np.abs(on.after - on.before).max() > 0.01
-    np.testing.assert_allclose(off.after, on.after, atol=1e-6)
-    far = dataclasses.replace(creep, nuisance=numbers | {name: 2.7 * middle})
-    assert np.abs(leftover(dataclasses.replace(frame, effects=(far,))).after - on.after).max() > 1e-4
-
-
 def test_map_has_every_kind_of_segment(found):
-    values = where_map(found["frame"])
-    assert set(values) == {"loading", "hold", "unloading", "reloading"}
-    assert len(values["hold"]) == 1
-    assert np.nanmax(np.abs(values["loading"])) > 4
+    places = found["frame"].places
+    assert {place.segment for place in places} == {"loading", "hold", "unloading", "reloading"}
+    assert sum(place.segment == "hold" for place in places) == 1
+    assert np.nanmax([abs(place.statistic) for place in places if place.segment == "loading"]) > 4
 
 
 def test_likeness_is_a_correlation_with_the_set_first(found):
-    names, both = likeness(found["frame"])
+    names, both = found["frame"].likeness.names, found["frame"].likeness.correlation
+    assert set(names) == set(found["frame"].ranking.names)
     assert names[0] == found["frame"].effects[0].mechanism
     np.testing.assert_allclose(np.diagonal(both), 1.0)
     np.testing.assert_allclose(both, both.T, atol=1e-12)

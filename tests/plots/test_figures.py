@@ -14,6 +14,7 @@ from matplotlib.image import imread
 
 from mcc_jax import plots
 from mcc_jax.calibrate import ElasticFit
+from mcc_jax.calibrate.paper.modulus import collapsed_branches
 from mcc_jax.campaign import Metadata
 from mcc_jax.plots import (
     paper_figures,
@@ -28,10 +29,8 @@ from mcc_jax.plots import (
     plot_residuals,
     save_figures,
 )
-from mcc_jax.plots.curves import adjusted_curve
-from mcc_jax.plots.dimensions import dimension_statistics
-from mcc_jax.plots.elastic import collapsed_branches
-from mcc_jax.plots.law import law_strain, stretches_outside
+from mcc_jax.plots.paper import adjusted_curve, dimension_statistics, law_strain, stretches_outside
+from mcc_jax.plots.style import shape_factors
 
 KINDS = ("paper", "cycles", "two", "dropped", "many")
 QUICK = [pytest.param(kind, marks=pytest.mark.long if kind in ("two", "many", "dropped") else ()) for kind in KINDS]
@@ -336,11 +335,12 @@ def test_a_law_that_misses_the_data_is_said_so(calibrations):
 def test_elastic_branches_collapse(calibration):
     left, right = panels(plot_elastic(calibration))
     fit = calibration.elastic
-    branches = collapsed_branches(calibration)
+    law = calibration.mean_law
+    branches = collapsed_branches(fit, shape_factors(calibration), law.unloading, law.strain_scaling)
     assert len(branches) == len(fit.branches)
     assert len(left.lines) == len(branches) + 2
-    law = line(left, "law, $f(s)$")
-    off = np.concatenate([s - np.interp(-r, -law.get_ydata(), law.get_xdata()) for s, r in branches])
+    curve = line(left, "law, $f(s)$")
+    off = np.concatenate([s - np.interp(-r, -curve.get_ydata(), curve.get_xdata()) for s, r in branches])
     assert np.sqrt(np.mean(off**2)) < 0.03  # the noise of the read-out over a few um of recovery
     np.testing.assert_allclose(right.collections[0].get_offsets()[:, 1], fit.per_branch_MPa / 1e3)
     assert right.lines[0].get_ydata()[0] == pytest.approx(fit.effective_modulus_MPa / 1e3)

@@ -25,9 +25,17 @@ from mcc_jax.plots import (
     posterior_figures,
     save_figures,
 )
-from mcc_jax.plots.forest import CoefficientTable, draw_forest, posterior_table, shrinkage
-from mcc_jax.plots.joint import density, spread_over, with_sd
-from mcc_jax.plots.posterior import PARAMETERS, enlarged_prior
+from mcc_jax.plots.posterior import (
+    PARAMETERS,
+    CoefficientTable,
+    density,
+    draw_forest,
+    enlarged_prior,
+    posterior_table,
+    shrinkage,
+    with_sd,
+)
+from mcc_jax.plots.style import spread_over
 from mcc_jax.simulate import paper_campaign
 
 KINDS = ("paper", *(pytest.param(kind, marks=pytest.mark.long) for kind in ("one", "odd")))

@@ -7,7 +7,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from mcc_jax.campaign import Metadata
-from mcc_jax.plots.text import is_simulated, particle_labels, plain
+from mcc_jax.plots.style import is_simulated, particle_labels, plain
 
 
 def drawn(text):

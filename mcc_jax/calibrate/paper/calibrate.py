@@ -97,15 +97,16 @@ class PaperCalibration(Calibration):
     @property
     def converged(self) -> bool:
         """Whether shape parameter and modulus both converged."""
-        return self._chosen.converged and self.elastic.converged
+        return self.chosen_shape.converged and self.elastic.converged
 
     @property
-    def _chosen(self) -> ShapeFit:
+    def chosen_shape(self) -> ShapeFit:
+        """The fit whose `a` is in the law."""
         return self.shape if self.objective == "full" or self.shape_reference is None else self.shape_reference
 
     def warnings(self) -> list[str]:
         """What a reader of the numbers must know, one sentence each."""
-        notes = [reason for reason in (self._chosen.reason, self.elastic.reason) if reason]
+        notes = [reason for reason in (self.chosen_shape.reason, self.elastic.reason) if reason]
         notes += map(str, self.findings)
         if self.plastic.at_bound:
             notes.append(
@@ -216,8 +217,8 @@ class PaperCalibration(Calibration):
                 "ess_bulk_min": None,
                 "divergences": None,
                 "pareto_k_max": None,
-                "a_objective_value": finite(self._chosen.objective),
-                "a_objective_value_at_zero": finite(self._chosen.objective_at_zero),
+                "a_objective_value": finite(self.chosen_shape.objective),
+                "a_objective_value_at_zero": finite(self.chosen_shape.objective_at_zero),
                 "master_rms_MPa": self.plastic.rms_MPa,
                 "elastic_rms_strain": finite(self.elastic.rms_strain),
                 "elastic_branches": len(self.elastic.branches),

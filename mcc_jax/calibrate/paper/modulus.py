@@ -225,3 +225,26 @@ def fit_effective_modulus(
         return ElasticFit(None, np.nan, np.asarray(alone), branches, False, "strain does not fall on unloading")
     reason = "" if converged else "the optimiser did not meet its tolerances within 200 steps"
     return ElasticFit(modulus, float(rms), np.asarray(alone), branches, bool(converged), reason)
+
+
+def collapsed_branches(
+    fit: ElasticFit, shape_factor: np.ndarray, unloading: Unloading, strain_scaling: StrainScaling
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Recovered over recoverable strain, and stress over peak stress, of every branch under the fitted modulus [-].
+
+    The zero of each branch is the one that the fit leaves free. Arguments as in `fit_effective_modulus`.
+    """
+    if fit.effective_modulus_MPa is None:
+        return []
+    top, deepest, eta = jnp.asarray(
+        [(b.stress_max_MPa, b.strain_max, shape_factor[b.particle]) for b in fit.branches]
+    ).T
+    log_modulus = jnp.log(jnp.asarray(float(fit.effective_modulus_MPa)))
+    delta = np.asarray(recoverable_strain(log_modulus, top, deepest, eta**strain_scaling.power, unloading))
+    ratios = [b.stress_MPa / b.stress_max_MPa for b in fit.branches]
+    # All branches in one call: every new length would be compiled anew.
+    released = np.split(
+        np.asarray(jax.jit(recovery)(jnp.asarray(np.concatenate(ratios)))), np.cumsum([len(r) for r in ratios])[:-1]
+    )
+    recovered = [(b.strain_max - b.strain) / d for b, d in zip(fit.branches, delta, strict=True)]
+    return [(m - np.mean(m - s), r) for m, s, r in zip(recovered, released, ratios, strict=True)]
