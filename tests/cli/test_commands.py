@@ -89,6 +89,7 @@ def test_demo_does_the_whole_job(run, tmp_path):
     expected = {
         "report.html",
         "calibration.json",
+        "calibration.msgpack",
         "discovery.json",
         "campaign",
         "figures",
@@ -123,7 +124,7 @@ def test_simulate_then_calibrate_twice_gives_the_same(run, simulated, tmp_path):
     two = json.loads(text)
     assert text == (out / "calibration.json").read_text(encoding="utf-8")
     # The figures of the first run would contradict what lies beside them now; the user's own file stays.
-    assert set(snapshot(out)) == {"calibration.json", "figures", "figures/mine.png"}
+    assert set(snapshot(out)) == {"calibration.json", "calibration.msgpack", "figures", "figures/mine.png"}
     assert two["figures"] == []
     assert one["runtime_s"] > 0
     for content in (one, two):
@@ -137,6 +138,7 @@ def test_calibrate_into_the_campaigns_own_folder(run, campaign):
     done(run("calibrate", campaign, "--out", campaign, "--no-figures", *reference))
     after = snapshot(campaign)
     content = json.loads(after.pop("calibration.json"))
+    assert after.pop("calibration.msgpack")
     assert after == before
     assert (content["a_objective"], content["reference_particle"]) == ("reference", "B")
     done(run("export", campaign, "--format", "json", "--out", campaign / "law", "--particle", "B"))
@@ -248,7 +250,7 @@ def test_convert_then_calibrate_says_that_the_law_does_not_fit(run, tmp_path):
     result = run("calibrate", tests, "--out", fit, "--method", "paper", "--no-figures")
     assert result.exit_code == (0 if json.loads((fit / "calibration.json").read_text())["converged"] else 3)
     assert "describes these tests badly" in result.stdout
-    assert snapshot(fit).keys() == {"calibration.json"}
+    assert snapshot(fit).keys() == {"calibration.json", "calibration.msgpack"}
 
 
 def test_convert_a_folder_keeps_its_words_short(run, tmp_path):

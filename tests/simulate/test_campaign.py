@@ -80,7 +80,6 @@ def test_displacement_control_reaches_the_asked_stress():
         assert PAPER_PEAK_STRESS_MPA[0] * 0.999 <= stress <= PAPER_PEAK_STRESS_MPA[1] * 1.001
 
 
-
 def test_padding_changes_no_particle():
     # The same particle alone, and beside one whose test is ten times as long.
     plastic = eqx.filter_vmap(Plastic)(jnp.array([7.0, 7.0]), jnp.array([3.0, 3.0]), jnp.array([2.7, 2.7]))
