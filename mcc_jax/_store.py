@@ -169,22 +169,16 @@ def _locked(directory: Path) -> Iterator[None]:
 
 def _work_folder(directory: Path) -> Path:
     for left_over in directory.glob(WORK + "*"):  # of runs that were killed: we hold the lock
-        if (left_over / MOVES).exists():
-            _finish(directory, left_over)
+        new, stale = [], []
+        # All results were complete where this file is; one that cannot be read is not of us, who make it whole.
+        with contextlib.suppress(ValueError, KeyError, TypeError):
+            moves = json.loads(read_regular(left_over / MOVES, LIMITS.result_bytes, ""))
+            new, stale = ([str(name) for name in moves[key]] for key in ("new", "stale"))
+        if not any(Path(name).is_absolute() or ".." in Path(name).parts for name in (*new, *stale)):
+            _move(directory, left_over, new, stale)
         shutil.rmtree(left_over, ignore_errors=True)
     # Inside the folder itself: the same file system for certain, even where the folder is a mount point.
     return Path(tempfile.mkdtemp(prefix=f"{WORK}{os.getpid()}-", dir=directory))
-
-
-def _finish(directory: Path, work: Path) -> None:
-    """Move what a run had still to move when it was killed: all its results were complete."""
-    try:
-        moves = json.loads(read_regular(work / MOVES, LIMITS.result_bytes, ""))
-        new, stale = ([str(name) for name in moves[key]] for key in ("new", "stale"))
-    except (ValueError, KeyError, TypeError):  # not written by us, who make it whole
-        return
-    if not any(Path(name).is_absolute() or ".." in Path(name).parts for name in new + stale):
-        _move(directory, work, new, stale)
 
 
 def _move(directory: Path, work: Path, new: list[str], stale: list[str]) -> None:
@@ -205,7 +199,15 @@ def _place(stage: Stage, work: Path, made: list[Path]) -> None:
             os.fsync(stream.fileno())  # onto the disk, where a full one shows at the latest
         _make((stage.directory / name).parent, made)
     for name in (*new, *stale):
-        _keep(stage.directory / name, work / "old" / name)
+        target, copy = stage.directory / name, work / "old" / name
+        if target.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(target))
+        if target.exists():
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                copy.hardlink_to(target)
+            except OSError:  # not every file system has hard links
+                shutil.copy2(target, copy)
     with _undisturbed():
         try:
             write_file(work / MOVES, lambda stream: stream.write(json.dumps({"new": new, "stale": stale}).encode()))
@@ -218,17 +220,6 @@ def _place(stage: Stage, work: Path, made: list[Path]) -> None:
                 else:
                     (stage.directory / name).unlink(missing_ok=True)
             raise
-
-
-def _keep(target: Path, copy: Path) -> None:
-    if target.is_dir():
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(target))
-    if target.exists():
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            copy.hardlink_to(target)
-        except OSError:  # not every file system has hard links
-            shutil.copy2(target, copy)
 
 
 @contextlib.contextmanager
