@@ -113,8 +113,8 @@ def calibrate(
 ) -> int | None:
     """Fit the law to the tests in the folder CAMPAIGN.
 
-    Writes calibration.json and figures/ into DIR, which may be the campaign's own folder; with bayes also posterior.nc,
-    the posterior as ArviZ data.
+    Writes calibration.json, calibration.msgpack (for mcc_jax.load) and figures/ into DIR, which may be the campaign's
+    own folder; with bayes also posterior.nc, the posterior as ArviZ data.
 
     \b
     Methods:
