@@ -28,7 +28,6 @@ from .campaign import Curve as Curve
 from .campaign import Metadata as Metadata
 from .campaign import Segment as Segment
 from .campaign import adjust as adjust
-from .campaign import batch as batch
 from .campaign import find_segments as find_segments
 from .campaign import read_campaign as read_campaign
 from .campaign import read_tester_file as read_tester_file

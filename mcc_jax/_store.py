@@ -1,4 +1,4 @@
-"""Results appear in a folder whole or not at all, and one run at a time."""
+"""Files appear whole or not at all: one of them, or all results in a folder, where one run writes at a time."""
 
 from __future__ import annotations
 
@@ -11,29 +11,20 @@ import shutil
 import signal
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from ._errors import InputError
-from ._lock import locked
 from .files import LIMITS, read_regular
 
-WORK = ".mcc-jax-work-"
+WORK, LOCK = ".mcc-jax-work-", ".mcc-jax.lock"
 MOVES = "moves.json"
 """In the work folder, while its results are moved into place: which files, so that the next run can finish the job."""
-_CANNOT_WRITE = (
-    errno.EACCES,
-    errno.EPERM,
-    errno.EROFS,
-    errno.ENOSPC,
-    errno.EDQUOT,
-    errno.EFBIG,
-    errno.EIO,
-    errno.ENOTDIR,
-    errno.ENAMETOOLONG,
-)
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_CANNOT_WRITE = (*_FULL, errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO, errno.ENOTDIR, errno.ENAMETOOLONG)
+_NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
 
 
 @dataclass
@@ -67,161 +58,44 @@ def results(directory: Path) -> Iterator[Stage]:
     """
     made: list[Path] = []
     try:
-        try:
-            made = _make(directory)
-            with locked(directory):
-                work = _work_folder(directory)
-                try:
-                    stage = Stage(directory, work / "new")
-                    stage.folder.mkdir()
-                    yield stage
-                    _place(stage, work)
-                finally:
-                    with _undisturbed():  # by the second Ctrl-C of somebody impatient
-                        shutil.rmtree(work, ignore_errors=True)
-        except OSError as error:
-            # Making the folder can fail at a parent of it, writing at anything inside.
-            place = "" if error.filename is None else str(error.filename)
-            if (
-                place and (place.startswith(str(directory)) or str(directory).startswith(place))
-            ) or error.errno in _CANNOT_WRITE:
-                raise _refusal(directory, error) from error
+        _make(directory, made)
+        with _locked(directory):
+            work = _work_folder(directory)
+            try:
+                stage = Stage(directory, work / "new")
+                stage.folder.mkdir()
+                yield stage
+                _place(stage, work, made)
+            finally:
+                with _undisturbed():  # by the second Ctrl-C of somebody impatient
+                    shutil.rmtree(work, ignore_errors=True)
+    except BaseException as error:
+        for folder in reversed(made):
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        told = _told(directory, error)
+        if told is error:
             raise
-        except InputError as error:
-            # Whoever wrote into the stage names it; the user knows only the folder.
-            if error.file is not None and WORK in str(error.file):
-                raise InputError(
-                    error.problem, file=directory, row=error.row, column=error.column, remedy=error.remedy
-                ) from error
-            raise
+        raise told from error
+
+
+def write_file(file: Path, write: Callable[[BinaryIO], object]) -> None:
+    """Write one file, which takes the place of an older one when it is complete and on the disk.
+
+    Args:
+        file: its folder exists.
+        write: writes the contents into the stream it gets.
+    """
+    handle, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.", suffix=".part")
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            write(stream)
+            stream.flush()
+            os.fsync(stream.fileno())
+        Path(name).replace(file)
     except BaseException:
-        for folder in reversed(made):
-            with contextlib.suppress(OSError):
-                folder.rmdir()
+        Path(name).unlink(missing_ok=True)
         raise
-
-
-def _refusal(directory: Path, error: OSError) -> InputError:
-    full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-    why = error.strerror or str(error)
-    if error.errno == errno.EISDIR and error.filename is not None:
-        why = f"{Path(error.filename).name} there is a folder, where a file is to be written"
-    remedy = "Make room and run again" if full else "Give --out a folder you may write to"
-    return InputError(f"results cannot be written there: {why}", file=directory, remedy=remedy)
-
-
-def _make(directory: Path) -> list[Path]:
-    if directory.exists() and not directory.is_dir():
-        raise InputError("is a file, not a folder", file=directory, remedy="Give --out another folder")
-    missing = [directory, *directory.parents]
-    missing = missing[: next((i for i, folder in enumerate(missing) if folder.exists()), len(missing))]
-    made: list[Path] = []
-    try:
-        for folder in reversed(missing):
-            folder.mkdir(exist_ok=True)
-            made.append(folder)
-    except OSError:
-        for folder in reversed(made):
-            with contextlib.suppress(OSError):
-                folder.rmdir()
-        raise
-    return made
-
-
-def _work_folder(directory: Path) -> Path:
-    for left_over in directory.glob(WORK + "*"):  # of runs that were killed: we hold the lock
-        if (left_over / MOVES).exists():
-            _finish(directory, left_over)
-        shutil.rmtree(left_over, ignore_errors=True)
-    # Inside the folder itself: the same file system for certain, even where the folder is a mount point.
-    return Path(tempfile.mkdtemp(prefix=WORK, dir=directory))
-
-
-def _finish(directory: Path, work: Path) -> None:
-    """Move what a run had still to move when it was killed: all its results were complete."""
-    try:
-        moves = json.loads(read_regular(work / MOVES, LIMITS.result_bytes, ""))
-        new, stale = ([str(name) for name in moves[key]] for key in ("new", "stale"))
-    except (ValueError, KeyError, TypeError):  # not written by us, who make it whole
-        return
-    if any(Path(name).is_absolute() or ".." in Path(name).parts for name in new + stale):
-        return
-    for name in new:
-        if (work / "new" / name).is_file():
-            _make((directory / name).parent)
-            (work / "new" / name).replace(directory / name)
-    for name in stale:
-        (directory / name).unlink(missing_ok=True)
-
-
-def _place(stage: Stage, work: Path) -> None:
-    """Move the files into the folder; if one cannot be moved, put all back as it was."""
-    old = work / "old"
-    names = [str(file.relative_to(stage.folder)) for file in sorted(stage.folder.rglob("*")) if file.is_file()]
-    for name in names:
-        _flush(stage.folder / name)
-    stale = [name for name in stage.stale if name not in names and (stage.directory / name).is_file()]
-    note = work / "note"
-    note.write_text(json.dumps({"new": names, "stale": stale}))
-    _flush(note)
-    done: list[str] = []
-    made: list[Path] = []
-    with _undisturbed():
-        try:
-            note.replace(work / MOVES)
-            for name in names:
-                target = stage.directory / name
-                made += _make(target.parent)
-                _keep(target, old / name)
-                done.append(name)
-                (stage.folder / name).replace(target)
-            for name in stale:
-                target = stage.directory / name
-                _keep(target, old / name)
-                done.append(name)
-                target.unlink()
-        except BaseException:
-            (work / MOVES).unlink(missing_ok=True)  # first: from here on nobody may finish this
-            for name in reversed(done):
-                if (old / name).exists():
-                    (old / name).replace(stage.directory / name)
-                else:
-                    (stage.directory / name).unlink(missing_ok=True)
-            for folder in reversed(made):
-                with contextlib.suppress(OSError):
-                    folder.rmdir()
-            raise
-
-
-def _flush(file: Path) -> None:
-    """Onto the disk, where a full one shows at the latest."""
-    with file.open("rb") as stream:
-        os.fsync(stream.fileno())
-
-
-def _keep(target: Path, copy: Path) -> None:
-    if target.is_dir():
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(target))
-    if not target.exists():
-        return
-    copy.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        copy.hardlink_to(target)
-    except OSError:  # not every file system has hard links
-        shutil.copy2(target, copy)
-
-
-@contextlib.contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Without interruption by Ctrl-C; for moments only."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def json_text(content: Any) -> str:
@@ -235,3 +109,127 @@ def _strict(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_strict(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _told(directory: Path, error: BaseException) -> BaseException:
+    """The error as the user is told it, who knows the folder but not the stage."""
+    if isinstance(error, InputError) and error.file is not None and WORK in str(error.file):
+        return InputError(error.problem, file=directory, row=error.row, column=error.column, remedy=error.remedy)
+    if not isinstance(error, OSError) or isinstance(error, InputError):
+        return error
+    # Making the folder can fail at a parent of it, writing at anything inside.
+    place = "" if error.filename is None else str(error.filename)
+    ours = bool(place) and (place.startswith(str(directory)) or str(directory).startswith(place))
+    if not ours and error.errno not in _CANNOT_WRITE:
+        return error
+    why = error.strerror or str(error)
+    if error.errno == errno.EISDIR and place:
+        why = f"{Path(place).name} there is a folder, where a file is to be written"
+    remedy = "Make room and run again" if error.errno in _FULL else "Give --out a folder you may write to"
+    return InputError(f"results cannot be written there: {why}", file=directory, remedy=remedy)
+
+
+def _make(directory: Path, made: list[Path]) -> None:
+    """Make a folder and its parents; those that were missing are appended to the list."""
+    if directory.exists() and not directory.is_dir():
+        raise InputError("is a file, not a folder", file=directory, remedy="Give --out another folder")
+    for folder in (*reversed(directory.parents), directory):
+        if not folder.exists():
+            folder.mkdir(exist_ok=True)
+            made.append(folder)
+
+
+@contextlib.contextmanager
+def _locked(directory: Path) -> Iterator[None]:
+    """Keep other runs out of a folder; the system drops the lock when the process ends, however it ends."""
+    from filelock import FileLock, Timeout
+
+    file = directory / LOCK
+    if file.is_symlink() or (file.exists() and not file.is_file()):
+        raise InputError("is no regular file, and cannot lock the folder", file=file, remedy="Remove it")
+    # It waits for a moment only, in which a run that ends removes its file.
+    lock = FileLock(file, timeout=0.1, thread_local=False, fallback_to_soft=False)
+    try:
+        lock.acquire()
+    except Timeout:
+        owner = next((f.name[len(WORK) :].partition("-")[0] for f in directory.glob(WORK + "*")), "")
+        who = f"another mcc-jax run (process {owner})" if owner.isdigit() else "another mcc-jax run"
+        remedy = "Wait for it to end, or give --out another folder"
+        raise InputError(f"{who} is writing there", file=directory, remedy=remedy) from None
+    except OSError as error:
+        if error.errno not in _NO_LOCKS:  # without locks files are still replaced one by one, each whole
+            raise
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):  # Windows removes no open file
+            file.unlink()
+        lock.release()
+
+
+def _work_folder(directory: Path) -> Path:
+    for left_over in directory.glob(WORK + "*"):  # of runs that were killed: we hold the lock
+        new, stale = [], []
+        # All results were complete where this file is; one that cannot be read is not of us, who make it whole.
+        with contextlib.suppress(ValueError, KeyError, TypeError):
+            moves = json.loads(read_regular(left_over / MOVES, LIMITS.result_bytes, ""))
+            new, stale = ([str(name) for name in moves[key]] for key in ("new", "stale"))
+        if not any(Path(name).is_absolute() or ".." in Path(name).parts for name in (*new, *stale)):
+            _move(directory, left_over, new, stale)
+        shutil.rmtree(left_over, ignore_errors=True)
+    # Inside the folder itself: the same file system for certain, even where the folder is a mount point.
+    return Path(tempfile.mkdtemp(prefix=f"{WORK}{os.getpid()}-", dir=directory))
+
+
+def _move(directory: Path, work: Path, new: list[str], stale: list[str]) -> None:
+    for name in new:
+        if (work / "new" / name).is_file():
+            (directory / name).parent.mkdir(parents=True, exist_ok=True)
+            (work / "new" / name).replace(directory / name)
+    for name in stale:
+        (directory / name).unlink(missing_ok=True)
+
+
+def _place(stage: Stage, work: Path, made: list[Path]) -> None:
+    """Move the files into the folder; if one cannot be moved, put all back as it was."""
+    new = [str(file.relative_to(stage.folder)) for file in sorted(stage.folder.rglob("*")) if file.is_file()]
+    stale = [name for name in stage.stale if name not in new and (stage.directory / name).is_file()]
+    for name in new:
+        with (stage.folder / name).open("rb") as stream:
+            os.fsync(stream.fileno())  # onto the disk, where a full one shows at the latest
+        _make((stage.directory / name).parent, made)
+    for name in (*new, *stale):
+        target, copy = stage.directory / name, work / "old" / name
+        if target.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(target))
+        if target.exists():
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                copy.hardlink_to(target)
+            except OSError:  # not every file system has hard links
+                shutil.copy2(target, copy)
+    with _undisturbed():
+        try:
+            write_file(work / MOVES, lambda stream: stream.write(json.dumps({"new": new, "stale": stale}).encode()))
+            _move(stage.directory, work, new, stale)
+        except BaseException:
+            (work / MOVES).unlink(missing_ok=True)  # first: from here on nobody may finish this
+            for name in (*new, *stale):
+                if (work / "old" / name).exists():
+                    (work / "old" / name).replace(stage.directory / name)
+                else:
+                    (stage.directory / name).unlink(missing_ok=True)
+            raise
+
+
+@contextlib.contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Without interruption by Ctrl-C; for moments only."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

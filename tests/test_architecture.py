@@ -20,7 +20,6 @@ LAYERS = {
     "_memory": LEAF,
     "_numerics": LEAF,
     "_results": LEAF,
-    "_lock": 1,
     "_format": 1,
     "_version": LEAF,
     "arguments": LEAF,

@@ -11,7 +11,7 @@ MADE_BY_THE_LIBRARY = {
     *("mcc_jax.BayesCalibration", "mcc_jax.Discovery", "mcc_jax.Energy", "mcc_jax.Identifiability"),
     *("mcc_jax.LeastSquaresCalibration", "mcc_jax.PaperCalibration", "mcc_jax.Power", "mcc_jax.PredictedCurves"),
     *("mcc_jax.InputError", "mcc_jax.Record", "mcc_jax.Response"),
-    *(f"mcc_jax.campaign.{name}" for name in ("Adjustment", "Batch", "Finding", "LoadingCurve", "SolidClass")),
+    *(f"mcc_jax.campaign.{name}" for name in ("Adjustment", "Finding", "LoadingCurve", "SolidClass")),
     *(f"mcc_jax.effects.{name}" for name in ("Context", "Equivalence", "Nuisance")),
     *(f"mcc_jax.calibrate.{name}" for name in ("ElasticBranch", "ElasticFit", "MasterCurve", "ParticleFit")),
     *(f"mcc_jax.calibrate.{name}" for name in ("PlasticFit", "ShapeFit", "StrainTable")),

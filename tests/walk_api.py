@@ -164,7 +164,6 @@ def examples(folder: Path) -> dict[str, Example]:
             contact=0.01,
         ),
         "adjust": Example(mcc.adjust, campaign=tests, threshold_MPa=0.2),
-        "batch": Example(mcc.batch, campaign=tests, multiple=1),
         "strain_table": Example(calibrate.strain_table, adjustment=adjustment, diameters_um=sizes, points=50),
         "fit_shape_parameter": Example(calibrate.fit_shape_parameter, table=table, objective="full"),
         "fit_polynomial": Example(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -79,7 +78,6 @@ class NakagamiPrior:
 
 
 MAX_SHAPE = 0.5
-_OF_SHAPE = "must be above 0 and at most 1/2"
 
 
 @dataclass(frozen=True)
@@ -160,7 +158,6 @@ _NAMES = {
     LogNormalPrior: "log-normal",
     NakagamiPrior: "nakagami",
 }
-_POSITIVE = {"sd", "log_sd", "median", "shape"}
 
 
 def read_priors(file: str | Path, unloading: Unloading | str = Unloading.PRINTED) -> Priors:
@@ -183,21 +180,18 @@ def read_priors(file: str | Path, unloading: Unloading | str = Unloading.PRINTED
     for name, entry in content.items():
         if name not in known:
             raise InputError(
-                f"there is no prior {name!r}", file=str(file), remedy=f"Known priors: {', '.join(sorted(known))}."
+                f"there is no prior {name!r}", file=file, remedy=f"Known priors: {', '.join(sorted(known))}."
             )
         fields = [f.name for f in dataclasses.fields(known[name])]
-        if not isinstance(entry, dict):
-            raise InputError(
-                f"prior {name!r} must be a table", file=str(file), remedy=f"Write [{name}] and its {', '.join(fields)}."
+        if not isinstance(entry, dict) or not set(entry) <= set(fields):
+            wrong = (
+                "must be a table" if not isinstance(entry, dict) else f"has no entry {min(set(entry) - set(fields))!r}"
             )
-        for key, value in entry.items():
-            if key not in fields:
-                raise InputError(
-                    f"prior {name!r} has no entry {key!r}", file=str(file), remedy=f"Its entries: {', '.join(fields)}."
-                )
-            number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-            if not number or (key in _POSITIVE and value <= 0) or (key == "shape" and value > MAX_SHAPE):
-                must = _OF_SHAPE if key == "shape" else f"must be a {'positive ' if key in _POSITIVE else ''}number"
-                raise InputError(f"{name}.{key} {must}, not {value!r}", file=str(file), remedy="Correct the entry.")
-        changes[name] = dataclasses.replace(known[name], **{k: float(v) for k, v in entry.items()})
+            remedy = f"Write [{name}] and its {', '.join(fields)}."
+            raise InputError(f"prior {name!r} {wrong}", file=file, remedy=remedy)
+        try:
+            numbers = {key: arguments.number(value, f"{name}.{key}") for key, value in entry.items()}
+            changes[name] = dataclasses.replace(known[name], **numbers)
+        except InputError as error:
+            raise InputError(error.problem, file=file, column=name, remedy="Correct the entry.") from None
     return dataclasses.replace(priors, **changes, changed=tuple(changes))

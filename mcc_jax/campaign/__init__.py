@@ -8,8 +8,6 @@ from .adjustment import campaign_segments as campaign_segments
 from .adjustment import effective_diameter_um as effective_diameter_um
 from .adjustment import loading_curve as loading_curve
 from .adjustment import stress_and_strain as stress_and_strain
-from .batch import Batch as Batch
-from .batch import batch as batch
 from .batch import of_each_particle as of_each_particle
 from .batch import particle_batch as particle_batch
 from .checksums import file_checksums as file_checksums

@@ -9,7 +9,7 @@ import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, NoReturn, get_args
 
 import numpy as np
 
@@ -55,12 +55,8 @@ def _check_sizes(entries: dict[str, Any], file: Path) -> None:
         for key, value in level:
             # TOML promises 64 bits only.
             if isinstance(value, int) and not -(2**63) <= value < 2**63:
-                raise InputError(
-                    "holds an integer of more than 64 bits",
-                    file=file,
-                    column=key,
-                    remedy="Write it with a decimal point",
-                )
+                problem = "holds an integer of more than 64 bits"
+                raise InputError(problem, file=file, column=key, remedy="Write it with a decimal point")
         level = [(key, item) for key, value in level for item in _items(value)]
         if not level:
             return
@@ -116,24 +112,18 @@ def parse_metadata(text: str, file: Path) -> Metadata:
         for known in (*_WORDS, *_QUANTITIES):
             if key != known and key.lower() == known:
                 raise InputError("is misspelt", file=file, column=key, remedy=f"Did you mean {known!r}?")
-    control = entries.pop("control", None)
+    control, provenance, corrections = (entries.pop(key, None) for key in _WORDS)
+
+    def refuse(key: str, problem: str, remedy: str) -> NoReturn:
+        raise InputError(problem, file=file, column=key, remedy=remedy)
+
     if control is not None and control not in get_args(Control):
-        raise InputError(
-            f"{control!r} is no way of control", file=file, column="control", remedy='Write "load" or "displacement"'
-        )
-    provenance = entries.pop("provenance", None)
+        refuse("control", f"{control!r} is no way of control", 'Write "load" or "displacement"')
     if provenance is not None and not isinstance(provenance, str):
-        raise InputError(
-            "must be text", file=file, column="provenance", remedy='Write it in quotes, provenance = "..."'
-        )
-    corrections = entries.pop("corrections", [])
+        refuse("provenance", "must be text", 'Write it in quotes, provenance = "..."')
+    corrections = [] if corrections is None else corrections
     if not isinstance(corrections, list) or not all(isinstance(name, str) for name in corrections):
-        raise InputError(
-            "must be a list of names",
-            file=file,
-            column="corrections",
-            remedy='Write corrections = ["frame_compliance"]',
-        )
+        refuse("corrections", "must be a list of names", 'Write corrections = ["frame_compliance"]')
     return Metadata(
         control=control,
         force_resolution_mN=_positive(entries, "force_resolution", file),
@@ -152,19 +142,11 @@ def _positive(entries: dict[str, Any], quantity: str, file: Path) -> float | Non
     where, factor = find_column(keys, quantity, _QUANTITIES[quantity], file, what="key")
     key = keys[where]
     value = entries.pop(key)
-    number = float("nan")
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        try:
-            number = float(convert(np.array([float(value)]), factor)[0])
-        except OverflowError:
-            number = math.inf
-    if not (0 < number < math.inf):
-        raise InputError(
-            f"{str(value)[:40]!r} is not a positive number",
-            file=file,
-            column=key,
-            remedy="Write the number alone, without quotes and unit, or remove the key",
-        )
+    plain = isinstance(value, int | float) and not isinstance(value, bool)
+    number = float(convert(np.array([float(value)]), factor)[0]) if plain else math.nan
+    if not 0 < number < math.inf:
+        remedy = "Write the number alone, without quotes and unit, or remove the key"
+        raise InputError(f"{str(value)[:40]!r} is not a positive number", file=file, column=key, remedy=remedy)
     return number
 
 

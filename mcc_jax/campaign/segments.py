@@ -21,6 +21,7 @@ from .._errors import InputError
 from .excursions import Drive, DriveOptions, Hold
 from .schema import A_CURVE, Control, Curve
 from .signal import branch_envelope, steady_clock, two_lines
+from .validate import check_finite
 
 SegmentKind = Literal["approach", "load", "hold", "unload", "reload"]
 
@@ -108,9 +109,9 @@ def find_segments(
     if not len(curve):
         raise InputError("the curve has no point", remedy="Give a test with two points or more.")
     for name in ("time_s", "force_mN", "displacement_um"):
-        bad = np.flatnonzero(~np.isfinite(getattr(curve, name)))
-        if bad.size:
-            raise InputError(f"the {name} of a curve is {getattr(curve, name)[bad[0]]} at sample {bad[0] + 1}")
+        check_finite(
+            getattr(curve, name), f"the {name} of a curve", lambda text, remedy: InputError(text, remedy=remedy)
+        )
     force, displacement = np.asarray(curve.force_mN, float), np.asarray(curve.displacement_um, float)
     options = DriveOptions(smallest_turn, noise_multiple, band, hold_slowness, hold_samples)
     clock = steady_clock(np.asarray(curve.time_s, float))

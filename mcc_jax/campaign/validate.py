@@ -103,17 +103,20 @@ def _check_text(text: str, what: str, fail: Callable[[str], InputError]) -> None
         raise fail(f"{what} holds a NUL character")
 
 
+def check_finite(values: np.ndarray, what: str, fail: Callable[..., InputError]) -> None:
+    """Refuse readings that are not finite, or too large to be measured; `fail` makes the error."""
+    bad = np.flatnonzero(~(np.abs(values) <= LARGEST_MAGNITUDE))
+    if bad.size:
+        remedy = "Leave that sample out, or check the unit if all are so large"
+        raise fail(f"{what} is {values[bad[0]]} at sample {bad[0] + 1}", remedy)
+
+
 def _check_curve(
     name: str, time: np.ndarray, force: np.ndarray, displacement: np.ndarray, fail: Callable[..., InputError]
 ) -> None:
     parts = {"time": time, "force": force, "displacement": displacement}
     for what, values in parts.items():
-        if not (np.abs(values) <= LARGEST_MAGNITUDE).all():
-            first = int(np.argmax(~(np.abs(values) <= LARGEST_MAGNITUDE)))
-            raise fail(
-                f"the {what} of particle {name!r} is {values[first]} at sample {first + 1}",
-                "Leave that sample out, or check the unit if all are so large",
-            )
+        check_finite(values, f"the {what} of particle {name!r}", fail)
         if what != "time" and not values.any():
             raise fail(f"every {what} of particle {name!r} is zero, so the test holds no data")
     if len(time) < 2:

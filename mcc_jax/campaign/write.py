@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import os
-import secrets
-import shutil
-from pathlib import Path
 
 import numpy as np
 
 from .. import arguments
-from .._errors import InputError
+from .._store import results
 from .csv import CURVES, METADATA
 from .curves import PARTICLES
 from .metadata import format_metadata
@@ -37,16 +34,9 @@ def write_campaign(campaign: Campaign, folder: str | os.PathLike[str]) -> None:
         CURVES: _format_curves(campaign),
         METADATA: format_metadata(campaign.metadata, path / METADATA),
     }
-    if path.exists() and not path.is_dir():
-        raise InputError("is a file, not a folder", file=path, remedy="Choose another folder")
-    try:
-        _place({name: text.encode("utf-8") for name, text in texts.items()}, path)
-    except OSError as error:
-        raise InputError(
-            f"the folder cannot be written: {error.strerror or error}",
-            file=path,
-            remedy="Choose a folder you may write to",
-        ) from None
+    with results(path) as stage:
+        for name, text in texts.items():
+            (stage.folder / name).write_bytes(text.encode("utf-8"))
 
 
 def _cell(text: str) -> str:
@@ -70,35 +60,3 @@ def _format_curves(campaign: Campaign) -> str:
         columns = (np.asarray(c, float).tolist() for c in (curve.time_s, curve.force_mN, curve.displacement_um))
         lines.extend(f"{cell},{t!r},{f!r},{d!r}" for t, f, d in zip(*columns, strict=True))
     return "\n".join(lines) + "\n"
-
-
-def _place(files: dict[str, bytes], folder: Path) -> None:
-    """Put all files into the folder, or leave it as it was."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    new = folder.parent / f".{folder.name or 'campaign'}-{secrets.token_hex(6)}"
-    new.mkdir()
-    try:
-        for name, data in files.items():
-            (new / name).write_bytes(data)
-        if not folder.exists():
-            new.rename(folder)
-            return
-        _replace_each(files, new, folder)
-    finally:
-        shutil.rmtree(new, ignore_errors=True)
-
-
-def _replace_each(names: dict[str, bytes], new: Path, folder: Path) -> None:
-    moved: list[str] = []
-    try:
-        for name in names:
-            if (folder / name).exists():
-                (folder / name).replace(new / f"{name}.old")
-            moved.append(name)
-            (new / name).replace(folder / name)
-    except OSError:
-        for name in moved:
-            (folder / name).unlink(missing_ok=True)
-            if (new / f"{name}.old").exists():
-                (new / f"{name}.old").replace(folder / name)
-        raise

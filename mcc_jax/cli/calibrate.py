@@ -3,25 +3,46 @@
 from __future__ import annotations
 
 import functools
+import math
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from click.core import ParameterSource
 
-from .._store import json_text, results
-from .group import NOT_CONVERGED
+from .._store import Stage, results
 from .options import (
     CampaignFolder,
+    json_option,
     law_options,
     leave_out_option,
+    no_figures_option,
     out_option,
     priors_option,
     seed_option,
     threshold_option,
 )
-from .session import beside, import_writers, say, say_table, session
+from .session import NOT_CONVERGED, Tell, beside, import_writers, say, say_table, session
+from .shared import (
+    joint_model,
+    listed,
+    provenance,
+    read_without,
+    require_particle,
+    say_files,
+    say_json,
+    sentence,
+    write_figures,
+)
 
+if TYPE_CHECKING:
+    from ..calibrate import BayesCalibration, LeastSquaresCalibration, PaperCalibration
+    from ..campaign import Campaign
+
+    type Calibration = PaperCalibration | LeastSquaresCalibration | BayesCalibration
+
+RESULT, POSTERIOR, ARCHIVE = "calibration.json", "posterior.nc", "calibration.msgpack"
 METHODS = ("paper", "least-squares", "bayes")
 # Which methods an option belongs to; given with another one it would be ignored, so it is refused.
 BELONGS = {
@@ -83,36 +104,17 @@ def _applies(name: str, method: str) -> bool:
     "--reference", metavar="NAME", help="Reference particle of that objective; by the paper's rule if absent.  [paper]"
 )
 @law_options
-@click.option("--no-figures", is_flag=True, help="Draw no figures.")
+@no_figures_option
 @seed_option()
-@click.option("--json", "as_json", is_flag=True, help="Print calibration.json instead of a summary.")
+@json_option(RESULT)
 @click.pass_context
 def calibrate(
-    context: click.Context,
-    campaign: Path,
-    out: Path,
-    method: str,
-    leave_out: tuple[str, ...],
-    threshold_MPa: float,
-    priors: Path | None,
-    modulus_scatter: bool,
-    shape_scatter: bool,
-    mode: str,
-    chains: int,
-    draws: int,
-    loss: str,
-    objective: str,
-    reference: str | None,
-    unloading: str,
-    strain_scaling: str,
-    no_figures: bool,
-    seed: int,
-    as_json: bool,
+    context: click.Context, campaign: Path, out: Path, method: str, no_figures: bool, as_json: bool, **options: Any
 ) -> int | None:
     """Fit the law to the tests in the folder CAMPAIGN.
 
-    Writes calibration.json and figures/ into DIR, which may be the campaign's own folder; with bayes also posterior.nc,
-    the posterior as ArviZ data.
+    Writes calibration.json, calibration.msgpack (for mcc_jax.load) and figures/ into DIR, which may be the campaign's
+    own folder; with bayes also posterior.nc, the posterior as ArviZ data.
 
     \b
     Methods:
@@ -134,55 +136,159 @@ def calibrate(
             option = "--" + name.replace("_", "-")
             raise click.UsageError(f"{option} belongs to --method {' or '.join(methods)}, not to {method}.")
     with session(12) as tell:
-        from ..campaign import read_campaign
-        from .calibration import (
-            left_out,
-            main_numbers,
-            require_particle,
-            say_files,
-            say_state,
-            say_warnings,
-            write_calibration,
-        )
-        from .provenance import provenance
-
-        tell("reading the campaign")
-        data = left_out(read_campaign(campaign), leave_out)
-        require_particle(reference, data.particles, data.source)
-        settings: dict[str, Any] = {"threshold_MPa": threshold_MPa, "seed": seed, "progress": tell}
+        data = read_without(campaign, options["leave_out"], tell)
+        if options["reference"] is not None:
+            require_particle(options["reference"], data, "--reference")
         origin = provenance("calibrate", campaign, {n: v for n, v in context.params.items() if _applies(n, method)})
         writers = functools.partial(import_writers, figures=not no_figures, posterior=method == "bayes")
         with results(out) as stage, beside(writers):
-            if method == "paper":
-                from ..calibrate import calibrate_paper
-                from ..law import StrainScaling, Unloading
-
-                calibration = calibrate_paper(
-                    data,
-                    objective="reference" if objective == "reference" else "full",
-                    reference=reference,
-                    unloading=Unloading(unloading),
-                    strain_scaling=StrainScaling(strain_scaling),
-                    **settings,
-                )
-            else:
-                from ..calibrate import calibrate_bayes, calibrate_least_squares
-                from .calibration import joint_model
-
-                model = joint_model(unloading, strain_scaling, modulus_scatter, shape_scatter, priors)
-                if method == "bayes":
-                    calibration = calibrate_bayes(data, model=model, mode=mode, chains=chains, draws=draws, **settings)  # pyright: ignore[reportArgumentType]  # click has checked the words
-                else:
-                    calibration = calibrate_least_squares(data, model=model, loss=loss, **settings)  # pyright: ignore[reportArgumentType]
+            calibration = _calibrated(data, method, options, tell)
             content = write_calibration(calibration, stage, origin=origin, figures=not no_figures, tell=tell)
     if as_json:
-        click.echo(json_text(content).encode(), nl=False)  # JSON is UTF-8, whatever the terminal speaks
-        return None if content["converged"] else NOT_CONVERGED
-    say_state(content)
-    say_table(("quantity", "value"), main_numbers(content))
-    misfit = content["diagnostics"].get("relative_misfit")
-    if misfit is not None:
-        say(f"The mean law misses the displacements by {100 * misfit:.1f} % of their range (median over particles).")
-    say_warnings(content)
-    say_files(out, [*content["figures"], *content["files"], "calibration.json"])
+        say_json(content)
+    else:
+        say_state(content)
+        say_table(("quantity", "value"), main_numbers(content))
+        misfit = content["diagnostics"].get("relative_misfit")
+        if misfit is not None:
+            say(
+                f"The mean law misses the displacements by {100 * misfit:.1f} % of their range (median over particles)."
+            )
+        say_warnings(content)
+        say_files(out, [*content["figures"], *content["files"], RESULT])
     return None if content["converged"] else NOT_CONVERGED
+
+
+def _calibrated(data: Campaign, method: str, options: dict[str, Any], tell: Tell) -> Calibration:
+    from ..calibrate import calibrate_bayes, calibrate_least_squares, calibrate_paper
+
+    def chosen(*names: str) -> dict[str, Any]:
+        return {name: options[name] for name in (*names, "threshold_MPa", "seed")} | {"progress": tell}
+
+    if method == "paper":
+        return calibrate_paper(data, **chosen("objective", "reference", "unloading", "strain_scaling"))
+    scatter = {name: options[name] for name in ("modulus_scatter", "shape_scatter")}
+    model = joint_model(options, **scatter)
+    if method == "bayes":
+        return calibrate_bayes(data, model=model, **chosen("mode", "chains", "draws"))
+    return calibrate_least_squares(data, model=model, **chosen("loss"))
+
+
+def write_calibration(
+    calibration: Calibration, stage: Stage, *, origin: Mapping[str, Any], figures: bool, tell: Tell
+) -> dict[str, Any]:
+    """Write the calibration, the figures and, if there is one, the posterior into the stage.
+
+    Files that an earlier calibration lists as its own, and this one does not write, become stale: they would contradict
+    what lies beside them now.
+
+    Args:
+        calibration: what was found.
+        stage: where to write.
+        origin: data, settings and versions, as `provenance` gives them.
+        figures: whether to draw.
+        tell: progress.
+
+    Returns:
+        The contents of `calibration.json`.
+    """
+    from ..calibrate import BayesCalibration, write_posterior
+
+    names = write_figures(stage, RESULT, functools.partial(_draw, calibration) if figures else None, tell)
+    files = [ARCHIVE]
+    if isinstance(calibration, BayesCalibration):
+        tell("writing the posterior")
+        write_posterior(calibration, stage.folder / POSTERIOR)
+        files.append(POSTERIOR)
+    ours = "|".join((POSTERIOR, ARCHIVE))
+    stage.stale += [name for name in listed(stage.directory / RESULT, "files", ours) if name not in files]
+    return calibration.write(stage.folder, figures=names, files=files, provenance=dict(origin))
+
+
+def _draw(calibration: Calibration) -> Mapping[str, Any]:
+    from ..plots import least_squares_figures, paper_figures, posterior_figures
+
+    figures: dict[str, Callable[[Any], Mapping[str, Any]]] = {
+        "paper": paper_figures,
+        "least-squares": least_squares_figures,
+        "bayes": posterior_figures,
+    }
+    return figures[calibration.to_json()["method"]](calibration)
+
+
+def main_numbers(content: dict[str, Any]) -> list[tuple[str, str]]:
+    """Name and value of what matters most in a `calibration.json`."""
+    modulus = content["effective_modulus_MPa"]
+    rows = [
+        ("shape parameter a", _estimate(content["a"])),
+        (
+            "effective modulus",
+            "unknown" if modulus["value"] is None or _modulus_open(content) else f"{_estimate(modulus, 1e-3)} GPa",
+        ),
+    ]
+    for name in ("C1", "C3", "C5"):
+        mean = content[f"log_{name}"]["mean"]
+        median = _exp(mean["value"])
+        spread = None if mean["sd"] is None or median is None else median * mean["sd"]
+        rows.append((f"{name}, median", _estimate({"value": median, "sd": spread})))
+        rows.append((f"{name}, sd of its logarithm", _estimate(content[f"log_{name}"]["sd"])))
+    rows.append(("yield stress sigma_y", f"{_estimate(content['yield_stress_MPa'])} MPa"))
+    return rows
+
+
+def _modulus_open(content: dict[str, Any]) -> bool:
+    from ..calibrate.judgement import MODULUS_OPEN
+
+    return any(one["check"] == MODULUS_OPEN for one in content.get("findings", []))
+
+
+def _estimate(estimate: dict[str, Any], factor: float = 1.0) -> str:
+    """A value with its standard deviation, which decides the digits of both."""
+    value, sd = estimate["value"], estimate["sd"]
+    if value is None or sd is None or not sd > 0:
+        return _number(None if value is None else value * factor)
+    value, sd = value * factor, sd * factor
+    digits = max(0, 1 - math.floor(math.log10(sd)))
+    if digits > 6 or abs(value) >= 1e6:
+        return f"{value:.4g} +- {sd:.2g}"
+    return f"{value:.{digits}f} +- {sd:.{digits}f}"
+
+
+def _exp(value: float | None) -> float | None:
+    return None if value is None or value > 700 else math.exp(value)
+
+
+def _number(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.4g}"
+
+
+def say_state(content: dict[str, Any]) -> None:
+    """Print how many particles took part, whether the fit converged, and whether its numbers can be true."""
+    used = sum(entry["kept"] for entry in content["particles"])
+    law = content["law"]
+    say(
+        f"Method {content['method']}: {used} of {len(content['particles'])} particles, "
+        + (f"a by the {content['a_objective']} objective, " if "a_objective" in content else "")
+        + f"unloading {law['unloading']}, strain scaling {law['strain_scaling']}; "
+        + _state(content)
+    )
+
+
+def _state(content: dict[str, Any]) -> str:
+    if not content["converged"]:
+        return "NOT converged."
+    bad = any(one["level"] == "bad" for one in content["findings"])
+    return "the optimisers converged, but NOT TO BE TRUSTED: see below." if bad else "converged."
+
+
+def say_warnings(content: dict[str, Any]) -> None:
+    """Print what a reader of the numbers must know."""
+    from ..campaign import Finding
+
+    bad = {str(Finding.from_json(one)) for one in content["findings"] if one["level"] == "bad"}
+    for warning in sorted(content["warnings"], key=lambda text: text not in bad):
+        colour = "red" if warning in bad else "yellow"
+        say(f"Warning: {sentence(warning)}", fg=colour, bold=warning in bad)
+    for entry in content["particles"]:
+        if not entry["kept"]:
+            say(f"Not used: particle {entry['particle']}: {entry['why_not']}.", fg="yellow")

@@ -9,8 +9,12 @@ from pathlib import Path
 import click
 
 from .._store import results
+from .calibrate import main_numbers, say_state, say_warnings, write_calibration
+from .discover import DISCOVERY, main_finding, write_discovery
 from .options import out_option, seed_option
+from .report import REPORT
 from .session import beside, import_writers, say, say_table, session
+from .shared import provenance, say_files
 
 CAMPAIGN_FILES = ("particles.csv", "curves.csv", "campaign.toml")
 
@@ -33,8 +37,6 @@ def demo(out: Path, seed: int) -> None:
         from ..calibrate import calibrate_bayes
         from ..campaign import write_campaign
         from ..simulate import paper_campaign
-        from .calibration import main_numbers, say_files, say_state, say_warnings, write_calibration
-        from .provenance import provenance
 
         with results(out) as stage:
             tell("simulating the campaign")
@@ -45,8 +47,6 @@ def demo(out: Path, seed: int) -> None:
                 calibration = calibrate_bayes(campaign, seed=seed, progress=tell)
             from ..discover import discover
             from ..report import read_results, report_page
-            from .discovery import DISCOVERY, main_finding, write_discovery
-            from .report import REPORT
 
             # One core draws while the others compile.
             with beside(lambda: discover(campaign, experiments=False, seed=seed, progress=tell)) as found:
@@ -94,7 +94,7 @@ def demo(out: Path, seed: int) -> None:
 
 def _import_the_rest() -> None:
     """What the demo needs after calibrating, seconds to import: discovery, drawing, the page, the posterior's file."""
-    from . import discovery, report  # noqa: F401  (the command `report` loads the package of that name)
+    from .. import discover, report  # noqa: F401
 
     import_writers(figures=True, posterior=True)
 

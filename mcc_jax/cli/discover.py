@@ -3,22 +3,35 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from .._store import json_text, results
+from .._errors import InputError
+from .._store import Stage, results
 from .options import (
     CampaignFolder,
     exclude_option,
+    json_option,
     law_options,
     leave_out_option,
+    no_figures_option,
     out_option,
     priors_option,
     seed_option,
     threshold_option,
 )
-from .session import beside, import_writers, say, session
+from .session import Tell, beside, import_writers, say, say_table, session
+from .shared import joint_model, provenance, read_without, say_files, say_json, sentence, write_figures
+
+if TYPE_CHECKING:
+    from ..discover import Discovery
+
+DISCOVERY = "discovery.json"
+ROWS = 6
+"""So many mechanisms stand in the table; the file has all."""
 
 
 @click.command(short_help="Find, name and add what the law misses.")
@@ -36,24 +49,18 @@ from .session import beside, import_writers, say, session
 @click.option(
     "--no-posterior", is_flag=True, help="Do not sample the law with effects: standard errors of its fit instead."
 )
-@click.option("--no-figures", is_flag=True, help="Draw no figures.")
+@no_figures_option
 @seed_option("Seed of the bootstrap.")
-@click.option("--json", "as_json", is_flag=True, help="Print discovery.json instead of a summary.")
+@json_option(DISCOVERY)
 def discover(
     campaign: Path,
     out: Path,
-    exclude: tuple[str, ...],
-    leave_out: tuple[str, ...],
-    threshold_MPa: float,
-    priors: Path | None,
-    unloading: str,
-    strain_scaling: str,
     no_held_out: bool,
     no_experiments: bool,
     no_posterior: bool,
     no_figures: bool,
-    seed: int,
     as_json: bool,
+    **options: Any,
 ) -> None:
     """Find where the law and the tests in the folder CAMPAIGN disagree, name what is missing, add it to the law, and
     show on particles that took no part that the gap is closed.
@@ -74,45 +81,102 @@ def discover(
       mcc-jax discover my-tests --out found --exclude thermal_drift --unloading punch
     """
     with session(20) as tell:
-        from ..campaign import read_campaign
         from ..discover import discover as find
-        from .calibration import joint_model, left_out, say_files
-        from .discovery import require_mechanisms, say_discovery, write_discovery
-        from .provenance import provenance
 
-        require_mechanisms(exclude)
-        tell("reading the campaign")
-        data = left_out(read_campaign(campaign), leave_out)
-        settings = {
-            "exclude": exclude,
-            "leave_out": leave_out,
-            "threshold_MPa": threshold_MPa,
-            "priors": priors,
-            "unloading": unloading,
-            "strain_scaling": strain_scaling,
-            "held_out": not no_held_out,
-            "experiments": not no_experiments,
-            "posterior": not no_posterior,
-            "seed": seed,
-        }
-        origin = provenance("discover", campaign, settings)
+        require_mechanisms(options["exclude"])
+        data = read_without(campaign, options["leave_out"], tell)
+        parts = {"experiments": not no_experiments, "posterior": not no_posterior}
+        origin = provenance("discover", campaign, options | {"held_out": not no_held_out} | parts)
         writers = functools.partial(import_writers, figures=not no_figures, posterior=False)
         with results(out) as stage, beside(writers):
-            found = find(
-                data,
-                exclude=exclude,
-                model=joint_model(unloading, strain_scaling, True, False, priors),
-                threshold_MPa=threshold_MPa,
-                confirm=not no_held_out,
-                experiments=not no_experiments,
-                posterior=not no_posterior,
-                seed=seed,
-                progress=tell,
-            )
+            model = joint_model(options)
+            chosen = {name: options[name] for name in ("exclude", "threshold_MPa", "seed")}
+            found = find(data, model=model, confirm=not no_held_out, progress=tell, **parts, **chosen)
             content = write_discovery(found, stage, origin=origin, figures=not no_figures, tell=tell)
     if as_json:
-        click.echo(json_text(content).encode(), nl=False)  # JSON is UTF-8, whatever the terminal speaks
+        say_json(content)
         return
     say_discovery(content)
     say()
-    say_files(out, [*content["figures"], "discovery.json"])
+    say_files(out, [*content["figures"], DISCOVERY])
+
+
+def require_mechanisms(names: tuple[str, ...]) -> None:
+    """Refuse to exclude what does not exist, before anything is computed.
+
+    Raises:
+        InputError: naming the mechanisms there are.
+    """
+    from ..effects import LIBRARY
+
+    for name in names:
+        if name not in LIBRARY:
+            raise InputError(f"there is no mechanism {name!r}", remedy=f"--exclude takes one of: {', '.join(LIBRARY)}")
+    if set(names) >= set(LIBRARY):
+        raise InputError("every mechanism is excluded", remedy="Leave one to look for")
+
+
+def write_discovery(
+    found: Discovery, stage: Stage, *, origin: Mapping[str, Any], figures: bool, tell: Tell
+) -> dict[str, Any]:
+    """Write `discovery.json` and the figures into the stage; see `write_calibration`."""
+
+    def draw() -> Mapping[str, Any]:
+        from ..plots import discovery_figures
+
+        return discovery_figures(found)
+
+    names = write_figures(stage, DISCOVERY, draw if figures else None, tell)
+    return found.write(stage.folder, figures=names, provenance=dict(origin))
+
+
+def say_discovery(content: dict[str, Any]) -> None:
+    """Print verdict, summary, notes, and the head of the ranking."""
+    import textwrap
+
+    say(f"Verdict: {content['verdict']}", bold=True)
+    for line in textwrap.wrap(content["summary"], 100, break_on_hyphens=False):
+        say(line)
+    for text in content["notes"]:
+        say(f"Note: {sentence(text)}", fg="yellow")
+    if not content["ranking"]:
+        return
+    say()
+    rows = []
+    for entry in content["ranking"][:ROWS]:
+        unit = "" if entry["unit"] == "-" else f" {entry['unit']}"
+        rows.append(
+            (
+                entry["mechanism"],
+                _number(entry["statistic"], ".1f"),
+                f"{_number(entry['estimate'], '.3g')}{unit}",
+                f"{_number(entry['detection_limit'], '.2g')}{unit}",
+                _number(entry["probability"], ".3f"),
+            )
+        )
+    say_table(("mechanism", "statistic", "estimate", "detection limit", "probability"), rows)
+    further = len(content["ranking"]) - len(rows)
+    say(
+        f"Each against the law alone{f'; {further} more in {DISCOVERY}' if further > 0 else ''}. Probability: of the "
+        "mechanism, if one is missing."
+    )
+
+
+def _number(value: float | None, form: str) -> str:
+    return "unknown" if value is None else format(value, form)
+
+
+def main_finding(content: dict[str, Any]) -> str:
+    """What a discovery found, in one line."""
+    verdict = content["verdict"]
+    if verdict == "NO_GAP":
+        return "nothing is missing in the law that these tests could show"
+    if verdict == "FIT_NOT_CONVERGED":
+        return "the law cannot be fitted well enough to ask what it lacks"
+    if verdict == "UNLISTED":
+        return "something is missing that no listed mechanism explains; a formula for it is in discovery.json"
+    names = " and ".join(effect["mechanism"].replace("_", " ") for effect in content["effects"])
+    sure = "" if verdict == "NAMED" else ", or what these tests cannot tell from it"
+    closed = content["gap"]["closed_fraction"]
+    gap = "" if closed is None else f"; it closes {100 * closed:.0f} % of the gap on held-out particles"
+    return f"missing is {names}{sure}{gap}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -187,11 +186,12 @@ def law_options(command: Any) -> Any:
     return unloading(scaling(command))
 
 
-def leave_out_option(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Particles that take no part; `apply` it to the campaign by `left_out`."""
-    return click.option(
-        "--leave-out",
-        multiple=True,
-        metavar="NAME",
-        help="Leave this particle out; may be given several times.",
-    )(command)
+leave_out_option = click.option(
+    "--leave-out", multiple=True, metavar="NAME", help="Leave this particle out; may be given several times."
+)
+no_figures_option = click.option("--no-figures", is_flag=True, help="Draw no figures.")
+
+
+def json_option(file: str, instead: str = "a summary") -> Any:
+    """`--json`: print the result's file."""
+    return click.option("--json", "as_json", is_flag=True, help=f"Print {file} instead of {instead}.")

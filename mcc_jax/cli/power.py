@@ -7,10 +7,12 @@ from typing import Any
 
 import click
 
-from .._store import json_text, results
+from .._store import results
+from .discover import require_mechanisms
 from .options import (
     CampaignFolder,
     exclude_option,
+    json_option,
     law_options,
     out_option,
     priors_option,
@@ -18,6 +20,7 @@ from .options import (
     threshold_option,
 )
 from .session import say, say_table, session
+from .shared import joint_model, read_without, say_files, say_json, write_result
 
 POWER = "power.json"
 
@@ -30,18 +33,8 @@ POWER = "power.json"
 @priors_option()
 @law_options
 @seed_option("For the record: nothing here is random.")
-@click.option("--json", "as_json", is_flag=True, help="Print power.json instead of a table.")
-def power(
-    campaign: Path,
-    out: Path,
-    exclude: tuple[str, ...],
-    threshold_MPa: float,
-    priors: Path | None,
-    unloading: str,
-    strain_scaling: str,
-    seed: int,
-    as_json: bool,
-) -> None:
+@json_option(POWER, "a table")
+def power(campaign: Path, out: Path, seed: int, as_json: bool, **options: Any) -> None:
     """Say how large each mechanism must be for the tests in the folder CAMPAIGN to show it, and which they cannot tell
     apart. CAMPAIGN is what `mcc-jax simulate` makes of your plan with your tester's noise, or a measured campaign.
 
@@ -53,28 +46,23 @@ def power(
       mcc-jax power planned --out planned
     """
     with session(20) as tell:
-        from ..campaign import read_campaign
         from ..discover import power_of_campaign
         from ..effects import LIBRARY
-        from .calibration import joint_model, say_files
-        from .discovery import require_mechanisms
-        from .figures import write_result
 
-        require_mechanisms(exclude)
-        tell("reading the campaign")
-        data = read_campaign(campaign)
+        require_mechanisms(options["exclude"])
+        data = read_without(campaign, (), tell)
         with results(out) as stage:
             found = power_of_campaign(
                 data,
-                library={name: m for name, m in LIBRARY.items() if name not in exclude},
-                model=joint_model(unloading, strain_scaling, True, False, priors),
-                threshold_MPa=threshold_MPa,
+                library={name: m for name, m in LIBRARY.items() if name not in options["exclude"]},
+                model=joint_model(options),
+                threshold_MPa=options["threshold_MPa"],
                 progress=tell,
             )
             content: dict[str, Any] = found.to_json() | {"seed": seed}
             write_result(stage, POWER, content)
     if as_json:
-        click.echo(json_text(content).encode(), nl=False)
+        say_json(content)
         return
     rows = []
     for entry in content["mechanisms"]:

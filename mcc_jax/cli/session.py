@@ -19,6 +19,8 @@ import click
 from .._errors import InputError
 
 Tell = Callable[[str], None]
+PROGRAM = "mcc-jax"
+DONE, DEFECT, BAD_INPUT, NOT_CONVERGED, INTERRUPTED = 0, 1, 2, 3, 130
 
 
 @contextlib.contextmanager

@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import shlex
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
+from .._errors import InputError
 from .._store import results
 from .options import Interval, Levels, Location, Number, law_options, out_option, seed_option
 from .session import say, session
 
+if TYPE_CHECKING:
+    import numpy as np
+
+    from ..campaign import Campaign
+    from ..law import MccLaw
+    from ..simulate import HiddenEffect, Programme
+
+MAX_ROWS = 10_000_000
+LONGEST_S = 1e12
 POSITIVE, NOT_NEGATIVE = {"least": 0, "above": True}, {"least": 0}
 
 
@@ -73,7 +86,7 @@ def _zero(name: str, unit: str, text: str) -> Any:
 @_zero("--resolution-mN", "mN", "Smallest step of force.")
 @_zero("--zero-um", "um", "Standard deviation of each test's zero of displacement.")
 @seed_option()
-def simulate(out: Path, particles: Path | None, unloading: str, strain_scaling: str, seed: int, **options: Any) -> None:
+def simulate(out: Path, **options: Any) -> None:
     """Put particles through a test programme in the computer and write the campaign into DIR.
 
     True coefficients go into the columns true_C1, true_C3, true_C5 of particles.csv, effects into campaign.toml.
@@ -101,37 +114,25 @@ def simulate(out: Path, particles: Path | None, unloading: str, strain_scaling: 
     _refuse_contradictions(options)
     with session(3) as tell:
         from ..campaign import write_campaign
-        from ..law import StrainScaling, Unloading
-        from .simulation import (
-            Material,
-            hidden_effects,
-            particle_sizes,
-            peaks_and_programme,
-            simulate_particles,
-        )
 
         tell("reading the input")
-        sizes = particle_sizes(particles)
-        hidden = hidden_effects(options["effects"], sizes)
-        material = Material(
-            {name: options[name] for name in ("C1", "C3", "C5")},
-            options["shared_material"],
-            options["a"],
-            options["effective_modulus"],
-            Unloading(unloading),
-            StrainScaling(strain_scaling),
-        )
+        sizes = _sizes(options["particles"])
+        hidden = _hidden_effects(options["effects"], sizes)
         tell("simulating")
-        laws = material.laws(sizes, seed)
-        peaks, programme = peaks_and_programme(options, laws, sizes, seed)
+        laws = _laws(options, sizes)
+        programme = _programme(options)
+        peaks = _peaks(options, programme, laws, sizes)
+        _check_size(programme, peaks, options["programme"])
         with results(out) as stage:
-            campaign = simulate_particles(laws, sizes, peaks, programme, options, hidden, seed)
+            campaign = _campaign(laws, sizes, peaks, programme, options, hidden)
             tell("writing")
             write_campaign(campaign, stage.folder)
     points = [len(curve) for curve in campaign.curves]
     forces = [curve.force_mN.max() for curve in campaign.curves]
-    say(f"Simulated {len(campaign)} particles, {sum(points)} points, {programme.control} control, seed {seed}.")
-    say(f"Peak forces {min(forces):.4g} to {max(forces):.4g} mN; the tests take up to {_duration(campaign):.4g} s.")
+    told = f"{sum(points)} points, {programme.control} control, seed {options['seed']}"
+    say(f"Simulated {len(campaign)} particles, {told}.")
+    longest = max(float(curve.time_s[-1]) for curve in campaign.curves)
+    say(f"Peak forces {min(forces):.4g} to {max(forces):.4g} mN; the tests take up to {longest:.4g} s.")
     for effect in hidden:
         variant = effect.variant
         drawn = " (drawn for each test)" if variant.parameter in effect.random else ""
@@ -145,10 +146,6 @@ def simulate(out: Path, particles: Path | None, unloading: str, strain_scaling: 
         say(f"Warning: the loading curve falls somewhere, and the particle {what}: {', '.join(falling)}.", fg="yellow")
     say(f"Written into {out}: particles.csv, curves.csv, campaign.toml")
     say(f"Next: mcc-jax calibrate {shlex.quote(str(out))} --out fit")
-
-
-def _duration(campaign: Any) -> float:
-    return max(float(curve.time_s[-1]) for curve in campaign.curves)
 
 
 def _refuse_contradictions(options: dict[str, Any]) -> None:
@@ -182,3 +179,210 @@ def _refuse_contradictions(options: dict[str, Any]) -> None:
             raise click.UsageError("--unload-to lies not below the --levels it unloads from.")
     if options["shared_material"] and all(given(name) for name in ("C1", "C3", "C5")):
         refuse("shared-material", "C1, --C3 and --C5", "they fix the material already")
+
+
+class Sizes(NamedTuple):
+    """Particles to simulate: names, diameters [um] of shape (N, 3), further columns, and the file they are from."""
+
+    names: tuple[str, ...]
+    diameters_um: np.ndarray
+    columns: Mapping[str, tuple[str, ...]]
+    file: Path | None
+
+
+def _sizes(file: Path | None) -> Sizes:
+    """The particles of a table, or of the paper's Table 1."""
+    from ..campaign import PAPER_DIAMETERS_UM, read_particles
+
+    if file is None:
+        return Sizes(tuple(str(i + 1) for i in range(len(PAPER_DIAMETERS_UM))), PAPER_DIAMETERS_UM, {}, None)
+    names, diameters, columns = read_particles(file)
+    # What an earlier simulation called the truth is not that of this one.
+    return Sizes(names, diameters, {k: v for k, v in columns.items() if not k.startswith("true_")}, file)
+
+
+def _laws(options: Mapping[str, Any], sizes: Sizes) -> MccLaw:
+    """One law per particle, of fixed or drawn coefficients.
+
+    Raises:
+        InputError: if `a` leaves a particle without stress.
+    """
+    import equinox as eqx
+    import jax
+    import jax.numpy as jnp
+
+    from ..campaign import of_each_particle
+    from ..geometry import plastic_shape_factor
+    from ..law import StrainScaling, Unloading
+    from ..simulate import law_for_each, paper_population
+
+    count, population, a = len(sizes.names), paper_population(), options["a"]
+    if options["shared_material"]:
+        plastic = jax.tree.map(lambda x: jnp.broadcast_to(x, (count,)), population.mean_law)
+    else:
+        plastic = population.sample(jax.random.key(options["seed"]), count)
+    for name in ("C1", "C3", "C5"):
+        if options[name] is not None:
+            plastic = eqx.tree_at(lambda p, n=name: getattr(p, n), plastic, jnp.full(count, options[name]))
+    eta = of_each_particle(sizes.diameters_um, lambda p: plastic_shape_factor(p, a))
+    if not (eta > 0).all():
+        worst = int(eta.argmin())
+        raise InputError(
+            f"the shape factor of particle {sizes.names[worst]!r} is {eta[worst]:.4g} with a = {a:g}",
+            file=sizes.file,
+            remedy="Give an --a nearer to zero: shape factors must be positive",
+        )
+    form, scaling = Unloading(options["unloading"]), StrainScaling(options["strain_scaling"])
+    return law_for_each(plastic, a, options["effective_modulus"], form, scaling)
+
+
+def _programme(options: Mapping[str, Any]) -> Programme:
+    """What the tester does."""
+    from ..simulate import Programme, read_programme
+
+    if options["programme"] is not None:
+        return read_programme(options["programme"])
+    return Programme.cycles(
+        control=options["control"] or "load",
+        rate=2.0 if options["rate"] is None else options["rate"],
+        levels=options["levels"] or (1.0,),
+        unload_to=options["unload_to"] or 0.0,
+        hold_s=options["hold_s"] or 0.0,
+        interval_s=options["interval_s"],
+        points=options["points"],
+    )
+
+
+def _peaks(options: Mapping[str, Any], programme: Programme, laws: MccLaw, sizes: Sizes) -> np.ndarray:
+    """Each particle's peak [mN or um], shape (N,).
+
+    Raises:
+        InputError: if the programme is unfit for what was given.
+    """
+    import equinox as eqx
+    import jax.numpy as jnp
+    import numpy as np
+
+    from ..campaign import particle_batch
+    from ..geometry import Particle
+    from ..simulate import PAPER_PEAK_STRESS_MPA
+
+    strained = options["peak_strain"] is not None
+    if strained and programme.control != "displacement":
+        raise InputError(
+            "the programme runs under load control, where --peak-strain has no meaning",
+            file=options["programme"],
+            remedy="Give --peak-stress",
+        )
+    # The same draws as `paper_campaign` makes.
+    rng = np.random.default_rng(np.random.SeedSequence(options["seed"]).generate_state(4))
+    low, high = options["peak_strain"] or options["peak_stress"] or PAPER_PEAK_STRESS_MPA
+    drawn = jnp.asarray(rng.uniform(low, high, len(sizes.names)))
+    particles = particle_batch(sizes.diameters_um)
+    if programme.control == "displacement" and not strained:
+        strain = eqx.filter_vmap(lambda law, particle, s: law.plastic.strain(s) / law.shape_factor(particle))
+        drawn = strain(laws, particles, drawn)
+    quantity = Particle.force if programme.control == "load" else Particle.displacement
+    return np.asarray(eqx.filter_vmap(quantity)(particles, drawn))
+
+
+def _check_size(programme: Programme, peaks: np.ndarray, file: Path | None) -> None:
+    """Refuse what would fill memory or disk.
+
+    Raises:
+        InputError: if so.
+    """
+    from ..simulate import Ramp
+
+    rows = 0.0
+    for peak in peaks:
+        duration, level = 0.0, 0.0
+        for step in programme.steps:
+            if isinstance(step, Ramp):
+                duration += abs(step.to - level) * float(peak) / step.rate
+                level = step.to
+            else:
+                duration += step.seconds
+        if not duration < LONGEST_S:
+            raise InputError(f"a test would take {duration:.4g} s", file=file, remedy="Give a higher rate")
+        samples = programme.points or math.ceil(duration / (programme.interval_s or 1.0))
+        rows += samples + len(programme.steps)
+        if rows > MAX_ROWS or samples * len(programme.steps) > 10 * MAX_ROWS:
+            raise InputError(
+                f"the campaign would have more than {MAX_ROWS} rows, or too many steps for its points",
+                file=file,
+                remedy="Take fewer points, a longer interval or a higher rate",
+            )
+
+
+def _hidden_effects(texts: Sequence[str], sizes: Sizes) -> tuple[HiddenEffect, ...]:
+    """The effects of the option --effect.
+
+    Raises:
+        InputError: naming the valid choices, or what an effect needs of the table of particles.
+    """
+    from ..effects import HUMIDITY_COLUMN, Need
+    from ..simulate import read_effect
+
+    hidden = []
+    for text in texts:
+        try:
+            hidden.append(read_effect(text))
+        except ValueError as error:
+            raise InputError(f"--effect {text}: {error}") from error
+    wet = [effect for effect in hidden if Need.HUMIDITY_COLUMN in effect.variant.needs]
+    if wet and HUMIDITY_COLUMN not in sizes.columns:
+        raise InputError(
+            f"--effect {wet[0].variant.mechanism}: needs a column {HUMIDITY_COLUMN} in the table of particles",
+            file=sizes.file,
+            remedy="Give --particles FILE with that column",
+        )
+    return tuple(hidden)
+
+
+def _campaign(
+    laws: MccLaw,
+    sizes: Sizes,
+    peaks: np.ndarray,
+    programme: Programme,
+    options: Mapping[str, Any],
+    effects: Sequence[HiddenEffect],
+) -> Campaign:
+    """The campaign, with the further columns of the particles' table.
+
+    Raises:
+        InputError: if the law or the programme give no usable curves.
+    """
+    from ..campaign import check_campaign
+    from ..campaign.record import humidity_column
+    from ..simulate import Instrument, simulate_campaign
+
+    instrument = Instrument(
+        displacement_noise_um=options["noise_um"],
+        force_noise_mN=options["noise_mN"],
+        displacement_resolution_um=options["resolution_um"],
+        force_resolution_mN=options["resolution_mN"],
+        zero_um=options["zero_um"],
+    )
+    humidity = humidity_column(sizes.names, sizes.columns, str(sizes.file or "")) if effects else None
+    extreme = "Choose less extreme values"
+    try:
+        campaign = simulate_campaign(
+            laws,
+            sizes.diameters_um,
+            peaks,
+            programme,
+            instrument=instrument,
+            particles=sizes.names,
+            effects=effects,
+            relative_humidity_percent=humidity,
+            seed=options["seed"],
+            provenance=f"simulated by mcc-jax simulate, seed {options['seed']}; not a measurement",
+        )
+    except ValueError as error:
+        raise InputError(str(error), file=options["programme"] or sizes.file, remedy=extreme) from error
+    campaign = dataclasses.replace(campaign, columns={**sizes.columns, **campaign.columns})
+    try:
+        return check_campaign(campaign, file="")
+    except InputError as error:
+        raise InputError(f"what was simulated is no campaign: {error.problem}", remedy=extreme) from error

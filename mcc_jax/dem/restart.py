@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
 import zipfile
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -15,6 +14,7 @@ import numpy as np
 
 from .. import arguments
 from .._errors import InputError
+from .._store import write_file
 from ..files import LIMITS, open_regular
 from .edges import Edges
 from .forces import A_PACKING, Packing, WallHistory
@@ -50,16 +50,8 @@ def save_state(path: str | Path, packing: Packing, state: State) -> None:
         "power": packing.sides.power,
     }
     arrays: dict[str, Any] = {f"leaf_{k}": np.asarray(leaf) for k, leaf in enumerate(jax.tree.leaves((packing, state)))}
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            np.savez(stream, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays)
-            stream.flush()
-            os.fsync(stream.fileno())
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    header_bytes = np.frombuffer(json.dumps(header).encode(), np.uint8)
+    write_file(path, lambda stream: np.savez(stream, header=header_bytes, **arrays))
 
 
 def load_state(path: str | Path) -> tuple[Packing, State]:

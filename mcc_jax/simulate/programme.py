@@ -180,61 +180,35 @@ def read_programme(file: str | Path) -> Programme:
     """
     file = arguments.file_path(file, "file")
     content = load_toml_file(file, "a TOML file with the programme")
-    unknown = set(content) - {"control", "rate", "points", "interval_s", "step"}
-    if unknown:
-        raise InputError(
-            f"unknown entry {sorted(unknown)[0]!r}", file=file, remedy="Known: control, rate, points, interval_s, step."
-        )
-    if not isinstance(content.get("step"), list) or not content["step"]:
-        raise InputError("has no [[step]]", file=file, remedy="Add steps with ramp_to or hold_s.")
-
-    def number(entry: dict, key: str, where: str) -> float:
-        value = entry.get(key)
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise InputError(
-                f"{where}: {key} must be a number, got {value!r}", file=file, remedy=f"Write it as {key} = 2.0."
-            )
-        return float(value)
-
-    def made(kind: type[Ramp] | type[Hold], where: str, *values: float) -> Ramp | Hold:
-        try:
-            return kind(*values)
-        except InputError as error:
-            raise InputError(f"{where}: {error.problem}", file=file, remedy="Correct the number.") from None
-
     steps: list[Ramp | Hold] = []
-    for i, entry in enumerate(content["step"], start=1):
-        where = f"step {i}"
-        if not isinstance(entry, dict) or ("ramp_to" in entry) == ("hold_s" in entry):
-            raise InputError(
-                f"{where} needs exactly one of ramp_to and hold_s",
-                file=file,
-                remedy="Make two steps of it.",
-            )
-        extra = set(entry) - {"ramp_to", "rate", "hold_s"}
-        if extra:
-            raise InputError(
-                f"{where}: unknown entry {sorted(extra)[0]!r}", file=file, remedy="Known: ramp_to, rate, hold_s."
-            )
-        if "hold_s" in entry:
-            steps.append(made(Hold, where, number(entry, "hold_s", where)))
-        elif "rate" in entry or "rate" in content:
-            rate = number(entry if "rate" in entry else content, "rate", where)
-            steps.append(made(Ramp, where, number(entry, "ramp_to", where), rate))
-        else:
-            raise InputError(f"{where} has no rate", file=file, remedy="Give it one, or one for all at the top.")
-    control = content.get("control", "load")
-    if control not in ("load", "displacement"):
-        raise InputError(
-            f"control must be 'load' or 'displacement', got {control!r}", file=file, remedy='Write control = "load".'
-        )
-    points = content.get("points")
-    interval = number(content, "interval_s", "the programme") if "interval_s" in content else None
-    if points is not None and (isinstance(points, bool) or not isinstance(points, int)):
-        raise InputError(f"points must be a whole number, got {points!r}", file=file, remedy="Write points = 300.")
-    if points is None and interval is None:
-        points = 300
+    where = "the programme"
     try:
-        return Programme(control, tuple(steps), interval, points)
-    except ValueError as error:
-        raise InputError(str(error), file=file, remedy="See the example in `mcc-jax simulate --help`.") from error
+        _only(content, ("control", "rate", "points", "interval_s", "step"), where)
+        if not isinstance(content.get("step"), list) or not content["step"]:
+            raise InputError("has no [[step]]")  # noqa: TRY301
+        for i, entry in enumerate(content["step"], start=1):
+            where = f"step {i}"
+            if not isinstance(entry, dict) or ("ramp_to" in entry) == ("hold_s" in entry):
+                raise InputError("exactly one of ramp_to and hold_s is needed")  # noqa: TRY301
+            _only(entry, ("ramp_to", "rate", "hold_s"), where)
+            if "hold_s" in entry:
+                steps.append(Hold(arguments.number(entry["hold_s"], "hold_s")))
+            elif "rate" in entry or "rate" in content:
+                rate = arguments.number(entry.get("rate", content.get("rate")), "rate")
+                steps.append(Ramp(arguments.number(entry["ramp_to"], "ramp_to"), rate))
+            else:
+                raise InputError("no rate: give it one, or one for all at the top")  # noqa: TRY301
+        where = "the programme"
+        control = arguments.choice(content.get("control", "load"), get_args(Control), "control")
+        interval_s = arguments.number(content["interval_s"], "interval_s") if "interval_s" in content else None
+        points = content.get("points", 300 if interval_s is None else None)
+        return Programme(control, steps, interval_s, None if points is None else arguments.whole(points, "points"))
+    except InputError as error:
+        remedy = error.remedy or "See the example in `mcc-jax simulate --help`."
+        raise InputError(f"{where}: {error.problem}", file=file, remedy=remedy) from None
+
+
+def _only(entries: dict, known: tuple[str, ...], where: str) -> None:
+    for key in entries:
+        if key not in known:
+            raise InputError(f"unknown entry {key!r}", remedy=f"Known in {where}: {', '.join(known)}.")

@@ -4,8 +4,8 @@ import pytest
 from asserting import refused, snapshot
 
 from mcc_jax import calibrate
-from mcc_jax.cli import calibration, group
-from mcc_jax.cli.main import cli
+from mcc_jax.cli import calibrate as command
+from mcc_jax.cli.main import OneLineGroup, cli, explain
 
 
 def edit(file, old, new, count=1):
@@ -226,7 +226,7 @@ def test_whatever_is_raised_leaves_old_results(run, simulated, tmp_path, monkeyp
         raise error
 
     monkeypatch.setattr(calibrate, "calibrate_bayes", lambda *_, **__: None)
-    monkeypatch.setattr(calibration, "write_calibration", fail)
+    monkeypatch.setattr(command, "write_calibration", fail)
     monkeypatch.delenv("MCC_JAX_DEBUG", raising=False)
     before = snapshot(tmp_path)
     for out in (old, tmp_path / "new"):
@@ -242,7 +242,7 @@ def test_debug_shows_the_traceback_of_a_defect_only(run, simulated, tmp_path, mo
     def fail(*_, **__):
         raise RuntimeError("planted")
 
-    monkeypatch.setattr(calibration, "write_calibration", fail)
+    monkeypatch.setattr(command, "write_calibration", fail)
     arguments = ["calibrate", simulated, "--out", tmp_path / "fit", "--method", "paper"]
     result = run("--debug", *arguments)
     assert (result.exit_code, "Traceback" in result.stderr) == (1, True)
@@ -252,9 +252,9 @@ def test_debug_shows_the_traceback_of_a_defect_only(run, simulated, tmp_path, mo
 
 
 def test_interruption_outside_a_command():
-    stop = group.explain(KeyboardInterrupt(), debug=False)
+    stop = explain(KeyboardInterrupt(), debug=False)
     assert (stop.status, stop.line) == (130, "interrupted")
-    assert isinstance(cli, group.OneLineGroup)
+    assert isinstance(cli, OneLineGroup)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="a name of undecodable bytes")

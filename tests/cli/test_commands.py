@@ -89,6 +89,7 @@ def test_demo_does_the_whole_job(run, tmp_path):
     expected = {
         "report.html",
         "calibration.json",
+        "calibration.msgpack",
         "discovery.json",
         "campaign",
         "figures",

@@ -8,7 +8,7 @@ from asserting import snapshot
 from click.testing import CliRunner
 
 from mcc_jax.campaign import PAPER_DIAMETERS_UM
-from mcc_jax.cli.discovery import main_finding
+from mcc_jax.cli.discover import main_finding
 from mcc_jax.cli.main import cli
 from mcc_jax.effects import LIBRARY
 

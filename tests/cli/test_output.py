@@ -7,8 +7,7 @@ import pytest
 from asserting import snapshot
 
 from mcc_jax import InputError
-from mcc_jax._lock import LOCK, locked
-from mcc_jax._store import MOVES, WORK, json_text, results
+from mcc_jax._store import LOCK, MOVES, WORK, json_text, results, write_file
 
 
 def test_results_appear_together(tmp_path):
@@ -183,22 +182,46 @@ def test_a_move_that_fails_leaves_nothing_to_finish(tmp_path):
     assert set(snapshot(tmp_path)) == {"b"}
 
 
-def test_a_lock_that_vanishes_is_taken_anew(tmp_path, monkeypatch):
-    from mcc_jax import _lock as lock
+@pytest.mark.parametrize("kind", ["link", "pipe", "folder"])
+def test_what_is_no_file_in_the_locks_place_is_refused(tmp_path, kind):
+    """Whoever may write into the folder may have put it there, for us to write through."""
+    out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
+    out.mkdir()
+    elsewhere.write_text("theirs")
+    lock = out / LOCK
+    {"link": lambda: lock.symlink_to(elsewhere), "pipe": lambda: os.mkfifo(lock), "folder": lock.mkdir}[kind]()
+    with pytest.raises(InputError, match="is no regular file, and cannot lock the folder"), results(out):
+        pass
+    assert elsewhere.read_text() == "theirs"
+    assert [file.name for file in out.iterdir()] == [LOCK]
 
-    attempts, try_lock = [], lock._try_lock
 
-    def racing(handle: int) -> bool:
-        if not attempts:  # the run before removes its file just now
-            (tmp_path / LOCK).unlink()
-        attempts.append(handle)
-        return try_lock(handle)
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS])
+def test_a_file_system_without_locks(tmp_path, monkeypatch, number):
+    fcntl = pytest.importorskip("fcntl")
 
-    monkeypatch.setattr(lock, "_try_lock", racing)
-    with locked(tmp_path):
-        assert len(attempts) == 2
-        assert (tmp_path / LOCK).exists()
-    assert not (tmp_path / LOCK).exists()
+    def no_locks(*_):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(fcntl, "flock", no_locks)
+    with results(tmp_path) as stage:
+        (stage.folder / "a").write_text("a")
+    assert snapshot(tmp_path) == {"a": b"a"}
+
+
+def test_one_file_is_replaced_when_it_is_complete(tmp_path):
+    file = tmp_path / "state"
+    file.write_text("old")
+
+    def half(stream):
+        stream.write(b"ha")
+        raise ValueError("planted")
+
+    with pytest.raises(ValueError, match="planted"):
+        write_file(file, half)
+    assert snapshot(tmp_path) == {"state": b"old"}
+    write_file(file, lambda stream: stream.write(b"new"))
+    assert snapshot(tmp_path) == {"state": b"new"}
 
 
 def test_json_is_strict():

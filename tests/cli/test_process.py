@@ -124,11 +124,11 @@ def test_killed_in_the_middle(tmp_path, number, status):
 @posix
 def test_who_interrupts_does_not_wait_for_other_threads():
     code = (
-        "import threading, time, click; from mcc_jax.cli import _main\n"
+        "import threading, time, click; from mcc_jax.cli.main import cli, main\n"
         "threading.Thread(target=time.sleep, args=(60,)).start()\n"
-        "@_main.cli.command()\n"
+        "@cli.command()\n"
         "def halt(): raise KeyboardInterrupt\n"
-        "_main.main()"
+        "main()"
     )
     result = subprocess.run([sys.executable, "-c", code, "halt"], capture_output=True, text=True, timeout=30)
     assert (result.returncode, result.stdout, result.stderr) == (130, "", "mcc-jax: interrupted\n")
@@ -141,14 +141,14 @@ def test_who_interrupts_does_not_wait_for_other_threads():
 )
 def test_a_signal_within_a_destructor_is_not_lost(number, status, line):
     code = (
-        "import os, time; from mcc_jax.cli import _main\n"
+        "import os, time; from mcc_jax.cli.main import cli, main\n"
         "class Shy:\n"
         f"    def __del__(self): os.kill(os.getpid(), {number:d}); time.sleep(1)\n"
-        "@_main.cli.command()\n"
+        "@cli.command()\n"
         "def halt():\n"
         "    Shy()\n"
         "    for _ in range(40): time.sleep(0.1)\n"
-        "_main.main()"
+        "main()"
     )
     result = subprocess.run([sys.executable, "-c", code, "halt"], capture_output=True, text=True, timeout=30)
     assert (result.returncode, result.stdout, result.stderr) == (status, "", line)

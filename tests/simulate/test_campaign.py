@@ -10,7 +10,6 @@ from mcc_jax import (
     Particle,
     Plastic,
     Programme,
-    batch,
     paper_campaign,
     simulate_campaign,
 )
@@ -79,19 +78,6 @@ def test_displacement_control_reaches_the_asked_stress():
     for curve, (D1, D2, D3) in zip(campaign.curves, campaign.diameters_um, strict=True):
         stress = 1e3 * curve.force_mN.max() / (np.pi * (D1 * D2 / D3 / 2) ** 2)
         assert PAPER_PEAK_STRESS_MPA[0] * 0.999 <= stress <= PAPER_PEAK_STRESS_MPA[1] * 1.001
-
-
-def test_unequal_lengths_are_padded_with_valid_values_and_masked():
-    campaign = quiet(seed=1, programme=Programme.cycles(interval_s=3.0))
-    lengths = [len(c) for c in campaign.curves]
-    assert len(set(lengths)) > 5
-    padded = batch(campaign, multiple=16)
-    assert padded.force.shape[1] % 16 == 0
-    assert np.isfinite(np.asarray(padded.displacement)).all()
-    np.testing.assert_array_equal(np.asarray(padded.mask).sum(axis=1), lengths)
-    for i, curve in enumerate(campaign.curves):
-        np.testing.assert_array_equal(np.asarray(padded.force)[i, : len(curve)], curve.force_mN)
-        assert (np.asarray(padded.force)[i, len(curve) :] == curve.force_mN[-1]).all()
 
 
 def test_padding_changes_no_particle():

@@ -107,14 +107,14 @@ def test_programme_file_round_trip(tmp_path):
         ("rate = 2", "no [[step]]"),
         ("speed = 2\n[[step]]\nramp_to=1", "unknown entry 'speed'"),
         ("[[step]]\nramp_to = 1", "no rate"),
-        ("rate=1\n[[step]]\nramp_to = 'full'", "must be a number"),
+        ("rate=1\n[[step]]\nramp_to = 'full'", "must be a finite number"),
         ("rate=1\n[[step]]\nramp_to = 1\nhold_s = 2", "exactly one of"),
         ("rate=1\n[[step]]\nramp_to = 1\nfast = true", "unknown entry 'fast'"),
         ("rate=-1\n[[step]]\nramp_to = 1", "rate"),
         ("rate=1\npoints=2.5\n[[step]]\nramp_to = 1", "whole number"),
         ("control='torque'\nrate=1\n[[step]]\nramp_to = 1", "control"),
         ("step = 3", "no [[step]]"),
-        ("rate=true\n[[step]]\nramp_to = 1", "must be a number"),
+        ("rate=true\n[[step]]\nramp_to = 1", "must be a finite number"),
     ],
 )
 def test_bad_programme_files_are_told_in_one_line(tmp_path, text, message):

@@ -149,71 +149,80 @@ def read_mapping(path: str | os.PathLike[str]) -> MappingFile:
     """
     file = Path(path)
     entries = load_toml_file(file, "a TOML mapping file")
-    known = [name for name in MappingFile.__dataclass_fields__ if name not in ("file", "pace")]
-    _only(entries, known, file)
+    try:
+        return MappingFile(file=file, **_values(entries, file))
+    except InputError as error:
+        raise InputError(error.problem, file=file, column=error.column, remedy=error.remedy) from None
+
+
+_WANTED = {
+    "encoding": (str, 'a name such as "latin-1"'),
+    "delimiter": (str, '"comma", "semicolon", "tab", "space" or one character'),
+    "sheet": ((str, int), "the sheet's name, or its number from 1 on"),
+    "decimal_mark": (str, '"." or ","'),
+    "thousands": (str, '"point", "comma", "apostrophe", "space", "none" or one of these characters'),
+    "missing": (list, 'a list of texts and numbers such as ["NaN", "", -999]'),
+    "comment_prefix": (str, 'text such as "#"'),
+    "skip_rows": (int, "a whole number, 0 or more"),
+    "begin": (str, "the text that the header begins with"),
+    "header_rows": (int, "a whole number, 0 or more"),
+    "skip_footer": (int, "a whole number, 0 or more"),
+    "end": (str, "the text that the first row below the samples begins with"),
+    "tests": (str, '"file", "blank line", "header" or "column"'),
+    "test_name": (str, "text"),
+    "control": (str, '"load" or "displacement"'),
+    "provenance": (str, "text"),
+}
+"""Kinds of the plain entries, and what to write."""
+
+
+def _wrong(problem: str, key: str, remedy: str) -> InputError:
+    return InputError(problem, column=key, remedy=remedy)
+
+
+def _values(entries: dict[str, Any], file: Path) -> dict[str, Any]:
+    _only(entries, [*_WANTED, "columns", "diameters_um", "diameters"])
     values: dict[str, Any] = {}
-    for key, kind, wanted in (
-        ("encoding", str, 'a name such as "latin-1"'),
-        ("delimiter", str, '"comma", "semicolon", "tab", "space" or one character'),
-        ("sheet", (str, int), "the sheet's name, or its number from 1 on"),
-        ("decimal_mark", str, '"." or ","'),
-        ("thousands", str, '"point", "comma", "apostrophe", "space", "none" or one of these characters'),
-        ("missing", list, 'a list of texts and numbers such as ["NaN", "", -999]'),
-        ("comment_prefix", str, 'text such as "#"'),
-        ("skip_rows", int, "a whole number, 0 or more"),
-        ("begin", str, "the text that the header begins with"),
-        ("header_rows", int, "a whole number, 0 or more"),
-        ("skip_footer", int, "a whole number, 0 or more"),
-        ("end", str, "the text that the first row below the samples begins with"),
-        ("tests", str, '"file", "blank line", "header" or "column"'),
-        ("test_name", str, "text"),
-        ("control", str, '"load" or "displacement"'),
-        ("provenance", str, "text"),
-    ):
+    for key, (kind, wanted) in _WANTED.items():
         if key in entries:
             value = entries[key]
             if not isinstance(value, kind) or isinstance(value, bool) or not _allowed(key, value):
-                raise InputError(f"{value!r} is not allowed", file=file, column=key, remedy=f"Write {wanted}")
+                raise _wrong(f"{value!r} is not allowed", key, f"Write {wanted}")
             values[key] = value
     if "delimiter" in values:
         values["delimiter"] = _DELIMITERS.get(values["delimiter"], values["delimiter"])
     if "thousands" in values:
         values["thousands"] = (_THOUSANDS | _SAME)[values["thousands"]]
-    if "missing" in values:
-        # TOML has a number nan, which equals nothing, itself included.
-        values["missing"] = tuple(
-            float(mark) if not isinstance(mark, str) and math.isfinite(mark) else str(mark).strip()
-            for mark in values["missing"]
-        )
-    _check_marks(values, file)
-    if values.get("test_name") is not None and values.get("tests", "file") != "file":
-        raise InputError('is for tests = "file" only', file=file, column="test_name", remedy="Remove it")
-    values["columns"], values["pace"] = _columns(entries, values, file)
+    # TOML has a number nan, which equals nothing, itself included.
+    values["missing"] = tuple(
+        float(mark) if not isinstance(mark, str) and math.isfinite(mark) else str(mark).strip()
+        for mark in values.get("missing", ())
+    )
+    _check_marks(values)
+    if "test_name" in values and values.get("tests", "file") != "file":
+        raise _wrong('is for tests = "file" only', "test_name", "Remove it")
+    values["columns"], values["pace"] = _columns(entries, values)
     if "diameters" in entries:
         if "diameters_um" in entries:
-            raise InputError("is given beside 'diameters_um'", file=file, column="diameters", remedy="Keep one of them")
-        values["diameters"] = _in_header(entries["diameters"], file)
+            raise _wrong("is given beside 'diameters_um'", "diameters", "Keep one of them")
+        values["diameters"] = _in_header(entries["diameters"])
     if "diameters_um" in entries:
         values["diameters_um"] = _diameters(entries["diameters_um"], file)
-    return MappingFile(file=file, **values)
+    return values
 
 
-def _check_marks(values: dict[str, Any], file: Path) -> None:
+def _check_marks(values: dict[str, Any]) -> None:
     """Refuse keys that contradict each other."""
     thousands = values.get("thousands", "")
-    if values.get("decimal_mark", ".") in thousands or (values.get("delimiter") == " " and " " in thousands):
-        other = "decimal mark" if values.get("decimal_mark", ".") in thousands else "delimiter"
-        raise InputError(
-            f"the mark between thousands is also the {other}",
-            file=file,
-            column="thousands",
-            remedy="Correct one of them",
-        )
+    decimals = values.get("decimal_mark", ".") in thousands
+    if decimals or (values.get("delimiter") == " " and " " in thousands):
+        other = "decimal mark" if decimals else "delimiter"
+        raise _wrong(f"the mark between thousands is also the {other}", "thousands", "Correct one of them")
     if "begin" in values and "skip_rows" in values:
-        raise InputError("is given beside 'skip_rows'", file=file, column="begin", remedy="Keep one of them")
+        raise _wrong("is given beside 'skip_rows'", "begin", "Keep one of them")
     needing = "begin" if "begin" in values else "tests" if values.get("tests") == "header" else None
     if needing is not None and values.get("header_rows", 1) == 0:
-        raise InputError("needs a header", file=file, column=needing, remedy="Write header_rows of at least 1")
+        raise _wrong("needs a header", needing, "Write header_rows of at least 1")
 
 
 def _allowed(key: str, value: Any) -> bool:
@@ -244,88 +253,78 @@ def _allowed(key: str, value: Any) -> bool:
             return bool(value.strip())
 
 
-def _only(entries: MappingABC[str, Any], known: list[str], file: Path, inside: str = "") -> None:
+def _only(entries: MappingABC[str, Any], known: list[str], inside: str = "") -> None:
     for key in entries:
         if key not in known:
             close = get_close_matches(key, known, n=1)
             remedy = f"Did you mean {inside + close[0]!r}?" if close else f"Known keys: {', '.join(known)}"
-            raise InputError("is not a key of a mapping file", file=file, column=inside + key, remedy=remedy)
+            raise _wrong("is not a key of a mapping file", inside + key, remedy)
 
 
-def _columns(entries: dict[str, Any], values: dict[str, Any], file: Path) -> tuple[dict[str, Column], Pace | None]:
+def _columns(entries: dict[str, Any], values: dict[str, Any]) -> tuple[dict[str, Column], Pace | None]:
     tables = entries.get("columns")
     if not isinstance(tables, dict):
-        raise InputError(
-            "the table 'columns' is missing",
-            file=file,
-            remedy='Add [columns.force] with column = "..." and unit = "mN"',
-        )
-    by_column = values.get("tests") == "column"
-    needed = [*DIMENSIONS, *(["test"] if by_column else [])]
+        remedy = 'Add [columns.force] with column = "..." and unit = "mN"'
+        raise InputError("the table 'columns' is missing", remedy=remedy)
+    needed = [*DIMENSIONS, *(["test"] if values.get("tests") == "column" else [])]
     for name in ("test", "particle", "sample", "specimen"):
         if name in tables and name not in needed:
-            raise InputError(
-                "is not a key of a mapping file",
-                file=file,
-                column=f"columns.{name}",
-                remedy='If a column names the test, write tests = "column" above [columns] and call it test there',
-            )
-    _only(tables, needed, file, "columns.")
+            remedy = 'If a column names the test, write tests = "column" above [columns] and call it test there'
+            raise _wrong("is not a key of a mapping file", f"columns.{name}", remedy)
+    _only(tables, needed, "columns.")
     found: dict[str, Column] = {}
     pace: Pace | None = None
     for name in needed:
         place = f"columns.{name}"
         table = tables.get(name)
         if not isinstance(table, dict):
-            raise InputError(f"the table {place!r} is missing", file=file, remedy=f"Add [{place}]")
+            raise InputError(f"the table {place!r} is missing", remedy=f"Add [{place}]")
         if name == "time" and ("speed" in table or "interval" in table):
-            pace = _pace(table, file)
+            pace = _pace(table)
             continue
         further = ["speed", "interval"] if name == "time" else []
-        _only(table, ["column", "unit", "sign", *further] if name in DIMENSIONS else ["column"], file, place + ".")
+        _only(table, ["column", "unit", "sign", *further] if name in DIMENSIONS else ["column"], place + ".")
         column = table.get("column")
-        if isinstance(column, bool) or not isinstance(column, str | int) or column in ("",) or column == 0:
-            raise InputError(
-                "must be a name in the header or a number from 1 on",
-                file=file,
-                column=f"{place}.column",
-                remedy='Write column = "Load" or column = 2',
-            )
+        if isinstance(column, bool) or not isinstance(column, str | int) or column in ("", 0):
+            remedy = 'Write column = "Load" or column = 2'
+            raise _wrong("must be a name in the header or a number from 1 on", f"{place}.column", remedy)
         if (isinstance(column, int) and column < 1) or (isinstance(column, str) and values.get("header_rows", 1) == 0):
-            raise InputError(
-                f"{column!r} cannot be found",
-                file=file,
-                column=f"{place}.column",
-                remedy="Count columns from 1; names need header_rows of at least 1",
-            )
-        found[name] = Column(column, *_meaning(table, name, file)) if name in DIMENSIONS else Column(column)
+            remedy = "Count columns from 1; names need header_rows of at least 1"
+            raise _wrong(f"{column!r} cannot be found", f"{place}.column", remedy)
+        found[name] = Column(column, *_meaning(table, name)) if name in DIMENSIONS else Column(column)
     return found, pace
 
 
-def _pace(table: dict[str, Any], file: Path) -> Pace:
+def _factor(unit: Any, dimension: str, place: str) -> Fraction:
+    if not isinstance(unit, str):
+        problem = "the unit is missing" if unit is None else f"{unit!r} is not a unit"
+    else:
+        try:
+            return unit_factor(unit, dimension)
+        except ValueError as error:
+            problem = str(error)
+    raise _wrong(problem, f"{place}.unit", f"Write one of {EXAMPLES[dimension]}")
+
+
+def _pace(table: dict[str, Any]) -> Pace:
     """The time from `speed` or `interval`."""
     which = "speed" if "speed" in table else "interval"
     place = "columns.time"
-    _only(table, [which, "unit"], file, f"{place}.")
+    _only(table, [which, "unit"], f"{place}.")
     value, unit = table[which], table.get("unit")
     if isinstance(value, bool) or not isinstance(value, int | float) or not 1e-15 <= value <= 1e15:
-        raise InputError(
-            f"{value!r} is not a positive number", file=file, column=f"{place}.{which}", remedy="Correct it"
-        )
-    example = "mm/s, um/s, mm/min" if which == "speed" else EXAMPLES[TIME]
+        raise _wrong(f"{value!r} is not a positive number", f"{place}.{which}", "Correct it")
+    if which == "interval":
+        return Pace(interval_s=float(value * _factor(unit, TIME, place)))
     length, slash, time = str(unit).partition("/")
-    try:
-        if not isinstance(unit, str) or bool(slash) != (which == "speed"):
-            raise ValueError("the unit is missing" if unit is None else f"{unit!r} is no unit of {which}")  # noqa: TRY301
-        if which == "interval":
-            return Pace(interval_s=float(value * unit_factor(unit, TIME)))
-        factor = unit_factor(length.strip(), LENGTH) / unit_factor(time.strip(), TIME)
-    except ValueError as error:
-        raise InputError(str(error), file=file, column=f"{place}.unit", remedy=f"Write one of {example}") from None
+    if not slash:
+        problem = "the unit is missing" if unit is None else f"{unit!r} is no unit of speed"
+        raise _wrong(problem, f"{place}.unit", "Write one of mm/s, um/s, mm/min")
+    factor = _factor(length.strip(), LENGTH, place) / _factor(time.strip(), TIME, place)
     return Pace(speed_um_per_s=float(value * factor))
 
 
-def _in_header(table: Any, file: Path) -> InHeader:
+def _in_header(table: Any) -> InHeader:
     """The rows above the samples that hold the diameters."""
     names = table.get("header") if isinstance(table, dict) else None
     names = [names] if isinstance(names, str) else names
@@ -334,49 +333,28 @@ def _in_header(table: Any, file: Path) -> InHeader:
         or len(names) not in (1, 3)
         or not all(isinstance(n, str) and n.strip() for n in names)
     ):
-        raise InputError(
-            "must name one row, or three",
-            file=file,
-            column="diameters.header",
-            remedy='Write header = "Gage length", or header = ["D1", "D2", "D3"]; diameters of your own belong in '
-            "[diameters_um]",
-        )
-    _only(table, ["header", "unit"], file, "diameters.")
-    unit = table.get("unit")
-    try:
-        factor = None if unit is None else unit_factor(str(unit), LENGTH)
-    except ValueError as error:
-        remedy = f"Write one of {EXAMPLES[LENGTH]}"
-        raise InputError(str(error), file=file, column="diameters.unit", remedy=remedy) from None
+        remedy = 'Write header = "Gage length", or header = ["D1", "D2", "D3"]; diameters of your own belong in '
+        raise _wrong("must name one row, or three", "diameters.header", remedy + "[diameters_um]")
+    _only(table, ["header", "unit"], "diameters.")
+    factor = _factor(table["unit"], LENGTH, "diameters") if "unit" in table else None
     return InHeader(tuple(same_text(name).strip() for name in names), factor)
 
 
-def _meaning(table: dict[str, Any], name: str, file: Path) -> tuple[Fraction, int]:
-    dimension, place = DIMENSIONS[name], f"columns.{name}"
-    unit, sign = table.get("unit"), table.get("sign", 1)
-    remedy = f"Write one of {EXAMPLES[dimension]}"
-    if not isinstance(unit, str):
-        problem = "the unit is missing" if unit is None else f"{unit!r} is not a unit"
-        raise InputError(problem, file=file, column=f"{place}.unit", remedy=remedy)
-    try:
-        factor = unit_factor(unit, dimension)
-    except ValueError as error:
-        raise InputError(str(error), file=file, column=f"{place}.unit", remedy=remedy) from None
+def _meaning(table: dict[str, Any], name: str) -> tuple[Fraction, int]:
+    place, sign = f"columns.{name}", table.get("sign", 1)
+    factor = _factor(table.get("unit"), DIMENSIONS[name], place)
     if isinstance(sign, bool) or sign not in (1, -1):
-        raise InputError(f"{sign!r} is not a sign", file=file, column=f"{place}.sign", remedy="Write 1 or -1")
+        raise _wrong(f"{sign!r} is not a sign", f"{place}.sign", "Write 1 or -1")
     return factor, int(sign)
 
 
 def _diameters(table: Any, file: Path) -> Diameters:
     if not isinstance(table, dict) or not table:
-        raise InputError("must be a table", file=file, column="diameters_um", remedy="Write all = [D1, D2, D3]")
+        raise _wrong("must be a table", "diameters_um", "Write all = [D1, D2, D3]")
     for name, triple in table.items():
-        numbers = isinstance(triple, list) and all(isinstance(v, int | float) and v is not True for v in triple)
-        if not numbers:
-            raise InputError(
-                "must be three numbers", file=file, column=f"diameters_um.{name}", remedy="Write [D1, D2, D3] in um"
-            )
+        if not isinstance(triple, list) or not all(isinstance(v, int | float) and v is not True for v in triple):
+            raise _wrong("must be three numbers", f"diameters_um.{name}", "Write [D1, D2, D3] in um")
         check_triple(triple, f"{name!r}", file)
-    if "all" in table and len(table) == 1:
+    if list(table) == ["all"]:
         return [float(value) for value in table["all"]]
     return {name: [float(value) for value in triple] for name, triple in table.items()}
