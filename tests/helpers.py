@@ -47,6 +47,13 @@ SOME_FORMS = pytest.mark.parametrize(
         if i % 4 == 0
     ],
 )
+
+
+def first_in_time(values, keep=1):
+    """Parameters of which a quick run takes the first; `pytest -m long` takes the others."""
+    return [v if i < keep else pytest.param(v, marks=pytest.mark.long) for i, v in enumerate(values)]
+
+
 EPS = {np.dtype("float64"): 2.0**-52, np.dtype("float32"): 2.0**-23}
 
 

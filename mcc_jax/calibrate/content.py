@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -29,6 +30,14 @@ def _no_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is no number of JSON")
 
 
+def _finite(text: str) -> float:
+    """A number that JSON can hold again: Python also reads 1e400, and would not write it."""
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"{text[:40]} is no number of JSON")
+    return number
+
+
 def read_result(file: Path, again: str) -> dict[str, Any]:
     """The contents of a result.
 
@@ -42,7 +51,7 @@ def read_result(file: Path, again: str) -> dict[str, Any]:
     remedy = f"Write it again: {again}"
     try:
         data = read_regular(file, LIMITS.result_bytes, remedy)
-        content = json.loads(data.decode("utf-8"), parse_constant=_no_constant)
+        content = json.loads(data.decode("utf-8"), parse_constant=_no_constant, parse_float=_finite)
     except InputError:
         raise
     except json.JSONDecodeError as error:

@@ -10,10 +10,11 @@ from .. import arguments
 from .._errors import InputError
 from .contact import MISALIGNMENT, POP_IN, TOE
 from .creep import CREEP
+from .cycles import HYSTERESIS, RATCHETING
 from .loading import FRICTION, HARDENING, RATE
 from .material import DAMAGE, DENSIFICATION, HUMIDITY, SHAPE, SIZE
 from .tester import DRIFT, FRAME, SINK_IN
-from .unloading import ADHESION, HYSTERESIS, RATCHETING, REVERSAL, SHAPE_OF_UNLOADING
+from .unloading import ADHESION, REVERSAL, SHAPE_OF_UNLOADING
 from .variant import Mechanism, Variant
 
 _ALL = (

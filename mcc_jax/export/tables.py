@@ -68,7 +68,7 @@ def curve_tables(
     """
     import pandas as pd
 
-    checked(law, particle, needed=bool(law.effects))
+    checked(law, particle, needed=bool(getattr(law, "effects", ())))
     strain_max = arguments.number(strain_max, "strain_max", above=0)
     tolerance = arguments.number(tolerance, "tolerance", above=0)
     formulas, side = law.formulas, None

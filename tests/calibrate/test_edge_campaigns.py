@@ -115,7 +115,7 @@ def test_the_campaign_is_ragged(campaign):
     assert len({len(curve) for curve in campaign.curves}) >= 5
 
 
-@methods
+@few
 def test_every_particle_has_numbers_or_a_reason(campaign, contents, method):
     content = contents[method]
     check_contract(content, campaign)

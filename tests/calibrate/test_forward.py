@@ -107,6 +107,7 @@ peak_slopes = eqx.filter_jit(
 )
 
 
+@pytest.mark.long
 @forms
 @pytest.mark.parametrize("hum", [0.0, 0.5], ids=["clean", "noisy"])
 def test_how_noise_of_force_moves_a_prediction(unloading, hum):

@@ -15,6 +15,7 @@ from worker import case_of
 ROOT = Path(__file__).parents[2]
 
 
+@pytest.mark.long
 def test_every_fault_is_noticed_and_kept(tmp_path):
     plan = shares("bad_targets", 9)
     table = run(Watched("bad_targets", plan, 0, tmp_path, seconds=0.5, double=False))

@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import (
-    ALL_IN_TIME,
     FORMS,
     SOME_FORMS,
     all_finite,
     between,
     close,
+    first_in_time,
     paper_law,
     paper_particle,
     shape_factor,
@@ -87,7 +87,7 @@ def compare(unloading, scaling, theta, seed, by_scan):
     return forward, scale
 
 
-@ALL_IN_TIME
+@SOME_FORMS
 @settings(max_examples=6, deadline=None, derandomize=True)
 @given(theta=thetas(softening=between(0.0, 0.8)), seed=st.integers(0, 10**6))
 def test_forward_is_reverse_is_finite_difference(unloading, scaling, theta, seed):
@@ -95,6 +95,7 @@ def test_forward_is_reverse_is_finite_difference(unloading, scaling, theta, seed
     compare(unloading, scaling, theta, seed, by_scan=False)
 
 
+@pytest.mark.long
 @SOME_FORMS
 @settings(max_examples=6, deadline=None, derandomize=True)
 @given(theta=thetas(softening=between(0.0, 0.8)), seed=st.integers(0, 10**6))
@@ -166,6 +167,7 @@ def test_value_and_derivatives_are_finite_where_branches_meet(unloading, scaling
     finite_everywhere(unloading, scaling, jnp.float64, along_a_path)
 
 
+@pytest.mark.long
 @SOME_FORMS
 def test_value_and_derivatives_are_finite_in_single_precision(unloading, scaling):
     finite_everywhere(unloading, scaling, jnp.float32, along_a_path)
@@ -188,7 +190,7 @@ def one_step(law, particle, state, value, load):
     return jnp.stack([response, state.displacement_max])
 
 
-@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("mode", first_in_time([jax.jacrev, jax.jacfwd]))
 def test_a_tie_has_the_loading_tangent(mode):
     """At the peak again: `step` takes it as loading; along a path the equal values share one loading tangent."""
     theta = jnp.asarray(THETA)

@@ -51,7 +51,7 @@ def routes(unloading, scaling):
     }
 
 
-@ALL_FORMS
+@ALL_IN_TIME
 @settings(max_examples=10, deadline=None, derandomize=True)
 @given(theta=thetas(), x=scaled_paths(), start=st.one_of(st.just(0.0), between(0.0, 0.6)))
 def test_closed_form_is_the_scan(unloading, scaling, theta, x, start):

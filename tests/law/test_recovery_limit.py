@@ -85,14 +85,14 @@ def test_random_paths_gain_nothing(unloading, scaling):
 def test_the_paths_would_show_a_gain(monkeypatch):
     """Without the limit the printed form gains on them, so the test above can fail."""
     import mcc_jax.formulas.branch as branch
-    import mcc_jax.law.mcc as mcc
+    import mcc_jax.formulas.contact as contact
 
     def none(peak, secant, tangent):
         return jnp.full_like(peak, jnp.inf), tangent > secant
 
     jax.clear_caches()
     monkeypatch.setattr(branch, "recovery_limit", none)
-    monkeypatch.setattr(mcc, "recovery_limit", none)
+    monkeypatch.setattr(contact, "recovery_limit", none)
     law, particle = energy_paths.draw(3, 200, *FORMS[0])
     whole, between = energy_paths.gains(*energy_paths.single(law, particle, *energy_paths.choices(3, 200)))
     jax.clear_caches()
