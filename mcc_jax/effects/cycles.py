@@ -13,6 +13,10 @@ from .effect import AbstractEffect
 from .record import RELOAD, UNLOAD, reload_progress
 from .variant import Mechanism, Need, Nuisance, Variant
 
+_NORM = 27 / 4
+"""What makes the largest value of x (1 - x)^2 one."""
+
+
 # ---- hysteresis of the reload ----------------------------------------------------------------------------------------
 
 

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from random import Random
 
+import pytest
 from mutators import mutate
 from runner import Watched, run, shares
 from targets import READERS
