@@ -61,7 +61,7 @@ def read_archive(file: Path) -> Any:
     try:
         archive = msgspec.msgpack.decode(raw, type=_Archive)
         known = archive.format == FORMAT
-    except (msgspec.DecodeError, RecursionError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"is no result of mcc_jax, or is cut off: {error}", file=file, remedy=AGAIN) from None
     if not known:
         raise InputError(f"is something else, {archive.format[:60]!r}", file=file, remedy=AGAIN)

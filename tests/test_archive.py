@@ -70,11 +70,15 @@ def damaged(file, change):
         (lambda file: file.write_bytes(file.read_bytes()[:-100]), "cut off"),
         (lambda file: file.write_bytes(b"\x89HDF\r\n\x1a\n and so on"), "no result of mcc_jax"),
         (lambda file: file.write_bytes(b""), "cut off"),
+        (
+            lambda file: file.write_bytes(file.read_bytes().replace(b"mcc_jax result", b"mcc_jax \xff\xfesult")),
+            "no result",
+        ),
         (lambda file: damaged(file, {"version": 2, "written_by": "9.1.0"}), "newer version, 9.1.0"),
         (lambda file: damaged(file, {"format": "another"}), "something else"),
         (lambda file: damaged(file, {"content": b"\x90"}), "checksum"),
     ],
-    ids=["truncated", "foreign", "empty", "newer", "another format", "changed"],
+    ids=["truncated", "foreign", "empty", "no text", "newer", "another format", "changed"],
 )
 def test_a_damaged_foreign_or_newer_file_is_one_line(tmp_path, change, words):
     file = tmp_path / "calibration.msgpack"
