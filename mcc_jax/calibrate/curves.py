@@ -11,12 +11,11 @@ import numpy as np
 
 from ..campaign import Campaign, Segment, campaign_segments, particle_batch
 from ..simulate import simulate_batch
-from .data import rows_from_contact
+from .data import MAX_POINTS, rows_from_contact
 from .laws import laws_of
+from .population import COEFFICIENTS
 
 KINDS = ("load", "hold", "unload", "reload")
-MAX_POINTS = 400
-"""Points of a longer record that are kept, as many as calibrations compare."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +88,7 @@ def fitted_curves(
 
 
 def _known(entry: Mapping[str, Any]) -> bool:
-    return entry["kept"] and all(entry[name]["value"] is not None for name in ("C1", "C3", "C5"))
+    return entry["kept"] and all(entry[name]["value"] is not None for name in COEFFICIENTS)
 
 
 def _measured(

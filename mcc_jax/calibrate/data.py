@@ -31,6 +31,9 @@ from .paper.prediction import READING_UM, point_noise_um
 MIN_POINTS = 12
 """Fewer usable points than this cannot carry three coefficients, a zero and their noise."""
 
+MAX_POINTS = 400
+"""Longer records are thinned to about so many rows."""
+
 MIN_CLIMB = 8.0
 """Displacement must grow over loading by this many times its noise, or there is no curve to fit."""
 
@@ -131,7 +134,9 @@ class Selection:
     notes: tuple[str, ...]
 
 
-def select_tests(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_points: int = 400) -> Selection:
+def select_tests(
+    campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_points: int = MAX_POINTS
+) -> Selection:
     """Choose what the joint calibration uses.
 
     Points count from the threshold stress on, below which surface asperities and not the particle deform. On unloading

@@ -13,6 +13,10 @@ BAD_MISFIT = 0.05
 """Share of the range of displacement; with the law's own data and a tester's noise it stays below 0.01."""
 
 
+NO_SAMPLER: dict[str, None] = dict.fromkeys(("rhat_max", "ess_bulk_min", "divergences", "pareto_k_max"))
+"""Diagnostics of methods that draw nothing."""
+
+
 def misfit_note(own_misfit: float) -> str | None:
     """A sentence if the law describes the tests badly even with each particle's own coefficients, else None."""
     if not own_misfit > BAD_MISFIT:

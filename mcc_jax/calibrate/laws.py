@@ -12,8 +12,8 @@ import numpy as np
 
 from .._errors import InputError
 from ..law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainScaling, Unloading
+from .population import COEFFICIENTS
 
-COEFFICIENTS = ("C1", "C3", "C5")
 RIGID_MPA = 1e9
 """Where no test was unloaded the modulus cannot matter; a stiff one keeps the law defined."""
 

@@ -15,7 +15,7 @@ from .. import arguments
 from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_tests
 from .block_arrow import Parameters, Solution
 from .data import Selection, Tests, compared_rows, own_misfit, ranges_um, root_mean_squares
-from .estimates import estimate, finite, force_zero, log_estimate, misfit_note, power_of_e
+from .estimates import NO_SAMPLER, estimate, finite, force_zero, log_estimate, misfit_note, power_of_e
 from .fit import beyond_numbers, population_at, prepare
 from .hierarchical import Pooled, fit_pooled, unpack
 from .judgement import judged, numbers_in_reach, unlike_others
@@ -224,10 +224,7 @@ class LeastSquaresCalibration(Calibration):
             "warnings": self.warnings(),
             "findings": [one.to_json() for one in self.findings],
             "diagnostics": {
-                "rhat_max": None,
-                "ess_bulk_min": None,
-                "divergences": None,
-                "pareto_k_max": None,
+                **NO_SAMPLER,
                 "steps": steps,
                 "loss": finite(float(self.solution.loss)),
                 "chi2_per_dof": finite(self._chi2()),

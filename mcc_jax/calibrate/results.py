@@ -23,21 +23,55 @@ from .curves import FittedCurve, fitted_curves
 from .data import Selection
 from .laws import law_of
 from .model import JointFit, JointModel
-from .population import Population
+from .population import COEFFICIENTS, Population
 
 ARCHIVE, CONTENT, DISCOVERY_ARCHIVE = "calibration.msgpack", "calibration.json", "discovery.msgpack"
 A_FOLDER = "Give a folder that a result's save, mcc-jax calibrate or mcc-jax discover wrote into."
 
 
-class Calibration(abc.ABC):
-    """A calibration of any method: `law`, `curves`, `save`; `mcc_jax.load` reads what was saved."""
+class Saved(abc.ABC):
+    """What is written as JSON for people and as an archive that `mcc_jax.load` reads.
 
-    archived: ClassVar[tuple[str, ...]] = ("curves",)  # kept with the fields: nobody works them out again
-    campaign: Any  # the tests, or None where only numbers are left
+    Attributes:
+        content_file: name of the JSON.
+        archive_file: name of the archive.
+    """
+
+    content_file: ClassVar[str]
+    archive_file: ClassVar[str]
 
     @abc.abstractmethod
     def to_json(self) -> dict[str, Any]:
-        """The contents of `calibration.json`."""
+        """The contents of the JSON."""
+
+    def save(self, folder: str | Path) -> None:
+        """Write the JSON and what `mcc_jax.load` reads into a folder: both or nothing.
+
+        Raises:
+            InputError: if the folder cannot be written, or a part cannot be read back.
+        """
+        with results(arguments.file_path(folder, "folder")) as stage:
+            self.write(stage.folder)
+
+    def write(self, folder: Path, **more: Any) -> dict[str, Any]:
+        """Write the files of `save` into a folder that appears as a whole; returns the contents of the JSON.
+
+        Args:
+            folder: an existing folder.
+            more: further entries of the JSON, such as provenance.
+        """
+        content = self.to_json() | more
+        (folder / self.content_file).write_text(json_text(content), encoding="utf-8")
+        (folder / self.archive_file).write_bytes(encode(self))
+        return content
+
+
+class Calibration(Saved):
+    """A calibration of any method: `law`, `curves`, `save`; `mcc_jax.load` reads what was saved."""
+
+    content_file, archive_file = CONTENT, ARCHIVE
+    archived: ClassVar[tuple[str, ...]] = ("curves",)  # kept with the fields: nobody works them out again
+    campaign: Any  # the tests, or None where only numbers are left
 
     def __repr__(self) -> str:
         content = self.to_json()
@@ -46,7 +80,7 @@ class Calibration(abc.ABC):
         title += "converged" if content["converged"] else "NOT converged"
         rows = [("shape parameter a", with_sd(content["a"]))]
         rows.append(("effective modulus", f"{with_sd(content['effective_modulus_MPa'], 1e-3)} GPa"))
-        for name in ("C1", "C3", "C5"):
+        for name in COEFFICIENTS:
             log = content[f"log_{name}"]
             rows.append((f"log {name}", f"mean {with_sd(log['mean'])}, sd between particles {with_sd(log['sd'])}"))
         law = content["law"]
@@ -82,27 +116,6 @@ class Calibration(abc.ABC):
     def predictions(self, particle: str) -> np.ndarray | None:
         """Draws of what may be measured of a particle at its rows [um], shape (draws, rows); None without draws."""
         return None
-
-    def save(self, folder: str | Path) -> None:
-        """Write `calibration.json` and what `mcc_jax.load` reads into a folder: both or nothing.
-
-        Raises:
-            InputError: if the folder cannot be written, or a part cannot be read back.
-        """
-        with results(arguments.file_path(folder, "folder")) as stage:
-            self.write(stage.folder)
-
-    def write(self, folder: Path, **more: Any) -> dict[str, Any]:
-        """Write the files of `save` into a folder that appears as a whole; returns the contents of the JSON.
-
-        Args:
-            folder: an existing folder.
-            more: further entries of the JSON, such as provenance.
-        """
-        content = self.to_json() | more
-        (folder / CONTENT).write_text(json_text(content), encoding="utf-8")
-        (folder / ARCHIVE).write_bytes(encode(self))
-        return content
 
 
 class PosteriorDraws(Calibration):
@@ -164,10 +177,10 @@ def load(folder: str | Path) -> Any:
     if not path.is_dir():
         raise InputError("there is no such folder", file=path, remedy=A_FOLDER)
     there = {entry.name for entry in path.iterdir()}
-    for archive, kind in ((DISCOVERY_ARCHIVE, object), (ARCHIVE, Calibration)):
+    for archive in (DISCOVERY_ARCHIVE, ARCHIVE):
         if archive in there:
             found = read_archive(path / archive)
-            if not isinstance(found, kind):
+            if not isinstance(found, Saved) or found.archive_file != archive:
                 raise InputError(f"holds a {type(found).__name__}", file=path / archive, remedy=A_FOLDER)
             return found
     tests = {"particles.csv", "curves.csv"} <= there

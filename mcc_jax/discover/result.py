@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from .. import arguments
-from .._archive import encode
 from .._errors import InputError
 from .._format import table
-from .._store import json_text, results
 from ..calibrate.estimates import finite
 from ..calibrate.laws import law_of
-from ..calibrate.results import DISCOVERY_ARCHIVE
+from ..calibrate.results import DISCOVERY_ARCHIVE, Saved
 from ..campaign import Finding
 from ..effects import EQUIVALENCES, AbstractEffect, Variant
 from ..law import MccLaw
@@ -91,7 +87,7 @@ class Effect:
 
 
 @dataclass(frozen=True, repr=False)
-class Discovery:
+class Discovery(Saved):
     """What is missing in the law, how sure that is, and what would tell more.
 
     Attributes:
@@ -120,6 +116,7 @@ class Discovery:
         likeness: which mechanisms look alike.
     """
 
+    content_file, archive_file = "discovery.json", DISCOVERY_ARCHIVE
     archived: ClassVar[tuple[str, ...]] = ("content",)  # kept with the fields: the system it needs is not
 
     verdict: Verdict
@@ -168,22 +165,6 @@ class Discovery:
         numbers = {"method": "bayes", "law": {"unloading": model.unloading, "strain_scaling": model.strain_scaling}}
         law = law_of(numbers | (self.after or self.before), particle)
         return law.with_effects(*(effect.build() for effect in self.effects))
-
-    def save(self, folder: str | Path) -> None:
-        """Write `discovery.json` and what `mcc_jax.load` reads into a folder: both or nothing.
-
-        Raises:
-            InputError: if the folder cannot be written, or a part cannot be read back.
-        """
-        with results(arguments.file_path(folder, "folder")) as stage:
-            self.write(stage.folder)
-
-    def write(self, folder: Path, **more: Any) -> dict[str, Any]:
-        """Write the files of `save` into a folder that appears as a whole; returns the contents of the JSON."""
-        content = self.to_json() | more
-        (folder / "discovery.json").write_text(json_text(content), encoding="utf-8")
-        (folder / DISCOVERY_ARCHIVE).write_bytes(encode(self))
-        return content
 
     def gap(self) -> dict[str, Any]:
         """The gap at every step, on held-out particles."""

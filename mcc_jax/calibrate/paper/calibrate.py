@@ -25,9 +25,8 @@ from ...campaign import (
 from ...campaign.reasons import refusal
 from ...geometry import plastic_shape_factor
 from ...law import MccLaw, StrainScaling, Unloading
-from ..curves import MAX_POINTS
-from ..data import rows_from_contact
-from ..estimates import estimate, finite, force_zero, misfit_note
+from ..data import MAX_POINTS, rows_from_contact
+from ..estimates import NO_SAMPLER, estimate, finite, force_zero, misfit_note
 from ..judgement import judged, numbers_in_reach, unlike_others
 from ..results import Calibration
 from .loading import PlasticFit, fit_population
@@ -213,10 +212,7 @@ class PaperCalibration(Calibration):
             "warnings": self.warnings(),
             "findings": [one.to_json() for one in self.findings],
             "diagnostics": {
-                "rhat_max": None,
-                "ess_bulk_min": None,
-                "divergences": None,
-                "pareto_k_max": None,
+                **NO_SAMPLER,
                 "a_objective_value": finite(self.chosen_shape.objective),
                 "a_objective_value_at_zero": finite(self.chosen_shape.objective_at_zero),
                 "master_rms_MPa": self.plastic.rms_MPa,
