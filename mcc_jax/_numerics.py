@@ -34,10 +34,10 @@ def _running_max_jvp(primals, tangents):
     if isinstance(tangent, SymbolicZero):
         return highest, tangent
     first = jnp.ones_like(path[:1], bool)
-    return highest, _held(tangent, jnp.concatenate([first, path[1:] > highest[:-1]]))
+    return highest, held(tangent, jnp.concatenate([first, path[1:] > highest[:-1]]))
 
 
-def _held(values: Path, record: Bool[Array, " steps"]) -> Path:
+def held(values: Path, record: Bool[Array, " steps"]) -> Path:
     """The value at the last record up to each step, the first step being one; linear in the values.
 
     By doubling. Transposed, that is a sum over the steps that hold a value, where indexing would become a scatter, on a

@@ -22,8 +22,11 @@ from ..campaign import (
     check_tests,
     particle_batch,
     stress_and_strain,
+    turning_forces,
 )
+from ..campaign.record import humidities, record_of
 from ..campaign.reasons import SHOWN, below_threshold, far_apart, no_climb, no_loading, refusal, too_few
+from ..effects import Record
 from ..geometry import Particle
 from .paper.modulus import MIN_RATIO
 from .paper.prediction import READING_UM, point_noise_um
@@ -43,33 +46,46 @@ class Tests(eqx.Module):
 
     Attributes:
         particle: sizes and shapes, leading axis N.
-        force: measured force [mN].
-        displacement: measured displacement [um], raw.
+        record: what the tester did, point by point; its forces are those of `turning_forces`.
+        displacement: measured displacement [um], raw; None to predict it.
         mask: which points are compared with the law.
         loading: which of them lie on virgin loading.
         contact: displacement at which the record says that the platen touches [um].
-        step: share of the peak force passed since the point before [-], the path length of correlated residuals.
-        branch: index of the point at which the largest force so far was reached: shared by the points of an elastic
-            branch.
+        path: where a point stands on its path of force: the sum of all changes of force up to it, in shares of the
+            largest force [-]. Correlated residuals live along it.
+        branch: index of the point from which a point's branch starts; its own on virgin loading.
+        reading: whether a point's force is a reading of its own.
+        peak_error: standard error of the force from which its branch starts, in those of a reading [-].
         weight: 1 for particles, 0 for copies that only fill up; None where all are particles.
         force_zero_sd: standard deviation of each test's zero of force [mN]; None where none was measured.
-        peak_sd: standard deviation of the force of each point's branch peak where it was worked out [mN]; None where
-            all were read.
+        peak_sd: standard deviation of the force of each point's branch peak where it was worked out otherwise, from
+            readings that saturate [mN]; None where none was.
     """
 
     __test__ = False  # no test of ours, whatever pytest thinks of the name
 
     particle: Particle
-    force: Float[Array, "particles points"]
-    displacement: Float[Array, "particles points"]
+    record: Record
+    displacement: Float[Array, "particles points"] | None
     mask: Bool[Array, "particles points"]
     loading: Bool[Array, "particles points"]
     contact: Float[Array, " particles"]
-    step: Float[Array, "particles points"]
+    path: Float[Array, "particles points"]
     branch: Int[Array, "particles points"]
+    reading: Bool[Array, "particles points"]
+    peak_error: Float[Array, "particles points"]
     weight: Float[Array, " particles"] | None = None
     force_zero_sd: Float[Array, " particles"] | None = None
     peak_sd: Float[Array, "particles points"] | None = None
+
+    @property
+    def force(self) -> Float[Array, "particles points"]:
+        """Force [mN] of every point."""
+        return self.record.force
+
+    def unobserved(self) -> Tests:
+        """The same tests without their displacements: a model predicts them."""
+        return replace(self, displacement=None)
 
     def __len__(self) -> int:
         return self.force.shape[0]
@@ -136,7 +152,12 @@ class Selection:
 
 def select_tests(
     campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_points: int = MAX_POINTS
-) -> Selection:
+) -> Tests:
+    """The tests as a `Model` takes them: points and particles chosen, padded to rectangular arrays; see `select`."""
+    return select(campaign, threshold_MPa=threshold_MPa, most_points=most_points).tests
+
+
+def select(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_points: int = MAX_POINTS) -> Selection:
     """Choose what the joint calibration uses.
 
     Points count from the threshold stress on, below which surface asperities and not the particle deform. On unloading
@@ -180,18 +201,23 @@ def select_tests(
         return np.stack([np.pad(v, (0, longest - len(v)), **options) for v in values])  # pyright: ignore[reportCallIssue, reportArgumentType]
 
     curves = [campaign.curves[i] for i in kept]
-    force = padded([c.force_mN[one.rows] for c, one in zip(curves, used, strict=True)], "edge").astype(float)
-    largest = force.max(axis=1, keepdims=True)
-    branch = _branches(force)
+    turning = [turning_forces(c, segments[i]) for i, c in zip(kept, curves, strict=True)]
+    force = padded([t.force[one.rows] for t, one in zip(turning, used, strict=True)], "edge").astype(float)
+    levels = padded([t.peak[one.rows] for t, one in zip(turning, used, strict=True)], "edge").astype(float)
+    error = padded([t.error[one.rows] for t, one in zip(turning, used, strict=True)], "edge").astype(float)
+    branch = _branches(levels, error > 0)
+    changes = np.abs(np.diff(force, axis=1, prepend=force[:, :1]))
     tests = Tests(
         particle_batch(campaign.diameters_um[list(kept)]),
-        jnp.asarray(force),
+        _records(campaign, kept, segments, [one.rows for one in used], longest, force, levels),
         jnp.asarray(padded([c.displacement_um[one.rows] for c, one in zip(curves, used, strict=True)], "edge"), float),
         jnp.asarray(padded([one.mask for one in used], "false")),
         jnp.asarray(padded([one.loading for one in used], "false")),
         jnp.asarray([one.contact for one in used]),
-        jnp.asarray(np.abs(np.diff(force, axis=1, prepend=force[:, :1])) / largest),
+        jnp.asarray(np.cumsum(changes, axis=1) / force.max(axis=1, keepdims=True)),
         jnp.asarray(branch),
+        jnp.asarray(padded([t.reading[one.rows] for t, one in zip(turning, used, strict=True)], "edge")),
+        jnp.asarray(error),
         None,
         *_errors_of_force(curves, used, branch),
     )
@@ -217,14 +243,37 @@ def _errors_of_force(
     for row, (one, of) in enumerate(zip(checked, used, strict=True)):
         if one is not None:
             peak[row, : len(of.rows)] = one.force_sd_mN[of.rows]
-    peak = np.take_along_axis(peak, branch, axis=1)
+    # A branch starts at its peak or one reading behind it.
+    peak = np.maximum(*(np.take_along_axis(peak, np.maximum(branch - back, 0), axis=1) for back in (0, 1)))
     return (jnp.asarray(zero) if zero.any() else None), (jnp.asarray(peak) if peak.any() else None)
 
 
-def _branches(force: np.ndarray) -> np.ndarray:
-    """Index of the point at which the largest force so far was reached."""
-    record = force >= np.maximum.accumulate(force, axis=1)
-    return np.maximum.accumulate(np.where(record, np.arange(force.shape[1]), 0), axis=1)
+def _branches(levels: np.ndarray, elastic: np.ndarray) -> np.ndarray:
+    """Index of the first point of every branch: points that start from one peak share it, loading has its own."""
+    same = np.concatenate([np.zeros_like(elastic[:, :1]), elastic[:, 1:] & elastic[:, :-1]], 1)
+    same[:, 1:] &= levels[:, 1:] == levels[:, :-1]
+    return np.maximum.accumulate(np.where(same, 0, np.arange(levels.shape[1])), axis=1)
+
+
+def _records(
+    campaign: Campaign,
+    kept: Sequence[int],
+    segments: Sequence[tuple[Segment, ...]],
+    rows: Sequence[np.ndarray],
+    longest: int,
+    force: np.ndarray,
+    levels: np.ndarray,
+) -> Record:
+    """What the tester did at the rows that are used, with forces and peaks as `turning_forces` has them."""
+    humidity = humidities(campaign)
+    records = []
+    for i, some in zip(kept, rows, strict=True):
+        own = None if humidity is None else float(humidity[i])
+        record = record_of(campaign.curves[i], segments[i], relative_humidity_percent=own)
+        chosen = np.pad(some, (0, longest - len(some)), mode="edge")
+        records.append(jax.tree.map(lambda x, at=chosen: np.asarray(x)[at] if np.ndim(x) else np.asarray(x), record))
+    together = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *records)
+    return replace(together, force=jnp.asarray(force), peak=jnp.asarray(levels))
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
-"""The joint fit that both methods share: particles, noise, population, and their best compromise."""
+"""The fit that least squares, posterior and evidence start from: particles, noise and population in agreement."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -11,23 +11,26 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from .. import arguments
 from .._errors import InputError
 from .._memory import make_room
-from ..campaign import Campaign
-from ..law import Unloading
+from ..campaign import THRESHOLD_MPA, Campaign
 from .compiling import compiled
-from .data import Selection, Tests, select_tests
-from .linearise import careful_enough, expected_latent, linear_data, summarise
-from .model import JointFit, JointModel, log_C3, prior_numbers
-from .noise import Noise, estimate_noise, particle_scales
+from .data import Selection, Tests, select
+from .distributions import SpreadCoordinate
+from .forward import Forms, Linear, Point, linearise
+from .marginal import Marginal, straighten, summarise
+from .mode import LogPosterior, most_probable, start_values
+from .model import Model, check_prior_of_a
+from .noise import Noise, NoiseFit, Whitening, estimate_noise, particle_scales
 from .paper.prediction import point_noise_um
-from .particle_fit import FIRST_STEPS, MAX_STEPS, Particles, fit_particles, linear_starts
-from .population import Population, Scatter, Summary
+from .particle_fit import FIRST_STEPS, MAX_STEPS, ParticleFits, fit_particles, linear_starts
+from .population import Population
 from .priors import Priors
 from .sharding import Blocks, Parts, block_size, count_of, filled_up, require_same
-from .transforms import LogPosterior, PriorNumbers, constrain, most_probable, recentred, unconstrain
+from .starts import start_of_effects
 
 WIDE = 1.5
 """Standard deviation of the logarithms that a particle by itself is allowed, around the prior's centre: no more than
@@ -40,22 +43,141 @@ NOISE_BLOCKS = 4
 """The noise of campaigns of more blocks is estimated from the particles of so many, spread evenly over the campaign:
 fifty thousand points say enough about four numbers."""
 
-ROUNDS = 2
-"""Noise, population and particles depend on each other a little: how often they are taken in turn."""
+ROUNDS, MAX_ROUNDS = 2, 8
+"""Noise, population and particles depend on each other a little: how often they are taken in turn, and how often at
+most where effects have to be linearised anew."""
+
+STILL = 0.1
+"""An effect is linearised anew until none of its numbers moves by more than this share of its standard deviation."""
+
+
+class Fit(eqx.Module):
+    """Particles, noise and population of a campaign in agreement.
+
+    Attributes:
+        model: what was assumed.
+        tests: the measurements.
+        individual: every particle on its own.
+        noise: the campaign's noise.
+        filters: its filters at the point.
+        point: most probable numbers of every particle.
+        residual: measured less predicted displacement there [um], 0 where masked.
+        marginal: the tests there, with every particle's own numbers integrated out.
+        mode, covariance: of the population in unbounded coordinates, in the order of `names`.
+        converged: for particles, noise and population in turn.
+    """
+
+    model: Model = eqx.field(static=True)
+    tests: Tests
+    individual: ParticleFits
+    noise: NoiseFit
+    filters: Whitening
+    point: Point
+    residual: Float[Array, "particles points"]
+    marginal: Marginal
+    mode: Float[Array, " d"]
+    covariance: Float[Array, "d d"]
+    converged: Bool[np.ndarray, " 3"]
+
+    @property
+    def target(self) -> LogPosterior:
+        """The density of the population given all tests, in unbounded coordinates."""
+        return LogPosterior(self.model, self.marginal)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the coordinates."""
+        return self.target.names
+
+    @property
+    def population(self) -> Population:
+        """The most probable population."""
+        return population_of(self.mode, self.target)
+
+    def nuts(self, *, explicit: bool = False, **settings: Any) -> Any:
+        """NumPyro's NUTS for the model, from the mode on, with the covariance as mass matrix.
+
+        Run it with `MCMC(fit.nuts(), ...).run(key, tests, fit.marginal)`: every particle is integrated out. Explicit,
+        every particle's own numbers are sampled under the exact likelihood, in the coordinates of this fit, in which
+        they mix; run it with `MCMC(fit.nuts(explicit=True), ...).run(key, tests)`.
+
+        Args:
+            explicit: sample every particle's own numbers.
+            settings: of `numpyro.infer.NUTS`.
+        """
+        from numpyro.infer import NUTS, init_to_value
+
+        values = start_values(self.mode, self.target)
+        arguments.flag(explicit, "explicit")
+        order = [self.names.index(name) for name in sorted(self.names)]
+        covariance = np.asarray(self.covariance)[np.ix_(order, order)]
+        metric: dict[Any, Any] = {tuple(sorted(self.names)): jnp.asarray(covariance)}
+        model: Any = self.model
+        if explicit:
+            size = self.marginal.scatter.size + 1
+            values["own"] = jnp.zeros((len(self.tests), size))
+            metric[("own",)] = jnp.ones(len(self.tests) * size)
+            model = ExplicitModel(self)
+        dense = [names for names in metric if names != ("own",)]
+        options = {"target_accept_prob": 0.9 if explicit else 0.8, **settings}
+        strategy = init_to_value(values=values)
+        return NUTS(model, init_strategy=strategy, inverse_mass_matrix=metric, dense_mass=dense, **options)
+
+    def first(self, count: int) -> Fit:
+        """The same of the first `count` particles: without copies that only fill up."""
+
+        def some(tree: Any) -> Any:
+            return jax.tree.map(lambda x: x[:count], tree)
+
+        marginal = replace(some(replace(self.marginal, weight=None)), scatter=self.marginal.scatter)
+        noise = replace(self.noise.noise, scale=self.noise.noise.scale[:count])
+        return replace(
+            self,
+            tests=some(replace(self.tests, weight=None)),
+            individual=some(self.individual),
+            noise=replace(self.noise, noise=noise),
+            filters=some(self.filters),
+            point=some(self.point),
+            residual=self.residual[:count],
+            marginal=marginal,
+        )
+
+
+class ExplicitModel:
+    """The model with every particle's own numbers explicit, in the coordinates and with the noise of a fit."""
+
+    def __init__(self, fit: Fit) -> None:
+        self.fit = fit
+
+    def __call__(self, tests: Tests) -> None:
+        """As `Model`."""
+        self.fit.model(tests, filters=self.fit.filters, around=self.fit.marginal)
+
+
+@compiled
+def population_of(free: Float[Array, " d"], target: LogPosterior) -> Population:
+    """The population at unbounded coordinates."""
+    return target.population(free)
+
+
+@compiled
+def linear_data(point: Point, tests: Tests, forms: Forms) -> Linear:
+    """All tests linearised, how noise of force moves them included."""
+    return linearise(point, tests, forms)
 
 
 def prepare(
     campaign: Campaign,
-    model: JointModel,
-    threshold_MPa: float,
+    model: Model,
+    threshold_MPa: float = THRESHOLD_MPA,
     *,
     fill_up: bool = True,
     block: int | None = None,
     meanwhile: Callable[[Tests, int], None] | None = None,
     tell: Callable[[str], None] = lambda _: None,
     **settings: Any,
-) -> tuple[Selection, Tests, JointFit, int]:
-    """What every joint calibration begins with: points and particles selected, filled up to blocks, and fitted.
+) -> tuple[Selection, Fit, int]:
+    """What every calibration begins with: points and particles selected, filled up to blocks, and fitted.
 
     Args:
         campaign: the tests.
@@ -65,10 +187,10 @@ def prepare(
         block: particles of a block; by default `block_size` of their number.
         meanwhile: called with the tests and the size of a block in a thread of its own while the fit runs.
         tell: called with the name of each step.
-        settings: of `fit_joint`.
+        settings: of `fit_tests`.
 
     Returns:
-        What was selected, the tests with copies that fill up, their fit, and the size of a block.
+        What was selected, the fit of the tests with copies that fill up, and the size of a block.
 
     Raises:
         InputError: if no particle can be used, numbers overflow, or processes were given different tests.
@@ -78,7 +200,7 @@ def prepare(
         raise ValueError(f"a block must have at least one particle, got {block}")
     make_room()
     tell("selecting points")
-    selection = select_tests(campaign, threshold_MPa=threshold_MPa)
+    selection = select(campaign, threshold_MPa=threshold_MPa)
     require_same(selection.tests)
     size = (block or block_size(len(selection.tests))) if fill_up else len(selection.tests)
     tests = filled_up(selection.tests, size) if fill_up else selection.tests
@@ -88,12 +210,13 @@ def prepare(
         # No daemon: a compiler must not outlive the interpreter. Who interrupts the fit need not wait for it here.
         aside = threading.Thread(target=meanwhile, args=(tests, size))
         aside.start()
-    fit = fit_joint(tests, model, read_out, block=size, tell=tell, **settings)
+    found = fit_tests(tests, model, read_out, block=size, tell=tell, **settings)
     if aside is not None:
         aside.join()
-    if not all(np.isfinite(np.asarray(part)).all() for part in (fit.latent, fit.zero, fit.mode, fit.covariance)):
+    parts = (found.point.latent, found.point.zero, found.mode, found.covariance)
+    if not all(np.isfinite(np.asarray(part)).all() for part in parts):
         raise beyond_numbers(campaign, selection)
-    return selection, tests, fit, size
+    return selection, found, size
 
 
 def beyond_numbers(campaign: Campaign, selection: Selection) -> InputError:
@@ -117,20 +240,130 @@ def beyond_numbers(campaign: Campaign, selection: Selection) -> InputError:
     )
 
 
-def fit_joint(
+class _Fitter:
+    """The turns of a fit: what stays the same in all of them."""
+
+    def __init__(self, tests: Tests, model: Model, blocks: Blocks, tell: Callable[[str], None]) -> None:
+        self.tests, self.model, self.blocks, self.tell = tests, model, blocks, tell
+        self.count, self.own = count_of(tests), blocks.cut(tests)
+        self.flatness = tests.flatness
+        self.varying = tuple(k for k, _ in model.scatter.varying)
+
+    def linear(self, point: Point) -> Parts:
+        return self.blocks.each(linear_data, self.blocks.cut(point), self.own, self.model.forms)
+
+    def summaries(self, point: Point, linear: Parts, noise: Noise) -> tuple[Marginal, Parts, Array]:
+        """All particles' summaries, this process's own filters, and the white noise of equal weight."""
+        m, cut = self.model, self.blocks.cut
+        kinds = m.zero_sd, m.scatter, m.correlation, m.along
+        found = self.blocks.each(summarise, cut(point), self.own, linear, cut(noise), *kinds)
+        marginal, filters, white = (Parts(tuple(wave[k] for wave in found.waves)) for k in range(3))
+        return self.blocks.whole(marginal), filters, self.blocks.whole(white)
+
+    def estimated(self, point: Point, linear: Parts, start: Noise, *, uncertainty: bool) -> NoiseFit:
+        """The noise, of very many particles from some of them."""
+        self.tell("estimating the noise")
+        m, blocks, own = self.model, self.blocks, self.own
+        if blocks.number > NOISE_BLOCKS:
+            rows = np.linspace(0, self.count - 1, NOISE_BLOCKS * blocks.size).astype(int)
+            blocks = Blocks(len(rows), blocks.size)
+            own = blocks.cut(_rows(self.tests, rows))
+            linear = blocks.each(linear_data, blocks.cut(_rows(point, rows)), own, m.forms)
+            some = replace(start, scale=start.scale[rows])
+        else:
+            some = start
+        prior = m.chosen_priors.noise
+        found = estimate_noise(
+            own, linear, m.zero_sd, prior, some, m.correlation, m.along, uncertainty=uncertainty, blocks=blocks
+        )
+        return replace(found, noise=replace(found.noise, scale=start.scale))
+
+    def particles(
+        self, white: Array | np.ndarray, centre: np.ndarray, width: np.ndarray, theta: Any, starts: Parts
+    ) -> ParticleFits:
+        """Every particle by itself, all blocks; what is late in many of them goes on in blocks of its own.
+
+        A block takes as long as its slowest particle, and nearly every block has one that is slow.
+        """
+        self.tell("fitting every particle")
+        arrays = tuple(jnp.asarray(np.asarray(v)) for v in (white, centre, width, theta))
+
+        def fit(blocks: Blocks, own: Parts, arrays: Any, starts: Parts, most_steps: int) -> ParticleFits:
+            cut = [blocks.cut(v) for v in arrays]
+            steps = jnp.asarray(np.asarray(most_steps))
+            return blocks.whole(
+                blocks.each(fit_particles, own, *cut, starts, self.model.forms, self.varying, steps)
+            )
+
+        if self.blocks.whole_here:
+            return fit(self.blocks, self.own, arrays, starts, MAX_STEPS)
+        found = fit(self.blocks, self.own, arrays, starts, FIRST_STEPS)
+        late = np.flatnonzero(~np.asarray(found.settled))
+        if not len(late):
+            return found
+        rows = np.pad(late, (0, -len(late) % self.blocks.size), mode="edge")
+        few = Blocks(len(rows), self.blocks.size)
+        ends = few.cut(np.moveaxis(np.asarray(found.ends)[rows], 1, 0), axis=1)
+        again = fit(few, few.cut(_rows(self.tests, rows)), _rows(arrays, rows), ends, MAX_STEPS)
+        return jax.tree.map(lambda x, y: x.at[late].set(y[: len(late)]), found, again)
+
+    def alone(self, white: np.ndarray) -> ParticleFits:
+        """Every particle on its own, without effects."""
+        priors, N = self.model.chosen_priors, len(self.tests)
+        middle = np.append(_centre(priors), 0.0)
+        centre = np.broadcast_to(middle, (N, 5)).copy()
+        centre[:, 4] = np.asarray(self.tests.contact) + priors.zero_um.mean
+        width = np.broadcast_to(np.array([WIDE] * 4 + [priors.zero_um.sd]), (N, 5))
+        starts = self.blocks.each(linear_starts, self.own, jnp.asarray(middle[3]), axis=1)
+        if self.varying:
+            centre, width = (np.pad(x, ((0, 0), (0, len(self.varying)))) for x in (centre, width))
+            width[:, 5:] = 1e-12
+            padded = ((0, 0), (0, 0), (0, len(self.varying)))
+            starts = Parts(tuple(jnp.pad(wave, padded) for wave in starts.waves), 1)
+        theta = np.broadcast_to(self.model.forms.without_effects, (N, len(self.model.forms.names)))
+        return self.particles(white, centre, width, theta, starts)
+
+    def together(
+        self, white: Array, before: Point, target: LogPosterior, free: Float[Array, " d"]
+    ) -> tuple[Point, bool]:
+        """Every particle under the population, from where it was and where the summaries expect it."""
+        expected = expect(free, target)
+        width = np.maximum(np.asarray(expected.sd), MIN_WIDTH)
+        varying = list(self.varying)
+        own = np.asarray(expected.theta)[:, varying]
+        zero_mean = np.asarray(self.tests.contact) + self.model.chosen_priors.zero_um.mean
+        zero_sd = np.full(len(self.tests), float(self.model.zero_sd))
+        spread = np.maximum(np.asarray(expected.theta_sd), 1e-12)
+        centre = np.column_stack([expected.mean, zero_mean, np.asarray(expected.theta_mean)])
+        widths = np.column_stack([width, zero_sd, spread])
+        several = [
+            np.column_stack([latent, zero, own])
+            for latent, zero in (
+                (before.latent, before.zero),
+                (expected.latent, expected.zero),
+                (expected.mean, before.zero),
+            )
+        ]
+        starts = self.blocks.cut(jnp.asarray(np.stack(several)), axis=1)
+        found = self.particles(white, centre, widths, expected.theta, starts)
+        return found.point, bool(np.all(np.asarray(found.converged)[: self.count]))
+
+
+def fit_tests(
     tests: Tests,
-    model: JointModel,
+    model: Model,
     read_out_um: float,
     *,
     correlated: bool = True,
     rounds: int = ROUNDS,
     block: int = 0,
     tell: Callable[[str], None] = lambda _: None,
-) -> JointFit:
+) -> Fit:
     """Fit particles, noise and population.
 
-    Particles come first, each on its own. Then, in turns: the noise from residuals linear in the particles' parameters,
-    the most probable population under the quadratic summaries, the most probable particles under that population.
+    Particles come first, each on its own. Then, in turns: the noise from residuals linear in the particles' numbers,
+    the most probable population under the summaries, the most probable particles under that population. The noise is
+    what is left under the model at hand: with effects it is not estimated before they are in.
 
     Args:
         tests: the measurements.
@@ -138,166 +371,165 @@ def fit_joint(
         read_out_um: noise of displacement from point to point, a first guess [um].
         correlated: estimate the whole noise; if False, white noise of the residuals' median modulus, which outliers do
             not move.
-        rounds: how often noise, population and particles take turns.
+        rounds: how often noise, population and particles take turns, at least.
         block: particles of a block (`Blocks`), of which there is a whole number; 0 for all in one.
         tell: called with the name of each step.
     """
-    zero_sd, priors = model.zero_sd, model.chosen_priors
-    flatness = tests.flatness
-    numbers = prior_numbers(priors, flatness, tests.weight)
+    N, effects = len(tests), bool(model.effects)
+    fitter = _Fitter(tests, model, Blocks(N, block), tell)
+    count, blocks, priors = fitter.count, fitter.blocks, model.chosen_priors
+    check_prior_of_a(priors, np.asarray(fitter.flatness))
     read_out = max(read_out_um, 1e-4)
-    tell("fitting every particle")
-    N = len(tests)
-    count = count_of(tests)
-    centre = np.broadcast_to(_centre(priors), (N, 4))
-    blocks = Blocks(N, block)
-    own = blocks.cut(tests)
-
-    def fitted(sizes: Any, middle: Any, width: Any, starts: Parts) -> Particles:
-        arrays = (jnp.asarray(sizes), jnp.asarray(middle), jnp.asarray(width))
-        return _fitted(blocks, tests, own, arrays, zero_sd, starts, model.unloading)
-
-    starts = blocks.each(linear_starts, own, jnp.asarray(centre[0, 3]), axis=1)
-    individual = fitted(np.full(N, read_out), centre, np.full((N, 4), WIDE), starts)
-    latent, zero = individual.latent, individual.zero
+    individual = fitter.alone(np.full(N, read_out))
+    point = individual.point
     four = [read_out, *np.asarray(priors.noise.median)[1:]]
-    noise = Noise.of(four, jnp.asarray(np.ones(len(tests))))
-    log_sd, noise_converged = jnp.asarray(np.full(4, np.nan)), True
-    numbers, free = _start(np.asarray(latent)[:count], np.asarray(flatness)[:count], model, numbers)
-
-    def summarised(at: tuple[Parts, Parts], data: Parts, noise: Noise) -> tuple[Summary, Parts, Array]:
-        """All particles' summaries, this process's own filters, and the white noise of equal weight."""
-        found = blocks.each(summarise, *at, own, data, blocks.cut(noise), zero_sd)
-        summaries, filters, white = (Parts(tuple(wave[k] for wave in found.waves)) for k in range(3))
-        return blocks.whole(summaries), filters, blocks.whole(white)
-
+    unknown = jnp.asarray(np.full((4, 4), np.nan)), jnp.asarray(np.nan)
+    noise = NoiseFit(Noise.of(four, jnp.asarray(np.ones(N))), *unknown, True)
+    start = _start(np.asarray(point.latent)[:count], np.asarray(fitter.flatness)[:count], model)
+    if effects:
+        found = start_of_effects(point, tests, fitter.linear(point), noise.noise, model, blocks)
+        start |= found.sites
+        point = replace(point, theta=jnp.asarray(np.broadcast_to(found.theta, point.theta.shape)))
+    free = None
     turn = 0
     while True:
-        at = blocks.cut(latent), blocks.cut(zero)
-        data = blocks.each(linear_data, *at, own, zero_sd, model.unloading)
+        linear = fitter.linear(point)
+        last = turn >= (max(rounds, MAX_ROUNDS) if effects else rounds)
         if not correlated:
-            residual = np.asarray(blocks.whole(Parts(tuple(wave.residual for wave in data.waves))))[:count]
+            residual = np.asarray(blocks.whole(Parts(tuple(wave.residual for wave in linear.waves))))[:count]
             width = 1.4826 * np.median(np.abs(residual[np.asarray(tests.mask)[:count]]))
             none = jnp.asarray(0.0)
-            noise = Noise(jnp.asarray(max(width, 1e-9)), none, none, jnp.asarray(1.0), jnp.asarray(np.ones(N)))
-        elif turn < rounds:
-            tell("estimating the noise")
-            chosen, some, start = blocks, data, noise
-            if blocks.number > NOISE_BLOCKS:
-                rows = np.linspace(0, count - 1, NOISE_BLOCKS * blocks.size).astype(int)
-                chosen, start = Blocks(len(rows), blocks.size), replace(noise, scale=noise.scale[rows])
-                at_rows = (chosen.cut(v) for v in _rows((latent, zero, tests), rows))
-                some = chosen.each(linear_data, *at_rows, zero_sd, model.unloading)
-            four, log_sd, noise_converged = estimate_noise(
-                some, priors.noise, start, uncertainty=turn == rounds - 1, blocks=chosen
-            )
-            noise = replace(four, scale=noise.scale)
-        summary, filtered, white = summarised(at, data, noise)
-        if correlated and turn < rounds:
-            old = np.asarray(noise.scale)
-            parts = (old, np.asarray(summary.squares), np.asarray(summary.count) - 4)
-            scale = np.pad(particle_scales(*(part[:count] for part in parts)), (0, N - count), mode="edge")
+            white_noise = Noise(jnp.asarray(max(width, 1e-9)), none, none, jnp.asarray(1.0), jnp.asarray(np.ones(N)))
+            noise = replace(noise, noise=white_noise)
+        elif (turn or not effects) and not last:
+            noise = fitter.estimated(point, linear, noise.noise, uncertainty=True)
+        marginal, filtered, white = fitter.summaries(point, linear, noise.noise)
+        if correlated and not last and (turn or not effects):
+            old = np.asarray(noise.noise.scale)
+            squares = np.asarray(marginal.gram)[:, -1, -1]
+            scale = particle_scales(old[:count], squares[:count], np.asarray(marginal.count)[:count] - 4)
+            scale = np.pad(scale, (0, N - count), mode="edge")
             if np.any(scale != old):
-                noise = eqx.tree_at(lambda n: n.scale, noise, jnp.asarray(scale))
-                summary, filtered, white = summarised(at, data, noise)
+                noise = replace(noise, noise=replace(noise.noise, scale=jnp.asarray(scale)))
+                marginal, filtered, white = fitter.summaries(point, linear, noise.noise)
         tell("fitting the population")
-        if turn:
-            numbers, free = recentred(numbers, free)
-        target = LogPosterior(numbers, summary, model.scatter)
-        target = replace(target, scatter=careful_enough(free, target, count))
+        target = LogPosterior(model, marginal)
+        if free is None:
+            free = target.unconstrain(start)
+        before = np.asarray(free)
+        target = careful_enough(free, target, count)
         free, covariance, mode_converged = most_probable(free, target)
-        if turn == rounds:
+        sd = np.sqrt(np.maximum(np.diagonal(np.asarray(covariance)), 1e-300))
+        moved = np.abs(np.asarray(free) - before) / sd
+        at_rest = turn >= rounds and (not effects or bool(np.all(moved[_of_effects(model, target.names)] < STILL)))
+        if last or at_rest:
             break
         turn += 1
-        tell("fitting every particle")
-        expected = expected_latent(free, target)
-        several = (latent, zero), (expected.latent, expected.zero), (expected.mean, zero)
-        # By NumPy, here and wherever a handful of numbers is put together once: JAX would compile every operation.
-        starts = jnp.asarray(np.stack([np.column_stack([np.asarray(w), np.asarray(z)]) for w, z in several]))
-        width = np.maximum(np.asarray(expected.sd), MIN_WIDTH)
-        found = fitted(white, expected.mean, width, blocks.cut(starts, axis=1))
-        latent, zero = found.latent, found.zero
-    converged = np.asarray([bool(np.all(np.asarray(individual.converged)[:count])), noise_converged, mode_converged])
-    filters, residual = blocks.whole(filtered), blocks.whole(Parts(tuple(wave.residual for wave in data.waves)))
-    return JointFit(
-        individual, noise, log_sd, filters, latent, zero, residual, summary, free, covariance, numbers, converged
+        point, _ = fitter.together(white, point, target, free)
+    converged = np.asarray(
+        [bool(np.all(np.asarray(individual.converged)[:count])), noise.converged, mode_converged and at_rest]
     )
+    filters = blocks.whole(filtered)
+    residual = blocks.whole(Parts(tuple(wave.residual for wave in linear.waves)))
+    marginal = target.marginal
+    return Fit(
+        model, tests, individual, noise, filters, point, residual, marginal, free, covariance, converged
+    )
+
+
+def _of_effects(model: Model, names: tuple[str, ...]) -> np.ndarray:
+    """Which coordinates are numbers of effects."""
+    own = tuple(v.mechanism for v in model.effects)
+    return np.array([any(n.startswith((f"{o}_size", f"{o}.")) for o in own) for n in names], bool)
 
 
 def _rows(tree: Any, rows: np.ndarray) -> Any:
     return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[rows]), tree)
 
 
-def _fitted(
-    blocks: Blocks,
-    tests: Tests,
-    own: Parts,
-    arrays: tuple[Array, Array, Array],
-    zero_sd: Array,
-    starts: Parts,
-    unloading: Unloading,
-) -> Particles:
-    """Every particle by itself, all blocks; what is late in many of them goes on in blocks of its own.
-
-    A block takes as long as its slowest particle, and nearly every block has one that is slow.
-
-    Args:
-        blocks: how the particles are cut.
-        tests: of all particles.
-        own: of this process.
-        arrays: noise, centre and width, as in `fit_particles`.
-        zero_sd, starts, unloading: as there.
-    """
-
-    def fit(blocks: Blocks, own: Parts, arrays: Iterable[Array], starts: Parts, most_steps: int) -> Particles:
-        cut = (blocks.cut(v) for v in arrays)
-        steps = jnp.asarray(np.asarray(most_steps))
-        return blocks.whole(blocks.each(fit_particles, own, *cut, zero_sd, starts, unloading, steps))
-
-    if blocks.whole_here:
-        return fit(blocks, own, arrays, starts, MAX_STEPS)
-    found = fit(blocks, own, arrays, starts, FIRST_STEPS)
-    late = np.flatnonzero(~np.asarray(found.settled))
-    if not len(late):
-        return found
-    rows = np.pad(late, (0, -len(late) % blocks.size), mode="edge")
-    few = Blocks(len(rows), blocks.size)
-    ends = few.cut(np.moveaxis(np.asarray(found.ends)[rows], 1, 0), axis=1)
-    again = fit(few, few.cut(_rows(tests, rows)), _rows(arrays, rows), ends, MAX_STEPS)
-    return jax.tree.map(lambda x, y: x.at[late].set(y[: len(late)]), found, again)
-
-
 def _centre(priors: Priors) -> np.ndarray:
     """Centre of b1, b3, b5, e for what a curve alone does not say: the prior's, at the paper's typical shape factor."""
     log_eta = np.log(1.4)
-    C = np.array([np.log(priors.C1.median), log_C3(priors), np.log(priors.C5.median)])
+    C = np.array([np.log(priors.C1.median), priors.log_C3, np.log(priors.C5.median)])
     return np.append(C + log_eta, np.log(priors.effective_modulus_MPa.median))
 
 
-@compiled
-def population_at(free: Float[Array, " d"], numbers: PriorNumbers, scatter: Scatter) -> Population:
-    """The population at unbounded coordinates."""
-    return constrain(free, numbers, scatter)[0]
-
-
-@compiled
-def populations(free: Float[Array, "draws d"], numbers: PriorNumbers, scatter: Scatter) -> Population:
-    """Populations of many unbounded coordinates, every field with a leading axis."""
-    return jax.vmap(lambda f: constrain(f, numbers, scatter)[0])(free)
-
-
-def _start(
-    latent: np.ndarray, flatness: np.ndarray, model: JointModel, numbers: PriorNumbers
-) -> tuple[PriorNumbers, Float[Array, " d"]]:
-    """Where to look for the population, the prior's a and the particles' own median and scatter under it; and the
-    coordinates centred there."""
+def _start(latent: np.ndarray, flatness: np.ndarray, model: Model) -> dict[str, float]:
+    """Where to look for the population: the prior's a and the particles' own median and scatter under it."""
     priors = model.chosen_priors
-    low, high = np.asarray(numbers.a)[2:]
-    a = float(np.clip(priors.a.mean, 0.9 * low, 0.9 * high))
+    most, least = max(flatness.max(), 1e-3), min(flatness.min(), -1e-3)
+    a = float(np.clip(priors.a.mean, -0.9 / most, -0.9 / least))
     log_eta = np.log(1 + a * flatness)
     b = latent[:, :3] - log_eta[:, None]
-    log_modulus = float(np.median(latent[:, 3] - model.shape_power * log_eta))
-    scales = np.array([priors.tau_C1.sd, priors.tau_C3.sd, priors.tau_C5.sd])
-    tau = np.clip(np.std(b, axis=0), 0.05 * scales, 2 * scales)
-    numbers = eqx.tree_at(lambda n: n.centre, numbers, jnp.asarray(np.median(latent[:, :3], axis=0)))
-    return numbers, unconstrain(a, log_modulus, np.median(b, axis=0), tau, numbers, model.scatter)
+    middle = np.median(b, axis=0) + log_eta.mean()
+    start = {"a": a, "log_modulus": float(np.median(latent[:, 3] - model.shape_power * log_eta)), "log_noise_factor": 0.0}
+    for j, name in enumerate(("C1", "C3", "C5")):
+        prior = getattr(priors, f"tau_{name}")
+        tau = float(np.clip(np.std(b[:, j]), 0.05 * prior.sd, 2 * prior.sd))
+        start |= {f"b{2 * j + 1}": float(middle[j]), f"tau_{name}_coordinate": SpreadCoordinate(prior).coordinate(tau)}
+    for name in ("modulus_scatter", "shape_scatter"):
+        start[f"{name}_coordinate"] = SpreadCoordinate(getattr(priors, name)).coordinate(0.1)
+    return start
+
+
+class Expected(eqx.Module):
+    """What a population says of its particles, and what the tests add.
+
+    Attributes:
+        mean, sd: of b1, b3, b5, e under the population, shape (N, 4).
+        latent: most probable ones given the tests, too, shape (N, 4).
+        theta: most probable numbers of the effects.
+        theta_mean, theta_sd: of the amplitudes that vary, under the population.
+        zero: most probable zeros [um], shape (N,).
+        hessian, stretch: of `Laplace`.
+    """
+
+    mean: Float[Array, "particles 4"]
+    sd: Float[Array, "particles 4"]
+    latent: Float[Array, "particles 4"]
+    theta: Float[Array, "particles numbers"]
+    theta_mean: Float[Array, "particles varying"]
+    theta_sd: Float[Array, "particles varying"]
+    zero: Float[Array, " particles"]
+    hessian: Float[Array, "particles k k"]
+    stretch: Float[Array, " k"]
+
+
+@compiled
+def expect(free: Float[Array, " d"], target: LogPosterior) -> Expected:
+    """The particles under the population at unbounded coordinates."""
+    marginal, population = target.marginal, target.population(free)
+    at = marginal.laplace(population)
+    none = marginal.place(population, jnp.zeros_like(at.deviations))
+    varying = jnp.asarray([k for k, _ in marginal.scatter.varying], int)
+    width = jnp.sqrt(jnp.sum(at.placed.jacobian**2, -1))
+    mean, factor = none.latent, none.jacobian[:, :4]
+    # Without the bend of the straightened coordinates, which is that of the point.
+    _, slope = straighten(mean - marginal.point.latent)
+    sd = jnp.sqrt(jnp.sum((factor / slope[..., None]) ** 2, -1))
+    zero = marginal.zero + jnp.einsum("np,np->n", marginal.zero_slope, at.placed.u)
+    theta = at.placed.theta
+    return Expected(
+        mean, sd, at.placed.latent, theta, none.theta[:, varying], width[:, 4:][:, varying], zero, at.hessian, at.stretch
+    )
+
+
+SHARP = 0.03
+"""Posterior standard deviation of the logarithm of a polynomial's coefficient below which one Newton step is enough."""
+
+
+def careful_enough(free: Float[Array, " d"], target: LogPosterior, count: int) -> LogPosterior:
+    """The target with as many Newton steps as the integration over the particles needs: none if every coefficient is
+    known sharply.
+
+    Args:
+        free: population in unbounded coordinates.
+        target: of the tests.
+        count: number of particles, without copies that only fill up.
+    """
+    scatter = replace(target.marginal.scatter, newton=0)
+    sharp = replace(target, marginal=replace(target.marginal, scatter=scatter))
+    at = expect(free, sharp)
+    variance = np.diagonal(np.linalg.inv(np.asarray(at.hessian)[:count]), axis1=1, axis2=2)
+    widest = float(np.max(np.sqrt(variance) * np.asarray(at.stretch)))
+    return sharp if widest < SHARP else target

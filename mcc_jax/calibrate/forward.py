@@ -1,25 +1,28 @@
-r"""The forward model of every joint calibration: displacement at measured force.
+r"""The forward model of every calibration: displacement at measured force, and its derivatives.
 
 The tester controls force and noise lives in displacement, so a test of particle i is
 
-.. math:: d_{ik} = z_i + \gamma(F_{i1} \dots F_{ik};\, b_i, e_i) + \text{noise}
+.. math:: d_{ik} = z_i + \gamma(F_{i1} \dots F_{ik};\, b_i, e_i, \theta_i) + \text{noise}
 
 with its zero z, and the law's displacement under load control. The law knows the coefficients only through products
 with the shape factor: :math:`b_j = \log(C_j \eta_p)`, and the modulus through :math:`e = \log(\bar E \eta_p^p)` with
 the power p of the strain scaling (half of it in the punch forms, where the modulus is squared). So the data of one
 particle never contain the shape parameter `a`: it enters through what particles of different shapes have in common
-(`population`).
+(`population`). :math:`\theta_i` are the numbers of the effects, amplitudes first.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from .._numerics import running_max
 from .._types import Path, Scalar
-from ..effects import AbstractEffect
+from ..effects import AbstractEffect, Record, Variant
 from ..geometry import Particle
 from ..law import MccLaw, Plastic, Unloading
 from .data import Tests
@@ -28,79 +31,137 @@ Latent = Float[Array, " 4"]
 """b1, b3, b5 and e of one particle."""
 
 
-def law_of(latent: Latent, unloading: Unloading, effects: tuple[AbstractEffect, ...] = ()) -> MccLaw:
-    """The law that has taken in its particle's shape: a = 0, coefficients times the shape factor."""
-    b1, b3, b5, e = latent
-    plastic = Plastic(jnp.exp(b1), jnp.exp(b3), jnp.exp(b5))
-    return MccLaw(plastic, 0.0, jnp.exp(e), unloading, effects=effects)
+class Forms(eqx.Module):
+    """What does not change while a law is fitted: its form of unloading and the formulas of its effects.
+
+    Attributes:
+        unloading: form of unloading.
+        effects: formulas of the effects.
+    """
+
+    unloading: Unloading = eqx.field(static=True)
+    effects: tuple[Variant, ...] = eqx.field(static=True, default=())
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the effects' numbers: every mechanism's amplitude, then their further numbers."""
+        further = (f"{v.mechanism}.{n.name}" for v in self.effects for n in v.nuisances)
+        return (*(v.mechanism for v in self.effects), *further)
+
+    @property
+    def without_effects(self) -> np.ndarray:
+        """Numbers with which the effects change nothing: amplitudes of zero, further numbers in their middle."""
+        return np.array([0.0] * len(self.effects) + [n.middle for v in self.effects for n in v.nuisances])
+
+    def build(self, theta: Float[Array, " numbers"]) -> tuple[AbstractEffect, ...]:
+        """The effects with these numbers, in the order of `names`."""
+        built, place = [], len(self.effects)
+        for k, variant in enumerate(self.effects):
+            further = {n.name: theta[place + i] for i, n in enumerate(variant.nuisances)}
+            built.append(variant.build(theta[k], **further))
+            place += len(variant.nuisances)
+        return tuple(built)
+
+    def law(self, latent: Latent, theta: Float[Array, " numbers"]) -> MccLaw:
+        """The law that has taken in its particle's shape: a = 0, coefficients times the shape factor."""
+        b1, b3, b5, e = latent
+        plastic = Plastic(jnp.exp(b1), jnp.exp(b3), jnp.exp(b5))
+        return MccLaw(plastic, 0.0, jnp.exp(e), self.unloading, effects=self.build(theta))
+
+    def displacement(
+        self, latent: Latent, theta: Float[Array, " numbers"], particle: Particle, record: Record
+    ) -> Path:
+        """Displacement [um] of a virgin particle along its test, from its own zero."""
+        return self.law(latent, theta).respond(particle, record)
 
 
-def displacement(latent: Latent, particle: Particle, force: Path, unloading: Unloading) -> Path:
-    """Displacement [um] of a virgin particle along a path of forces [mN], from its own zero."""
-    law = law_of(latent, unloading)
-    return law.path_load(particle, law.init(particle), force)[1]
+class Point(eqx.Module):
+    """Where tests are linearised.
+
+    Attributes:
+        latent: b1, b3, b5, e of every particle.
+        zero: zeros of displacement [um].
+        theta: numbers of the effects of every particle, in the order of `Forms.names`; amplitudes may differ from
+            particle to particle, the others are the same for all.
+    """
+
+    latent: Float[Array, "particles 4"]
+    zero: Float[Array, " particles"]
+    theta: Float[Array, "particles numbers"]
 
 
-def raw_residual(
-    latent: Float[Array, "particles 4"], zero: Float[Array, " particles"], tests: Tests, unloading: Unloading
-) -> Float[Array, "particles points"]:
+class Linear(eqx.Module):
+    """Residuals of N tests, linear in everything the prediction depends on.
+
+    Attributes:
+        residual: measured less predicted displacement at the point [um], 0 where masked.
+        columns: derivatives of the prediction by b1, b3, b5, e and the effects' numbers, 0 where masked.
+        by_force: by a point's own reading of force [um/mN].
+        by_peak: by the force from which its branch starts [um/mN].
+        by_offset: by an error that all forces of a test share [um/mN].
+    """
+
+    residual: Float[Array, "particles points"]
+    columns: Float[Array, "particles points numbers"]
+    by_force: Float[Array, "particles points"]
+    by_peak: Float[Array, "particles points"]
+    by_offset: Float[Array, "particles points"]
+
+
+def residuals(point: Point, tests: Tests, forms: Forms) -> Float[Array, "particles points"]:
     """Measured less predicted displacement [um], 0 where masked."""
-    predicted = jax.vmap(lambda w, p, f: displacement(w, p, f, unloading))(latent, tests.particle, tests.force)
-    return jnp.where(tests.mask, tests.displacement - predicted - zero[:, None], 0.0)
+    predicted = jax.vmap(forms.displacement)(point.latent, point.theta, tests.particle, tests.record)
+    return jnp.where(tests.mask, tests.displacement - predicted - point.zero[:, None], 0.0)
 
 
 def linearise(
-    latent: Float[Array, "particles 4"], zero: Float[Array, " particles"], tests: Tests, unloading: Unloading
-) -> tuple[Float[Array, "particles points"], Float[Array, "particles points 5"]]:
-    """Residuals [um] and their derivatives with respect to each particle's b1, b3, b5, e and zero."""
-    residual, J, _, _ = _linearise(latent, zero, tests, unloading, False)
-    return residual, J
+    point: Point, tests: Tests, forms: Forms, *, with_numbers: bool = True, with_force: bool = True
+) -> Linear:
+    """Linearise all tests, by forward derivatives in as many directions as one particle has numbers.
 
+    Args:
+        point: around what.
+        tests: the measurements.
+        forms: the law.
+        with_numbers: whether derivatives by the particle's numbers are wanted; none if not.
+        with_force: whether derivatives by force are wanted; 0 if not.
+    """
+    record, still = tests.record, jnp.zeros_like(tests.force)
+    count, size = len(tests), 4 + point.theta.shape[1]
 
-def linearise_with_force(
-    latent: Float[Array, "particles 4"], zero: Float[Array, " particles"], tests: Tests, unloading: Unloading
-) -> tuple[
-    Float[Array, "particles points"],
-    Float[Array, "particles points 5"],
-    Float[Array, "particles points"],
-    Float[Array, "particles points"],
-]:
-    """The same, and the change of each prediction with its own force and with its branch's peak force [um/mN]."""
-    return _linearise(latent, zero, tests, unloading, True)
+    def predicted(numbers: Array, force: Array, peak: Array) -> Array:
+        moved = eqx.tree_at(lambda r: (r.force, r.peak), record, (force, peak))
+        return jax.vmap(lambda x, *one: forms.displacement(x[:4], x[4:], *one))(numbers, tests.particle, moved)
 
-
-def _linearise(latent, zero, tests, unloading, with_force):
-    count = len(tests)
-
-    def predicted(w, force):
-        return jax.vmap(lambda *one: displacement(one[0], one[1], one[2], unloading))(w, tests.particle, force)
-
-    value, push = jax.linearize(predicted, latent, tests.force)
-    still = jnp.zeros_like(tests.force)
-    record = tests.force >= jax.vmap(running_max)(tests.force)
-    directions = jnp.broadcast_to(jnp.eye(4)[:, None], (4, count, 4))
-    forces = [still] * 4
+    numbers = jnp.concatenate([point.latent, point.theta], 1)
+    value, push = jax.linearize(predicted, numbers, tests.force, record.peak)
+    directions = [jnp.broadcast_to(jnp.eye(size)[:, None], (size, count, size))] if with_numbers else []
+    wanted = size if with_numbers else 0
+    forces = peaks = [still] * wanted
     if with_force:
-        directions = jnp.concatenate([directions, jnp.zeros((2, count, 4))])
-        # Behind a peak a prediction moves with the peak's force, too; that part is taken off again.
-        forces += [jnp.ones_like(still), jnp.where(record, 1.0, 0.0)]
-    columns = jax.vmap(push)(directions, jnp.stack(forces))
-    used = tests.mask
-    J = jnp.where(used[..., None], -jnp.moveaxis(columns[:4], 0, -1), 0.0)
-    own = jnp.where(used, -1.0, 0.0)[..., None]
-    residual = jnp.where(used, tests.displacement - value - zero[:, None], 0.0)
-    if not with_force:
-        return residual, jnp.concatenate([J, own], -1), still, still
-    moved = jnp.where(record, columns[4], columns[4] - columns[5])
-    return residual, jnp.concatenate([J, own], -1), moved, jnp.where(record, 0.0, columns[5])
+        directions.append(jnp.zeros((2, count, size)))
+        own = jnp.where(tests.reading, 1.0, 0.0)
+        elastic = jnp.where(tests.peak_error > 0, 1.0, 0.0)
+        # A reading on virgin loading is its own peak; where the estimate stands in for readings, both move together.
+        forces = [*forces, own, 1 - own]
+        peaks = [*peaks, 1 - elastic, elastic]
+    columns = jax.vmap(push)(jnp.concatenate(directions), jnp.stack(forces), jnp.stack(peaks))
+    columns = jnp.where(tests.mask[None], columns, 0.0)
+    residual = still
+    if tests.displacement is not None:
+        residual = jnp.where(tests.mask, tests.displacement - value - point.zero[:, None], 0.0)
+    by_force, by_peak = columns[wanted:] if with_force else (still, still)
+    return Linear(residual, jnp.moveaxis(columns[:wanted], 0, -1), by_force, by_peak, by_force + by_peak)
 
 
 def snap(latent: Latent, particle: Particle) -> Scalar:
     """Logarithm of the force [mN] at which loading snaps through; infinite if the law is monotone."""
-    law = law_of(latent, Unloading.PRINTED)
-    K1, K3, K5 = law.plastic.polynomial
+    b1, b3, b5, _ = latent
+    K1, K3, K5 = Plastic(jnp.exp(b1), jnp.exp(b3), jnp.exp(b5)).polynomial
     falls = 9 * K3 * K3 > 20 * K1 * K5
     root = jnp.sqrt(jnp.where(falls, 9 * K3 * K3 - 20 * K1 * K5, 1.0))
     square = 2 * K1 / (3 * K3 + root)  # of the scaled strain at the peak
     force = particle.force(jnp.sqrt(square) * (K1 - square * (K3 - square * K5)))
     return jnp.where(falls, jnp.log(jnp.where(falls, force, 1.0)), jnp.inf)
+
+

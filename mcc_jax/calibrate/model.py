@@ -1,83 +1,219 @@
-"""What a joint calibration assumes of a campaign, and the fit that both methods start from."""
+"""The probabilistic model of a campaign, as a NumPyro model: this file is its definition."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+import dataclasses
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+import numpyro
+import numpyro.distributions as dist
+from jaxtyping import Array, Float
+from numpyro import deterministic, sample
 
 from .. import arguments
 from .._errors import InputError
+from .._types import Scalar
+from ..effects import Variant, find_variant
 from ..law import StrainScaling, Unloading
-from .noise import Noise, Whitening
-from .particle_fit import Particles
-from .population import Scatter, Summary
-from .priors import Priors
-from .transforms import PriorNumbers
-
-BLUR = 0.01
-"""Width of a population's mean where nothing scatters, about: only a coordinate's scale."""
+from .data import Tests
+from .distributions import Amplitude, RecordNoise, SpreadCoordinate, nuisance_prior
+from .forward import Forms, Point, linearise
+from .marginal import Marginal
+from .noise import Along, Correlation, Noise, Whitening, whitening
+from .population import COEFFICIENTS, Population, Scatter, particles_at
+from .priors import NakagamiPrior, Priors
 
 ALMOST = 0.98
 """Share of the way to the value of a at which a particle's shape factor would vanish."""
 
 
 @dataclass(frozen=True)
-class JointModel:
-    """What is assumed about a campaign.
+class Model:
+    """What is assumed about a campaign; called with tests, it is a NumPyro model.
 
     Attributes:
         unloading: form of unloading, to which the modulus belongs.
         strain_scaling: how the shape factor enters unloading.
         modulus_scatter: let the modulus differ from particle to particle.
         shape_scatter: let `a` differ from particle to particle.
-        priors: what is believed beforehand.
+        priors: what is believed beforehand; the defaults of the form of unloading if None.
+        effects: formulas that act on the law, one a mechanism; see `with_effects`.
+        varying: mechanisms whose amplitude differs from particle to particle.
+        correlation: how rough correlated residuals are.
+        along: what they are correlated along, the path of force or time.
 
     Raises:
-        InputError: for an unknown form (which may be given as its text), or what is no `Priors`.
+        InputError: for an unknown form (which may be given as its text), or what is no `Priors` and no effect.
     """
 
-    unloading: Unloading
-    strain_scaling: StrainScaling
-    modulus_scatter: bool
-    shape_scatter: bool
-    priors: Priors | None
+    unloading: Unloading = Unloading.PRINTED
+    strain_scaling: StrainScaling = StrainScaling.RAW
+    modulus_scatter: bool = False
+    shape_scatter: bool = False
+    priors: Priors | None = None
+    effects: tuple[Variant, ...] = ()
+    varying: tuple[str, ...] = ()
+    correlation: Correlation = Correlation.EXPONENTIAL
+    along: Along = Along.LOAD
 
-    def __init__(
+    def __post_init__(self) -> None:
+        if self.priors is not None:
+            arguments.instance(self.priors, Priors, "priors", "Read them with mcc_jax.read_priors(file).")
+        for name, kind in (
+            ("unloading", Unloading),
+            ("strain_scaling", StrainScaling),
+            ("correlation", Correlation),
+            ("along", Along),
+        ):
+            object.__setattr__(self, name, arguments.member(getattr(self, name), kind, name))
+        for name in ("modulus_scatter", "shape_scatter"):
+            object.__setattr__(self, name, arguments.flag(getattr(self, name), name))
+        effects = tuple(_variant(one) for one in _several(self.effects))
+        object.__setattr__(self, "effects", effects)
+        names = [v.mechanism for v in effects]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise InputError(f"{twice[0]} stands twice in one model", remedy="Take one formula of each mechanism.")
+        own = [v.mechanism for v in effects if v.random_per_test]
+        varying = tuple(dict.fromkeys([*_several(self.varying), *own]))
+        for name in varying:
+            arguments.choice(name, names, "effect to vary")
+        object.__setattr__(self, "varying", varying)
+
+    # ---- the model ---------------------------------------------------------------------------------------------------
+
+    def __call__(
         self,
-        unloading: Unloading | str = Unloading.PRINTED,
-        strain_scaling: StrainScaling | str = StrainScaling.RAW,
-        modulus_scatter: bool = False,
-        shape_scatter: bool = False,
-        priors: Priors | None = None,
+        tests: Tests | None,
+        marginal: Marginal | None = None,
+        *,
+        filters: Whitening | None = None,
+        around: Marginal | None = None,
     ) -> None:
-        if priors is not None:
-            arguments.instance(priors, Priors, "priors", "Read them with mcc_jax.read_priors(file).")
-        fields = {
-            "unloading": arguments.member(unloading, Unloading, "unloading"),
-            "strain_scaling": arguments.member(strain_scaling, StrainScaling, "strain_scaling"),
-            "modulus_scatter": arguments.flag(modulus_scatter, "modulus_scatter"),
-            "shape_scatter": arguments.flag(shape_scatter, "shape_scatter"),
-            "priors": priors,
-        }
-        for name, value in fields.items():
-            object.__setattr__(self, name, value)
+        """Displacement under measured force, of particles of one material.
 
-    @property
-    def scatter(self) -> Scatter:
-        """What scatters, and the power of the strain scaling."""
-        return Scatter(self.modulus_scatter, self.shape_scatter, self.shape_power)
+        Args:
+            tests: the measurements; `tests.unobserved()` to predict them.
+            marginal: of a fit: particles are integrated out, and the tests themselves are not looked at.
+            filters: of a fit: the noise as it was estimated, but for a common factor; sampled if None.
+            around: of a fit: every particle's own numbers are sampled in the coordinates of its Laplace approximation.
+        """
+        shapes = tests if marginal is None else marginal
+        assert shapes is not None
+        if marginal is not None:
+            population = self.population(shapes)
+            numpyro.factor("tests", jnp.sum(marginal.log_likelihood(population)))
+            return
+        assert tests is not None
+        p, count, size = self.chosen_priors, len(tests), self.scatter.size
+        population = self.population(shapes, noise_factor=filters is not None)
+        noise = None if filters is not None else self._noise(count)
+        with numpyro.plate("particle", count):
+            if around is None:
+                xi = sample("deviation", dist.Normal().expand([size]).to_event(1))  # not centred: a spread may be 0
+                zero = sample("zero_um", dist.Normal(tests.contact + p.zero_um.mean, p.zero_um.sd))
+            else:
+                xi, zero = self._around(population, tests, around)
+            own = particles_at(population, tests.flatness, self.scatter, xi)
+            eta = 1 + population.a * tests.flatness
+            deterministic("C", jnp.exp(own.latent[:, :3]) / eta[:, None])
+            law = jax.vmap(self.forms.displacement)
+            clean = law(own.latent, own.theta, tests.particle, tests.record)
+            if noise is not None:
+                filters = self._filters(noise, Point(own.latent, zero, own.theta), tests)
+            observed = RecordNoise(clean + zero[:, None], filters, jnp.exp(population.log_noise))
+            sample("displacement_um", observed, obs=tests.displacement)
 
-    @property
-    def shape_power(self) -> float:
-        """Power of the shape factor in e: the scaling's, or half of it in the forms that square the modulus."""
-        return self.strain_scaling.power / self.unloading.stress_power
+    def population(self, shapes: Any, *, noise_factor: bool = True) -> Population:
+        """Priors of what all particles share, as NumPyro sites.
+
+        Args:
+            shapes: what has the `flatness` of the particles (`Tests` or `Marginal`).
+            noise_factor: whether a common factor on the noise is sampled.
+        """
+        p = self.chosen_priors
+        weight = jnp.ones_like(shapes.flatness) if shapes.weight is None else shapes.weight
+        # Every shape factor must be positive.
+        most, least = jnp.maximum(jnp.max(shapes.flatness), 1e-3), jnp.minimum(jnp.min(shapes.flatness), -1e-3)
+        reach = max(8 * p.a.sd, 8.0)  # the bounds scale a coordinate; they are no belief
+        low = jnp.maximum(-ALMOST / most, p.a.mean - reach)
+        high = jnp.minimum(-ALMOST / least, p.a.mean + reach)
+        a = sample("a", dist.TruncatedNormal(p.a.mean, p.a.sd, low=low, high=high))
+        modulus = p.effective_modulus_MPa
+        log_modulus = sample("log_modulus", dist.Normal(np.log(modulus.median), modulus.log_sd))
+        deterministic("effective_modulus_MPa", jnp.exp(log_modulus))
+        # Means at the campaign's average shape, so that they hardly depend on a.
+        shift = jnp.sum(weight * jnp.log1p(a * shapes.flatness)) / jnp.sum(weight)
+        b1 = sample("b1", dist.Normal(np.log(p.C1.median) + shift, p.C1.log_sd))
+        b5 = sample("b5", dist.Normal(np.log(p.C5.median) + shift, p.C5.log_sd))
+        # The softening 9 C3^6 / (20 C1 C5^5) is log-normal: 1 where the curve goes flat.
+        b3_mean = (np.log(20 / 9) + b1 + 5 * b5 + np.log(p.softening.median)) / 6
+        b3 = sample("b3", dist.Normal(b3_mean, p.softening.log_sd / 6))
+        mu = deterministic("mu", jnp.stack([b1, b3, b5]) - shift)
+        for j, name in enumerate(COEFFICIENTS):
+            deterministic(f"{name}_median", jnp.exp(mu[j]))
+        tau = jnp.stack([spread(f"tau_{name}", getattr(p, f"tau_{name}")) for name in COEFFICIENTS])
+        zero = jnp.zeros(())
+        modulus_scatter = spread("modulus_scatter", p.modulus_scatter) if self.modulus_scatter else zero
+        shape_scatter = spread("shape_scatter", p.shape_scatter) if self.shape_scatter else zero
+        theta, theta_scatter = self._effects()
+        log_noise = zero
+        if noise_factor:
+            factor = p.noise_factor
+            log_noise = sample("log_noise_factor", dist.Normal(np.log(factor.median), factor.log_sd))
+            deterministic("noise_factor", jnp.exp(log_noise))
+        return Population(
+            a, log_modulus, mu, tau, modulus_scatter, shape_scatter, log_noise, theta, theta_scatter
+        )
+
+    def _effects(self) -> tuple[Float[Array, " numbers"], Float[Array, " varying"]]:
+        """Amplitudes on their physical side, further numbers within what is plausible, spreads of those that vary."""
+        amplitudes, further, spreads = [], [], []
+        for v in self.effects:
+            size = sample(f"{v.mechanism}_size", Amplitude(v))
+            amplitudes.append(deterministic(v.mechanism, (v.sign or 1) * v.plausible[0] * size))
+            for n in v.nuisances:
+                further.append(sample(f"{v.mechanism}.{n.name}", nuisance_prior(n)))
+            if v.mechanism in self.varying:
+                # In the logarithm, or in the amplitude's own unit where it may have either sign.
+                prior = NakagamiPrior(v.plausible[1] if self._signed(v) else 0.5, shape=0.25)
+                spreads.append(spread(f"tau_{v.mechanism}", prior))
+        none = jnp.zeros(0)
+        theta = jnp.concatenate([none, *(jnp.reshape(x, 1) for x in (*amplitudes, *further))])
+        return theta, jnp.concatenate([none, *(jnp.reshape(x, 1) for x in spreads)])
+
+    def _around(self, population: Population, tests: Tests, around: Marginal) -> tuple[Array, Array]:
+        """Every particle's own numbers, sampled as standard normal ones; the density is that of the plain model."""
+        size, prior = self.scatter.size, self.chosen_priors.zero_um
+        normal = sample("own", dist.Normal().expand([size + 1]).to_event(1))
+        drawn = around.draw(population, normal[:, :size], normal[:, size])
+        zero = deterministic("zero_um", drawn.zero)
+        plain = jnp.sum(dist.Normal().log_prob(drawn.deviations), -1)
+        plain += dist.Normal(tests.contact + prior.mean, prior.sd).log_prob(zero) + drawn.log_volume
+        numpyro.factor("coordinates", plain - jnp.sum(dist.Normal().log_prob(normal), -1))
+        return drawn.deviations, zero
+
+    def _noise(self, count: int) -> Noise:
+        """White noise in displacement and in force, correlated noise along the path; all particles alike."""
+        p = self.chosen_priors
+        names = ("noise_displacement_um", "noise_force_mN", "noise_correlated_um", "noise_length")
+        priors = ((name, getattr(p, name)) for name in names)
+        numbers = [sample(name, dist.LogNormal(np.log(one.median), one.log_sd)) for name, one in priors]
+        return Noise(*numbers, jnp.ones(count))
+
+    def _filters(self, noise: Noise, point: Point, tests: Tests) -> Whitening:
+        """The noise as displacement: how noise of force moves the prediction is taken as known."""
+        linear = linearise(jax.lax.stop_gradient(point), tests, self.forms, with_numbers=False)
+        return jax.vmap(lambda *one: whitening(noise, *one, self.correlation, self.along))(
+            noise.scale, tests, linear
+        )
+
+    # ---- what follows from it ----------------------------------------------------------------------------------------
 
     @property
     def chosen_priors(self) -> Priors:
@@ -85,113 +221,80 @@ class JointModel:
         return self.priors or Priors.default(self.unloading)
 
     @property
+    def shape_power(self) -> float:
+        """Power of the shape factor in e: the scaling's, or half of it in the forms that square the modulus."""
+        return self.strain_scaling.power / self.unloading.stress_power
+
+    @property
+    def forms(self) -> Forms:
+        """The formulas of law and effects."""
+        return Forms(self.unloading, self.effects)
+
+    @property
+    def scatter(self) -> Scatter:
+        """What differs from particle to particle."""
+        varying = [(k, self._signed(v)) for k, v in enumerate(self.effects) if v.mechanism in self.varying]
+        return Scatter(self.modulus_scatter, self.shape_scatter, self.shape_power, tuple(varying))
+
+    @staticmethod
+    def _signed(variant: Variant) -> bool:
+        return variant.sign == 0 or variant.random_per_test
+
+    @property
     def zero_sd(self) -> Array:
         """Standard deviation of the zeros [um]."""
         return jnp.asarray(self.chosen_priors.zero_um.sd)
 
+    def with_effects(self, *effects: Any, varying: Any = ()) -> Model:
+        """The model with further effects.
 
-class JointFit(eqx.Module):
-    """Particles, noise and population in agreement: the common starting point of least squares and posterior.
+        Args:
+            effects: each by name, "mechanism" or "mechanism:variant", of `mcc_jax.effects.LIBRARY`, or a `Variant`.
+            varying: mechanisms whose amplitude differs from particle to particle, also of effects there are.
 
-    Attributes:
-        individual: every particle on its own.
-        noise: the campaign's noise.
-        noise_log_sd: standard deviations of the logarithms of its four numbers.
-        filters: its filters at the latent vectors.
-        latent, zero: most probable latent vectors and zeros [um].
-        residual: measured less predicted displacement there [um], 0 where masked.
-        summary: quadratic summaries there.
-        mode, covariance: of the population in unbounded coordinates, given the summaries.
-        numbers: its priors.
-        converged: for particles, noise and population in turn.
-    """
-
-    individual: Particles
-    noise: Noise
-    noise_log_sd: Float[Array, " 4"]
-    filters: Whitening
-    latent: Float[Array, "particles 4"]
-    zero: Float[Array, " particles"]
-    residual: Float[Array, "particles points"]
-    summary: Summary
-    mode: Float[Array, " d"]
-    covariance: Float[Array, "d d"]
-    numbers: PriorNumbers
-    converged: Bool[np.ndarray, " 3"]
-
-    def first(self, count: int) -> JointFit:
-        """The same of the first `count` particles: without copies that only fill up."""
-
-        def some(tree: Any) -> Any:
-            return jax.tree.map(lambda x: x[:count], tree)
-
-        return replace(
-            self,
-            individual=some(self.individual),
-            noise=replace(self.noise, scale=self.noise.scale[:count]),
-            filters=some(self.filters),
-            latent=self.latent[:count],
-            zero=self.zero[:count],
-            residual=self.residual[:count],
-            summary=some(self.summary),
-            numbers=replace(self.numbers, flatness=self.numbers.flatness[:count], weight=None),
+        Raises:
+            InputError: for a name that does not exist, naming those that do; for two formulas of one mechanism.
+        """
+        new = tuple(_variant(one) for one in effects)
+        return dataclasses.replace(
+            self, effects=(*self.effects, *new), varying=(*self.varying, *_several(varying))
         )
 
 
-def prior_numbers(
-    priors: Priors, flatness: Float[Array, " particles"], weight: Float[Array, " particles"] | None = None
-) -> PriorNumbers:
-    """Priors as arrays; `a` is bounded to where every particle's shape factor is positive."""
-    flat = np.asarray(flatness)
-    most, least = max(flat.max(), 1e-3), min(flat.min(), -1e-3)
-    # The bounds scale a coordinate; they are no belief, and stay far from where data or prior could want to go.
-    reach = max(8 * priors.a.sd, 8.0)
-    wide = priors.a.mean + np.array([-reach, reach])
-    low, high = max(-ALMOST / most, wide[0]), min(-ALMOST / least, wide[1])
-    if not (low < high and low < priors.a.mean + 6 * priors.a.sd and high > priors.a.mean - 6 * priors.a.sd):
-        raise InputError(
-            f"the prior of a ({priors.a.mean:g} +- {priors.a.sd:g}) leaves no value under which every particle's shape "
-            f"factor is positive ({-ALMOST / most:.3g} < a < {-ALMOST / least:.3g})",
-            remedy="Widen the prior, or check the diameters.",
-        )
-
-    def log_pair(prior):
-        return jnp.asarray([np.log(prior.median), prior.log_sd])
-
-    spreads = (priors.tau_C1, priors.tau_C3, priors.tau_C5, priors.modulus_scatter, priors.shape_scatter)
-    return PriorNumbers(
-        a=jnp.asarray([priors.a.mean, priors.a.sd, low, high]),
-        log_modulus=log_pair(priors.effective_modulus_MPa),
-        mu_1=log_pair(priors.C1),
-        mu_5=log_pair(priors.C5),
-        softening=log_pair(priors.softening),
-        spread=jnp.asarray([[p.sd, 1 / (2 * p.shape)] for p in spreads]),
-        log_noise=log_pair(priors.noise_factor),
-        centre=jnp.asarray([np.log(priors.C1.median), log_C3(priors), np.log(priors.C5.median)]),
-        blur=jnp.asarray(np.full(3, BLUR)),
-        flatness=flatness,
-        weight=weight,
-    )
+def spread(name: str, prior: NakagamiPrior) -> Scalar:
+    """A standard deviation over the particles, sampled through a coordinate that may have either sign."""
+    distribution = SpreadCoordinate(prior)
+    return deterministic(name, distribution.spread(sample(f"{name}_coordinate", distribution)))
 
 
-def log_C3(priors: Priors) -> float:
-    """The prior's log C3 at the medians of the others."""
-    log_C1, log_C5 = np.log(priors.C1.median), np.log(priors.C5.median)
-    return float((np.log(20 / 9) + log_C1 + 5 * log_C5 + np.log(priors.softening.median)) / 6)
+def _several(value: Any) -> tuple[Any, ...]:
+    return (value,) if isinstance(value, str | Variant) else tuple(value)
 
 
-def checked_settings(
-    progress: Callable[[str], None] | None, model: JointModel | None, threshold_MPa: Any, block: int | None
-) -> tuple[Callable[[str], None], JointModel, float]:
-    """What all joint calibrations share, with the defaults filled in.
+def _variant(effect: Any) -> Variant:
+    found = find_variant(effect) if isinstance(effect, str) else effect
+    remedy = 'Give a name such as "creep:logarithmic", or a mcc_jax.Variant.'
+    found = arguments.instance(found, Variant, "an effect of a model", remedy)
+    for nuisance in found.nuisances:
+        if nuisance.random_per_test:
+            raise InputError(
+                f"{nuisance.name} of {found.mechanism}:{found.name} differs at random from test to test",
+                remedy="A model has one value for all tests; take another formula of the mechanism.",
+            )
+    return found
+
+
+def check_prior_of_a(priors: Priors, flatness: np.ndarray) -> None:
+    """Make sure that the prior of `a` leaves values under which every particle's shape factor is positive.
 
     Raises:
-        InputError: for one of the wrong kind or out of its range.
+        InputError: if it does not.
     """
-    tell = arguments.teller(progress)
-    if model is not None:
-        arguments.instance(model, JointModel, "model", "Make one with mcc_jax.JointModel().")
-    if block is not None:
-        arguments.whole(block, "block", least=1)
-    threshold = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
-    return tell, model or JointModel(), threshold
+    most, least = max(flatness.max(), 1e-3), min(flatness.min(), -1e-3)
+    low, high = -ALMOST / most, -ALMOST / least
+    if not (low < priors.a.mean + 6 * priors.a.sd and high > priors.a.mean - 6 * priors.a.sd):
+        raise InputError(
+            f"the prior of a ({priors.a.mean:g} +- {priors.a.sd:g}) leaves no value under which every particle's shape "
+            f"factor is positive ({low:.3g} < a < {high:.3g})",
+            remedy="Widen the prior, or check the diameters.",
+        )

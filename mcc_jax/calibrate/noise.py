@@ -1,30 +1,62 @@
-r"""Noise of a test: white read-out noise, noise of force, and residuals that are correlated along the load path.
+r"""Noise of a test: white read-out noise, noise of force, and residuals that are correlated along its path.
 
 .. math:: d_k - z - \gamma_k = o_k + w_k, \qquad
     w_k \sim N(0,\, s_i^2 (\sigma_w^2 + \sigma_F^2 \gamma'^2_k)), \qquad
-    \mathrm{Cov}(o_k, o_l) = s_i^2 \sigma_o^2 \exp(-|p_k - p_l| / \ell)
+    \mathrm{Cov}(o_k, o_l) = s_i^2 \sigma_o^2\, \rho(|p_k - p_l| / \ell)
 
-with p the path length of force in shares of the peak (an Ornstein-Uhlenbeck process along it), and a scale s_i of each
-particle's own. The peak from which an elastic branch starts is one noisy reading, too, and moves the whole branch: a
-variance :math:`s_i^2 \sigma_F^2 c c^T` with c the change of the branch with its peak. The covariance is never formed: a
-Kalman filter turns residuals into independent ones in linear time, and each branch's direction is then shrunk.
+with p the path length of force in shares of the peak, or time, :math:`\rho` an exponential or Matern correlation, and a
+scale s_i of each particle's own. The force from which a branch starts has an error of its own, which moves the whole
+branch: a variance :math:`s_i^2 \sigma_F^2 c c^T` with c the change of the branch with its peak. The covariance is never
+formed: tinygp factors its quasiseparable part in linear time, and each branch's direction is then shrunk.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import enum
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from tinygp.kernels import quasisep
+from tinygp.noise import Diagonal
+from tinygp.solvers.quasisep.solver import QuasisepSolver
 
 from .._types import Path, Scalar
 from .compiling import compiled
+from .data import Tests
+from .forward import Linear
 from .paper.prediction import READING_UM
+from .priors import NoisePrior
 from .sharding import Blocks, Parts
-from .small_matrices import Cholesky
+from .small_matrices import eliminate
+
+
+class Correlation(enum.Enum):
+    """How residuals that are not white hang together: how rough they are."""
+
+    EXPONENTIAL = "exponential"
+    MATERN_32 = "matern-3/2"
+    MATERN_52 = "matern-5/2"
+
+    def kernel(self, length: Scalar, sd: Scalar) -> quasisep.Quasisep:
+        """The covariance function, with a correlation length and a standard deviation."""
+        kinds = {
+            Correlation.EXPONENTIAL: quasisep.Exp,
+            Correlation.MATERN_32: quasisep.Matern32,
+            Correlation.MATERN_52: quasisep.Matern52,
+        }
+        return kinds[self](scale=length, sigma=sd)
+
+
+class Along(enum.Enum):
+    """What residuals are correlated along."""
+
+    LOAD = "load"
+    TIME = "time"
 
 
 class Noise(eqx.Module):
@@ -34,7 +66,7 @@ class Noise(eqx.Module):
         displacement: white noise of displacement [um].
         force: white noise of force [mN].
         correlated: standard deviation of the correlated residual [um].
-        length: its correlation length, in shares of the peak force passed [-].
+        length: its correlation length, in shares of the peak force passed [-], or in seconds.
         scale: each particle's own factor on all of them [-], shape (N,).
     """
 
@@ -62,181 +94,143 @@ class Noise(eqx.Module):
         return cls(displacement, force, correlated, length, scale)
 
 
+MASKED_UM2 = 1e12
+"""Variance of a point that does not count [um^2]: beyond any reading, and far from where doubles lose digits."""
+
+
 class Whitening(eqx.Module):
-    """The Kalman filter of one test, ready to whiten any residuals of it; linear.
+    """The factored covariance of one test's noise, ready to turn residuals into independent ones of variance 1.
 
     Attributes:
-        decay: correlation with the point before.
-        gain: share of a surprise that the correlated part takes.
-        weight: one over the standard deviation of a surprise, 0 where the point is masked.
-        peak: whitened change of every point with the noise of its branch's peak, 0 on loading.
+        solver: factor of the quasiseparable part: white and correlated noise.
+        mask: which points count.
+        peak: whitened change of every point with the error of its branch's peak, 0 on loading.
         branch: which branch a point belongs to.
-        common: whitened change of every point with the error of the zero of force, which all points share; None where
-            no zero was measured.
+        common: whitened change of every point with the error of the zero of force; None where no zero was measured.
     """
 
-    decay: Path
-    gain: Path
-    weight: Path
+    solver: QuasisepSolver
+    mask: Bool[Array, " steps"]
     peak: Path
     branch: Int[Array, " steps"]
     common: Path | None = None
 
-    def __call__(self, residual: Path) -> Path:
-        """Independent residuals of standard deviation 1 (0 where masked)."""
-
-        def advance(expected, point):
-            r, decay, gain = point
-            surprise = r - decay * expected
-            return decay * expected + gain * surprise, surprise
-
-        _, surprise = jax.lax.scan(advance, jnp.zeros_like(residual[0]), (residual, self.decay, self.gain))
-        white = surprise * self.weight
+    def __call__(self, values: Float[Array, "steps columns"]) -> Float[Array, "steps columns"]:
+        """Columns of values over the points, independent and of variance 1; they must be 0 where masked."""
+        white = _triangular(self.solver, values)
         # 1 + p is the variance along a branch's direction: along it, and only there, divide by its root.
-        power = self._power()
-        shrink = (1 - 1 / jnp.sqrt(1 + power)) / jnp.where(power > 0, power, 1.0)
-        along = jax.ops.segment_sum(self.peak * white, self.branch, len(white))
-        white = white - self.peak * (shrink * along)[self.branch]
+        shrink = _shrink(self._power())
+        along = jax.ops.segment_sum(self.peak[:, None] * white, self.branch, len(self.peak))
+        white = white - self.peak[:, None] * (shrink[:, None] * along)[self.branch]
         if self.common is None:
             return white
-        shared = self.common @ self.common
-        # Division by its root along one more direction; the second form of (1 - 1/sqrt(1 + p))/p is finite at p = 0.
-        root = jnp.sqrt(1 + shared)
-        return white - self.common * (self.common @ white) / (root * (1 + root))
+        return white - self.common[:, None] * (_shrink(self.common @ self.common) * (self.common @ white))[None]
+
+    def colour(self, white: Path, of_branches: Path, of_zero: Scalar) -> Path:
+        """A draw of the noise [um] from standard normal numbers: of every point, every branch and the zero of force."""
+        with standard_promotion():
+            drawn = white + self.peak * of_branches[self.branch]
+            drawn = drawn if self.common is None else drawn + self.common * of_zero
+            return self.solver.dot_triangular(drawn)
 
     @property
-    def least_squares(self) -> Scalar:
-        """Sum of squares that reading alone brings about, however well the law fits."""
-        return READING_UM**2 * jnp.sum(self.weight**2)
+    def log_det(self) -> Scalar:
+        """Logarithm of the covariance's determinant, over the points that count."""
+        diagonal = self.solver.factor.diag.d
+        own = 2 * jnp.sum(jnp.where(self.mask, jnp.log(jnp.where(self.mask, diagonal, 1.0)), 0.0))
+        shared = 0.0 if self.common is None else jnp.log1p(self.common @ self.common)
+        return own + jnp.sum(jnp.log1p(self._power())) + shared
+
+    @property
+    def reading(self) -> Scalar:
+        """Sum of squares that reading a display of finite steps alone brings about, however well the law fits."""
+        return READING_UM**2 * jnp.sum(jnp.where(self.mask, self.solver.factor.diag.d**-2.0, 0.0))
 
     def _power(self) -> Path:
         return jax.ops.segment_sum(self.peak**2, self.branch, len(self.peak))
 
-    @property
-    def log_det(self) -> Scalar:
-        """Logarithm of the covariance's determinant, over the points that are not masked."""
-        used = self.weight > 0
-        own = -2 * jnp.sum(jnp.where(used, jnp.log(jnp.where(used, self.weight, 1.0)), 0.0))
-        shared = 0.0 if self.common is None else jnp.log1p(self.common @ self.common)
-        return own + jnp.sum(jnp.log1p(self._power())) + shared
+
+def _shrink(power: Array) -> Array:
+    """(1 - 1/sqrt(1 + p))/p, finite at p = 0."""
+    root = jnp.sqrt(1 + power)
+    return 1 / (root * (1 + root))
+
+
+@contextmanager
+def standard_promotion() -> Iterator[None]:
+    """NumPyro and tinygp count on JAX's usual promotion of types and ranks, whatever the caller's settings are."""
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        yield
+
+
+def _triangular(solver: QuasisepSolver, values: Array) -> Array:
+    with standard_promotion():
+        return solver.solve_triangular(values)
 
 
 def whitening(
-    noise: Noise,
-    scale: Scalar,
-    step: Path,
-    mask: Bool[Array, " steps"],
-    compliance: Path,
-    peak: Path,
-    branch: Int[Array, " steps"],
-    peak_sd: Path | None = None,
-    common: Path | None = None,
+    noise: Noise, scale: Scalar, tests: Tests, linear: Linear, correlation: Correlation, along: Along
 ) -> Whitening:
-    """The filter of one test.
+    """The factored covariance of one test.
 
     Args:
         noise: the campaign's noise; `noise.scale` is not used.
         scale: this particle's scale.
-        step: path length since the point before [-].
-        mask: which points count.
-        compliance: how far noise of force moves the predicted displacement [um/mN].
-        peak: how far noise of the branch's peak force moves it [um/mN].
-        branch: which branch a point belongs to.
-        peak_sd: standard deviation of the branch's peak force where it was worked out, not read [mN]; None where all
-            were read.
-        common: how far one standard deviation of the zero of force moves the predicted displacement [um]; None where
-            no zero was measured.
+        tests: the test, without the axis of the particles.
+        linear: how its prediction moves with force, without that axis.
+        correlation, along: of the correlated residuals.
     """
-    decay = jnp.exp(-step / noise.length)
-    stationary = noise.correlated**2
-    read_out = noise.displacement**2 + (noise.force * compliance) ** 2
-
-    def advance(variance, point):
-        decay, used, own = point
-        variance = decay**2 * variance + (1 - decay**2) * stationary
-        total = variance + own
-        gain = jnp.where(used, variance / total, 0.0)
-        return (1 - gain) * variance, (gain, total)
-
-    _, (gain, total) = jax.lax.scan(advance, stationary, (decay, mask, read_out))
-    weight = jnp.where(mask, 1 / (scale * jnp.sqrt(total)), 0.0)
-    still = Whitening(decay, gain, weight, jnp.zeros_like(step), branch)
-    read = scale * noise.force
-    level = read if peak_sd is None else jnp.sqrt(read**2 + peak_sd**2)
-    filtered = Whitening(decay, gain, weight, still(jnp.where(mask, level * peak, 0.0)), branch)
-    if common is None:
-        return filtered
-    return Whitening(decay, gain, weight, filtered.peak, branch, filtered(jnp.where(mask, common, 0.0)))
+    read_out = noise.displacement**2 + (noise.force * linear.by_force) ** 2
+    variance = jnp.where(tests.mask, scale**2 * read_out, MASKED_UM2)
+    place = tests.path if along is Along.LOAD else tests.record.time
+    with standard_promotion():
+        kernel = correlation.kernel(noise.length, scale * noise.correlated)
+        solver = QuasisepSolver(kernel, place, Diagonal(variance), assume_sorted=True)
+    error = scale * noise.force * tests.peak_error
+    error = error if tests.peak_sd is None else jnp.sqrt(error**2 + tests.peak_sd**2)
+    directions = [error * linear.by_peak]
+    if tests.force_zero_sd is not None:
+        directions.append(tests.force_zero_sd * linear.by_offset)
+    white = _triangular(solver, jnp.stack(directions, 1))
+    still = Whitening(solver, tests.mask, white[:, 0], tests.branch)
+    if tests.force_zero_sd is None:
+        return still
+    return Whitening(solver, tests.mask, white[:, 0], tests.branch, still(jnp.stack(directions, 1))[:, 1])
 
 
-class Linear(eqx.Module):
-    """Residuals of N tests, linear in each particle's own parameters around a point.
+def restricted_likelihood(
+    noise: Noise, tests: Tests, linear: Linear, zero_sd: Scalar, correlation: Correlation, along: Along
+) -> Float[Array, " particles"]:
+    """Log likelihood of each test under the noise, the particle's b1, b3, b5, e and zero integrated out.
 
-    Attributes:
-        residual: at the point [um].
-        jacobian: derivative with respect to the particle's P parameters.
-        prior: precision that keeps directions without data in place.
-        step, mask, compliance, peak, branch, peak_sd, common: as in `whitening`.
-        weight: 1 for particles, 0 for copies that only fill up; None where all are particles.
+    They have standard deviations of 1 and `zero_sd`: wide, and enough to keep directions without data in place.
     """
 
-    residual: Float[Array, "particles points"]
-    jacobian: Float[Array, "particles points P"]
-    prior: Float[Array, "particles P"]
-    step: Float[Array, "particles points"]
-    mask: Bool[Array, "particles points"]
-    compliance: Float[Array, "particles points"]
-    peak: Float[Array, "particles points"]
-    branch: Int[Array, "particles points"]
-    weight: Float[Array, " particles"] | None = None
-    peak_sd: Float[Array, "particles points"] | None = None
-    common: Float[Array, "particles points"] | None = None
+    def one(scale: Scalar, tests: Tests, linear: Linear) -> Scalar:
+        filtered = whitening(noise, scale, tests, linear, correlation, along)
+        columns = [linear.columns[:, :4], jnp.where(tests.mask, zero_sd, 0.0)[:, None], linear.residual[:, None]]
+        white = filtered(jnp.concatenate(columns, 1))
+        left, log_integral = eliminate(white.T @ white, tuple(range(5)), jnp.ones(5))
+        return log_integral - 0.5 * (left[0, 0] + filtered.log_det)
 
-
-def restricted_likelihood(noise: Noise, data: Linear) -> Float[Array, " particles"]:
-    """Log likelihood of each test under the noise, with the particle's own parameters integrated out."""
-
-    def one(scale, residual, jacobian, prior, *path):
-        filtered = whitening(noise, scale, *path)
-        r = filtered(residual)
-        J = jax.vmap(filtered, in_axes=1, out_axes=1)(jacobian)
-        factor = Cholesky(J.T @ J + jnp.diag(prior))
-        explained = factor.forward(J.T @ r)
-        return -0.5 * (filtered.log_det + r @ r - explained @ explained + factor.log_det())
-
-    return jax.vmap(one)(
-        noise.scale,
-        data.residual,
-        data.jacobian,
-        data.prior,
-        data.step,
-        data.mask,
-        data.compliance,
-        data.peak,
-        data.branch,
-        data.peak_sd,
-        data.common,
-    )
-
-
-class NoisePrior(eqx.Module):
-    """Log-normal priors of the four numbers of the noise: medians and standard deviations of the logarithm."""
-
-    median: Float[Array, " 4"]
-    log_sd: Float[Array, " 4"]
-
-    def log_density(self, logs: np.ndarray) -> np.ndarray:
-        """Log density of the logarithms, up to a constant; shape (..., 4) becomes (...)."""
-        return np.asarray(-0.5 * np.sum(((logs - np.log(self.median)) / np.asarray(self.log_sd)) ** 2, -1))
+    return jax.vmap(one)(noise.scale, tests, linear)
 
 
 @compiled
 def likelihoods(
-    logs: Float[Array, "many 4"], scale: Float[Array, " particles"], data: Linear
+    logs: Float[Array, "many 4"],
+    scale: Float[Array, " particles"],
+    tests: Tests,
+    linear: Linear,
+    zero_sd: Scalar,
+    correlation: Correlation,
+    along: Along,
 ) -> Float[Array, "many particles"]:
     """Log likelihood of each test under each of many noises; 0 of copies that only fill up."""
-    each = jax.vmap(lambda one: restricted_likelihood(Noise.from_logs(one, scale), data))(logs)
-    return each if data.weight is None else data.weight[None] * each
+    each = jax.vmap(
+        lambda one: restricted_likelihood(Noise.from_logs(one, scale), tests, linear, zero_sd, correlation, along)
+    )(logs)
+    return each if tests.weight is None else tests.weight[None] * each
 
 
 STEP = 1e-3
@@ -246,61 +240,81 @@ DIFFERENCES = STEP * np.concatenate([np.zeros((1, 4)), np.eye(4), -np.eye(4)])
 """What is added to the logarithms for a value and its gradient."""
 
 
+class NoiseFit(eqx.Module):
+    """The noise of a campaign, by restricted maximum likelihood with its prior.
+
+    Attributes:
+        noise: its numbers.
+        covariance: of the logarithms of the four numbers; NaN where it was not worked out.
+        log_evidence: what the four numbers add to a log marginal likelihood at them: log prior and Laplace's volume.
+        converged: whether the optimiser met its tolerances.
+    """
+
+    noise: Noise
+    covariance: Float[Array, "4 4"]
+    log_evidence: Float[Array, ""]
+    converged: bool = eqx.field(static=True)
+
+
 def estimate_noise(
-    data: Linear | Parts,
+    tests: Parts,
+    linear: Parts,
+    zero_sd: Scalar,
     prior: NoisePrior,
     start: Noise,
+    correlation: Correlation,
+    along: Along,
     *,
     uncertainty: bool = True,
-    blocks: Blocks | None = None,
-) -> tuple[Noise, Float[Array, " 4"], bool]:
+    blocks: Blocks,
+) -> NoiseFit:
     """Noise by restricted maximum likelihood with its prior.
 
     The particles' scales stay as they are (`particle_scales`). Derivatives with respect to four numbers are cheaper as
     differences, all of them in one batch, than to compile.
 
     Args:
-        data: linear residuals; with `blocks`, of this process's own particles.
+        tests, linear: measurements and linear residuals, of this process's own particles.
+        zero_sd: standard deviation of the zeros [um].
         prior: prior of the four numbers.
         start: where to begin, and the particles' scales.
-        uncertainty: whether to work out standard deviations.
-        blocks: how the particles are cut; all in one block by default.
-
-    Returns:
-        The noise, standard deviations of the logarithms of its four numbers (or NaN), and whether the optimiser
-        converged.
+        correlation, along: of the correlated residuals.
+        uncertainty: whether to work out the covariance.
+        blocks: how the particles are cut.
     """
     from scipy.optimize import minimize
 
-    blocks = blocks or Blocks(len(start.scale))
-    own = data if isinstance(data, Parts) else blocks.cut(data)
     scale = blocks.cut(start.scale)
 
     def value_and_gradient(logs: np.ndarray) -> tuple[float, np.ndarray]:
-        at = logs + DIFFERENCES
-        each = blocks.whole(blocks.each(likelihoods, jnp.asarray(at), scale, own, axis=1))
+        at = jnp.asarray(logs + DIFFERENCES)
+        each = blocks.whole(
+            blocks.each(likelihoods, at, scale, tests, linear, zero_sd, correlation, along, axis=1)
+        )
         # Summed here, in one order, however the particles are spread.
-        values = -(np.sum(np.asarray(each), axis=1) + prior.log_density(at))
+        values = -(np.sum(np.asarray(each), axis=1) + prior.log_density(np.asarray(at)))
         return float(values[0]), (values[1:5] - values[5:]) / (2 * STEP)
 
     # No tester reads better than a few tenths of a nanometre: noise-free data, of a simulation say, get that much.
     bounds = [(m - 3 * s, m + 6 * s) for m, s in zip(np.log(prior.median), np.asarray(prior.log_sd), strict=True)]
-    numbers = start.displacement, start.force, start.correlated, start.length
-    inside = np.clip(np.log([float(v) for v in numbers]), *np.transpose(bounds))
+    inside = np.clip(np.asarray(start.logs), *np.transpose(bounds))
     found = minimize(value_and_gradient, inside, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-9})
     noise = Noise.of(np.exp(found.x), start.scale)
+    unknown, nothing = jnp.asarray(np.full((4, 4), np.nan)), jnp.asarray(np.nan)
     if not uncertainty:
-        return noise, jnp.asarray(np.full(4, np.nan)), bool(found.success)
+        return NoiseFit(noise, unknown, nothing, bool(found.success))
     width = 0.02
     columns = [
         (value_and_gradient(found.x + width * e)[1] - value_and_gradient(found.x - width * e)[1]) / (2 * width)
         for e in np.eye(4)
     ]
     if not np.isfinite(columns).all():
-        return noise, jnp.asarray(np.full(4, np.nan)), False
+        return NoiseFit(noise, unknown, nothing, False)
     values, vectors = np.linalg.eigh((np.array(columns) + np.array(columns).T) / 2)
-    sd = np.sqrt(np.sum(vectors**2 / np.maximum(values, 1e-6), axis=1))
-    return noise, jnp.asarray(sd), bool(found.success)
+    values = np.maximum(values, 1e-6)
+    volume = float(prior.log_density(found.x)) + 2 * np.log(2 * np.pi) - 0.5 * np.sum(np.log(values))
+    covariance = jnp.asarray((vectors / values) @ vectors.T)
+    return NoiseFit(noise, covariance, jnp.asarray(volume), bool(found.success))
 
 
 OUTLYING = 5.0

@@ -9,10 +9,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._types import Path, Scalar
 from ..geometry import Particle
-from ..law import Unloading
 from .compiling import compiled
 from .data import Tests
-from .forward import linearise, snap
+from .forward import Forms, Point, linearise, snap
 from .small_matrices import Cholesky
 
 SHIFTS = 21
@@ -32,23 +31,21 @@ LEFT_TO_GAIN = 1e-6
 """Log probability still to gain at which a fit is finished, where residuals are as large as the noise."""
 
 
-class Particles(eqx.Module):
+class ParticleFits(eqx.Module):
     """Fits of single particles.
 
     Attributes:
-        latent: b1, b3, b5, e, shape (N, 4).
-        zero: zero of displacement [um].
+        point: where they ended.
         rms: root mean square residual [um].
         converged: whether the best start's fit met its tolerances.
-        ends: where the fit from each start ended: b1, b3, b5, e and zero.
+        ends: where the fit from each start ended: b1, b3, b5, e, zero and the amplitudes that vary.
         settled: whether the fits from all starts met their tolerances.
     """
 
-    latent: Float[Array, "particles 4"]
-    zero: Float[Array, " particles"]
+    point: Point
     rms: Float[Array, " particles"]
     converged: Bool[Array, " particles"]
-    ends: Float[Array, "particles starts 5"]
+    ends: Float[Array, "particles starts p"]
     settled: Bool[Array, " particles"]
 
 
@@ -110,13 +107,14 @@ def linear_starts(tests: Tests, log_modulus: Scalar) -> Float[Array, "starts par
 def fit_particles(
     tests: Tests,
     noise: Float[Array, " particles"],
-    centre: Float[Array, "particles 4"],
-    width: Float[Array, "particles 4"],
-    zero_sd: Scalar,
-    starts: Float[Array, "starts particles 5"],
-    unloading: Unloading,
+    centre: Float[Array, "particles p"],
+    width: Float[Array, "particles p"],
+    theta: Float[Array, "particles numbers"],
+    starts: Float[Array, "starts particles p"],
+    forms: Forms,
+    varying: tuple[int, ...] = (),
     most_steps: int | Int[Array, ""] = MAX_STEPS,
-) -> Particles:
+) -> ParticleFits:
     """Fit every particle by itself, its modulus included, from several starts.
 
     Levenberg-Marquardt for all particles and starts in step, each with a damping of its own: one that has converged
@@ -125,13 +123,14 @@ def fit_particles(
     Args:
         tests: the measurements.
         noise: scale of each particle's residuals [um].
-        centre, width: normal prior of each particle's b1, b3, b5, e.
-        zero_sd: how far the zero may lie from the recorded contact [um].
-        starts: b1, b3, b5, e and zero to start from.
-        unloading: form of unloading.
+        centre, width: normal prior of each particle's b1, b3, b5, e, zero [um], and the amplitudes that vary.
+        theta: numbers of the effects; those that vary are fitted.
+        starts: where to start from.
+        forms: the law.
+        varying: places of the amplitudes that vary.
         most_steps: give up after as many.
     """
-    count = len(starts)
+    count, size = len(starts), starts.shape[-1]
 
     def tile(x: Array) -> Array:
         return jnp.tile(x, (count, *[1] * (x.ndim - 1)))
@@ -139,13 +138,18 @@ def fit_particles(
     many: Tests = jax.tree.map(tile, tests)
     scale = tile(noise)[:, None]
     points = jnp.maximum(jnp.sum(many.mask, 1), 1).astype(noise.dtype)
-    middle = jnp.concatenate([tile(centre), many.contact[:, None]], 1)
-    width = jnp.concatenate([tile(width), jnp.full((len(middle), 1), zero_sd)], 1)
+    middle, width, shared = tile(centre), tile(width), tile(theta)
+
+    def at(y: Array) -> Point:
+        own = shared.at[:, jnp.asarray(varying, int)].set(y[:, 5:]) if varying else shared
+        return Point(y[:, :4], y[:, 4], own)
 
     def normal_equations(y):
-        r, J = linearise(y[:, :4], y[:, 4], many, unloading)
-        r, J, away = r / scale, J / scale[..., None], (y - middle) / width
-        H = jnp.einsum("nkp,nkq->npq", J, J) + jnp.eye(5)[None] / width[..., None] ** 2
+        linear = linearise(at(y), many, forms, with_force=False)
+        columns = [linear.columns[..., :4], jnp.where(many.mask, 1.0, 0.0)[..., None]]
+        columns += [linear.columns[..., 4 + k : 5 + k] for k in varying]
+        r, J, away = linear.residual / scale, -jnp.concatenate(columns, -1) / scale[..., None], (y - middle) / width
+        H = jnp.einsum("nkp,nkq->npq", J, J) + jnp.eye(size)[None] / width[..., None] ** 2
         g = jnp.einsum("nkp,nk->np", J, r) + away / width
         loss = 0.5 * (jnp.sum(r**2, 1) + jnp.sum(away**2, 1))
         return jnp.where(jnp.isfinite(loss), loss, jnp.inf), g, H
@@ -153,9 +157,9 @@ def fit_particles(
     def step(carry):
         y, loss, g, H, damping, count, _ = carry
         diagonal = jnp.diagonal(H, axis1=1, axis2=2)
-        move = -Cholesky(H + jnp.eye(5)[None] * (damping[:, None] * diagonal)[:, None, :]).solve(g)
-        # No logarithm moves by more than a factor of e, no zero by more than a tenth of its prior's reach, at a time.
-        most = jnp.max(jnp.abs(move) / jnp.append(jnp.ones(4), zero_sd)[None], 1)
+        move = -Cholesky(H + jnp.eye(size)[None] * (damping[:, None] * diagonal)[:, None, :]).solve(g)
+        # No logarithm moves by more than a factor of e, nothing else by more than its prior's width, at a time.
+        most = jnp.max(jnp.abs(move) / jnp.concatenate([jnp.ones_like(move[:, :4]), width[:, 4:]], 1), 1)
         tried = y + move / jnp.maximum(most, 1.0)[:, None]
         new_loss, new_g, new_H = normal_equations(tried)
         better = new_loss < loss
@@ -170,10 +174,10 @@ def fit_particles(
         damping = jnp.where(done, damping, jnp.where(better, jnp.maximum(damping / 8, 1e-9), damping * 4))
         return (*map(choose, (tried, new_loss, new_g, new_H), (y, loss, g, H)), damping, count + 1, done)
 
-    y = starts.reshape(-1, 5)
+    y = starts.reshape(-1, size)
     unfinished = jnp.zeros(len(y), bool)
     # The first pass evaluates the start: an infinite loss accepts whatever comes, and no force moves it.
-    carry = (y, jnp.full(len(y), jnp.inf), jnp.zeros((len(y), 5)), jnp.broadcast_to(jnp.eye(5), (len(y), 5, 5)))
+    carry = (y, jnp.full(len(y), jnp.inf), jnp.zeros_like(y), jnp.broadcast_to(jnp.eye(size), (len(y), size, size)))
     carry = (*carry, jnp.full(len(y), 1e-3), 0, unfinished)
     going = lambda c: (c[5] < 2) | ((c[5] < most_steps) & ~jnp.all(c[6]))  # noqa: E731  # a condition, no function
     y, loss, _, _, _, _, done = jax.lax.while_loop(going, step, carry)
@@ -181,7 +185,7 @@ def fit_particles(
     # A snap-through below the first load that counts is no part of the test: nothing shows it. A sharp rise from
     # nothing is fitted so if it may be, and the fit then presses the snap-through against that first load for good.
     first = jnp.min(jnp.where(many.mask & many.loading, many.force, jnp.inf), 1)
-    unseen = jax.vmap(snap)(y.reshape(-1, 5)[:, :4], many.particle) < jnp.log(first)
+    unseen = jax.vmap(snap)(y.reshape(-1, size)[:, :4], many.particle) < jnp.log(first)
     seen = jnp.where(unseen.reshape(loss.shape), jnp.inf, loss)
     # Unless nothing else comes near the data: then the particle has snapped through before anybody looked.
     near = jnp.min(seen, axis=0) < FAR * jnp.min(loss, axis=0) + FAR
@@ -191,5 +195,6 @@ def fit_particles(
         return jnp.take_along_axis(values, best.reshape(1, -1, *[1] * (values.ndim - 2)), axis=0)[0]
 
     found = take(y)
+    point = Point(found[:, :4], found[:, 4], at(jnp.tile(found, (count, 1))).theta[: len(tests)])
     rms = noise * jnp.sqrt(2 * take(loss) / points[: len(tests)])
-    return Particles(found[:, :4], found[:, 4], rms, take(done), jnp.moveaxis(y, 0, 1), jnp.all(done, 0))
+    return ParticleFits(point, rms, take(done), jnp.moveaxis(y, 0, 1), jnp.all(done, 0))

@@ -7,13 +7,28 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
 
 from .. import arguments
 from .._errors import InputError
 from ..campaign import load_toml_file
 from ..law import Unloading
-from .noise import NoisePrior
+
+
+class NoisePrior(eqx.Module):
+    """Log-normal priors of the four numbers of the noise: medians and standard deviations of the logarithm."""
+
+    median: Float[Array, " 4"]
+    log_sd: Float[Array, " 4"]
+
+    def log_density(self, logs: np.ndarray) -> np.ndarray:
+        """Log density of the logarithms; shape (..., 4) becomes (...)."""
+        sd = np.asarray(self.log_sd)
+        away = (logs - np.log(self.median)) / sd
+        return np.asarray(-0.5 * np.sum(away**2, -1) - np.sum(np.log(sd * np.sqrt(2 * np.pi))))
 
 
 @dataclass(frozen=True)
@@ -135,6 +150,12 @@ class Priors:
         if unloading is Unloading.PRINTED:
             return cls()
         return cls(effective_modulus_MPa=LogNormalPrior(500.0, 1.0))
+
+    @property
+    def log_C3(self) -> float:
+        """log C3 at the medians of the others."""
+        log_C1, log_C5 = np.log(self.C1.median), np.log(self.C5.median)
+        return float((np.log(20 / 9) + log_C1 + 5 * log_C5 + np.log(self.softening.median)) / 6)
 
     @property
     def noise(self) -> NoisePrior:

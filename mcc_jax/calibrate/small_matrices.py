@@ -6,7 +6,10 @@ differentiates into the same.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 Matrix = Float[Array, "*batch p p"]
@@ -55,3 +58,34 @@ class Cholesky:
         eye = jnp.eye(self.size)
         columns = [self.solve(jnp.broadcast_to(eye[i], (*self.rows[0][0].shape, self.size))) for i in range(self.size)]
         return jnp.stack(columns, -1)
+
+
+def eliminate(
+    gram: Matrix, own: Sequence[int], precision: Vector, mean: Vector | float = 0.0
+) -> tuple[Float[Array, "*batch r r"], Float[Array, "*batch"]]:
+    r"""Integrate numbers with a normal prior out of a Gaussian likelihood: a Schur complement.
+
+    With the design matrix X of a linear model y = X x + noise of variance 1, and the Gram matrix of [X, y],
+
+    .. math:: \int e^{-\frac12 \|y - X_o x_o - X_r x_r\|^2}\, N(x_o;\, m, P^{-1})\, dx_o
+        = e^{L - \frac12 (x_r, -1)^T G' (x_r, -1)}
+
+    Args:
+        gram: Gram matrix, the data in its last column.
+        own: which columns are integrated out.
+        precision: P, of each of them.
+        mean: m.
+
+    Returns:
+        G', over the columns that are left, and L.
+    """
+    inside = np.asarray(own)
+    rest = np.asarray([k for k in range(gram.shape[-1]) if k not in own])
+    mean = jnp.broadcast_to(jnp.asarray(mean), precision.shape)
+    inner = gram[..., inside[:, None], inside[None]] + jnp.vectorize(jnp.diag, signature="(n)->(n,n)")(precision)
+    border = gram[..., inside[:, None], rest[None]].at[..., -1].add(precision * mean)
+    factor = Cholesky(inner)
+    half = jnp.stack([factor.forward(border[..., k]) for k in range(len(rest))], -1)
+    left = gram[..., rest[:, None], rest[None]] - jnp.einsum("...pi,...pj->...ij", half, half)
+    left = left.at[..., -1, -1].add(jnp.sum(precision * mean**2, -1))
+    return left, 0.5 * (jnp.sum(jnp.log(precision), -1) - factor.log_det())

@@ -42,5 +42,8 @@ from .segments import Segment as Segment
 from .segments import SegmentKind as SegmentKind
 from .segments import find_segments as find_segments
 from .segments import summarise_segments as summarise_segments
+from .turning import TurningForces as TurningForces
+from .turning import TurningOptions as TurningOptions
+from .turning import turning_forces as turning_forces
 from .validate import check_campaign as check_campaign
 from .write import write_campaign as write_campaign

@@ -40,6 +40,9 @@ class Record(eqx.Module):
         rate: magnitude of the latest ramp's force rate [mN/s]; 0 while unknown.
         loading_rate: the same of the latest loading or reloading ramp [mN/s].
         relative_humidity: relative humidity of the room [%], one number per test.
+        peak: force from which the branch of each point starts [mN], on virgin loading its own force, where a measured
+            record tells it better than its largest reading does (`mcc_jax.campaign.turning_forces`); None for the
+            largest force so far.
     """
 
     force: Values
@@ -53,6 +56,7 @@ class Record(eqx.Module):
     rate: Values
     loading_rate: Values
     relative_humidity: Values
+    peak: Values | None = None
 
     @property
     def at_points(self) -> Record:

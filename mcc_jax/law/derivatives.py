@@ -12,13 +12,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .. import arguments
-from .._numerics import running_max
 from .._types import Path, Scalar
 from ..effects import AbstractEffect, Context, Record
 from ..formulas import Formulas, recovery, tangent_modulus
 from ..geometry import Particle
 from .mcc import MccLaw
-from .response import additions, no_memory
+from .response import additions, no_memory, since_peak
 
 
 def signatures(
@@ -106,6 +105,6 @@ def _response(law: Formulas, context: Context, shift: Path, stiffness: Path) -> 
     particle, record = context.particle, context.record
     virgin = record.force >= context.peak_force
     strain = _virgin_strain(law, context) + shift
-    peak = running_max(jnp.where(virgin, particle.displacement(strain), 0.0))
+    peak = since_peak(record)(jnp.where(virgin, particle.displacement(strain), 0.0))
     recoverable = law.recoverable_displacement(particle, peak, context.peak_force, stiffness)
     return peak - jnp.where(record.force < context.peak_force, recoverable * recovery(context.load_share), 0.0)

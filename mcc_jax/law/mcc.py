@@ -17,7 +17,7 @@ from ..effects import AbstractEffect, Context, Record, Variant, clean_record, fi
 from ..formulas import Formulas
 from ..geometry import Particle
 from .base import AbstractContactLaw
-from .response import factor_at_peak, folded, force_at, modified, no_memory, one_point, peak_forces, whole_path
+from .response import factor_at_peak, folded, force_at, modified, no_memory, one_point, peak_forces, since_peak, whole_path
 
 TESTED_STRAIN = 0.67
 """Scaled strain eta_p eps at which the paper's tests ended, on its mean curve (peaks of 7 to 16 MPa)."""
@@ -256,12 +256,13 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
         if self.effects:
             state = eqx.tree_at(lambda s: s.memory.point.time, state, record.time[0])
             return self._along(particle, state, record)[1]
-        return self.path_load(particle, state, record.force)[1]
+        zero = state.displacement_max
+        return self.peak_and_displacement(particle, zero, record.force, peak_forces(record, zero))[1]
 
     def context(self, particle: Particle, record: Record) -> Context:
         """What effects are told along a record, from a virgin particle: the law with modified parameters."""
         zero = jnp.zeros_like(particle.D3)
-        return modified(self.formulas, self.effects, particle, zero, record, peak_forces(record, zero), running_max)
+        return modified(self.formulas, self.effects, particle, zero, record, peak_forces(record, zero), since_peak(record))
 
     def _along(self, particle: Particle, state: History, record: Record) -> tuple[History, Path]:
         peak, memory, displacement = whole_path(

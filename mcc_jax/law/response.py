@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import optimistix as optx
 
 from .._errors import InputError
-from .._numerics import running_max
+from .._numerics import held, running_max
 from .._types import Path, Scalar, Values
 from ..effects import AbstractEffect, AbstractModulusAtPeak, Context, Record
 from ..effects.record import first_point, follow
@@ -47,9 +47,19 @@ def no_memory(effects: Effects, zero: Scalar, relative_humidity: Scalar | None =
 
 
 def peak_forces(record: Record, before: Scalar) -> Path:
-    """Largest force so far [mN] at every point of a record."""
-    highest = running_max(record.force)
+    """Force from which the branch of every point of a record starts [mN]: the largest so far, if the record knows no
+    better."""
+    highest = running_max(record.force) if record.peak is None else record.peak
     return jnp.where(highest > before, highest, before)
+
+
+def since_peak(record: Record) -> Callable[[Path], Path]:
+    """What carries the displacement of virgin loading along the branches that follow: the running maximum, or where the
+    record knows its peaks, the latest value on virgin loading."""
+    if record.peak is None:
+        return running_max
+    virgin = (record.force >= record.peak).at[0].set(True)
+    return lambda values: held(values, virgin)
 
 
 def one_point(
@@ -81,7 +91,7 @@ def whole_path(
 ) -> tuple[Scalar, Memory, Path]:
     """The same after all points of a record, closed form but for the memories."""
     highest = peak_forces(record, memory.peak_force)
-    context = modified(law, effects, particle, displacement_max, record, highest, running_max)
+    context = modified(law, effects, particle, displacement_max, record, highest, since_peak(record))
     after, displacement = additions(effects, memory, context)
     return context.peak_displacement[-1], after, displacement
 

@@ -1,0 +1,334 @@
+r"""The likelihood of the tests with every particle's own numbers integrated out: the embedded Laplace approximation.
+
+Around a point every test is summarised by one whitened Gram matrix, of the derivatives of its prediction and its
+residual (`summarise`). Its zero is integrated out exactly (`eliminate`). What is left of a particle,
+
+.. math:: w_i = m_i + S \xi_i, \quad \xi_i \sim N(0, 1), \qquad
+    m_i = (\mu_1 + \log\eta_i,\ \mu_3 + \log\eta_i,\ \mu_5 + \log\eta_i,\ \log\bar E + p \log\eta_i), \quad
+    \eta_i = \eta_p(a)
+
+and, where an effect differs from particle to particle, :math:`A_i = A e^{\tau \xi}` (:math:`A + \tau \xi` where both
+signs are physical), is integrated out by Laplace's method. The Gram matrix is a quadratic not in w, but in the
+coefficients of the stress's polynomial, :math:`\kappa_j = (e^{j (b_j - \hat b_j)} - 1)/j`, and in the amplitudes,
+because the prediction is nearly linear in these and the ridges of the likelihood are straight. Deviations, not
+coefficients, are the variables, so everything stays regular when a spread is exactly 0: there is no funnel.
+
+References:
+    Margossian et al. (2020), Hamiltonian Monte Carlo using an adjoint-differentiated Laplace approximation.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._types import Scalar
+from .compiling import compiled
+from .data import Tests
+from .forward import Linear, Point, snap
+from .noise import Along, Correlation, Noise, Whitening, whitening
+from .population import Population, Scatter, moments, particles_at
+from .small_matrices import Cholesky, eliminate
+
+FARTHEST = 4.0
+"""Exponents are cut here: a coefficient e^4 times its fitted value is nowhere near any test."""
+
+MIN_SHARE = 0.05
+"""A coefficient of the polynomial is not drawn below this share of its most probable value."""
+
+
+class Marginal(eqx.Module):
+    r"""The tests around a point, zeros integrated out.
+
+    With u the numbers (kappa, amplitudes and further numbers less those of the point), the log likelihood of a test is
+
+    .. math:: L - n\lambda - \tfrac12 e^{-2\lambda} (u, -1)^T G (u, -1)
+
+    with :math:`\lambda` the population's `log_noise`. The zero given u is normal around `zero + zero_slope u` with
+    standard deviation `zero_sd` (times the noise factor).
+
+    Attributes:
+        point: around what.
+        gram: G, shape (N, Q, Q); the residual is its last column.
+        log_scale: L: noise's determinant and the zero's integral.
+        count: n, number of points.
+        zero, zero_slope, zero_sd: distribution of the zero [um].
+        flatness: 1 - D3^2/(D1 D2) of every particle [-].
+        weight: 1 for particles, 0 for copies that only fill up; None where all are particles.
+        scatter: what differs from particle to particle.
+    """
+
+    point: Point
+    gram: Float[Array, "particles q q"]
+    log_scale: Float[Array, " particles"]
+    count: Float[Array, " particles"]
+    zero: Float[Array, " particles"]
+    zero_slope: Float[Array, "particles u"]
+    zero_sd: Float[Array, " particles"]
+    flatness: Float[Array, " particles"]
+    weight: Float[Array, " particles"] | None
+    scatter: Scatter
+
+    def log_likelihood(self, population: Population) -> Float[Array, " particles"]:
+        """Log likelihood of each test, the particle's own numbers integrated out; 0 of copies that only fill up."""
+        each = self.laplace(population).log_likelihood
+        return each if self.weight is None else self.weight * each
+
+    def place(self, population: Population, xi: Float[Array, "particles k"]) -> Placed:
+        """Numbers u of all particles at deviations xi, and their derivatives."""
+        at = particles_at(population, self.flatness, self.scatter, xi)
+        kappa, slope = straighten(at.latent - self.point.latent)
+        jacobian = slope[..., None] * at.factor
+        numbers, own = at.theta.shape[1], at.factor.shape[-1]
+        if numbers:
+            jacobian = jnp.pad(jacobian, ((0, 0), (0, numbers), (0, len(self.scatter.varying))))
+            for j, (k, _) in enumerate(self.scatter.varying):
+                jacobian = jacobian.at[:, 4 + k, own + j].set(at.slope[:, j])
+            kappa = jnp.concatenate([kappa, at.theta - self.point.theta], 1)
+        return Placed(at.latent, at.theta, kappa, jacobian)
+
+    def stretch(self, population: Population) -> Float[Array, " k"]:
+        r""":math:`j \tau_j` of every deviation, by which what it moves bends; 0 where it moves in a straight line."""
+        bends = [jnp.array([1.0, 3.0, 5.0]) * population.tau, jnp.zeros(self.scatter.of_latent - 3)]
+        for j, (_, signed) in enumerate(self.scatter.varying):
+            bends.append(jnp.zeros(1) if signed else population.theta_scatter[j : j + 1])
+        return jnp.concatenate(bends)
+
+    def laplace(self, population: Population) -> Laplace:
+        """Integrate every particle's deviations out by Laplace's method."""
+        share = jnp.exp(-2 * population.log_noise)
+        eye = jnp.eye(self.scatter.size)[None]
+
+        def expand(at: Marginal, population: Population, xi: Array, share: Array) -> tuple[Placed, Array, Array]:
+            placed = at.place(population, xi)
+            precision, score = at.gram[:, :-1, :-1], at.gram[:, :-1, -1]
+            pull = jnp.einsum("npq,nq->np", precision, placed.u) - score
+            curvature = share * jnp.einsum("npk,npq,nql->nkl", placed.jacobian, precision, placed.jacobian)
+            return placed, share * jnp.einsum("npk,np->nk", placed.jacobian, pull), curvature
+
+        def newton(at: Marginal, population: Population, xi: Array, share: Array) -> Array:
+            _, gradient, curvature = expand(at, population, xi, share)
+            return xi - Cholesky(curvature + eye).solve(xi + gradient)
+
+        def start() -> Array:
+            # The linear solution: slopes at the point, not at the population's mean, which may lie far away.
+            none = jnp.zeros((len(self.flatness), self.scatter.size))
+            mean = self.place(population, none)
+            away = jnp.concatenate([mean.latent - self.point.latent, mean.u[:, 4:]], 1)
+            _, factor = moments(population, self.flatness, self.scatter)
+            jacobian = mean.jacobian.at[:, :4, : factor.shape[-1]].set(factor)
+            precision, score = self.gram[:, :-1, :-1], self.gram[:, :-1, -1]
+            pull = score - jnp.einsum("npq,nq->np", precision, away)
+            curvature = share * jnp.einsum("npk,npq,nql->nkl", jacobian, precision, jacobian)
+            return Cholesky(curvature + eye).solve(share * jnp.einsum("npk,np->nk", jacobian, pull))
+
+        xi = start()
+        if self.scatter.newton:
+            # Found without derivatives; one last step with them carries the derivative of the whole iteration.
+            fixed, still, frozen = jax.lax.stop_gradient((self, population, share))
+            xi = jax.lax.fori_loop(
+                0, self.scatter.newton, lambda _, x: newton(fixed, still, x, frozen), jax.lax.stop_gradient(xi)
+            )
+            xi = newton(self, population, xi, share)
+        placed, _, curvature = expand(self, population, xi, share)
+        border = jnp.concatenate([placed.u, -jnp.ones((len(self.flatness), 1))], 1)
+        squares = jnp.einsum("np,npq,nq->n", border, self.gram, border)
+        stretch = self.stretch(population)
+        # In straightened coordinates the likelihood is quadratic; what bends is the prior: xi^2/2 has the curvature
+        # 1 - j tau xi.
+        bend = jnp.maximum(1 - stretch[None] * xi, 0.25)
+        hessian = curvature + eye * bend[..., None, :]
+        inner = Cholesky(hessian)
+        tilt = 0.5 * jnp.sum(inner.forward(jnp.broadcast_to(stretch, xi.shape)) ** 2, -1)
+        value = -0.5 * share * squares - 0.5 * jnp.sum(xi**2, -1) - 0.5 * inner.log_det() + tilt
+        value += self.log_scale - self.count * population.log_noise
+        return Laplace(xi, hessian, stretch, value, placed)
+
+    def draw(self, population: Population, normal: Array, normal_zero: Array) -> ParticleDraw:
+        """Every particle's own numbers given the population, from standard normal numbers.
+
+        Args:
+            population: what all particles share.
+            normal: shape (N, k).
+            normal_zero: shape (N,).
+        """
+        at = self.laplace(population)
+        inner = Cholesky(at.hessian)
+        nu = inner.backward(normal)
+        y = at.stretch[None] * nu
+        inside = y > MIN_SHARE - 1
+        y = jnp.where(inside, y, 0.0)
+        small = jnp.abs(y) < 1e-5
+        safe = jnp.where(small, 1.0, y)
+        quotient = jnp.where(small, 1 - y / 2 + y * y / 3, jnp.log1p(safe) / safe)
+        deviations = at.deviations + nu * quotient
+        placed = self.place(population, deviations)
+        sd = self.zero_sd * jnp.exp(population.log_noise)
+        zero = self.zero + jnp.einsum("np,np->n", self.zero_slope, placed.u) + sd * normal_zero
+        volume = -0.5 * inner.log_det() - jnp.sum(jnp.log1p(y), -1) + jnp.log(sd)
+        volume = jnp.where(jnp.all(inside, -1), volume, -jnp.inf)
+        return ParticleDraw(placed.latent, placed.theta, zero, deviations, volume, at.log_likelihood)
+
+
+class Placed(NamedTuple):
+    """Where particles are.
+
+    Attributes:
+        latent: w.
+        theta: numbers of their effects.
+        u: their difference from the point, in the coordinates of the Gram matrix.
+        jacobian: derivatives of u by the deviations.
+    """
+
+    latent: Float[Array, "particles 4"]
+    theta: Float[Array, "particles numbers"]
+    u: Float[Array, "particles u"]
+    jacobian: Float[Array, "particles u k"]
+
+
+class Laplace(eqx.Module):
+    """Deviations of all particles given the population, around the most probable ones.
+
+    Attributes:
+        deviations: most probable xi, shape (N, k).
+        hessian: curvature there in the straightened coordinates nu.
+        stretch: :math:`j \\tau_j` by which :math:`\\xi_j = \\hat\\xi_j + \\log(1 + j\\tau_j\\nu_j)/(j\\tau_j)`.
+        log_likelihood: of each test, integrated.
+        placed: where the particles are.
+    """
+
+    deviations: Float[Array, "particles k"]
+    hessian: Float[Array, "particles k k"]
+    stretch: Float[Array, " k"]
+    log_likelihood: Float[Array, " particles"]
+    placed: Placed
+
+
+class ParticleDraw(NamedTuple):
+    """One draw of all particles given the population.
+
+    Attributes:
+        latent: w, shape (N, 4).
+        theta: numbers of their effects.
+        zero: zero of displacement [um].
+        deviations: xi, shape (N, k).
+        log_volume: log of the volume by which the map from standard normal numbers to xi and zero stretches; minus
+            infinity outside its range.
+        log_likelihood: of each test, integrated.
+    """
+
+    latent: Float[Array, "particles 4"]
+    theta: Float[Array, "particles numbers"]
+    zero: Float[Array, " particles"]
+    deviations: Float[Array, "particles k"]
+    log_volume: Float[Array, " particles"]
+    log_likelihood: Float[Array, " particles"]
+
+
+def straighten(away: Float[Array, "*batch 4"]) -> tuple[Float[Array, "*batch 4"], Float[Array, "*batch 4"]]:
+    """kappa, in which stress is linear, and its derivative, from w less the point's."""
+    powers = jnp.array([1.0, 3.0, 5.0])
+    powers = jnp.broadcast_to(powers, away[..., :3].shape)
+    exponent = jnp.clip(powers * away[..., :3], -FARTHEST, FARTHEST)
+    kappa = jnp.concatenate([jnp.expm1(exponent) / powers, away[..., 3:]], -1)
+    return kappa, jnp.concatenate([jnp.exp(exponent), jnp.ones_like(away[..., 3:])], -1)
+
+
+class Summaries(NamedTuple):
+    """What `summarise` gives.
+
+    Attributes:
+        marginal: the tests with their zeros integrated out.
+        filters: the noise, in which noise of force has become noise of displacement.
+        white: standard deviation [um] of white noise that would weigh a test as much as its noise does.
+    """
+
+    marginal: Marginal
+    filters: Whitening
+    white: Float[Array, " particles"]
+
+
+@compiled
+def summarise(
+    point: Point,
+    tests: Tests,
+    linear: Linear,
+    noise: Noise,
+    zero_sd: Scalar,
+    scatter: Scatter,
+    correlation: Correlation,
+    along: Along,
+) -> Summaries:
+    """Summarise all tests around a point by Gauss-Newton curvature.
+
+    Args:
+        point: around what.
+        tests: the measurements.
+        linear: the tests linearised there.
+        noise: the noise.
+        zero_sd: how far a zero may lie from the recorded contact [um].
+        scatter: what differs from particle to particle.
+        correlation, along: of the correlated residuals.
+    """
+    filters = jax.vmap(lambda *one: whitening(noise, *one, correlation, along))(noise.scale, tests, linear)
+    ones = jnp.where(tests.mask, 1.0, 0.0)
+    columns = jnp.concatenate([linear.columns, ones[..., None], linear.residual[..., None]], -1)
+    white = jax.vmap(lambda f, x: f(x))(filters, columns)
+    gram = jnp.einsum("nkp,nkq->npq", white, white)
+    slope, offset, weight = jax.vmap(_snap_evidence)(
+        point.latent, tests.particle, tests.force, tests.mask & tests.loading
+    )
+    seen = jnp.concatenate([slope, jnp.zeros((len(tests), gram.shape[-1] - 5)), offset[:, None]], 1)
+    gram += weight[:, None, None] * seen[:, :, None] * seen[:, None, :]
+    # It bounds where a particle may go, and is no datum: where the point stands it costs nothing.
+    gram = gram.at[:, -1, -1].add(jax.vmap(lambda f: f.reading)(filters) - weight * offset**2)
+    place = gram.shape[-1] - 2
+    away = tests.contact - point.zero
+    precision = jnp.broadcast_to(1 / zero_sd**2, (len(tests), 1))
+    left, log_integral = eliminate(gram, (place,), precision, away[:, None])
+    total = gram[:, place, place] + precision[:, 0]
+    slopes = -gram[:, place, :place] / total[:, None]
+    at = (gram[:, place, -1] + precision[:, 0] * away) / total
+    points = jnp.sum(tests.mask, 1).astype(away.dtype)
+    log_det = jax.vmap(lambda f: f.log_det)(filters)
+    log_scale = log_integral - 0.5 * log_det - 0.5 * points * float(np.log(2 * np.pi))
+    marginal = Marginal(
+        point=point,
+        gram=left,
+        log_scale=log_scale,
+        count=points - 1,
+        zero=point.zero + at,
+        zero_slope=slopes,
+        zero_sd=1 / jnp.sqrt(total),
+        flatness=tests.flatness,
+        weight=tests.weight,
+        scatter=scatter,
+    )
+    reading = jax.vmap(lambda f: jnp.sum(jnp.where(f.mask, f.solver.factor.diag.d**-2.0, 0.0)))(filters)
+    return Summaries(marginal, filters, jnp.sqrt(points / jnp.maximum(reading, 1e-30)))
+
+
+def _snap_evidence(latent, particle, force, used):
+    """What a jump says that no residual does: that the curve's peak lies between the two forces around it.
+
+    The likelihood of a particle that snaps through falls off a cliff where the jump would move to another point of the
+    record. A normal distribution of the logarithm of the force at the peak, as wide as the interval, stands in for it.
+
+    Returns:
+        Derivative of that logarithm by the latent vector, distance of the interval's middle from it, and its precision:
+        zero unless the test shows a jump.
+    """
+    value, slope = jax.value_and_grad(snap)(latent, particle)
+    at = jnp.where(jnp.isfinite(value), jnp.exp(jnp.where(jnp.isfinite(value), value, 0.0)), jnp.inf)
+    below = jnp.max(jnp.where(used & (force <= at), force, 0.0))
+    above = jnp.min(jnp.where(used & (force > at), force, jnp.inf))
+    seen = jnp.isfinite(above) & (below > 0)
+    low, high = jnp.log(jnp.where(seen, below, 1.0)), jnp.log(jnp.where(seen, above, 2.0))
+    width = jnp.maximum(high - low, 1e-6)
+    middle = jnp.where(seen, (low + high) / 2 - jnp.where(seen, value, 0.0), 0.0)
+    return jnp.where(seen, slope, 0.0), middle, jnp.where(seen, 12 / width**2, 0.0)

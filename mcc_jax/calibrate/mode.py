@@ -1,0 +1,214 @@
+"""The mode of the population in coordinates without bounds, given the tests with every particle integrated out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from numpyro import handlers
+from numpyro.infer.util import constrain_fn, potential_energy, unconstrain_fn
+
+from .._types import Scalar
+from .compiling import compiled
+from .marginal import Marginal
+from .model import Model
+from .noise import standard_promotion
+from .population import Population
+
+
+class Shapes(eqx.Module):
+    """What the population's priors need to know of the particles.
+
+    Attributes:
+        flatness: 1 - D3^2/(D1 D2) [-].
+        weight: 1 for particles, 0 for copies that only fill up; None where all are particles.
+    """
+
+    flatness: Float[Array, " particles"]
+    weight: Float[Array, " particles"] | None = None
+
+
+@cache
+def coordinate_names(model: Model) -> tuple[str, ...]:
+    """Names of the sites that are sampled when particles are integrated out; all are numbers."""
+    shapes = Shapes(jnp.asarray([0.1, 0.2]))
+    with standard_promotion():
+        trace = handlers.trace(handlers.seed(model.population, jax.random.key(0))).get_trace(shapes)
+    return tuple(name for name, site in trace.items() if site["type"] == "sample")
+
+
+class LogPosterior(eqx.Module):
+    """The density of the population given all tests, as a function of unbounded coordinates.
+
+    Attributes:
+        model: whose priors.
+        marginal: the tests.
+    """
+
+    model: Model = eqx.field(static=True)
+    marginal: Marginal
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the coordinates."""
+        return coordinate_names(self.model)
+
+    def signed(self) -> list[int]:
+        """Positions of the coordinates that may have either sign for the same spread."""
+        return [i for i, name in enumerate(self.names) if name.endswith("_coordinate")]
+
+    def log_density(self, free: Float[Array, " d"]) -> Scalar:
+        """Log density given all tests, with its constant."""
+        with standard_promotion():
+            return -potential_energy(self.model, (None, self.marginal), {}, self.sites(free))
+
+    def population(self, free: Float[Array, " d"]) -> Population:
+        """The population at unbounded coordinates."""
+        return population_at(self.model, Shapes(self.marginal.flatness, self.marginal.weight), self.sites(free))
+
+    def sites(self, free: Array) -> dict[str, Array]:
+        """Unbounded coordinates by the names of their sites."""
+        return {name: free[i] for i, name in enumerate(self.names)}
+
+    def unconstrain(self, values: dict[str, Any]) -> Float[Array, " d"]:
+        """Unbounded coordinates of the sites' values."""
+        given = {name: jnp.asarray(float(values[name])) for name in self.names}
+        shapes = Shapes(self.marginal.flatness, self.marginal.weight)
+        with standard_promotion():
+            free = unconstrain_fn(handlers.seed(self.model.population, jax.random.key(0)), (shapes,), {}, given)
+        return jnp.stack([jnp.asarray(free[name]) for name in self.names])
+
+
+def population_at(model: Model, shapes: Shapes, sites: dict[str, Array]) -> Population:
+    """The population at the unbounded coordinates of its sites."""
+    with standard_promotion():
+        prior = handlers.seed(model.population, jax.random.key(0))
+        values = constrain_fn(prior, (shapes,), {}, sites)
+        return handlers.substitute(prior, data=values)(shapes)
+
+
+def start_values(free: Float[Array, " d"], target: LogPosterior) -> dict[str, Array]:
+    """Values of the sampled sites at unbounded coordinates."""
+    shapes = Shapes(target.marginal.flatness, target.marginal.weight)
+    with standard_promotion():
+        prior = handlers.seed(target.model.population, jax.random.key(0))
+        values = constrain_fn(prior, (shapes,), {}, target.sites(free))
+    return {name: values[name] for name in target.names}
+
+
+@compiled
+def populations(free: Float[Array, "draws d"], target: LogPosterior) -> Population:
+    """Populations of many unbounded coordinates, every field with a leading axis."""
+    return jax.vmap(target.population)(free)
+
+
+ROWS = 250
+"""Most coordinates that gradients are asked for in one go."""
+
+LEFT_TO_GAIN = 1e-6
+"""Twice the log probability still to gain, by Newton's method, at which a mode is reached."""
+
+ATTEMPTS = 4
+
+
+@compiled
+def _gradients(
+    free: Float[Array, "rows d"], count: Int[Array, ""], target: LogPosterior
+) -> tuple[Float[Array, " rows"], Float[Array, "rows d"]]:
+    expand = jax.value_and_grad(lambda one: -target.log_density(one))
+
+    def add(i, found):
+        return jax.tree.map(lambda all_rows, one: all_rows.at[i].set(one), found, expand(free[i]))
+
+    return jax.lax.fori_loop(0, count, add, (jnp.zeros_like(free[:, 0]), jnp.zeros_like(free)))
+
+
+def gradients(free: np.ndarray, target: LogPosterior) -> tuple[np.ndarray, np.ndarray]:
+    """Minus the log density at up to `ROWS` coordinates, shape (many, d), and its gradients.
+
+    Always compiled for `ROWS`, so that few and many of them share their compilation.
+    """
+    rows = jnp.asarray(np.pad(free, ((0, ROWS - len(free)), (0, 0)), mode="edge"))
+    value, slope = _gradients(rows, jnp.asarray(np.asarray(len(free))), target)
+    return np.asarray(value)[: len(free)], np.asarray(slope)[: len(free)]
+
+
+def most_probable(
+    start: Float[Array, " d"], target: LogPosterior
+) -> tuple[Float[Array, " d"], Float[Array, "d d"], bool]:
+    """Mode of the population in unbounded coordinates, covariance there, and whether the optimiser converged.
+
+    Newton's method in a trust region (SciPy), in coordinates scaled by the curvature at the start. The curvature comes
+    from differences of exact gradients, which are quicker than second derivatives are to compile. Where the density has
+    no curvature that is a number, even at the start, the covariance is not one either.
+    """
+    # Steps may lead to where numbers overflow; they are refused.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _most_probable(np.asarray(start), target)
+
+
+def _most_probable(origin: np.ndarray, target: LogPosterior) -> tuple[Float[Array, " d"], Float[Array, "d d"], bool]:
+    d = len(origin)
+    width = np.full(d, 1e-5)
+
+    def expand(free: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        steps = np.diag(width)
+        points = free + np.concatenate([np.zeros((1, d)), steps, -steps])
+        value, slope = gradients(points, target)
+        curvature = (slope[1 : d + 1] - slope[d + 1 :]) / (2 * width[:, None])
+        return float(value[0]), slope[0], (curvature + curvature.T) / 2
+
+    # Where data are very exact the scales at the start are far from those at the mode: then once more from there.
+    success = False
+    if not all(np.isfinite(part).all() for part in expand(origin)):
+        return jnp.asarray(origin), jnp.asarray(np.full((d, d), np.nan)), False
+    for _ in range(ATTEMPTS):
+        unit = 1 / np.sqrt(np.maximum(np.abs(np.diagonal(expand(origin)[2])), 1e-8))
+        width = 1e-3 * np.minimum(unit, 1.0)
+        found = _newton(expand, origin, unit)
+        origin = origin + unit * found.x
+        success = bool(found.success)
+        if success:
+            break
+    _, slope, curvature = expand(origin)
+    # Curvatures differ by many powers of ten: on the scale of each coordinate, what is not convex is taken as wide.
+    scale = 1 / np.sqrt(np.maximum(np.abs(np.diagonal(curvature)), 1e-8))
+    values, vectors = np.linalg.eigh(curvature * scale * scale[:, None])
+    convex = bool(np.all(values > 1e-7))
+    values = np.where(values > 1e-7, values, 0.01)
+    covariance = (vectors / values) @ vectors.T * scale * scale[:, None]
+    # Rounding may keep the optimiser from its tolerance at the very mode: what counts is what is left to gain.
+    there = convex and float(slope @ covariance @ slope) < LEFT_TO_GAIN
+    return jnp.asarray(origin), jnp.asarray(covariance), success or there
+
+
+def _newton(expand: Callable[[np.ndarray], tuple[float, np.ndarray, np.ndarray]], origin: np.ndarray, unit: np.ndarray):
+    from scipy.optimize import minimize
+
+    memory: dict[bytes, tuple[float, np.ndarray, np.ndarray]] = {}
+
+    def at(z: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        key = z.tobytes()
+        if key not in memory:
+            memory.clear()
+            found = expand(origin + unit * z)
+            # A step may lead to where spreads overflow: then it is refused, for which SciPy wants finite derivatives.
+            if not all(np.isfinite(part).all() for part in found):
+                found = (np.inf, np.zeros_like(origin), np.eye(len(origin)))
+            memory[key] = found
+        return memory[key]
+
+    return minimize(
+        lambda z: at(z)[0],
+        np.zeros_like(origin),
+        jac=lambda z: at(z)[1] * unit,
+        hess=lambda z: at(z)[2] * unit * unit[:, None],
+        method="trust-exact",
+        options={"gtol": 1e-4, "maxiter": 200},
+    )

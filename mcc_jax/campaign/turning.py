@@ -1,0 +1,210 @@
+"""The force at which each branch of a test begins, estimated from the ramp or the hold around it, with its error.
+
+The largest of many noisy readings lies above the force that was reached, and a hold offers hundreds of them. The law
+unloads from the force that was reached, so a turning point is where the ramps before and behind it meet, or the mean of
+the hold between them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from .schema import Curve
+from .segments import Segment
+from .signal import noise_level
+
+
+@dataclass(frozen=True)
+class TurningOptions:
+    """How the force at a turning point is estimated.
+
+    Attributes:
+        share: of the peak force within which readings on both sides tell the turning point. A ramp under displacement
+            control is bent; over so short a part of it a parabola follows it to less than the noise.
+        most: readings on each side at most; more than these say nothing new against the bend.
+        curved: readings from which on a parabola is drawn through them, not a straight line.
+        least: fewer readings draw no line: the reading itself is taken.
+        trend: a hold whose readings change by more standard errors than this relaxes, and its mean says nothing.
+        inside: readings of a hold within so many robust standard deviations of its median are of the hold.
+        fits: a line follows the readings if they scatter about it by less than so many times the noise; else fewer of
+            them, nearer the turning point, are taken.
+        resolved: noise below this share of the peak is none: the reading itself is exact.
+        apart: an estimate further from the reading than this many standard deviations is refused.
+    """
+
+    share: float = 0.1
+    most: int = 41
+    curved: int = 9
+    least: int = 4
+    trend: float = 4.0
+    inside: float = 3.0
+    fits: float = 2.0
+    resolved: float = 1e-6
+    apart: float = 6.0
+
+
+class TurningForces(NamedTuple):
+    """The forces of a test as a law is to be compared with them; every array of shape (n,).
+
+    Attributes:
+        force: force [mN]: readings, and the estimate where many readings repeat one force (holds, turning points).
+        peak: force from which the branch of each point starts [mN]; on virgin loading its own force.
+        error: standard error of `peak` in standard errors of a reading; 0 on virgin loading.
+        reading: whether a point's force is a reading of its own.
+    """
+
+    force: np.ndarray
+    peak: np.ndarray
+    error: np.ndarray
+    reading: np.ndarray
+
+
+def turning_forces(
+    curve: Curve, segments: tuple[Segment, ...], options: TurningOptions | None = None
+) -> TurningForces:
+    """Estimate the force at which every branch begins.
+
+    Args:
+        curve: the test.
+        segments: of the curve, from `find_segments`.
+        options: see `TurningOptions`.
+    """
+    options = options or TurningOptions()
+    time, raw = np.asarray(curve.time_s, float), np.asarray(curve.force_mN, float)
+    force, peak = raw.copy(), raw.copy()
+    error, reading = np.zeros(len(raw)), np.ones(len(raw), bool)
+    level, level_error = None, 0.0
+    # Readings that saturate are replaced by what the ramps say, with an error of its own.
+    worked_out = curve.checked is not None and bool(np.any(curve.checked.force_sd_mN))
+    if worked_out:
+        options = replace(options, share=0.0)
+    for k, part in enumerate(segments):
+        rows = slice(part.start, part.stop)
+        if part.kind == "approach":
+            continue
+        if part.kind == "load":
+            before, before_error, level = level, level_error, None
+            if k + 1 < len(segments):
+                level, level_error = _level(time, raw, part, segments[k + 1], options)
+                force[rows] = peak[rows] = np.minimum(raw[rows], level)
+            if before is not None:  # up to the force reached before, loading goes along the last branch
+                elastic = part.start + np.flatnonzero(force[rows] <= before)
+                peak[elastic], error[elastic] = before, before_error
+            continue
+        if level is None:  # the record begins behind its peak
+            ends = np.polyfit(time[rows][: options.most] - time[part.start], raw[rows][: options.most], 1)
+            enough = len(raw[rows]) >= options.least
+            level, level_error = (float(max(ends[1], raw[part.start])) if enough else float(raw[part.start])), 1.0
+        peak[rows], error[rows] = level, level_error
+        force[rows] = np.minimum(raw[rows], level)
+        if part.kind == "reload" and k + 1 < len(segments) and segments[k + 1].kind == "load":
+            beyond = part.start + np.flatnonzero(raw[rows] > level)
+            force[beyond] = peak[beyond] = raw[beyond]
+            error[beyond] = 0.0
+        if segments[k - 1].kind == "load":
+            # A hold repeats the force at which it began; of a turning point that is its first point alone.
+            held = _held(time, raw, part, options) if part.kind == "hold" else None
+            if held is None:
+                held = np.array([part.start])
+            force[held], reading[held] = level, False
+            ramp = slice(part.start, held[0])  # the end of the ramp, within the band that a hold is known by
+            force[ramp] = peak[ramp] = np.minimum(raw[ramp], level)
+            error[ramp] = 0.0
+    return TurningForces(force, peak, error, reading)
+
+
+def _level(
+    time: np.ndarray, raw: np.ndarray, up: Segment, after: Segment, options: TurningOptions
+) -> tuple[float, float]:
+    """The force at which loading ends, and its standard error in those of a reading."""
+    held = _held(time, raw, after, options) if after.kind == "hold" and options.share else None
+    if held is not None:
+        return float(np.mean(raw[held])), 1 / np.sqrt(len(held))
+    largest = float(raw[up.start : min(after.start + 1, after.stop)].max())
+    noise = noise_level(raw, float(np.ptp(raw)))
+    if noise <= options.resolved * abs(largest):
+        return largest, 1.0
+    near = raw > (1 - options.share) * largest
+    turn = float(time[after.start])
+    rising = _Curve.through(time, raw, _run(near, up.start, up.stop, -1, options.most), turn, noise, options)
+    falling = _Curve.through(time, raw, _run(near, after.start, after.stop, 1, options.most), turn, noise, options)
+    if rising is None or falling is None:
+        return largest, 1.0
+    if after.kind == "hold":  # a relaxing force: only the ramp tells where it began
+        level, variance = rising.at(0.0)
+    else:
+        step = max(turn - float(time[max(after.start - 1, up.start)]), float(time[min(after.start + 1, len(time) - 1)]) - turn)
+        instants = np.linspace(-step, step, 41)
+        gap = [abs(rising.at(t)[0] - falling.at(t)[0]) for t in instants]
+        meet = float(instants[int(np.argmin(gap))])
+        (one, first), (other, second) = rising.at(meet), falling.at(meet)
+        steep, down = rising.slope(meet), falling.slope(meet)
+        # Where two lines meet: each is weighed by the slope of the other.
+        share = down / (down - steep) if steep > 0 > down else 0.5
+        level, variance = share * one + (1 - share) * other, share**2 * first + (1 - share) ** 2 * second
+    if not abs(level - largest) <= options.apart * noise:
+        return largest, 1.0
+    return float(level), float(min(np.sqrt(variance), 1.0))
+
+
+def _run(near: np.ndarray, start: int, stop: int, direction: int, most: int) -> np.ndarray:
+    """Rows of the unbroken run of `near` at the end (-1) or the beginning (1) of a segment."""
+    order = np.arange(start, stop)[::direction]
+    order = order[: int(np.argmin(near[order])) if not near[order].all() else len(order)]
+    return np.sort(order[:most])
+
+
+def _held(time: np.ndarray, raw: np.ndarray, part: Segment, options: TurningOptions) -> np.ndarray | None:
+    """Rows of a hold whose readings scatter about one force; None if there is none, as where the force relaxes.
+
+    A hold begins and ends with readings of the ramps beside it that come close to it: they lie apart from the others.
+    """
+    force = raw[part.start : part.stop]
+    away = np.abs(force - np.median(force))
+    sd = 1.4826 * float(np.median(away))
+    rows = part.start + np.flatnonzero(away <= options.inside * sd)
+    if len(rows) < options.least:
+        return None
+    clock, values = time[rows] - time[rows].mean(), raw[rows]
+    if not np.any(clock):
+        return rows
+    slope = clock @ values / (clock @ clock)
+    left = values - values.mean() - slope * clock
+    error = np.sqrt(left @ left / (len(values) - 2) / (clock @ clock))
+    return rows if abs(slope) <= options.trend * error or sd == 0 else None
+
+
+class _Curve(NamedTuple):
+    """A line or parabola through readings near a turning point, and its covariance for readings of variance 1."""
+
+    values: np.ndarray
+    covariance: np.ndarray
+    unit: float
+
+    @classmethod
+    def through(
+        cls, time: np.ndarray, raw: np.ndarray, rows: np.ndarray, turn: float, noise: float, options: TurningOptions
+    ) -> _Curve | None:
+        """The one through as many of the rows nearest the turning point as it follows to within the noise."""
+        while len(rows) >= options.least and np.ptp(time[rows]) > 0:
+            x, force = time[rows] - turn, raw[rows]
+            unit = float(np.abs(x).max())
+            design = np.vander(x / unit, 3 if len(rows) >= options.curved else 2, increasing=True)
+            values, _, rank, _ = np.linalg.lstsq(design, force, rcond=None)
+            left = force - design @ values
+            if rank == design.shape[1] and left @ left <= (options.fits * noise) ** 2 * len(rows):
+                return cls(values, np.linalg.inv(design.T @ design), unit)
+            nearest = np.argsort(np.abs(x), kind="stable")[: len(rows) // 2]
+            rows = np.sort(rows[nearest])
+        return None
+
+    def at(self, time: float) -> tuple[float, float]:
+        x = (time / self.unit) ** np.arange(len(self.values))
+        return float(x @ self.values), float(x @ self.covariance @ x)
+
+    def slope(self, time: float) -> float:
+        k = np.arange(1, len(self.values))
+        return float((k * (time / self.unit) ** (k - 1)) @ self.values[1:] / self.unit)
