@@ -160,13 +160,14 @@ class Drawer:
             restless: positions of the restless ones.
             candidates: how many per draw: first, and for the few that scatter most even then.
         """
-        latent, zero, _, ratio = (cast(np.ndarray, v) for v in drawn)
+        latent, theta, zero, _, ratio = (cast(np.ndarray, v) for v in drawn)
         few = max(FEW, self.count // 100)
         for many in candidates:
             if not len(restless):
                 return
             better = self.some(key, restless, population, many)
             latent[:, restless], zero[:, restless] = better.latent, better.zero
+            theta[:, restless] = better.theta
             ratio[:, restless] = better.log_ratio
             k[restless] = pareto_k(ratio[:, restless])
             restless = restless[np.argsort(-unrest(ratio[:, restless]))][:few]

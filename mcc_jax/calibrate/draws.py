@@ -1,8 +1,9 @@
-"""The draws behind the posterior: the sampler's runs, every particle drawn back, weights applied, diagnostics."""
+"""The draws behind the posterior: the population's, every particle drawn back, weights applied, diagnostics."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -10,56 +11,85 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .compiling import compiled
 from .conditional import Drawer, chunk_of, corrected, every, stride_of, weighted
-from .data import Tests
-from .fit import populations
+from .fit import Fit
 from .importance import sample_weighted
-from .linearise import careful_enough
-from .model import JointFit, JointModel
-from .nuts import Chains, Length, by_chains
-from .population import COEFFICIENTS, Population, Scatter
+from .mode import LogPosterior, populations
+from .noise import standard_promotion
+from .nuts import Chains, Length, by_chains, sample_density
+from .population import COEFFICIENTS, Population
 from .reweighting import PROBES
-from .sampling import ExactLikelihood, sample_joint, sample_population
+from .sampling import ExactLikelihood
 from .sharding import count_of
-from .transforms import LogPosterior
 from .weights import diagnostics
 
 ACCEPT = (0.8, 0.95, 0.99)
 """Acceptance that the sampler aims at: after divergences once more, and once more, with smaller steps."""
 
 
-def draw_fast(
-    key: Array, tests: Tests, model: JointModel, fit: JointFit, length: Length, block: int, *, patient: bool = True
-) -> dict[str, Any]:
-    """The population sampled, the particles drawn back and corrected by exact weights: fields of the result."""
-    scatter = careful_enough(fit.mode, LogPosterior(fit.numbers, fit.summary, model.scatter), count_of(tests))
-    exact = ExactLikelihood(tests, fit.filters, fit.summary, scatter, model.zero_sd, model.unloading)
-    target = LogPosterior(fit.numbers, fit.summary, scatter)
-    return draw_around(key, fit.mode, fit.covariance, target, exact, model, length, block, patient=patient)
+@dataclass(frozen=True)
+class Draws:
+    """Draws of population and particles, and how good they are; axes (chain, draw, ...).
 
-
-def draw_around(
-    key: Array,
-    mode: Array,
-    covariance: Array,
-    target: LogPosterior,
-    exact: ExactLikelihood,
-    model: JointModel,
-    length: Length,
-    block: int = 0,
-    *,
-    patient: bool = True,
-) -> dict[str, Any]:
-    """The same for any density of the population, around its mode, and any exact likelihood of the tests.
-
-    More than one block (0 for a single one) takes tests whose every array has one row per particle. Without patience
-    the sampler never runs, which takes minutes where numbers cannot be true: the draws are then those of the proposal.
+    Attributes:
+        population: draws of the population.
+        C: draws of every particle's C1, C3, C5.
+        modulus_MPa: of its effective modulus.
+        zero_um: of its zero.
+        shape_factor: of its eta_p.
+        theta: of the numbers of its effects.
+        log_likelihood: of its whole test given the population, the particle integrated out.
+        pareto_k: of every particle's importance weights.
+        pareto_k_joint: of the weights of all particles together; None where they were not formed.
+        weights_applied: whether the draws were resampled by the particles' own weights.
+        divergences: number of divergent trajectories.
+        rhat, ess_bulk, ess_tail: by parameter of the population.
+        leapfrogs: mean number of leapfrog steps of a draw; 0 of independent draws.
+        notes: what a reader must know.
     """
-    tests, scatter = exact.tests, exact.scatter
+
+    population: Population
+    C: np.ndarray
+    modulus_MPa: np.ndarray
+    zero_um: np.ndarray
+    shape_factor: np.ndarray
+    theta: np.ndarray
+    log_likelihood: np.ndarray
+    pareto_k: np.ndarray
+    pareto_k_joint: float | None
+    weights_applied: bool
+    divergences: int
+    rhat: dict[str, float]
+    ess_bulk: dict[str, float]
+    ess_tail: dict[str, float]
+    leapfrogs: float
+    notes: tuple[str, ...] = ()
+
+
+def exact_likelihood(fit: Fit) -> ExactLikelihood:
+    """The tests of a fit with their exact likelihood."""
+    return ExactLikelihood(fit.tests, fit.filters, fit.marginal, fit.model.zero_prior, fit.model.forms)
+
+
+def draw_fast(key: Array, fit: Fit, length: Length, block: int, *, patient: bool = True) -> Draws:
+    """The population sampled, the particles drawn back and corrected by exact weights.
+
+    Without patience the sampler never runs, which takes minutes where numbers cannot be true: the draws are then those
+    of the proposal.
+
+    Args:
+        key: random key.
+        fit: the fit to draw around.
+        length: how many draws.
+        block: particles of a block, as they were fitted; 0 for a single one.
+        patient: see above.
+    """
+    count, target, exact = count_of(fit.tests), fit.target, exact_likelihood(fit)
     population_key, particle_key, check_key, pick_key = jax.random.split(key, 4)
-    few = stride_of(count_of(tests), length.total) == 1
-    run, population, good = _sampled(population_key, mode, covariance, target, length, not few, patient)
-    names, stacked = _stack(population, scatter, length)
+    few = stride_of(count, length.total) == 1
+    run, population, good = _sampled(population_key, fit, target, length, not few, patient)
+    names, stacked = _stack(population, fit, length)
     flat = stacked.reshape(length.total, -1)
     if few:
         found = weighted(Drawer(exact, block, chunk_of(length.total)), population, length, check_key, pick_key)
@@ -67,75 +97,92 @@ def draw_around(
         keys = check_key, pick_key, particle_key
         found = corrected(Drawer(exact, block, PROBES), population, flat, length, *keys)
     stacked, population = flat[found.chosen].reshape(stacked.shape), every(population, found.chosen)
-    particles = found.particles[:3]
-    return {
-        **_fields(run, population, names, stacked, particles, tests, model, length, found.keep),
-        "pareto_k": found.k,
-        "pareto_k_joint": found.k_joint if good else np.inf,
-        "weights_applied": few,
-        "notes": found.notes,
-    }
+    drawn = _collected(run, population, names, stacked, found.particles[:4], fit, length, found.keep)
+    k_joint = found.k_joint if good else np.inf
+    return replace(drawn, pareto_k=found.k, pareto_k_joint=k_joint, weights_applied=few, notes=found.notes)
 
 
 def _sampled(
-    key: Array, mode: Array, covariance: Array, target: LogPosterior, length: Length, many: bool, patient: bool
+    key: Array, fit: Fit, target: LogPosterior, length: Length, many: bool, patient: bool
 ) -> tuple[Chains, Population, bool]:
     """Draws of the population: independent ones, weighted, if the weights are good enough, else the sampler's.
 
     And whether they are good: without patience the sampler does not run.
     """
     shape: dict[str, Any] = {"chains": length.chains, "draws": length.draws, "many": many}
-    found = sample_weighted(key, mode, covariance, target, **shape)
+    found = sample_weighted(key, fit.mode, fit.covariance, target, **shape)
     if found is not None:
         return *found, True
     if not patient:
-        bad = sample_weighted(key, mode, covariance, target, **shape, however_bad=True)
+        bad = sample_weighted(key, fit.mode, fit.covariance, target, **shape, however_bad=True)
         assert bad is not None
         return *bad, False
+    run = _patient(lambda aim: by_chains(sample_density, key, length, fit.mode, fit.covariance, target, aim))
+    return run, jax.tree.map(np.asarray, populations(jnp.asarray(_rows(run)), target)), True
 
-    return *_patient(lambda aim: by_chains(sample_population, key, length, mode, covariance, target, aim)), True
+
+def _rows(run: Chains) -> np.ndarray:
+    return np.asarray(run.position).reshape(-1, run.position.shape[-1])
 
 
-def _patient[*Ts](run: Callable[[Array], tuple[Chains, *Ts]]) -> tuple[Chains, *Ts]:
+def _patient(run: Callable[[Array], Chains]) -> Chains:
     """What the sampler finds; where any trajectory diverged it runs again, with smaller steps."""
     # From arrays, not from Python numbers: another number would be compiled anew.
     first, *smaller = (jnp.asarray(np.asarray(accept)) for accept in ACCEPT)
     found = run(first)
     for accept in smaller:
-        if not np.any(np.asarray(found[0].divergent)):
+        if not np.any(np.asarray(found.divergent)):
             break
         found = run(accept)
     return found
 
 
-def draw_joint(key: Array, tests: Tests, model: JointModel, fit: JointFit, length: Length) -> dict[str, Any]:
-    """Population and particles sampled together under the exact likelihood: fields of the result."""
-    scatter = careful_enough(fit.mode, LogPosterior(fit.numbers, fit.summary, model.scatter), count_of(tests))
-    exact = ExactLikelihood(tests, fit.filters, fit.summary, scatter, model.zero_sd, model.unloading)
-    run, free, *particles = _patient(
-        lambda aim: by_chains(sample_joint, key, length, fit.mode, fit.covariance, fit.numbers, exact, aim)
-    )
-    population = populations(free.reshape(-1, free.shape[-1]), fit.numbers, scatter)
-    names, stacked = _stack(population, scatter, length)
-    return {
-        **_fields(run, population, names, stacked, particles, tests, model, length),
-        "pareto_k": np.zeros(len(tests)),
-        "pareto_k_joint": None,
-        "weights_applied": False,
-    }
+def draw_joint(key: Array, fit: Fit, length: Length) -> Draws:
+    """Population and particles sampled together by NumPyro's NUTS under the exact likelihood (`Fit.nuts`)."""
+    from numpyro.infer import MCMC
+
+    with standard_promotion():
+        mcmc = MCMC(
+            fit.nuts(explicit=True),
+            num_warmup=length.warmup,
+            num_samples=length.draws,
+            num_chains=length.chains,
+            chain_method="sequential",
+            progress_bar=False,
+        )
+        mcmc.run(key, fit.tests, extra_fields=("diverging", "num_steps"))
+        samples, extra = mcmc.get_samples(), mcmc.get_extra_fields(group_by_chain=True)
+    sites = {name: jnp.asarray(samples[name]) for name in (*fit.names, "own")}
+    population, drawn = _explicit(sites, fit.target)
+    population, particles = jax.tree.map(np.asarray, (population, drawn))
+    still = jnp.zeros((length.chains, length.draws, 1))
+    run = Chains(still, extra["diverging"], extra["num_steps"], jnp.zeros(length.chains))
+    names, stacked = _stack(population, fit, length)
+    return _collected(run, population, names, stacked, particles, fit, length)
 
 
-def _fields(
+@compiled
+def _explicit(sites: dict[str, Array], target: LogPosterior) -> tuple[Population, tuple[Array, ...]]:
+    """Populations and particles at draws of the explicit model's sites."""
+
+    def one(values: dict[str, Array]) -> tuple[Population, tuple[Array, ...]]:
+        population, own = target.at_values(values), values["own"]
+        drawn = target.marginal.draw(population, own[:, :-1], own[:, -1])
+        return population, (drawn.latent, drawn.theta, drawn.zero, drawn.log_likelihood)
+
+    return jax.lax.map(one, sites)
+
+
+def _collected(
     run: Chains,
     population: Population,
     names: list[str],
     stacked: np.ndarray,
-    particles: Sequence[Any],
-    tests: Tests,
-    model: JointModel,
+    particles: Any,
+    fit: Fit,
     length: Length,
     keep: int = 1,
-) -> dict[str, Any]:
+) -> Draws:
     """What the results of both modes have in common; of the population every `keep`-th draw of each chain."""
 
     def shaped(x: Any) -> np.ndarray:
@@ -143,42 +190,48 @@ def _fields(
 
     population = jax.tree.map(shaped, population)
     rhat, bulk, tail = diagnostics(names, stacked)
-    count = count_of(tests)
-    latent, zero, likelihood = (np.asarray(v) for v in particles)
-    return {
-        "population": population,
-        **_particles(latent, zero, population, np.asarray(tests.flatness)[:count], model, length.chains),
-        "log_likelihood": likelihood.reshape(length.chains, -1, count),
-        "divergences": int(np.sum(np.asarray(run.divergent))),
-        "rhat": rhat,
-        "ess_bulk": bulk,
-        "ess_tail": tail,
-        "leapfrogs": float(np.mean(np.asarray(run.steps))),
-    }
-
-
-def _particles(
-    latent: np.ndarray, zero: np.ndarray, population: Population, flatness: np.ndarray, model: JointModel, chains: int
-) -> dict[str, np.ndarray]:
-    """C, modulus, zero and shape factor of the particles from their latent vectors."""
-    count = len(flatness)
+    count = count_of(fit.tests)
+    latent, theta, zero, likelihood = (np.asarray(v) for v in particles)
+    flatness = np.asarray(fit.marginal.flatness)[:count]
     eta = 1 + np.asarray(population.a)[..., None] * flatness
-    latent = latent.reshape(chains, -1, count, 4)
+    latent = latent.reshape(length.chains, -1, count, 4)
     log_eta = np.log(eta)
-    # What scatter of `a` there is has gone into b alone; a particle's coefficients are those under the common a.
-    C = np.exp(latent[..., :3] - log_eta[..., None])
-    modulus = np.exp(latent[..., 3] - model.shape_power * log_eta)
-    return {"C": C, "modulus_MPa": modulus, "zero_um": zero.reshape(chains, -1, count), "shape_factor": eta}
+    return Draws(
+        population=population,
+        # What scatter of `a` there is has gone into b alone; a particle's coefficients are those under the common a.
+        C=np.exp(latent[..., :3] - log_eta[..., None]),
+        modulus_MPa=np.exp(latent[..., 3] - fit.model.shape_power * log_eta),
+        zero_um=zero.reshape(length.chains, -1, count),
+        shape_factor=eta,
+        theta=theta.reshape(length.chains, len(theta) // length.chains, count, theta.shape[-1]),
+        log_likelihood=likelihood.reshape(length.chains, -1, count),
+        pareto_k=np.zeros(count),
+        pareto_k_joint=None,
+        weights_applied=False,
+        divergences=int(np.sum(np.asarray(run.divergent))),
+        rhat=rhat,
+        ess_bulk=bulk,
+        ess_tail=tail,
+        leapfrogs=float(np.mean(np.asarray(run.steps))),
+    )
 
 
-def _stack(population: Population, scatter: Scatter, length: Length) -> tuple[list[str], np.ndarray]:
-    columns = {"a": population.a, "log_modulus": population.log_modulus}
-    columns |= {f"mu_{n}": population.mu[:, j] for j, n in enumerate(COEFFICIENTS)}
-    columns |= {f"tau_{n}": population.tau[:, j] for j, n in enumerate(COEFFICIENTS)}
-    if scatter.modulus:
-        columns["modulus_scatter"] = population.modulus_scatter
-    if scatter.shape:
-        columns["shape_scatter"] = population.shape_scatter
-    columns["noise_factor"] = population.log_noise
-    columns |= population.further()
-    return list(columns), np.stack([np.asarray(v).reshape(length.chains, length.draws) for v in columns.values()], -1)
+def named_numbers(population: Population, fit: Fit) -> Mapping[str, np.ndarray]:
+    """Draws of everything that all particles share, by the names of coordinates that a diagnostic is worked out of."""
+    p, model = population, fit.model
+    columns = {"a": p.a, "log_modulus": p.log_modulus}
+    columns |= {f"mu_{n}": p.mu[..., j] for j, n in enumerate(COEFFICIENTS)}
+    columns |= {f"tau_{n}": p.tau[..., j] for j, n in enumerate(COEFFICIENTS)}
+    if model.modulus_scatter:
+        columns["modulus_scatter"] = p.modulus_scatter
+    if model.shape_scatter:
+        columns["shape_scatter"] = p.shape_scatter
+    columns |= {name: p.theta[..., k] for k, name in enumerate(model.forms.names)}
+    columns |= {f"tau_{name}": p.theta_scatter[..., j] for j, name in enumerate(model.varying_in_order)}
+    columns["noise_factor"] = p.log_noise
+    return {name: np.asarray(v) for name, v in columns.items()}
+
+
+def _stack(population: Population, fit: Fit, length: Length) -> tuple[list[str], np.ndarray]:
+    columns = named_numbers(population, fit)
+    return list(columns), np.stack([v.reshape(length.chains, length.draws) for v in columns.values()], -1)

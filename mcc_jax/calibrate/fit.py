@@ -255,7 +255,7 @@ class _Fitter:
     def summaries(self, point: Point, linear: Parts, noise: Noise) -> tuple[Marginal, Parts, Array]:
         """All particles' summaries, this process's own filters, and the white noise of equal weight."""
         m, cut = self.model, self.blocks.cut
-        kinds = m.zero_sd, m.scatter, m.correlation, m.along
+        kinds = m.zero_prior, m.scatter, m.correlation, m.along
         found = self.blocks.each(summarise, cut(point), self.own, linear, cut(noise), *kinds)
         marginal, filters, white = (Parts(tuple(wave[k] for wave in found.waves)) for k in range(3))
         return self.blocks.whole(marginal), filters, self.blocks.whole(white)
@@ -274,7 +274,7 @@ class _Fitter:
             some = start
         prior = m.chosen_priors.noise
         found = estimate_noise(
-            own, linear, m.zero_sd, prior, some, m.correlation, m.along, uncertainty=uncertainty, blocks=blocks
+            own, linear, m.zero_prior[1], prior, some, m.correlation, m.along, uncertainty=uncertainty, blocks=blocks
         )
         return replace(found, noise=replace(found.noise, scale=start.scale))
 
@@ -332,7 +332,7 @@ class _Fitter:
         varying = list(self.varying)
         own = np.asarray(expected.theta)[:, varying]
         zero_mean = np.asarray(self.tests.contact) + self.model.chosen_priors.zero_um.mean
-        zero_sd = np.full(len(self.tests), float(self.model.zero_sd))
+        zero_sd = np.full(len(self.tests), self.model.chosen_priors.zero_um.sd)
         spread = np.maximum(np.asarray(expected.theta_sd), 1e-12)
         centre = np.column_stack([expected.mean, zero_mean, np.asarray(expected.theta_mean)])
         widths = np.column_stack([width, zero_sd, spread])

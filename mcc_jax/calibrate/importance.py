@@ -25,7 +25,7 @@ from jaxtyping import Array, Float
 from .compiling import compiled, even_batch
 from .nuts import Chains, side_by_side
 from .population import Population
-from .transforms import FIRST_SPREAD, ROWS, LogPosterior, gradients
+from .mode import ROWS, LogPosterior, gradients, populations
 from .weights import PARETO_K_MOST, effective_share, ordered_resample, smoothed_weights
 
 FREEDOM = 10
@@ -58,12 +58,7 @@ AT_ONCE = 4096
 @compiled
 def log_densities(free: Float[Array, "many d"], target: LogPosterior) -> Float[Array, " many"]:
     """Log density of the population at many coordinates."""
-    return jax.lax.map(target.log_density, free, batch_size=even_batch(len(free), AT_ONCE // len(target.flatness)))
-
-
-@compiled
-def _populations(free: Float[Array, "many d"], target: LogPosterior) -> Population:
-    return jax.vmap(target.population)(free)
+    return jax.lax.map(target.log_density, free, batch_size=even_batch(len(free), AT_ONCE // len(target.marginal.flatness)))
 
 
 def sample_weighted(
@@ -94,7 +89,7 @@ def sample_weighted(
     from scipy.stats import multivariate_t
 
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
-    spreads = np.arange(len(mode))[FIRST_SPREAD : FIRST_SPREAD + target.scatter.size]
+    spreads = np.array(target.signed())
     signs = np.ones((2 ** len(spreads), len(mode)))
     signs[:, spreads] = list(product((1.0, -1.0), repeat=len(spreads)))
 
@@ -157,5 +152,5 @@ def _resampled(
     chosen = np.stack([part[ordered_resample(own, draws)] for part, own in several])
     still = np.zeros(chosen.shape[:2], int)
     run = Chains(cast(Any, chosen), cast(Any, still > 0), cast(Any, still), cast(Any, np.zeros(chains)))
-    population = _populations(jnp.asarray(chosen.reshape(-1, len(free[0]))), target)
+    population = populations(jnp.asarray(chosen.reshape(-1, len(free[0]))), target)
     return run, jax.tree.map(np.asarray, population)

@@ -27,7 +27,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._types import Scalar
 from .compiling import compiled
 from .data import Tests
 from .forward import Linear, Point, snap
@@ -259,7 +258,7 @@ def summarise(
     tests: Tests,
     linear: Linear,
     noise: Noise,
-    zero_sd: Scalar,
+    zero_prior: Float[Array, " 2"],
     scatter: Scatter,
     correlation: Correlation,
     along: Along,
@@ -271,7 +270,7 @@ def summarise(
         tests: the measurements.
         linear: the tests linearised there.
         noise: the noise.
-        zero_sd: how far a zero may lie from the recorded contact [um].
+        zero_prior: mean and standard deviation of the zeros, from the recorded contact [um].
         scatter: what differs from particle to particle.
         correlation, along: of the correlated residuals.
     """
@@ -288,8 +287,8 @@ def summarise(
     # It bounds where a particle may go, and is no datum: where the point stands it costs nothing.
     gram = gram.at[:, -1, -1].add(jax.vmap(lambda f: f.reading)(filters) - weight * offset**2)
     place = gram.shape[-1] - 2
-    away = tests.contact - point.zero
-    precision = jnp.broadcast_to(1 / zero_sd**2, (len(tests), 1))
+    away = tests.contact + zero_prior[0] - point.zero
+    precision = jnp.broadcast_to(1 / zero_prior[1] ** 2, (len(tests), 1))
     left, log_integral = eliminate(gram, (place,), precision, away[:, None])
     total = gram[:, place, place] + precision[:, 0]
     slopes = -gram[:, place, :place] / total[:, None]

@@ -72,6 +72,12 @@ class LogPosterior(eqx.Module):
         """The population at unbounded coordinates."""
         return population_at(self.model, Shapes(self.marginal.flatness, self.marginal.weight), self.sites(free))
 
+    def at_values(self, values: dict[str, Array]) -> Population:
+        """The population at values of its sites."""
+        prior = handlers.substitute(self.model.population, data=values)
+        with standard_promotion():
+            return handlers.seed(prior, jax.random.key(0))(Shapes(self.marginal.flatness, self.marginal.weight))
+
     def sites(self, free: Array) -> dict[str, Array]:
         """Unbounded coordinates by the names of their sites."""
         return {name: free[i] for i, name in enumerate(self.names)}

@@ -236,14 +236,20 @@ class Model:
         varying = [(k, self._signed(v)) for k, v in enumerate(self.effects) if v.mechanism in self.varying]
         return Scatter(self.modulus_scatter, self.shape_scatter, self.shape_power, tuple(varying))
 
+    @property
+    def varying_in_order(self) -> tuple[str, ...]:
+        """Mechanisms whose amplitude differs from particle to particle, in the order of the effects."""
+        return tuple(v.mechanism for v in self.effects if v.mechanism in self.varying)
+
     @staticmethod
     def _signed(variant: Variant) -> bool:
         return variant.sign == 0 or variant.random_per_test
 
     @property
-    def zero_sd(self) -> Array:
-        """Standard deviation of the zeros [um]."""
-        return jnp.asarray(self.chosen_priors.zero_um.sd)
+    def zero_prior(self) -> Array:
+        """Mean and standard deviation of the zeros, from the recorded contact [um]."""
+        zero = self.chosen_priors.zero_um
+        return jnp.asarray(np.array([zero.mean, zero.sd]))
 
     def with_effects(self, *effects: Any, varying: Any = ()) -> Model:
         """The model with further effects.

@@ -12,9 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
 
-from .._types import Scalar, ScalarLike
+from .._types import Scalar
+from .compiling import compiled
+from .mode import LogPosterior
+from .noise import standard_promotion
 
 PAIR = 2
+"""Chains that one call of the sampler takes, on a CPU."""
+
+MAX_TREE_DEPTH = 6
+"""Around its mode, in coordinates scaled by the curvature there, a density that is near normal takes 7 leapfrog steps a
+draw; one that needs more than 63 is not one this sampler should be trusted with, and shows in R-hat."""
 
 
 class Chains(NamedTuple):
@@ -79,44 +87,47 @@ def chains_together(chains: int) -> int:
     return PAIR if jax.default_backend() == "cpu" and chains % PAIR == 0 else chains
 
 
-def sample(
+@compiled
+def sample_density(
     keys: Key[Array, " chains"],
-    log_density: Callable[[Float[Array, " d"]], Scalar],
     mode: Float[Array, " d"],
-    factor: Float[Array, "d d"],
+    covariance: Float[Array, "d d"],
+    target: LogPosterior,
+    accept: Scalar,
     *,
     warmup: int,
     draws: int,
-    accept: ScalarLike = 0.8,
-    together: bool = False,
 ) -> Chains:
-    """Sample a density whose mode and covariance are roughly known.
+    """Sample the population, all particles integrated out, around a mode and covariance that are roughly known.
 
-    The sampler works in coordinates in which that covariance is the identity, so little is left to adapt. Call it
-    inside `jit`: MCMC objects of NumPyro compile anew for every data set, this does so once per shape.
+    The sampler works in coordinates in which that covariance is the identity, so little is left to adapt. MCMC objects
+    of NumPyro compile anew for every data set, this does so once per shape.
 
     Args:
         keys: a random key for every chain.
-        log_density: log density in unbounded coordinates.
         mode: centre of the coordinates; chains begin scattered around it.
-        factor: Cholesky factor of the covariance.
+        covariance: there.
+        target: the density.
+        accept: mean acceptance that the step size aims at; higher is slower and follows narrower densities.
         warmup: draws thrown away while the step size adapts.
         draws: draws kept per chain.
-        accept: mean acceptance that the step size aims at; higher is slower and follows narrower densities.
-        together: advance all chains in step (for accelerators), instead of one after the other.
     """
     from numpyro.infer import NUTS
 
-    dimension = mode.shape[0]
+    dimension, factor = mode.shape[0], jnp.linalg.cholesky(covariance)
 
     def potential(z: Float[Array, " d"]) -> Scalar:
-        value = -log_density(mode + factor @ z)
+        value = -target.log_density(mode + factor @ z)
         return jnp.where(jnp.isnan(value), jnp.inf, value)
 
     def chain(key):
         # A traced number does as well as a Python one: another value then needs no new compilation.
-        target = cast(float, accept)
-        kernel = NUTS(potential_fn=potential, dense_mass=dimension < 40, target_accept_prob=target)
+        kernel = NUTS(
+            potential_fn=potential,
+            dense_mass=True,
+            target_accept_prob=cast(float, accept),
+            max_tree_depth=MAX_TREE_DEPTH,
+        )
         start_key, key = jax.random.split(key)
         start = jax.random.normal(start_key, (dimension,), mode.dtype)
         state = kernel.init(key, warmup, start, (), {})
@@ -129,7 +140,7 @@ def sample(
         state, (z, divergent, steps) = jax.lax.scan(advance, state, None, length=warmup + draws)
         return z[warmup:], divergent[warmup:], steps[warmup:], state.adapt_state.step_size
 
-    # NumPyro counts on JAX's usual promotion of types and ranks, whatever the caller's settings are.
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+    together = jax.default_backend() != "cpu"
+    with standard_promotion():
         z, divergent, steps, step_size = jax.vmap(chain)(keys) if together else jax.lax.map(chain, keys)
     return Chains(mode[None, None] + jnp.einsum("ij,cnj->cni", factor, z), divergent, steps, step_size)

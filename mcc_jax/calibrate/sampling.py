@@ -1,7 +1,7 @@
-"""The posterior: the population sampled with all particles integrated out, the particles drawn back, and exact weights.
+"""Every particle drawn back given draws of the population, with exact weights.
 
-1. Given the summaries (`population`), nothing but the population is left to sample: seven to eleven numbers.
-2. Given a draw of the population, every particle's parameters are normal and independent: drawn directly.
+1. Given the summaries (`marginal`), nothing but the population is left to sample.
+2. Given a draw of the population, every particle's parameters are nearly normal and independent: drawn directly.
 3. A summary is a quadratic; the true likelihood of a test is not. Their ratio at the drawn parameters is the draw's
    importance weight, which makes the result exact whatever the summary's quality, and shows that quality (Pareto k).
    Particles whose ratio scatters (a curve that snaps through, say) get several candidates per draw of the population,
@@ -17,17 +17,14 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key
 
-from .._types import Scalar
-from ..law import Unloading
 from .compiling import compiled, even_batch
 from .data import Tests
-from .forward import displacement
+from .forward import Forms, Point, residuals
+from .marginal import Marginal, ParticleDraw
 from .noise import Whitening
-from .nuts import Chains, sample
-from .population import Draw, Population, Scatter, Summary, draw_latent
-from .transforms import LogPosterior, PriorNumbers, constrain
+from .population import Population
 
 
 class ParticleDraws(NamedTuple):
@@ -35,42 +32,17 @@ class ParticleDraws(NamedTuple):
 
     Attributes:
         latent: b1, b3, b5, e.
+        theta: numbers of the effects.
         zero: zero of displacement [um].
         log_likelihood: of every test given the population, the particle integrated out.
         log_ratio: log of exact over quadratic likelihood; 0 where the exact one was not looked at.
     """
 
     latent: Float[Array, "draws particles 4"]
+    theta: Float[Array, "draws particles numbers"]
     zero: Float[Array, "draws particles"]
     log_likelihood: Float[Array, "draws particles"]
     log_ratio: Float[Array, "draws particles"]
-
-
-@compiled
-def sample_population(
-    keys: Key[Array, " chains"],
-    mode: Float[Array, " d"],
-    covariance: Float[Array, "d d"],
-    target: LogPosterior,
-    accept: Scalar,
-    *,
-    warmup: int,
-    draws: int,
-) -> tuple[Chains, Population]:
-    """NUTS over the population, all particles integrated out, a chain for each key; populations of all in one row."""
-    factor = jnp.linalg.cholesky(covariance)
-    together = jax.default_backend() != "cpu"
-    run = sample(
-        keys,
-        target.log_density,
-        mode,
-        factor,
-        warmup=warmup,
-        draws=draws,
-        accept=accept,
-        together=together,
-    )
-    return run, jax.vmap(target.population)(run.position.reshape(-1, mode.shape[0]))
 
 
 class ExactLikelihood(eqx.Module):
@@ -79,61 +51,41 @@ class ExactLikelihood(eqx.Module):
     Attributes:
         tests: the measurements.
         filters: their noise.
-        summary: quadratic summaries of the same tests.
-        scatter: what scatters.
-        zero_sd: standard deviation of the zeros [um].
-        unloading: form of unloading.
+        marginal: the same tests, summarised.
+        zero_prior: mean and standard deviation of the zeros, from the recorded contact [um].
+        forms: the law.
     """
 
     tests: Tests
     filters: Whitening
-    summary: Summary
-    scatter: Scatter
-    zero_sd: Float[Array, ""]
-    unloading: Unloading = eqx.field(static=True)
-
-    def draw(
-        self, population: Population, normal: Float[Array, "particles k"], normal_zero: Float[Array, " particles"]
-    ) -> Draw:
-        """Particles given the population, under the summaries, from standard normal numbers."""
-        summary = self.summary_at(population)
-        return draw_latent(population, summary, self.tests.flatness, self.scatter, normal, normal_zero)
+    marginal: Marginal
+    zero_prior: Float[Array, " 2"]
+    forms: Forms
 
     def some(self, which: Int[Array, " chosen"]) -> ExactLikelihood:
         """Some of the tests."""
-        chosen = [jax.tree.map(lambda x: x[which], part) for part in self.by_test()]
-        return eqx.tree_at(lambda exact: exact.by_test(), self, tuple(chosen))
 
-    def by_test(self) -> tuple[PyTree, ...]:
-        """The fields with one row per test."""
-        return self.tests, self.filters, self.summary
+        def chosen(tree):
+            return jax.tree.map(lambda x: x[which] if x.ndim else x, tree)
 
-    def summary_at(self, population: Population) -> Summary:
-        """The summaries, which may depend on what all particles share."""
-        return self.summary
-
-    def predicted(
-        self, population: Population, latent: Float[Array, "particles 4"]
-    ) -> Float[Array, "particles points"]:
-        """Displacement [um] of every particle from its own zero."""
-        return jax.vmap(lambda w, particle, force: displacement(w, particle, force, self.unloading))(
-            latent, self.tests.particle, self.tests.force
+        return ExactLikelihood(
+            chosen(self.tests), chosen(self.filters), chosen(self.marginal), self.zero_prior, self.forms
         )
 
-    def log_likelihood(
-        self, population: Population, latent: Float[Array, "particles 4"], zero: Float[Array, " particles"]
-    ) -> Float[Array, " particles"]:
-        """Log likelihood of each test at given parameters, and log prior of its zero, up to a constant."""
+    def log_likelihood(self, population: Population, drawn: ParticleDraw) -> Float[Array, " particles"]:
+        """Log likelihood of each test at drawn parameters, times the prior density of its zero."""
         tests = self.tests
-        residual = tests.displacement - self.predicted(population, latent) - zero[:, None]
+        residual = residuals(Point(drawn.latent, drawn.zero, drawn.theta), tests, self.forms)
 
-        def squares(r, mask, filtered):
-            return jnp.sum(filtered(jnp.where(mask, r, 0.0)) ** 2) + filtered.least_squares
+        def one(r, filtered):
+            squares = jnp.sum(filtered(r[:, None]) ** 2) + filtered.reading
+            points = jnp.sum(filtered.mask).astype(r.dtype)
+            constant = filtered.log_det + points * (2 * population.log_noise + math.log(2 * math.pi))
+            return -0.5 * (jnp.exp(-2 * population.log_noise) * squares + constant)
 
-        total = jax.vmap(squares)(residual, tests.mask, self.filters)
-        at_zero = ((zero - tests.contact) / self.zero_sd) ** 2
-        points = jnp.sum(tests.mask, 1).astype(total.dtype)
-        return -0.5 * (jnp.exp(-2 * population.log_noise) * total + at_zero) - points * population.log_noise
+        mean, sd = self.zero_prior
+        at_zero = -0.5 * ((drawn.zero - tests.contact - mean) / sd) ** 2 - jnp.log(sd * math.sqrt(2 * math.pi))
+        return jax.vmap(one)(residual, self.filters) + at_zero
 
 
 REACH = 3.0
@@ -164,93 +116,49 @@ def draw_particles(
     draws = population.a.shape[0]
     count = len(exact.tests)
 
+    numbers = exact.marginal.point.theta.shape[1]
+
     def one(arguments):
-        key, at = arguments
+        key, row = arguments
+        at = jax.tree.map(lambda x: x[row], population)
         deviate, zeros, pick = jax.random.split(key, 3)
 
         def candidate(normal, normal_zero, reach):
             normal, normal_zero = reach * normal, reach * normal_zero
-            drawn = exact.draw(at, normal, normal_zero)
+            drawn = exact.marginal.draw(at, normal, normal_zero)
             ratio = jnp.zeros(count)
             if candidates:
-                truth = exact.log_likelihood(at, drawn.latent, drawn.zero)
+                # Of the standard normal densities of deviations and proposal all constants cancel but the zero's.
+                truth = exact.log_likelihood(at, drawn) + 0.5 * math.log(2 * math.pi)
                 prior = -0.5 * jnp.sum(drawn.deviations**2, -1)
                 square = 0.5 * (jnp.sum(normal**2, -1) + normal_zero**2)
                 proposal = -square - drawn.log_volume
                 if candidates > 1:
-                    far = -square / REACH**2 - (exact.scatter.size + 1) * math.log(REACH)
+                    far = -square / REACH**2 - (exact.marginal.scatter.size + 1) * math.log(REACH)
                     proposal = jnp.logaddexp(-square, far) - math.log(2) - drawn.log_volume
-                ratio = truth + prior - proposal - drawn.log_likelihood - jnp.log(exact.summary.zero_sd)
+                ratio = truth + prior - proposal - drawn.log_likelihood
                 ratio = jnp.where(jnp.isfinite(ratio), ratio, -jnp.inf)
-            return drawn.latent, drawn.zero, drawn.log_likelihood, ratio
+            return drawn.latent, drawn.theta if numbers else None, drawn.zero, drawn.log_likelihood, ratio
 
         shape = (max(candidates, 1), count)
-        latent, zero, likelihood, ratio = jax.vmap(candidate)(
-            jax.random.normal(deviate, (*shape, exact.scatter.size)),
+        latent, theta, zero, likelihood, ratio = jax.vmap(candidate)(
+            jax.random.normal(deviate, (*shape, exact.marginal.scatter.size)),
             jax.random.normal(zeros, shape),
             jnp.where(jnp.arange(shape[0]) % 2 == 0, 1.0, REACH),
         )
         if candidates <= 1:
-            return ParticleDraws(latent[0], zero[0], likelihood[0], ratio[0])
+            return latent[0], theta[0] if numbers else None, zero[0], likelihood[0], ratio[0]
         chosen: Int[Array, " particles"] = jax.random.categorical(pick, jnp.maximum(ratio, -1e30), axis=0)
         mean = jax.scipy.special.logsumexp(ratio, axis=0) - jnp.log(candidates)
 
         def take(values):
             return jnp.take_along_axis(values, chosen.reshape(1, count, *[1] * (values.ndim - 2)), axis=0)[0]
 
-        return ParticleDraws(take(latent), take(zero), likelihood[0], mean)
+        return take(latent), take(theta) if numbers else None, take(zero), likelihood[0], mean
 
     rows = ROWS if jax.default_backend() == "cpu" else ROWS_OF_ACCELERATORS
     batch = even_batch(draws, rows // (count * max(candidates, 1)))
     each = jnp.where(common, keys, jax.random.split(keys[0], draws))
-    return jax.lax.map(one, (each, population), batch_size=batch)
-
-
-@compiled
-def sample_joint(
-    keys: Key[Array, " chains"],
-    mode: Float[Array, " d"],
-    covariance: Float[Array, "d d"],
-    numbers: PriorNumbers,
-    exact: ExactLikelihood,
-    accept: Scalar,
-    *,
-    warmup: int,
-    draws: int,
-) -> tuple[
-    Chains,
-    Float[Array, "chains draws d"],
-    Float[Array, "chains draws n 4"],
-    Float[Array, "chains draws n"],
-    Float[Array, "chains draws n"],
-]:
-    r"""NUTS over population and all particles at once, under the exact likelihood: the plain joint model.
-
-    .. math:: p(\text{population}) \prod_i N(\xi_i; 0, 1)\, N(z_i; z_{i0}, s_z^2)\, p(y_i | w_i, z_i)
-
-    The sampler's coordinates of a particle are standard normal numbers that `draw_latent` maps to its deviations and
-    zero; the volume of that map is part of the density, which is therefore the plain one, whatever the summaries are.
-    """
-    d, count, k = mode.shape[0], len(exact.tests), exact.scatter.size
-
-    def place(position):
-        free, rest = position[:d], position[d:].reshape(count, k + 1)
-        population, prior = constrain(free, numbers, exact.scatter)
-        return population, prior, exact.draw(population, rest[:, :k], rest[:, k])
-
-    def log_density(position):
-        population, prior, drawn = place(position)
-        likelihood = jnp.sum(exact.log_likelihood(population, drawn.latent, drawn.zero))
-        return prior + likelihood - 0.5 * jnp.sum(drawn.deviations**2) + jnp.sum(drawn.log_volume)
-
-    size = d + count * (k + 1)
-    factor = jnp.eye(size).at[:d, :d].set(jnp.linalg.cholesky(covariance))
-    centre = jnp.zeros(size).at[:d].set(mode)
-    run = sample(keys, log_density, centre, factor, warmup=warmup, draws=draws, accept=accept)
-
-    def latents(position):
-        _, _, drawn = place(position)
-        return drawn.latent, drawn.zero, drawn.log_likelihood
-
-    particles = jax.lax.map(lambda chain: jax.vmap(latents)(chain), run.position)
-    return run, run.position[..., :d], *particles
+    # Arrays without an entry are left out: `map` cannot cut them in batches.
+    latent, theta, *rest = jax.lax.map(one, (each, jnp.arange(draws)), batch_size=batch)
+    return ParticleDraws(latent, jnp.zeros((draws, count, 0)) if theta is None else theta, *rest)

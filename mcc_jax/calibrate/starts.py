@@ -78,7 +78,7 @@ def start_of_effects(
     """
     candidates = [(v, further) for v in model.effects for further in v.grid()]
     effects = tuple(v.build(0.0, **further) for v, further in candidates)
-    kinds = effects, model.forms, model.zero_sd, model.correlation, model.along
+    kinds = effects, model.forms, model.zero_prior[1], model.correlation, model.along
     cut = blocks.cut
     found = blocks.whole(blocks.each(_score, cut(point), cut(tests), linear, cut(noise), *kinds))
     score, information = np.asarray(found)[: count_of(tests)].sum(0).T
