@@ -3,6 +3,8 @@
     uv run python benchmarks/house.py            the working tree
     uv run python benchmarks/house.py COMMIT     that commit beside it
 
+The old engine of discovery is a row of its own outside the totals: it is to be deleted as a whole.
+
 A constant is a number assigned at module level, each member of a tuple once (redesign's way of counting).
 """
 
@@ -16,6 +18,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = "mcc_jax"
+OUTSIDE = "discover/legacy"
+"""Counted, but in no total."""
 
 
 def git(*arguments: str) -> str:
@@ -50,7 +54,8 @@ def house(commit: str | None) -> dict[str, tuple[int, int, int, int]]:
     found: dict[str, list[int]] = defaultdict(lambda: [0, 0, 0, 0])
     for name, text in sources(commit).items():
         parts = name.split("/")
-        for package in (parts[1] if len(parts) > 2 else "(root)", "all"):
+        of = (parts[1] if len(parts) > 2 else "(root)", "all")
+        for package in (OUTSIDE,) if name.startswith(f"{PACKAGE}/{OUTSIDE}/") else of:
             lines, own = text.count("\n"), found[package]
             own[0], own[1], own[2], own[3] = own[0] + lines, own[1] + 1, own[2] + constants(text), max(own[3], lines)
     return {
@@ -65,7 +70,7 @@ def main() -> None:
     now = house(None)
     before = house(commit) if commit else {}
     print("| package | lines | files | constants | longest file |\n|---|---|---|---|---|")
-    for name in sorted({*now, *before}, key=lambda n: (n == "all", n)):
+    for name in sorted({*now, *before}, key=lambda n: (n == OUTSIDE, n == "all", n)):
         old, new = before.get(name, (0, 0, 0, 0)), now.get(name, (0, 0, 0, 0))
         cells = [f"{a} -> {b}" if commit else f"{b}" for a, b in zip(old, new, strict=True)]
         print(f"| {name} | {' | '.join(cells)} |")

@@ -112,6 +112,7 @@ def test_a_discovery_comes_back_with_its_law(tmp_path):
     again = mcc.load(tmp_path)
     assert encode(again) == encode(found)
     assert again.to_json() == found.to_json()
+    assert type(again.base.model) is mcc.JointModel
     law = again.law()
     assert [effect.name for effect in law.effects] == ["frame_compliance:linear"]
     force, time = jnp.linspace(0.0, 100.0, 30), jnp.arange(30.0)

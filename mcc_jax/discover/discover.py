@@ -12,9 +12,7 @@ import numpy as np
 from .. import arguments
 from .._errors import InputError
 from ..calibrate import JointModel
-from ..calibrate.data import ranges_um, root_mean_squares
 from ..calibrate.judgement import unlike_others
-from ..calibrate.model import checked_settings
 from ..campaign import Campaign, Finding, available_data, campaign_findings, check_plausibility, check_tests
 from ..campaign.quality import named
 from ..effects import LIBRARY, Mechanism
@@ -27,6 +25,8 @@ from .estimates import detection_limits, estimated_effects, population_parameter
 from .evidence import Ranking, random_probability, rank
 from .experiments import next_experiments
 from .extensions import Extensions, serious
+from .legacy.data import ranges_um, root_mean_squares
+from .legacy.settings import checked_settings
 from .linear_model import Base, Signals, System, base_fit, build_system, signals_of
 from .model_selection import chooser, name_missing, span_of
 from .noise_estimation import refined
@@ -86,7 +86,7 @@ def discover(
     """
     started = time.perf_counter()
     campaign = check_tests(campaign)
-    tell, assumed, threshold_MPa = checked_settings(progress, model, threshold_MPa, None)
+    tell, assumed, threshold_MPa = checked_settings(progress, model, threshold_MPa)
     seed = arguments.seed(seed)
     for name, value in (("confirm", confirm), ("experiments", experiments), ("posterior", posterior)):
         arguments.flag(value, name)

@@ -102,9 +102,9 @@ def detection_limits(system: System, view: Projection, ranking: Ranking) -> dict
 
 def population_parameters(base: Base, view: Projection | None, shift: np.ndarray | None = None) -> dict[str, Any]:
     """The population's parameters, moved as a linear system says, which itself may stand a shift away."""
-    from ..calibrate.fit import population_at
+    from .legacy.fit import population_at
 
-    population = population_at(base.fit.mode, base.fit.numbers, base.model.scatter)
+    population = population_at(base.fit.mode, base.fit.numbers, base.legacy_model.scatter)
     values = np.array([float(population.a), float(population.log_modulus), *np.asarray(population.mu)])
     sd = np.full(len(GLOBALS), np.nan)
     if shift is not None:

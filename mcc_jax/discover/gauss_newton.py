@@ -26,15 +26,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..calibrate.compiling import compiled
-from ..calibrate.fit import population_at
-from ..calibrate.forward import law_of
-from ..calibrate.noise import Whitening
-from ..calibrate.population import Population, Scatter, moments
 from ..effects import AbstractEffect, Nuisance, Record, Variant
 from ..geometry import Particle
 from ..law import Unloading
 from .candidates import Candidate
+from .legacy.compiling import compiled
+from .legacy.fit import population_at
+from .legacy.forward import law_of
+from .legacy.noise import Whitening
+from .legacy.population import Population, Scatter, moments
 from .linear_model import Base, Signals, System, first_loaded, mean_by_globals, steps_of, turning_of
 from .normal_equations import gram_matrices, in_batches
 
@@ -204,7 +204,7 @@ def refit(base: Base, candidates: tuple[Candidate, ...], prior: np.ndarray, curv
     state = State(
         base.fit.latent,
         base.fit.zero,
-        jnp.zeros((len(base.tests), base.model.scatter.size)),
+        jnp.zeros((len(base.tests), base.legacy_model.scatter.size)),
         jnp.zeros(len(prior)),
         jnp.zeros(len(own)),
     )
@@ -252,7 +252,7 @@ def system_at(base: Base, system: System, signals: Signals, chosen: list[int], f
         found.mean - state.latent,
         found.by_globals,
         found.factor,
-        base.model.zero_sd,
+        base.legacy_model.zero_sd,
         state.zero - tests.contact,
     )
     candidates, at = list(system.candidates), np.zeros(len(system.candidates))
@@ -286,11 +286,11 @@ class _Problem:
         self.own = jnp.asarray(own)
         # Slots that are not used are held at zero.
         self.slots = jnp.asarray(np.pad(own, (0, SLOTS - len(own)), constant_values=1.0))
-        self.start = population_at(base.fit.mode, base.fit.numbers, base.model.scatter)
+        self.start = population_at(base.fit.mode, base.fit.numbers, base.legacy_model.scatter)
 
     def population(self, state: State) -> tuple[Array, Array, Array]:
         """Mean of the latent vectors, its derivatives, and the factor of their covariance."""
-        flat, scatter = self.base.tests.flatness, self.base.model.scatter
+        flat, scatter = self.base.tests.flatness, self.base.legacy_model.scatter
         there, mean, factor = _moved(self.start, state.shift, flat, scatter)
         return mean, mean_by_globals(there, flat, scatter), factor
 
@@ -304,7 +304,7 @@ class _Problem:
     def deviance(self, state: State, view: tuple[Array, Array, Array]) -> float:
         """D."""
         base = self.base
-        away = (np.asarray(state.zero) - np.asarray(base.tests.contact)) / float(base.model.zero_sd)
+        away = (np.asarray(state.zero) - np.asarray(base.tests.contact)) / float(base.legacy_model.zero_sd)
         value = float(_squares(view[0], base.fit.filters)) + float(np.sum(np.asarray(state.deviations) ** 2))
         value += float(np.sum(away**2)) + float(np.sum(np.asarray(self.prior) * np.asarray(state.shift) ** 2))
         value += float(np.sum(np.asarray(self.own) * np.asarray(state.theta) ** 2))
@@ -335,7 +335,7 @@ class _Problem:
             mean - state.latent,
             slope,
             factor,
-            base.model.zero_sd,
+            base.legacy_model.zero_sd,
             state.zero - base.tests.contact,
             state.shift,
             self.prior,

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..calibrate.compiling import compiled
+from .legacy.compiling import compiled
 from .normal_equations import in_batches, own_rows
 
 

@@ -25,15 +25,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..calibrate import JointModel
-from ..calibrate.compiling import compiled
-from ..calibrate.data import Selection, Tests, longer
-from ..calibrate.fit import population_at, prepare
-from ..calibrate.forward import law_of, snap
-from ..calibrate.linearise import linear_data
-from ..calibrate.model import JointFit
-from ..calibrate.noise import Linear, Whitening
-from ..calibrate.population import Population, Scatter, moments
-from ..calibrate.sharding import Blocks, block_size, filled_up
 from ..campaign import Campaign, campaign_segments, record_batch
 from ..effects import LIBRARY, Context, Mechanism, Record
 from ..geometry import Particle
@@ -41,6 +32,17 @@ from ..law import Unloading, signatures
 from .candidates import Candidate, candidates_of
 from .dictionary import GAUGE, ROOM, Feature, map_features, values_of, words
 from .laplace_correction import Turned, by_latent, turning
+from .legacy.compiling import compiled
+from .legacy.data import Selection, Tests, longer
+from .legacy.fit import population_at, prepare
+from .legacy.forward import law_of, snap
+from .legacy.linearise import linear_data
+from .legacy.model import JointFit
+from .legacy.model import JointModel as LegacyModel
+from .legacy.noise import Linear, Whitening
+from .legacy.population import Population, Scatter, moments
+from .legacy.settings import legacy_model
+from .legacy.sharding import Blocks, block_size, filled_up
 from .normal_equations import gram_matrices, in_batches
 from .pop_in import Steps, is_step
 
@@ -210,6 +212,11 @@ class Base:
         """The arrays of the tests."""
         return self.selection.tests
 
+    @property
+    def legacy_model(self) -> LegacyModel:
+        """What was assumed, as the fit takes it."""
+        return legacy_model(self.model)
+
     def name_of(self, row: int) -> str:
         """Name of a particle that took part, by its row."""
         return self.campaign.particles[self.selection.kept[row]]
@@ -226,7 +233,7 @@ class Base:
         tests, blocks = self.filled()
         own = self.fit.latent if latent is None else latent
         at = (blocks.cut(v) for v in longer((own, self.fit.zero), len(tests)))
-        data = blocks.each(linear_data, *at, blocks.cut(tests), self.model.zero_sd, self.model.unloading)
+        data = blocks.each(linear_data, *at, blocks.cut(tests), self.legacy_model.zero_sd, self.model.unloading)
         return jax.tree.map(lambda x: x[: len(self.tests)], blocks.whole(data))
 
 
@@ -234,7 +241,7 @@ def base_fit(
     campaign: Campaign, model: JointModel, *, threshold_MPa: float, tell: Callable[[str], None] = lambda _: None
 ) -> Base:
     """Fit the base law with everything natural free: every particle's coefficients and modulus, and the noise."""
-    selection, _, fit, _ = prepare(campaign, model, threshold_MPa, tell=tell)
+    selection, _, fit, _ = prepare(campaign, legacy_model(model), threshold_MPa, tell=tell)
     own = fit.first(len(selection.kept))
     return Base(campaign, selection, model, own, records_of(campaign, selection), threshold_MPa)
 
@@ -350,7 +357,7 @@ def build_system(base: Base, signals: Signals) -> System:
     """The linear system of a fitted campaign."""
     candidates, places, some = signals.candidates, map_features(), words()
     fit, tests = base.fit, base.tests
-    scatter = base.model.scatter
+    scatter = base.legacy_model.scatter
     population = population_at(fit.mode, fit.numbers, scatter)
     data = base.linear()
     flat = tests.flatness
@@ -369,7 +376,7 @@ def build_system(base: Base, signals: Signals) -> System:
         mean - fit.latent,
         by_globals,
         factor,
-        base.model.zero_sd,
+        base.legacy_model.zero_sd,
         fit.zero - tests.contact,
     )
     top = jnp.max(tests.force, axis=1)
@@ -402,7 +409,7 @@ def turning_of(base: Base, signals: Signals, jacobian: Array, by_globals: Array,
     count = factor.shape[-1] + 1 + 1 + by_globals.shape[-1] + signals.added.shape[1] + signals.seen.shape[1]
     if signals.turned is None:
         return np.zeros((len(base.tests), count))
-    own = (base.tests.mask, base.fit.filters, factor, by_globals, base.model.zero_sd)
+    own = (base.tests.mask, base.fit.filters, factor, by_globals, base.legacy_model.zero_sd)
     return turning(jacobian, signals.turned, *own)
 
 

@@ -13,12 +13,13 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 
-from ..calibrate.data import longer
-from ..calibrate.linearise import linear_data, summarise
-from ..calibrate.noise import Noise, Whitening, estimate_noise, particle_scales
-from ..calibrate.population import Summary
-from ..calibrate.sharding import Parts
-from ..calibrate.transforms import LogPosterior, most_probable
+from .legacy.data import longer
+from .legacy.linearise import linear_data, summarise
+from .legacy.noise import Noise, Whitening, estimate_noise, particle_scales
+from .legacy.population import Summary
+from .legacy.settings import noise_prior
+from .legacy.sharding import Parts
+from .legacy.transforms import LogPosterior, most_probable
 from .linear_model import Base, Signals, System
 from .score import project
 
@@ -91,7 +92,7 @@ def refined(base: Base, system: System, signals: Signals) -> tuple[Base, bool]:
     columns, theta = systematic(system)
     if not len(columns):
         return base, False
-    fit, model, count = base.fit, base.model, len(base.tests)
+    fit, model, count = base.fit, base.legacy_model, len(base.tests)
     # Filled up as for the fit itself: everything is compiled already.
     tests, blocks = base.filled()
     gap = jnp.einsum("k,nkp->np", jnp.asarray(theta), signals.of(columns))
@@ -107,7 +108,7 @@ def refined(base: Base, system: System, signals: Signals) -> tuple[Base, bool]:
         return summary, filters
 
     start = replace(fit.noise, scale=scale)
-    noise, _, fine = estimate_noise(data, model.chosen_priors.noise, start, uncertainty=False, blocks=blocks)
+    noise, _, fine = estimate_noise(data, noise_prior(model.chosen_priors), start, uncertainty=False, blocks=blocks)
     summary, filters = summarised(noise)
     old = np.asarray(noise.scale)
     parts = (old, _least_squares(summary), np.asarray(summary.count) - 4)

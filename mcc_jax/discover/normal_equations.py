@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..calibrate.compiling import compiled
+from .legacy.compiling import compiled
 
 BATCH = 20
 """Particles at a time: campaigns of any number share what is compiled."""

@@ -13,17 +13,17 @@ import numpy as np
 from .. import arguments
 from .._errors import InputError
 from ..calibrate import JointModel
-from ..calibrate.data import Tests, select_tests
 from ..calibrate.estimates import finite
-from ..calibrate.forward import law_of
-from ..calibrate.linearise import linear_data, summarise
-from ..calibrate.model import checked_settings
-from ..calibrate.noise import Noise
 from ..campaign import Campaign, Curve, Metadata, available_data, check_campaign
 from ..effects import LIBRARY, Mechanism
 from ..effects.library import checked_library
 from ..simulate import Programme, simulate_campaign
 from .candidates import untestable
+from .legacy.data import Tests, select_tests
+from .legacy.forward import law_of
+from .legacy.linearise import linear_data, summarise
+from .legacy.noise import Noise
+from .legacy.settings import checked_settings
 from .linear_model import Base, System, base_fit, build_system, records_of, signals_of
 from .score import DETECTABLE, project
 
@@ -76,7 +76,7 @@ def planned_base(base: Base, plan: Plan) -> Base:
 
 
 def _expected(campaign: Campaign, base: Base, latent, noise: Noise) -> Base:
-    fit, model = base.fit, base.model
+    fit, model = base.fit, base.legacy_model
     selection = select_tests(campaign, threshold_MPa=base.threshold_MPa)
     kept = np.asarray(selection.kept)
     tests: Tests = selection.tests
@@ -92,7 +92,7 @@ def _expected(campaign: Campaign, base: Base, latent, noise: Noise) -> Base:
         fit,
         (noise, filters, latent, zero, data.residual, summary, numbers),
     )
-    return Base(campaign, selection, model, new, records_of(campaign, selection), base.threshold_MPa)
+    return Base(campaign, selection, base.model, new, records_of(campaign, selection), base.threshold_MPa)
 
 
 def planned_system(base: Base, plan: Plan, library: Mapping[str, Mechanism]) -> System:
@@ -187,9 +187,9 @@ def power(
         base: a fitted campaign, of which material and noise are taken.
         library: the mechanisms.
     """
-    from ..calibrate.fit import population_at
-    from ..calibrate.population import moments
     from ..campaign import particle_batch
+    from .legacy.fit import population_at
+    from .legacy.population import moments
 
     diameters_um = arguments.diameters(diameters_um)
     peaks_mN = arguments.floats(peaks_mN, "peaks_mN", shape="the largest force of every particle, shape (N,)")
@@ -200,8 +200,8 @@ def power(
     checked_library(library)
     particles = particle_batch(diameters_um)
     flat = eqx.filter_vmap(lambda particle: particle.flatness)(particles)
-    population = population_at(base.fit.mode, base.fit.numbers, base.model.scatter)
-    latent, _ = moments(population, flat, base.model.scatter)
+    population = population_at(base.fit.mode, base.fit.numbers, base.legacy_model.scatter)
+    latent, _ = moments(population, flat, base.legacy_model.scatter)
     laws = eqx.filter_vmap(lambda w: law_of(w, base.model.unloading))(latent)
     campaign = planned_campaign(laws, np.asarray(diameters_um, float), np.asarray(peaks_mN, float), plan)
     noise = eqx.tree_at(lambda n: n.scale, base.fit.noise, jnp.ones(len(diameters_um)))
@@ -232,7 +232,7 @@ def power_of_campaign(
     """
     check_campaign(campaign)
     checked_library(library)
-    tell, assumed, threshold_MPa = checked_settings(progress, model, threshold_MPa, None)
+    tell, assumed, threshold_MPa = checked_settings(progress, model, threshold_MPa)
     assumed = replace(assumed, modulus_scatter=True)
     base = base_fit(campaign, assumed, threshold_MPa=threshold_MPa, tell=tell)
     tell("signatures of all effects")

@@ -9,7 +9,7 @@ score and squares,
     \delta = \theta - \hat\theta
 
 so the population and :math:`\theta` are sampled together with the particles integrated out, as without effects
-(`calibrate.sampling`); the particles are drawn back, and the weights that make the draws exact come from the
+(`legacy.sampling`); the particles are drawn back, and the weights that make the draws exact come from the
 extended law itself.
 """
 
@@ -25,21 +25,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from ..calibrate.compiling import compiled
-from ..calibrate.draws import Length, draw_around
 from ..calibrate.estimates import finite
-from ..calibrate.fit import population_at
-from ..calibrate.forward import law_of
-from ..calibrate.linearise import careful_enough, linear_data, summarise
-from ..calibrate.noise import Whitening
-from ..calibrate.population import Population, Summary, marginal_likelihood
-from ..calibrate.posterior import ESS_LEAST, RHAT_MOST, population_json, unmixed
-from ..calibrate.sampling import ExactLikelihood
-from ..calibrate.sharding import count_of
-from ..calibrate.transforms import LogPosterior, constrain, most_probable, unconstrain
-from ..calibrate.weights import PARETO_K_MOST
 from ..effects import Record
 from .gauss_newton import Formula, Refit, effects_of, slices
+from .legacy.compiling import compiled
+from .legacy.diagnostics import ESS_LEAST, RHAT_MOST, population_json, unmixed
+from .legacy.draws import Length, draw_around
+from .legacy.fit import population_at
+from .legacy.forward import law_of
+from .legacy.linearise import careful_enough, linear_data, summarise
+from .legacy.noise import Whitening
+from .legacy.population import Population, Summary, marginal_likelihood
+from .legacy.sampling import ExactLikelihood
+from .legacy.sharding import count_of
+from .legacy.transforms import LogPosterior, constrain, most_probable, unconstrain
+from .legacy.weights import PARETO_K_MOST
 from .linear_model import Base
 
 LENGTH = Length(4, 300, 1000)
@@ -239,7 +239,7 @@ def extended_posterior(base: Base, found: Refit, *, length: Length = LENGTH, see
         length: chains, warm-up and draws.
         seed: random seed.
     """
-    fit, tests, model, state = base.fit, base.tests, base.model, found.state
+    fit, tests, model, state = base.fit, base.tests, base.legacy_model, found.state
     zero_sd = model.zero_sd
     data = linear_data(fit.latent, fit.zero, tests, zero_sd, model.unloading)
     data = eqx.tree_at(lambda d: (d.residual, d.jacobian), data, (found.residual, found.jacobian))

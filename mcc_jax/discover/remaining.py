@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..calibrate.compiling import compiled
-from ..calibrate.fit import population_at
-from ..calibrate.population import moments
 from .evidence import Ranking
 from .gauss_newton import Refit
+from .legacy.compiling import compiled
+from .legacy.fit import population_at
+from .legacy.population import moments
 from .linear_model import GLOBALS, Base, Signals, System, feature_values, mean_by_globals, whitened
 from .normal_equations import common_rows, in_batches, own_rows
 from .score import project
@@ -100,7 +100,7 @@ def residuals(
 
 def _to_first_order(base: Base, system: System, signals: Signals, inside: np.ndarray, words: np.ndarray) -> Array:
     """Residuals with the population moved and columns added as the linear system says, every particle fitted anew."""
-    fit, tests, scatter = base.fit, base.tests, base.model.scatter
+    fit, tests, scatter = base.fit, base.tests, base.legacy_model.scatter
     theta = project(system, inside[:0], inside=np.concatenate([inside, words]).astype(int)).theta
     shift, effects, formula = np.split(theta, np.cumsum([len(GLOBALS), len(inside)]))
     extra = jnp.einsum("k,nkp->np", effects, signals.of(inside))
@@ -111,7 +111,7 @@ def _to_first_order(base: Base, system: System, signals: Signals, inside: np.nda
     mean, factor = moments(population, tests.flatness, scatter)
     rows = (data.residual, data.jacobian, fit.filters, mean - fit.latent, fit.zero - tests.contact)
     slope = mean_by_globals(population, tests.flatness, scatter)
-    moved, zero_sd = np.tile(shift, (len(tests), 1)), np.full(len(tests), float(base.model.zero_sd))
+    moved, zero_sd = np.tile(shift, (len(tests), 1)), np.full(len(tests), float(base.legacy_model.zero_sd))
     return in_batches(_fitted, (*rows, slope, factor, moved, jnp.where(tests.mask, extra, 0.0), zero_sd))
 
 

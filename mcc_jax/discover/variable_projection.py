@@ -22,14 +22,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..calibrate.compiling import compiled
-from ..calibrate.fit import population_at
-from ..calibrate.noise import Whitening
-from ..calibrate.population import moments
 from ..effects import Context
 from ..law import Unloading
 from .dictionary import Feature, Form, further_words
 from .forward_selection import MAX_WORDS
+from .legacy.compiling import compiled
+from .legacy.fit import population_at
+from .legacy.noise import Whitening
+from .legacy.population import moments
 from .linear_model import Base, Signals, System, feature_values, law_of, mean_by_globals
 from .normal_equations import common_rows, in_batches, own_rows
 
@@ -97,14 +97,14 @@ class Tuner:
             signals: what effects and features add in it.
             system: its linear system.
         """
-        fit, tests, scatter = base.fit, base.tests, base.model.scatter
+        fit, tests, scatter = base.fit, base.tests, base.legacy_model.scatter
         population = population_at(fit.mode, fit.numbers, scatter)
         flat, data = tests.flatness, base.linear()
         mean, factor = moments(population, flat, scatter)
         by_globals = mean_by_globals(population, flat, scatter)
         contexts = partial(_contexts, unloading=base.model.unloading)
         seen = in_batches(contexts, (fit.latent, tests.particle, base.records)), tests.mask
-        self._rows = _Rows(seen, (data.jacobian, fit.filters, factor), base.model.zero_sd)
+        self._rows = _Rows(seen, (data.jacobian, fit.filters, factor), base.legacy_model.zero_sd)
         self._prior = system.prior
         away = mean - fit.latent, fit.zero - tests.contact
         self._fixed = self._rows.reduced(in_batches(_fixed, (data.residual, data.jacobian, *away, by_globals)))[0]

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from campaigns import cached, refined_system
 
-from mcc_jax.calibrate.draws import Length
-from mcc_jax.calibrate.linearise import linear_data, summarise
 from mcc_jax.discover import discover
 from mcc_jax.discover.extensions import Extensions
+from mcc_jax.discover.legacy.draws import Length
+from mcc_jax.discover.legacy.linearise import linear_data, summarise
 from mcc_jax.discover.posterior import _movable, extended_posterior
 from mcc_jax.effects import LIBRARY
 
@@ -38,7 +38,7 @@ def posterior(extended):
 @pytest.mark.long
 def test_moved_summaries_are_those_of_moved_residuals(extended):
     base, found = extended
-    fit, tests, state, zero_sd = base.fit, base.tests, found.state, base.model.zero_sd
+    fit, tests, state, zero_sd = base.fit, base.tests, found.state, base.legacy_model.zero_sd
     data = linear_data(fit.latent, fit.zero, tests, zero_sd, base.model.unloading)
 
     def at(residual):

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from scipy.stats import norm
 from scipy.stats import t as student
 
-from mcc_jax.calibrate.fit import population_at
-from mcc_jax.calibrate.population import moments
 from mcc_jax.campaign import Campaign
 from mcc_jax.discover import discover
 from mcc_jax.discover.evidence import evidence_of_steps, jumps, random_probability
+from mcc_jax.discover.legacy.fit import population_at
+from mcc_jax.discover.legacy.population import moments
 from mcc_jax.discover.linear_model import base_fit, build_system, first_loaded, signals_of
 from mcc_jax.discover.pop_in import ODD, over_tests, tamed
 from mcc_jax.discover.score import project
@@ -61,12 +61,12 @@ def whole():
 def test_steps_are_columns_like_any_other(broken, particle):
     """Against dense matrices: the particle's own parameters integrated out of whitened steps."""
     base, system, _ = broken
-    fit, tests, scatter = base.fit, base.tests, base.model.scatter
+    fit, tests, scatter = base.fit, base.tests, base.legacy_model.scatter
     data = base.linear()
     _, factor = moments(population_at(fit.mode, fit.numbers, scatter), tests.flatness, scatter)
     white = jax.tree.map(lambda leaf: leaf[particle], fit.filters)
     J, S = np.asarray(data.jacobian[particle]), np.asarray(factor[particle])
-    own = np.column_stack([J[:, :4] @ S, float(base.model.zero_sd) * J[:, 4]])
+    own = np.column_stack([J[:, :4] @ S, float(base.legacy_model.zero_sd) * J[:, 4]])
     used = np.asarray(tests.mask[particle])
     first = np.asarray(first_loaded(tests))[particle]
     count = len(used)

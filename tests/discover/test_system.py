@@ -10,11 +10,11 @@ import pytest
 from campaigns import campaign
 
 from mcc_jax.calibrate import JointModel
-from mcc_jax.calibrate.fit import population_at
-from mcc_jax.calibrate.forward import law_of, raw_residual
-from mcc_jax.calibrate.population import moments
 from mcc_jax.campaign import THRESHOLD_MPA
 from mcc_jax.discover.discrepancy import Closure
+from mcc_jax.discover.legacy.fit import population_at
+from mcc_jax.discover.legacy.forward import law_of, raw_residual
+from mcc_jax.discover.legacy.population import moments
 from mcc_jax.discover.linear_model import base_fit, build_system, signals_of, tails_of
 from mcc_jax.discover.noise_estimation import refined, systematic
 from mcc_jax.discover.normal_equations import BATCH, in_batches
@@ -44,7 +44,7 @@ def fitted():
 def whitened(fitted):
     """Residual, deviations, zero, population and formulas of all particles by differences, whitened."""
     base, signals, _ = fitted
-    fit, tests, scatter = base.fit, base.tests, base.model.scatter
+    fit, tests, scatter = base.fit, base.tests, base.legacy_model.scatter
     population = population_at(fit.mode, fit.numbers, scatter)
 
     def mean_of(step):
@@ -88,7 +88,7 @@ def whitened(fitted):
     def white(column):
         return np.asarray(jax.vmap(lambda f, x: f(x))(fit.filters, column))
 
-    inner = [white(c) for c in (*own, base.model.zero_sd * zero)]
+    inner = [white(c) for c in (*own, base.legacy_model.zero_sd * zero)]
     return np.stack(inner, 2), np.stack([white(c) for c in (first, *by_population, *formulas)], 2)
 
 
@@ -145,7 +145,7 @@ def test_noise_is_what_it_would_be_if_nothing_were_hidden(fitted):
     np.testing.assert_allclose(again.fit.noise.scale, plain.fit.noise.scale, rtol=0.1)
 
     def scatter(b):
-        population = population_at(b.fit.mode, b.fit.numbers, b.model.scatter)
+        population = population_at(b.fit.mode, b.fit.numbers, b.legacy_model.scatter)
         return float(population.modulus_scatter), *np.asarray(population.tau).tolist()
 
     assert scatter(base)[0] > 0.1

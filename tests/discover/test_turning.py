@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from campaigns import MODEL, SINGLE, campaign, monotone_draws, peaks_at
 
-from mcc_jax.calibrate.fit import population_at
-from mcc_jax.calibrate.population import moments
 from mcc_jax.campaign import PAPER_DIAMETERS_UM
+from mcc_jax.discover.legacy.fit import population_at
+from mcc_jax.discover.legacy.population import moments
 from mcc_jax.discover.linear_model import base_fit, build_system, signals_of
 from mcc_jax.discover.normal_equations import own_rows
 from mcc_jax.discover.score import project
@@ -31,8 +31,8 @@ def fitted():
 
 def log_determinant(base, particle, own_change, theta, slopes):
     """Half the logarithm of the curvature's determinant, a particle's own parameters and a column moved."""
-    population = population_at(base.fit.mode, base.fit.numbers, base.model.scatter)
-    factor = moments(population, base.tests.flatness, base.model.scatter)[1]
+    population = population_at(base.fit.mode, base.fit.numbers, base.legacy_model.scatter)
+    factor = moments(population, base.tests.flatness, base.legacy_model.scatter)[1]
     S = factor[particle]
     k = S.shape[-1]
     latent = base.fit.latent.at[particle].add(S @ own_change[:k])
@@ -41,7 +41,7 @@ def log_determinant(base, particle, own_change, theta, slopes):
     rows = own_rows(jnp.concatenate([by_latent, J[:, 4:]], 1), S)
     white = jax.tree.map(lambda leaf: leaf[particle], base.fit.filters)
     X = jax.vmap(white)(jnp.where(base.tests.mask[particle][None], rows, 0.0))
-    prior = jnp.concatenate([jnp.ones(k), 1 / base.model.zero_sd[None] ** 2])
+    prior = jnp.concatenate([jnp.ones(k), 1 / base.legacy_model.zero_sd[None] ** 2])
     return X, float(0.5 * jnp.linalg.slogdet(X @ X.T + jnp.diag(prior))[1]), prior, white
 
 
@@ -51,7 +51,7 @@ def test_curvature_adds_the_slope_of_the_logarithm_of_the_determinant(fitted, pa
     r""":math:`\tfrac12 d\log|H|/d\theta` along :math:`\hat b = -\theta H^{-1} X^T x`, by differences."""
     base, signals, system = fitted
     slopes = signals.turned.signals[particle, :, k]
-    still = jnp.zeros(base.model.scatter.size)
+    still = jnp.zeros(base.legacy_model.scatter.size)
     X, _, prior, white = log_determinant(base, particle, still, 0.0, 0 * slopes)
     x = white(jnp.where(base.tests.mask[particle], signals.added[particle, k], 0.0))
     change = -jnp.linalg.solve(X @ X.T + jnp.diag(prior), X @ x)

@@ -1,0 +1,356 @@
+"""A campaign as the joint calibration sees it: rectangular arrays, and which points and particles take part."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ... import arguments
+from ...calibrate.paper.modulus import MIN_RATIO
+from ...calibrate.paper.prediction import READING_UM, point_noise_um
+from ...campaign import (
+    THRESHOLD_MPA,
+    Campaign,
+    Curve,
+    Segment,
+    campaign_segments,
+    check_tests,
+    particle_batch,
+    stress_and_strain,
+)
+from ...campaign.reasons import SHOWN, below_threshold, far_apart, no_climb, no_loading, refusal, too_few
+from ...geometry import Particle
+
+MIN_POINTS = 12
+"""Fewer usable points than this cannot carry three coefficients, a zero and their noise."""
+
+MAX_POINTS = 400
+"""Longer records are thinned to about so many rows."""
+
+MIN_CLIMB = 8.0
+"""Displacement must grow over loading by this many times its noise, or there is no curve to fit."""
+
+
+class Tests(eqx.Module):
+    """N tests as rectangular arrays; shorter ones are padded with their last point, which is masked.
+
+    Attributes:
+        particle: sizes and shapes, leading axis N.
+        force: measured force [mN].
+        displacement: measured displacement [um], raw.
+        mask: which points are compared with the law.
+        loading: which of them lie on virgin loading.
+        contact: displacement at which the record says that the platen touches [um].
+        step: share of the peak force passed since the point before [-], the path length of correlated residuals.
+        branch: index of the point at which the largest force so far was reached: shared by the points of an elastic
+            branch.
+        weight: 1 for particles, 0 for copies that only fill up; None where all are particles.
+        force_zero_sd: standard deviation of each test's zero of force [mN]; None where none was measured.
+        peak_sd: standard deviation of the force of each point's branch peak where it was worked out [mN]; None where
+            all were read.
+    """
+
+    __test__ = False  # no test of ours, whatever pytest thinks of the name
+
+    particle: Particle
+    force: Float[Array, "particles points"]
+    displacement: Float[Array, "particles points"]
+    mask: Bool[Array, "particles points"]
+    loading: Bool[Array, "particles points"]
+    contact: Float[Array, " particles"]
+    step: Float[Array, "particles points"]
+    branch: Int[Array, "particles points"]
+    weight: Float[Array, " particles"] | None = None
+    force_zero_sd: Float[Array, " particles"] | None = None
+    peak_sd: Float[Array, "particles points"] | None = None
+
+    def __len__(self) -> int:
+        return self.force.shape[0]
+
+    @property
+    def flatness(self) -> Float[Array, " particles"]:
+        """1 - D3^2/(D1 D2) of every particle [-], through which `a` acts."""
+        return eqx.filter_vmap(lambda particle: particle.flatness)(self.particle)
+
+    @property
+    def effective_diameter(self) -> Float[Array, " particles"]:
+        """D1 D2/D3 of every particle [um]."""
+        return eqx.filter_vmap(lambda particle: particle.effective_diameter)(self.particle)
+
+
+def enlarged(tests: Tests, particles: int) -> Tests:
+    """The same tests among as many: copies of the last particle are added that count for nothing.
+
+    Every particle gets a weight, whether copies are needed or not: one kind of arrays, one compilation.
+    """
+    weight = np.ones(len(tests)) if tests.weight is None else np.asarray(tests.weight)
+    return replace(longer(tests, particles), weight=jnp.asarray(np.pad(weight, (0, particles - len(tests)))))
+
+
+def longer(tree: Any, particles: int) -> Any:
+    """Arrays over as many particles; copies of the last one are added."""
+
+    def one(x: Any) -> Array:
+        x = np.asarray(x)
+        more = particles - len(x)
+        return jnp.asarray(np.pad(x, [(0, more)] + [(0, 0)] * (x.ndim - 1), mode="edge") if more else x)
+
+    return jax.tree.map(one, tree)
+
+
+LENGTHS = (64, 128, 192, 320, 448)
+"""Numbers of points that records are padded to, and beyond them in steps of the last: campaigns of similar length
+share one compilation."""
+
+
+def padded_length(points: int) -> int:
+    """The length that records of so many points are padded to."""
+    return next((length for length in LENGTHS if length >= points), points + -points % LENGTHS[-1])
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Which particles take part, and which points of each.
+
+    Attributes:
+        tests: the arrays of those that do.
+        kept: their positions in the campaign.
+        why_not: for each particle of the campaign, None if kept, else the reason.
+        rows: for each kept particle, the rows of its curve, as `check_tests` left it, that stand in `tests`.
+        notes: what a reader must know about particles that are kept.
+    """
+
+    tests: Tests
+    kept: tuple[int, ...]
+    why_not: tuple[str | None, ...]
+    rows: tuple[np.ndarray, ...]
+    notes: tuple[str, ...]
+
+
+def select_tests(
+    campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_points: int = MAX_POINTS
+) -> Selection:
+    """Choose what the joint calibration uses.
+
+    Points count from the threshold stress on, below which surface asperities and not the particle deform. On unloading
+    and reloading they count from `MIN_RATIO` of the peak, below which displacement depends on force with an infinite
+    slope. The approach never counts. Of longer records every n-th row is used, turning points always.
+
+    Args:
+        campaign: the tests.
+        threshold_MPa: stress of the threshold [MPa].
+        most_points: thin records longer than this.
+
+    Raises:
+        InputError: if no particle can be used.
+        InputError: for a threshold that is negative or not finite.
+        RuntimeError: in single precision.
+    """
+    campaign = check_tests(campaign)
+    threshold_MPa = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
+    if not jax.config.read("jax_enable_x64"):
+        raise RuntimeError(
+            "the joint calibration needs double precision; "
+            'call jax.config.update("jax_enable_x64", True) before anything else'
+        )
+    segments = campaign_segments(campaign)
+    prepared = [
+        _prepare(curve, diameters, parts, threshold_MPa, most_points)
+        for curve, diameters, parts in zip(campaign.curves, campaign.diameters_um, segments, strict=True)
+    ]
+    stress = [None if isinstance(one, str) else one.stress_max_MPa for one in prepared]
+    strain = [None if isinstance(one, str) else one.strain_range for one in prepared]
+    prepared = [apart or one for one, apart in zip(prepared, far_apart(stress, strain), strict=True)]
+    why_not = tuple(one if isinstance(one, str) else None for one in prepared)
+    kept = tuple(i for i, one in enumerate(prepared) if not isinstance(one, str))
+    if not kept:
+        raise refusal(campaign, "no particle can be used", why_not)
+    used = [one for one in prepared if not isinstance(one, str)]
+    longest = padded_length(max(len(one.rows) for one in used))
+
+    def padded(values: list[np.ndarray], fill: str) -> np.ndarray:
+        options = {"mode": "edge"} if fill == "edge" else {"mode": "constant", "constant_values": False}
+        return np.stack([np.pad(v, (0, longest - len(v)), **options) for v in values])  # pyright: ignore[reportCallIssue, reportArgumentType]
+
+    curves = [campaign.curves[i] for i in kept]
+    force = padded([c.force_mN[one.rows] for c, one in zip(curves, used, strict=True)], "edge").astype(float)
+    largest = force.max(axis=1, keepdims=True)
+    branch = _branches(force)
+    tests = Tests(
+        particle_batch(campaign.diameters_um[list(kept)]),
+        jnp.asarray(force),
+        jnp.asarray(padded([c.displacement_um[one.rows] for c, one in zip(curves, used, strict=True)], "edge"), float),
+        jnp.asarray(padded([one.mask for one in used], "false")),
+        jnp.asarray(padded([one.loading for one in used], "false")),
+        jnp.asarray([one.contact for one in used]),
+        jnp.asarray(np.abs(np.diff(force, axis=1, prepend=force[:, :1])) / largest),
+        jnp.asarray(branch),
+        None,
+        *_errors_of_force(curves, used, branch),
+    )
+    return Selection(
+        tests, kept, why_not, tuple(one.rows for one in used), tuple(_notes(campaign, kept, used, most_points))
+    )
+
+
+def compared_rows(selection: Selection) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    """Rows of every kept particle's curve, and which of them are compared, by its place in the campaign."""
+    mask = np.asarray(selection.tests.mask)
+    both = zip(selection.kept, selection.rows, mask, strict=True)
+    return {place: (rows, used[: len(rows)]) for place, rows, used in both}
+
+
+def _errors_of_force(
+    curves: Sequence[Curve], used: Sequence[_Prepared], branch: np.ndarray
+) -> tuple[Array | None, Array | None]:
+    """Errors of the zeros of force, and of the peaks of branches that were worked out; None where there are none."""
+    checked = [c.checked for c in curves]
+    zero = np.array([0.0 if one is None else one.force_zero_sd_mN for one in checked])
+    peak = np.zeros(branch.shape)
+    for row, (one, of) in enumerate(zip(checked, used, strict=True)):
+        if one is not None:
+            peak[row, : len(of.rows)] = one.force_sd_mN[of.rows]
+    peak = np.take_along_axis(peak, branch, axis=1)
+    return (jnp.asarray(zero) if zero.any() else None), (jnp.asarray(peak) if peak.any() else None)
+
+
+def _branches(force: np.ndarray) -> np.ndarray:
+    """Index of the point at which the largest force so far was reached."""
+    record = force >= np.maximum.accumulate(force, axis=1)
+    return np.maximum.accumulate(np.where(record, np.arange(force.shape[1]), 0), axis=1)
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    rows: np.ndarray
+    mask: np.ndarray
+    loading: np.ndarray
+    contact: float
+    stress_max_MPa: float
+    strain_range: float
+    unloading_hidden: bool
+
+
+TURNS_SHARE = 4
+"""Of records with more segments than one for so many rows that are kept, hundreds of cycles, whole cycles are left out:
+turning points that are always kept would be most of what is left."""
+
+
+def rows_from_contact(curve: Curve, segments: tuple[Segment, ...], most_points: int) -> np.ndarray:
+    """Rows of a test behind its approach; of longer records every n-th, turning points and the largest force always.
+
+    Of hundreds of cycles, whole unloadings and reloadings are left out of longer records, evenly; what they started
+    from stays, and so does the law's state, which knows the largest force only.
+    """
+    first = segments[0]
+    start = first.stop if first.kind == "approach" and len(segments) > 1 else 0
+    rows = np.arange(start, len(curve))
+    if len(rows) <= most_points:
+        return rows
+    turns = [int(np.argmax(curve.force_mN))]
+    if len(segments) <= most_points // TURNS_SHARE:
+        turns += [part.start for part in segments] + [part.stop - 1 for part in segments]
+        thinned = [rows[:: -(-len(rows) // most_points)]]
+    else:
+        elastic = [k for k, part in enumerate(segments) if part.kind in ("hold", "unload", "reload")]
+        some = [segments[k] for k in elastic[:: -(-len(elastic) // (most_points // TURNS_SHARE))]]
+        turns += [part.start for part in some] + [part.stop - 1 for part in some]
+        force = np.asarray(curve.force_mN)
+        # The largest force before each, from which the law unloads.
+        highest = np.maximum.accumulate(np.where(force >= np.maximum.accumulate(force), np.arange(len(force)), 0))
+        turns += [int(highest[part.start]) for part in some]
+        virgin = np.zeros(len(curve), bool)
+        for part in segments:
+            if part.kind == "load":
+                virgin[part.start : part.stop] = True
+        kept = np.zeros(len(curve), bool)
+        for part in some:
+            kept[part.start : part.stop] = True
+        # Half of the rows for each: the one loading of many cycles is short.
+        parts = np.flatnonzero(virgin), np.flatnonzero(kept & ~virgin)
+        thinned = [part[part >= start][:: -(-len(part) * 2 // most_points) or 1] for part in parts]
+    return np.unique(np.concatenate([*thinned, [t for t in turns if t >= start]]).astype(int))
+
+
+def _prepare(
+    curve: Curve, diameters: np.ndarray, segments: tuple[Segment, ...], threshold: float, most_points: int
+) -> _Prepared | str:
+    """The rows of one test that are used, or why there are none."""
+    stress, strain = stress_and_strain(curve, diameters, segments)
+    kind = np.empty(len(curve), dtype="<U8")
+    for part in segments:
+        kind[part.start : part.stop] = part.kind
+    if not (kind == "load").any():
+        return no_loading(curve, segments, stress, threshold)
+    first = segments[0]
+    contact = float(curve.displacement_um[first.stop]) if first.kind == "approach" and len(segments) > 1 else None
+    rows = rows_from_contact(curve, segments, most_points)
+    peak = np.maximum.accumulate(stress[rows])
+    loading = (kind[rows] == "load") & (stress[rows] >= threshold) & (stress[rows] > 0)
+    elastic = np.isin(kind[rows], ("hold", "unload", "reload")) & (stress[rows] >= MIN_RATIO * peak)
+    mask = loading | (elastic & (stress[rows] >= threshold) & (peak > 0))
+    hidden = bool((mask & ~loading).any())
+    mask, loading = mask & curve.compared[rows], loading & curve.compared[rows]
+    hidden &= not (mask & ~loading).any()
+    if stress.max() <= threshold:
+        return below_threshold(float(stress.max()), threshold)
+    if loading.sum() < MIN_POINTS:
+        return too_few(int(loading.sum()), MIN_POINTS)
+    climb = curve.displacement_um[rows[loading]]
+    third = max(len(climb) // 3, 1)
+    rise, noise = climb[-third:].mean() - climb[:third].mean(), max(point_noise_um(curve), READING_UM)
+    if rise <= MIN_CLIMB * noise / np.sqrt(third):
+        return no_climb(float(rise) if rise >= 0 or -rise > MIN_CLIMB * noise / np.sqrt(third) else 0.0)
+    contact = float(curve.displacement_um[0]) if contact is None else contact
+    largest, reach = float(stress[rows][mask].max()), float(np.ptp(strain[rows][mask]))
+    return _Prepared(rows, mask, loading, contact, largest, reach, hidden)
+
+
+def ranges_um(tests: Tests) -> np.ndarray:
+    """Range of the displacements that are compared, of every test [um], shape (N,)."""
+    mask, measured = np.asarray(tests.mask), np.asarray(tests.displacement)
+    return np.where(mask, measured, -np.inf).max(1) - np.where(mask, measured, np.inf).min(1)
+
+
+def root_mean_squares(tests: Tests, residual: Array | np.ndarray) -> np.ndarray:
+    """Root mean square of every test's residuals [um], shape (N,); residuals are 0 where masked."""
+    count = np.maximum(np.asarray(tests.mask).sum(1), 1)
+    return np.sqrt((np.asarray(residual) ** 2).sum(1) / count)
+
+
+def own_misfit(tests: Tests, residual: Float[Array, "particles points"]) -> float:
+    """Median over the particles of the root mean square residual, in shares of the range of displacement [-]."""
+    return float(np.median(root_mean_squares(tests, residual) / np.maximum(ranges_um(tests), 1e-300)))
+
+
+def _notes(campaign: Campaign, kept: tuple[int, ...], used: Sequence[_Prepared], most_points: int):
+    thinned = sum(len(one.rows) < len(campaign.curves[i]) - 1 for i, one in zip(kept, used, strict=True))
+    if any(len(campaign.curves[i]) > most_points for i in kept):
+        yield f"{thinned} records were thinned to about {most_points} rows"
+    pairs = zip(kept, used, strict=True)
+    silent = [(campaign.particles[i], one) for i, one in pairs if not (one.mask & ~one.loading).any()]
+    for hidden, what in ((False, "never unloaded"), (True, "without unloading that can be compared with the law")):
+        names = [repr(name) for name, one in silent if one.unloading_hidden is hidden]
+        more = f", ... ({len(names)} of {len(kept)})" if len(names) > SHOWN else ""
+        if len(names) == 1:
+            yield f"particle {names[0]} is {what}: it says nothing about the modulus"
+        elif names:
+            yield f"particles {', '.join(names[:SHOWN])}{more} are {what}: they say nothing about the modulus"
+    seen: dict[bytes, int] = {}
+    for i in kept:
+        curve = campaign.curves[i]
+        fingerprint = curve.force_mN.tobytes() + curve.displacement_um.tobytes()
+        if fingerprint in seen:
+            first = campaign.particles[seen[fingerprint]]
+            yield (
+                f"particles {first!r} and {campaign.particles[i]!r} have the same curve to the last digit: "
+                "one test counted twice makes everything look too certain"
+            )
+        seen.setdefault(fingerprint, i)

@@ -1,0 +1,195 @@
+"""Every particle by itself: starts without iteration, then its own least squares from several of them."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ..._types import Path, Scalar
+from ...geometry import Particle
+from ...law import Unloading
+from .compiling import compiled
+from .data import Tests
+from .forward import linearise, snap
+from .small_matrices import Cholesky
+
+SHIFTS = 21
+SPREAD = 0.04
+"""Zeros tried lie within this share of the effective diameter around the recorded contact."""
+
+VARIATIONS = ((0.0, 0.0, 0.0), (0.05, -0.1, 0.03), (-0.05, 0.06, -0.02))
+"""What is added to the linear start's b1, b3, b5 for further starts."""
+
+MAX_STEPS, FIRST_STEPS = 200, 10
+"""Most steps of a fit, and how many all particles of many blocks take before the late ones go on by themselves."""
+
+FAR = 4.0
+"""How many times the least sum of squares a fit without an unseen snap-through may leave, to be preferred."""
+
+LEFT_TO_GAIN = 1e-6
+"""Log probability still to gain at which a fit is finished, where residuals are as large as the noise."""
+
+
+class Particles(eqx.Module):
+    """Fits of single particles.
+
+    Attributes:
+        latent: b1, b3, b5, e, shape (N, 4).
+        zero: zero of displacement [um].
+        rms: root mean square residual [um].
+        converged: whether the best start's fit met its tolerances.
+        ends: where the fit from each start ended: b1, b3, b5, e and zero.
+        settled: whether the fits from all starts met their tolerances.
+    """
+
+    latent: Float[Array, "particles 4"]
+    zero: Float[Array, " particles"]
+    rms: Float[Array, " particles"]
+    converged: Bool[Array, " particles"]
+    ends: Float[Array, "particles starts 5"]
+    settled: Bool[Array, " particles"]
+
+
+def _polynomial(x: Path, stress: Path, weight: Path) -> Float[Array, " 3"]:
+    """K1, K3, K5 by linear least squares."""
+    design = jnp.stack([x, -(x**3), x**5], 1) * weight[:, None]
+    scale = jnp.sqrt(jnp.sum(design**2, axis=0)) + 1e-30
+    scaled = design / scale[None]
+    ridge = jnp.eye(3) * 1e-9
+    return Cholesky(scaled.T @ scaled + ridge).solve(scaled.T @ (stress * weight)) / scale
+
+
+def linear_start(
+    particle: Particle, force: Path, measured: Path, loading: Bool[Array, " steps"], contact: Scalar
+) -> tuple[Float[Array, " 3"], Scalar]:
+    """Coefficients (as b) and zero of one particle from its loading, without iteration.
+
+    Stress is linear in the three coefficients at a given zero, so zeros are tried on a grid; deviations of stress are
+    divided by the slope, which makes them deviations of strain.
+    """
+    stress = particle.stress(force)
+    reach = particle.effective_diameter
+    top = jnp.max(jnp.where(loading, stress, 0.0))
+
+    def at(shift):
+        x = jnp.where(loading, (measured - contact) / reach - shift, 0.0)
+        possible = jnp.all(jnp.where(loading, x > 1e-4, True))
+        x = jnp.maximum(x, 1e-4)
+        used = jnp.where(loading, 1.0, 0.0)
+        K = _polynomial(x, stress, used)
+
+        def slope(K):
+            return jnp.maximum(K[0] - 3 * K[1] * x**2 + 5 * K[2] * x**4, 0.05 * top / jnp.max(x))
+
+        for _ in range(2):
+            K = _polynomial(x, stress, used / slope(K))
+        # Each term carries at least a hundredth of the largest stress: logarithms follow.
+        far = jnp.max(x)
+        K = jnp.maximum(K, 0.01 * top / jnp.stack([far, far**3, far**5]))
+        deviation = (K[0] * x - K[1] * x**3 + K[2] * x**5 - stress) / slope(K)
+        return jnp.where(possible, jnp.sum(used * deviation**2), jnp.inf), K
+
+    shifts = jnp.linspace(-SPREAD, SPREAD, SHIFTS)
+    losses, coefficients = jax.vmap(at)(shifts)
+    best = jnp.argmin(losses)
+    K = jnp.where(jnp.isfinite(losses[best]), coefficients[best], jnp.array([6.0, 27.0, 144.0]))
+    return jnp.log(K) / jnp.array([1.0, 3.0, 5.0]), contact + shifts[best] * reach
+
+
+@compiled
+def linear_starts(tests: Tests, log_modulus: Scalar) -> Float[Array, "starts particles 5"]:
+    """Several starts for every particle: the linear one and variations of it."""
+    b, zero = jax.vmap(linear_start)(tests.particle, tests.force, tests.displacement, tests.loading, tests.contact)
+    first = jnp.concatenate([b, jnp.full((len(tests), 1), log_modulus), zero[:, None]], 1)
+    return first[None] + jnp.pad(jnp.asarray(VARIATIONS), ((0, 0), (0, 2)))[:, None]
+
+
+@compiled
+def fit_particles(
+    tests: Tests,
+    noise: Float[Array, " particles"],
+    centre: Float[Array, "particles 4"],
+    width: Float[Array, "particles 4"],
+    zero_sd: Scalar,
+    starts: Float[Array, "starts particles 5"],
+    unloading: Unloading,
+    most_steps: int | Int[Array, ""] = MAX_STEPS,
+) -> Particles:
+    """Fit every particle by itself, its modulus included, from several starts.
+
+    Levenberg-Marquardt for all particles and starts in step, each with a damping of its own: one that has converged
+    waits for the others, so there is one loop whatever their number.
+
+    Args:
+        tests: the measurements.
+        noise: scale of each particle's residuals [um].
+        centre, width: normal prior of each particle's b1, b3, b5, e.
+        zero_sd: how far the zero may lie from the recorded contact [um].
+        starts: b1, b3, b5, e and zero to start from.
+        unloading: form of unloading.
+        most_steps: give up after as many.
+    """
+    count = len(starts)
+
+    def tile(x: Array) -> Array:
+        return jnp.tile(x, (count, *[1] * (x.ndim - 1)))
+
+    many: Tests = jax.tree.map(tile, tests)
+    scale = tile(noise)[:, None]
+    points = jnp.maximum(jnp.sum(many.mask, 1), 1).astype(noise.dtype)
+    middle = jnp.concatenate([tile(centre), many.contact[:, None]], 1)
+    width = jnp.concatenate([tile(width), jnp.full((len(middle), 1), zero_sd)], 1)
+
+    def normal_equations(y):
+        r, J = linearise(y[:, :4], y[:, 4], many, unloading)
+        r, J, away = r / scale, J / scale[..., None], (y - middle) / width
+        H = jnp.einsum("nkp,nkq->npq", J, J) + jnp.eye(5)[None] / width[..., None] ** 2
+        g = jnp.einsum("nkp,nk->np", J, r) + away / width
+        loss = 0.5 * (jnp.sum(r**2, 1) + jnp.sum(away**2, 1))
+        return jnp.where(jnp.isfinite(loss), loss, jnp.inf), g, H
+
+    def step(carry):
+        y, loss, g, H, damping, count, _ = carry
+        diagonal = jnp.diagonal(H, axis1=1, axis2=2)
+        move = -Cholesky(H + jnp.eye(5)[None] * (damping[:, None] * diagonal)[:, None, :]).solve(g)
+        # No logarithm moves by more than a factor of e, no zero by more than a tenth of its prior's reach, at a time.
+        most = jnp.max(jnp.abs(move) / jnp.append(jnp.ones(4), zero_sd)[None], 1)
+        tried = y + move / jnp.maximum(most, 1.0)[:, None]
+        new_loss, new_g, new_H = normal_equations(tried)
+        better = new_loss < loss
+        # What a step would still gain, in units of the scatter that there is: where the law does not describe the
+        # curve, that is many times the noise.
+        scatter = 1 + 2 * jnp.where(jnp.isfinite(loss), loss, 0.0) / points
+        done = (jnp.abs(jnp.einsum("np,np->n", move, g)) < LEFT_TO_GAIN * scatter) | (damping > 1e8)
+
+        def choose(new, old):
+            return jnp.where(better.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+
+        damping = jnp.where(done, damping, jnp.where(better, jnp.maximum(damping / 8, 1e-9), damping * 4))
+        return (*map(choose, (tried, new_loss, new_g, new_H), (y, loss, g, H)), damping, count + 1, done)
+
+    y = starts.reshape(-1, 5)
+    unfinished = jnp.zeros(len(y), bool)
+    # The first pass evaluates the start: an infinite loss accepts whatever comes, and no force moves it.
+    carry = (y, jnp.full(len(y), jnp.inf), jnp.zeros((len(y), 5)), jnp.broadcast_to(jnp.eye(5), (len(y), 5, 5)))
+    carry = (*carry, jnp.full(len(y), 1e-3), 0, unfinished)
+    going = lambda c: (c[5] < 2) | ((c[5] < most_steps) & ~jnp.all(c[6]))  # noqa: E731  # a condition, no function
+    y, loss, _, _, _, _, done = jax.lax.while_loop(going, step, carry)
+    y, loss, done = (v.reshape(count, len(tests), *v.shape[1:]) for v in (y, loss, done))
+    # A snap-through below the first load that counts is no part of the test: nothing shows it. A sharp rise from
+    # nothing is fitted so if it may be, and the fit then presses the snap-through against that first load for good.
+    first = jnp.min(jnp.where(many.mask & many.loading, many.force, jnp.inf), 1)
+    unseen = jax.vmap(snap)(y.reshape(-1, 5)[:, :4], many.particle) < jnp.log(first)
+    seen = jnp.where(unseen.reshape(loss.shape), jnp.inf, loss)
+    # Unless nothing else comes near the data: then the particle has snapped through before anybody looked.
+    near = jnp.min(seen, axis=0) < FAR * jnp.min(loss, axis=0) + FAR
+    best = jnp.argmin(jnp.where(near[None], seen, loss), axis=0)
+
+    def take(values):
+        return jnp.take_along_axis(values, best.reshape(1, -1, *[1] * (values.ndim - 2)), axis=0)[0]
+
+    found = take(y)
+    rms = noise * jnp.sqrt(2 * take(loss) / points[: len(tests)])
+    return Particles(found[:, :4], found[:, 4], rms, take(done), jnp.moveaxis(y, 0, 1), jnp.all(done, 0))
