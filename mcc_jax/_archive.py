@@ -3,7 +3,7 @@
 A value is written as MessagePack. Arrays keep dtype, shape and bytes; an object is the name of its class, its fields
 (but for those whose metadata say `archived=False`: working arrays, which are None when read) and
 the cached properties that its class lists in `archived`, and is built again without running any of its code. Only
-classes of this package are built.
+classes of this package are built, and those of `FOREIGN`.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from .files import LIMITS, read_regular
 
 FORMAT, VERSION = "mcc_jax result", 1
 AGAIN = "Write it again with the command or function that made it, or move it away."
+FOREIGN = ("tinygp.kernels.quasisep", "tinygp.solvers.quasisep")
 _PLAIN = (bool, int, float, str, bytes, type(None))
 
 
@@ -112,8 +113,13 @@ def _array(value: jax.Array | np.ndarray | np.generic, where: str) -> dict[str, 
     return {"array": kind, "dtype": array.dtype.str, "shape": list(array.shape), "bytes": array.tobytes()}
 
 
+def _trusted(module: str) -> bool:
+    """Whether classes of a module are built: this package's, and the factored covariances of tinygp, which are data."""
+    return any(module == one or module.startswith(f"{one}.") for one in (__name__.split(".")[0], *FOREIGN))
+
+
 def _name(kind: type, where: str) -> str:
-    if kind.__module__.split(".")[0] != __name__.split(".")[0] or "<" in kind.__qualname__:
+    if not _trusted(kind.__module__) or "<" in kind.__qualname__:
         raise InputError(
             f"{where} is of the class {kind.__module__}.{kind.__qualname__}, which is not of mcc_jax",
             remedy="Such results cannot be read back; keep the script that makes them.",
@@ -168,7 +174,7 @@ def _built(value: Any) -> Any:
 
 def _class(name: str, base: type) -> Any:
     module, _, path = name.partition(":")
-    if module.split(".")[0] != __name__.split(".")[0]:
+    if not _trusted(module):
         raise TypeError(f"{module} is not of mcc_jax")
     found: Any = importlib.import_module(module)
     for part in path.split("."):

@@ -6,13 +6,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from .. import arguments
-from .population import COEFFICIENTS
+from ..law import MccLaw
+from .compiling import compiled
+from .data import Tests
+from .effects import effect_numbers
+from .mode import log_priors, prior_populations
+from .model import Model
+from .noise import Whitening, standard_promotion
+from .population import COEFFICIENTS, Population, flattened
 from .posterior import BayesCalibration
-from .predict import A_CALIBRATION, predict_measured
-from .priors import LogNormalPrior, NakagamiPrior, NormalPrior, Priors
+from .predict import A_CALIBRATION, laws_with, predict_measured, predicted_by
 
 if TYPE_CHECKING:
     from xarray import DataTree
@@ -45,48 +53,44 @@ MAX_PREDICTIVE = 2_000_000
 """At most as many predicted points are kept: of large campaigns the first particles only."""
 
 
-def prior_draws(priors: Priors, low: float, high: float, shape: tuple[int, int], seed: int) -> dict[str, Any]:
-    """Draws of the population from its prior, by the names of the posterior."""
-    rng = np.random.default_rng(seed)
-
-    def normal(prior: NormalPrior | LogNormalPrior) -> np.ndarray:
-        if isinstance(prior, NormalPrior):
-            return prior.mean + prior.sd * rng.standard_normal(shape)
-        return np.log(prior.median) + prior.log_sd * rng.standard_normal(shape)
-
-    def spread(prior: NakagamiPrior) -> np.ndarray:
-        return prior.sd * np.sqrt(2 * rng.gamma(prior.shape, size=shape))
-
-    from scipy.stats import truncnorm
-
-    bounds = ((low - priors.a.mean) / priors.a.sd, (high - priors.a.mean) / priors.a.sd)
-    a = truncnorm.rvs(*bounds, loc=priors.a.mean, scale=priors.a.sd, size=shape, random_state=rng)
-    mu_1, mu_5, softening = normal(priors.C1), normal(priors.C5), normal(priors.softening)
-    mu_3 = (np.log(20 / 9) + mu_1 + 5 * mu_5 + softening) / 6
-    spreads = (priors.tau_C1, priors.tau_C3, priors.tau_C5)
-    return {
-        "a": a,
-        "effective_modulus_MPa": np.exp(normal(priors.effective_modulus_MPa)),
-        "mu": np.stack([mu_1, mu_3, mu_5], -1),
-        "tau": np.stack([spread(p) for p in spreads], -1),
-        "modulus_scatter": spread(priors.modulus_scatter),
-        "shape_scatter": spread(priors.shape_scatter),
-        "noise_factor": np.exp(normal(priors.noise_factor)),
-    }
+POINT_DRAWS = 250
+"""Draws per chain kept where every point has a likelihood of its own."""
 
 
-def to_arviz(calibration: BayesCalibration, *, prior_count: int = 500, seed: int = 0) -> DataTree:
+def prior_draws(calibration: BayesCalibration, count: int, seed: int) -> dict[str, np.ndarray]:
+    """Draws of the population from its prior, by the names of the posterior, shape (1, count, ...)."""
+    keys = jax.random.split(jax.random.key(seed), count)
+    drawn = prior_populations(keys, calibration.model, calibration.fit.tests.flatness)
+    return _variables(jax.tree.map(lambda x: np.asarray(x)[None], drawn), calibration.model)
+
+
+def _variables(p: Population, model: Model) -> dict[str, np.ndarray]:
+    """The population by the names of the model's sites; of ArviZ's `mu` and `tau` all three in one."""
+    mu, tau = np.asarray(p.mu), np.asarray(p.tau)
+    named = {"a": np.asarray(p.a), "effective_modulus_MPa": np.exp(np.asarray(p.log_modulus)), "mu": mu, "tau": tau}
+    for j, name in enumerate(COEFFICIENTS):
+        named |= {f"{name}_median": np.exp(mu[..., j]), f"tau_{name}": tau[..., j]}
+    for name, there in (("modulus_scatter", model.modulus_scatter), ("shape_scatter", model.shape_scatter)):
+        named |= {name: np.asarray(getattr(p, name))} if there else {}
+    return named | effect_numbers(p, model) | {"noise_factor": np.exp(np.asarray(p.log_noise))}
+
+
+def to_arviz(calibration: BayesCalibration, *, prior_count: int = 500, points: bool = False, seed: int = 0) -> DataTree:
     """The posterior as an ArviZ `DataTree`.
 
-    Groups: `posterior` (population and every particle), `log_likelihood` (variable `test`: each particle's whole test
-    given the population, the particle integrated out, so that ArviZ's `loo` leaves one *particle* out),
-    `sample_stats` (`lp_test`: their sum), `prior`, `prior_predictive` and `posterior_predictive` (displacement at the
-    measured forces),
-    `observed_data`, `constant_data`. Every variable has its unit in its attributes. Padded points are NaN.
+    Groups: `posterior` (population, effects and every particle), `log_likelihood`, `log_prior` (by site), `prior`,
+    `prior_predictive` and `posterior_predictive` (displacement at the measured forces), `sample_stats` (`lp_test`),
+    `observed_data`, `constant_data`. Every variable has its unit in its attributes.
+
+    `log_likelihood` holds the variable `test`: each particle's whole test given the population, the particle integrated
+    out, so that ArviZ's `loo` leaves one *particle* out. With `points` it holds `displacement_um` instead, the density
+    of every reading given those before it and its particle's own numbers, along the dimension `observation`, which
+    observed data and predictions then share; draws are thinned.
 
     Args:
         calibration: the posterior.
         prior_count: draws from the prior.
+        points: likelihoods by reading.
         seed: random seed of prior and predictive draws.
     """
     from arviz_base import from_dict
@@ -94,92 +98,79 @@ def to_arviz(calibration: BayesCalibration, *, prior_count: int = 500, seed: int
     arguments.instance(calibration, BayesCalibration, "calibration", A_CALIBRATION)
     prior_count = arguments.whole(prior_count, "prior_count", least=1)
     seed = arguments.seed(seed)
-    c = calibration
-    named = c.named_population()
-    chains, draws = named["a"].shape
-    particles = list(c.particles)
-    posterior: dict[str, Any] = {
-        "a": named["a"],
-        "effective_modulus_MPa": named["effective_modulus_MPa"],
-        "mu": np.asarray(c.population.mu),
-        "tau": np.asarray(c.population.tau),
-        "yield_stress_MPa": c.yield_stress_MPa(),
-        "noise_factor": named["noise_factor"],
-        "C": c.C,
-        "zero_um": c.zero_um,
-        "eta_p": c.shape_factor,
+    points = arguments.flag(points, "points")
+    c, tests = calibration, calibration.selection.tests
+    particles, mask = list(c.particles), np.asarray(tests.mask)
+    chains, draws = np.asarray(c.population.a).shape
+    thin = slice(None, None, -(-draws // POINT_DRAWS) if points else 1)
+    population = jax.tree.map(lambda x: np.asarray(x)[:, thin], c.population)
+    posterior: dict[str, Any] = _variables(population, c.model) | {
+        "yield_stress_MPa": c.yield_stress_MPa()[:, thin],
+        "C": c.C[:, thin],
+        "zero_um": c.zero_um[:, thin],
+        "eta_p": c.shape_factor[:, thin],
     }
-    for name in ("modulus_scatter", "shape_scatter"):
-        if name in named:
-            posterior[name] = named[name]
     if c.model.modulus_scatter:
-        posterior["particle_modulus_MPa"] = c.modulus_MPa
-    low, high = np.asarray(c.fit.numbers.a)[2:]
-    prior = prior_draws(c.model.chosen_priors, float(low), float(high), (1, prior_count), seed)
-    prior = {name: values for name, values in prior.items() if name in posterior}
-
-    tests = c.selection.tests
-    points = tests.force.shape[1]
-    mask = np.asarray(tests.mask)
-    shown = max(1, min(len(particles), MAX_PREDICTIVE // (chains * PREDICTIVE_DRAWS * points)))
-    some = min(PREDICTIVE_DRAWS, draws)
-    predicted = np.full((chains, some, shown, points), np.nan, np.float32)
-    before = np.full((1, some, shown, points), np.nan, np.float32)
-    for row in range(shown):
-        curves = predict_measured(c, particles[row], count=chains * some, seed=seed + row)
-        assert curves.observed_um is not None
-        length = len(curves.force_mN)
-        shaped = curves.observed_um[: chains * some].reshape(chains, some, length)
-        predicted[:, :, row, :length] = np.where(mask[row, :length], shaped, np.nan)
-        before[0, :, row, :length] = np.where(
-            mask[row, :length], _prior_curves(c, prior, row, some, seed)[:, :length], np.nan
-        )
+        posterior["particle_modulus_MPa"] = c.modulus_MPa[:, thin]
+    for name in c.model.varying_in_order:
+        place = [v.mechanism for v in c.model.effects].index(name)
+        posterior[f"particle_{name}"] = c.theta[:, thin, :, place]
+    flat = jax.tree.map(jnp.asarray, flattened(population))
+    prior_density = {
+        name: np.asarray(values).reshape(chains, -1)
+        for name, values in log_priors(flat, c.model, c.fit.tests.flatness).items()
+    }
+    prior = prior_draws(c, prior_count, seed)
+    shown, predicted, before = _predictive(c, prior, seed)
     observed = np.where(mask, np.asarray(tests.displacement), np.nan)
-    coords = {
+    likelihood: dict[str, Any] = {"test": c.log_likelihood[:, thin]}
+    along = ["particle", "point"]
+    if points:
+        likelihood = {"displacement_um": _point_likelihoods(c, thin)[..., mask]}
+        observed, along = observed[mask], ["observation"]
+        predicted, before = (x[..., mask[:shown]] for x in (predicted, before))
+    one_each = dict.fromkeys(("zero_um", "eta_p", "particle_modulus_MPa", "test", "pareto_k", "points"), ["particle"])
+    one_each |= {f"particle_{name}": ["particle"] for name in c.model.varying_in_order}
+    dims = {
+        **dict.fromkeys(("mu", "tau"), ["coefficient"]),
+        "C": ["particle", "coefficient"],
+        **one_each,
+        "diameters_um": ["particle", "axis"],
+        **dict.fromkeys(("force_mN", "mask"), ["particle", "point"]),
+        "displacement_um": along,
+    }
+    coords: dict[str, Any] = {
         "particle": particles,
         "coefficient": list(COEFFICIENTS),
-        "point": np.arange(points),
+        "point": np.arange(mask.shape[1]),
         "axis": ["D1", "D2", "D3"],
     }
-    coords["particle_shown"] = particles[:shown]
-    dims = {
-        "mu": ["coefficient"],
-        "tau": ["coefficient"],
-        "C": ["particle", "coefficient"],
-        "zero_um": ["particle"],
-        "eta_p": ["particle"],
-        "particle_modulus_MPa": ["particle"],
-        "test": ["particle"],
-        "displacement_um": ["particle", "point"],
-        "force_mN": ["particle", "point"],
-        "diameters_um": ["particle", "axis"],
-        "mask": ["particle", "point"],
-        "pareto_k": ["particle"],
+    if points:
+        coords["observation"] = np.arange(mask.sum())
+    constant = {
+        "force_mN": np.asarray(tests.force),
+        "diameters_um": c.campaign.diameters_um[list(c.selection.kept)],
+        "mask": mask,
+        "points": mask.sum(1),
+        "pareto_k": c.pareto_k,
     }
-    tree = from_dict(
-        {
-            "posterior": posterior,
-            "log_likelihood": {"test": c.log_likelihood},
-            "sample_stats": {"lp_test": c.log_likelihood.sum(-1)},
-            "prior": prior,
-            "observed_data": {"displacement_um": observed},
-            "constant_data": {
-                "force_mN": np.asarray(tests.force),
-                "diameters_um": c.campaign.diameters_um[list(c.selection.kept)],
-                "mask": mask,
-                "pareto_k": c.pareto_k,
-            },
-        },
-        coords=coords,
-        dims=dims,
-    )
+    groups = {
+        "posterior": posterior,
+        "log_likelihood": likelihood,
+        "log_prior": prior_density,
+        "sample_stats": {"lp_test": c.log_likelihood[:, thin].sum(-1)},
+        "prior": prior,
+        "observed_data": {"displacement_um": observed},
+        "constant_data": constant,
+    }
+    tree = from_dict(groups, coords=coords, dims=dims)
+    some = coords | {"particle": particles[:shown]}
+    if points:
+        some["observation"] = np.arange(mask[:shown].sum())
     curves = from_dict(
-        {
-            "posterior_predictive": {"displacement_um": predicted},
-            "prior_predictive": {"displacement_um": before},
-        },
-        coords={"particle": particles[:shown], "point": np.arange(points)},
-        dims={"displacement_um": ["particle", "point"]},
+        {"posterior_predictive": {"displacement_um": predicted}, "prior_predictive": {"displacement_um": before}},
+        coords={name: some[name] for name in along},
+        dims={"displacement_um": along},
     )
     for group in ("posterior_predictive", "prior_predictive"):
         tree[group] = curves[group]
@@ -194,6 +185,7 @@ def to_arviz(calibration: BayesCalibration, *, prior_count: int = 500, seed: int
             "seed": c.seed,
             "unloading": c.model.unloading.value,
             "strain_scaling": c.model.strain_scaling.value,
+            "effects": ", ".join(c.model.variants),
             "converged": str(c.converged),
             "divergences": c.divergences,
         }
@@ -204,23 +196,69 @@ def to_arviz(calibration: BayesCalibration, *, prior_count: int = 500, seed: int
     return tree
 
 
+def _predictive(c: BayesCalibration, prior: dict[str, np.ndarray], seed: int) -> tuple[int, np.ndarray, np.ndarray]:
+    """How many particles are shown, and draws of their displacements by posterior and prior; NaN where masked."""
+    mask = np.asarray(c.selection.tests.mask)
+    chains, draws = np.asarray(c.population.a).shape
+    points = mask.shape[1]
+    shown = max(1, min(len(mask), MAX_PREDICTIVE // (chains * PREDICTIVE_DRAWS * points)))
+    some = min(PREDICTIVE_DRAWS, draws)
+    predicted = np.full((chains, some, shown, points), np.nan, np.float32)
+    before = np.full((1, some, shown, points), np.nan, np.float32)
+    for row in range(shown):
+        curves = predict_measured(c, c.particles[row], count=chains * some, seed=seed + row)
+        assert curves.observed_um is not None
+        length = curves.observed_um.shape[1]
+        shaped = curves.observed_um[: chains * some].reshape(chains, some, length)
+        predicted[:, :, row, :length] = np.where(mask[row, :length], shaped, np.nan)
+        before[0, :, row] = np.where(mask[row], _prior_curves(c, prior, row, some, seed), np.nan)
+    return shown, predicted, before
+
+
+def _point_likelihoods(c: BayesCalibration, thin: slice) -> np.ndarray:
+    """Log density of every reading given those before it and its particle's own numbers, shape (chain, draw, N, n)."""
+    tests, filters = c.fit.tests, c.fit.filters
+    C, a = c.C[:, thin], np.asarray(c.population.a)[:, thin]
+    modulus, zero, theta = c.modulus_MPa[:, thin], c.zero_um[:, thin], c.theta[:, thin]
+    factor = np.exp(np.asarray(c.population.log_noise)[:, thin]).reshape(-1)
+    found = []
+    for row in range(len(c.particles)):
+        own_C, own_modulus, own_theta, own_zero = flattened(tuple(x[:, :, row] for x in (C, modulus, theta, zero)))
+        laws = laws_with(c.model, own_C, a.reshape(-1), own_modulus, own_theta)
+        test, noise = jax.tree.map(lambda x, r=row: x[r], (tests, filters))
+        found.append(np.asarray(_one_ahead(laws, jnp.asarray(own_zero), jnp.asarray(factor), test, noise)))
+    return np.stack(found, 1).reshape(*a.shape, len(c.particles), -1)
+
+
+@compiled
+def _one_ahead(laws: MccLaw, zero: Array, factor: Array, test: Tests, noise: Whitening) -> Array:
+    assert test.displacement is not None
+    measured = test.displacement
+
+    def one(given: Any) -> Array:
+        law, z, f = given
+        away = jnp.where(test.mask, measured - law.respond(test.particle, test.record) - z, 0.0)
+        with standard_promotion():
+            innovation = noise.solver.solve_triangular(away)
+        sd = noise.solver.factor.diag.d * f
+        return -0.5 * (innovation / f) ** 2 - jnp.log(sd) - 0.5 * jnp.log(2 * jnp.pi)
+
+    return jax.lax.map(one, (laws, zero, factor))
+
+
 def _prior_curves(c: BayesCalibration, prior: dict[str, np.ndarray], row: int, count: int, seed: int) -> np.ndarray:
     """Curves of the row-th particle from the prior, around its recorded contact."""
-    import jax.numpy as jnp
-
-    from ..campaign import particle_batch
-    from .predict import _laws, _paths
-
     rng = np.random.default_rng([seed, row])
     pick = rng.integers(prior["a"].shape[1], size=count)
     C = np.exp(prior["mu"][0, pick] + prior["tau"][0, pick] * rng.standard_normal((count, 3)))
-    laws = _laws(c, C, prior["a"][0, pick], prior["effective_modulus_MPa"][0, pick])
-    tests = c.selection.tests
-    sizes = particle_batch(np.broadcast_to(c.campaign.diameters_um[c.selection.kept[row]], (count, 3)))
-    force = np.asarray(tests.force[row])
-    clean = np.asarray(_paths(laws, sizes, jnp.asarray(np.broadcast_to(force, (count, len(force))))))
-    zero = float(tests.contact[row]) + c.model.chosen_priors.zero_um.sd * rng.standard_normal((count, 1))
-    return clean + zero
+    theta = np.zeros((count, len(c.model.forms.names)))
+    for k, name in enumerate(c.model.forms.names):
+        theta[:, k] = prior[name][0, pick]
+    laws = laws_with(c.model, C, prior["a"][0, pick], prior["effective_modulus_MPa"][0, pick], theta)
+    test = jax.tree.map(lambda x: x[row], c.fit.tests)
+    clean = np.asarray(predicted_by(laws, test.particle, test.record))
+    zero = c.model.chosen_priors.zero_um
+    return clean + float(test.contact) + zero.mean + zero.sd * rng.standard_normal((count, 1))
 
 
 def write_posterior(calibration: BayesCalibration, file: str | Path) -> None:

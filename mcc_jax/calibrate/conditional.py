@@ -183,6 +183,7 @@ class Drawn(NamedTuple):
         k: Pareto k of every particle's weights.
         k_joint: of the population's.
         keep: see `particles`.
+        log_ratio: logarithm of the mean ratio of exact to quadratic likelihood of all tests, and its standard error.
         notes: what a reader must know.
     """
 
@@ -190,6 +191,7 @@ class Drawn(NamedTuple):
     particles: ParticleDraws
     k: np.ndarray
     k_joint: float
+    log_ratio: tuple[float, float]
     keep: int = 1
     notes: tuple[str, ...] = ()
 
@@ -201,8 +203,9 @@ def weighted(drawer: Drawer, population: Population, length: Length, check_key: 
     k = pareto_k(ratio)
     restless = np.flatnonzero((unrest(ratio) > RESTLESS) | (k > PARETO_K_MOST))
     drawer.settle(pick_key, particles, population, k, restless, CANDIDATES)
-    chosen, k_joint = _resampled(ratio.sum(1), length)
-    return Drawn(chosen, jax.tree.map(lambda x: x[chosen], particles), k, k_joint)
+    total = ratio.sum(1)
+    chosen, k_joint = _resampled(total, length)
+    return Drawn(chosen, jax.tree.map(lambda x: x[chosen], particles), k, k_joint, mean_ratio(total))
 
 
 def corrected(
@@ -248,7 +251,19 @@ def corrected(
     particles = drawer.all(particle_key, some, 0)
     restless = np.flatnonzero((scatter > RESTLESS_OF_MANY) | (k > PARETO_K_MOST))
     drawer.settle(pick_key, particles, some, k, restless, CANDIDATES_OF_MANY)
-    return Drawn(chosen, particles, k, k_joint, keep, tuple(notes))
+    # The regression tells how the correction changes over the posterior; how large it is, every particle tells alone.
+    each = [mean_ratio(ratio[:, i]) for i in range(ratio.shape[1])]
+    log_ratio = float(sum(v for v, _ in each)), float(np.sqrt(sum(error**2 for _, error in each)))
+    return Drawn(chosen, particles, k, k_joint, log_ratio, keep, tuple(notes))
+
+
+def mean_ratio(log_ratio: np.ndarray) -> tuple[float, float]:
+    """Logarithm of the mean of importance ratios, and its standard error."""
+    finite = np.where(np.isfinite(log_ratio), log_ratio, -np.inf)
+    if not np.isfinite(finite).any():
+        return -np.inf, np.inf
+    ratio = np.exp(finite - finite.max())
+    return float(finite.max() + np.log(ratio.mean())), float(ratio.std() / ratio.mean() / np.sqrt(len(ratio)))
 
 
 def _resampled(log_weight: np.ndarray, length: Length) -> tuple[np.ndarray, float]:

@@ -6,13 +6,17 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-import jax.numpy as jnp
+import jax
 import numpy as np
+from jaxtyping import Array
 
 from ..campaign import Campaign, Segment, campaign_segments, particle_batch
-from ..simulate import simulate_batch
-from .data import MAX_POINTS, rows_from_contact
-from .laws import laws_of
+from ..effects import Record
+from ..geometry import Particle
+from ..law import MccLaw
+from .compiling import compiled
+from .data import MAX_POINTS, records_of, rows_from_contact
+from .laws import Variants, laws_of
 from .population import COEFFICIENTS
 
 KINDS = ("load", "hold", "unload", "reload")
@@ -63,6 +67,7 @@ def fitted_curves(
     campaign: Campaign,
     compared: Mapping[int, tuple[np.ndarray, np.ndarray]],
     predictions: Callable[[str], np.ndarray | None],
+    variants: Variants | None = None,
 ) -> tuple[FittedCurve, ...]:
     """The tests of a campaign beside its calibrated law. Needs double precision, as calibration does.
 
@@ -71,6 +76,7 @@ def fitted_curves(
         campaign: the tests.
         compared: see `Calibration.compared`.
         predictions: see `Calibration.predictions`.
+        variants: formulas of effects that are not in the library.
     """
     segments = campaign_segments(campaign)
     shown = [_measured(campaign, i, parts, compared.get(i)) for i, parts in enumerate(segments)]
@@ -79,7 +85,9 @@ def fitted_curves(
     rows = [i for i, one in enumerate(told) if _known(entries[one.name])]
     if not rows:
         return tuple(told)
-    for row, um in zip(rows, _displacements(content, campaign, [told[i] for i in rows], rows), strict=True):
+    for row, um in zip(
+        rows, _displacements(content, campaign, [told[i] for i in rows], rows, compared, variants), strict=True
+    ):
         zero = entries[told[row].name]["zero_um"]["value"] or 0.0
         told[row] = replace(told[row], own_um=um[0] + zero, typical_um=um[1] + zero)
         if row in compared:
@@ -99,7 +107,7 @@ def _measured(
     for part in segments:
         kind[part.start : part.stop] = KINDS.index(part.kind) if part.kind in KINDS else 0
     if compared is None:
-        rows = rows_from_contact(curve, segments, MAX_POINTS)
+        rows = _rows(campaign, i, segments)
         compared = rows, np.ones(len(rows), bool)
     rows, used = compared
     nothing = np.full(len(rows), np.nan)
@@ -107,20 +115,36 @@ def _measured(
     return FittedCurve(campaign.particles[i], None, *measured, kind[rows], used, nothing, nothing, nothing, nothing)
 
 
+def _rows(campaign: Campaign, i: int, segments: tuple[Segment, ...]) -> np.ndarray:
+    return rows_from_contact(campaign.curves[i], segments, MAX_POINTS)
+
+
 def _displacements(
-    content: Mapping[str, Any], campaign: Campaign, shown: list[FittedCurve], rows: list[int]
+    content: Mapping[str, Any],
+    campaign: Campaign,
+    shown: list[FittedCurve],
+    places: list[int],
+    compared: Mapping[int, tuple[np.ndarray, np.ndarray]],
+    variants: Variants | None,
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Displacement [um] of every test under its measured force, by its own law and by the typical one."""
-    longest = max(len(one.force_mN) for one in shown)
-    longest += -longest % 64  # campaigns of similar length then share one compilation
-    force = jnp.asarray([np.pad(one.force_mN, (0, longest - len(one.force_mN)), mode="edge") for one in shown])
-    sizes = campaign.diameters_um[rows]
+    segments = campaign_segments(campaign)
+    rows = [compared[i][0] if i in compared else _rows(campaign, i, segments[i]) for i in places]
+    sizes = campaign.diameters_um[places]
+    # Campaigns of similar length share one compilation.
+    longest = max(len(one) for one in rows)
+    records = records_of(campaign, places, segments, rows, longest + -longest % 64).record
     particles = particle_batch(sizes)
     own, typical = (
-        np.asarray(simulate_batch(laws, particles, force, control="load").displacement)
-        for laws in laws_of(content, [one.name for one in shown], sizes)
+        np.asarray(_respond(laws, particles, records))
+        for laws in laws_of(content, [one.name for one in shown], sizes, variants)
     )
     return [(o[: len(one.kind)], t[: len(one.kind)]) for one, o, t in zip(shown, own, typical, strict=True)]
+
+
+@compiled
+def _respond(laws: MccLaw, particles: Particle, records: Record) -> Array:
+    return jax.vmap(lambda law, *one: law.respond(*one))(laws, particles, records)
 
 
 def _with_band(one: FittedCurve, draws: np.ndarray | None) -> FittedCurve:

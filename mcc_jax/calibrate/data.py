@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -24,8 +24,8 @@ from ..campaign import (
     stress_and_strain,
     turning_forces,
 )
-from ..campaign.record import humidities, record_of
 from ..campaign.reasons import SHOWN, below_threshold, far_apart, no_climb, no_loading, refusal, too_few
+from ..campaign.record import humidities, record_of
 from ..effects import Record
 from ..geometry import Particle
 from .paper.modulus import MIN_RATIO
@@ -150,9 +150,7 @@ class Selection:
     notes: tuple[str, ...]
 
 
-def select_tests(
-    campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_points: int = MAX_POINTS
-) -> Tests:
+def select_tests(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_points: int = MAX_POINTS) -> Tests:
     """The tests as a `Model` takes them: points and particles chosen, padded to rectangular arrays; see `select`."""
     return select(campaign, threshold_MPa=threshold_MPa, most_points=most_points).tests
 
@@ -201,23 +199,21 @@ def select(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_poi
         return np.stack([np.pad(v, (0, longest - len(v)), **options) for v in values])  # pyright: ignore[reportCallIssue, reportArgumentType]
 
     curves = [campaign.curves[i] for i in kept]
-    turning = [turning_forces(c, segments[i]) for i, c in zip(kept, curves, strict=True)]
-    force = padded([t.force[one.rows] for t, one in zip(turning, used, strict=True)], "edge").astype(float)
-    levels = padded([t.peak[one.rows] for t, one in zip(turning, used, strict=True)], "edge").astype(float)
-    error = padded([t.error[one.rows] for t, one in zip(turning, used, strict=True)], "edge").astype(float)
-    branch = _branches(levels, error > 0)
+    records = records_of(campaign, kept, segments, [one.rows for one in used], longest)
+    force, levels = np.asarray(records.record.force), np.asarray(records.record.peak)
+    branch = _branches(levels, records.error > 0)
     changes = np.abs(np.diff(force, axis=1, prepend=force[:, :1]))
     tests = Tests(
         particle_batch(campaign.diameters_um[list(kept)]),
-        _records(campaign, kept, segments, [one.rows for one in used], longest, force, levels),
+        records.record,
         jnp.asarray(padded([c.displacement_um[one.rows] for c, one in zip(curves, used, strict=True)], "edge"), float),
         jnp.asarray(padded([one.mask for one in used], "false")),
         jnp.asarray(padded([one.loading for one in used], "false")),
         jnp.asarray([one.contact for one in used]),
         jnp.asarray(np.cumsum(changes, axis=1) / force.max(axis=1, keepdims=True)),
         jnp.asarray(branch),
-        jnp.asarray(padded([t.reading[one.rows] for t, one in zip(turning, used, strict=True)], "edge")),
-        jnp.asarray(error),
+        jnp.asarray(records.reading),
+        jnp.asarray(records.error),
         None,
         *_errors_of_force(curves, used, branch),
     )
@@ -255,25 +251,48 @@ def _branches(levels: np.ndarray, elastic: np.ndarray) -> np.ndarray:
     return np.maximum.accumulate(np.where(same, 0, np.arange(levels.shape[1])), axis=1)
 
 
-def _records(
+class Records(NamedTuple):
+    """What the testers did, as laws and noise are told; every array of shape (N, points).
+
+    Attributes:
+        record: with the forces and peaks of `turning_forces`.
+        reading, error: as there.
+    """
+
+    record: Record
+    reading: np.ndarray
+    error: np.ndarray
+
+
+def records_of(
     campaign: Campaign,
-    kept: Sequence[int],
+    places: Sequence[int],
     segments: Sequence[tuple[Segment, ...]],
     rows: Sequence[np.ndarray],
     longest: int,
-    force: np.ndarray,
-    levels: np.ndarray,
-) -> Record:
-    """What the tester did at the rows that are used, with forces and peaks as `turning_forces` has them."""
+) -> Records:
+    """Records of some tests at some of their rows, padded with the last one.
+
+    Args:
+        campaign: the tests.
+        places: which of them.
+        segments: of all tests.
+        rows: of those.
+        longest: length to pad to.
+    """
     humidity = humidities(campaign)
-    records = []
-    for i, some in zip(kept, rows, strict=True):
+    records, reading, error = [], [], []
+    for i, some in zip(places, rows, strict=True):
         own = None if humidity is None else float(humidity[i])
         record = record_of(campaign.curves[i], segments[i], relative_humidity_percent=own)
+        turning = turning_forces(campaign.curves[i], segments[i])
+        record = replace(record, force=jnp.asarray(turning.force), peak=jnp.asarray(turning.peak))
         chosen = np.pad(some, (0, longest - len(some)), mode="edge")
         records.append(jax.tree.map(lambda x, at=chosen: np.asarray(x)[at] if np.ndim(x) else np.asarray(x), record))
+        reading.append(turning.reading[chosen])
+        error.append(turning.error[chosen])
     together = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *records)
-    return replace(together, force=jnp.asarray(force), peak=jnp.asarray(levels))
+    return Records(together, np.stack(reading), np.stack(error))
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -29,8 +29,8 @@ class SpreadCoordinate(dist.Distribution):
     tail towards minus infinity. Of :math:`\tau^{2m-1}` and :math:`d\tau/dx` only cosh x is left.
     """
 
-    arg_constraints: ClassVar[dict[str, Any]] = {}
-    support = constraints.real
+    arg_constraints: Any = {}  # noqa: RUF012  # as NumPyro has it
+    support: Any = constraints.real
 
     def __init__(self, prior: NakagamiPrior) -> None:
         self.prior, self.power = prior, 1 / (2 * prior.shape)
@@ -40,11 +40,11 @@ class SpreadCoordinate(dist.Distribution):
         """The spread at a coordinate."""
         return KNEE * self.prior.sd * jnp.sinh(jnp.abs(coordinate)) ** self.power
 
-    def coordinate(self, spread: float) -> float:
-        """The coordinate, > 0, of a spread."""
-        return float(np.arcsinh((spread / (KNEE * self.prior.sd)) ** (1 / self.power)))
+    def coordinate(self, spread: Array) -> Array:
+        """The coordinate, >= 0, of a spread."""
+        return jnp.arcsinh((spread / (KNEE * self.prior.sd)) ** (1 / self.power))
 
-    def log_prob(self, value: Array) -> Array:
+    def log_prob(self, value: Any, intermediates: Any = None) -> Array:
         """Log density of the coordinate."""
         m, s = self.prior.shape, self.prior.sd
         constant = -math.lgamma(m) - m * math.log(2 * s**2) + 2 * m * math.log(KNEE * s) + math.log(self.power)
@@ -69,7 +69,7 @@ class Amplitude(dist.Distribution):
     evenly in the logarithm from the smallest to the largest plausible amplitude.
     """
 
-    arg_constraints: ClassVar[dict[str, Any]] = {}
+    arg_constraints: Any = {}  # noqa: RUF012  # as NumPyro has it
 
     def __init__(self, variant: Variant) -> None:
         low, high = variant.plausible
@@ -82,7 +82,7 @@ class Amplitude(dist.Distribution):
         """Softplus keeps the coordinate linear where the amplitude is more than barely plausible."""
         return constraints.real if self.both else constraints.softplus_positive
 
-    def log_prob(self, value: Array) -> Array:
+    def log_prob(self, value: Any, intermediates: Any = None) -> Array:
         """Log density."""
         each = [-0.5 * (value / s) ** 2 - math.log(s * math.sqrt(2 * math.pi)) for s in self.scales.tolist()]
         total = logsumexp(jnp.stack(each), axis=0) - math.log(SCALES)
@@ -113,14 +113,14 @@ class RecordNoise(dist.Distribution):
         factor: a common factor on it.
     """
 
-    arg_constraints: ClassVar[dict[str, Any]] = {}
-    support = constraints.real_vector
+    arg_constraints: Any = {}  # noqa: RUF012  # as NumPyro has it
+    support: Any = constraints.real_vector
 
     def __init__(self, loc: Float[Array, "particles points"], filters: Whitening, factor: Array) -> None:
         self.loc, self.filters, self.factor = loc, filters, factor
         super().__init__(batch_shape=loc.shape[:1], event_shape=loc.shape[1:])
 
-    def log_prob(self, value: Array) -> Array:
+    def log_prob(self, value: Any, intermediates: Any = None) -> Array:
         """Log density of every test; points that do not count carry nothing."""
 
         def one(filtered: Whitening, away: Array) -> Array:
@@ -136,9 +136,7 @@ class RecordNoise(dist.Distribution):
         count, points = self.loc.shape
 
         def one(key: Any) -> Array:
-            white, of_branches, of_zero = (
-                jax.random.normal(k, (count, points)) for k in jax.random.split(key, 3)
-            )
+            white, of_branches, of_zero = (jax.random.normal(k, (count, points)) for k in jax.random.split(key, 3))
             drawn = eqx.filter_vmap(lambda f, *normal: f.colour(*normal))(
                 self.filters, white, of_branches, of_zero[:, 0]
             )

@@ -13,9 +13,9 @@ from jaxtyping import Array
 
 from .compiling import compiled
 from .conditional import Drawer, chunk_of, corrected, every, stride_of, weighted
-from .fit import Fit
+from .fitting import Fit
 from .importance import sample_weighted
-from .mode import LogPosterior, populations
+from .mode import LogPosterior, density_of, populations
 from .noise import standard_promotion
 from .nuts import Chains, Length, by_chains, sample_density
 from .population import COEFFICIENTS, Population
@@ -46,6 +46,8 @@ class Draws:
         divergences: number of divergent trajectories.
         rhat, ess_bulk, ess_tail: by parameter of the population.
         leapfrogs: mean number of leapfrog steps of a draw; 0 of independent draws.
+        log_evidence: the log marginal likelihood of the model, and its standard error (infinite where it is Laplace's
+            approximation alone).
         notes: what a reader must know.
     """
 
@@ -64,6 +66,7 @@ class Draws:
     ess_bulk: dict[str, float]
     ess_tail: dict[str, float]
     leapfrogs: float
+    log_evidence: tuple[float, float] = (np.nan, np.inf)
     notes: tuple[str, ...] = ()
 
 
@@ -88,7 +91,7 @@ def draw_fast(key: Array, fit: Fit, length: Length, block: int, *, patient: bool
     count, target, exact = count_of(fit.tests), fit.target, exact_likelihood(fit)
     population_key, particle_key, check_key, pick_key = jax.random.split(key, 4)
     few = stride_of(count, length.total) == 1
-    run, population, good = _sampled(population_key, fit, target, length, not few, patient)
+    run, population, good, (integral, error) = _sampled(population_key, fit, target, length, not few, patient)
     names, stacked = _stack(population, fit, length)
     flat = stacked.reshape(length.total, -1)
     if few:
@@ -99,26 +102,32 @@ def draw_fast(key: Array, fit: Fit, length: Length, block: int, *, patient: bool
     stacked, population = flat[found.chosen].reshape(stacked.shape), every(population, found.chosen)
     drawn = _collected(run, population, names, stacked, found.particles[:4], fit, length, found.keep)
     k_joint = found.k_joint if good else np.inf
-    return replace(drawn, pareto_k=found.k, pareto_k_joint=k_joint, weights_applied=few, notes=found.notes)
+    value = integral + found.log_ratio[0] + float(fit.noise.log_evidence)
+    evidence = value, float(np.hypot(error, found.log_ratio[1]))
+    checked = {"pareto_k": found.k, "pareto_k_joint": k_joint, "weights_applied": few}
+    return replace(drawn, **checked, log_evidence=evidence, notes=found.notes)
 
 
 def _sampled(
     key: Array, fit: Fit, target: LogPosterior, length: Length, many: bool, patient: bool
-) -> tuple[Chains, Population, bool]:
+) -> tuple[Chains, Population, bool, tuple[float, float]]:
     """Draws of the population: independent ones, weighted, if the weights are good enough, else the sampler's.
 
-    And whether they are good: without patience the sampler does not run.
+    And whether they are good (without patience the sampler does not run), and the log of the density's integral with
+    its standard error, by Laplace's method where the sampler drew.
     """
     shape: dict[str, Any] = {"chains": length.chains, "draws": length.draws, "many": many}
     found = sample_weighted(key, fit.mode, fit.covariance, target, **shape)
     if found is not None:
-        return *found, True
+        return found.run, found.population, True, (found.log_evidence, found.error)
+    volume = 0.5 * np.linalg.slogdet(2 * np.pi * np.asarray(fit.covariance))[1] + len(target.signed()) * np.log(2)
+    laplace = float(density_of(fit.mode, target)) + float(volume), np.inf
     if not patient:
         bad = sample_weighted(key, fit.mode, fit.covariance, target, **shape, however_bad=True)
         assert bad is not None
-        return *bad, False
+        return bad.run, bad.population, False, laplace
     run = _patient(lambda aim: by_chains(sample_density, key, length, fit.mode, fit.covariance, target, aim))
-    return run, jax.tree.map(np.asarray, populations(jnp.asarray(_rows(run)), target)), True
+    return run, jax.tree.map(np.asarray, populations(jnp.asarray(_rows(run)), target)), True, laplace
 
 
 def _rows(run: Chains) -> np.ndarray:

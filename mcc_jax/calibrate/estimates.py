@@ -13,6 +13,9 @@ BAD_MISFIT = 0.05
 """Share of the range of displacement; with the law's own data and a tester's noise it stays below 0.01."""
 
 
+BAD_NOISE_SHARE = 0.5
+"""Share of the residual's variance that correlated noise may hold: half, and it is as large as what is read-out noise."""
+
 NO_SAMPLER: dict[str, None] = dict.fromkeys(("rhat_max", "ess_bulk_min", "divergences", "pareto_k_max"))
 """Diagnostics of methods that draw nothing."""
 
@@ -25,6 +28,16 @@ def misfit_note(own_misfit: float) -> str | None:
         "even with its own C1, C3, C5 the law misses a test's displacements by "
         f"{100 * own_misfit:.0f} % of their range (median): "
         "it describes these tests badly, or they are no compressions of single particles"
+    )
+
+
+def noise_note(share: float) -> str | None:
+    """A sentence if correlated noise has taken up what the law misses, else None."""
+    if not share > BAD_NOISE_SHARE:
+        return None
+    return (
+        f"{100 * share:.0f} % of the scatter that is left is correlated along a test: more likely something that the "
+        "law misses than noise of the instrument; mcc_jax.discover looks for what it is"
     )
 
 

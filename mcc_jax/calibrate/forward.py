@@ -13,8 +13,6 @@ particle never contain the shape parameter `a`: it enters through what particles
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -68,9 +66,7 @@ class Forms(eqx.Module):
         plastic = Plastic(jnp.exp(b1), jnp.exp(b3), jnp.exp(b5))
         return MccLaw(plastic, 0.0, jnp.exp(e), self.unloading, effects=self.build(theta))
 
-    def displacement(
-        self, latent: Latent, theta: Float[Array, " numbers"], particle: Particle, record: Record
-    ) -> Path:
+    def displacement(self, latent: Latent, theta: Float[Array, " numbers"], particle: Particle, record: Record) -> Path:
         """Displacement [um] of a virgin particle along its test, from its own zero."""
         return self.law(latent, theta).respond(particle, record)
 
@@ -110,6 +106,7 @@ class Linear(eqx.Module):
 
 def residuals(point: Point, tests: Tests, forms: Forms) -> Float[Array, "particles points"]:
     """Measured less predicted displacement [um], 0 where masked."""
+    assert tests.displacement is not None
     predicted = jax.vmap(forms.displacement)(point.latent, point.theta, tests.particle, tests.record)
     return jnp.where(tests.mask, tests.displacement - predicted - point.zero[:, None], 0.0)
 
@@ -163,5 +160,3 @@ def snap(latent: Latent, particle: Particle) -> Scalar:
     square = 2 * K1 / (3 * K3 + root)  # of the scaled strain at the peak
     force = particle.force(jnp.sqrt(square) * (K1 - square * (K3 - square * K5)))
     return jnp.where(falls, jnp.log(jnp.where(falls, force, 1.0)), jnp.inf)
-
-

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._types import Scalar, Values
-from ..law import Unloading
+from .._types import Values
 from .block_arrow import Parameters, Solution, minimise
 from .compiling import compiled
 from .data import Tests
-from .forward import raw_residual
+from .forward import Forms, Point, residuals
 from .noise import Whitening
 from .population import Population, Scatter, moments
 from .small_matrices import Cholesky
@@ -43,63 +43,78 @@ class Pooled(eqx.Module):
 
     Attributes:
         whitening: the noise filters.
-        tau: standard deviations of log C1, log C3, log C5 over the particles.
-        modulus_scatter, shape_scatter: the same for the log modulus and for a.
-        zero_sd: how far a zero may lie from the recorded contact [um].
-        unloading: form of unloading.
-        scatter: which further quantities scatter.
+        population: whose spreads weigh the deviations of the particles.
+        zero_prior: mean and standard deviation of the zeros, from the recorded contact [um].
+        further: mean and standard deviation of the logarithm of every further number of an effect.
+        forms: the law.
+        scatter: what differs from particle to particle.
         loss: "linear", "soft_l1" or "cauchy", applied to the whitened residuals.
     """
 
     whitening: Whitening
-    tau: Float[Array, " 3"]
-    modulus_scatter: Scalar
-    shape_scatter: Scalar
-    zero_sd: Scalar
-    unloading: Unloading = eqx.field(static=True)
+    population: Population
+    zero_prior: Float[Array, " 2"]
+    further: Float[Array, "further 2"]
+    forms: Forms
     scatter: Scatter = eqx.field(static=True)
     loss: str = eqx.field(static=True, default="linear")
 
 
-def unpack(y: Parameters, settings: Pooled, tests: Tests) -> tuple[Float[Array, "particles 4"], Float[Array, " n"]]:
-    """Latent vectors and zeros: local are b1, b3, b5, zero and, if it scatters, e."""
-    if settings.scatter.modulus:
-        return jnp.concatenate([y.local[:, :3], y.local[:, 4:]], 1), y.local[:, 3]
-    log_eta = jnp.log(jnp.maximum(1 + y.shared[0] * tests.flatness, 1e-3))
-    e = y.shared[1] + settings.scatter.power * log_eta
-    return jnp.concatenate([y.local[:, :3], e[:, None]], 1), y.local[:, 3]
+SHARED = ("a", "log effective modulus", "mu_C1", "mu_C3", "mu_C5")
+"""The shared parameters, behind which the effects' amplitudes stand and the logarithms of their further numbers."""
 
 
-def pooled_residual(settings: Pooled, tests: Tests) -> Callable[[Parameters], tuple[Array, Array, Array]]:
+def unpack(y: Parameters, settings: Pooled, tests: Tests) -> Point:
+    """Every particle's numbers: local are b1, b3, b5, zero and, where they differ, e and amplitudes."""
+    scatter, size = settings.scatter, len(settings.forms.effects)
+    if scatter.modulus:
+        latent, own = jnp.concatenate([y.local[:, :3], y.local[:, 4:5]], 1), y.local[:, 5:]
+    else:
+        log_eta = jnp.log(jnp.maximum(1 + y.shared[0] * tests.flatness, 1e-3))
+        e = y.shared[1] + scatter.power * log_eta
+        latent, own = jnp.concatenate([y.local[:, :3], e[:, None]], 1), y.local[:, 4:]
+    amplitudes, further = y.shared[len(SHARED) :][:size], y.shared[len(SHARED) + size :]
+    theta = jnp.concatenate([amplitudes, jnp.exp(further)])
+    theta = jnp.broadcast_to(theta, (len(latent), len(theta)))
+    for j, (k, _) in enumerate(scatter.varying):
+        theta = theta.at[:, k].set(own[:, j])
+    return Point(latent, y.local[:, 3], theta)
+
+
+def pooled_residual(settings: Pooled, tests: Tests) -> Callable[[Parameters], tuple[Array, ...]]:
     r"""Residuals of the pooled least squares, as a function of the parameters.
 
-    Whitened residuals of displacement, deviations of the particles from the population in its standard deviations, and
-    of the zeros from the recorded contacts. Local parameters are b1, b3, b5, zero (and e, if the modulus scatters),
-    shared are a, log Ebar, mu1, mu3, mu5.
+    Whitened residuals of displacement, deviations of the particles from the population in its standard deviations, of
+    the zeros from the recorded contacts, and of the effects' further numbers from what is plausible.
     """
-    size = 4 if settings.scatter.modulus else 3
-    tau = jnp.maximum(settings.tau, MIN_SPREAD)
+    scatter, at = settings.scatter, settings.population
+    size = 4 if scatter.modulus else 3
+    tau = jnp.maximum(at.tau, MIN_SPREAD)
+    modulus = jnp.maximum(at.modulus_scatter, MIN_SPREAD)
+    mean_zero, sd_zero = settings.zero_prior
+    count = jnp.asarray(float(len(tests))) if tests.weight is None else jnp.sum(tests.weight)
 
     def residual(y: Parameters):
-        latent, zero = unpack(y, settings, tests)
-        data = jax.vmap(lambda f, r: f(r))(settings.whitening, raw_residual(latent, zero, tests, settings.unloading))
-        population = Population(
-            y.shared[0],
-            y.shared[1],
-            y.shared[2:],
-            tau,
-            jnp.maximum(settings.modulus_scatter, MIN_SPREAD),
-            settings.shape_scatter,
-            jnp.zeros(()),
-        )
-        mean, factor = moments(population, tests.flatness, settings.scatter)
+        point = unpack(y, settings, tests)
+        away = residuals(point, tests, settings.forms)
+        data = jax.vmap(lambda f, r: f(r[:, None])[:, 0])(settings.whitening, away)
+        moved = replace(at, a=y.shared[0], log_modulus=y.shared[1], mu=y.shared[2:5], tau=tau, modulus_scatter=modulus)
+        mean, factor = moments(moved, tests.flatness, scatter)
         covariance = jnp.einsum("npk,nqk->npq", factor, factor)[:, :size, :size]
-        pooled = Cholesky(covariance).forward((latent - mean)[:, :size])
-        found = robust(settings.loss, data), pooled, ((zero - tests.contact) / settings.zero_sd)[:, None]
-        if tests.weight is None:
-            return found
-        weight = tests.weight[:, None]
-        return found[0] * weight, found[1] * weight, found[2] * weight
+        pooled = Cholesky(covariance).forward((point.latent - mean)[:, :size])
+        zero = ((point.zero - tests.contact - mean_zero) / sd_zero)[:, None]
+        found = [robust(settings.loss, data), pooled, zero]
+        for j, (k, signed) in enumerate(scatter.varying):
+            shared = y.shared[len(SHARED) + k]
+            unit = jnp.maximum(at.theta_scatter[j], MIN_SPREAD) * (1.0 if signed else jnp.abs(at.theta[k]))
+            found.append(((point.theta[:, k] - shared) / unit)[:, None])
+        if len(settings.further):
+            # A prior that all share, in equal parts of all particles.
+            logs = y.shared[len(SHARED) + len(settings.forms.effects) :]
+            part = (logs - settings.further[:, 0]) / (settings.further[:, 1] * jnp.sqrt(count))
+            found.append(jnp.broadcast_to(part, (len(tests), len(part))))
+        weight = 1.0 if tests.weight is None else tests.weight[:, None]
+        return tuple(one * weight for one in found)
 
     return residual
 

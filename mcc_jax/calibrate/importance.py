@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from itertools import product
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -23,9 +23,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .compiling import compiled, even_batch
+from .mode import ROWS, LogPosterior, gradients, populations
 from .nuts import Chains, side_by_side
 from .population import Population
-from .mode import ROWS, LogPosterior, gradients, populations
 from .weights import PARETO_K_MOST, effective_share, ordered_resample, smoothed_weights
 
 FREEDOM = 10
@@ -58,7 +58,25 @@ AT_ONCE = 4096
 @compiled
 def log_densities(free: Float[Array, "many d"], target: LogPosterior) -> Float[Array, " many"]:
     """Log density of the population at many coordinates."""
-    return jax.lax.map(target.log_density, free, batch_size=even_batch(len(free), AT_ONCE // len(target.marginal.flatness)))
+    return jax.lax.map(
+        target.log_density, free, batch_size=even_batch(len(free), AT_ONCE // len(target.marginal.flatness))
+    )
+
+
+class Weighted(NamedTuple):
+    """Draws of the population by importance resampling.
+
+    Attributes:
+        run: the draws, in the sampler's form.
+        population: the same as populations.
+        log_evidence: logarithm of the integral of the density: of the mean weight.
+        error: its standard error.
+    """
+
+    run: Chains
+    population: Population
+    log_evidence: float
+    error: float
 
 
 def sample_weighted(
@@ -71,7 +89,7 @@ def sample_weighted(
     draws: int,
     many: bool = False,
     however_bad: bool = False,
-) -> tuple[Chains, Population] | None:
+) -> Weighted | None:
     """Draws of the population by importance resampling, in the sampler's form; None if the weights are not good enough.
 
     A spread's coordinate may have either sign for the same spread: proposal and draws are folded to positive ones.
@@ -102,14 +120,16 @@ def sample_weighted(
         return np.asarray(log_densities(jnp.asarray(part), target)) if many else -gradients(part, target)[0]
 
     def proposed(count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Draws of the proposal and their log weights, up to a constant."""
+        """Draws of the proposal and their log weights."""
         factor = np.linalg.cholesky(width)
         standard = np.asarray(unit.rvs(size=int(count + -count % ROWS), random_state=rng))
         free = folded(centre + standard @ factor.T)
         every_sign = (free[:, None] * signs - centre).reshape(-1, len(mode))
         density = unit.logpdf(solve_triangular(factor, every_sign.T, lower=True).T).reshape(len(free), -1)
         log_density = np.concatenate(side_by_side(densities, np.split(free, len(free) // ROWS)))
-        log_weight = log_density - logsumexp(density, axis=1)
+        # The density is even in every spread's coordinate: folded, as much again for each; and the proposal's volume.
+        log_weight = log_density - logsumexp(density, axis=1) + len(spreads) * math.log(2)
+        log_weight = log_weight + np.sum(np.log(np.diagonal(factor)))
         return free[:count], log_weight[:count]
 
     # Standard deviations of coordinates differ by many powers of ten, for which SciPy takes a matrix to be singular.
@@ -124,7 +144,7 @@ def sample_weighted(
         if however_bad:
             finite = np.where(np.isfinite(log_weight), log_weight, -np.inf)
             weight = np.exp(finite - finite.max()) if np.isfinite(finite).any() else np.ones(len(finite))
-            return _resampled(free, weight / weight.sum(), target, chains, draws)
+            return Weighted(*_resampled(free, weight / weight.sum(), target, chains, draws), np.nan, np.inf)
         weight, k = smoothed_weights(log_weight)
         share = effective_share(weight)
         if k <= PARETO_K_MOST and share >= (GOOD_SHARE if turn < ROUNDS - 1 else least):
@@ -136,7 +156,9 @@ def sample_weighted(
             weight, k = smoothed_weights(log_weight)
             share = effective_share(weight)
             if k <= PARETO_K_MOST and share >= least:
-                return _resampled(free, weight, target, chains, draws)
+                value = float(logsumexp(log_weight) - math.log(len(log_weight)))
+                error = math.sqrt(max(1 / share - 1, 0.0) / len(weight))
+                return Weighted(*_resampled(free, weight, target, chains, draws), value, error)
         if share * len(weight) < ENOUGH * len(mode):
             return None
         centre = weight @ free

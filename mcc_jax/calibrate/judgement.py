@@ -18,6 +18,7 @@ from .._errors import InputError
 from ..campaign import Campaign, Finding, campaign_findings, check_plausibility
 from ..campaign.quality import named
 from ..campaign.reasons import or_slip
+from .fitting import Fit
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,19 @@ class JudgementOptions:
 
 MODULUS_OPEN = "unknown modulus"
 """The `check` of the finding that the tests leave the modulus open."""
+
+
+def noise_share(fit: Fit) -> float:
+    """Share of the variance that is left of the residuals which the fit holds for correlated noise [-].
+
+    White noise of read-out and force does not repeat from one reading to the next; what is correlated along a test and
+    no smaller than it is, is rather what the law misses.
+    """
+    noise, tests = fit.noise.noise, fit.tests
+    mask, factor = np.asarray(tests.mask), np.asarray(fit.filters.solver.matrix.diag.d)
+    variance = np.where(mask, factor, 0.0).sum(1) / np.maximum(mask.sum(1), 1)
+    correlated = (np.asarray(noise.scale) * float(noise.correlated)) ** 2
+    return float(np.median(correlated / variance))
 
 
 def unlike_others(

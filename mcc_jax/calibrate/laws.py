@@ -7,18 +7,30 @@ from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from .._errors import InputError
+from ..effects import AbstractEffect, Variant
 from ..law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainScaling, Unloading
+from .effects import built
 from .population import COEFFICIENTS
 
 RIGID_MPA = 1e9
 """Where no test was unloaded the modulus cannot matter; a stiff one keeps the law defined."""
 
 
-def law_of(content: Mapping[str, Any], particle: str | None = None, diameters_um: np.ndarray | None = None) -> MccLaw:
+Variants = Mapping[str, Variant]
+"""Formulas that are not in the library, by "mechanism:variant"."""
+
+
+def law_of(
+    content: Mapping[str, Any],
+    particle: str | None = None,
+    diameters_um: np.ndarray | None = None,
+    variants: Variants | None = None,
+) -> MccLaw:
     """The law that a `calibration.json` describes, of the median particle or of one of these diameters [um]."""
     entry = None if particle is None else entry_of(content, particle)
     if entry is None:
@@ -29,10 +41,12 @@ def law_of(content: Mapping[str, Any], particle: str | None = None, diameters_um
     modulus = _number(content["effective_modulus_MPa"], "effective_modulus_MPa")
     if entry is not None:
         a, modulus = _own_shape(content, entry, diameters_um, a), _own_modulus(entry, modulus)
-    return MccLaw(Plastic(*C), a, modulus, *_forms(content))
+    return MccLaw(Plastic(*C), a, modulus, *_forms(content), effects=_effects(content, entry, variants))
 
 
-def laws_of(content: Mapping[str, Any], names: list[str], diameters_um: np.ndarray) -> tuple[MccLaw, MccLaw]:
+def laws_of(
+    content: Mapping[str, Any], names: list[str], diameters_um: np.ndarray, variants: Variants | None = None
+) -> tuple[MccLaw, MccLaw]:
     """Laws of particles that took part, each with its own numbers, and as many times that of the typical particle.
 
     The typical law has the medians of the coefficients; of the paper's method it is the law of the expected stress.
@@ -45,15 +59,28 @@ def laws_of(content: Mapping[str, Any], names: list[str], diameters_um: np.ndarr
     moduli = [_own_modulus(entry, modulus) for entry in entries]
     form, scaling = _forms(content)
 
-    def law(C: Any, a: Any, modulus: Any) -> MccLaw:
-        return MccLaw(Plastic(C[0], C[1], C[2]), a, modulus, form, scaling)
+    def law(C: Any, a: Any, modulus: Any, effects: Any) -> MccLaw:
+        return MccLaw(Plastic(C[0], C[1], C[2]), a, modulus, form, scaling, effects=effects)
+
+    def together(several: list[tuple[AbstractEffect, ...]]) -> Any:
+        return jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v, float) for v in x]), *several)
 
     count = len(names)
     typical = np.broadcast_to(_typical(content), own.shape)
     make = eqx.filter_vmap(law)
     return (
-        make(jnp.asarray(own), jnp.asarray(shapes), jnp.asarray(moduli)),
-        make(jnp.asarray(typical), jnp.full(count, a), jnp.full(count, modulus)),
+        make(
+            jnp.asarray(own),
+            jnp.asarray(shapes),
+            jnp.asarray(moduli),
+            together([_effects(content, entry, variants) for entry in entries]),
+        ),
+        make(
+            jnp.asarray(typical),
+            jnp.full(count, a),
+            jnp.full(count, modulus),
+            together([_effects(content, None, variants)] * count),
+        ),
     )
 
 
@@ -86,6 +113,14 @@ def _number(estimate: Mapping[str, Any], name: str) -> float:
     if value is None or (name.startswith("log_") and abs(value) > 100):
         raise InputError(f"{name} has no sensible value", remedy="Calibrate again on tests that tell it.")
     return float(value)
+
+
+def _effects(
+    content: Mapping[str, Any], entry: Mapping[str, Any] | None, variants: Variants | None
+) -> tuple[AbstractEffect, ...]:
+    """The effects, with a particle's own amplitudes where they differ."""
+    own = {} if entry is None else entry.get("amplitudes") or {}
+    return tuple(built(one, variants, own.get(one["mechanism"])) for one in content.get("effects", ()))
 
 
 def _own_modulus(entry: Mapping[str, Any], modulus: float) -> float:

@@ -13,19 +13,21 @@ import numpy as np
 
 from .. import arguments
 from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_tests
+from ..effects import Variant
 from .block_arrow import Parameters, Solution
 from .data import Selection, Tests, compared_rows, own_misfit, ranges_um, root_mean_squares
-from .estimates import NO_SAMPLER, estimate, finite, force_zero, log_estimate, misfit_note, power_of_e
-from .fit import beyond_numbers, population_at, prepare
-from .hierarchical import Pooled, fit_pooled, unpack
-from .judgement import judged, numbers_in_reach, unlike_others
-from .model import JointFit, JointModel, checked_settings
+from .distributions import SpreadCoordinate
+from .effects import effect_entries
+from .estimates import NO_SAMPLER, estimate, finite, force_zero, log_estimate, misfit_note, noise_note, power_of_e
+from .fitting import Fit, beyond_numbers, checked_settings, prepare
+from .forward import residuals
+from .hierarchical import SHARED, Pooled, fit_pooled, unpack
+from .judgement import judged, noise_share, numbers_in_reach, unlike_others
+from .model import Model
 from .population import COEFFICIENTS
 from .results import Calibration
-from .transforms import FIRST_SPREAD, spread_slope
 
 Loss = Literal["linear", "soft_l1", "cauchy"]
-SHARED = ("a", "log effective modulus", "mu_C1", "mu_C3", "mu_C5")
 STARTS = (0.0, 2.5)
 """Values of a to start from besides the population's mode."""
 
@@ -40,11 +42,13 @@ class Identifiability:
     Attributes:
         singular_values: of the curvature, every parameter on the scale of its own, largest first; all
             would be 1 if the parameters did not interact, and 0 marks a combination that the data leave open.
-        directions: the combinations, one row each, in the order of `SHARED`.
+        directions: the combinations, one row each, in the order of `names`.
+        names: of the parameters.
     """
 
     singular_values: np.ndarray
     directions: np.ndarray
+    names: tuple[str, ...] = SHARED
 
     @property
     def open(self) -> list[str]:
@@ -52,7 +56,7 @@ class Identifiability:
         found = []
         for value, row in zip(self.singular_values, self.directions, strict=True):
             if value < OPEN:
-                terms = [f"{w:+.2f} {n}" for w, n in zip(row, SHARED, strict=True) if abs(w) > 0.1]
+                terms = [f"{w:+.2f} {n}" for w, n in zip(row, self.names, strict=True) if abs(w) > 0.1]
                 found.append(" ".join(terms))
         return found
 
@@ -77,9 +81,9 @@ class LeastSquaresCalibration(Calibration):
 
     campaign: Campaign
     selection: Selection
-    model: JointModel
+    model: Model
     loss: Loss
-    fit: JointFit
+    fit: Fit
     settings: Pooled
     solution: Solution
     identifiability: Identifiability
@@ -87,6 +91,11 @@ class LeastSquaresCalibration(Calibration):
     seed: int
     runtime_s: float
     findings: tuple[Finding, ...] = ()
+
+    @property
+    def variants(self) -> dict[str, Variant]:
+        """The formulas of the law's effects by name."""
+        return self.model.variants
 
     def compared(self) -> Mapping[int, tuple[np.ndarray, np.ndarray]]:
         """Rows of every particle's curve that stand in the tests, and which of them are compared."""
@@ -129,15 +138,14 @@ class LeastSquaresCalibration(Calibration):
             notes.append(f"{count - agree} of {count} starts ended at a worse optimum")
         notes += self.selection.notes
         misfit = misfit_note(own_misfit(self.selection.tests, jnp.asarray(self.residual())))
-        if misfit is not None:
-            notes.append(misfit)
+        notes += [note for note in (misfit, noise_note(noise_share(self.fit))) if note is not None]
         dropped = sum(reason is not None for reason in self.selection.why_not)
         if dropped:
             notes.append(f"{dropped} of {len(self.campaign)} particles could not be used")
         if self._alone:
             notes.append("one particle says nothing of the scatter between particles: no spread is given")
-        elif np.any(np.asarray(self.settings.tau) < 1e-3):
-            small = [n for n, t in zip(COEFFICIENTS, np.asarray(self.settings.tau), strict=True) if t < 1e-3]
+        elif np.any(np.asarray(self.settings.population.tau) < 1e-3):
+            small = [n for n, t in zip(COEFFICIENTS, np.asarray(self.settings.population.tau), strict=True) if t < 1e-3]
             notes.append(f"the spread of {', '.join(small)} cannot be told from zero")
         return notes
 
@@ -153,7 +161,8 @@ class LeastSquaresCalibration(Calibration):
     def to_json(self) -> dict[str, Any]:
         """The contents of `calibration.json`."""
         tests = self.selection.tests
-        latent, zero = (np.asarray(v) for v in unpack(self.solution.value, self.settings, tests))
+        point = unpack(self.solution.value, self.settings, tests)
+        latent, zero, theta = np.asarray(point.latent), np.asarray(point.zero), np.asarray(point.theta)
         own, between, shared = (np.asarray(v) for v in self.solution.normal.covariance())
         values = np.asarray(self.solution.value.shared)
         sds, known = self._shared_sd, self._known
@@ -178,20 +187,24 @@ class LeastSquaresCalibration(Calibration):
                 if self.model.modulus_scatter:
                     log_modulus = float(latent[row, 3] - self.model.shape_power * log_eta[row])
                     found["effective_modulus_MPa"] = estimate(power_of_e(log_modulus))
+                if self.model.varying:
+                    places = {v.mechanism: k for k, v in enumerate(self.model.effects)}
+                    own_theta = {m: estimate(float(theta[row, places[m]])) for m in self.model.varying_in_order}
+                    found["amplitudes"] = own_theta
             entries.append(
                 {
                     "particle": name,
                     **found,
                     "rms_um": finite(float(rms[row])) if row is not None else None,
-                    "noise_scale": finite(float(self.fit.noise.scale[row])) if row is not None else None,
+                    "noise_scale": finite(float(self.fit.noise.noise.scale[row])) if row is not None else None,
                     "kept": row is not None,
                     "why_not": self.selection.why_not[i],
                     "force_zero_mN": force_zero(self.campaign.curves[i]),
                 }
             )
-        tau = np.asarray(self.settings.tau)
+        tau = np.asarray(self.settings.population.tau)
         spread_sd = self._spread_sd()
-        logs, log_sds = np.asarray(self.fit.noise.logs), np.asarray(self.fit.noise_log_sd)
+        logs, log_sds = np.asarray(self.fit.noise.noise.logs), self.fit.noise.log_sd
         numbers = ("displacement_um", "force_mN", "correlated_um", "correlation_length")
         steps = int(self.solution.steps)
         return {
@@ -202,7 +215,7 @@ class LeastSquaresCalibration(Calibration):
             "runtime_s": self.runtime_s,
             "seed": self.seed,
             "law": {"unloading": self.model.unloading.value, "strain_scaling": self.model.strain_scaling.value},
-            "effects": [],
+            "effects": effect_entries(self.model, self._effects(), estimates=True),
             "loss": self.loss,
             **{
                 f"log_{name}": {
@@ -236,12 +249,9 @@ class LeastSquaresCalibration(Calibration):
 
     def residual(self) -> np.ndarray:
         """Measured less predicted displacement [um], shape (N, points), 0 where masked."""
-        from .forward import raw_residual
-
-        latent, zero = unpack(self.solution.value, self.settings, self.selection.tests)
-        return np.asarray(
-            jax.jit(raw_residual, static_argnums=3)(latent, zero, self.selection.tests, self.model.unloading)
-        )
+        tests = self.selection.tests
+        point = unpack(self.solution.value, self.settings, tests)
+        return np.asarray(jax.jit(residuals)(point, tests, self.model.forms))
 
     def rms_um(self) -> np.ndarray:
         """Root mean square residual of every particle [um], shape (N,)."""
@@ -261,7 +271,7 @@ class LeastSquaresCalibration(Calibration):
     def _known(self) -> list[bool]:
         """Which of the shared parameters the data do not leave open."""
         free = bool(self.identifiability.open)
-        return [not (free and self._open_share(q) > 0.1) for q in range(5)]
+        return [not (free and self._open_share(q) > 0.1) for q in range(len(self.solution.value.shared))]
 
     @property
     def _alone(self) -> bool:
@@ -270,9 +280,24 @@ class LeastSquaresCalibration(Calibration):
 
     def _spread_sd(self) -> np.ndarray:
         """Standard deviations of the three spreads, from those of their coordinates."""
-        spreads = slice(FIRST_SPREAD, FIRST_SPREAD + 3)
-        slope = spread_slope(np.asarray(self.fit.mode)[spreads], np.asarray(self.fit.numbers.spread)[:3])
-        return slope * np.sqrt(np.diagonal(np.asarray(self.fit.covariance)))[spreads]
+        mode, sd = np.asarray(self.fit.mode), np.sqrt(np.diagonal(np.asarray(self.fit.covariance)))
+        found = []
+        for name in COEFFICIENTS:
+            place = self.fit.names.index(f"tau_{name}_coordinate")
+            spread = SpreadCoordinate(getattr(self.model.chosen_priors, f"tau_{name}")).spread
+            found.append(abs(float(jax.grad(spread)(jnp.asarray(mode[place])))) * sd[place])
+        return np.array(found)
+
+    def _effects(self) -> dict[str, Any]:
+        """Estimates of the effects' numbers by the names of their sites."""
+        values, sds = np.asarray(self.solution.value.shared)[len(SHARED) :], self._shared_sd[len(SHARED) :]
+        size, found = len(self.model.effects), {}
+        for k, name in enumerate(self.model.forms.names):
+            log = k >= size
+            found[name] = log_estimate(values[k], sds[k]) if log else _normal(float(values[k]), float(sds[k]))
+        for j, name in enumerate(self.model.varying_in_order):
+            found[f"tau_{name}"] = estimate(float(self.settings.population.theta_scatter[j]))
+        return found
 
     def _chi2(self) -> float:
         used = int(np.asarray(self.selection.tests.mask).sum())
@@ -292,7 +317,7 @@ def _spread(value: float, sd: float) -> dict[str, Any]:
     return estimate(value, sd, (max(value - 1.96 * sd, 0.0), value + 1.96 * sd))
 
 
-def identifiability(solution: Solution) -> Identifiability:
+def identifiability(solution: Solution, names: tuple[str, ...] = SHARED) -> Identifiability:
     """Singular values and directions of the shared parameters' curvature, all particles' own parameters eliminated."""
     complement = np.asarray(solution.normal.schur()[2])
     raw = np.diagonal(np.asarray(solution.normal.shared))
@@ -302,13 +327,13 @@ def identifiability(solution: Solution) -> Identifiability:
     left = np.sqrt(np.maximum(np.diagonal(scaled), 1e-300))
     values, vectors = np.linalg.eigh(scaled / left / left[:, None])
     order = np.argsort(values)[::-1]
-    return Identifiability(np.maximum(values[order], 0.0), vectors.T[order])
+    return Identifiability(np.maximum(values[order], 0.0), vectors.T[order], names)
 
 
-def calibrate_least_squares(
+def least_squares(
     campaign: Campaign,
+    model: Model | None = None,
     *,
-    model: JointModel | None = None,
     threshold_MPa: float = THRESHOLD_MPA,
     loss: Loss = "linear",
     seed: int = 0,
@@ -346,23 +371,15 @@ def calibrate_least_squares(
     seed = arguments.seed(seed)
     arguments.choice(loss, get_args(Loss), "loss")
     with numbers_in_reach(campaign):
-        selection, tests, fit, _ = prepare(
+        selection, fit, _ = prepare(
             campaign, model, threshold_MPa, block=block, tell=tell, correlated=loss == "linear", rounds=1
         )
-        population = population_at(fit.mode, fit.numbers, model.scatter)
-        settings = Pooled(
-            fit.filters,
-            population.tau,
-            population.modulus_scatter,
-            population.shape_scatter,
-            model.zero_sd,
-            model.unloading,
-            model.scatter,
-            loss,
-        )
+        tests, population = fit.tests, fit.population
+        settings = Pooled(fit.filters, population, model.zero_prior, _further(model), model.forms, model.scatter, loss)
         tell("fitting all particles together")
-        low, high = np.asarray(fit.numbers.a)[2:]
-        starts = [float(population.a), *(a for a in STARTS if 0.9 * low < a < 0.9 * high)]
+        flatness = np.asarray(tests.flatness)
+        low, high = -0.9 / max(flatness.max(), 1e-3), -0.9 / min(flatness.min(), -1e-3)
+        starts = [float(population.a), *(a for a in STARTS if low < a < high)]
         mu, log_modulus = np.asarray(population.mu), float(population.log_modulus)
         found = [solve(fit, settings, tests, a, mu, log_modulus) for a in starts]
         losses = np.array([float(one.loss) for one in found])
@@ -381,7 +398,7 @@ def calibrate_least_squares(
         fit,
         settings,
         best,
-        identifiability(best),
+        identifiability(best, (*SHARED, *model.forms.names)),
         (agree, len(starts)),
         seed,
         time.perf_counter() - started,
@@ -390,14 +407,27 @@ def calibrate_least_squares(
 
     def again(some: Campaign) -> dict[str, Any]:
         settings: dict[str, Any] = {"threshold_MPa": threshold_MPa, "loss": loss, "seed": seed, "block": block}
-        return calibrate_least_squares(some, model=model, without_flagged=False, **settings).answer()
+        return least_squares(some, model, without_flagged=False, **settings).answer()
 
     findings = judged(campaign, calibration.answer(), outlying, again if without_flagged else None)
     return replace(calibration, findings=findings, runtime_s=time.perf_counter() - started)
 
 
-def solve(fit: JointFit, settings: Pooled, tests: Tests, a: float, mu: np.ndarray, log_modulus: float) -> Solution:
+calibrate_least_squares = least_squares
+
+
+def _further(model: Model) -> Any:
+    """Mean and standard deviation of the logarithm of every further number."""
+    ranges = [n.plausible for v in model.effects for n in v.nuisances]
+    rows = [[0.5 * np.log(low * high), np.log(high / low) / 4] for low, high in ranges]
+    return jnp.asarray(np.array(rows).reshape(-1, 2))
+
+
+def solve(fit: Fit, settings: Pooled, tests: Tests, a: float, mu: np.ndarray, log_modulus: float) -> Solution:
     """The pooled least squares from the fitted particles and the given shared parameters."""
-    local = [fit.latent[:, :3], fit.zero[:, None]] + ([fit.latent[:, 3:]] if settings.scatter.modulus else [])
-    shared = jnp.asarray(np.concatenate([[a, log_modulus], mu]))
+    local = [fit.point.latent[:, :3], fit.point.zero[:, None]]
+    local += [fit.point.latent[:, 3:]] if settings.scatter.modulus else []
+    local += [fit.point.theta[:, k : k + 1] for k, _ in settings.scatter.varying]
+    theta, size = np.asarray(fit.population.theta), len(settings.forms.effects)
+    shared = jnp.asarray(np.concatenate([[a, log_modulus], mu, theta[:size], np.log(theta[size:])]))
     return fit_pooled(tests, settings, Parameters(jnp.concatenate(local, 1), shared))

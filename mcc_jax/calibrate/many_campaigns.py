@@ -13,7 +13,7 @@ import jax
 from .. import arguments
 from .._errors import InputError
 from ..campaign import THRESHOLD_MPA, Campaign, check_campaign
-from .data import select_tests
+from .data import select
 from .least_squares import LeastSquaresCalibration, calibrate_least_squares
 from .posterior import BayesCalibration, calibrate_bayes
 from .sharding import block_size
@@ -101,7 +101,7 @@ def _first_of_each_size(campaigns: list[Campaign], threshold_MPa: float) -> list
     first: dict[tuple[int, int], int] = {}
     for i, campaign in enumerate(campaigns):
         try:
-            particles, points = select_tests(campaign, threshold_MPa=threshold_MPa).tests.force.shape
+            particles, points = select(campaign, threshold_MPa=threshold_MPa).tests.force.shape
         except Exception:  # whatever is wrong with it is told when its turn comes
             continue
         block = block_size(particles)

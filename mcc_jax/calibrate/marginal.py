@@ -27,6 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._types import Scalar
 from .compiling import compiled
 from .data import Tests
 from .forward import Linear, Point, snap
@@ -274,7 +275,11 @@ def summarise(
         scatter: what differs from particle to particle.
         correlation, along: of the correlated residuals.
     """
-    filters = jax.vmap(lambda *one: whitening(noise, *one, correlation, along))(noise.scale, tests, linear)
+
+    def of_one(scale: Scalar, tests: Tests, linear: Linear) -> Whitening:
+        return whitening(noise, scale, tests, linear, correlation, along)
+
+    filters = jax.vmap(of_one)(noise.scale, tests, linear)
     ones = jnp.where(tests.mask, 1.0, 0.0)
     columns = jnp.concatenate([linear.columns, ones[..., None], linear.residual[..., None]], -1)
     white = jax.vmap(lambda f, x: f(x))(filters, columns)

@@ -10,16 +10,20 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpyro
+import numpyro.handlers
 from jaxtyping import Array, Float, Int
-from numpyro import handlers
 from numpyro.infer.util import constrain_fn, potential_energy, unconstrain_fn
 
 from .._types import Scalar
 from .compiling import compiled
+from .distributions import SpreadCoordinate
 from .marginal import Marginal
 from .model import Model
 from .noise import standard_promotion
-from .population import Population
+from .population import COEFFICIENTS, Population
+
+handlers: Any = numpyro.handlers
 
 
 class Shapes(eqx.Module):
@@ -66,7 +70,8 @@ class LogPosterior(eqx.Module):
     def log_density(self, free: Float[Array, " d"]) -> Scalar:
         """Log density given all tests, with its constant."""
         with standard_promotion():
-            return -potential_energy(self.model, (None, self.marginal), {}, self.sites(free))
+            potential: Any = potential_energy(self.model, (None, self.marginal), {}, self.sites(free))
+            return -potential
 
     def population(self, free: Float[Array, " d"]) -> Population:
         """The population at unbounded coordinates."""
@@ -99,6 +104,51 @@ def population_at(model: Model, shapes: Shapes, sites: dict[str, Array]) -> Popu
         return handlers.substitute(prior, data=values)(shapes)
 
 
+def values_of(population: Population, model: Model, flatness: Array) -> dict[str, Array]:
+    """Values of the sampled sites at a population; of a spread's coordinate the positive one."""
+    p, priors = population, model.chosen_priors
+    shift = jnp.mean(jnp.log1p(p.a * flatness))
+    values = {"a": p.a, "log_modulus": p.log_modulus, "log_noise_factor": p.log_noise}
+    spreads = {}
+    for j, name in enumerate(COEFFICIENTS):
+        values[f"b{2 * j + 1}"] = p.mu[j] + shift
+        spreads[f"tau_{name}"] = p.tau[j], getattr(priors, f"tau_{name}")
+    for name in ("modulus_scatter", "shape_scatter"):
+        spreads[name] = getattr(p, name), getattr(priors, name)
+    for k, v in enumerate(model.effects):
+        values[f"{v.mechanism}_size"] = (v.sign or 1) * p.theta[k] / v.plausible[0]
+    values |= {name: p.theta[k] for k, name in enumerate(model.forms.names) if k >= len(model.effects)}
+    for j, v in enumerate(v for v in model.effects if v.mechanism in model.varying):
+        spreads[f"tau_{v.mechanism}"] = p.theta_scatter[j], model.spread_prior(v)
+    values |= {f"{name}_coordinate": SpreadCoordinate(prior).coordinate(s) for name, (s, prior) in spreads.items()}
+    return {name: values[name] for name in coordinate_names(model)}
+
+
+@compiled
+def log_priors(population: Population, model: Model, flatness: Array) -> dict[str, Array]:
+    """Log density of the prior of every sampled site, at draws of the population with a leading axis."""
+
+    def one(at: Population) -> dict[str, Array]:
+        values = values_of(at, model, flatness)
+        with standard_promotion():
+            prior = handlers.substitute(handlers.seed(model.population, jax.random.key(0)), data=values)
+            trace = handlers.trace(prior).get_trace(Shapes(flatness))
+            return {name: trace[name]["fn"].log_prob(values[name]) for name in values}
+
+    return jax.vmap(one)(population)
+
+
+@compiled
+def prior_populations(keys: Array, model: Model, flatness: Array) -> Population:
+    """Draws of the population from its prior, one a key."""
+
+    def one(key: Array) -> Population:
+        with standard_promotion():
+            return handlers.seed(model.population, key)(Shapes(flatness))
+
+    return jax.vmap(one)(keys)
+
+
 def start_values(free: Float[Array, " d"], target: LogPosterior) -> dict[str, Array]:
     """Values of the sampled sites at unbounded coordinates."""
     shapes = Shapes(target.marginal.flatness, target.marginal.weight)
@@ -106,6 +156,12 @@ def start_values(free: Float[Array, " d"], target: LogPosterior) -> dict[str, Ar
         prior = handlers.seed(target.model.population, jax.random.key(0))
         values = constrain_fn(prior, (shapes,), {}, target.sites(free))
     return {name: values[name] for name in target.names}
+
+
+@compiled
+def density_of(free: Float[Array, " d"], target: LogPosterior) -> Scalar:
+    """Log density at unbounded coordinates."""
+    return target.log_density(free)
 
 
 @compiled

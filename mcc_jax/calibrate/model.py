@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import jax
@@ -13,7 +12,6 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 from jaxtyping import Array, Float
-from numpyro import deterministic, sample
 
 from .. import arguments
 from .._errors import InputError
@@ -22,12 +20,14 @@ from ..effects import Variant, find_variant
 from ..law import StrainScaling, Unloading
 from .data import Tests
 from .distributions import Amplitude, RecordNoise, SpreadCoordinate, nuisance_prior
-from .forward import Forms, Point, linearise
+from .forward import Forms, Linear, Point, linearise
 from .marginal import Marginal
 from .noise import Along, Correlation, Noise, Whitening, whitening
 from .population import COEFFICIENTS, Population, Scatter, particles_at
 from .priors import NakagamiPrior, Priors
 
+sample: Any = numpyro.sample
+deterministic: Any = numpyro.deterministic
 ALMOST = 0.98
 """Share of the way to the value of a at which a particle's shape factor would vanish."""
 
@@ -167,9 +167,7 @@ class Model:
             factor = p.noise_factor
             log_noise = sample("log_noise_factor", dist.Normal(np.log(factor.median), factor.log_sd))
             deterministic("noise_factor", jnp.exp(log_noise))
-        return Population(
-            a, log_modulus, mu, tau, modulus_scatter, shape_scatter, log_noise, theta, theta_scatter
-        )
+        return Population(a, log_modulus, mu, tau, modulus_scatter, shape_scatter, log_noise, theta, theta_scatter)
 
     def _effects(self) -> tuple[Float[Array, " numbers"], Float[Array, " varying"]]:
         """Amplitudes on their physical side, further numbers within what is plausible, spreads of those that vary."""
@@ -180,9 +178,7 @@ class Model:
             for n in v.nuisances:
                 further.append(sample(f"{v.mechanism}.{n.name}", nuisance_prior(n)))
             if v.mechanism in self.varying:
-                # In the logarithm, or in the amplitude's own unit where it may have either sign.
-                prior = NakagamiPrior(v.plausible[1] if self._signed(v) else 0.5, shape=0.25)
-                spreads.append(spread(f"tau_{v.mechanism}", prior))
+                spreads.append(spread(f"tau_{v.mechanism}", self.spread_prior(v)))
         none = jnp.zeros(0)
         theta = jnp.concatenate([none, *(jnp.reshape(x, 1) for x in (*amplitudes, *further))])
         return theta, jnp.concatenate([none, *(jnp.reshape(x, 1) for x in spreads)])
@@ -209,9 +205,11 @@ class Model:
     def _filters(self, noise: Noise, point: Point, tests: Tests) -> Whitening:
         """The noise as displacement: how noise of force moves the prediction is taken as known."""
         linear = linearise(jax.lax.stop_gradient(point), tests, self.forms, with_numbers=False)
-        return jax.vmap(lambda *one: whitening(noise, *one, self.correlation, self.along))(
-            noise.scale, tests, linear
-        )
+
+        def one(scale: Scalar, tests: Tests, linear: Linear) -> Whitening:
+            return whitening(noise, scale, tests, linear, self.correlation, self.along)
+
+        return jax.vmap(one)(noise.scale, tests, linear)
 
     # ---- what follows from it ----------------------------------------------------------------------------------------
 
@@ -224,6 +222,11 @@ class Model:
     def shape_power(self) -> float:
         """Power of the shape factor in e: the scaling's, or half of it in the forms that square the modulus."""
         return self.strain_scaling.power / self.unloading.stress_power
+
+    @property
+    def variants(self) -> dict[str, Variant]:
+        """The formulas of the effects by "mechanism:variant"."""
+        return {f"{v.mechanism}:{v.name}": v for v in self.effects}
 
     @property
     def forms(self) -> Forms:
@@ -240,6 +243,11 @@ class Model:
     def varying_in_order(self) -> tuple[str, ...]:
         """Mechanisms whose amplitude differs from particle to particle, in the order of the effects."""
         return tuple(v.mechanism for v in self.effects if v.mechanism in self.varying)
+
+    def spread_prior(self, variant: Variant) -> NakagamiPrior:
+        """Prior of how much an amplitude differs between particles: in the logarithm, or in its own unit where it may
+        have either sign. Open in its order of magnitude."""
+        return NakagamiPrior(variant.plausible[1] if self._signed(variant) else 0.5, shape=0.25)
 
     @staticmethod
     def _signed(variant: Variant) -> bool:
@@ -262,9 +270,10 @@ class Model:
             InputError: for a name that does not exist, naming those that do; for two formulas of one mechanism.
         """
         new = tuple(_variant(one) for one in effects)
-        return dataclasses.replace(
-            self, effects=(*self.effects, *new), varying=(*self.varying, *_several(varying))
-        )
+        return dataclasses.replace(self, effects=(*self.effects, *new), varying=(*self.varying, *_several(varying)))
+
+
+JointModel = Model
 
 
 def spread(name: str, prior: NakagamiPrior) -> Scalar:

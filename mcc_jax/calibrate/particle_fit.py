@@ -98,6 +98,7 @@ def linear_start(
 @compiled
 def linear_starts(tests: Tests, log_modulus: Scalar) -> Float[Array, "starts particles 5"]:
     """Several starts for every particle: the linear one and variations of it."""
+    assert tests.displacement is not None
     b, zero = jax.vmap(linear_start)(tests.particle, tests.force, tests.displacement, tests.loading, tests.contact)
     first = jnp.concatenate([b, jnp.full((len(tests), 1), log_modulus), zero[:, None]], 1)
     return first[None] + jnp.pad(jnp.asarray(VARIATIONS), ((0, 0), (0, 2)))[:, None]

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._types import Scalar
@@ -117,3 +121,8 @@ def particles_at(
         theta = theta.at[:, k].set(value)
         slopes.append((jnp.broadcast_to(tau, mine.shape) if signed else tau * value)[:, None])
     return Particles(latent, theta, factor, jnp.concatenate(slopes, 1))
+
+
+def flattened(draws: Any) -> Any:
+    """Arrays of draws with the axes (chain, draw, ...), all chains in one row."""
+    return jax.tree.map(lambda x: np.asarray(x).reshape(x.shape[0] * x.shape[1], *x.shape[2:]), draws)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, NamedTuple, get_args
 
 import jax
@@ -12,14 +12,16 @@ import numpy as np
 
 from .. import arguments
 from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_plausibility, check_tests
+from ..effects import Variant
 from .data import Selection, compared_rows, own_misfit, ranges_um, root_mean_squares
-from .draws import Length, draw_fast, draw_joint
-from .estimates import estimate, finite, force_zero, log_estimate, misfit_note, summary
-from .fit import prepare
-from .judgement import judged, numbers_in_reach, unlike_others
-from .model import JointFit, JointModel, checked_settings
+from .draws import Draws, draw_fast, draw_joint
+from .effects import effect_entries, effect_numbers
+from .estimates import estimate, finite, force_zero, log_estimate, misfit_note, noise_note, summary
+from .fitting import Fit, checked_settings, prepare
+from .judgement import judged, noise_share, numbers_in_reach, unlike_others
+from .model import Model
+from .nuts import Length
 from .population import COEFFICIENTS, Population
-from .precompile import compile_ahead
 from .predict import predict_measured
 from .results import PosteriorDraws
 from .weights import PARETO_K_MOST
@@ -56,6 +58,7 @@ class BayesCalibration(PosteriorDraws):
         modulus_MPa: draws of every particle's effective modulus.
         zero_um: draws of every particle's zero.
         shape_factor: draws of every particle's eta_p.
+        theta: draws of the numbers of every particle's effects, in the order of `model.forms.names`.
         log_likelihood: of every particle's whole test under each draw of the population, the particle integrated out:
             what leave-one-particle-out needs.
         mode: "fast" or "joint".
@@ -67,19 +70,21 @@ class BayesCalibration(PosteriorDraws):
         divergences: number of divergent trajectories.
         rhat, ess_bulk, ess_tail: by parameter of the population, before any thinning.
         leapfrogs: mean number of leapfrog steps of a draw; 0 of independent draws (`importance`).
+        log_evidence: log marginal likelihood of the model, and its standard error.
         seed, runtime_s: for the record.
         findings: what a reader must know of the tests and of the plausibility of the answer.
     """
 
     campaign: Campaign
     selection: Selection
-    model: JointModel
-    fit: JointFit
+    model: Model
+    fit: Fit
     population: Population
     C: np.ndarray
     modulus_MPa: np.ndarray
     zero_um: np.ndarray
     shape_factor: np.ndarray
+    theta: np.ndarray
     log_likelihood: np.ndarray
     mode: Mode
     pareto_k: np.ndarray
@@ -90,6 +95,7 @@ class BayesCalibration(PosteriorDraws):
     ess_bulk: dict[str, float]
     ess_tail: dict[str, float]
     leapfrogs: float
+    log_evidence: tuple[float, float]
     seed: int
     runtime_s: float
     notes: tuple[str, ...] = field(default=())
@@ -98,6 +104,11 @@ class BayesCalibration(PosteriorDraws):
     def compared(self) -> Mapping[int, tuple[np.ndarray, np.ndarray]]:
         """Rows of every particle's curve that stand in the tests, and which of them are compared."""
         return compared_rows(self.selection)
+
+    @property
+    def variants(self) -> dict[str, Variant]:
+        """The formulas of the law's effects by name."""
+        return self.model.variants
 
     def predictions(self, particle: str) -> np.ndarray | None:
         """Draws of what may be measured of a particle at its rows [um], shape (draws, rows)."""
@@ -153,6 +164,7 @@ class BayesCalibration(PosteriorDraws):
             named["modulus_scatter"] = p.modulus_scatter
         if self.model.shape_scatter:
             named["shape_scatter"] = p.shape_scatter
+        named |= effect_numbers(p, self.model)
         named["noise_factor"] = np.exp(np.asarray(p.log_noise))
         return {name: np.asarray(values) for name, values in named.items()}
 
@@ -160,8 +172,7 @@ class BayesCalibration(PosteriorDraws):
         """What a reader of the numbers must know, one sentence each."""
         notes = [*self.failures(), *map(str, self.findings), *self.selection.notes, *self.notes]
         misfit = misfit_note(own_misfit(self.selection.tests, self.fit.residual))
-        if misfit is not None:
-            notes.append(misfit)
+        notes += [note for note in (misfit, noise_note(self.noise_share)) if note is not None]
         dropped = sum(reason is not None for reason in self.selection.why_not)
         if dropped:
             notes.append(f"{dropped} of {len(self.campaign)} particles could not be used")
@@ -190,6 +201,11 @@ class BayesCalibration(PosteriorDraws):
         r""":math:`\sigma_y = E[C_1]/17.16` [MPa] (eq. 22), one number per draw of the population."""
         return np.exp(np.asarray(self.population.mu)[..., 0] + np.asarray(self.population.tau)[..., 0] ** 2 / 2) / 17.16
 
+    @property
+    def noise_share(self) -> float:
+        """Share of what the law misses that correlated noise has taken up; see `noise_share`."""
+        return noise_share(self.fit)
+
     def rms_um(self) -> np.ndarray:
         """Root mean square residual of every particle at the most probable parameters [um]."""
         return root_mean_squares(self.selection.tests, self.fit.residual)
@@ -201,9 +217,9 @@ class BayesCalibration(PosteriorDraws):
     def to_json(self) -> dict[str, Any]:
         """The contents of `calibration.json`."""
         named = self.named_population()
-        noise = self.fit.noise
+        noise = self.fit.noise.noise
         numbers = ("displacement_um", "force_mN", "correlated_um", "correlation_length")
-        logs, sds = np.asarray(noise.logs), np.asarray(self.fit.noise_log_sd)
+        logs, sds = np.asarray(noise.logs), self.fit.noise.log_sd
         entries = []
         rms = self.rms_um()
         position = {i: row for row, i in enumerate(self.selection.kept)}
@@ -217,6 +233,10 @@ class BayesCalibration(PosteriorDraws):
                 draws["zero_um"] = summary(self.zero_um[..., row])
                 if self.model.modulus_scatter:
                     draws["effective_modulus_MPa"] = summary(self.modulus_MPa[..., row])
+                if self.model.varying:
+                    places = {v.mechanism: k for k, v in enumerate(self.model.effects)}
+                    own = {m: summary(self.theta[..., row, places[m]]) for m in self.model.varying_in_order}
+                    draws["amplitudes"] = own
             entries.append(
                 {
                     "particle": name,
@@ -237,7 +257,7 @@ class BayesCalibration(PosteriorDraws):
             "runtime_s": self.runtime_s,
             "seed": self.seed,
             "law": {"unloading": self.model.unloading.value, "strain_scaling": self.model.strain_scaling.value},
-            "effects": [],
+            "effects": effect_entries(self.model, named),
             "modulus_scatter": summary(named["modulus_scatter"]) if self.model.modulus_scatter else None,
             "shape_scatter": summary(named["shape_scatter"]) if self.model.shape_scatter else None,
             "yield_stress_MPa": summary(self.yield_stress_MPa()),
@@ -259,6 +279,9 @@ class BayesCalibration(PosteriorDraws):
                 "pareto_k_joint": None if self.pareto_k_joint is None else finite(self.pareto_k_joint),
                 "weights_applied": self.weights_applied,
                 "leapfrogs_mean": finite(self.leapfrogs),
+                "log_evidence": finite(self.log_evidence[0]),
+                "log_evidence_error": finite(self.log_evidence[1]),
+                "noise_share": finite(self.noise_share),
                 "own_misfit": finite(own_misfit(self.selection.tests, self.fit.residual)),
                 "failures": self.failures(),
             },
@@ -288,10 +311,10 @@ def unmixed(rhat: Mapping[str, float], ess_bulk: Mapping[str, float]) -> tuple[W
     )
 
 
-def calibrate_bayes(
+def sample(
     campaign: Campaign,
+    model: Model | None = None,
     *,
-    model: JointModel | None = None,
     threshold_MPa: float = THRESHOLD_MPA,
     mode: Mode = "fast",
     chains: int = 4,
@@ -339,18 +362,15 @@ def calibrate_bayes(
     chains, draws = (arguments.whole(n, name, least=1) for n, name in ((chains, "chains"), (draws, "draws")))
     length = Length(chains, arguments.whole(warmup, "warmup", least=1), draws)
     fast = mode == "fast"
-    ahead = (lambda tests, size: compile_ahead(tests, size, model, length)) if fast else None
     with numbers_in_reach(campaign):
-        selection, tests, fit, size = prepare(
-            campaign, model, threshold_MPa, fill_up=fast, block=block, meanwhile=ahead, tell=tell
-        )
+        selection, fit, size = prepare(campaign, model, threshold_MPa, fill_up=fast, block=block, tell=tell)
         tell("sampling the population" if fast else "sampling everything")
         key = jax.random.key(seed)
         likely = not any(one.level == "bad" for one in check_plausibility(campaign.raw or campaign))
         if fast:
-            parts = draw_fast(key, tests, model, fit, length, size, patient=likely)
+            drawn = draw_fast(key, fit, length, size, patient=likely)
         else:
-            parts = draw_joint(key, tests, model, fit, length)
+            drawn = draw_joint(key, fit, length)
     tell("diagnosing")
     calibration = BayesCalibration(
         campaign=campaign,
@@ -360,7 +380,7 @@ def calibrate_bayes(
         mode=mode,
         seed=seed,
         runtime_s=time.perf_counter() - started,
-        **parts,
+        **{f.name: getattr(drawn, f.name) for f in fields(Draws)},
     )
     tests = calibration.selection.tests
     outlying = unlike_others(calibration.particles, calibration.rms_um(), ranges_um(tests))
@@ -368,7 +388,10 @@ def calibrate_bayes(
     def again(some: Campaign) -> dict[str, Any]:
         settings: dict[str, Any] = {"threshold_MPa": threshold_MPa, "mode": mode, "seed": seed, "block": block}
         few: dict[str, Any] = {"chains": chains, "warmup": warmup, "draws": draws}
-        return calibrate_bayes(some, model=model, without_flagged=False, **settings, **few).answer()
+        return sample(some, model, without_flagged=False, **settings, **few).answer()
 
     findings = judged(campaign, calibration.answer(), outlying, again if without_flagged else None)
     return replace(calibration, findings=findings, runtime_s=time.perf_counter() - started)
+
+
+calibrate_bayes = sample

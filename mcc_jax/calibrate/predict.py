@@ -9,14 +9,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from .. import arguments
 from .._errors import InputError
-from ..campaign import PAPER_EFFECTIVE_MODULUS_MPA, PAPER_LOG_C, PAPER_SHAPE_PARAMETER, particle_batch
+from ..campaign import PAPER_EFFECTIVE_MODULUS_MPA, PAPER_LOG_C, PAPER_SHAPE_PARAMETER
+from ..effects import Record
+from ..geometry import Particle
 from ..law import MccLaw, Plastic
 from .compiling import compiled
 from .estimates import summary
-from .population import COEFFICIENTS
+from .model import Model
+from .noise import Whitening
+from .population import COEFFICIENTS, flattened
 from .results import PosteriorDraws
 
 A_CALIBRATION = "Make one with mcc_jax.calibrate_bayes(campaign)."
@@ -53,17 +58,43 @@ class PredictedCurves:
 
 
 @compiled
-def _paths(laws: MccLaw, particles: Any, forces: Any):
-    return jax.lax.map(lambda one: one[0].path_load(one[1], one[0].init(one[1]), one[2])[1], (laws, particles, forces))
+def _paths(laws: MccLaw, particle: Particle, force: Array, time: Array) -> Array:
+    """Displacement [um] of one particle along a clean path, by each of many laws."""
+
+    def one(law: MccLaw) -> Array:
+        return law.path_load(particle, law.init(particle), force, time)[1]
+
+    return jax.lax.map(one, laws)
 
 
-def _laws(calibration: PosteriorDraws, C: np.ndarray, a: np.ndarray, modulus: np.ndarray) -> MccLaw:
-    model = calibration.model
+@compiled
+def predicted_by(laws: MccLaw, particle: Particle, record: Record) -> Array:
+    """Displacement [um] of one particle along its measured test, by each of many laws."""
+    return jax.lax.map(lambda law: law.respond(particle, record), laws)
 
-    def one(C: Any, a: Any, E: Any) -> MccLaw:
-        return MccLaw(Plastic(C[0], C[1], C[2]), a, E, model.unloading, model.strain_scaling)
 
-    return eqx.filter_vmap(one)(jnp.asarray(C), jnp.asarray(a), jnp.asarray(modulus))
+@compiled
+def _noise(filters: Whitening, key: Array, count: int) -> Array:
+    """Draws of a test's noise [um]; of points that do not count as large as usual."""
+
+    def one(key: Array) -> Array:
+        keys = jax.random.split(key, 3)
+        white, of_branches, of_zero = (jax.random.normal(k, filters.peak.shape) for k in keys)
+        return jnp.where(filters.mask, filters.colour(white, of_branches, of_zero[0]), usual * white)
+
+    variance = jnp.where(filters.mask, filters.solver.matrix.diag.d, jnp.nan)
+    usual = jnp.sqrt(jnp.nanmedian(variance))
+    return jax.lax.map(one, jax.random.split(key, count))
+
+
+def laws_with(model: Model, C: np.ndarray, a: np.ndarray, modulus: np.ndarray, theta: np.ndarray) -> MccLaw:
+    """Laws with these numbers, every array field with a leading axis."""
+
+    def one(C: Any, a: Any, E: Any, theta: Any) -> MccLaw:
+        plastic = Plastic(C[0], C[1], C[2])
+        return MccLaw(plastic, a, E, model.unloading, model.strain_scaling, effects=model.forms.build(theta))
+
+    return eqx.filter_vmap(one)(*(jnp.asarray(x) for x in (C, a, modulus, theta)))
 
 
 def sample_laws(calibration: PosteriorDraws, count: int, *, seed: int = 0) -> MccLaw:
@@ -83,18 +114,23 @@ def sample_laws(calibration: PosteriorDraws, count: int, *, seed: int = 0) -> Mc
     arguments.instance(calibration, PosteriorDraws, "calibration", A_CALIBRATION)
     count = arguments.whole(count, "count", least=1)
     rng = np.random.default_rng(arguments.seed(seed))
-    p = jax.tree.map(lambda x: np.asarray(x).reshape(-1, *np.asarray(x).shape[2:]), calibration.population)
+    p = flattened(calibration.population)
     pick = rng.integers(len(p.a), size=count)
     C = np.exp(p.mu[pick] + p.tau[pick] * rng.standard_normal((count, 3)))
     a = p.a[pick] + p.shape_scatter[pick] * rng.standard_normal(count)
     modulus = np.exp(p.log_modulus[pick] + p.modulus_scatter[pick] * rng.standard_normal(count))
-    return _laws(calibration, C, a, modulus)
+    theta = np.array(p.theta[pick])
+    for j, (k, signed) in enumerate(calibration.model.scatter.varying):
+        own = p.theta_scatter[pick, j] * rng.standard_normal(count)
+        theta[:, k] = theta[:, k] + own if signed else theta[:, k] * np.exp(own)
+    return laws_with(calibration.model, C, a, modulus, theta)
 
 
 def predict_new_particle(
     calibration: PosteriorDraws,
     diameters_um: Any,
     force_mN: Any,
+    time_s: Any = None,
     *,
     count: int = 500,
     seed: int = 0,
@@ -105,6 +141,7 @@ def predict_new_particle(
         calibration: the posterior.
         diameters_um: its D1, D2, D3 [um].
         force_mN: path of forces, loading and unloading [mN], shape (n,).
+        time_s: times of the same points [s], for effects that depend on time; none passes if None.
         count: number of draws.
         seed: random seed.
 
@@ -116,12 +153,11 @@ def predict_new_particle(
     force_mN = np.asarray(arguments.path(force_mN, "force_mN"))
     if not np.isfinite(force_mN).all():
         raise InputError(f"force_mN is {force_mN[~np.isfinite(force_mN)][0]} at one point", remedy="Leave it out.")
+    time = np.zeros(len(force_mN)) if time_s is None else np.asarray(arguments.path(time_s, "time_s"))
+    arguments.same_length(force_mN=force_mN, time_s=time)
     laws = sample_laws(calibration, count, seed=seed)
-    paths = np.broadcast_to(np.asarray(force_mN, float), (count, len(force_mN)))
-    particles = particle_batch(np.broadcast_to(sizes, (count, 3)))
-    return PredictedCurves(
-        np.asarray(force_mN, float), np.asarray(_paths(laws, particles, jnp.asarray(paths))), None, laws
-    )
+    paths = _paths(laws, Particle(*sizes), jnp.asarray(np.asarray(force_mN, float)), jnp.asarray(time))
+    return PredictedCurves(np.asarray(force_mN, float), np.asarray(paths), None, laws)
 
 
 def predict_measured(calibration: PosteriorDraws, particle: str, *, count: int = 200, seed: int = 0) -> PredictedCurves:
@@ -152,40 +188,20 @@ def predict_measured(calibration: PosteriorDraws, particle: str, *, count: int =
     def chosen(values: np.ndarray) -> np.ndarray:
         return values.reshape(chains * draws, *values.shape[2:])[pick]
 
-    laws = _laws(
-        calibration,
+    laws = laws_with(
+        calibration.model,
         chosen(calibration.C[:, :, row]),
         chosen(np.asarray(calibration.population.a)),
         chosen(calibration.modulus_MPa[:, :, row]),
+        chosen(calibration.theta[:, :, row]),
     )
-    force = np.asarray(tests.force[row])
-    particles = particle_batch(
-        np.broadcast_to(calibration.campaign.diameters_um[calibration.selection.kept[row]], (len(pick), 3))
-    )
-    paths = jnp.asarray(np.broadcast_to(force, (len(pick), len(force))))
-    clean = np.asarray(_paths(laws, particles, paths))[:, :length] + chosen(calibration.zero_um[:, :, row])[:, None]
-    # Noise as a tester would add it: one over the filter's weight where points count, their median elsewhere.
-    noise = calibration.fit.noise
-    weight = np.asarray(calibration.fit.filters.weight[row])[:length]
-    usual = 1 / np.median(weight[weight > 0])
+    tests, filters = (jax.tree.map(lambda x: x[row], tree) for tree in (tests, calibration.fit.filters))
+    zero = chosen(calibration.zero_um[:, :, row])[:, None]
+    clean = np.asarray(predicted_by(laws, tests.particle, tests.record)) + zero
     factor = np.exp(chosen(np.asarray(calibration.population.log_noise)))[:, None]
-    white = np.where(weight > 0, 1 / np.where(weight > 0, weight, 1.0), usual)
-    correlated = float(noise.correlated) * float(noise.scale[row])
-    step = np.asarray(tests.step[row])[:length]
-    wander = _wander(rng, step, correlated, max(float(noise.length), 1e-9), len(pick))
-    read = np.sqrt(np.maximum(white**2 - correlated**2, 0.05 * white**2))
-    observed = clean + factor * (wander + read * rng.standard_normal(clean.shape))
-    return PredictedCurves(force[:length], clean, observed, laws)
-
-
-def _wander(rng: np.random.Generator, step: np.ndarray, sd: float, length: float, count: int) -> np.ndarray:
-    """Paths of an Ornstein-Uhlenbeck process, shape (count, n)."""
-    decay = np.exp(-step / length)
-    values = np.empty((count, len(step)))
-    values[:, 0] = sd * rng.standard_normal(count)
-    for k in range(1, len(step)):
-        values[:, k] = decay[k] * values[:, k - 1] + sd * np.sqrt(1 - decay[k] ** 2) * rng.standard_normal(count)
-    return values
+    noise = np.asarray(_noise(filters, jax.random.key(seed), len(pick)))
+    observed = clean + factor * noise
+    return PredictedCurves(np.asarray(tests.force)[:length], clean[:, :length], observed[:, :length], laws)
 
 
 def compare_with_paper(calibration: PosteriorDraws) -> list[dict[str, Any]]:

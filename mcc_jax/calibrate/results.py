@@ -17,12 +17,14 @@ from .._errors import InputError
 from .._format import table, with_sd
 from .._store import json_text, results
 from ..campaign import Campaign, read_campaign
+from ..effects import Variant
 from ..law import MccLaw
 from .content import read_result
 from .curves import FittedCurve, fitted_curves
 from .data import Selection
+from .fitting import Fit
 from .laws import law_of
-from .model import JointFit, JointModel
+from .model import Model
 from .population import COEFFICIENTS, Population
 
 ARCHIVE, CONTENT, DISCOVERY_ARCHIVE = "calibration.msgpack", "calibration.json", "discovery.msgpack"
@@ -99,15 +101,21 @@ class Calibration(Saved):
         """
         campaign = self.campaign
         if campaign is None or particle not in campaign.particles:
-            return law_of(self.to_json(), particle)
-        return law_of(self.to_json(), particle, campaign.diameters_um[campaign.index(particle)])
+            return law_of(self.to_json(), particle, variants=self.variants)
+        size = campaign.diameters_um[campaign.index(particle)]
+        return law_of(self.to_json(), particle, size, self.variants)
+
+    @property
+    def variants(self) -> dict[str, Variant]:
+        """The formulas of the law's effects by name, which need not be of the library."""
+        return {}
 
     @cached_property
     def curves(self) -> tuple[FittedCurve, ...]:
         """Every test of the campaign from contact on: measured, compared, and as the law has it."""
         if self.campaign is None:
             return ()
-        return fitted_curves(self.to_json(), self.campaign, self.compared(), self.predictions)
+        return fitted_curves(self.to_json(), self.campaign, self.compared(), self.predictions, self.variants)
 
     def compared(self) -> Mapping[int, tuple[np.ndarray, np.ndarray]]:
         """Of each particle that took part, by its place in the campaign: rows of its curve, and which are compared."""
@@ -123,12 +131,13 @@ class PosteriorDraws(Calibration):
 
     campaign: Campaign
     selection: Selection
-    model: JointModel
-    fit: JointFit
+    model: Model
+    fit: Fit
     population: Population
     C: np.ndarray
     modulus_MPa: np.ndarray
     zero_um: np.ndarray
+    theta: np.ndarray
     seed: int
 
     @property

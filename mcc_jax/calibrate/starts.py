@@ -60,9 +60,7 @@ class Start(NamedTuple):
     theta: np.ndarray
 
 
-def start_of_effects(
-    point: Point, tests: Tests, linear: Parts, noise: Noise, model: Model, blocks: Blocks
-) -> Start:
+def start_of_effects(point: Point, tests: Tests, linear: Parts, noise: Noise, model: Model, blocks: Blocks) -> Start:
     """Values of the effects' sites to start from.
 
     Of every formula the values of its grid are taken whose amplitude, to first order, explains most of the residuals

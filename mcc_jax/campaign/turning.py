@@ -62,9 +62,7 @@ class TurningForces(NamedTuple):
     reading: np.ndarray
 
 
-def turning_forces(
-    curve: Curve, segments: tuple[Segment, ...], options: TurningOptions | None = None
-) -> TurningForces:
+def turning_forces(curve: Curve, segments: tuple[Segment, ...], options: TurningOptions | None = None) -> TurningForces:
     """Estimate the force at which every branch begins.
 
     Args:
@@ -136,7 +134,9 @@ def _level(
     if after.kind == "hold":  # a relaxing force: only the ramp tells where it began
         level, variance = rising.at(0.0)
     else:
-        step = max(turn - float(time[max(after.start - 1, up.start)]), float(time[min(after.start + 1, len(time) - 1)]) - turn)
+        step = max(
+            turn - float(time[max(after.start - 1, up.start)]), float(time[min(after.start + 1, len(time) - 1)]) - turn
+        )
         instants = np.linspace(-step, step, 41)
         gap = [abs(rising.at(t)[0] - falling.at(t)[0]) for t in instants]
         meet = float(instants[int(np.argmin(gap))])

@@ -17,7 +17,17 @@ from ..effects import AbstractEffect, Context, Record, Variant, clean_record, fi
 from ..formulas import Formulas
 from ..geometry import Particle
 from .base import AbstractContactLaw
-from .response import factor_at_peak, folded, force_at, modified, no_memory, one_point, peak_forces, since_peak, whole_path
+from .response import (
+    factor_at_peak,
+    folded,
+    force_at,
+    modified,
+    no_memory,
+    one_point,
+    peak_forces,
+    since_peak,
+    whole_path,
+)
 
 TESTED_STRAIN = 0.67
 """Scaled strain eta_p eps at which the paper's tests ended, on its mean curve (peaks of 7 to 16 MPa)."""
@@ -262,7 +272,9 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
     def context(self, particle: Particle, record: Record) -> Context:
         """What effects are told along a record, from a virgin particle: the law with modified parameters."""
         zero = jnp.zeros_like(particle.D3)
-        return modified(self.formulas, self.effects, particle, zero, record, peak_forces(record, zero), since_peak(record))
+        return modified(
+            self.formulas, self.effects, particle, zero, record, peak_forces(record, zero), since_peak(record)
+        )
 
     def _along(self, particle: Particle, state: History, record: Record) -> tuple[History, Path]:
         peak, memory, displacement = whole_path(

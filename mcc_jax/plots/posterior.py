@@ -14,7 +14,6 @@ from matplotlib.ticker import MaxNLocator
 
 from ..calibrate import BayesCalibration, LeastSquaresCalibration, compare_with_paper
 from ..calibrate.arviz import prior_draws
-from ..calibrate.fit import population_at
 from ..calibrate.population import COEFFICIENTS
 from . import style
 from .curves import plot_bands, plot_fits, plot_new_particle, plot_whitened
@@ -196,8 +195,7 @@ def plot_pairs(calibration: BayesCalibration) -> Figure:
 
 def prior_of(calibration: BayesCalibration) -> dict[str, np.ndarray]:
     """Draws of the population's prior, by the names and in the units of the figures."""
-    low, high = np.asarray(calibration.fit.numbers.a)[2:].tolist()
-    found = prior_draws(calibration.model.chosen_priors, low, high, (1, style.SETTINGS.density_draws), 0)
+    found = prior_draws(calibration, style.SETTINGS.density_draws, 0)
     for vector in ("mu", "tau"):
         found |= {f"{vector}_{name}": found[vector][..., j] for j, name in enumerate(COEFFICIENTS)}
     return _scaled(found)
@@ -314,7 +312,7 @@ def least_squares_table(calibration: LeastSquaresCalibration) -> CoefficientTabl
     found = [[entry[n] for n in COEFFICIENTS] for entry in calibration.to_json()["particles"] if entry["kept"]]
     centre = np.array([[one["value"] for one in row] for row in found], float)
     wide = np.array([[one["interval_95"] or [np.nan, np.nan] for one in row] for row in found], float)
-    mu, tau = np.asarray(calibration.solution.value.shared)[2:], np.asarray(calibration.settings.tau)
+    mu, tau = np.asarray(calibration.solution.value.shared)[2:5], np.asarray(calibration.settings.population.tau)
     spread = np.exp(mu + 1.96 * np.array([[-1.0], [1.0]]) * tau)
     return CoefficientTable(centre, np.moveaxis(wide, -1, 0), None, np.exp(mu), spread)
 
@@ -405,9 +403,9 @@ def plot_estimates(calibration: LeastSquaresCalibration) -> Figure:
 def shrinkage(calibration: BayesCalibration) -> tuple[np.ndarray, np.ndarray]:
     """log C1, C3, C5 of each particle alone, under the most probable a, and posterior means, both of shape (N, 3)."""
     fit = calibration.fit
-    a = float(population_at(fit.mode, fit.numbers, calibration.model.scatter).a)
+    a = float(fit.population.a)
     eta = 1 + a * np.asarray(calibration.selection.tests.flatness)
-    alone = np.asarray(fit.individual.latent)[:, :3] - np.log(eta)[:, None]
+    alone = np.asarray(fit.individual.point.latent)[:, :3] - np.log(eta)[:, None]
     return alone, np.log(np.asarray(calibration.C)).mean(axis=(0, 1))
 
 

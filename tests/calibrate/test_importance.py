@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from jaxtyping import Array
 from joint_cases import random_summary
+from mcc_jax.calibrate.transforms import LogPosterior, most_probable, unconstrain
 
 from mcc_jax import calibrate_bayes, paper_campaign
 from mcc_jax.calibrate import draws as drawing
@@ -14,7 +15,6 @@ from mcc_jax.calibrate.model import prior_numbers
 from mcc_jax.calibrate.population import Scatter
 from mcc_jax.calibrate.priors import Priors
 from mcc_jax.calibrate.sampling import sample_population
-from mcc_jax.calibrate.transforms import LogPosterior, most_probable, unconstrain
 
 COUNT = 200
 

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from joint_cases import COEFFICIENTS, DIAMETERS, NOISE, SNAPPING, modulus_of, simulated, true_latent
+from mcc_jax.calibrate.fit import WIDE, _centre
 
 from mcc_jax import Instrument, StrainScaling, Unloading
 from mcc_jax.calibrate import JointModel
 from mcc_jax.calibrate import fit as fitting
 from mcc_jax.calibrate.data import select_tests
-from mcc_jax.calibrate.fit import WIDE, _centre
 from mcc_jax.calibrate.forward import raw_residual, snap
 from mcc_jax.calibrate.particle_fit import fit_particles, linear_starts
 from mcc_jax.calibrate.sharding import Blocks

@@ -9,12 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from joint_cases import random_summary
-
-from mcc_jax import InputError, JointModel
-from mcc_jax.calibrate import NormalPrior, Priors
 from mcc_jax.calibrate.fit import population_at
-from mcc_jax.calibrate.model import prior_numbers
-from mcc_jax.calibrate.population import Population
 from mcc_jax.calibrate.transforms import (
     LogPosterior,
     PriorNumbers,
@@ -25,6 +20,11 @@ from mcc_jax.calibrate.transforms import (
     spread_slope,
     unconstrain,
 )
+
+from mcc_jax import InputError, JointModel
+from mcc_jax.calibrate import NormalPrior, Priors
+from mcc_jax.calibrate.model import prior_numbers
+from mcc_jax.calibrate.population import Population
 
 PLAIN = JointModel().scatter
 MODULUS, BOTH = JointModel(modulus_scatter=True).scatter, JointModel(modulus_scatter=True, shape_scatter=True).scatter

@@ -118,7 +118,7 @@ class Fit(eqx.Module):
             values["own"] = jnp.zeros((len(self.tests), size))
             metric[("own",)] = jnp.ones(len(self.tests) * size)
             model = ExplicitModel(self)
-        dense = [names for names in metric if names != ("own",)]
+        dense: Any = [names for names in metric if names != ("own",)]
         options = {"target_accept_prob": 0.9 if explicit else 0.8, **settings}
         strategy = init_to_value(values=values)
         return NUTS(model, init_strategy=strategy, inverse_mass_matrix=metric, dense_mass=dense, **options)
@@ -291,9 +291,7 @@ class _Fitter:
         def fit(blocks: Blocks, own: Parts, arrays: Any, starts: Parts, most_steps: int) -> ParticleFits:
             cut = [blocks.cut(v) for v in arrays]
             steps = jnp.asarray(np.asarray(most_steps))
-            return blocks.whole(
-                blocks.each(fit_particles, own, *cut, starts, self.model.forms, self.varying, steps)
-            )
+            return blocks.whole(blocks.each(fit_particles, own, *cut, starts, self.model.forms, self.varying, steps))
 
         if self.blocks.whole_here:
             return fit(self.blocks, self.own, arrays, starts, MAX_STEPS)
@@ -432,9 +430,7 @@ def fit_tests(
     filters = blocks.whole(filtered)
     residual = blocks.whole(Parts(tuple(wave.residual for wave in linear.waves)))
     marginal = target.marginal
-    return Fit(
-        model, tests, individual, noise, filters, point, residual, marginal, free, covariance, converged
-    )
+    return Fit(model, tests, individual, noise, filters, point, residual, marginal, free, covariance, converged)
 
 
 def _of_effects(model: Model, names: tuple[str, ...]) -> np.ndarray:
@@ -462,13 +458,20 @@ def _start(latent: np.ndarray, flatness: np.ndarray, model: Model) -> dict[str, 
     log_eta = np.log(1 + a * flatness)
     b = latent[:, :3] - log_eta[:, None]
     middle = np.median(b, axis=0) + log_eta.mean()
-    start = {"a": a, "log_modulus": float(np.median(latent[:, 3] - model.shape_power * log_eta)), "log_noise_factor": 0.0}
+    start = {
+        "a": a,
+        "log_modulus": float(np.median(latent[:, 3] - model.shape_power * log_eta)),
+        "log_noise_factor": 0.0,
+    }
     for j, name in enumerate(("C1", "C3", "C5")):
         prior = getattr(priors, f"tau_{name}")
         tau = float(np.clip(np.std(b[:, j]), 0.05 * prior.sd, 2 * prior.sd))
-        start |= {f"b{2 * j + 1}": float(middle[j]), f"tau_{name}_coordinate": SpreadCoordinate(prior).coordinate(tau)}
+        start |= {
+            f"b{2 * j + 1}": float(middle[j]),
+            f"tau_{name}_coordinate": float(SpreadCoordinate(prior).coordinate(tau)),
+        }
     for name in ("modulus_scatter", "shape_scatter"):
-        start[f"{name}_coordinate"] = SpreadCoordinate(getattr(priors, name)).coordinate(0.1)
+        start[f"{name}_coordinate"] = float(SpreadCoordinate(getattr(priors, name)).coordinate(0.1))
     return start
 
 
@@ -510,7 +513,15 @@ def expect(free: Float[Array, " d"], target: LogPosterior) -> Expected:
     zero = marginal.zero + jnp.einsum("np,np->n", marginal.zero_slope, at.placed.u)
     theta = at.placed.theta
     return Expected(
-        mean, sd, at.placed.latent, theta, none.theta[:, varying], width[:, 4:][:, varying], zero, at.hessian, at.stretch
+        mean,
+        sd,
+        at.placed.latent,
+        theta,
+        none.theta[:, varying],
+        width[:, 4:][:, varying],
+        zero,
+        at.hessian,
+        at.stretch,
     )
 
 
@@ -533,3 +544,20 @@ def careful_enough(free: Float[Array, " d"], target: LogPosterior, count: int) -
     variance = np.diagonal(np.linalg.inv(np.asarray(at.hessian)[:count]), axis1=1, axis2=2)
     widest = float(np.max(np.sqrt(variance) * np.asarray(at.stretch)))
     return sharp if widest < SHARP else target
+
+
+def checked_settings(
+    progress: Callable[[str], None] | None, model: Model | None, threshold_MPa: Any, block: int | None
+) -> tuple[Callable[[str], None], Model, float]:
+    """What all calibrations share, with the defaults filled in.
+
+    Raises:
+        InputError: for one of the wrong kind or out of its range.
+    """
+    tell = arguments.teller(progress)
+    if model is not None:
+        arguments.instance(model, Model, "model", "Make one with mcc_jax.Model().")
+    if block is not None:
+        arguments.whole(block, "block", least=1)
+    threshold = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
+    return tell, model or Model(), threshold
