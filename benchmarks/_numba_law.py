@@ -88,13 +88,13 @@ def numpy_step(C1, C3, C5, a, modulus, D1, D2, D3, peak, displacement):
     K5 = C5 * C5
     K5 = K5 * K5 * C5
     K3 = C3 * C3 * C3
-    secant = C1 - square * (K3 - square * K5)
-    secant = np.maximum(secant, 0)
+    secant = np.maximum(C1 - square * (K3 - square * K5), 0)
+    carries = (x > 0) & (secant > 0)
     with np.errstate(divide="ignore", invalid="ignore"):
         least = _SHARE * secant
         limit = highest * least / np.maximum(C1 - square * (3 * K3 - 5 * square * K5), least)
         drop = (highest - displacement) / np.minimum(diameter * np.sqrt(eta * secant / (_CONSTANT * modulus)), limit)
-    u = np.clip(1 - drop, 0, 1)
+    u = np.clip(1 - np.where(carries, drop, 1.0), 0, 1)  # nothing recovers where no stress was carried: 0 / 0
     z = 2 * u - 1
     ratio = np.full_like(z, RATIO_64[0])
     for c in RATIO_64[1:]:
@@ -102,4 +102,4 @@ def numpy_step(C1, C3, C5, a, modulus, D1, D2, D3, peak, displacement):
         ratio += c
     ratio *= u * np.sqrt(u)
     ratio = np.where(displacement >= highest, 1.0, ratio)
-    return highest, np.where(x > 0, x * secant * ratio, 0.0) * (np.pi / 4e3) * diameter * diameter
+    return highest, np.where(carries, x * secant * ratio, 0.0) * (np.pi / 4e3) * diameter * diameter

@@ -10,7 +10,7 @@ FIELDS = ("D1", "D2", "D3")
 def numpy_residual(tests, settings):
     """The pooled residuals as a function of one flat vector: every particle's b1, b3, b5, zero, then the shared five.
 
-    For monotone laws, the printed form and raw scaling, without further scatter.
+    For monotone laws, the printed form with its limit and raw scaling, without further scatter.
     """
     D1, D2, D3 = (np.asarray(getattr(tests.particle, name)) for name in FIELDS)
     diameter = (D1 * D2 / D3)[:, None]
@@ -39,8 +39,10 @@ def numpy_residual(tests, settings):
         b, zero = local[:, :3], local[:, 3]
         K1, K3, K5 = (np.exp(k * b[:, j])[:, None] for j, k in enumerate((1, 3, 5)))
         x = loading_strain(K1, K3, K5, highest)
-        secant = K1 - x**2 * (K3 - x**2 * K5)
-        predicted = diameter * (x - np.sqrt(secant / (4.12 * np.exp(e))) * recovered)
+        secant, tangent = K1 - x**2 * (K3 - x**2 * K5), K1 - x**2 * (3 * K3 - 5 * x**2 * K5)
+        least = 3 * np.pi / 8 * secant
+        limit = x * least / np.maximum(tangent, least)  # no contact gives back more than it took
+        predicted = diameter * (x - np.minimum(np.sqrt(secant / (4.12 * np.exp(e))), limit) * recovered)
         r = np.where(mask, measured - predicted - zero[:, None], 0.0)
         white = np.empty_like(r)
         expected = np.zeros(count)

@@ -82,6 +82,9 @@ def data_from_campaign(campaign: Campaign, *, points: int = 180, zero_um: np.nda
 def law_stress(xp: ModuleType, data: TextbookData, a: Any, Ebar: Any, C1: Any, C3: Any, C5: Any) -> Any:
     """Stress [MPa] of every point by the printed law, raw scaling.
 
+    Without the limit of what a contact recovers, which would only add work: every point that is unloaded comes from a
+    peak strain of 0.3 or more, and there the limit matters for moduli of a few MPa alone.
+
     Args:
         xp: the array library: `numpy`, `jax.numpy` or `pytensor.tensor`.
         data: sizes and strains.

@@ -125,14 +125,14 @@ def _told(directory: Path, error: BaseException) -> BaseException:
     why = error.strerror or str(error)
     if error.errno == errno.EISDIR and place:
         why = f"{Path(place).name} there is a folder, where a file is to be written"
-    remedy = "Make room and run again" if error.errno in _FULL else "Give --out a folder you may write to"
+    remedy = "Make room and run again" if error.errno in _FULL else "Give a folder you may write to"
     return InputError(f"results cannot be written there: {why}", file=directory, remedy=remedy)
 
 
 def _make(directory: Path, made: list[Path]) -> None:
     """Make a folder and its parents; those that were missing are appended to the list."""
     if directory.exists() and not directory.is_dir():
-        raise InputError("is a file, not a folder", file=directory, remedy="Give --out another folder")
+        raise InputError("is a file, not a folder", file=directory, remedy="Give another folder")
     for folder in (*reversed(directory.parents), directory):
         if not folder.exists():
             folder.mkdir(exist_ok=True)
@@ -154,7 +154,7 @@ def _locked(directory: Path) -> Iterator[None]:
     except Timeout:
         owner = next((f.name[len(WORK) :].partition("-")[0] for f in directory.glob(WORK + "*")), "")
         who = f"another mcc-jax run (process {owner})" if owner.isdigit() else "another mcc-jax run"
-        remedy = "Wait for it to end, or give --out another folder"
+        remedy = "Wait for it to end, or give another folder"
         raise InputError(f"{who} is writing there", file=directory, remedy=remedy) from None
     except OSError as error:
         if error.errno not in _NO_LOCKS:  # without locks files are still replaced one by one, each whole

@@ -129,14 +129,14 @@ def to_arviz(calibration: BayesCalibration, *, prior_count: int = 500, points: b
         likelihood = {"displacement_um": _point_likelihoods(c, thin)[..., mask]}
         observed, along = observed[mask], ["observation"]
         predicted, before = (x[..., mask[:shown]] for x in (predicted, before))
-    one_each = dict.fromkeys(("zero_um", "eta_p", "particle_modulus_MPa", "test", "pareto_k", "points"), ["particle"])
-    one_each |= {f"particle_{name}": ["particle"] for name in c.model.varying_in_order}
+    one_each = ("zero_um", "eta_p", "particle_modulus_MPa", "test", "pareto_k", "points")
+    one_each += tuple(f"particle_{name}" for name in c.model.varying_in_order)
     dims = {
-        **dict.fromkeys(("mu", "tau"), ["coefficient"]),
+        **{name: ["coefficient"] for name in ("mu", "tau")},
         "C": ["particle", "coefficient"],
-        **one_each,
+        **{name: ["particle"] for name in one_each},
         "diameters_um": ["particle", "axis"],
-        **dict.fromkeys(("force_mN", "mask"), ["particle", "point"]),
+        **{name: ["particle", "point"] for name in ("force_mN", "mask")},
         "displacement_um": along,
     }
     coords: dict[str, Any] = {

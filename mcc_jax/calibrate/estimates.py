@@ -14,7 +14,7 @@ BAD_MISFIT = 0.05
 
 
 BAD_NOISE_SHARE = 0.5
-"""Share of the residual's variance that correlated noise may hold: half, and it is as large as what is read-out noise."""
+"""Share of the residual's variance that correlated noise may hold: at half it is as large as read-out noise."""
 
 NO_SAMPLER: dict[str, None] = dict.fromkeys(("rhat_max", "ess_bulk_min", "divergences", "pareto_k_max"))
 """Diagnostics of methods that draw nothing."""

@@ -175,8 +175,7 @@ class Model:
         for v in self.effects:
             size = sample(f"{v.mechanism}_size", Amplitude(v))
             amplitudes.append(deterministic(v.mechanism, (v.sign or 1) * v.plausible[0] * size))
-            for n in v.nuisances:
-                further.append(sample(f"{v.mechanism}.{n.name}", nuisance_prior(n)))
+            further += [sample(f"{v.mechanism}.{n.name}", nuisance_prior(n)) for n in v.nuisances]
             if v.mechanism in self.varying:
                 spreads.append(spread(f"tau_{v.mechanism}", self.spread_prior(v)))
         none = jnp.zeros(0)

@@ -367,10 +367,7 @@ def sample(
         tell("sampling the population" if fast else "sampling everything")
         key = jax.random.key(seed)
         likely = not any(one.level == "bad" for one in check_plausibility(campaign.raw or campaign))
-        if fast:
-            drawn = draw_fast(key, fit, length, size, patient=likely)
-        else:
-            drawn = draw_joint(key, fit, length)
+        drawn = draw_fast(key, fit, length, size, patient=likely) if fast else draw_joint(key, fit, length)
     tell("diagnosing")
     calibration = BayesCalibration(
         campaign=campaign,

@@ -19,12 +19,11 @@ from ..formulas import Formulas, energy_ratio, recovery_limit, secant_modulus, t
 from ..formulas.loading_inverse import loading_work
 from ..geometry import Particle
 from ..law import TESTED_STRAIN, MccLaw
+from ..law.passivity import never_falls, peaks_up_to
 from ..law.response import factor_at_peak, folded
 
 Normal = Float[Array, " 3"]
 Flags = Bool[Array, "..."]
-PASSIVE_POINTS = 256
-"""Peaks up to the tested one at which a side with effects is asked whether it loses more than at the last."""
 
 
 class Numbers(NamedTuple):
@@ -90,11 +89,10 @@ class HalfContact(eqx.Module):
         """
         if not self.effects:
             return jnp.asarray(True)
-        d = self.tested * jnp.linspace(0.0, 1.0, PASSIVE_POINTS + 1, dtype=self.k1.dtype)
+        d = peaks_up_to(self.tested)
         force = d * secant_modulus(self.k1, self.k3, self.k5, d)
         stored = force * recovered(self.power, self.numbers(d), force, d)[0] * energy_ratio(jnp.zeros_like(d))
-        lost = loading_work(self.k1, self.k3, self.k5, d) - stored
-        return jnp.all(jnp.diff(lost) >= -8 * jnp.finfo(d.dtype).eps * lost[-1])
+        return jnp.all(never_falls(loading_work(self.k1, self.k3, self.k5, d), stored))
 
     @property
     def is_monotone(self) -> Flag:

@@ -11,7 +11,7 @@ from .._numerics import shared
 from .._types import Scalar, Values
 from .loading_inverse import secant_modulus, tangent_modulus
 from .recovery import stress_ratio
-from .recovery_limit import recovery_limit
+from .recovery_limit import SHARE, recovery_limit
 from .unloading import StrainScaling, Unloading
 
 AREA = 1e-3 * jnp.pi / 4
@@ -137,15 +137,21 @@ def _branch_force_jvp(power, primals, tangents):
     s = jnp.where(inside, s, 0.0)
     fall = jnp.where(inside, 4 / jnp.pi * shared(jnp.sqrt((1 - s) * (1 + s))), 0.0)
     h = 0.5 * s * fall
-    slope = tangent_modulus(k1, k3, k5, peak)
-    dforce = peak * (dk1 - square * (dk3 - square * dk5)) + slope * dpeak
-    dslope = dk1 - square * (3 * dk3 - 5 * square * dk5) - peak * (6 * k3 - 20 * square * k5) * dpeak
     with_force = jnp.where(limited, jnp.where(steep, 2.0, 0.0), float(power))
     with_peak = jnp.where(limited, jnp.where(steep, 0.0, -2.0), 1.0)
-    with_slope = jnp.where(limited & steep, shared(2 * h * force / jnp.where(steep, slope, 1.0)), 0.0)
     factor = jnp.where(secant > 0, ratio + with_force * h, 0.0)
-    change = factor * dforce - with_peak * h * secant * dpeak - with_slope * dslope
-    change = change + jnp.where(limited, 0.0, shared(h * force / c)) * dc - shared(force * fall / span) * ddrop
+    # At the limit F_P / T is the span over a constant.
+    by_slope = jnp.where(limited & steep, 2 / SHARE * h * span, 0.0)
+    by_peak = factor * tangent_modulus(k1, k3, k5, peak) - with_peak * h * secant
+    by_peak = by_peak + by_slope * peak * (6 * k3 - 20 * square * k5)
+    by_c = jnp.where(limited, 0.0, shared(h * force / c))
+    by_drop = shared(force * fall / span)
+    # The same for each factor of a tangent: one barrier for each, so that what a derivative does not need is left out.
+    factors = factor * peak, by_slope, by_peak, by_c, by_drop
+    by_force, by_slope, by_peak, by_c, by_drop = map(jax.lax.optimization_barrier, factors)
+    change = (by_force - by_slope) * dk1 - square * ((by_force - 3 * by_slope) * dk3)
+    change = change + square * square * ((by_force - 5 * by_slope) * dk5) + by_peak * dpeak
+    change = change + by_c * dc - by_drop * ddrop
     # Transposed, this is a barrier for the cotangent, which otherwise would be computed again for each input.
     return force * ratio, jax.lax.optimization_barrier(change)
 

@@ -36,6 +36,10 @@ class AbstractContactLaw[State](eqx.Module):
         """Whether the law gives this particle any stress at all."""
         return jnp.asarray(True)
 
+    def gain_strain(self, particle: Particle, state: State) -> Scalar:
+        """Peak strain [-], up to that of the state, beyond which loading and release gain energy; infinite if none."""
+        return jnp.full_like(particle.D3, jnp.inf)
+
     @abc.abstractmethod
     def init(self, particle: Particle) -> State:
         """State of a particle that was never loaded."""

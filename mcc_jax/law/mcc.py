@@ -13,10 +13,12 @@ from .. import arguments
 from .._errors import InputError
 from .._numerics import compiled_whole, running_max
 from .._types import Flag, Path, Scalar, scalar
-from ..effects import AbstractEffect, Context, Record, Variant, clean_record, find_variant
+from ..effects import AbstractEffect, AbstractModulusAtPeak, Context, Record, Variant, clean_record, find_variant
+from ..effects.record import first_point
 from ..formulas import Formulas
 from ..geometry import Particle
 from .base import AbstractContactLaw
+from .passivity import first_gain
 from .response import (
     factor_at_peak,
     folded,
@@ -283,6 +285,24 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
         return History(peak, memory), displacement
 
     # ---- energy ------------------------------------------------------------------------------------------------------
+
+    @compiled_whole
+    def gain_strain(self, particle: Particle, state: History) -> Scalar:
+        """Smallest peak strain [-] beyond which the particle, loaded further and released, gains energy.
+
+        Infinite where it does not up to the state's peak, and without damage and densification it never does
+        (`recovery_limit`). Damage that grows fast adds more recovery than further loading takes. Methods that advance
+        the law do not ask; `simulate.drive` does. Effects on parameters and on the modulus at the peak enter; others
+        (cyclic damage, rates, creep) have no energy in closed form and are left aside.
+        """
+        at_peak = tuple(e for e in self.effects if isinstance(e, AbstractModulusAtPeak))
+        if not at_peak:
+            return super().gain_strain(particle, state)
+        record = first_point(particle.D3.dtype) if state.memory is None else state.memory.point
+        formulas = self.formulas
+        for effect in self.effects:
+            formulas = effect.modify(formulas, particle, record)
+        return first_gain(formulas, at_peak, particle, state.displacement_max)
 
     @compiled_whole
     def energy(self, particle: Particle, history: History, displacement: Scalar) -> Energy:

@@ -28,7 +28,7 @@ from ..campaign import (
 from ..effects import HUMIDITY_COLUMN, REFERENCE_HUMIDITY_PERCENT, Need
 from ..geometry import Particle
 from ..law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainScaling, Unloading
-from .drive import A_LAW, simulate_batch
+from .drive import A_LAW, gains_energy, simulate_batch
 from .effects import HiddenEffect, batched_humidity, hidden_effects, humidities_of
 from .instrument import Instrument
 from .programme import Programme
@@ -155,8 +155,10 @@ def simulate_campaign(
     force, displacement = np.asarray(response.force, float), np.asarray(response.displacement, float)
     bad = np.flatnonzero(np.asarray(response.result != RESULTS.successful))
     if len(bad):
-        reason = RESULTS[jax.tree.map(lambda x: x[bad[0]], response.result)]
-        raise InputError(f"particle {names[bad[0]]!r}: {reason}")
+        law, particle, one = jax.tree.map(lambda x: x[bad[0]], (acting, particle_batch(diameters_um), response))
+        if one.result == RESULTS.gains_energy:
+            raise gains_energy(law, particle, one.state, f"particle {names[bad[0]]!r}")
+        raise InputError(f"particle {names[bad[0]]!r}: {RESULTS[one.result]}")
     streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(count)]
     curves = []
     for i, (time, _) in enumerate(samples):

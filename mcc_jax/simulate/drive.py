@@ -14,6 +14,7 @@ from .._errors import InputError
 from .._results import RESULTS
 from .._types import Path
 from ..campaign import Control
+from ..effects import AbstractModulusAtPeak
 from ..geometry import Particle
 from ..law import AbstractContactLaw, MccLaw
 
@@ -52,6 +53,9 @@ def drive(
 ) -> Response:
     """Drive one particle along a path of displacements [um] or forces [mN].
 
+    A particle whose damage or densification would let it gain energy somewhere up to the largest strain of the path is
+    refused (`MccLaw.gain_strain`).
+
     Batch it with `equinox.filter_vmap` over law, particle and path, or use `simulate_batch`.
 
     Args:
@@ -70,9 +74,10 @@ def drive(
 
     Raises:
         InputError: for a control that does not exist, a path that is none, times that are not as many as its points; if
-            a law with effects gets no times, or one without effects gets some.
+            a law with effects gets no times, or one without effects gets some; with `throw`, naming effects and strain,
+            if the particle would gain energy.
         EquinoxRuntimeError: with `throw`, if anything in the response is not finite or the particle can carry no
-            stress.
+            stress; within compiled code also if the particle would gain energy.
     """
     arguments.instance(law, AbstractContactLaw, "law", A_LAW)
     arguments.instance(particle, Particle, "particle", A_PARTICLE)
@@ -85,7 +90,21 @@ def drive(
         time = arguments.path(time, "time")
         arguments.same_length(path=path, time=time)
     _check_times(law, time is not None, "time")
-    return _drive(law, particle, path, time, control, state, throw)
+    traced = any(map(arguments.is_traced, jax.tree.leaves((law, particle, path, time, state))))
+    response = _drive(law, particle, path, time, control, state, throw, traced)
+    if throw and not traced and response.result == RESULTS.gains_energy:
+        raise gains_energy(law, particle, response.state)
+    return response
+
+
+def gains_energy(law: AbstractContactLaw, particle: Particle, state: Any, name: str = "the particle") -> InputError:
+    """What to tell of a law and particle that gain energy (`RESULTS.gains_energy`): effects, strain and remedy."""
+    names = ", ".join(e.name for e in getattr(law, "effects", ()) if isinstance(e, AbstractModulusAtPeak))
+    beyond = f"loaded beyond a strain of {float(law.gain_strain(particle, state)):.2g}"
+    return InputError(
+        f"with {names or 'its law'} {name}, {beyond} and released, would give back more energy than that took",
+        remedy="Take a smaller amplitude, a stiffer effective modulus, or a path that ends below that strain.",
+    )
 
 
 @eqx.filter_jit
@@ -97,8 +116,9 @@ def _drive(
     control: Control,
     state: Any,
     throw: bool,
+    traced: bool,
 ) -> Response:
-    """The compiled part of `drive`, its arguments checked."""
+    """The compiled part of `drive`, its arguments checked; a gain of energy raises here only where `traced`."""
     start = law.init(particle) if state is None else state
     times = () if time is None else (time,)
     if control == "load":
@@ -108,11 +128,16 @@ def _drive(
         displacement = path
         end, force = law.path(particle, start, path, *times)
     finite = jnp.all(jnp.isfinite(displacement)) & jnp.all(jnp.isfinite(force))
-    result = RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite_response)
+    passive = jnp.isinf(law.gain_strain(particle, end))
+    result = RESULTS.where(passive, RESULTS.successful, RESULTS.gains_energy)
+    result = RESULTS.where(finite, result, RESULTS.nonfinite_response)
     result = RESULTS.where(law.carries_stress(particle), result, RESULTS.no_stress)
     result = RESULTS.where(law.is_valid, result, RESULTS.bad_parameter)
     response = Response(displacement, force, law.is_monotone, end, result)
-    return result.error_if(response, result != RESULTS.successful) if throw else response
+    if not throw:
+        return response
+    raises = result != RESULTS.successful
+    return result.error_if(response, raises if traced else raises & (result != RESULTS.gains_energy))
 
 
 def simulate_batch(

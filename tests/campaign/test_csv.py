@@ -461,9 +461,9 @@ def test_failure_half_way_leaves_everything_as_it_was(tmp_path, monkeypatch, fai
 
 def test_folder_that_cannot_be_written(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("x")
-    with pytest.raises(InputError, match="is a file, not a folder"):
+    with pytest.raises(InputError, match=r"is a file, not a folder\. Give another folder"):
         write_campaign(simple(), tmp_path / "file")
-    with pytest.raises(InputError, match="cannot be written"):
+    with pytest.raises(InputError, match=r"cannot be written.*Give a folder you may write to"):
         write_campaign(simple(), tmp_path / "file" / "below")
 
     def refuse(self, **_):
