@@ -68,7 +68,9 @@ def table(rows: list[dict[str, object]]) -> str:
         for hold in (0.0, 10.0):
             some = [r for r in rows if r["force_noise_mN"] == force and r["hold_s"] == hold]
             z = np.array([r["z"] for r in some], float)
-            lines.append(f"| {force} | {hold:g} | {len(some)} | {z.mean():+.2f} | {sum(bool(r['covered']) for r in some)} |")
+            lines.append(
+                f"| {force} | {hold:g} | {len(some)} | {z.mean():+.2f} | {sum(bool(r['covered']) for r in some)} |"
+            )
     z = np.array([r["z"] for r in rows], float)
     covered = sum(bool(r["covered"]) for r in rows)
     lines.append(f"| all | | {len(rows)} | {z.mean():+.2f} +- {z.std() / np.sqrt(len(z)):.2f} | {covered} |")

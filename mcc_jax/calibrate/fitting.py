@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 from .. import arguments
 from .._errors import InputError
 from .._memory import make_room
-from ..campaign import THRESHOLD_MPA, Campaign
+from ..campaign import THRESHOLD_MPA, Campaign, other_material
 from .compiling import compiled
 from .data import Selection, Tests, select
 from .distributions import SpreadCoordinate
@@ -199,6 +199,7 @@ def prepare(
     if block is not None and block < 1:
         raise ValueError(f"a block must have at least one particle, got {block}")
     make_room()
+    model, _ = in_own_units(campaign, model)
     tell("selecting points")
     selection = select(campaign, threshold_MPa=threshold_MPa)
     require_same(selection.tests)
@@ -217,6 +218,29 @@ def prepare(
     if not all(np.isfinite(np.asarray(part)).all() for part in parts):
         raise beyond_numbers(campaign, selection)
     return selection, found, size
+
+
+def in_own_units(campaign: Campaign, model: Model) -> tuple[Model, str | None]:
+    """The model with priors in the campaign's own stress and strain, if its material is not like cellulose.
+
+    Priors that were given stay.
+
+    Returns:
+        The model, and what a reader must know; None where nothing was changed.
+    """
+    if model.priors is not None:
+        return model, None
+    material = other_material(campaign)
+    if material is None:
+        return model, None
+    priors = Priors.of_scale(material.stress_MPa, material.strain, model.unloading)
+    return replace(model, priors=priors), OWN_UNITS.format(material.stress_MPa, material.strain)
+
+
+OWN_UNITS = (
+    "Priors are in this campaign's own units, {:.3g} MPa at a scaled strain of {:.2g}, not in those of micro-crystalline "
+    "cellulose"
+)
 
 
 def beyond_numbers(campaign: Campaign, selection: Selection) -> InputError:

@@ -393,7 +393,7 @@ def least_squares(
     calibration = LeastSquaresCalibration(
         campaign,
         selection,
-        model,
+        fit.model,
         loss,
         fit,
         settings,

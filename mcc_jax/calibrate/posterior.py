@@ -11,14 +11,17 @@ import jax
 import numpy as np
 
 from .. import arguments
+from .._errors import InputError
+from .._format import with_sd
 from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_plausibility, check_tests
 from ..effects import Variant
 from .data import Selection, compared_rows, own_misfit, ranges_um, root_mean_squares
 from .draws import Draws, draw_fast, draw_joint
 from .effects import effect_entries, effect_numbers
 from .estimates import estimate, finite, force_zero, log_estimate, misfit_note, noise_note, summary
-from .fitting import Fit, checked_settings, prepare
+from .fitting import Fit, checked_settings, in_own_units, prepare
 from .judgement import judged, noise_share, numbers_in_reach, unlike_others
+from .least_squares import least_squares
 from .model import Model
 from .nuts import Length
 from .population import COEFFICIENTS, Population
@@ -372,7 +375,7 @@ def sample(
     calibration = BayesCalibration(
         campaign=campaign,
         selection=selection,
-        model=model,
+        model=fit.model,
         fit=fit.first(len(selection.kept)),
         mode=mode,
         seed=seed,
@@ -388,7 +391,38 @@ def sample(
         return sample(some, model, without_flagged=False, **settings, **few).answer()
 
     findings = judged(campaign, calibration.answer(), outlying, again if without_flagged else None)
-    return replace(calibration, findings=findings, runtime_s=time.perf_counter() - started)
+    told = [in_own_units(campaign, model)[1]]
+    if model.effects and without_flagged:
+        tell("calibrating without the effects")
+        told.append(_moved_by_effects(campaign, model, calibration, threshold_MPa))
+    notes = (*calibration.notes, *(one for one in told if one is not None))
+    return replace(calibration, findings=findings, notes=notes, runtime_s=time.perf_counter() - started)
+
+
+def _moved_by_effects(
+    campaign: Campaign, model: Model, calibration: BayesCalibration, threshold_MPa: float
+) -> str | None:
+    """A sentence if a or the modulus move by more than their stated error when the effects come into the law."""
+    plain = replace(model, effects=(), varying=())
+    try:
+        base = least_squares(campaign, plain, threshold_MPa=threshold_MPa, without_flagged=False)
+    except InputError:
+        return None  # without the effects there is no answer to compare with
+    before, after = base.answer(), calibration.answer()
+    moved = []
+    for name, unit, factor in (("effective_modulus_MPa", " GPa", 1e-3), ("a", "", 1.0)):
+        old, new = before[name], after[name]
+        if old["value"] is None or abs(new["value"] - old["value"]) <= 2 * max(old["sd"] or 0.0, new["sd"]):
+            continue
+        label = "the effective modulus" if unit else "a"
+        moved.append(f"{label} from {with_sd(old, factor)}{unit} to {with_sd(new, factor)}{unit}")
+    if not moved:
+        return None
+    names = ", ".join(model.variants)
+    return (
+        f"With {names} in the law {' and '.join(moved)}, by more than the error it had: without the effect the base "
+        "law's own numbers had taken up what it explains"
+    )
 
 
 calibrate_bayes = sample

@@ -93,6 +93,8 @@ class NakagamiPrior:
 
 
 MAX_SHAPE = 0.5
+CELLULOSE = 11.0, 0.6
+"""Peak stress [MPa] and scaled strain there of the paper's tests, about: what the default priors belong to."""
 
 
 @dataclass(frozen=True)
@@ -150,6 +152,40 @@ class Priors:
         if unloading is Unloading.PRINTED:
             return cls()
         return cls(effective_modulus_MPa=LogNormalPrior(500.0, 1.0))
+
+    @classmethod
+    def of_scale(cls, stress_MPa: float, strain: float, unloading: Unloading | str = Unloading.PRINTED) -> Priors:
+        r"""Priors in a campaign's own stress and strain, for a material that is not like micro-crystalline cellulose.
+
+        Under a change of units of stress and strain the coefficients go as :math:`C_1 \sim \sigma/\epsilon`,
+        :math:`C_5 \sim \sigma^{1/5}/\epsilon` and the modulus as :math:`\sigma/\epsilon^3` (printed form) or
+        :math:`\sigma/\epsilon^{3/2}` (punch forms), so medians move with the median peak; widths are twice those for
+        cellulose, since a shape of curve that is known for one material is a guess for another.
+
+        Args:
+            stress_MPa, strain: at the median test's peak.
+            unloading: form of unloading.
+        """
+        base = cls.default(unloading)
+        up, along = stress_MPa / CELLULOSE[0], strain / CELLULOSE[1]
+        power = 3.0 if arguments.member(unloading, Unloading, "unloading").stress_power == 1 else 1.5
+
+        def moved(prior: LogNormalPrior, factor: float) -> LogNormalPrior:
+            return LogNormalPrior(prior.median * factor, 2 * prior.log_sd)
+
+        def wider(prior: NakagamiPrior) -> NakagamiPrior:
+            return NakagamiPrior(2 * prior.sd, prior.shape)
+
+        return dataclasses.replace(
+            base,
+            C1=moved(base.C1, up / along),
+            C5=moved(base.C5, up**0.2 / along),
+            softening=moved(base.softening, 1.0),
+            effective_modulus_MPa=moved(base.effective_modulus_MPa, up / along**power),
+            tau_C1=wider(base.tau_C1),
+            tau_C3=wider(base.tau_C3),
+            tau_C5=wider(base.tau_C5),
+        )
 
     @property
     def log_C3(self) -> float:

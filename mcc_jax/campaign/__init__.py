@@ -23,6 +23,7 @@ from .paper import PAPER_LOAD_RATE_MN_PER_S as PAPER_LOAD_RATE_MN_PER_S
 from .paper import PAPER_LOG_C as PAPER_LOG_C
 from .paper import PAPER_SHAPE_PARAMETER as PAPER_SHAPE_PARAMETER
 from .plausibility import check_plausibility as check_plausibility
+from .plausibility import other_material as other_material
 from .plausible_ranges import PlausibilityOptions as PlausibilityOptions
 from .plausible_ranges import SolidClass as SolidClass
 from .quality import QualityOptions as QualityOptions

@@ -433,8 +433,34 @@ def _hull(ranges: Sequence[Range]) -> Range:
     return min(low for low, _ in ranges), max(high for _, high in ranges)
 
 
-def _another_material(tests: _Tests, options: PlausibilityOptions) -> list[Finding]:
-    """Tests that are much stiffer or softer than micro-crystalline cellulose, which accuses nobody."""
+@dataclass(frozen=True)
+class Material:
+    """How stiff a campaign's material is beside micro-crystalline cellulose.
+
+    Attributes:
+        decades: logarithm to the base of 10 of the ratio of stresses at the same strain.
+        stress_MPa: median peak stress.
+        strain: median strain there, scaled with the paper's shape factor [-].
+    """
+
+    decades: float
+    stress_MPa: float
+    strain: float
+
+
+def other_material(campaign: Campaign, options: PlausibilityOptions | None = None) -> Material | None:
+    """How much stiffer or softer than micro-crystalline cellulose the tests are; None if they are like it, or if a slip
+    of unit or sign is more likely."""
+    options = options or PlausibilityOptions()
+    given = campaign.raw or campaign
+    if worst(check_plausibility(given, options=options)) == "bad":
+        return None
+    with np.errstate(all="ignore"):
+        tests = _Tests.of(given, None, options, swapped=False)
+        return None if tests is None else _material(tests, options)
+
+
+def _material(tests: _Tests, options: PlausibilityOptions) -> Material | None:
     numbers = log_numbers(tests.given, tests.diameters_um)
     it = Apparent.of(numbers)
     D1, D2, D3 = tests.diameters_um.T
@@ -443,13 +469,22 @@ def _another_material(tests: _Tests, options: PlausibilityOptions) -> list[Findi
     ratios = it.stress - np.log10(C1 * x - (C3 * x) ** 3 + (C5 * x) ** 5)
     ratio = _median(np.where(np.isfinite(tests.column("fullness")), ratios, np.nan))
     if not abs(ratio) > np.log10(options.stiffer):
+        return None
+    return Material(ratio, float(10 ** _median(it.stress)), float(np.nanmedian(x)))
+
+
+def _another_material(tests: _Tests, options: PlausibilityOptions) -> list[Finding]:
+    """Tests that are much stiffer or softer than micro-crystalline cellulose, which accuses nobody."""
+    found = _material(tests, options)
+    if found is None:
         return []
-    word = "stiffer" if ratio > 0 else "softer"
+    it = Apparent.of(log_numbers(tests.given, tests.diameters_um))
+    word = "stiffer" if found.decades > 0 else "softer"
     return [
         Finding(
             CHECK,
             "told",
-            f"The material is {_number(abs(ratio))} times {word} in loading than micro-crystalline cellulose"
+            f"The material is {_number(abs(found.decades))} times {word} in loading than micro-crystalline cellulose"
             f" (Avicel PH-200): {_number(_median(it.stress))} MPa at a strain of"
             f" {_number(_median(it.strain))}; a typical solid otherwise",
         )

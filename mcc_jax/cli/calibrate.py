@@ -55,6 +55,8 @@ BELONGS = {
     "priors": ("least-squares", "bayes"),
     "modulus_scatter": ("least-squares", "bayes"),
     "shape_scatter": ("least-squares", "bayes"),
+    "effects": ("least-squares", "bayes"),
+    "varying": ("least-squares", "bayes"),
 }
 NO_SETTINGS = ("campaign", "out", "no_figures", "as_json")
 
@@ -73,6 +75,19 @@ def _applies(name: str, method: str) -> bool:
 @priors_option("  [least-squares, bayes]")
 @click.option(
     "--modulus-scatter", is_flag=True, help="Let every particle have its own modulus.  [least-squares, bayes]"
+)
+@click.option(
+    "--effect",
+    "effects",
+    multiple=True,
+    metavar="MECHANISM[:VARIANT]",
+    help="An effect that acts on the law, fitted with it; repeatable.  [least-squares, bayes]",
+)
+@click.option(
+    "--varying",
+    multiple=True,
+    metavar="MECHANISM",
+    help="Such an effect whose amplitude differs from particle to particle; repeatable.  [least-squares, bayes]",
 )
 @click.option("--shape-scatter", is_flag=True, help="Let a differ from particle to particle.  [least-squares, bayes]")
 @click.option(
@@ -128,12 +143,13 @@ def calibrate(
     Examples:
       mcc-jax calibrate my-tests --out my-fit
       mcc-jax calibrate my-tests --out my-fit --priors priors.toml --draws 4000
+      mcc-jax calibrate my-tests --out my-fit --effect creep:logarithmic
       mcc-jax calibrate my-tests --out my-fit --method paper --threshold-MPa 0.1
     """
     for name, methods in BELONGS.items():
         given = context.get_parameter_source(name) not in (ParameterSource.DEFAULT, None)
         if given and method not in methods:
-            option = "--" + name.replace("_", "-")
+            option = "--effect" if name == "effects" else "--" + name.replace("_", "-")
             raise click.UsageError(f"{option} belongs to --method {' or '.join(methods)}, not to {method}.")
     with session(12) as tell:
         data = read_without(campaign, options["leave_out"], tell)
@@ -160,7 +176,7 @@ def calibrate(
 
 
 def _calibrated(data: Campaign, method: str, options: dict[str, Any], tell: Tell) -> Calibration:
-    from ..calibrate import calibrate_bayes, calibrate_least_squares, calibrate_paper
+    from ..calibrate import calibrate_paper, least_squares, sample
 
     def chosen(*names: str) -> dict[str, Any]:
         return {name: options[name] for name in (*names, "threshold_MPa", "seed")} | {"progress": tell}
@@ -168,10 +184,10 @@ def _calibrated(data: Campaign, method: str, options: dict[str, Any], tell: Tell
     if method == "paper":
         return calibrate_paper(data, **chosen("objective", "reference", "unloading", "strain_scaling"))
     scatter = {name: options[name] for name in ("modulus_scatter", "shape_scatter")}
-    model = joint_model(options, **scatter)
+    model = joint_model(options, **scatter).with_effects(*options["effects"], varying=options["varying"])
     if method == "bayes":
-        return calibrate_bayes(data, model=model, **chosen("mode", "chains", "draws"))
-    return calibrate_least_squares(data, model=model, **chosen("loss"))
+        return sample(data, model, **chosen("mode", "chains", "draws"))
+    return least_squares(data, model, **chosen("loss"))
 
 
 def write_calibration(
@@ -232,6 +248,9 @@ def main_numbers(content: dict[str, Any]) -> list[tuple[str, str]]:
         spread = None if mean["sd"] is None or median is None else median * mean["sd"]
         rows.append((f"{name}, median", _estimate({"value": median, "sd": spread})))
         rows.append((f"{name}, sd of its logarithm", _estimate(content[f"log_{name}"]["sd"])))
+    for effect in content["effects"]:
+        label = f"{effect['mechanism']}, {effect['variant']}"
+        rows += [(f"{label}: {name}", _estimate(value)) for name, value in effect["parameters"].items()]
     rows.append(("yield stress sigma_y", f"{_estimate(content['yield_stress_MPa'])} MPa"))
     return rows
 

@@ -17,7 +17,7 @@ from ..files import LIMITS, read_regular
 from .session import Tell, say
 
 if TYPE_CHECKING:
-    from ..calibrate import JointModel
+    from ..calibrate import Model
     from ..campaign import Campaign
 
 FIGURES = "figures"
@@ -51,18 +51,18 @@ def require_particle(name: str, campaign: Campaign, option: str) -> None:
         raise InputError(f"there is no particle {name!r}", file=campaign.source or None, remedy=remedy)
 
 
-def joint_model(options: Mapping[str, Any], *, modulus_scatter: bool = True, shape_scatter: bool = False) -> JointModel:
+def joint_model(options: Mapping[str, Any], *, modulus_scatter: bool = True, shape_scatter: bool = False) -> Model:
     """The model that `--unloading`, `--strain-scaling` and `--priors` describe.
 
     Raises:
         InputError: for a file of priors that cannot be used.
     """
-    from ..calibrate import JointModel, read_priors
+    from ..calibrate import Model, read_priors
     from ..law import StrainScaling, Unloading
 
     form = Unloading(options["unloading"])
     priors = None if options["priors"] is None else read_priors(options["priors"], form)
-    return JointModel(form, StrainScaling(options["strain_scaling"]), modulus_scatter, shape_scatter, priors)
+    return Model(form, StrainScaling(options["strain_scaling"]), modulus_scatter, shape_scatter, priors)
 
 
 def provenance(command: str, campaign: Path, settings: Mapping[str, Any], *, told: str | None = None) -> dict[str, Any]:
