@@ -156,7 +156,7 @@ def sample_weighted(
             weight, k = smoothed_weights(log_weight)
             share = effective_share(weight)
             if k <= PARETO_K_MOST and share >= least:
-                value = float(logsumexp(log_weight) - math.log(len(log_weight)))
+                value = float(cast(Any, logsumexp(log_weight))) - math.log(len(log_weight))
                 error = math.sqrt(max(1 / share - 1, 0.0) / len(weight))
                 return Weighted(*_resampled(free, weight, target, chains, draws), value, error)
         if share * len(weight) < ENOUGH * len(mode):

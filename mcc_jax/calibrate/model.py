@@ -199,7 +199,8 @@ class Model:
         names = ("noise_displacement_um", "noise_force_mN", "noise_correlated_um", "noise_length")
         priors = ((name, getattr(p, name)) for name in names)
         numbers = [sample(name, dist.LogNormal(np.log(one.median), one.log_sd)) for name, one in priors]
-        return Noise(*numbers, jnp.ones(count))
+        displacement, force, correlated, length = numbers
+        return Noise(displacement, force, correlated, length, jnp.ones(count))
 
     def _filters(self, noise: Noise, point: Point, tests: Tests) -> Whitening:
         """The noise as displacement: how noise of force moves the prediction is taken as known."""

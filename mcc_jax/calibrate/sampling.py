@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -138,7 +138,8 @@ def draw_particles(
                     proposal = jnp.logaddexp(-square, far) - math.log(2) - drawn.log_volume
                 ratio = truth + prior - proposal - drawn.log_likelihood
                 ratio = jnp.where(jnp.isfinite(ratio), ratio, -jnp.inf)
-            return drawn.latent, drawn.theta if numbers else None, drawn.zero, drawn.log_likelihood, ratio
+            theta: Any = drawn.theta if numbers else None
+            return drawn.latent, theta, drawn.zero, drawn.log_likelihood, ratio
 
         shape = (max(candidates, 1), count)
         latent, theta, zero, likelihood, ratio = jax.vmap(candidate)(
@@ -147,14 +148,14 @@ def draw_particles(
             jnp.where(jnp.arange(shape[0]) % 2 == 0, 1.0, REACH),
         )
         if candidates <= 1:
-            return latent[0], theta[0] if numbers else None, zero[0], likelihood[0], ratio[0]
+            return latent[0], theta[0] if numbers else theta, zero[0], likelihood[0], ratio[0]
         chosen: Int[Array, " particles"] = jax.random.categorical(pick, jnp.maximum(ratio, -1e30), axis=0)
         mean = jax.scipy.special.logsumexp(ratio, axis=0) - jnp.log(candidates)
 
         def take(values):
             return jnp.take_along_axis(values, chosen.reshape(1, count, *[1] * (values.ndim - 2)), axis=0)[0]
 
-        return take(latent), take(theta) if numbers else None, take(zero), likelihood[0], mean
+        return take(latent), take(theta) if numbers else theta, take(zero), likelihood[0], mean
 
     rows = ROWS if jax.default_backend() == "cpu" else ROWS_OF_ACCELERATORS
     batch = even_batch(draws, rows // (count * max(candidates, 1)))
