@@ -18,7 +18,7 @@ TARGET = 1.5
 STATEMENTS = {
     "bare": "import mcc_jax",
     "every name": "from mcc_jax import *",
-    "base": "import jax, equinox, optimistix",
+    "base": "import jax, equinox, optimistix, numpyro",
 }
 
 

@@ -46,7 +46,7 @@ LAYERS = {
 }
 # What importing the package must not load: slow, optional, or for the command line only.
 HEAVY = (
-    *("numpyro", "arviz", "pandas", "matplotlib", "scipy.optimize", "scipy.stats"),
+    *("arviz", "pandas", "matplotlib", "scipy.optimize", "scipy.stats"),
     *("pint", "rich", "click", "bokeh", "jinja2", "jsonschema"),
 )
 FILES = sorted(p for p in PACKAGE.rglob("*.py"))
