@@ -79,7 +79,7 @@ class Tests(eqx.Module):
     peak_sd: Float[Array, "particles points"] | None = None
 
     @property
-    def force(self) -> Float[Array, "particles points"]:
+    def force(self) -> Float[Array, "*particles points"]:
         """Force [mN] of every point."""
         return self.record.force
 

@@ -40,7 +40,7 @@ class SpreadCoordinate(dist.Distribution):
         """The spread at a coordinate."""
         return KNEE * self.prior.sd * jnp.sinh(jnp.abs(coordinate)) ** self.power
 
-    def coordinate(self, spread: Array) -> Array:
+    def coordinate(self, spread: Array | float) -> Array:
         """The coordinate, >= 0, of a spread."""
         return jnp.arcsinh((spread / (KNEE * self.prior.sd)) ** (1 / self.power))
 

@@ -199,6 +199,8 @@ def posterior(scatter):
             modulus_scatter=jnp.asarray(scatter),
             shape_scatter=jnp.asarray(0.0),
             log_noise=jnp.asarray(0.0),
+            theta=jnp.zeros(0),
+            theta_scatter=jnp.zeros(0),
         )
 
     found = object.__new__(BayesCalibration)

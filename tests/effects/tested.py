@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from helpers import paper_law, paper_particle, with_dtype
 
-from mcc_jax.calibrate.forward import law_of
+from mcc_jax.calibrate.forward import Forms
 from mcc_jax.effects import LIBRARY, clean_record
 from mcc_jax.law import Unloading, signatures
 
@@ -45,7 +45,8 @@ def latent_law():
     """The same law as a fit has it: a = 0, coefficients multiplied by the shape factor."""
     eta = LAW.shape_factor(PARTICLE)
     C = jnp.stack([LAW.plastic.C1, LAW.plastic.C3, LAW.plastic.C5])
-    return law_of(jnp.concatenate([jnp.log(C * eta), jnp.log(LAW.effective_modulus)[None]]), Unloading.PRINTED)
+    latent = jnp.concatenate([jnp.log(C * eta), jnp.log(LAW.effective_modulus)[None]])
+    return Forms(Unloading.PRINTED).law(latent, jnp.zeros(0))
 
 
 def respond(variant, amplitude, law=LAW, record=RECORD, particle=PARTICLE, **nuisance):

@@ -6,7 +6,7 @@ import pytest
 from pathological import campaign_of, run_one
 from pathological_kinds import KINDS
 
-from mcc_jax.calibrate.data import select_tests
+from mcc_jax.calibrate.data import select
 
 BY_NAME = {kind.name: kind for kind in KINDS}
 FITTED = (
@@ -51,7 +51,7 @@ def test_ends_in_a_result(name):
 )
 def test_hundreds_of_cycles_are_selected(name):
     campaign = campaign_of(BY_NAME[name], 0)
-    chosen = select_tests(campaign)
+    chosen = select(campaign)
     assert len(chosen.kept) == len(campaign)
     assert max(map(len, chosen.rows)) < 700
     for rows, curve in zip(chosen.rows, campaign.curves, strict=True):
