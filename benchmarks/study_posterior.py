@@ -1,26 +1,22 @@
-"""Is the posterior's uncertainty honest? Simulation-based calibration of the joint posterior.
+"""Is the posterior's uncertainty honest? Simulation-based calibration of the posterior.
 
-For every campaign the truth is drawn from the prior (population, particles, peak stresses), the tests are simulated as
-a tester would record them, and the posterior is sampled. If everything is right, the true value's rank among posterior
-draws is uniform (Talts et al. 2018), and intervals cover as often as they say. Settings:
+For every campaign the truth is drawn from the prior (population, effects, particles, peak stresses), the tests are
+simulated as a tester would record them, and the posterior is sampled. If everything is right, the true value's rank
+among posterior draws is uniform (Talts et al. 2018), and intervals cover as often as they say. Settings:
 
 - prior: 20 particles with the sizes of the paper's Table 1, everything drawn from priors around the paper's values;
-- collapsed: the same with tau_C3 = 4.9e-9 (the paper's value) in truth;
+- creep: the same with logarithmic creep, whose amplitude and time are drawn from the model's own priors;
+- collapsed: tau_C3 = 4.9e-9 (the paper's value) in truth;
 - five: 5 particles;
 - wide: the library's default priors, whose corners hold powders that nobody has seen (C1 of 1 MPa, snap-through).
 
-Run `uv run --group bench python benchmarks/study_posterior.py --write` (50 minutes on 2 cores);
-`--campaigns 20` for a look.
+Run `uv run --group bench python benchmarks/study_posterior.py --setting creep --part 0/6`, each part some ten minutes
+on 2 cores: it keeps what it has in `results/sbc/` and goes on from there. `--write` draws tables and figure of all parts.
 """
 
 from __future__ import annotations
 
-import os
-import tempfile
-import time
-from concurrent.futures import ProcessPoolExecutor
-from functools import partial
-from multiprocessing import get_context
+import json
 from pathlib import Path
 
 import _report
@@ -29,9 +25,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mcc_jax.calibrate import JointModel, LogNormalPrior, NakagamiPrior, NormalPrior, Priors, calibrate_bayes
-from mcc_jax.calibrate.arviz import prior_draws
-from mcc_jax.calibrate.model import prior_numbers
+from mcc_jax import HiddenEffect
+from mcc_jax.calibrate import LogNormalPrior, Model, NakagamiPrior, NormalPrior, Priors, sample
+from mcc_jax.calibrate.effects import effect_numbers
+from mcc_jax.calibrate.mode import prior_populations
 from mcc_jax.campaign import PAPER_DIAMETERS_UM, particle_batch
 from mcc_jax.geometry import Particle
 from mcc_jax.law import Plastic
@@ -56,44 +53,65 @@ AROUND = Priors(
 )
 
 
-def draw_truth(seed: int, count: int, collapsed: bool, model: JointModel):
-    """A population from the prior, N of the paper's particles, and their laws and peak forces."""
+CREEP = "creep:logarithmic"
+CAMPAIGNS = 300
+FOLDER = Path(__file__).parent / "results" / "sbc"
+SETTINGS = ("prior", "creep", "collapsed", "five", "wide")
+
+
+def model_of(setting: str) -> Model:
+    """What is assumed in a setting."""
+    model = Model(priors=None if setting == "wide" else AROUND)
+    return model.with_effects(CREEP) if setting == "creep" else model
+
+
+def quantities(setting: str) -> tuple[str, ...]:
+    """What is ranked in a setting."""
+    return (*QUANTITIES, "creep", "creep.tau_s") if setting == "creep" else QUANTITIES
+
+
+def draw_truth(seed: int, setting: str):
+    """A population from the prior by names, N of the paper's particles, their laws, peak forces and effects."""
+    model = model_of(setting)
     rng = np.random.default_rng([seed, 1])
-    chosen = np.sort(rng.choice(len(PAPER_DIAMETERS_UM), size=count, replace=False))
+    chosen = np.sort(rng.choice(len(PAPER_DIAMETERS_UM), size=5 if setting == "five" else 20, replace=False))
     diameters = PAPER_DIAMETERS_UM[chosen]
     particles = particle_batch(diameters)
-    low, high = np.asarray(prior_numbers(model.chosen_priors, eqx.filter_vmap(lambda p: p.flatness)(particles)).a)[2:]
-    truth = {k: v[0, 0] for k, v in prior_draws(model.chosen_priors, low, high, (1, 1), seed).items()}
-    if collapsed:
-        truth["tau"] = np.array([truth["tau"][0], COLLAPSED, truth["tau"][2]])
-    C = np.exp(truth["mu"] + truth["tau"] * rng.standard_normal((count, 3)))
-    laws = law_for_each(
-        eqx.filter_vmap(Plastic)(*jnp.asarray(C).T), float(truth["a"]), float(truth["effective_modulus_MPa"])
-    )
-    stress = rng.uniform(7, 16, count)
-    peaks = np.asarray(eqx.filter_vmap(Particle.force)(particles, jnp.asarray(stress)))
-    return truth, diameters, laws, peaks
-
-
-def one_campaign(seed: int, count: int, collapsed: bool, model: JointModel):
-    """Rank and probability of the truth in the posterior, by quantity, and how the run went."""
-    truth, diameters, laws, peaks = draw_truth(seed, count, collapsed, model)
-    programme = Programme.cycles(points=POINTS)
-    campaign = simulate_campaign(laws, diameters, peaks, programme, instrument=INSTRUMENT, seed=seed)
-    posterior = calibrate_bayes(campaign, model=model, seed=seed)
-    named = posterior.named_population()
-    values = {"a": truth["a"], "effective_modulus_MPa": truth["effective_modulus_MPa"]}
+    flatness = eqx.filter_vmap(lambda p: p.flatness)(particles)
+    drawn = prior_populations(jax.random.key(seed)[None], model, flatness)
+    p = jax.tree.map(lambda x: np.asarray(x)[0], drawn)
+    tau = np.array([p.tau[0], COLLAPSED, p.tau[2]]) if setting == "collapsed" else p.tau
+    truth = {"a": float(p.a), "effective_modulus_MPa": float(np.exp(p.log_modulus))}
     for j, name in enumerate(("C1", "C3", "C5")):
-        values[f"mu_{name}"], values[f"tau_{name}"] = truth["mu"][j], truth["tau"][j]
+        truth |= {f"mu_{name}": p.mu[j], f"tau_{name}": tau[j]}
+    truth |= {name: float(value) for name, value in effect_numbers(p, model).items()}
+    C = np.exp(p.mu + tau * rng.standard_normal((len(chosen), 3)))
+    laws = law_for_each(eqx.filter_vmap(Plastic)(*jnp.asarray(C).T), truth["a"], truth["effective_modulus_MPa"])
+    peaks = np.asarray(eqx.filter_vmap(Particle.force)(particles, jnp.asarray(rng.uniform(7, 16, len(chosen)))))
+    effects = [
+        HiddenEffect(v, truth[v.mechanism], {n.name: truth[f"{v.mechanism}.{n.name}"] for n in v.nuisances})
+        for v in model.effects
+    ]
+    return truth, diameters, laws, peaks, effects
+
+
+def one_campaign(seed: int, setting: str) -> dict:
+    """Rank and probability of the truth in the posterior, by quantity, and how the run went."""
+    truth, diameters, laws, peaks, effects = draw_truth(seed, setting)
+    programme = Programme.cycles(points=POINTS, hold_s=10.0 if effects else 0.0)
+    told = {"instrument": INSTRUMENT, "seed": seed, "effects": effects}
+    campaign = simulate_campaign(laws, diameters, peaks, programme, **told)
+    posterior = sample(campaign, model_of(setting), seed=seed, without_flagged=False)
+    named = posterior.named_population()
     rng = np.random.default_rng([seed, 2])
     row = {"seed": seed}
-    for name in QUANTITIES:
+    for name in quantities(setting):
         draws = named[name].ravel()
         some = draws[np.linspace(0, len(draws) - 1, THINNED).round().astype(int)]
-        below, equal = int((some < values[name]).sum()), int((some == values[name]).sum())
+        below, equal = int((some < truth[name]).sum()), int((some == truth[name]).sum())
         row[f"rank {name}"] = below + int(rng.integers(equal + 1))
-        row[f"share {name}"] = float((draws < values[name]).mean())
-        row[f"z {name}"] = float((draws.mean() - values[name]) / draws.std())
+        row[f"share {name}"] = float((draws < truth[name]).mean())
+        row[f"z {name}"] = float((draws.mean() - truth[name]) / draws.std())
     monotone = np.asarray(eqx.filter_vmap(lambda law: law.is_monotone)(laws))
     row |= {
         "kept": len(posterior.particles),
@@ -126,7 +144,7 @@ def judge(rows: list[dict], setting: str) -> list[dict]:
     grid = np.arange(1, THINNED + 1) / (THINNED + 1)
     limit = band(len(rows))
     table = []
-    for name in QUANTITIES:
+    for name in quantities(setting):
         ranks, share = (np.array([row[f"{kind} {name}"] for row in rows]) for kind in ("rank", "share"))
         line = {"setting": setting, "quantity": name}
         fixed = setting == "collapsed" and name == "tau_C3"
@@ -151,13 +169,14 @@ def plot(results: dict[str, list[dict]], file: Path) -> None:
     """Rank histograms, one row per setting."""
     import matplotlib.pyplot as plt
 
+    columns = max(len(quantities(setting)) for setting in results)
     figure, axes = plt.subplots(
-        len(results), len(QUANTITIES), figsize=(18, 2.4 * len(results)), sharey="row", squeeze=False
+        len(results), columns, figsize=(2.2 * columns, 2.4 * len(results)), sharey="row", squeeze=False
     )
     for line, (setting, rows) in zip(axes, results.items(), strict=True):
         expected = len(rows) / 10
         sd = np.sqrt(len(rows) * 0.1 * 0.9)
-        for axis, name in zip(line, QUANTITIES, strict=True):
+        for axis, name in zip(line, quantities(setting), strict=False):
             axis.axhspan(expected - 1.96 * sd, expected + 1.96 * sd, color="0.85")
             axis.hist([row[f"rank {name}"] for row in rows], bins=np.linspace(0, THINNED + 1, 11), color="#0072B2")
             axis.set_title(name.replace("effective_modulus_MPa", "modulus"), fontsize=9)
@@ -168,68 +187,50 @@ def plot(results: dict[str, list[dict]], file: Path) -> None:
     figure.savefig(file, dpi=110)
 
 
-def _in_float64() -> None:
-    jax.config.update("jax_enable_x64", True)
+def run(setting: str, part: int, parts: int) -> None:
+    """The campaigns of one part, those that are kept already left out."""
+    FOLDER.mkdir(exist_ok=True)
+    file = FOLDER / f"{setting}_{part}_of_{parts}.json"
+    rows = json.loads(file.read_text()) if file.exists() else []
+    for seed in range(part, CAMPAIGNS, parts)[len(rows) :]:
+        rows.append(one_campaign(seed, setting))
+        file.write_text(json.dumps(rows, indent=0) + "\n")
+        if len(rows) % 10 == 0:
+            print(f"{setting}, part {part}: {len(rows)} campaigns", flush=True)
 
 
 def main():
     parser = _report.parser(__doc__)
-    parser.add_argument("--campaigns", type=int, default=700)
-    parser.add_argument("--first", type=int, default=0, help="seed of the first campaign: others are a fresh study")
-    parser.add_argument("--workers", type=int, default=os.cpu_count())
-    parser.add_argument("--settings", nargs="+", default=["prior", "collapsed", "five"])
+    parser.add_argument("--setting", choices=SETTINGS)
+    parser.add_argument("--part", default="0/1")
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    seeds = range(arguments.first, arguments.first + arguments.campaigns)
+    if arguments.setting:
+        run(arguments.setting, *map(int, arguments.part.split("/")))
+        return
     results: dict[str, list[dict]] = {}
-    verdicts, runs = [], []
-    for setting in arguments.settings:
-        count = 5 if setting == "five" else 20
-        model = JointModel(priors=None if setting == "wide" else AROUND)
-        started = time.perf_counter()
-        rows = []
-        work = partial(one_campaign, count=count, collapsed=setting == "collapsed", model=model)
-        with ProcessPoolExecutor(arguments.workers, get_context("spawn"), _in_float64) as pool:
-            for row in pool.map(work, seeds, chunksize=5):
-                rows.append(row)
-                if len(rows) % 20 == 0:
-                    print(f"{setting}: {len(rows)} campaigns, {time.perf_counter() - started:.0f} s", flush=True)
-        results[setting] = rows
-        verdicts += judge(rows, setting)
-        runs.append(
-            {
-                "setting": setting,
-                "campaigns": len(rows),
-                "s per campaign": round((time.perf_counter() - started) / len(rows), 2),
-                "not converged": sum(bool(row["failures"]) for row in rows),
-                "R-hat at most": round(max(row["rhat"] for row in rows), 3),
-                "bulk ESS at least": round(min(row["ess"] for row in rows)),
-                "divergences": sum(row["divergences"] for row in rows),
-                "particles not monotone": sum(row["not monotone"] for row in rows),
-                "particles not kept": sum(count - row["kept"] for row in rows),
-            }
-        )
-        for row in rows:
-            if row["failures"]:
-                print(
-                    setting,
-                    row["seed"],
-                    row["not monotone"],
-                    round(row["k"], 2),
-                    row["k joint"],
-                    row["failures"][:250],
-                )
-    tables = {"Coverage": verdicts, "Runs": runs}
-    settings = {
-        "points per test": POINTS,
-        "seeds": f"{seeds.start} to {seeds.stop - 1}",
-        "instrument": str(INSTRUMENT),
-        **_report.environment("jax", "numpyro", "numpy"),
-    }
-    tables["Settings"] = _report.settings(settings)
-    _report.write("posterior", "Simulation-based calibration of the joint posterior", tables, arguments.write)
-    folder = Path(__file__).parent / "results" if arguments.write else Path(tempfile.gettempdir())
-    plot(results, folder / "posterior_ranks.png")
+    for setting in SETTINGS:
+        rows = [row for file in sorted(FOLDER.glob(f"{setting}_*.json")) for row in json.loads(file.read_text())]
+        if rows:
+            results[setting] = rows
+    verdicts = [line for setting, rows in results.items() for line in judge(rows, setting)]
+    runs = [
+        {
+            "setting": setting,
+            "campaigns": len(rows),
+            "not converged": sum(bool(row["failures"]) for row in rows),
+            "R-hat at most": round(max(row["rhat"] for row in rows), 3),
+            "bulk ESS at least": round(min(row["ess"] for row in rows)),
+            "divergences": sum(row["divergences"] for row in rows),
+            "particles not monotone": sum(row["not monotone"] for row in rows),
+        }
+        for setting, rows in results.items()
+    ]
+    settings = {"points per test": POINTS, "instrument": str(INSTRUMENT), **_report.environment("jax", "numpyro")}
+    tables = {"Coverage": verdicts, "Runs": runs, "Settings": _report.settings(settings)}
+    _report.write("posterior", "Simulation-based calibration of the posterior", tables, arguments.write)
+    if arguments.write:
+        plot(results, Path(__file__).parent / "results" / "posterior_ranks.png")
 
 
 if __name__ == "__main__":
