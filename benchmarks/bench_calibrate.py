@@ -61,7 +61,7 @@ def least_squares(repeats: int) -> tuple[list[dict], list[dict]]:
     residual = numpy_residual(whole.selection.tests, whole.settings)
     ours_loss, ours_here = float(found.loss), float(0.5 * np.sum(residual(ours) ** 2))
     assert abs(ours_loss - ours_here) < 1e-6 * ours_loss, (ours_loss, ours_here)
-    local = np.concatenate([np.asarray(whole.fit.latent)[:, :3], np.asarray(whole.fit.zero)[:, None]], 1)
+    local = np.concatenate([np.asarray(whole.fit.point.latent)[:, :3], np.asarray(whole.fit.point.zero)[:, None]], 1)
     x0 = np.concatenate([local.ravel(), first])
     rows = [
         {

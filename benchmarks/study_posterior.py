@@ -11,7 +11,7 @@ among posterior draws is uniform (Talts et al. 2018), and intervals cover as oft
 - wide: the library's default priors, whose corners hold powders that nobody has seen (C1 of 1 MPa, snap-through).
 
 Run `uv run --group bench python benchmarks/study_posterior.py --setting creep --part 0/6`, each part some ten minutes
-on 2 cores: it keeps what it has in `results/sbc/` and goes on from there. `--write` draws tables and figure of all parts.
+on 2 cores: it keeps what it has in `results/sbc/` and goes on from there. `--write` draws tables and figure of all.
 """
 
 from __future__ import annotations

@@ -241,6 +241,7 @@ class LeastSquaresCalibration(Calibration):
                 "steps": steps,
                 "loss": finite(float(self.solution.loss)),
                 "chi2_per_dof": finite(self._chi2()),
+                "noise_share": finite(noise_share(self.fit)),
                 "singular_values": [float(v) for v in self.identifiability.singular_values],
                 "open_combinations": self.identifiability.open,
                 "agreeing_starts": list(self.agreeing_starts),

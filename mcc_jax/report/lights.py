@@ -10,7 +10,7 @@ import numpy as np
 
 from .._format import number, percent
 from ..calibrate.curves import FittedCurve
-from ..calibrate.estimates import BAD_MISFIT
+from ..calibrate.estimates import BAD_MISFIT, BAD_NOISE_SHARE
 from ..calibrate.posterior import ESS_LEAST, RHAT_MOST
 from ..calibrate.weights import PARETO_K_MOST
 from ..campaign import Finding, campaign_findings, check_plausibility, check_tests
@@ -22,6 +22,7 @@ RHAT_BAD, ESS_BAD, PARETO_K_BAD = 1.05, 100.0, 1.0
 """From here on the gate is not just missed: the draws cannot be used."""
 
 GOOD_MISFIT = 0.01
+GOOD_NOISE_SHARE = 0.2
 INSIDE = (0.90, 0.99)
 NOT_MONOTONE = 0.05
 FEW_PARTICLES = 6
@@ -174,6 +175,18 @@ def _fit(content: dict[str, Any], shown: Sequence[FittedCurve]) -> list[Light]:
                 f"at most {percent(GOOD_MISFIT)}",
                 "Median misfit with each particle's own coefficients, as a share of its range of displacement. If "
                 "large: these may be no compressions of single particles, or the diameters are wrong.",
+            )
+        )
+    noise = d.get("noise_share")
+    if noise is not None:
+        found.append(
+            Light(
+                _below(noise, GOOD_NOISE_SHARE, BAD_NOISE_SHARE),
+                "What is left is noise",
+                f"{percent(noise)} hangs together",
+                f"at most {percent(GOOD_NOISE_SHARE)}",
+                "Share of what is left that is correlated along a test. A large one is not noise of the instrument but "
+                "something that the law misses, and the stated errors are those of a law that misses it.",
             )
         )
     if share is not None:

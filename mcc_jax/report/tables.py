@@ -18,7 +18,7 @@ from ..campaign import (
     effective_diameter_um,
 )
 from .read import Results
-from .sentences import plain
+from .sentences import plain, quantity
 
 KINDS = {"approach": "approach", "load": "loading", "hold": "hold", "unload": "unloading", "reload": "reloading"}
 
@@ -112,6 +112,18 @@ def parameters(content: dict[str, Any]) -> list[dict[str, str]]:
                 "paper": number(PAPER_LOG_C[name][1]),
             }
         )
+    for effect in content.get("effects", ()):
+        for name, value in effect["parameters"].items():
+            rows.append(
+                {
+                    "symbol": "",
+                    "sub": "",
+                    "name": f"{plain(effect['mechanism']).capitalize()}: {quantity(name)}",
+                    "meaning": f"An effect in the law beside the formulas above: {effect['equation']}",
+                    **_told(value),
+                    "paper": "not in it",
+                }
+            )
     if "yield_stress_MPa" in content:
         rows.append(
             {
