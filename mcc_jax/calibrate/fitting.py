@@ -11,7 +11,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpyro
+import numpyro.distributions as dist
 from jaxtyping import Array, Bool, Float
+
+from numpyro.infer.util import constrain_fn, potential_energy
 
 from .. import arguments
 from .._errors import InputError
@@ -22,7 +26,7 @@ from .data import Selection, Tests, select
 from .distributions import SpreadCoordinate
 from .forward import Forms, Linear, Point, linearise
 from .marginal import Marginal, straighten, summarise
-from .mode import LogPosterior, most_probable, start_values
+from .mode import LogPosterior, handlers, most_probable
 from .model import Model, check_prior_of_a
 from .noise import Noise, NoiseFit, Whitening, estimate_noise, particle_scales
 from .paper.prediction import point_noise_um
@@ -107,22 +111,11 @@ class Fit(eqx.Module):
         """
         from numpyro.infer import NUTS, init_to_value
 
-        values = start_values(self.mode, self.target)
         arguments.flag(explicit, "explicit")
-        order = [self.names.index(name) for name in sorted(self.names)]
-        covariance = np.asarray(self.covariance)[np.ix_(order, order)]
-        metric: dict[Any, Any] = {tuple(sorted(self.names)): jnp.asarray(covariance)}
-        model: Any = self.model
-        if explicit:
-            size = self.marginal.scatter.size + 1
-            values["own"] = jnp.zeros((len(self.tests), size))
-            metric[("own",)] = jnp.ones(len(self.tests) * size)
-            model = ExplicitModel(self)
-        dense: Any = [names for names in metric if names != ("own",)]
-# The mass matrix stays: to adapt it, NumPyro shrinks variances towards 1e-3, far beyond those of a or C3.
-        options = {"target_accept_prob": 0.9 if explicit else 0.8, "adapt_mass_matrix": False, **settings}
-        strategy = init_to_value(values=values)
-        return NUTS(model, init_strategy=strategy, inverse_mass_matrix=metric, dense_mass=dense, **options)
+        size = len(self.names) + explicit * len(self.tests) * (self.marginal.scatter.size + 1)
+        start = init_to_value(values={"coordinates": jnp.zeros(size)})
+        options = {"dense_mass": size < MAX_DENSE, "target_accept_prob": 0.9 if explicit else 0.8, **settings}
+        return NUTS(FitCoordinates(self, size), init_strategy=start, **options)
 
     def first(self, count: int) -> Fit:
         """The same of the first `count` particles: without copies that only fill up."""
@@ -144,15 +137,37 @@ class Fit(eqx.Module):
         )
 
 
-class ExplicitModel:
-    """The model with every particle's own numbers explicit, in the coordinates and with the noise of a fit."""
+MAX_DENSE = 60
+"""Numbers up to which NUTS adapts a whole mass matrix: more it cannot learn from a few hundred steps."""
 
-    def __init__(self, fit: Fit) -> None:
-        self.fit = fit
 
-    def __call__(self, tests: Tests) -> None:
-        """As `Model`."""
-        self.fit.model(tests, filters=self.fit.filters, around=self.fit.marginal)
+class FitCoordinates:
+    """The model in the coordinates of a fit, as a NumPyro model: its density, written in numbers that are near standard
+    normal, every site of the model as a `deterministic`.
+
+    A posterior whose widths span five powers of ten does not mix in its own coordinates.
+    """
+
+    def __init__(self, fit: Fit, size: int) -> None:
+        self.fit, self.size = fit, size
+
+    def __call__(self, tests: Tests, marginal: Marginal | None = None) -> None:
+        """As `Model`: with `marginal` every particle is integrated out, else its own numbers are explicit."""
+        fit, improper = self.fit, dist.ImproperUniform(dist.constraints.real, (), (self.size,))
+        position: Any = numpyro.sample("coordinates", improper)
+        d = len(fit.names)
+        free = fit.mode + jnp.linalg.cholesky(fit.covariance) @ position[:d]
+        sites = fit.target.sites(free)
+        told = {} if marginal is not None else {"filters": fit.filters, "around": fit.marginal}
+        if marginal is None:
+            sites["own"] = position[d:].reshape(len(tests), -1)
+        with handlers.block():  # the model is evaluated here, and stands for no sites of its own
+            potential: Any = potential_energy(fit.model, (tests, marginal), told, sites)
+            model = handlers.seed(fit.model, jax.random.key(0))
+            values = constrain_fn(model, (tests, marginal), told, sites, return_deterministic=True)
+        numpyro.factor("density", -potential)
+        for name, value in values.items():
+            numpyro.deterministic(name, value)
 
 
 @compiled

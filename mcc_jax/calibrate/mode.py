@@ -149,15 +149,6 @@ def prior_populations(keys: Array, model: Model, flatness: Array) -> Population:
     return jax.vmap(one)(keys)
 
 
-def start_values(free: Float[Array, " d"], target: LogPosterior) -> dict[str, Array]:
-    """Values of the sampled sites at unbounded coordinates."""
-    shapes = Shapes(target.marginal.flatness, target.marginal.weight)
-    with standard_promotion():
-        prior = handlers.seed(target.model.population, jax.random.key(0))
-        values = constrain_fn(prior, (shapes,), {}, target.sites(free))
-    return {name: values[name] for name in target.names}
-
-
 @compiled
 def density_of(free: Float[Array, " d"], target: LogPosterior) -> Scalar:
     """Log density at unbounded coordinates."""
