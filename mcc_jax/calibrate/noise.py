@@ -128,9 +128,14 @@ class Whitening(eqx.Module):
 
     def colour(self, white: Path, of_branches: Path, of_zero: Scalar) -> Path:
         """A draw of the noise [um] from standard normal numbers: of every point, every branch and the zero of force."""
+        power = self._power()
+        drawn = white + self.peak * of_branches[self.branch]
+        if self.common is not None:
+            # `common` has been shrunk along the branches: along them, multiply by the root again.
+            along = jax.ops.segment_sum(self.peak * self.common, self.branch, len(self.peak))
+            grown = self.common + self.peak * (along / (1 + jnp.sqrt(1 + power)))[self.branch]
+            drawn = drawn + grown * of_zero
         with standard_promotion():
-            drawn = white + self.peak * of_branches[self.branch]
-            drawn = drawn if self.common is None else drawn + self.common * of_zero
             return self.solver.dot_triangular(drawn)
 
     @property

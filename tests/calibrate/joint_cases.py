@@ -14,7 +14,9 @@ from mcc_jax import (
     simulate_campaign,
 )
 from mcc_jax.calibrate.data import select_tests
-from mcc_jax.calibrate.population import Population, Summary
+from mcc_jax.calibrate.forward import Point
+from mcc_jax.calibrate.marginal import Marginal
+from mcc_jax.calibrate.population import Population
 
 A, EBAR = 1.43, 16_000.0
 NOISE = Instrument(displacement_noise_um=0.02, force_noise_mN=0.05)
@@ -72,7 +74,7 @@ def five_particles(seed=0):
 
 def five_tests():
     """What the joint calibration sees of them."""
-    return select_tests(five_particles()).tests
+    return select_tests(five_particles())
 
 
 def true_latent(C=COEFFICIENTS, diameters=DIAMETERS, *, unloading=Unloading.PRINTED, scaling=StrainScaling.RAW):
@@ -95,17 +97,26 @@ def random_precision(rng, count, size, *, spread=1.0):
     return np.einsum("nij,nj,nkj->nik", Q, values, Q)
 
 
-def random_summary(rng, count, *, precision=8.0):
-    """A summary of `count` tests with all entries at random."""
-    return Summary(
-        point=jnp.asarray(0.3 * rng.standard_normal((count, 4))),
-        precision=jnp.asarray(precision * random_precision(rng, count, 4)),
-        score=jnp.asarray(rng.standard_normal((count, 4))),
-        squares=jnp.asarray(20 + 5 * rng.random(count)),
+def random_marginal(rng, scatter, flatness, *, precision=8.0, numbers=0):
+    """The tests of particles with all entries at random, and so many numbers of effects."""
+    count, size = len(flatness), 4 + numbers
+    A = precision * random_precision(rng, count, size)
+    score = rng.standard_normal((count, size))
+    square = np.einsum("np,npq,nq->n", score, np.linalg.inv(A), score) + 20 + 5 * rng.random(count)
+    gram = np.concatenate([A, score[:, None]], 1)
+    gram = np.concatenate([gram, np.concatenate([score, square[:, None]], 1)[..., None]], 2)
+    point = Point(*(jnp.asarray(0.3 * rng.standard_normal(s)) for s in ((count, 4), count, (count, numbers))))
+    return Marginal(
+        point=point,
+        gram=jnp.asarray(gram),
+        log_scale=jnp.asarray(rng.standard_normal(count)),
         count=jnp.asarray(np.floor(20 + 5 * rng.random(count))),
-        zero=jnp.asarray(rng.standard_normal(count)),
-        zero_slope=jnp.asarray(rng.standard_normal((count, 4))),
+        zero=point.zero,
+        zero_slope=jnp.asarray(rng.standard_normal((count, size))),
         zero_sd=jnp.asarray(0.1 + rng.random(count)),
+        flatness=jnp.asarray(flatness),
+        weight=None,
+        scatter=scatter,
     )
 
 
@@ -119,5 +130,7 @@ def random_population(rng, scatter, **changes):
         "modulus_scatter": 0.3 if scatter.modulus else 0.0,
         "shape_scatter": 0.2 if scatter.shape else 0.0,
         "log_noise": 0.2 * rng.standard_normal(),
+        "theta": np.zeros(0),
+        "theta_scatter": np.zeros(0),
     }
     return Population(**{name: jnp.asarray(value) for name, value in {**numbers, **changes}.items()})

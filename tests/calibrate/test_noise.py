@@ -1,5 +1,8 @@
-"""The noise filter against dense Gaussian algebra, and what is estimated with it against known numbers."""
+"""The noise against dense normal distributions, and what is estimated with it against known numbers."""
 
+from dataclasses import replace
+
+import equinox as eqx
 import hypothesis.strategies as st
 import jax
 import jax.numpy as jnp
@@ -8,220 +11,309 @@ import pytest
 from hypothesis import given, settings
 from scipy.stats import multivariate_normal
 
+from mcc_jax.calibrate.data import Tests
+from mcc_jax.calibrate.distributions import RecordNoise
+from mcc_jax.calibrate.forward import Linear
 from mcc_jax.calibrate.noise import (
-    Linear,
+    Along,
+    Correlation,
     Noise,
-    NoisePrior,
     Whitening,
     estimate_noise,
     particle_scales,
     restricted_likelihood,
     whitening,
 )
+from mcc_jax.calibrate.paper.prediction import READING_UM
+from mcc_jax.calibrate.priors import NoisePrior
+from mcc_jax.calibrate.sharding import Blocks
+from mcc_jax.campaign import particle_batch
+from mcc_jax.effects import Record
 
 POINTS = 12
-STEPS = st.lists(st.floats(0.0, 0.5, allow_subnormal=False), min_size=POINTS, max_size=POINTS).map(
-    lambda s: np.array([0.0, *s[1:]])
-)
-MASKS = st.lists(st.booleans(), min_size=POINTS, max_size=POINTS).map(np.array)
-SIZES = st.floats(0.01, 2.0, allow_subnormal=False)
-SEEDS = st.integers(0, 2**32 - 1)
-SETTINGS = settings(max_examples=60)
+# Loading, a branch behind its peak, loading on, and another branch; of loading every point is a branch of its own.
+ELASTIC = np.repeat([False, True, False, True], POINTS // 4)
+BRANCH = np.where(ELASTIC, np.repeat([0, 3, 6, 9], POINTS // 4), np.arange(POINTS))
+AT_THE_END = np.arange(POINTS) >= POINTS // 2
+FOUR = (0.2, 0.3, 0.5, 0.3)
+KINDS = [(Correlation.EXPONENTIAL, Along.LOAD), (Correlation.MATERN_32, Along.TIME), (Correlation.MATERN_52, Along.LOAD)]
+kinds = pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind[0].value)
+RHO = {
+    Correlation.EXPONENTIAL: lambda x: np.exp(-x),
+    Correlation.MATERN_32: lambda x: (1 + np.sqrt(3) * x) * np.exp(-np.sqrt(3) * x),
+    Correlation.MATERN_52: lambda x: (1 + np.sqrt(5) * x + 5 * x**2 / 3) * np.exp(-np.sqrt(5) * x),
+}
 
 
-# Loading, a branch behind its peak, loading on, and another branch.
-BRANCH = np.repeat([0, 1, 2, 3], POINTS // 4)
-ONE_BRANCH = np.repeat([0, 1], POINTS // 2)
+def arrays(rng, *, count=1, elastic=AT_THE_END, masked=0.2, zero_sd=None, peak_sd=None, points=POINTS):
+    """Tests with paths, times, branches and derivatives by force at random; no law is behind them."""
+    shape = (count, points)
+    step = rng.random(shape) / 4 * (rng.random(shape) < 0.9)  # some points repeat the one before
+    branch = BRANCH if elastic is ELASTIC else np.where(elastic, np.argmax(elastic), np.arange(points))
+    still = [jnp.zeros(shape)] * 9
+    tests = Tests(
+        particle_batch(np.full((count, 3), 200.0)),
+        Record(still[0], jnp.asarray(np.cumsum(rng.random(shape), 1)), *[jnp.zeros(shape, int)] * 3, *still[:5], still[5]),
+        jnp.zeros(shape),
+        jnp.asarray(rng.random(shape) >= masked),
+        jnp.asarray(np.broadcast_to(~elastic, shape)),
+        jnp.zeros(count),
+        jnp.asarray(np.cumsum(step, 1)),
+        jnp.asarray(np.broadcast_to(branch, shape)),
+        jnp.asarray(rng.random(shape) < 0.8),
+        jnp.asarray(np.where(elastic, 0.3 + rng.random(shape), 0.0)),
+        None,
+        None if zero_sd is None else jnp.full(count, zero_sd),
+        None if peak_sd is None else jnp.asarray(np.where(elastic, peak_sd, 0.0) * np.ones(shape)),
+    )
+    by_force, by_peak = rng.standard_normal((2, *shape))
+    columns, residual = rng.standard_normal((*shape, 4)), rng.standard_normal(shape)
+    own = np.asarray(tests.mask)
+    zeros = (np.where(own, x, 0.0) for x in (residual, by_force, by_peak, by_force + by_peak))
+    residual, *derivatives = map(jnp.asarray, zeros)
+    return tests, Linear(residual, jnp.asarray(np.where(own[..., None], columns, 0.0)), *derivatives)
 
 
-def dense_covariance(four, scale, step, compliance, peak=None, branch=None):
-    """The covariance in the docstring of `noise`, written out."""
+def dense(four, scale, tests, linear, i=0, kind=KINDS[0]):
+    """The covariance in the docstring of `noise`, written out, of the points that count."""
     white, force, correlated, length = four
-    path = np.cumsum(step)
-    wander = correlated**2 * np.exp(-np.abs(path[:, None] - path) / length)
-    total = np.diag(white**2 + (force * compliance) ** 2) + wander
-    if peak is not None:
-        for b in np.unique(branch):
-            c = np.where(branch == b, peak, 0.0)
-            total = total + force**2 * np.outer(c, c)
-    return scale**2 * total
+    correlation, along = kind
+    place = np.asarray(tests.path[i] if along is Along.LOAD else tests.record.time[i])
+    total = correlated**2 * RHO[correlation](np.abs(place[:, None] - place) / length)
+    total = scale**2 * (total + np.diag(white**2 + (force * np.asarray(linear.by_force[i])) ** 2))
+    variance = (scale * force * np.asarray(tests.peak_error[i])) ** 2
+    variance += 0.0 if tests.peak_sd is None else np.asarray(tests.peak_sd[i]) ** 2
+    branch = np.asarray(tests.branch[i])
+    for b in np.unique(branch):
+        c = np.where(branch == b, np.sqrt(variance) * np.asarray(linear.by_peak[i]), 0.0)
+        total += np.outer(c, c)
+    if tests.force_zero_sd is not None:
+        c = float(tests.force_zero_sd[i]) * np.asarray(linear.by_offset[i])
+        total += np.outer(c, c)
+    return total
 
 
-def still_branches():
-    """Compliance, and branches whose peaks move nothing."""
-    return jnp.ones(POINTS), jnp.zeros(POINTS), jnp.asarray(BRANCH)
+@eqx.filter_jit
+def filters(four, scale, tests, linear, correlation, along) -> Whitening:
+    noise = Noise(*(jnp.asarray(v, float) for v in four), scale)
+    return jax.vmap(lambda s, *one: whitening(noise, s, *one, correlation, along))(scale, tests, linear)
 
 
-def noise_of(four, scale=(1.0,)):
-    return Noise(*(jnp.asarray(float(v)) for v in four), jnp.asarray(np.asarray(scale, float)))
+@eqx.filter_jit
+def log_probability(loc, filtered, factor, value):
+    return RecordNoise(loc, filtered, factor).log_prob(value)
 
 
-@jax.jit
-def whitened(four, scale, step, mask, compliance, residual, peak, branch):
-    noise = Noise(*four, jnp.ones(1))
-    filtered = whitening(noise, scale, step, mask, compliance, peak, branch)
-    return filtered(residual), filtered.log_det
+def expected(four, scale, factor, tests, linear, away, kind):
+    """Log densities of the tests, and what the steps of the display count for besides."""
+    found = []
+    for i in range(len(tests)):
+        mask = np.asarray(tests.mask[i])
+        covariance = factor**2 * dense(four, scale[i], tests, linear, i, kind)[mask][:, mask]
+        found.append(multivariate_normal(cov=covariance).logpdf(away[i][mask]) if mask.any() else 0.0)
+    return np.array(found)
 
 
-@SETTINGS
-@given(STEPS, MASKS, SIZES, SIZES, st.none() | SIZES, SIZES, SIZES, SEEDS)
-def test_whitening_is_the_dense_gaussian(step, mask, white, force, correlated, length, scale, seed):
-    rng = np.random.default_rng(seed)
-    compliance, residual, peak = rng.standard_normal((3, POINTS))
-    # Where residuals are correlated, one branch; without correlation, any number.
-    branch = BRANCH if correlated is None else ONE_BRANCH
-    peak = np.where(branch % 2 == 1, peak, 0.0)
-    four = (white, force, correlated or 0.0, length)
-    arguments = (tuple(map(np.float64, four)), np.float64(scale), step, mask, compliance, residual, peak, branch)
-    independent, log_det = whitened(*arguments)
-    assert np.all(np.asarray(independent)[~mask] == 0)
-    covariance = dense_covariance(four, scale, step, compliance, peak, branch)[mask][:, mask]
-    used = residual[mask]
-    expected = multivariate_normal(cov=covariance).logpdf(used) if mask.any() else 0.0
-    actual = -0.5 * (np.sum(np.asarray(independent) ** 2) + float(log_det) + mask.sum() * np.log(2 * np.pi))
-    np.testing.assert_allclose(actual, expected, rtol=1e-7, atol=1e-8)
+def found_density(four, scale, factor, tests, linear, away, kind):
+    filtered = filters(four, jnp.asarray(scale), tests, linear, *kind)
+    values = log_probability(jnp.ones_like(tests.force), filtered, jnp.asarray(factor), jnp.asarray(away + 1.0))
+    # Reading a display of finite steps is misfit whatever the law says.
+    return np.asarray(values + 0.5 * jax.vmap(lambda f: f.reading)(filtered) / factor**2)
 
 
-@SETTINGS
-@given(STEPS, MASKS, SIZES, SIZES, SEEDS)
-def test_masked_points_count_for_nothing(step, mask, correlated, length, seed):
-    rng = np.random.default_rng(seed)
-    compliance, peak, one, two = rng.standard_normal((4, POINTS))
-    other = np.where(mask, one, two)
-    arguments = (tuple(map(np.float64, (0.3, 0.2, correlated, length))), np.float64(1.0), step, mask, compliance)
-    for a, b in zip(*(whitened(*arguments, r, peak, BRANCH) for r in (one, other)), strict=True):
-        np.testing.assert_array_equal(a, b)
+@settings(max_examples=30)
+@given(
+    st.sampled_from([(KINDS[0], None), *((kind, 0.2) for kind in KINDS)]),
+    st.integers(0, 2**32 - 1),
+    st.sampled_from([(0.0, 1.0), (0.5, 1.7), (1.0, 0.6)]),
+)
+def test_the_density_is_the_dense_normal_one(case, seed, more):
+    """With a branch at the end, errors of its peak and of the zero of force, a scale and a common factor."""
+    rng, (kind, known), (masked, factor) = np.random.default_rng(seed), case, more
+    tests, linear = arrays(rng, masked=masked, zero_sd=known, peak_sd=known, count=2)
+    four, scale = np.exp(0.7 * rng.standard_normal(4)) * FOUR, np.exp(0.5 * rng.standard_normal(2))
+    away = rng.standard_normal((2, POINTS))
+    wanted = expected(four, scale, factor, tests, linear, away, kind)
+    np.testing.assert_allclose(
+        found_density(four, scale, factor, tests, linear, away, kind), wanted, rtol=1e-7, atol=1e-7
+    )
 
 
-def test_whitening_is_linear_and_whitens():
-    rng = np.random.default_rng(2)
-    step, compliance = np.append(0.0, rng.random(POINTS - 1) / 5), rng.standard_normal(POINTS)
-    four = (0.2, 0.3, 0.5, 0.3)
-    peak = np.where(ONE_BRANCH == 1, rng.standard_normal(POINTS), 0.0)
-    path = (step, np.full(POINTS, True), compliance, peak, ONE_BRANCH)
-    filtered = whitening(noise_of(four), jnp.asarray(1.7), *map(jnp.asarray, path))
-    L = np.asarray(jax.vmap(filtered, in_axes=1, out_axes=1)(jnp.eye(POINTS)))
-    covariance = dense_covariance(four, 1.7, step, compliance, peak, ONE_BRANCH)
-    np.testing.assert_allclose(L @ covariance @ L.T, np.eye(POINTS), rtol=0, atol=1e-12)
+def test_white_noise_of_two_branches_is_dense_too():
+    rng = np.random.default_rng(5)
+    tests, linear = arrays(rng, elastic=ELASTIC, zero_sd=0.4, count=3)
+    four, scale, away = (0.2, 0.3, 0.0, 0.3), np.array([0.5, 1.0, 2.0]), rng.standard_normal((3, POINTS))
+    wanted = expected(four, scale, 1.3, tests, linear, away, KINDS[0])
+    np.testing.assert_allclose(found_density(four, scale, 1.3, tests, linear, away, KINDS[0]), wanted, rtol=1e-8)
 
 
-def test_two_branches_of_correlated_residuals_are_nearly_the_dense_gaussian():
+@kinds
+def test_correlated_noise_of_two_branches_is_nearly_dense(kind):
     """The filter carries a little of one branch's direction into what follows; as in tests, correlation is weak."""
     rng = np.random.default_rng(3)
-    step, mask = np.full(POINTS, 0.05), np.full(POINTS, True)
-    compliance, peak = np.full(POINTS, 0.1), np.where(BRANCH % 2 == 1, 0.3, 0.0)
+    tests, linear = arrays(rng, elastic=ELASTIC, masked=0.0)
+    still = jnp.full((1, POINTS), 0.1)
+    linear = replace(linear, by_force=still, by_peak=3 * still)
+    record = replace(tests.record, time=jnp.asarray(0.05 * np.arange(POINTS)[None]))
+    tests = replace(tests, path=record.time, record=record, peak_error=jnp.asarray(1.0 * ELASTIC[None]))
     four = (0.02, 0.05, 0.01, 0.2)
-    covariance = dense_covariance(four, 1.0, step, compliance, peak, BRANCH)
+    factor = np.linalg.cholesky(dense(four, 1.0, tests, linear, kind=kind))
     for _ in range(5):
-        r = np.linalg.cholesky(covariance) @ rng.standard_normal(POINTS)
-        independent, log_det = whitened(
-            tuple(map(np.float64, four)), np.float64(1.0), step, mask, compliance, r, peak, BRANCH
-        )
-        actual = -0.5 * (np.sum(np.asarray(independent) ** 2) + float(log_det) + POINTS * np.log(2 * np.pi))
-        assert abs(actual - multivariate_normal(cov=covariance).logpdf(r)) < 0.3
+        away = (factor @ rng.standard_normal(POINTS))[None]
+        gap = found_density(four, np.ones(1), 1.0, tests, linear, away, kind)
+        assert np.abs(gap - expected(four, np.ones(1), 1.0, tests, linear, away, kind)).max() < 0.3
 
 
-def test_without_correlation_it_only_divides():
-    step = jnp.asarray(np.full(POINTS, 0.1))
-    mask, residual = jnp.asarray(np.full(POINTS, True)), jnp.arange(POINTS, dtype=float)
-    filtered = whitening(noise_of((0.5, 0.0, 0.0, 1.0)), jnp.asarray(2.0), step, mask, *still_branches())
-    np.testing.assert_allclose(filtered(residual), residual, rtol=1e-14)
-    np.testing.assert_allclose(float(filtered.log_det), 0.0, atol=1e-14)
+@kinds
+def test_draws_have_the_covariance_of_the_density(kind):
+    """They are linear in standard normal numbers: their covariance is the product of the columns."""
+    rng = np.random.default_rng(7)
+    tests, linear = arrays(rng, zero_sd=0.6, peak_sd=0.3)
+    (filtered,) = [jax.tree.map(lambda x: x[0], filters(FOUR, jnp.ones(1), tests, linear, *kind))]
+    columns = jax.vmap(lambda x: filtered.colour(x[:POINTS], x[POINTS:-1], x[-1]))(jnp.eye(2 * POINTS + 1))
+    used = np.asarray(tests.mask[0])
+    covariance = np.einsum("kn,km->nm", columns, columns)[used][:, used]
+    np.testing.assert_allclose(covariance, dense(FOUR, 1.0, tests, linear, kind=kind)[used][:, used], rtol=1e-6)
 
 
-# ---- parameters integrated out ---------------------------------------------------------------------------------------
+def test_draws_of_the_distribution_are_around_the_prediction_and_nan_where_masked():
+    rng = np.random.default_rng(8)
+    tests, linear = arrays(rng, zero_sd=0.6, count=2)
+    filtered, loc = filters(FOUR, jnp.ones(2), tests, linear, *KINDS[0]), rng.standard_normal((2, POINTS))
+    law = RecordNoise(jnp.asarray(loc), filtered, jnp.asarray(2.0))
+    drawn = np.asarray(law.sample(jax.random.key(0), (100, 60)))
+    assert drawn.shape == (100, 60, 2, POINTS)
+    drawn = drawn.reshape(6000, 2, POINTS)
+    np.testing.assert_array_equal(np.isfinite(drawn).all(0), tests.mask)
+    for i in range(2):
+        mask = np.asarray(tests.mask[i])
+        covariance = 4 * dense(FOUR, 1.0, tests, linear, i)[mask][:, mask]
+        sd = np.sqrt(np.diag(covariance))
+        off = drawn[:, i, mask] - loc[i, mask]
+        assert np.all(np.abs(off.mean(0)) < 5 * sd / np.sqrt(6000))
+        np.testing.assert_allclose(off.T @ off / 6000 / sd / sd[:, None], covariance / sd / sd[:, None], atol=0.06)
 
 
-def linear_problem(four, scale, *, points=POINTS, count=1, seed=0, masked=0.1):
-    """Tests that are linear in three parameters of their own, with noise as the docstring of `noise` has it."""
-    rng = np.random.default_rng(seed)
-    path = np.linspace(0, 1.6, points)
-    residual = np.empty((count, points))
-    jacobian, compliance = np.empty((count, points, 3)), np.empty((count, points))
-    step = np.broadcast_to(np.append(0.0, np.diff(path)), (count, points))
-    branch = np.broadcast_to((path > 1).astype(int), (count, points))
-    peak = np.where(branch == 1, 0.1 + 0.2 * rng.random((count, 1)), 0.0)
-    for i in range(count):
-        jacobian[i] = np.stack([np.ones(points), path, rng.random() + np.sqrt(path)], 1)
-        compliance[i] = 0.05 + rng.random() * np.exp(-2 * path)
-        covariance = dense_covariance(four, scale[i], step[i], compliance[i], peak[i], branch[i])
-        noise = np.linalg.cholesky(covariance) @ rng.standard_normal(points)
-        residual[i] = noise + jacobian[i] @ rng.standard_normal(3)
-    mask = rng.random((count, points)) >= masked
-    prior = np.tile([0.5, 1.0, 2.0], (count, 1))
-    arrays = (residual, jacobian, prior, step, mask, compliance, peak, branch)
-    return Linear(*(jnp.asarray(v) for v in arrays))
+def test_masked_points_count_for_nothing():
+    rng = np.random.default_rng(1)
+    tests, linear = arrays(rng, masked=0.4, zero_sd=0.2)
+    one, two = rng.standard_normal((2, 1, POINTS))
+    other = np.where(np.asarray(tests.mask), one, two)
+    values = (found_density(FOUR, np.ones(1), 1.0, tests, linear, v, KINDS[0]) for v in (one, other))
+    np.testing.assert_array_equal(*values)
+    filtered = jax.tree.map(lambda x: x[0], filters(FOUR, jnp.ones(1), tests, linear, *KINDS[0]))
+    assert np.abs(np.asarray(filtered(linear.residual[0][:, None]))[~np.asarray(tests.mask[0])]).max() < 1e-5
+
+
+def test_white_noise_only_divides_and_a_display_reads_in_steps():
+    rng = np.random.default_rng(2)
+    tests, linear = arrays(rng, masked=0.0)
+    still = replace(linear, by_peak=jnp.zeros((1, POINTS)))
+    filtered = jax.tree.map(lambda x: x[0], filters((0.5, 0.0, 0.0, 1.0), jnp.full(1, 2.0), tests, still, *KINDS[0]))
+    np.testing.assert_allclose(filtered(linear.residual[0][:, None])[:, 0], linear.residual[0], rtol=1e-14)
+    np.testing.assert_allclose(float(filtered.log_det), 0.0, atol=1e-12)
+    np.testing.assert_allclose(float(filtered.reading), POINTS * READING_UM**2, rtol=1e-12)
+
+
+# ---- numbers integrated out, and the noise estimated -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.6])
-def test_restricted_likelihood_is_the_dense_gaussian_with_the_parameters_in_the_covariance(scale):
-    four = (0.2, 0.3, 0.5, 0.3)
-    data = linear_problem(four, (1.0, 1.0), count=2)
-    noise = noise_of(four, (scale, 1.0))
-    actual = np.asarray(jax.jit(restricted_likelihood)(noise, data))
+def test_restricted_likelihood_is_the_dense_normal_one_with_the_numbers_in_the_covariance(scale):
+    rng = np.random.default_rng(0)
+    tests, linear = arrays(rng, count=2)
+    noise, zero_sd = Noise.of(FOUR, jnp.asarray([scale, 1.0])), 1.5
+    actual = np.asarray(jax.jit(lambda: restricted_likelihood(noise, tests, linear, jnp.asarray(zero_sd), *KINDS[0]))())
     for i in range(2):
-        mask, J = np.asarray(data.mask[i]), np.asarray(data.jacobian[i])
-        r, prior = np.asarray(data.residual[i])[mask], np.asarray(data.prior[i])
-        path = (np.asarray(v[i]) for v in (data.step, data.compliance, data.peak, data.branch))
-        V = dense_covariance(four, (scale, 1.0)[i], *path)
-        total = (V + J @ np.diag(1 / prior) @ J.T)[mask][:, mask]
-        expected = multivariate_normal(cov=total).logpdf(r)
-        constant = 0.5 * mask.sum() * np.log(2 * np.pi) - 0.5 * np.log(prior).sum()
-        np.testing.assert_allclose(actual[i], expected + constant, rtol=1e-9)
+        mask = np.asarray(tests.mask[i])
+        X = np.concatenate([np.asarray(linear.columns[i]), np.full((POINTS, 1), zero_sd)], 1)
+        total = (dense(FOUR, (scale, 1.0)[i], tests, linear, i) + X @ X.T)[mask][:, mask]
+        wanted = multivariate_normal(cov=total).logpdf(np.asarray(linear.residual[i])[mask])
+        np.testing.assert_allclose(actual[i], wanted + 0.5 * mask.sum() * np.log(2 * np.pi), rtol=1e-9)
 
 
 KNOWN = np.array([0.02, 0.05, 0.04, 0.2])
 WEAK = NoisePrior(jnp.asarray([0.05, 0.02, 0.01, 0.5]), jnp.asarray([1.5, 1.0, 1.5, 1.0]))
+COUNT, LENGTH = 10, 100
+
+
+def known_tests(four, scale):
+    """Tests that are linear in four numbers and a zero, with noise of known size."""
+    rng = np.random.default_rng(7)
+    path = np.broadcast_to(np.linspace(0, 1.6, LENGTH), (COUNT, LENGTH))
+    tests, linear = arrays(rng, count=COUNT, points=LENGTH, elastic=np.arange(LENGTH) >= 60, masked=0.1)
+    branch = np.where(path > 1, 63, np.arange(LENGTH))
+    tests = replace(tests, path=jnp.asarray(path), branch=jnp.asarray(branch), peak_error=jnp.asarray(1.0 * (path > 1)))
+    rows = np.stack([np.sqrt(path), path, path**2, np.where(path > 1, path - 1, 0.0)], -1)
+    by_force = 0.05 + rng.random((COUNT, 1)) * np.exp(-2 * path)
+    by_peak = np.where(path > 1, 0.1 + 0.2 * rng.random((COUNT, 1)), 0.0)
+    linear = replace(linear, by_force=jnp.asarray(by_force), by_peak=jnp.asarray(by_peak))
+    residual = np.einsum("nkp,np->nk", rows, rng.standard_normal((COUNT, 4))) + rng.standard_normal((COUNT, 1))
+    for i in range(COUNT):
+        residual[i] += np.linalg.cholesky(dense(four, scale[i], tests, linear, i)) @ rng.standard_normal(LENGTH)
+    mask = np.asarray(tests.mask)
+    return tests, replace(
+        linear,
+        residual=jnp.asarray(np.where(mask, residual, 0.0)),
+        columns=jnp.asarray(np.where(mask[..., None], rows, 0.0)),
+    )
+
+
+def estimate(tests, linear, start, **options):
+    blocks = Blocks(COUNT)
+    parts = blocks.cut(tests), blocks.cut(linear)
+    return estimate_noise(*parts, jnp.asarray(2.0), WEAK, start, *KINDS[0], blocks=blocks, **options)
 
 
 @pytest.fixture(scope="module")
 def estimated():
-    rng = np.random.default_rng(11)
-    scale = np.exp(0.5 * rng.standard_normal(10))
-    data = linear_problem(KNOWN, scale, points=100, count=10, seed=7)
-    start = noise_of(WEAK.median, scale)
-    return data, start, estimate_noise(data, WEAK, start)
+    scale = np.exp(0.5 * np.random.default_rng(11).standard_normal(COUNT))
+    tests, linear = known_tests(KNOWN, scale)
+    start = Noise.of(np.asarray(WEAK.median), jnp.asarray(scale))
+    return tests, linear, start, estimate(tests, linear, start)
 
 
 def test_known_noise_is_recovered(estimated):
-    _, start, (noise, sd, converged) = estimated
-    sd = np.asarray(sd)
-    assert converged
-    assert np.all((sd > 0.01) & (sd < 0.5))
-    off = (np.asarray(noise.logs) - np.log(KNOWN)) / sd
+    *_, start, found = estimated
+    assert found.converged
+    assert np.all((found.log_sd > 0.01) & (found.log_sd < 0.7))
+    off = (np.asarray(found.noise.logs) - np.log(KNOWN)) / found.log_sd
     assert np.all(np.abs(off) < 3), off
-    np.testing.assert_array_equal(noise.scale, start.scale)
+    np.testing.assert_array_equal(found.noise.scale, start.scale)
 
 
-def test_the_estimate_is_the_maximum(estimated):
-    data, start, (noise, _, _) = estimated
+def test_the_estimate_is_the_maximum_and_its_volume_laplace_s(estimated):
+    tests, linear, start, found = estimated
 
-    likelihood = jax.jit(lambda logs: jnp.sum(restricted_likelihood(Noise.from_logs(logs, start.scale), data)))
+    @jax.jit
+    def likelihood(logs):
+        noise = Noise.from_logs(logs, start.scale)
+        return jnp.sum(restricted_likelihood(noise, tests, linear, jnp.asarray(2.0), *KINDS[0]))
 
     def loss(logs):
         return -(float(likelihood(jnp.asarray(logs))) + float(WEAK.log_density(logs)))
 
-    best = np.asarray(noise.logs)
+    best = np.asarray(found.noise.logs)
     for direction in np.eye(4):
-        for size in (-0.1, 0.1):
-            assert loss(best + size * direction) > loss(best)
+        assert min(loss(best - 0.1 * direction), loss(best + 0.1 * direction)) > loss(best)
+    volume = 0.5 * np.linalg.slogdet(2 * np.pi * np.asarray(found.covariance))[1]
+    np.testing.assert_allclose(float(found.log_evidence), float(WEAK.log_density(best)) + volume, rtol=1e-9)
 
 
 def test_the_start_does_not_matter(estimated):
-    data, start, (noise, _, _) = estimated
-    elsewhere = noise_of((0.3, 0.01, 0.005, 0.05), start.scale)
-    again, sd, converged = estimate_noise(data, WEAK, elsewhere, uncertainty=False)
-    assert converged
-    assert np.all(np.isnan(np.asarray(sd)))
-    np.testing.assert_allclose(again.logs, noise.logs, atol=5e-3)
+    tests, linear, start, found = estimated
+    again = estimate(tests, linear, Noise.of((0.3, 0.01, 0.005, 0.05), start.scale), uncertainty=False)
+    assert again.converged
+    assert np.all(np.isnan(np.asarray(again.covariance)))
+    np.testing.assert_allclose(again.noise.logs, found.noise.logs, atol=5e-3)
 
 
 def test_data_without_noise_end_at_the_bound_and_stay_finite():
-    data = linear_problem((1e-9, 0.0, 0.0, 1.0), np.ones(10), points=100, count=10)
-    noise, sd, _ = estimate_noise(data, WEAK, noise_of(WEAK.median, np.ones(10)))
-    assert np.all(np.isfinite(np.asarray(noise.logs)))
-    assert np.all(np.isfinite(np.asarray(sd)))
-    assert float(noise.displacement) < 1e-3
+    tests, linear = known_tests((1e-9, 0.0, 0.0, 1.0), np.ones(COUNT))
+    found = estimate(tests, linear, Noise.of(np.asarray(WEAK.median), jnp.ones(COUNT)))
+    assert np.all(np.isfinite(np.asarray(found.noise.logs)))
+    assert np.all(np.isfinite(found.log_sd))
+    assert float(found.noise.displacement) < 1e-3
 
 
 # ---- scales of the particles -----------------------------------------------------------------------------------------
@@ -276,18 +368,3 @@ def test_scales_of_extreme_residuals_are_finite_and_positive(squares):
     assert np.all(np.isfinite(scale))
     assert np.all(scale > 0)
 
-
-def test_whitening_of_a_batch_is_that_of_each():
-    rng = np.random.default_rng(4)
-    step, compliance, r, peak = np.abs(rng.standard_normal((4, 2, POINTS)))
-    branch = np.broadcast_to(BRANCH, (2, POINTS))
-    mask = rng.random((2, POINTS)) < 0.8
-    scale, noise = np.array([0.5, 2.0]), noise_of((0.2, 0.3, 0.5, 0.3), (0.5, 2.0))
-    batch: Whitening = jax.vmap(lambda s, *one: whitening(noise, s, *one))(
-        noise.scale, *map(jnp.asarray, (step, mask, compliance, peak, branch))
-    )
-    together = jax.vmap(lambda f, x: f(x))(batch, jnp.asarray(r))
-    for i in range(2):
-        four = tuple(map(np.float64, (0.2, 0.3, 0.5, 0.3)))
-        alone, _ = whitened(four, scale[i], step[i], mask[i], compliance[i], r[i], peak[i], branch[i])
-        np.testing.assert_allclose(together[i], alone, rtol=1e-12, atol=1e-14)
