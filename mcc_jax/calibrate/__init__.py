@@ -8,7 +8,7 @@ from .evidence import Evidence as Evidence
 from .evidence import compare as compare
 from .evidence import fit as fit
 from .evidence import log_evidence as log_evidence
-from .fitting import Fit as Fit
+from .fit_result import Fit as Fit
 from .least_squares import Identifiability as Identifiability
 from .least_squares import LeastSquaresCalibration as LeastSquaresCalibration
 from .least_squares import calibrate_least_squares as calibrate_least_squares

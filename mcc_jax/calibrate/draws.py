@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from .compiling import compiled
 from .conditional import Drawer, chunk_of, corrected, every, stride_of, weighted
-from .fitting import Fit
+from .fit_result import Fit
 from .importance import sample_weighted
 from .mode import LogPosterior, density_of, populations
 from .noise import standard_promotion

@@ -11,7 +11,8 @@ import numpy as np
 from .. import arguments
 from .._errors import InputError
 from ..campaign import THRESHOLD_MPA, Campaign, check_tests
-from .fitting import Fit, checked_settings, prepare
+from .fit_result import Fit
+from .fitting import checked_settings, prepare
 from .judgement import numbers_in_reach
 from .model import Model
 from .posterior import BayesCalibration, sample

@@ -7,15 +7,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import numpyro
-import numpyro.distributions as dist
-from jaxtyping import Array, Bool, Float
-
-from numpyro.infer.util import constrain_fn, potential_energy
+from jaxtyping import Array, Float
 
 from .. import arguments
 from .._errors import InputError
@@ -24,14 +19,15 @@ from ..campaign import THRESHOLD_MPA, Campaign, other_material
 from .compiling import compiled
 from .data import Selection, Tests, select
 from .distributions import SpreadCoordinate
+from .expectation import careful_enough, expect
+from .fit_result import Fit
 from .forward import Forms, Linear, Point, linearise
-from .marginal import Marginal, straighten, summarise
-from .mode import LogPosterior, handlers, most_probable
+from .marginal import Marginal, summarise
+from .mode import LogPosterior, most_probable
 from .model import Model, check_prior_of_a
-from .noise import Noise, NoiseFit, Whitening, estimate_noise, particle_scales
+from .noise import Noise, NoiseFit, estimate_noise, particle_scales
 from .paper.prediction import point_noise_um
 from .particle_fit import FIRST_STEPS, MAX_STEPS, ParticleFits, fit_particles, linear_starts
-from .population import Population
 from .priors import Priors
 from .sharding import Blocks, Parts, block_size, count_of, filled_up, require_same
 from .starts import start_of_effects
@@ -53,127 +49,6 @@ most where effects have to be linearised anew."""
 
 STILL = 0.1
 """An effect is linearised anew until none of its numbers moves by more than this share of its standard deviation."""
-
-
-class Fit(eqx.Module):
-    """Particles, noise and population of a campaign in agreement.
-
-    Attributes:
-        model: what was assumed.
-        tests: the measurements.
-        individual: every particle on its own.
-        noise: the campaign's noise.
-        filters: its filters at the point.
-        point: most probable numbers of every particle.
-        residual: measured less predicted displacement there [um], 0 where masked.
-        marginal: the tests there, with every particle's own numbers integrated out.
-        mode, covariance: of the population in unbounded coordinates, in the order of `names`.
-        converged: for particles, noise and population in turn.
-    """
-
-    model: Model = eqx.field(static=True)
-    tests: Tests
-    individual: ParticleFits
-    noise: NoiseFit
-    filters: Whitening
-    point: Point
-    residual: Float[Array, "particles points"]
-    marginal: Marginal
-    mode: Float[Array, " d"]
-    covariance: Float[Array, "d d"]
-    converged: Bool[np.ndarray, " 3"]
-
-    @property
-    def target(self) -> LogPosterior:
-        """The density of the population given all tests, in unbounded coordinates."""
-        return LogPosterior(self.model, self.marginal)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the coordinates."""
-        return self.target.names
-
-    @property
-    def population(self) -> Population:
-        """The most probable population."""
-        return population_of(self.mode, self.target)
-
-    def nuts(self, *, explicit: bool = False, **settings: Any) -> Any:
-        """NumPyro's NUTS for the model, from the mode on, with the covariance as mass matrix.
-
-        Run it with `MCMC(fit.nuts(), ...).run(key, tests, fit.marginal)`: every particle is integrated out. Explicit,
-        every particle's own numbers are sampled under the exact likelihood, in the coordinates of this fit, in which
-        they mix; run it with `MCMC(fit.nuts(explicit=True), ...).run(key, tests)`.
-
-        Args:
-            explicit: sample every particle's own numbers.
-            settings: of `numpyro.infer.NUTS`.
-        """
-        from numpyro.infer import NUTS, init_to_value
-
-        arguments.flag(explicit, "explicit")
-        size = len(self.names) + explicit * len(self.tests) * (self.marginal.scatter.size + 1)
-        start = init_to_value(values={"coordinates": jnp.zeros(size)})
-        options = {"dense_mass": size < MAX_DENSE, "target_accept_prob": 0.9 if explicit else 0.8, **settings}
-        return NUTS(FitCoordinates(self, size), init_strategy=start, **options)
-
-    def first(self, count: int) -> Fit:
-        """The same of the first `count` particles: without copies that only fill up."""
-
-        def some(tree: Any) -> Any:
-            return jax.tree.map(lambda x: x[:count], tree)
-
-        marginal = replace(some(replace(self.marginal, weight=None)), scatter=self.marginal.scatter)
-        noise = replace(self.noise.noise, scale=self.noise.noise.scale[:count])
-        return replace(
-            self,
-            tests=some(replace(self.tests, weight=None)),
-            individual=some(self.individual),
-            noise=replace(self.noise, noise=noise),
-            filters=some(self.filters),
-            point=some(self.point),
-            residual=self.residual[:count],
-            marginal=marginal,
-        )
-
-
-MAX_DENSE = 60
-"""Numbers up to which NUTS adapts a whole mass matrix: more it cannot learn from a few hundred steps."""
-
-
-class FitCoordinates:
-    """The model in the coordinates of a fit, as a NumPyro model: its density, written in numbers that are near standard
-    normal, every site of the model as a `deterministic`.
-
-    A posterior whose widths span five powers of ten does not mix in its own coordinates.
-    """
-
-    def __init__(self, fit: Fit, size: int) -> None:
-        self.fit, self.size = fit, size
-
-    def __call__(self, tests: Tests, marginal: Marginal | None = None) -> None:
-        """As `Model`: with `marginal` every particle is integrated out, else its own numbers are explicit."""
-        fit, improper = self.fit, dist.ImproperUniform(dist.constraints.real, (), (self.size,))
-        position: Any = numpyro.sample("coordinates", improper)
-        d = len(fit.names)
-        free = fit.mode + jnp.linalg.cholesky(fit.covariance) @ position[:d]
-        sites = fit.target.sites(free)
-        told = {} if marginal is not None else {"filters": fit.filters, "around": fit.marginal}
-        if marginal is None:
-            sites["own"] = position[d:].reshape(len(tests), -1)
-        with handlers.block():  # the model is evaluated here, and stands for no sites of its own
-            potential: Any = potential_energy(fit.model, (tests, marginal), told, sites)
-            model = handlers.seed(fit.model, jax.random.key(0))
-            values = constrain_fn(model, (tests, marginal), told, sites, return_deterministic=True)
-        numpyro.factor("density", -potential)
-        for name, value in values.items():
-            numpyro.deterministic(name, value)
-
-
-@compiled
-def population_of(free: Float[Array, " d"], target: LogPosterior) -> Population:
-    """The population at unbounded coordinates."""
-    return target.population(free)
 
 
 @compiled
@@ -513,77 +388,6 @@ def _start(latent: np.ndarray, flatness: np.ndarray, model: Model) -> dict[str, 
     for name in ("modulus_scatter", "shape_scatter"):
         start[f"{name}_coordinate"] = float(SpreadCoordinate(getattr(priors, name)).coordinate(0.1))
     return start
-
-
-class Expected(eqx.Module):
-    """What a population says of its particles, and what the tests add.
-
-    Attributes:
-        mean, sd: of b1, b3, b5, e under the population, shape (N, 4).
-        latent: most probable ones given the tests, too, shape (N, 4).
-        theta: most probable numbers of the effects.
-        theta_mean, theta_sd: of the amplitudes that vary, under the population.
-        zero: most probable zeros [um], shape (N,).
-        hessian, stretch: of `Laplace`.
-    """
-
-    mean: Float[Array, "particles 4"]
-    sd: Float[Array, "particles 4"]
-    latent: Float[Array, "particles 4"]
-    theta: Float[Array, "particles numbers"]
-    theta_mean: Float[Array, "particles varying"]
-    theta_sd: Float[Array, "particles varying"]
-    zero: Float[Array, " particles"]
-    hessian: Float[Array, "particles k k"]
-    stretch: Float[Array, " k"]
-
-
-@compiled
-def expect(free: Float[Array, " d"], target: LogPosterior) -> Expected:
-    """The particles under the population at unbounded coordinates."""
-    marginal, population = target.marginal, target.population(free)
-    at = marginal.laplace(population)
-    none = marginal.place(population, jnp.zeros_like(at.deviations))
-    varying = jnp.asarray([k for k, _ in marginal.scatter.varying], int)
-    width = jnp.sqrt(jnp.sum(at.placed.jacobian**2, -1))
-    mean, factor = none.latent, none.jacobian[:, :4]
-    # Without the bend of the straightened coordinates, which is that of the point.
-    _, slope = straighten(mean - marginal.point.latent)
-    sd = jnp.sqrt(jnp.sum((factor / slope[..., None]) ** 2, -1))
-    zero = marginal.zero + jnp.einsum("np,np->n", marginal.zero_slope, at.placed.u)
-    theta = at.placed.theta
-    return Expected(
-        mean,
-        sd,
-        at.placed.latent,
-        theta,
-        none.theta[:, varying],
-        width[:, 4:][:, varying],
-        zero,
-        at.hessian,
-        at.stretch,
-    )
-
-
-SHARP = 0.03
-"""Posterior standard deviation of the logarithm of a polynomial's coefficient below which one Newton step is enough."""
-
-
-def careful_enough(free: Float[Array, " d"], target: LogPosterior, count: int) -> LogPosterior:
-    """The target with as many Newton steps as the integration over the particles needs: none if every coefficient is
-    known sharply.
-
-    Args:
-        free: population in unbounded coordinates.
-        target: of the tests.
-        count: number of particles, without copies that only fill up.
-    """
-    scatter = replace(target.marginal.scatter, newton=0)
-    sharp = replace(target, marginal=replace(target.marginal, scatter=scatter))
-    at = expect(free, sharp)
-    variance = np.diagonal(np.linalg.inv(np.asarray(at.hessian)[:count]), axis1=1, axis2=2)
-    widest = float(np.max(np.sqrt(variance) * np.asarray(at.stretch)))
-    return sharp if widest < SHARP else target
 
 
 def checked_settings(

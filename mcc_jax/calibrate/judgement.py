@@ -18,7 +18,7 @@ from .._errors import InputError
 from ..campaign import Campaign, Finding, campaign_findings, check_plausibility
 from ..campaign.quality import named
 from ..campaign.reasons import or_slip
-from .fitting import Fit
+from .fit_result import Fit
 
 
 @dataclass(frozen=True)

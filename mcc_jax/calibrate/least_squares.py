@@ -19,7 +19,8 @@ from .data import Selection, Tests, compared_rows, own_misfit, ranges_um, root_m
 from .distributions import SpreadCoordinate
 from .effects import effect_entries
 from .estimates import NO_SAMPLER, estimate, finite, force_zero, log_estimate, misfit_note, noise_note, power_of_e
-from .fitting import Fit, beyond_numbers, checked_settings, prepare
+from .fit_result import Fit
+from .fitting import beyond_numbers, checked_settings, prepare
 from .forward import residuals
 from .hierarchical import SHARED, Pooled, fit_pooled, unpack
 from .judgement import judged, noise_share, numbers_in_reach, unlike_others

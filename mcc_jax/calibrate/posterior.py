@@ -19,7 +19,8 @@ from .data import Selection, compared_rows, own_misfit, ranges_um, root_mean_squ
 from .draws import Draws, draw_fast, draw_joint
 from .effects import effect_entries, effect_numbers
 from .estimates import estimate, finite, force_zero, log_estimate, misfit_note, noise_note, summary
-from .fitting import Fit, checked_settings, in_own_units, prepare
+from .fit_result import Fit
+from .fitting import checked_settings, in_own_units, prepare
 from .judgement import judged, noise_share, numbers_in_reach, unlike_others
 from .least_squares import least_squares
 from .model import Model

@@ -22,7 +22,7 @@ from ..law import MccLaw
 from .content import read_result
 from .curves import FittedCurve, fitted_curves
 from .data import Selection
-from .fitting import Fit
+from .fit_result import Fit
 from .laws import law_of
 from .model import Model
 from .population import COEFFICIENTS, Population
