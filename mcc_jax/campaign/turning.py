@@ -173,9 +173,7 @@ def _run(near: np.ndarray, start: int, stop: int, direction: int, most: int) -> 
     return np.sort(order[:most])
 
 
-def _held(
-    time: np.ndarray, raw: np.ndarray, part: Segment, noise: float, options: TurningOptions
-) -> np.ndarray | None:
+def _held(time: np.ndarray, raw: np.ndarray, part: Segment, noise: float, options: TurningOptions) -> np.ndarray | None:
     """Rows of a hold whose readings scatter about one force; None where the force relaxes.
 
     A hold begins and ends with readings of the ramps beside it that come close to it: they lie apart from the others.

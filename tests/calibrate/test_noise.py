@@ -36,7 +36,11 @@ ELASTIC = np.repeat([False, True, False, True], POINTS // 4)
 BRANCH = np.where(ELASTIC, np.repeat([0, 3, 6, 9], POINTS // 4), np.arange(POINTS))
 AT_THE_END = np.arange(POINTS) >= POINTS // 2
 FOUR = (0.2, 0.3, 0.5, 0.3)
-KINDS = [(Correlation.EXPONENTIAL, Along.LOAD), (Correlation.MATERN_32, Along.TIME), (Correlation.MATERN_52, Along.LOAD)]
+KINDS = [
+    (Correlation.EXPONENTIAL, Along.LOAD),
+    (Correlation.MATERN_32, Along.TIME),
+    (Correlation.MATERN_52, Along.LOAD),
+]
 kinds = pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind[0].value)
 RHO = {
     Correlation.EXPONENTIAL: lambda x: np.exp(-x),
@@ -53,7 +57,9 @@ def arrays(rng, *, count=1, elastic=AT_THE_END, masked=0.2, zero_sd=None, peak_s
     still = [jnp.zeros(shape)] * 9
     tests = Tests(
         particle_batch(np.full((count, 3), 200.0)),
-        Record(still[0], jnp.asarray(np.cumsum(rng.random(shape), 1)), *[jnp.zeros(shape, int)] * 3, *still[:5], still[5]),
+        Record(
+            still[0], jnp.asarray(np.cumsum(rng.random(shape), 1)), *[jnp.zeros(shape, int)] * 3, *still[:5], still[5]
+        ),
         jnp.zeros(shape),
         jnp.asarray(rng.random(shape) >= masked),
         jnp.asarray(np.broadcast_to(~elastic, shape)),
@@ -367,4 +373,3 @@ def test_scales_of_extreme_residuals_are_finite_and_positive(squares):
     scale = particle_scales(np.ones(2), np.array(squares), np.array([100.0, 100.0]))
     assert np.all(np.isfinite(scale))
     assert np.all(scale > 0)
-

@@ -110,5 +110,7 @@ def test_what_is_eliminated_leaves_the_marginal_normal_distribution(places, batc
 
 def test_without_a_mean_it_is_zero():
     gram, precision = jnp.asarray(random_precision(np.random.default_rng(2), 1, 4)[0]), jnp.asarray([0.5, 2.0])
-    for one, two in zip(eliminate(gram, (0, 2), precision), eliminate(gram, (0, 2), precision, jnp.zeros(2)), strict=True):
+    for one, two in zip(
+        eliminate(gram, (0, 2), precision), eliminate(gram, (0, 2), precision, jnp.zeros(2)), strict=True
+    ):
         np.testing.assert_array_equal(one, two)

@@ -1,5 +1,7 @@
 """Forces at which branches begin: exact where readings are, unbiased and as certain as told where they are noisy."""
 
+from itertools import pairwise
+
 import hypothesis.strategies as st
 import numpy as np
 import pytest
@@ -19,7 +21,7 @@ def drive(*corners, points=400, bend=0.0, on_reading=True):
     if on_reading:
         time = np.unique(np.concatenate([time, when]))
     force = np.interp(time, when, level)
-    for k, (a, b) in enumerate(zip(when, when[1:], strict=False)):
+    for k, (a, b) in enumerate(pairwise(when)):
         inside = (time >= a) & (time <= b)
         share = (time[inside] - a) / (b - a)
         force[inside] += bend * (level[k + 1] - level[k]) * share * (share - 1)
@@ -65,7 +67,9 @@ def test_of_a_clean_record_the_reading_is_the_level(name, points, slower, bend):
     np.testing.assert_allclose(found.peak, np.maximum.accumulate(force), rtol=1e-9)
 
 
-@pytest.mark.parametrize(("bend", "points"), [(0.0, 400), pytest.param(0.3, 1200, marks=pytest.mark.long)], ids=["straight", "bent"])
+@pytest.mark.parametrize(
+    ("bend", "points"), [(0.0, 400), pytest.param(0.3, 1200, marks=pytest.mark.long)], ids=["straight", "bent"]
+)
 @pytest.mark.parametrize("on_reading", [True, False], ids=["on a reading", "between readings"])
 @pytest.mark.parametrize("name", ["ramp", *first_in_time(["reloads with holds", "hold", "reloads"])])
 def test_noisy_levels_are_unbiased_and_as_certain_as_told(name, bend, points, on_reading):
