@@ -75,6 +75,7 @@ def turning_forces(curve: Curve, segments: tuple[Segment, ...], options: Turning
     force, peak = raw.copy(), raw.copy()
     error, reading = np.zeros(len(raw)), np.ones(len(raw), bool)
     level, level_error = None, 0.0
+    noise = noise_level(raw, float(np.ptp(raw)))
     # Readings that saturate are replaced by what the ramps say, with an error of its own.
     worked_out = curve.checked is not None and bool(np.any(curve.checked.force_sd_mN))
     if worked_out:
@@ -86,7 +87,7 @@ def turning_forces(curve: Curve, segments: tuple[Segment, ...], options: Turning
         if part.kind == "load":
             before, before_error, level = level, level_error, None
             if k + 1 < len(segments):
-                level, level_error = _level(time, raw, part, segments[k + 1], options)
+                level, level_error = _level(time, raw, part, segments[k + 1], noise, options)
                 force[rows] = peak[rows] = np.minimum(raw[rows], level)
             if before is not None:  # up to the force reached before, loading goes along the last branch
                 elastic = part.start + np.flatnonzero(force[rows] <= before)
@@ -104,7 +105,7 @@ def turning_forces(curve: Curve, segments: tuple[Segment, ...], options: Turning
             error[beyond] = 0.0
         if segments[k - 1].kind == "load":
             # A hold repeats the force at which it began; of a turning point that is its first point alone.
-            held = _held(time, raw, part, options) if part.kind == "hold" else None
+            held = _held(time, raw, part, noise, options) if part.kind == "hold" else None
             if held is None:
                 held = np.array([part.start])
             force[held], reading[held] = level, False
@@ -115,39 +116,54 @@ def turning_forces(curve: Curve, segments: tuple[Segment, ...], options: Turning
 
 
 def _level(
-    time: np.ndarray, raw: np.ndarray, up: Segment, after: Segment, options: TurningOptions
+    time: np.ndarray, raw: np.ndarray, up: Segment, after: Segment, noise: float, options: TurningOptions
 ) -> tuple[float, float]:
     """The force at which loading ends, and its standard error in those of a reading."""
-    held = _held(time, raw, after, options) if after.kind == "hold" and options.share else None
+    held = _held(time, raw, after, noise, options) if after.kind == "hold" and options.share else None
     if held is not None:
         return float(np.mean(raw[held])), 1 / np.sqrt(len(held))
     largest = float(raw[up.start : min(after.start + 1, after.stop)].max())
-    noise = noise_level(raw, float(np.ptp(raw)))
     if noise <= options.resolved * abs(largest):
         return largest, 1.0
     near = raw > (1 - options.share) * largest
     turn = float(time[after.start])
-    rising = _Curve.through(time, raw, _run(near, up.start, up.stop, -1, options.most), turn, noise, options)
-    falling = _Curve.through(time, raw, _run(near, after.start, after.stop, 1, options.most), turn, noise, options)
+    before = _run(near, up.start, up.stop, -1, options.most)
+    behind = _run(near, after.start, after.stop, 1, options.most)
+    held = after.kind == "hold"  # a relaxing force: only the ramp tells where it began
+    # The readings beside the turn may be on either side of it: first without them, then each where it belongs.
+    beside = 0 if held else 1
+    rising = _Curve.through(time, raw, before[: len(before) - beside], turn, noise, options)
+    falling = _Curve.through(time, raw, behind[beside:], turn, noise, options)
     if rising is None or falling is None:
         return largest, 1.0
-    if after.kind == "hold":  # a relaxing force: only the ramp tells where it began
+    if held:
         level, variance = rising.at(0.0)
-    else:
-        step = max(
-            turn - float(time[max(after.start - 1, up.start)]), float(time[min(after.start + 1, len(time) - 1)]) - turn
-        )
-        instants = np.linspace(-step, step, 41)
-        gap = [abs(rising.at(t)[0] - falling.at(t)[0]) for t in instants]
-        meet = float(instants[int(np.argmin(gap))])
-        (one, first), (other, second) = rising.at(meet), falling.at(meet)
-        steep, down = rising.slope(meet), falling.slope(meet)
-        # Where two lines meet: each is weighed by the slope of the other.
-        share = down / (down - steep) if steep > 0 > down else 0.5
-        level, variance = share * one + (1 - share) * other, share**2 * first + (1 - share) ** 2 * second
-    if not abs(level - largest) <= options.apart * noise:
+        return (largest, 1.0) if abs(level - largest) > options.apart * noise else (level, min(variance**0.5, 1.0))
+    step = max(
+        turn - float(time[max(after.start - 1, up.start)]), float(time[min(after.start + 1, len(time) - 1)]) - turn
+    )
+    both = np.concatenate([before, behind])
+    early = time[both] < turn + _meeting(rising, falling, step)
+    again = [_Curve.through(time, raw, both[side], turn, noise, options) for side in (early, ~early)]
+    if again[0] is not None and again[1] is not None:
+        rising, falling = again[0], again[1]
+    meet = _meeting(rising, falling, step)
+    (one, first), (other, second) = rising.at(meet), falling.at(meet)
+    steep, down = rising.slope(meet), falling.slope(meet)
+    # Where two lines meet: each is weighed by the slope of the other.
+    share = down / (down - steep) if steep > 0 > down else 0.5
+    level, variance = share * one + (1 - share) * other, share**2 * first + (1 - share) ** 2 * second
+    # Between two readings the force rises further than the larger of them.
+    if not abs(level - largest) <= options.apart * noise + step * max(steep, -down, 0.0):
         return largest, 1.0
     return float(level), float(min(np.sqrt(variance), 1.0))
+
+
+def _meeting(rising: _Curve, falling: _Curve, step: float) -> float:
+    """When the ramps before and behind a turning point come closest to each other, from the turning reading on."""
+    instants = np.linspace(-step, step, 41)
+    gap = [abs(rising.at(t)[0] - falling.at(t)[0]) for t in instants]
+    return float(instants[int(np.argmin(gap))])
 
 
 def _run(near: np.ndarray, start: int, stop: int, direction: int, most: int) -> np.ndarray:
@@ -157,8 +173,8 @@ def _run(near: np.ndarray, start: int, stop: int, direction: int, most: int) -> 
     return np.sort(order[:most])
 
 
-def _held(time: np.ndarray, raw: np.ndarray, part: Segment, options: TurningOptions) -> np.ndarray | None:
-    """Rows of a hold whose readings scatter about one force; None if there is none, as where the force relaxes.
+def _held(time: np.ndarray, raw: np.ndarray, part: Segment, noise: float, options: TurningOptions) -> np.ndarray | None:
+    """Rows of a hold whose readings scatter about one force; None where the force relaxes.
 
     A hold begins and ends with readings of the ramps beside it that come close to it: they lie apart from the others.
     """
@@ -166,8 +182,8 @@ def _held(time: np.ndarray, raw: np.ndarray, part: Segment, options: TurningOpti
     away = np.abs(force - np.median(force))
     sd = 1.4826 * float(np.median(away))
     rows = part.start + np.flatnonzero(away <= options.inside * sd)
-    if len(rows) < options.least:
-        return None
+    if len(rows) < options.least:  # too few to tell what they scatter about: those as high as the highest
+        return part.start + np.flatnonzero(force >= force.max() - options.inside * noise)
     clock, values = time[rows] - time[rows].mean(), raw[rows]
     if not np.any(clock):
         return rows

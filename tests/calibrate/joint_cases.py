@@ -13,10 +13,13 @@ from mcc_jax import (
     law_for_each,
     simulate_campaign,
 )
-from mcc_jax.calibrate.data import select_tests
-from mcc_jax.calibrate.forward import Point
+from mcc_jax.calibrate.data import Tests, select_tests
+from mcc_jax.calibrate.forward import Linear
 from mcc_jax.calibrate.marginal import Marginal
+from mcc_jax.calibrate.noise import Along, Correlation
 from mcc_jax.calibrate.population import Population
+from mcc_jax.campaign import particle_batch
+from mcc_jax.effects import Record
 
 A, EBAR = 1.43, 16_000.0
 NOISE = Instrument(displacement_noise_um=0.02, force_noise_mN=0.05)
@@ -97,22 +100,19 @@ def random_precision(rng, count, size, *, spread=1.0):
     return np.einsum("nij,nj,nkj->nik", Q, values, Q)
 
 
-def random_marginal(rng, scatter, flatness, *, precision=8.0, numbers=0):
-    """The tests of particles with all entries at random, and so many numbers of effects."""
-    count, size = len(flatness), 4 + numbers
-    A = precision * random_precision(rng, count, size)
-    score = rng.standard_normal((count, size))
-    square = np.einsum("np,npq,nq->n", score, np.linalg.inv(A), score) + 20 + 5 * rng.random(count)
-    gram = np.concatenate([A, score[:, None]], 1)
-    gram = np.concatenate([gram, np.concatenate([score, square[:, None]], 1)[..., None]], 2)
-    point = Point(*(jnp.asarray(0.3 * rng.standard_normal(s)) for s in ((count, 4), count, (count, numbers))))
+def random_marginal(rng, scatter, point, flatness, *, scale=1.0):
+    """Tests with all entries at random that know each number to about `scale`."""
+    count, size = len(flatness), 4 + point.theta.shape[1]
+    A = random_precision(rng, count, size) / scale**2
+    score = rng.standard_normal((count, size, 1)) / scale
+    square = 20 + 5 * rng.random((count, 1, 1)) + np.einsum("npk,npq,nqk->nk", score, np.linalg.inv(A), score)[:, None]
     return Marginal(
         point=point,
-        gram=jnp.asarray(gram),
+        gram=jnp.asarray(np.block([[A, score], [np.swapaxes(score, 1, 2), square]])),
         log_scale=jnp.asarray(rng.standard_normal(count)),
         count=jnp.asarray(np.floor(20 + 5 * rng.random(count))),
-        zero=point.zero,
-        zero_slope=jnp.asarray(rng.standard_normal((count, size))),
+        zero=jnp.asarray(rng.standard_normal(count)),
+        zero_slope=jnp.asarray(rng.standard_normal((count, size)) / scale),
         zero_sd=jnp.asarray(0.1 + rng.random(count)),
         flatness=jnp.asarray(flatness),
         weight=None,
@@ -134,3 +134,72 @@ def random_population(rng, scatter, **changes):
         "theta_scatter": np.zeros(0),
     }
     return Population(**{name: jnp.asarray(value) for name, value in {**numbers, **changes}.items()})
+
+
+# ---- tests without a law behind them -----------------------------------------------------------------------------------
+
+POINTS = 12
+# Loading, a branch behind its peak, loading on, and another branch; of loading every point is a branch of its own.
+ELASTIC = np.repeat([False, True, False, True], POINTS // 4)
+BRANCH = np.where(ELASTIC, np.repeat([0, 3, 6, 9], POINTS // 4), np.arange(POINTS))
+AT_THE_END = np.arange(POINTS) >= POINTS // 2
+KINDS = [
+    (Correlation.EXPONENTIAL, Along.LOAD),
+    (Correlation.MATERN_32, Along.TIME),
+    (Correlation.MATERN_52, Along.LOAD),
+]
+RHO = {
+    Correlation.EXPONENTIAL: lambda x: np.exp(-x),
+    Correlation.MATERN_32: lambda x: (1 + np.sqrt(3) * x) * np.exp(-np.sqrt(3) * x),
+    Correlation.MATERN_52: lambda x: (1 + np.sqrt(5) * x + 5 * x**2 / 3) * np.exp(-np.sqrt(5) * x),
+}
+
+
+def random_tests(rng, *, count=1, elastic=AT_THE_END, masked=0.2, zero_sd=None, peak_sd=None, points=POINTS):
+    """Tests with paths, times, branches and derivatives by force at random; no law is behind them."""
+    shape = (count, points)
+    step = rng.random(shape) / 4 * (rng.random(shape) < 0.9)  # some points repeat the one before
+    branch = BRANCH if elastic is ELASTIC else np.where(elastic, np.argmax(elastic), np.arange(points))
+    still = [jnp.zeros(shape)] * 9
+    tests = Tests(
+        particle_batch(np.full((count, 3), 200.0)),
+        Record(
+            still[0], jnp.asarray(np.cumsum(rng.random(shape), 1)), *[jnp.zeros(shape, int)] * 3, *still[:5], still[5]
+        ),
+        jnp.zeros(shape),
+        jnp.asarray(rng.random(shape) >= masked),
+        jnp.asarray(np.broadcast_to(~elastic, shape)),
+        jnp.zeros(count),
+        jnp.asarray(np.cumsum(step, 1)),
+        jnp.asarray(np.broadcast_to(branch, shape)),
+        jnp.asarray(rng.random(shape) < 0.8),
+        jnp.asarray(np.where(elastic, 0.3 + rng.random(shape), 0.0)),
+        None,
+        None if zero_sd is None else jnp.full(count, zero_sd),
+        None if peak_sd is None else jnp.asarray(np.where(elastic, peak_sd, 0.0) * np.ones(shape)),
+    )
+    by_force, by_peak = rng.standard_normal((2, *shape))
+    columns, residual = rng.standard_normal((*shape, 4)), rng.standard_normal(shape)
+    own = np.asarray(tests.mask)
+    zeros = (np.where(own, x, 0.0) for x in (residual, by_force, by_peak, by_force + by_peak))
+    residual, *derivatives = map(jnp.asarray, zeros)
+    return tests, Linear(residual, jnp.asarray(np.where(own[..., None], columns, 0.0)), *derivatives)
+
+
+def dense(four, scale, tests, linear, i=0, kind=KINDS[0]):
+    """The covariance in the docstring of `noise`, written out, of the points that count."""
+    white, force, correlated, length = four
+    correlation, along = kind
+    place = np.asarray(tests.path[i] if along is Along.LOAD else tests.record.time[i])
+    total = correlated**2 * RHO[correlation](np.abs(place[:, None] - place) / length)
+    total = scale**2 * (total + np.diag(white**2 + (force * np.asarray(linear.by_force[i])) ** 2))
+    variance = (scale * force * np.asarray(tests.peak_error[i])) ** 2
+    variance += 0.0 if tests.peak_sd is None else np.asarray(tests.peak_sd[i]) ** 2
+    branch = np.asarray(tests.branch[i])
+    for b in np.unique(branch):
+        c = np.where(branch == b, np.sqrt(variance) * np.asarray(linear.by_peak[i]), 0.0)
+        total += np.outer(c, c)
+    if tests.force_zero_sd is not None:
+        c = float(tests.force_zero_sd[i]) * np.asarray(linear.by_offset[i])
+        total += np.outer(c, c)
+    return total

@@ -9,14 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from joint_cases import ELASTIC, KINDS, POINTS, dense, random_tests
 from scipy.stats import multivariate_normal
 
-from mcc_jax.calibrate.data import Tests
 from mcc_jax.calibrate.distributions import RecordNoise
-from mcc_jax.calibrate.forward import Linear
 from mcc_jax.calibrate.noise import (
-    Along,
-    Correlation,
     Noise,
     Whitening,
     estimate_noise,
@@ -27,76 +24,9 @@ from mcc_jax.calibrate.noise import (
 from mcc_jax.calibrate.paper.prediction import READING_UM
 from mcc_jax.calibrate.priors import NoisePrior
 from mcc_jax.calibrate.sharding import Blocks
-from mcc_jax.campaign import particle_batch
-from mcc_jax.effects import Record
 
-POINTS = 12
-# Loading, a branch behind its peak, loading on, and another branch; of loading every point is a branch of its own.
-ELASTIC = np.repeat([False, True, False, True], POINTS // 4)
-BRANCH = np.where(ELASTIC, np.repeat([0, 3, 6, 9], POINTS // 4), np.arange(POINTS))
-AT_THE_END = np.arange(POINTS) >= POINTS // 2
 FOUR = (0.2, 0.3, 0.5, 0.3)
-KINDS = [
-    (Correlation.EXPONENTIAL, Along.LOAD),
-    (Correlation.MATERN_32, Along.TIME),
-    (Correlation.MATERN_52, Along.LOAD),
-]
 kinds = pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind[0].value)
-RHO = {
-    Correlation.EXPONENTIAL: lambda x: np.exp(-x),
-    Correlation.MATERN_32: lambda x: (1 + np.sqrt(3) * x) * np.exp(-np.sqrt(3) * x),
-    Correlation.MATERN_52: lambda x: (1 + np.sqrt(5) * x + 5 * x**2 / 3) * np.exp(-np.sqrt(5) * x),
-}
-
-
-def arrays(rng, *, count=1, elastic=AT_THE_END, masked=0.2, zero_sd=None, peak_sd=None, points=POINTS):
-    """Tests with paths, times, branches and derivatives by force at random; no law is behind them."""
-    shape = (count, points)
-    step = rng.random(shape) / 4 * (rng.random(shape) < 0.9)  # some points repeat the one before
-    branch = BRANCH if elastic is ELASTIC else np.where(elastic, np.argmax(elastic), np.arange(points))
-    still = [jnp.zeros(shape)] * 9
-    tests = Tests(
-        particle_batch(np.full((count, 3), 200.0)),
-        Record(
-            still[0], jnp.asarray(np.cumsum(rng.random(shape), 1)), *[jnp.zeros(shape, int)] * 3, *still[:5], still[5]
-        ),
-        jnp.zeros(shape),
-        jnp.asarray(rng.random(shape) >= masked),
-        jnp.asarray(np.broadcast_to(~elastic, shape)),
-        jnp.zeros(count),
-        jnp.asarray(np.cumsum(step, 1)),
-        jnp.asarray(np.broadcast_to(branch, shape)),
-        jnp.asarray(rng.random(shape) < 0.8),
-        jnp.asarray(np.where(elastic, 0.3 + rng.random(shape), 0.0)),
-        None,
-        None if zero_sd is None else jnp.full(count, zero_sd),
-        None if peak_sd is None else jnp.asarray(np.where(elastic, peak_sd, 0.0) * np.ones(shape)),
-    )
-    by_force, by_peak = rng.standard_normal((2, *shape))
-    columns, residual = rng.standard_normal((*shape, 4)), rng.standard_normal(shape)
-    own = np.asarray(tests.mask)
-    zeros = (np.where(own, x, 0.0) for x in (residual, by_force, by_peak, by_force + by_peak))
-    residual, *derivatives = map(jnp.asarray, zeros)
-    return tests, Linear(residual, jnp.asarray(np.where(own[..., None], columns, 0.0)), *derivatives)
-
-
-def dense(four, scale, tests, linear, i=0, kind=KINDS[0]):
-    """The covariance in the docstring of `noise`, written out, of the points that count."""
-    white, force, correlated, length = four
-    correlation, along = kind
-    place = np.asarray(tests.path[i] if along is Along.LOAD else tests.record.time[i])
-    total = correlated**2 * RHO[correlation](np.abs(place[:, None] - place) / length)
-    total = scale**2 * (total + np.diag(white**2 + (force * np.asarray(linear.by_force[i])) ** 2))
-    variance = (scale * force * np.asarray(tests.peak_error[i])) ** 2
-    variance += 0.0 if tests.peak_sd is None else np.asarray(tests.peak_sd[i]) ** 2
-    branch = np.asarray(tests.branch[i])
-    for b in np.unique(branch):
-        c = np.where(branch == b, np.sqrt(variance) * np.asarray(linear.by_peak[i]), 0.0)
-        total += np.outer(c, c)
-    if tests.force_zero_sd is not None:
-        c = float(tests.force_zero_sd[i]) * np.asarray(linear.by_offset[i])
-        total += np.outer(c, c)
-    return total
 
 
 @eqx.filter_jit
@@ -136,7 +66,7 @@ def found_density(four, scale, factor, tests, linear, away, kind):
 def test_the_density_is_the_dense_normal_one(case, seed, more):
     """With a branch at the end, errors of its peak and of the zero of force, a scale and a common factor."""
     rng, (kind, known), (masked, factor) = np.random.default_rng(seed), case, more
-    tests, linear = arrays(rng, masked=masked, zero_sd=known, peak_sd=known, count=2)
+    tests, linear = random_tests(rng, masked=masked, zero_sd=known, peak_sd=known, count=2)
     four, scale = np.exp(0.7 * rng.standard_normal(4)) * FOUR, np.exp(0.5 * rng.standard_normal(2))
     away = rng.standard_normal((2, POINTS))
     wanted = expected(four, scale, factor, tests, linear, away, kind)
@@ -147,7 +77,7 @@ def test_the_density_is_the_dense_normal_one(case, seed, more):
 
 def test_white_noise_of_two_branches_is_dense_too():
     rng = np.random.default_rng(5)
-    tests, linear = arrays(rng, elastic=ELASTIC, zero_sd=0.4, count=3)
+    tests, linear = random_tests(rng, elastic=ELASTIC, zero_sd=0.4, count=3)
     four, scale, away = (0.2, 0.3, 0.0, 0.3), np.array([0.5, 1.0, 2.0]), rng.standard_normal((3, POINTS))
     wanted = expected(four, scale, 1.3, tests, linear, away, KINDS[0])
     np.testing.assert_allclose(found_density(four, scale, 1.3, tests, linear, away, KINDS[0]), wanted, rtol=1e-8)
@@ -157,7 +87,7 @@ def test_white_noise_of_two_branches_is_dense_too():
 def test_correlated_noise_of_two_branches_is_nearly_dense(kind):
     """The filter carries a little of one branch's direction into what follows; as in tests, correlation is weak."""
     rng = np.random.default_rng(3)
-    tests, linear = arrays(rng, elastic=ELASTIC, masked=0.0)
+    tests, linear = random_tests(rng, elastic=ELASTIC, masked=0.0)
     still = jnp.full((1, POINTS), 0.1)
     linear = replace(linear, by_force=still, by_peak=3 * still)
     record = replace(tests.record, time=jnp.asarray(0.05 * np.arange(POINTS)[None]))
@@ -174,7 +104,7 @@ def test_correlated_noise_of_two_branches_is_nearly_dense(kind):
 def test_draws_have_the_covariance_of_the_density(kind):
     """They are linear in standard normal numbers: their covariance is the product of the columns."""
     rng = np.random.default_rng(7)
-    tests, linear = arrays(rng, zero_sd=0.6, peak_sd=0.3)
+    tests, linear = random_tests(rng, zero_sd=0.6, peak_sd=0.3)
     (filtered,) = [jax.tree.map(lambda x: x[0], filters(FOUR, jnp.ones(1), tests, linear, *kind))]
     columns = jax.vmap(lambda x: filtered.colour(x[:POINTS], x[POINTS:-1], x[-1]))(jnp.eye(2 * POINTS + 1))
     used = np.asarray(tests.mask[0])
@@ -184,7 +114,7 @@ def test_draws_have_the_covariance_of_the_density(kind):
 
 def test_draws_of_the_distribution_are_around_the_prediction_and_nan_where_masked():
     rng = np.random.default_rng(8)
-    tests, linear = arrays(rng, zero_sd=0.6, count=2)
+    tests, linear = random_tests(rng, zero_sd=0.6, count=2)
     filtered, loc = filters(FOUR, jnp.ones(2), tests, linear, *KINDS[0]), rng.standard_normal((2, POINTS))
     law = RecordNoise(jnp.asarray(loc), filtered, jnp.asarray(2.0))
     drawn = np.asarray(law.sample(jax.random.key(0), (100, 60)))
@@ -202,7 +132,7 @@ def test_draws_of_the_distribution_are_around_the_prediction_and_nan_where_maske
 
 def test_masked_points_count_for_nothing():
     rng = np.random.default_rng(1)
-    tests, linear = arrays(rng, masked=0.4, zero_sd=0.2)
+    tests, linear = random_tests(rng, masked=0.4, zero_sd=0.2)
     one, two = rng.standard_normal((2, 1, POINTS))
     other = np.where(np.asarray(tests.mask), one, two)
     values = (found_density(FOUR, np.ones(1), 1.0, tests, linear, v, KINDS[0]) for v in (one, other))
@@ -213,7 +143,7 @@ def test_masked_points_count_for_nothing():
 
 def test_white_noise_only_divides_and_a_display_reads_in_steps():
     rng = np.random.default_rng(2)
-    tests, linear = arrays(rng, masked=0.0)
+    tests, linear = random_tests(rng, masked=0.0)
     still = replace(linear, by_peak=jnp.zeros((1, POINTS)))
     filtered = jax.tree.map(lambda x: x[0], filters((0.5, 0.0, 0.0, 1.0), jnp.full(1, 2.0), tests, still, *KINDS[0]))
     np.testing.assert_allclose(filtered(linear.residual[0][:, None])[:, 0], linear.residual[0], rtol=1e-14)
@@ -227,7 +157,7 @@ def test_white_noise_only_divides_and_a_display_reads_in_steps():
 @pytest.mark.parametrize("scale", [1.0, 0.6])
 def test_restricted_likelihood_is_the_dense_normal_one_with_the_numbers_in_the_covariance(scale):
     rng = np.random.default_rng(0)
-    tests, linear = arrays(rng, count=2)
+    tests, linear = random_tests(rng, count=2)
     noise, zero_sd = Noise.of(FOUR, jnp.asarray([scale, 1.0])), 1.5
     actual = np.asarray(jax.jit(lambda: restricted_likelihood(noise, tests, linear, jnp.asarray(zero_sd), *KINDS[0]))())
     for i in range(2):
@@ -247,7 +177,7 @@ def known_tests(four, scale):
     """Tests that are linear in four numbers and a zero, with noise of known size."""
     rng = np.random.default_rng(7)
     path = np.broadcast_to(np.linspace(0, 1.6, LENGTH), (COUNT, LENGTH))
-    tests, linear = arrays(rng, count=COUNT, points=LENGTH, elastic=np.arange(LENGTH) >= 60, masked=0.1)
+    tests, linear = random_tests(rng, count=COUNT, points=LENGTH, elastic=np.arange(LENGTH) >= 60, masked=0.1)
     branch = np.where(path > 1, 63, np.arange(LENGTH))
     tests = replace(tests, path=jnp.asarray(path), branch=jnp.asarray(branch), peak_error=jnp.asarray(1.0 * (path > 1)))
     rows = np.stack([np.sqrt(path), path, path**2, np.where(path > 1, path - 1, 0.0)], -1)
