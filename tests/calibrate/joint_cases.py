@@ -58,6 +58,7 @@ def simulated(
     instrument=None,
     seed=0,
     particles=None,
+    **more,
 ):
     """A campaign of particles with the given C1, C3, C5; noise-free unless an instrument is given."""
     C = np.asarray(C, float)
@@ -65,7 +66,7 @@ def simulated(
     laws = law_for_each(plastic, A, modulus_of(unloading), unloading, scaling)
     peaks = peak_force(diameters, peak_MPa)
     return simulate_campaign(
-        laws, np.asarray(diameters), peaks, programme, instrument=instrument, particles=particles, seed=seed
+        laws, np.asarray(diameters), peaks, programme, instrument=instrument, particles=particles, seed=seed, **more
     )
 
 
