@@ -174,10 +174,11 @@ def to_arviz(calibration: BayesCalibration, *, prior_count: int = 500, points: b
     )
     for group in ("posterior_predictive", "prior_predictive"):
         tree[group] = curves[group]
+    units = UNITS | {v.mechanism: v.unit for v in c.model.effects}
+    units |= {f"{v.mechanism}.{n.name}": n.name.rpartition("_")[2] for v in c.model.effects for n in v.nuisances}
     for group in tree.children.values():
         for name, variable in group.data_vars.items():
-            if str(name) in UNITS:
-                variable.attrs["units"] = UNITS[str(name)]
+            variable.attrs["units"] = units.get(str(name), "nat" if group.name == "log_prior" else "1")
     tree.attrs.update(
         {
             "method": "bayes",

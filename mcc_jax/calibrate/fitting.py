@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -64,7 +63,6 @@ def prepare(
     *,
     fill_up: bool = True,
     block: int | None = None,
-    meanwhile: Callable[[Tests, int], None] | None = None,
     tell: Callable[[str], None] = lambda _: None,
     **settings: Any,
 ) -> tuple[Selection, Fit, int]:
@@ -76,7 +74,6 @@ def prepare(
         threshold_MPa: points below this stress on loading do not count [MPa].
         fill_up: let copies that count for nothing make up whole blocks; if False, all particles are one block.
         block: particles of a block; by default `block_size` of their number.
-        meanwhile: called with the tests and the size of a block in a thread of its own while the fit runs.
         tell: called with the name of each step.
         settings: of `fit_tests`.
 
@@ -97,14 +94,7 @@ def prepare(
     size = (block or block_size(len(selection.tests))) if fill_up else len(selection.tests)
     tests = filled_up(selection.tests, size) if fill_up else selection.tests
     read_out = float(np.median([point_noise_um(campaign.curves[i]) for i in selection.kept]))
-    aside = None
-    if meanwhile is not None:
-        # No daemon: a compiler must not outlive the interpreter. Who interrupts the fit need not wait for it here.
-        aside = threading.Thread(target=meanwhile, args=(tests, size))
-        aside.start()
     found = fit_tests(tests, model, read_out, block=size, tell=tell, **settings)
-    if aside is not None:
-        aside.join()
     parts = (found.point.latent, found.point.zero, found.mode, found.covariance)
     if not all(np.isfinite(np.asarray(part)).all() for part in parts):
         raise beyond_numbers(campaign, selection)

@@ -12,8 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .. import arguments
 from .schema import Curve
-from .segments import Segment
+from .segments import Segment, check_segmented
 from .signal import noise_level
 
 
@@ -70,6 +71,9 @@ def turning_forces(curve: Curve, segments: tuple[Segment, ...], options: Turning
         segments: of the curve, from `find_segments`.
         options: see `TurningOptions`.
     """
+    check_segmented(curve, segments)
+    if options is not None:
+        arguments.instance(options, TurningOptions, "options", "Make one with mcc_jax.campaign.TurningOptions().")
     options = options or TurningOptions()
     time, raw = np.asarray(curve.time_s, float), np.asarray(curve.force_mN, float)
     force, peak = raw.copy(), raw.copy()

@@ -2,7 +2,6 @@
 
 import json
 import math
-import threading
 from dataclasses import replace
 
 import numpy as np
@@ -18,8 +17,7 @@ from mcc_jax import (
     calibrate_bayes,
     calibrate_least_squares,
 )
-from mcc_jax.calibrate import fit as fitting
-from mcc_jax.calibrate.data import select_tests
+from mcc_jax.calibrate.data import select, select_tests
 
 METHODS = {
     "bayes": lambda campaign: calibrate_bayes(campaign, draws=200, chains=2),
@@ -150,7 +148,7 @@ def test_the_good_particles_are_recovered_all_the_same(campaign, contents, metho
 
 
 def test_selected_points_are_those_of_the_record(campaign):
-    selection = select_tests(campaign)
+    selection = select(campaign)
     tests = selection.tests
     assert tests.force.shape == (5, 320)
     assert tuple(campaign.particles[i] for i in selection.kept) == KEPT
@@ -239,26 +237,3 @@ def test_no_usable_particle_is_told_by_name(method):
     assert "'feather'" in told
     assert "'dust'" in told
     assert "0.2 MPa" in told
-
-
-def test_an_interrupted_fit_does_not_wait_for_what_runs_meanwhile(monkeypatch):
-    begun, end = threading.Event(), threading.Event()
-
-    def meanwhile(*_):
-        begun.set()
-        assert end.wait(60)
-
-    def interrupted(*_, **__):
-        assert begun.wait(60)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(fitting, "fit_joint", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        fitting.prepare(one("A", 0), fitting.JointModel(), 0.2, meanwhile=meanwhile)
-    assert not end.is_set()
-    aside = [thread for thread in threading.enumerate() if meanwhile.__name__ in thread.name]
-    end.set()
-    for thread in aside:
-        thread.join(60)
-        assert not thread.is_alive()
-    assert len(aside) == 1

@@ -3,13 +3,14 @@
 import dataclasses
 import json
 
+import jax
 import numpy as np
 import pytest
 from scipy.stats import halfnorm, nakagami
 
 from mcc_jax import InputError, JointModel, Priors, Unloading, read_priors
 from mcc_jax.calibrate import LogNormalPrior, NakagamiPrior, NormalPrior
-from mcc_jax.calibrate.arviz import prior_draws
+from mcc_jax.calibrate.distributions import SpreadCoordinate
 
 
 @pytest.fixture
@@ -122,8 +123,8 @@ def test_no_prior_of_a_spread(sd, shape):
 
 @pytest.mark.parametrize("shape", [0.5, 0.125])
 def test_draws_of_a_spread_s_prior(shape):
-    priors = dataclasses.replace(Priors(), tau_C3=NakagamiPrior(0.2, shape))
-    tau = prior_draws(priors, -1.0, 3.0, (1, 100_000), 0)["tau"][0, :, 1]
+    coordinate = SpreadCoordinate(NakagamiPrior(0.2, shape))
+    tau = np.asarray(coordinate.spread(coordinate.sample(jax.random.key(0), (100_000,))))
     theirs = nakagami(shape, scale=0.2 * np.sqrt(2 * shape))
     for share in (0.1, 0.2, 0.5, 0.9):
         assert abs((tau < theirs.ppf(share)).mean() - share) < 4 * np.sqrt(share * (1 - share) / 100_000)
