@@ -451,6 +451,7 @@ class Material:
 def other_material(campaign: Campaign, options: PlausibilityOptions | None = None) -> Material | None:
     """How much stiffer or softer than micro-crystalline cellulose the tests are; None if they are like it, or if a slip
     of unit or sign is more likely."""
+    check_campaign(campaign)
     options = options or PlausibilityOptions()
     given = campaign.raw or campaign
     if worst(check_plausibility(given, options=options)) == "bad":

@@ -137,7 +137,7 @@ def random_population(rng, scatter, **changes):
     return Population(**{name: jnp.asarray(value) for name, value in {**numbers, **changes}.items()})
 
 
-# ---- tests without a law behind them -----------------------------------------------------------------------------------
+# ---- tests without a law behind them ---------------------------------------------------------------------------------
 
 POINTS = 12
 # Loading, a branch behind its peak, loading on, and another branch; of loading every point is a branch of its own.

@@ -44,7 +44,7 @@ def test_noise_free_tests_leave_no_residual(unloading, scaling):
     assert np.asarray(tests.mask).sum() > 4 * 40
     np.testing.assert_allclose(residual_of(point_at(latent), tests, law), 0.0, atol=1e-9)
     # Another modulus, or a zero, does leave one: the test above could fail.
-    away = residual_of(point_at(latent + [0.0, 0.0, 0.0, 0.01]), tests, law)
+    away = residual_of(point_at(np.add(latent, [0.0, 0.0, 0.0, 0.01])), tests, law)
     assert np.abs(away).max() > 1e-3
 
 

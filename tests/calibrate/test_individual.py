@@ -7,34 +7,33 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from joint_cases import COEFFICIENTS, DIAMETERS, NOISE, SNAPPING, modulus_of, simulated, true_latent
-from mcc_jax.calibrate.fit import WIDE, _centre
 
 from mcc_jax import Instrument, StrainScaling, Unloading
-from mcc_jax.calibrate import JointModel
-from mcc_jax.calibrate import fit as fitting
-from mcc_jax.calibrate.data import select_tests
-from mcc_jax.calibrate.forward import raw_residual, snap
+from mcc_jax.calibrate import Model, select_tests
+from mcc_jax.calibrate.fitting import WIDE, _centre
+from mcc_jax.calibrate.forward import Forms, residuals, snap
 from mcc_jax.calibrate.particle_fit import fit_particles, linear_starts
-from mcc_jax.calibrate.sharding import Blocks
 
 SNAPS = np.stack([COEFFICIENTS[0], SNAPPING, COEFFICIENTS[2], SNAPPING * np.array([1.0, 1.01, 0.99])])
 
 
-def fitted(campaign, noise, unloading=Unloading.PRINTED, zero_sd=5.0):
-    tests = select_tests(campaign).tests
-    return tests, fit(tests, noise, unloading, zero_sd)
+def fitted(campaign, noise, unloading=Unloading.PRINTED):
+    tests = select_tests(campaign)
+    return tests, fit(tests, noise, unloading)
 
 
-def fit(tests, noise, unloading=Unloading.PRINTED, zero_sd=5.0, starts=None):
-    centre = np.broadcast_to(_centre(JointModel(unloading).chosen_priors), (len(tests), 4))
+def fit(tests, noise, unloading=Unloading.PRINTED, starts=None):
+    middle = _centre(Model(unloading).chosen_priors)
+    centre = np.column_stack([np.broadcast_to(middle, (len(tests), 4)), np.asarray(tests.contact)])
+    width = np.broadcast_to(np.array([WIDE] * 4 + [5.0]), (len(tests), 5))
     return fit_particles(
         tests,
         jnp.full(len(tests), noise),
         jnp.asarray(centre),
-        jnp.full((len(tests), 4), WIDE),
-        jnp.asarray(zero_sd),
-        linear_starts(tests, jnp.asarray(centre[0, 3])) if starts is None else starts,
-        unloading,
+        jnp.asarray(width),
+        jnp.zeros((len(tests), 0)),
+        linear_starts(tests, jnp.asarray(middle[3])) if starts is None else starts,
+        Forms(unloading),
     )
 
 
@@ -43,8 +42,8 @@ def test_noise_free_particles_are_recovered(unloading):
     form = {"unloading": unloading, "scaling": StrainScaling.CONTACT}
     _, found = fitted(simulated(**form), 1e-6, unloading)
     assert np.all(np.asarray(found.converged))
-    np.testing.assert_allclose(found.latent, true_latent(**form), rtol=0, atol=1e-6)
-    np.testing.assert_allclose(found.zero, 0.0, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(found.point.latent, true_latent(**form), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(found.point.zero, 0.0, rtol=0, atol=1e-6)
     assert np.all(np.asarray(found.rms) < 1e-5)
 
 
@@ -53,8 +52,8 @@ def test_an_offset_of_the_record_is_the_zero():
     _, found = fitted(campaign, 1e-6)
     offset = np.array([curve.displacement_um[0] for curve in campaign.curves])
     assert np.ptp(offset) > 1
-    np.testing.assert_allclose(found.latent, true_latent(), rtol=0, atol=1e-6)
-    np.testing.assert_allclose(found.zero, offset, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(found.point.latent, true_latent(), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(found.point.zero, offset, rtol=0, atol=1e-5)
 
 
 @pytest.fixture(scope="module")
@@ -72,51 +71,36 @@ def test_the_snapping_particles_do_snap(snapping):
 
 def test_a_curve_that_snaps_is_reproduced_within_noise(snapping):
     _, tests, found = snapping
-    residual = np.asarray(raw_residual(found.latent, found.zero, tests, Unloading.PRINTED))
+    residual = np.asarray(residuals(found.point, tests, Forms(Unloading.PRINTED)))
     rms = np.sqrt((residual**2).sum(1) / np.asarray(tests.mask).sum(1))
     # Read-out noise is 0.02 um; noise of force adds some through the slope, most where a particle snaps.
     assert np.all(rms[[0, 2]] < 0.03)
     assert np.all(rms[[1, 3]] < 0.1), rms
-    assert np.all(np.isfinite(np.asarray(found.latent)))
+    assert np.all(np.isfinite(np.asarray(found.point.latent)))
 
 
 def test_coefficients_of_a_curve_that_snaps_are_near_the_truth(snapping):
     _, _, found = snapping
-    np.testing.assert_allclose(np.asarray(found.latent)[:, :3], true_latent(SNAPS)[:, :3], atol=0.05)
-
-
-@pytest.mark.long
-def test_late_fits_go_on_in_blocks_of_their_own(snapping, monkeypatch):
-    _, tests, wanted = snapping
-    monkeypatch.setattr(fitting, "FIRST_STEPS", 3)  # nobody is done by then
-    blocks = Blocks(4, 2)
-    own, zero_sd = blocks.cut(tests), jnp.asarray(5.0)
-    centre = jnp.asarray(np.broadcast_to(_centre(JointModel().chosen_priors), (4, 4)))
-    arrays = jnp.full(4, 0.03), centre, jnp.full((4, 4), WIDE)
-    starts = blocks.cut(linear_starts(tests, centre[0, 3]), axis=1)
-    found = fitting._fitted(blocks, tests, own, arrays, zero_sd, starts, Unloading.PRINTED)
-    assert np.all(np.asarray(found.converged))
-    np.testing.assert_allclose(found.latent, wanted.latent, atol=1e-4)
-    np.testing.assert_allclose(found.rms, wanted.rms, rtol=1e-4)
+    np.testing.assert_allclose(np.asarray(found.point.latent)[:, :3], true_latent(SNAPS)[:, :3], atol=0.05)
 
 
 def test_coefficients_are_within_their_noise():
     _, found = fitted(simulated(instrument=NOISE, seed=3), 0.02)
     assert np.all(np.asarray(found.converged))
-    off = np.asarray(found.latent) - true_latent()
+    off = np.asarray(found.point.latent) - true_latent()
     assert np.all(np.abs(off) < [0.05, 0.02, 0.02, 0.05]), off
     assert np.all((np.asarray(found.rms) > 0.015) & (np.asarray(found.rms) < 0.04))
 
 
 def test_without_unloading_the_modulus_stays_at_its_prior():
-    tests = select_tests(simulated(instrument=NOISE)).tests
+    tests = select_tests(simulated(instrument=NOISE))
     loading_only = replace(tests, mask=tests.loading)
-    centre = _centre(JointModel().chosen_priors)
+    centre = _centre(Model().chosen_priors)
     found = fit(loading_only, 0.02)
-    np.testing.assert_allclose(found.latent[:, 3], centre[3], rtol=1e-6)
-    assert np.all(np.abs(np.asarray(found.latent)[:, :3] - true_latent()[:, :3]) < 0.05)
+    np.testing.assert_allclose(found.point.latent[:, 3], centre[3], rtol=1e-6)
+    assert np.all(np.abs(np.asarray(found.point.latent)[:, :3] - true_latent()[:, :3]) < 0.05)
     assert abs(float(centre[3]) - np.log(modulus_of(Unloading.PRINTED))) > 0.1
-    assert len(DIAMETERS) == len(found.zero)
+    assert len(DIAMETERS) == len(found.point.zero)
 
 
 def test_no_snap_through_is_put_where_nothing_shows_it():
@@ -126,16 +110,16 @@ def test_no_snap_through_is_put_where_nothing_shows_it():
         replace(curve, displacement_um=8 * np.sqrt(np.maximum(curve.force_mN, 0) / curve.force_mN.max()))
         for curve in campaign.curves
     ]
-    tests = select_tests(replace(campaign, curves=tuple(sharp)), threshold_MPa=0.0).tests
+    tests = select_tests(replace(campaign, curves=tuple(sharp)), threshold_MPa=0.0)
     first = jnp.min(jnp.where(tests.mask & tests.loading, tests.force, jnp.inf), 1)
 
     def unseen(latent):
         return np.asarray(jax.vmap(snap)(latent, tests.particle) < jnp.log(first))
 
     alone = fit(tests, 0.03)
-    assert unseen(alone.latent).any()  # no start led anywhere else: there is nothing better to say
+    assert unseen(alone.point.latent).any()  # no start led anywhere else: there is nothing better to say
     steep = jnp.asarray([9.0, 2.5, 4.5, 12.0, 0.0])
     both = jnp.concatenate([jnp.moveaxis(alone.ends, 1, 0), jnp.broadcast_to(steep, (1, len(tests), 5))])
     found = fit(tests, 0.03, starts=both)
-    assert not unseen(found.latent).any()
+    assert not unseen(found.point.latent).any()
     assert np.all(np.asarray(found.rms) > 0.999 * np.asarray(alone.rms))

@@ -15,7 +15,7 @@ DRAWS = 200
 
 
 def drive(*corners, points=400, bend=0.0, on_reading=True):
-    """Times and forces of straight ramps between (time, force), rising ones bent; turns fall on a reading or between."""
+    """Times and forces of straight ramps between (time, force), rising ones bent; turns on a reading or between."""
     when, level = np.array(corners, float).T
     time = np.linspace(0, when[-1], points)
     if on_reading:

@@ -1,0 +1,80 @@
+"""An effect hidden in a campaign, and in the law that is fitted: recovered, preferred, saved, read, driven."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mcc_jax as mcc
+from mcc_jax.effects import find_variant
+
+CREEP, AMPLITUDE, TAU_S = "creep:logarithmic", 2e-4, 3.0
+
+
+@pytest.fixture(scope="module")
+def campaign():
+    """Eight particles that creep, loaded twice with a hold at each peak."""
+    programme = mcc.Programme.cycles(levels=(0.5, 1.0), hold_s=10.0, points=160)
+    hidden = mcc.HiddenEffect(find_variant(CREEP), AMPLITUDE, {"tau_s": TAU_S})
+    instrument = mcc.Instrument(displacement_noise_um=0.08, force_noise_mN=0.05)
+    whole = mcc.paper_campaign(0, programme=programme, instrument=instrument, effects=[hidden])
+    return whole.without(*whole.particles[8:])
+
+
+@pytest.fixture(scope="module")
+def posterior(campaign):
+    return mcc.sample(campaign, mcc.Model().with_effects(CREEP), seed=0)
+
+
+def test_amplitude_time_and_modulus_are_recovered(posterior):
+    assert posterior.converged, posterior.failures()
+    named = posterior.named_population()
+    truth = {"creep": AMPLITUDE, "creep.tau_s": TAU_S, "effective_modulus_MPa": 16_000.0, "a": 1.43}
+    for name, value in truth.items():
+        assert abs(named[name].mean() - value) < 4 * named[name].std(), name
+    assert named["creep"].std() < 0.1 * AMPLITUDE
+
+
+def test_what_moved_is_told(posterior):
+    told = [note for note in posterior.warnings() if "effective modulus from" in note]
+    assert len(told) == 1
+    assert CREEP in told[0]
+
+
+def test_the_noise_is_that_of_the_instrument(posterior):
+    noise = posterior.fit.noise.noise
+    assert float(noise.displacement) == pytest.approx(0.08, rel=0.1)
+    assert posterior.noise_share < 0.5
+
+
+def test_models_are_compared_by_evidence_and_by_particles_left_out(campaign, posterior):
+    table = mcc.compare(campaign, [mcc.Model(), posterior])
+    base, with_creep = table.to_dict("records")
+    assert with_creep["log_evidence"] - base["log_evidence"] > 50
+    assert base["elpd_difference"] < -5 * base["elpd_difference_error"] < 0
+    assert base["noise_share"] > 0.5 > with_creep["noise_share"]
+    assert base["chi2_per_point"] > 2 > with_creep["chi2_per_point"]
+
+
+def test_least_squares_agrees_with_the_mode(campaign, posterior):
+    squares = mcc.least_squares(campaign, mcc.Model().with_effects(CREEP))
+    mode, named = posterior.fit.population, posterior.named_population()
+    found = squares.to_json()["effects"][0]["parameters"]
+    for name, key, at in (("creep_compliance_per_MPa", "creep", 0), ("tau_s", "creep.tau_s", 1)):
+        assert abs(found[name]["value"] - float(mode.theta[at])) < 0.3 * named[key].std(), name
+
+
+def test_a_saved_law_with_its_effect_drives(posterior, tmp_path):
+    posterior.save(tmp_path / "result")
+    law = mcc.load(tmp_path / "result").law()
+    assert [effect.name for effect in law.effects] == [CREEP]
+    particle = mcc.Particle(200.0, 190.0, 180.0)
+    force, time = jnp.asarray([0.0, 200.0, 200.0]), jnp.asarray([0.0, 10.0, 60.0])
+    moved = mcc.drive(law, particle, force, time=time, control="load").displacement
+    still = mcc.drive(law.without_effects(), particle, force, control="load").displacement
+    assert float(moved[2] - moved[1]) > 1.0
+    np.testing.assert_allclose(still[2], still[1])
+
+
+def test_two_formulas_of_one_mechanism_are_refused():
+    with pytest.raises(mcc.InputError, match="creep stands twice"):
+        mcc.Model().with_effects(CREEP, "creep")
