@@ -45,7 +45,7 @@ class Pooled(eqx.Module):
         whitening: the noise filters.
         population: whose spreads weigh the deviations of the particles.
         zero_prior: mean and standard deviation of the zeros, from the recorded contact [um].
-        further: mean and standard deviation of the logarithm of every further number of an effect.
+        further: mean and standard deviation of every further number of an effect, of its logarithm if it is positive.
         forms: the law.
         scatter: what differs from particle to particle.
         loss: "linear", "soft_l1" or "cauchy", applied to the whitened residuals.
@@ -74,7 +74,8 @@ def unpack(y: Parameters, settings: Pooled, tests: Tests) -> Point:
         e = y.shared[1] + scatter.power * log_eta
         latent, own = jnp.concatenate([y.local[:, :3], e[:, None]], 1), y.local[:, 4:]
     amplitudes, further = y.shared[len(SHARED) :][:size], y.shared[len(SHARED) + size :]
-    theta = jnp.concatenate([amplitudes, jnp.exp(further)])
+    positive = settings.forms.positive
+    theta = jnp.concatenate([amplitudes, jnp.where(positive, jnp.exp(jnp.where(positive, further, 0.0)), further)])
     theta = jnp.broadcast_to(theta, (len(latent), len(theta)))
     for j, (k, _) in enumerate(scatter.varying):
         theta = theta.at[:, k].set(own[:, j])

@@ -295,7 +295,7 @@ class LeastSquaresCalibration(Calibration):
         values, sds = np.asarray(self.solution.value.shared)[len(SHARED) :], self._shared_sd[len(SHARED) :]
         size, found = len(self.model.effects), {}
         for k, name in enumerate(self.model.forms.names):
-            log = k >= size
+            log = k >= size and self.model.forms.positive[k - size]
             found[name] = log_estimate(values[k], sds[k]) if log else _normal(float(values[k]), float(sds[k]))
         for j, name in enumerate(self.model.varying_in_order):
             found[f"tau_{name}"] = estimate(float(self.settings.population.theta_scatter[j]))
@@ -419,10 +419,10 @@ calibrate_least_squares = least_squares
 
 
 def _further(model: Model) -> Any:
-    """Mean and standard deviation of the logarithm of every further number."""
-    ranges = [n.plausible for v in model.effects for n in v.nuisances]
-    rows = [[0.5 * np.log(low * high), np.log(high / low) / 4] for low, high in ranges]
-    return jnp.asarray(np.array(rows).reshape(-1, 2))
+    """Mean and standard deviation of every further number, of its logarithm if it is positive."""
+    ranges = [np.array(n.plausible) for v in model.effects for n in v.nuisances]
+    ends = [np.log(ends) if ends[0] > 0 else ends for ends in ranges]
+    return jnp.asarray(np.array([[end.mean(), np.ptp(end) / 4] for end in ends]).reshape(-1, 2))
 
 
 def solve(fit: Fit, settings: Pooled, tests: Tests, a: float, mu: np.ndarray, log_modulus: float) -> Solution:
@@ -431,5 +431,7 @@ def solve(fit: Fit, settings: Pooled, tests: Tests, a: float, mu: np.ndarray, lo
     local += [fit.point.latent[:, 3:]] if settings.scatter.modulus else []
     local += [fit.point.theta[:, k : k + 1] for k, _ in settings.scatter.varying]
     theta, size = np.asarray(fit.population.theta), len(settings.forms.effects)
-    shared = jnp.asarray(np.concatenate([[a, log_modulus], mu, theta[:size], np.log(theta[size:])]))
+    positive = settings.forms.positive
+    further = np.where(positive, np.log(np.where(positive, theta[size:], 1.0)), theta[size:])
+    shared = jnp.asarray(np.concatenate([[a, log_modulus], mu, theta[:size], further]))
     return fit_pooled(tests, settings, Parameters(jnp.concatenate(local, 1), shared))
