@@ -71,7 +71,15 @@ def test_a_saved_law_with_its_effect_drives(posterior, tmp_path):
     force, time = jnp.asarray([0.0, 200.0, 200.0]), jnp.asarray([0.0, 10.0, 60.0])
     moved = mcc.drive(law, particle, force, time=time, control="load").displacement
     still = mcc.drive(law.without_effects(), particle, force, control="load").displacement
-    assert float(moved[2] - moved[1]) > 1.0
+    # D c [ln(1 + t/tau) convolved with d sigma]: a ramp of 10 s, then 50 s at its end.
+    effect, tau = law.effects[0], float(law.effects[0].tau_s)
+    stress, diameter = float(particle.stress(force[1])), float(particle.effective_diameter)
+
+    def integral(t):
+        return (t + tau) * np.log1p(t / tau) - t
+
+    by_hand = diameter * float(effect.amplitude) * stress / 10 * (integral(60) - integral(50) - integral(10))
+    assert float(moved[2] - moved[1]) == pytest.approx(by_hand, rel=0.05)
     np.testing.assert_allclose(still[2], still[1])
 
 
