@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -51,39 +52,52 @@ class Model:
         InputError: for an unknown form (which may be given as its text), or what is no `Priors` and no effect.
     """
 
-    unloading: Unloading = Unloading.PRINTED
-    strain_scaling: StrainScaling = StrainScaling.RAW
-    modulus_scatter: bool = False
-    shape_scatter: bool = False
-    priors: Priors | None = None
-    effects: tuple[Variant, ...] = ()
-    varying: tuple[str, ...] = ()
-    correlation: Correlation = Correlation.EXPONENTIAL
-    along: Along = Along.LOAD
+    unloading: Unloading
+    strain_scaling: StrainScaling
+    modulus_scatter: bool
+    shape_scatter: bool
+    priors: Priors | None
+    effects: tuple[Variant, ...]
+    varying: tuple[str, ...]
+    correlation: Correlation
+    along: Along
 
-    def __post_init__(self) -> None:
-        if self.priors is not None:
-            arguments.instance(self.priors, Priors, "priors", "Read them with mcc_jax.read_priors(file).")
-        for name, kind in (
-            ("unloading", Unloading),
-            ("strain_scaling", StrainScaling),
-            ("correlation", Correlation),
-            ("along", Along),
-        ):
-            object.__setattr__(self, name, arguments.member(getattr(self, name), kind, name))
-        for name in ("modulus_scatter", "shape_scatter"):
-            object.__setattr__(self, name, arguments.flag(getattr(self, name), name))
-        effects = tuple(_variant(one) for one in _several(self.effects))
-        object.__setattr__(self, "effects", effects)
-        names = [v.mechanism for v in effects]
+    def __init__(
+        self,
+        unloading: Unloading | str = Unloading.PRINTED,
+        strain_scaling: StrainScaling | str = StrainScaling.RAW,
+        modulus_scatter: bool = False,
+        shape_scatter: bool = False,
+        priors: Priors | None = None,
+        effects: Any = (),
+        varying: Any = (),
+        correlation: Correlation | str = Correlation.EXPONENTIAL,
+        along: Along | str = Along.LOAD,
+    ) -> None:
+        if priors is not None:
+            arguments.instance(priors, Priors, "priors", "Read them with mcc_jax.read_priors(file).")
+        chosen = tuple(_variant(one) for one in _several(effects))
+        names = [v.mechanism for v in chosen]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise InputError(f"{twice[0]} stands twice in one model", remedy="Take one formula of each mechanism.")
-        own = [v.mechanism for v in effects if v.random_per_test]
-        varying = tuple(dict.fromkeys([*_several(self.varying), *own]))
-        for name in varying:
+        own = [v.mechanism for v in chosen if v.random_per_test]
+        differ = tuple(dict.fromkeys([*_several(varying), *own]))
+        for name in differ:
             arguments.choice(name, names, "effect to vary")
-        object.__setattr__(self, "varying", varying)
+        fields = {
+            "unloading": arguments.member(unloading, Unloading, "unloading"),
+            "strain_scaling": arguments.member(strain_scaling, StrainScaling, "strain_scaling"),
+            "modulus_scatter": arguments.flag(modulus_scatter, "modulus_scatter"),
+            "shape_scatter": arguments.flag(shape_scatter, "shape_scatter"),
+            "priors": priors,
+            "effects": chosen,
+            "varying": differ,
+            "correlation": arguments.member(correlation, Correlation, "correlation"),
+            "along": arguments.member(along, Along, "along"),
+        }
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
 
     # ---- the model ---------------------------------------------------------------------------------------------------
 
@@ -283,7 +297,10 @@ def spread(name: str, prior: NakagamiPrior) -> Scalar:
 
 
 def _several(value: Any) -> tuple[Any, ...]:
-    return (value,) if isinstance(value, str | Variant) else tuple(value)
+    if isinstance(value, str | Variant):
+        return (value,)
+    remedy = 'Give a list of names such as ["creep:logarithmic"].'
+    return tuple(arguments.instance(value, Sequence, "a list of effects", remedy))
 
 
 def _variant(effect: Any) -> Variant:

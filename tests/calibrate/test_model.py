@@ -21,7 +21,7 @@ from scipy.stats import halfnorm, kstest, lognorm, nakagami, norm
 from mcc_jax import InputError, Model, Priors, Programme
 from mcc_jax.calibrate import NakagamiPrior, NormalPrior, select_tests
 from mcc_jax.calibrate.distributions import Amplitude, SpreadCoordinate, nuisance_prior
-from mcc_jax.calibrate.fitting import population_of
+from mcc_jax.calibrate.fit_result import population_of
 from mcc_jax.calibrate.forward import Point
 from mcc_jax.calibrate.mode import LogPosterior, Shapes, log_priors, most_probable, populations, start_values, values_of
 from mcc_jax.calibrate.model import check_prior_of_a

@@ -178,7 +178,7 @@ def test_blocks_that_do_not_come_out_even_are_told():
 
 
 def test_what_fills_up_counts_for_nothing():
-    tests = select_tests(simulated(instrument=NOISE, programme=Programme.cycles(points=40))).tests
+    tests = select_tests(simulated(instrument=NOISE, programme=Programme.cycles(points=40)))
     filled = filled_up(tests, 3)
     assert (len(tests), len(filled), count_of(tests), count_of(filled)) == (4, 6, 4, 4)
     np.testing.assert_array_equal(filled.weight, [1, 1, 1, 1, 0, 0])
