@@ -111,7 +111,7 @@ def test_two_processes_give_the_numbers_of_one(alone, two_processes, process):
     assert_same(arrays(two_processes, process), arrays(alone))
 
 
-FITS = ("mode", "covariance", "noise", "noise_log_sd", "scale", "latent", "residual", "weight")
+FITS = ("mode", "covariance", "noise", "noise_log_sd", "scale", "latent", "residual", "variance")
 
 
 @pytest.mark.long
