@@ -156,7 +156,7 @@ def test_selected_points_are_those_of_the_record(campaign):
         rows = selection.rows[row]
         read = np.asarray(tests.reading[row])[: len(rows)]
         force, raw = np.asarray(tests.force[row])[: len(rows)], campaign.curves[i].force_mN[rows]
-        assert (~read).sum() <= 3  # the turning points alone
+        assert read.mean() > 0.8  # all but turning points and holds
         np.testing.assert_allclose(force[read], np.minimum(raw, np.asarray(tests.record.peak[row])[: len(rows)])[read])
         mask, loading = np.asarray(tests.mask[row]), np.asarray(tests.loading[row])
         assert not mask[len(rows) :].any()

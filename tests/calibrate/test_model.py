@@ -23,7 +23,7 @@ from mcc_jax.calibrate import NakagamiPrior, NormalPrior, select_tests
 from mcc_jax.calibrate.distributions import Amplitude, SpreadCoordinate, nuisance_prior
 from mcc_jax.calibrate.fit_result import population_of
 from mcc_jax.calibrate.forward import Point
-from mcc_jax.calibrate.mode import LogPosterior, Shapes, log_priors, most_probable, populations, start_values, values_of
+from mcc_jax.calibrate.mode import LogPosterior, Shapes, log_priors, most_probable, populations, values_of
 from mcc_jax.calibrate.model import check_prior_of_a
 from mcc_jax.calibrate.noise import standard_promotion
 from mcc_jax.effects import LIBRARY, find_variant
@@ -209,7 +209,7 @@ def test_the_density_is_priors_times_likelihood_times_volume(target, density):
     @eqx.filter_jit
     def parts(free):
         def sites(x):
-            values = start_values(x, target)
+            values = values_of(target.population(x), target.model, target.marginal.flatness)
             return jnp.stack([values[name] for name in target.names])
 
         population = target.population(free)

@@ -8,6 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from ... import arguments
+from ..._errors import InputError
 from ...calibrate import JointModel as PublicModel
 from ...calibrate.priors import Priors
 from .model import JointModel
@@ -30,7 +31,16 @@ def checked_settings(
 
 
 def legacy_model(model: PublicModel) -> JointModel:
-    """The model that a user gave, as this package has it."""
+    """The model that a user gave, as this package has it.
+
+    Raises:
+        InputError: for a model with effects, which the search adds by itself.
+    """
+    if model.effects:
+        raise InputError(
+            f"discovery knows no effects beforehand, and the model has {', '.join(model.variants)}",
+            remedy="Give the model without effects; mcc_jax.compare compares models that have some.",
+        )
     return JointModel(
         unloading=model.unloading,
         strain_scaling=model.strain_scaling,
