@@ -29,6 +29,8 @@ from mcc_jax.calibrate.noise import Along, Correlation, Noise
 from mcc_jax.calibrate.population import Scatter, moments
 from mcc_jax.campaign import particle_batch
 
+pytestmark = pytest.mark.long  # minutes of compiling; the quick run has the model end to end
+
 FLAT = np.array([0.15, 0.45, -0.1])
 PLAIN = Model().scatter
 EFFECTS = Scatter(varying=((1, False), (0, True)))

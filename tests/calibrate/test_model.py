@@ -28,6 +28,8 @@ from mcc_jax.calibrate.model import check_prior_of_a
 from mcc_jax.calibrate.noise import standard_promotion
 from mcc_jax.effects import LIBRARY, find_variant
 
+pytestmark = pytest.mark.long  # minutes of compiling; the quick run has the model end to end
+
 EFFECTS = Model().with_effects("creep:logarithmic", "unloading_shape:symmetric_bow", varying="creep")
 MODELS = {"effects": EFFECTS, "plain": Model(modulus_scatter=True, shape_scatter=True)}
 models = pytest.mark.parametrize("model", first_in_time(list(MODELS.values())), ids=MODELS)
