@@ -112,8 +112,7 @@ def to_arviz(calibration: BayesCalibration, *, prior_count: int = 500, points: b
     }
     if c.model.modulus_scatter:
         posterior["particle_modulus_MPa"] = c.modulus_MPa[:, thin]
-    for name in c.model.varying_in_order:
-        place = [v.mechanism for v in c.model.effects].index(name)
+    for name, place in c.model.varying_places.items():
         posterior[f"particle_{name}"] = c.theta[:, thin, :, place]
     flat = jax.tree.map(jnp.asarray, flattened(population))
     prior_density = {
@@ -130,7 +129,7 @@ def to_arviz(calibration: BayesCalibration, *, prior_count: int = 500, points: b
         observed, along = observed[mask], ["observation"]
         predicted, before = (x[..., mask[:shown]] for x in (predicted, before))
     one_each = ("zero_um", "eta_p", "particle_modulus_MPa", "test", "pareto_k", "points")
-    one_each += tuple(f"particle_{name}" for name in c.model.varying_in_order)
+    one_each += tuple(f"particle_{name}" for name in c.model.varying_places)
     dims = {
         **{name: ["coefficient"] for name in ("mu", "tau")},
         "C": ["particle", "coefficient"],

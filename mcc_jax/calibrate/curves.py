@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -86,7 +86,9 @@ def fitted_curves(
     if not rows:
         return tuple(told)
     for row, um in zip(
-        rows, _displacements(content, campaign, [told[i] for i in rows], rows, compared, variants), strict=True
+        rows,
+        _displacements(content, campaign, segments, [told[i] for i in rows], rows, compared, variants),
+        strict=True,
     ):
         zero = entries[told[row].name]["zero_um"]["value"] or 0.0
         told[row] = replace(told[row], own_um=um[0] + zero, typical_um=um[1] + zero)
@@ -122,13 +124,13 @@ def _rows(campaign: Campaign, i: int, segments: tuple[Segment, ...]) -> np.ndarr
 def _displacements(
     content: Mapping[str, Any],
     campaign: Campaign,
+    segments: Sequence[tuple[Segment, ...]],
     shown: list[FittedCurve],
     places: list[int],
     compared: Mapping[int, tuple[np.ndarray, np.ndarray]],
     variants: Variants | None,
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Displacement [um] of every test under its measured force, by its own law and by the typical one."""
-    segments = campaign_segments(campaign)
     rows = [compared[i][0] if i in compared else _rows(campaign, i, segments[i]) for i in places]
     sizes = campaign.diameters_um[places]
     # Campaigns of similar length share one compilation.

@@ -96,12 +96,20 @@ class Amplitude(dist.Distribution):
         return drawn if self.both else jnp.abs(drawn)
 
 
+def nuisance_moments(nuisance: Nuisance) -> tuple[float, float]:
+    """Prior mean and standard deviation of a further number of a formula, of its logarithm if it must be positive."""
+    low, high = nuisance.plausible
+    if low > 0:
+        low, high = math.log(low), math.log(high)
+    return (low + high) / 2, (high - low) / 4
+
+
 def nuisance_prior(nuisance: Nuisance) -> dist.Distribution:
     """A further number of a formula: normal in the logarithm over its plausible range, or on it if it may be 0."""
     low, high = nuisance.plausible
     if low > 0:
-        return dist.LogNormal(0.5 * math.log(low * high), math.log(high / low) / 4)
-    return dist.TruncatedNormal((low + high) / 2, (high - low) / 4, low=low, high=high)
+        return dist.LogNormal(*nuisance_moments(nuisance))
+    return dist.TruncatedNormal(*nuisance_moments(nuisance), low=low, high=high)
 
 
 class RecordNoise(dist.Distribution):
@@ -122,14 +130,8 @@ class RecordNoise(dist.Distribution):
 
     def log_prob(self, value: Any, intermediates: Any = None) -> Array:
         """Log density of every test; points that do not count carry nothing."""
-
-        def one(filtered: Whitening, away: Array) -> Array:
-            points = jnp.sum(filtered.mask).astype(away.dtype)
-            squares = jnp.sum(filtered(jnp.where(filtered.mask, away, 0.0)[:, None]) ** 2) + filtered.reading
-            constant = filtered.log_det + points * (2 * jnp.log(self.factor) + math.log(2 * math.pi))
-            return -0.5 * (squares / self.factor**2 + constant)
-
-        return eqx.filter_vmap(one)(self.filters, value - self.loc)
+        away = jnp.where(self.filters.mask, value - self.loc, 0.0)
+        return jax.vmap(lambda f, one: f.log_density(one, jnp.log(self.factor)))(self.filters, away)
 
     def sample(self, key: Any, sample_shape: tuple[int, ...] = ()) -> Array:
         """Draws; points that do not count are NaN, as ArviZ wants ragged data."""

@@ -13,6 +13,7 @@ from jaxtyping import Array
 
 from .compiling import compiled
 from .conditional import Drawer, chunk_of, corrected, every, stride_of, weighted
+from .effects import effect_numbers
 from .fit_result import Fit
 from .importance import sample_weighted
 from .mode import LogPosterior, density_of, populations
@@ -235,8 +236,7 @@ def named_numbers(population: Population, fit: Fit) -> Mapping[str, np.ndarray]:
         columns["modulus_scatter"] = p.modulus_scatter
     if model.shape_scatter:
         columns["shape_scatter"] = p.shape_scatter
-    columns |= {name: p.theta[..., k] for k, name in enumerate(model.forms.names)}
-    columns |= {f"tau_{name}": p.theta_scatter[..., j] for j, name in enumerate(model.varying_in_order)}
+    columns |= effect_numbers(p, model)
     columns["noise_factor"] = p.log_noise
     return {name: np.asarray(v) for name, v in columns.items()}
 

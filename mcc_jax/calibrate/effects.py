@@ -17,7 +17,7 @@ def effect_numbers(population: Population, model: Model) -> dict[str, np.ndarray
     """Numbers of the effects by the names of their sites, with the leading axes of the population."""
     theta, spread = np.asarray(population.theta), np.asarray(population.theta_scatter)
     named = {name: theta[..., k] for k, name in enumerate(model.forms.names)}
-    return named | {f"tau_{name}": spread[..., j] for j, name in enumerate(model.varying_in_order)}
+    return named | {f"tau_{name}": spread[..., j] for j, name in enumerate(model.varying_places)}
 
 
 def effect_entries(model: Model, draws: Mapping[str, Any], estimates: bool = False) -> list[dict[str, Any]]:

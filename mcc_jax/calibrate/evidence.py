@@ -12,7 +12,7 @@ from .. import arguments
 from .._errors import InputError
 from ..campaign import THRESHOLD_MPA, Campaign, check_tests
 from .fit_result import Fit
-from .fitting import checked_settings, prepare
+from .fitting import checked_settings, in_own_units, prepare
 from .judgement import numbers_in_reach
 from .model import Model
 from .posterior import BayesCalibration, sample
@@ -42,6 +42,7 @@ def fit(
     campaign = check_tests(campaign)
     tell, model, threshold_MPa = checked_settings(progress, model, threshold_MPa, None)
     with numbers_in_reach(campaign):
+        model, _ = in_own_units(campaign, model)
         _, found, _ = prepare(campaign, model, threshold_MPa, fill_up=False, tell=tell)
     return found
 
@@ -95,6 +96,7 @@ def compare(campaign: Campaign, models: Sequence[Model | BayesCalibration], *, s
     """
     import pandas as pd
     from arviz_stats.base.array import array_stats
+    from scipy.special import logsumexp
 
     arguments.instance(models, Sequence, "models", "Give a list of mcc_jax.Model.")
     if not models:
@@ -110,10 +112,10 @@ def compare(campaign: Campaign, models: Sequence[Model | BayesCalibration], *, s
     for one in found:
         lookup = np.moveaxis(one.log_likelihood.reshape(-1, len(one.particles)), 0, -1)
         smoothed, _ = array_stats.psislw(-lookup, axis=-1)
-        elpds.append(_log_mean(smoothed + lookup))
+        elpds.append(logsumexp(smoothed + lookup, axis=-1))  # of weights that add up to 1
         rows.append(
             {
-                "model": ", ".join(f"{v.mechanism}:{v.name}" for v in one.model.effects) or "no effects",
+                "model": ", ".join(one.model.variants) or "no effects",
                 "log_evidence": one.log_evidence[0],
                 "log_evidence_error": one.log_evidence[1],
                 "elpd": float(elpds[-1].sum()),
@@ -130,12 +132,6 @@ def compare(campaign: Campaign, models: Sequence[Model | BayesCalibration], *, s
         row["elpd_difference"] = float(away.sum())
         row["elpd_difference_error"] = float(np.std(away) * np.sqrt(len(away)))
     return pd.DataFrame(rows)
-
-
-def _log_mean(values: np.ndarray) -> np.ndarray:
-    """Log of the sum of exponentials along the last axis, of weights that add up to 1."""
-    largest = values.max(-1)
-    return largest + np.log(np.exp(values - largest[..., None]).sum(-1))
 
 
 def _chi2(one: BayesCalibration, base: BayesCalibration) -> float:

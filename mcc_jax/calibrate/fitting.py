@@ -70,7 +70,7 @@ def prepare(
 
     Args:
         campaign: the tests.
-        model: what is assumed.
+        model: what is assumed, its priors as `in_own_units` has them.
         threshold_MPa: points below this stress on loading do not count [MPa].
         fill_up: let copies that count for nothing make up whole blocks; if False, all particles are one block.
         block: particles of a block; by default `block_size` of their number.
@@ -87,7 +87,6 @@ def prepare(
     if block is not None and block < 1:
         raise ValueError(f"a block must have at least one particle, got {block}")
     make_room()
-    model, _ = in_own_units(campaign, model)
     tell("selecting points")
     selection = select(campaign, threshold_MPa=threshold_MPa)
     require_same(selection.tests)
@@ -226,9 +225,7 @@ class _Fitter:
         theta = np.broadcast_to(self.model.forms.without_effects, (N, len(self.model.forms.names)))
         return self.particles(white, centre, width, theta, starts)
 
-    def together(
-        self, white: Array, before: Point, target: LogPosterior, free: Float[Array, " d"]
-    ) -> tuple[Point, bool]:
+    def together(self, white: Array, before: Point, target: LogPosterior, free: Float[Array, " d"]) -> Point:
         """Every particle under the population, from where it was and where the summaries expect it."""
         expected = expect(free, target)
         width = np.maximum(np.asarray(expected.sd), MIN_WIDTH)
@@ -248,8 +245,7 @@ class _Fitter:
             )
         ]
         starts = self.blocks.cut(jnp.asarray(np.stack(several)), axis=1)
-        found = self.particles(white, centre, widths, expected.theta, starts)
-        return found.point, bool(np.all(np.asarray(found.converged)[: self.count]))
+        return self.particles(white, centre, widths, expected.theta, starts).point
 
 
 def fit_tests(
@@ -305,7 +301,9 @@ def fit_tests(
             white_noise = Noise(jnp.asarray(max(width, 1e-9)), none, none, jnp.asarray(1.0), jnp.asarray(np.ones(N)))
             noise = replace(noise, noise=white_noise)
         elif (turn or not effects) and not last:
-            noise = fitter.estimated(point, linear, noise.noise, uncertainty=True)
+            # With effects no round knows that it is the last.
+            uncertainty = effects or turn == rounds - 1
+            noise = fitter.estimated(point, linear, noise.noise, uncertainty=uncertainty)
         marginal, filtered, white = fitter.summaries(point, linear, noise.noise)
         if correlated and not last and (turn or not effects):
             old = np.asarray(noise.noise.scale)
@@ -328,7 +326,7 @@ def fit_tests(
         if last or at_rest:
             break
         turn += 1
-        point, _ = fitter.together(white, point, target, free)
+        point = fitter.together(white, point, target, free)
     converged = np.asarray(
         [bool(np.all(np.asarray(individual.converged)[:count])), noise.converged, mode_converged and at_rest]
     )

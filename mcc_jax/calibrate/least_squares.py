@@ -16,11 +16,11 @@ from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_tests
 from ..effects import Variant
 from .block_arrow import Parameters, Solution
 from .data import Selection, Tests, compared_rows, own_misfit, ranges_um, root_mean_squares
-from .distributions import SpreadCoordinate
+from .distributions import SpreadCoordinate, nuisance_moments
 from .effects import effect_entries
 from .estimates import NO_SAMPLER, estimate, finite, force_zero, log_estimate, misfit_note, noise_note, power_of_e
 from .fit_result import Fit
-from .fitting import beyond_numbers, checked_settings, prepare
+from .fitting import beyond_numbers, checked_settings, in_own_units, prepare
 from .forward import residuals
 from .hierarchical import SHARED, Pooled, fit_pooled, unpack
 from .judgement import judged, noise_share, numbers_in_reach, unlike_others
@@ -189,9 +189,8 @@ class LeastSquaresCalibration(Calibration):
                     log_modulus = float(latent[row, 3] - self.model.shape_power * log_eta[row])
                     found["effective_modulus_MPa"] = estimate(power_of_e(log_modulus))
                 if self.model.varying:
-                    places = {v.mechanism: k for k, v in enumerate(self.model.effects)}
-                    own_theta = {m: estimate(float(theta[row, places[m]])) for m in self.model.varying_in_order}
-                    found["amplitudes"] = own_theta
+                    places = self.model.varying_places
+                    found["amplitudes"] = {m: estimate(float(theta[row, k])) for m, k in places.items()}
             entries.append(
                 {
                     "particle": name,
@@ -297,7 +296,7 @@ class LeastSquaresCalibration(Calibration):
         for k, name in enumerate(self.model.forms.names):
             log = k >= size and self.model.forms.positive[k - size]
             found[name] = log_estimate(values[k], sds[k]) if log else _normal(float(values[k]), float(sds[k]))
-        for j, name in enumerate(self.model.varying_in_order):
+        for j, name in enumerate(self.model.varying_places):
             found[f"tau_{name}"] = estimate(float(self.settings.population.theta_scatter[j]))
         return found
 
@@ -373,8 +372,9 @@ def least_squares(
     seed = arguments.seed(seed)
     arguments.choice(loss, get_args(Loss), "loss")
     with numbers_in_reach(campaign):
+        chosen, _ = in_own_units(campaign, model)
         selection, fit, _ = prepare(
-            campaign, model, threshold_MPa, block=block, tell=tell, correlated=loss == "linear", rounds=1
+            campaign, chosen, threshold_MPa, block=block, tell=tell, correlated=loss == "linear", rounds=1
         )
         tests, population = fit.tests, fit.population
         settings = Pooled(fit.filters, population, model.zero_prior, _further(model), model.forms, model.scatter, loss)
@@ -420,9 +420,8 @@ calibrate_least_squares = least_squares
 
 def _further(model: Model) -> Any:
     """Mean and standard deviation of every further number, of its logarithm if it is positive."""
-    ranges = [np.array(n.plausible) for v in model.effects for n in v.nuisances]
-    ends = [np.log(ends) if ends[0] > 0 else ends for ends in ranges]
-    return jnp.asarray(np.array([[end.mean(), np.ptp(end) / 4] for end in ends]).reshape(-1, 2))
+    moments = [nuisance_moments(n) for v in model.effects for n in v.nuisances]
+    return jnp.asarray(np.array(moments).reshape(-1, 2))
 
 
 def solve(fit: Fit, settings: Pooled, tests: Tests, a: float, mu: np.ndarray, log_modulus: float) -> Solution:

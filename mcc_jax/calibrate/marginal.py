@@ -313,8 +313,8 @@ def summarise(
         weight=tests.weight,
         scatter=scatter,
     )
-    reading = jax.vmap(lambda f: jnp.sum(jnp.where(f.mask, f.solver.factor.diag.d**-2.0, 0.0)))(filters)
-    return Summaries(marginal, filters, jnp.sqrt(points / jnp.maximum(reading, 1e-30)))
+    information = jax.vmap(lambda f: f.information)(filters)
+    return Summaries(marginal, filters, jnp.sqrt(points / jnp.maximum(information, 1e-30)))
 
 
 def _snap_evidence(latent, particle, force, used):

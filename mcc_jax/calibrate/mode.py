@@ -27,7 +27,7 @@ handlers: Any = numpyro.handlers
 
 
 class Shapes(eqx.Module):
-    """What the population's priors need to know of the particles.
+    """What the population's priors need to know of the particles where there is no `Marginal`.
 
     Attributes:
         flatness: 1 - D3^2/(D1 D2) [-].
@@ -75,13 +75,15 @@ class LogPosterior(eqx.Module):
 
     def population(self, free: Float[Array, " d"]) -> Population:
         """The population at unbounded coordinates."""
-        return population_at(self.model, Shapes(self.marginal.flatness, self.marginal.weight), self.sites(free))
+        with standard_promotion():
+            prior = handlers.seed(self.model.population, jax.random.key(0))
+            return self.at_values(constrain_fn(prior, (self.marginal,), {}, self.sites(free)))
 
     def at_values(self, values: dict[str, Array]) -> Population:
         """The population at values of its sites."""
         prior = handlers.substitute(self.model.population, data=values)
         with standard_promotion():
-            return handlers.seed(prior, jax.random.key(0))(Shapes(self.marginal.flatness, self.marginal.weight))
+            return handlers.seed(prior, jax.random.key(0))(self.marginal)
 
     def sites(self, free: Array) -> dict[str, Array]:
         """Unbounded coordinates by the names of their sites."""
@@ -90,18 +92,10 @@ class LogPosterior(eqx.Module):
     def unconstrain(self, values: dict[str, Any]) -> Float[Array, " d"]:
         """Unbounded coordinates of the sites' values."""
         given = {name: jnp.asarray(float(values[name])) for name in self.names}
-        shapes = Shapes(self.marginal.flatness, self.marginal.weight)
         with standard_promotion():
-            free = unconstrain_fn(handlers.seed(self.model.population, jax.random.key(0)), (shapes,), {}, given)
+            prior = handlers.seed(self.model.population, jax.random.key(0))
+            free = unconstrain_fn(prior, (self.marginal,), {}, given)
         return jnp.stack([jnp.asarray(free[name]) for name in self.names])
-
-
-def population_at(model: Model, shapes: Shapes, sites: dict[str, Array]) -> Population:
-    """The population at the unbounded coordinates of its sites."""
-    with standard_promotion():
-        prior = handlers.seed(model.population, jax.random.key(0))
-        values = constrain_fn(prior, (shapes,), {}, sites)
-        return handlers.substitute(prior, data=values)(shapes)
 
 
 def values_of(population: Population, model: Model, flatness: Array) -> dict[str, Array]:

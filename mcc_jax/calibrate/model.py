@@ -250,13 +250,13 @@ class Model:
     @property
     def scatter(self) -> Scatter:
         """What differs from particle to particle."""
-        varying = [(k, self._signed(v)) for k, v in enumerate(self.effects) if v.mechanism in self.varying]
-        return Scatter(self.modulus_scatter, self.shape_scatter, self.shape_power, tuple(varying))
+        varying = tuple((k, self._signed(self.effects[k])) for k in self.varying_places.values())
+        return Scatter(self.modulus_scatter, self.shape_scatter, self.shape_power, varying)
 
     @property
-    def varying_in_order(self) -> tuple[str, ...]:
-        """Mechanisms whose amplitude differs from particle to particle, in the order of the effects."""
-        return tuple(v.mechanism for v in self.effects if v.mechanism in self.varying)
+    def varying_places(self) -> dict[str, int]:
+        """Mechanisms whose amplitude differs from particle to particle, and their places among the effects."""
+        return {v.mechanism: k for k, v in enumerate(self.effects) if v.mechanism in self.varying}
 
     def spread_prior(self, variant: Variant) -> NakagamiPrior:
         """Prior of how much an amplitude differs between particles: in the logarithm, or in its own unit where it may

@@ -147,9 +147,21 @@ class Whitening(eqx.Module):
         return own + jnp.sum(jnp.log1p(self._power())) + shared
 
     @property
+    def information(self) -> Scalar:
+        """Sum over the points that count of one over the variance of each given those before [1/um^2]."""
+        return jnp.sum(jnp.where(self.mask, self.solver.factor.diag.d**-2.0, 0.0))
+
+    def log_density(self, away: Path, log_factor: Scalar) -> Scalar:
+        """Log density of a test's residuals [um], 0 where masked, under the noise times a common factor."""
+        points = jnp.sum(self.mask).astype(away.dtype)
+        squares = jnp.sum(self(away[:, None]) ** 2) + self.reading
+        constant = self.log_det + points * (2 * log_factor + float(np.log(2 * np.pi)))
+        return -0.5 * (jnp.exp(-2 * log_factor) * squares + constant)
+
+    @property
     def reading(self) -> Scalar:
         """Sum of squares that reading a display of finite steps alone brings about, however well the law fits."""
-        return READING_UM**2 * jnp.sum(jnp.where(self.mask, self.solver.factor.diag.d**-2.0, 0.0))
+        return READING_UM**2 * self.information
 
     def _power(self) -> Path:
         return jax.ops.segment_sum(self.peak**2, self.branch, len(self.peak))

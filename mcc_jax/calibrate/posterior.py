@@ -238,9 +238,8 @@ class BayesCalibration(PosteriorDraws):
                 if self.model.modulus_scatter:
                     draws["effective_modulus_MPa"] = summary(self.modulus_MPa[..., row])
                 if self.model.varying:
-                    places = {v.mechanism: k for k, v in enumerate(self.model.effects)}
-                    own = {m: summary(self.theta[..., row, places[m]]) for m in self.model.varying_in_order}
-                    draws["amplitudes"] = own
+                    places = self.model.varying_places
+                    draws["amplitudes"] = {m: summary(self.theta[..., row, k]) for m, k in places.items()}
             entries.append(
                 {
                     "particle": name,
@@ -367,7 +366,8 @@ def sample(
     length = Length(chains, arguments.whole(warmup, "warmup", least=1), draws)
     fast = mode == "fast"
     with numbers_in_reach(campaign):
-        selection, fit, size = prepare(campaign, model, threshold_MPa, fill_up=fast, block=block, tell=tell)
+        chosen, own_units = in_own_units(campaign, model)
+        selection, fit, size = prepare(campaign, chosen, threshold_MPa, fill_up=fast, block=block, tell=tell)
         tell("sampling the population" if fast else "sampling everything")
         key = jax.random.key(seed)
         likely = not any(one.level == "bad" for one in check_plausibility(campaign.raw or campaign))
@@ -392,7 +392,7 @@ def sample(
         return sample(some, model, without_flagged=False, **settings, **few).answer()
 
     findings = judged(campaign, calibration.answer(), outlying, again if without_flagged else None)
-    told = [in_own_units(campaign, model)[1]]
+    told = [own_units]
     if model.effects and without_flagged:
         tell("calibrating without the effects")
         told.append(_moved_by_effects(campaign, model, calibration, threshold_MPa))

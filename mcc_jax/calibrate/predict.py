@@ -186,7 +186,7 @@ def predict_measured(calibration: PosteriorDraws, particle: str, *, count: int =
     pick = rng.choice(chains * draws, size=min(count, chains * draws), replace=False)
 
     def chosen(values: np.ndarray) -> np.ndarray:
-        return values.reshape(chains * draws, *values.shape[2:])[pick]
+        return flattened(values)[pick]
 
     laws = laws_with(
         calibration.model,

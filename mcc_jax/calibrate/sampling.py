@@ -76,16 +76,9 @@ class ExactLikelihood(eqx.Module):
         """Log likelihood of each test at drawn parameters, times the prior density of its zero."""
         tests = self.tests
         residual = residuals(Point(drawn.latent, drawn.zero, drawn.theta), tests, self.forms)
-
-        def one(r, filtered):
-            squares = jnp.sum(filtered(r[:, None]) ** 2) + filtered.reading
-            points = jnp.sum(filtered.mask).astype(r.dtype)
-            constant = filtered.log_det + points * (2 * population.log_noise + math.log(2 * math.pi))
-            return -0.5 * (jnp.exp(-2 * population.log_noise) * squares + constant)
-
         mean, sd = self.zero_prior
         at_zero = -0.5 * ((drawn.zero - tests.contact - mean) / sd) ** 2 - jnp.log(sd * math.sqrt(2 * math.pi))
-        return jax.vmap(one)(residual, self.filters) + at_zero
+        return jax.vmap(lambda f, r: f.log_density(r, population.log_noise))(self.filters, residual) + at_zero
 
 
 REACH = 3.0
