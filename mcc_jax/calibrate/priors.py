@@ -163,7 +163,8 @@ class Priors:
         cellulose, since a shape of curve that is known for one material is a guess for another.
 
         Args:
-            stress_MPa, strain: at the median test's peak.
+            stress_MPa: at the median test's peak.
+            strain: at the same peak.
             unloading: form of unloading.
         """
         base = cls.default(unloading)
