@@ -1,14 +1,15 @@
 """Is the modulus right under holds and a noisy load cell? `python benchmarks/study_noise.py --part 0/4`.
 
 48 campaigns of 12 particles: force noise of 0.05 and 0.3 mN, with and without a hold of 10 s at the peak, three
-protocols (one cycle, two cycles, and the second at another rate). Every part writes its own rows, and is skipped where
-they stand; `--table` draws the table of all.
+protocols (one cycle, two cycles, and the second at another rate), four times each. Every campaign has particles and
+noise of its own. Every part writes its own rows, and goes on from those that stand; `--table` draws the table of all.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+from itertools import product
 from pathlib import Path
 
 import jax
@@ -17,7 +18,7 @@ import numpy as np
 import mcc_jax as mcc
 
 RESULTS = Path(__file__).parent / "results"
-MODULUS_MPA, PARTICLES, SEEDS = 16_000.0, 12, 4
+MODULUS_MPA, PARTICLES, TIMES = 16_000.0, 12, 4
 PROTOCOLS = {
     "one cycle": {"levels": (1.0,)},
     "two cycles": {"levels": (0.5, 1.0)},
@@ -27,13 +28,8 @@ PROTOCOLS = {
 
 def cases() -> list[tuple[str, float, float, int]]:
     """Protocol, force noise [mN], hold [s] and seed of every campaign."""
-    return [
-        (protocol, force, hold, seed)
-        for seed in range(SEEDS)
-        for protocol in PROTOCOLS
-        for force in (0.05, 0.3)
-        for hold in (0.0, 10.0)
-    ]
+    several = product(range(TIMES), PROTOCOLS, (0.05, 0.3), (0.0, 10.0))
+    return [(protocol, force, hold, seed) for seed, (_, protocol, force, hold) in enumerate(several)]
 
 
 def campaign_of(protocol: str, force: float, hold: float, seed: int) -> mcc.Campaign:
@@ -85,7 +81,7 @@ def main() -> None:
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     if arguments.table:
-        rows = [r for file in sorted(RESULTS.glob("noise_*.json")) for r in json.loads(file.read_text())]
+        rows = [r for file in sorted(RESULTS.glob("noise_*_of_*.json")) for r in json.loads(file.read_text())]
         (RESULTS / "noise.md").write_text(table(rows))
         print(table(rows))
         return

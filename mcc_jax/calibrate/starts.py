@@ -22,7 +22,7 @@ from .small_matrices import eliminate
 
 
 @compiled
-def _score(
+def score_of_effects(
     point: Point,
     tests: Tests,
     linear: Linear,
@@ -78,7 +78,7 @@ def start_of_effects(point: Point, tests: Tests, linear: Parts, noise: Noise, mo
     effects = tuple(v.build(0.0, **further) for v, further in candidates)
     kinds = effects, model.forms, model.zero_prior[1], model.correlation, model.along
     cut = blocks.cut
-    found = blocks.whole(blocks.each(_score, cut(point), cut(tests), linear, cut(noise), *kinds))
+    found = blocks.whole(blocks.each(score_of_effects, cut(point), cut(tests), linear, cut(noise), *kinds))
     score, information = np.asarray(found)[: count_of(tests)].sum(0).T
     start: dict[str, float] = {}
     values: dict[str, float] = {}
