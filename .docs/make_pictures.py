@@ -49,7 +49,7 @@ def law():
 
 def posterior():
     """What twenty tests say about the shape parameter and C3: more about both together than about each."""
-    draws = mcc.calibrate_bayes(mcc.paper_campaign(seed=0, instrument=NOISE)).named_population()
+    draws = mcc.sample(mcc.paper_campaign(seed=0, instrument=NOISE)).named_population()
     a, C3 = draws["a"].ravel(), np.exp(draws["mu_C3"].ravel())
     true_C3 = float(np.exp(mcc.paper_population().C3.mean))
     figure, ax = panel("A posterior", "shape parameter a [-]", "C3 of the median particle [-]")

@@ -21,7 +21,7 @@ import jax
 import numpy as np
 from _numpy_residual import numpy_residual
 
-from mcc_jax.calibrate import calibrate_bayes, calibrate_least_squares
+from mcc_jax.calibrate import least_squares, sample
 from mcc_jax.calibrate.least_squares import solve
 from mcc_jax.campaign import write_campaign
 from mcc_jax.simulate import paper_campaign
@@ -32,22 +32,22 @@ IMPORTED = "import mcc_jax.calibrate, arviz_stats.base, scipy.optimize, scipy.st
 COLD = """
 import jax, sys
 jax.config.update("jax_enable_x64", True)
-from mcc_jax import calibrate_bayes, read_campaign
-calibrate_bayes(read_campaign(sys.argv[1]))
+from mcc_jax import sample, read_campaign
+sample(read_campaign(sys.argv[1]))
 """
 
 
-def least_squares(repeats: int) -> tuple[list[dict], list[dict]]:
+def squares(repeats: int) -> tuple[list[dict], list[dict]]:
     """Ours, SciPy's and lmfit's, from the same start to the same optimum."""
     import lmfit
     from scipy.optimize import least_squares as scipy_least_squares
 
     campaign = paper_campaign(0)
-    whole = calibrate_least_squares(campaign)
+    whole = least_squares(campaign)
     seconds = []
     for _ in range(repeats):
         start = time.perf_counter()
-        calibrate_least_squares(campaign)
+        least_squares(campaign)
         seconds.append(time.perf_counter() - start)
     shared = np.asarray(whole.solution.value.shared)
     first = np.concatenate([[1.0], shared[1:2] + 0.05, shared[2:]])
@@ -112,11 +112,11 @@ def posterior(repeats: int, budget: float) -> tuple[list[dict], list[dict]]:
         campaign = paper_campaign(0)
         write_campaign(campaign, f"{kept}/campaign")
         cold, again = (_new_process(kept) for _ in range(2))
-    calibrate_bayes(campaign)
+    sample(campaign)
     seconds, results = [], []
     for seed in range(repeats):
         start = time.perf_counter()
-        results.append(calibrate_bayes(campaign, seed=seed))
+        results.append(sample(campaign, seed=seed))
         seconds.append(time.perf_counter() - start)
     warm = float(np.median(seconds))
     # The worst of all seeds: one seed's smallest ESS is itself a matter of luck.
@@ -191,7 +191,7 @@ def main():
     parser.add_argument("--budget", type=float, default=200.0, help="seconds for each textbook sampler")
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    fits, fit_verdicts = least_squares(arguments.repeats)
+    fits, fit_verdicts = squares(arguments.repeats)
     samplers, sampler_verdicts = posterior(arguments.repeats, arguments.budget)
     settings = {
         "campaign": "paper_campaign(0): 20 particles, 301 points each",

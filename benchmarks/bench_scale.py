@@ -27,7 +27,7 @@ def one_size(count: int, points: int) -> dict:
     import jax.numpy as jnp
     import numpy as np
 
-    from mcc_jax.calibrate import calibrate_bayes
+    from mcc_jax.calibrate import sample
     from mcc_jax.campaign import PAPER_DIAMETERS_UM, particle_batch
     from mcc_jax.geometry import Particle
     from mcc_jax.simulate import Instrument, Programme, law_for_each, paper_population, simulate_campaign
@@ -43,7 +43,7 @@ def one_size(count: int, points: int) -> dict:
     seconds = []
     for _ in range(2):
         start = time.perf_counter()
-        result = calibrate_bayes(campaign, chains=2, draws=1000)
+        result = sample(campaign, chains=2, draws=1000)
         seconds.append(time.perf_counter() - start)
     named = result.named_population()
     return {

@@ -1,4 +1,6 @@
-"""Is a hidden effect recovered by the model that has it? `python benchmarks/study_hidden.py --setting creep-8 --part 0/2`.
+"""Is a hidden effect recovered by the model that has it?
+
+Run `python benchmarks/study_hidden.py --setting creep-8 --part 0/2`.
 
 40 campaigns of 12 particles a setting, two cycles with holds of 10 s. In each an effect is hidden, creep or frame
 compliance, as strong as the setting says: by the misfit that the base law leaves (chi2 per point of the true noise,

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from arviz_stats.base import array_stats
 
-from mcc_jax.calibrate import calibrate_bayes
+from mcc_jax.calibrate import sample
 from mcc_jax.simulate import paper_campaign
 
 MOST = 0.05
@@ -55,9 +55,9 @@ def main() -> None:
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     campaign = paper_campaign(0)
-    fast = calibrate_bayes(campaign, draws=FAST)
+    fast = sample(campaign, draws=FAST)
     started = time.perf_counter()
-    joint = calibrate_bayes(campaign, mode="joint", draws=arguments.draws, warmup=arguments.warmup)
+    joint = sample(campaign, mode="joint", draws=arguments.draws, warmup=arguments.warmup)
     seconds = time.perf_counter() - started
     rows = [compare(name, fast.named_population()[name], draws) for name, draws in joint.named_population().items()]
     worst = {key: max(row[key] for row in rows) for key in list(rows[0])[1:6]}

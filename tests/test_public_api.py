@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 MADE_BY_THE_LIBRARY = {
-    *("mcc_jax.BayesCalibration", "mcc_jax.Discovery", "mcc_jax.Energy", "mcc_jax.Identifiability"),
+    *("mcc_jax.Posterior", "mcc_jax.Discovery", "mcc_jax.Energy", "mcc_jax.Identifiability"),
     *("mcc_jax.Evidence", "mcc_jax.Fit", "mcc_jax.campaign.TurningForces"),
-    *("mcc_jax.LeastSquaresCalibration", "mcc_jax.PaperCalibration", "mcc_jax.Power", "mcc_jax.PredictedCurves"),
+    *("mcc_jax.LeastSquares", "mcc_jax.PaperCalibration", "mcc_jax.Power", "mcc_jax.PredictedCurves"),
     *("mcc_jax.InputError", "mcc_jax.Record", "mcc_jax.Response"),
     *(f"mcc_jax.campaign.{name}" for name in ("Adjustment", "Finding", "LoadingCurve", "SolidClass")),
     *(f"mcc_jax.effects.{name}" for name in ("Context", "Equivalence", "Nuisance")),

@@ -13,8 +13,8 @@ from mcc_jax.simulate import read_effect
 
 METHODS = {
     "paper": mcc.calibrate_paper,
-    "least-squares": mcc.calibrate_least_squares,
-    "bayes": lambda campaign: mcc.calibrate_bayes(campaign, draws=300),
+    "least-squares": mcc.least_squares,
+    "bayes": lambda campaign: mcc.sample(campaign, draws=300),
 }
 SIZES = mcc.Particle(200.0, 190.0, 160.0)
 
@@ -112,7 +112,7 @@ def test_a_discovery_comes_back_with_its_law(tmp_path):
     again = mcc.load(tmp_path)
     assert encode(again) == encode(found)
     assert again.to_json() == found.to_json()
-    assert type(again.base.model) is mcc.JointModel
+    assert type(again.base.model) is mcc.Model
     law = again.law()
     assert [effect.name for effect in law.effects] == ["frame_compliance:linear"]
     force, time = jnp.linspace(0.0, 100.0, 30), jnp.arange(30.0)

@@ -169,8 +169,8 @@ def examples(folder: Path) -> dict[str, Example]:
         "fit_polynomial": Example(
             calibrate.fit_polynomial, strain=np.linspace(0.01, 0.3, 9), stress_MPa=np.linspace(0.1, 3.0, 9)
         ),
-        "JointModel": Example(
-            mcc.JointModel, unloading="printed", strain_scaling="raw", modulus_scatter=False, shape_scatter=False
+        "Model": Example(
+            mcc.Model, unloading="printed", strain_scaling="raw", modulus_scatter=False, shape_scatter=False
         ),
         "LogNormalPrior": Example(mcc.LogNormalPrior, median=6.0, log_sd=0.5),
         "NormalPrior": Example(mcc.NormalPrior, mean=1.0, sd=1.0, signed=("mean",)),
@@ -185,11 +185,11 @@ def examples(folder: Path) -> dict[str, Example]:
             seed=0,
             run=False,
         ),
-        "calibrate_least_squares": Example(
-            mcc.calibrate_least_squares, campaign=tests, threshold_MPa=0.2, loss="linear", seed=0, block=1, run=False
+        "least_squares": Example(
+            mcc.least_squares, campaign=tests, threshold_MPa=0.2, loss="linear", seed=0, block=1, run=False
         ),
-        "calibrate_bayes": Example(
-            mcc.calibrate_bayes,
+        "sample": Example(
+            mcc.sample,
             campaign=tests,
             threshold_MPa=0.2,
             mode="fast",

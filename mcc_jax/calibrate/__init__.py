@@ -10,11 +10,9 @@ from .evidence import fit as fit
 from .evidence import log_evidence as log_evidence
 from .fit_result import Fit as Fit
 from .least_squares import Identifiability as Identifiability
-from .least_squares import LeastSquaresCalibration as LeastSquaresCalibration
-from .least_squares import calibrate_least_squares as calibrate_least_squares
+from .least_squares import LeastSquares as LeastSquares
 from .least_squares import least_squares as least_squares
 from .many_campaigns import calibrate_many as calibrate_many
-from .model import JointModel as JointModel
 from .model import Model as Model
 from .paper.calibrate import PaperCalibration as PaperCalibration
 from .paper.calibrate import calibrate_paper as calibrate_paper
@@ -38,8 +36,7 @@ from .paper.shape import Objective as Objective
 from .paper.shape import ShapeFit as ShapeFit
 from .paper.shape import choose_reference as choose_reference
 from .paper.shape import fit_shape_parameter as fit_shape_parameter
-from .posterior import BayesCalibration as BayesCalibration
-from .posterior import calibrate_bayes as calibrate_bayes
+from .posterior import Posterior as Posterior
 from .posterior import sample as sample
 from .predict import PredictedCurves as PredictedCurves
 from .predict import compare_with_paper as compare_with_paper

@@ -19,7 +19,7 @@ from .mode import log_priors, prior_populations
 from .model import Model
 from .noise import Whitening, standard_promotion
 from .population import COEFFICIENTS, Population, flattened
-from .posterior import BayesCalibration
+from .posterior import Posterior
 from .predict import A_CALIBRATION, laws_with, predict_measured, predicted_by
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ POINT_DRAWS = 250
 """Draws per chain kept where every point has a likelihood of its own."""
 
 
-def prior_draws(calibration: BayesCalibration, count: int, seed: int) -> dict[str, np.ndarray]:
+def prior_draws(calibration: Posterior, count: int, seed: int) -> dict[str, np.ndarray]:
     """Draws of the population from its prior, by the names of the posterior, shape (1, count, ...)."""
     keys = jax.random.split(jax.random.key(seed), count)
     drawn = prior_populations(keys, calibration.model, calibration.fit.tests.flatness)
@@ -75,7 +75,7 @@ def _variables(p: Population, model: Model) -> dict[str, np.ndarray]:
     return named | effect_numbers(p, model) | {"noise_factor": np.exp(np.asarray(p.log_noise))}
 
 
-def to_arviz(calibration: BayesCalibration, *, prior_count: int = 500, points: bool = False, seed: int = 0) -> DataTree:
+def to_arviz(calibration: Posterior, *, prior_count: int = 500, points: bool = False, seed: int = 0) -> DataTree:
     """The posterior as an ArviZ `DataTree`.
 
     Groups: `posterior` (population, effects and every particle), `log_likelihood`, `log_prior` (by site), `prior`,
@@ -95,7 +95,7 @@ def to_arviz(calibration: BayesCalibration, *, prior_count: int = 500, points: b
     """
     from arviz_base import from_dict
 
-    arguments.instance(calibration, BayesCalibration, "calibration", A_CALIBRATION)
+    arguments.instance(calibration, Posterior, "calibration", A_CALIBRATION)
     prior_count = arguments.whole(prior_count, "prior_count", least=1)
     seed = arguments.seed(seed)
     points = arguments.flag(points, "points")
@@ -196,7 +196,7 @@ def to_arviz(calibration: BayesCalibration, *, prior_count: int = 500, points: b
     return tree
 
 
-def _predictive(c: BayesCalibration, prior: dict[str, np.ndarray], seed: int) -> tuple[int, np.ndarray, np.ndarray]:
+def _predictive(c: Posterior, prior: dict[str, np.ndarray], seed: int) -> tuple[int, np.ndarray, np.ndarray]:
     """How many particles are shown, and draws of their displacements by posterior and prior; NaN where masked."""
     mask = np.asarray(c.selection.tests.mask)
     chains, draws = np.asarray(c.population.a).shape
@@ -215,7 +215,7 @@ def _predictive(c: BayesCalibration, prior: dict[str, np.ndarray], seed: int) ->
     return shown, predicted, before
 
 
-def _point_likelihoods(c: BayesCalibration, thin: slice) -> np.ndarray:
+def _point_likelihoods(c: Posterior, thin: slice) -> np.ndarray:
     """Log density of every reading given those before it and its particle's own numbers, shape (chain, draw, N, n)."""
     tests, filters = c.fit.tests, c.fit.filters
     C, a = c.C[:, thin], np.asarray(c.population.a)[:, thin]
@@ -246,7 +246,7 @@ def _one_ahead(laws: MccLaw, zero: Array, factor: Array, test: Tests, noise: Whi
     return jax.lax.map(one, (laws, zero, factor))
 
 
-def _prior_curves(c: BayesCalibration, prior: dict[str, np.ndarray], row: int, count: int, seed: int) -> np.ndarray:
+def _prior_curves(c: Posterior, prior: dict[str, np.ndarray], row: int, count: int, seed: int) -> np.ndarray:
     """Curves of the row-th particle from the prior, around its recorded contact."""
     rng = np.random.default_rng([seed, row])
     pick = rng.integers(prior["a"].shape[1], size=count)
@@ -261,12 +261,12 @@ def _prior_curves(c: BayesCalibration, prior: dict[str, np.ndarray], row: int, c
     return clean + float(test.contact) + zero.mean + zero.sd * rng.standard_normal((count, 1))
 
 
-def write_posterior(calibration: BayesCalibration, file: str | Path) -> None:
+def write_posterior(calibration: Posterior, file: str | Path) -> None:
     """Write `posterior.nc` (NetCDF 4), readable by `arviz.from_netcdf` and `xarray.open_datatree`.
 
     Of several processes, which all have the same posterior, only the first one writes.
     """
-    arguments.instance(calibration, BayesCalibration, "calibration", A_CALIBRATION)
+    arguments.instance(calibration, Posterior, "calibration", A_CALIBRATION)
     file = arguments.file_path(file, "file")
     if jax.process_index() == 0:
         to_arviz(calibration, seed=calibration.seed).to_netcdf(file, engine="h5netcdf")

@@ -15,7 +15,7 @@ from .fit_result import Fit
 from .fitting import checked_settings, in_own_units, prepare
 from .judgement import numbers_in_reach
 from .model import Model
-from .posterior import BayesCalibration, sample
+from .posterior import Posterior, sample
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -62,7 +62,7 @@ class Evidence:
     pareto_k: float
 
 
-def log_evidence(campaign: Campaign | BayesCalibration, model: Model | None = None, *, seed: int = 0) -> Evidence:
+def log_evidence(campaign: Campaign | Posterior, model: Model | None = None, *, seed: int = 0) -> Evidence:
     """The log marginal likelihood of a model, by importance sampling around its fit.
 
     Population and effects are integrated by importance sampling, particles by Laplace's approximation corrected with
@@ -73,12 +73,12 @@ def log_evidence(campaign: Campaign | BayesCalibration, model: Model | None = No
         model: what is assumed; of a posterior its own.
         seed: random seed.
     """
-    posterior = campaign if isinstance(campaign, BayesCalibration) else sample(campaign, model, seed=seed)
+    posterior = campaign if isinstance(campaign, Posterior) else sample(campaign, model, seed=seed)
     k = np.inf if posterior.pareto_k_joint is None else posterior.pareto_k_joint
     return Evidence(*posterior.log_evidence, float(k))
 
 
-def compare(campaign: Campaign, models: Sequence[Model | BayesCalibration], *, seed: int = 0) -> pd.DataFrame:
+def compare(campaign: Campaign, models: Sequence[Model | Posterior], *, seed: int = 0) -> pd.DataFrame:
     """Models of one campaign side by side, one row each.
 
     Columns: `log_evidence` and its error, `elpd` (expected log predictive density of a particle left out, by
@@ -101,7 +101,7 @@ def compare(campaign: Campaign, models: Sequence[Model | BayesCalibration], *, s
     arguments.instance(models, Sequence, "models", "Give a list of mcc_jax.Model.")
     if not models:
         raise InputError("there is no model to compare")
-    found = [one if isinstance(one, BayesCalibration) else sample(campaign, one, seed=seed) for one in models]
+    found = [one if isinstance(one, Posterior) else sample(campaign, one, seed=seed) for one in models]
     counted = [np.asarray(one.selection.tests.mask).sum(1) for one in found]
     if any(
         one.particles != found[0].particles or not np.array_equal(n, counted[0])
@@ -134,7 +134,7 @@ def compare(campaign: Campaign, models: Sequence[Model | BayesCalibration], *, s
     return pd.DataFrame(rows)
 
 
-def _chi2(one: BayesCalibration, base: BayesCalibration) -> float:
+def _chi2(one: Posterior, base: Posterior) -> float:
     """Mean square of residuals in standard deviations of the white noise of a base model."""
     variance: Any = np.asarray(base.fit.filters.solver.matrix.diag.d)
     noise = base.fit.noise.noise

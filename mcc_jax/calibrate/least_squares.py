@@ -63,7 +63,7 @@ class Identifiability:
 
 
 @dataclass(frozen=True, repr=False)
-class LeastSquaresCalibration(Calibration):
+class LeastSquares(Calibration):
     """The joint least-squares fit of a campaign.
 
     Attributes:
@@ -341,7 +341,7 @@ def least_squares(
     block: int | None = None,
     without_flagged: bool = True,
     progress: Callable[[str], None] | None = None,
-) -> LeastSquaresCalibration:
+) -> LeastSquares:
     r"""Least squares for a, modulus, and every particle's C1, C3, C5 and zero at once.
 
     .. math:: \min \sum_i \left\| L^{-1} (d_i - z_i - \gamma_i) \right\|^2
@@ -357,7 +357,7 @@ def least_squares(
         threshold_MPa: points below this stress on loading do not count [MPa].
         loss: "linear", or a robust one of the whitened residuals, "soft_l1" or "cauchy".
         seed: kept for the record.
-        block: particles of a block, as in `calibrate_bayes`; the last step, the fit of all together, is done by every
+        block: particles of a block, as in `sample`; the last step, the fit of all together, is done by every
             process for itself on one device.
         without_flagged: where single particles are flagged (a broken one, one unlike all others), calibrate again
             without them and say what the answer is then.
@@ -392,7 +392,7 @@ def least_squares(
     fit, best = fit.first(count), found[int(np.argmin(losses))].first(count)
     settings = replace(settings, whitening=fit.filters)
     agree = int(np.sum(losses <= losses.min() * (1 + 1e-5) + 1e-6))
-    calibration = LeastSquaresCalibration(
+    calibration = LeastSquares(
         campaign,
         selection,
         fit.model,
@@ -413,9 +413,6 @@ def least_squares(
 
     findings = judged(campaign, calibration.answer(), outlying, again if without_flagged else None)
     return replace(calibration, findings=findings, runtime_s=time.perf_counter() - started)
-
-
-calibrate_least_squares = least_squares
 
 
 def _further(model: Model) -> Any:

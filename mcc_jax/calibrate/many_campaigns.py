@@ -14,11 +14,11 @@ from .. import arguments
 from .._errors import InputError
 from ..campaign import THRESHOLD_MPA, Campaign, check_campaign
 from .data import select
-from .least_squares import LeastSquaresCalibration, calibrate_least_squares
-from .posterior import BayesCalibration, calibrate_bayes
+from .least_squares import LeastSquares, least_squares
+from .posterior import Posterior, sample
 from .sharding import block_size
 
-Calibration = BayesCalibration | LeastSquaresCalibration
+Calibration = Posterior | LeastSquares
 
 
 def calibrate_many(
@@ -33,8 +33,8 @@ def calibrate_many(
     """Calibrate many campaigns.
 
     Campaigns of similar size share one compilation: every calibration fills its campaign up to one of few sizes, with
-    copies of a particle that count for nothing and with masked points. So every result is that of `calibrate_bayes` or
-    `calibrate_least_squares` with the same settings and seed, bit for bit, whatever else stands in the queue. The
+    copies of a particle that count for nothing and with masked points. So every result is that of `sample` or
+    `least_squares` with the same settings and seed, bit for bit, whatever else stands in the queue. The
     posterior's mode "joint" fills up points only.
 
     Args:
@@ -46,7 +46,7 @@ def calibrate_many(
             them all.
         progress: called with a campaign's position and the name of its step, "done" or "failed" last; with several
             workers from their threads.
-        settings: of `calibrate_bayes` or `calibrate_least_squares`: model, seed, chains, loss, ...
+        settings: of `sample` or `least_squares`: model, seed, chains, loss, ...
 
     Returns:
         Results in the order of the campaigns; in place of one that fails, its exception.
@@ -56,8 +56,8 @@ def calibrate_many(
         TypeError: for settings that the method does not have.
     """
     methods: dict[str, Callable[..., Calibration]] = {
-        "bayes": calibrate_bayes,
-        "least-squares": calibrate_least_squares,
+        "bayes": sample,
+        "least-squares": least_squares,
     }
     arguments.choice(method, methods, "method")
     workers = arguments.whole(workers, "workers", least=1)

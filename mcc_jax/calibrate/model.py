@@ -287,9 +287,6 @@ class Model:
         return dataclasses.replace(self, effects=(*self.effects, *new), varying=(*self.varying, *_several(varying)))
 
 
-JointModel = Model
-
-
 def spread(name: str, prior: NakagamiPrior) -> Scalar:
     """A standard deviation over the particles, sampled through a coordinate that may have either sign."""
     distribution = SpreadCoordinate(prior)

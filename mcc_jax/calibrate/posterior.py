@@ -46,7 +46,7 @@ class Worst(NamedTuple):
 
 
 @dataclass(frozen=True, repr=False)
-class BayesCalibration(PosteriorDraws):
+class Posterior(PosteriorDraws):
     """The posterior of a campaign.
 
     Draws have the axes (chain, draw, ...); where importance weights were needed they have been applied, in order within
@@ -327,7 +327,7 @@ def sample(
     block: int | None = None,
     without_flagged: bool = True,
     progress: Callable[[str], None] | None = None,
-) -> BayesCalibration:
+) -> Posterior:
     """The joint posterior of everything: a, modulus, population, noise, and every particle's C1, C3, C5 and zero.
 
     The population is drawn around its mode and weighted, or sampled by NUTS where the weights are not good enough: see
@@ -373,7 +373,7 @@ def sample(
         likely = not any(one.level == "bad" for one in check_plausibility(campaign.raw or campaign))
         drawn = draw_fast(key, fit, length, size, patient=likely) if fast else draw_joint(key, fit, length)
     tell("diagnosing")
-    calibration = BayesCalibration(
+    calibration = Posterior(
         campaign=campaign,
         selection=selection,
         model=fit.model,
@@ -400,9 +400,7 @@ def sample(
     return replace(calibration, findings=findings, notes=notes, runtime_s=time.perf_counter() - started)
 
 
-def _moved_by_effects(
-    campaign: Campaign, model: Model, calibration: BayesCalibration, threshold_MPa: float
-) -> str | None:
+def _moved_by_effects(campaign: Campaign, model: Model, calibration: Posterior, threshold_MPa: float) -> str | None:
     """A sentence if a or the modulus move by more than their stated error when the effects come into the law."""
     plain = replace(model, effects=(), varying=())
     try:
@@ -424,6 +422,3 @@ def _moved_by_effects(
         f"With {names} in the law {' and '.join(moved)}, by more than the error it had: without the effect the base "
         "law's own numbers had taken up what it explains"
     )
-
-
-calibrate_bayes = sample

@@ -24,7 +24,7 @@ from .noise import Whitening
 from .population import COEFFICIENTS, flattened
 from .results import PosteriorDraws
 
-A_CALIBRATION = "Make one with mcc_jax.calibrate_bayes(campaign)."
+A_CALIBRATION = "Make one with mcc_jax.sample(campaign)."
 
 
 @dataclass(frozen=True)

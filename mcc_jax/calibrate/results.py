@@ -127,7 +127,7 @@ class Calibration(Saved):
 
 
 class PosteriorDraws(Calibration):
-    """A calibration by draws of a posterior, as predictions need it; see `BayesCalibration` for its attributes."""
+    """A calibration by draws of a posterior, as predictions need it; see `Posterior` for its attributes."""
 
     campaign: Campaign
     selection: Selection
@@ -176,7 +176,7 @@ def load(folder: str | Path) -> Any:
         folder: where `save`, `mcc-jax calibrate` or `mcc-jax discover` wrote.
 
     Returns:
-        A `Discovery`, a `PaperCalibration`, `LeastSquaresCalibration`, `BayesCalibration` or `OldCalibration`, or a
+        A `Discovery`, a `PaperCalibration`, `LeastSquares`, `Posterior` or `OldCalibration`, or a
         `Campaign`.
 
     Raises:

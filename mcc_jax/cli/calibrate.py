@@ -37,10 +37,10 @@ from .shared import (
 )
 
 if TYPE_CHECKING:
-    from ..calibrate import BayesCalibration, LeastSquaresCalibration, PaperCalibration
+    from ..calibrate import LeastSquares, PaperCalibration, Posterior
     from ..campaign import Campaign
 
-    type Calibration = PaperCalibration | LeastSquaresCalibration | BayesCalibration
+    type Calibration = PaperCalibration | LeastSquares | Posterior
 
 RESULT, POSTERIOR, ARCHIVE = "calibration.json", "posterior.nc", "calibration.msgpack"
 METHODS = ("paper", "least-squares", "bayes")
@@ -208,11 +208,11 @@ def write_calibration(
     Returns:
         The contents of `calibration.json`.
     """
-    from ..calibrate import BayesCalibration, write_posterior
+    from ..calibrate import Posterior, write_posterior
 
     names = write_figures(stage, RESULT, functools.partial(_draw, calibration) if figures else None, tell)
     files = [ARCHIVE]
-    if isinstance(calibration, BayesCalibration):
+    if isinstance(calibration, Posterior):
         tell("writing the posterior")
         write_posterior(calibration, stage.folder / POSTERIOR)
         files.append(POSTERIOR)

@@ -34,7 +34,7 @@ def demo(out: Path, seed: int) -> None:
       mcc-jax demo --out try --seed 1
     """
     with session(29) as tell:
-        from ..calibrate import calibrate_bayes
+        from ..calibrate import sample
         from ..campaign import write_campaign
         from ..simulate import paper_campaign
 
@@ -44,7 +44,7 @@ def demo(out: Path, seed: int) -> None:
             write_campaign(campaign, stage.folder / "campaign")
             origin = provenance("demo", stage.folder / "campaign", {"seed": seed}, told="campaign")
             with beside(_import_the_rest):  # compilers leave a core to Python
-                calibration = calibrate_bayes(campaign, seed=seed, progress=tell)
+                calibration = sample(campaign, seed=seed, progress=tell)
             from ..discover import discover
             from ..report import read_results, report_page
 

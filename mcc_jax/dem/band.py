@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from .. import arguments
 from .._errors import InputError
-from ..calibrate import BayesCalibration
+from ..calibrate import Posterior
 from ..law import MccLaw, Plastic
 from .forces import Packing
 from .load_steps import LoadStep, Solver
@@ -68,7 +68,7 @@ class Band(NamedTuple):
 
 
 def population_packing(
-    calibration: BayesCalibration,
+    calibration: Posterior,
     diameter: Any,
     *,
     seed: int = 0,
@@ -89,8 +89,8 @@ def population_packing(
     Raises:
         InputError: if the population hardly has a monotone law.
     """
-    remedy = "Make one with mcc_jax.calibrate_bayes(campaign)."
-    arguments.instance(calibration, BayesCalibration, "calibration", remedy)
+    remedy = "Make one with mcc_jax.sample(campaign)."
+    arguments.instance(calibration, Posterior, "calibration", remedy)
     diameter = arguments.path(diameter, "diameter", many="Give one diameter [um] for each sphere.")
     arguments.positive(diameter, "diameter [um]")
     seed = arguments.seed(seed)

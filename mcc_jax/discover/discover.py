@@ -11,7 +11,7 @@ import numpy as np
 
 from .. import arguments
 from .._errors import InputError
-from ..calibrate import JointModel
+from ..calibrate import Model
 from ..calibrate.judgement import unlike_others
 from ..campaign import Campaign, Finding, available_data, campaign_findings, check_plausibility, check_tests
 from ..campaign.quality import named
@@ -54,7 +54,7 @@ def discover(
     *,
     library: Mapping[str, Mechanism] | None = None,
     exclude: Sequence[str] = (),
-    model: JointModel | None = None,
+    model: Model | None = None,
     threshold_MPa: float = 0.0,
     confirm: bool = True,
     experiments: bool = True,
@@ -100,7 +100,7 @@ def discover(
         if name not in known:
             raise InputError(f"there is no mechanism {name!r}", remedy=f"Known: {', '.join(known)}.")
         known.pop(name)
-    assumed = JointModel(assumed.unloading, assumed.strain_scaling, True, assumed.shape_scatter, assumed.priors)
+    assumed = Model(assumed.unloading, assumed.strain_scaling, True, assumed.shape_scatter, assumed.priors)
     findings = campaign_findings(campaign)
     wrong = [one for one in check_plausibility(campaign.raw or campaign) if one.level == "bad"]
     if wrong:
@@ -130,7 +130,7 @@ def discover(
 def _settled_fit(
     campaign: Campaign,
     findings: Sequence[Finding],
-    model: JointModel,
+    model: Model,
     threshold_MPa: float,
     tell: Callable[[str], None],
 ) -> tuple[Base, list[Finding]]:

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..calibrate import JointModel
+from ..calibrate import Model
 from ..campaign import Campaign, campaign_segments, record_batch
 from ..effects import LIBRARY, Context, Mechanism, Record
 from ..geometry import Particle
@@ -38,7 +38,7 @@ from .legacy.fit import population_at, prepare
 from .legacy.forward import law_of, snap
 from .legacy.linearise import linear_data
 from .legacy.model import JointFit
-from .legacy.model import JointModel as LegacyModel
+from .legacy.model import Model as LegacyModel
 from .legacy.noise import Linear, Whitening
 from .legacy.population import Population, Scatter, moments
 from .legacy.settings import legacy_model
@@ -202,7 +202,7 @@ class Base:
 
     campaign: Campaign
     selection: Selection
-    model: JointModel
+    model: Model
     fit: JointFit
     records: Record
     threshold_MPa: float
@@ -238,7 +238,7 @@ class Base:
 
 
 def base_fit(
-    campaign: Campaign, model: JointModel, *, threshold_MPa: float, tell: Callable[[str], None] = lambda _: None
+    campaign: Campaign, model: Model, *, threshold_MPa: float, tell: Callable[[str], None] = lambda _: None
 ) -> Base:
     """Fit the base law with everything natural free: every particle's coefficients and modulus, and the noise."""
     selection, _, fit, _ = prepare(campaign, legacy_model(model), threshold_MPa, tell=tell)

@@ -12,7 +12,7 @@ import numpy as np
 
 from .. import arguments
 from .._errors import InputError
-from ..calibrate import JointModel
+from ..calibrate import Model
 from ..calibrate.estimates import finite
 from ..campaign import Campaign, Curve, Metadata, available_data, check_campaign
 from ..effects import LIBRARY, Mechanism
@@ -214,7 +214,7 @@ def power_of_campaign(
     campaign: Campaign,
     *,
     library: Mapping[str, Mechanism] = LIBRARY,
-    model: JointModel | None = None,
+    model: Model | None = None,
     threshold_MPa: float = 0.0,
     progress: Callable[[str], None] | None = None,
 ) -> Power:

@@ -15,10 +15,10 @@ from matplotlib.patches import Patch
 from .. import arguments
 from .._errors import InputError
 from ..calibrate import (
-    BayesCalibration,
-    LeastSquaresCalibration,
+    LeastSquares,
     PaperCalibration,
     ParticleFit,
+    Posterior,
     predict_new_particle,
 )
 from ..calibrate.curves import FittedCurve
@@ -96,9 +96,7 @@ def _draw_grid(curves: Sequence[FittedCurve], titles: Sequence[str]) -> Figure:
     return figure
 
 
-def _beside(
-    calibration: BayesCalibration | LeastSquaresCalibration, what: str, line: str, extra: Sequence[Patch] = ()
-) -> Figure:
+def _beside(calibration: Posterior | LeastSquares, what: str, line: str, extra: Sequence[Patch] = ()) -> Figure:
     """At most so many particles that took part, spread over the campaign, measured and as the calibration has them."""
     kept = calibration.selection.kept
     chosen = [kept[row] for row in style.spread_over(len(kept), style.SETTINGS.panels)]
@@ -128,7 +126,7 @@ def _told(curve: FittedCurve) -> str:
 
 
 @style.styled
-def plot_bands(calibration: BayesCalibration) -> Figure:
+def plot_bands(calibration: Posterior) -> Figure:
     """Force [mN] over displacement [um] of at most 12 particles, and what the posterior expects of each.
 
     The particles are spread evenly over the campaign. Points: measured, light where they are not compared with the law.
@@ -141,7 +139,7 @@ def plot_bands(calibration: BayesCalibration) -> Figure:
 
 
 @style.styled
-def plot_fits(calibration: LeastSquaresCalibration) -> Figure:
+def plot_fits(calibration: LeastSquares) -> Figure:
     """Force [mN] over displacement [um] of at most 12 particles, spread over the campaign, measured and fitted.
 
     Points: measured, light where they are not compared with the law. Line: the joint fit. The strip beside each panel
@@ -151,7 +149,7 @@ def plot_fits(calibration: LeastSquaresCalibration) -> Figure:
 
 
 @style.styled
-def plot_whitened(calibration: LeastSquaresCalibration) -> Figure:
+def plot_whitened(calibration: LeastSquares) -> Figure:
     """Residuals of all particles over load, each divided by its noise and freed from correlation [-].
 
     Load is the share of the particle's own peak force [-]; virgin loading left, unloading and reloading in the middle.
@@ -208,7 +206,7 @@ def _histogram(ax: Axes, values: np.ndarray, reach: float) -> None:
     ax.legend(loc="upper right", handlelength=1.2)
 
 
-def _usual_force(calibration: BayesCalibration, diameters_um: np.ndarray) -> float:
+def _usual_force(calibration: Posterior, diameters_um: np.ndarray) -> float:
     """Force that brings a particle of that size to the campaign's median peak stress [mN]."""
     campaign = calibration.campaign
     ratios = [
@@ -219,7 +217,7 @@ def _usual_force(calibration: BayesCalibration, diameters_um: np.ndarray) -> flo
 
 
 @style.styled
-def plot_new_particle(calibration: BayesCalibration, diameters_um: Any = None) -> Figure:
+def plot_new_particle(calibration: Posterior, diameters_um: Any = None) -> Figure:
     """Force [mN] over displacement [um] of a particle that was never measured, loading and unloading.
 
     Bands: central 50 % and 95 % of the posterior's curves at each force, scatter of the particles and uncertainty of

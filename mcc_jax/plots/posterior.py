@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse, Patch
 from matplotlib.ticker import MaxNLocator
 
-from ..calibrate import BayesCalibration, LeastSquaresCalibration, compare_with_paper
+from ..calibrate import LeastSquares, Posterior, compare_with_paper
 from ..calibrate.arviz import prior_draws
 from ..calibrate.population import COEFFICIENTS
 from . import style
@@ -58,7 +58,7 @@ PARAMETERS = {
 
 
 @style.of_its_kind
-def posterior_figures(calibration: BayesCalibration) -> dict[str, Figure]:
+def posterior_figures(calibration: Posterior) -> dict[str, Figure]:
     """Every figure of the posterior, by the stem of its file's name.
 
     Returns:
@@ -75,7 +75,7 @@ def posterior_figures(calibration: BayesCalibration) -> dict[str, Figure]:
 
 
 @style.of_its_kind
-def least_squares_figures(calibration: LeastSquaresCalibration) -> dict[str, Figure]:
+def least_squares_figures(calibration: LeastSquares) -> dict[str, Figure]:
     """Every figure of the joint least squares, by the stem of its file's name.
 
     Returns:
@@ -146,7 +146,7 @@ def with_sd(value: float, sd: float) -> str:
 
 
 @style.styled
-def plot_pairs(calibration: BayesCalibration) -> Figure:
+def plot_pairs(calibration: Posterior) -> Figure:
     """Every pair of the population's parameters, one dot per draw; on the diagonal each alone, with mean and sd.
 
     Shape parameter `a` [-], effective modulus [GPa], and mean and standard deviation of log C1, C3, C5 [-], with the
@@ -193,7 +193,7 @@ def plot_pairs(calibration: BayesCalibration) -> Figure:
     return style.finish(figure, calibration.campaign.metadata, title=title, lines=lines)
 
 
-def prior_of(calibration: BayesCalibration) -> dict[str, np.ndarray]:
+def prior_of(calibration: Posterior) -> dict[str, np.ndarray]:
     """Draws of the population's prior, by the names and in the units of the figures."""
     found = prior_draws(calibration, style.SETTINGS.density_draws, 0)
     for vector in ("mu", "tau"):
@@ -202,7 +202,7 @@ def prior_of(calibration: BayesCalibration) -> dict[str, np.ndarray]:
 
 
 @style.styled
-def plot_prior_posterior(calibration: BayesCalibration) -> Figure:
+def plot_prior_posterior(calibration: Posterior) -> Figure:
     """Prior and posterior density of every parameter of the population, with the paper's value.
 
     Two panels per parameter: over the range of the prior, where a narrow posterior is what the data added, and
@@ -298,7 +298,7 @@ class CoefficientTable:
     spread: np.ndarray
 
 
-def posterior_table(calibration: BayesCalibration) -> CoefficientTable:
+def posterior_table(calibration: Posterior) -> CoefficientTable:
     """Medians and intervals of the posterior; the spread includes what is not known of the population."""
     q = np.quantile(np.asarray(calibration.C), [0.025, 0.25, 0.5, 0.75, 0.975], axis=(0, 1))
     mu, tau = (np.asarray(v).reshape(-1, 3) for v in (calibration.population.mu, calibration.population.tau))
@@ -307,7 +307,7 @@ def posterior_table(calibration: BayesCalibration) -> CoefficientTable:
     return CoefficientTable(q[2], q[[0, 4]], q[[1, 3]], np.exp(np.median(mu, axis=0)), spread)
 
 
-def least_squares_table(calibration: LeastSquaresCalibration) -> CoefficientTable:
+def least_squares_table(calibration: LeastSquares) -> CoefficientTable:
     """Estimates and 95 % intervals of the joint least squares."""
     found = [[entry[n] for n in COEFFICIENTS] for entry in calibration.to_json()["particles"] if entry["kept"]]
     centre = np.array([[one["value"] for one in row] for row in found], float)
@@ -367,7 +367,7 @@ def draw_forest(table: CoefficientTable, labels: Sequence[str]) -> tuple[Figure,
     return figure, handles
 
 
-def _forest(calibration: BayesCalibration | LeastSquaresCalibration, table: CoefficientTable) -> Figure:
+def _forest(calibration: Posterior | LeastSquares, table: CoefficientTable) -> Figure:
     names = style.particle_labels(calibration.campaign.particles)
     labels = [names[i] for i in calibration.selection.kept]
     figure, handles = draw_forest(table, labels)
@@ -380,7 +380,7 @@ def _forest(calibration: BayesCalibration | LeastSquaresCalibration, table: Coef
 
 
 @style.styled
-def plot_forest(calibration: BayesCalibration) -> Figure:
+def plot_forest(calibration: Posterior) -> Figure:
     """C1, C3, C5 [-] of every particle: median, 50 % and 95 % interval of the posterior.
 
     The line is the population's median, the band holds 95 % of its particles (uncertainty of the population included).
@@ -391,7 +391,7 @@ def plot_forest(calibration: BayesCalibration) -> Figure:
 
 
 @style.styled
-def plot_estimates(calibration: LeastSquaresCalibration) -> Figure:
+def plot_estimates(calibration: LeastSquares) -> Figure:
     """C1, C3, C5 [-] of every particle by joint least squares, with 95 % error bars.
 
     Line and band are the population's median and the interval of 95 % of its particles. Particles stand as in
@@ -400,7 +400,7 @@ def plot_estimates(calibration: LeastSquaresCalibration) -> Figure:
     return _forest(calibration, least_squares_table(calibration))
 
 
-def shrinkage(calibration: BayesCalibration) -> tuple[np.ndarray, np.ndarray]:
+def shrinkage(calibration: Posterior) -> tuple[np.ndarray, np.ndarray]:
     """log C1, C3, C5 of each particle alone, under the most probable a, and posterior means, both of shape (N, 3)."""
     fit = calibration.fit
     a = float(fit.population.a)
@@ -410,7 +410,7 @@ def shrinkage(calibration: BayesCalibration) -> tuple[np.ndarray, np.ndarray]:
 
 
 @style.styled
-def plot_shrinkage(calibration: BayesCalibration) -> Figure:
+def plot_shrinkage(calibration: Posterior) -> Figure:
     """What each particle gains from the others: log C1, C3, C5 [-] fitted alone, and in the posterior.
 
     An arrow leads from the best fit of the particle's own curve (circle; its shape factor under the most probable `a`)

@@ -21,7 +21,7 @@ from matplotlib.font_manager import findfont, get_font
 
 from .. import arguments
 from .._errors import InputError
-from ..calibrate import BayesCalibration, LeastSquaresCalibration, PaperCalibration
+from ..calibrate import LeastSquares, PaperCalibration, Posterior
 from ..campaign import Campaign, Metadata, check_campaign
 
 
@@ -113,8 +113,8 @@ RC: dict[Any, Any] = {
 }
 _MADE_BY = {
     "PaperCalibration": "mcc_jax.calibrate_paper(campaign)",
-    "LeastSquaresCalibration": "mcc_jax.calibrate_least_squares(campaign)",
-    "BayesCalibration": "mcc_jax.calibrate_bayes(campaign)",
+    "LeastSquares": "mcc_jax.least_squares(campaign)",
+    "Posterior": "mcc_jax.sample(campaign)",
     "Discovery": "mcc_jax.discover.discover(campaign)",
 }
 
@@ -223,9 +223,9 @@ def wrapped(text: str, figure: Figure) -> list[str]:
     return textwrap.wrap(text[:1].upper() + text[1:], int(figure.get_size_inches()[0] * 14))
 
 
-def cautions(figure: Figure, calibration: BayesCalibration | LeastSquaresCalibration) -> list[str]:
+def cautions(figure: Figure, calibration: Posterior | LeastSquares) -> list[str]:
     """Lines below the title that say why the numbers must not be relied on; none if they may be."""
-    if isinstance(calibration, BayesCalibration):
+    if isinstance(calibration, Posterior):
         reasons = calibration.failures()
     else:
         reasons = [calibration.reason] if calibration.reason else []
@@ -339,6 +339,6 @@ def every(count: int, most: int) -> slice:
     return slice(None, None, max(1, -(-count // most)))
 
 
-def shape_factors(calibration: PaperCalibration | BayesCalibration | LeastSquaresCalibration) -> np.ndarray:
+def shape_factors(calibration: PaperCalibration | Posterior | LeastSquares) -> np.ndarray:
     """eta_p of every particle of the campaign as the calibration states it [-], shape (N,); NaN where it does not."""
     return np.array([entry["eta_p"]["value"] for entry in calibration.to_json()["particles"]], float)

@@ -37,11 +37,11 @@ def main(folder: Path, address: str, processes: int, process: int, seed: int, ev
     # Not before: nothing may ask for devices before the processes know of each other.
     from joint_cases import five_particles
 
-    from mcc_jax.calibrate import calibrate_bayes, write_posterior
+    from mcc_jax.calibrate import sample, write_posterior
 
     campaign = five_particles(seed)
     try:
-        found = calibrate_bayes(campaign, chains=2, warmup=100, draws=60, seed=3, block=2)
+        found = sample(campaign, chains=2, warmup=100, draws=60, seed=3, block=2)
     except Exception as error:
         (folder / f"error_{process}.txt").write_text(f"{type(error).__name__}: {error}", encoding="utf-8")
         raise

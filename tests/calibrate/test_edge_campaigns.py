@@ -14,14 +14,14 @@ from mcc_jax import (
     InputError,
     Programme,
     Ramp,
-    calibrate_bayes,
-    calibrate_least_squares,
+    least_squares,
+    sample,
 )
 from mcc_jax.calibrate.data import select, select_tests
 
 METHODS = {
-    "bayes": lambda campaign: calibrate_bayes(campaign, draws=200, chains=2),
-    "least-squares": calibrate_least_squares,
+    "bayes": lambda campaign: sample(campaign, draws=200, chains=2),
+    "least-squares": least_squares,
 }
 methods = pytest.mark.parametrize("method", list(METHODS))
 few = pytest.mark.parametrize("method", [pytest.param("bayes", marks=pytest.mark.long), "least-squares"])

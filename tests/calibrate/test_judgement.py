@@ -9,7 +9,7 @@ from helpers import first_in_time
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcc_jax import calibrate_least_squares, calibrate_paper
+from mcc_jax import calibrate_paper, least_squares
 from mcc_jax._errors import InputError
 from mcc_jax.calibrate.judgement import MODULUS_OPEN, JudgementOptions, judged, unknown_modulus, unlike_others
 from mcc_jax.campaign import check_tests
@@ -34,7 +34,7 @@ def calibrated(kind):
         "broken": lambda: faulty.broken(clean(), only=("3",)),
         "spiked": lambda: faulty.spiked(clean(), height=60.0, channel="force"),
     }[kind]()
-    return calibrate_least_squares(campaign, without_flagged=kind == "broken")
+    return least_squares(campaign, without_flagged=kind == "broken")
 
 
 def modulus(kind):
@@ -86,7 +86,7 @@ def test_a_modulus_that_no_unloading_tells_is_told_as_unknown():
 def test_a_broken_particle_is_named_with_the_answer_without_it():
     (found,) = calibrated("broken").findings
     assert (found.check, found.particles) == ("breakage", ("3",))
-    rest = calibrate_least_squares(clean().without("3"), without_flagged=False).answer()["effective_modulus_MPa"]
+    rest = least_squares(clean().without("3"), without_flagged=False).answer()["effective_modulus_MPa"]
     value = f"{1e-3 * rest['value']:.4g}"
     assert f"without it the modulus is {value}" in found.sentence
     assert "with it the modulus is" in found.sentence

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mcc_jax import calibrate_bayes, paper_campaign
+from mcc_jax import paper_campaign, sample
 from mcc_jax.calibrate import conditional
 from mcc_jax.calibrate import draws as drawing
 from mcc_jax.calibrate.reweighting import correction
@@ -33,7 +33,7 @@ def test_the_error_is_that_of_the_random_numbers():
 @pytest.mark.long
 def test_the_shortcuts_agree_with_exact_weights(paper_posterior, monkeypatch):
     monkeypatch.setattr(conditional, "MAX_CHECKED", 40_000)  # so that twenty particles count as many
-    many = calibrate_bayes(paper_campaign(0))
+    many = sample(paper_campaign(0))
     assert many.leapfrogs == 0
     assert not many.weights_applied
     assert many.converged, many.failures()

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from joint_cases import NOISE, flatness, simulated, true_coefficients
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares as scipy_least_squares
 
-from mcc_jax import Curve, Instrument, Programme, calibrate_least_squares, paper_campaign
+from mcc_jax import Curve, Instrument, Programme, least_squares, paper_campaign
 from mcc_jax.calibrate.block_arrow import Parameters
 from mcc_jax.calibrate.hierarchical import pooled_residual, robust
 
@@ -24,7 +24,7 @@ def campaign_of(instrument=NOISE):
 
 @pytest.fixture(scope="module")
 def result():
-    return calibrate_least_squares(campaign_of())
+    return least_squares(campaign_of())
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +93,7 @@ def by_scipy(result):
     jacobian = jax.jit(jax.jacfwd(flat))
     rng = np.random.default_rng(0)
     start = x + 0.02 * rng.standard_normal(len(x))
-    found = least_squares(
+    found = scipy_least_squares(
         lambda v: np.asarray(flat(jnp.asarray(v))),
         start,
         jac=lambda v: np.asarray(jacobian(jnp.asarray(v))),
@@ -130,7 +130,7 @@ def test_the_covariance_is_that_of_scipy_s_jacobian(result, by_scipy):
 
 
 def test_the_same_campaign_gives_the_same_json(result):
-    again = calibrate_least_squares(result.campaign).to_json()
+    again = least_squares(result.campaign).to_json()
     first = result.to_json()
     del again["runtime_s"], first["runtime_s"]
     assert json.dumps(again) == json.dumps(first)
@@ -143,7 +143,7 @@ def test_particles_of_one_shape_leave_the_shape_parameter_open():
     """a and the means of log C can then make up for each other."""
     same = np.array([170.0, 180.0, 140.0]) * np.linspace(0.8, 1.2, 8)[:, None]
     C = true_coefficients(campaign_of())
-    found = calibrate_least_squares(simulated(C, same, programme=Programme.cycles(points=300), instrument=NOISE))
+    found = least_squares(simulated(C, same, programme=Programme.cycles(points=300), instrument=NOISE))
     content = json.loads(json.dumps(found.to_json(), allow_nan=False))
     assert content["diagnostics"]["open_combinations"]
     assert "a" in content["diagnostics"]["open_combinations"][0]
@@ -173,8 +173,8 @@ def with_outliers():
 
 @pytest.mark.parametrize("loss", ["soft_l1", pytest.param("cauchy", marks=pytest.mark.long)])
 def test_a_robust_loss_resists_outliers(with_outliers, loss):
-    found = calibrate_least_squares(with_outliers, loss=loss)
-    linear = calibrate_least_squares(with_outliers)
+    found = least_squares(with_outliers, loss=loss)
+    linear = least_squares(with_outliers)
     content = json.loads(json.dumps(found.to_json(), allow_nan=False))
     assert content["loss"] == loss
     truth = np.log(true_coefficients(with_outliers))
@@ -209,7 +209,7 @@ def test_robust_residuals_are_the_losses_in_words(loss):
 def test_without_noise_every_particle_is_known_exactly():
     """Only a is not: how the particles' own coefficients scatter limits it, however good the tests are."""
     campaign = campaign_of(Instrument())
-    content = json.loads(json.dumps(calibrate_least_squares(campaign).to_json(), allow_nan=False))
+    content = json.loads(json.dumps(least_squares(campaign).to_json(), allow_nan=False))
     assert abs(content["a"]["value"] - 1.43) < 4 * content["a"]["sd"]
     true_eta = 1 + 1.43 * flatness(campaign.diameters_um)
     for particle, C, eta in zip(content["particles"], true_coefficients(campaign), true_eta, strict=True):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from joint_cases import COEFFICIENTS, DIAMETERS, NOISE, Programme, simulated
 
-from mcc_jax import InputError, calibrate_bayes, calibrate_least_squares, calibrate_many
+from mcc_jax import InputError, calibrate_many, least_squares, sample
 from mcc_jax.calibrate.conditional import CANDIDATES
 from mcc_jax.calibrate.data import LENGTHS, padded_length
 
@@ -109,7 +109,7 @@ def test_campaigns_of_similar_size_share_their_compilations(queued):
 @pytest.mark.long
 @pytest.mark.parametrize("i", [0, 1, 3])
 def test_the_numbers_are_those_of_one_by_one(queued, campaigns, i):
-    one, many = calibrate_bayes(campaigns[i], **SETTINGS), queued[0][i]
+    one, many = sample(campaigns[i], **SETTINGS), queued[0][i]
     for name, draws in one.named_population().items():
         np.testing.assert_array_equal(many.named_population()[name], draws, err_msg=name)
     for name in ("C", "modulus_MPa", "zero_um", "shape_factor", "log_likelihood", "pareto_k"):
@@ -126,7 +126,7 @@ def test_least_squares_with_two_workers(campaigns):
     assert "no particle can be used" in str(found[1])
     assert {(0, "done"), (1, "failed"), (2, "done")} <= set(told)
     for i in (0, 2):
-        one = calibrate_least_squares(three[i])
+        one = least_squares(three[i])
         assert found[i].campaign is three[i]
         for many, alone in zip(found[i].solution.value, one.solution.value, strict=True):
             np.testing.assert_array_equal(many, alone)

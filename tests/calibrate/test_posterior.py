@@ -9,11 +9,11 @@ import pytest
 from joint_cases import NOISE, Programme, flatness, simulated, true_coefficients
 
 from mcc_jax import (
-    calibrate_bayes,
     compare_with_paper,
     paper_campaign,
     predict_measured,
     predict_new_particle,
+    sample,
     sample_laws,
     to_arviz,
     write_posterior,
@@ -125,8 +125,8 @@ def without_time(result):
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_nearly_the_same_numbers(result):
-    assert without_time(calibrate_bayes(paper_campaign(0))) == without_time(result)
-    other = calibrate_bayes(paper_campaign(0), seed=1)
+    assert without_time(sample(paper_campaign(0))) == without_time(result)
+    other = sample(paper_campaign(0), seed=1)
     assert without_time(other) != without_time(result)
     one, two = result.named_population(), other.named_population()
     for name in one:
@@ -262,7 +262,7 @@ def small():
 
 @pytest.fixture(scope="module")
 def both(small):
-    return [calibrate_bayes(small, mode=mode) for mode in ("fast", "joint")]
+    return [sample(small, mode=mode) for mode in ("fast", "joint")]
 
 
 def gap(one, two):
@@ -309,7 +309,7 @@ def test_the_joint_mode_says_nothing_of_weights(both):
 
 @pytest.mark.long
 def test_too_few_draws_are_not_called_converged():
-    short = calibrate_bayes(paper_campaign(0), draws=20, warmup=20)
+    short = sample(paper_campaign(0), draws=20, warmup=20)
     assert not short.converged
     content = json.loads(json.dumps(short.to_json(), allow_nan=False))
     assert content["converged"] is False

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import halfnorm, nakagami
 
-from mcc_jax import InputError, JointModel, Priors, Unloading, read_priors
+from mcc_jax import InputError, Model, Priors, Unloading, read_priors
 from mcc_jax.calibrate import LogNormalPrior, NakagamiPrior, NormalPrior
 from mcc_jax.calibrate.distributions import SpreadCoordinate
 
@@ -57,8 +57,8 @@ def test_what_is_not_named_is_the_default_of_the_form(read, unloading):
     found = read("[a]\nsd = 0.3\n", unloading)
     assert found.effective_modulus_MPa == Priors.default(unloading).effective_modulus_MPa
     assert found.effective_modulus_MPa.median < 0.1 * Priors().effective_modulus_MPa.median
-    assert JointModel(unloading).chosen_priors == Priors.default(unloading)
-    assert JointModel(unloading, priors=found).chosen_priors == found
+    assert Model(unloading).chosen_priors == Priors.default(unloading)
+    assert Model(unloading, priors=found).chosen_priors == found
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from joint_cases import NOISE, Programme, five_tests, simulated
 
-from mcc_jax import calibrate_bayes
+from mcc_jax import sample
 from mcc_jax.calibrate.data import select_tests
 from mcc_jax.calibrate.particle_fit import linear_starts
 from mcc_jax.calibrate.sharding import MOST, SIZES, Blocks, Parts, block_size, count_of, filled_up
@@ -174,7 +174,7 @@ def test_blocks_that_do_not_come_out_even_are_told():
         Blocks(5, 2)
     campaign = simulated(instrument=NOISE, programme=Programme.cycles(points=40))
     with pytest.raises(ValueError, match="block must be a whole number >= 1"):
-        calibrate_bayes(campaign, block=0)
+        sample(campaign, block=0)
 
 
 def test_what_fills_up_counts_for_nothing():

@@ -225,7 +225,7 @@ def test_whatever_is_raised_leaves_old_results(run, simulated, tmp_path, monkeyp
         (stage.folder / "calibration.json").write_text("half")
         raise error
 
-    monkeypatch.setattr(calibrate, "calibrate_bayes", lambda *_, **__: None)
+    monkeypatch.setattr(calibrate, "sample", lambda *_, **__: None)
     monkeypatch.setattr(command, "write_calibration", fail)
     monkeypatch.delenv("MCC_JAX_DEBUG", raising=False)
     before = snapshot(tmp_path)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mcc_jax import InputError, MccLaw, Plastic, paper_law
-from mcc_jax.calibrate import BayesCalibration
+from mcc_jax.calibrate import Posterior
 from mcc_jax.calibrate.population import Population
 from mcc_jax.dem import (
     Solver,
@@ -203,7 +203,7 @@ def posterior(scatter):
             theta_scatter=jnp.zeros(0),
         )
 
-    found = object.__new__(BayesCalibration)
+    found = object.__new__(Posterior)
     model = SimpleNamespace(unloading=LAW.unloading, strain_scaling=LAW.strain_scaling)
     for name, value in (("model", model), ("population", jax.vmap(jax.vmap(drawn))(jnp.arange(5.0)[None]))):
         object.__setattr__(found, name, value)

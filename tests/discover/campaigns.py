@@ -5,7 +5,7 @@ import functools
 import jax
 import numpy as np
 
-from mcc_jax.calibrate import JointModel
+from mcc_jax.calibrate import Model
 from mcc_jax.campaign import PAPER_DIAMETERS_UM, THRESHOLD_MPA, Campaign
 from mcc_jax.discover.linear_model import base_fit, build_system, signals_of
 from mcc_jax.discover.noise_estimation import refined
@@ -76,7 +76,7 @@ def mixed(one, other, from_other):
 
 cached = functools.cache(campaign)
 
-MODEL = JointModel(modulus_scatter=True)
+MODEL = Model(modulus_scatter=True)
 
 
 def refined_system(whole, library):

@@ -5,14 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from mcc_jax import InputError, JointModel, LogNormalPrior, NormalPrior, Priors
-from mcc_jax.discover.legacy.model import JointModel as LegacyModel
+from mcc_jax import InputError, LogNormalPrior, Model, NormalPrior, Priors
+from mcc_jax.discover.legacy.model import Model as LegacyModel
 from mcc_jax.discover.legacy.settings import checked_settings, legacy_model, noise_prior
 
 
 def test_a_model_is_taken_over_field_by_field():
     priors = dataclasses.replace(Priors.default(), a=NormalPrior(0.5, 0.1), zero_um=NormalPrior(0.0, 2.0))
-    given = JointModel("punch", "contact", True, True, priors)
+    given = Model("punch", "contact", True, True, priors)
     taken = legacy_model(given)
     for f in dataclasses.fields(LegacyModel):
         assert getattr(taken, f.name) == getattr(given, f.name), f.name
@@ -25,7 +25,7 @@ def test_a_model_is_taken_over_field_by_field():
 def test_without_a_model_the_public_default_is_kept():
     tell, model, threshold = checked_settings(None, None, 0)
     tell("nothing happens")
-    assert model == JointModel()
+    assert model == Model()
     assert threshold == 0.0
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from campaigns import campaign
 
-from mcc_jax.calibrate import JointModel
+from mcc_jax.calibrate import Model
 from mcc_jax.campaign import THRESHOLD_MPA
 from mcc_jax.discover.discrepancy import Closure
 from mcc_jax.discover.legacy.fit import population_at
@@ -24,7 +24,7 @@ from mcc_jax.effects import LIBRARY, Mechanism
 
 pytestmark = pytest.mark.long  # searches for effects for minutes; `.ci/run` does so once, as its users do
 
-MODEL = JointModel(modulus_scatter=True)
+MODEL = Model(modulus_scatter=True)
 CHOSEN = {"frame_compliance": "linear", "rate_dependence": "flow_log_strain_rate", "damage": "exponential"}
 SMALL = {
     name: Mechanism(name, LIBRARY[name].explanation, (LIBRARY[name][variant],)) for name, variant in CHOSEN.items()

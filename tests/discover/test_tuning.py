@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from campaigns import campaign
 
-from mcc_jax.calibrate import JointModel
+from mcc_jax.calibrate import Model
 from mcc_jax.campaign import Campaign, Curve
 from mcc_jax.discover import dictionary as words
 from mcc_jax.discover.discrepancy import FOLDS, find_closure
@@ -27,7 +27,7 @@ AMOUNT = 2e-3
 
 
 def systems(whole):
-    base = base_fit(whole, JointModel(modulus_scatter=True), threshold_MPa=0.0)
+    base = base_fit(whole, Model(modulus_scatter=True), threshold_MPa=0.0)
     signals = signals_of(base, LISTED)
     return base, signals, build_system(base, signals)
 

@@ -25,12 +25,12 @@ import numpy as np
 from pathological_kinds import KINDS, MODULUS_MPA, Kind
 
 from mcc_jax import Campaign, InputError, write_campaign
-from mcc_jax.calibrate import calibrate_bayes, calibrate_least_squares, calibrate_paper
+from mcc_jax.calibrate import calibrate_paper, least_squares, sample
 
 METHODS: dict[str, Callable[[Campaign], Any]] = {
     "paper": calibrate_paper,
-    "least-squares": calibrate_least_squares,
-    "bayes": lambda campaign: calibrate_bayes(campaign, draws=500),
+    "least-squares": least_squares,
+    "bayes": lambda campaign: sample(campaign, draws=500),
 }
 COMMAND = {"command least-squares": "least-squares", "command paper": "paper"}
 DISCOVER = "discover"

@@ -12,7 +12,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.quiver import Quiver
 from scipy.stats import nakagami
 
-from mcc_jax.calibrate import calibrate_bayes, calibrate_least_squares
+from mcc_jax.calibrate import least_squares, sample
 from mcc_jax.campaign import Metadata
 from mcc_jax.plots import (
     least_squares_figures,
@@ -60,7 +60,7 @@ class Calibrations(dict):
     def __missing__(self, name):
         assert name == "one"
         one = paper_campaign(0).select(np.arange(20) == 3)
-        self[name] = calibrate_bayes(one, draws=200, chains=2), calibrate_least_squares(one)
+        self[name] = sample(one, draws=200, chains=2), least_squares(one)
         return self[name]
 
 
@@ -68,7 +68,7 @@ class Calibrations(dict):
 def calibrations(paper_posterior):
     """Posterior and least squares of 20 particles, of one, and of 20 of which some have odd names."""
     campaign = paper_campaign(0)
-    found = Calibrations(paper=(paper_posterior, calibrate_least_squares(campaign)))
+    found = Calibrations(paper=(paper_posterior, least_squares(campaign)))
     names = list(campaign.particles)
     names[:4] = "$x_1$ <b>", "a_b^c", "a very long name of a particle of the second batch", "中文"
     renamed = dataclasses.replace(campaign, particles=tuple(names))

@@ -15,7 +15,7 @@ from .data import Tests
 from .fit import populations
 from .importance import sample_weighted
 from .linearise import careful_enough
-from .model import JointFit, JointModel
+from .model import JointFit, Model
 from .nuts import Chains, Length, by_chains
 from .population import COEFFICIENTS, Population, Scatter
 from .reweighting import PROBES
@@ -29,7 +29,7 @@ ACCEPT = (0.8, 0.95, 0.99)
 
 
 def draw_fast(
-    key: Array, tests: Tests, model: JointModel, fit: JointFit, length: Length, block: int, *, patient: bool = True
+    key: Array, tests: Tests, model: Model, fit: JointFit, length: Length, block: int, *, patient: bool = True
 ) -> dict[str, Any]:
     """The population sampled, the particles drawn back and corrected by exact weights: fields of the result."""
     scatter = careful_enough(fit.mode, LogPosterior(fit.numbers, fit.summary, model.scatter), count_of(tests))
@@ -44,7 +44,7 @@ def draw_around(
     covariance: Array,
     target: LogPosterior,
     exact: ExactLikelihood,
-    model: JointModel,
+    model: Model,
     length: Length,
     block: int = 0,
     *,
@@ -108,7 +108,7 @@ def _patient[*Ts](run: Callable[[Array], tuple[Chains, *Ts]]) -> tuple[Chains, *
     return found
 
 
-def draw_joint(key: Array, tests: Tests, model: JointModel, fit: JointFit, length: Length) -> dict[str, Any]:
+def draw_joint(key: Array, tests: Tests, model: Model, fit: JointFit, length: Length) -> dict[str, Any]:
     """Population and particles sampled together under the exact likelihood: fields of the result."""
     scatter = careful_enough(fit.mode, LogPosterior(fit.numbers, fit.summary, model.scatter), count_of(tests))
     exact = ExactLikelihood(tests, fit.filters, fit.summary, scatter, model.zero_sd, model.unloading)
@@ -132,7 +132,7 @@ def _fields(
     stacked: np.ndarray,
     particles: Sequence[Any],
     tests: Tests,
-    model: JointModel,
+    model: Model,
     length: Length,
     keep: int = 1,
 ) -> dict[str, Any]:
@@ -158,7 +158,7 @@ def _fields(
 
 
 def _particles(
-    latent: np.ndarray, zero: np.ndarray, population: Population, flatness: np.ndarray, model: JointModel, chains: int
+    latent: np.ndarray, zero: np.ndarray, population: Population, flatness: np.ndarray, model: Model, chains: int
 ) -> dict[str, np.ndarray]:
     """C, modulus, zero and shape factor of the particles from their latent vectors."""
     count = len(flatness)

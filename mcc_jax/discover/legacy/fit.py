@@ -22,7 +22,7 @@ from ...law import Unloading
 from .compiling import compiled
 from .data import Selection, Tests, select_tests
 from .linearise import careful_enough, expected_latent, linear_data, summarise
-from .model import JointFit, JointModel, log_C3, prior_numbers
+from .model import JointFit, Model, log_C3, prior_numbers
 from .noise import Noise, estimate_noise, particle_scales
 from .particle_fit import FIRST_STEPS, MAX_STEPS, Particles, fit_particles, linear_starts
 from .population import Population, Scatter, Summary
@@ -47,7 +47,7 @@ ROUNDS = 2
 
 def prepare(
     campaign: Campaign,
-    model: JointModel,
+    model: Model,
     threshold_MPa: float,
     *,
     fill_up: bool = True,
@@ -120,7 +120,7 @@ def beyond_numbers(campaign: Campaign, selection: Selection) -> InputError:
 
 def fit_joint(
     tests: Tests,
-    model: JointModel,
+    model: Model,
     read_out_um: float,
     *,
     correlated: bool = True,
@@ -288,7 +288,7 @@ def populations(free: Float[Array, "draws d"], numbers: PriorNumbers, scatter: S
 
 
 def _start(
-    latent: np.ndarray, flatness: np.ndarray, model: JointModel, numbers: PriorNumbers
+    latent: np.ndarray, flatness: np.ndarray, model: Model, numbers: PriorNumbers
 ) -> tuple[PriorNumbers, Float[Array, " d"]]:
     """Where to look for the population, the prior's a and the particles' own median and scatter under it; and the
     coordinates centred there."""

@@ -28,7 +28,7 @@ ALMOST = 0.98
 
 
 @dataclass(frozen=True)
-class JointModel:
+class Model:
     """What is assumed about a campaign.
 
     Attributes:

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 
 from ... import arguments
 from ..._errors import InputError
-from ...calibrate import JointModel as PublicModel
+from ...calibrate import Model as PublicModel
 from ...calibrate.priors import Priors
-from .model import JointModel
+from .model import Model
 from .noise import NoisePrior
 
 
@@ -25,12 +25,12 @@ def checked_settings(
     """
     tell = arguments.teller(progress)
     if model is not None:
-        arguments.instance(model, PublicModel, "model", "Make one with mcc_jax.JointModel().")
+        arguments.instance(model, PublicModel, "model", "Make one with mcc_jax.Model().")
     threshold = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
     return tell, model or PublicModel(), threshold
 
 
-def legacy_model(model: PublicModel) -> JointModel:
+def legacy_model(model: PublicModel) -> Model:
     """The model that a user gave, as this package has it.
 
     Raises:
@@ -41,7 +41,7 @@ def legacy_model(model: PublicModel) -> JointModel:
             f"discovery knows no effects beforehand, and the model has {', '.join(model.variants)}",
             remedy="Give the model without effects; mcc_jax.compare compares models that have some.",
         )
-    return JointModel(
+    return Model(
         unloading=model.unloading,
         strain_scaling=model.strain_scaling,
         modulus_scatter=model.modulus_scatter,
