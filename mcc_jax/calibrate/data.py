@@ -60,6 +60,7 @@ class Tests(eqx.Module):
         force_zero_sd: standard deviation of each test's zero of force [mN]; None where none was measured.
         peak_sd: standard deviation of the force of each point's branch peak where it was worked out otherwise, from
             readings that saturate [mN]; None where none was.
+        reading_weight: by how much the white noise of a point is less in variance [-]; None where all are alike.
     """
 
     __test__ = False  # no test of ours, whatever pytest thinks of the name
@@ -77,6 +78,7 @@ class Tests(eqx.Module):
     weight: Float[Array, " particles"] | None = None
     force_zero_sd: Float[Array, " particles"] | None = None
     peak_sd: Float[Array, "particles points"] | None = None
+    reading_weight: Float[Array, "particles points"] | None = None
 
     @property
     def force(self) -> Float[Array, "*particles points"]:

@@ -72,8 +72,12 @@ def log_evidence(campaign: Campaign | Posterior, model: Model | None = None, *, 
         campaign: the tests, or a posterior that was sampled.
         model: what is assumed; of a posterior its own.
         seed: random seed.
+
+    Raises:
+        InputError: for a model with robust noise.
     """
     posterior = campaign if isinstance(campaign, Posterior) else sample(campaign, model, seed=seed)
+    _refuse_robust(posterior)
     k = np.inf if posterior.pareto_k_joint is None else posterior.pareto_k_joint
     return Evidence(*posterior.log_evidence, float(k))
 
@@ -92,7 +96,7 @@ def compare(campaign: Campaign, models: Sequence[Model | Posterior], *, seed: in
         seed: random seed.
 
     Raises:
-        InputError: for no model, or posteriors whose tests are not the same.
+        InputError: for no model, one with robust noise, or posteriors whose tests are not the same.
     """
     import pandas as pd
     from arviz_stats.base.array import array_stats
@@ -102,6 +106,8 @@ def compare(campaign: Campaign, models: Sequence[Model | Posterior], *, seed: in
     if not models:
         raise InputError("there is no model to compare")
     found = [one if isinstance(one, Posterior) else sample(campaign, one, seed=seed) for one in models]
+    for one in found:
+        _refuse_robust(one)
     counted = [np.asarray(one.selection.tests.mask).sum(1) for one in found]
     if any(
         one.particles != found[0].particles or not np.array_equal(n, counted[0])
@@ -132,6 +138,14 @@ def compare(campaign: Campaign, models: Sequence[Model | Posterior], *, seed: in
         row["elpd_difference"] = float(away.sum())
         row["elpd_difference_error"] = float(np.std(away) * np.sqrt(len(away)))
     return pd.DataFrame(rows)
+
+
+def _refuse_robust(posterior: Posterior) -> None:
+    if posterior.model.robust:
+        raise InputError(
+            "readings are weighed anew in every robust fit, so its likelihood cannot be compared with another's",
+            remedy="Compare models with robust=False.",
+        )
 
 
 def _chi2(one: Posterior, base: Posterior) -> float:

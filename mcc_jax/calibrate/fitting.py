@@ -24,7 +24,7 @@ from .forward import Forms, Linear, Point, linearise
 from .marginal import Marginal, summarise
 from .mode import LogPosterior, most_probable
 from .model import Model, check_prior_of_a
-from .noise import Noise, NoiseFit, estimate_noise, particle_scales
+from .noise import Noise, NoiseFit, estimate_noise, particle_scales, squared_innovations, student_weights
 from .paper.prediction import point_noise_um
 from .particle_fit import FIRST_STEPS, MAX_STEPS, ParticleFits, fit_particles, linear_starts
 from .priors import Priors
@@ -41,6 +41,9 @@ MIN_WIDTH = 1e-3
 NOISE_BLOCKS = 4
 """The noise of campaigns of more blocks is estimated from the particles of so many, spread evenly over the campaign:
 fifty thousand points say enough about four numbers."""
+
+STUDENT_STEPS = 4
+"""How often weights of readings and noise are taken in turn, in each round: they settle in fewer than a dozen."""
 
 ROUNDS, MAX_ROUNDS = 2, 8
 """Noise, population and particles depend on each other a little: how often they are taken in turn, and how often at
@@ -149,7 +152,10 @@ class _Fitter:
 
     def __init__(self, tests: Tests, model: Model, blocks: Blocks, tell: Callable[[str], None]) -> None:
         self.tests, self.model, self.blocks, self.tell = tests, model, blocks, tell
-        self.count, self.own = count_of(tests), blocks.cut(tests)
+        if model.robust:
+            self.tests = replace(tests, reading_weight=jnp.asarray(np.ones(tests.mask.shape)))
+        self.count, self.own = count_of(tests), blocks.cut(self.tests)
+        self.weighted = self.tests, self.own
         self.flatness = tests.flatness
         self.varying = tuple(k for k, _ in model.scatter.varying)
 
@@ -160,9 +166,20 @@ class _Fitter:
         """All particles' summaries, this process's own filters, and the white noise of equal weight."""
         m, cut = self.model, self.blocks.cut
         kinds = m.zero_prior, m.scatter, m.correlation, m.along
-        found = self.blocks.each(summarise, cut(point), self.own, linear, cut(noise), *kinds)
+        found = self.blocks.each(summarise, cut(point), self.weighted[1], linear, cut(noise), *kinds)
         marginal, filters, white = (Parts(tuple(wave[k] for wave in found.waves)) for k in range(3))
         return self.blocks.whole(marginal), filters, self.blocks.whole(white)
+
+    def weigh(self, filters: Parts, linear: Parts, noise: Noise) -> None:
+        """Weights of the readings under Student noise, anew; `weighted` are the tests as inference takes them."""
+        blocks = self.blocks
+        squares = np.asarray(
+            blocks.whole(blocks.each(squared_innovations, self.weighted[1], filters, linear, blocks.cut(noise)))
+        )
+        weight, overstated = student_weights(squares, np.asarray(self.tests.mask))
+        self.tests = replace(self.tests, reading_weight=jnp.asarray(weight))
+        weighted = replace(self.tests, reading_weight=jnp.asarray(weight / overstated))
+        self.own, self.weighted = blocks.cut(self.tests), (weighted, blocks.cut(weighted))
 
     def estimated(self, point: Point, linear: Parts, start: Noise, *, uncertainty: bool) -> NoiseFit:
         """The noise, of very many particles from some of them."""
@@ -290,7 +307,7 @@ def fit_tests(
         start |= found.sites
         point = replace(point, theta=jnp.asarray(np.broadcast_to(found.theta, point.theta.shape)))
     free = None
-    turn = 0
+    turn, uncertainty = 0, True
     while True:
         linear = fitter.linear(point)
         last = turn >= (max(rounds, MAX_ROUNDS) if effects else rounds)
@@ -305,6 +322,10 @@ def fit_tests(
             uncertainty = effects or turn == rounds - 1
             noise = fitter.estimated(point, linear, noise.noise, uncertainty=uncertainty)
         marginal, filtered, white = fitter.summaries(point, linear, noise.noise)
+        for _ in range(STUDENT_STEPS if model.robust and not last and (turn or not effects) else 0):
+            fitter.weigh(filtered, linear, noise.noise)
+            noise = fitter.estimated(point, linear, noise.noise, uncertainty=uncertainty)
+            marginal, filtered, white = fitter.summaries(point, linear, noise.noise)
         if correlated and not last and (turn or not effects):
             old = np.asarray(noise.noise.scale)
             squares = np.asarray(marginal.gram)[:, -1, -1]
@@ -333,7 +354,9 @@ def fit_tests(
     filters = blocks.whole(filtered)
     residual = blocks.whole(Parts(tuple(wave.residual for wave in linear.waves)))
     marginal = target.marginal
-    return Fit(model, tests, individual, noise, filters, point, residual, marginal, free, covariance, converged)
+    return Fit(
+        model, fitter.weighted[0], individual, noise, filters, point, residual, marginal, free, covariance, converged
+    )
 
 
 def _of_effects(model: Model, names: tuple[str, ...]) -> np.ndarray:

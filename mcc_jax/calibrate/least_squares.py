@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import arguments
+from .._errors import InputError
 from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_tests
 from ..effects import Variant
 from .block_arrow import Parameters, Solution
@@ -78,6 +79,7 @@ class LeastSquares(Calibration):
         agreeing_starts: how many starts ended at the same optimum, of how many.
         seed, runtime_s: for the record; nothing here is random.
         findings: what a reader must know of the tests and of the plausibility of the answer.
+        notes: what else a reader must know.
     """
 
     campaign: Campaign
@@ -92,6 +94,7 @@ class LeastSquares(Calibration):
     seed: int
     runtime_s: float
     findings: tuple[Finding, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def variants(self) -> dict[str, Variant]:
@@ -137,7 +140,7 @@ class LeastSquares(Calibration):
         agree, count = self.agreeing_starts
         if agree < count:
             notes.append(f"{count - agree} of {count} starts ended at a worse optimum")
-        notes += self.selection.notes
+        notes += [*self.selection.notes, *self.notes]
         misfit = misfit_note(own_misfit(self.selection.tests, jnp.asarray(self.residual())))
         notes += [note for note in (misfit, noise_note(noise_share(self.fit))) if note is not None]
         dropped = sum(reason is not None for reason in self.selection.why_not)
@@ -371,8 +374,10 @@ def least_squares(
     tell, model, threshold_MPa = checked_settings(progress, model, threshold_MPa, block)
     seed = arguments.seed(seed)
     arguments.choice(loss, get_args(Loss), "loss")
+    if model.robust and loss != "linear":
+        raise InputError("robust noise and a robust loss exclude each other", remedy="Take one of them.")
     with numbers_in_reach(campaign):
-        chosen, _ = in_own_units(campaign, model)
+        chosen, own_units = in_own_units(campaign, model)
         selection, fit, _ = prepare(
             campaign, chosen, threshold_MPa, block=block, tell=tell, correlated=loss == "linear", rounds=1
         )
@@ -412,7 +417,8 @@ def least_squares(
         return least_squares(some, model, without_flagged=False, **settings).answer()
 
     findings = judged(campaign, calibration.answer(), outlying, again if without_flagged else None)
-    return replace(calibration, findings=findings, runtime_s=time.perf_counter() - started)
+    notes = () if own_units is None else (own_units,)
+    return replace(calibration, findings=findings, notes=notes, runtime_s=time.perf_counter() - started)
 
 
 def _further(model: Model) -> Any:

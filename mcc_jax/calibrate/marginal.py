@@ -298,9 +298,8 @@ def summarise(
     total = gram[:, place, place] + precision[:, 0]
     slopes = -gram[:, place, :place] / total[:, None]
     at = (gram[:, place, -1] + precision[:, 0] * away) / total
-    points = jnp.sum(tests.mask, 1).astype(away.dtype)
-    log_det = jax.vmap(lambda f: f.log_det)(filters)
-    log_scale = log_integral - 0.5 * log_det - 0.5 * points * float(np.log(2 * np.pi))
+    points, log_det = jax.vmap(lambda f: (f.points, f.log_det))(filters)
+    log_scale = log_integral - 0.5 * (log_det + float(np.log(2 * np.pi)) * jnp.sum(ones, 1))
     marginal = Marginal(
         point=point,
         gram=left,

@@ -23,7 +23,7 @@ from .data import Tests
 from .distributions import Amplitude, RecordNoise, SpreadCoordinate, nuisance_prior
 from .forward import Forms, Linear, Point, linearise
 from .marginal import Marginal
-from .noise import Along, Correlation, Noise, Whitening, whitening
+from .noise import FREEDOM, Along, Correlation, Noise, Whitening, whitening
 from .population import COEFFICIENTS, Population, Scatter, particles_at
 from .priors import NakagamiPrior, Priors
 
@@ -47,6 +47,7 @@ class Model:
         varying: mechanisms whose amplitude differs from particle to particle.
         correlation: how rough correlated residuals are.
         along: what they are correlated along, the path of force or time.
+        robust: white noise is Student's with 4 degrees of freedom, so that spikes count for little.
 
     Raises:
         InputError: for an unknown form (which may be given as its text), or what is no `Priors` and no effect.
@@ -61,6 +62,7 @@ class Model:
     varying: tuple[str, ...]
     correlation: Correlation
     along: Along
+    robust: bool
 
     def __init__(
         self,
@@ -73,6 +75,7 @@ class Model:
         varying: Any = (),
         correlation: Correlation | str = Correlation.EXPONENTIAL,
         along: Along | str = Along.LOAD,
+        robust: bool = False,
     ) -> None:
         if priors is not None:
             arguments.instance(priors, Priors, "priors", "Read them with mcc_jax.read_priors(file).")
@@ -95,6 +98,7 @@ class Model:
             "varying": differ,
             "correlation": arguments.member(correlation, Correlation, "correlation"),
             "along": arguments.member(along, Along, "along"),
+            "robust": arguments.flag(robust, "robust"),
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
@@ -138,6 +142,10 @@ class Model:
             deterministic("C", jnp.exp(own.latent[:, :3]) / eta[:, None])
             law = jax.vmap(self.forms.displacement)
             clean = law(own.latent, own.theta, tests.particle, tests.record)
+            if noise is not None and self.robust:
+                # Normal noise whose precision is gamma distributed from reading to reading is Student's.
+                gamma = dist.Gamma(FREEDOM / 2, FREEDOM / 2).expand([tests.force.shape[1]]).to_event(1)
+                tests = dataclasses.replace(tests, reading_weight=sample("reading_weight", gamma))
             if noise is not None:
                 filters = self._filters(noise, Point(own.latent, zero, own.theta), tests)
             observed = RecordNoise(clean + zero[:, None], filters, jnp.exp(population.log_noise))

@@ -15,6 +15,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -107,6 +108,7 @@ class Whitening(eqx.Module):
         peak: whitened change of every point with the error of its branch's peak, 0 on loading.
         branch: which branch a point belongs to.
         common: whitened change of every point with the error of the zero of force; None where no zero was measured.
+        weights: of the readings; None where all count alike.
     """
 
     solver: QuasisepSolver
@@ -114,6 +116,7 @@ class Whitening(eqx.Module):
     peak: Path
     branch: Int[Array, " steps"]
     common: Path | None = None
+    weights: Path | None = None
 
     def __call__(self, values: Float[Array, "steps columns"]) -> Float[Array, "steps columns"]:
         """Columns of values over the points, independent and of variance 1; they must be 0 where masked."""
@@ -153,10 +156,15 @@ class Whitening(eqx.Module):
 
     def log_density(self, away: Path, log_factor: Scalar) -> Scalar:
         """Log density of a test's residuals [um], 0 where masked, under the noise times a common factor."""
-        points = jnp.sum(self.mask).astype(away.dtype)
         squares = jnp.sum(self(away[:, None]) ** 2) + self.reading
-        constant = self.log_det + points * (2 * log_factor + float(np.log(2 * np.pi)))
+        count = jnp.sum(jnp.where(self.mask, float(np.log(2 * np.pi)), 0.0))
+        constant = self.log_det + 2 * self.points * log_factor + count
         return -0.5 * (jnp.exp(-2 * log_factor) * squares + constant)
+
+    @property
+    def points(self) -> Scalar:
+        """Number of readings that count, each with its weight: what a factor on all noise is known by."""
+        return jnp.sum(jnp.where(self.mask, 1.0 if self.weights is None else self.weights, 0.0))
 
     @property
     def reading(self) -> Scalar:
@@ -197,8 +205,7 @@ def whitening(
         linear: how its prediction moves with force, without that axis.
         correlation, along: of the correlated residuals.
     """
-    read_out = noise.displacement**2 + (noise.force * linear.by_force) ** 2
-    variance = jnp.where(tests.mask, scale**2 * read_out, MASKED_UM2)
+    variance = jnp.where(tests.mask, scale**2 * _read_out(noise, tests, linear), MASKED_UM2)
     place = tests.path if along is Along.LOAD else tests.record.time
     with standard_promotion():
         kernel = correlation.kernel(noise.length, scale * noise.correlated)
@@ -209,10 +216,52 @@ def whitening(
     if tests.force_zero_sd is not None:
         directions.append(tests.force_zero_sd * linear.by_offset)
     white = _triangular(solver, jnp.stack(directions, 1))
-    still = Whitening(solver, tests.mask, white[:, 0], tests.branch)
+    still = Whitening(solver, tests.mask, white[:, 0], tests.branch, None, tests.reading_weight)
     if tests.force_zero_sd is None:
         return still
-    return Whitening(solver, tests.mask, white[:, 0], tests.branch, still(jnp.stack(directions, 1))[:, 1])
+    return replace(still, common=still(jnp.stack(directions, 1))[:, 1])
+
+
+def _read_out(noise: Noise, tests: Tests, linear: Linear) -> Array:
+    variance = noise.displacement**2 + (noise.force * linear.by_force) ** 2
+    return variance if tests.reading_weight is None else variance / tests.reading_weight
+
+
+FREEDOM = 4.0
+"""Degrees of freedom of robust noise (Lange, Little and Taylor 1989): weights fall off from two deviations on."""
+
+
+@compiled
+def squared_innovations(
+    tests: Tests, filters: Whitening, linear: Linear, noise: Noise
+) -> Float[Array, "particles points"]:
+    """Squares of the residuals, each given those before it, in variances that they have at a weight of 1."""
+
+    def one(scale: Scalar, tests: Tests, filters: Whitening, linear: Linear) -> Array:
+        white = filters(linear.residual[:, None])[:, 0]
+        variance = filters.solver.factor.diag.d**2
+        weight = jnp.ones(()) if tests.reading_weight is None else tests.reading_weight
+        own = scale**2 * _read_out(noise, tests, linear)
+        return jnp.where(tests.mask, white**2 * variance / (variance + own * (weight - 1)), 0.0)
+
+    return jax.vmap(one)(noise.scale, tests, filters, linear)
+
+
+def student_weights(squares: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, float]:
+    r"""Weights :math:`(\nu + 1)/(\nu + z^2)` of readings under Student noise, and by how much they overstate them.
+
+    They are those of the EM algorithm. Taken for known they make the readings look more exact than they are, by the
+    ratio of Huber's sandwich variance of a mean to the weighted one.
+
+    Args:
+        squares: z^2, shape (N, points).
+        mask: which points count.
+    """
+    weight = np.where(mask, (FREEDOM + 1) / (FREEDOM + squares), 1.0)
+    z2, w = squares[mask], weight[mask]
+    slope = (FREEDOM + 1) * (FREEDOM - z2) / (FREEDOM + z2) ** 2
+    sandwich = np.mean(w**2 * z2) / np.maximum(np.mean(slope), 0.1) ** 2
+    return weight, float(max(sandwich * np.mean(w) / np.mean(w * z2), 1.0))
 
 
 def restricted_likelihood(

@@ -150,6 +150,9 @@ def fit_particles(
         columns = [linear.columns[..., :4], jnp.where(many.mask, 1.0, 0.0)[..., None]]
         columns += [linear.columns[..., 4 + k : 5 + k] for k in varying]
         r, J, away = linear.residual / scale, -jnp.concatenate(columns, -1) / scale[..., None], (y - middle) / width
+        if many.reading_weight is not None:
+            root = jnp.sqrt(many.reading_weight)
+            r, J = root * r, root[..., None] * J
         H = jnp.einsum("nkp,nkq->npq", J, J) + jnp.eye(size)[None] / width[..., None] ** 2
         g = jnp.einsum("nkp,nk->np", J, r) + away / width
         loss = 0.5 * (jnp.sum(r**2, 1) + jnp.sum(away**2, 1))

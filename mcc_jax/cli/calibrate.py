@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from collections.abc import Callable, Mapping
@@ -55,6 +56,7 @@ BELONGS = {
     "priors": ("least-squares", "bayes"),
     "modulus_scatter": ("least-squares", "bayes"),
     "shape_scatter": ("least-squares", "bayes"),
+    "robust": ("least-squares", "bayes"),
     "effects": ("least-squares", "bayes"),
     "varying": ("least-squares", "bayes"),
 }
@@ -90,6 +92,7 @@ def _applies(name: str, method: str) -> bool:
     help="Such an effect whose amplitude differs from particle to particle; repeatable.  [least-squares, bayes]",
 )
 @click.option("--shape-scatter", is_flag=True, help="Let a differ from particle to particle.  [least-squares, bayes]")
+@click.option("--robust", is_flag=True, help="Noise with heavy tails: spikes count for little.  [least-squares, bayes]")
 @click.option(
     "--mode",
     type=click.Choice(["fast", "joint"]),
@@ -185,6 +188,7 @@ def _calibrated(data: Campaign, method: str, options: dict[str, Any], tell: Tell
         return calibrate_paper(data, **chosen("objective", "reference", "unloading", "strain_scaling"))
     scatter = {name: options[name] for name in ("modulus_scatter", "shape_scatter")}
     model = joint_model(options, **scatter).with_effects(*options["effects"], varying=options["varying"])
+    model = dataclasses.replace(model, robust=options["robust"])
     if method == "bayes":
         return sample(data, model, **chosen("mode", "chains", "draws"))
     return least_squares(data, model, **chosen("loss"))
