@@ -17,7 +17,7 @@ hypothesis.settings.load_profile("repository")
 
 
 def pytest_configure(config):
-    """What is compiled is kept for later modules, notebooks and commands, until this run of pytest ends.
+    """What is compiled is kept for later modules, notebooks and commands, until this run ends, or in the folder given.
 
     All workers share one folder, which the first process makes. JAX locks a folder that is limited in size; otherwise
     one process might read half of what another is writing.
@@ -25,8 +25,10 @@ def pytest_configure(config):
     _keep_everything()
     if hasattr(config, "workerinput"):
         return  # set by what the environment says
-    folder = tempfile.mkdtemp(prefix="compiled-")
-    config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR")  # of several runs that share what they compile, as in CI
+    if folder is None:
+        folder = tempfile.mkdtemp(prefix="compiled-")
+        config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
     settings = {
         "jax_compilation_cache_dir": folder,
         "jax_compilation_cache_max_size": 8 * 2**30,

@@ -20,7 +20,7 @@ from .model import Model
 from .noise import Whitening, standard_promotion
 from .population import COEFFICIENTS, Population, flattened
 from .posterior import Posterior
-from .predict import A_CALIBRATION, laws_with, predict_measured, predicted_by
+from .predict import A_CALIBRATION, laws_with, predicted_at, predicted_by
 
 if TYPE_CHECKING:
     from xarray import DataTree
@@ -120,7 +120,7 @@ def to_arviz(calibration: Posterior, *, prior_count: int = 500, points: bool = F
         for name, values in log_priors(flat, c.model, c.fit.tests.flatness).items()
     }
     prior = prior_draws(c, prior_count, seed)
-    shown, predicted, before = _predictive(c, prior, seed)
+    shown, predicted, before = _predictive(c, prior, seed, thin if points else None)
     observed = np.where(mask, np.asarray(tests.displacement), np.nan)
     likelihood: dict[str, Any] = {"test": c.log_likelihood[:, thin]}
     along = ["particle", "point"]
@@ -196,22 +196,30 @@ def to_arviz(calibration: Posterior, *, prior_count: int = 500, points: bool = F
     return tree
 
 
-def _predictive(c: Posterior, prior: dict[str, np.ndarray], seed: int) -> tuple[int, np.ndarray, np.ndarray]:
-    """How many particles are shown, and draws of their displacements by posterior and prior; NaN where masked."""
+def _predictive(
+    c: Posterior, prior: dict[str, np.ndarray], seed: int, thin: slice | None
+) -> tuple[int, np.ndarray, np.ndarray]:
+    """How many particles are shown, and draws of their displacements by posterior and prior; NaN where masked.
+
+    Of the posterior either draws and particles enough for a picture, or, thinned, the draws that likelihoods stand for.
+    """
     mask = np.asarray(c.selection.tests.mask)
     chains, draws = np.asarray(c.population.a).shape
     points = mask.shape[1]
-    shown = max(1, min(len(mask), MAX_PREDICTIVE // (chains * PREDICTIVE_DRAWS * points)))
-    some = min(PREDICTIVE_DRAWS, draws)
-    predicted = np.full((chains, some, shown, points), np.nan, np.float32)
-    before = np.full((1, some, shown, points), np.nan, np.float32)
+    shown = len(mask)
+    if thin is None:
+        shown = max(1, min(shown, MAX_PREDICTIVE // (chains * PREDICTIVE_DRAWS * points)))
+        thin = slice(None, None, -(-draws // PREDICTIVE_DRAWS))
+    pick = np.arange(chains * draws).reshape(chains, draws)[:, thin]
+    predicted = np.full((*pick.shape, shown, points), np.nan, np.float32)
+    before = np.full((1, PREDICTIVE_DRAWS, shown, points), np.nan, np.float32)
     for row in range(shown):
-        curves = predict_measured(c, c.particles[row], count=chains * some, seed=seed + row)
+        curves = predicted_at(c, row, pick.ravel(), seed + row)
         assert curves.observed_um is not None
         length = curves.observed_um.shape[1]
-        shaped = curves.observed_um[: chains * some].reshape(chains, some, length)
+        shaped = curves.observed_um.reshape(*pick.shape, length)
         predicted[:, :, row, :length] = np.where(mask[row, :length], shaped, np.nan)
-        before[0, :, row] = np.where(mask[row], _prior_curves(c, prior, row, some, seed), np.nan)
+        before[0, :, row] = np.where(mask[row], _prior_curves(c, prior, row, PREDICTIVE_DRAWS, seed), np.nan)
     return shown, predicted, before
 
 

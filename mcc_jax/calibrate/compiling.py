@@ -1,8 +1,10 @@
-"""How the functions of the joint calibration are compiled."""
+"""How the functions of a calibration are compiled and run."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, cast
 
 import equinox as eqx
@@ -26,3 +28,9 @@ def even_batch(count: int, most: int) -> int:
     most = max(1, min(count, most))
     even = next(size for size in range(most, 0, -1) if count % size == 0)
     return even if 2 * even >= most else most
+
+
+def side_by_side[A, B](function: Callable[[A], B], arguments: Iterable[A]) -> list[B]:
+    """What a function returns for each of its arguments, on as many threads as there are cores."""
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return list(pool.map(function, arguments))

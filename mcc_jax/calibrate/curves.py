@@ -15,9 +15,10 @@ from ..effects import Record
 from ..geometry import Particle
 from ..law import MccLaw
 from .compiling import compiled
-from .data import MAX_POINTS, records_of, rows_from_contact
+from .data import records_of, rows_from_contact
 from .laws import Variants, laws_of
 from .population import COEFFICIENTS
+from .settings import SELECTION
 
 KINDS = ("load", "hold", "unload", "reload")
 
@@ -118,7 +119,7 @@ def _measured(
 
 
 def _rows(campaign: Campaign, i: int, segments: tuple[Segment, ...]) -> np.ndarray:
-    return rows_from_contact(campaign.curves[i], segments, MAX_POINTS)
+    return rows_from_contact(campaign.curves[i], segments, SELECTION.most_points)
 
 
 def _displacements(

@@ -30,15 +30,7 @@ from ..effects import Record
 from ..geometry import Particle
 from .paper.modulus import MIN_RATIO
 from .paper.prediction import READING_UM, point_noise_um
-
-MIN_POINTS = 12
-"""Fewer usable points than this cannot carry three coefficients, a zero and their noise."""
-
-MAX_POINTS = 400
-"""Longer records are thinned to about so many rows."""
-
-MIN_CLIMB = 8.0
-"""Displacement must grow over loading by this many times its noise, or there is no curve to fit."""
+from .settings import SELECTION
 
 
 class Tests(eqx.Module):
@@ -123,14 +115,9 @@ def longer(tree: Any, particles: int) -> Any:
     return jax.tree.map(one, tree)
 
 
-LENGTHS = (64, 128, 192, 320, 448)
-"""Numbers of points that records are padded to, and beyond them in steps of the last: campaigns of similar length
-share one compilation."""
-
-
 def padded_length(points: int) -> int:
     """The length that records of so many points are padded to."""
-    return next((length for length in LENGTHS if length >= points), points + -points % LENGTHS[-1])
+    return next((length for length in SELECTION.lengths if length >= points), points + -points % SELECTION.lengths[-1])
 
 
 @dataclass(frozen=True)
@@ -152,12 +139,15 @@ class Selection:
     notes: tuple[str, ...]
 
 
-def select_tests(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_points: int = MAX_POINTS) -> Tests:
+MOST = SELECTION.most_points
+
+
+def select_tests(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_points: int = MOST) -> Tests:
     """The tests as a `Model` takes them: points and particles chosen, padded to rectangular arrays; see `select`."""
     return select(campaign, threshold_MPa=threshold_MPa, most_points=most_points).tests
 
 
-def select(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_points: int = MAX_POINTS) -> Selection:
+def select(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_points: int = MOST) -> Selection:
     """Choose what the joint calibration uses.
 
     Points count from the threshold stress on, below which surface asperities and not the particle deform. On unloading
@@ -308,11 +298,6 @@ class _Prepared:
     unloading_hidden: bool
 
 
-TURNS_SHARE = 4
-"""Of records with more segments than one for so many rows that are kept, hundreds of cycles, whole cycles are left out:
-turning points that are always kept would be most of what is left."""
-
-
 def rows_from_contact(curve: Curve, segments: tuple[Segment, ...], most_points: int) -> np.ndarray:
     """Rows of a test behind its approach; of longer records every n-th, turning points and the largest force always.
 
@@ -325,12 +310,12 @@ def rows_from_contact(curve: Curve, segments: tuple[Segment, ...], most_points: 
     if len(rows) <= most_points:
         return rows
     turns = [int(np.argmax(curve.force_mN))]
-    if len(segments) <= most_points // TURNS_SHARE:
+    if len(segments) <= most_points // SELECTION.turns_share:
         turns += [part.start for part in segments] + [part.stop - 1 for part in segments]
         thinned = [rows[:: -(-len(rows) // most_points)]]
     else:
         elastic = [k for k, part in enumerate(segments) if part.kind in ("hold", "unload", "reload")]
-        some = [segments[k] for k in elastic[:: -(-len(elastic) // (most_points // TURNS_SHARE))]]
+        some = [segments[k] for k in elastic[:: -(-len(elastic) // (most_points // SELECTION.turns_share))]]
         turns += [part.start for part in some] + [part.stop - 1 for part in some]
         force = np.asarray(curve.force_mN)
         # The largest force before each, from which the law unloads.
@@ -371,13 +356,13 @@ def _prepare(
     hidden &= not (mask & ~loading).any()
     if stress.max() <= threshold:
         return below_threshold(float(stress.max()), threshold)
-    if loading.sum() < MIN_POINTS:
-        return too_few(int(loading.sum()), MIN_POINTS)
+    if loading.sum() < SELECTION.least_points:
+        return too_few(int(loading.sum()), SELECTION.least_points)
     climb = curve.displacement_um[rows[loading]]
     third = max(len(climb) // 3, 1)
     rise, noise = climb[-third:].mean() - climb[:third].mean(), max(point_noise_um(curve), READING_UM)
-    if rise <= MIN_CLIMB * noise / np.sqrt(third):
-        return no_climb(float(rise) if rise >= 0 or -rise > MIN_CLIMB * noise / np.sqrt(third) else 0.0)
+    if rise <= SELECTION.climb * noise / np.sqrt(third):
+        return no_climb(float(rise) if rise >= 0 or -rise > SELECTION.climb * noise / np.sqrt(third) else 0.0)
     contact = float(curve.displacement_um[0]) if contact is None else contact
     largest, reach = float(stress[rows][mask].max()), float(np.ptp(strain[rows][mask]))
     return _Prepared(rows, mask, loading, contact, largest, reach, hidden)

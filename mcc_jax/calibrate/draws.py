@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,21 +12,15 @@ import numpy as np
 from jaxtyping import Array
 
 from .compiling import compiled
-from .conditional import Drawer, chunk_of, corrected, every, stride_of, weighted
 from .effects import effect_numbers
 from .fit_result import Fit
-from .importance import sample_weighted
-from .mode import LogPosterior, density_of, populations
+from .importance import diagnostics, sample_weighted
+from .mode import LogPosterior, density_of
 from .noise import standard_promotion
-from .nuts import Chains, Length, by_chains, sample_density
+from .particles import Drawer, ExactLikelihood, Length, chunk_of, corrected, every, stride_of, weighted
 from .population import COEFFICIENTS, Population
-from .reweighting import PROBES
-from .sampling import ExactLikelihood
+from .settings import SAMPLING
 from .sharding import count_of
-from .weights import diagnostics
-
-ACCEPT = (0.8, 0.95, 0.99)
-"""Acceptance that the sampler aims at: after divergences once more, and once more, with smaller steps."""
 
 
 @dataclass(frozen=True)
@@ -89,19 +83,21 @@ def draw_fast(key: Array, fit: Fit, length: Length, block: int, *, patient: bool
         block: particles of a block, as they were fitted; 0 for a single one.
         patient: see above.
     """
-    count, target, exact = count_of(fit.tests), fit.target, exact_likelihood(fit)
+    count, exact = count_of(fit.tests), exact_likelihood(fit)
     population_key, particle_key, check_key, pick_key = jax.random.split(key, 4)
     few = stride_of(count, length.total) == 1
-    run, population, good, (integral, error) = _sampled(population_key, fit, target, length, not few, patient)
+    run, good, (integral, error) = _sampled(population_key, fit, length, not few, patient)
+    population = run.population
     names, stacked = _stack(population, fit, length)
     flat = stacked.reshape(length.total, -1)
     if few:
         found = weighted(Drawer(exact, block, chunk_of(length.total)), population, length, check_key, pick_key)
     else:
         keys = check_key, pick_key, particle_key
-        found = corrected(Drawer(exact, block, PROBES), population, flat, length, *keys)
+        found = corrected(Drawer(exact, block, SAMPLING.probes), population, flat, length, *keys)
     stacked, population = flat[found.chosen].reshape(stacked.shape), every(population, found.chosen)
-    drawn = _collected(run, population, names, stacked, found.particles[:4], fit, length, found.keep)
+    run = run._replace(population=population)
+    drawn = _collected(run, names, stacked, found.particles[:4], fit, length, found.keep)
     k_joint = found.k_joint if good else np.inf
     value = integral + found.log_ratio[0] + float(fit.noise.log_evidence)
     evidence = value, float(np.hypot(error, found.log_ratio[1]))
@@ -109,83 +105,85 @@ def draw_fast(key: Array, fit: Fit, length: Length, block: int, *, patient: bool
     return replace(drawn, **checked, log_evidence=evidence, notes=found.notes)
 
 
-def _sampled(
-    key: Array, fit: Fit, target: LogPosterior, length: Length, many: bool, patient: bool
-) -> tuple[Chains, Population, bool, tuple[float, float]]:
-    """Draws of the population: independent ones, weighted, if the weights are good enough, else the sampler's.
+class Run(NamedTuple):
+    """Draws of the population, all chains in a row, and how the sampler ran.
 
-    And whether they are good (without patience the sampler does not run), and the log of the density's integral with
-    its standard error, by Laplace's method where the sampler drew.
+    Attributes:
+        population: the draws.
+        divergences: number of divergent trajectories.
+        leapfrogs: mean number of leapfrog steps of a draw; 0 of independent draws.
     """
+
+    population: Population
+    divergences: int = 0
+    leapfrogs: float = 0.0
+
+
+def _sampled(key: Array, fit: Fit, length: Length, many: bool, patient: bool) -> tuple[Run, bool, tuple[float, float]]:
+    """Draws of the population: independent ones, weighted, if the weights are good enough, else NUTS's.
+
+    And whether they are good (without patience NUTS does not run), and the log of the density's integral with its
+    standard error, by Laplace's method where NUTS drew.
+    """
+    target = fit.target
     shape: dict[str, Any] = {"chains": length.chains, "draws": length.draws, "many": many}
     found = sample_weighted(key, fit.mode, fit.covariance, target, **shape)
     if found is not None:
-        return found.run, found.population, True, (found.log_evidence, found.error)
+        return Run(found.population), True, (found.log_evidence, found.error)
     volume = 0.5 * np.linalg.slogdet(2 * np.pi * np.asarray(fit.covariance))[1] + len(target.signed()) * np.log(2)
     laplace = float(density_of(fit.mode, target)) + float(volume), np.inf
     if not patient:
         bad = sample_weighted(key, fit.mode, fit.covariance, target, **shape, however_bad=True)
         assert bad is not None
-        return bad.run, bad.population, False, laplace
-    run = _patient(lambda aim: by_chains(sample_density, key, length, fit.mode, fit.covariance, target, aim))
-    return run, jax.tree.map(np.asarray, populations(jnp.asarray(_rows(run)), target)), True, laplace
+        return Run(bad.population), False, laplace
+    return _nuts(key, fit, length, max_tree_depth=SAMPLING.tree_depth)[0], True, laplace
 
 
-def _rows(run: Chains) -> np.ndarray:
-    return np.asarray(run.position).reshape(-1, run.position.shape[-1])
-
-
-def _patient(run: Callable[[Array], Chains]) -> Chains:
-    """What the sampler finds; where any trajectory diverged it runs again, with smaller steps."""
-    # From arrays, not from Python numbers: another number would be compiled anew.
-    first, *smaller = (jnp.asarray(np.asarray(accept)) for accept in ACCEPT)
-    found = run(first)
-    for accept in smaller:
-        if not np.any(np.asarray(found.divergent)):
-            break
-        found = run(accept)
-    return found
-
-
-def draw_joint(key: Array, fit: Fit, length: Length) -> Draws:
-    """Population and particles sampled together by NumPyro's NUTS under the exact likelihood (`Fit.nuts`)."""
+def _nuts(key: Array, fit: Fit, length: Length, *, explicit: bool = False, **settings: Any) -> tuple[Run, Any]:
+    """NumPyro's NUTS on the model of a fit, and every particle's own numbers where they are explicit."""
     from numpyro.infer import MCMC
 
     with standard_promotion():
         mcmc = MCMC(
-            fit.nuts(explicit=True),
+            fit.nuts(explicit=explicit, **settings),
             num_warmup=length.warmup,
             num_samples=length.draws,
             num_chains=length.chains,
-            chain_method="sequential",
+            chain_method="vectorized",
             progress_bar=False,
         )
-        mcmc.run(key, fit.tests, extra_fields=("diverging", "num_steps"))
-        samples, extra = mcmc.get_samples(), mcmc.get_extra_fields(group_by_chain=True)
-    sites = {name: jnp.asarray(samples[name]) for name in (*fit.names, "own")}
-    population, drawn = _explicit(sites, fit.target)
-    population, particles = jax.tree.map(np.asarray, (population, drawn))
-    still = jnp.zeros((length.chains, length.draws, 1))
-    run = Chains(still, extra["diverging"], extra["num_steps"], jnp.zeros(length.chains))
-    names, stacked = _stack(population, fit, length)
-    return _collected(run, population, names, stacked, particles, fit, length)
+        told = (fit.tests,) if explicit else (fit.tests, fit.marginal)
+        mcmc.run(key, *told, extra_fields=("diverging", "num_steps"))
+        samples, extra = mcmc.get_samples(), mcmc.get_extra_fields()
+    names = (*fit.names, "own") if explicit else fit.names
+    population, particles = _at_sites({name: jnp.asarray(samples[name]) for name in names}, fit.target)
+    population, particles = jax.tree.map(np.asarray, (population, particles))
+    return Run(population, int(np.sum(extra["diverging"])), float(np.mean(extra["num_steps"]))), particles
 
 
 @compiled
-def _explicit(sites: dict[str, Array], target: LogPosterior) -> tuple[Population, tuple[Array, ...]]:
-    """Populations and particles at draws of the explicit model's sites."""
+def _at_sites(sites: dict[str, Array], target: LogPosterior) -> tuple[Population, tuple[Array, ...] | None]:
+    """Populations, and particles where they are explicit, at draws of the model's sites."""
 
-    def one(values: dict[str, Array]) -> tuple[Population, tuple[Array, ...]]:
-        population, own = target.at_values(values), values["own"]
+    def one(values: dict[str, Array]) -> tuple[Population, tuple[Array, ...] | None]:
+        population, own = target.at_values(values), values.get("own")
+        if own is None:
+            return population, None
         drawn = target.marginal.draw(population, own[:, :-1], own[:, -1])
         return population, (drawn.latent, drawn.theta, drawn.zero, drawn.log_likelihood)
 
     return jax.lax.map(one, sites)
 
 
+def draw_joint(key: Array, fit: Fit, length: Length) -> Draws:
+    """Population and particles sampled together by NumPyro's NUTS under the exact likelihood (`Fit.nuts`)."""
+    run, particles = _nuts(key, fit, length, explicit=True)
+    names, stacked = _stack(run.population, fit, length)
+    return _collected(run, names, stacked, particles, fit, length)
+
+
 def _collected(
-    run: Chains,
-    population: Population,
+    run: Run,
     names: list[str],
     stacked: np.ndarray,
     particles: Any,
@@ -198,7 +196,7 @@ def _collected(
     def shaped(x: Any) -> np.ndarray:
         return np.asarray(x).reshape(length.chains, length.draws, *x.shape[1:])[:, ::keep]
 
-    population = jax.tree.map(shaped, population)
+    population = jax.tree.map(shaped, run.population)
     rhat, bulk, tail = diagnostics(names, stacked)
     count = count_of(fit.tests)
     latent, theta, zero, likelihood = (np.asarray(v) for v in particles)
@@ -218,11 +216,11 @@ def _collected(
         pareto_k=np.zeros(count),
         pareto_k_joint=None,
         weights_applied=False,
-        divergences=int(np.sum(np.asarray(run.divergent))),
+        divergences=run.divergences,
         rhat=rhat,
         ess_bulk=bulk,
         ess_tail=tail,
-        leapfrogs=float(np.mean(np.asarray(run.steps))),
+        leapfrogs=run.leapfrogs,
     )
 
 

@@ -8,13 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..campaign import Curve
-
-BAD_MISFIT = 0.05
-"""Share of the range of displacement; with the law's own data and a tester's noise it stays below 0.01."""
-
-
-BAD_NOISE_SHARE = 0.5
-"""Share of the residual's variance that correlated noise may hold: at half it is as large as read-out noise."""
+from .settings import JUDGEMENT
 
 NO_SAMPLER: dict[str, None] = dict.fromkeys(("rhat_max", "ess_bulk_min", "divergences", "pareto_k_max"))
 """Diagnostics of methods that draw nothing."""
@@ -22,7 +16,7 @@ NO_SAMPLER: dict[str, None] = dict.fromkeys(("rhat_max", "ess_bulk_min", "diverg
 
 def misfit_note(own_misfit: float) -> str | None:
     """A sentence if the law describes the tests badly even with each particle's own coefficients, else None."""
-    if not own_misfit > BAD_MISFIT:
+    if not own_misfit > JUDGEMENT.misfit:
         return None
     return (
         "even with its own C1, C3, C5 the law misses a test's displacements by "
@@ -33,7 +27,7 @@ def misfit_note(own_misfit: float) -> str | None:
 
 def noise_note(share: float) -> str | None:
     """A sentence if correlated noise has taken up what the law misses, else None."""
-    if not share > BAD_NOISE_SHARE:
+    if not share > JUDGEMENT.noise_share:
         return None
     return (
         f"{100 * share:.0f} % of the scatter that is left is correlated along a test: more likely something that the "

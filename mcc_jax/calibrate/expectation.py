@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from .compiling import compiled
 from .marginal import straighten
 from .mode import LogPosterior
+from .settings import FIT
 
 
 class Expected(eqx.Module):
@@ -64,10 +65,6 @@ def expect(free: Float[Array, " d"], target: LogPosterior) -> Expected:
     )
 
 
-SHARP = 0.03
-"""Posterior standard deviation of the logarithm of a polynomial's coefficient below which one Newton step is enough."""
-
-
 def careful_enough(free: Float[Array, " d"], target: LogPosterior, count: int) -> LogPosterior:
     """The target with as many Newton steps as the integration over the particles needs: none if every coefficient is
     known sharply.
@@ -82,4 +79,4 @@ def careful_enough(free: Float[Array, " d"], target: LogPosterior, count: int) -
     at = expect(free, sharp)
     variance = np.diagonal(np.linalg.inv(np.asarray(at.hessian)[:count]), axis1=1, axis2=2)
     widest = float(np.max(np.sqrt(variance) * np.asarray(at.stretch)))
-    return sharp if widest < SHARP else target
+    return sharp if widest < FIT.sharp else target

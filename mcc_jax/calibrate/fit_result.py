@@ -24,6 +24,7 @@ from .model import Model
 from .noise import NoiseFit, Whitening
 from .particle_fit import ParticleFits
 from .population import Population
+from .settings import SAMPLING
 
 
 class Fit(eqx.Module):
@@ -70,7 +71,7 @@ class Fit(eqx.Module):
         return population_of(self.mode, self.target)
 
     def nuts(self, *, explicit: bool = False, **settings: Any) -> Any:
-        """NumPyro's NUTS for the model, from the mode on, with the covariance as mass matrix.
+        """NumPyro's NUTS for the model, from the mode on, in coordinates in which the covariance there is the identity.
 
         Run it with `MCMC(fit.nuts(), ...).run(key, tests, fit.marginal)`: every particle is integrated out. Explicit,
         every particle's own numbers are sampled under the exact likelihood, in the coordinates of this fit, in which
@@ -85,8 +86,9 @@ class Fit(eqx.Module):
         arguments.flag(explicit, "explicit")
         size = len(self.names) + explicit * len(self.tests) * (self.marginal.scatter.size + 1)
         start = init_to_value(values={"coordinates": jnp.zeros(size)})
-        options = {"dense_mass": size < MAX_DENSE, "target_accept_prob": 0.9 if explicit else 0.8, **settings}
-        return NUTS(FitCoordinates(self, size), init_strategy=start, **options)
+        return NUTS(
+            FitCoordinates(self, size), **{"target_accept_prob": SAMPLING.accept, **settings}, init_strategy=start
+        )
 
     def first(self, count: int) -> Fit:
         """The same of the first `count` particles: without copies that only fill up."""
@@ -106,10 +108,6 @@ class Fit(eqx.Module):
             residual=self.residual[:count],
             marginal=marginal,
         )
-
-
-MAX_DENSE = 60
-"""Numbers up to which NUTS adapts a whole mass matrix: more it cannot learn from a few hundred steps."""
 
 
 class FitCoordinates:

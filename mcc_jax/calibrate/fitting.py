@@ -26,31 +26,11 @@ from .mode import LogPosterior, most_probable
 from .model import Model, check_prior_of_a
 from .noise import Noise, NoiseFit, estimate_noise, particle_scales, squared_innovations, student_weights
 from .paper.prediction import point_noise_um
-from .particle_fit import FIRST_STEPS, MAX_STEPS, ParticleFits, fit_particles, linear_starts
+from .particle_fit import ParticleFits, fit_particles, linear_starts
 from .priors import Priors
+from .settings import FIT
 from .sharding import Blocks, Parts, block_size, count_of, filled_up, require_same
 from .starts import start_of_effects
-
-WIDE = 1.5
-"""Standard deviation of the logarithms that a particle by itself is allowed, around the prior's centre: no more than
-what keeps a coefficient finite about which its curve says nothing."""
-
-MIN_WIDTH = 1e-3
-"""Least such standard deviation under the population: any smaller and the problem is badly scaled."""
-
-NOISE_BLOCKS = 4
-"""The noise of campaigns of more blocks is estimated from the particles of so many, spread evenly over the campaign:
-fifty thousand points say enough about four numbers."""
-
-STUDENT_STEPS = 4
-"""How often weights of readings and noise are taken in turn, in each round: they settle in fewer than a dozen."""
-
-ROUNDS, MAX_ROUNDS = 2, 8
-"""Noise, population and particles depend on each other a little: how often they are taken in turn, and how often at
-most where effects have to be linearised anew."""
-
-STILL = 0.1
-"""An effect is linearised anew until none of its numbers moves by more than this share of its standard deviation."""
 
 
 @compiled
@@ -185,8 +165,8 @@ class _Fitter:
         """The noise, of very many particles from some of them."""
         self.tell("estimating the noise")
         m, blocks, own = self.model, self.blocks, self.own
-        if blocks.number > NOISE_BLOCKS:
-            rows = np.linspace(0, self.count - 1, NOISE_BLOCKS * blocks.size).astype(int)
+        if blocks.number > FIT.noise_blocks:
+            rows = np.linspace(0, self.count - 1, FIT.noise_blocks * blocks.size).astype(int)
             blocks = Blocks(len(rows), blocks.size)
             own = blocks.cut(_rows(self.tests, rows))
             linear = blocks.each(linear_data, blocks.cut(_rows(point, rows)), own, m.forms)
@@ -215,15 +195,15 @@ class _Fitter:
             return blocks.whole(blocks.each(fit_particles, own, *cut, starts, self.model.forms, self.varying, steps))
 
         if self.blocks.whole_here:
-            return fit(self.blocks, self.own, arrays, starts, MAX_STEPS)
-        found = fit(self.blocks, self.own, arrays, starts, FIRST_STEPS)
+            return fit(self.blocks, self.own, arrays, starts, FIT.steps)
+        found = fit(self.blocks, self.own, arrays, starts, FIT.first_steps)
         late = np.flatnonzero(~np.asarray(found.settled))
         if not len(late):
             return found
         rows = np.pad(late, (0, -len(late) % self.blocks.size), mode="edge")
         few = Blocks(len(rows), self.blocks.size)
         ends = few.cut(np.moveaxis(np.asarray(found.ends)[rows], 1, 0), axis=1)
-        again = fit(few, few.cut(_rows(self.tests, rows)), _rows(arrays, rows), ends, MAX_STEPS)
+        again = fit(few, few.cut(_rows(self.tests, rows)), _rows(arrays, rows), ends, FIT.steps)
         return jax.tree.map(lambda x, y: x.at[late].set(y[: len(late)]), found, again)
 
     def alone(self, white: np.ndarray) -> ParticleFits:
@@ -232,7 +212,7 @@ class _Fitter:
         middle = np.append(_centre(priors), 0.0)
         centre = np.broadcast_to(middle, (N, 5)).copy()
         centre[:, 4] = np.asarray(self.tests.contact) + priors.zero_um.mean
-        width = np.broadcast_to(np.array([WIDE] * 4 + [priors.zero_um.sd]), (N, 5))
+        width = np.broadcast_to(np.array([FIT.alone] * 4 + [priors.zero_um.sd]), (N, 5))
         starts = self.blocks.each(linear_starts, self.own, jnp.asarray(middle[3]), axis=1)
         if self.varying:
             centre, width = (np.pad(x, ((0, 0), (0, len(self.varying)))) for x in (centre, width))
@@ -245,7 +225,7 @@ class _Fitter:
     def together(self, white: Array, before: Point, target: LogPosterior, free: Float[Array, " d"]) -> Point:
         """Every particle under the population, from where it was and where the summaries expect it."""
         expected = expect(free, target)
-        width = np.maximum(np.asarray(expected.sd), MIN_WIDTH)
+        width = np.maximum(np.asarray(expected.sd), FIT.narrowest)
         varying = list(self.varying)
         own = np.asarray(expected.theta)[:, varying]
         zero_mean = np.asarray(self.tests.contact) + self.model.chosen_priors.zero_um.mean
@@ -271,7 +251,7 @@ def fit_tests(
     read_out_um: float,
     *,
     correlated: bool = True,
-    rounds: int = ROUNDS,
+    rounds: int = FIT.rounds,
     block: int = 0,
     tell: Callable[[str], None] = lambda _: None,
 ) -> Fit:
@@ -310,7 +290,7 @@ def fit_tests(
     turn, uncertainty = 0, True
     while True:
         linear = fitter.linear(point)
-        last = turn >= (max(rounds, MAX_ROUNDS) if effects else rounds)
+        last = turn >= (max(rounds, FIT.most_rounds) if effects else rounds)
         if not correlated:
             residual = np.asarray(blocks.whole(Parts(tuple(wave.residual for wave in linear.waves))))[:count]
             width = 1.4826 * np.median(np.abs(residual[np.asarray(tests.mask)[:count]]))
@@ -322,7 +302,7 @@ def fit_tests(
             uncertainty = effects or turn == rounds - 1
             noise = fitter.estimated(point, linear, noise.noise, uncertainty=uncertainty)
         marginal, filtered, white = fitter.summaries(point, linear, noise.noise)
-        for _ in range(STUDENT_STEPS if model.robust and not last and (turn or not effects) else 0):
+        for _ in range(FIT.student_steps if model.robust and not last and (turn or not effects) else 0):
             fitter.weigh(filtered, linear, noise.noise)
             noise = fitter.estimated(point, linear, noise.noise, uncertainty=uncertainty)
             marginal, filtered, white = fitter.summaries(point, linear, noise.noise)
@@ -343,7 +323,7 @@ def fit_tests(
         free, covariance, mode_converged = most_probable(free, target)
         sd = np.sqrt(np.maximum(np.diagonal(np.asarray(covariance)), 1e-300))
         moved = np.abs(np.asarray(free) - before) / sd
-        at_rest = turn >= rounds and (not effects or bool(np.all(moved[_of_effects(model, target.names)] < STILL)))
+        at_rest = turn >= rounds and (not effects or bool(np.all(moved[_of_effects(model, target.names)] < FIT.still)))
         if last or at_rest:
             break
         turn += 1

@@ -22,6 +22,7 @@ from .marginal import Marginal
 from .model import Model
 from .noise import standard_promotion
 from .population import COEFFICIENTS, Population
+from .settings import FIT
 
 handlers: Any = numpyro.handlers
 
@@ -155,15 +156,6 @@ def populations(free: Float[Array, "draws d"], target: LogPosterior) -> Populati
     return jax.vmap(target.population)(free)
 
 
-ROWS = 250
-"""Most coordinates that gradients are asked for in one go."""
-
-LEFT_TO_GAIN = 1e-6
-"""Twice the log probability still to gain, by Newton's method, at which a mode is reached."""
-
-ATTEMPTS = 4
-
-
 @compiled
 def _gradients(
     free: Float[Array, "rows d"], count: Int[Array, ""], target: LogPosterior
@@ -177,11 +169,11 @@ def _gradients(
 
 
 def gradients(free: np.ndarray, target: LogPosterior) -> tuple[np.ndarray, np.ndarray]:
-    """Minus the log density at up to `ROWS` coordinates, shape (many, d), and its gradients.
+    """Minus the log density at up to `FIT.gradients` coordinates, shape (many, d), and its gradients.
 
-    Always compiled for `ROWS`, so that few and many of them share their compilation.
+    Always compiled for as many, so that few and many of them share their compilation.
     """
-    rows = jnp.asarray(np.pad(free, ((0, ROWS - len(free)), (0, 0)), mode="edge"))
+    rows = jnp.asarray(np.pad(free, ((0, FIT.gradients - len(free)), (0, 0)), mode="edge"))
     value, slope = _gradients(rows, jnp.asarray(np.asarray(len(free))), target)
     return np.asarray(value)[: len(free)], np.asarray(slope)[: len(free)]
 
@@ -215,7 +207,7 @@ def _most_probable(origin: np.ndarray, target: LogPosterior) -> tuple[Float[Arra
     success = False
     if not all(np.isfinite(part).all() for part in expand(origin)):
         return jnp.asarray(origin), jnp.asarray(np.full((d, d), np.nan)), False
-    for _ in range(ATTEMPTS):
+    for _ in range(FIT.attempts):
         unit = 1 / np.sqrt(np.maximum(np.abs(np.diagonal(expand(origin)[2])), 1e-8))
         width = 1e-3 * np.minimum(unit, 1.0)
         found = _newton(expand, origin, unit)
@@ -231,7 +223,7 @@ def _most_probable(origin: np.ndarray, target: LogPosterior) -> tuple[Float[Arra
     values = np.where(values > 1e-7, values, 0.01)
     covariance = (vectors / values) @ vectors.T * scale * scale[:, None]
     # Rounding may keep the optimiser from its tolerance at the very mode: what counts is what is left to gain.
-    there = convex and float(slope @ covariance @ slope) < LEFT_TO_GAIN
+    there = convex and float(slope @ covariance @ slope) < FIT.mode_gain
     return jnp.asarray(origin), jnp.asarray(covariance), success or there
 
 

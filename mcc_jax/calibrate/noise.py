@@ -32,6 +32,7 @@ from .data import Tests
 from .forward import Linear
 from .paper.prediction import READING_UM
 from .priors import NoisePrior
+from .settings import FIT
 from .sharding import Blocks, Parts
 from .small_matrices import eliminate
 
@@ -386,10 +387,6 @@ def estimate_noise(
     return NoiseFit(noise, covariance, jnp.asarray(volume), bool(found.success))
 
 
-OUTLYING = 5.0
-"""A particle whose noise differs by this many standard deviations keeps its own scale whatever the others do."""
-
-
 def particle_scales(scale: np.ndarray, squares: np.ndarray, freedom: np.ndarray) -> np.ndarray:
     """Every particle's scale from its whitened sum of squares, pulled towards 1 unless they scatter beyond chance.
 
@@ -407,5 +404,5 @@ def particle_scales(scale: np.ndarray, squares: np.ndarray, freedom: np.ndarray)
     # Up to twice the uncertainty of this estimate itself, all particles share one scale, but for outliers.
     if scatter <= 2 * np.median(chance) * np.sqrt(2 / len(log_scale)):
         scatter = 0.0
-    outlier = np.abs(away) > OUTLYING * np.sqrt(scatter + chance)
+    outlier = np.abs(away) > FIT.outlying * np.sqrt(scatter + chance)
     return np.exp(np.where(outlier, away, scatter / (scatter + chance) * away))

@@ -12,23 +12,8 @@ from ..geometry import Particle
 from .compiling import compiled
 from .data import Tests
 from .forward import Forms, Point, linearise, snap
+from .settings import FIT
 from .small_matrices import Cholesky
-
-SHIFTS = 21
-SPREAD = 0.04
-"""Zeros tried lie within this share of the effective diameter around the recorded contact."""
-
-VARIATIONS = ((0.0, 0.0, 0.0), (0.05, -0.1, 0.03), (-0.05, 0.06, -0.02))
-"""What is added to the linear start's b1, b3, b5 for further starts."""
-
-MAX_STEPS, FIRST_STEPS = 200, 10
-"""Most steps of a fit, and how many all particles of many blocks take before the late ones go on by themselves."""
-
-FAR = 4.0
-"""How many times the least sum of squares a fit without an unseen snap-through may leave, to be preferred."""
-
-LEFT_TO_GAIN = 1e-6
-"""Log probability still to gain at which a fit is finished, where residuals are as large as the noise."""
 
 
 class ParticleFits(eqx.Module):
@@ -88,7 +73,7 @@ def linear_start(
         deviation = (K[0] * x - K[1] * x**3 + K[2] * x**5 - stress) / slope(K)
         return jnp.where(possible, jnp.sum(used * deviation**2), jnp.inf), K
 
-    shifts = jnp.linspace(-SPREAD, SPREAD, SHIFTS)
+    shifts = jnp.linspace(-FIT.zero_reach, FIT.zero_reach, FIT.zeros)
     losses, coefficients = jax.vmap(at)(shifts)
     best = jnp.argmin(losses)
     K = jnp.where(jnp.isfinite(losses[best]), coefficients[best], jnp.array([6.0, 27.0, 144.0]))
@@ -101,7 +86,7 @@ def linear_starts(tests: Tests, log_modulus: Scalar) -> Float[Array, "starts par
     assert tests.displacement is not None
     b, zero = jax.vmap(linear_start)(tests.particle, tests.force, tests.displacement, tests.loading, tests.contact)
     first = jnp.concatenate([b, jnp.full((len(tests), 1), log_modulus), zero[:, None]], 1)
-    return first[None] + jnp.pad(jnp.asarray(VARIATIONS), ((0, 0), (0, 2)))[:, None]
+    return first[None] + jnp.pad(jnp.asarray(FIT.variations), ((0, 0), (0, 2)))[:, None]
 
 
 @compiled
@@ -114,7 +99,7 @@ def fit_particles(
     starts: Float[Array, "starts particles p"],
     forms: Forms,
     varying: tuple[int, ...] = (),
-    most_steps: int | Int[Array, ""] = MAX_STEPS,
+    most_steps: int | Int[Array, ""] = FIT.steps,
 ) -> ParticleFits:
     """Fit every particle by itself, its modulus included, from several starts.
 
@@ -170,7 +155,7 @@ def fit_particles(
         # What a step would still gain, in units of the scatter that there is: where the law does not describe the
         # curve, that is many times the noise.
         scatter = 1 + 2 * jnp.where(jnp.isfinite(loss), loss, 0.0) / points
-        done = (jnp.abs(jnp.einsum("np,np->n", move, g)) < LEFT_TO_GAIN * scatter) | (damping > 1e8)
+        done = (jnp.abs(jnp.einsum("np,np->n", move, g)) < FIT.gain * scatter) | (damping > 1e8)
 
         def choose(new, old):
             return jnp.where(better.reshape(-1, *[1] * (old.ndim - 1)), new, old)
@@ -192,7 +177,7 @@ def fit_particles(
     unseen = jax.vmap(snap)(y.reshape(-1, size)[:, :4], many.particle) < jnp.log(first)
     seen = jnp.where(unseen.reshape(loss.shape), jnp.inf, loss)
     # Unless nothing else comes near the data: then the particle has snapped through before anybody looked.
-    near = jnp.min(seen, axis=0) < FAR * jnp.min(loss, axis=0) + FAR
+    near = jnp.min(seen, axis=0) < FIT.unseen * jnp.min(loss, axis=0) + FIT.unseen
     best = jnp.argmin(jnp.where(near[None], seen, loss), axis=0)
 
     def take(values):

@@ -24,16 +24,11 @@ from .fitting import checked_settings, in_own_units, prepare
 from .judgement import judged, noise_share, numbers_in_reach, unlike_others
 from .least_squares import least_squares
 from .model import Model
-from .nuts import Length
+from .particles import Length
 from .population import COEFFICIENTS, Population
 from .predict import predict_measured
 from .results import PosteriorDraws
-from .weights import PARETO_K_MOST
-
-RHAT_MOST = 1.01
-ESS_LEAST = 400.0
-"""The gate: R-hat at most, bulk ESS at least, no divergence, Pareto k at most `PARETO_K_MOST` (Vehtari et al. 2021,
-2024)."""
+from .settings import SAMPLING
 
 Mode = Literal["fast", "joint"]
 
@@ -67,7 +62,7 @@ class Posterior(PosteriorDraws):
             what leave-one-particle-out needs.
         mode: "fast" or "joint".
         pareto_k: of every particle's importance weights.
-        pareto_k_joint: of the weights of all particles together, of many particles as the regression of `reweighting`
+        pareto_k_joint: of the weights of all particles together, of many particles as the regression of `correction`
             has them; None where they were not formed.
         weights_applied: whether the draws were resampled by the particles' own weights. Of many particles those of the
             population were by `pareto_k_joint`'s, and only particles whose weights scatter were drawn by theirs.
@@ -128,21 +123,21 @@ class Posterior(PosteriorDraws):
         found = []
         rhat, ess = unmixed(self.rhat, self.ess_bulk)
         if rhat is not None:
-            found.append(f"R-hat of {rhat.name} is {rhat.value:.3f}, above {RHAT_MOST}: draw longer (--draws)")
+            found.append(f"R-hat of {rhat.name} is {rhat.value:.3f}, above {SAMPLING.rhat}: draw longer (--draws)")
         if ess is not None:
-            found.append(f"bulk ESS of {ess.name} is {ess.value:.0f}, below {ESS_LEAST:.0f}: draw longer (--draws)")
+            found.append(f"bulk ESS of {ess.name} is {ess.value:.0f}, below {SAMPLING.ess:.0f}: draw longer (--draws)")
         if self.divergences:
             found.append(f"{self.divergences} trajectories diverged: draw longer, or narrow the priors")
-        bad = np.flatnonzero(~(self.pareto_k <= PARETO_K_MOST))
+        bad = np.flatnonzero(~(self.pareto_k <= SAMPLING.pareto_k))
         if len(bad):
             names = ", ".join(self.particles[i] for i in bad[:5]) + (", ..." if len(bad) > 5 else "")
             found.append(
-                f"Pareto k is above {PARETO_K_MOST} for particle {names}: its likelihood is far from the quadratic "
+                f"Pareto k is above {SAMPLING.pareto_k} for particle {names}: its likelihood is far from the quadratic "
                 "that the fast mode takes it for; use --mode joint, or leave the particle out"
             )
-        if self.pareto_k_joint is not None and not self.pareto_k_joint <= PARETO_K_MOST:
+        if self.pareto_k_joint is not None and not self.pareto_k_joint <= SAMPLING.pareto_k:
             found.append(
-                f"Pareto k of all particles together is {self.pareto_k_joint:.2f}, above {PARETO_K_MOST}: "
+                f"Pareto k of all particles together is {self.pareto_k_joint:.2f}, above {SAMPLING.pareto_k}: "
                 "use --mode joint"
             )
         reasons = ("the noise", "the population's mode")
@@ -309,8 +304,8 @@ def unmixed(rhat: Mapping[str, float], ess_bulk: Mapping[str, float]) -> tuple[W
     slowest = max(rhat, key=lambda name: rhat[name])
     fewest = min(ess_bulk, key=lambda name: ess_bulk[name])
     return (
-        None if rhat[slowest] <= RHAT_MOST else Worst(slowest, rhat[slowest]),
-        None if ess_bulk[fewest] >= ESS_LEAST else Worst(fewest, ess_bulk[fewest]),
+        None if rhat[slowest] <= SAMPLING.rhat else Worst(slowest, rhat[slowest]),
+        None if ess_bulk[fewest] >= SAMPLING.ess else Worst(fewest, ess_bulk[fewest]),
     )
 
 
@@ -332,7 +327,7 @@ def sample(
 
     The population is drawn around its mode and weighted, or sampled by NUTS where the weights are not good enough: see
     `importance`. Of many particles (more than 400,000 draws of single ones) the exact likelihood enters by
-    regression, and at most four million draws of single particles are kept: see `reweighting`.
+    regression, and at most four million draws of single particles are kept: see `particles`.
 
     The particles are worked on in blocks, which spread over all devices of the process and, once
     `jax.distributed.initialize` has been called, over all processes: every one of them then calls this function with

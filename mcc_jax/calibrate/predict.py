@@ -179,11 +179,15 @@ def predict_measured(calibration: PosteriorDraws, particle: str, *, count: int =
         known = ", ".join(calibration.particles)
         raise InputError(f"particle {arguments.shown(particle)} did not take part", remedy=f"There are: {known}.")
     row = calibration.particles.index(particle)
+    chains, draws = calibration.zero_um.shape[:2]
+    pick = np.random.default_rng(seed).choice(chains * draws, size=min(count, chains * draws), replace=False)
+    return predicted_at(calibration, row, pick, seed)
+
+
+def predicted_at(calibration: PosteriorDraws, row: int, pick: np.ndarray, seed: int) -> PredictedCurves:
+    """As `predict_measured`, of the row-th particle at chosen draws of all chains in a row."""
     tests = calibration.selection.tests
     length = len(calibration.selection.rows[row])
-    rng = np.random.default_rng(seed)
-    chains, draws = calibration.zero_um.shape[:2]
-    pick = rng.choice(chains * draws, size=min(count, chains * draws), replace=False)
 
     def chosen(values: np.ndarray) -> np.ndarray:
         return flattened(values)[pick]

@@ -10,9 +10,7 @@ import numpy as np
 
 from .._format import number, percent
 from ..calibrate.curves import FittedCurve
-from ..calibrate.estimates import BAD_MISFIT, BAD_NOISE_SHARE
-from ..calibrate.posterior import ESS_LEAST, RHAT_MOST
-from ..calibrate.weights import PARETO_K_MOST
+from ..calibrate.settings import JUDGEMENT, SAMPLING
 from ..campaign import Finding, campaign_findings, check_plausibility, check_tests
 from ..campaign.findings import worst
 from .read import Results, checksums_told
@@ -124,17 +122,17 @@ def _sampler(d: dict[str, Any]) -> list[Light]:
     worst = None if k is None else max(k, joint or k)
     return [
         Light(
-            _below(rhat, RHAT_MOST, RHAT_BAD),
+            _below(rhat, SAMPLING.rhat, RHAT_BAD),
             "Chains agree (R-hat)",
             number(rhat),
-            f"at most {RHAT_MOST}",
+            f"at most {SAMPLING.rhat}",
             "Chains that started apart must end with one answer. If not: more draws (--draws).",
         ),
         Light(
-            _below(None if ess is None else -ess, -ESS_LEAST, -ESS_BAD),
+            _below(None if ess is None else -ess, -SAMPLING.ess, -ESS_BAD),
             "Independent draws (bulk ESS)",
             number(ess),
-            f"at least {ESS_LEAST:.0f}",
+            f"at least {SAMPLING.ess:.0f}",
             "So many independent draws the chains are worth. If too few: more draws (--draws).",
         ),
         Light(
@@ -145,10 +143,10 @@ def _sampler(d: dict[str, Any]) -> list[Light]:
             "The sampler could not follow the posterior everywhere. If not 0: more draws, or narrower priors.",
         ),
         Light(
-            _below(worst, PARETO_K_MOST, PARETO_K_BAD),
+            _below(worst, SAMPLING.pareto_k, PARETO_K_BAD),
             "Fast mode is accurate (Pareto k)",
             number(worst, 2),
-            f"at most {PARETO_K_MOST}",
+            f"at most {SAMPLING.pareto_k}",
             "How well the quadratic summaries of the fast mode stand for the tests themselves. If not: --mode joint.",
         ),
     ]
@@ -169,7 +167,7 @@ def _fit(content: dict[str, Any], shown: Sequence[FittedCurve]) -> list[Light]:
     if misfit is not None and np.isfinite(misfit):
         found.append(
             Light(
-                _below(misfit, GOOD_MISFIT, BAD_MISFIT),
+                _below(misfit, GOOD_MISFIT, JUDGEMENT.misfit),
                 "The law's form fits",
                 f"off by {percent(misfit)}",
                 f"at most {percent(GOOD_MISFIT)}",
@@ -181,7 +179,7 @@ def _fit(content: dict[str, Any], shown: Sequence[FittedCurve]) -> list[Light]:
     if noise is not None:
         found.append(
             Light(
-                _below(noise, GOOD_NOISE_SHARE, BAD_NOISE_SHARE),
+                _below(noise, GOOD_NOISE_SHARE, JUDGEMENT.noise_share),
                 "What is left is noise",
                 f"{percent(noise)} hangs together",
                 f"at most {percent(GOOD_NOISE_SHARE)}",

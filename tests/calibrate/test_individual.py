@@ -10,9 +10,10 @@ from joint_cases import COEFFICIENTS, DIAMETERS, NOISE, SNAPPING, modulus_of, si
 
 from mcc_jax import Instrument, StrainScaling, Unloading
 from mcc_jax.calibrate import Model, select_tests
-from mcc_jax.calibrate.fitting import WIDE, _centre
+from mcc_jax.calibrate.fitting import _centre
 from mcc_jax.calibrate.forward import Forms, residuals, snap
 from mcc_jax.calibrate.particle_fit import fit_particles, linear_starts
+from mcc_jax.calibrate.settings import FIT
 
 SNAPS = np.stack([COEFFICIENTS[0], SNAPPING, COEFFICIENTS[2], SNAPPING * np.array([1.0, 1.01, 0.99])])
 
@@ -25,7 +26,7 @@ def fitted(campaign, noise, unloading=Unloading.PRINTED):
 def fit(tests, noise, unloading=Unloading.PRINTED, starts=None):
     middle = _centre(Model(unloading).chosen_priors)
     centre = np.column_stack([np.broadcast_to(middle, (len(tests), 4)), np.asarray(tests.contact)])
-    width = np.broadcast_to(np.array([WIDE] * 4 + [5.0]), (len(tests), 5))
+    width = np.broadcast_to(np.array([FIT.alone] * 4 + [5.0]), (len(tests), 5))
     return fit_particles(
         tests,
         jnp.full(len(tests), noise),

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from mcc_jax import paper_campaign, sample
-from mcc_jax.calibrate import conditional
 from mcc_jax.calibrate import draws as drawing
-from mcc_jax.calibrate.reweighting import correction
+from mcc_jax.calibrate import particles
+from mcc_jax.calibrate.particles import correction
+from mcc_jax.calibrate.settings import SamplingSettings
 
 
 def test_a_slope_is_found_through_any_rotation_of_the_parameters():
@@ -32,7 +33,9 @@ def test_the_error_is_that_of_the_random_numbers():
 
 @pytest.mark.long
 def test_the_shortcuts_agree_with_exact_weights(paper_posterior, monkeypatch):
-    monkeypatch.setattr(conditional, "MAX_CHECKED", 40_000)  # so that twenty particles count as many
+    monkeypatch.setattr(
+        particles, "SAMPLING", SamplingSettings(compared=40_000)
+    )  # so that twenty particles count as many
     many = sample(paper_campaign(0))
     assert many.leapfrogs == 0
     assert not many.weights_applied
@@ -55,7 +58,7 @@ def test_the_exact_likelihood_corrects_summaries_that_are_off(paper_posterior, m
     length = drawing.Length(4, 300, 1000)
     pulled = fit.summary.score.at[:, 0].add(0.15 * jnp.sqrt(fit.summary.precision[:, 0, 0]))
     off = type(fit)(**{**vars(fit), "summary": type(fit.summary)(**{**vars(fit.summary), "score": pulled})})
-    monkeypatch.setattr(conditional, "MAX_CHECKED", 40_000)
+    monkeypatch.setattr(particles, "SAMPLING", SamplingSettings(compared=40_000))
     corrected = drawing.draw_fast(jax.random.key(0), selection.tests, model, off, length, 0)["population"].mu[..., 0]
     monkeypatch.setattr(conditional, "correction", lambda _, draws: (np.zeros(len(draws)), 0.0))
     raw = drawing.draw_fast(jax.random.key(0), selection.tests, model, off, length, 0)["population"].mu[..., 0]

@@ -9,8 +9,8 @@ import pytest
 from joint_cases import COEFFICIENTS, DIAMETERS, NOISE, Programme, simulated
 
 from mcc_jax import InputError, calibrate_many, least_squares, sample
-from mcc_jax.calibrate.conditional import CANDIDATES
-from mcc_jax.calibrate.data import LENGTHS, padded_length
+from mcc_jax.calibrate.data import padded_length
+from mcc_jax.calibrate.settings import SAMPLING, SELECTION
 
 SETTINGS = {"chains": 2, "warmup": 150, "draws": 100, "seed": 3}
 FUNCTIONS = (
@@ -101,7 +101,7 @@ def test_campaigns_of_similar_size_share_their_compilations(queued):
     _, first, further = queued
     for name in FUNCTIONS:
         # Ahead, in a thread of its own, and for use: the same. Restless particles are drawn by another program.
-        most = 1 + len(CANDIDATES) if name == "draw_particles" else 1
+        most = 1 + len(SAMPLING.candidates) if name == "draw_particles" else 1
         assert 1 <= first.count(name) <= most, (name, first)
         assert name not in further
 
@@ -135,7 +135,7 @@ def test_least_squares_with_two_workers(campaigns):
 
 def test_records_are_padded_to_few_lengths():
     assert [padded_length(n) for n in (1, 64, 65, 301, 448, 449)] == [64, 64, 128, 320, 448, 896]
-    assert all(padded_length(n) == n for n in LENGTHS)
+    assert all(padded_length(n) == n for n in SELECTION.lengths)
 
 
 def test_wrong_arguments_are_told(campaigns):

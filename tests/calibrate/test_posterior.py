@@ -18,7 +18,7 @@ from mcc_jax import (
     to_arviz,
     write_posterior,
 )
-from mcc_jax.calibrate.weights import ordered_resample, pareto_k, smoothed_weights
+from mcc_jax.calibrate.importance import ordered_resample, pareto_k, smoothed_weights
 
 
 @pytest.fixture(scope="module")

@@ -25,10 +25,11 @@ from ...campaign import (
 from ...campaign.reasons import refusal
 from ...geometry import plastic_shape_factor
 from ...law import MccLaw, StrainScaling, Unloading
-from ..data import MAX_POINTS, rows_from_contact
+from ..data import rows_from_contact
 from ..estimates import NO_SAMPLER, estimate, finite, force_zero, misfit_note
 from ..judgement import judged, numbers_in_reach, unlike_others
 from ..results import Calibration
+from ..settings import SELECTION
 from .loading import PlasticFit, fit_population
 from .master_curve import MasterCurve, StrainTable, master_curve, strain_table
 from .modulus import ElasticFit, campaign_branches, fit_effective_modulus
@@ -84,7 +85,7 @@ class PaperCalibration(Calibration):
         found = {}
         for i, fit in enumerate(self.particles):
             if fit is not None:
-                rows = rows_from_contact(self.campaign.curves[i], segments[i], MAX_POINTS)
+                rows = rows_from_contact(self.campaign.curves[i], segments[i], SELECTION.most_points)
                 found[i] = rows, fit.used[rows]
         return found
 

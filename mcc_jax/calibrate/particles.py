@@ -1,0 +1,430 @@
+"""Every particle drawn back given draws of the population, with exact weights.
+
+1. Given the summaries (`marginal`), nothing but the population is left to sample.
+2. Given a draw of the population, every particle's parameters are nearly normal and independent: drawn directly.
+3. A summary is a quadratic; the true likelihood of a test is not. Their ratio at the drawn parameters is the draw's
+   importance weight, which makes the result exact whatever the summary's quality, and shows that quality (Pareto k).
+   Particles whose ratio scatters (a curve that snaps through, say) get several candidates per draw of the population,
+   of which one is kept in proportion to its ratio, and the mean ratio becomes the weight: the same exact posterior,
+   with less scatter.
+
+The exact weight of a draw of the population is the product of all particles' ratios of exact to quadratic likelihood.
+Of many particles the product scatters far more than it says: nearly all of its scatter is that of the particles' own
+draws. With the same random numbers for every draw of the population that scatter cancels, and the sum of log ratios is
+smooth in the population's parameters, linear over the little that the posterior leaves open: some tens of draws tell
+it (`correction`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from .compiling import compiled, even_batch, side_by_side
+from .data import Tests
+from .forward import Forms, Point, residuals
+from .importance import ordered_resample, pareto_k, smoothed_weights, unrest
+from .marginal import Marginal, ParticleDraw
+from .noise import Whitening
+from .population import Population
+from .settings import NUMERICS, SAMPLING
+from .sharding import Blocks, count_of
+
+
+class ParticleDraws(NamedTuple):
+    """Draws of the particles' parameters, one for each draw of the population.
+
+    Attributes:
+        latent: b1, b3, b5, e.
+        theta: numbers of the effects.
+        zero: zero of displacement [um].
+        log_likelihood: of every test given the population, the particle integrated out.
+        log_ratio: log of exact over quadratic likelihood; 0 where the exact one was not looked at.
+    """
+
+    latent: Float[Array, "draws particles 4"]
+    theta: Float[Array, "draws particles numbers"]
+    zero: Float[Array, "draws particles"]
+    log_likelihood: Float[Array, "draws particles"]
+    log_ratio: Float[Array, "draws particles"]
+
+
+class ExactLikelihood(eqx.Module):
+    """Tests with their exact likelihood, and what particles are drawn by.
+
+    Attributes:
+        tests: the measurements.
+        filters: their noise.
+        marginal: the same tests, summarised.
+        zero_prior: mean and standard deviation of the zeros, from the recorded contact [um].
+        forms: the law.
+    """
+
+    tests: Tests
+    filters: Whitening
+    marginal: Marginal
+    zero_prior: Float[Array, " 2"]
+    forms: Forms
+
+    def some(self, which: Int[Array, " chosen"]) -> ExactLikelihood:
+        """Some of the tests."""
+
+        def chosen(tree):
+            return jax.tree.map(lambda x: x[which] if x.ndim else x, tree)
+
+        return ExactLikelihood(
+            chosen(self.tests), chosen(self.filters), chosen(self.marginal), self.zero_prior, self.forms
+        )
+
+    def log_likelihood(self, population: Population, drawn: ParticleDraw) -> Float[Array, " particles"]:
+        """Log likelihood of each test at drawn parameters, times the prior density of its zero."""
+        tests = self.tests
+        residual = residuals(Point(drawn.latent, drawn.zero, drawn.theta), tests, self.forms)
+        mean, sd = self.zero_prior
+        at_zero = -0.5 * ((drawn.zero - tests.contact - mean) / sd) ** 2 - jnp.log(sd * math.sqrt(2 * math.pi))
+        return jax.vmap(lambda f, r: f.log_density(r, population.log_noise))(self.filters, residual) + at_zero
+
+
+@compiled
+def draw_particles(
+    keys: Key[Array, " 1"],
+    population: Population,
+    exact: ExactLikelihood,
+    candidates: int = 1,
+    common: bool | Bool[Array, ""] = False,
+) -> ParticleDraws:
+    """Draw the particles' parameters given each draw of the population, and compare with the exact likelihood.
+
+    Args:
+        keys: a single random key; with an axis, so that blocks of particles on several devices have one each.
+        population: draws, every field with a leading axis.
+        exact: the tests.
+        candidates: how many to draw and choose from; 0 draws one and does not look at the exact likelihood.
+        common: use the same random numbers for every draw of the population.
+    """
+    draws = population.a.shape[0]
+    count = len(exact.tests)
+
+    numbers = exact.marginal.point.theta.shape[1]
+
+    def one(arguments):
+        key, row = arguments
+        at = jax.tree.map(lambda x: x[row], population)
+        deviate, zeros, pick = jax.random.split(key, 3)
+
+        def candidate(normal, normal_zero, reach):
+            normal, normal_zero = reach * normal, reach * normal_zero
+            drawn = exact.marginal.draw(at, normal, normal_zero)
+            ratio = jnp.zeros(count)
+            if candidates:
+                # Of the standard normal densities of deviations and proposal all constants cancel but the zero's.
+                truth = exact.log_likelihood(at, drawn) + 0.5 * math.log(2 * math.pi)
+                prior = -0.5 * jnp.sum(drawn.deviations**2, -1)
+                square = 0.5 * (jnp.sum(normal**2, -1) + normal_zero**2)
+                proposal = -square - drawn.log_volume
+                if candidates > 1:
+                    far = -square / SAMPLING.reach**2 - (exact.marginal.scatter.size + 1) * math.log(SAMPLING.reach)
+                    proposal = jnp.logaddexp(-square, far) - math.log(2) - drawn.log_volume
+                ratio = truth + prior - proposal - drawn.log_likelihood
+                ratio = jnp.where(jnp.isfinite(ratio), ratio, -jnp.inf)
+            theta: Any = drawn.theta if numbers else None
+            return drawn.latent, theta, drawn.zero, drawn.log_likelihood, ratio
+
+        shape = (max(candidates, 1), count)
+        latent, theta, zero, likelihood, ratio = jax.vmap(candidate)(
+            jax.random.normal(deviate, (*shape, exact.marginal.scatter.size)),
+            jax.random.normal(zeros, shape),
+            jnp.where(jnp.arange(shape[0]) % 2 == 0, 1.0, SAMPLING.reach),
+        )
+        if candidates <= 1:
+            return latent[0], theta[0] if numbers else theta, zero[0], likelihood[0], ratio[0]
+        chosen: Int[Array, " particles"] = jax.random.categorical(pick, jnp.maximum(ratio, -1e30), axis=0)
+        mean = jax.scipy.special.logsumexp(ratio, axis=0) - jnp.log(candidates)
+
+        def take(values):
+            return jnp.take_along_axis(values, chosen.reshape(1, count, *[1] * (values.ndim - 2)), axis=0)[0]
+
+        return take(latent), take(theta) if numbers else theta, take(zero), likelihood[0], mean
+
+    rows = NUMERICS.rows if jax.default_backend() == "cpu" else NUMERICS.rows_of_accelerators
+    batch = even_batch(draws, rows // (count * max(candidates, 1)))
+    each = jnp.where(common, keys, jax.random.split(keys[0], draws))
+    # Arrays without an entry are left out: `map` cannot cut them in batches.
+    latent, theta, *rest = jax.lax.map(one, (each, jnp.arange(draws)), batch_size=batch)
+    return ParticleDraws(latent, jnp.zeros((draws, count, 0)) if theta is None else theta, *rest)
+
+
+class Length(NamedTuple):
+    """How long a sampler runs: chains, and draws of each before and after it has settled."""
+
+    chains: int
+    warmup: int
+    draws: int
+
+    @property
+    def total(self) -> int:
+        """Draws kept of all chains."""
+        return self.chains * self.draws
+
+
+def stride_of(count: int, total: int) -> int:
+    """Every how many-th draw is compared with the exact likelihood: all of them for few particles."""
+    return max(1, -(-total * count // SAMPLING.compared))
+
+
+def chunk_of(total: int) -> int | None:
+    """Draws of a chunk where all are compared: on a CPU two of them run side by side, on any number of cores."""
+    return -(-total // NUMERICS.side_by_side) if jax.default_backend() == "cpu" else None
+
+
+def every(population: Population, which: int | np.ndarray) -> Population:
+    """Every so-many-th draw, or those at given positions."""
+    rows = slice(None, None, which) if isinstance(which, int) else which
+    return jax.tree.map(lambda x: np.asarray(x)[rows], population)
+
+
+class Drawer:
+    """Draws of the particles, as arrays of NumPy with the axes (draw, particle), without copies that only fill up.
+
+    Attributes:
+        count: number of particles.
+    """
+
+    def __init__(self, exact: ExactLikelihood, block: int, chunk: int | None = None) -> None:
+        """Cut the tests into blocks.
+
+        Args:
+            exact: the tests.
+            block: particles of a block; 0 for a single one.
+            chunk: draws of the population worked on in one go, so that one compilation serves any number of them; all
+                by default. Chunks run side by side where all particles are one block.
+        """
+        self.count = count_of(exact.tests)
+        self._exact, self._blocks, self._chunk = exact, Blocks(len(exact.tests), block), chunk
+        self._own = self._blocks.cut(exact)
+
+    def all(self, key: Array, population: Population, candidates: int = 1, *, common: bool = False) -> ParticleDraws:
+        """All particles, with `candidates` and `common` of `draw_particles`."""
+        blocks = self._blocks
+
+        def draw(key: Array, population: Population) -> list[np.ndarray]:
+            keys, same = blocks.keys(key), jnp.asarray(np.asarray(common))
+            found = blocks.whole(blocks.each(draw_particles, keys, population, self._own, candidates, same, axis=1))
+            return [np.asarray(v)[:, : self.count] for v in found]
+
+        return self._chunked(draw, key, population, common)
+
+    def _chunked(
+        self,
+        draw: Callable[[Array, Population], list[np.ndarray]],
+        key: Array,
+        population: Population,
+        common: bool,
+    ) -> ParticleDraws:
+        """Draws under all populations, the last one repeated to fill up chunks."""
+        draws = len(np.asarray(population.a))
+        chunk = self._chunk or draws
+
+        def one(first: int) -> list[np.ndarray]:
+            rows = np.minimum(np.arange(first, first + chunk), draws - 1)
+            own = key if common or not first else jax.random.fold_in(key, first)
+            return draw(own, jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[rows]), population))
+
+        # Several processes exchange the numbers of their blocks, in one order.
+        found = (side_by_side if self._blocks.whole_here else map)(one, range(0, draws, chunk))
+        return ParticleDraws(*(cast(Any, np.concatenate(several)[:draws]) for several in zip(*found, strict=True)))
+
+    def some(
+        self, key: Array, which: np.ndarray, population: Population, candidates: int, *, common: bool = False
+    ) -> ParticleDraws:
+        """Some particles. They are few: every process draws all of them."""
+        found = []
+        for i in range(0, len(which), NUMERICS.group):
+            group = which[i : i + NUMERICS.group]
+            # Always of one of a few sizes, the first one repeated: every size would be compiled anew.
+            size = min(self.count, NUMERICS.group, 4 ** int(np.ceil(np.log(max(len(group), 2)) / np.log(4))))
+            padded = jnp.asarray(np.pad(group, (0, size - len(group)), constant_values=group[0]))
+            exact, count = self._exact.some(padded), len(group)
+
+            def draw(
+                key: Array, population: Population, exact: ExactLikelihood = exact, count: int = count
+            ) -> list[np.ndarray]:
+                same = jnp.asarray(np.asarray(common))
+                drawn = draw_particles(key[None], population, exact, candidates, same)
+                return [np.asarray(v)[:, :count] for v in drawn]
+
+            found.append(self._chunked(draw, jax.random.fold_in(key, 1000 * i + candidates), population, common))
+        return ParticleDraws(*(cast(Any, np.concatenate(several, 1)) for several in zip(*found, strict=True)))
+
+    def settle(
+        self,
+        key: Array,
+        drawn: ParticleDraws,
+        population: Population,
+        k: np.ndarray,
+        restless: np.ndarray,
+        candidates: Iterable[int],
+    ) -> None:
+        """Draw restless particles anew from many candidates, in place, and their Pareto k, until none is left.
+
+        Args:
+            key: random key.
+            drawn: of all particles under `population`.
+            population: draws.
+            k: of every particle.
+            restless: positions of the restless ones.
+            candidates: how many per draw: first, and for the few that scatter most even then.
+        """
+        latent, theta, zero, _, ratio = (cast(np.ndarray, v) for v in drawn)
+        few = max(SAMPLING.few, self.count // 100)
+        for many in candidates:
+            if not len(restless):
+                return
+            better = self.some(key, restless, population, many)
+            latent[:, restless], zero[:, restless] = better.latent, better.zero
+            theta[:, restless] = better.theta
+            ratio[:, restless] = better.log_ratio
+            k[restless] = pareto_k(ratio[:, restless])
+            restless = restless[np.argsort(-unrest(ratio[:, restless]))][:few]
+            restless = restless[unrest(ratio[:, restless]) > SAMPLING.restless]
+
+
+class Drawn(NamedTuple):
+    """Particles drawn back.
+
+    Attributes:
+        chosen: which draws of the population stand for the weighted ones.
+        particles: under every `keep`-th of these.
+        k: Pareto k of every particle's weights.
+        k_joint: of the population's.
+        keep: see `particles`.
+        log_ratio: logarithm of the mean ratio of exact to quadratic likelihood of all tests, and its standard error.
+        notes: what a reader must know.
+    """
+
+    chosen: np.ndarray
+    particles: ParticleDraws
+    k: np.ndarray
+    k_joint: float
+    log_ratio: tuple[float, float]
+    keep: int = 1
+    notes: tuple[str, ...] = ()
+
+
+def weighted(drawer: Drawer, population: Population, length: Length, check_key: Array, pick_key: Array) -> Drawn:
+    """Few particles: the weight of a draw is the product of all particles' ratios of exact to quadratic likelihood."""
+    particles = drawer.all(check_key, population)
+    ratio = np.asarray(particles.log_ratio)
+    k = pareto_k(ratio)
+    restless = np.flatnonzero((unrest(ratio) > SAMPLING.restless) | (k > SAMPLING.pareto_k))
+    drawer.settle(pick_key, particles, population, k, restless, SAMPLING.candidates)
+    total = ratio.sum(1)
+    chosen, k_joint = _resampled(total, length)
+    return Drawn(chosen, jax.tree.map(lambda x: x[chosen], particles), k, k_joint, mean_ratio(total))
+
+
+def corrected(
+    drawer: Drawer,
+    population: Population,
+    parameters: np.ndarray,
+    length: Length,
+    check_key: Array,
+    pick_key: Array,
+    particle_key: Array,
+) -> Drawn:
+    """Many particles: the draws of the population are weighted by regression (`correction`).
+
+    Of each particle some draws are compared with the exact likelihood. Those whose weights scatter are drawn from
+    several candidates; of the others the draws are left as they are.
+    """
+    checks = SAMPLING.probes * max(2, SAMPLING.compared // (SAMPLING.probes * drawer.count))
+    ratio = np.asarray(drawer.all(check_key, every(population, evenly(length.total, checks))).log_ratio)
+    scatter, k = unrest(ratio), pareto_k(ratio)
+    wild: set[int] = set()
+
+    def total(which: int, rows: np.ndarray) -> np.ndarray:
+        probes, own = every(population, rows), jax.random.fold_in(check_key, which)
+        ratio = np.maximum(drawer.all(own, probes, common=True).log_ratio, SAMPLING.lowest)
+        # A single candidate may fall off a cliff of the likelihood as the population moves, which says nothing of all.
+        if len(unsteady := np.flatnonzero(np.ptp(ratio, axis=0) > SAMPLING.unsteady)):
+            better = drawer.some(own, unsteady, probes, SAMPLING.candidates[-1], common=True).log_ratio
+            ratio[:, unsteady] = np.maximum(better, SAMPLING.lowest)
+        if len(unsteady := np.flatnonzero(np.ptp(ratio, axis=0) > SAMPLING.unsteady)):
+            wild.update(unsteady.tolist())
+            ratio[:, unsteady] = 0.0
+        return ratio.sum(1)
+
+    log_weight, error = correction(total, parameters)
+    notes = []
+    if error > SAMPLING.unsure:
+        notes.append(f"the means of the population are known to {error:.2f} of their standard deviations only")
+    if wild:
+        notes.append(f"{len(wild)} particles act on the population through their quadratic summary alone")
+    chosen, k_joint = _resampled(log_weight, length)
+    keep = max(1, -(-length.total * drawer.count // SAMPLING.kept))
+    some = every(every(population, chosen), keep)
+    particles = drawer.all(particle_key, some, 0)
+    restless = np.flatnonzero((scatter > SAMPLING.restless_of_many) | (k > SAMPLING.pareto_k))
+    drawer.settle(pick_key, particles, some, k, restless, SAMPLING.candidates_of_many)
+    # The regression tells how the correction changes over the posterior; how large it is, every particle tells alone.
+    each = [mean_ratio(ratio[:, i]) for i in range(ratio.shape[1])]
+    log_ratio = float(sum(v for v, _ in each)), float(np.sqrt(sum(error**2 for _, error in each)))
+    return Drawn(chosen, particles, k, k_joint, log_ratio, keep, tuple(notes))
+
+
+def mean_ratio(log_ratio: np.ndarray) -> tuple[float, float]:
+    """Logarithm of the mean of importance ratios, and its standard error."""
+    finite = np.where(np.isfinite(log_ratio), log_ratio, -np.inf)
+    if not np.isfinite(finite).any():
+        return -np.inf, np.inf
+    ratio = np.exp(finite - finite.max())
+    return float(finite.max() + np.log(ratio.mean())), float(ratio.std() / ratio.mean() / np.sqrt(len(ratio)))
+
+
+def _resampled(log_weight: np.ndarray, length: Length) -> tuple[np.ndarray, float]:
+    """Which draws stand for the weighted ones, in order within each chain, and the Pareto k of the weights."""
+    weight, k = smoothed_weights(log_weight)
+    rows = (slice(c * length.draws, (c + 1) * length.draws) for c in range(length.chains))
+    return np.concatenate([row.start + ordered_resample(weight[row], length.draws) for row in rows]), k
+
+
+def evenly(count: int, some: int) -> np.ndarray:
+    """Positions of some of many draws, spread evenly."""
+    return np.linspace(0, count - 1, some).astype(int)
+
+
+class Correction(NamedTuple):
+    """What the exact likelihood adds to the log density of the population.
+
+    Attributes:
+        log_weight: of every draw, up to a constant.
+        error: standard error of its slope, in standard deviations of the posterior by which it would move the means.
+    """
+
+    log_weight: np.ndarray
+    error: float
+
+
+def correction(total: Callable[[int, np.ndarray], np.ndarray], draws: np.ndarray) -> Correction:
+    """Regression of the sum of log ratios on the population's parameters, and its prediction for every draw.
+
+    Args:
+        total: the sums at the given rows of `draws`, all with the same random numbers, which depend on the first
+            argument: 0 or 1.
+        draws: of the parameters, shape (draws, parameters).
+    """
+    rows = evenly(len(draws), SAMPLING.probes)
+    unit, values, _ = np.linalg.svd(draws - draws.mean(0), full_matrices=False)
+    # Uncorrelated and of standard deviation 1, so that a slope is the shift of a mean in standard deviations.
+    white = unit[:, values > 1e-9 * values[0]] * np.sqrt(len(draws))
+    design = np.concatenate([np.ones((len(rows), 1)), white[rows]], 1)
+    slopes = np.stack([np.linalg.lstsq(design, total(which, rows), rcond=None)[0][1:] for which in (0, 1)])
+    # Two estimates from independent random numbers: half their difference is the standard error of their mean.
+    return Correction(white @ slopes.mean(0), float(np.linalg.norm(slopes[0] - slopes[1]) / 2))
