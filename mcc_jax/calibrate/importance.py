@@ -6,9 +6,10 @@ distribution around the mode are weighted,
 
 .. math:: w_s \propto p(\theta_s \mid \text{tests}) / q(\theta_s)
 
-and the proposal is fitted to its own weighted draws until the weights' Pareto k and effective size say that it is good
-enough (Cappe et al. 2004; Vehtari et al. 2024). If they never do, the sampler has to run (`nuts`). The density by
-itself takes a quarter of the sampler's time to compile, and all draws are worked on side by side.
+and one distribution more is fitted to all weighted draws, q the mixture of all so far, until the weights' Pareto k and
+effective size say that they are good enough (adaptive multiple importance sampling, Cornuet et al. 2012; Vehtari et al.
+2024). If they never do, NUTS has to run. The density by itself takes a quarter of the sampler's time to compile, and
+all draws are worked on side by side.
 """
 
 from __future__ import annotations
@@ -41,11 +42,13 @@ class Weighted(NamedTuple):
     """Draws of the population by importance resampling.
 
     Attributes:
-        population: the draws, all chains in a row.
+        free: the draws in unbounded coordinates, all chains in a row.
+        population: the same as populations.
         log_evidence: logarithm of the integral of the density: of the mean weight.
         error: its standard error.
     """
 
+    free: np.ndarray
     population: Population
     log_evidence: float
     error: float
@@ -64,7 +67,7 @@ def sample_weighted(
 ) -> Weighted | None:
     """Draws of the population by importance resampling; None if the weights are not good enough.
 
-    A spread's coordinate may have either sign for the same spread: proposal and draws are folded to positive ones.
+    A spread's coordinate may have either sign for the same spread: proposals and draws are folded to positive ones.
 
     Args:
         key: random key.
@@ -74,75 +77,127 @@ def sample_weighted(
         many: propose no more than is kept: a density is dear.
         however_bad: give the draws of the first round whatever their weights.
     """
-    from scipy.linalg import solve_triangular
     from scipy.special import logsumexp
-    from scipy.stats import multivariate_t
 
-    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
-    spreads = np.array(target.signed())
-    signs = np.ones((2 ** len(spreads), len(mode)))
-    signs[:, spreads] = list(product((1.0, -1.0), repeat=len(spreads)))
-
-    def folded(free: np.ndarray) -> np.ndarray:
-        free[..., spreads] = np.abs(free[..., spreads])
-        return free
-
-    def densities(part: np.ndarray) -> np.ndarray:
-        # Of few particles a gradient takes no time to speak of, and what the mode was found by is compiled already.
-        return np.asarray(log_densities(jnp.asarray(part), target)) if many else -gradients(part, target)[0]
-
-    def proposed(count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Draws of the proposal and their log weights."""
-        factor = np.linalg.cholesky(width)
-        standard = np.asarray(unit.rvs(size=int(count + -count % FIT.gradients), random_state=rng))
-        free = folded(centre + standard @ factor.T)
-        every_sign = (free[:, None] * signs - centre).reshape(-1, len(mode))
-        density = unit.logpdf(solve_triangular(factor, every_sign.T, lower=True).T).reshape(len(free), -1)
-        log_density = np.concatenate(side_by_side(densities, np.split(free, len(free) // FIT.gradients)))
-        # The density is even in every spread's coordinate: folded, as much again for each; and the proposal's volume.
-        log_weight = log_density - logsumexp(density, axis=1) + len(spreads) * math.log(2)
-        log_weight = log_weight + np.sum(np.log(np.diagonal(factor)))
-        return free[:count], log_weight[:count]
-
-    # Standard deviations of coordinates differ by many powers of ten, for which SciPy takes a matrix to be singular.
-    shape = cast(Any, np.eye(len(mode)) * (1 - 2 / SAMPLING.freedom))  # its stub takes a number
-    unit = multivariate_t(np.zeros(len(mode)), shape, SAMPLING.freedom)
     kept = chains * draws
     trial = min(SAMPLING.trial // 4, kept) if many else SAMPLING.trial
-    least = SAMPLING.good_share if many else SAMPLING.least_share
-    centre, width = folded(np.array(mode)), np.asarray(covariance)
+    mixture = _Mixture(np.asarray(jax.random.key_data(key)), target, many)
+    centre, width = mixture.folded(np.array(mode)), np.asarray(covariance)
     for turn in range(SAMPLING.rounds):
-        free, log_weight = proposed(trial)
+        mixture.propose(centre, width, trial)
+        free, log_weight = mixture.free, mixture.log_weight
         if however_bad:
             finite = np.where(np.isfinite(log_weight), log_weight, -np.inf)
             weight = np.exp(finite - finite.max()) if np.isfinite(finite).any() else np.ones(len(finite))
-            return Weighted(_resampled(free, weight / weight.sum(), target, chains, draws), np.nan, np.inf)
+            return Weighted(*_resampled(free, weight / weight.sum(), target, chains, draws), np.nan, np.inf)
         weight, k = smoothed_weights(log_weight)
         share = effective_share(weight)
-        if k <= SAMPLING.pareto_k and share >= (SAMPLING.good_share if turn < SAMPLING.rounds - 1 else least):
-            total = kept if many else chains * math.ceil(SAMPLING.proposed * draws / share)
-            if total > trial:
-                further, more = proposed(total - trial)
-                free, log_weight = np.concatenate([free, further]), np.concatenate([log_weight, more])
-            free, log_weight = free[:total], log_weight[:total]
-            weight, k = smoothed_weights(log_weight)
-            share = effective_share(weight)
-            if k <= SAMPLING.pareto_k and share >= least:
+        last = turn == SAMPLING.rounds - 1
+        if k <= SAMPLING.pareto_k and (share >= SAMPLING.good_share or share * len(free) >= kept or last):
+            total = kept if many else min(math.ceil(SAMPLING.proposed * kept / share), SAMPLING.rounds * trial)
+            if total > len(free):
+                mixture.propose(centre, width, total - len(free))
+                free, log_weight = mixture.free, mixture.log_weight
+                weight, k = smoothed_weights(log_weight)
+                share = effective_share(weight)
+            if k <= SAMPLING.pareto_k and share * len(free) >= SAMPLING.least:
                 value = float(cast(Any, logsumexp(log_weight))) - math.log(len(log_weight))
                 error = math.sqrt(max(1 / share - 1, 0.0) / len(weight))
-                return Weighted(_resampled(free, weight, target, chains, draws), value, error)
-        if share * len(weight) < SAMPLING.enough * len(mode):
+                return Weighted(*_resampled(free, weight, target, chains, draws), value, error)
+        weight = _tempered(log_weight, SAMPLING.enough * len(mode))
+        if weight is None:
             return None
         centre = weight @ free
         width = (free - centre).T @ (weight[:, None] * (free - centre))
     return None
 
 
-def _resampled(free: np.ndarray, weight: np.ndarray, target: LogPosterior, chains: int, draws: int) -> Population:
+class _Mixture:
+    """Draws of one Student distribution after another, all weighted by the mixture of them.
+
+    Attributes:
+        free: the draws.
+        log_weight: log density less that of the mixture, in the parts that each distribution has of the draws.
+    """
+
+    def __init__(self, seed: np.ndarray, target: LogPosterior, many: bool) -> None:
+        from scipy.stats import multivariate_t
+
+        self._rng, self._target, self._many = np.random.default_rng(seed), target, many
+        self._spreads = np.array(target.signed())
+        d = len(target.names)
+        self._signs = np.ones((2 ** len(self._spreads), d))
+        self._signs[:, self._spreads] = list(product((1.0, -1.0), repeat=len(self._spreads)))
+        # Standard deviations of coordinates differ by many powers of ten, for which SciPy takes a matrix for singular.
+        shape = cast(Any, np.eye(d) * (1 - 2 / SAMPLING.freedom))  # its stub takes a number
+        self._unit = multivariate_t(np.zeros(d), shape, SAMPLING.freedom)
+        self._parts: list[tuple[np.ndarray, np.ndarray, int]] = []
+        self.free, self._log_density = np.empty((0, d)), np.empty(0)
+        self._log_proposals = np.empty((0, 0))
+
+    def folded(self, free: np.ndarray) -> np.ndarray:
+        """Spreads' coordinates made positive."""
+        free[..., self._spreads] = np.abs(free[..., self._spreads])
+        return free
+
+    def propose(self, centre: np.ndarray, width: np.ndarray, count: int) -> None:
+        """Add draws of one more distribution, with its mean and covariance."""
+        factor = np.linalg.cholesky(width)
+        rows = int(count + -count % FIT.gradients)
+        new = self.folded(centre + np.asarray(self._unit.rvs(size=rows, random_state=self._rng)) @ factor.T)
+        log_density = np.concatenate(side_by_side(self._densities, np.split(new, rows // FIT.gradients)))
+        self.free = np.concatenate([self.free, new[:count]])
+        self._log_density = np.concatenate([self._log_density, log_density[:count]])
+        old = [self._proposal(new[:count], *part[:2]) for part in self._parts]
+        known = np.concatenate([self._log_proposals, np.stack(old, 1) if old else np.empty((count, 0))])
+        self._parts.append((centre, factor, count))
+        self._log_proposals = np.column_stack([known, self._proposal(self.free, centre, factor)])
+
+    @property
+    def log_weight(self) -> np.ndarray:
+        from scipy.special import logsumexp
+
+        share = np.log([count for *_, count in self._parts]) - np.log(len(self.free))
+        # The density is even in every spread's coordinate: folded, as much again for each.
+        twice = len(self._spreads) * math.log(2)
+        return self._log_density + twice - logsumexp(self._log_proposals + share, axis=1)
+
+    def _proposal(self, free: np.ndarray, centre: np.ndarray, factor: np.ndarray) -> np.ndarray:
+        from scipy.linalg import solve_triangular
+        from scipy.special import logsumexp
+
+        every_sign = (free[:, None] * self._signs - centre).reshape(-1, free.shape[1])
+        density = self._unit.logpdf(solve_triangular(factor, every_sign.T, lower=True).T).reshape(len(free), -1)
+        return logsumexp(density, axis=1) - np.sum(np.log(np.diagonal(factor)))
+
+    def _densities(self, part: np.ndarray) -> np.ndarray:
+        # Of few particles a gradient takes no time to speak of, and what the mode was found by is compiled already.
+        if self._many:
+            return np.asarray(log_densities(jnp.asarray(part), self._target))
+        return -gradients(part, self._target)[0]
+
+
+def _tempered(log_weight: np.ndarray, enough: int) -> np.ndarray | None:
+    """Weights to a power of at most 1 at which they are as many effective draws as a covariance takes, if there is."""
+    finite = np.where(np.isfinite(log_weight), log_weight, -np.inf)
+    if np.isfinite(finite).sum() < enough:
+        return None
+    log = finite - finite.max()
+    for power in 0.8 ** np.arange(30):
+        weight = np.exp(power * log)
+        weight /= weight.sum()
+        if effective_share(weight) * len(weight) >= enough:
+            return weight
+    return None
+
+
+def _resampled(
+    free: np.ndarray, weight: np.ndarray, target: LogPosterior, chains: int, draws: int
+) -> tuple[np.ndarray, Population]:
     """Weighted draws as equally weighted ones, each chain from draws of its own."""
-    several = zip(np.split(free, chains), np.split(weight, chains), strict=True)
-    chosen = np.concatenate([part[ordered_resample(own, draws)] for part, own in several])
-    return jax.tree.map(np.asarray, populations(jnp.asarray(chosen), target))
+    parts = (slice(c, None, chains) for c in range(chains))
+    chosen = np.concatenate([free[part][ordered_resample(weight[part], draws)] for part in parts])
+    return chosen, jax.tree.map(np.asarray, populations(jnp.asarray(chosen), target))
 
 
 def diagnostics(names: list[str], draws: np.ndarray) -> tuple[dict[str, float], dict[str, float], dict[str, float]]:

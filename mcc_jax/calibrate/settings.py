@@ -84,12 +84,13 @@ class SamplingSettings:
     Attributes:
         rhat, ess, pareto_k: the gate: R-hat at most, bulk ESS at least, Pareto k at most (Vehtari et al. 2021, 2024).
         freedom: degrees of freedom of the Student proposal: its tails are wider than the posterior's.
-        rounds: how often the proposal may be fitted anew.
-        enough: effective draws per coordinate that a proposal may be fitted to.
-        good_share: effective share of the proposed draws from which on the proposal need not be fitted any better.
-        least_share: least effective share with which the proposed draws are used; less, and NUTS runs.
-        proposed: so many times as many effective draws as are kept are proposed; of large campaigns, whose densities
-            are dear, as many as are kept.
+        rounds: how many distributions are proposed from, at most.
+        enough: effective draws per coordinate that a distribution may be fitted to; their weights are tempered if need
+            be.
+        good_share: effective share of the proposed draws from which on no further distribution is fitted.
+        least: least effective number of proposed draws with which they are used; fewer, and NUTS runs.
+        proposed: so many times as many effective draws as are kept are proposed, at most as many as all rounds would;
+            of large campaigns, whose densities are dear, as many as are kept.
         trial: draws that a proposal is tried on, and fitted to; of large campaigns a quarter.
         accept: acceptance that NUTS aims at. Where spreads are small what all particles share is narrow (a funnel), and
             with fewer than some ten particles the usual 0.8 lets trajectories diverge there.
@@ -119,7 +120,7 @@ class SamplingSettings:
     rounds: int = 6
     enough: int = 5
     good_share: float = 0.5
-    least_share: float = 0.1
+    least: float = 800.0
     proposed: float = 2.0
     trial: int = 4000
     accept: float = 0.99

@@ -46,6 +46,7 @@ def test_the_noise_is_that_of_the_instrument(posterior):
     assert posterior.noise_share < 0.5
 
 
+@pytest.mark.long
 def test_models_are_compared_by_evidence_and_by_particles_left_out(campaign, posterior):
     table = mcc.compare(campaign, [mcc.Model(), posterior])
     base, with_creep = table.to_dict("records")
@@ -55,6 +56,7 @@ def test_models_are_compared_by_evidence_and_by_particles_left_out(campaign, pos
     assert base["chi2_per_point"] > 2 > with_creep["chi2_per_point"]
 
 
+@pytest.mark.long
 def test_least_squares_agrees_with_the_mode(campaign, posterior):
     squares = mcc.least_squares(campaign, mcc.Model().with_effects(CREEP))
     mode, named = posterior.fit.population, posterior.named_population()

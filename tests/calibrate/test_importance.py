@@ -43,12 +43,9 @@ def normal(paper_posterior):
 def test_weighted_draws_are_those_of_a_known_density(normal, off):
     start = jnp.asarray((CENTRE + off * WIDTH) * np.where(np.arange(9) == 5, -1, 1))  # of either sign
     found = sample_weighted(jax.random.key(0), start, jnp.diag(jnp.asarray(WIDTH**2)), normal, chains=2, draws=2000)
-    chains, population = found.run, found.population
-    assert chains.position.shape == (2, 2000, 9)
-    assert not chains.divergent.any()
-    assert not chains.steps.any()
-    assert population.mu.shape == (4000, 3)
-    free = np.asarray(chains.position).reshape(-1, 9)
+    free = found.free
+    assert free.shape == (4000, 9)
+    assert found.population.mu.shape == (4000, 3)
     mean, sd = CENTRE.copy(), WIDTH.copy()
     mean[6], sd[6] = WIDTH[6] * np.sqrt(2 / np.pi), WIDTH[6] * np.sqrt(1 - 2 / np.pi)  # half-normal
     np.testing.assert_array_less(np.abs(free.mean(0) - mean), 0.08 * sd)

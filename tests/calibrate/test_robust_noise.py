@@ -40,7 +40,7 @@ def modulus(result):
     return found["value"], found["sd"]
 
 
-@pytest.mark.parametrize("calibrate", [least_squares, sample])
+@pytest.mark.parametrize("calibrate", [least_squares, pytest.param(sample, marks=pytest.mark.long)])
 def test_spikes_count_for_little(clean, spiked, calibrate):
     without, plain, robust = (
         modulus(calibrate(campaign, Model(robust=weigh), without_flagged=False))
