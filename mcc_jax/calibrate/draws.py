@@ -15,7 +15,7 @@ from .compiling import compiled
 from .effects import effect_numbers
 from .fit_result import Fit
 from .importance import diagnostics, sample_weighted
-from .mode import LogPosterior, density_of
+from .mode import LogPosterior, density_of, populations
 from .noise import standard_promotion
 from .particles import Drawer, ExactLikelihood, Length, chunk_of, corrected, every, stride_of, weighted
 from .population import COEFFICIENTS, Population
@@ -136,50 +136,83 @@ def _sampled(key: Array, fit: Fit, length: Length, many: bool, patient: bool) ->
         bad = sample_weighted(key, fit.mode, fit.covariance, target, **shape, however_bad=True)
         assert bad is not None
         return Run(bad.population), False, laplace
-    return _nuts(key, fit, length, max_tree_depth=SAMPLING.tree_depth)[0], True, laplace
+    free, divergent, steps = _sample_density(
+        jax.random.split(key, length.chains), fit.mode, fit.covariance, target, warmup=length.warmup, draws=length.draws
+    )
+    population = jax.tree.map(np.asarray, populations(free.reshape(-1, free.shape[-1]), target))
+    return Run(population, int(np.sum(divergent)), float(np.mean(steps))), True, laplace
 
 
-def _nuts(key: Array, fit: Fit, length: Length, *, explicit: bool = False, **settings: Any) -> tuple[Run, Any]:
-    """NumPyro's NUTS on the model of a fit, and every particle's own numbers where they are explicit."""
+@compiled
+def _sample_density(
+    keys: Array, mode: Array, covariance: Array, target: LogPosterior, *, warmup: int, draws: int
+) -> tuple[Array, Array, Array]:
+    """NUTS on the population's density: draws of all chains, which diverged, and leapfrog steps.
+
+    A function of the data, compiled once for a shape: NumPyro's `MCMC` compiles anew for every data set.
+    """
+    from numpyro.infer import NUTS
+
+    factor = jnp.linalg.cholesky(covariance)
+
+    def potential(z: Array) -> Array:
+        value = -target.log_density(mode + factor @ z)
+        return jnp.where(jnp.isnan(value), jnp.inf, value)
+
+    options: dict[str, Any] = {
+        "target_accept_prob": SAMPLING.fallback_accept,
+        "max_tree_depth": SAMPLING.tree_depth,
+    }
+
+    def chain(key: Array) -> tuple[Array, Array, Array]:
+        kernel = NUTS(potential_fn=potential, **options)
+        start_key, key = jax.random.split(key)
+        state = kernel.init(key, warmup, jax.random.normal(start_key, mode.shape, mode.dtype), (), {})
+
+        def advance(state: Any, _: None) -> tuple[Any, tuple[Array, Array, Array]]:
+            state = kernel.sample(state, (), {})
+            return state, (state.z, state.diverging, state.num_steps)
+
+        # One loop for warm-up and draws, so that the sampler is compiled once.
+        _, (z, divergent, steps) = jax.lax.scan(advance, state, None, length=warmup + draws)
+        return mode + z[warmup:] @ factor.T, divergent[warmup:], steps[warmup:]
+
+    with standard_promotion():
+        return jax.vmap(chain)(keys)
+
+
+def draw_joint(key: Array, fit: Fit, length: Length) -> Draws:
+    """Population and particles sampled together by NumPyro's NUTS under the exact likelihood (`Fit.nuts`)."""
     from numpyro.infer import MCMC
 
     with standard_promotion():
         mcmc = MCMC(
-            fit.nuts(explicit=explicit, **settings),
+            fit.nuts(explicit=True),
             num_warmup=length.warmup,
             num_samples=length.draws,
             num_chains=length.chains,
             chain_method="vectorized",
             progress_bar=False,
         )
-        told = (fit.tests,) if explicit else (fit.tests, fit.marginal)
-        mcmc.run(key, *told, extra_fields=("diverging", "num_steps"))
+        mcmc.run(key, fit.tests, extra_fields=("diverging", "num_steps"))
         samples, extra = mcmc.get_samples(), mcmc.get_extra_fields()
-    names = (*fit.names, "own") if explicit else fit.names
-    population, particles = _at_sites({name: jnp.asarray(samples[name]) for name in names}, fit.target)
-    population, particles = jax.tree.map(np.asarray, (population, particles))
-    return Run(population, int(np.sum(extra["diverging"])), float(np.mean(extra["num_steps"]))), particles
+    sites = {name: jnp.asarray(samples[name]) for name in (*fit.names, "own")}
+    population, particles = jax.tree.map(np.asarray, _explicit(sites, fit.target))
+    run = Run(population, int(np.sum(extra["diverging"])), float(np.mean(extra["num_steps"])))
+    names, stacked = _stack(population, fit, length)
+    return _collected(run, names, stacked, particles, fit, length)
 
 
 @compiled
-def _at_sites(sites: dict[str, Array], target: LogPosterior) -> tuple[Population, tuple[Array, ...] | None]:
-    """Populations, and particles where they are explicit, at draws of the model's sites."""
+def _explicit(sites: dict[str, Array], target: LogPosterior) -> tuple[Population, tuple[Array, ...]]:
+    """Populations and particles at draws of the explicit model's sites."""
 
-    def one(values: dict[str, Array]) -> tuple[Population, tuple[Array, ...] | None]:
-        population, own = target.at_values(values), values.get("own")
-        if own is None:
-            return population, None
+    def one(values: dict[str, Array]) -> tuple[Population, tuple[Array, ...]]:
+        population, own = target.at_values(values), values["own"]
         drawn = target.marginal.draw(population, own[:, :-1], own[:, -1])
         return population, (drawn.latent, drawn.theta, drawn.zero, drawn.log_likelihood)
 
     return jax.lax.map(one, sites)
-
-
-def draw_joint(key: Array, fit: Fit, length: Length) -> Draws:
-    """Population and particles sampled together by NumPyro's NUTS under the exact likelihood (`Fit.nuts`)."""
-    run, particles = _nuts(key, fit, length, explicit=True)
-    names, stacked = _stack(run.population, fit, length)
-    return _collected(run, names, stacked, particles, fit, length)
 
 
 def _collected(

@@ -94,8 +94,9 @@ class SamplingSettings:
         trial: draws that a proposal is tried on, and fitted to; of large campaigns a quarter.
         accept: acceptance that NUTS aims at. Where spreads are small what all particles share is narrow (a funnel), and
             with fewer than some ten particles the usual 0.8 lets trajectories diverge there.
-        tree_depth: of NUTS as a fallback. Around its mode, in coordinates scaled by the curvature there, a density that
-            is near normal takes 7 leapfrog steps a draw; one that needs more than 63 shows in R-hat.
+        fallback_accept, tree_depth: of NUTS where importance sampling failed. Around its mode, in coordinates scaled by
+            the curvature there, a density that is near normal takes 15 leapfrog steps a draw; one that needs more than
+            31 would take minutes, and shows in R-hat.
         restless, restless_of_many: a particle whose weight scatters by more than this share of its mean gets several
             candidates per draw; of many particles, whose weights are not applied, a mean is then wrong by at most this
             share of its standard deviation.
@@ -124,10 +125,11 @@ class SamplingSettings:
     proposed: float = 2.0
     trial: int = 4000
     accept: float = 0.99
-    tree_depth: int = 6
+    fallback_accept: float = 0.95
+    tree_depth: int = 5
     restless: float = 0.3
     restless_of_many: float = 0.1
-    candidates: tuple[int, ...] = (16, 64)
+    candidates: tuple[int, ...] = (16, 32)
     candidates_of_many: tuple[int, ...] = (2, 16)
     few: int = 4
     reach: float = 3.0
