@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import os
+import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, cast
@@ -28,6 +30,12 @@ def even_batch(count: int, most: int) -> int:
     most = max(1, min(count, most))
     even = next(size for size in range(most, 0, -1) if count % size == 0)
     return even if 2 * even >= most else most
+
+
+def imported_meanwhile(*names: str) -> None:
+    """Import what is needed later beside what is compiled first: together they would take seconds longer."""
+    for name in names:
+        threading.Thread(target=importlib.import_module, args=(name,), daemon=True).start()
 
 
 def side_by_side[A, B](function: Callable[[A], B], arguments: Iterable[A]) -> list[B]:

@@ -42,10 +42,15 @@ class Shapes(eqx.Module):
 @cache
 def coordinate_names(model: Model) -> tuple[str, ...]:
     """Names of the sites that are sampled when particles are integrated out; all are numbers."""
-    shapes = Shapes(jnp.asarray([0.1, 0.2]))
-    with standard_promotion():
+    names: list[str] = []
+
+    def collect(shapes: Shapes) -> None:
         trace = handlers.trace(handlers.seed(model.population, jax.random.key(0))).get_trace(shapes)
-    return tuple(name for name, site in trace.items() if site["type"] == "sample")
+        names.extend(name for name, site in trace.items() if site["type"] == "sample")
+
+    with standard_promotion():
+        jax.eval_shape(collect, Shapes(jnp.zeros(2)))  # nothing is computed, so nothing is compiled
+    return tuple(names)
 
 
 class LogPosterior(eqx.Module):
@@ -92,11 +97,15 @@ class LogPosterior(eqx.Module):
 
     def unconstrain(self, values: dict[str, Any]) -> Float[Array, " d"]:
         """Unbounded coordinates of the sites' values."""
-        given = {name: jnp.asarray(float(values[name])) for name in self.names}
-        with standard_promotion():
-            prior = handlers.seed(self.model.population, jax.random.key(0))
-            free = unconstrain_fn(prior, (self.marginal,), {}, given)
-        return jnp.stack([jnp.asarray(free[name]) for name in self.names])
+        return _unconstrained(jnp.asarray(np.array([float(values[name]) for name in self.names])), self)
+
+
+@compiled
+def _unconstrained(values: Float[Array, " d"], target: LogPosterior) -> Float[Array, " d"]:
+    with standard_promotion():
+        prior = handlers.seed(target.model.population, jax.random.key(0))
+        free = unconstrain_fn(prior, (target.marginal,), {}, target.sites(values))
+    return jnp.stack([jnp.asarray(free[name]) for name in target.names])
 
 
 def values_of(population: Population, model: Model, flatness: Array) -> dict[str, Array]:

@@ -15,6 +15,7 @@ from .._errors import InputError
 from .._format import with_sd
 from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_plausibility, check_tests
 from ..effects import Variant
+from .compiling import imported_meanwhile
 from .data import Selection, compared_rows, own_misfit, ranges_um, root_mean_squares
 from .draws import Draws, draw_fast, draw_joint
 from .effects import effect_entries, effect_numbers
@@ -353,6 +354,7 @@ def sample(
             wrong kind or out of its range.
     """
     started = time.perf_counter()
+    imported_meanwhile("scipy.stats", "arviz_stats.base.array")
     campaign = check_tests(campaign)
     tell, model, threshold_MPa = checked_settings(progress, model, threshold_MPa, block)
     seed = arguments.seed(seed)

@@ -122,7 +122,7 @@ class SamplingSettings:
     enough: int = 5
     good_share: float = 0.5
     least: float = 800.0
-    proposed: float = 2.0
+    proposed: float = 1.5
     trial: int = 4000
     accept: float = 0.99
     fallback_accept: float = 0.95
