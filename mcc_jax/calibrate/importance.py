@@ -160,7 +160,8 @@ class _Mixture:
         share = np.log([count for *_, count in self._parts]) - np.log(len(self.free))
         # The density is even in every spread's coordinate: folded, as much again for each.
         twice = len(self._spreads) * math.log(2)
-        return self._log_density + twice - logsumexp(self._log_proposals + share, axis=1)
+        mixture = np.asarray(logsumexp(self._log_proposals + share, axis=1))
+        return self._log_density + twice - mixture
 
     def _proposal(self, free: np.ndarray, centre: np.ndarray, factor: np.ndarray) -> np.ndarray:
         from scipy.linalg import solve_triangular
