@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+from collections.abc import Iterator
 from itertools import product
 from typing import Any, NamedTuple, cast
 
@@ -25,7 +26,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .compiling import compiled, even_batch, side_by_side
-from .mode import LogPosterior, gradients, populations
+from .mode import LogPosterior, expanded, gradients, populations
 from .population import Population
 from .settings import FIT, NUMERICS, SAMPLING
 
@@ -104,12 +105,52 @@ def sample_weighted(
                 value = float(cast(Any, logsumexp(log_weight))) - math.log(len(log_weight))
                 error = math.sqrt(max(1 / share - 1, 0.0) / len(weight))
                 return Weighted(*_resampled(free, weight, target, chains, draws), value, error)
+        if turn == 0:
+            # What all particles share is the narrower the smaller a spread is: a funnel, into which more narrow
+            # distributions reach, each around the most probable population at one value of a spread.
+            for place in target.signed():
+                for centre, width in _along(place, np.array(mode), np.asarray(covariance), target):
+                    mixture.propose(mixture.folded(centre), width, trial // SAMPLING.parts)
+            log_weight, free = mixture.log_weight, mixture.free
         weight = _tempered(log_weight, SAMPLING.enough * len(mode))
         if weight is None:
             return None
         centre = weight @ free
         width = (free - centre).T @ (weight[:, None] * (free - centre))
     return None
+
+
+def _along(
+    place: int, mode: np.ndarray, covariance: np.ndarray, target: LogPosterior
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Mean and covariance of the population at values of one coordinate on both sides of its mode."""
+    sd = np.sqrt(np.diagonal(covariance))
+    others = np.delete(np.arange(len(mode)), place)
+    for side in (-1, 1):
+        free = np.array(mode)
+        for _ in range(SAMPLING.nodes):
+            free[place] += side * sd[place]
+            if free[place] < -0.5 * sd[place]:
+                break
+            for _ in range(SAMPLING.newton):  # the others follow
+                _, slope, curvature = expanded(free, 1e-3 * np.minimum(sd, 1.0), target)
+                if not (np.isfinite(slope).all() and np.isfinite(curvature).all()):
+                    return
+                within = _inverse(curvature[np.ix_(others, others)], sd[others])
+                step = within @ slope[others]
+                free[others] -= step / max(1.0, float(np.max(np.abs(step) / sd[others])))
+            tangent = -within @ curvature[others, place]
+            width = np.zeros_like(covariance)
+            width[np.ix_(others, others)] = within + sd[place] ** 2 * np.outer(tangent, tangent)
+            width[others, place] = width[place, others] = sd[place] ** 2 * tangent
+            width[place, place] = sd[place] ** 2
+            yield free.copy(), width
+
+
+def _inverse(curvature: np.ndarray, sd: np.ndarray) -> np.ndarray:
+    """The inverse, on the scale of each coordinate; what is not convex is taken as wide."""
+    values, vectors = np.linalg.eigh(curvature * sd * sd[:, None])
+    return (vectors / np.where(values > 0.01, values, 0.1)) @ vectors.T * sd * sd[:, None]
 
 
 class _Mixture:
@@ -195,8 +236,8 @@ def _tempered(log_weight: np.ndarray, enough: int) -> np.ndarray | None:
 def _resampled(
     free: np.ndarray, weight: np.ndarray, target: LogPosterior, chains: int, draws: int
 ) -> tuple[np.ndarray, Population]:
-    """Weighted draws as equally weighted ones, each chain from draws of its own."""
-    parts = (slice(c, None, chains) for c in range(chains))
+    """Weighted draws as equally weighted ones, each chain from draws of its own, in no order."""
+    parts = np.split(np.random.default_rng(len(free)).permutation(len(free) - len(free) % chains), chains)
     chosen = np.concatenate([free[part][ordered_resample(weight[part], draws)] for part in parts])
     return chosen, jax.tree.map(np.asarray, populations(jnp.asarray(chosen), target))
 

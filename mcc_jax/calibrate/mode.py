@@ -206,11 +206,7 @@ def _most_probable(origin: np.ndarray, target: LogPosterior) -> tuple[Float[Arra
     width = np.full(d, 1e-5)
 
     def expand(free: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        steps = np.diag(width)
-        points = free + np.concatenate([np.zeros((1, d)), steps, -steps])
-        value, slope = gradients(points, target)
-        curvature = (slope[1 : d + 1] - slope[d + 1 :]) / (2 * width[:, None])
-        return float(value[0]), slope[0], (curvature + curvature.T) / 2
+        return expanded(free, width, target)
 
     # Where data are very exact the scales at the start are far from those at the mode: then once more from there.
     success = False
@@ -234,6 +230,14 @@ def _most_probable(origin: np.ndarray, target: LogPosterior) -> tuple[Float[Arra
     # Rounding may keep the optimiser from its tolerance at the very mode: what counts is what is left to gain.
     there = convex and float(slope @ covariance @ slope) < FIT.mode_gain
     return jnp.asarray(origin), jnp.asarray(covariance), success or there
+
+
+def expanded(free: np.ndarray, width: np.ndarray, target: LogPosterior) -> tuple[float, np.ndarray, np.ndarray]:
+    """Minus the log density, its gradient, and its curvature from differences of gradients over these widths."""
+    d, steps = len(free), np.diag(width)
+    value, slope = gradients(free + np.concatenate([np.zeros((1, d)), steps, -steps]), target)
+    curvature = (slope[1 : d + 1] - slope[d + 1 :]) / (2 * width[:, None])
+    return float(value[0]), slope[0], (curvature + curvature.T) / 2
 
 
 def _newton(expand: Callable[[np.ndarray], tuple[float, np.ndarray, np.ndarray]], origin: np.ndarray, unit: np.ndarray):

@@ -88,6 +88,9 @@ class SamplingSettings:
         enough: effective draws per coordinate that a distribution may be fitted to; their weights are tempered if need
             be.
         good_share: effective share of the proposed draws from which on no further distribution is fitted.
+        nodes, newton, parts: where the first is not good enough, distributions around the most probable population at
+            so many values on either side of each spread, a standard deviation apart, found in so many steps; each gets
+            one part in so many of a trial.
         least: least effective number of proposed draws with which they are used; fewer, and NUTS runs.
         proposed: so many times as many effective draws as are kept are proposed, at most as many as all rounds would;
             of large campaigns, whose densities are dear, as many as are kept.
@@ -120,6 +123,9 @@ class SamplingSettings:
     freedom: int = 10
     rounds: int = 6
     enough: int = 5
+    nodes: int = 3
+    newton: int = 4
+    parts: int = 4
     good_share: float = 0.5
     least: float = 800.0
     proposed: float = 1.5
