@@ -127,7 +127,7 @@ def _along(
     sd = np.sqrt(np.diagonal(covariance))
     others = np.delete(np.arange(len(mode)), place)
     for side in (-1, 1):
-        free = np.array(mode)
+        free, within, curvature = np.array(mode), covariance[np.ix_(others, others)], np.zeros_like(covariance)
         for _ in range(SAMPLING.nodes):
             free[place] += side * sd[place]
             if free[place] < -0.5 * sd[place]:
