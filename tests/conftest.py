@@ -83,8 +83,35 @@ def pytest_xdist_make_scheduler(config, log):
     return ByGroup(config, log) if config.getoption("dist") == "loadfile" else None
 
 
-def pytest_collection_modifyitems(items):
-    """Tests of one group stand together, the longest first."""
+CASES = 5
+"""Of a test with more cases as many run, spread evenly; `--every-case` and `-k` run all."""
+
+
+def pytest_addoption(parser):
+    parser.addoption("--every-case", action="store_true", help=f"also of tests with more than {CASES} cases")
+
+
+def some_of_many(config, items):
+    """The tests to run, and those that are left out."""
+    if config.getoption("--every-case") or config.option.keyword:
+        return items, []
+    several = {}
+    for item in items:
+        several.setdefault(item.nodeid.split("[")[0], []).append(item)
+    kept = []
+    for cases in several.values():
+        step = max(1, (len(cases) - 1) / (CASES - 1))
+        kept += [cases[round(k * step)] for k in range(min(CASES, len(cases)))]
+    chosen = {id(item) for item in kept}
+    return [i for i in items if id(i) in chosen], [i for i in items if id(i) not in chosen]
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(config, items):
+    """Tests of one group stand together, the longest first; of tests with many cases some."""
+    items[:], left_out = some_of_many(config, items)
+    if left_out:
+        config.hook.pytest_deselected(items=left_out)
 
     def place(item):
         group = group_of(item.nodeid)

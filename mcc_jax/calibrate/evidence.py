@@ -76,8 +76,8 @@ def log_evidence(campaign: Campaign | Posterior, model: Model | None = None, *, 
     Raises:
         InputError: for a model with robust noise.
     """
+    _refuse_robust(campaign.model if isinstance(campaign, Posterior) else model)
     posterior = campaign if isinstance(campaign, Posterior) else sample(campaign, model, seed=seed)
-    _refuse_robust(posterior)
     k = np.inf if posterior.pareto_k_joint is None else posterior.pareto_k_joint
     return Evidence(*posterior.log_evidence, float(k))
 
@@ -105,9 +105,9 @@ def compare(campaign: Campaign, models: Sequence[Model | Posterior], *, seed: in
     arguments.instance(models, Sequence, "models", "Give a list of mcc_jax.Model.")
     if not models:
         raise InputError("there is no model to compare")
+    for one in models:
+        _refuse_robust(one.model if isinstance(one, Posterior) else one)
     found = [one if isinstance(one, Posterior) else sample(campaign, one, seed=seed) for one in models]
-    for one in found:
-        _refuse_robust(one)
     counted = [np.asarray(one.selection.tests.mask).sum(1) for one in found]
     if any(
         one.particles != found[0].particles or not np.array_equal(n, counted[0])
@@ -140,8 +140,8 @@ def compare(campaign: Campaign, models: Sequence[Model | Posterior], *, seed: in
     return pd.DataFrame(rows)
 
 
-def _refuse_robust(posterior: Posterior) -> None:
-    if posterior.model.robust:
+def _refuse_robust(model: Model | None) -> None:
+    if model is not None and model.robust:
         raise InputError(
             "readings are weighed anew in every robust fit, so its likelihood cannot be compared with another's",
             remedy="Compare models with robust=False.",

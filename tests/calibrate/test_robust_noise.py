@@ -9,7 +9,7 @@ import pytest
 from joint_cases import NOISE
 from numpyro.infer.util import log_density
 
-from mcc_jax import InputError, Model, compare, least_squares, paper_campaign, sample, select_tests
+from mcc_jax import InputError, Model, compare, least_squares, log_evidence, paper_campaign, sample, select_tests
 from mcc_jax.calibrate.noise import standard_promotion, student_weights
 
 SPIKED, SPIKE_UM = 0.05, 0.5
@@ -67,6 +67,7 @@ def test_weights_say_what_a_mean_is_known_by(freedom):
     assert np.mean(claimed) == pytest.approx(np.var(means), rel=0.25)
 
 
+@pytest.mark.long
 def test_explicit_model_samples_the_weights(clean):
     """Without a fit the weight of every reading is a number of the model."""
     tests = select_tests(clean)
@@ -83,4 +84,6 @@ def test_what_cannot_be_is_refused(clean):
     with pytest.raises(InputError, match="exclude each other"):
         least_squares(clean, Model(robust=True), loss="cauchy")
     with pytest.raises(InputError, match="robust=False"):
-        compare(clean, [sample(clean, Model(robust=True), draws=50, chains=2, without_flagged=False)])
+        compare(clean, [Model(), Model(robust=True)])
+    with pytest.raises(InputError, match="robust=False"):
+        log_evidence(clean, Model(robust=True))
