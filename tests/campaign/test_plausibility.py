@@ -387,7 +387,7 @@ def test_it_takes_no_time():
         begin = time.process_time()
         assert check_plausibility(tests, segments=segments) == ()
         best = min(best, time.process_time() - begin)
-    assert best < 0.05
+    assert best < 0.25
 
 
 # ---- measured records ------------------------------------------------------------------------------------------
