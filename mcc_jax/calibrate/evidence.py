@@ -106,6 +106,7 @@ def compare(campaign: Campaign, models: Sequence[Model | Posterior], *, seed: in
     if not models:
         raise InputError("there is no model to compare")
     for one in models:
+        arguments.instance(one, (Model, Posterior), "models", "Give a list of mcc_jax.Model.")
         _refuse_robust(one.model if isinstance(one, Posterior) else one)
     found = [one if isinstance(one, Posterior) else sample(campaign, one, seed=seed) for one in models]
     counted = [np.asarray(one.selection.tests.mask).sum(1) for one in found]
