@@ -21,6 +21,7 @@ from .noise import Whitening, standard_promotion
 from .population import COEFFICIENTS, Population, flattened
 from .posterior import Posterior
 from .predict import A_CALIBRATION, laws_with, predicted_at, predicted_by
+from .settings import SAMPLING
 
 if TYPE_CHECKING:
     from xarray import DataTree
@@ -46,15 +47,6 @@ UNITS = {
     "pareto_k": "1",
     "lp_test": "nat",
 }
-PREDICTIVE_DRAWS = 50
-"""Curves per chain and particle kept in the predictive groups."""
-
-MAX_PREDICTIVE = 2_000_000
-"""At most as many predicted points are kept: of large campaigns the first particles only."""
-
-
-POINT_DRAWS = 250
-"""Draws per chain kept where every point has a likelihood of its own."""
 
 
 def prior_draws(calibration: Posterior, count: int, seed: int) -> dict[str, np.ndarray]:
@@ -102,7 +94,7 @@ def to_arviz(calibration: Posterior, *, prior_count: int = 500, points: bool = F
     c, tests = calibration, calibration.selection.tests
     particles, mask = list(c.particles), np.asarray(tests.mask)
     chains, draws = np.asarray(c.population.a).shape
-    thin = slice(None, None, -(-draws // POINT_DRAWS) if points else 1)
+    thin = slice(None, None, -(-draws // SAMPLING.points_draws) if points else 1)
     population = jax.tree.map(lambda x: np.asarray(x)[:, thin], c.population)
     posterior: dict[str, Any] = _variables(population, c.model) | {
         "yield_stress_MPa": c.yield_stress_MPa()[:, thin],
@@ -208,18 +200,18 @@ def _predictive(
     points = mask.shape[1]
     shown = len(mask)
     if thin is None:
-        shown = max(1, min(shown, MAX_PREDICTIVE // (chains * PREDICTIVE_DRAWS * points)))
-        thin = slice(None, None, -(-draws // PREDICTIVE_DRAWS))
+        shown = max(1, min(shown, SAMPLING.points // (chains * SAMPLING.curves * points)))
+        thin = slice(None, None, -(-draws // SAMPLING.curves))
     pick = np.arange(chains * draws).reshape(chains, draws)[:, thin]
     predicted = np.full((*pick.shape, shown, points), np.nan, np.float32)
-    before = np.full((1, PREDICTIVE_DRAWS, shown, points), np.nan, np.float32)
+    before = np.full((1, SAMPLING.curves, shown, points), np.nan, np.float32)
     for row in range(shown):
         curves = predicted_at(c, row, pick.ravel(), seed + row)
         assert curves.observed_um is not None
         length = curves.observed_um.shape[1]
         shaped = curves.observed_um.reshape(*pick.shape, length)
         predicted[:, :, row, :length] = np.where(mask[row, :length], shaped, np.nan)
-        before[0, :, row] = np.where(mask[row], _prior_curves(c, prior, row, PREDICTIVE_DRAWS, seed), np.nan)
+        before[0, :, row] = np.where(mask[row], _prior_curves(c, prior, row, SAMPLING.curves, seed), np.nan)
     return shown, predicted, before
 
 

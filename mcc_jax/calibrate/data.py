@@ -29,8 +29,8 @@ from ..campaign.record import humidities, record_of
 from ..effects import Record
 from ..geometry import Particle
 from .paper.modulus import MIN_RATIO
-from .paper.prediction import READING_UM, point_noise_um
-from .settings import SELECTION
+from .paper.prediction import point_noise_um
+from .settings import PAPER, SELECTION
 
 
 class Tests(eqx.Module):
@@ -360,7 +360,7 @@ def _prepare(
         return too_few(int(loading.sum()), SELECTION.least_points)
     climb = curve.displacement_um[rows[loading]]
     third = max(len(climb) // 3, 1)
-    rise, noise = climb[-third:].mean() - climb[:third].mean(), max(point_noise_um(curve), READING_UM)
+    rise, noise = climb[-third:].mean() - climb[:third].mean(), max(point_noise_um(curve), PAPER.reading_um)
     if rise <= SELECTION.climb * noise / np.sqrt(third):
         return no_climb(float(rise) if rise >= 0 or -rise > SELECTION.climb * noise / np.sqrt(third) else 0.0)
     contact = float(curve.displacement_um[0]) if contact is None else contact

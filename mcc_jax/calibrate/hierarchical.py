@@ -17,10 +17,8 @@ from .data import Tests
 from .forward import Forms, Point, residuals
 from .noise import Whitening
 from .population import Population, Scatter, moments
+from .settings import FIT
 from .small_matrices import Cholesky
-
-MIN_SPREAD = 1e-4
-"""Least standard deviation of log C in the pooled residuals; any smaller and the problem is badly scaled."""
 
 
 def robust(loss: str, r: Values) -> Values:
@@ -90,8 +88,8 @@ def pooled_residual(settings: Pooled, tests: Tests) -> Callable[[Parameters], tu
     """
     scatter, at = settings.scatter, settings.population
     size = 4 if scatter.modulus else 3
-    tau = jnp.maximum(at.tau, MIN_SPREAD)
-    modulus = jnp.maximum(at.modulus_scatter, MIN_SPREAD)
+    tau = jnp.maximum(at.tau, FIT.least_spread)
+    modulus = jnp.maximum(at.modulus_scatter, FIT.least_spread)
     mean_zero, sd_zero = settings.zero_prior
     count = jnp.asarray(float(len(tests))) if tests.weight is None else jnp.sum(tests.weight)
 
@@ -107,7 +105,7 @@ def pooled_residual(settings: Pooled, tests: Tests) -> Callable[[Parameters], tu
         found = [robust(settings.loss, data), pooled, zero]
         for j, (k, signed) in enumerate(scatter.varying):
             shared = y.shared[len(SHARED) + k]
-            unit = jnp.maximum(at.theta_scatter[j], MIN_SPREAD) * (1.0 if signed else jnp.abs(at.theta[k]))
+            unit = jnp.maximum(at.theta_scatter[j], FIT.least_spread) * (1.0 if signed else jnp.abs(at.theta[k]))
             found.append(((point.theta[:, k] - shared) / unit)[:, None])
         if len(settings.further):
             # A prior that all share, in equal parts of all particles.

@@ -28,13 +28,9 @@ from .judgement import judged, noise_share, numbers_in_reach, unlike_others
 from .model import Model
 from .population import COEFFICIENTS
 from .results import Calibration
+from .settings import FIT
 
 Loss = Literal["linear", "soft_l1", "cauchy"]
-STARTS = (0.0, 2.5)
-"""Values of a to start from besides the population's mode."""
-
-OPEN = 1e-3
-"""A combination of shared parameters counts as open if its curvature, each parameter scaled to its own, is smaller."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +53,7 @@ class Identifiability:
         """Combinations that the data leave open, in words."""
         found = []
         for value, row in zip(self.singular_values, self.directions, strict=True):
-            if value < OPEN:
+            if value < FIT.open:
                 terms = [f"{w:+.2f} {n}" for w, n in zip(row, self.names, strict=True) if abs(w) > 0.1]
                 found.append(" ".join(terms))
         return found
@@ -309,7 +305,7 @@ class LeastSquares(Calibration):
         return float(np.sum(np.asarray(self.solution.residual[0]) ** 2) / freedom)
 
     def _open_share(self, parameter: int) -> float:
-        rows = self.identifiability.directions[self.identifiability.singular_values < OPEN]
+        rows = self.identifiability.directions[self.identifiability.singular_values < FIT.open]
         return float(np.sum(rows[:, parameter] ** 2)) if len(rows) else 0.0
 
 
@@ -386,7 +382,7 @@ def least_squares(
         tell("fitting all particles together")
         flatness = np.asarray(tests.flatness)
         low, high = -0.9 / max(flatness.max(), 1e-3), -0.9 / min(flatness.min(), -1e-3)
-        starts = [float(population.a), *(a for a in STARTS if low < a < high)]
+        starts = [float(population.a), *(a for a in FIT.shapes if low < a < high)]
         mu, log_modulus = np.asarray(population.mu), float(population.log_modulus)
         found = [solve(fit, settings, tests, a, mu, log_modulus) for a in starts]
         losses = np.array([float(one.loss) for one in found])

@@ -30,9 +30,8 @@ from .._types import Path, Scalar
 from .compiling import compiled
 from .data import Tests
 from .forward import Linear
-from .paper.prediction import READING_UM
 from .priors import NoisePrior
-from .settings import FIT
+from .settings import FIT, PAPER
 from .sharding import Blocks, Parts
 from .small_matrices import eliminate
 
@@ -170,7 +169,7 @@ class Whitening(eqx.Module):
     @property
     def reading(self) -> Scalar:
         """Sum of squares that reading a display of finite steps alone brings about, however well the law fits."""
-        return READING_UM**2 * self.information
+        return PAPER.reading_um**2 * self.information
 
     def _power(self) -> Path:
         return jax.ops.segment_sum(self.peak**2, self.branch, len(self.peak))

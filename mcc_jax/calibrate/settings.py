@@ -10,6 +10,30 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
+class PaperSettings:
+    """What the paper's own steps leave out, and where they begin.
+
+    Attributes:
+        unloaded_from: points of unloading below this share of the peak stress are left out: strain there depends on
+            stress with an infinite slope.
+        smallest_share: a factor of the quintic is kept at least this share of the largest stress, so that its logarithm
+            exists.
+        spread_from: the spread of stress is fitted from so many thresholds on, 1 MPa in the paper.
+        shape_starts: values of a from which the collapse is sought.
+        shape_factor: shape factors beyond this, twice the paper's largest, come from curves that do not collapse.
+        reading_um: what no record of displacement is better than [um]: counted as misfit at every point, so that the
+            noise of a record without any, of a simulation say, is small but not nothing.
+    """
+
+    unloaded_from: float = 0.05
+    smallest_share: float = 1e-6
+    spread_from: float = 5.0
+    shape_starts: tuple[float, ...] = (-0.5, 0.0, 1.0, 3.0)
+    shape_factor: float = 4.0
+    reading_um: float = 2e-4
+
+
+@dataclass(frozen=True)
 class SelectionSettings:
     """Which points and particles take part.
 
@@ -54,6 +78,10 @@ class FitSettings:
         mode_gain: twice the log probability still to gain, by Newton's method, at which the mode is reached.
         attempts: how often the search for the mode begins anew where it stopped.
         outlying: a particle whose noise differs by so many standard deviations keeps its own scale.
+        shapes: values of a that least squares begins from besides the population's mode.
+        open: a combination of shared parameters is open where its curvature, each scaled to its own, is smaller.
+        least_spread: least standard deviation of log C in the residuals of least squares: with any smaller the problem
+            is badly scaled.
     """
 
     zeros: int = 21
@@ -75,6 +103,9 @@ class FitSettings:
     mode_gain: float = 1e-6
     attempts: int = 4
     outlying: float = 5.0
+    shapes: tuple[float, float] = (0.0, 2.5)
+    open: float = 1e-3
+    least_spread: float = 1e-4
 
 
 @dataclass(frozen=True)
@@ -115,6 +146,9 @@ class SamplingSettings:
         lowest: log ratio that counts where the exact likelihood vanishes: differences of infinities say nothing.
         unsure: standard error of the correction, in standard deviations of the posterior, that a reader is told of.
         kept: at most so many draws of single particles are kept; of very large campaigns every n-th draw.
+        curves, points: curves per chain and particle that are predicted for ArviZ, and most points of them all: of
+            large campaigns the first particles only.
+        points_draws: draws per chain kept where every point has a likelihood of its own.
     """
 
     rhat: float = 1.01
@@ -145,6 +179,9 @@ class SamplingSettings:
     lowest: float = -1e3
     unsure: float = 0.3
     kept: int = 4_000_000
+    curves: int = 50
+    points: int = 2_000_000
+    points_draws: int = 250
 
 
 @dataclass(frozen=True)
@@ -171,6 +208,8 @@ class Numerics:
         densities: particles times draws.
         group: restless particles that are drawn together.
         side_by_side: pieces that draws are cut into on a CPU, on any number of cores.
+        blocks: sizes of a campaign that is one block: those between are filled up, so that few sizes are compiled. The
+            last is the most particles of a block: on a processor larger ones are no faster, smaller ones slower.
     """
 
     rows: int = 640
@@ -178,7 +217,8 @@ class Numerics:
     densities: int = 4096
     group: int = 64
     side_by_side: int = 2
+    blocks: tuple[int, ...] = (4, 8, 12, 16, 20, 24, 32, 40, 48, 64)
 
 
-SELECTION, FIT, SAMPLING = SelectionSettings(), FitSettings(), SamplingSettings()
+PAPER, SELECTION, FIT, SAMPLING = PaperSettings(), SelectionSettings(), FitSettings(), SamplingSettings()
 JUDGEMENT, NUMERICS = JudgementSettings(), Numerics()

@@ -26,22 +26,18 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from .._errors import InputError
 from .compiling import compiled
 from .data import Tests, enlarged
+from .settings import NUMERICS
 
 AXIS = "particles"
 """Name of the only axis of the mesh of a process's devices."""
 
-MOST = 64
-"""Most particles of a block. On a processor larger ones are no faster; smaller ones are slower, but spread finer."""
-
-SIZES = (4, 8, 12, 16, 20, 24, 32, 40, 48, MOST)
-"""Sizes of a campaign that is one block: those between are filled up, so that few sizes have to be compiled."""
-
 
 def block_size(count: int) -> int:
     """Particles of each block of a campaign of that many."""
-    if count <= MOST:
-        return next(size for size in SIZES if size >= count)
-    size = -(-count // -(-count // MOST))
+    most = NUMERICS.blocks[-1]
+    if count <= most:
+        return next(size for size in NUMERICS.blocks if size >= count)
+    size = -(-count // -(-count // most))
     return size + -size % 4
 
 

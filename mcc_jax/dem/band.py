@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from .. import arguments
 from .._errors import InputError
 from ..calibrate import Posterior
+from ..calibrate.population import Population, Scatter, particles_at
 from ..law import MccLaw, Plastic
 from .forces import Packing
 from .load_steps import LoadStep, Solver
@@ -31,7 +32,7 @@ class PopulationPacking(NamedTuple):
 
     Attributes:
         packing_of: the packing for one row of `draws`; differentiable.
-        draws: (draws, 10), columns as in `names`.
+        draws: (draws, columns), as in `names`.
         names: of the columns.
     """
 
@@ -78,7 +79,7 @@ def population_packing(
 
     The z of every particle are drawn once and kept, so that a draw of the population moves all particles together:
     the band is about the population, not about which particles one happened to take. Particles not monotone at the
-    posterior mean are drawn anew.
+    posterior mean are drawn anew. Effects of the model act in the contacts, but for those of the tester.
 
     Args:
         calibration: the posterior.
@@ -87,7 +88,7 @@ def population_packing(
         density: of a particle [kg/m^3].
 
     Raises:
-        InputError: if the population hardly has a monotone law.
+        InputError: if the population hardly has a monotone law; for effects that contacts cannot have, by name.
     """
     remedy = "Make one with mcc_jax.sample(campaign)."
     arguments.instance(calibration, Posterior, "calibration", remedy)
@@ -96,31 +97,39 @@ def population_packing(
     seed = arguments.seed(seed)
     density = arguments.number(density, "density [kg/m^3]", above=0)
     model, p = calibration.model, calibration.population
-    columns = [p.a, p.log_modulus, *np.moveaxis(np.asarray(p.mu), -1, 0), *np.moveaxis(np.asarray(p.tau), -1, 0)]
-    columns += [p.modulus_scatter, p.shape_scatter]
+    forms, varying = model.forms, model.scatter.varying
+    last = (p.mu, p.tau, p.theta, p.theta_scatter)
+    mu, tau, theta, theta_scatter = (list(np.moveaxis(np.asarray(x, float), -1, 0)) for x in last)
+    columns = [p.a, p.log_modulus, *mu, *tau, p.modulus_scatter, p.shape_scatter, *theta, *theta_scatter]
     draws = np.stack([np.asarray(x, float).ravel() for x in columns], axis=1)
     names = ("a", "ln Ebar", "mu1", "mu3", "mu5", "tau1", "tau3", "tau5", "scatter of ln Ebar", "scatter of a")
+    names += (*forms.names, *(f"scatter of {name}" for name in model.varying_places))
     size = jnp.asarray(diameter, float)
+    own = Scatter(modulus=True, shape=True, power=model.shape_power, varying=varying)
 
     def laws(values: Array, z: Array) -> MccLaw:
-        def one(z: Array) -> MccLaw:
-            C = jnp.exp(values[2:5] + values[5:8] * z[:3])
-            modulus = jnp.exp(values[1] + values[8] * z[3])
-            return MccLaw(
-                Plastic(C[0], C[1], C[2]), values[0] + values[9] * z[4], modulus, model.unloading, model.strain_scaling
-            )
+        numbers = jnp.split(values[10:], [len(forms.names)])
+        population = Population(
+            values[0], values[1], values[2:5], values[5:8], values[8], values[9], jnp.zeros(()), *numbers
+        )
+        particles = particles_at(population, jnp.zeros(len(z)), own, z)
 
-        return eqx.filter_vmap(one)(z)
+        def one(latent: Array, theta: Array) -> MccLaw:
+            C, modulus = jnp.exp(latent[:3]), jnp.exp(latent[3])
+            forms_of = model.unloading, model.strain_scaling, forms.build(theta)
+            return MccLaw(Plastic(C[0], C[1], C[2]), values[0], modulus, *forms_of).of_particle()
+
+        return eqx.filter_vmap(one)(particles.latent, particles.theta)
 
     rng = np.random.default_rng(seed)
-    z = rng.standard_normal((len(size), 5))
+    z = rng.standard_normal((len(size), own.size))
     for _ in range(REDRAWS):
         wrong = ~np.asarray(
             eqx.filter_vmap(lambda law: law.is_monotone)(laws(jnp.asarray(draws.mean(0)), jnp.asarray(z)))
         )
         if not wrong.any():
             break
-        z[wrong] = rng.standard_normal((int(wrong.sum()), 5))
+        z[wrong] = rng.standard_normal((int(wrong.sum()), own.size))
     else:
         raise InputError(
             f"{REDRAWS} draws of a particle's law, none monotone", remedy="The calibrated scatter is too large."
@@ -130,6 +139,7 @@ def population_packing(
     def packing_of(values: Array) -> Packing:
         return spheres(laws(values, kept), size, density)
 
+    packing_of(jnp.asarray(draws.mean(0)))  # refuses here, by name, effects that no contact can have
     return PopulationPacking(packing_of, draws, names)
 
 

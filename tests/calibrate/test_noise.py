@@ -21,8 +21,8 @@ from mcc_jax.calibrate.noise import (
     restricted_likelihood,
     whitening,
 )
-from mcc_jax.calibrate.paper.prediction import READING_UM
 from mcc_jax.calibrate.priors import NoisePrior
+from mcc_jax.calibrate.settings import PAPER
 from mcc_jax.calibrate.sharding import Blocks
 
 FOUR = (0.2, 0.3, 0.5, 0.3)
@@ -148,7 +148,7 @@ def test_white_noise_only_divides_and_a_display_reads_in_steps():
     filtered = jax.tree.map(lambda x: x[0], filters((0.5, 0.0, 0.0, 1.0), jnp.full(1, 2.0), tests, still, *KINDS[0]))
     np.testing.assert_allclose(filtered(linear.residual[0][:, None])[:, 0], linear.residual[0], rtol=1e-14)
     np.testing.assert_allclose(float(filtered.log_det), 0.0, atol=1e-12)
-    np.testing.assert_allclose(float(filtered.reading), POINTS * READING_UM**2, rtol=1e-12)
+    np.testing.assert_allclose(float(filtered.reading), POINTS * PAPER.reading_um**2, rtol=1e-12)
 
 
 # ---- numbers integrated out, and the noise estimated -----------------------------------------------------------------

@@ -16,7 +16,8 @@ from joint_cases import NOISE, Programme, five_tests, simulated
 from mcc_jax import sample
 from mcc_jax.calibrate.data import select_tests
 from mcc_jax.calibrate.particle_fit import linear_starts
-from mcc_jax.calibrate.sharding import MOST, SIZES, Blocks, Parts, block_size, count_of, filled_up
+from mcc_jax.calibrate.settings import NUMERICS
+from mcc_jax.calibrate.sharding import Blocks, Parts, block_size, count_of, filled_up
 
 LIMIT_S = 400
 HERE = Path(__file__).parent
@@ -149,9 +150,9 @@ def test_processes_with_different_campaigns_are_told(tmp_path):
 def test_blocks_waste_little_and_have_few_sizes(count):
     size = block_size(count)
     filled = count + -count % size
-    assert size <= MOST
-    assert size in SIZES or count > MOST
-    assert filled - count <= max(3, count // 3 if count <= MOST else count // 8)
+    assert size <= NUMERICS.blocks[-1]
+    assert size in NUMERICS.blocks or count > NUMERICS.blocks[-1]
+    assert filled - count <= max(3, count // 3 if count <= NUMERICS.blocks[-1] else count // 8)
     assert block_size(filled) == size  # what is filled up once stays as it is
 
 

@@ -1,7 +1,5 @@
 """Quasi-static compaction: the plate test, equilibrium, lists, Euler's identity, gradients, band, inverse."""
 
-from types import SimpleNamespace
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,7 +7,7 @@ import numpy as np
 import pytest
 
 from mcc_jax import InputError, MccLaw, Plastic, paper_law
-from mcc_jax.calibrate import Posterior
+from mcc_jax.calibrate import Model, Posterior
 from mcc_jax.calibrate.population import Population
 from mcc_jax.dem import (
     Solver,
@@ -186,8 +184,10 @@ def test_reverse_mode_gives_the_same_sensitivities(sensitivity, pressed):
     np.testing.assert_allclose(jax.grad(total)(jnp.zeros(4)), expected, rtol=1e-8)
 
 
-def posterior(scatter):
-    """A calibration of which only the population's draws, one chain of five, and the form of unloading are known."""
+def posterior(scatter, effect=None):
+    """A calibration of which only the population's draws, one chain of five, and the model are known."""
+    model = Model().with_effects(*([effect] if effect else []), varying=[effect] if effect else ())
+    numbers = jnp.asarray(0.01 * (1 + np.arange(len(model.forms.names))))
 
     def drawn(k):
         at = 0.01 * k
@@ -199,12 +199,11 @@ def posterior(scatter):
             modulus_scatter=jnp.asarray(scatter),
             shape_scatter=jnp.asarray(0.0),
             log_noise=jnp.asarray(0.0),
-            theta=jnp.zeros(0),
-            theta_scatter=jnp.zeros(0),
+            theta=numbers,
+            theta_scatter=jnp.full(len(model.varying), scatter),
         )
 
     found = object.__new__(Posterior)
-    model = SimpleNamespace(unloading=LAW.unloading, strain_scaling=LAW.strain_scaling)
     for name, value in (("model", model), ("population", jax.vmap(jax.vmap(drawn))(jnp.arange(5.0)[None]))):
         object.__setattr__(found, name, value)
     return found
@@ -228,6 +227,18 @@ def test_packing_of_a_population_scatters_the_same_particles_in_every_draw():
     assert np.log(first / np.asarray(DIAMETERS)).std() > 0.1
     slope = jax.jacfwd(made.packing_of)(jnp.asarray(made.draws[0])).sides.k1[:, made.names.index("mu1")]
     np.testing.assert_allclose(slope, first, rtol=1e-12)
+
+
+def test_packing_of_a_population_has_the_effects_of_its_model_or_refuses_them():
+    made = population_packing(posterior(0.2, "damage"), np.asarray(DIAMETERS), seed=1)
+    assert made.draws.shape == (5, len(made.names))
+    assert "scatter of damage" in made.names
+    (effect,) = made.packing_of(jnp.asarray(made.draws[0])).sides.effects
+    amplitude = np.log(np.asarray(effect.amplitude) / 0.01)
+    assert amplitude.std() > 0.1
+    assert abs(amplitude.mean()) < 0.2
+    with pytest.raises(InputError, match="creep"):
+        population_packing(posterior(0.0, "creep"), np.asarray(DIAMETERS))
 
 
 @pytest.mark.long

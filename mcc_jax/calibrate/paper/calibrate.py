@@ -29,15 +29,12 @@ from ..data import rows_from_contact
 from ..estimates import NO_SAMPLER, estimate, finite, force_zero, misfit_note
 from ..judgement import judged, numbers_in_reach, unlike_others
 from ..results import Calibration
-from ..settings import SELECTION
+from ..settings import PAPER, SELECTION
 from .loading import PlasticFit, fit_population
 from .master_curve import MasterCurve, StrainTable, master_curve, strain_table
 from .modulus import ElasticFit, campaign_branches, fit_effective_modulus
 from .prediction import ParticleFit, point_noise_um, predict_particles
 from .shape import Objective, ShapeFit, fit_shape_parameter
-
-PLAUSIBLE_SHAPE_FACTOR = 4.0
-"""Shape factors beyond this, twice the paper's largest, come from curves that do not collapse, not from shape."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -122,7 +119,7 @@ class PaperCalibration(Calibration):
         dropped = int((~self.adjustment.kept).sum())
         if dropped:
             notes.append(f"{dropped} of {len(self.campaign)} particles could not be used")
-        if self.shape_factor_max > PLAUSIBLE_SHAPE_FACTOR:
+        if self.shape_factor_max > PAPER.shape_factor:
             notes.append(
                 f"a = {self.a:.3g} makes shape factors of up to {self.shape_factor_max:.3g}: "
                 "the shape factor does not bring these curves together"

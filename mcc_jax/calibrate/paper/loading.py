@@ -10,14 +10,8 @@ import numpy as np
 from ... import arguments
 from ..._errors import InputError
 from ...law import LogNormal, PlasticPopulation
+from ..settings import PAPER
 from .master_curve import MasterCurve
-
-SMALLEST_SHARE = 1e-6
-"""A factor of the quintic is kept at least this share of the largest stress, so that its logarithm exists."""
-
-
-SPREAD_FROM = 5.0
-"""The spread is fitted from this many thresholds on, 1 MPa in the paper."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +44,7 @@ def fit_polynomial(strain: np.ndarray, stress_MPa: np.ndarray) -> np.ndarray:
         stress_MPa: stresses [MPa] > 0, shape (n,).
 
     Returns:
-        The three factors [MPa]. One that would be negative is put at `SMALLEST_SHARE` of the largest stress.
+        The three factors [MPa]. One that would be negative is put at a small share of the largest stress.
     """
     strain = arguments.floats(strain, "strain", shape="a 1-D array of strains")
     stress_MPa = arguments.floats(stress_MPa, "stress_MPa", shape="a 1-D array of stresses [MPa]")
@@ -61,7 +55,7 @@ def fit_polynomial(strain: np.ndarray, stress_MPa: np.ndarray) -> np.ndarray:
     # Columns of one size: the three powers differ by orders of magnitude at small strains.
     scale = np.linalg.norm(design, axis=0)
     factors, _ = nnls(design / scale, np.ones_like(stress_MPa))
-    smallest = SMALLEST_SHARE * stress_MPa.max() / np.abs(strain).max() ** np.array([1, 3, 5])
+    smallest = PAPER.smallest_share * stress_MPa.max() / np.abs(strain).max() ** np.array([1, 3, 5])
     return np.maximum(factors / scale, smallest)
 
 
@@ -108,7 +102,7 @@ def fit_population(master: MasterCurve, threshold_MPa: float = 0.0) -> PlasticFi
     fitted = K1 * x - K3 * x**3 + K5 * x**5
     variance = ((K1 - 3 * K3 * x**2 + 5 * K5 * x**4) * sd) ** 2
     # The offset step makes all curves meet at the threshold: the spread near it is its doing, not the particles'.
-    known = np.isfinite(variance) & (variance > 0) & (count > 1) & (stress >= SPREAD_FROM * threshold_MPa)
+    known = np.isfinite(variance) & (variance > 0) & (count > 1) & (stress >= PAPER.spread_from * threshold_MPa)
     variances = np.zeros(3)
     if known.sum() >= 3:
         # A variance has a standard error in proportion to itself: relative residuals here too.
@@ -116,7 +110,7 @@ def fit_population(master: MasterCurve, threshold_MPa: float = 0.0) -> PlasticFi
         scale = np.linalg.norm(design, axis=0)
         variances = nnls(design / scale, np.ones(int(known.sum())))[0] / scale
     names, orders = ("C1", "C3", "C5"), (1, 3, 5)
-    smallest = SMALLEST_SHARE * stress.max() / x.max() ** np.array(orders)
+    smallest = PAPER.smallest_share * stress.max() / x.max() ** np.array(orders)
     distributions = (
         LogNormal.from_power_moments(order, jnp.asarray(mean), jnp.asarray(variance))
         for order, mean, variance in zip(orders, means, variances, strict=True)

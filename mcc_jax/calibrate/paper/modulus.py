@@ -17,9 +17,9 @@ from ..._types import Scalar
 from ...campaign import Adjustment, Campaign, Curve, Segment, check_campaign, stress_and_strain
 from ...formulas import recovery
 from ...law import StrainScaling, Unloading
+from ..settings import PAPER
 
-MIN_RATIO = 0.05
-"""Points below this share of the peak stress are left out: strain there depends on stress with an infinite slope."""
+MIN_RATIO = PAPER.unloaded_from
 
 
 BRANCHES = "Take those of mcc_jax.calibrate.campaign_branches(campaign, adjustment)."

@@ -23,10 +23,6 @@ from ...law import MccLaw, Plastic
 from ...simulate import simulate_batch
 from .loading import fit_polynomial
 
-READING_UM = 2e-4
-"""What no record of displacement is better than [um]: counted as misfit at every point, so that the noise of a record
-without any, of a simulation say, is small but not nothing."""
-
 
 @dataclass(frozen=True)
 class ParticleFit:

@@ -15,10 +15,10 @@ from jaxtyping import Array, Bool, Float
 from ... import arguments
 from ..._errors import InputError
 from ..._types import Scalar
+from ..settings import PAPER
 from .master_curve import StrainTable, enough
 
 Objective = Literal["full", "reference"]
-STARTS = (-0.5, 0.0, 1.0, 3.0)
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ def fit_shape_parameter(table: StrainTable, objective: Objective = "full", refer
         raise InputError("the shape parameter needs at least two particles")
     use = enough(table)
     stress, strain, reached = table.stress_MPa[use], table.strain[:, use], table.reached[:, use]
-    starts = jnp.asarray(STARTS, dtype=float)
+    starts = jnp.asarray(PAPER.shape_starts, dtype=float)
     if objective == "full":
         row = None
         data = (strain, _weights(stress, reached), reached, table.flatness)

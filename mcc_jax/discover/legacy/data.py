@@ -14,7 +14,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ... import arguments
 from ...calibrate.paper.modulus import MIN_RATIO
-from ...calibrate.paper.prediction import READING_UM, point_noise_um
+from ...calibrate.paper.prediction import point_noise_um
+from ...calibrate.settings import PAPER
 from ...campaign import (
     THRESHOLD_MPA,
     Campaign,
@@ -305,7 +306,7 @@ def _prepare(
         return too_few(int(loading.sum()), MIN_POINTS)
     climb = curve.displacement_um[rows[loading]]
     third = max(len(climb) // 3, 1)
-    rise, noise = climb[-third:].mean() - climb[:third].mean(), max(point_noise_um(curve), READING_UM)
+    rise, noise = climb[-third:].mean() - climb[:third].mean(), max(point_noise_um(curve), PAPER.reading_um)
     if rise <= MIN_CLIMB * noise / np.sqrt(third):
         return no_climb(float(rise) if rise >= 0 or -rise > MIN_CLIMB * noise / np.sqrt(third) else 0.0)
     contact = float(curve.displacement_um[0]) if contact is None else contact

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..._types import Path, Scalar
-from ...calibrate.paper.prediction import READING_UM
+from ...calibrate.settings import PAPER
 from .compiling import compiled
 from .sharding import Blocks, Parts
 from .small_matrices import Cholesky
@@ -107,7 +107,7 @@ class Whitening(eqx.Module):
     @property
     def least_squares(self) -> Scalar:
         """Sum of squares that reading alone brings about, however well the law fits."""
-        return READING_UM**2 * jnp.sum(self.weight**2)
+        return PAPER.reading_um**2 * jnp.sum(self.weight**2)
 
     def _power(self) -> Path:
         return jax.ops.segment_sum(self.peak**2, self.branch, len(self.peak))
