@@ -53,7 +53,10 @@ def _keep_everything():
 
 GROUPS = {
     "discover": ("tests/discover/", "tests/cli/test_discover", "tests/plots/test_discovery_figures"),
-    "posterior": ("tests/calibrate/test_posterior", "tests/plots/test_joint_figures", "tests/plots/test_figures"),
+    "posterior": (
+        *("tests/calibrate/test_posterior", "tests/calibrate/test_arviz_functions"),
+        *("tests/plots/test_joint_figures", "tests/plots/test_figures"),
+    ),
     "calibrate": ("tests/calibrate/",),
     "effects": ("tests/effects/",),
     "law": ("tests/law/",),
@@ -83,7 +86,7 @@ def pytest_xdist_make_scheduler(config, log):
     return ByGroup(config, log) if config.getoption("dist") == "loadfile" else None
 
 
-CASES = 5
+CASES = 3
 """Of a test with more cases as many run, spread evenly; `--every-case` and `-k` run all."""
 
 

@@ -124,14 +124,18 @@ def without_time(result):
     return json.dumps(content)
 
 
-def test_the_same_seed_gives_the_same_bytes_and_another_seed_nearly_the_same_numbers(result):
-    assert without_time(sample(paper_campaign(0))) == without_time(result)
+def test_another_seed_gives_nearly_the_same_numbers(result):
     other = sample(paper_campaign(0), seed=1)
     assert without_time(other) != without_time(result)
     one, two = result.named_population(), other.named_population()
     for name in one:
         assert abs(one[name].mean() - two[name].mean()) < 0.15 * one[name].std(), name
         assert one[name].std() == pytest.approx(two[name].std(), rel=0.2), name
+
+
+@pytest.mark.long
+def test_the_same_seed_gives_the_same_bytes(result):
+    assert without_time(sample(paper_campaign(0))) == without_time(result)
 
 
 def test_probability_not_monotone_is_that_of_draws_from_the_population(result):

@@ -40,6 +40,7 @@ def modulus(result):
     return found["value"], found["sd"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("calibrate", [least_squares, pytest.param(sample, marks=pytest.mark.long)])
 def test_spikes_count_for_little(clean, spiked, calibrate):
     without, plain, robust = (

@@ -206,6 +206,7 @@ def test_reference_objective_is_the_paper_s_integral(scattered):
     assert float(jnp.sum(residuals**2)) == pytest.approx(total, rel=1e-10)
 
 
+@pytest.mark.long
 def test_the_minimum_is_one(scattered):
     table = strain_table(adjust(scattered), scattered.diameters_um)
     for objective in ("full", "reference"):

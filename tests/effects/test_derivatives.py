@@ -76,10 +76,13 @@ def test_the_law_of_a_fit_gives_the_same(variant):
     np.testing.assert_allclose(values[6], values[4], rtol=1e-9, atol=1e-9)
 
 
-def test_signatures_are_the_derivatives_at_the_null():
+@pytest.mark.parametrize("every", [pytest.param(True, marks=pytest.mark.long), False], ids=["all", "one a mechanism"])
+def test_signatures_are_the_derivatives_at_the_null(every):
     rows, again = signature_rows(RECORD, RECORD)
     np.testing.assert_array_equal(rows, again)
     for variant, row in zip(VARIANTS, rows, strict=True):
+        if not every and variant not in (FEW[0], FEW[2], FEW[4], FEW[10]):
+            continue
         exact = lanes(variant)[1][0]
         np.testing.assert_allclose(row, exact, atol=1e-9 * np.abs(exact).max(), rtol=0)
 

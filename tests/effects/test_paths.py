@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from helpers import paper_particle
 from tested import FORCE, HUMIDITY, LAW, PARTICLE, RECORD, TIME, VARIANTS
 
@@ -115,6 +116,7 @@ def test_displacement_control_undoes_load_control():
     assert relaxed[-1] < 0.999 * relaxed[0]
 
 
+@pytest.mark.long
 def test_derivatives_under_displacement_control():
     """Implicit rule in both modes against finite differences: by amplitudes and by the displacement itself."""
     names = ("frame_compliance", "creep", "platen_friction")

@@ -107,6 +107,7 @@ def recovered_from(law, diameters, peaks):
     return particle.displacement(law.recoverable_strain(particle, particle.strain(peaks)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", [PLATES, PAIR], ids=["plates", "equal pair"])
 def test_equals_the_library_where_the_recovery_is_limited(program, kind):
     """Peaks from 1e-9 to twice the tested range, moduli down to that of a rubber: formula, peak and slope as limits."""

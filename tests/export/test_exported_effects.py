@@ -186,19 +186,28 @@ assert not [name for name in sys.modules if name.startswith(("mcc_jax", "equinox
 """
 
 
-def test_a_fresh_process_with_jax_alone_follows_memory_and_time(tmp_path):
-    """Creep, frame, a drift, cyclic damage and adhesion: as `mcc_jax.drive` to 1e-12, memory included."""
-    law = paper_law().with_effects(
-        "creep:logarithmic", "frame_compliance", "thermal_drift", "damage:cyclic", "size_effect"
-    )
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("creep:logarithmic", "frame_compliance"),
+        pytest.param(
+            ("creep:logarithmic", "frame_compliance", "thermal_drift", "damage:cyclic", "size_effect"),
+            marks=pytest.mark.long,
+        ),
+    ],
+    ids=["two", "five"],
+)
+def test_a_fresh_process_with_jax_alone_follows_memory_and_time(names, tmp_path):
+    """Creep, frame, a drift, cyclic damage: as `mcc_jax.drive` to 1e-12, memory included."""
+    law = paper_law().with_effects(*names)
     turns = [0.0, 40.0, 37.0, 60.0, 58.0, 58.5]
     x = np.concatenate([np.linspace(a, b, 9) for a, b in itertools.pairwise(turns)])
     time = np.cumsum(np.random.default_rng(0).uniform(0.1, 5.0, len(x)))
     by_displacement = drive(law, PARTICLE, x, time=time)
     force = np.array(by_displacement.force)
     by_load = drive(law, PARTICLE, force, time=time, control="load")
-    names = write_export("jax", law, PARTICLE, tmp_path)
-    assert "mcc_force_float64.jax_export" not in names
+    files = write_export("jax", law, PARTICLE, tmp_path)
+    assert "mcc_force_float64.jax_export" not in files
     sizes, own = ([PARTICLE.D1, PARTICLE.D2, PARTICLE.D3], [law.plastic.C1, law.plastic.C3, law.plastic.C5])
     np.savez(tmp_path / "given.npz", displacement=x, force=force, time=time,
              diameters=np.tile(sizes, (2, 1)), coefficients=np.tile(own, (2, 1)))  # fmt: skip
