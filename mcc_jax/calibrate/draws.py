@@ -23,24 +23,27 @@ from .settings import SAMPLING
 from .sharding import count_of
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Draws:
     """Draws of population and particles, and how good they are; axes (chain, draw, ...).
 
     Attributes:
         population: draws of the population.
-        C: draws of every particle's C1, C3, C5.
+        C: draws of every particle's C1, C3, C5, shape (chains, draws, N, 3).
         modulus_MPa: of its effective modulus.
         zero_um: of its zero.
         shape_factor: of its eta_p.
-        theta: of the numbers of its effects.
-        log_likelihood: of its whole test given the population, the particle integrated out.
+        theta: of the numbers of its effects, in the order of `model.forms.names`.
+        log_likelihood: of its whole test under each draw of the population, the particle integrated out: what
+            leave-one-particle-out needs.
         pareto_k: of every particle's importance weights.
-        pareto_k_joint: of the weights of all particles together; None where they were not formed.
-        weights_applied: whether the draws were resampled by the particles' own weights.
+        pareto_k_joint: of the weights of all particles together, of many particles as the regression of `correction`
+            has them; None where they were not formed.
+        weights_applied: whether the draws were resampled by the particles' own weights. Of many particles those of the
+            population were by `pareto_k_joint`'s, and only particles whose weights scatter were drawn by theirs.
         divergences: number of divergent trajectories.
-        rhat, ess_bulk, ess_tail: by parameter of the population.
-        leapfrogs: mean number of leapfrog steps of a draw; 0 of independent draws.
+        rhat, ess_bulk, ess_tail: by parameter of the population, before any thinning.
+        leapfrogs: mean number of leapfrog steps of a draw; 0 of independent draws (`importance`).
         log_evidence: the log marginal likelihood of the model, and its standard error (infinite where it is Laplace's
             approximation alone).
         notes: what a reader must know.

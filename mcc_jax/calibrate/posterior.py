@@ -41,8 +41,8 @@ class Worst(NamedTuple):
     value: float
 
 
-@dataclass(frozen=True, repr=False)
-class Posterior(PosteriorDraws):
+@dataclass(frozen=True, repr=False, kw_only=True)
+class Posterior(PosteriorDraws, Draws):
     """The posterior of a campaign.
 
     Draws have the axes (chain, draw, ...); where importance weights were needed they have been applied, in order within
@@ -53,52 +53,20 @@ class Posterior(PosteriorDraws):
         selection: which particles and points took part.
         model: what was assumed.
         fit: the joint fit it started from.
-        population: draws of the population.
-        C: draws of every particle's C1, C3, C5, shape (chains, draws, N, 3).
-        modulus_MPa: draws of every particle's effective modulus.
-        zero_um: draws of every particle's zero.
-        shape_factor: draws of every particle's eta_p.
-        theta: draws of the numbers of every particle's effects, in the order of `model.forms.names`.
-        log_likelihood: of every particle's whole test under each draw of the population, the particle integrated out:
-            what leave-one-particle-out needs.
         mode: "fast" or "joint".
-        pareto_k: of every particle's importance weights.
-        pareto_k_joint: of the weights of all particles together, of many particles as the regression of `correction`
-            has them; None where they were not formed.
-        weights_applied: whether the draws were resampled by the particles' own weights. Of many particles those of the
-            population were by `pareto_k_joint`'s, and only particles whose weights scatter were drawn by theirs.
-        divergences: number of divergent trajectories.
-        rhat, ess_bulk, ess_tail: by parameter of the population, before any thinning.
-        leapfrogs: mean number of leapfrog steps of a draw; 0 of independent draws (`importance`).
-        log_evidence: log marginal likelihood of the model, and its standard error.
         seed, runtime_s: for the record.
         findings: what a reader must know of the tests and of the plausibility of the answer.
+
+    The others are those of `Draws`.
     """
 
     campaign: Campaign
     selection: Selection
     model: Model
     fit: Fit
-    population: Population
-    C: np.ndarray
-    modulus_MPa: np.ndarray
-    zero_um: np.ndarray
-    shape_factor: np.ndarray
-    theta: np.ndarray
-    log_likelihood: np.ndarray
     mode: Mode
-    pareto_k: np.ndarray
-    pareto_k_joint: float | None
-    weights_applied: bool
-    divergences: int
-    rhat: dict[str, float]
-    ess_bulk: dict[str, float]
-    ess_tail: dict[str, float]
-    leapfrogs: float
-    log_evidence: tuple[float, float]
     seed: int
     runtime_s: float
-    notes: tuple[str, ...] = field(default=())
     findings: tuple[Finding, ...] = field(default=())
 
     def compared(self) -> Mapping[int, tuple[np.ndarray, np.ndarray]]:
