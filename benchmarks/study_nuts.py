@@ -5,8 +5,8 @@ Run `python benchmarks/study_nuts.py --law base|creep|varying [--particles 6]`; 
 One campaign (seed 0; 6 particles, or as many as are asked for), 4 chains of 300 + 1000 draws each. `creep` has one
 shared effect, amplitude and time; `varying` lets its amplitude differ from test to test. Differences are of the sites
 of the contract, to `mcc.sample`, in its standard deviations (median over sites) and in Monte Carlo standard errors of
-the difference (largest), of means and of standard deviations. Of `mcc.sample`, whose draws are resampled by weight, that error is
-a little too small.
+the difference (largest), of means and of standard deviations. Of `mcc.sample`, whose draws are resampled by weight,
+that error is a little too small.
 """
 
 from __future__ import annotations
