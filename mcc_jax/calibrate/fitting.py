@@ -139,8 +139,30 @@ class _Fitter:
         self.flatness = tests.flatness
         self.varying = tuple(k for k, _ in model.scatter.varying)
 
-    def linear(self, point: Point) -> Parts:
-        return self.blocks.each(linear_data, self.blocks.cut(point), self.own, self.model.forms)
+    def linear(self, point: Point, sd: np.ndarray | None = None) -> Parts:
+        """All tests linearised; with effects and how they bend over a standard deviation of each number, if given."""
+        found = self.blocks.each(linear_data, self.blocks.cut(point), self.own, self.model.forms)
+        numbers = point.theta.shape[1]
+        if not numbers:
+            return found
+        bends = [self._bend(point, k, 0.0 if sd is None else float(sd[k])) for k in range(numbers)]
+        waves = (replace(w, bends=jnp.concatenate(each, -1)) for w, *each in zip(found.waves, *bends, strict=True))
+        return Parts(tuple(waves), found.axis)
+
+    def _bend(self, point: Point, number: int, step: float) -> list[Array]:
+        """Derivative of all columns by one of the effects' numbers, by differences over a step; 0 for a step of 0."""
+
+        def moved(by: float) -> Parts:
+            theta = point.theta.at[:, number].add(by)
+            return self.blocks.each(
+                linear_data, self.blocks.cut(replace(point, theta=theta)), self.own, self.model.forms
+            )
+
+        if not step:
+            size = 4 + point.theta.shape[1]
+            return [jnp.zeros((*wave.mask.shape, size)) for wave in self.own.waves]
+        pairs = zip(moved(step).waves, moved(-step).waves, strict=True)
+        return [(up.columns - down.columns) / (2 * step) for up, down in pairs]
 
     def summaries(self, point: Point, linear: Parts, noise: Noise) -> tuple[Marginal, Parts, Array]:
         """All particles' summaries, this process's own filters, and the white noise of equal weight."""
@@ -288,8 +310,8 @@ def fit_tests(
         point = replace(point, theta=jnp.asarray(np.broadcast_to(found.theta, point.theta.shape)))
     free = None
     turn, uncertainty = 0, True
+    linear = fitter.linear(point)
     while True:
-        linear = fitter.linear(point)
         last = turn >= (max(rounds, FIT.most_rounds) if effects else rounds)
         if not correlated:
             residual = np.asarray(blocks.whole(Parts(tuple(wave.residual for wave in linear.waves))))[:count]
@@ -328,6 +350,13 @@ def fit_tests(
             break
         turn += 1
         point = fitter.together(white, point, target, free)
+        linear = fitter.linear(point)
+    if effects:
+        # Once more, with how the law bends over what is still open of the effects' numbers.
+        linear = fitter.linear(point, _widths(free, covariance, target))
+        marginal, filtered, white = fitter.summaries(point, linear, noise.noise)
+        target = careful_enough(free, LogPosterior(model, marginal), count)
+        free, covariance, mode_converged = most_probable(free, target)
     converged = np.asarray(
         [bool(np.all(np.asarray(individual.converged)[:count])), noise.converged, mode_converged and at_rest]
     )
@@ -337,6 +366,20 @@ def fit_tests(
     return Fit(
         model, fitter.weighted[0], individual, noise, filters, point, residual, marginal, free, covariance, converged
     )
+
+
+def _widths(free: Array, covariance: Array, target: LogPosterior) -> np.ndarray:
+    """Standard deviations of the effects' numbers that all particles share, each within half of a positive one."""
+    slope = np.asarray(theta_slope(free, target))
+    sd = np.sqrt(np.maximum(np.einsum("kd,de,ke->k", slope, np.asarray(covariance), slope), 1e-300))
+    middle = np.abs(np.asarray(target.population(free).theta))
+    return np.minimum(sd, np.where(middle > 0, 0.5 * middle, np.inf))
+
+
+@compiled
+def theta_slope(free: Float[Array, " d"], target: LogPosterior) -> Float[Array, "numbers d"]:
+    """Derivatives of the effects' numbers by the unbounded coordinates."""
+    return jax.jacfwd(lambda x: target.population(x).theta)(free)
 
 
 def _of_effects(model: Model, names: tuple[str, ...]) -> np.ndarray:

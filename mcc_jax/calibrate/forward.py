@@ -100,6 +100,8 @@ class Linear(eqx.Module):
         by_force: by a point's own reading of force [um/mN].
         by_peak: by the force from which its branch starts [um/mN].
         by_offset: by an error that all forces of a test share [um/mN].
+        bends: how the columns change with each of the effects' numbers: those of the first number, then of the next;
+            None for a law without effects.
     """
 
     residual: Float[Array, "particles points"]
@@ -107,6 +109,7 @@ class Linear(eqx.Module):
     by_force: Float[Array, "particles points"]
     by_peak: Float[Array, "particles points"]
     by_offset: Float[Array, "particles points"]
+    bends: Float[Array, "particles points bends"] | None = None
 
 
 def residuals(point: Point, tests: Tests, forms: Forms) -> Float[Array, "particles points"]:

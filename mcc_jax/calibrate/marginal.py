@@ -45,7 +45,8 @@ MIN_SHARE = 0.05
 class Marginal(eqx.Module):
     r"""The tests around a point, zeros integrated out.
 
-    With u the numbers (kappa, amplitudes and further numbers less those of the point), the log likelihood of a test is
+    With u the numbers (kappa, amplitudes and further numbers less those of the point, and the products of these by
+    which a law with effects bends), the log likelihood of a test is
 
     .. math:: L - n\lambda - \tfrac12 e^{-2\lambda} (u, -1)^T G (u, -1)
 
@@ -82,15 +83,17 @@ class Marginal(eqx.Module):
     def place(self, population: Population, xi: Float[Array, "particles k"]) -> Placed:
         """Numbers u of all particles at deviations xi, and their derivatives."""
         at = particles_at(population, self.flatness, self.scatter, xi)
-        kappa, slope = straighten(at.latent - self.point.latent)
+        u, slope = straighten(at.latent - self.point.latent)
         jacobian = slope[..., None] * at.factor
         numbers, own = at.theta.shape[1], at.factor.shape[-1]
         if numbers:
             jacobian = jnp.pad(jacobian, ((0, 0), (0, numbers), (0, len(self.scatter.varying))))
             for j, (k, _) in enumerate(self.scatter.varying):
                 jacobian = jacobian.at[:, 4 + k, own + j].set(at.slope[:, j])
-            kappa = jnp.concatenate([kappa, at.theta - self.point.theta], 1)
-        return Placed(at.latent, at.theta, kappa, jacobian)
+            u = jnp.concatenate([u, at.theta - self.point.theta], 1)
+        if u.shape[1] < self.gram.shape[-1] - 1:
+            u, jacobian = with_products(u, jacobian)
+        return Placed(at.latent, at.theta, u, jacobian)
 
     def stretch(self, population: Population) -> Float[Array, " k"]:
         r""":math:`j \tau_j` of every deviation, by which what it moves bends; 0 where it moves in a straight line."""
@@ -173,6 +176,21 @@ class Marginal(eqx.Module):
         volume = -0.5 * inner.log_det() - jnp.sum(jnp.log1p(y), -1) + jnp.log(sd)
         volume = jnp.where(jnp.all(inside, -1), volume, -jnp.inf)
         return ParticleDraw(placed.latent, placed.theta, zero, deviations, volume, at.log_likelihood)
+
+
+def with_products(
+    u: Float[Array, "particles u"], jacobian: Float[Array, "particles u k"]
+) -> tuple[Float[Array, "particles q"], Float[Array, "particles q k"]]:
+    """Numbers and what they bend by: the product of each of an effect's numbers with all numbers, half of it where both
+    are an effect's, in the order of `Linear.bends`; and the derivatives."""
+    half = jnp.concatenate([jnp.ones(4), jnp.full(u.shape[1] - 4, 0.5)])[None]
+    own, own_slope = u[:, 4:], jacobian[:, 4:]
+    products = own[:, :, None] * (half * u)[:, None, :]
+    slopes = own_slope[:, :, None, :] * (half * u)[:, None, :, None]
+    slopes += own[:, :, None, None] * (half[..., None] * jacobian)[:, None]
+    count = len(u), own.shape[1] * u.shape[1]
+    u = jnp.concatenate([u, products.reshape(count)], 1)
+    return u, jnp.concatenate([jacobian, slopes.reshape(*count, jacobian.shape[2])], 1)
 
 
 class Placed(NamedTuple):
@@ -281,7 +299,8 @@ def summarise(
 
     filters = jax.vmap(of_one)(noise.scale, tests, linear)
     ones = jnp.where(tests.mask, 1.0, 0.0)
-    columns = jnp.concatenate([linear.columns, ones[..., None], linear.residual[..., None]], -1)
+    bends = [] if linear.bends is None else [linear.bends]
+    columns = jnp.concatenate([linear.columns, *bends, ones[..., None], linear.residual[..., None]], -1)
     white = jax.vmap(lambda f, x: f(x))(filters, columns)
     gram = jnp.einsum("nkp,nkq->npq", white, white)
     slope, offset, weight = jax.vmap(_snap_evidence)(

@@ -1,10 +1,15 @@
 """An effect hidden in a campaign, and in the law that is fitted: recovered, preferred, saved, read, driven."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import mcc_jax as mcc
+from mcc_jax.calibrate.fitting import _Fitter
+from mcc_jax.calibrate.forward import Point, residuals
+from mcc_jax.calibrate.marginal import straighten, with_products
+from mcc_jax.calibrate.sharding import Blocks
 from mcc_jax.effects import find_variant
 
 CREEP, AMPLITUDE, TAU_S = "creep:logarithmic", 2e-4, 3.0
@@ -32,6 +37,38 @@ def test_amplitude_time_and_modulus_are_recovered(posterior):
     for name, value in truth.items():
         assert abs(named[name].mean() - value) < 4 * named[name].std(), name
     assert named["creep"].std() < 0.1 * AMPLITUDE
+
+
+def test_tests_bend_with_the_effects_numbers(posterior):
+    """To second order in creep and its time, and in each of them with the particle's own numbers."""
+    fit, model = posterior.fit, posterior.model
+    fitter = _Fitter(fit.tests, model, Blocks(len(fit.tests)), print)
+    sd = np.array([posterior.named_population()[name].std() for name in model.forms.names])
+    (linear,) = fitter.linear(fit.point, sd).waves
+    away = np.concatenate([[0.002, 0.001, -0.001, 0.02], 1.5 * sd])
+    latent, theta = fit.point.latent + away[None, :4], fit.point.theta + away[None, 4:]
+    moved = residuals(Point(latent, fit.point.zero, theta), fit.tests, model.forms)
+    straight, _ = straighten(jnp.broadcast_to(away[:4], latent.shape))
+    u = jnp.concatenate([straight, jnp.broadcast_to(away[4:], theta.shape)], 1)
+    u2, _ = with_products(u, jnp.zeros((*u.shape, 1)))
+    change = np.asarray(linear.residual - moved)
+    first = change - np.einsum("npq,nq->np", linear.columns, u)
+    second = change - np.einsum("npq,nq->np", np.concatenate([linear.columns, linear.bends], -1), u2)
+    assert np.sqrt(np.mean(second**2)) < 0.35 * np.sqrt(np.mean(first**2))
+
+
+def test_products_and_their_derivatives():
+    rng = np.random.default_rng(0)
+    base, along = jnp.asarray(rng.standard_normal((3, 7))), jnp.asarray(rng.standard_normal((3, 7, 2)))
+
+    def products(x):
+        return with_products(base + jnp.einsum("nqk,k->nq", along, x), along)[0]
+
+    value, slope = with_products(base, along)
+    assert value.shape == (3, 7 + 3 * 7)
+    np.testing.assert_allclose(value[:, 7 + 7 + 4], base[:, 5] * base[:, 4] / 2)  # second number with the first
+    np.testing.assert_allclose(value[:, 7 + 2], base[:, 4] * base[:, 2])  # first number with b5
+    np.testing.assert_allclose(slope, jax.jacfwd(products)(jnp.zeros(2)), rtol=1e-12)
 
 
 def test_what_moved_is_told(posterior):
