@@ -76,8 +76,8 @@ def exact_likelihood(fit: Fit) -> ExactLikelihood:
 def draw_fast(key: Array, fit: Fit, length: Length, block: int, *, patient: bool = True) -> Draws:
     """The population sampled, the particles drawn back and corrected by exact weights.
 
-    Without patience the sampler never runs, which takes minutes where numbers cannot be true: the draws are then those
-    of the proposal.
+    Without patience, and where the fit did not converge, the sampler never runs, which takes minutes there: the draws
+    are then those of the proposal.
 
     Args:
         key: random key.
@@ -89,6 +89,7 @@ def draw_fast(key: Array, fit: Fit, length: Length, block: int, *, patient: bool
     count, exact = count_of(fit.tests), exact_likelihood(fit)
     population_key, particle_key, check_key, pick_key = jax.random.split(key, 4)
     few = stride_of(count, length.total) == 1
+    patient = patient and bool(np.all(np.asarray(fit.converged)[1:]))
     run, good, (integral, error) = _sampled(population_key, fit, length, not few, patient)
     population = run.population
     names, stacked = _stack(population, fit, length)

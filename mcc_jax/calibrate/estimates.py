@@ -25,13 +25,18 @@ def misfit_note(own_misfit: float) -> str | None:
     )
 
 
-def noise_note(share: float) -> str | None:
-    """A sentence if correlated noise has taken up what the law misses, else None."""
+def missed(rms_um: np.ndarray, share: float) -> str:
+    """How far the law is from the tests, in words, from every particle's root mean square and `own_misfit`."""
+    return f"{np.median(rms_um):.2g} um, {100 * share:.2g} % of their range (medians)"
+
+
+def noise_note(share: float, by: str) -> str | None:
+    """A sentence if correlated noise has taken up what the law misses, `by` so much (`missed`), else None."""
     if not share > JUDGEMENT.noise_share:
         return None
     return (
-        f"{100 * share:.0f} % of the scatter that is left is correlated along a test: more likely something that the "
-        "law misses than noise of the instrument; mcc_jax.discover looks for what it is"
+        f"the law misses displacements by {by}; {100 * share:.0f} % of that is correlated along a test: more likely "
+        "something that the law lacks than noise of the instrument; mcc_jax.discover looks for what it is"
     )
 
 

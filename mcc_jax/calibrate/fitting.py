@@ -150,19 +150,21 @@ class _Fitter:
         return Parts(tuple(waves), found.axis)
 
     def _bend(self, point: Point, number: int, step: float) -> list[Array]:
-        """Derivative of all columns by one of the effects' numbers, by differences over a step; 0 for a step of 0."""
+        """Derivative of all columns by one of the effects' numbers, as in `Marginal`, by differences over a step; 0 for
+        a step of 0."""
+        now = float(point.theta[0, number])
 
-        def moved(by: float) -> Parts:
-            theta = point.theta.at[:, number].add(by)
-            return self.blocks.each(
-                linear_data, self.blocks.cut(replace(point, theta=theta)), self.own, self.model.forms
-            )
+        def moved(by: float) -> list[Array]:
+            factor = float(np.exp(by / now)) if number in self.model.scatter.positive else 1.0
+            theta = point.theta.at[:, number].add(now * (factor - 1) if factor != 1 else by)
+            cut = self.blocks.cut(replace(point, theta=theta))
+            found = self.blocks.each(linear_data, cut, self.own, self.model.forms)
+            return [wave.columns.at[..., 4 + number].mul(factor) for wave in found.waves]
 
         if not step:
             size = 4 + point.theta.shape[1]
             return [jnp.zeros((*wave.mask.shape, size)) for wave in self.own.waves]
-        pairs = zip(moved(step).waves, moved(-step).waves, strict=True)
-        return [(up.columns - down.columns) / (2 * step) for up, down in pairs]
+        return [(up - down) / (2 * step) for up, down in zip(moved(step), moved(-step), strict=True)]
 
     def summaries(self, point: Point, linear: Parts, noise: Noise) -> tuple[Marginal, Parts, Array]:
         """All particles' summaries, this process's own filters, and the white noise of equal weight."""

@@ -153,6 +153,14 @@ def _inverse(curvature: np.ndarray, sd: np.ndarray) -> np.ndarray:
     return (vectors / np.where(values > 0.01, values, 0.1)) @ vectors.T * sd * sd[:, None]
 
 
+def _factor(covariance: np.ndarray) -> np.ndarray:
+    """Lower triangular factor of a covariance whose numbers span many powers of ten, of what rounding left of it."""
+    sd = np.sqrt(np.maximum(np.diagonal(covariance), 1e-300))
+    values, vectors = np.linalg.eigh(covariance / np.outer(sd, sd))
+    correlation = (vectors * np.maximum(values, 1e-12 * values[-1])) @ vectors.T
+    return sd[:, None] * np.linalg.cholesky(correlation + 1e-13 * np.eye(len(sd)))
+
+
 class _Mixture:
     """Draws of one Student distribution after another, all weighted by the mixture of them.
 
@@ -183,7 +191,7 @@ class _Mixture:
 
     def propose(self, centre: np.ndarray, width: np.ndarray, count: int) -> None:
         """Add draws of one more distribution, with its mean and covariance."""
-        factor = np.linalg.cholesky(width)
+        factor = _factor(width)
         rows = int(count + -count % FIT.gradients)
         new = self.folded(centre + np.asarray(self._unit.rvs(size=rows, random_state=self._rng)) @ factor.T)
         log_density = np.concatenate(side_by_side(self._densities, np.split(new, rows // FIT.gradients)))

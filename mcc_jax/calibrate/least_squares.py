@@ -19,7 +19,17 @@ from .block_arrow import Parameters, Solution
 from .data import Selection, Tests, compared_rows, own_misfit, ranges_um, root_mean_squares
 from .distributions import SpreadCoordinate, nuisance_moments
 from .effects import effect_entries
-from .estimates import NO_SAMPLER, estimate, finite, force_zero, log_estimate, misfit_note, noise_note, power_of_e
+from .estimates import (
+    NO_SAMPLER,
+    estimate,
+    finite,
+    force_zero,
+    log_estimate,
+    misfit_note,
+    missed,
+    noise_note,
+    power_of_e,
+)
 from .fit_result import Fit
 from .fitting import beyond_numbers, checked_settings, in_own_units, prepare
 from .forward import residuals
@@ -137,8 +147,9 @@ class LeastSquares(Calibration):
         if agree < count:
             notes.append(f"{count - agree} of {count} starts ended at a worse optimum")
         notes += [*self.selection.notes, *self.notes]
-        misfit = misfit_note(own_misfit(self.selection.tests, jnp.asarray(self.residual())))
-        notes += [note for note in (misfit, noise_note(noise_share(self.fit))) if note is not None]
+        share = own_misfit(self.selection.tests, jnp.asarray(self.residual()))
+        told = misfit_note(share), noise_note(noise_share(self.fit), missed(self.rms_um(), share))
+        notes += [note for note in told if note is not None]
         dropped = sum(reason is not None for reason in self.selection.why_not)
         if dropped:
             notes.append(f"{dropped} of {len(self.campaign)} particles could not be used")

@@ -45,8 +45,8 @@ MIN_SHARE = 0.05
 class Marginal(eqx.Module):
     r"""The tests around a point, zeros integrated out.
 
-    With u the numbers (kappa, amplitudes and further numbers less those of the point, and the products of these by
-    which a law with effects bends), the log likelihood of a test is
+    With u the numbers (kappa, amplitudes and further numbers less those of the point, the positive ones in the
+    logarithm, and the products of these by which a law with effects bends), the log likelihood of a test is
 
     .. math:: L - n\lambda - \tfrac12 e^{-2\lambda} (u, -1)^T G (u, -1)
 
@@ -90,7 +90,10 @@ class Marginal(eqx.Module):
             jacobian = jnp.pad(jacobian, ((0, 0), (0, numbers), (0, len(self.scatter.varying))))
             for j, (k, _) in enumerate(self.scatter.varying):
                 jacobian = jacobian.at[:, 4 + k, own + j].set(at.slope[:, j])
-            u = jnp.concatenate([u, at.theta - self.point.theta], 1)
+            away, start = at.theta - self.point.theta, self.point.theta
+            for k in self.scatter.positive:
+                away = away.at[:, k].set(start[:, k] * jnp.log(at.theta[:, k] / start[:, k]))
+            u = jnp.concatenate([u, away], 1)
         if u.shape[1] < self.gram.shape[-1] - 1:
             u, jacobian = with_products(u, jacobian)
         return Placed(at.latent, at.theta, u, jacobian)

@@ -19,7 +19,7 @@ from .compiling import imported_meanwhile
 from .data import Selection, compared_rows, own_misfit, ranges_um, root_mean_squares
 from .draws import Draws, draw_fast, draw_joint
 from .effects import effect_entries, effect_numbers
-from .estimates import estimate, finite, force_zero, log_estimate, misfit_note, noise_note, summary
+from .estimates import estimate, finite, force_zero, log_estimate, misfit_note, missed, noise_note, summary
 from .fit_result import Fit
 from .fitting import checked_settings, in_own_units, prepare
 from .judgement import judged, noise_share, numbers_in_reach, unlike_others
@@ -89,6 +89,14 @@ class Posterior(PosteriorDraws, Draws):
 
     def failures(self) -> list[str]:
         """Why the result must not be called converged, and what to do; empty if all gates are passed."""
+        reasons = ("noise", "population")
+        unfitted = [r for r, fine in zip(reasons, np.asarray(self.fit.converged)[1:], strict=True) if not fine]
+        if unfitted and self.mode == "fast":  # of what was drawn around a fit that is none, no diagnostic says anything
+            by = missed(self.rms_um(), self._own_misfit)
+            return [
+                f"no {' and '.join(unfitted)} fits these tests: the law misses them by {by}; look at the curves, leave "
+                "out the particles that are unlike the others, or look for what is missing (discover)"
+            ]
         found = []
         rhat, ess = unmixed(self.rhat, self.ess_bulk)
         if rhat is not None:
@@ -109,11 +117,11 @@ class Posterior(PosteriorDraws, Draws):
                 f"Pareto k of all particles together is {self.pareto_k_joint:.2f}, above {SAMPLING.pareto_k}: "
                 "use --mode joint"
             )
-        reasons = ("the noise", "the population's mode")
-        for reason, fine in zip(reasons, np.asarray(self.fit.converged)[1:], strict=True):
-            if not fine and self.mode == "fast":
-                found.append(f"the optimiser for {reason} did not meet its tolerances")
         return found
+
+    @property
+    def _own_misfit(self) -> float:
+        return own_misfit(self.selection.tests, self.fit.residual)
 
     @property
     def converged(self) -> bool:
@@ -139,8 +147,9 @@ class Posterior(PosteriorDraws, Draws):
     def warnings(self) -> list[str]:
         """What a reader of the numbers must know, one sentence each."""
         notes = [*self.failures(), *map(str, self.findings), *self.selection.notes, *self.notes]
-        misfit = misfit_note(own_misfit(self.selection.tests, self.fit.residual))
-        notes += [note for note in (misfit, noise_note(self.noise_share)) if note is not None]
+        by = missed(self.rms_um(), self._own_misfit)
+        told = misfit_note(self._own_misfit), noise_note(self.noise_share, by)
+        notes += [note for note in told if note is not None]
         dropped = sum(reason is not None for reason in self.selection.why_not)
         if dropped:
             notes.append(f"{dropped} of {len(self.campaign)} particles could not be used")
@@ -249,7 +258,7 @@ class Posterior(PosteriorDraws, Draws):
                 "log_evidence": finite(self.log_evidence[0]),
                 "log_evidence_error": finite(self.log_evidence[1]),
                 "noise_share": finite(self.noise_share),
-                "own_misfit": finite(own_misfit(self.selection.tests, self.fit.residual)),
+                "own_misfit": finite(self._own_misfit),
                 "failures": self.failures(),
             },
         }
