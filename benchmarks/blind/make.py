@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -35,8 +36,17 @@ class Made:
 def drawn(case: Case, master: int, attempt: int) -> tuple[np.random.Generator, World, Noise]:
     """The campaign of an attempt before any strength is known, its noise, and the random numbers that follow."""
     rng = case.rng(master, attempt)
-    world = generators()[case.generator].draw(rng, case)
+    generator = generators()[case.generator]
+    if case.kind == "pair" and attempt:  # another formula may reach what the first cannot
+        case = replace(case, effects=tuple((m, _next(generator, m, f, attempt), v) for m, f, v in case.effects))
+    world = generator.draw(rng, case)
     return rng, world, noise_.draw(rng, case.noise, world.count)
+
+
+def _next(generator: ModuleType, mechanism: str, formula: str, steps: int) -> str:
+    """The formula so many places further among those of its mechanism."""
+    known = generator.formulas(mechanism)
+    return known[(known.index(formula) + steps) % len(known)]
 
 
 def make(case: Case, master: int, drawing: Drawing = SETTINGS.drawing) -> Made:

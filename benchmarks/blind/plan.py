@@ -124,7 +124,10 @@ def _pairs(rng: np.random.Generator, drawing: Drawing) -> Iterator[Case]:
             both = [known[name].protocols(m, f) for m, f in zip(couple, formulas, strict=True)]
             protocol = "P2" if ("P2",) in both else PROTOCOLS[int(rng.integers(1, 3))]
             effects = tuple((m, f, next(levels)) for m, f in zip(couple, formulas, strict=True))
-            yield Case(0, "pair", name, effects, protocol, next(counts), next(noises))
+            count, noise = next(counts), next(noises)
+            if set(couple) & set(BETWEEN_PARTICLES):  # many particles, and no scatter that hides the effect
+                count, noise = max(drawing.particles), "clean" if noise in drawing.scattering else noise
+            yield Case(0, "pair", name, effects, protocol, count, noise)
 
 
 def _nulls(rng: np.random.Generator, drawing: Drawing) -> Iterator[Case]:

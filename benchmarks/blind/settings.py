@@ -32,6 +32,7 @@ class Drawing:
         unlisted: campaigns with an effect on no list.
         faults: campaigns of each kind of fault of the tester.
         noises: kinds of noise that campaigns with an effect take in turn.
+        scattering: kinds of noise that make particles differ.
         particles: numbers of particles that campaigns take in turn.
         enough_particles: least number for effects that show between particles only.
         strong: strength from which on these get the largest number.
@@ -63,6 +64,7 @@ class Drawing:
     unlisted: int = 30
     faults: int = 10
     noises: tuple[str, ...] = (*("clean",) * 6, "rough", "smooth", "heavy", "scale", "modulus", "shape")
+    scattering: tuple[str, ...] = ("modulus", "shape")
     particles: tuple[int, ...] = (5, 10, 20, 20, 40, 60)
     enough_particles: int = 20
     strong: float = 60.0
@@ -71,7 +73,7 @@ class Drawing:
         default_factory=lambda: {"single": 40, "pair": 10, "null": 30, "unlisted": 10, "fault": 10}
     )
     largest_unlisted: float = 400.0
-    attempts: int = 12
+    attempts: int = 6
     weak_attempts: int = 3
     reached: float = 0.9
     snap_strain: float = 0.03

@@ -54,7 +54,8 @@ class World:
     """A campaign before noise.
 
     columns: of `particles.csv`. diameter: effective, um. spread: standard deviations of ln C1, ln C3, ln C5 between
-    particles. truth: parameters of the population. hidden: what the case asks for. curves: displacement in um at every
+    particles. deviation: of ln C1, ln C3, ln C5 and ln modulus from the population, (4, n). truth: parameters of the
+    population. hidden: what the case asks for. curves: displacement in um at every
     reading for effects and a shift of the base law. listed: formulas of all listed mechanisms that this campaign can
     show, for comparison; pop-ins are left out, whose signature is whatever jumps there are.
     """
@@ -65,6 +66,7 @@ class World:
     slices: tuple[slice, ...]
     diameter: np.ndarray
     spread: np.ndarray
+    deviation: np.ndarray
     truth: dict[str, float]
     hidden: tuple[Hidden, ...]
     curves: Callable[[Sized, Shift | None], np.ndarray]

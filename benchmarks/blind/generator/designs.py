@@ -28,6 +28,7 @@ PROTOCOLS = ("P0", "P1", "P2")
 HUMIDITY_PERCENT = (10.0, 40.0, 75.0)
 HOLD_S = (20.0, 120.0)
 SIZE_SCATTER = 0.06
+WIDE = (0.5, 2.0)
 _TOUCH = 0.004  # of the peak: where records begin and end
 
 
@@ -50,11 +51,13 @@ class Path:
     unloading: np.ndarray
 
 
-def sizes(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Rows of Table 1: as they stand, or resampled with some scatter on each diameter."""
-    if count == len(TABLE_1) and rng.random() < 0.5:
+def sizes(rng: np.random.Generator, count: int, wide: bool = False) -> np.ndarray:
+    """Rows of Table 1: as they stand, or resampled with some scatter on each diameter; `wide` over a factor of four."""
+    if count == len(TABLE_1) and not wide and rng.random() < 0.5:
         return TABLE_1.copy()
     rows = TABLE_1[rng.integers(0, len(TABLE_1), count)]
+    if wide:
+        rows = rows * np.exp(rng.uniform(*np.log(WIDE), (count, 1)))
     rows = rows * np.exp(SIZE_SCATTER * rng.standard_normal(rows.shape))
     # A flat particle lies flat: D3 stays below the geometric mean of the others, as in the table.
     rows[:, 2] = np.minimum(rows[:, 2], 0.985 * np.sqrt(rows[:, 0] * rows[:, 1]))

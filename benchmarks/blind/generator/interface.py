@@ -51,7 +51,13 @@ def draw(rng: np.random.Generator, case: Case) -> World:
     forms = [BY_NAME[mechanism, formula] for mechanism, formula, _ in case.effects]
     humid = case.humidity or any(HUMIDITY in form.needs for form in forms)
     scatter = {name: sd if case.noise == name else 0.0 for name, sd in SCATTER.items()}
-    particles = designs.population(rng, designs.sizes(rng, case.particles), scatter["modulus"], scatter["shape"], humid)
+    particles = designs.population(
+        rng,
+        designs.sizes(rng, case.particles, any(form.mechanism == "size_effect" for form in forms)),
+        scatter["modulus"],
+        scatter["shape"],
+        humid,
+    )
     path = designs.programme(rng, particles, case.protocol)
     asked = [Effect(form, form.draw(rng, case.particles), int(rng.choice(form.signs))) for form in forms]
     size = path.time.shape[1]
@@ -65,6 +71,12 @@ def draw(rng: np.random.Generator, case: Case) -> World:
         tuple(slice(i * size, (i + 1) * size) for i in range(case.particles)),
         particles.De,
         np.array([sd for _, sd in LOG_C.values()]),
+        np.stack(
+            [
+                *(np.log(getattr(particles, name)) - mean for name, (mean, _) in LOG_C.items()),
+                np.log(particles.modulus / EFFECTIVE_MODULUS_MPA),
+            ]
+        ),
         truth,
         tuple(map(_hidden, asked)),
         lambda sized, shift: _curves(particles, path, sized, shift),

@@ -88,6 +88,7 @@ def draw(rng: np.random.Generator, case: Case) -> World:
         campaign.path.slices,
         tested.De,
         particles.LOG_C_SD,
+        np.vstack([np.log(tested.C).T - particles.LOG_C_MEAN[:, None], np.log(tested.modulus / tested.mean_modulus)]),
         truth,
         tuple(map(_hidden, asked)),
         lambda sized, shift: _curves(campaign, sized, shift),
