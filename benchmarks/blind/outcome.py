@@ -11,7 +11,6 @@ import numpy as np
 from .settings import FAULT_CHECKS, SETTINGS
 
 NAMING = ("NAMED", "SET")
-FOUND = (*NAMING, "UNLISTED")
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import kstest
 
-from .outcome import FOUND, NAMING, Outcome, calibration_error, share_over, wilson
+from .outcome import Outcome, calibration_error, share_over, wilson
 from .settings import SETTINGS
 from .truth import Truths
 
@@ -140,9 +140,8 @@ def faults(outcomes: Sequence[Outcome]) -> list[Row]:
     """Faults of the tester."""
     rows = [_rate("fault of the tester, no physics named", [not o.named for o in outcomes], least=1.0)]
     rows.append(_rate("fault of the tester, told as what it is", [o.told for o in outcomes]))
-    for kind in dict.fromkeys(o.case["fault"] for o in outcomes):
-        rows.append(_rate(f"  {kind} told", [o.told for o in outcomes if o.case["fault"] == kind]))
-    return rows
+    kinds = dict.fromkeys(o.case["fault"] for o in outcomes)
+    return [*rows, *(_rate(f"  {k} told", [o.told for o in outcomes if o.case["fault"] == k]) for k in kinds)]
 
 
 def unlisted(hidden: Sequence[Outcome], listed: Sequence[Outcome], truths: Truths) -> list[Row]:
@@ -250,6 +249,3 @@ def running(outcomes: Sequence[Outcome], kinds: dict[str, str]) -> list[Row]:
     cold = [o.result["wall_s"] for o in twenty if o.result["cold"]]
     rows.append(_value("seconds a campaign of 20 particles, warm (median)", warm, of=np.median))
     return [*rows, _value("seconds a campaign of 20 particles, cold (median)", cold, of=np.median)]
-
-
-__all__ = ["FOUND", "NAMING", "Row", "table"]

@@ -1,7 +1,7 @@
 """Solve the campaigns of a sealed run, one outcome a line, kept at once.
 
 `python -m benchmarks.blind.run --name 2026-11-27-4711 --part 1/8`. Outcomes stand in
-`benchmarks/results/blind/NAME/part_1_of_8.jsonl`, with `--label aic` in `NAME-aic/`; campaigns that have one, in whatever
+`benchmarks/results/blind/NAME/part_1_of_8.jsonl`, with `--label aic` in `NAME-aic/`; campaigns that have one, in any
 part, are skipped, so a stopped run goes on where it was. A campaign that crashes its process or is not answered in time
 costs its own case only.
 """
@@ -70,7 +70,8 @@ def solve(
     return len(queue)
 
 
-def _part(text: str) -> tuple[int, int]:
+def part_of(text: str) -> tuple[int, int]:
+    """A part of a run from its text i/n."""
     number, _, parts = text.partition("/")
     if not (number.isdigit() and parts.isdigit() and 1 <= int(number) <= int(parts)):
         raise argparse.ArgumentTypeError(f"{text!r} is no part: say 1/8")
@@ -81,7 +82,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Make what is missing, look at the seal, solve a part."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--name", required=True, help="of the run: DATE-SEED")
-    parser.add_argument("--part", type=_part, default=(1, 1), help="i/n: every n-th campaign from the i-th on (1/1)")
+    parser.add_argument("--part", type=part_of, default=(1, 1), help="i/n: every n-th campaign from the i-th on (1/1)")
     parser.add_argument("--solver", default="inprocess", help="inprocess, or module:function")
     parser.add_argument("--label", default="", help="of another solver's outcomes: they stand in NAME-LABEL")
     parser.add_argument("--subset", type=int, help="only the fixed subset, given by its size (100)")

@@ -28,8 +28,8 @@ def load(name: str, results: Path = RESULTS, work: Path = sealing.WORK, sealed: 
 
 def kinds_of(name: str, results: Path = RESULTS) -> dict[str, str]:
     """Kind of every wrong verdict that `refit` has looked at."""
-    place = results / name / "kinds.json"
-    return {key: row["kind"] for key, row in json.loads(place.read_text()).items()} if place.exists() else {}
+    files = sorted((results / name).glob("kinds*.json"))
+    return {key: row["kind"] for file in files for key, row in json.loads(file.read_text()).items()}
 
 
 def wrong(outcomes: list[Outcome], kinds: dict[str, str]) -> list[list[str]]:

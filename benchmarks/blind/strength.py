@@ -68,6 +68,19 @@ class Projection:
         """What is left, whitened, of a small change of the displacement: one linear step from the truth."""
         return self._solve(change, self._at_truth, self._start)[0]
 
+    @property
+    def deviation(self) -> np.ndarray:
+        """What the particles' true deviations from the population add to the data of a score test, um.
+
+        Curves are taken about the particles' true numbers; a test that knows the population only sees these, too.
+        """
+        C1, C3, C5, modulus = self.world.deviation
+        columns = self._at_truth[0]
+        full = np.zeros((len(columns), 6))
+        full[:, self._used] = columns
+        own = np.stack([C1, C3, C5, 0.0 * C1, modulus, 0.0 * C1], axis=1)[self.world.owner]
+        return np.sum(full * own, axis=1)
+
     def unexplained(self, change: np.ndarray) -> np.ndarray:
         """What of a small change of the displacement the base law cannot take up, um."""
         tangents = self._at_truth

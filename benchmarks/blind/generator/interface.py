@@ -16,9 +16,6 @@ from .law import EFFECTIVE_MODULUS_MPA, LOG_C, SHAPE_PARAMETER, Particles, monot
 if TYPE_CHECKING:
     from ..plan import Case
 
-TAU_S = 30.0
-"""Of creep where formulas are compared."""
-
 
 def formulas(mechanism: str) -> tuple[str, ...]:
     """Names of a mechanism's formulas, the exact one first."""
@@ -101,11 +98,4 @@ def _listed(case: Case, humid: bool) -> Iterator[Hidden]:
             continue
         if HUMIDITY in form.needs and not humid:
             continue
-        yield _hidden(
-            Effect(
-                form,
-                {"tau": TAU_S}
-                if form.form == "exact" and form.mechanism == "creep"
-                else form.draw(rng, case.particles),
-            )
-        )
+        yield _hidden(Effect(form, form.draw(rng, case.particles)))
