@@ -15,22 +15,9 @@ from typing import Any
 
 import numpy as np
 
-STEP_LIMIT = 3
-"""Names that stepwise AIC adds at most."""
+from .settings import SETTINGS
 
-PADDED = 60
-"""Particles to which tests are filled up, so that formulas compile once."""
-
-LENGTHS = (0.1, 0.2, 0.4)
-"""Correlation lengths of the discrepancy, over the range of its two coordinates."""
-
-SIZES = (0.001, 0.003, 0.01, 0.03)
-"""Standard deviations of the discrepancy, over the particle's diameter."""
-
-WAVES = 8
-"""Cosines of the discrepancy along each coordinate."""
-
-ZERO_SD_UM = 10.0
+_B, _ZERO_SD_UM = SETTINGS.baselines, SETTINGS.refitting.zero_sd_um
 
 
 def answer(verdict: str, effects: Sequence[tuple[str, str, float]] = (), **more: Any) -> dict[str, Any]:
@@ -79,7 +66,7 @@ def fitted(folder: Path, with_formulas: bool) -> Fitted:
 
     def filled(tree: Any) -> Any:
         arrays, rest = eqx.partition(tree, eqx.is_array)
-        more = PADDED - count
+        more = _B.padded - count
         grown = jax.tree.map(
             lambda x: jnp.pad(x, [(0, more), *[(0, 0)] * (x.ndim - 1)], mode="edge") if x.ndim else x, arrays
         )
@@ -101,7 +88,7 @@ def fitted(folder: Path, with_formulas: bool) -> Fitted:
     own, common, coordinates = [], [], []
     for i, at in enumerate(rows):
         J = base[i, at]
-        own.append(np.column_stack([J[:, :3] * tau, np.full(len(at), ZERO_SD_UM)]))
+        own.append(np.column_stack([J[:, :3] * tau, np.full(len(at), _ZERO_SD_UM)]))
         shape = J[:, :3].sum(1) * flatness[i] / (1.0 + float(fit.population.a) * flatness[i])
         common.append(np.column_stack([J, shape]))
         coordinates.append(np.column_stack([force[i, at] / force[i, at].max(), path[i, at] / path[i, at].max()]))
@@ -158,7 +145,7 @@ def aic(folder: Path, *, seed: int = 0) -> dict[str, Any]:
     effects: list[tuple[str, str, float]] = []
     ranking: list[dict[str, Any]] = []
     taken: set[str] = set()
-    for _ in range(STEP_LIMIT):
+    for _ in range(_B.names):
         norm = np.linalg.norm(X, axis=0)
         score = np.where(norm > 1e-6 * np.maximum(usual, 1e-300), y @ X / np.maximum(norm, 1e-300), 0.0)
         score = np.where((signs != 0) & (np.sign(score) != signs), 0.0, score)
@@ -184,18 +171,18 @@ def discrepancy(folder: Path, *, seed: int = 0) -> dict[str, Any]:
     """A smooth Gaussian process for what the law lacks, common to all particles, after Kennedy and O'Hagan (2001).
 
     Its coordinates are the share of the largest load and the share of the load path. It names nothing: UNLISTED where
-    its marginal likelihood, less two nats for its two hyperparameters, is above that of white noise alone. The gap
-    closed is of particles left out.
+    its marginal likelihood, less two nats for its two hyperparameters, is above that of white noise alone, and it
+    closes some of the gap of particles left out.
     """
     base = fitted(Path(folder), with_formulas=False)
     sd = float(np.sqrt(np.mean(np.concatenate(base.residual) ** 2)))
-    waves = list(product(range(WAVES), repeat=2))
+    waves = list(product(range(_B.waves), repeat=2))
     basis = [[_cosine(c, wave) * d for c, d in zip(base.coordinates, base.diameter, strict=True)] for wave in waves]
     y, X = eliminated(base, sd, basis)
     gram, moment, square = X.T @ X, X.T @ y, float(y @ y)
     best, weights = _without(square, len(y)), None
     plain = best
-    for length, size in product(LENGTHS, SIZES):
+    for length, size in product(_B.lengths, _B.sizes):
         spectrum = np.array([np.exp(-0.5 * (np.pi * length) ** 2 * (a * a + b * b)) for a, b in waves])
         prior = np.sqrt(size**2 * spectrum / spectrum.sum())
         value, found = _with(gram, moment, square, len(y), prior)
@@ -204,7 +191,8 @@ def discrepancy(folder: Path, *, seed: int = 0) -> dict[str, Any]:
     gap = {"heldout": "leave-one-particle-out", "steps": [], "closed_fraction": None}
     if weights is not None:
         gap["closed_fraction"] = _closed(base, X, y, weights[1] ** 2 / weights[0][1])
-    return answer("UNLISTED" if best - plain > 2.0 else "NO_GAP", gap=gap, log_bayes_factor=best - plain)
+    missing = best - plain > _B.hyperparameters and gap["closed_fraction"] > 0
+    return answer("UNLISTED" if missing else "NO_GAP", gap=gap, log_bayes_factor=best - plain)
 
 
 def _cosine(coordinates: np.ndarray, wave: tuple[int, int]) -> np.ndarray:

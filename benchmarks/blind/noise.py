@@ -7,15 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from .settings import SETTINGS
 from .world import World
 
-ZERO_SD_UM = 2.0
-"""Standard deviation of the zero of displacement between tests."""
-
-SCATTER = {"modulus": 0.10, "shape": 0.05}
-"""Kind of nuisance: standard deviation of the logarithm of each particle's modulus, or of its strain's factor."""
-
-_STEEPEST = 5.0
+_T = SETTINGS.testers
 _JITTER = 1e-8
 
 
@@ -48,15 +43,15 @@ def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
 
 def draw(rng: np.random.Generator, kind: str, count: int) -> Noise:
     """Sizes of the noise of a kind (see `settings.Drawing.nulls`)."""
-    white, wander = _log_uniform(rng, 0.02, 0.05), _log_uniform(rng, 0.06, 0.15)
-    length, along, kernel = _log_uniform(rng, 0.5, 2.0), "load", "exponential"
+    white, wander = _log_uniform(rng, *_T.white_um), _log_uniform(rng, *_T.wander_um)
+    length, along, kernel = _log_uniform(rng, *_T.usual_MPa), "load", "exponential"
     if kind in ("rough", "smooth"):
-        wander *= 1.5
+        wander *= _T.strong_wander
         along = str(rng.choice(["load", "time"]))
-        length = _log_uniform(rng, 1.0, 4.0) if along == "load" else _log_uniform(rng, 10.0, 60.0)
+        length = _log_uniform(rng, *(_T.length_MPa if along == "load" else _T.length_s))
         kernel = "exponential" if kind == "rough" else str(rng.choice(["matern32", "matern52"]))
-    scale = np.exp(0.5 * rng.standard_normal(count)) if kind == "scale" else np.ones(count)
-    return Noise(white, wander, length, along, kernel, float(rng.uniform(0.0, 0.03)), kind == "heavy", scale)
+    scale = np.exp(_T.scale_sd * rng.standard_normal(count)) if kind == "scale" else np.ones(count)
+    return Noise(white, wander, length, along, kernel, float(rng.uniform(*_T.force_mN)), kind == "heavy", scale)
 
 
 def _correlation(kernel: str, distance: np.ndarray) -> np.ndarray:
@@ -81,7 +76,7 @@ def slopes(world: World) -> np.ndarray:
     for s in world.slices:
         with np.errstate(divide="ignore", invalid="ignore"):
             slope = np.gradient(world.base[s]) / np.gradient(world.force[s])
-        out[s] = np.clip(np.where(np.isfinite(slope), slope, 0.0), -_STEEPEST, _STEEPEST)
+        out[s] = np.clip(np.where(np.isfinite(slope), slope, 0.0), -_T.steepest_um_per_mN, _T.steepest_um_per_mN)
     return out
 
 
@@ -112,7 +107,7 @@ def sample(rng: np.random.Generator, noise: Noise, world: World) -> tuple[np.nda
         number = len(correlations)
         wander = np.linalg.cholesky(correlations) @ unit(number)
         displacement[s] = noise.scale[i] * (noise.wander_um * wander + noise.white_um * unit(number))
-    zero = rng.normal(0.0, ZERO_SD_UM, world.count)
+    zero = rng.normal(0.0, _T.zero_um, world.count)
     return displacement + zero[world.owner], noise.force_mN * rng.standard_normal(len(world.force))
 
 
@@ -130,11 +125,11 @@ def with_fault(rng: np.random.Generator, kind: str, world: World, clean: Reading
     """Readings with a fault of the tester in them, and what it is."""
     if kind == "force_zero":
         peaks = [world.force[s].max() for s in world.slices]
-        offset = float(rng.choice([-1, 1]) * rng.uniform(0.01, 0.04) * np.median(peaks))
+        offset = float(rng.choice([-1, 1]) * rng.uniform(*_T.offset) * np.median(peaks))
         return Readings(clean.owner, clean.time, clean.force + offset, clean.displacement), {"offset_mN": offset}
     if kind == "clipping":
         tops = [clean.displacement[s].max() for s in world.slices]
-        limit = float(np.quantile(tops, rng.uniform(0.4, 0.8)))
+        limit = float(np.quantile(tops, rng.uniform(*_T.clipped_from)))
         clipped = np.minimum(clean.displacement, limit)
         return Readings(clean.owner, clean.time, clean.force, clipped), {"limit_um": limit}
     if kind == "breakage":
@@ -146,15 +141,16 @@ def _broken(rng: np.random.Generator, world: World, clean: Readings) -> tuple[Re
     """Particles that break on the way up: a jump with a dip of the force; half of these records end soon after."""
     force, displacement = clean.force.copy(), clean.displacement.copy()
     kept = np.ones(len(force), bool)
-    broken = np.sort(rng.choice(world.count, int(rng.integers(1, 1 + max(1, min(3, world.count // 4)))), replace=False))
+    most = max(1, min(_T.broken[0], world.count // _T.broken[1]))
+    broken = np.sort(rng.choice(world.count, int(rng.integers(1, 1 + most)), replace=False))
     for i in broken:
         s = world.slices[i]
-        at = s.start + int(np.argmax(world.force[s] >= rng.uniform(0.4, 0.9) * world.force[s].max()))
-        jump = rng.uniform(0.05, 0.2) * world.diameter[i]
+        at = s.start + int(np.argmax(world.force[s] >= rng.uniform(*_T.breaks_at) * world.force[s].max()))
+        jump = rng.uniform(*_T.jump) * world.diameter[i]
         displacement[at] += 0.5 * jump
         displacement[at + 1 : s.stop] += jump
-        force[at : min(at + 3, s.stop)] *= rng.uniform(0.5, 0.8)
+        force[at : min(at + 3, s.stop)] *= rng.uniform(*_T.dip)
         if rng.random() < 0.5:
-            kept[at + int(rng.integers(5, 15)) : s.stop] = False
+            kept[at + int(rng.integers(*_T.rows_after)) : s.stop] = False
     readings = Readings(clean.owner[kept], clean.time[kept], force[kept], displacement[kept])
     return readings, {"particles": [str(i + 1) for i in broken]}

@@ -14,24 +14,11 @@ from . import make
 from .baselines import answer
 from .noise import slopes
 from .plan import from_record
+from .settings import SETTINGS
 from .strength import Projection, signature
 from .world import Hidden
 
-DRAWS = 2000
-LEVEL = 0.05
-"""Family-wise level of "anything at all", by simulation."""
-
-SECOND = 6.0
-"""Nats that a second name must gain beyond the first."""
-
-UNLISTED = 1e-6
-"""Tail probability of what is left from which on no listed formula will do."""
-
-REFINED = 6
-"""Formulas that are followed to their finite amplitude."""
-
-STRONG = 5.0
-"""Statistic from which on they are."""
+_B = SETTINGS.baselines
 
 
 def readings(folder: Path) -> np.ndarray:
@@ -56,17 +43,17 @@ def solve(folder: Path, seed: int = 0) -> dict[str, Any]:
     rng = np.random.default_rng(seed)
     null = np.abs(_admissible(_normal(rng, G @ G.T), signed)).max(axis=1)
     first, drop, left, tangent = _best(projection, known, G, signed, y)
-    p = float((1 + np.sum(null >= np.sqrt(max(2 * max(drop.values()), 0.0)))) / (DRAWS + 1))
+    p = float((1 + np.sum(null >= np.sqrt(max(2 * max(drop.values()), 0.0)))) / (_B.draws + 1))
     ranking = _ranking(drop)
     more = {"ranking": ranking, "p_anything_missing": p}
-    if p >= LEVEL:
+    if p >= _B.level:
         return answer("UNLISTED" if _too_much(y) else "NO_GAP", **more)
     names = [(first.mechanism, first.formula, ranking[0]["probability"])]
     others = [k for k, h in enumerate(known) if h.mechanism != first.mechanism]
     H = G[others] - np.outer(G[others] @ tangent, tangent)
     H = H / np.maximum(np.linalg.norm(H, axis=1, keepdims=True), 1e-9)
     second, gain, after, _ = _best(projection, [known[k] for k in others], H, signed[others], left)
-    if max(gain.values()) > SECOND:
+    if max(gain.values()) > _B.second:
         names.append((second.mechanism, second.formula, 1.0))
         left = after
     if _too_much(left):
@@ -75,12 +62,12 @@ def solve(folder: Path, seed: int = 0) -> dict[str, Any]:
 
 
 def _too_much(left: np.ndarray) -> bool:
-    return bool(chi2.sf(float(left @ left), len(left)) < UNLISTED)
+    return bool(chi2.sf(float(left @ left), len(left)) < _B.unlisted)
 
 
 def _normal(rng: np.random.Generator, covariance: np.ndarray) -> np.ndarray:
     values, vectors = np.linalg.eigh(covariance)
-    return rng.standard_normal((DRAWS, len(values))) * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
+    return rng.standard_normal((_B.draws, len(values))) * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
 
 
 def _admissible(score: np.ndarray, signed: np.ndarray) -> np.ndarray:
@@ -101,9 +88,9 @@ def _best(
     half = 0.5 * score**2
     lefts = [y - s * g for s, g in zip(score, G, strict=True)]
     raw = np.abs(G @ y)  # a strong effect may have the forbidden sign to first order
-    if raw.max() > STRONG:
+    if raw.max() > _B.strong:
         true = [k for k, h in enumerate(known) if h in projection.world.hidden]
-        for k in {*np.argsort(-raw)[:REFINED].tolist(), *true}:
+        for k in {*np.argsort(-raw)[: _B.followed].tolist(), *true}:
             refined = _followed(projection, known[k], y, float(raw[k]))
             value = 0.5 * float(y @ y - refined @ refined)
             if value > half[k]:

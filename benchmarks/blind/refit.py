@@ -24,9 +24,6 @@ from .settings import SETTINGS
 Evidence = Callable[[Sequence[str]], float]
 """Log evidence of the law with effects, each "mechanism:variant"."""
 
-MOST = 9
-"""Combinations of formulas of a pair that are fitted at most."""
-
 
 def kind_of(truth: float, winner: float) -> str:
     """The kind of a wrong verdict, from the log evidences of the truth and of the winner."""
@@ -41,7 +38,7 @@ def judge(outcome: Outcome, formulas: dict[str, list[str]], evidence: Evidence) 
         return {"kind": "not compared", "verdict": outcome.verdict}
     winner = evidence([f"{e['mechanism']}:{e['variant']}" for e in outcome.found["effects"]])
     ways = list(product(*([f"{m}:{v}" for v in formulas[m]] for m in outcome.truth)))
-    step = max(1, -(-len(ways) // MOST)) if len(outcome.truth) > 1 else 1
+    step = max(1, -(-len(ways) // SETTINGS.baselines.combinations)) if len(outcome.truth) > 1 else 1
     tried = {" + ".join(way): evidence(way) for way in ways[::step]}
     best = max(tried, key=lambda way: tried[way]) if tried else ""
     truth = tried.get(best, evidence(()))

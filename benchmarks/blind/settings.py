@@ -135,9 +135,109 @@ class Scoring:
 
 
 @dataclass(frozen=True)
+class Testers:
+    """Noise and faults of testers; ranges are of campaigns, evenly in the logarithm where they start above zero.
+
+    Attributes:
+        white_um, force_mN: white noise of displacement and of force.
+        wander_um: standard deviation of the correlated residual; strong_wander times as much where it is the nuisance.
+        usual_MPa: its length on the load path; of a nuisance length_MPa, or length_s where it wanders in time.
+        scale_sd: of the logarithm of a particle's own factor, where these differ.
+        scatter: kind of nuisance: standard deviation of the logarithm of each particle's modulus, or strain's factor.
+        zero_um: standard deviation of the zero of displacement between tests.
+        steepest_um_per_mN: largest slope of a curve by which an error of the force counts.
+        offset: of the zero of force, over the median largest force.
+        clipped_from: quantile of the particles' largest displacements at which the gauge ends.
+        broken: most particles that break, and one in how many.
+        breaks_at, jump, dip: share of the largest load, jump over the diameter, factor of the force for three readings.
+        rows_after: readings after which half of the broken records end.
+    """
+
+    white_um: tuple[float, float] = (0.02, 0.05)
+    force_mN: tuple[float, float] = (0.0, 0.03)
+    wander_um: tuple[float, float] = (0.06, 0.15)
+    strong_wander: float = 1.5
+    usual_MPa: tuple[float, float] = (0.5, 2.0)
+    length_MPa: tuple[float, float] = (1.0, 4.0)
+    length_s: tuple[float, float] = (10.0, 60.0)
+    scale_sd: float = 0.5
+    scatter: dict[str, float] = field(default_factory=lambda: {"modulus": 0.10, "shape": 0.05})
+    zero_um: float = 2.0
+    steepest_um_per_mN: float = 5.0
+    offset: tuple[float, float] = (0.01, 0.04)
+    clipped_from: tuple[float, float] = (0.4, 0.8)
+    broken: tuple[int, int] = (3, 4)
+    breaks_at: tuple[float, float] = (0.4, 0.9)
+    jump: tuple[float, float] = (0.05, 0.2)
+    dip: tuple[float, float] = (0.5, 0.8)
+    rows_after: tuple[int, int] = (5, 15)
+
+
+@dataclass(frozen=True)
+class Refitting:
+    """How strengths are found.
+
+    Attributes:
+        step: of differences, in logarithms.
+        zero_sd_um: prior standard deviation of each test's zero.
+        least_spread: standard deviation that a spread has at least.
+        rounds, halvings: of Gauss-Newton.
+        settled: relative gain of a round below which it ends.
+        close: relative error of lambda that is close enough, after `search` trials at most.
+        weak: lambda up to which a signature counts as linear.
+    """
+
+    step: float = 1e-4
+    zero_sd_um: float = 10.0
+    least_spread: float = 1e-6
+    rounds: int = 8
+    halvings: int = 5
+    settled: float = 0.004
+    close: float = 0.015
+    search: int = 9
+    weak: float = 3.0
+
+
+@dataclass(frozen=True)
+class Baselines:
+    """Oracle, stepwise AIC and smooth discrepancy.
+
+    Attributes:
+        names: most names that stepwise AIC adds.
+        padded: particles to which tests are filled up, so that formulas compile once.
+        lengths: correlation lengths of the discrepancy, over the range of its two coordinates.
+        sizes: standard deviations of the discrepancy, over the particle's diameter.
+        waves: cosines of the discrepancy along each coordinate.
+        hyperparameters: nats that the discrepancy must gain for its two hyperparameters.
+        draws, level: simulated nulls of the oracle, and its family-wise level of "anything at all".
+        second: nats that the oracle's second name must gain.
+        unlisted: tail probability of the oracle's remaining chi2 from which on no listed formula will do.
+        followed, strong: formulas that the oracle follows to finite amplitudes, from this statistic on.
+        combinations: formulas of a pair that `refit` fits at most.
+    """
+
+    names: int = 3
+    padded: int = 60
+    lengths: tuple[float, ...] = (0.1, 0.2, 0.4)
+    sizes: tuple[float, ...] = (0.001, 0.003, 0.01, 0.03)
+    waves: int = 8
+    hyperparameters: float = 2.0
+    draws: int = 2000
+    level: float = 0.05
+    second: float = 6.0
+    unlisted: float = 1e-6
+    followed: int = 6
+    strong: float = 5.0
+    combinations: int = 9
+
+
+@dataclass(frozen=True)
 class Settings:
     """All choices of the bench."""
 
+    testers: Testers = field(default_factory=Testers)
+    refitting: Refitting = field(default_factory=Refitting)
+    baselines: Baselines = field(default_factory=Baselines)
     drawing: Drawing = field(default_factory=Drawing)
     running: Running = field(default_factory=Running)
     scoring: Scoring = field(default_factory=Scoring)

@@ -12,19 +12,13 @@ from functools import cached_property
 
 import numpy as np
 
-from .noise import SCATTER, Noise, whitening
+from .noise import Noise, whitening
+from .settings import SETTINGS
 from .world import Hidden, Shift, World
 
 Tangents = tuple[np.ndarray, np.ndarray]
 
-_STEP = 1e-4
-_ZERO_SD_UM = 10.0
-_LEAST_SPREAD = 1e-6
-_ROUNDS, _HALVINGS = 8, 5
-_SETTLED = 0.004
-_CLOSE = 0.015
-_SEARCH = 9
-_SMALL = 3.0
+_R = SETTINGS.refitting
 
 
 @dataclass(frozen=True)
@@ -54,8 +48,8 @@ class Projection:
     def __init__(self, world: World, noise: Noise, nuisance: str = "") -> None:
         self.world = world
         self.whiteners = whitening(noise, world)
-        scatter = {name: sd if name == nuisance else 0.0 for name, sd in SCATTER.items()}
-        sd = [*np.maximum(world.spread, _LEAST_SPREAD), scatter["shape"], scatter["modulus"], _ZERO_SD_UM]
+        scatter = {name: sd if name == nuisance else 0.0 for name, sd in SETTINGS.testers.scatter.items()}
+        sd = [*np.maximum(world.spread, _R.least_spread), scatter["shape"], scatter["modulus"], _R.zero_sd_um]
         self._used = np.flatnonzero(sd)
         self._sd = np.asarray(sd)[self._used]
         self._start = Point(np.zeros((world.count, len(self._used))), np.zeros(5))
@@ -99,15 +93,15 @@ class Projection:
             tried = self._objective(curves, start)
             if tried[1] < objective:
                 point, (residual, objective) = start, tried
-        for _ in range(_ROUNDS):
+        for _ in range(_R.rounds):
             tangents = self._tangents(point)
             white, own, shared = self._solve(residual, tangents, point)
             predicted = float(white @ white)
-            if objective - predicted < _SETTLED * predicted + 1e-3:
+            if objective - predicted < _R.settled * predicted + 1e-3:
                 break
             size = max(np.abs(shared).max(), np.abs(own[:, :-1] * self._sd[:-1]).max(), 1e-9)
             share = min(1.0, 0.5 / size)
-            for _ in range(_HALVINGS):
+            for _ in range(_R.halvings):
                 tried_point = Point(point.own + share * own, point.shared + share * shared)
                 tried = self._objective(curves, tried_point)
                 if tried[1] < objective:
@@ -145,11 +139,11 @@ class Projection:
             step = np.zeros(3) if log_C is None else log_C
 
             def moved(sign: float) -> np.ndarray:
-                h = sign * _STEP
+                h = sign * _R.step
                 shift = Shift(at.log_C + h * step[:, None], at.log_modulus + h * log_modulus, at.a + h * a)
                 return self.world.curves((), shift)
 
-            return (moved(1.0) - moved(-1.0)) / (2.0 * _STEP)
+            return (moved(1.0) - moved(-1.0)) / (2.0 * _R.step)
 
         log_C = [slope(row) for row in np.eye(3)]
         modulus = slope(log_modulus=1.0)
@@ -181,8 +175,8 @@ def signature(projection: Projection, hidden: Hidden) -> np.ndarray:
     world, amplitude = projection.world, 1e-2 * min(hidden.start, hidden.largest)
     small = projection.project(world.curves([(hidden, amplitude)], None) - world.base)
     size = np.linalg.norm(small)
-    if size > _SMALL:  # formulas bend with their amplitude
-        small = projection.project(world.curves([(hidden, amplitude * _SMALL / size)], None) - world.base)
+    if size > _R.weak:  # formulas bend with their amplitude
+        small = projection.project(world.curves([(hidden, amplitude * _R.weak / size)], None) - world.base)
         size = np.linalg.norm(small)
     return small / size if size > 1e-4 else np.zeros_like(small)
 
@@ -194,13 +188,13 @@ def amplitude_for(projection: Projection, hidden: Hidden, target: float) -> tupl
     slope = np.linalg.norm(projection.project(world.curves([(hidden, small)], None) - world.base)) / small
     theta = min(hidden.largest, 0.95 * target / max(slope, 1e-12))
     below, above, best, point = (0.0, 0.0), None, None, None
-    for _ in range(_SEARCH):
+    for _ in range(_R.search):
         found = projection.refit(world.curves([(hidden, theta)], None), point)
         point = found.point
         miss = abs(np.log(max(found.strength, 1e-9) / target))
         if best is None or miss < best[0]:
             best = (miss, theta, found)
-        if abs(found.strength / target - 1.0) < _CLOSE or (theta >= hidden.largest and found.strength < target):
+        if abs(found.strength / target - 1.0) < _R.close or (theta >= hidden.largest and found.strength < target):
             break
         if found.strength < target:
             below = (theta, found.strength)

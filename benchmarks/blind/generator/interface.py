@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..noise import SCATTER
+from ..settings import SETTINGS
 from ..world import Hidden, Shift, Sized, World
 from . import designs
 from .effects import BY_NAME, HUMIDITY, LISTED, RELOAD, UNLISTED, Effect
@@ -47,7 +47,7 @@ def draw(rng: np.random.Generator, case: Case) -> World:
     """A campaign before noise, with the effects that the case asks for."""
     forms = [BY_NAME[mechanism, formula] for mechanism, formula, _ in case.effects]
     humid = case.humidity or any(HUMIDITY in form.needs for form in forms)
-    scatter = {name: sd if case.noise == name else 0.0 for name, sd in SCATTER.items()}
+    scatter = {name: sd if case.noise == name else 0.0 for name, sd in SETTINGS.testers.scatter.items()}
     particles = designs.population(
         rng,
         designs.sizes(rng, case.particles, any(form.mechanism == "size_effect" for form in forms)),

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..noise import SCATTER
+from ..settings import SETTINGS
 from ..world import Hidden, Shift, Sized, World
 from . import campaign as campaign_
 from . import effects, particles
@@ -63,7 +63,7 @@ def draw(rng: np.random.Generator, case: Case) -> World:
         if not reloads and rng.random() < FURTHER_RELOAD:
             reloads = 1
     humid = case.humidity or any(effect.humidity for effect in asked)
-    scatter = {name: sd if case.noise == name else 0.0 for name, sd in SCATTER.items()}
+    scatter = {name: sd if case.noise == name else 0.0 for name, sd in SETTINGS.testers.scatter.items()}
     campaign = campaign_.draw(
         rng,
         case.particles,
