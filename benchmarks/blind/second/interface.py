@@ -13,7 +13,7 @@ from ..world import Hidden, Shift, Sized, World
 from . import campaign as campaign_
 from . import effects, particles
 from .campaign import Campaign
-from .effects import Effect
+from .effects import Effect, Formula
 from .law import Shift as LawShift
 from .law import simulate
 
@@ -24,13 +24,13 @@ FURTHER_RELOAD = 0.3
 """Share of campaigns with partial unloading that get a further reload though no effect asks for it."""
 
 
-def _formulas(mechanism: str) -> tuple[type[Effect], ...]:
+def _formulas(mechanism: str) -> tuple[Formula, ...]:
     return effects.UNLISTED if mechanism == "unlisted" else effects.LISTED[mechanism]
 
 
 def formulas(mechanism: str) -> tuple[str, ...]:
     """Names of a mechanism's formulas, the specification's first."""
-    return tuple(formula.__name__ for formula in _formulas(mechanism))
+    return tuple(formula.name for formula in _formulas(mechanism))
 
 
 def unlisted() -> tuple[str, ...]:
@@ -38,8 +38,8 @@ def unlisted() -> tuple[str, ...]:
     return formulas("unlisted")
 
 
-def _find(mechanism: str, name: str) -> type[Effect]:
-    return next(formula for formula in _formulas(mechanism) if formula.__name__ == name)
+def _find(mechanism: str, name: str) -> Formula:
+    return next(formula for formula in _formulas(mechanism) if formula.name == name)
 
 
 def protocols(mechanism: str, formula: str) -> tuple[str, ...]:
@@ -48,10 +48,8 @@ def protocols(mechanism: str, formula: str) -> tuple[str, ...]:
 
 
 def _hidden(effect: Effect) -> Hidden:
-    return Hidden(
-        effect.mechanism, type(effect).__name__, effect.describe(), effect.unit, effect.start, effect.largest,
-        type(effect).signed, effect,
-    )  # fmt: skip
+    f = effect.formula
+    return Hidden(f.mechanism, f.name, effect.describe(), f.unit, f.start, f.largest, f.signed, effect)
 
 
 def draw(rng: np.random.Generator, case: Case) -> World:
@@ -59,10 +57,10 @@ def draw(rng: np.random.Generator, case: Case) -> World:
     asked = [_find(mechanism, formula)(rng) for mechanism, formula, _ in case.effects]
     reloads = 0
     if case.protocol != "P0":
-        reloads = max([effect.reloads for effect in asked], default=0)
+        reloads = max([effect.formula.reloads for effect in asked], default=0)
         if not reloads and rng.random() < FURTHER_RELOAD:
             reloads = 1
-    humid = case.humidity or any(effect.humidity for effect in asked)
+    humid = case.humidity or any(effect.formula.humidity for effect in asked)
     scatter = {name: sd if case.noise == name else 0.0 for name, sd in SETTINGS.testers.scatter.items()}
     campaign = campaign_.draw(
         rng,
@@ -70,8 +68,8 @@ def draw(rng: np.random.Generator, case: Case) -> World:
         case.protocol,
         humidity=particles.humidity_levels(rng, case.particles) if humid else None,
         reloads=reloads,
-        wide=any(effect.wide for effect in asked),
-        low_turn=any(effect.low_turn for effect in asked),
+        wide=any(effect.formula.wide for effect in asked),
+        low_turn=any(effect.formula.low_turn for effect in asked),
         modulus_scatter=scatter["modulus"],
         shape_scatter=scatter["shape"],
     )

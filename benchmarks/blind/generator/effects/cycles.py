@@ -15,10 +15,6 @@ def _lag(s: State, rise: Callable[[Array], Array]) -> Array:
     return np.where(s.path.reload, rise(v), 0.0)
 
 
-def _hysteresis() -> Hooks:
-    return {"strain": lambda k, e, s: e - k * s.delta * _lag(s, lambda v: 4.0 * v * (1.0 - v))}
-
-
 def _hysteresis_skewed() -> Hooks:
     # Slip begins late: the lag peaks in the upper half of the reload.
     return {"strain": lambda k, e, s: e - k * s.delta * _lag(s, lambda v: 6.75 * v**2 * (1.0 - v))}
@@ -45,19 +41,18 @@ def _ratchet_settling() -> Hooks:
     return {"strain": strain}
 
 
+# fmt: off
 FORMS = (
     Form(
-        "reload_hysteresis", "exact", "h d_el 4 u (1 - u) on reloads", 0.05, _hysteresis, (0.01, 0.4), needs=(RELOAD,)
+        "reload_hysteresis", "exact", "h d_el 4 u (1 - u) on reloads", 0.05,
+        lambda: {"strain": lambda k, e, s: e - k * s.delta * _lag(s, lambda v: 4.0 * v * (1.0 - v))}, (0.01, 0.4),
+        needs=(RELOAD,),
     ),
     Form(
-        "reload_hysteresis",
-        "skewed",
-        "h d_el 6.75 v^2 (1 - v) on reloads",
-        0.05,
-        _hysteresis_skewed,
-        (0.01, 0.4),
+        "reload_hysteresis", "skewed", "h d_el 6.75 v^2 (1 - v) on reloads", 0.05, _hysteresis_skewed, (0.01, 0.4),
         needs=(RELOAD,),
     ),
     Form("ratcheting", "exact", "c per reload", 1e-3, _ratchet, (5e-5, 1e-2), needs=(RELOAD,)),
     Form("ratcheting", "settling", "c sqrt(number of reloads)", 1e-3, _ratchet_settling, (5e-5, 1e-2), needs=(RELOAD,)),
 )
+# fmt: on

@@ -26,31 +26,11 @@ def _hardening_normalised() -> Hooks:
     return {"flow": flow}
 
 
-def _hardening_loading() -> Hooks:
-    return {"flow": lambda k, y, x, s: y * (np.maximum(x, 1e-12) / 0.3) ** k}
-
-
-def _size() -> Hooks:
-    return {"C1": lambda k, C, s: C * (s.particle.De / 200.0) ** -k}
-
-
 def _size_gradient() -> Hooks:
     # Strain-gradient hardening: sqrt(1 + length / size).
     return {
         "C1": lambda k, C, s: C * np.sqrt(np.maximum(1.0 + k * 200.0 / s.particle.De, 0.05) / np.maximum(1.0 + k, 0.05))
     }
-
-
-def _size_linear() -> Hooks:
-    return {"C1": lambda k, C, s: C * np.maximum(1.0 + k * (200.0 / s.particle.De - 1.0), 0.05)}
-
-
-def _shape_second() -> Hooks:
-    return {"shape": lambda k, eta, s: eta + k * (1.0 - s.particle.q) ** 2}
-
-
-def _shape_in_plane() -> Hooks:
-    return {"shape": lambda k, eta, s: eta + k * np.log(s.particle.D1 / s.particle.D2) ** 2}
 
 
 def _shape_power() -> Hooks:
@@ -88,17 +68,9 @@ def _draw_cascade(rng: np.random.Generator, count: int) -> dict[str, Any]:
     return {"at": rng.uniform(0.1, 0.98, (count, events)), "size": 0.35 * rng.exponential(1.0, (count, events))}
 
 
-def _toe() -> Hooks:
-    return {"strain": lambda k, e, s: e - k * np.exp(-s.sigma_P / 0.6)}
-
-
 def _toe_power() -> Hooks:
     # Asperities flattened as a power of the stress.
     return {"strain": lambda k, e, s: e - k / (1.0 + s.sigma_P / 0.3) ** 1.5}
-
-
-def _toe_exponent() -> Hooks:
-    return {"strain": lambda k, e, s: e + k * (1.0 - np.exp(-np.sqrt(s.sigma_P / 0.25)))}
 
 
 def _friction() -> Hooks:
@@ -140,87 +112,72 @@ def _humidity_glass() -> Hooks:
     return {"C1": lambda k, C, s: C * drop(k, s), "modulus": lambda k, E, s: E * drop(0.5 * k, s)}
 
 
+# fmt: off
 FORMS = (
     Form(
-        "finite_hardening_exponent",
-        "exact",
-        "C1 x^(1+k), unloading exponent 2 (1+k), k = 1/(2m)",
-        0.02,
-        _hardening,
-        (0.005, 0.25),
+        "finite_hardening_exponent", "exact", "C1 x^(1+k), unloading exponent 2 (1+k), k = 1/(2m)", 0.02, _hardening,
+        (0.005, 0.25), largest=0.6,
+    ),
+    Form(
+        "finite_hardening_exponent", "normalised", "C1 x c(m) (x/0.2)^k", 0.02, _hardening_normalised, (0.005, 0.25),
         largest=0.6,
     ),
     Form(
-        "finite_hardening_exponent",
-        "normalised",
-        "C1 x c(m) (x/0.2)^k",
-        0.02,
-        _hardening_normalised,
-        (0.005, 0.25),
-        largest=0.6,
-    ),
-    Form("finite_hardening_exponent", "whole", "sigma (x/0.3)^k", 0.02, _hardening_loading, (0.005, 0.25), largest=0.6),
-    Form("size_effect", "exact", "C1 (D_e/200)^-n", 0.5, _size, (0.05, 0.8), largest=1.5),
-    Form(
-        "size_effect", "gradient", "C1 sqrt((1 + k 200/D_e)/(1 + k))", 0.5, _size_gradient, (0.1, 50.0), largest=100.0
-    ),
-    Form("size_effect", "linear", "C1 (1 + k (200/D_e - 1))", 0.5, _size_linear, (0.05, 0.8), largest=1.2),
-    Form("shape_second_order", "exact", "eta + b (1 - q)^2", 0.3, _shape_second, (0.03, 1.5), (1, -1), largest=3.0),
-    Form(
-        "shape_second_order", "in_plane", "eta + c ln^2(D1/D2)", 0.1, _shape_in_plane, (0.02, 0.6), (1, -1), largest=1.5
+        "finite_hardening_exponent", "whole", "sigma (x/0.3)^k", 0.02,
+        lambda: {"flow": lambda k, y, x, s: y * (np.maximum(x, 1e-12) / 0.3) ** k}, (0.005, 0.25), largest=0.6,
     ),
     Form(
-        "shape_second_order",
-        "power",
-        "eta + b (1/q - 1 - (1 - q))",
-        0.3,
-        _shape_power,
-        (0.02, 1.0),
-        (1, -1),
+        "size_effect", "exact", "C1 (D_e/200)^-n", 0.5,
+        lambda: {"C1": lambda k, C, s: C * (s.particle.De / 200.0) ** -k}, (0.05, 0.8), largest=1.5,
+    ),
+    Form(
+        "size_effect", "gradient", "C1 sqrt((1 + k 200/D_e)/(1 + k))", 0.5, _size_gradient, (0.1, 50.0), largest=100.0,
+    ),
+    Form(
+        "size_effect", "linear", "C1 (1 + k (200/D_e - 1))", 0.5,
+        lambda: {"C1": lambda k, C, s: C * np.maximum(1.0 + k * (200.0 / s.particle.De - 1.0), 0.05)}, (0.05, 0.8),
+        largest=1.2,
+    ),
+    Form(
+        "shape_second_order", "exact", "eta + b (1 - q)^2", 0.3,
+        lambda: {"shape": lambda k, eta, s: eta + k * (1.0 - s.particle.q) ** 2}, (0.03, 1.5), (1, -1), largest=3.0,
+    ),
+    Form(
+        "shape_second_order", "in_plane", "eta + c ln^2(D1/D2)", 0.1,
+        lambda: {"shape": lambda k, eta, s: eta + k * np.log(s.particle.D1 / s.particle.D2) ** 2}, (0.02, 0.6), (1, -1),
+        largest=1.5,
+    ),
+    Form(
+        "shape_second_order", "power", "eta + b (1/q - 1 - (1 - q))", 0.3, _shape_power, (0.02, 1.0), (1, -1),
         largest=1.0,
     ),
     Form("pop_in", "exact", "sum D_j H(F - F_j)", 2e-3, _pop_in, (3e-4, 0.05), draw=_draw_pop_in),
     Form(
-        "pop_in",
-        "burst",
-        "sum D_j (1 - exp(-(F - F_j)/(0.02 F_max)))",
-        2e-3,
-        _pop_in_burst,
-        (3e-4, 0.05),
+        "pop_in", "burst", "sum D_j (1 - exp(-(F - F_j)/(0.02 F_max)))", 2e-3, _pop_in_burst, (3e-4, 0.05),
         draw=_draw_pop_in,
     ),
     Form("pop_in", "cascade", "seven small D_j H(F - F_j)", 2e-3, _pop_in, (3e-4, 0.05), draw=_draw_cascade),
-    Form("toe_asperity", "exact", "-d D_e exp(-sigma_max/0.6)", 3e-3, _toe, (3e-4, 0.05)),
+    Form(
+        "toe_asperity", "exact", "-d D_e exp(-sigma_max/0.6)", 3e-3,
+        lambda: {"strain": lambda k, e, s: e - k * np.exp(-s.sigma_P / 0.6)}, (3e-4, 0.05),
+    ),
     Form("toe_asperity", "power", "-d D_e (1 + sigma_max/0.3)^-1.5", 3e-3, _toe_power, (3e-4, 0.05)),
-    Form("toe_asperity", "root", "d D_e (1 - exp(-sqrt(sigma_max/0.25)))", 3e-3, _toe_exponent, (3e-4, 0.05)),
+    Form(
+        "toe_asperity", "root", "d D_e (1 - exp(-sqrt(sigma_max/0.25)))", 3e-3,
+        lambda: {"strain": lambda k, e, s: e + k * (1.0 - np.exp(-np.sqrt(s.sigma_P / 0.25)))}, (3e-4, 0.05),
+    ),
     Form("platen_friction", "exact", "sigma (1 + (2 mu/3) a_c/h)", 0.05, _friction, (0.01, 0.6), largest=3.0),
     Form(
-        "platen_friction",
-        "slab",
-        "sigma 2 (exp(z) - 1 - z)/z^2, z = 2 mu a/h",
-        0.05,
-        _friction_slab,
-        (0.01, 0.6),
+        "platen_friction", "slab", "sigma 2 (exp(z) - 1 - z)/z^2, z = 2 mu a/h", 0.05, _friction_slab, (0.01, 0.6),
         largest=2.0,
     ),
     Form(
-        "humidity",
-        "exact",
-        "C1 exp(-k dw), E exp(-k dw/2), dw = (RH - 40)/10",
-        0.1,
-        _humidity,
-        (0.01, 0.4),
-        needs=(HUMIDITY,),
-        largest=0.6,
+        "humidity", "exact", "C1 exp(-k dw), E exp(-k dw/2), dw = (RH - 40)/10", 0.1, _humidity, (0.01, 0.4),
+        needs=(HUMIDITY,), largest=0.6,
     ),
     Form(
-        "humidity",
-        "glass",
-        "softening about 55 % RH",
-        0.1,
-        _humidity_glass,
-        (0.01, 0.4),
-        needs=(HUMIDITY,),
+        "humidity", "glass", "softening about 55 % RH", 0.1, _humidity_glass, (0.01, 0.4), needs=(HUMIDITY,),
         largest=0.6,
     ),
 )
+# fmt: on

@@ -9,30 +9,6 @@ from .form import Array, Form, Hooks, State
 from .state import contact_radius
 
 
-def _frame() -> Hooks:
-    return {"observable": lambda k, g, s: g + k * s.F}
-
-
-def _frame_stiffening() -> Hooks:
-    return {"observable": lambda k, g, s: g + k * 300.0 * (s.F / 300.0) ** 0.8}
-
-
-def _frame_seated() -> Hooks:
-    return {"observable": lambda k, g, s: g + k * 350.0 * np.log1p(s.F / 350.0)}
-
-
-def _drift() -> Hooks:
-    return {"observable": lambda k, g, s: g + k * s.t}
-
-
-def _drift_decaying(tau: float) -> Hooks:
-    return {"observable": lambda k, g, s: g + k * tau * (1.0 - np.exp(-s.t / tau))}
-
-
-def _drift_per_test(share: Array) -> Hooks:
-    return {"observable": lambda k, g, s: g + k * share[:, None] * s.t}
-
-
 def _sink_in() -> Hooks:
     # gamma += F / (2 a_c E*), amplitude 1 / E* in 1/MPa.
     def observable(k: float, g: Array, s: State) -> Array:
@@ -52,10 +28,6 @@ def _sink_in_hertz() -> Hooks:
     return {"observable": observable}
 
 
-def _tilt() -> Hooks:
-    return {"observable": lambda k, g, s: g + k * contact_radius(s.eps, s.particle.Re)}
-
-
 def _tilt_wedge() -> Hooks:
     # The high edge touches first: the gap under it closes over a tenth of strain.
     return {
@@ -63,33 +35,40 @@ def _tilt_wedge() -> Hooks:
     }
 
 
+# fmt: off
 FORMS = (
-    Form("frame_compliance", "exact", "C F", 1e-3, _frame, (5e-5, 5e-3), parameter="compliance_um_per_mN"),
-    Form("frame_compliance", "stiffening", "C F0 (F/F0)^0.8", 1e-3, _frame_stiffening, (5e-5, 5e-3)),
-    Form("frame_compliance", "seated", "C F0 ln(1 + F/F0)", 1e-3, _frame_seated, (5e-5, 5e-3)),
-    Form("thermal_drift", "exact", "v t", 1e-3, _drift, (1e-5, 1e-2), (1, -1), parameter="rate_um_per_s"),
     Form(
-        "thermal_drift",
-        "decaying",
-        "v tau (1 - exp(-t/tau))",
-        1e-3,
-        _drift_decaying,
-        (1e-5, 2e-2),
-        (1, -1),
+        "frame_compliance", "exact", "C F", 1e-3, lambda: {"observable": lambda k, g, s: g + k * s.F}, (5e-5, 5e-3),
+        parameter="compliance_um_per_mN",
+    ),
+    Form(
+        "frame_compliance", "stiffening", "C F0 (F/F0)^0.8", 1e-3,
+        lambda: {"observable": lambda k, g, s: g + k * 300.0 * (s.F / 300.0) ** 0.8}, (5e-5, 5e-3),
+    ),
+    Form(
+        "frame_compliance", "seated", "C F0 ln(1 + F/F0)", 1e-3,
+        lambda: {"observable": lambda k, g, s: g + k * 350.0 * np.log1p(s.F / 350.0)}, (5e-5, 5e-3),
+    ),
+    Form(
+        "thermal_drift", "exact", "v t", 1e-3, lambda: {"observable": lambda k, g, s: g + k * s.t}, (1e-5, 1e-2),
+        (1, -1), parameter="rate_um_per_s",
+    ),
+    Form(
+        "thermal_drift", "decaying", "v tau (1 - exp(-t/tau))", 1e-3,
+        lambda tau: {"observable": lambda k, g, s: g + k * tau * (1.0 - np.exp(-s.t / tau))}, (1e-5, 2e-2), (1, -1),
         draw=lambda rng, count: {"tau": float(rng.uniform(60.0, 200.0))},
     ),
     Form(
-        "thermal_drift",
-        "per_test",
-        "v_i t, v_i of one sign and a spread of 50 %",
-        1e-3,
-        _drift_per_test,
-        (1e-5, 1e-2),
-        (1, -1),
+        "thermal_drift", "per_test", "v_i t, v_i of one sign and a spread of 50 %", 1e-3,
+        lambda share: {"observable": lambda k, g, s: g + k * share[:, None] * s.t}, (1e-5, 1e-2), (1, -1),
         draw=lambda rng, count: {"share": 1.0 + 0.5 * rng.standard_normal(count)},
     ),
-    Form("misalignment", "exact", "alpha a_c", 0.01, _tilt, (1e-3, 0.08)),
+    Form(
+        "misalignment", "exact", "alpha a_c", 0.01,
+        lambda: {"observable": lambda k, g, s: g + k * contact_radius(s.eps, s.particle.Re)}, (1e-3, 0.08),
+    ),
     Form("misalignment", "wedge", "alpha D_e sqrt(1 - exp(-eps/0.12))", 0.01, _tilt_wedge, (1e-3, 0.08)),
     Form("platen_sink_in", "exact", "F/(2 a_c E*)", 1e-4, _sink_in, (5e-6, 1e-3)),
     Form("platen_sink_in", "growing", "F/(2 a(F) E*)", 1e-4, _sink_in_hertz, (5e-6, 1e-3)),
 )
+# fmt: on

@@ -19,18 +19,6 @@ def _memory(state: State, kernel: Callable[[Array], Array]) -> Array:
     return np.einsum("nij,nj->ni", np.where(lag > 0, kernel(np.maximum(lag, 0.0)), 0.0), steps)
 
 
-def _creep(tau: float) -> Hooks:
-    return {"strain": lambda k, e, s: e + k * _memory(s, lambda lag: 1.0 - np.exp(-lag / tau))}
-
-
-def _creep_logarithmic(tau: float) -> Hooks:
-    return {"strain": lambda k, e, s: e + k * _memory(s, lambda lag: np.log1p(lag / tau))}
-
-
-def _creep_power(power: float) -> Hooks:
-    return {"strain": lambda k, e, s: e + k * _memory(s, lambda lag: (lag / 60.0) ** power)}
-
-
 _RATE_0 = 1e-3
 
 
@@ -55,27 +43,25 @@ def _tau(rng: np.random.Generator, count: int) -> dict[str, Any]:
     return {"tau": float(np.exp(rng.uniform(np.log(10.0), np.log(90.0))))}
 
 
+# fmt: off
 FORMS = (
-    Form("creep", "exact", "tau de/dt + e = c sigma", 1e-4, _creep, (1e-5, 3e-3), draw=_tau),
     Form(
-        "creep",
-        "logarithmic",
-        "c ln(1 + t/tau) as memory kernel",
-        1e-4,
-        _creep_logarithmic,
-        (1e-6, 1e-3),
+        "creep", "exact", "tau de/dt + e = c sigma", 1e-4,
+        lambda tau: {"strain": lambda k, e, s: e + k * _memory(s, lambda lag: 1.0 - np.exp(-lag / tau))}, (1e-5, 3e-3),
+        draw=_tau,
+    ),
+    Form(
+        "creep", "logarithmic", "c ln(1 + t/tau) as memory kernel", 1e-4,
+        lambda tau: {"strain": lambda k, e, s: e + k * _memory(s, lambda lag: np.log1p(lag / tau))}, (1e-6, 1e-3),
         draw=lambda rng, count: {"tau": float(rng.uniform(2.0, 10.0))},
     ),
     Form(
-        "creep",
-        "power",
-        "c (t/60 s)^0.3 as memory kernel",
-        1e-4,
-        _creep_power,
-        (1e-6, 3e-3),
+        "creep", "power", "c (t/60 s)^0.3 as memory kernel", 1e-4,
+        lambda power: {"strain": lambda k, e, s: e + k * _memory(s, lambda lag: (lag / 60.0) ** power)}, (1e-6, 3e-3),
         draw=lambda rng, count: {"power": 0.3},
     ),
     Form("rate_dependence", "exact", "C1 (1 + m ln(rate/rate0))", 0.02, _rate, (0.003, 0.1)),
     Form("rate_dependence", "power", "sigma (rate/rate0)^m", 0.02, _rate_power, (0.003, 0.1)),
     Form("rate_dependence", "root", "C1 (1 + m sqrt(rate/rate0))", 0.02, _rate_cowper, (0.003, 0.1)),
 )
+# fmt: on

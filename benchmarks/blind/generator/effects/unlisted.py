@@ -76,18 +76,13 @@ def _second_contact() -> Hooks:
     return {"flow": flow}
 
 
+# fmt: off
 FORMS = (
     Form("unlisted", "stiffness_bump", "sigma (1 + k exp(-((eps-0.15)/0.035)^2))", 0.03, _bump, largest=0.5),
     Form("unlisted", "strain_ripple", "k sin(2 pi eps_P / 0.06)", 1e-3, _ripple),
     Form("unlisted", "unloading_kink", "-k (0.6 - u)_+", 2e-3, _kink),
     Form(
-        "unlisted",
-        "pore_locking",
-        "sigma (1 + k logistic((x-0.33)/0.012))",
-        0.03,
-        _locking,
-        (0.0, np.inf),
-        (1,),
+        "unlisted", "pore_locking", "sigma (1 + k logistic((x-0.33)/0.012))", 0.03, _locking, (0.0, np.inf), (1,),
         largest=1.0,
     ),
     Form("unlisted", "room_temperature", "k sin(2 pi t / 47 s)", 0.05, _room),
@@ -99,3 +94,4 @@ FORMS = (
     Form("unlisted", "fading_shape", "sigma (1 - k (eta-1)(eps-0.2)_+)", 0.5, _shape_strain, largest=6.0),
     Form("unlisted", "second_contact", "+ k (eps-gap)_+ exp(-(eps-gap)/0.05)", 1.0, _second_contact, largest=40.0),
 )
+# fmt: on

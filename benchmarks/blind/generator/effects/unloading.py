@@ -60,17 +60,9 @@ def _adhesion_dugdale() -> Hooks:
     return _bond(strength)
 
 
-def _damage() -> Hooks:
-    return {"modulus": lambda k, E, s: E * np.exp(-k * (s.eps_P - 0.3))}
-
-
 def _damage_lemaitre() -> Hooks:
     # Damage grows with the square of the strain from a threshold.
     return {"modulus": lambda k, E, s: E / (1.0 + k * np.maximum(s.eps_P - 0.15, 0.0) ** 2 / 0.25)}
-
-
-def _damage_work() -> Hooks:
-    return {"modulus": lambda k, E, s: E * np.exp(-k * _work(s) / 1.5)}
 
 
 def _work(s: State) -> Array:
@@ -82,21 +74,9 @@ def _porosity(eps_P: Array) -> Array:
     return 0.42 * np.exp(-2.2 * eps_P)
 
 
-def _densification() -> Hooks:
-    return {"modulus": lambda k, E, s: E * np.exp(-k * _porosity(s.eps_P))}
-
-
 def _densification_power() -> Hooks:
     # Open-cell form: the modulus as a power of the relative density.
     return {"modulus": lambda k, E, s: E * ((1.0 - _porosity(s.eps_P)) / (1.0 - _porosity(0.35))) ** k}
-
-
-def _densification_linear() -> Hooks:
-    return {"modulus": lambda k, E, s: E * np.maximum(1.0 + k * (s.eps_P - 0.35), 0.05)}
-
-
-def _unloading_shape() -> Hooks:
-    return {"recovered_fraction": lambda k, f, s: f ** (1.0 + k)}
 
 
 def _unloading_shape_power() -> Hooks:
@@ -104,57 +84,55 @@ def _unloading_shape_power() -> Hooks:
     return {"recovered_fraction": lambda k, f, s: np.clip((1.0 - k) * f + k * (1.0 - np.sqrt(s.u)), 0.0, 1.0)}
 
 
-def _reverse() -> Hooks:
-    return {"strain": lambda k, e, s: e - k * (1.0 - s.u) ** 4 * below(s)}
-
-
 def _reverse_threshold() -> Hooks:
     # Reverse yield begins when the load has fallen to 0.45 of its peak.
     return {"strain": lambda k, e, s: e - k * np.maximum(1.0 - s.u / 0.45, 0.0) ** 1.5}
 
 
-def _reverse_square() -> Hooks:
-    return {"strain": lambda k, e, s: e - k * (s.delta / 0.02) * np.maximum(1.0 - s.u / 0.7, 0.0) ** 3}
-
-
+# fmt: off
 FORMS = (
     Form("adhesion", "exact", "sigma - s phi^1.5 r(phi)", 0.5, _adhesion, (0.02, 3.0), largest=6.0),
     Form(
-        "adhesion",
-        "dugdale",
-        "sigma - s (1 - f^2)(1 - exp(-(f/0.35)^2))",
-        0.5,
-        _adhesion_dugdale,
-        (0.02, 3.0),
+        "adhesion", "dugdale", "sigma - s (1 - f^2)(1 - exp(-(f/0.35)^2))", 0.5, _adhesion_dugdale, (0.02, 3.0),
         largest=6.0,
     ),
-    Form("damage", "exact", "E exp(-k (eps_P - e0))", 1.0, _damage, (0.1, 8.0), largest=14.0),
+    Form(
+        "damage", "exact", "E exp(-k (eps_P - e0))", 1.0,
+        lambda: {"modulus": lambda k, E, s: E * np.exp(-k * (s.eps_P - 0.3))}, (0.1, 8.0), largest=14.0,
+    ),
     Form("damage", "lemaitre", "E / (1 + k (eps_P - 0.15)^2 / 0.25)", 1.0, _damage_lemaitre, (0.1, 12.0), largest=80.0),
-    Form("damage", "work", "E exp(-k w / w0)", 1.0, _damage_work, (0.05, 3.0), largest=8.0),
-    Form("densification_stiffening", "exact", "E exp(-b p)", 1.0, _densification, (0.2, 10.0), largest=30.0),
     Form(
-        "densification_stiffening", "power", "E ((1-p)/(1-p0))^b", 1.0, _densification_power, (0.2, 8.0), largest=30.0
+        "damage", "work", "E exp(-k w / w0)", 1.0, lambda: {"modulus": lambda k, E, s: E * np.exp(-k * _work(s) / 1.5)},
+        (0.05, 3.0), largest=8.0,
     ),
     Form(
-        "densification_stiffening",
-        "linear",
-        "E (1 + b (eps_P - 0.35))",
-        1.0,
-        _densification_linear,
-        (0.1, 6.0),
-        largest=6.0,
+        "densification_stiffening", "exact", "E exp(-b p)", 1.0,
+        lambda: {"modulus": lambda k, E, s: E * np.exp(-k * _porosity(s.eps_P))}, (0.2, 10.0), largest=30.0,
     ),
-    Form("unloading_shape", "exact", "s^(1+k) for s", 0.1, _unloading_shape, (0.01, 0.6), (1, -1), largest=0.7),
     Form(
-        "unloading_shape",
-        "power_law",
-        "(1-k) s + k (1 - sqrt(u))",
-        0.1,
-        _unloading_shape_power,
-        (0.02, 1.0),
+        "densification_stiffening", "power", "E ((1-p)/(1-p0))^b", 1.0, _densification_power, (0.2, 8.0), largest=30.0,
+    ),
+    Form(
+        "densification_stiffening", "linear", "E (1 + b (eps_P - 0.35))", 1.0,
+        lambda: {"modulus": lambda k, E, s: E * np.maximum(1.0 + k * (s.eps_P - 0.35), 0.05)}, (0.1, 6.0), largest=6.0,
+    ),
+    Form(
+        "unloading_shape", "exact", "s^(1+k) for s", 0.1,
+        lambda: {"recovered_fraction": lambda k, f, s: f ** (1.0 + k)}, (0.01, 0.6), (1, -1), largest=0.7,
+    ),
+    Form(
+        "unloading_shape", "power_law", "(1-k) s + k (1 - sqrt(u))", 0.1, _unloading_shape_power, (0.02, 1.0),
         largest=1.0,
     ),
-    Form("reverse_plasticity", "exact", "-c (1 - u)^4 on unloading", 2e-3, _reverse, (2e-4, 0.03)),
+    Form(
+        "reverse_plasticity", "exact", "-c (1 - u)^4 on unloading", 2e-3,
+        lambda: {"strain": lambda k, e, s: e - k * (1.0 - s.u) ** 4 * below(s)}, (2e-4, 0.03),
+    ),
     Form("reverse_plasticity", "threshold", "-c (1 - u/0.45)_+^1.5", 2e-3, _reverse_threshold, (2e-4, 0.03)),
-    Form("reverse_plasticity", "cubic", "-c (d_el/0.02)(1 - u/0.7)_+^3", 2e-3, _reverse_square, (2e-4, 0.03)),
+    Form(
+        "reverse_plasticity", "cubic", "-c (d_el/0.02)(1 - u/0.7)_+^3", 2e-3,
+        lambda: {"strain": lambda k, e, s: e - k * (s.delta / 0.02) * np.maximum(1.0 - s.u / 0.7, 0.0) ** 3},
+        (2e-4, 0.03),
+    ),
 )
+# fmt: on

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,76 +12,88 @@ from ..campaign import Campaign as Campaign
 
 Array = np.ndarray
 State = SimpleNamespace
+Range = tuple[str, float, float]
 
 
-class Effect:
-    """One formula with its own numbers; a hidden effect is a pair (effect, amplitude).
+@dataclass(frozen=True)
+class Formula:
+    """One formula; called with random numbers it gives an effect.
 
-    mechanism: listed name, or "unlisted". text: the formula with the amplitude th. start: a usual amplitude, in `unit`.
-    protocols: those that can show it. reloads: further cycles it asks for. largest: bound of the amplitude. signed:
-    whether both signs occur. humidity, wide, low_turn: what particles and path must have.
-
-    Every method is without effect unless a subclass replaces it. theta is the amplitude, c the campaign, s the state of
-    `law.simulate`.
+    text: the formula with the amplitude th. steps: what of the law it changes, see `Effect`; each is called with the
+    amplitude first and the effect's numbers n last. numbers: name and how it is drawn, evenly ("even", also in the
+    logarithm, "log", or whole, "whole"). start: a usual amplitude, in `unit`. protocols: those that can show it.
+    reloads: further cycles it asks for. largest: bound of the amplitude. signed: whether both signs occur. humidity,
+    wide, low_turn: what particles and path must have.
     """
 
-    mechanism = ""
-    text = ""
-    start = 1.0
-    unit = ""
-    protocols = ("P0", "P1")
-    reloads = 0
-    largest = np.inf
-    signed = False
-    humidity = False
-    wide = False
-    low_turn = False
+    mechanism: str
+    name: str
+    text: str
+    steps: Mapping[str, Callable]
+    numbers: Mapping[str, Range] = field(default_factory=dict)
+    start: float = 1.0
+    unit: str = "-"
+    protocols: tuple[str, ...] = ("P0", "P1")
+    reloads: int = 0
+    largest: float = np.inf
+    signed: bool = False
+    humidity: bool = False
+    wide: bool = False
+    low_turn: bool = False
 
-    def __init__(self, rng: np.random.Generator) -> None:
-        self.sign = rng.choice([-1, 1]) if self.signed else 1
-        self.drawn = SimpleNamespace(**self.draw(rng))
+    def __call__(self, rng: np.random.Generator) -> Effect:
+        sign = int(rng.choice([-1, 1])) if self.signed else 1
+        return Effect(self, SimpleNamespace(sign=sign, **{k: _draw(rng, *how) for k, how in self.numbers.items()}))
 
-    def draw(self, rng: np.random.Generator) -> dict[str, float | int]:
-        """The formula's numbers."""
-        return {}
+
+def _draw(rng: np.random.Generator, how: str, low: float, high: float) -> float | int:
+    if how == "whole":
+        return int(rng.integers(int(low), int(high)))
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))) if how == "log" else rng.uniform(low, high))
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """A formula with its numbers; a hidden effect is a pair (effect, amplitude). Steps it lacks change nothing.
+
+    theta is the amplitude, c the campaign, s the state of `law.simulate`.
+    """
+
+    formula: Formula
+    n: SimpleNamespace
+
+    def changes(self, step: str) -> bool:
+        """Whether the formula has that step."""
+        return step in self.formula.steps
+
+    def _step(self, step: str, otherwise: Array | float | None, theta: float, *given: object) -> Array | float:
+        return self.formula.steps[step](theta, *given, self.n) if self.changes(step) else otherwise
 
     def coefficients(self, theta: float, c: Campaign, values: State) -> None:
         """Change C1, C3, C5, modulus and eta of the particles in place."""
+        self._step("coefficients", None, theta, c, values)
 
     def loading(self, theta: float, terms: State) -> None:
         """Change the terms of the loading curve in place."""
+        self._step("loading", None, theta, terms)
 
     def stress(self, theta: float, c: Campaign, peak: Array, stress: Array) -> tuple[Array, Array]:
         """Largest stress so far and stress that the particle feels."""
-        return peak, stress
+        return self.formula.steps["stress"](theta, c, self.n) if self.changes("stress") else (peak, stress)
 
     def modulus(self, theta: float, c: Campaign, s: State) -> Array | float:
         """Factor of the modulus."""
-        return 1.0
+        return self._step("modulus", 1.0, theta, c, s)
 
     def unloading(self, theta: float, c: Campaign, s: State, recovered: Array, ratio: Array) -> Array:
-        """Stress over sigma_P at the recovered fraction."""
-        return ratio
+        """Stress over sigma_P at the recovered fraction: what the formula adds to the ratio."""
+        return ratio + self._step("unloading", 0.0, theta, c, s, recovered)
 
     def displacement(self, theta: float, c: Campaign, s: State) -> Array | float:
         """Displacement in um beside the law's."""
-        return 0.0
-
-    def changes(self, step: str) -> bool:
-        """Whether this effect replaces the method of that name."""
-        return getattr(type(self), step) is not getattr(Effect, step)
+        return self._step("displacement", 0.0, theta, c, s)
 
     def describe(self) -> str:
         """The formula with its numbers."""
-        numbers = {name: f"{v:.4g}" if isinstance(v, float) else v for name, v in vars(self.drawn).items()}
-        return self.text.format(sg="+" if self.sign > 0 else "-", **numbers)
-
-
-def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
-    """A number between the two, even in its logarithm."""
-    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
-
-
-def power(x: Array, exponent: float) -> Array:
-    """x to the exponent, safe at zero."""
-    return np.maximum(x, 1e-12) ** exponent
+        numbers = {name: f"{v:.4g}" if isinstance(v, float) else v for name, v in vars(self.n).items()}
+        return self.formula.text.format(sg="+" if self.n.sign > 0 else "-", **numbers)
