@@ -9,6 +9,7 @@ import importlib
 import inspect
 import json
 import math
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -51,12 +52,15 @@ def thinned(values: Any) -> list[float]:
 
 
 def find(name: str) -> Solver:
-    """A solver by name: "inprocess" or "module:function"."""
+    """A solver by name: "inprocess", "module:function", or "checkout:FOLDER" for the library of another checkout."""
     if name == "inprocess":
         return in_process
     module, _, function = name.partition(":")
+    if module == "checkout":
+        sys.path.insert(0, function)
+        return in_process
     if not function:
-        raise ValueError(f"no solver {name!r}: say inprocess or module:function")
+        raise ValueError(f"no solver {name!r}: say inprocess, module:function or checkout:FOLDER")
     return getattr(importlib.import_module(module), function)
 
 

@@ -98,7 +98,7 @@ def _sized(
     alike = resemblances(projection, found.white, hidden.mechanism)
     share = np.sqrt(max(1.0 - alike[0][2] ** 2, 1e-6)) if alike else 1.0
     if case.kind == "unlisted":
-        target = min(drawing.largest_unlisted, target / share)
+        target = float(min(drawing.largest_unlisted, target / share))
         theta, found = amplitude_for(projection, hidden, target)
         alike = resemblances(projection, found.white)
         share = np.sqrt(max(1.0 - alike[0][2] ** 2, 1e-6)) if alike else 1.0

@@ -115,9 +115,12 @@ def _followed(projection: Projection, hidden: Hidden, y: np.ndarray, score: floa
     small = 1e-3 * min(hidden.start, hidden.largest)
     size = np.linalg.norm(projection.project(world.curves([(hidden, small)], None) - world.base))
     guess = np.log(max(abs(score), 1.0) * small / max(size, 1e-12))
-    top = min(guess + 1.5, np.log(hidden.largest))
+    top = min(guess + _B.reach, np.log(hidden.largest))
+    grid = np.linspace(min(guess, top) - _B.reach, top, _B.scanned)
+    step = grid[1] - grid[0]
+    least = min(grid, key=lambda x: float(np.sum(left(x) ** 2)))  # the misfit may have several minima
     found = minimize_scalar(
-        lambda x: float(np.sum(left(x) ** 2)), bounds=(min(guess, top) - 1.5, top), method="bounded",
-        options={"maxiter": 14},
+        lambda x: float(np.sum(left(x) ** 2)), bounds=(least - step, min(least + step, top)), method="bounded",
+        options={"maxiter": 12},
     )  # fmt: skip
     return left(float(found.x))

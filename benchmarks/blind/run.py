@@ -83,7 +83,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--name", required=True, help="of the run: DATE-SEED")
     parser.add_argument("--part", type=part_of, default=(1, 1), help="i/n: every n-th campaign from the i-th on (1/1)")
-    parser.add_argument("--solver", default="inprocess", help="inprocess, or module:function")
+    parser.add_argument("--solver", default="inprocess", help="inprocess, module:function or checkout:FOLDER")
     parser.add_argument("--label", default="", help="of another solver's outcomes: they stand in NAME-LABEL")
     parser.add_argument("--subset", type=int, help="only the fixed subset, given by its size (100)")
     parser.add_argument("--seed", type=int, default=0, help="of the solver (0)")

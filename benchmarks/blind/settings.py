@@ -213,6 +213,7 @@ class Baselines:
         second: nats that the oracle's second name must gain.
         unlisted: tail probability of the oracle's remaining chi2 from which on no listed formula will do.
         followed, strong: formulas that the oracle follows to finite amplitudes, from this statistic on.
+        reach, scanned: how far in the logarithm, and at how many amplitudes, it looks on either side of the linear one.
         combinations: formulas of a pair that `refit` fits at most.
     """
 
@@ -228,6 +229,8 @@ class Baselines:
     unlisted: float = 1e-6
     followed: int = 6
     strong: float = 5.0
+    reach: float = 2.5
+    scanned: int = 10
     combinations: int = 9
 
 

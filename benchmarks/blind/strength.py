@@ -88,6 +88,8 @@ class Projection:
     def refit(self, curves: np.ndarray, start: Point | None = None) -> Refit:
         """The nearest base law by Gauss-Newton with steps halved; linear in the last step."""
         point = self._start
+        if not np.all(np.isfinite(curves)):  # beyond where the formula means anything
+            return Refit(np.zeros_like(curves), np.inf, np.zeros_like(curves), point)
         residual, objective = self._objective(curves, point)
         if start is not None:
             tried = self._objective(curves, start)

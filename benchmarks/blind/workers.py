@@ -17,14 +17,15 @@ from .settings import SETTINGS, Running
 
 def _serve(pipe: Connection, solver: str, seed: int) -> None:
     """Solve what comes through the pipe until None comes."""
+    solve: adapter.Solver | None = None
     with contextlib.suppress(Exception):  # a solver that cannot be found shows in every outcome
-        adapter.find(solver)
+        solve = adapter.find(solver)
     pipe.send(None)  # started: from here on time counts
     cold = True
     while (task := pipe.recv()) is not None:
         began = time.perf_counter()
         try:
-            discovery = adapter.find(solver)(Path(task), seed=seed)
+            discovery = (solve or adapter.find(solver))(Path(task), seed=seed)
             wrong = adapter.problem(discovery)
             outcome = {"status": "invalid" if wrong else "ok", "error": wrong, "discovery": adapter.kept(discovery)}
         except Exception as error:

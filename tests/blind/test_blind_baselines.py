@@ -1,0 +1,100 @@
+"""The baselines: an oracle on made campaigns, AIC and the discrepancy on a small linear problem."""
+
+import numpy as np
+import pytest
+
+from benchmarks.blind import adapter, baselines, plan, seal
+from benchmarks.blind.plan import Case
+
+NAME = "day-5"
+
+
+def single(number, level, mechanism="thermal_drift", formula="exact"):
+    return Case(number, "single", "first", ((mechanism, formula, level),), "P1", 10, "clean")
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """A null, a clear effect, one with the forbidden sign to first order at its strength, one that is on no list."""
+    place = tmp_path_factory.mktemp("oracle")
+    cases = [
+        Case(0, "null", "second", (), "P1", 10, "smooth"),
+        single(1, 20.0),
+        single(2, 100.0, "adhesion", "dugdale"),
+        Case(3, "unlisted", "second", (("unlisted", "SerratedFlow", 100.0),), "P0", 5, "clean"),
+    ]
+    seal.seal(NAME, place / "work", place / "sealed", cases)
+    names = plan.keys(5, 460)
+    return [place / "work" / NAME / "campaigns" / names[k] for k in range(4)]
+
+
+def test_the_oracle_knows(folders):
+    found = [baselines.oracle(folder) for folder in folders]
+    assert all(adapter.problem(one) is None for one in found)
+    assert [one["verdict"] for one in found] == ["NO_GAP", "NAMED", "NAMED", "UNLISTED"]
+    assert [[e["mechanism"] for e in one["effects"]] for one in found[1:3]] == [["thermal_drift"], ["adhesion"]]
+    assert found[0]["p_anything_missing"] > 0.05
+    assert found[1]["ranking"][0]["mechanism"] == "thermal_drift"
+
+
+def made_up(hidden, seed=0):
+    """A base fit of eight particles with two candidate formulas, one of them hidden."""
+    rng = np.random.default_rng(seed)
+    at = np.linspace(0.0, 1.0, 100)
+    shapes = {("creep", "a"): (np.sin(5 * at), 1), ("damage", "b"): (np.cos(9 * at), 1), ("adhesion", "c"): (at**6, 1)}
+    residual = [0.1 * rng.standard_normal(100) + (hidden * np.sin(5 * at)) for _ in range(8)]
+    return baselines.Fitted(
+        residual=residual,
+        own=[np.column_stack([at, np.full(100, 10.0)]) for _ in range(8)],
+        common=[np.column_stack([at, at**2]) for _ in range(8)],
+        coordinates=[np.column_stack([at, at]) for _ in range(8)],
+        diameter=np.full(8, 100.0),
+        signatures={name: ([shape] * 8, sign) for name, (shape, sign) in shapes.items()},
+    )
+
+
+def test_aic_names_what_lowers_it(monkeypatch):
+    monkeypatch.setattr(baselines, "fitted", lambda folder, with_formulas: made_up(0.5))
+    found = baselines.aic("here")
+    assert found["verdict"] == "NAMED"
+    assert found["effects"][0]["mechanism"] == "creep"
+    assert found["ranking"][0]["probability"] > 0.99
+    # An amplitude of the forbidden sign is never named.
+    monkeypatch.setattr(baselines, "fitted", lambda folder, with_formulas: made_up(-0.5))
+    assert "creep" not in [e["mechanism"] for e in baselines.aic("here")["effects"]]
+
+
+def test_the_discrepancy_says_whether_something_is_missing(monkeypatch):
+    monkeypatch.setattr(baselines, "fitted", lambda folder, with_formulas: made_up(0.5))
+    found = baselines.discrepancy("here")
+    assert (found["verdict"], found["effects"]) == ("UNLISTED", [])
+    assert 0.5 < found["gap"]["closed_fraction"] < 1.0
+    monkeypatch.setattr(baselines, "fitted", lambda folder, with_formulas: made_up(0.0))
+    assert baselines.discrepancy("here")["verdict"] == "NO_GAP"
+
+
+def test_marginal_likelihood_against_the_dense_one():
+    """At a fixed variance it is that of N(0, variance + X diag(prior^2) X'), up to a constant."""
+    rng = np.random.default_rng(1)
+    X, y, prior = rng.standard_normal((30, 3)), rng.standard_normal(30), np.array([0.5, 1.0, 2.0])
+    value, (weights, variance) = baselines._with(X.T @ X, X.T @ y, float(y @ y), 30, prior)
+    dense = variance * np.eye(30) + X * prior**2 @ X.T
+    expected = -0.5 * (np.linalg.slogdet(dense)[1] + y @ np.linalg.solve(dense, y)) + 15.0
+    assert value == pytest.approx(expected, rel=1e-10)
+    assert weights == pytest.approx(prior**2 * (X.T @ np.linalg.solve(dense, y)), rel=1e-8)
+
+
+def test_the_library_of_another_checkout_comes_first(monkeypatch, tmp_path):
+    import sys
+
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    assert adapter.find(f"checkout:{tmp_path}") is adapter.in_process
+    assert sys.path[0] == str(tmp_path)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("solver", [baselines.aic, baselines.discrepancy])
+def test_baselines_on_a_made_campaign(folders, solver):
+    found = solver(folders[1])
+    assert adapter.problem(found) is None
+    assert found["verdict"] in ("NAMED", "UNLISTED")
