@@ -37,6 +37,10 @@ def drawn(case: Case, master: int, attempt: int) -> tuple[np.random.Generator, W
     """The campaign of an attempt before any strength is known, its noise, and the random numbers that follow."""
     rng = case.rng(master, attempt)
     generator = generators()[case.generator]
+    if case.effects and attempt:  # more particles show more
+        sizes = sorted(set(SETTINGS.drawing.particles))
+        more = sizes[min(sizes.index(case.particles) + 2 * attempt, len(sizes) - 1)]
+        case = replace(case, particles=more)
     if case.kind == "pair" and attempt:  # another formula may reach what the first cannot
         case = replace(case, effects=tuple((m, _next(generator, m, f, attempt), v) for m, f, v in case.effects))
     world = generator.draw(rng, case)
@@ -63,7 +67,7 @@ def make(case: Case, master: int, drawing: Drawing = SETTINGS.drawing) -> Made:
         if not snaps and (not weak or attempt + 1 >= drawing.weak_attempts):
             break
     answer: dict[str, Any] = {"case": case.record(), "master": master, "attempt": attempt, "snaps": snaps}
-    answer |= {"truth": world.truth, "noise": noise.record(), "points": len(world.force)}
+    answer |= {"truth": world.truth, "noise": noise.record(), "points": len(world.force), "particles": world.count}
     answer["effects"] = [
         {
             "mechanism": h.mechanism, "formula": h.formula, "equation": h.equation, "amplitude": theta, "unit": h.unit,

@@ -244,7 +244,7 @@ def running(outcomes: Sequence[Outcome], kinds: dict[str, str]) -> list[Row]:
     else:
         text = f"not measured: {len(known)} of {len(wrong)} wrong verdicts have a kind"
         rows.append(Row("search failures among all campaigns", "<= 1 %", text, "", 0, None))
-    twenty = [o for o in outcomes if o.case["particles"] == 20 and o.result["status"] == "ok"]
+    twenty = [o for o in outcomes if o.answer["particles"] == 20 and o.result["status"] == "ok"]
     warm = [o.result["wall_s"] for o in twenty if not o.result["cold"]]
     cold = [o.result["wall_s"] for o in twenty if o.result["cold"]]
     rows.append(_value("seconds a campaign of 20 particles, warm (median)", warm, of=np.median))

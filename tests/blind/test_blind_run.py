@@ -9,7 +9,7 @@ import pytest
 from benchmarks.blind import adapter, plan, run, seal, workers
 from benchmarks.blind.settings import Running
 
-FAST = Running(timeout_s=3.0, start_timeout_s=60.0, renew_after=2)
+FAST = Running(timeout_s=2.0, start_timeout_s=60.0, renew_after=2)
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,7 @@ def test_a_crash_a_hang_and_a_dead_process_cost_one_campaign_each():
     found = list(workers.outcomes([(n, Path(n)) for n in names], "fake_solvers:moody", running=running))
     assert [row["status"] for row in found] == ["crash", "ok", "timeout", "invalid", "crash", "ok"]
     assert found[0]["error"] == "ValueError: no"
-    assert found[2]["error"] == "no answer in 3 s"
+    assert found[2]["error"] == "no answer in 2 s"
     assert found[4]["error"] == "the process died"
     assert found[3]["error"] == "verdict 'PERHAPS'"
 

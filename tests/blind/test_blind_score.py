@@ -15,7 +15,13 @@ def outcome(kind, verdict, effects=(), hidden=(), *, key="k", status="ok", noise
     """Hidden are (mechanism, lambda)."""
     case = {"kind": kind, "generator": "first", "noise": noise, "fault": fault, "particles": 20}
     told = [{"mechanism": m, "formula": "f", "lambda": v, "lambda_residual": v} for m, v in hidden]
-    answer = {"case": case, "effects": told, "points": 5000, "correlation": more.pop("correlation", 0.1)}
+    answer = {
+        "case": case,
+        "effects": told,
+        "points": 5000,
+        "particles": 20,
+        "correlation": more.pop("correlation", 0.1),
+    }
     answer["truth"] = {"effective_modulus_MPa": 16000.0, "log_C1": 1.9}
     found = discovery(verdict, effects, more.pop("sets", ()), **more)
     result = {
