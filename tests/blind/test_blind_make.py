@@ -44,8 +44,13 @@ def test_generators_share_no_code_with_each_other_or_the_library(name):
                 assert module in allowed
 
 
-@pytest.mark.parametrize("generator", GENERATORS)
-@pytest.mark.parametrize("protocol", plan.PROTOCOLS)
+QUICK = (("first", "P1"), ("second", "P2"))
+
+
+@pytest.mark.parametrize(
+    ("generator", "protocol"),
+    [pytest.param(g, p, marks=() if (g, p) in QUICK else pytest.mark.long) for g in GENERATORS for p in plan.PROTOCOLS],
+)
 def test_generators_agree_with_the_law_without_effects(generator, protocol):
     """Against the library's own law, which neither knows."""
     import jax.numpy as jnp
