@@ -1,7 +1,6 @@
-"""The one place that knows how the solver is called and what its experiments are called.
+"""The one place that knows how the solver is called and what of its answer is kept.
 
-A solver is a function solve(folder, *, exclude=(), seed=0, options=None) -> dictionary of `discovery.json`, plus the
-key "options_not_offered" with the names of options it has not.
+A solver is a function solve(folder, *, seed=0) -> dictionary of `discovery.json`.
 """
 
 from __future__ import annotations
@@ -9,69 +8,63 @@ from __future__ import annotations
 import importlib
 import inspect
 import json
-import subprocess
+import math
 import sys
-import tempfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+
+from .settings import SETTINGS
+
+Solver = Callable[..., dict[str, Any]]
 
 VERDICTS = ("NO_GAP", "NAMED", "SET", "UNLISTED", "FIT_NOT_CONVERGED")
+KEPT = (
+    "verdict", "summary", "effects", "candidate_set", "ranking", "where", "closure", "leads", "gap", "parameters_after",
+    "p_anything_missing", "findings", "notes", "runtime_s",
+)  # fmt: skip
+"""Keys of `discovery.json` that an outcome keeps."""
 
-# Mechanism: name of the parameter in discovery.json that means what the exact formula's amplitude means, for recovery.
-PARAMETERS = {"frame_compliance": "compliance_um_per_mN"}
 
-
-def in_process(folder, *, exclude=(), seed=0, options=None):
-    """`mcc_jax.discover.discover` in this process: many campaigns share one compilation."""
+def in_process(folder: Path, *, seed: int = 0) -> dict[str, Any]:
+    """`mcc_jax.discover.discover` in this process: campaigns share what is compiled."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
     from mcc_jax.campaign import read_campaign
 
     discover = importlib.import_module("mcc_jax.discover").discover
+    wanted = {"seed": seed, "experiments": False}
     offered = inspect.signature(discover).parameters
-    wanted = {"seed": seed, **({"exclude": tuple(exclude)} if exclude else {}), **(options or {})}
-    missing = sorted(name for name in wanted if name not in offered)
-    if "exclude" in missing:
-        raise TypeError("the solver cannot strike a name from its library")
-    result = discover(read_campaign(folder), **{name: value for name, value in wanted.items() if name in offered})
-    data = result.to_json()
-    data = json.loads(data) if isinstance(data, str) else json.loads(json.dumps(data))
-    if data.get("closure") is not None:
-        for key, held_out in (("correction_um", False), ("held_out_correction_um", True)):
-            # Without NaN: rows that took no part are not corrected.
-            found = result.correction_um(held_out=held_out)
-            data["closure"][key] = {name: [v if v == v else 0.0 for v in map(float, um)] for name, um in found.items()}
-    return {**data, "options_not_offered": [name for name in missing if name != "seed"]}
+    found = discover(read_campaign(folder), **{name: value for name, value in wanted.items() if name in offered})
+    data = found.to_json()
+    data = json.loads(data if isinstance(data, str) else json.dumps(data))
+    if data.get("closure") is not None and hasattr(found, "correction_um"):
+        corrections = found.correction_um(held_out=True)
+        data["closure"]["held_out_correction_um"] = {name: thinned(values) for name, values in corrections.items()}
+    return data
 
 
-def by_command(folder, *, exclude=(), seed=0, options=None):
-    """`mcc-jax discover` as a user calls it, a process of its own."""
-    with tempfile.TemporaryDirectory() as scratch:
-        out = Path(scratch) / "out"
-        command = [sys.executable, "-m", "mcc_jax", "discover", str(folder), "--out", str(out), "--seed", str(seed)]
-        for name in exclude:
-            command += ["--exclude", name]
-        for name, value in (options or {}).items():
-            command += [f"--{name.replace('_', '-')}", str(value)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise RuntimeError(f"exit status {done.returncode}: {done.stderr.strip()[-500:]}")
-        return {**json.loads((out / "discovery.json").read_text()), "options_not_offered": []}
+def thinned(values: Any) -> list[float]:
+    """Every few readings of a correction, nil where there is none."""
+    stride = SETTINGS.running.closure_stride
+    return [round(float(v), 4) if math.isfinite(v) else 0.0 for v in values[::stride]]
 
 
-def find(name):
-    """A solver by name: "inprocess", "command" or "module:function"."""
+def find(name: str) -> Solver:
+    """A solver by name: "inprocess", "module:function", or "checkout:FOLDER" for the library of another checkout."""
     if name == "inprocess":
         return in_process
-    if name == "command":
-        return by_command
     module, _, function = name.partition(":")
+    if module == "checkout":
+        sys.path.insert(0, function)
+        return in_process
     if not function:
-        raise ValueError(f"no solver {name!r}: say inprocess, command or module:function")
+        raise ValueError(f"no solver {name!r}: say inprocess, module:function or checkout:FOLDER")
     return getattr(importlib.import_module(module), function)
 
 
-def problem(discovery):
+def problem(discovery: Any) -> str | None:
     """What makes this no valid answer, or None."""
     if not isinstance(discovery, dict):
         return "no dictionary"
@@ -89,21 +82,6 @@ def problem(discovery):
     return None
 
 
-def follow_up_of(experiments, case):
-    """What the first proposed experiment changes in the case, or None where there is none that the generator can do."""
-    if not experiments:
-        return None
-    text = json.dumps(experiments[0].get("experiment", "")).lower()
-    if "rate" in text:
-        protocol = "P2"
-    elif any(word in text for word in ("hold", "reload", "cycle")):
-        protocol = "P1" if case["protocol"] == "P0" else case["protocol"]
-    elif any(word in text for word in ("more particles", "more of the same", "repeat")):
-        protocol = case["protocol"]
-    else:
-        return None
-    count = experiments[0].get("particles", case["count"])
-    changes = {} if protocol == case["protocol"] else {"protocol": protocol}
-    if count != case["count"]:
-        changes |= {"count": count, "resample": True}
-    return changes
+def kept(discovery: Any) -> dict[str, Any]:
+    """What an outcome keeps of an answer."""
+    return {key: discovery[key] for key in KEPT if key in discovery} if isinstance(discovery, dict) else {}

@@ -1,444 +1,215 @@
-"""The scorer on answers made by hand: a perfect solver passes every row, a bad one fails where it is bad."""
+"""The scorer on made-up outcomes, against figures worked out by hand."""
 
 import json
 
 import numpy as np
 import pytest
+from fake_solvers import discovery
 
-from benchmarks import _report
-from benchmarks.blind import scoring, sealing, smoke
-from benchmarks.blind.generator import effects, tiers
-
-
-def estimate(value, sd):
-    return {"value": value, "sd": sd, "interval_95": [value - 1.96 * sd, value + 1.96 * sd]}
+from benchmarks.blind import make, refit, rows, score, truth
+from benchmarks.blind.outcome import Outcome, calibration_error, share_over, wilson
+from benchmarks.blind.plan import Case
 
 
-def answer_to(case):
-    """What `campaigns.build` would keep of a case, without simulating it."""
-    struck = {"lambda_residual": case.effects[0][2]} if case.effects else {}
-    hidden = [
-        {
-            "mechanism": m,
-            "form": f,
-            "amplitude": 2e-3,
-            "lambda": v,
-            "lambda_target": v,
-            "plausible": True,
-            "lambda_residual": v,
-            **struck,
-        }
-        for m, f, v in case.effects
-    ]
-    twins = []
-    if case.tier == "T1":
-        other = next(name for name in effects.MECHANISMS if name != case.effects[0][0])
-        strength = case.effects[0][2]
-        rho = 0.95 if strength <= 5 else 0.2
-        twins = [
-            {
-                "mechanism": other,
-                "rho": rho,
-                "expected_dll": 0.5 * strength**2 * (1 - rho**2),
-                "realised_dll": 0.5 if strength <= 5 else 99.0,
-            }
-        ]
-    truth = {"a": 1.43, "effective_modulus_MPa": 16e3, "log_C1": 1.9027}
-    return {
-        "case": case.record(),
-        "master_seed": 1,
-        "effects": hidden,
-        "twins": twins,
-        "truth": truth,
-        "rho_pair": 0.1,
-        "oracle": {
-            "best": hidden[0]["mechanism"] if hidden else None,
-            "statistics": {
-                name: 9.0 if hidden and name == hidden[0]["mechanism"] else 1.0
-                for name in ("creep", "damage", *(e["mechanism"] for e in hidden))
-            },
-        },
+def outcome(kind, verdict, effects=(), hidden=(), *, key="k", status="ok", noise="clean", fault="", **more):
+    """Hidden are (mechanism, lambda)."""
+    case = {"kind": kind, "generator": "first", "noise": noise, "fault": fault, "particles": 20}
+    told = [{"mechanism": m, "formula": "f", "lambda": v, "lambda_residual": v} for m, v in hidden]
+    answer = {
+        "case": case,
+        "effects": told,
+        "points": 5000,
+        "particles": 20,
+        "correlation": more.pop("correlation", 0.1),
     }
-
-
-def perfect(answer, number):
-    """The discovery a perfect solver would return; `number` spreads the estimates as their errors say."""
-    case, hidden = answer["case"], answer["effects"]
-    pull = 2.05 * (-1) ** number if number % 20 == 0 else 0.9 * (-1) ** number
-    struck = case["tier"] in ("T4", "T5")
-    named = [] if struck or case["tier"] == "T6" else [e["mechanism"] for e in hidden]
-    verdict = "UNLISTED" if struck else "NAMED" if named else "NO_GAP"
-    sets = [[name] for name in named]
-    if answer["twins"] and answer["twins"][0]["realised_dll"] < 2:
-        verdict, sets = "SET", [[named[0], answer["twins"][0]["mechanism"]]]
-    steps = [{"added": None, "chi2_per_dof": 1.3 if hidden else 1.0, "systematic_um": 0.1, "elpd": 0.0, "elpd_se": 1.0}]
-    steps += [{"added": n, "chi2_per_dof": 1.0, "systematic_um": 0.0, "elpd": 9.0, "elpd_se": 1.0} for n in named]
-    return {
-        "verdict": verdict,
-        "effects": [
-            {
-                "mechanism": n,
-                "probability": 0.97,
-                "parameters": {"compliance_um_per_mN": estimate(2e-3 + 1e-4 * pull, 1e-4)},
-            }
-            for n in named
-        ],
-        "candidate_set": sets,
-        "ranking": [{"mechanism": n, "probability": 0.99 if number % 10 else 0.01} for n in named]
-        + [
-            {
-                "mechanism": "humidity" if named != ["humidity"] else "creep",
-                "probability": 0.01 if number % 10 else 0.99,
-            }
-        ],
-        "untestable": [{"mechanism": case["cell"], "needs": "other data"}] if case["tier"] == "T6" else [],
-        "gap": {"floor": 1.0, "steps": steps, "closed_fraction": 0.97},
-        "closure": None,
-        "parameters_before": {
-            "effective_modulus_MPa": estimate(12e3, 1e3),
-            "log_C1": {"mean": estimate(2.4, 0.1)},
-            "a": estimate(1.0, 0.1),
-        },
-        "parameters_after": {
-            "effective_modulus_MPa": estimate(16e3 + 1e3 * pull, 1e3),
-            "log_C1": {"mean": estimate(1.9027 + 0.1 * pull, 0.1)},
-            "a": estimate(1.43 + 0.1 * pull, 0.1),
-        },
-        "next_experiments": [{"experiment": "hold", "separates": sets[0]}] if verdict == "SET" else [],
-        "runtime_s": 3.0,
-    }
-
-
-@pytest.fixture(scope="module")
-def perfect_run():
-    found = []
-    for number, case in enumerate(tiers.plan(seeds=2)):
-        answer = answer_to(case)
-        result = {"status": "ok", "wall_s": 3.0, "cold": number == 0, "discovery": perfect(answer, number)}
-        found.append(scoring.Outcome(f"c{number:05d}", answer, result))
-    results = {o.key: o.result for o in found}
-    results["c00000#repeat"] = {**found[0].result, "discovery": {**found[0].found, "runtime_s": 9.0}}
-    results["c00000#cold"] = {**found[0].result, "wall_s": 80.0}
-    return found, results
-
-
-def rows(found, results=None):
-    return {row["metric"]: row for row in scoring.acceptance(found, results or {})}
-
-
-def changed(found, which, **discovery):
-    """The outcomes with the answers of some of them altered."""
-    out = []
-    for o in found:
-        altered = {**o.result, "discovery": {**o.found, **discovery}}
-        out.append(scoring.Outcome(o.key, o.answer, altered) if which(o) else o)
-    return out
-
-
-def test_a_perfect_solver_passes_every_row_that_can_be_measured(perfect_run):
-    table = rows(*perfect_run)
-    judged = {name: row["result"] for name, row in table.items() if row["gate"] != "none"}
-    bad = {name: table[name] for name, result in judged.items() if result is False}
-    assert not bad
-    missing = {name for name, result in judged.items() if result == "not measured"}
-    assert missing == {
-        "closure, T4, lambda>=20: NRMSE of the correction on held-out particles (median)",
-        "proposed experiment resolves the set (simulated)",
-    }
-
-
-def test_rows_without_gate_are_never_passed(perfect_run):
-    assert all(row["result"] == "-" for row in rows(*perfect_run).values() if row["gate"] == "none")
-
-
-def test_false_alarms_are_counted_with_their_interval(perfect_run):
-    found, results = perfect_run
-    clean = [o for o in found if o.case["cell"] == "clean"]
-    alarmed = {o.key for o in clean[:10]}
-    told = changed(
-        found, lambda o: o.key in alarmed, verdict="NAMED", effects=[{"mechanism": "creep"}], candidate_set=[["creep"]]
-    )
-    row = rows(told, results)["false alarm, clean null"]
-    assert row["observed"] == "10.0% (10/100)"
-    assert row["result"] is False
-    assert row["95% interval"] == "4.9-17.6%"
-    assert rows(told, results)["false alarm, heavy tails"]["result"] is True
-
-
-@pytest.mark.parametrize(
-    ("status", "verdict"), [("crash", None), ("timeout", None), ("invalid", "NO_GAP"), ("ok", "FIT_NOT_CONVERGED")]
-)
-def test_no_answer_is_a_failure_everywhere(perfect_run, status, verdict):
-    found, _ = perfect_run
-    lost = [
-        scoring.Outcome(
-            o.key,
-            o.answer,
-            {
-                "status": status,
-                "error": "gone",
-                "wall_s": 1.0,
-                "cold": False,
-                "discovery": verdict and {**o.found, "verdict": verdict},
-            },
-        )
-        for o in found
-    ]
-    table = rows(lost)
-    failed = [name for name, row in table.items() if row["result"] is False]
-    for metric in (
-        "false alarm, clean null",
-        "top-1, exact formula, lambda=10, P1",
-        "true effect in the set, exact, lambda>=5",
-        "false UNLISTED, T1 and T2",
-        "UNLISTED said, T4 and T5, residual lambda>=10",
-        "two effects, both named, abs(rho)<.7",
-        "UNTESTABLE said, with the data needed (T6)",
-        "held-out gap closed, lambda>=20 (mean share)",
-    ):
-        assert metric in failed
-    assert sum(row["campaigns"] for row in scoring.failures(lost)) == len(lost)
-    assert not any(
-        row["result"] is True for name, row in table.items() if name.startswith(("false", "top", "true", "two", "UN"))
-    )
-
-
-def test_a_solver_that_always_names_the_same_is_found_out(perfect_run):
-    found, results = perfect_run
-    stuck = changed(
-        found,
-        lambda o: True,
-        verdict="NAMED",
-        effects=[{"mechanism": "creep", "probability": 0.9}],
-        candidate_set=[["creep"]],
-    )
-    table = rows(stuck, results)
-    assert table["top-1, exact formula, lambda=10, P1"]["observed"].startswith("5.0%")
-    assert table["calibration of the stated probability, ECE"]["result"] is False
-    assert table["two effects, false discoveries among names"]["result"] is False
-    assert table["mean size of the set, lambda=10"]["result"] is True
-    counts = scoring.confusion(stuck)
-    assert all(set(row) == {"creep"} for row in counts.values())
-
-
-def test_a_solver_that_never_decides_is_found_out(perfect_run):
-    found, results = perfect_run
-    everything = [list(effects.MECHANISMS)]
-    vague = changed(found, lambda o: o.verdict in ("NAMED", "SET"), verdict="SET", candidate_set=everything)
-    table = rows(vague, results)
-    assert table["true effect in the set, exact, lambda>=5"]["result"] is True
-    assert table["mean size of the set, lambda=5"]["result"] is False
-    assert table["'cannot separate' said, lambda^2(1-rho^2)>=30 (pairs)"]["result"] is False
-
-
-def test_who_leads_the_ranking_counts_whatever_the_verdict(perfect_run):
-    found, results = perfect_run
-    one = next(o for o in found if o.tier == "T1")
-    ranked = [{"mechanism": "other", "probability": 0.3}, {"mechanism": one.truth[0], "probability": 0.6}]
-    led = {**one.result, "discovery": {**one.found, "verdict": "NO_GAP", "effects": [], "ranking": ranked}}
-    assert scoring.Outcome("c", one.answer, led).leads
-    assert not scoring.Outcome("c", one.answer, led).right
-    for other in (
-        [],
-        [{"mechanism": "other", "probability": 1.0}],
-        [{**ranked[0]}, {**ranked[1], "probability": None}],
-    ):
-        lost = {**led, "discovery": {**led["discovery"], "ranking": other}}
-        assert not scoring.Outcome("c", one.answer, lost).leads
-    metrics = [row["metric"] for row in scoring.acceptance(found, results)]
-    assert len(set(metrics)) == len(metrics)
-
-
-def test_campaigns_off_their_strength_do_not_count_for_it(perfect_run):
-    found, _ = perfect_run
-    o = next(o for o in found if o.tier == "T1" and o.strength == 10.0)
-    weak = json.loads(json.dumps(o.answer))
-    weak["effects"][0]["lambda"] = 7.0
-    assert scoring.Outcome("c", weak, o.result).strength is None
-    assert scoring.by_mechanism([scoring.Outcome("c", weak, o.result)])[0]["off strength"] == 1
-
-
-def test_biased_parameters_fail(perfect_run):
-    found, results = perfect_run
-    off = {
-        "effective_modulus_MPa": estimate(12e3, 1e3),
-        "log_C1": {"mean": estimate(1.9027, 0.1)},
-        "a": estimate(1.43, 0.1),
-    }
-    table = rows(changed(found, lambda o: o.tier == "T1", parameters_after=off), results)
-    assert table["95% interval covers effective_modulus_MPa"]["result"] is False
-    assert table["bias of effective_modulus_MPa, in SE (absolute mean)"]["observed"].startswith("4")
-    assert table["95% interval covers log_C1"]["result"] is False  # 100 % is too wide
-    assert table["bias of a, in SE (absolute mean)"]["result"] is True
-
-
-def test_the_time_from_nothing_is_that_of_the_campaign_solved_alone(perfect_run):
-    found, results = perfect_run
-    name = "run time of one campaign of 20, cold (largest)"
-    assert rows(found, results)[name]["observed"].startswith("80 s")
-    slow = {**results, "c00000#cold": {**results["c00000#cold"], "wall_s": 91.0}}
-    assert rows(found, slow)[name]["result"] is False
-
-
-def test_a_cut_of_bias_is_judged_by_what_was_drawn(perfect_run):
-    """A campaign's particles lie away from the population by chance, whatever the effect."""
-    found, results = perfect_run
-    name = "bias of log_C1 cut by adding the effect (mean over mechanisms biased by more than 1 SE)"
-    assert rows(found, results)[name]["result"] is True
-    estimates = {"log_C1": {"mean": estimate(2.4, 0.1)}}
-    wrong = changed(found, lambda o: o.tier == "T1", parameters_after=estimates)
-    assert rows(wrong, results)[name]["result"] is False
-    drawn = [
-        scoring.Outcome(o.key, {**o.answer, "truth": {**o.answer["truth"], "log_C1_drawn": 2.4 + 0.01}}, o.result)
-        for o in changed(wrong, lambda o: True, parameters_before={"log_C1": {"mean": estimate(2.9, 0.1)}})
-    ]
-    assert rows(drawn, results)[name]["result"] is True
-
-
-def test_clopper_pearson():
-    assert scoring.interval(0, 500) == pytest.approx((0.0, 1 - 0.025 ** (1 / 500)))
-    assert scoring.interval(20, 20) == pytest.approx((0.025 ** (1 / 20), 1.0))
-    assert scoring.interval(5, 10) == pytest.approx((0.1870860, 0.8129140), abs=1e-6)
-    assert scoring.interval(0, 0) == (0.0, 1.0)
-
-
-def test_reliability():
-    pairs = [(0.9, True)] * 9 + [(0.9, False)] + [(0.3, True)] * 5 + [(0.3, False)] * 5
-    table, error = scoring.reliability(pairs)
-    assert table == [(pytest.approx(0.3), 0.5, 10), (pytest.approx(0.9), pytest.approx(0.9), 10)]
-    assert error == pytest.approx(0.1)
-    assert scoring.reliability([(1.0, True)]) == ([(1.0, 1.0, 1)], 0.0)
-    assert scoring.reliability([]) == ([], None)
-
-
-def test_determinism_ignores_the_time_only(perfect_run):
-    found, results = perfect_run
-    assert rows(found, results)["same seed, same answer"]["result"] is True
-    other = {**results, "c00000#repeat": {**found[0].result, "discovery": {**found[0].found, "summary": "else"}}}
-    assert rows(found, other)["same seed, same answer"]["result"] is False
-
-
-def test_follow_up_counts_sets_that_collapse(perfect_run, monkeypatch):
-    found, results = perfect_run
-    asked = next(o for o in found if o.verdict == "SET")
-    key = f"{asked.key}+next"
-    name = asked.truth[0]
-    resolved = {
-        "status": "ok",
-        "wall_s": 1,
+    answer["truth"] = {"effective_modulus_MPa": 16000.0, "log_C1": 1.9}
+    found = discovery(verdict, effects, more.pop("sets", ()), **more)
+    result = {
+        "key": key,
+        "status": status,
+        "discovery": found if status == "ok" else None,
+        "wall_s": 2.0,
         "cold": False,
-        "discovery": {"verdict": "NAMED", "effects": [{"mechanism": name}], "candidate_set": [[name]]},
     }
-    metric = "proposed experiment resolves the set (simulated)"
-    assert rows(found, {**results, key: resolved})[metric]["observed"] == "100.0% (1/1)"
-    sure = "  of these with a stated power of 0.9 or more"
-    for power in (0.95, 0.3):
-        monkeypatch.setitem(asked.found["next_experiments"][0], "power", power)
-        assert ("1/1" in rows(found, {**results, key: resolved})[sure]["observed"]) == (power > 0.9)
-    assert rows(found, {**results, key: asked.result})[metric]["observed"] == "0.0% (0/1)"
+    return Outcome(key, answer, result)
 
 
-def test_closure_error_sees_only_what_the_base_law_cannot_take_up():
-    from benchmarks.blind.generator import campaigns, law
+def by_name(found):
+    return {row.name: row for row in found}
 
-    case = tiers.Case(
-        "k",
-        "T4",
-        "drive_backlash",
-        "P1",
-        count=4,
-        resample=True,
-        effects=(("drive_backlash", "unlisted", 20.0),),
-        residual=True,
+
+def test_wilson_and_means_over_mechanisms():
+    low, high = wilson(8, 10)  # by hand: (0.8 + 0.19207 -+ 1.95996 sqrt(0.016 + 0.0096036)) / 1.384146
+    assert (low, high) == pytest.approx((0.490162, 0.943318), abs=2e-6)
+    assert wilson(0, 20)[0] == 0.0
+    assert share_over([True, False, True, True]) == 0.75
+    assert share_over([True, True, True, False], ["a", "a", "a", "b"]) == 0.5
+    # Two bins: 0.9 and 0.95 (one right of two), 0.15 (wrong): (|1.85 - 1| + |0.15|) / 3.
+    assert calibration_error([0.9, 0.95, 0.15], [True, False, False]) == pytest.approx(1.0 / 3)
+
+
+def test_singles():
+    found = by_name(
+        rows.singles(
+            [
+                outcome("single", "NAMED", [("creep", 0.9)], [("creep", 20.0)]),
+                outcome("single", "SET", [("creep", 0.6)], [("creep", 60.0)], sets=[["creep", "adhesion"]]),
+                outcome("single", "NAMED", [("creep", 0.9), ("adhesion", 0.5)], [("creep", 9.6)]),
+                outcome("single", "SET", [("damage", 0.5)], [("adhesion", 100.0)], sets=[["damage", "adhesion"]]),
+                outcome("single", "NO_GAP", (), [("adhesion", 5.0)]),
+                outcome("single", "NO_GAP", (), [("adhesion", 300.0)], status="crash"),
+            ]
+        )
     )
-    answer = campaigns.build(case, 3).answer
-    drawn, _ = campaigns.design(case, 3)
-    hidden = drawn.effects[0](answer["effects"][0]["amplitude"])
-    base = law.simulate(drawn.particles, drawn.path)
-    change = law.simulate(drawn.particles, drawn.path, hidden) - base
-
-    def error(curves):
-        return scoring.closure_error(answer, {str(i + 1): row.tolist() for i, row in enumerate(curves)})
-
-    assert error(change) == pytest.approx(0.0, abs=1e-9)
-    stiffer = law.simulate(drawn.particles.with_(modulus=drawn.particles.modulus * 1.05), drawn.path) - base
-    assert error(change + stiffer) < 0.01
-    assert error(0.5 * change) == pytest.approx(0.5, abs=0.01)
-    assert error(np.zeros_like(change)) == pytest.approx(1.0)
-
-    def of_range(curves):
-        return scoring.curve_error(answer, {str(i + 1): row.tolist() for i, row in enumerate(curves)})
-
-    assert of_range(change) == pytest.approx(0.0, abs=1e-9)
-    assert of_range(change + stiffer) < 0.005
-    assert of_range(0.5 * change) == pytest.approx(0.5 * of_range(np.zeros_like(change)), rel=1e-6)
-    # A root mean square over a range: below a half for any curve around zero.
-    assert 0.05 < of_range(np.zeros_like(change)) < 0.5
+    # Creep: two of three right; adhesion: none of two (a crash is wrong); the weak one counts apart.
+    row = found["right name alone, lambda >= 10"]
+    assert (row.text, row.number, row.passed) == ("33.3 %", 5, False)
+    assert found["right name alone, lambda >= 50"].text == "50.0 %"
+    assert found["  said as NAMED"].text == "16.7 %"
+    assert found["ghost beside the right name, lambda >= 10"].text == "16.7 %"
+    assert found["true name reported, lambda >= 10"].text == "75.0 %"
+    assert found["right name alone, lambda < 7.5 (oracle less 5 points)"].number == 1
 
 
-def test_tables_and_pictures(perfect_run, tmp_path):
-    found, results = perfect_run
-    made = scoring.pictures(found, tmp_path, "blind")
-    assert made == ["blind_confusion.png", "blind_reliability.png", "blind_power.png"]
-    assert all((tmp_path / name).stat().st_size > 10_000 for name in made)
-    for table in (
-        scoring.acceptance(found, results),
-        scoring.by_mechanism(found),
-        scoring.by_noise(found),
-        scoring.gaps(found),
-    ):
-        lines = _report.table(table).splitlines()
-        assert len({line.count("|") for line in lines}) == 1
+def test_pairs():
+    both = [("creep", 30.0), ("adhesion", 40.0)]
+    found = by_name(
+        rows.pairs(
+            [
+                outcome("pair", "NAMED", [("creep", 1), ("adhesion", 1)], both),
+                outcome("pair", "NAMED", [("creep", 1), ("damage", 1)], both),
+                outcome("pair", "NAMED", [("creep", 1)], both, correlation=-0.9),
+                outcome("pair", "NAMED", [("creep", 1)], [("creep", 30.0), ("adhesion", 5.0)]),
+            ]
+        )
+    )
+    assert found["two effects, both named, lambda >= 20, correlation < 0.8"].text == "50.0 %"
+    wrong = found["two effects, a wrong name, lambda >= 20, correlation < 0.8"]
+    assert (wrong.text, wrong.number, wrong.passed) == ("50.0 %", 2, False)
 
 
-def test_smoke_lists_forty_and_knows_right_from_wrong():
-    cases = smoke.cases()
-    assert len({case.id for case in cases}) == len(cases) == 40
-    for number, case in enumerate(cases):
-        right = perfect(answer_to(case), number)
-        assert smoke.check(case, right) is None
-        wrong = "NAMED" if right["verdict"] != "NAMED" else "NO_GAP"
-        assert smoke.check(case, {**right, "verdict": wrong, "effects": []}) is not None
-    # The list is part of what is sealed: whoever changes it says so here.
-    assert smoke.fingerprint() == SMOKE
+def test_nulls_and_faults():
+    even = [outcome("null", "NO_GAP", p_anything_missing=(k + 0.5) / 40) for k in range(40)]
+    found = by_name(rows.nulls([*even, outcome("null", "SET", [("creep", 0.5)], noise="smooth")]))
+    assert found["alarm, nothing hidden"].text == "2.4 %"
+    assert found["  of these with noise of kind smooth"].text == "100.0 %"
+    assert found["bootstrap p values uniform (KS p)"].passed
+    low = by_name(rows.nulls([outcome("null", "NO_GAP", p_anything_missing=0.01 * k) for k in range(20)]))
+    assert not low["bootstrap p values uniform (KS p)"].passed
+    told = [{"check": "zero of force"}]
+    found = by_name(
+        rows.faults(
+            [
+                outcome("fault", "FIT_NOT_CONVERGED", fault="clipping", findings=told),
+                outcome("fault", "NO_GAP", fault="force_zero", findings=told),
+                outcome("fault", "NAMED", [("pop_in", 1)], fault="breakage"),
+            ]
+        )
+    )
+    assert found["fault of the tester, no physics named"].text == "66.7 %"
+    assert found["fault of the tester, told as what it is"].text == "33.3 %"
+    assert found["  force_zero told"].text == "100.0 %"
 
 
-SMOKE = "f758f8641fb08ab18c319b4fbfe1d9d9016084706ec2c3a99377ff307e427f7a"
+class Known:
+    """Truths worked out elsewhere."""
+
+    def curve_error(self, outcome):
+        return outcome.result["error"]
+
+    def held_by_places(self, outcome):
+        return outcome.result["held"], 0.25
 
 
-# --- the seal --------------------------------------------------------------------------------------------------------
-@pytest.fixture
-def sealed(tmp_path):
-    cases = [tiers.Case(f"s{k}", "T0", "clean", "P0", count=3, resample=True) for k in range(3)]
-    digest = sealing.seal(tmp_path / "run", cases, master=4, jobs=1)
-    return tmp_path / "run", digest
+def test_unlisted_places_and_probabilities():
+    hidden = [("unlisted", 12.0)]
+    said = [outcome("unlisted", "UNLISTED", (), hidden) for _ in range(3)]
+    for one, error in zip(said, (0.05, 0.2, None), strict=True):
+        one.result["error"] = error
+    listed = [outcome("single", v, (), [("creep", 30.0)]) for v in ("UNLISTED", "NO_GAP")]
+    found = by_name(rows.unlisted([*said, outcome("unlisted", "NO_GAP", (), hidden)], listed, Known()))
+    assert found["UNLISTED said, residual lambda >= 10"].text == "75.0 %"
+    assert found["UNLISTED said where a listed mechanism is true"].text == "50.0 %"
+    assert found["curve within 10 % of its range, held out"].text == "50.0 %"
+    for one, held in zip(listed, (0.71, 0.69), strict=True):
+        one.result["held"] = held
+    found = by_name(rows.places(listed, Known()))
+    assert found["places hold >= 70 % of the difference, lambda >= 20"].text == "50.0 %"
+    ranked = [{"mechanism": "creep", "probability": 0.5}, {"mechanism": "damage", "probability": 0.5}]
+    one = outcome("single", "SET", [("creep", 0.5)], [("creep", 30.0)], sets=[["creep"]], ranking=ranked)
+    found = by_name(rows.probabilities([one], [one]))
+    assert found["log score of the true name, nats a single campaign"].text == f"{np.log(0.5):.3g}"
+    assert found["calibration error of stated probabilities (ECE)"].text == "0.5"
+    assert found["coverage of sets less stated mass"].text == "0.5"
 
 
-def test_sealed_answers_open(sealed):
-    folder, digest = sealed
-    content = sealing.open_answers(folder)
-    assert sorted(content["answers"]) == ["c00001", "c00002", "c00003"]
-    assert sorted(a["case"]["id"] for a in content["answers"].values()) == ["s0", "s1", "s2"]
-    assert (folder / "seal.txt").read_text().startswith(digest)
-    assert len(content["nonce"]) == 64
-    assert "clean" not in (folder / "tasks.json").read_text()
+def test_closing_and_running():
+    def one(chi2, low, high, verdict="NAMED"):
+        estimate = {"interval_95": [low, high]}
+        after = {"effective_modulus_MPa": estimate, "log_C1": {"mean": {"interval_95": [1.8, 2.0]}}}
+        gap = {"steps": [{"chi2_per_dof": 9.0}, {"chi2_per_dof": chi2}]}
+        effects = [("creep", 1)] if verdict == "NAMED" else ()
+        return outcome("single", verdict, effects, [("creep", 30.0)], key=str(chi2), gap=gap, parameters_after=after)
+
+    some = [one(1.05, 15000, 17000), one(1.07, 15000, 15500), one(0.99, 15000, 17000, "NO_GAP")]
+    found = by_name(rows.closing(some))
+    # Half width with 5000 readings: 1.96 * 0.02 + 0.02 = 0.0592.
+    assert found["chi2 per point of the extended law within its interval, lambda >= 20"].text == "66.7 %"
+    assert found["effective_modulus_MPa within its 95 % interval"].text == "66.7 %"
+    assert found["log_C1 within its 95 % interval"].text == "100.0 %"
+    found = by_name(rows.running(some, {}))
+    assert found["search failures among all campaigns"].text.startswith("not measured: 0 of 1")
+    found = by_name(rows.running(some, {"0.99": "search failure"}))
+    assert found["search failures among all campaigns"].text == "33.3 %"
 
 
-def test_same_cases_get_another_hash_each_time(tmp_path, sealed):
-    cases = [tiers.Case(f"s{k}", "T0", "clean", "P0", count=3, resample=True) for k in range(3)]
-    assert sealing.seal(tmp_path / "again", cases, master=4, jobs=1) != sealed[1]
+def test_places_are_segments_and_shares_of_load():
+    case = Case(1, "null", "first", (), "P1", 5, "clean")
+    _, drawn, _ = make.drawn(case, 5, 0)
+    every = truth.inside_places(drawn, [{"segment": "all", "load_fraction": [0.0, 1.0]}])
+    assert every.all()
+    assert not truth.inside_places(drawn, []).any()
+    up = truth.inside_places(drawn, [{"segment": "loading", "load_fraction": [0.5, 1.0]}])
+    s = drawn.slices[0]
+    share = drawn.force[s] / drawn.force[s].max()
+    assert share[up[s]].min() >= 0.5
+    assert 0 < up.mean() < 0.5
+    down = truth.inside_places(drawn, [{"segment": "unloading"}])
+    assert not (up & down).any()
 
 
-@pytest.mark.parametrize("what", ["answers", "campaign", "seal"])
-def test_whatever_is_touched_breaks_the_seal(sealed, what, tmp_path):
-    folder, _ = sealed
-    if what == "answers":
-        path = folder / "answers.json"
-        path.write_text(path.read_text().replace("clean", "creep", 1))
-    elif what == "campaign":
-        with (folder / "campaigns/c00002/curves.csv").open("a") as curves:
-            curves.write("\n")
-    other = tmp_path / "other.txt"
-    other.write_text("0" * 64)
-    with pytest.raises(sealing.SealBroken):
-        sealing.open_answers(folder, other if what == "seal" else None)
+def test_kinds_of_wrong_verdicts():
+    assert refit.kind_of(10.0, 0.0) == "search failure"
+    assert refit.kind_of(0.0, 10.0) == "library gap"
+    assert refit.kind_of(1.0, 0.0) == "ambiguous"
+    values = {(): 0.0, ("creep:a",): 5.0, ("creep:b",): 20.0, ("damage:v",): 12.0}
+    formulas = {"creep": ["a", "b"], "damage": ["v"]}
+    wrong = outcome("single", "NAMED", [("damage", 1)], [("creep", 30.0)])
+    found = refit.judge(wrong, formulas, lambda names: values[tuple(names)])
+    assert (found["kind"], found["truth"], found["evidence_winner"]) == ("search failure", "creep:b", 12.0)
+    lost = outcome("single", "UNLISTED", (), [("creep", 30.0)])
+    assert refit.judge(lost, formulas, lambda names: 0.0)["kind"] == "not compared"
+
+
+def test_a_report_from_files(tmp_path):
+    from benchmarks.blind import plan, run, seal
+
+    cases = [c for c in plan.plan(3) if c.kind == "null" and c.particles == 5][:3]
+    work, sealed, results = tmp_path / "work", tmp_path / "sealed", tmp_path / "results"
+    seal.seal("day-3", work, sealed, cases)
+    keys = sorted(seal.open_answers("day-3", work, sealed))
+    for name, verdicts in (("day-3", ("NO_GAP", "UNLISTED", "NO_GAP")), ("day-3-other", ("NO_GAP", "NO_GAP"))):
+        (results / name).mkdir(parents=True)
+        (results / name / "run.json").write_text(json.dumps({"campaigns": "day-3"}))
+        lines = [{"key": k, "status": "ok", "wall_s": 1.0, "cold": False, "discovery": discovery(v)}
+                 for k, v in zip(keys, verdicts, strict=False)]  # fmt: skip
+        (results / name / "part_1_of_1.jsonl").write_text("\n".join(map(json.dumps, lines)) + "\n")
+    assert len(run.read_outcomes(results / "day-3")) == 3
+    text = score.report(["day-3", "day-3-other"], results, work, sealed)
+    assert "3 of 3 campaigns answered" in text
+    assert "| alarm, nothing hidden | <= 6.5 % | 33.3 % |" in text
+    assert "on the 2 campaigns that both answered" in text
+    assert "## Wrong verdicts: 1" in text
+    (work / "day-3/answers.json").write_text((work / "day-3/answers.json").read_text() + " ")
+    with pytest.raises(seal.SealBroken):
+        score.report(["day-3"], results, work, sealed)

@@ -1,1 +1,1 @@
-"""Synthetic campaigns with hidden effects, in NumPy alone: nothing here knows the library under test."""
+"""The first generator, in NumPy and SciPy; `interface` alone knows what the bench calls."""

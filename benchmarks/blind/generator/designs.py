@@ -21,11 +21,14 @@ TABLE_1 = np.array(
 
 PEAK_MPA = (7.0, 16.0)
 MARGIN = 0.9  # of a loading curve that is not replaced, from falling
-LOAD_RATE_MN_PER_S = 2.0
+RATE_MN_PER_S = (0.8, 4.0)
+RATE_RATIO = (5.0, 20.0)
 POINTS = 260
 PROTOCOLS = ("P0", "P1", "P2")
 HUMIDITY_PERCENT = (10.0, 40.0, 75.0)
-HOLD_S = 60.0
+HOLD_S = (20.0, 120.0)
+SIZE_SCATTER = 0.06
+WIDE = (0.5, 2.0)
 _TOUCH = 0.004  # of the peak: where records begin and end
 
 
@@ -48,87 +51,90 @@ class Path:
     unloading: np.ndarray
 
 
-def sizes(rng, count, resample):
-    """Rows of Table 1: as they stand, or resampled with 6 % of scatter on each diameter."""
-    if not resample and count == len(TABLE_1):
+def sizes(rng: np.random.Generator, count: int, wide: bool = False) -> np.ndarray:
+    """Rows of Table 1: as they stand, or resampled with some scatter on each diameter; `wide` over a factor of four."""
+    if count == len(TABLE_1) and not wide and rng.random() < 0.5:
         return TABLE_1.copy()
     rows = TABLE_1[rng.integers(0, len(TABLE_1), count)]
-    rows = rows * np.exp(0.06 * rng.standard_normal(rows.shape))
+    if wide:
+        rows = rows * np.exp(rng.uniform(*np.log(WIDE), (count, 1)))
+    rows = rows * np.exp(SIZE_SCATTER * rng.standard_normal(rows.shape))
     # A flat particle lies flat: D3 stays below the geometric mean of the others, as in the table.
     rows[:, 2] = np.minimum(rows[:, 2], 0.985 * np.sqrt(rows[:, 0] * rows[:, 1]))
     return np.round(rows, 2)
 
 
-def population(rng, diameters, modulus_spread=0.0, snap_through=False, humidity=False):
-    """Particles with the log-normal coefficients of Table 2.
+def population(
+    rng: np.random.Generator,
+    diameters: np.ndarray,
+    modulus_scatter: float = 0.0,
+    shape_scatter: float = 0.0,
+    humidity: bool = False,
+) -> Particles:
+    """Particles with the log-normal coefficients of Table 2, those whose loading curve nearly falls drawn again.
 
-    Draws whose loading curve is nearly not monotone are replaced, unless `snap_through`, which forces one or two of
-    them.
+    The scatters are standard deviations of logarithms: of the modulus, and of a factor of the strain (of C1, C3 and C5
+    alike).
     """
     count = len(diameters)
-
-    def draw(wanted, accept):
-        kept = np.empty((0, 3))
-        while len(kept) < wanted:
-            trial = np.exp(
-                np.stack([mean + sd * rng.standard_normal(400) for mean, sd in LOG_C.values()], axis=1),
-            )
-            kept = np.concatenate([kept, trial[accept(*trial.T)]])
-        return kept[:wanted]
-
-    C = draw(count, lambda C1, C3, C5: is_monotone(C1, C3, C5, margin=MARGIN))
-    if snap_through:
-        jumping = int(rng.integers(1, 3))
-        C[rng.choice(count, jumping, replace=False)] = draw(jumping, lambda *c: ~is_monotone(*c))
+    C = np.empty((0, 3))
+    while len(C) < count:
+        trial = np.exp(np.stack([mean + sd * rng.standard_normal(400) for mean, sd in LOG_C.values()], axis=1))
+        C = np.concatenate([C, trial[is_monotone(*trial.T, margin=MARGIN)]])
+    C = C[:count] * np.exp(shape_scatter * rng.standard_normal((count, 1)))
     columns = {}
     if humidity:
         columns["batch"] = np.resize([1.0, 2.0, 3.0], count)
         columns["relative_humidity_percent"] = np.resize(HUMIDITY_PERCENT, count)
-    return Particles(
-        *diameters.T,
-        *C.T,
-        modulus=EFFECTIVE_MODULUS_MPA * np.exp(modulus_spread * rng.standard_normal(count)),
-        zero=rng.normal(0.0, 2.0, count),
-        columns=columns,
-    )
+    modulus = EFFECTIVE_MODULUS_MPA * np.exp(modulus_scatter * rng.standard_normal(count))
+    return Particles(*diameters.T, *C.T, modulus=modulus, columns=columns)
 
 
-def _legs(protocol):
-    """(from, to, seconds of hold or None) in fractions of the peak load."""
+Leg = tuple[float, float, float | None]
+"""From, to (shares of the peak load), seconds of hold or None."""
+
+
+def _legs(rng: np.random.Generator, protocol: str) -> list[Leg]:
     if protocol == "P0":
         return [(_TOUCH, 1.0, None), (1.0, _TOUCH, None)]
+    turn, low, second = rng.uniform(0.4, 0.65), rng.uniform(0.015, 0.12), rng.uniform(0.15, 0.4)
     return [
-        (_TOUCH, 0.5, None),
-        (0.5, 0.02, None),
-        (0.02, 1.0, None),
-        (1.0, 1.0, HOLD_S),
-        (1.0, 0.25, None),
-        (0.25, 1.0, None),
+        (_TOUCH, turn, None),
+        (turn, low, None),
+        (low, 1.0, None),
+        (1.0, 1.0, float(rng.uniform(*HOLD_S))),
+        (1.0, second, None),
+        (second, 1.0, None),
         (1.0, _TOUCH, None),
     ]
 
 
-def programme(rng, particles, protocol, points=POINTS):
-    """Path of each particle: peak stress uniform in 7-16 MPa, samples shared out by duration.
+def programme(rng: np.random.Generator, particles: Particles, protocol: str, points: int = POINTS) -> Path:
+    """Path of each particle: peak stress uniform in a range, samples shared out by duration.
 
-    P0 one cycle at 2 mN/s; P1 half-load cycle, full load, hold of 60 s, partial unloading, reload, unloading; P2 the
-    same, with ten times the rate on every second particle.
+    P0 one cycle; P1 a cycle on the way, full load, a hold, partial unloading, reload, unloading; P2 the same, every
+    second particle several times as fast.
     """
     if protocol not in PROTOCOLS:
         raise ValueError(f"no protocol {protocol!r}")
     count = len(particles.D1)
     peak = rng.uniform(*PEAK_MPA, count) * np.pi * particles.De**2 / 4.0 * MN_PER_MPA_UM2
-    rate = np.full(count, LOAD_RATE_MN_PER_S)
+    rate = np.full(count, np.exp(rng.uniform(*np.log(RATE_MN_PER_S))))
     if protocol == "P2":
-        rate[1::2] *= 10.0
-    legs = _legs(protocol)
+        rate[1::2] *= rng.uniform(*RATE_RATIO)
+    legs = _legs(rng, protocol)
     rows = [_sample(legs, peak[i], rate[i], points) for i in range(count)]
     return Path(*(np.stack(column) for column in zip(*rows, strict=True)))
 
 
-def _sample(legs, peak, rate, points):
+def _sample(legs: list[Leg], peak: float, rate: float, points: int) -> tuple[np.ndarray, ...]:
     seconds = np.array([hold if hold is not None else abs(stop - start) * peak / rate for start, stop, hold in legs])
-    share = np.maximum(10, np.floor(seconds / seconds.sum() * (points - 1))).astype(int)
+    weight = seconds / seconds.sum()
+    held = np.array([hold is not None for *_, hold in legs])
+    if held.any():  # a slow logger in holds: they take a fifth of the samples at most
+        share = min(0.2, weight[held].sum())
+        weight = np.where(held, share * weight / weight[held].sum(), (1.0 - share) * weight / weight[~held].sum())
+    share = np.maximum(8, np.floor(weight * (points - 1))).astype(int)
     share[np.argmax(share)] += points - 1 - share.sum()
     time, force, rates, reload, turn, reloads, since, unloading = (
         [np.array([v])] for v in (0, _TOUCH, rate, 0, 1, 0, 0, 0)
@@ -151,14 +157,7 @@ def _sample(legs, peak, rate, points):
         since.append(clock + duration * part - last_turn)
         unloading.append(np.full(n, stop < start))
         clock, largest = clock + duration, max(largest, stop)
-    join = np.concatenate
-    return (
-        join(time) * 1.0,
-        join(force) * peak,
-        join(rates) * 1.0,
-        join(reload).astype(bool),
-        join(turn) * 1.0,
-        join(reloads) * 1.0,
-        join(since) * 1.0,
-        join(unloading).astype(bool),
-    )
+    columns = [np.concatenate(parts) for parts in (time, force, rates, reload, turn, reloads, since, unloading)]
+    columns[1] = columns[1] * peak
+    kinds = (float, float, float, bool, float, float, float, bool)
+    return tuple(column.astype(kind) for column, kind in zip(columns, kinds, strict=True))

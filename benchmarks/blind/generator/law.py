@@ -12,11 +12,18 @@ An effect changes one or several of the steps below; without effects the hooks a
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.stats import norm
+
+if TYPE_CHECKING:
+    from .designs import Path
+
+Number = np.ndarray | float
 
 SHAPE_PARAMETER = 1.43
 CONTACT_AREA = 1.43  # the paper's c^2 for perfect plasticity; equal to the shape parameter by coincidence
@@ -40,37 +47,36 @@ class Particles:
     C3: np.ndarray
     C5: np.ndarray
     modulus: np.ndarray
-    zero: np.ndarray
     columns: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
-    def De(self):
+    def De(self) -> np.ndarray:
         return self.D1 * self.D2 / self.D3
 
     @property
-    def q(self):
+    def q(self) -> np.ndarray:
         return self.D3**2 / (self.D1 * self.D2)
 
-    def with_(self, **changes):
+    def with_(self, **changes: np.ndarray) -> Particles:
         return replace(self, **changes)
 
 
-def shape_factor(q, a=SHAPE_PARAMETER):
+def shape_factor(q: np.ndarray, a: float = SHAPE_PARAMETER) -> np.ndarray:
     """1 + a (1 - D3 / D_e); note D3 / D_e = D3^2 / (D1 D2) = q."""
     return 1.0 + a * (1.0 - q)
 
 
-def master_stress(x, C1, C3, C5):
+def master_stress(x: np.ndarray, C1: Number, C3: Number, C5: Number) -> np.ndarray:
     """The loading polynomial in MPa."""
     return x * (C1 - x * x * (C3**3 - x * x * C5**5))
 
 
-def is_monotone(C1, C3, C5, margin=1.0):
+def is_monotone(C1: Number, C3: Number, C5: Number, margin: float = 1.0) -> np.ndarray | bool:
     """Whether the loading polynomial never falls; `margin` below one asks for more than that."""
     return margin * 20.0 * C1 * C5**5 >= 9.0 * C3**6
 
 
-def monotone_means(margin):
+def monotone_means(margin: float) -> np.ndarray:
     """Means of ln C1, ln C3, ln C5 over draws that are monotone with a margin: a normal distribution cut by a plane."""
     means, sds = np.array(list(LOG_C.values())).T
     along = np.array([1.0, -6.0, 5.0])
@@ -79,13 +85,13 @@ def monotone_means(margin):
     return means + along * sds**2 / spread * norm.pdf(z) / norm.sf(z)
 
 
-def unloading_ratio(s):
+def unloading_ratio(s: np.ndarray) -> np.ndarray:
     """sigma / sigma_P at the recovered fraction s."""
     s = np.clip(s, 0.0, 1.0)
     return 2.0 / np.pi * (np.arccos(s) - s * np.sqrt((1.0 - s) * (1.0 + s)))
 
 
-def recovered_fraction(ratio):
+def recovered_fraction(ratio: np.ndarray) -> np.ndarray:
     """Inverse of `unloading_ratio`: with T = 2 acos s it is Kepler's equation T - sin T = pi ratio."""
     ratio = np.clip(ratio, 0.0, 1.0)
     z = np.cbrt(6.0 * ratio)
@@ -98,12 +104,12 @@ def recovered_fraction(ratio):
     return np.cos(0.5 * angle)
 
 
-def full_recovery(stress, strain, modulus):
+def full_recovery(stress: np.ndarray, strain: np.ndarray, modulus: np.ndarray) -> np.ndarray:
     """Strain recovered between `stress` and zero."""
     return np.sqrt(stress / (PUNCH * modulus * np.maximum(strain, 1e-12)))
 
 
-def first_strain(stress, curve):
+def first_strain(stress: np.ndarray, curve: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """The first x at which the running maximum of `curve` (a function of x) reaches `stress`; (particles, samples)."""
     values = curve(np.broadcast_to(_X, (stress.shape[0], _X.size)))
     envelope = np.maximum.accumulate(values, axis=1)
@@ -123,15 +129,20 @@ def first_strain(stress, curve):
     return x0 + (x1 - x0) * np.clip((stress - y0) / rise, 0.0, 1.0)
 
 
-def simulate(particles, path, effects=(), a=SHAPE_PARAMETER):
-    """Displacement in um along `path` (see `designs`), without noise but with the zero offset.
+def simulate(
+    particles: Particles,
+    path: Path,
+    effects: Sequence[tuple[dict[str, Callable], float]] = (),
+    a: float = SHAPE_PARAMETER,
+) -> np.ndarray:
+    """Displacement in um along `path` (see `designs`), without noise and from its own zero.
 
     `effects` are pairs (hooks, amplitude); hooks is a dictionary of functions, each called as f(amplitude, value,
     state), and "flow" as f(amplitude, stress, x, state).
     """
     p, state = _state(particles, path, a)
 
-    def apply(name, value):
+    def apply(name: str, value: np.ndarray) -> np.ndarray:
         for hooks, amplitude in effects:
             if name in hooks:
                 value = hooks[name](amplitude, value, state)
@@ -142,7 +153,7 @@ def simulate(particles, path, effects=(), a=SHAPE_PARAMETER):
     state.C3 = apply("C3", particles.C3[:, None])
     state.C5 = apply("C5", particles.C5[:, None])
 
-    def loading(x):
+    def loading(x: np.ndarray) -> np.ndarray:
         stress = master_stress(x, state.C1, state.C3, state.C5)
         for hooks, amplitude in effects:
             if "flow" in hooks:
@@ -165,21 +176,10 @@ def simulate(particles, path, effects=(), a=SHAPE_PARAMETER):
     state.eps = state.eps_P - state.recovery
     state.eps = apply("strain", state.eps)
     state.gamma = p.De * state.eps
-    return apply("observable", state.gamma) + particles.zero[:, None]
+    return apply("observable", state.gamma)
 
 
-def coefficients(particles, path, effects):
-    """C1 in MPa and modulus in MPa per particle, with the effects that only rescale them."""
-    _, state = _state(particles, path, SHAPE_PARAMETER)
-    values = {"C1": particles.C1[:, None], "modulus": particles.modulus[:, None]}
-    for hooks, amplitude in effects:
-        for name in values:
-            if name in hooks:
-                values[name] = hooks[name](amplitude, values[name], state)
-    return {name: value[:, 0] for name, value in values.items()}
-
-
-def _state(particles, path, a):
+def _state(particles: Particles, path: Path, a: float) -> tuple[SimpleNamespace, SimpleNamespace]:
     """What the hooks may look at from the start: geometry, path, stresses."""
     p = SimpleNamespace(
         De=particles.De[:, None],
@@ -206,7 +206,7 @@ def _state(particles, path, a):
     return p, state
 
 
-def _strain_rate(state, path):
+def _strain_rate(state: SimpleNamespace, path: Path) -> np.ndarray:
     """Strain rate on the loading curve when its largest stress was first reached, 1/s."""
     slope = state.C1 - 3.0 * state.C3**3 * state.x**2 + 5.0 * state.C5**5 * state.x**4
     stress_rate = path.rate / (np.pi * state.particle.Re**2 * MN_PER_MPA_UM2)

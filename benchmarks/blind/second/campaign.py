@@ -1,10 +1,13 @@
-"""Who is tested, how, and with what noise."""
+"""Who is tested, and how."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
-from . import noise, particles, path
+import numpy as np
+
+from . import particles, path
 
 
 @dataclass(frozen=True)
@@ -13,27 +16,26 @@ class Campaign:
 
     particles: particles.Particles
     path: path.Path
-    noise: noise.Noise
-    memory: dict = field(default_factory=dict)
+    memory: dict[Any, np.ndarray] = field(default_factory=dict)
 
     @property
-    def owner(self):
+    def owner(self) -> np.ndarray:
+        """The particle of every sample."""
         return self.path.owner
 
 
 def draw(
-    rng,
-    count=20,
-    protocol="P0",
+    rng: np.random.Generator,
+    count: int = 20,
+    protocol: str = "P0",
     *,
-    reloads=0,
-    noise_kind="clean",
-    wide=False,
-    low_turn=False,
-    modulus_scatter=0.0,
-    humidity=None,
-):
-    """Draw a campaign: particles, then their paths, then the noise."""
-    tested = particles.draw(rng, count, wide, modulus_scatter, humidity)
-    loaded = path.draw(rng, tested, protocol, reloads, low_turn)
-    return Campaign(tested, loaded, noise.draw(rng, loaded, noise_kind))
+    reloads: int = 0,
+    wide: bool = False,
+    low_turn: bool = False,
+    modulus_scatter: float = 0.0,
+    shape_scatter: float = 0.0,
+    humidity: np.ndarray | None = None,
+) -> Campaign:
+    """Draw a campaign: particles, then their paths."""
+    tested = particles.draw(rng, count, wide, modulus_scatter, shape_scatter, humidity)
+    return Campaign(tested, path.draw(rng, tested, protocol, reloads, low_turn))

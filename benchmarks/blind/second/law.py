@@ -7,14 +7,21 @@ delta^2 = sigma_P / (4.12 Ebar eps_P).
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from types import SimpleNamespace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+if TYPE_CHECKING:
+    from .campaign import Campaign
+    from .effects.effect import Effect
+
+Curve = Callable[[np.ndarray], np.ndarray]
+Sized = Sequence[tuple["Effect", float]]
+
 CONTACT_AREA = 1.43  # Storakers' largest c^2 of the contact radius; not the shape parameter
 PUNCH = 4.12
-MIN_RISE = 0.06  # of a changed loading curve, over C1 eta_p
 
 _ANGLE = np.linspace(0, np.pi / 2, 40001)
 # For small angles the closed form loses its digits to cancellation.
@@ -31,13 +38,13 @@ class Shift(NamedTuple):
 
     log_C: np.ndarray | tuple[float, ...] = (0.0, 0.0, 0.0)
     a: float = 0.0
-    log_modulus: float = 0.0
+    log_modulus: np.ndarray | float = 0.0
 
 
 NO_SHIFT = Shift()
 
 
-def unloading_ratio(s):
+def unloading_ratio(s: np.ndarray) -> np.ndarray:
     """f(s) = (2/pi) [acos s - s sqrt(1 - s^2)], the stress over sigma_P."""
     s = np.clip(s, 0, 1)
     height = np.sqrt((1 - s) * (1 + s))
@@ -45,12 +52,12 @@ def unloading_ratio(s):
     return (2 / np.pi) * np.where(angle < 0.01, 2 * angle**3 / 3, angle - s * height)
 
 
-def recovered_fraction(ratio):
+def recovered_fraction(ratio: np.ndarray) -> np.ndarray:
     """Inverse of `unloading_ratio`, from a table in which the cube root is nearly straight."""
     return np.cos(np.interp(np.cbrt(np.clip(ratio, 0, 1)), _ROOT, _ANGLE))
 
 
-def bisect(function, low, high, target, rounds=34):
+def bisect(function: Curve, low: np.ndarray, high: np.ndarray, target: np.ndarray, rounds: int = 34) -> np.ndarray:
     """Where an increasing function of arrays reaches `target`."""
     for _ in range(rounds):
         middle = 0.5 * (low + high)
@@ -59,7 +66,7 @@ def bisect(function, low, high, target, rounds=34):
     return 0.5 * (low + high)
 
 
-def coefficients(campaign, effects=(), shift=NO_SHIFT):
+def coefficients(campaign: Campaign, effects: Sized = (), shift: Shift = NO_SHIFT) -> SimpleNamespace:
     """C1, C3, C5, modulus in MPa and eta_p of each particle."""
     p = campaign.particles
     values = SimpleNamespace(
@@ -74,14 +81,14 @@ def coefficients(campaign, effects=(), shift=NO_SHIFT):
     return values
 
 
-def loading(campaign, effects, values, owner):
+def loading(campaign: Campaign, effects: Sized, values: SimpleNamespace, owner: np.ndarray) -> Curve:
     """The loading curve as a function of strain, for samples that belong to the particles `owner`."""
     p = campaign.particles
     C1, C3, C5, eta = (getattr(values, name)[owner] for name in ("C1", "C3", "C5", "eta"))
     De, D = p.De[owner], p.D[owner]
     stress_rate = (campaign.path.rate / p.area)[owner]
 
-    def stress(eps):
+    def stress(eps: np.ndarray) -> np.ndarray:
         x = eta * eps
         terms = SimpleNamespace(
             x=x,
@@ -106,20 +113,7 @@ def loading(campaign, effects, values, owner):
     return stress
 
 
-def is_monotone(campaign, effects, points=400):
-    """Whether each changed loading curve rises up to the particle's largest stress, so that nothing snaps through."""
-    values = coefficients(campaign, effects)
-    count = len(campaign.particles)
-    owner = np.repeat(np.arange(count), points)
-    x = np.tile(np.linspace(1 / points, 1, points), count)
-    eps = 0.85 * x / values.eta[owner]
-    stress = loading(campaign, effects, values, owner)(eps).reshape(count, points)
-    slope = np.diff(stress, axis=1) / np.diff(eps.reshape(count, points), axis=1)
-    below = stress[:, 1:] < campaign.path.largest_stress[:, None]
-    return bool(np.all((slope / (values.C1 * values.eta)[:, None])[below] > MIN_RISE))
-
-
-def simulate(campaign, effects=(), shift=NO_SHIFT):
+def simulate(campaign: Campaign, effects: Sized = (), shift: Shift = NO_SHIFT) -> np.ndarray:
     """Displacement in um at every sample, without noise. effects: pairs (effect, amplitude)."""
     p, path, owner = campaign.particles, campaign.path, campaign.owner
     values = coefficients(campaign, effects, shift)
@@ -147,13 +141,13 @@ def simulate(campaign, effects=(), shift=NO_SHIFT):
     return gamma
 
 
-def _recovered(campaign, effects, s):
+def _recovered(campaign: Campaign, effects: Sized, s: SimpleNamespace) -> np.ndarray:
     """The recovered fraction at the load fraction u: from the table, or by bisection where an effect changes f."""
     changing = [(effect, theta) for effect, theta in effects if effect.changes("unloading")]
     if not changing:
         return np.where(s.u >= 1, 0.0, recovered_fraction(s.u))
 
-    def falling(fraction):
+    def falling(fraction: np.ndarray) -> np.ndarray:
         ratio = unloading_ratio(fraction)
         for effect, theta in changing:
             ratio = effect.unloading(theta, campaign, s, fraction, ratio)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -51,40 +51,55 @@ class Particles:
     bursts: tuple[tuple[int, np.ndarray, np.ndarray], ...]
     humidity: np.ndarray | None
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.D)
 
     @cached_property
-    def De(self):
+    def De(self) -> np.ndarray:
         return self.D[:, 0] * self.D[:, 1] / self.D[:, 2]
 
     @cached_property
-    def Re(self):
+    def Re(self) -> np.ndarray:
         return self.De / 2
 
     @cached_property
-    def area(self):
+    def area(self) -> np.ndarray:
         """mN per MPa."""
         return np.pi * self.Re**2 * MN_PER_MPA_UM2
 
     @cached_property
-    def q(self):
+    def q(self) -> np.ndarray:
         return self.D[:, 2] ** 2 / (self.D[:, 0] * self.D[:, 1])
 
 
-def least_slope(C1, C3, C5):
+def least_slope(C1: np.ndarray, C3: np.ndarray, C5: np.ndarray) -> np.ndarray:
     """The least slope of the loading polynomial over its slope at zero."""
     x2 = 0.3 * C3**3 / C5**5
     return (C1 - 3 * C3**3 * x2 + 5 * C5**5 * x2**2) / C1
 
 
-def humidity_levels(rng, count):
+@cache
+def population_means() -> np.ndarray:
+    """Means of ln C1, ln C3, ln C5 over what is drawn: steep enough curves only."""
+    rng = np.random.default_rng(0)
+    logs = LOG_C_MEAN + LOG_C_SD * rng.standard_normal((200_000, 3))
+    return logs[least_slope(*np.exp(logs.T)) > MIN_SLOPE].mean(0)
+
+
+def humidity_levels(rng: np.random.Generator, count: int) -> np.ndarray:
     """Relative humidity in % per particle: four chambers and what a sensor reads there."""
     levels = np.array([11.0, 33.0, 54.0, 75.0])
     return np.round(levels[rng.permutation(count) % 4] + np.round(rng.uniform(-2, 2, count), 1), 1)
 
 
-def draw(rng, count, wide=False, modulus_scatter=0.0, humidity=None):
+def draw(
+    rng: np.random.Generator,
+    count: int,
+    wide: bool = False,
+    modulus_scatter: float = 0.0,
+    shape_scatter: float = 0.0,
+    humidity: np.ndarray | None = None,
+) -> Particles:
     """A population like the paper's; `wide` spreads its sizes over a factor of four."""
     a = SHAPE_PARAMETER + SHAPE_SPREAD * rng.standard_normal()
     mean_modulus = MODULUS_MPA * np.exp(MODULUS_SPREAD * rng.standard_normal())
@@ -92,20 +107,21 @@ def draw(rng, count, wide=False, modulus_scatter=0.0, humidity=None):
     for i in range(count):
         C[i] = _coefficients(rng)
         D[i] = np.round(_sizes(rng, i, count, wide), 2)
+    C *= np.exp(shape_scatter * rng.standard_normal((count, 1)))
     modulus = mean_modulus * np.exp(modulus_scatter * rng.standard_normal(count))
     normal, uniform = rng.standard_normal((count, 8)), rng.random((count, 8))
     bursts = tuple(_bursts(rng) for _ in range(count))
     return Particles(D, C, a, mean_modulus, modulus, normal, uniform, bursts, humidity)
 
 
-def _coefficients(rng):
+def _coefficients(rng: np.random.Generator) -> np.ndarray:
     while True:
         C = np.exp(LOG_C_MEAN + LOG_C_SD * rng.standard_normal(3))
         if least_slope(*C) > MIN_SLOPE:
             return C
 
 
-def _sizes(rng, i, count, wide):
+def _sizes(rng: np.random.Generator, i: int, count: int, wide: bool) -> np.ndarray:
     own_row = count == len(TABLE_1) and not wide and rng.random() < 0.5
     row = TABLE_1[i] if own_row else TABLE_1[rng.integers(len(TABLE_1))]
     scale = np.exp(rng.uniform(np.log(0.45), np.log(2.0))) if wide else np.exp(0.10 * rng.standard_normal())
@@ -115,7 +131,6 @@ def _sizes(rng, i, count, wide):
             return D
 
 
-def _bursts(rng):
+def _bursts(rng: np.random.Generator) -> tuple[int, np.ndarray, np.ndarray]:
     number = 1 + rng.poisson(2.0)
-    rng.random(MAX_BURSTS)  # no effect uses these, but later draws follow them
     return number, rng.exponential(1.0, MAX_BURSTS), rng.weibull(4.0, MAX_BURSTS)

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+if TYPE_CHECKING:
+    from .particles import Particles
+
 VIRGIN, UNLOAD, RELOAD, HOLD = 0, 1, 2, 3
-HOLD_S, HOLD_POINTS = 30.0, 14
-RATE_MN_S = 2.0
+HOLD_S, HOLD_POINTS = (15.0, 90.0), 14
+RATES_MN_S = (1.0, 2.0, 4.0)
 RATE_PAIRS = ((2.0, 20.0), (1.0, 10.0), (0.5, 8.0))
 FIRST, LAST = 0.005, 0.015
 """First and last force over the largest."""
@@ -46,11 +50,13 @@ class Path:
     travelled: np.ndarray
     reloads: tuple[tuple[int, int, int, int], ...]
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.time)
 
 
-def draw(rng, particles, protocol, reloads=0, low_turn=False):
+def draw(
+    rng: np.random.Generator, particles: Particles, protocol: str, reloads: int = 0, low_turn: bool = False
+) -> Path:
     """P0: up and down. P1: a partial unloading on the way, a hold, `reloads` further cycles. P2: P1 at two rates.
 
     low_turn: the partial unloading starts at a quarter of the peak and goes nearly to zero.
@@ -58,8 +64,9 @@ def draw(rng, particles, protocol, reloads=0, low_turn=False):
     count = len(particles)
     largest_stress = rng.uniform(7, 16, count)
     largest_force = largest_stress * particles.area
-    rates = (RATE_MN_S,)
-    rate = np.full(count, RATE_MN_S)
+    rates = (float(rng.choice(RATES_MN_S)),)
+    rate = np.full(count, rates[0])
+    hold = float(rng.uniform(*HOLD_S))
     if protocol == "P2":
         rates = RATE_PAIRS[rng.integers(len(RATE_PAIRS))]
         rate = np.array(rates)[rng.permutation(count) % 2]
@@ -68,7 +75,7 @@ def draw(rng, particles, protocol, reloads=0, low_turn=False):
     else:
         turn = (rng.uniform(0.45, 0.6), rng.uniform(0.08, 0.18))
     legs = [
-        _programme(protocol, largest_force[i], rate[i], int(rng.integers(200, 256)), reloads, turn)
+        _programme(protocol, largest_force[i], rate[i], int(rng.integers(200, 256)), reloads, turn, hold)
         for i in range(count)
     ]
     ends = np.cumsum([0, *(len(time) for time, _ in legs)])
@@ -91,7 +98,9 @@ def draw(rng, particles, protocol, reloads=0, low_turn=False):
     )
 
 
-def _programme(protocol, largest, rate, points, reloads, turn):
+def _programme(
+    protocol: str, largest: float, rate: float, points: int, reloads: int, turn: tuple[float, float], hold: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Time in s and force in mN of one test: ramps at `rate` in mN/s, samples shared out by the way of the force."""
     last = LAST * largest
     if protocol == "P0":
@@ -103,7 +112,7 @@ def _programme(protocol, largest, rate, points, reloads, turn):
     ramps, way = [], 0.0
     for goal in goals:
         if goal is None:
-            ramps.append((now, now, HOLD_S, True))
+            ramps.append((now, now, hold, True))
             continue
         ramps.append((now, goal, abs(goal - now) / rate, False))
         way += abs(goal - now)
@@ -117,7 +126,7 @@ def _programme(protocol, largest, rate, points, reloads, turn):
     return np.array(time), np.array(force)
 
 
-def _history(time, stress):
+def _history(time: np.ndarray, stress: np.ndarray) -> dict[str, Any]:
     """Branch, last trough and counters at each sample of one particle."""
     number = len(stress)
     peak = np.maximum.accumulate(stress)

@@ -6,40 +6,13 @@ zero. Conventions: displacement in um, force in mN, stress in MPa; u = F / F_P, 
 its strain.
 """
 
-from . import _cycles, _loading, _machine, _time, _unlisted, _unloading
-from ._form import HUMIDITY as HUMIDITY
-from ._form import RELOAD as RELOAD
-from ._form import Effect as Effect
-from ._form import Form as Form
+from . import cycles, loading, machine, time, unlisted, unloading
+from .form import HUMIDITY as HUMIDITY
+from .form import RELOAD as RELOAD
+from .form import Effect as Effect
+from .form import Form as Form
 
-MECHANISMS = (
-    "frame_compliance",
-    "thermal_drift",
-    "creep",
-    "rate_dependence",
-    "adhesion",
-    "damage",
-    "densification_stiffening",
-    "reload_hysteresis",
-    "ratcheting",
-    "finite_hardening_exponent",
-    "unloading_shape",
-    "size_effect",
-    "shape_second_order",
-    "pop_in",
-    "toe_asperity",
-    "platen_friction",
-    "misalignment",
-    "platen_sink_in",
-    "reverse_plasticity",
-    "humidity",
-)
-"""Names in the order in which campaigns are drawn: another order would be another plan."""
+LISTED = (*machine.FORMS, *time.FORMS, *unloading.FORMS, *cycles.FORMS, *loading.FORMS)
+UNLISTED = unlisted.FORMS
 
-_FORMS = (*_machine.FORMS, *_time.FORMS, *_unloading.FORMS, *_cycles.FORMS, *_loading.FORMS)
-LISTED = tuple(form for name in MECHANISMS for form in _FORMS if form.mechanism == name)
-UNLISTED = _unlisted.FORMS
-
-EXACT = {form.mechanism: form for form in LISTED if form.form == "exact"}
-VARIANTS = {name: tuple(f for f in LISTED if f.mechanism == name and f.form != "exact") for name in MECHANISMS}
 BY_NAME = {(form.mechanism, form.form): form for form in (*LISTED, *UNLISTED)}

@@ -1,0 +1,178 @@
+"""Campaigns of both generators: their law, their independence, strengths, noise and faults."""
+
+import ast
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.blind import make, noise, plan, world
+from benchmarks.blind.plan import Case
+from benchmarks.blind.settings import MECHANISMS, SETTINGS
+from benchmarks.blind.strength import Projection, amplitude_for, signature
+
+BENCH = Path(__file__).parents[2] / "benchmarks/blind"
+GENERATORS = {"first": "generator", "second": "second"}
+
+
+def null(generator, protocol="P1", particles=5, **more):
+    return Case(**{"number": 3, "kind": "null", "effects": (), "noise": "clean", **more},
+                generator=generator, protocol=protocol, particles=particles)  # fmt: skip
+
+
+def single(generator, mechanism, formula, level, **more):
+    return null(generator, **{"kind": "single", "effects": ((mechanism, formula, level),), **more})
+
+
+def imports(file):
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield "." * node.level + (node.module or ",".join(alias.name for alias in node.names))
+
+
+@pytest.mark.parametrize("name", GENERATORS.values())
+def test_generators_share_no_code_with_each_other_or_the_library(name):
+    allowed = {"..world", "..settings", "..plan"}
+    for file in (BENCH / name).rglob("*.py"):
+        depth = len(file.relative_to(BENCH / name).parts)
+        for module in imports(file):
+            assert module.split(".")[0] not in ("mcc_jax", "benchmarks", "jax"), file.name
+            if module.startswith("." * (depth + 1)):
+                assert file.name == "interface.py", file
+                assert module in allowed
+
+
+QUICK = (("first", "P1"), ("second", "P2"))
+
+
+@pytest.mark.parametrize(
+    ("generator", "protocol"),
+    [pytest.param(g, p, marks=() if (g, p) in QUICK else pytest.mark.long) for g in GENERATORS for p in plan.PROTOCOLS],
+)
+def test_generators_agree_with_the_law_without_effects(generator, protocol):
+    """Against the library's own law, which neither knows."""
+    import jax.numpy as jnp
+
+    from mcc_jax import MccLaw, Particle, Plastic, drive
+
+    _, drawn, _ = make.drawn(null(generator, protocol), 5, 0)
+    logs = drawn.deviation[:3]
+    means = {"first": (1.9027, 1.1015, 0.9784), "second": (1.9027, 1.1015, 0.9784)}[generator]
+    modulus = drawn.truth["effective_modulus_MPa"] * np.exp(drawn.deviation[3])
+    for i, s in enumerate(drawn.slices):
+        C = np.exp(np.array(means) + logs[:, i])
+        law = MccLaw(Plastic(*map(jnp.asarray, C)), drawn.truth["a"], jnp.asarray(modulus[i]))
+        sizes = [jnp.asarray(drawn.columns[f"D{k}_um"][i]) for k in (1, 2, 3)]
+        there = drive(law, Particle(*sizes), jnp.asarray(drawn.force[s]), control="load")
+        assert np.asarray(there.displacement) == pytest.approx(drawn.base[s], rel=2e-4, abs=2e-3)
+
+
+def test_generators_agree_with_each_other():
+    """Both laws on the same particle along the same path, to the accuracy of the second's table."""
+    from benchmarks.blind.generator import designs
+    from benchmarks.blind.generator import law as first
+    from benchmarks.blind.second import campaign
+    from benchmarks.blind.second import law as second
+
+    drawn = campaign.draw(np.random.default_rng(1), 1, "P0")
+    p, loaded = drawn.particles, drawn.path
+    particles = first.Particles(*p.D.T, *p.C.T, modulus=p.modulus)
+    force, still = loaded.force[None], np.zeros((1, len(loaded)))
+    path = designs.Path(loaded.time[None], force, still, still > 0, still, still, still, still > 0)
+    ours = first.simulate(particles, path, a=p.a)[0]
+    assert ours == pytest.approx(second.simulate(drawn), rel=1e-6, abs=1e-4)
+
+
+@pytest.mark.parametrize("generator", GENERATORS)
+def test_every_formula_is_nil_at_zero_and_shows(generator):
+    known = world.generators()[generator]
+    forms = [(m, f) for m in MECHANISMS for f in known.formulas(m)] + [("unlisted", f) for f in known.unlisted()]
+    for mechanism, formula in forms:
+        protocol = known.protocols(mechanism, formula)[0]
+        drawn = known.draw(np.random.default_rng(2), single(generator, mechanism, formula, 1.0, protocol=protocol))
+        hidden = drawn.hidden[0]
+        # The second's sliding disc keeps a friction of 1e-4 where its formula would divide by zero.
+        assert drawn.curves([(hidden, 0.0)], None) == pytest.approx(drawn.base, abs=3e-3), formula
+        assert np.abs(drawn.curves([(hidden, min(hidden.start, hidden.largest))], None) - drawn.base).max() > 1e-3
+        assert (hidden.mechanism, hidden.formula) == (mechanism, formula)
+
+
+@pytest.mark.parametrize(("generator", "formula"), [("first", "exact"), ("second", "FrameLinear")])
+def test_strength_is_the_whitened_length_of_what_is_left(generator, formula):
+    rng, drawn, drawn_noise = make.drawn(single(generator, "frame_compliance", formula, 20.0), 5, 0)
+    projection = Projection(drawn, drawn_noise)
+    theta, found = amplitude_for(projection, drawn.hidden[0], 20.0)
+    assert found.strength == pytest.approx(20.0, rel=SETTINGS.refitting.close)
+    change = drawn.curves([(drawn.hidden[0], theta)], None) - drawn.base
+    assert np.linalg.norm(projection.project(change)) == pytest.approx(20.0, rel=0.1)
+    assert np.linalg.norm(signature(projection, drawn.hidden[0])) == pytest.approx(1.0)
+    # A change that the base law can make is nothing.
+    shift = world.Shift(np.full((3, drawn.count), 1e-4), np.full(drawn.count, 2e-4), 1e-4)
+    own = drawn.curves((), shift) - drawn.base
+    assert np.linalg.norm(projection.project(own)) < 0.02 * np.linalg.norm(projection.whiten(own))
+    whitened = projection.whiten(noise.sample(rng, drawn_noise, drawn)[0] * 0 + 1.0)
+    assert np.all(np.isfinite(whitened))
+
+
+@pytest.mark.parametrize("kind", ["clean", "rough", "smooth", "heavy", "scale"])
+def test_noise_has_its_covariance(kind):
+    """What is left of pure noise has as much chi2 as there are readings, and a few per mille less for the fit."""
+    rng, drawn, drawn_noise = make.drawn(null("first", "P0", 10, noise=kind), 5, 0)
+    projection = Projection(drawn, drawn_noise)
+    on_displacement, on_force = noise.sample(rng, drawn_noise, drawn)
+    left = projection.project(on_displacement - noise.slopes(drawn) * on_force)
+    number = len(drawn.force)
+    heavy = 4.0 if kind == "heavy" else 1.0
+    assert left @ left == pytest.approx(number, abs=heavy * 6 * np.sqrt(2 * number))
+
+
+@pytest.mark.parametrize("fault", ["force_zero", "clipping", "breakage"])
+def test_faults(fault):
+    case = null("second", "P0", 10, kind="fault", fault=fault)
+    made, clean = make.make(case, 5), make.make(null("second", "P0", 10), 5)
+    told, there, before = made.answer["fault"], made.readings, clean.readings
+    assert told["kind"] == fault
+    if fault == "force_zero":
+        assert there.force - before.force == pytest.approx(told["offset_mN"])
+    elif fault == "clipping":
+        assert there.displacement.max() == told["limit_um"] < before.displacement.max()
+    else:
+        changed = {str(i + 1) for i in range(10)
+                   if not np.array_equal(there.force[there.owner == i], before.force[before.owner == i])}  # fmt: skip
+        assert changed == set(told["particles"])
+
+
+def test_a_made_case_is_written_and_read_by_the_library(tmp_path):
+    from mcc_jax.campaign import read_campaign
+
+    case = single("first", "thermal_drift", "exact", 20.0)
+    made = make.make(case, 5)
+    make.write(made, tmp_path / "one")
+    make.write(make.make(case, 5), tmp_path / "two")
+    assert make.digest_of(tmp_path / "one") == make.digest_of(tmp_path / "two")
+    campaign = read_campaign(tmp_path / "one")
+    assert len(campaign.curves) == 5
+    effect = made.answer["effects"][0]
+    assert effect["lambda"] == pytest.approx(20.0, rel=0.02)
+    assert effect["alike"][0]["mechanism"] != "thermal_drift"
+    assert made.left_um.shape == made.effect_um.shape == made.readings.force.shape
+    assert 0 < np.linalg.norm(made.left_um) < np.linalg.norm(made.effect_um)
+
+
+def test_segments_of_a_path():
+    force = np.array([1.0, 2.0, 3.0, 2.0, 1.0, 2.0, 3.0, 4.0, 4.0, 2.0])
+    kinds = [world.LOADING] * 3 + [world.UNLOADING] * 2 + [world.RELOADING] * 2 + [world.LOADING, world.HOLD]
+    assert world.segments(force).tolist() == [*kinds, world.UNLOADING]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("generator", GENERATORS)
+@pytest.mark.parametrize("mechanism", MECHANISMS)
+def test_every_mechanism_reaches_a_moderate_strength(generator, mechanism):
+    known = world.generators()[generator]
+    formula = known.formulas(mechanism)[0]
+    protocol = known.protocols(mechanism, formula)[-1]
+    made = make.make(single(generator, mechanism, formula, 8.0, protocol=protocol, particles=40), 5)
+    assert made.answer["effects"][0]["lambda"] > 4.0
