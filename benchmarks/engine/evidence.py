@@ -1,0 +1,284 @@
+r"""The log marginal likelihood of a hypothesis: a linear Gaussian model around a state, its scales at their mode.
+
+Around the state every test i is
+
+.. math:: y_i = J_i T v_i + \zeta_i + V_i S w_i + M_i \epsilon + B_i R g + A_i \theta + \text{noise}
+
+with the particle's own deviations v, zero and further numbers w, what all particles share: population, further numbers
+of the effects and weights of a misfit (epsilon, g), and the amplitudes theta. All but the amplitudes are standard
+normal, once their scales T, S, R are taken into the columns. They are integrated out in closed form, particles first
+(`eliminate`); an amplitude's prior is a mixture of half-normals, whose integral is closed, too. Scales and noise are at
+their posterior mode, and their curvature is integrated by Laplace's method.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import log_ndtr, logsumexp
+from jaxtyping import Array, Float
+
+from mcc_jax.calibrate.compiling import compiled
+from mcc_jax.calibrate.data import Tests
+from mcc_jax.calibrate.distributions import SCALES, SpreadCoordinate
+from mcc_jax.calibrate.forward import Linear
+from mcc_jax.calibrate.noise import Along, Correlation, Noise, whitening
+from mcc_jax.calibrate.small_matrices import Cholesky
+
+
+class Design(eqx.Module):
+    """The columns of a hypothesis around a state, every number in units of its prior's standard deviation.
+
+    Attributes:
+        tests, linear: the tests, and how noise of force moves them.
+        own: columns of each particle's own numbers: b1, b3, b5, e (per unit), the zero, further ones.
+        common: of what all particles share: the population's five, further numbers of effects, misfits.
+        amplitude: of the amplitudes, per unit of `unit`.
+        data: what is explained [um].
+        scale: each particle's own factor on the noise.
+        group: which scale a common column has: 0 where it is fixed at 1, else its place among `misfits`.
+        noise: prior of the four numbers of the noise: means and standard deviations of the logarithms, shape (2, 4).
+        largest: largest scale of each amplitude's prior in its unit, over the smallest, which is the unit.
+        spreads: scale and shape of the priors of the spreads of b1, b3, b5, e and of further own numbers.
+        misfits: median and standard deviation of the logarithm of each misfit's scale.
+    """
+
+    tests: Tests
+    linear: Linear
+    own: Float[Array, "particles points o"]
+    common: Float[Array, "particles points c"]
+    amplitude: Float[Array, "particles points k"]
+    data: Float[Array, "particles points"]
+    scale: Float[Array, " particles"]
+    group: Any
+    noise: Float[Array, "2 4"]
+    largest: Float[Array, " k"]
+    sign: Float[Array, " k"]
+    misfits: Float[Array, "g 2"]
+    kinds: Kinds = eqx.field(static=True)
+
+
+@dataclass(frozen=True)
+class Kinds:
+    """What a compiled evidence depends on besides the shapes of its arrays.
+
+    Attributes:
+        spreads: priors of the spreads of b1, b3, b5, e, and of further own numbers.
+        correlation, along: of the noise.
+    """
+
+    spreads: tuple[Any, ...]
+    correlation: Correlation
+    along: Along
+
+
+class Left(NamedTuple):
+    """What the particles leave: Gram matrices of the common columns, the amplitudes and the data, and log integrals."""
+
+    gram: Float[Array, "particles r r"]
+    log_integral: Float[Array, " particles"]
+
+
+def scales_of(free: Float[Array, " h"], design: Design) -> tuple[Noise, Array, Array]:
+    """Noise, scales of the own columns and of the common ones, at the hyperparameters.
+
+    They are logarithms of the noise's four numbers, the spreads' coordinates, and logarithms of the misfits' scales.
+    """
+    spreads = design.kinds.spreads
+    noise = Noise.from_logs(free[:4], design.scale)
+    x = free[4 : 4 + len(spreads)]
+    tau = [SpreadCoordinate(prior).spread(x[j]) for j, prior in enumerate(spreads)]
+    own = jnp.stack([*tau[:4], jnp.ones(()), *tau[4:]])
+    misfit = jnp.concatenate([jnp.ones(1), jnp.exp(free[4 + len(spreads) :])])
+    return noise, own, misfit[design.group]
+
+
+def grams(free: Float[Array, " h"], design: Design) -> tuple[Array, Array]:
+    """Gram matrix of every test's whitened and scaled columns, and its noise's log density at 0."""
+    noise, own, common = scales_of(free, design)
+    kinds = design.kinds
+    columns = jnp.concatenate([design.own, design.common, design.amplitude, design.data[..., None]], -1)
+    factor = jnp.concatenate([own, common, jnp.ones(design.amplitude.shape[-1] + 1)])
+
+    def one(scale: Array, tests: Tests, linear: Linear, columns: Array) -> tuple[Array, Array]:
+        filtered = whitening(noise, scale, tests, linear, kinds.correlation, kinds.along)
+        white = filtered(columns) * factor[None]
+        gram = (white.T @ white).at[-1, -1].add(filtered.reading)
+        count = jnp.sum(jnp.where(tests.mask, 1.0, 0.0))
+        return gram, -0.5 * (filtered.log_det + count * float(np.log(2 * np.pi)))
+
+    return jax.vmap(one)(design.scale, design.tests, design.linear, columns)
+
+
+def left_of(free: Float[Array, " h"], design: Design) -> Left:
+    """Integrate every particle's own numbers out."""
+    gram, log_density = grams(free, design)
+    left, log_integral = eliminate_first(gram, design.own.shape[-1])
+    return Left(left, log_integral + log_density)
+
+
+def eliminate_first(gram: Array, count: int) -> tuple[Array, Array]:
+    """Integrate the first columns out, whose numbers are standard normal: what is left of the form, log integral."""
+    inner = gram[..., :count, :count] + jnp.eye(count)
+    border = gram[..., :count, count:]
+    if gram.ndim > 2:
+        factor = Cholesky(inner[..., None, :, :])
+        half = jnp.swapaxes(factor.forward(jnp.swapaxes(border, -1, -2)), -1, -2)
+        log_det = factor.log_det()[..., 0]
+    else:
+        root = jnp.linalg.cholesky(inner)
+        half = jax.scipy.linalg.solve_triangular(root, border, lower=True)
+        log_det = 2 * jnp.sum(jnp.log(jnp.diagonal(root)))
+    left = gram[..., count:, count:] - jnp.swapaxes(half, -1, -2) @ half
+    return left, -0.5 * log_det
+
+
+def amplitudes(left: Array, sign: Array, largest: Array) -> tuple[Array, Array, Array]:
+    """Log integral over amplitudes, and their mean and standard deviation under the best scales.
+
+    Each has an equal mixture of half-normal priors (normal where both signs are physical), whose scales are spread
+    evenly in the logarithm from 1 to `largest`. Where several are cut, the corner's probability is taken for the
+    product of the single ones.
+    """
+    count = len(sign)
+    if not count:
+        return -0.5 * left[-1, -1], jnp.zeros(0), jnp.zeros(0)
+    gram, score = left[:-1, :-1], left[:-1, -1]
+    steps = jnp.asarray(np.linspace(0, 1, SCALES))
+    axes = jnp.meshgrid(*(steps for _ in range(count)), indexing="ij")
+    scale = jnp.exp(jnp.stack([a.ravel() for a in axes], -1) * jnp.log(largest)[None])
+
+    def one(s: Array) -> tuple[Array, Array, Array]:
+        precision = gram + jnp.diag(s**-2.0)
+        root = jnp.linalg.cholesky(precision)
+        covariance = jax.scipy.linalg.cho_solve((root, True), jnp.eye(count))
+        mean = covariance @ score
+        sd = jnp.sqrt(jnp.diagonal(covariance))
+        value = 0.5 * score @ mean - jnp.sum(jnp.log(jnp.diagonal(root))) - jnp.sum(jnp.log(s))
+        cut = jnp.where(sign == 0, 0.0, float(np.log(2)) + log_ndtr(sign * mean / sd))
+        return value + jnp.sum(cut), mean, sd
+
+    value, mean, sd = jax.vmap(one)(scale)
+    best = jnp.argmax(value)
+    total = logsumexp(value) - count * float(np.log(SCALES)) - 0.5 * left[-1, -1]
+    return total, mean[best], sd[best]
+
+
+def log_prior(free: Float[Array, " h"], design: Design) -> Array:
+    """Log prior of the hyperparameters, of a spread's coordinate of either sign together."""
+    spreads = design.kinds.spreads
+    z = (free[:4] - design.noise[0]) / design.noise[1]
+    value = -0.5 * jnp.sum(z**2) - jnp.sum(jnp.log(design.noise[1] * float(np.sqrt(2 * np.pi))))
+    for j, prior in enumerate(spreads):
+        value = value + float(np.log(2)) + SpreadCoordinate(prior).log_prob(free[4 + j])
+    m = (free[4 + len(spreads) :] - design.misfits[:, 0]) / design.misfits[:, 1]
+    return value - 0.5 * jnp.sum(m**2) - jnp.sum(jnp.log(design.misfits[:, 1] * float(np.sqrt(2 * np.pi))))
+
+
+def log_joint(free: Float[Array, " h"], design: Design) -> Array:
+    """Log marginal likelihood at the hyperparameters, times their prior."""
+    left = left_of(free, design)
+    gram, integral = eliminate_first(jnp.sum(left.gram, 0), design.common.shape[-1])
+    return (
+        jnp.sum(left.log_integral)
+        + integral
+        + amplitudes(gram, design.sign, design.largest)[0]
+        + log_prior(free, design)
+    )
+
+
+value_and_gradient = compiled(jax.value_and_grad(log_joint))
+left_by_particle = compiled(left_of)
+
+
+class Solution(NamedTuple):
+    """Posterior means at the hyperparameters.
+
+    Attributes:
+        own: of every particle's own numbers, in units of `Design.own`.
+        common: of what all share, in units of `Design.common`.
+        amplitude, sd: of the amplitudes.
+    """
+
+    own: Float[Array, "particles o"]
+    common: Float[Array, " c"]
+    amplitude: Float[Array, " k"]
+    sd: Float[Array, " k"]
+
+
+@compiled
+def solve(free: Float[Array, " h"], design: Design) -> Solution:
+    """Posterior means of all numbers, an amplitude of a forbidden sign at zero."""
+    _, own, common = scales_of(free, design)
+    gram, _ = grams(free, design)
+    o, c = design.own.shape[-1], design.common.shape[-1]
+    left, _ = eliminate_first(gram, o)
+    total = jnp.sum(left, 0)
+    after, _ = eliminate_first(total, c)
+    _, theta, sd = amplitudes(after, design.sign, design.largest)
+    theta = jnp.where(design.sign * theta < 0, 0.0, theta)
+    data = total[:c, -1] - total[:c, c:-1] @ theta
+    epsilon = jnp.linalg.solve(total[:c, :c] + jnp.eye(c), data)
+    rest = gram[:, :o, -1] - gram[:, :o, o + c : -1] @ theta - gram[:, :o, o : o + c] @ epsilon
+    v = jnp.linalg.solve(gram[:, :o, :o] + jnp.eye(o), rest[..., None])[..., 0]
+    return Solution(v * own[None], epsilon * common, theta, sd)
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """The mode of the hyperparameters.
+
+    Attributes:
+        free: the hyperparameters.
+        log_evidence: log marginal likelihood, the hyperparameters integrated out by Laplace's method.
+        log_joint: at the mode.
+        evaluations: of the density.
+    """
+
+    free: np.ndarray
+    log_evidence: float
+    log_joint: float
+    evaluations: int
+
+
+def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, step: float = 1e-2) -> Optimum:
+    """The mode of the hyperparameters by L-BFGS, in coordinates scaled by their expected curvature."""
+    from scipy.optimize import minimize
+
+    count = float(np.asarray(design.tests.mask).sum())
+    N, h = len(design.tests), len(start)
+    spreads = len(design.kinds.spreads)
+    expected = np.concatenate([[1.5, 0.2, 0.1, 0.02] * 1, np.ones(h - 4)])
+    expected[:4] *= count
+    expected[4 : 4 + spreads] = 2.0 * N
+    expected[4 + spreads :] = 2.0
+    scale = 1 / np.sqrt(expected)
+
+    def down(x: np.ndarray) -> tuple[float, np.ndarray]:
+        value, slope = value_and_gradient(jnp.asarray(x * scale), design)
+        return -float(value), -np.asarray(slope) * scale
+
+    found = minimize(
+        down, start / scale, jac=True, method="L-BFGS-B", options={"ftol": 1e-9, "gtol": 0.03, "maxiter": 60}
+    )
+    free = found.x * scale
+    joint = -float(found.fun)
+    evidence = joint
+    if curvature:
+        columns = []
+        for j in range(h):
+            e = np.zeros(h)
+            e[j] = step / max(scale[j], 0.0) * scale[j] * scale[j]
+            e[j] = 0.3 * scale[j]
+            up = np.asarray(value_and_gradient(jnp.asarray(free + e), design)[1])
+            low = np.asarray(value_and_gradient(jnp.asarray(free - e), design)[1])
+            columns.append(-(up - low) / (2 * e[j]))
+        hessian = (np.array(columns) + np.array(columns).T) / 2
+        values = np.maximum(np.linalg.eigvalsh(hessian * np.outer(scale, scale)), 1e-3)
+        evidence += 0.5 * h * np.log(2 * np.pi) - 0.5 * np.sum(np.log(values)) + np.sum(np.log(scale))
+    return Optimum(free, float(evidence), joint, int(found.nfev))

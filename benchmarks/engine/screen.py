@@ -1,0 +1,177 @@
+"""First-order search: every formula at every value of its grid, singly and in pairs, around the base fit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+from scipy.special import log_ndtr, logsumexp
+
+from mcc_jax.calibrate.compiling import compiled
+from mcc_jax.calibrate.data import Tests
+from mcc_jax.calibrate.distributions import SCALES
+from mcc_jax.calibrate.forward import Forms, Linear
+from mcc_jax.calibrate.noise import whitening
+from mcc_jax.discover.candidates import Candidate, candidates_of
+from mcc_jax.effects import AbstractEffect, Mechanism
+from mcc_jax.law import signatures
+
+from .design import Base, State, design_of
+from .evidence import Design, eliminate_first, scales_of
+
+NOISES = tuple((sd, length) for sd in (1.0, 0.4, 0.15, 0.05) for length in (1.0, 0.3))
+SPREADS = (1.0, 0.5)
+
+
+@compiled
+def candidate_columns(state: State, tests: Tests, effects: tuple[AbstractEffect, ...], forms: Forms) -> Array:
+    """Signatures of all candidates at the base law, shape (N, points, candidates)."""
+
+    def one(latent: Array, tests: Tests) -> Array:
+        columns = signatures(forms.law(latent, jnp.zeros(0)), tests.particle, tests.record, effects)
+        return jnp.where(tests.mask[None], columns, 0.0).T
+
+    return jax.vmap(one)(state.point.latent, tests)
+
+
+@compiled
+def candidate_grams(free: Array, design: Design, columns: Array) -> tuple[Array, Array]:
+    """Per particle, the Gram matrix of population, candidates and data, its own numbers integrated out."""
+    noise, own, common = scales_of(free, design)
+    kinds = design.kinds
+    every = jnp.concatenate([design.own, design.common, columns, design.data[..., None]], -1)
+    factor = jnp.concatenate([own, common, jnp.ones(columns.shape[-1] + 1)])
+
+    def one(scale: Array, tests: Tests, linear: Linear, columns: Array) -> tuple[Array, Array]:
+        filtered = whitening(noise, scale, tests, linear, kinds.correlation, kinds.along)
+        white = filtered(columns) * factor[None]
+        gram = (white.T @ white).at[-1, -1].add(filtered.reading)
+        count = jnp.sum(jnp.where(tests.mask, 1.0, 0.0))
+        return gram, -0.5 * (filtered.log_det + count * float(np.log(2 * np.pi)))
+
+    gram, log_density = jax.vmap(one)(design.scale, design.tests, design.linear, every)
+    left, integral = eliminate_first(gram, design.own.shape[-1])
+    return left, integral + log_density
+
+
+@dataclass(frozen=True)
+class Setting:
+    """The candidates' scores at some hyperparameters, all else integrated out.
+
+    Attributes:
+        log_null: log marginal likelihood without any, times the hyperparameters' prior.
+        gram: information among candidates, in units of their smallest plausible amplitudes.
+        score: their scores.
+        each: the same per particle, population not yet integrated out: (N, 5 + candidates + 1) squared.
+    """
+
+    free: np.ndarray
+    log_null: float
+    gram: np.ndarray
+    score: np.ndarray
+    each: np.ndarray
+
+
+@dataclass(frozen=True)
+class Screen:
+    """All candidates against the base law.
+
+    Attributes:
+        candidates: the formulas.
+        settings: hyperparameters that were tried.
+        single: log Bayes factor of each candidate against nothing missing, at the best setting of each hypothesis.
+    """
+
+    candidates: tuple[Candidate, ...]
+    settings: tuple[Setting, ...]
+    columns: Array
+
+    @property
+    def null(self) -> float:
+        return max(s.log_null for s in self.settings)
+
+    def singles(self) -> tuple[np.ndarray, np.ndarray]:
+        """Log marginal likelihood of each candidate at its best setting, and its amplitude there in natural units."""
+        signs = np.array([c.variant.sign for c in self.candidates])
+        largest = np.array([c.variant.plausible[1] / c.variant.plausible[0] for c in self.candidates])
+        best = np.full(len(signs), -np.inf)
+        amplitude = np.zeros(len(signs))
+        for s in self.settings:
+            value, mean = single_integrals(s.score, np.diagonal(s.gram), signs, largest)
+            better = s.log_null + value > best
+            best, amplitude = np.where(better, s.log_null + value, best), np.where(better, mean, amplitude)
+        return best, amplitude * np.array([c.variant.plausible[0] for c in self.candidates])
+
+    def pairs(self, members: Sequence[int]) -> list[tuple[float, int, int]]:
+        """Log marginal likelihood of pairs of candidates of different mechanisms, best first."""
+        signs = np.array([c.variant.sign for c in self.candidates])
+        largest = np.array([c.variant.plausible[1] / c.variant.plausible[0] for c in self.candidates])
+        names = [c.mechanism for c in self.candidates]
+        first, second = np.array(
+            [(a, b) for i, a in enumerate(members) for b in members[i + 1 :] if names[a] != names[b]]
+        ).T
+        best = np.full(len(first), -np.inf)
+        for s in self.settings:
+            best = np.maximum(best, s.log_null + pair_integrals(s, first, second, signs, largest))
+        order = np.argsort(-best)
+        return [(float(best[k]), int(first[k]), int(second[k])) for k in order]
+
+
+def single_integrals(
+    score: np.ndarray, information: np.ndarray, signs: np.ndarray, largest: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Log integral over each amplitude alone, and its mean under the best scale."""
+    scale = np.exp(np.linspace(0, 1, SCALES)[:, None] * np.log(largest)[None])
+    precision = information[None] + scale**-2.0
+    mean = score[None] / precision
+    value = 0.5 * score[None] * mean - 0.5 * np.log(precision) - np.log(scale)
+    value += np.where(signs == 0, 0.0, np.log(2) + log_ndtr(signs * mean * np.sqrt(precision)))
+    best = np.argmax(value, 0)
+    return logsumexp(value, axis=0) - np.log(SCALES), mean[best, np.arange(len(score))]
+
+
+def pair_integrals(s: Setting, a: np.ndarray, b: np.ndarray, signs: np.ndarray, largest: np.ndarray) -> np.ndarray:
+    """Log integral over two amplitudes, for many pairs."""
+    found = []
+    for one in np.linspace(0, 1, SCALES):
+        for two in np.linspace(0, 1, SCALES):
+            sa, sb = largest[a] ** one, largest[b] ** two
+            p, q, r = s.gram[a, a] + sa**-2.0, s.gram[b, b] + sb**-2.0, s.gram[a, b]
+            det = np.maximum(p * q - r * r, 1e-12 * p * q)
+            ma, mb = (q * s.score[a] - r * s.score[b]) / det, (p * s.score[b] - r * s.score[a]) / det
+            value = 0.5 * (s.score[a] * ma + s.score[b] * mb) - 0.5 * np.log(det) - np.log(sa * sb)
+            for m, sd, sign in ((ma, np.sqrt(q / det), signs[a]), (mb, np.sqrt(p / det), signs[b])):
+                value = value + np.where(sign == 0, 0.0, np.log(2) + log_ndtr(sign * m / sd))
+            found.append(value)
+    return np.asarray(logsumexp(np.stack(found), axis=0)) - 2 * np.log(SCALES)
+
+
+def screen(base: Base, state: State, free: np.ndarray, library: Mapping[str, Mechanism]) -> Screen:
+    """Scores of all candidates around the base fit, at several settings of noise and spreads."""
+    from .evidence import log_prior
+
+    candidates = candidates_of(library)
+    design = design_of(base, state, ())
+    effects = tuple(c.effect for c in candidates)
+    columns = candidate_columns(state, base.tests, effects, Forms(base.model.unloading))
+    columns = columns * jnp.asarray(np.array([c.variant.plausible[0] for c in candidates]))
+    settings = []
+    prior = compiled(log_prior)
+    for sd, length in NOISES:
+        for spread in SPREADS:
+            at = free.copy()
+            at[2] += np.log(sd)
+            at[3] += np.log(length)
+            at[4:8] *= spread
+            left, integral = candidate_grams(jnp.asarray(at), design, columns)
+            each = np.asarray(left)
+            total, log_pop = eliminate_first(jnp.asarray(each.sum(0)), 5)
+            total = np.asarray(total)
+            null = float(np.sum(np.asarray(integral))) + float(log_pop) - 0.5 * total[-1, -1]
+            null += float(prior(jnp.asarray(at), design))
+            settings.append(Setting(at, null, total[:-1, :-1], total[:-1, -1], each))
+    return Screen(candidates, tuple(settings), columns)
