@@ -96,10 +96,9 @@ def functions(names: tuple[str, ...], at: dict[str, Array], *, degree: int = DEG
             x = x * jnp.cos(np.pi * k * at[n])
         columns.append(x)
     smooth = [x * np.sqrt(1.0 / max(len(columns), 1)) * np.sqrt(2) for x in columns]
-    rough = []
-    for n in some:
-        for centre in np.linspace(0, 1, hats):
-            rough.append(jnp.maximum(1 - jnp.abs(at[n] - centre) * (hats - 1), 0.0) / np.sqrt(len(some)))
+    width, share = 1 / (hats - 1), np.sqrt(len(some))
+    centres = [(n, centre) for n in some for centre in np.linspace(0, 1, hats)]
+    rough = [jnp.maximum(1 - jnp.abs(at[n] - centre) / width, 0.0) / share for n, centre in centres]
     return jnp.stack([*smooth, *rough], -1) if columns else jnp.zeros((*next(iter(at.values())).shape, 0))
 
 

@@ -146,7 +146,7 @@ class Searcher:
             values[f] = r.log_evidence
             if best is None or r.log_evidence > best.log_evidence:
                 best, gain = r, r.log_evidence - first
-        for f, (first, k) in ordered[most:]:
+        for f, (first, _) in ordered[most:]:
             values[f] = min(first + min(gain, 0.0), best.log_evidence)
         named = Named((mechanism,), float(logsumexp(list(values.values())) - np.log(len(values))), best=best)
         named.formulas = {(f,): v for f, v in values.items()}
@@ -199,13 +199,10 @@ class Searcher:
         """Log evidence with a smooth discrepancy common to all particles, in coordinates of its own."""
         at, tests = self.at, self.base.tests
         size = np.asarray(tests.effective_diameter)
-        columns = []
-        for name in ("strain", "travel", "load", "clock"):
-            for k in range(1, 6):
-                columns.append(jnp.cos(np.pi * k * at[name]))
-        for i in range(1, 3):
-            for j in range(1, 3):
-                columns.append(jnp.cos(np.pi * i * at["peak"]) * jnp.cos(np.pi * j * at["load"]))
+        alone = [(name, k) for name in ("strain", "travel", "load", "clock") for k in range(1, 6)]
+        columns = [jnp.cos(np.pi * k * at[name]) for name, k in alone]
+        both = [(i, j) for i in range(1, 3) for j in range(1, 3)]
+        columns += [jnp.cos(np.pi * i * at["peak"]) * jnp.cos(np.pi * j * at["load"]) for i, j in both]
         smooth = jnp.stack(columns, -1) / np.sqrt(len(columns))
         waves = []
         for name in ("travel", "clock"):
