@@ -22,8 +22,6 @@ from mcc_jax.effects import Variant
 
 from .evidence import Design, Kinds, Solution
 
-FIVE = 5
-
 
 class State(eqx.Module):
     """Where a hypothesis is linear.
@@ -73,18 +71,7 @@ def base_columns(state: State, tests: Tests, linear: Linear, prior: tuple[Array,
     columns = jnp.einsum("npk,nkb,bc->npc", linear.columns[..., :4], slope, factor)
     away = at + jnp.einsum("nkb,b->nk", slope, mean - state.population) - state.point.latent
     data = linear.residual - jnp.einsum("npk,nk->np", linear.columns[..., :4], away)
-    return columns, data, slope, away
-
-
-@dataclass(frozen=True)
-class Hypothesis:
-    """What may be missing: formulas, one a mechanism."""
-
-    variants: tuple[Variant, ...] = ()
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(v.mechanism for v in self.variants)
+    return columns, data
 
 
 @dataclass(frozen=True)
@@ -114,12 +101,12 @@ class Base:
         beta = jnp.concatenate([jnp.stack([p.a, p.log_modulus]), p.mu + shift])
         return State(replace(self.fit.point, theta=jnp.zeros((len(self.tests), 0))), beta)
 
-    def start_free(self, misfits: int = 0) -> np.ndarray:
+    def start_free(self) -> np.ndarray:
         p = self.fit.population
         noise = np.asarray(self.fit.noise.noise.logs)
         tau = [*np.asarray(p.tau), max(float(p.modulus_scatter), 1e-3)]
         x = [float(SpreadCoordinate(s).coordinate(max(float(t), 1e-4))) for s, t in zip(self.spreads, tau, strict=True)]
-        return np.concatenate([noise, np.maximum(x, 0.3), np.zeros(misfits)])
+        return np.concatenate([noise, np.maximum(x, 0.3)])
 
 
 def design_of(
@@ -140,7 +127,7 @@ def design_of(
     tests, model = base.tests, base.model
     forms = Forms(model.unloading, variants)
     linear = linear_data(state.point, tests, forms)
-    population, data, _, _ = base_columns(state, tests, linear, base.prior, model.shape_power)
+    population, data = base_columns(state, tests, linear, base.prior, model.shape_power)
     zero_mean, zero_sd = np.asarray(model.zero_prior)
     ones = jnp.where(tests.mask, 1.0, 0.0)
     away = tests.contact + zero_mean - state.point.zero

@@ -194,6 +194,7 @@ def log_joint(free: Float[Array, " h"], design: Design) -> Array:
 
 value_and_gradient = compiled(jax.value_and_grad(log_joint))
 left_by_particle = compiled(left_of)
+prior_density = compiled(log_prior)
 
 
 class Solution(NamedTuple):
@@ -246,17 +247,16 @@ class Optimum:
     evaluations: int
 
 
-def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, step: float = 1e-2) -> Optimum:
+def optimise(design: Design, start: np.ndarray, *, curvature: bool = True) -> Optimum:
     """The mode of the hyperparameters by L-BFGS, in coordinates scaled by their expected curvature."""
     from scipy.optimize import minimize
 
     count = float(np.asarray(design.tests.mask).sum())
     N, h = len(design.tests), len(start)
     spreads = len(design.kinds.spreads)
-    expected = np.concatenate([[1.5, 0.2, 0.1, 0.02] * 1, np.ones(h - 4)])
-    expected[:4] *= count
+    expected = np.full(h, 2.0)
+    expected[:4] = count * np.array([1.5, 0.2, 0.1, 0.02])
     expected[4 : 4 + spreads] = 2.0 * N
-    expected[4 + spreads :] = 2.0
     scale = 1 / np.sqrt(expected)
 
     def down(x: np.ndarray) -> tuple[float, np.ndarray]:
@@ -273,7 +273,6 @@ def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, step:
         columns = []
         for j in range(h):
             e = np.zeros(h)
-            e[j] = step / max(scale[j], 0.0) * scale[j] * scale[j]
             e[j] = 0.3 * scale[j]
             up = np.asarray(value_and_gradient(jnp.asarray(free + e), design)[1])
             low = np.asarray(value_and_gradient(jnp.asarray(free - e), design)[1])

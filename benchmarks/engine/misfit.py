@@ -12,7 +12,6 @@ from jaxtyping import Array
 from mcc_jax.calibrate.compiling import compiled
 from mcc_jax.calibrate.data import Tests
 from mcc_jax.calibrate.forward import Forms
-from mcc_jax.effects.record import HOLD
 
 from .design import State
 
@@ -49,7 +48,7 @@ def coordinates(state: State, tests: Tests, forms: Forms) -> dict[str, Array]:
     def one(latent: Array, tests: Tests) -> dict[str, Array]:
         law = forms.law(latent, jnp.zeros(0))
         c = law.context(tests.particle, tests.record)
-        time, _holds = tests.record.time, tests.record.kind == HOLD
+        time = tests.record.time
         turned = jnp.concatenate([jnp.ones(1, bool), tests.record.kind[1:] != tests.record.kind[:-1]])
         begun = jax.lax.cummax(jnp.where(turned, time, -jnp.inf))
         ones = jnp.ones_like(time)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -65,21 +66,18 @@ def refined(
         solution = solve(jnp.asarray(optimum.free), design)
         if before is not None and optimum.log_joint < value - 5.0 and k < steps - 1:
             # What was linear there is not here: half the way back.
-            state = _between(before[0], state)
-            before = (before[0], before[1])
+            state = _between(before, state)
             value = -np.inf
             continue
         free = optimum.free
         still = abs(optimum.log_joint - value) < STILL and k > 1
         if still or k == steps - 1:
             break
-        before, value = (state, solution), optimum.log_joint
+        before, value = state, optimum.log_joint
         state = moved(base, state, variants, solution, 1.0)
     optimum = optimise(design, free)
     return Refined(variants, state, design, optimum, solve(jnp.asarray(optimum.free), design))
 
 
 def _between(a: State, b: State) -> State:
-    import jax
-
     return jax.tree.map(lambda x, y: 0.5 * (x + y), a, b)

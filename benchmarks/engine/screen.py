@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -14,14 +14,13 @@ from scipy.special import log_ndtr, logsumexp
 from mcc_jax.calibrate.compiling import compiled
 from mcc_jax.calibrate.data import Tests
 from mcc_jax.calibrate.distributions import SCALES
-from mcc_jax.calibrate.forward import Forms, Linear
-from mcc_jax.calibrate.noise import whitening
+from mcc_jax.calibrate.forward import Forms
 from mcc_jax.discover.candidates import Candidate, candidates_of
 from mcc_jax.effects import AbstractEffect, Mechanism
 from mcc_jax.law import signatures
 
 from .design import Base, State, design_of
-from .evidence import Design, eliminate_first, scales_of
+from .evidence import eliminate_first, left_by_particle, prior_density
 
 NOISES = tuple((sd, length) for sd in (1.0, 0.4, 0.15, 0.05) for length in (1.0, 0.3))
 SPREADS = (1.0, 0.5)
@@ -38,26 +37,6 @@ def candidate_columns(state: State, tests: Tests, effects: tuple[AbstractEffect,
     return jax.vmap(one)(state.point.latent, tests)
 
 
-@compiled
-def candidate_grams(free: Array, design: Design, columns: Array) -> tuple[Array, Array]:
-    """Per particle, the Gram matrix of population, candidates and data, its own numbers integrated out."""
-    noise, own, common = scales_of(free, design)
-    kinds = design.kinds
-    every = jnp.concatenate([design.own, design.common, columns, design.data[..., None]], -1)
-    factor = jnp.concatenate([own, common, jnp.ones(columns.shape[-1] + 1)])
-
-    def one(scale: Array, tests: Tests, linear: Linear, columns: Array) -> tuple[Array, Array]:
-        filtered = whitening(noise, scale, tests, linear, kinds.correlation, kinds.along)
-        white = filtered(columns) * factor[None]
-        gram = (white.T @ white).at[-1, -1].add(filtered.reading)
-        count = jnp.sum(jnp.where(tests.mask, 1.0, 0.0))
-        return gram, -0.5 * (filtered.log_det + count * float(np.log(2 * np.pi)))
-
-    gram, log_density = jax.vmap(one)(design.scale, design.tests, design.linear, every)
-    left, integral = eliminate_first(gram, design.own.shape[-1])
-    return left, integral + log_density
-
-
 @dataclass(frozen=True)
 class Setting:
     """The candidates' scores at some hyperparameters, all else integrated out.
@@ -66,14 +45,12 @@ class Setting:
         log_null: log marginal likelihood without any, times the hyperparameters' prior.
         gram: information among candidates, in units of their smallest plausible amplitudes.
         score: their scores.
-        each: the same per particle, population not yet integrated out: (N, 5 + candidates + 1) squared.
     """
 
     free: np.ndarray
     log_null: float
     gram: np.ndarray
     score: np.ndarray
-    each: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -83,7 +60,7 @@ class Screen:
     Attributes:
         candidates: the formulas.
         settings: hyperparameters that were tried.
-        single: log Bayes factor of each candidate against nothing missing, at the best setting of each hypothesis.
+        columns: signatures of the candidates, per smallest plausible amplitude.
     """
 
     candidates: tuple[Candidate, ...]
@@ -152,26 +129,23 @@ def pair_integrals(s: Setting, a: np.ndarray, b: np.ndarray, signs: np.ndarray, 
 
 def screen(base: Base, state: State, free: np.ndarray, library: Mapping[str, Mechanism]) -> Screen:
     """Scores of all candidates around the base fit, at several settings of noise and spreads."""
-    from .evidence import log_prior
-
     candidates = candidates_of(library)
     design = design_of(base, state, ())
     effects = tuple(c.effect for c in candidates)
     columns = candidate_columns(state, base.tests, effects, Forms(base.model.unloading))
     columns = columns * jnp.asarray(np.array([c.variant.plausible[0] for c in candidates]))
+    design = replace(design, amplitude=columns)
     settings = []
-    prior = compiled(log_prior)
     for sd, length in NOISES:
         for spread in SPREADS:
             at = free.copy()
             at[2] += np.log(sd)
             at[3] += np.log(length)
             at[4:8] *= spread
-            left, integral = candidate_grams(jnp.asarray(at), design, columns)
-            each = np.asarray(left)
-            total, log_pop = eliminate_first(jnp.asarray(each.sum(0)), 5)
+            left, integral = left_by_particle(jnp.asarray(at), design)
+            total, log_pop = eliminate_first(jnp.sum(left, 0), 5)
             total = np.asarray(total)
             null = float(np.sum(np.asarray(integral))) + float(log_pop) - 0.5 * total[-1, -1]
-            null += float(prior(jnp.asarray(at), design))
-            settings.append(Setting(at, null, total[:-1, :-1], total[:-1, -1], each))
+            null += float(prior_density(jnp.asarray(at), design))
+            settings.append(Setting(at, null, total[:-1, :-1], total[:-1, -1]))
     return Screen(candidates, tuple(settings), columns)

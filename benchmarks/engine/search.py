@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 from scipy.special import logsumexp
 
-from mcc_jax.calibrate.fitting import linear_data
 from mcc_jax.calibrate.forward import Forms
 from mcc_jax.discover.candidates import candidates_of
 from mcc_jax.effects import Mechanism
 
 from .design import Base, design_of
-from .evidence import optimise
+from .evidence import eliminate_first, left_by_particle, optimise
 from .misfit import COORDINATES, coordinates, functions, padded
 from .own import drift, pop_in
 from .refine import Refined, refined
-from .screen import Screen, candidate_columns, pair_integrals, screen, single_integrals
+from .screen import Screen, Setting, candidate_columns, pair_integrals, screen, single_integrals
 
 ONE, TWO = 64, 128
 PAIR, UNLISTED, GENERAL = -5.0, -5.0, -5.0
@@ -106,20 +106,10 @@ class Searcher:
             self.cache[key] = refined(self.base, self.null.state, variants, np.array(numbers), self.small)
         return self.cache[key]
 
-    def misfit_columns(self, r: Refined, which: int) -> np.ndarray:
+    def misfit_columns(self, r: Refined, which: int) -> Array:
         """Columns by which one of the formulas may be wrong, at its amplitude."""
-        v = r.variants[which]
-        linear = linear_data(r.state.point, self.base.tests, Forms(self.base.model.unloading, r.variants))
-        own = linear.columns[..., 4 + which] * float(r.theta[which])
-        phi = functions(COORDINATES[v.mechanism], self.at)
-        columns = [own[..., None] * phi]
-        siblings = []
-        for k, c in enumerate(self.screen.candidates):
-            if c.mechanism == v.mechanism and c.variant.name != v.name:
-                s = self.screen.columns[..., k]
-                size = float(jnp.sum(s * own)) / max(float(jnp.sum(s * s)), 1e-300)
-                siblings.append(size * s - own)
-        return columns, siblings
+        own = r.design.amplitude[..., which] * float(r.theta[which] / r.variants[which].plausible[0])
+        return own[..., None] * functions(COORDINATES[r.variants[which].mechanism], self.at)
 
     def with_misfit(self, r: Refined) -> tuple[float, tuple[float, ...]]:
         """Log evidence with every name's misfit."""
@@ -127,9 +117,7 @@ class Searcher:
         size = ONE if K == 1 else TWO // 2
         basis, group, priors, start = [], [], [], []
         for i in range(K):
-            columns, _ = self.misfit_columns(r, i)
-            b = padded(columns[0], size)
-            basis.append(b)
+            basis.append(padded(self.misfit_columns(r, i), size))
             group += [i + 1] * size
             priors.append([np.log(0.1), 0.8])
             start.append(np.log(0.1))
@@ -162,19 +150,15 @@ class Searcher:
 
     def seconds(self, r: Refined) -> list[tuple[float, int]]:
         """Candidates beside a name, to first order around its optimum, best first."""
-        from .evidence import eliminate_first
-        from .screen import Setting, candidate_grams
-
         design = r.design
-        left, integral = candidate_grams(
-            jnp.asarray(r.optimum.free), design, jnp.concatenate([design.amplitude, self.screen.columns], -1)
-        )
+        every = jnp.concatenate([design.amplitude, self.screen.columns], -1)
+        left, integral = left_by_particle(jnp.asarray(r.optimum.free), replace(design, amplitude=every))
         each = jnp.sum(left, 0)
         c = design.common.shape[-1]
         total, log_pop = eliminate_first(each, c)
         total = np.asarray(total)
         null = float(jnp.sum(integral)) + float(log_pop) - 0.5 * total[-1, -1]
-        s = Setting(r.optimum.free, null, total[:-1, :-1], total[:-1, -1], np.zeros(0))
+        s = Setting(r.optimum.free, null, total[:-1, :-1], total[:-1, -1])
         cs = self.screen.candidates
         signs = np.array([r.variants[0].sign, *(c.variant.sign for c in cs)])
         largest = np.array(
@@ -195,7 +179,7 @@ class Searcher:
         ]
         return [(float(value[k]), int(k)) for k in order]
 
-    def general(self, r: Refined, start: float) -> tuple[float, Any]:
+    def general(self, r: Refined, start: float) -> float:
         """Log evidence with a smooth discrepancy common to all particles, in coordinates of its own."""
         at, tests = self.at, self.base.tests
         size = np.asarray(tests.effective_diameter)
@@ -215,7 +199,7 @@ class Searcher:
         unit = np.log(3 * np.exp(self.null.optimum.free[0]))
         d = design_of(self.base, r.state, r.variants, basis, np.array([[unit, 1.5], [unit, 1.5]]), group)
         o = optimise(d, np.append(r.optimum.free, [unit, unit - start]))
-        return o.log_evidence, o
+        return o.log_evidence
 
     def run(self) -> Search:
         """All hypotheses."""
@@ -226,7 +210,7 @@ class Searcher:
         lead = rank[names[0]]
         strong = lead - self.screen.null > 10
         # Mechanisms that are far behind to first order stay as they are.
-        for _i, m in enumerate(names[:5]):
+        for m in names[:5]:
             found[(m,)] = self.single(m, order[m], 2 if strong else 1)
         for one in sorted(found.values(), key=lambda x: -x.alone)[:2]:
             if strong:
@@ -249,7 +233,7 @@ class Searcher:
                 self.full["pop_in"].variants[0].plausible,
             )
             found[("pop_in",)] = Named(("pop_in",), own.log_evidence + np.log(2), own=own)
-        unlisted, _ = self.general(self.null, 1.0)
+        unlisted = self.general(self.null, 1.0)
         search = Search(self.null, self.screen, found, unlisted)
         leaders = sorted((x for x in found.values() if x.best is not None), key=lambda x: -x.value)
         if leaders[0].value - self.null.log_evidence > 5:

@@ -19,7 +19,7 @@ from .compiling import compiled
 from .data import Selection, Tests, select
 from .distributions import SpreadCoordinate
 from .expectation import careful_enough, expect
-from .fit_result import Fit
+from .fit_result import Fit, population_of
 from .forward import Forms, Linear, Point, linearise
 from .marginal import Marginal, summarise
 from .mode import LogPosterior, most_probable
@@ -152,11 +152,11 @@ class _Fitter:
     def _bend(self, point: Point, number: int, step: float) -> list[Array]:
         """Derivative of all columns by one of the effects' numbers, as in `Marginal`, by differences over a step; 0 for
         a step of 0."""
-        now = float(point.theta[0, number])
+        now, positive = float(point.theta[0, number]), number in self.model.scatter.positive
 
         def moved(by: float) -> list[Array]:
-            factor = float(np.exp(by / now)) if number in self.model.scatter.positive else 1.0
-            theta = point.theta.at[:, number].add(now * (factor - 1) if factor != 1 else by)
+            factor = float(np.exp(by / now)) if positive else 1.0
+            theta = point.theta.at[:, number].add(now * (factor - 1) if positive else by)
             cut = self.blocks.cut(replace(point, theta=theta))
             found = self.blocks.each(linear_data, cut, self.own, self.model.forms)
             return [wave.columns.at[..., 4 + number].mul(factor) for wave in found.waves]
@@ -374,7 +374,7 @@ def _widths(free: Array, covariance: Array, target: LogPosterior) -> np.ndarray:
     """Standard deviations of the effects' numbers that all particles share, each within half of a positive one."""
     slope = np.asarray(theta_slope(free, target))
     sd = np.sqrt(np.maximum(np.einsum("kd,de,ke->k", slope, np.asarray(covariance), slope), 1e-300))
-    middle = np.abs(np.asarray(target.population(free).theta))
+    middle = np.abs(np.asarray(population_of(free, target).theta))
     return np.minimum(sd, np.where(middle > 0, 0.5 * middle, np.inf))
 
 

@@ -41,7 +41,7 @@ def modulus(result):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("calibrate", [least_squares, pytest.param(sample, marks=pytest.mark.long)])
+@pytest.mark.parametrize("calibrate", [least_squares, sample])
 def test_spikes_count_for_little(clean, spiked, calibrate):
     without, plain, robust = (
         modulus(calibrate(campaign, Model(robust=weigh), without_flagged=False))

@@ -76,7 +76,7 @@ def test_the_law_of_a_fit_gives_the_same(variant):
     np.testing.assert_allclose(values[6], values[4], rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("every", [pytest.param(True, marks=pytest.mark.long), False], ids=["all", "one a mechanism"])
+@pytest.mark.parametrize("every", [pytest.param(True, marks=pytest.mark.long), False], ids=["all", "some"])
 def test_signatures_are_the_derivatives_at_the_null(every):
     rows, again = signature_rows(RECORD, RECORD)
     np.testing.assert_array_equal(rows, again)
