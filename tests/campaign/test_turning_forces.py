@@ -86,6 +86,26 @@ def test_noisy_levels_are_unbiased_and_as_certain_as_told(name, bend, points, on
         assert np.mean(error < 0.9) > 0.98
 
 
+@pytest.mark.parametrize("step", [0.5, 1.0, 4.3])
+@pytest.mark.parametrize("width", [0.5, 1.0, 2.0])
+def test_a_rounded_tip_is_not_sharpened(step, width):
+    """A machine turns round in the time of a few readings; where straight ramps would meet it has never been.
+
+    The level may be out by a few deviations of a reading, as the largest reading is, not by a share of a step; if the
+    machine turns within half a reading, by half a step, since a sharp tip between readings looks the same.
+    """
+    rng, noise, away = np.random.default_rng(5), 0.05, []
+    for _ in range(20):
+        count = int(PEAK / step)
+        at = np.arange(-count, count + 1) + rng.uniform(-0.5, 0.5)
+        force = PEAK - step * (np.hypot(width, at) - width)
+        force -= force[0]
+        true = force.max()
+        found = levels(curve_of(np.arange(len(at), dtype=float), force + noise * rng.standard_normal(len(at))))[1]
+        away.append((found[-1] - true) / noise)
+    assert abs(np.median(away)) < max(3.0, 0.5 * step / noise if width < 1 else 0.0)
+
+
 def test_many_cycles_start_from_their_own_levels():
     """Each one goes a little further than the one before it."""
     tops = np.linspace(100, PEAK, 30)
