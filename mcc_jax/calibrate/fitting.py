@@ -304,7 +304,8 @@ def fit_tests(
 
     Particles come first, each on its own. Then, in turns: the noise from residuals linear in the particles' numbers,
     the most probable population under the summaries, the most probable particles under that population. The noise is
-    what is left under the model at hand: with effects it is not estimated before they are in.
+    what is left under the model at hand: with effects it is not estimated before they are in, and every further step is
+    halved until the tests are more probable where it ends (`_Fitter.step`).
 
     Args:
         tests: the measurements.

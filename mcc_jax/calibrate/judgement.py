@@ -19,6 +19,7 @@ from ..campaign import Campaign, Finding, campaign_findings, check_plausibility
 from ..campaign.quality import named
 from ..campaign.reasons import or_slip
 from .fit_result import Fit
+from .settings import JUDGEMENT
 
 
 @dataclass(frozen=True)
