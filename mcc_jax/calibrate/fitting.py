@@ -271,23 +271,23 @@ class _Fitter:
     def step(
         self, white: Array, noise: Noise, before: Point, target: LogPosterior, ends: tuple[Array, Array]
     ) -> tuple[Point, Parts, Array]:
-        """Particles and population after a step, halved as long as the density of the tests linearised there is not as
-        high as where it began (Gauss-Newton with a line search).
+        """Particles and population after a step of Gauss-Newton, halved while the density, with the tests linearised
+        where it ends, is lower than where it begins.
 
         Args:
             white, before, target: as in `together`.
             noise: the noise.
             ends: where the step begins and ends, in unbounded coordinates.
         """
-        least = _density(ends[0], target) - FIT.still
-        for k in range(FIT.halvings + 1):
-            free = ends[0] + 0.5**k * (ends[1] - ends[0])
+        least, share = _density(ends[0], target) - FIT.still, 1.0
+        while True:
+            free = ends[0] + share * (ends[1] - ends[0])
             point = self.together(white, before, target, free)
             linear = self.linear(point)
             marginal = replace(self.summaries(point, linear, noise)[0], scatter=target.marginal.scatter)
-            if _density(free, replace(target, marginal=marginal)) > least:
-                break
-        return point, linear, free
+            share /= 2
+            if _density(free, replace(target, marginal=marginal)) > least or share < 0.5**FIT.halvings:
+                return point, linear, free
 
 
 def fit_tests(
