@@ -1,7 +1,8 @@
-"""First-order search: every formula at every value of its grid, singly and in pairs, around the base fit."""
+"""First-order search: every formula at every value of its grid, singly and in pairs, around the base law."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -11,19 +12,17 @@ import numpy as np
 from jaxtyping import Array
 from scipy.special import log_ndtr, logsumexp
 
-from mcc_jax.calibrate.compiling import compiled
-from mcc_jax.calibrate.data import Tests
-from mcc_jax.calibrate.distributions import SCALES
-from mcc_jax.calibrate.forward import Forms
-from mcc_jax.discover.candidates import Candidate, candidates_of
-from mcc_jax.effects import AbstractEffect, Mechanism
-from mcc_jax.law import signatures
-
-from .design import Base, State, design_of
-from .evidence import eliminate_first, left_by_particle, prior_density
-
-NOISES = tuple((sd, length) for sd in (1.0, 0.4, 0.15, 0.05) for length in (1.0, 0.3))
-SPREADS = (1.0, 0.5)
+from ..calibrate.compiling import compiled
+from ..calibrate.data import Tests
+from ..calibrate.distributions import SCALES
+from ..calibrate.forward import Forms
+from ..effects import AbstractEffect, Mechanism
+from ..law import signatures
+from .base import Base, State
+from .candidates import Candidate, candidates_of
+from .design import FURTHER, design_of
+from .evidence import left_by_particle, prior_density, without_first
+from .settings import NUMERICS
 
 
 @compiled
@@ -69,12 +68,22 @@ class Screen:
 
     @property
     def null(self) -> float:
+        """Log marginal likelihood without any, at its best setting."""
         return max(s.log_null for s in self.settings)
+
+    @property
+    def signs(self) -> np.ndarray:
+        """Physical signs of the candidates."""
+        return np.array([c.variant.sign for c in self.candidates])
+
+    @property
+    def largest(self) -> np.ndarray:
+        """Largest plausible amplitudes of the candidates over the smallest."""
+        return np.array([c.variant.plausible[1] / c.variant.plausible[0] for c in self.candidates])
 
     def singles(self) -> tuple[np.ndarray, np.ndarray]:
         """Log marginal likelihood of each candidate at its best setting, and its amplitude there in natural units."""
-        signs = np.array([c.variant.sign for c in self.candidates])
-        largest = np.array([c.variant.plausible[1] / c.variant.plausible[0] for c in self.candidates])
+        signs, largest = self.signs, self.largest
         best = np.full(len(signs), -np.inf)
         amplitude = np.zeros(len(signs))
         for s in self.settings:
@@ -83,19 +92,16 @@ class Screen:
             best, amplitude = np.where(better, s.log_null + value, best), np.where(better, mean, amplitude)
         return best, amplitude * np.array([c.variant.plausible[0] for c in self.candidates])
 
-    def pairs(self, members: Sequence[int]) -> list[tuple[float, int, int]]:
-        """Log marginal likelihood of pairs of candidates of different mechanisms, best first."""
-        signs = np.array([c.variant.sign for c in self.candidates])
-        largest = np.array([c.variant.plausible[1] / c.variant.plausible[0] for c in self.candidates])
-        names = [c.mechanism for c in self.candidates]
-        first, second = np.array(
-            [(a, b) for i, a in enumerate(members) for b in members[i + 1 :] if names[a] != names[b]]
-        ).T
-        best = np.full(len(first), -np.inf)
-        for s in self.settings:
-            best = np.maximum(best, s.log_null + pair_integrals(s, first, second, signs, largest))
-        order = np.argsort(-best)
-        return [(float(best[k]), int(first[k]), int(second[k])) for k in order]
+    @property
+    def information(self) -> np.ndarray:
+        """Information on each candidate's amplitude at the first setting, in units of the smallest plausible one."""
+        return np.diagonal(self.settings[0].gram)
+
+    @property
+    def similarity(self) -> np.ndarray:
+        """Correlations of the candidates' projected signatures at the first setting."""
+        root = np.sqrt(np.maximum(self.information, 1e-300))
+        return self.settings[0].gram / root / root[:, None]
 
 
 def single_integrals(
@@ -127,25 +133,38 @@ def pair_integrals(s: Setting, a: np.ndarray, b: np.ndarray, signs: np.ndarray, 
     return np.asarray(logsumexp(np.stack(found), axis=0)) - 2 * np.log(SCALES)
 
 
-def screen(base: Base, state: State, free: np.ndarray, library: Mapping[str, Mechanism]) -> Screen:
-    """Scores of all candidates around the base fit, at several settings of noise and spreads."""
-    candidates = candidates_of(library)
-    design = design_of(base, state, ())
+def signature_columns(base: Base, state: State, candidates: Sequence[Candidate]) -> Array:
+    """Signatures of candidates at the base law, in units of their smallest plausible amplitudes."""
     effects = tuple(c.effect for c in candidates)
-    columns = candidate_columns(state, base.tests, effects, Forms(base.model.unloading))
-    columns = columns * jnp.asarray(np.array([c.variant.plausible[0] for c in candidates]))
-    design = replace(design, amplitude=columns)
+    columns = candidate_columns(state, base.tests, effects, base.forms)
+    return columns * jnp.asarray(np.array([c.variant.plausible[0] for c in candidates]))
+
+
+def screen(
+    base: Base, state: State, free: np.ndarray, library: Mapping[str, Mechanism], *, several: bool = True
+) -> Screen:
+    """Scores of all candidates around the base law, at several settings of noise and spreads.
+
+    Args:
+        base: the tests.
+        state: where the base law fits.
+        free: its hyperparameters, the first setting.
+        library: where the candidates are from.
+        several: whether other settings than the first are wanted.
+    """
+    candidates = candidates_of(library)
+    columns = signature_columns(base, state, candidates)
+    design = replace(design_of(base, state), amplitude=columns)
     settings = []
-    for sd, length in NOISES:
-        for spread in SPREADS:
-            at = free.copy()
-            at[2] += np.log(sd)
-            at[3] += np.log(length)
-            at[4:8] *= spread
-            left, integral = left_by_particle(jnp.asarray(at), design)
-            total, log_pop = eliminate_first(jnp.sum(left, 0), 5)
-            total = np.asarray(total)
-            null = float(np.sum(np.asarray(integral))) + float(log_pop) - 0.5 * total[-1, -1]
-            null += float(prior_density(jnp.asarray(at), design))
-            settings.append(Setting(at, null, total[:-1, :-1], total[:-1, -1]))
+    grid = itertools.product(NUMERICS.noise_factors, NUMERICS.length_factors, NUMERICS.spread_factors)
+    for sd, length, spread in grid if several else [(1.0, 1.0, 1.0)]:
+        at = free.copy()
+        at[2:4] += np.log([sd, length])
+        at[4:8] *= spread
+        left, integral = left_by_particle(jnp.asarray(at), design)
+        total, log_population = without_first(jnp.sum(left, 0), FURTHER)
+        total = np.asarray(total)
+        null = float(np.sum(np.asarray(integral))) + float(log_population) - 0.5 * total[-1, -1]
+        null += float(prior_density(jnp.asarray(at), design))
+        settings.append(Setting(at, null, total[:-1, :-1], total[:-1, -1]))
     return Screen(candidates, tuple(settings), columns)

@@ -9,13 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from mcc_jax.calibrate.compiling import compiled
-from mcc_jax.calibrate.data import Tests
-from mcc_jax.calibrate.forward import Forms
+from ..calibrate.compiling import compiled
+from ..calibrate.data import Tests
+from ..calibrate.forward import Forms
+from .base import State
+from .settings import NUMERICS
 
-from .design import State
-
-HATS, DEGREE = 8, 2
 COORDINATES = {
     "frame_compliance": ("force",),
     "thermal_drift": ("time",),
@@ -40,10 +39,13 @@ COORDINATES = {
 }
 """In what a formula of each mechanism may be wrong: what its own formulas depend on."""
 
+ANY = ("peak", "load", "since")
+"""The same of a mechanism that is not of the library."""
+
 
 @compiled
 def coordinates(state: State, tests: Tests, forms: Forms) -> dict[str, Array]:
-    """Coordinates of every point, each between 0 and 1 over the campaign."""
+    """Coordinates of every point: strain and travel in diameters, force, loads, times, sizes."""
 
     def one(latent: Array, tests: Tests) -> dict[str, Array]:
         law = forms.law(latent, jnp.zeros(0))
@@ -57,7 +59,7 @@ def coordinates(state: State, tests: Tests, forms: Forms) -> dict[str, Array]:
             "strain": c.peak_strain,
             "load": c.load_share,
             "force": c.force,
-            "travel": c.displacement,
+            "travel": c.displacement / tests.particle.effective_diameter,
             "time": jnp.log1p(time / 5.0),
             "since": jnp.log1p((time - begun) / 5.0),
             "clock": time,
@@ -69,17 +71,21 @@ def coordinates(state: State, tests: Tests, forms: Forms) -> dict[str, Array]:
             "humidity": ones * tests.record.relative_humidity,
         }
 
-    found = jax.vmap(one)(state.point.latent, tests)
+    return jax.vmap(one)(state.point.latent, tests)
 
-    def scaled(x: Array) -> Array:
-        low = jnp.min(jnp.where(tests.mask, x, jnp.inf))
-        high = jnp.max(jnp.where(tests.mask, x, -jnp.inf))
+
+def scaled(at: dict[str, Array], mask: Array) -> dict[str, Array]:
+    """Coordinates between 0 and 1 over the campaign."""
+
+    def one(x: Array) -> Array:
+        low = jnp.min(jnp.where(mask, x, jnp.inf))
+        high = jnp.max(jnp.where(mask, x, -jnp.inf))
         return jnp.clip((x - low) / jnp.where(high > low, high - low, 1.0), 0.0, 1.0)
 
-    return {name: scaled(x) for name, x in found.items()}
+    return {name: one(x) for name, x in at.items()}
 
 
-def functions(names: tuple[str, ...], at: dict[str, Array], *, degree: int = DEGREE, hats: int = HATS) -> Array:
+def functions(names: tuple[str, ...], at: dict[str, Array], *, degree: int = NUMERICS.degree, hats: int = NUMERICS.hats) -> Array:
     """Smooth products of cosines and hat functions over some coordinates, shape (N, points, functions).
 
     Their squares add up to about 1 at every point for the products and for the hats of each coordinate together, so
@@ -101,6 +107,21 @@ def functions(names: tuple[str, ...], at: dict[str, Array], *, degree: int = DEG
     return jnp.stack([*smooth, *rough], -1) if columns else jnp.zeros((*next(iter(at.values())).shape, 0))
 
 
-def padded(columns: Array, size: int) -> Array:
-    """Columns of nothing added, so that few shapes are compiled."""
-    return jnp.pad(columns, ((0, 0), (0, 0), (0, size - columns.shape[-1])))
+def general(at: dict[str, Array], size: Array, mask: Array) -> tuple[Array, int]:
+    """Functions of a smooth discrepancy that no mechanism explains, and how many of them are smooth; the others are
+    periodic.
+
+    It is common to all particles, in proportion to their size, and lives in reduced strain, travel, load and time.
+    """
+    alone = [(name, k) for name in ("strain", "travel", "load", "clock") for k in range(1, 6)]
+    columns = [jnp.cos(np.pi * k * at[name]) for name, k in alone]
+    both = [(i, j) for i in range(1, 3) for j in range(1, 3)]
+    columns += [jnp.cos(np.pi * i * at["peak"]) * jnp.cos(np.pi * j * at["load"]) for i, j in both]
+    smooth = jnp.stack(columns, -1) / np.sqrt(len(columns))
+    waves = []
+    for name in ("travel", "clock"):
+        for k in range(2, NUMERICS.waves):
+            waves += [jnp.cos(2 * np.pi * k * at[name]), jnp.sin(2 * np.pi * k * at[name])]
+    periodic = jnp.stack(waves, -1) / np.sqrt(len(waves))
+    basis = jnp.concatenate([smooth, periodic], -1) * (size / jnp.mean(size))[:, None, None]
+    return jnp.where(mask[..., None], basis, 0.0), len(columns)
