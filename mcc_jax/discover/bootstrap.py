@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +11,7 @@ from scipy.special import logsumexp
 
 from ..calibrate.distributions import SCALES
 from .candidates import candidates_of
-from .evidence import left_by_particle
+from .evidence import left_by_particle, with_amplitudes
 from .misfit import general
 from .screen import signature_columns, single_integrals
 from .search import SUDDEN, Search
@@ -51,7 +51,7 @@ class _Statistic:
         formulas = jnp.zeros((*basis.shape[:2], 0)) if screen is None else screen.columns
         self.counts = [POPULATION, formulas.shape[-1], basis.shape[-1], len(self.own_names), steps.shape[-1]]
         every = jnp.concatenate([design.common[..., :POPULATION], formulas, basis, *own, steps], -1)
-        nothing = replace(design, common=every[..., :0], amplitude=every, group=design.group[:0])
+        nothing = with_amplitudes(replace(design, common=every[..., :0], group=design.group[:0]), every)
         left = np.asarray(left_by_particle(jnp.asarray(search.null.optimum.free), nothing).gram)
         self.scores = Scores(left[:, :-1, :-1], left[:, :-1, -1])
         self.library = len(search.library)
@@ -88,11 +88,12 @@ class _Statistic:
         total = score[..., shared].sum(1)
         s = total[:, POPULATION:] - total[:, :POPULATION] @ inner @ G[:POPULATION, POPULATION:]
         G = G[POPULATION:, POPULATION:] - G[POPULATION:, :POPULATION] @ inner @ G[:POPULATION, POPULATION:]
-        logs, prior = [], -np.log(self.library)
+        logs: list[Any] = []
+        prior = -float(np.log(self.library))
         if f:
             scores, powers = s[:, :f].ravel(), np.tile(np.diagonal(G)[:f], len(s))
             each, _ = single_integrals(scores, powers, np.tile(self.signs, len(s)), np.tile(self.largest, len(s)))
-            logs.append(prior + logsumexp(each.reshape(len(s), f) + self.weight, axis=1))
+            logs.append(prior + np.asarray(logsumexp(each.reshape(len(s), f) + self.weight, axis=1)))
         smooth = []
         for size in self.unit * np.array([0.1, 0.3, 1.0, 3.0]):
             spread = np.eye(len(basis)) + size**2 * G[f:, f:]
@@ -107,7 +108,7 @@ class _Statistic:
                 for scale in np.geomspace(1.0, self.own_ratio[k], SCALES):
                     spread = 1 + scale**2 * power
                     values.append(np.sum(0.5 * (scale**2 * rest[..., own[k]] ** 2 / spread - np.log(spread)), 1))
-            logs.append(prior + logsumexp(values, axis=0) - np.log(len(values)))
+            logs.append(prior + np.asarray(logsumexp(values, axis=0)) - np.log(len(values)))
         if len(steps):
             scores, powers = rest[..., steps].ravel(), np.tile(gram[:, steps, steps].ravel(), len(score))
             ones = np.ones(len(scores))
@@ -115,7 +116,7 @@ class _Statistic:
             ratio = logsumexp(each.reshape(*rest.shape[:2], len(steps)), axis=2) - np.log(len(steps))
             any_ = np.logaddexp(np.log1p(-DECISIONS.jump), np.log(DECISIONS.jump) + ratio)
             logs.append(prior + any_.sum(1))
-        return logsumexp(logs, axis=0)
+        return np.asarray(logsumexp(logs, axis=0))
 
 
 def p_anything(search: Search, seed: int) -> float:

@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from .evidence import Design, left_by_particle, scales_of, without_first
+from .evidence import Design, left_by_particle, scales_of, with_amplitudes, without_first
 from .search import UNLISTED, Search
 from .settings import NUMERICS
 
 LETTERS = {
-    "strain": ("e", "peak strain", 1.0),
-    "travel": ("g", "displacement / D_e", 1.0),
-    "load": ("u", "F / F_peak", 1.0),
-    "clock": ("t", "time [s]", 1.0),
-    "force": ("F", "force [mN]", 1.0),
+    "strain": ("e", "peak strain"),
+    "travel": ("g", "displacement / D_e"),
+    "load": ("u", "F / F_peak"),
+    "clock": ("t", "time [s]"),
+    "force": ("F", "force [mN]"),
 }
-"""Coordinates of a formula: letter, meaning, unit."""
+"""Coordinates of a formula: letter and meaning."""
 
 ENOUGH = 0.9
 """Share of what two terms explain from which on one term is enough."""
@@ -134,7 +134,7 @@ def closure(search: Search, seed: int) -> Closure:
     curve = np.asarray(smooth.curve_um)[..., None]
     known = np.zeros((*curve.shape[:2], 0)) if search.screen is None else np.asarray(search.screen.columns)
     every = jnp.concatenate([jnp.asarray(values / scale), jnp.asarray(curve), jnp.asarray(known)], -1)
-    left = np.asarray(left_by_particle(free, replace(null, amplitude=every)).gram)
+    left = np.asarray(left_by_particle(free, with_amplitudes(null, every)).gram)
     T = len(terms)
     everyone = np.arange(len(left))
     chosen, weights = _best_terms(left, null.common.shape[-1], T, everyone)
@@ -223,7 +223,7 @@ def _along(search: Search, name: str, x: np.ndarray, span: tuple[float, float]) 
     basis = functions(at) * size[:, None, None] / np.sqrt(N)
     basis = jnp.where(tests.mask[..., None], jnp.asarray(basis), 0.0)
     free = jnp.asarray(smooth.optimum.free[:8])
-    left = left_by_particle(free, replace(search.null.design, amplitude=basis))
+    left = left_by_particle(free, with_amplitudes(search.null.design, basis))
     total, _ = without_first(jnp.sum(left.gram, 0), search.null.design.common.shape[-1])
     G, s = np.asarray(total)[:-1, :-1], np.asarray(total)[:-1, -1]
     # Weights have the size that the smooth discrepancy was found to have, in units of strain.

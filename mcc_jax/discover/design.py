@@ -90,7 +90,7 @@ def design_of(base: Base, state: State, variants: tuple[Variant, ...] = (), more
     own = [linear.columns[..., :4], (zero_sd * ones)[..., None], *([] if more.own is None else [more.own])]
     K, effect, theta = len(variants), linear.columns[..., 4:], state.point.theta
     units = jnp.asarray(np.array([v.plausible[0] for v in variants]))
-    amplitude = [effect[..., :K] * units, *([] if more.amplitude is None else [more.amplitude])]
+    amplitude = [effect[..., :K] * units[None, None], *([] if more.amplitude is None else [more.amplitude])]
     data = data + jnp.einsum("npk,nk->np", effect[..., :K], theta[:, :K])
     common, place = [population], K
     for v in variants:

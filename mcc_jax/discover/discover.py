@@ -98,7 +98,9 @@ def discover(
     findings = campaign_findings(campaign)
     wrong = [one for one in check_plausibility(campaign.raw or campaign) if one.level == "bad"]
     if wrong:
-        summary = f"These numbers cannot be true as they stand: {wrong[0]} Nothing is looked for before that is settled."
+        summary = (
+            f"These numbers cannot be true as they stand: {wrong[0]} Nothing is looked for before that is settled."
+        )
         found = Discovery("FIT_NOT_CONVERGED", summary, None, None, seed, 0.0)
         return _finished(found, (*wrong, *findings), started)
     base, left_out = _settled_fit(campaign, findings, without_effects(assumed), threshold_MPa, tell)

@@ -100,6 +100,12 @@ def with_noise(design: Design, kind: NoiseKind) -> Design:
     return replace(design, noise=design.noise.at[0, 3].add(float(np.log(kind.length))), kinds=kinds)
 
 
+def with_amplitudes(design: Design, columns: Array) -> Design:
+    """The design with other amplitudes, of either sign, whose priors nobody asks for."""
+    count = columns.shape[-1]
+    return replace(design, amplitude=columns, sign=jnp.zeros(count), largest=jnp.ones(count))
+
+
 class Left(NamedTuple):
     """What the particles leave: Gram matrices of the common columns, the amplitudes and the data, and log integrals."""
 
@@ -271,9 +277,7 @@ class Optimum:
     evaluations: int
 
 
-def optimise(
-    design: Design, start: np.ndarray, *, curvature: bool = True, without: Optimum | None = None
-) -> Optimum:
+def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, without: Optimum | None = None) -> Optimum:
     """The mode of the hyperparameters by L-BFGS, in coordinates scaled by their expected curvature.
 
     Args:

@@ -11,6 +11,7 @@ from scipy.special import ndtr
 from ..effects import Mechanism
 from ..simulate import Programme
 from .base import Base
+from .candidates import Candidate
 from .plan import Plan, planned_base
 from .screen import Screen, screen
 from .search import Search
@@ -88,20 +89,23 @@ def _power(search: Search, members: list[str], other: Screen, copies: float) -> 
     """Least probability over the true names that further tests leave it alone."""
     assert search.screen is not None
     needed = np.log(DECISIONS.set_mass / (1 - DECISIONS.set_mass))
-    place = {(c.variant.mechanism, c.variant.name, *sorted(c.nuisance.items())): k for k, c in enumerate(other.candidates)}
-    at, amplitude = {}, {}
+    there = {_key(c): k for k, c in enumerate(other.candidates)}
+    at: dict[str, int] = {}
+    amplitude: dict[str, float] = {}
+    information = search.screen.information
     for name in members:
         best = search.found[(name,)].best
         assert best is not None
         variant = best.variants[0]
         family = [
-            (k, c) for k, c in enumerate(search.screen.candidates) if (c.mechanism, c.variant.name) == (name, variant.name)
+            (k, c)
+            for k, c in enumerate(search.screen.candidates)
+            if (c.mechanism, c.variant.name) == (name, variant.name)
         ]
-        k, c = max(family, key=lambda kc: search.screen.information[kc[0]] if search.screen else 0.0)
-        there = place.get((name, variant.name, *sorted(c.nuisance.items())))
-        if there is None:
+        _, c = max(family, key=lambda one: information[one[0]])
+        if _key(c) not in there:
             return 0.0
-        at[name] = k, there
+        at[name] = there[_key(c)]
         amplitude[name] = float(best.theta[0]) / variant.plausible[0]
     worst = 1.0
     new = other.settings[0].gram
@@ -110,9 +114,14 @@ def _power(search: Search, members: list[str], other: Screen, copies: float) -> 
             if rival == name:
                 continue
             lead = search.found[(name,)].log_evidence - search.found[(rival,)].log_evidence
-            (_, i), (_, j) = at[name], at[rival]
+            i, j = at[name], at[rival]
             total = copies * new[np.ix_([i, j], [i, j])]
             left = total[0, 0] - total[0, 1] ** 2 / max(total[1, 1], 1e-300)
             squares = float(amplitude[name] ** 2 * max(left, 0.0))
             worst = min(worst, float(ndtr((squares / 2 + lead - needed) / np.sqrt(max(squares, 1e-12)))))
     return worst
+
+
+def _key(candidate: Candidate) -> tuple[Any, ...]:
+    """What names a formula at one value of its grid."""
+    return (candidate.mechanism, candidate.variant.name, *sorted(candidate.nuisance.items()))

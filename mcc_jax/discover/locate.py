@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,7 +55,7 @@ def places(base: Base, left: np.ndarray) -> tuple[Place, ...]:
     for code, name in KINDS.items():
         if not (mask & (kind == code)).any():
             continue
-        for low, high in [(0.0, 1.0)] if code == HOLD else list(zip(edges[:-1], edges[1:], strict=True)):
+        for low, high in [(0.0, 1.0)] if code == HOLD else list(itertools.pairwise(edges)):
             inside = mask & (kind == code) & (load >= low) & ((load < high) | (high >= 1))
             if not inside.any():
                 found.append(Place(name, (float(low), float(high)), float("nan"), 0, ()))

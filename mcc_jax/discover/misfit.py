@@ -85,7 +85,9 @@ def scaled(at: dict[str, Array], mask: Array) -> dict[str, Array]:
     return {name: one(x) for name, x in at.items()}
 
 
-def functions(names: tuple[str, ...], at: dict[str, Array], *, degree: int = NUMERICS.degree, hats: int = NUMERICS.hats) -> Array:
+def functions(
+    names: tuple[str, ...], at: dict[str, Array], *, degree: int = NUMERICS.degree, hats: int = NUMERICS.hats
+) -> Array:
     """Smooth products of cosines and hat functions over some coordinates, shape (N, points, functions).
 
     Their squares add up to about 1 at every point for the products and for the hats of each coordinate together, so

@@ -25,7 +25,6 @@ from .evidence import Design, Optimum, Solution, optimise, scales_of, solve
 from .screen import single_integrals
 from .settings import DECISIONS, NUMERICS
 
-
 SPREAD = NakagamiPrior(1.0, shape=0.25)
 """Prior of a spread over the tests in units of the largest plausible one, open in its order of magnitude."""
 

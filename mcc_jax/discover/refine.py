@@ -54,12 +54,13 @@ def refined(base: Base, state: State, variants: tuple[Variant, ...], numbers: np
         numbers: where the effects' numbers are linearised first: amplitudes of zero and further numbers.
         free: hyperparameters to start from.
     """
-    state, before, value = state.with_numbers(numbers), None, -np.inf
+    state, value = state.with_numbers(numbers), -np.inf
+    before = state
     design = design_of(base, state, variants)
     for k in range(NUMERICS.steps):
         optimum = optimise(design, free, curvature=False)
         last = k == NUMERICS.steps - 1
-        if before is not None and optimum.log_joint < value - WORSE and not last:
+        if optimum.log_joint < value - WORSE and not last:
             state, value = between(before, state), -np.inf  # what was linear there is not here
         else:
             if last and optimum.log_joint < value - WORSE:

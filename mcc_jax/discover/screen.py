@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ from ..law import signatures
 from .base import Base, State
 from .candidates import Candidate, candidates_of
 from .design import FURTHER, design_of
-from .evidence import left_by_particle, prior_density, without_first
+from .evidence import left_by_particle, prior_density, with_amplitudes, without_first
 from .settings import NUMERICS
 
 
@@ -137,7 +137,7 @@ def signature_columns(base: Base, state: State, candidates: Sequence[Candidate])
     """Signatures of candidates at the base law, in units of their smallest plausible amplitudes."""
     effects = tuple(c.effect for c in candidates)
     columns = candidate_columns(state, base.tests, effects, base.forms)
-    return columns * jnp.asarray(np.array([c.variant.plausible[0] for c in candidates]))
+    return columns * jnp.asarray(np.array([c.variant.plausible[0] for c in candidates]))[None, None]
 
 
 def screen(
@@ -154,7 +154,7 @@ def screen(
     """
     candidates = candidates_of(library)
     columns = signature_columns(base, state, candidates)
-    design = replace(design_of(base, state), amplitude=columns)
+    design = with_amplitudes(design_of(base, state), columns)
     settings = []
     grid = itertools.product(NUMERICS.noise_factors, NUMERICS.length_factors, NUMERICS.spread_factors)
     for sd, length, spread in grid if several else [(1.0, 1.0, 1.0)]:

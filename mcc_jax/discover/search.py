@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -26,6 +26,7 @@ from .evidence import (
     left_by_particle,
     optimise,
     solve,
+    with_amplitudes,
     with_noise,
     without_first,
 )
@@ -171,7 +172,7 @@ class Search:
     def posterior(self) -> dict[Names, float]:
         """Probability of every hypothesis, most probable first."""
         logs = self.log_posteriors()
-        total = logsumexp(list(logs.values()))
+        total = float(logsumexp(list(logs.values())))
         return {names: float(np.exp(v - total)) for names, v in logs.items()}
 
     # ---- one name ----------------------------------------------------------------------------------------------------
@@ -283,7 +284,7 @@ class Search:
         assert self.screen is not None
         first, cs = r.variants[0], self.screen.candidates
         every = jnp.concatenate([r.design.amplitude[..., :1], self.screen.columns], -1)
-        left, _ = left_by_particle(jnp.asarray(r.optimum.free), replace(r.design, amplitude=every))
+        left, _ = left_by_particle(jnp.asarray(r.optimum.free), with_amplitudes(r.design, every))
         total, _ = without_first(jnp.sum(left, 0), r.design.common.shape[-1])
         total = np.asarray(total)
         s = Setting(r.optimum.free, 0.0, total[:-1, :-1], total[:-1, -1])
@@ -334,7 +335,9 @@ class Search:
         for m in serious:
             self.single(m, each)
         if strong:
-            leading = [one.names[0] for one in sorted(self.found.values(), key=lambda x: -x.log_evidence)[:2] if one.names]
+            leading = [
+                one.names[0] for one in sorted(self.found.values(), key=lambda x: -x.log_evidence)[:2] if one.names
+            ]
             self.fit_ahead(leading, NUMERICS.all_formulas)
             for m in leading:
                 self.single(m, NUMERICS.all_formulas)

@@ -59,7 +59,9 @@ def _verdict(found: Discovery, count: int) -> str:
     """What is missing, and where, in one sentence."""
     chance = f"probability of so much evidence by chance: {found.p_any:.2g}"
     if found.verdict == "NO_GAP":
-        return f"The law and the {count} tests agree within the noise; nothing is missing that they could show ({chance})."
+        return (
+            f"The law and the {count} tests agree within the noise; nothing is missing that they could show ({chance})."
+        )
     names = " and ".join(_plain(e.mechanism) for e in found.effects)
     lead = f"The law misses {names}" if names else "The law misses something that no listed mechanism explains"
     if found.verdict == "SET":
