@@ -99,7 +99,7 @@ class _Statistic:
             spread = np.eye(len(basis)) + size**2 * G[f:, f:]
             value = 0.5 * size**2 * np.einsum("mk,km->m", s[:, f:], np.linalg.solve(spread, s[:, f:].T))
             smooth.append(value - 0.5 * np.linalg.slogdet(spread)[1])
-        logs.append(-DECISIONS.unlisted + logsumexp(smooth, axis=0) - np.log(len(smooth)))
+        logs.append(-DECISIONS.unlisted + np.asarray(logsumexp(smooth, axis=0)) - np.log(len(smooth)))
         rest = score - np.einsum("ncp,mp->mnc", gram[:, :, :POPULATION], total[:, :POPULATION] @ inner)
         for name in dict.fromkeys(self.own_names):
             values = []

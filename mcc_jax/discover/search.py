@@ -172,7 +172,7 @@ class Search:
     def posterior(self) -> dict[Names, float]:
         """Probability of every hypothesis, most probable first."""
         logs = self.log_posteriors()
-        total = float(logsumexp(list(logs.values())))
+        total = float(np.logaddexp.reduce(list(logs.values())))
         return {names: float(np.exp(v - total)) for names, v in logs.items()}
 
     # ---- one name ----------------------------------------------------------------------------------------------------

@@ -29,7 +29,8 @@ def summary_of(found: Discovery) -> str:
     count = len(found.base.selection.kept) if found.base is not None else 0
     sentences = [_verdict(found, count)]
     for effect, names in zip(found.effects, found.candidate_set, strict=True):
-        value = f"{effect.variant.parameter} = {effect.amplitude:.3g} +- {effect.sd:.2g}"
+        unit = "" if effect.variant.unit == "-" else f" {effect.variant.unit}"
+        value = f"{effect.variant.name.replace('_', ' ')}, {effect.amplitude:.3g} +- {effect.sd:.2g}{unit}"
         sentences.append(f"It is {_plain(effect.mechanism)} with probability {effect.probability:.2f} ({value}).")
         if effect.jumps:
             sentences.append(_jumps(found, effect))
