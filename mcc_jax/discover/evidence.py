@@ -303,7 +303,7 @@ def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, witho
             return 1e30, np.zeros(len(x))  # a step into numbers beyond arithmetic is taken back
         return -float(value), -np.asarray(slope) * scale
 
-    options = {"ftol": 1e-9, "gtol": 0.03, "maxiter": 60}
+    options = {"ftol": 1e-9, "gtol": 0.1, "maxiter": 40}
     found = minimize(down, start / scale, jac=True, method="L-BFGS-B", options=options)
     joint = -float(found.fun)
     evidence, free = joint, found.x * scale
