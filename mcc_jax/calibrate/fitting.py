@@ -22,7 +22,7 @@ from .expectation import careful_enough, expect
 from .fit_result import Fit, population_of
 from .forward import Forms, Linear, Point, linearise
 from .marginal import Marginal, summarise
-from .mode import LogPosterior, most_probable
+from .mode import LogPosterior, gradients, most_probable
 from .model import Model, check_prior_of_a
 from .noise import Noise, NoiseFit, estimate_noise, particle_scales, squared_innovations, student_weights
 from .paper.prediction import point_noise_um
@@ -268,6 +268,27 @@ class _Fitter:
         starts = self.blocks.cut(jnp.asarray(np.stack(several)), axis=1)
         return self.particles(white, centre, widths, expected.theta, starts).point
 
+    def step(
+        self, white: Array, noise: Noise, before: Point, target: LogPosterior, ends: tuple[Array, Array]
+    ) -> tuple[Point, Parts, Array]:
+        """Particles and population after a step of Gauss-Newton, halved while the density, with the tests linearised
+        where it ends, is lower than where it begins.
+
+        Args:
+            white, before, target: as in `together`.
+            noise: the noise.
+            ends: where the step begins and ends, in unbounded coordinates.
+        """
+        least, share = _density(ends[0], target) - FIT.still, 1.0
+        while True:
+            free = ends[0] + share * (ends[1] - ends[0])
+            point = self.together(white, before, target, free)
+            linear = self.linear(point)
+            marginal = replace(self.summaries(point, linear, noise)[0], scatter=target.marginal.scatter)
+            share /= 2
+            if _density(free, replace(target, marginal=marginal)) > least or share < 0.5**FIT.halvings:
+                return point, linear, free
+
 
 def fit_tests(
     tests: Tests,
@@ -283,7 +304,8 @@ def fit_tests(
 
     Particles come first, each on its own. Then, in turns: the noise from residuals linear in the particles' numbers,
     the most probable population under the summaries, the most probable particles under that population. The noise is
-    what is left under the model at hand: with effects it is not estimated before they are in.
+    what is left under the model at hand: with effects it is not estimated before they are in, and every further step is
+    halved until the tests are more probable where it ends (`_Fitter.step`).
 
     Args:
         tests: the measurements.
@@ -342,17 +364,21 @@ def fit_tests(
         target = LogPosterior(model, marginal)
         if free is None:
             free = target.unconstrain(start)
-        before = np.asarray(free)
+        before = free
         target = careful_enough(free, target, count)
         free, covariance, mode_converged = most_probable(free, target)
-        sd = np.sqrt(np.maximum(np.diagonal(np.asarray(covariance)), 1e-300))
-        moved = np.abs(np.asarray(free) - before) / sd
-        at_rest = turn >= rounds and (not effects or bool(np.all(moved[_of_effects(model, target.names)] < FIT.still)))
+        if effects and not turn:  # amplitudes of zero tell nothing of further numbers
+            free = jnp.where(jnp.asarray(["." in name for name in target.names]), before, free)
+        gain = _density(free, target) - _density(before, target) if effects else 0.0
+        at_rest = turn >= rounds and (not effects or gain < FIT.still)
         if last or at_rest:
             break
         turn += 1
-        point = fitter.together(white, point, target, free)
-        linear = fitter.linear(point)
+        if effects and turn > 1:
+            point, linear, free = fitter.step(white, noise.noise, point, target, (before, free))
+        else:
+            point = fitter.together(white, point, target, free)
+            linear = fitter.linear(point)
     if effects:
         # Once more, with how the law bends over what is still open of the effects' numbers.
         linear = fitter.linear(point, _widths(free, covariance, target))
@@ -384,10 +410,8 @@ def theta_slope(free: Float[Array, " d"], target: LogPosterior) -> Float[Array, 
     return jax.jacfwd(lambda x: target.population(x).theta)(free)
 
 
-def _of_effects(model: Model, names: tuple[str, ...]) -> np.ndarray:
-    """Which coordinates are numbers of effects."""
-    own = tuple(v.mechanism for v in model.effects)
-    return np.array([any(n.startswith((f"{o}_size", f"{o}.")) for o in own) for n in names], bool)
+def _density(free: Array, target: LogPosterior) -> float:
+    return -float(gradients(np.asarray(free)[None], target)[0][0])
 
 
 def _rows(tree: Any, rows: np.ndarray) -> Any:

@@ -19,6 +19,7 @@ from ..campaign import Campaign, Finding, campaign_findings, check_plausibility
 from ..campaign.quality import named
 from ..campaign.reasons import or_slip
 from .fit_result import Fit
+from .settings import JUDGEMENT
 
 
 @dataclass(frozen=True)
@@ -56,11 +57,24 @@ def noise_share(fit: Fit) -> float:
     White noise of read-out and force does not repeat from one reading to the next; what is correlated along a test and
     no smaller than it is, is rather what the law misses.
     """
-    noise, tests = fit.noise.noise, fit.tests
-    mask, factor = np.asarray(tests.mask), np.asarray(fit.filters.solver.matrix.diag.d)
-    variance = np.where(mask, factor, 0.0).sum(1) / np.maximum(mask.sum(1), 1)
-    correlated = (np.asarray(noise.scale) * float(noise.correlated)) ** 2
+    variance, correlated = _variances(fit)
     return float(np.median(correlated / variance))
+
+
+def at_noise_level(fit: Fit, rms_um: np.ndarray) -> bool:
+    """Whether what the law misses, `rms_um` of every particle, is mostly white noise of read-out and force.
+
+    Correlated noise and a common factor on the noise, which grow with a misfit, do not count.
+    """
+    variance, correlated = _variances(fit)
+    return bool(np.median((1 - JUDGEMENT.noise_share) * rms_um**2 - (variance - correlated)) <= 0)
+
+
+def _variances(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+    """Mean variance of every test's noise [um^2], and of its correlated part."""
+    noise, mask = fit.noise.noise, np.asarray(fit.tests.mask)
+    variance = np.where(mask, np.asarray(fit.filters.solver.matrix.diag.d), 0.0).sum(1) / np.maximum(mask.sum(1), 1)
+    return variance, (np.asarray(noise.scale) * float(noise.correlated)) ** 2
 
 
 def unlike_others(

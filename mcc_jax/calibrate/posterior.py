@@ -22,7 +22,7 @@ from .effects import effect_entries, effect_numbers
 from .estimates import estimate, finite, force_zero, log_estimate, misfit_note, missed, noise_note, summary
 from .fit_result import Fit
 from .fitting import checked_settings, in_own_units, prepare
-from .judgement import judged, noise_share, numbers_in_reach, unlike_others
+from .judgement import at_noise_level, judged, noise_share, numbers_in_reach, unlike_others
 from .least_squares import least_squares
 from .model import Model
 from .particles import Length
@@ -92,9 +92,14 @@ class Posterior(PosteriorDraws, Draws):
         reasons = ("noise", "population")
         unfitted = [r for r, fine in zip(reasons, np.asarray(self.fit.converged)[1:], strict=True) if not fine]
         if unfitted and self.mode == "fast":  # of what was drawn around a fit that is none, no diagnostic says anything
-            by = missed(self.rms_um(), self._own_misfit)
+            by, what = missed(self.rms_um(), self._own_misfit), " and ".join(unfitted)
+            if at_noise_level(self.fit, self.rms_um()):
+                return [
+                    f"the search for the {what} did not come to rest, although the law misses these tests by no more "
+                    f"than noise, {by}: they leave numbers of the model open; narrow the priors, or leave out an effect"
+                ]
             return [
-                f"no {' and '.join(unfitted)} fits these tests: the law misses them by {by}; look at the curves, leave "
+                f"no {what} was found that fits these tests: the law misses them by {by}; look at the curves, leave "
                 "out the particles that are unlike the others, or look for what is missing (discover)"
             ]
         found = []

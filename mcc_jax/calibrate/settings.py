@@ -70,7 +70,8 @@ class FitSettings:
         noise_blocks: the noise of campaigns of more blocks is estimated from the particles of so many.
         rounds, most_rounds: how often noise, population and particles are taken in turn, at least, and at most where
             effects have to be linearised anew.
-        still: an effect is linearised anew until none of its numbers moves by more standard deviations.
+        still: log density still to gain at which effects are not linearised anew: a tenth of a standard deviation.
+        halvings: how often a step of a model with effects is halved, at most, until it raises the density.
         student_steps: how often weights of readings and noise are taken in turn, in each round.
         sharp: posterior standard deviation of the logarithm of a polynomial's coefficient below which one Newton step
             integrates a particle out.
@@ -95,8 +96,9 @@ class FitSettings:
     narrowest: float = 1e-3
     noise_blocks: int = 4
     rounds: int = 2
-    most_rounds: int = 8
-    still: float = 0.1
+    most_rounds: int = 20
+    still: float = 0.005
+    halvings: int = 8
     student_steps: int = 4
     sharp: float = 0.03
     gradients: int = 250

@@ -1,5 +1,7 @@
 """An effect hidden in a campaign, and in the law that is fitted: recovered, preferred, saved, read, driven."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,14 +17,18 @@ from mcc_jax.effects import find_variant
 CREEP, AMPLITUDE, TAU_S = "creep:logarithmic", 2e-4, 3.0
 
 
-@pytest.fixture(scope="module")
-def campaign():
+def creeping(tau_s):
     """Eight particles that creep, loaded twice with a hold at each peak."""
     programme = mcc.Programme.cycles(levels=(0.5, 1.0), hold_s=10.0, points=160)
-    hidden = mcc.HiddenEffect(find_variant(CREEP), AMPLITUDE, {"tau_s": TAU_S})
+    hidden = mcc.HiddenEffect(find_variant(CREEP), AMPLITUDE, {"tau_s": tau_s})
     instrument = mcc.Instrument(displacement_noise_um=0.08, force_noise_mN=0.05)
     whole = mcc.paper_campaign(0, programme=programme, instrument=instrument, effects=[hidden])
     return whole.without(*whole.particles[8:])
+
+
+@pytest.fixture(scope="module")
+def campaign():
+    return creeping(TAU_S)
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +43,22 @@ def test_amplitude_time_and_modulus_are_recovered(posterior):
     for name, value in truth.items():
         assert abs(named[name].mean() - value) < 4 * named[name].std(), name
     assert named["creep"].std() < 0.1 * AMPLITUDE
+
+
+@pytest.mark.parametrize("tau_s", [0.1, 0.3])
+def test_strong_creep_with_a_time_far_from_the_priors_is_found(tau_s):
+    """Undamped steps leave for times of 1e-5 s and 1e5 s in turn, and end in numbers that overflow."""
+    fit = mcc.fit(creeping(tau_s), mcc.Model().with_effects(CREEP))
+    assert fit.converged.all()
+    np.testing.assert_allclose(fit.population.theta, [AMPLITUDE, tau_s], rtol=0.15)
+
+
+def test_what_did_not_come_to_rest_is_told_from_what_does_not_fit(posterior):
+    """A misfit as small as the noise is no misfit, however large a factor on the noise has become."""
+    fit = replace(posterior.fit, converged=np.array([True, True, False]))
+    assert "did not come to rest" in replace(posterior, fit=fit).failures()[0]
+    astray = replace(posterior, fit=replace(fit, residual=10 * fit.residual))
+    assert "no population was found that fits these tests" in astray.failures()[0]
 
 
 def test_tests_bend_with_the_effects_numbers(posterior):
