@@ -94,4 +94,5 @@ class Numerics:
     shares: int = 60
 
 
-DECISIONS, NUMERICS = Decisions(), Numerics()
+DECISIONS = Decisions()
+NUMERICS = Numerics()
