@@ -281,9 +281,10 @@ def pareto_k(log_weight: np.ndarray) -> np.ndarray:
     result = np.zeros(len(columns))
     # Weights that are all equal have no tail to fit.
     varied = np.std(columns, axis=1) > 1e-9
-    if varied.any():
-        with np.errstate(all="ignore"):
-            result[varied] = array_stats.psislw(-columns[varied], axis=-1)[1]
+    for row in np.flatnonzero(varied):
+        result[row] = np.inf
+        with np.errstate(all="ignore"), contextlib.suppress(ValueError):  # of a tail whose weights are all the same
+            result[row] = array_stats.psislw(-columns[row], axis=-1)[1]
     return np.where(np.isnan(result), np.inf, result)
 
 

@@ -368,6 +368,16 @@ def test_weights_turn_draws_of_one_distribution_into_those_of_another():
     assert x[chosen].std() == pytest.approx(1.0, abs=0.1)
 
 
+def test_weights_whose_tail_is_all_alike_are_not_to_be_relied_on():
+    """A quarter of the draws hold everything, or one does: no tail to fit, no answer to believe."""
+    log_weight = np.random.default_rng(0).normal(size=(4000, 3))
+    log_weight[:, 1] = np.where(np.arange(4000) < 1000, 0.0, -5.0)
+    log_weight[:, 2] = np.where(np.arange(4000) == 7, 0.0, -np.inf)
+    k = pareto_k(log_weight)
+    assert k[0] < 0.7
+    assert np.isinf(k[1:]).all()
+
+
 def test_pareto_k_is_the_index_of_the_upper_tail():
     rng = np.random.default_rng(1)
     exponential = rng.standard_exponential((4000, 2))
