@@ -11,7 +11,7 @@ from .. import arguments
 from .._errors import InputError
 from ..calibrate import Model, Posterior, sample
 from ..calibrate.fitting import checked_settings
-from ..calibrate.judgement import unlike_others
+from ..calibrate.judgement import numbers_in_reach, unlike_others
 from ..campaign import Campaign, Finding, available_data, campaign_findings, check_plausibility, check_tests
 from ..campaign.quality import named
 from ..effects import LIBRARY, Mechanism
@@ -109,9 +109,10 @@ def discover(
     if not testable:
         raise InputError("no mechanism is left to look for", remedy="Exclude fewer, or measure what the others need.")
     tell("signatures of all effects")
-    search = Search(base, testable, tell).run()
-    tell("is anything missing")
-    p_any = p_anything(search, seed)
+    with numbers_in_reach(base.campaign):
+        search = Search(base, testable, tell).run()
+        tell("is anything missing")
+        p_any = p_anything(search, seed)
     probabilities = search.posterior()
     nothing = p_any >= DECISIONS.level or probabilities[()] >= 0.5
     ranking = ranking_of(search)

@@ -285,6 +285,9 @@ def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, witho
         start: hyperparameters to begin with; those that only make up shapes may be left out.
         curvature: whether they are integrated out; if not, `log_evidence` is the log posterior at the mode.
         without: the optimum without misfits, whose curvature is taken for that of the hyperparameters it has.
+
+    Raises:
+        FloatingPointError: if it has no evidence where it begins.
     """
     from scipy.optimize import minimize
 
@@ -306,6 +309,8 @@ def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, witho
     options = {"ftol": 1e-9, "gtol": 0.1, "maxiter": 40}
     found = minimize(down, start / scale, jac=True, method="L-BFGS-B", options=options)
     joint = -float(found.fun)
+    if joint < -1e29:
+        raise FloatingPointError("the evidence of a hypothesis is no number")
     evidence, free = joint, found.x * scale
     if curvature:
         wanted = np.flatnonzero(used)
