@@ -75,6 +75,24 @@ def test_the_density_is_the_dense_normal_one(case, seed, more):
     )
 
 
+def test_the_density_has_a_slope_where_some_peaks_were_worked_out():
+    """Peaks that were read have no error of their own: a root there has no derivative."""
+    rng = np.random.default_rng(2)
+    tests, linear = random_tests(rng, peak_sd=0.2, count=2)
+    tests = replace(tests, peak_sd=jnp.zeros_like(tests.peak_sd).at[0].set(0.2))
+    away = jnp.asarray(rng.standard_normal((2, POINTS)))
+
+    def density(logs):
+        filtered = filters(jnp.exp(logs), jnp.ones(2), tests, linear, *KINDS[0])
+        return jnp.sum(log_probability(jnp.ones_like(tests.force), filtered, jnp.asarray(1.0), away))
+
+    logs = jnp.log(jnp.asarray(FOUR))
+    slope = np.asarray(jax.grad(density)(logs))
+    for k, unit in enumerate(np.eye(4)):
+        up, down = (float(density(logs + sign * 1e-5 * unit)) for sign in (1, -1))
+        assert slope[k] == pytest.approx((up - down) / 2e-5, rel=1e-4, abs=1e-4)
+
+
 def test_white_noise_of_two_branches_is_dense_too():
     rng = np.random.default_rng(5)
     tests, linear = random_tests(rng, elastic=ELASTIC, zero_sd=0.4, count=3)
