@@ -37,7 +37,6 @@ LAYERS = {
     "simulate": 7,
     "calibrate": 8,
     "dem": 9,
-    "discover.legacy": 9,
     "discover": 10,
     "export": 11,
     "plots": 11,
@@ -120,16 +119,6 @@ def test_imports_point_downwards(name):
         )
         leaf = layer(name) == layer(target) == LEAF
         assert layer(target) < layer(name) or leaf, f"{name} imports {target}, of a later layer"
-
-
-PUBLIC_TO_DISCOVERY = {"", "curves", "estimates", "judgement", "laws", "paper", "priors", "results"}
-"""What discovery takes of `calibrate`: the package's public names, and what stays there whatever becomes of the fit."""
-
-
-@pytest.mark.parametrize("name", sorted(n for n in MODULES if n.split(".")[0] == "discover"))
-def test_discovery_needs_no_private_module_of_calibrate(name):
-    needed = [target.split(".") for target in imports(MODULES[name])]
-    assert {(parts[1:] or [""])[0] for parts in needed if parts[0] == "calibrate"} <= PUBLIC_TO_DISCOVERY
 
 
 def test_no_cycles():

@@ -17,7 +17,7 @@ MADE_BY_THE_LIBRARY = {
     *(f"mcc_jax.calibrate.{name}" for name in ("ElasticBranch", "ElasticFit", "MasterCurve", "ParticleFit")),
     *(f"mcc_jax.calibrate.{name}" for name in ("PlasticFit", "ShapeFit", "StrainTable")),
     *("mcc_jax.calibrate.FittedCurve", "mcc_jax.calibrate.OldCalibration"),
-    *(f"mcc_jax.discover.{name}" for name in ("Closure", "Effect", "ExtendedPosterior")),
+    *(f"mcc_jax.discover.{name}" for name in ("Closure", "Effect")),
     *(f"mcc_jax.dem.{name}" for name in ("Band", "Compaction", "CompactionFit", "ContactEnergy", "Edges", "Forces")),
     *(f"mcc_jax.dem.{name}" for name in ("HalfContact", "LoadStep", "Motion", "Packing", "PopulationPacking")),
     *(f"mcc_jax.dem.{name}" for name in ("Replayed", "Segment", "Sensitivity", "State", "Trajectory", "WallHistory")),

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..effects import Mechanism, Nuisance, Variant
 from ..law import PUNCH_AREA
-from .linear_model import Base
+from .base import Base
 
 PUNCH = "punch_radius_um"
 
@@ -23,7 +23,7 @@ def without_punch(library: Mapping[str, Mechanism], base: Base) -> dict[str, Mec
     tests = base.tests
     size = np.asarray(tests.effective_diameter)
     travel = np.where(np.asarray(tests.mask), np.asarray(tests.displacement), -np.inf).max(1) - np.asarray(
-        base.fit.zero
+        base.state.point.zero
     )
     widest = float(np.max(np.sqrt(PUNCH_AREA * size * np.maximum(travel, 0.0))))
     outgrown = diameter is not None and 2 * widest > diameter

@@ -1,397 +1,353 @@
-r"""Naming: how well each mechanism explains what the base law leaves, alone or together with others.
+r"""The log marginal likelihood of a hypothesis: a linear Gaussian model around a state, its scales at their mode.
 
-With scores U and information I of a formula's amplitude (in units of the largest believable one), and a prior that
-spreads the amplitude over its plausible range, a mixture of normal distributions of scale s cut at the physical sign,
+Around the state every test i is
 
-.. math:: E = \frac{2}{\sqrt{1 + I s^2}} \exp\!\left(\frac{U^2 s^2}{2 (1 + I s^2)}\right)
-    \Phi\!\left(\frac{U s}{\sqrt{1 + I s^2}}\right)
+.. math:: y_i = J_i T v_i + \zeta_i + V_i S w_i + M_i \epsilon + B_i R g + A_i \theta + \text{noise}
 
-is the formula's evidence against nothing. A mechanism's evidence is the mean over its formulas: nature may use any of
-them, or one that resembles them.
+with the particle's own deviations v, zero and further numbers w, what all particles share: population, further numbers
+of the effects and weights of a misfit (epsilon, g), and the amplitudes theta. All but the amplitudes are standard
+normal, once their scales T, S, R are taken into the columns. They are integrated out in closed form, particles first
+(`eliminate`); an amplitude's prior is a mixture of half-normals, whose integral is closed, too. Scales and noise are at
+their posterior mode, and their curvature is integrated by Laplace's method.
 """
 
 from __future__ import annotations
 
-import itertools
-from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
-from scipy.special import logsumexp
+from jax.scipy.special import log_ndtr, logsumexp
+from jaxtyping import Array, Float
 
-from .candidates import located
-from .linear_model import System
-from .pop_in import (
-    ODD,
-    ODD_STEP,
-    SCALES,
-    SHARES,
-    Jump,
-    Steps,
-    evidence_by_scale,
-    is_step,
-    over_tests,
-    root_of,
-    tamed,
-)
-from .score import Projection, Statistic
-
-LOOSENESS = 0.005
-"""No family of formulas contains nature's own: of the explained chi2 so much may be missed by the true mechanism.
-
-Measured on 73 blind campaigns of the second generator, in formulas that need not be in the library: 0.92 of the names
-are right; 0.94 is stated without it, 0.88 with 0.012. In 278 of the first generator stated probabilities are nearer to
-shares right below 0.006 than above."""
+from ..calibrate.compiling import compiled
+from ..calibrate.data import Tests
+from ..calibrate.distributions import SCALES, SpreadCoordinate
+from ..calibrate.forward import Linear
+from ..calibrate.noise import Along, Correlation, Noise, whitening
+from ..calibrate.small_matrices import eliminate
 
 
-def log_evidence(U: np.ndarray, information: np.ndarray, sign: np.ndarray) -> np.ndarray:
-    """Log evidence of amplitudes against zero, element by element."""
-    return logsumexp(evidence_by_scale(U, information, sign), axis=-1) - np.log(len(SCALES))
+class Design(eqx.Module):
+    """The columns of a hypothesis around a state, every number in units of its prior's standard deviation.
 
-
-def log_evidence_at_random(
-    scores: np.ndarray,
-    information: np.ndarray,
-    sign: np.ndarray,
-    groups: list[np.ndarray],
-    placed: np.ndarray | None = None,
-) -> np.ndarray:
-    """Log evidence of amplitudes that differ from test to test: a normal distribution around zero, cut at the sign.
-
-    Args:
-        scores, information: shapes (..., N, K).
-        sign: physical signs, shape (K,).
-        groups: columns of which every test has one of its own, equally probable beforehand.
-        placed: which columns are of effects that some tests may not have, those with a place of their own; none if
-            None.
-
-    Returns:
-        One number per group, shape (..., G).
+    Attributes:
+        tests, linear: the tests, and how noise of force moves them.
+        own: columns of each particle's own numbers: b1, b3, b5, e (per unit), the zero, further ones.
+        common: of what all particles share: the population's five, further numbers of effects, misfits.
+        amplitude: of the amplitudes, per unit of `unit`.
+        data: what is explained [um].
+        scale: each particle's own factor on the noise.
+        group: which scale a common column has: 0 where it is fixed at 1, else its place among `misfits`.
+        noise: prior of the four numbers of the noise: means and standard deviations of the logarithms, shape (2, 4).
+        largest: largest scale of each amplitude's prior in its unit, over the smallest, which is the unit.
+        spreads: scale and shape of the priors of the spreads of b1, b3, b5, e and of further own numbers.
+        misfits: median and standard deviation of the logarithm of each misfit's scale.
+        used: 1 for hyperparameters of the hypothesis, 0 for those that only make up shapes.
     """
-    each = evidence_by_scale(scores, information, sign)
-    found = []
-    for members in groups:
-        one = logsumexp(each[..., members, :], axis=-2) - np.log(len(members))
-        some = placed is not None and placed[members].all()
-        found.append(over_tests(one, SHARES, ODD_STEP) if some else over_tests(one, (1.0,), ODD))
-    return np.stack(found, -1)
 
-
-COMMON = 1.0
-"""Probability of all other formulas of a mechanism together, that of its first, the common one, being 1."""
-
-
-def formula_weights(system: System) -> np.ndarray:
-    """Probability of every candidate's formula among those of its mechanism, whatever its further numbers: the common
-    formula counts as much as all the others together."""
-    found = np.zeros(len(system.candidates))
-    for name in {c.mechanism for c in system.candidates}:
-        members = [k for k, c in enumerate(system.candidates) if c.mechanism == name]
-        variants = list(dict.fromkeys(system.candidates[k].variant.name for k in members))
-        share = {v: COMMON / (len(variants) - 1) for v in variants[1:]} | {variants[0]: 1.0}
-        found[members] = [share[system.candidates[k].variant.name] / sum(share.values()) for k in members]
-    return found
-
-
-def weights(system: System, formulas: np.ndarray) -> np.ndarray:
-    """Probability of every candidate among those of its mechanism, from that of its formula: shared by its points."""
-    names = [(c.mechanism, c.variant.name) for c in system.candidates]
-    count = Counter(names)
-    return formulas / np.array([count[name] for name in names])
-
-
-def evidence_of_any(system: System, projection: Projection) -> Statistic:
-    """Log evidence that one of the mechanisms is there, each as probable beforehand as any other: of estimates over
-    standard errors of the projection's columns, among them formulas."""
-    at = np.flatnonzero(np.isin(projection.columns, system.candidate_columns))
-    k = projection.columns[at] - system.candidate_columns[0]
-    information, sign = projection.total[at], system.signs[k]
-    weight = weights(system, formula_weights(system))[k]
-
-    def statistic(t: np.ndarray) -> np.ndarray:
-        scores = np.atleast_2d(t)[:, at] * np.sqrt(information)
-        parts = (log_evidence(some, information, sign) for some in np.array_split(scores, max(t.size // 10**6, 1)))
-        return np.concatenate([np.asarray(logsumexp(part, b=weight, axis=-1)) for part in parts]).reshape(t.shape[:-1])
-
-    return statistic
-
-
-def random_groups(system: System) -> list[np.ndarray]:
-    """Candidates whose amplitude or location differs from test to test: each test has one member of its group."""
-    groups: dict[tuple, list[int]] = {}
-    for k, candidate in enumerate(system.candidates):
-        variant = candidate.variant
-        free = {n.name for n in variant.nuisances if n.random_per_test}
-        if variant.random_per_test or free:
-            fixed = tuple(sorted((n, v) for n, v in candidate.nuisance.items() if n not in free))
-            groups.setdefault((variant.mechanism, variant.name, fixed), []).append(k)
-    return [np.array(members) for members in groups.values()]
-
-
-def _placed(system: System, columns: np.ndarray) -> np.ndarray:
-    """Which candidates have a place of their own in every test."""
-    return np.array([located(system.candidates[k].variant) for k in columns], bool)
-
-
-def _tamed(system: System, scores: np.ndarray, information: np.ndarray, placed: np.ndarray) -> np.ndarray:
-    """Scores of what has a place of its own shrunk: it shows in a few points, which have the tails of the noise."""
-    if not np.isfinite(system.tails) or not placed.any():
-        return scores
-    scale = np.sqrt(np.maximum(information, 1e-300))
-    return np.where(placed, scale * tamed(scores / scale, system.tails), scores)
-
-
-def evidence_of_steps(system: System, projection: Projection, inflation: np.ndarray | float = 1.0) -> float:
-    """Log evidence of sudden steps at any points beside what was projected off; minus infinity without any to look
-    for.
-
-    Args:
-        system: the system.
-        projection: of which particles, and what was projected off.
-        inflation: by which the noise of every particle is larger than modelled.
-    """
-    if system.steps is None:
-        return -np.inf
-    _, shrunk = _scores_of_steps(system, system.steps, projection, inflation)
-    return float(system.steps.evidence(shrunk, projection.particles))
-
-
-def jumps(system: System, projection: Projection) -> tuple[Jump, ...]:
-    """The sudden steps that are more probable than not beside what was projected off."""
-    if system.steps is None:
-        return ()
-    return system.steps.jumps(*_scores_of_steps(system, system.steps, projection, 1.0), projection.particles)
-
-
-def _scores_of_steps(
-    system: System, steps: Steps, projection: Projection, inflation: np.ndarray | float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Scores of steps, and as far as they count."""
-    particles = projection.particles
-    scores = steps.scores(particles, projection.nuisance, projection.theta)
-    scores = scores / np.broadcast_to(inflation, len(particles))[:, None]
-    return scores, _tamed(system, scores, steps.information[particles], np.ones(scores.shape[1:], bool))
-
-
-def random_probability(system: System, projection: Projection, seed: int, *, draws: int = 800) -> float:
-    """Probability under the noise model that effects which differ from test to test seem as evident as they do."""
-    groups = random_groups(system)
-    if not groups:
-        return 1.0
-    # A test whose noise is larger than modelled must not look like an effect.
-    inflation = np.sqrt(np.maximum(projection.residual / np.maximum(system.points[projection.particles], 1), 1.0))
-    observed = evidence_of_steps(system, projection, inflation)
-    rng = np.random.default_rng([seed, 43])
-    drawn = np.full(draws, -np.inf)
-    if system.steps is not None:
-        drawn = system.steps.drawn_evidence(projection.particles, draws, rng)
-        groups = [members for members in groups if not is_step(system.candidates[members[0]])]
-    if groups:
-        index = np.concatenate(groups)
-        sign, placed = system.signs[index], _placed(system, index)
-        bounds = np.cumsum([0, *map(len, groups)])
-        local = [np.arange(a, b) for a, b in itertools.pairwise(bounds)]
-        information = projection.information[:, index][:, :, index]
-        each = np.einsum("nkk->nk", information)
-        scores = _tamed(system, projection.scores[:, index] / inflation[:, None], each, placed)
-        observed = max(observed, float(log_evidence_at_random(scores, each, sign, local, placed).max()))
-        factor = root_of(information)
-        for some in np.array_split(np.arange(draws), 8):
-            normal = rng.standard_normal((len(some), *each.shape))
-            scores = np.einsum("nkl,bnl->bnk", factor, normal)
-            own = log_evidence_at_random(scores, each, sign, local, placed).max(-1)
-            drawn[some] = np.maximum(drawn[some], own)
-    return (int((drawn >= observed).sum()) + 1) / (draws + 1)
+    tests: Tests
+    linear: Linear
+    own: Float[Array, "particles points o"]
+    common: Float[Array, "particles points c"]
+    amplitude: Float[Array, "particles points k"]
+    data: Float[Array, "particles points"]
+    scale: Float[Array, " particles"]
+    group: Any
+    noise: Float[Array, "2 4"]
+    largest: Float[Array, " k"]
+    sign: Float[Array, " k"]
+    misfits: Float[Array, "g 2"]
+    used: Float[Array, " h"]
+    kinds: Kinds = eqx.field(static=True)
 
 
 @dataclass(frozen=True)
-class Ranking:
-    """Mechanisms against what is left.
+class Kinds:
+    """What a compiled evidence depends on besides the shapes of its arrays.
 
     Attributes:
-        names: mechanisms, best first.
-        log_evidence: theirs, the mean over formulas.
-        probability: share of each among them all, tempered by `LOOSENESS`.
-        best: each one's best candidate, the common formula preferred as far as it is the more probable one beforehand.
-        gain: drop of -2 log likelihood by it.
-        at_random: whether amplitudes that differ from test to test explain more than a common one.
-        evidence: log evidence of every candidate, minus infinity for those the base law can imitate.
-        favour: the same with the probability of its formula beforehand.
-        temperature: by which logarithms were divided.
+        spreads: priors of the spreads of b1, b3, b5, e, and of further own numbers.
+        correlation, along: of the noise.
     """
 
-    names: tuple[str, ...]
-    log_evidence: np.ndarray
-    probability: np.ndarray
-    best: tuple[int, ...]
-    gain: np.ndarray
-    at_random: tuple[bool, ...]
-    evidence: np.ndarray
-    favour: np.ndarray
-    temperature: float
-
-    def members(self, least: float) -> list[str]:
-        """Mechanisms whose probability is at least this share of the best one's."""
-        return [n for n, p in zip(self.names, self.probability, strict=True) if p >= least * self.probability[0]]
+    spreads: tuple[Any, ...]
+    correlation: Correlation
+    along: Along
 
 
-def rank(system: System, projection: Projection, *, refitted: Mapping[int, float] | None = None) -> Ranking:
-    """Rank all mechanisms by what they explain beyond what was projected off.
+@dataclass(frozen=True)
+class NoiseKind:
+    """How the noise that is not white hangs together.
 
-    Args:
-        system: the system.
-        projection: scores and information of all candidates.
-        refitted: drop of -2 log likelihood by those candidates that were fitted as they are (`gauss_newton`). It
-            replaces the linear one, and no formula of the same mechanism counts for more than the best of these.
+    Attributes:
+        correlation: how rough it is.
+        along: what it runs along.
+        length: its length's prior median over the model's own, whose unit may be another.
     """
-    sign = system.signs
-    U, total = projection.scores.sum(0), projection.total
-    alive = projection.alive
-    common = np.where(alive, log_evidence(U, total, sign), -np.inf)
-    each = np.einsum("nkk->nk", projection.information)
-    differing = np.full(len(sign), -np.inf)
-    groups = random_groups(system)
-    if groups:
-        placed = _placed(system, np.arange(len(sign)))
-        scores = _tamed(system, projection.scores, each, placed)
-        values = log_evidence_at_random(scores, each, sign, groups, placed)
-        anywhere = evidence_of_steps(system, projection)
-        for members, value in zip(groups, values, strict=True):
-            some = np.isfinite(anywhere) and is_step(system.candidates[members[0]])
-            differing[members] = anywhere if some else value
-    random = np.isfinite(differing)
-    evidence = np.logaddexp(common, differing) - np.where(random, np.log(2), 0.0)
-    linear = np.where(alive, U**2 / np.maximum(total, 1e-300), 0.0)
-    exact = dict(refitted or {})
-    for k, drop in exact.items():
-        evidence[k] += (drop - linear[k]) / 2
-        linear[k] = drop
-    for name in {system.candidates[k].mechanism for k in exact}:
-        most = max(evidence[k] for k in exact if system.candidates[k].mechanism == name)
-        for k, candidate in enumerate(system.candidates):
-            if candidate.mechanism == name and k not in exact:
-                evidence[k] = min(evidence[k], most)
-    names = list(dict.fromkeys(c.mechanism for c in system.candidates))
-    formulas = formula_weights(system)
-    weight, favour = weights(system, formulas), evidence + np.log(formulas)
-    found = []
-    for name in names:
-        members = [k for k, c in enumerate(system.candidates) if c.mechanism == name]
-        value = logsumexp(evidence[members], b=weight[members])
-        best = max(exact.keys() & set(members) or members, key=lambda k: favour[k])
-        gain = linear[best] if np.isfinite(evidence[best]) else 0.0
-        if differing[best] > common[best]:
-            gain = max(gain, 2 * differing[best])
-        found.append((value, best, gain, bool(differing[best] > common[best])))
-    order = np.argsort([-f[0] for f in found], kind="stable")
-    values = np.array([found[i][0] for i in order])
-    gains = np.array([found[i][2] for i in order])
-    temperature = 1 + LOOSENESS * max(2 * values[0], 0.0) if np.isfinite(values[0]) else 1.0
-    share = np.exp((values - values[0]) / temperature)
-    return Ranking(
-        tuple(names[i] for i in order),
-        values,
-        share / share.sum(),
-        tuple(found[i][1] for i in order),
-        gains,
-        tuple(found[i][3] for i in order),
-        evidence,
-        favour,
-        float(temperature),
+
+    correlation: Correlation
+    along: Along
+    length: float = 1.0
+
+
+def with_noise(design: Design, kind: NoiseKind) -> Design:
+    """The design with noise of another kind."""
+    kinds = replace(design.kinds, correlation=kind.correlation, along=kind.along)
+    return replace(design, noise=design.noise.at[0, 3].add(float(np.log(kind.length))), kinds=kinds)
+
+
+def with_amplitudes(design: Design, columns: Array) -> Design:
+    """The design with other amplitudes, of either sign, whose priors nobody asks for."""
+    count = columns.shape[-1]
+    return replace(design, amplitude=columns, sign=jnp.zeros(count), largest=jnp.ones(count))
+
+
+class Left(NamedTuple):
+    """What the particles leave: Gram matrices of the common columns, the amplitudes and the data, and log integrals."""
+
+    gram: Float[Array, "particles r r"]
+    log_integral: Float[Array, " particles"]
+
+
+def scales_of(free: Float[Array, " h"], design: Design) -> tuple[Noise, Array, Array]:
+    """Noise, scales of the own columns and of the common ones, at the hyperparameters.
+
+    They are logarithms of the noise's four numbers, the spreads' coordinates, and logarithms of the misfits' scales.
+    """
+    spreads = design.kinds.spreads
+    noise = Noise.from_logs(free[:4], design.scale)
+    x = free[4 : 4 + len(spreads)]
+    tau = [SpreadCoordinate(prior).spread(x[j]) for j, prior in enumerate(spreads)]
+    own = jnp.stack([*tau[:4], jnp.ones(()), *tau[4:]])
+    misfit = jnp.concatenate([jnp.ones(1), jnp.exp(free[4 + len(spreads) :])])
+    return noise, own, misfit[design.group]
+
+
+def grams(free: Float[Array, " h"], design: Design) -> tuple[Array, Array]:
+    """Gram matrix of every test's whitened and scaled columns, and its noise's log density at 0."""
+    noise, own, common = scales_of(free, design)
+    kinds = design.kinds
+    columns = jnp.concatenate([design.own, design.common, design.amplitude, design.data[..., None]], -1)
+    factor = jnp.concatenate([own, common, jnp.ones(design.amplitude.shape[-1] + 1)])
+
+    def one(scale: Array, tests: Tests, linear: Linear, columns: Array) -> tuple[Array, Array]:
+        filtered = whitening(noise, scale, tests, linear, kinds.correlation, kinds.along)
+        white = filtered(columns) * factor[None]
+        gram = (white.T @ white).at[-1, -1].add(filtered.reading)
+        count = jnp.sum(jnp.where(tests.mask, 1.0, 0.0))
+        return gram, -0.5 * (filtered.log_det + count * float(np.log(2 * np.pi)))
+
+    return jax.vmap(one)(design.scale, design.tests, design.linear, columns)
+
+
+def left_of(free: Float[Array, " h"], design: Design) -> Left:
+    """Integrate every particle's own numbers out."""
+    gram, log_density = grams(free, design)
+    left, log_integral = without_first(gram, design.own.shape[-1])
+    return Left(left, log_integral + log_density)
+
+
+def without_first(gram: Array, count: int) -> tuple[Array, Array]:
+    """Integrate the first columns out, whose numbers are standard normal: what is left of the form, log integral."""
+    return eliminate(gram, range(count), jnp.ones((*gram.shape[:-2], count)), written_out=False)
+
+
+def amplitudes(left: Array, sign: Array, largest: Array) -> tuple[Array, Array, Array]:
+    """Log integral over amplitudes, and their mean and standard deviation under the best scales.
+
+    Each has an equal mixture of half-normal priors (normal where both signs are physical), whose scales are spread
+    evenly in the logarithm from 1 to `largest`. Where several are cut, the corner's probability is taken for the
+    product of the single ones.
+    """
+    count = len(sign)
+    if not count:
+        return -0.5 * left[-1, -1], jnp.zeros(0), jnp.zeros(0)
+    gram, score = left[:-1, :-1], left[:-1, -1]
+    steps = jnp.asarray(np.linspace(0, 1, SCALES))
+    axes = jnp.meshgrid(*(steps for _ in range(count)), indexing="ij")
+    scale = jnp.exp(jnp.stack([a.ravel() for a in axes], -1) * jnp.log(largest)[None])
+
+    def one(s: Array) -> tuple[Array, Array, Array]:
+        precision = gram + jnp.diag(s**-2.0)
+        root = jnp.linalg.cholesky(precision)
+        covariance = jax.scipy.linalg.cho_solve((root, True), jnp.eye(count))
+        mean = covariance @ score
+        sd = jnp.sqrt(jnp.diagonal(covariance))
+        value = 0.5 * score @ mean - jnp.sum(jnp.log(jnp.diagonal(root))) - jnp.sum(jnp.log(s))
+        cut = jnp.where(sign == 0, 0.0, float(np.log(2)) + log_ndtr(sign * mean / sd))
+        return value + jnp.sum(cut), mean, sd
+
+    value, mean, sd = jax.vmap(one)(scale)
+    best = jnp.argmax(value)
+    total = logsumexp(value) - count * float(np.log(SCALES)) - 0.5 * left[-1, -1]
+    return total, mean[best], sd[best]
+
+
+def log_prior(free: Float[Array, " h"], design: Design) -> Array:
+    """Log prior of the hyperparameters, of a spread's coordinate of either sign together; of those that only make up
+    shapes it is standard normal, which Laplace's method integrates to 1."""
+    spreads = design.kinds.spreads
+    log_2pi = float(np.log(2 * np.pi))
+    z = (free[:4] - design.noise[0]) / design.noise[1]
+    each = [-0.5 * z**2 - jnp.log(design.noise[1]) - 0.5 * log_2pi]
+    if spreads:
+        of_spreads = [SpreadCoordinate(prior).log_prob(free[4 + j]) for j, prior in enumerate(spreads)]
+        each.append(float(np.log(2)) + jnp.stack(of_spreads))
+    m = (free[4 + len(spreads) :] - design.misfits[:, 0]) / design.misfits[:, 1]
+    each.append(-0.5 * m**2 - jnp.log(design.misfits[:, 1]) - 0.5 * log_2pi)
+    nothing = -0.5 * free**2 - 0.5 * log_2pi
+    return jnp.sum(jnp.where(design.used > 0, jnp.concatenate(each), nothing))
+
+
+def log_joint(free: Float[Array, " h"], design: Design) -> Array:
+    """Log marginal likelihood at the hyperparameters, times their prior."""
+    left = left_of(free, design)
+    gram, integral = without_first(jnp.sum(left.gram, 0), design.common.shape[-1])
+    return (
+        jnp.sum(left.log_integral)
+        + integral
+        + amplitudes(gram, design.sign, design.largest)[0]
+        + log_prior(free, design)
     )
 
 
-def family_columns(system: System, names: tuple[str, ...]) -> np.ndarray:
-    """Columns of all formulas of some mechanisms."""
-    return np.array([system.column(k) for k, c in enumerate(system.candidates) if c.mechanism in names], int)
+value_and_gradient = compiled(jax.value_and_grad(log_joint))
+left_by_particle = compiled(left_of)
+prior_density = compiled(log_prior)
+
+
+class Solution(NamedTuple):
+    """Posterior means at the hyperparameters.
+
+    Attributes:
+        own: of every particle's own numbers, in units of `Design.own`.
+        common: of what all share, in units of `Design.common`.
+        amplitude, sd: of the amplitudes.
+    """
+
+    own: Float[Array, "particles o"]
+    common: Float[Array, " c"]
+    amplitude: Float[Array, " k"]
+    sd: Float[Array, " k"]
+
+
+def _solved(matrix: Array, values: Array) -> Array:
+    """The solution of positive definite equations."""
+    root = jnp.linalg.cholesky(matrix)
+    half = jax.scipy.linalg.solve_triangular(root, values, lower=True)
+    return jax.scipy.linalg.solve_triangular(root, half, lower=True, trans=1)
+
+
+@compiled
+def solve(free: Float[Array, " h"], design: Design) -> Solution:
+    """Posterior means of all numbers, an amplitude of a forbidden sign at zero."""
+    _, own, common = scales_of(free, design)
+    gram, _ = grams(free, design)
+    o, c = design.own.shape[-1], design.common.shape[-1]
+    left, _ = without_first(gram, o)
+    total = jnp.sum(left, 0)
+    after, _ = without_first(total, c)
+    _, theta, sd = amplitudes(after, design.sign, design.largest)
+    theta = jnp.where(design.sign * theta < 0, 0.0, theta)
+    data = total[:c, -1] - total[:c, c:-1] @ theta
+    epsilon = _solved(total[:c, :c] + jnp.eye(c), data[:, None])[:, 0]
+    rest = gram[:, :o, -1] - gram[:, :o, o + c : -1] @ theta - gram[:, :o, o : o + c] @ epsilon
+    v = _solved(gram[:, :o, :o] + jnp.eye(o)[None], rest[..., None])[..., 0]
+    return Solution(v * own[None], epsilon * common, theta, sd)
 
 
 @dataclass(frozen=True)
-class Pair:
-    """Two formulas of different mechanisms together.
+class Optimum:
+    """The mode of the hyperparameters.
 
     Attributes:
-        log_evidence: of their mechanisms together, the mean over both families of formulas.
-        gain: drop of -2 log likelihood by the two formulas.
-        stronger, weaker: the two most evident formulas; the one that takes away more alone comes first.
+        free: the hyperparameters.
+        log_evidence: log marginal likelihood, the hyperparameters integrated out by Laplace's method.
+        log_joint: at the mode.
+        evaluations: of the density.
     """
 
+    free: np.ndarray
     log_evidence: float
-    gain: float
-    stronger: int
-    weaker: int
-
-    @property
-    def both(self) -> tuple[int, int]:
-        """The two formulas."""
-        return self.stronger, self.weaker
-
-    def fitted(self, drop: float) -> Pair:
-        """The same where the two formulas, fitted as they are, take away so much."""
-        return replace(self, log_evidence=self.log_evidence + (drop - self.gain) / 2, gain=drop)
+    log_joint: float
+    evaluations: int
 
 
-def other_formulas(system: System, projection: Projection, pair: Pair, most: int) -> list[Pair]:
-    """The pair with another formula of one of its mechanisms: of each, those that take away most beside the other, one
-    for every variant and `most` at most."""
-    U, both, sign = projection.scores.sum(0), projection.information.sum(0), system.signs
-    d = np.maximum(np.diagonal(both), 1e-300)
-    found: list[Pair] = []
-    for own, other in (pair.both, pair.both[::-1]):
-        left = d - both[:, other] ** 2 / d[other]
-        beside = U - both[:, other] * U[other] / d[other]
-        gain = np.where(_physical(beside, sign) & (left > 1e-4 * d), beside**2 / np.maximum(left, 1e-300), 0.0)
-        now = system.candidates[own]
-        best: dict[str, int] = {}
-        for k in np.argsort(-gain, kind="stable").tolist():
-            c = system.candidates[k]
-            if c.mechanism == now.mechanism and c.variant.name != now.variant.name and gain[k] > 0:
-                best.setdefault(c.variant.name, k)
-        place = "stronger" if own == pair.stronger else "weaker"
-        found.extend(replace(pair, **{place: k}) for k in list(best.values())[:most])
-    return found
+def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, without: Optimum | None = None) -> Optimum:
+    """The mode of the hyperparameters by L-BFGS, in coordinates scaled by their expected curvature.
 
+    Args:
+        design: of a hypothesis.
+        start: hyperparameters to begin with; those that only make up shapes may be left out.
+        curvature: whether they are integrated out; if not, `log_evidence` is the log posterior at the mode.
+        without: the optimum without misfits, whose curvature is taken for that of the hyperparameters it has.
 
-def pairs(system: System, projection: Projection) -> list[Pair]:
-    r"""Pairs of mechanisms by their evidence together, the best first.
-
-    .. math:: E_{ij} = E(U_j, I_j) \, E(U_{i|j}, I_{i|j}), \qquad U_{i|j} = U_i - I_{ij} U_j / I_j, \quad
-        I_{i|j} = I_i - I_{ij}^2 / I_j
-
-    with j the formula of more evidence alone; none where one of both amplitudes together has an impossible sign.
+    Raises:
+        FloatingPointError: if it has no evidence where it begins.
     """
-    sign = system.signs
-    U, both = projection.scores.sum(0), projection.information.sum(0)
-    d = np.diagonal(both)
-    names = np.array([c.mechanism for c in system.candidates])
-    alive = projection.alive & (d > 0)
-    left = d[:, None] - both**2 / np.where(alive, d, 1.0)[None]  # information of i beside j
-    fine = alive[:, None] & alive[None] & (left > 1e-4 * d[:, None]) & (names[:, None] != names[None])
-    left = np.where(fine, left, 1.0)
-    beside = np.where(fine, U[:, None] - both * (U / np.where(alive, d, 1.0))[None], 0.0)
-    theta = beside / left
-    right = fine & _physical(theta, sign[:, None]) & _physical(theta.T, sign[None])
-    alone = np.where(alive, log_evidence(U, d, sign), -np.inf)
-    stronger = (alone[None] > alone[:, None]) | ((alone[None] == alone[:, None]) & np.tri(len(U), k=-1, dtype=bool))
-    formulas = formula_weights(system)
-    weight, formula = np.log(weights(system, formulas)), np.log(formulas)
-    own = np.where(right & stronger, alone[None] + log_evidence(beside, left, sign[:, None]), -np.inf)
-    evidence = np.maximum(own, own.T)
-    families = {name: np.flatnonzero(names == name) for name in dict.fromkeys(names)}
-    found = []
-    for one, other in itertools.combinations(families.values(), 2):
-        block = evidence[np.ix_(one, other)]
-        if np.isfinite(block).any():
-            row, column = np.unravel_index(np.argmax(block + formula[one][:, None] + formula[other]), block.shape)
-            i, j = int(one[row]), int(other[column])
-            if not stronger[j, i]:
-                i, j = j, i
-            value = np.asarray(logsumexp(block + weight[one][:, None] + weight[other][None]))
-            gain = U[i] ** 2 / d[i] + beside[j, i] ** 2 / left[j, i]
-            found.append(Pair(float(value), float(gain), i, j))
-    return sorted(found, key=lambda p: -p.log_evidence)
+    from scipy.optimize import minimize
+
+    count = float(np.asarray(design.tests.mask).sum())
+    used = np.asarray(design.used) > 0
+    start = np.concatenate([start, np.zeros(len(used) - len(start))])
+    spreads = len(design.kinds.spreads)
+    expected = np.full(len(start), 2.0)
+    expected[:4] = count * np.array([1.5, 0.2, 0.1, 0.02])
+    expected[4 : 4 + spreads] = 2.0 * len(design.tests)
+    scale = 1 / np.sqrt(np.where(used, expected, 1.0))
+
+    def down(x: np.ndarray) -> tuple[float, np.ndarray]:
+        value, slope = value_and_gradient(jnp.asarray(x * scale), design)
+        if not (np.isfinite(float(value)) and np.isfinite(np.asarray(slope)).all()):
+            return 1e30, np.zeros(len(x))  # a step into numbers beyond arithmetic is taken back
+        return -float(value), -np.asarray(slope) * scale
+
+    options = {"ftol": 1e-9, "gtol": 0.1, "maxiter": 40}
+    found = minimize(down, start / scale, jac=True, method="L-BFGS-B", options=options)
+    joint = -float(found.fun)
+    if joint < -1e29:
+        raise FloatingPointError("the evidence of a hypothesis is no number")
+    evidence, free = joint, found.x * scale
+    if curvature:
+        wanted = np.flatnonzero(used)
+        if without is not None:
+            wanted = wanted[wanted >= 4 + spreads]
+            evidence += without.log_evidence - without.log_joint
+        columns = []
+        for j in wanted:
+            e = np.where(np.arange(len(start)) == j, 0.3, 0.0)
+            columns.append((down(found.x + e)[1] - down(found.x - e)[1])[wanted] / 0.6)
+        hessian = (np.array(columns) + np.array(columns).T) / 2
+        values = np.maximum(np.linalg.eigvalsh(hessian), 1e-3)
+        evidence += 0.5 * len(wanted) * np.log(2 * np.pi) - 0.5 * np.sum(np.log(values)) + np.sum(np.log(scale[wanted]))
+        if without is None:  # of those that only make up shapes
+            evidence += 0.5 * np.sum(~used) * np.log(2 * np.pi)
+        else:
+            evidence += 0.5 * (np.sum(~used) - np.sum(~used[: 4 + spreads])) * np.log(2 * np.pi)
+    return Optimum(free, float(evidence), joint, int(found.nfev))
 
 
-def _physical(theta: np.ndarray, sign: np.ndarray) -> np.ndarray:
-    return (sign == 0) | (theta * sign > 0)
+@compiled
+def residual_of(solution: Solution, design: Design) -> Float[Array, "particles points"]:
+    """What a solution leaves of the data [um]."""
+    taken = jnp.einsum("npo,no->np", design.own, solution.own)
+    taken += jnp.einsum("npc,c->np", design.common, solution.common)
+    return design.data - taken - jnp.einsum("npk,k->np", design.amplitude, solution.amplitude)
+
+
+@compiled
+def whitened(free: Float[Array, " h"], design: Design, values: Array) -> tuple[Array, Array]:
+    """Values over the points [um], independent and of variance 1, and the standard deviation of each point given those
+    before it."""
+    noise, _, _ = scales_of(free, design)
+    kinds = design.kinds
+
+    def one(scale: Array, tests: Tests, linear: Linear, values: Array) -> tuple[Array, Array]:
+        filtered = whitening(noise, scale, tests, linear, kinds.correlation, kinds.along)
+        return filtered(values[:, None])[:, 0], filtered.solver.factor.diag.d
+
+    return jax.vmap(one)(design.scale, design.tests, design.linear, values)

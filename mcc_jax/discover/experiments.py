@@ -1,36 +1,29 @@
-"""Which further tests would tell the members of a set apart: the ranking, tried on tests that are not made yet."""
+"""Which further tests would tell apart what these cannot: expected log Bayes factors of tests that are not made yet."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.special import ndtr
 
 from ..effects import Mechanism
 from ..simulate import Programme
-from .evidence import Ranking, formula_weights, rank, weights
-from .linear_model import Base, System
-from .model_selection import LIKE_THE_BEST
-from .plan import Plan, planned_system
-from .pop_in import root_of
-from .score import Projection, project
-
-ENOUGH = 0.9
-"""Probability of a verdict of one name from which on an experiment is worth it."""
+from .base import Base
+from .candidates import Candidate
+from .plan import Plan, planned_base
+from .screen import Screen, screen
+from .search import Search
+from .settings import DECISIONS
 
 EVEN = 0.5
-"""Least probability of it with which an experiment is proposed: particles are too dear for less than an even chance."""
+"""Least probability with which an experiment is proposed: particles are too dear for less than an even chance."""
 
 COPIES = (0.5, 1, 2, 3, 5, 10)
 """Further particles that are tried, over those of the campaign."""
 
-MAX_PARTICLES = 200
-"""Further ones that are asked for at most."""
-
-CAMPAIGNS = 24
-"""Campaigns drawn for every name that may be the true one."""
+MOST_PARTICLES = 200
 
 TURNS = 16
 """Points that turning points may add to a programme's own."""
@@ -38,13 +31,10 @@ TURNS = 16
 
 def menu(points: int) -> tuple[Plan, ...]:
     """Further tests that every tester can do, sampled into about so many points."""
-    cycles = {"levels": (0.5, 1.0, 1.0), "unload_to": 0.3, "hold_s": 60.0, "points": points}
+    cycles: dict[str, Any] = {"levels": (0.5, 1.0, 1.0), "unload_to": 0.3, "hold_s": 60.0, "points": points}
     return (
         Plan("a hold of 60 s at the largest load", (Programme.cycles(hold_s=60.0, points=points),)),
-        Plan(
-            "a cycle at half load, a hold of 60 s at the largest load, and a reload",
-            (Programme.cycles(**cycles),),
-        ),
+        Plan("a cycle at half load, a hold of 60 s at the largest load, and a reload", (Programme.cycles(**cycles),)),
         Plan(
             "two loading rates, every second particle ten times faster, with a cycle and a hold",
             (Programme.cycles(**cycles), Programme.cycles(rate=20.0, **cycles)),
@@ -52,188 +42,86 @@ def menu(points: int) -> tuple[Plan, ...]:
     )
 
 
-def next_experiments(
-    base: Base,
-    system: System,
-    chosen: list[int],
-    steps: list[Ranking],
-    *,
-    refitted: Mapping[int, float] | None = None,
-    seed: int = 0,
-) -> list[dict[str, Any]]:
-    """For every effect with rivals, further tests by the probability that with them one name is left: the right one.
+def next_experiments(search: Search, names: tuple[str, ...]) -> list[dict[str, Any]]:
+    """Further tests by the probability that with them the right one of several names is left alone.
 
-    Each member of the set is taken for true in turn, in each of its formulas as far as that is probable and as large as
-    it would have to be. Further tests of each kind are drawn and judged together with those that were made. `power` is
-    the share in which the true one alone is left, the members weighted by their probability.
+    Each name is taken for true in turn, in the formula and as large as it was fitted. The log Bayes factor of the true
+    one over a rival, whose amplitude is fitted anew, is normal with mean m/2 and variance m, m the squared signature
+    that the rival's leaves; these tests and the further ones add up. `power` is the probability that it exceeds the
+    odds which a single name needs, for the rival that is worst.
 
     Args:
-        base: the base fit.
-        system: the linear system.
-        chosen: the effects.
-        steps: the ranking of each beside the others.
-        refitted: drop of -2 log likelihood by those candidates that were fitted as they are, as in `rank`.
-        seed: of the tests drawn.
+        search: all hypotheses.
+        names: the members of the set.
 
     Returns:
-        As in `discovery.json`, the most telling experiment first; of those that tell enough, the one with the fewest
-        further particles. None that has less than an even chance.
+        As in `discovery.json`, the most telling first; none that has less than an even chance.
     """
-    needed = [(k, step) for k, step in zip(chosen, steps, strict=True) if len(step.members(LIKE_THE_BEST)) > 1]
-    if not needed:
+    members = [n for n in names if n in search.shared and search.found[(n,)].best is not None]
+    if len(members) < 2:
         return []
-    # The same formulas and the same number of points as in the campaign itself: everything is compiled already.
-    library: dict[str, Mechanism] = {}
-    for name in dict.fromkeys(c.mechanism for c in system.candidates):
-        variants = {c.variant.name: c.variant for c in system.candidates if c.mechanism == name}
-        library[name] = Mechanism(name, "", tuple(variants.values()))
+    base = search.base
     points = max(base.tests.force.shape[1] - TURNS, 32)
-    options: list[tuple[str, System]] = [("more particles, tested in the same way", system)]
-    options += [(plan.name, planned_system(base, plan, library)) for plan in menu(points)]
+    assert search.screen is not None
+    options: list[tuple[str, Screen, int]] = [
+        ("more particles, tested in the same way", search.screen, len(base.tests))
+    ]
+    library = {name: search.library[name] for name in members}
+    options += [(plan.name, *_screened(base, plan, library)) for plan in menu(points)]
     found = []
-    for k, step in needed:
-        others = [c for c in chosen if c != k]
-        for name, other in options:
-            trial = _Trial.of(system, other, step, others, refitted or {})
-            if trial is None:
-                continue
-            particles, power = trial.fewest(seed)
-            if power < EVEN:
-                continue
-            found.append(
-                {
-                    "experiment": name,
-                    "separates": step.members(LIKE_THE_BEST),
-                    "particles": particles,
-                    "power": power,
-                }
-            )
-    found.sort(key=lambda one: (-min(one["power"], ENOUGH), one["particles"]))
+    for text, other, count in options:
+        tried = [n for n in (round(c * count) for c in COPIES) if 0 < n <= MOST_PARTICLES] or [count]
+        powers = [_power(search, members, other, n / count) for n in tried]
+        enough = [k for k, p in enumerate(powers) if p >= DECISIONS.enough]
+        k = enough[0] if enough else len(tried) - 1
+        if powers[k] >= EVEN:
+            found.append({"experiment": text, "separates": members, "particles": tried[k], "power": powers[k]})
+    found.sort(key=lambda one: (-min(one["power"], DECISIONS.enough), one["particles"]))
     return found
 
 
-@dataclass(frozen=True)
-class _Truth:
-    """A member of the set that may be the true one.
-
-    Attributes:
-        share: how probable it is.
-        formulas: its candidates, as positions.
-        probability: theirs, if it is the true one.
-        amplitude: theirs.
-        sd: standard deviation of each amplitude.
-    """
-
-    share: float
-    formulas: np.ndarray
-    probability: np.ndarray
-    amplitude: np.ndarray
-    sd: np.ndarray
+def _screened(base: Base, plan: Plan, library: Mapping[str, Mechanism]) -> tuple[Screen, int]:
+    planned = planned_base(base, plan)
+    return screen(planned, planned.state, base.hyperparameters, library, several=False), len(planned.tests)
 
 
-@dataclass(frozen=True)
-class _Trial:
-    """Further tests, beside those that were made, and what may be found by them.
-
-    Attributes:
-        system: of the further tests, with the formulas of the set's members alone.
-        made: their scores and information in the tests that were made, the other effects in the law.
-        view: the same in the further tests of as many particles.
-        truths: the members.
-    """
-
-    system: System
-    made: Projection
-    view: Projection
-    truths: tuple[_Truth, ...]
-
-    @classmethod
-    def of(
-        cls, measured: System, other: System, step: Ranking, others: list[int], refitted: Mapping[int, float]
-    ) -> _Trial | None:
-        """None where the further tests show nothing of a member."""
-        place = {(c.variant, *sorted(c.nuisance.items())): j for j, c in enumerate(other.candidates)}
-        at = [place.get((c.variant, *sorted(c.nuisance.items()))) for c in measured.candidates]
-        beside = [at[c] for c in others]
-        members = step.members(LIKE_THE_BEST)
-        if any(j is None for j in (*beside, *(at[k] for k in step.best[: len(members)]))):
-            return None
-        family = [k for k, c in enumerate(measured.candidates) if c.mechanism in members and at[k] is not None]
-        keep = np.array([at[k] for k in family], int)
-        inside = np.array([other.column(j) for j in beside if j is not None], int)
-        view = project(other, other.candidate_columns, inside=inside).only(keep)
-        now = project(measured, measured.candidate_columns, inside=np.array([measured.column(c) for c in others], int))
-        made = _as_fitted(now.only(np.array(family)), measured, family, refitted)
-        weight = weights(measured, formula_weights(measured))
-        names = [measured.candidates[k].mechanism for k in family]
-        truths = []
-        ranked = zip(members, step.best, step.gain, step.at_random, step.probability, strict=False)
-        for name, best, gain, random, share in ranked:
-            # A step at random is drawn as it was found.
-            own = [family.index(best)] if random else [i for i, mechanism in enumerate(names) if mechanism == name]
-            evidence = np.array([step.evidence[family[i]] for i in own])
-            likely = weight[[family[i] for i in own]] * np.exp(evidence - evidence.max())
-            amplitude, information = made.estimate[own], np.maximum(made.total[own], 1e-300)
-            if random:
-                amplitude = np.sign(amplitude) * np.sqrt(max(gain, 0.0) / information)
-            truths.append(_Truth(float(share), np.array(own), likely / likely.sum(), amplitude, information**-0.5))
-        # Steps at any point are not drawn: places on the grid stand for them.
-        alone = replace(other, candidates=tuple(other.candidates[j] for j in keep), steps=None)
-        return cls(alone, made, view, tuple(truths))
-
-    def fewest(self, seed: int) -> tuple[int, float]:
-        """The smallest number of further particles that is enough, or else the largest, and its power."""
-        count = len(self.system.points)
-        tried = [n for n in (round(c * count) for c in COPIES) if 0 < n <= MAX_PARTICLES] or [count]
-        most = self.power(tried[-1], seed)
-        if most < ENOUGH:
-            return tried[-1], most
-        for further in tried[:-1]:
-            power = self.power(further, seed)
-            if power >= ENOUGH:
-                return further, power
-        return tried[-1], most
-
-    def power(self, further: int, seed: int) -> float:
-        """Probability that the true name alone is left, with so many further particles."""
-        view, made = self.view, self.made
-        rng = np.random.default_rng([seed, 53])
-        tested = rng.permutation(len(view.scores))[np.arange(further) % len(view.scores)]
-        factor, new = root_of(view.information)[tested], view.information[tested]
-        information = np.concatenate([made.information, new])
-        both = replace(view, survival=np.maximum(made.survival, view.survival), information=information)
-        weight, power = 0.0, 0.0
-        for truth in self.truths:
-            name, hits = self.system.candidates[int(truth.formulas[0])].mechanism, 0
-            for _ in range(CAMPAIGNS):
-                which = rng.choice(len(truth.formulas), p=truth.probability)
-                k = truth.formulas[which]
-                amplitude = truth.amplitude[which] + truth.sd[which] * rng.standard_normal()
-                sign = self.system.signs[k]
-                amplitude = sign * abs(amplitude) if sign else amplitude
-                noise = np.einsum("nkl,nl->nk", factor, rng.standard_normal((further, factor.shape[-1])))
-                scores = np.concatenate([made.scores, new[:, :, k] * amplitude + noise])
-                hits += rank(self.system, replace(both, scores=scores)).members(LIKE_THE_BEST) == [name]
-            weight += truth.share
-            power += truth.share * hits / CAMPAIGNS
-        return power / weight
+def _power(search: Search, members: list[str], other: Screen, copies: float) -> float:
+    """Least probability over the true names that further tests leave it alone."""
+    assert search.screen is not None
+    needed = np.log(DECISIONS.set_mass / (1 - DECISIONS.set_mass))
+    there = {_key(c): k for k, c in enumerate(other.candidates)}
+    at: dict[str, int] = {}
+    amplitude: dict[str, float] = {}
+    information = search.screen.information
+    for name in members:
+        best = search.found[(name,)].best
+        assert best is not None
+        variant = best.variants[0]
+        family = [
+            (k, c)
+            for k, c in enumerate(search.screen.candidates)
+            if (c.mechanism, c.variant.name) == (name, variant.name)
+        ]
+        _, c = max(family, key=lambda one: information[one[0]])
+        if _key(c) not in there:
+            return 0.0
+        at[name] = there[_key(c)]
+        amplitude[name] = float(best.theta[0]) / variant.plausible[0]
+    worst = 1.0
+    new = other.settings[0].gram
+    for name in members:
+        for rival in members:
+            if rival == name:
+                continue
+            lead = search.found[(name,)].log_evidence - search.found[(rival,)].log_evidence
+            i, j = at[name], at[rival]
+            total = copies * new[np.ix_([i, j], [i, j])]
+            left = total[0, 0] - total[0, 1] ** 2 / max(total[1, 1], 1e-300)
+            squares = float(amplitude[name] ** 2 * max(left, 0.0))
+            worst = min(worst, float(ndtr((squares / 2 + lead - needed) / np.sqrt(max(squares, 1e-12)))))
+    return worst
 
 
-def _as_fitted(view: Projection, system: System, family: list[int], refitted: Mapping[int, float]) -> Projection:
-    """Scores that take away as much as the candidates do where they were fitted as they are, and no other formula of
-    their mechanisms more than the best of these."""
-    scores, total = view.scores.copy(), np.maximum(view.total, 1e-300)
-    linear = np.maximum(view.gaussian**2, 1e-300)
-    most: dict[str, float] = {}
-    for k, drop in refitted.items():
-        name = system.candidates[k].mechanism
-        most[name] = max(most.get(name, 0.0), drop)
-    for i, k in enumerate(family):
-        candidate = system.candidates[k]
-        if k in refitted:
-            sign = candidate.variant.sign or np.sign(view.gaussian[i])
-            each = view.information[:, i, i]
-            scores[:, i] = each * sign * np.sqrt(refitted[k] / total[i])
-        elif candidate.mechanism in most:
-            scores[:, i] *= np.sqrt(min(most[candidate.mechanism] / linear[i], 1.0))
-    return replace(view, scores=scores)
+def _key(candidate: Candidate) -> tuple[Any, ...]:
+    """What names a formula at one value of its grid."""
+    return (candidate.mechanism, candidate.variant.name, *sorted(candidate.nuisance.items()))

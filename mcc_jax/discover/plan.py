@@ -9,25 +9,25 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from .. import arguments
 from .._errors import InputError
 from ..calibrate import Model
+from ..calibrate.data import select
 from ..calibrate.estimates import finite
-from ..campaign import Campaign, Curve, Metadata, available_data, check_campaign
+from ..calibrate.fitting import checked_settings
+from ..calibrate.forward import Point
+from ..campaign import Campaign, Curve, Metadata, available_data, check_campaign, particle_batch
 from ..effects import LIBRARY, Mechanism
 from ..effects.library import checked_library
 from ..simulate import Programme, simulate_campaign
+from .base import Base, State, base_fit
 from .candidates import untestable
-from .legacy.data import Tests, select_tests
-from .legacy.forward import law_of
-from .legacy.linearise import linear_data, summarise
-from .legacy.noise import Noise
-from .legacy.settings import checked_settings
-from .linear_model import Base, System, base_fit, build_system, records_of, signals_of
-from .score import DETECTABLE, project
+from .design import particle_means
+from .screen import Screen, screen
+from .settings import DECISIONS
 
-ALIKE = 0.9
 _A_PROGRAMME = "Take mcc_jax.Programme.cycles()."
 
 
@@ -67,38 +67,30 @@ def planned_base(base: Base, plan: Plan) -> Base:
     """A base fit as it would be if the same particles were tested by a plan, with the same noise."""
     arguments.instance(base, Base, "base", "Take the base of a discovery.")
     arguments.instance(plan, Plan, "plan", "Make one with mcc_jax.Plan(name, [programme]).")
-    fit = base.fit
-    kept = list(base.selection.kept)
-    laws = eqx.filter_vmap(lambda w: law_of(w, base.model.unloading))(fit.latent)
     peaks = np.asarray(jnp.max(base.tests.force, axis=1))
-    campaign = planned_campaign(laws, base.campaign.diameters_um[kept], peaks, plan)
-    return _expected(campaign, base, fit.latent, fit.noise)
+    diameters = base.campaign.diameters_um[list(base.selection.kept)]
+    return _expected(base, plan, diameters, peaks, base.state.point.latent, base.scale)
 
 
-def _expected(campaign: Campaign, base: Base, latent, noise: Noise) -> Base:
-    fit, model = base.fit, base.legacy_model
-    selection = select_tests(campaign, threshold_MPa=base.threshold_MPa)
-    kept = np.asarray(selection.kept)
-    tests: Tests = selection.tests
-    latent = latent[kept]
-    zero = jnp.zeros(len(kept))
-    noise = eqx.tree_at(lambda n: n.scale, noise, noise.scale[kept])
-    data = linear_data(latent, zero, tests, model.zero_sd, model.unloading)
-    data = eqx.tree_at(lambda d: d.residual, data, jnp.zeros_like(data.residual))
-    summary, filters, _ = summarise(latent, zero, tests, data, noise, model.zero_sd)
-    numbers = eqx.tree_at(lambda n: n.flatness, fit.numbers, tests.flatness)
-    new = eqx.tree_at(
-        lambda f: (f.noise, f.filters, f.latent, f.zero, f.residual, f.summary, f.numbers),
-        fit,
-        (noise, filters, latent, zero, data.residual, summary, numbers),
+def _expected(base: Base, plan: Plan, diameters: np.ndarray, peaks: np.ndarray, latent: Array, scale: Any) -> Base:
+    """The base of a campaign that is as the law says, of particles with these numbers."""
+    laws = eqx.filter_vmap(lambda w: base.forms.law(w, jnp.zeros(0)))(latent)
+    campaign = planned_campaign(laws, diameters, peaks, plan)
+    selection = select(campaign, threshold_MPa=base.threshold_MPa)
+    kept, tests = np.asarray(selection.kept), selection.tests
+    point = Point(latent[kept], jnp.zeros(len(kept)), jnp.zeros((len(kept), 0)))
+    state = State(point, base.state.population)
+    zeros = np.zeros(len(kept))
+    return replace(
+        base,
+        campaign=campaign,
+        selection=selection,
+        tests=tests,
+        scale=np.asarray(scale)[kept],
+        state=state,
+        rms_um=zeros,
+        range_um=zeros,
     )
-    return Base(campaign, selection, base.model, new, records_of(campaign, selection), base.threshold_MPa)
-
-
-def planned_system(base: Base, plan: Plan, library: Mapping[str, Mechanism]) -> System:
-    """The linear system of the same particles under another plan."""
-    planned = planned_base(base, plan)
-    return build_system(planned, signals_of(planned, library))
 
 
 @dataclass(frozen=True)
@@ -139,32 +131,28 @@ class Power:
         }
 
 
-def power_of(system: System, missing: Sequence[dict[str, str]]) -> Power:
-    """Detection limits and inseparable pairs of a linear system; residuals play no part."""
-    view = project(system, system.candidate_columns)
-    both = view.similarity()
+def power_of(found: Screen, missing: Sequence[dict[str, str]]) -> Power:
+    """Detection limits and inseparable pairs of what was screened; residuals play no part."""
+    both, strength = found.similarity, found.information
     limits, units, plausible = {}, {}, {}
-    strength = view.total * view.alive
     members: dict[str, list[int]] = {}
-    for k, candidate in enumerate(system.candidates):
+    for k, candidate in enumerate(found.candidates):
         if strength[k] > 0:
             members.setdefault(candidate.mechanism, []).append(k)
     for name, ks in members.items():
         # The first formula is the common one; the limit is that of the family's first formula that leaves a trace.
-        k = ks[0]
-        unit = system.candidates[k].unit_amplitude
-        limits[name] = float(DETECTABLE / np.sqrt(strength[k]) * unit)
-        units[name] = system.candidates[k].variant.unit
-        plausible[name] = system.candidates[k].variant.plausible
+        variant = found.candidates[ks[0]].variant
+        limits[name] = float(DECISIONS.detectable / np.sqrt(strength[ks[0]]) * variant.plausible[0])
+        units[name] = variant.unit
+        plausible[name] = variant.plausible
     alike = []
     names = list(members)
-    signs = system.signs
     for a, one in enumerate(names):
         for other in names[a + 1 :]:
             block = both[np.ix_(members[one], members[other])]
-            product = signs[members[one]][:, None] * signs[members[other]][None]
+            product = found.signs[members[one]][:, None] * found.signs[members[other]][None]
             value = float(np.max(np.where(product == 0, np.abs(block), block * product)))
-            if value >= ALIKE:
+            if value >= DECISIONS.alike:
                 alike.append((one, other, value))
     alike.sort(key=lambda item: -item[2])
     return Power(tuple(names), limits, units, plausible, tuple(alike), tuple(missing))
@@ -187,27 +175,17 @@ def power(
         base: a fitted campaign, of which material and noise are taken.
         library: the mechanisms.
     """
-    from ..campaign import particle_batch
-    from .legacy.fit import population_at
-    from .legacy.population import moments
-
     diameters_um = arguments.diameters(diameters_um)
-    peaks_mN = arguments.floats(peaks_mN, "peaks_mN", shape="the largest force of every particle, shape (N,)")
-    arguments.same_length(diameters_um=diameters_um, peaks_mN=np.atleast_1d(peaks_mN))
+    peaks_mN = np.atleast_1d(arguments.floats(peaks_mN, "peaks_mN", shape="the largest force of each, shape (N,)"))
+    arguments.same_length(diameters_um=diameters_um, peaks_mN=peaks_mN)
     arguments.positive(peaks_mN, "peaks_mN")
     arguments.instance(plan, Plan, "plan", "Make one with mcc_jax.Plan(name, [programme]).")
     arguments.instance(base, Base, "base", "Take the base of a discovery.")
     checked_library(library)
-    particles = particle_batch(diameters_um)
-    flat = eqx.filter_vmap(lambda particle: particle.flatness)(particles)
-    population = population_at(base.fit.mode, base.fit.numbers, base.legacy_model.scatter)
-    latent, _ = moments(population, flat, base.legacy_model.scatter)
-    laws = eqx.filter_vmap(lambda w: law_of(w, base.model.unloading))(latent)
-    campaign = planned_campaign(laws, np.asarray(diameters_um, float), np.asarray(peaks_mN, float), plan)
-    noise = eqx.tree_at(lambda n: n.scale, base.fit.noise, jnp.ones(len(diameters_um)))
-    planned = _expected(campaign, base, latent, noise)
-    system, missing = _testable(planned, library)
-    return power_of(replace(system, usable=np.ones(len(system.points), bool)), missing)
+    flat = eqx.filter_vmap(lambda particle: particle.flatness)(particle_batch(diameters_um))
+    latent = particle_means(base.state.population, flat, base.model.shape_power)
+    planned = _expected(base, plan, np.asarray(diameters_um, float), peaks_mN, latent, np.ones(len(diameters_um)))
+    return power_of(*screened(planned, library))
 
 
 def power_of_campaign(
@@ -232,14 +210,18 @@ def power_of_campaign(
     """
     check_campaign(campaign)
     checked_library(library)
-    tell, assumed, threshold_MPa = checked_settings(progress, model, threshold_MPa)
-    assumed = replace(assumed, modulus_scatter=True)
-    base = base_fit(campaign, assumed, threshold_MPa=threshold_MPa, tell=tell)
+    tell, assumed, threshold_MPa = checked_settings(progress, model, threshold_MPa, None)
+    base = base_fit(campaign, without_effects(assumed), threshold_MPa=threshold_MPa, tell=tell)
     tell("signatures of all effects")
-    return power_of(*_testable(base, library))
+    return power_of(*screened(base, library))
 
 
-def _testable(base: Base, library: Mapping[str, Mechanism]) -> tuple[System, Sequence[dict[str, str]]]:
-    """The linear system with all formulas that the campaign can be searched for, and what the others need."""
+def without_effects(model: Model) -> Model:
+    """The model without effects, its modulus free to scatter."""
+    return replace(model, modulus_scatter=True, effects=(), varying=(), robust=False)
+
+
+def screened(base: Base, library: Mapping[str, Mechanism]) -> tuple[Screen, Sequence[dict[str, str]]]:
+    """All formulas that the campaign can be searched for, to first order, and what the others need."""
     testable, missing = untestable(library, available_data(base.campaign))
-    return build_system(base, signals_of(base, testable)), missing
+    return screen(base, base.state, base.hyperparameters, testable, several=False), missing

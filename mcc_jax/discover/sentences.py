@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from .experiments import ENOUGH
+from .settings import DECISIONS
 
 if TYPE_CHECKING:
     from .result import Discovery, Effect
-
 
 SHOWN = 5
 """Most jumps that are told one by one."""
@@ -26,58 +25,81 @@ def _plain(name: str) -> str:
 
 
 def summary_of(found: Discovery) -> str:
-    """One paragraph: is there a gap, where, what explains it, what that did, what next."""
-    sentences = []
+    """One paragraph: what is missing, where, how sure, what that did, what next."""
     count = len(found.base.selection.kept) if found.base is not None else 0
-    if found.verdict == "NO_GAP":
-        sentences.append(
-            f"The law and the {count} tests agree within the noise (probability of so large a deviation by chance: "
-            f"{found.p_any:.2g}); nothing is missing that these data could show."
-        )
-    else:
-        sentences.append(f"The law and the {count} tests disagree (family-wise p = {found.p_any:.2g}){_place(found)}.")
+    sentences = [_verdict(found, count)]
     for effect, names in zip(found.effects, found.candidate_set, strict=True):
-        value = f"{effect.variant.parameter} = {effect.amplitude:.3g} +- {effect.sd:.2g}"
-        rivals = [_plain(n) for n in names if n != effect.mechanism]
-        sentences.append(f"Best name: {_plain(effect.mechanism)} (probability {effect.probability:.2f}; {value}).")
+        unit = "" if effect.variant.unit == "-" else f" {effect.variant.unit}"
+        value = f"{effect.variant.name.replace('_', ' ')}, {effect.amplitude:.3g} +- {effect.sd:.2g}{unit}"
+        sentences.append(f"It is {_plain(effect.mechanism)} with probability {effect.probability:.2f} ({value}).")
         if effect.jumps:
             sentences.append(_jumps(found, effect))
+        rivals = [_plain(n) for n in names if n != effect.mechanism]
         if rivals:
-            sentences.append(f"These data cannot tell it from {_listed(rivals)}.")
+            sentences.append(f"These tests cannot tell it from {_listed(rivals)}.")
+        if effect.misfit > 2 * DECISIONS.misfit:
+            sentences.append(f"Its formula is off by about {100 * effect.misfit:.0f} % of the effect.")
     if found.closure is not None:
         near = f", most like {_plain(found.closure.resembles[0][0])}" if found.closure.resembles else ""
-        sentences.append(f"No listed mechanism explains it; a formula does{near}: {found.closure.formula}.")
-    gap = found.gap()
-    if gap["closed_fraction"] is not None:
-        steps = gap["steps"]
-        sentences.append(
-            f"On held-out particles this closes {100 * gap['closed_fraction']:.0f} % of the systematic gap "
-            f"(chi2 per point {steps[0]['chi2_per_dof']:.3f} before, {steps[-1]['chi2_per_dof']:.3f} after)."
-        )
+        sentences.append(f"A formula describes it{near}: {found.closure.formula}.")
+    sentences += _gap(found)
+    if found.leads:
+        names = ", ".join(_plain(one["mechanism"]) for one in found.leads)
+        sentences.append(f"Beside it, what is left may be {names}; that is not added to the law.")
     if found.after and found.verdict in ("NAMED", "SET", "UNLISTED"):
         before, after = (p["effective_modulus_MPa"]["value"] / 1000 for p in (found.before, found.after))
-        sentences.append(f"It moves the effective modulus from {before:.3g} to {after:.3g} GPa.")
-    if found.next_experiments:
-        best = found.next_experiments[0]
-        names = _listed([_plain(n) for n in best["separates"]])
-        sure = best["power"] >= ENOUGH
-        doubt = "" if sure else f"No further test of those tried on paper would surely separate {names}. "
-        done = f"separate {names}" if sure else "do so"
-        sentences.append(
-            f"{doubt}{'Next' if sure else 'The best'}: {best['experiment']}, {best['particles']} further particles, "
-            f"judged together with these, would {done} with probability {best['power']:.2f}."
-        )
-    surely = found.next_experiments and found.next_experiments[0]["power"] >= ENOUGH
-    if found.checks and not surely:
-        each = "; ".join(f"{_plain(one['mechanism'])}: {one['check']}" for one in found.checks[:CHECKED])
-        sentences.append(f"Each would show by itself ({each}).")
+        sentences.append(f"With it the effective modulus is {after:.3g} GPa instead of {before:.3g} GPa.")
+    sentences += _next(found)
     if found.untestable:
-        sentences.append(
-            "These data say nothing about "
-            + "; ".join(f"{_plain(u['mechanism'])} (needs {u['needs']})" for u in found.untestable)
-            + "."
-        )
+        needs = "; ".join(f"{_plain(u['mechanism'])} (needs {u['needs']})" for u in found.untestable)
+        sentences.append(f"These tests say nothing about {needs}.")
     return " ".join(sentences)
+
+
+def _verdict(found: Discovery, count: int) -> str:
+    """What is missing, and where, in one sentence."""
+    chance = f"probability of so much evidence by chance: {found.p_any:.2g}"
+    if found.verdict == "NO_GAP":
+        return (
+            f"The law and the {count} tests agree within the noise; nothing is missing that they could show ({chance})."
+        )
+    names = " and ".join(_plain(e.mechanism) for e in found.effects)
+    lead = f"The law misses {names}" if names else "The law misses something that no listed mechanism explains"
+    if found.verdict == "SET":
+        lead += ", or what looks like it"
+    return f"{lead}: law and {count} tests disagree{_place(found)} ({chance})."
+
+
+def _gap(found: Discovery) -> list[str]:
+    gap = found.gap()
+    if gap["closed_fraction"] is None:
+        return []
+    first, last = (step["chi2_per_dof"] for step in (gap["steps"][0], gap["steps"][-1]))
+    open_still = gap["steps"][-1]["chi2_interval_95"][0]
+    told = [
+        f"On held-out particles it closes {100 * gap['closed_fraction']:.0f} % of the gap "
+        f"(chi2 per point {first:.3g} before, {last:.3g} after; 1 is noise alone)."
+    ]
+    if open_still is not None and open_still > 1.05:
+        told.append("The gap is named, not closed: the formula does not describe all of it.")
+    return told
+
+
+def _next(found: Discovery) -> list[str]:
+    told = []
+    best = found.next_experiments[0] if found.next_experiments else None
+    sure = best is not None and best["power"] >= DECISIONS.enough
+    if best is not None:
+        names = _listed([_plain(n) for n in best["separates"]])
+        doubt = "" if sure else f"No further test of those tried on paper would surely separate {names}. "
+        told.append(
+            f"{doubt}{'Next' if sure else 'The best'}: {best['experiment']}, {best['particles']} further particles; "
+            f"with these it would separate {names} with probability {best['power']:.2f}."
+        )
+    if found.checks and not sure:
+        each = "; ".join(f"{_plain(one['mechanism'])}: {one['check']}" for one in found.checks[:CHECKED])
+        told.append(f"Each would show by itself ({each}).")
+    return told
 
 
 def _jumps(found: Discovery, effect: Effect) -> str:
@@ -95,4 +117,5 @@ def _place(found: Discovery) -> str:
     first = found.where[0]
     low, high = first["load_fraction"]
     part = "" if first["segment"] == "hold" else f" between {100 * low:.0f} and {100 * high:.0f} % of the largest load"
-    return f", most of all on {first['segment']}{part}, in {len(first['particles'])} particles"
+    segment = f"{first['segment']}s" if first["segment"] == "hold" else first["segment"]
+    return f", most of all in {segment}{part}, in {len(first['particles'])} particles"

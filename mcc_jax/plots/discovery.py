@@ -15,8 +15,8 @@ from matplotlib.patches import Patch
 
 from .._errors import InputError
 from ..discover import Discovery
-from ..discover.residual_map import Place
-from ..discover.score import DETECTABLE
+from ..discover.locate import Place
+from ..discover.settings import DECISIONS
 from . import style
 from .curves import plot_before_after
 
@@ -61,15 +61,15 @@ def plain_name(name: str) -> str:
 def plot_where(found: Discovery) -> Figure:
     """Where law and tests disagree: kind of segment, share of the test's largest force, share of the gap [-].
 
-    Colour and number are the place's share of the systematic gap; the arrow says whether more (up) or less displacement
-    is measured than the law predicts. A hold is one place. Hatched: no points, or nothing the law could not take up.
+    Colour and number are the place's share of the squared difference between the law with and without what was added;
+    the arrow says whether more (up) or less displacement is measured than the law predicts. A hold is one place.
+    Hatched: no points.
     """
     kinds = list(dict.fromkeys(place.segment for place in found.places))
-    energy = np.array([np.fmax(place.statistic**2 - 1, 0.0) for place in found.places])
-    shares = energy / max(float(energy.sum()), 1e-300)
+    shares = np.array([place.share for place in found.places])
     figure = style.new_figure(7.6, 3.1)
     ax = figure.subplots()
-    largest = max(1e-3, float(shares.max(initial=0.0)))
+    largest = max(1e-3, float(np.nanmax(shares, initial=0.0)))
     colours = style.sequential(np.array([0.0, largest]))
     colours.set_cmap("YlOrBr")
     for place, share in zip(found.places, shares, strict=True):
@@ -91,12 +91,12 @@ def plot_where(found: Discovery) -> Figure:
 def _box(ax: Axes, row: int, place: Place, share: float, largest: float, colours: ScalarMappable) -> None:
     low, high = place.load_fraction
     bar: style.Look = {"width": high - low, "left": low, "height": 0.86}
-    if not np.isfinite(place.statistic):
+    if not np.isfinite(share):
         ax.barh(row, color="white", edgecolor="#D0D0D0", hatch="////", linewidth=0, **bar)
         return
     ax.barh(row, color=colours.to_rgba(np.array(share)), edgecolor="white", linewidth=1, **bar)
     if share >= 0.01:
-        words = f"{100 * share:.0f} % {'↑' if place.statistic > 0 else '↓'}"
+        words = f"{100 * share:.0f} % {'↑' if place.sign > 0 else '↓'}"
         ink = "white" if 0.6 * largest < share else style.BLACK
         ax.text((low + high) / 2, row, words, ha="center", va="center", fontsize=style.SMALL, color=ink)
 
@@ -122,7 +122,7 @@ def plot_ranking(found: Discovery) -> Figure:
     figure = style.new_figure(9.4, 1.3 + 0.235 * count)
     ax = figure.subplots()
     beside: style.Look = {"transform": ax.get_yaxis_transform(), "va": "center", "fontsize": style.SMALL}
-    scale = max([1.6 * DETECTABLE, *(abs(e["statistic"]) for e in entries)])
+    scale = max([1.6 * DECISIONS.detectable, *(abs(e["statistic"]) for e in entries)])
     any_impossible = False
     for row, entry in enumerate(entries):
         name, unit = entry["mechanism"], entry["unit"]
@@ -141,7 +141,7 @@ def plot_ranking(found: Discovery) -> Figure:
     for row, missing in enumerate(found.untestable, start=len(entries)):
         needs = f"needs {missing['needs']}"
         ax.text(0.012 * scale, row, needs, va="center", fontsize=style.SMALL, color=style.GREY, zorder=5, bbox=patch)
-    ax.axvline(DETECTABLE, **_FLOOR)
+    ax.axvline(DECISIONS.detectable, **_FLOOR)
     ax.set_yticks(range(count), [plain_name(e["mechanism"]) for e in (*entries, *found.untestable)])
     for tick in ax.get_yticklabels()[len(entries) :]:
         tick.set_color(style.GREY)

@@ -112,7 +112,7 @@ def test_the_command_says_what_it_found(found):
     for word in ("mechanism", "statistic", "detection limit", "probability", "frame_compliance", str(out)):
         assert word in text
     assert len(content["figures"]) == 6
-    assert set(snapshot(out)) == {"discovery.json", "figures", *content["figures"]}
+    assert set(snapshot(out)) == {"discovery.json", "discovery.msgpack", "figures", *content["figures"]}
     for name in content["figures"]:
         assert (out / name).read_bytes().startswith(b"\x89PNG")
 
@@ -125,7 +125,7 @@ def test_same_seed_same_file_and_stale_figures_go(found, tests, tmp_path):
     (out / "figures" / "mine.png").write_text("a file of the user's")
     text = done(call("discover", tests / "frame", "--out", out, "--no-experiments", "--no-figures", "--json"))
     assert text == (out / "discovery.json").read_text(encoding="utf-8")
-    assert set(snapshot(out)) == {"discovery.json", "figures", "figures/mine.png"}
+    assert set(snapshot(out)) == {"discovery.json", "discovery.msgpack", "figures", "figures/mine.png"}
     second = json.loads(text)
     for content in (first, second):
         assert content.pop("runtime_s") > 0

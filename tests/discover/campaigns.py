@@ -6,9 +6,8 @@ import jax
 import numpy as np
 
 from mcc_jax.calibrate import Model
-from mcc_jax.campaign import PAPER_DIAMETERS_UM, THRESHOLD_MPA, Campaign
-from mcc_jax.discover.linear_model import base_fit, build_system, signals_of
-from mcc_jax.discover.noise_estimation import refined
+from mcc_jax.campaign import PAPER_DIAMETERS_UM, Campaign
+from mcc_jax.discover.base import base_fit
 from mcc_jax.simulate import (
     Instrument,
     Programme,
@@ -79,10 +78,6 @@ cached = functools.cache(campaign)
 MODEL = Model(modulus_scatter=True)
 
 
-def refined_system(whole, library):
-    """Base fit of a campaign, its noise without what is systematic; what the formulas add; the linear system."""
-    base = base_fit(whole, MODEL, threshold_MPa=THRESHOLD_MPA)
-    signals = signals_of(base, library)
-    base, changed = refined(base, build_system(base, signals), signals)
-    assert changed
-    return base, signals, build_system(base, signals)
+def base_of(whole):
+    """The base fit of a campaign, all points counting."""
+    return base_fit(whole, MODEL, threshold_MPa=0.0, tell=lambda _: None)

@@ -1,0 +1,246 @@
+"""From a search to what is said: effects with their numbers, sets, rankings, residuals, what remains."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..calibrate import Posterior
+from ..calibrate.estimates import estimate, finite, summary
+from ..effects import Mechanism
+from .base import Base
+from .evidence import residual_of, whitened
+from .own_numbers import OwnNumbers
+from .result import Effect, Likeness, Residuals
+from .screen import screen
+from .search import UNLISTED, Hypothesis, Names, Search
+from .settings import DECISIONS
+
+
+def population_parameters(search: Search, names: Names) -> dict[str, Any]:
+    """The population's parameters under a hypothesis, by the curvature of its linear model."""
+    from .evidence import scales_of
+
+    fitted = search.found[names].fitted
+    assert fitted is not None
+    design, optimum, solution = fitted
+    mean, factor = map(np.asarray, search.base.population_prior)
+    beta = mean + factor @ np.asarray(solution.common[:5])
+    sd = np.sqrt(np.diagonal(factor @ _covariance(design, optimum.free)[:5, :5] @ factor.T))
+    _, tau, _ = scales_of(jnp.asarray(optimum.free), design)
+    shift = float(np.mean(np.log1p(np.maximum(beta[0] * np.asarray(design.tests.flatness), -0.99))))
+    means = beta[2:5] - shift
+
+    def entry(value: float, width: float) -> dict[str, Any]:
+        return estimate(value, width, (value - 1.96 * width, value + 1.96 * width))
+
+    modulus = float(np.exp(beta[1]))
+    low, high = (modulus * float(np.exp(sign * 1.96 * sd[1])) for sign in (-1, 1))
+    return {
+        "a": entry(float(beta[0]), float(sd[0])),
+        "effective_modulus_MPa": estimate(modulus, modulus * float(sd[1]), (low, high)),
+        **{
+            f"log_{name}": {"mean": entry(float(means[j]), float(sd[2 + j])), "sd": estimate(float(tau[j]))}
+            for j, name in enumerate(("C1", "C3", "C5"))
+        },
+    }
+
+
+def _covariance(design: Any, free: np.ndarray) -> np.ndarray:
+    """Posterior covariance of the common numbers, the amplitudes integrated out with flat priors."""
+    from .evidence import left_by_particle
+
+    left = np.asarray(left_by_particle(jnp.asarray(free), design).gram).sum(0)[:-1, :-1]
+    c = design.common.shape[-1]
+    prior = np.concatenate([np.ones(c), 1 / np.asarray(design.largest) ** 2])
+    return np.linalg.inv(left + np.diag(prior))
+
+
+def effects_of(search: Search, names: Names, probabilities: Mapping[str, float], p_any: float) -> tuple[Effect, ...]:
+    """The effects of a hypothesis with their numbers."""
+    one = search.found[names]
+    if one.own is not None:
+        return (_of_their_own(one.own, probabilities[names[0]], p_any),)
+    if one.best is None:
+        return ()
+    r = one.best
+    cov = _covariance(r.design, r.optimum.free)
+    c = r.design.common.shape[-1]
+    place, found = len(r.variants), []
+    for k, variant in enumerate(r.variants):
+        nuisance = {n.name: float(r.theta[place + i]) for i, n in enumerate(variant.nuisances)}
+        place += len(nuisance)
+        sd = float(np.sqrt(cov[c + k, c + k])) * variant.plausible[0]
+        size = one.sizes[k] if k < len(one.sizes) and one.with_misfit > one.alone else 0.0
+        amplitude = float(r.theta[k])
+        found.append(Effect(variant, nuisance, amplitude, sd, probabilities[variant.mechanism], p_any, misfit=size))
+    order = {name: i for i, name in enumerate(sorted(names, key=lambda n: -search.found[(n,)].log_evidence))}
+    return tuple(sorted(found, key=lambda e: order[e.mechanism]))
+
+
+def _of_their_own(own: OwnNumbers, probability: float, p_any: float) -> Effect:
+    """A mechanism whose amplitude differs from test to test, or sudden steps."""
+    unit = own.variant.plausible[0]
+    if own.jumps:
+        size = np.array([jump.size for jump in own.jumps])
+        spread = np.var(size, ddof=1) if len(size) > 1 else 0.0
+        sd = float(np.sqrt(max(spread, np.mean([j.sd**2 for j in own.jumps])) / len(size)))
+        places = {n.name: float(np.median([j.stress_MPa for j in own.jumps])) for n in own.variant.nuisances}
+        return Effect(own.variant, places, float(size.mean()), sd, probability, p_any, True, jumps=own.jumps)
+    amplitude, sd = float(own.solution.amplitude[0]) * unit, float(own.solution.sd[0]) * unit
+    return Effect(own.variant, own.nuisance, amplitude, sd, probability, p_any, True)
+
+
+def with_draws(effect: Effect, posterior: Posterior) -> Effect:
+    """The effect with its numbers from the posterior."""
+    from dataclasses import replace
+
+    named = posterior.named_population()
+    amplitude = named[effect.mechanism]
+    further = {n.name: named[f"{effect.mechanism}.{n.name}"] for n in effect.variant.nuisances}
+    return replace(
+        effect,
+        amplitude=float(amplitude.mean()),
+        sd=float(amplitude.std()),
+        nuisance={name: float(draws.mean()) for name, draws in further.items()},
+        estimates={effect.variant.parameter: summary(amplitude)} | {n: summary(d) for n, d in further.items()},
+    )
+
+
+def name_probabilities(search: Search) -> dict[str, float]:
+    """Probability of each mechanism to be missing, if anything is."""
+    found = search.posterior()
+    gap = max(1.0 - found.get((), 0.0), 1e-300)
+    return {m: sum(p for names, p in found.items() if m in names) / gap for m in search.library}
+
+
+def sets_of(search: Search, leader: Names, effects: Sequence[Effect]) -> tuple[tuple[str, ...], ...]:
+    """For each effect the mechanisms that may be in its place, most probable first, itself among them."""
+    logs = {names: one.log_evidence for names, one in search.found.items()}
+    found = []
+    for effect in effects:
+        others = [e.mechanism for e in effects if e is not effect]
+        rivals = {}
+        for names, value in logs.items():
+            if len(names) == len(leader) and names != UNLISTED and set(others) <= set(names):
+                (own,) = set(names) - set(others) if set(names) - set(others) else (None,)
+                if own is not None:
+                    rivals[own] = value
+        best = max(rivals.values())
+        weight = {name: float(np.exp(value - best)) for name, value in rivals.items()}
+        total, held, members = sum(weight.values()), 0.0, []
+        for name in sorted(weight, key=lambda n: -weight[n]):
+            members.append(name)
+            held += weight[name] / total
+            if held >= DECISIONS.set_mass:
+                break
+        ordered = [effect.mechanism, *(m for m in members if m != effect.mechanism)]
+        found.append(tuple(ordered))
+    return tuple(found)
+
+
+def ranking_of(search: Search) -> tuple[dict[str, Any], ...]:
+    """Every mechanism alone against the base law, most probable first."""
+    logs = {m: search.found[(m,)].log_evidence if (m,) in search.found else -np.inf for m in search.library}
+    best = max(logs.values())
+    weight = {m: float(np.exp(v - best)) for m, v in logs.items()}
+    total = max(sum(weight.values()), 1e-300)
+    own = {m: x for m, x in search.library.items() if m not in search.shared}
+    views = [search.screen] if search.screen is not None else []
+    if own:
+        views.append(screen(search.base, search.state, search.null.optimum.free, own, several=False))
+    entries = {}
+    for view in views:
+        first = view.settings[0]
+        information = np.maximum(view.information, 1e-300)
+        z = first.score / np.sqrt(information)
+        value, _ = view.singles()
+        for k in np.argsort(-value):
+            c = view.candidates[k]
+            if c.mechanism in entries:
+                continue
+            unit = c.variant.plausible[0]
+            entries[c.mechanism] = {
+                "mechanism": c.mechanism,
+                "variant": c.variant.name,
+                "statistic": finite(float(z[k])),
+                "estimate": finite(float(first.score[k] / information[k] * unit)),
+                "detection_limit": finite(float(DECISIONS.detectable / np.sqrt(information[k]) * unit)),
+                "unit": c.variant.unit,
+                "parameter": c.variant.parameter,
+                "probability": weight[c.mechanism] / total,
+                "sign": c.variant.sign,
+            }
+    return tuple(sorted(entries.values(), key=lambda e: -e["probability"]))
+
+
+def likeness_of(search: Search, sets: Sequence[Sequence[str]], ranking: Sequence[Mapping[str, Any]]) -> Likeness | None:
+    """How alike the mechanisms of a ranking look, each by its best formula."""
+    if search.screen is None:
+        return None
+    value, _ = search.screen.singles()
+    wanted = [name for names in sets for name in names] + [entry["mechanism"] for entry in ranking]
+    best: dict[str, int] = {}
+    for name in dict.fromkeys(wanted):
+        ks = [k for k, c in enumerate(search.screen.candidates) if c.mechanism == name]
+        if ks:
+            best[name] = max(ks, key=lambda k: value[k])
+    rows = np.array(list(best.values()), int)
+    score = search.screen.settings[0].score[rows]
+    sign = np.where(search.screen.signs[rows] == 0, np.where(score < 0, -1, 1), search.screen.signs[rows])
+    return Likeness(tuple(best), search.screen.similarity[np.ix_(rows, rows)] * sign * sign[:, None])
+
+
+def residuals_of(search: Search, winner: Names | None) -> Residuals:
+    """Residuals of every test, without and with what was found, both in units of the noise of the latter."""
+    base: Base = search.base
+    nothing = search.null
+    before = residual_of(nothing.solution, nothing.design)
+    fitted = search.found[winner or ()].fitted
+    assert fitted is not None
+    design, optimum, solution = fitted
+    after = residual_of(solution, design)
+    free = jnp.asarray(optimum.free)
+    white_before, _ = whitened(free, design, before)
+    white_after, sd = whitened(free, design, after)
+    mask = np.asarray(base.tests.mask)
+    return Residuals(
+        np.asarray(base.tests.record.time),
+        np.asarray(base.tests.record.kind),
+        mask,
+        np.where(mask, before, 0.0),
+        np.where(mask, after, 0.0),
+        np.where(mask, white_before, 0.0),
+        np.where(mask, white_after, 0.0),
+        np.where(mask, sd, 0.0),
+        tuple(base.selection.kept),
+    )
+
+
+def leads_of(search: Search, winner: Names) -> tuple[dict[str, Any], ...]:
+    """Second names that improve on the winner without leading it by the margin."""
+    if len(winner) != 1 or winner == UNLISTED:
+        return ()
+    alone = search.found[winner]
+    gap = max(alone.log_evidence - search.null.log_evidence, 1e-300)
+    found = []
+    for names, pair in search.found.items():
+        if len(names) == 2 and winner[0] in names and pair.log_evidence > alone.log_evidence + DECISIONS.lead:
+            (second,) = set(names) - set(winner)
+            share = (pair.log_evidence - alone.log_evidence) / (gap + pair.log_evidence - alone.log_evidence)
+            found.append({"mechanism": second, "share": float(share), "resembles": []})
+    return tuple(sorted(found, key=lambda lead: -lead["share"]))
+
+
+def checks_of(known: Mapping[str, Mechanism], sets: Sequence[tuple[str, ...]]) -> tuple[dict[str, str], ...]:
+    """For every mechanism that has rivals, what would show it by itself."""
+    rivals = dict.fromkeys(name for names in sets if len(names) > 1 for name in names)
+    return tuple({"mechanism": name, "check": known[name].check} for name in rivals if known[name].check)
+
+
+def leader_of(search: Search) -> Hypothesis:
+    """The most probable hypothesis other than nothing."""
+    return next(search.found[names] for names in search.log_posteriors() if names)

@@ -1,0 +1,145 @@
+"""Where the search begins: the tests, and the base law at its fit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..calibrate.data import Selection, Tests, ranges_um, root_mean_squares
+from ..calibrate.distributions import SpreadCoordinate
+from ..calibrate.fitting import in_own_units, prepare
+from ..calibrate.forward import Forms, Point, snap
+from ..calibrate.judgement import numbers_in_reach
+from ..calibrate.model import Model
+from ..campaign import Campaign
+
+
+class State(eqx.Module):
+    """Where a hypothesis is linear.
+
+    Attributes:
+        point: every particle's numbers, its zero, and those of the effects.
+        population: a, log modulus, and the means of b1, b3, b5 at the campaign's average shape.
+    """
+
+    point: Point
+    population: Float[Array, " 5"]
+
+    def with_numbers(self, numbers: np.ndarray) -> State:
+        """The same with numbers of effects, the same for all particles."""
+        shape = (len(self.point.zero), len(numbers))
+        return State(replace(self.point, theta=jnp.asarray(np.broadcast_to(numbers, shape))), self.population)
+
+
+@dataclass(frozen=True)
+class Base:
+    """The tests, what is assumed, and the base law at its fit.
+
+    Attributes:
+        campaign: the tests that took part in the search.
+        selection: which of their points.
+        model: without effects; the modulus may scatter between particles.
+        tests: as arrays.
+        scale: each particle's own factor on the noise [-].
+        state: where the base law fits.
+        hyperparameters: logarithms of the noise's four numbers, coordinates of the spreads of b1, b3, b5 and e.
+        converged: whether noise and population did.
+        threshold_MPa: stress below which points do not count [MPa].
+        rms_um, range_um: of every test, residuals of the particle's own fit and range of displacement [um].
+    """
+
+    campaign: Campaign
+    selection: Selection
+    model: Model
+    tests: Tests
+    scale: np.ndarray
+    state: State
+    hyperparameters: np.ndarray
+    converged: bool
+    threshold_MPa: float
+    rms_um: np.ndarray
+    range_um: np.ndarray
+
+    @property
+    def forms(self) -> Forms:
+        """Formulas of the base law."""
+        return Forms(self.model.unloading)
+
+    @property
+    def spreads(self) -> tuple[Any, ...]:
+        """Priors of the spreads of b1, b3, b5 and e."""
+        p = self.model.chosen_priors
+        return p.tau_C1, p.tau_C3, p.tau_C5, p.modulus_scatter
+
+    @property
+    def population_prior(self) -> tuple[Array, Array]:
+        """Prior of `State.population`: mean, and factor of the covariance."""
+        p = self.model.chosen_priors
+        mean, factor = np.zeros(5), np.zeros((5, 5))
+        mean[0], factor[0, 0] = p.a.mean, p.a.sd
+        mean[1], factor[1, 1] = np.log(p.effective_modulus_MPa.median), p.effective_modulus_MPa.log_sd
+        mean[2], factor[2, 2] = np.log(p.C1.median), p.C1.log_sd
+        mean[4], factor[4, 4] = np.log(p.C5.median), p.C5.log_sd
+        # The softening 9 C3^6 / (20 C1 C5^5) has a prior of its own.
+        mean[3] = (np.log(20 / 9) + mean[2] + 5 * mean[4] + np.log(p.softening.median)) / 6
+        factor[3, 2], factor[3, 4], factor[3, 3] = factor[2, 2] / 6, 5 * factor[4, 4] / 6, p.softening.log_sd / 6
+        return jnp.asarray(mean), jnp.asarray(factor)
+
+    def name_of(self, row: int) -> str:
+        """The particle of a row of the tests."""
+        return self.campaign.particles[self.selection.kept[row]]
+
+    @property
+    def snapping(self) -> tuple[str, ...]:
+        """Particles whose law snaps through below their largest force: there no displacement belongs to a force."""
+        log_force = np.asarray(jax.vmap(snap)(self.state.point.latent, self.tests.particle))
+        most = np.log(np.max(np.where(self.tests.mask, self.tests.force, 1e-300), axis=1))
+        return tuple(name for name, low in zip(self.names, log_force < most, strict=True) if low)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The particles of all rows."""
+        return tuple(map(self.name_of, range(len(self.tests))))
+
+
+def base_fit(campaign: Campaign, model: Model, *, threshold_MPa: float, tell: Callable[[str], None]) -> Base:
+    """Fit the base law to a campaign.
+
+    Raises:
+        InputError: if no particle can be used, or the numbers are beyond arithmetic.
+    """
+    with numbers_in_reach(campaign):
+        model, _ = in_own_units(campaign, model)
+        selection, fit, _ = prepare(campaign, model, threshold_MPa, fill_up=False, tell=tell)
+    p = fit.population
+    shift = float(jnp.mean(jnp.log1p(p.a * fit.tests.flatness)))
+    population = jnp.concatenate([jnp.stack([p.a, p.log_modulus]), p.mu + shift])
+    point = replace(fit.point, theta=jnp.zeros((len(fit.tests), 0)))
+    spreads = [*np.asarray(p.tau), max(float(p.modulus_scatter), 1e-3)]
+    base = Base(
+        campaign,
+        selection,
+        model,
+        fit.tests,
+        np.asarray(fit.noise.noise.scale),
+        State(point, population),
+        np.zeros(0),
+        bool(np.all(np.asarray(fit.converged)[1:])),
+        threshold_MPa,
+        root_mean_squares(fit.tests, fit.residual),
+        ranges_um(fit.tests),
+    )
+    x = [
+        float(SpreadCoordinate(prior).coordinate(max(float(tau), 1e-4)))
+        for prior, tau in zip(base.spreads, spreads, strict=True)
+    ]
+    # Where a spread is nil its coordinate has no slope: begin a little beside it.
+    logs = np.asarray(fit.noise.noise.logs)
+    return replace(base, hyperparameters=np.concatenate([logs, np.maximum(x, 0.3)]))

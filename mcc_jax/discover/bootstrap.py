@@ -1,0 +1,134 @@
+"""Is anything missing at all? A parametric bootstrap of the first-order evidence of all hypotheses together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.special import logsumexp
+
+from ..calibrate.distributions import SCALES
+from .candidates import candidates_of
+from .evidence import left_by_particle, with_amplitudes
+from .misfit import general
+from .screen import signature_columns, single_integrals
+from .search import SUDDEN, Search
+from .settings import DECISIONS, NUMERICS
+
+POPULATION = 5
+"""Numbers of the population, which come first among what all particles share."""
+
+
+class Scores(NamedTuple):
+    """Scores of columns in every particle, its own numbers integrated out.
+
+    Attributes:
+        gram: information, shape (N, c, c); the population's columns come first.
+        score: shape (N, c).
+    """
+
+    gram: np.ndarray
+    score: np.ndarray
+
+
+class _Statistic:
+    """The log evidence of anything against nothing, from scores at the base law's hyperparameters."""
+
+    def __init__(self, search: Search) -> None:
+        base, state = search.base, search.state
+        design, screen = search.null.design, search.screen
+        basis, self.smooth = general(search.at, base.tests.effective_diameter, base.tests.mask)
+        own, self.own_names, self.own_ratio = [], [], []
+        for name, mechanism in search.library.items():
+            if name not in search.shared and name != SUDDEN:
+                candidates = candidates_of({name: mechanism})
+                own.append(signature_columns(base, state, candidates))
+                self.own_names += [name] * len(candidates)
+                self.own_ratio += [c.variant.plausible[1] / c.variant.plausible[0] for c in candidates]
+        steps = self._steps(search) if SUDDEN in search.library else jnp.zeros((*basis.shape[:2], 0))
+        formulas = jnp.zeros((*basis.shape[:2], 0)) if screen is None else screen.columns
+        self.counts = [POPULATION, formulas.shape[-1], basis.shape[-1], len(self.own_names), steps.shape[-1]]
+        every = jnp.concatenate([design.common[..., :POPULATION], formulas, basis, *own, steps], -1)
+        nothing = with_amplitudes(replace(design, common=every[..., :0], group=design.group[:0]), every)
+        left = np.asarray(left_by_particle(jnp.asarray(search.null.optimum.free), nothing).gram)
+        self.scores = Scores(left[:, :-1, :-1], left[:, :-1, -1])
+        self.library = len(search.library)
+        self.unit = float(DECISIONS.general * np.exp(search.null.optimum.free[0]))
+        self.ratio_of_steps = 1.0
+        if SUDDEN in search.library:
+            low, high = search.library[SUDDEN].variants[0].plausible
+            self.ratio_of_steps = high / low
+        if screen is not None:
+            self.signs, self.largest = screen.signs, screen.largest
+            names = [(c.mechanism, c.variant.name) for c in screen.candidates]
+            mechanisms = {m: len({f for n, f in names if n == m}) for m, _ in names}
+            grid = {name: names.count(name) for name in set(names)}
+            self.weight = -np.log([mechanisms[n[0]] * grid[n] for n in names])
+
+    @staticmethod
+    def _steps(search: Search):
+        """Steps at some points of every test's loading."""
+        loading = np.asarray(search.base.tests.loading & search.base.tests.mask)
+        mask = np.asarray(search.base.tests.mask)
+        columns = np.zeros((*loading.shape, NUMERICS.thinned))
+        for i, rows in enumerate(map(np.flatnonzero, loading)):
+            if len(rows) > 1:
+                for k, j in enumerate(rows[np.linspace(1, len(rows) - 1, NUMERICS.thinned).astype(int)]):
+                    columns[i, j:, k] = np.where(mask[i, j:], search.library[SUDDEN].variants[0].plausible[0], 0.0)
+        return jnp.asarray(columns)
+
+    def __call__(self, score: np.ndarray) -> np.ndarray:
+        """Log evidence ratios of campaigns, from scores of shape (campaigns, N, columns)."""
+        _, formulas, basis, own, steps = np.split(np.arange(score.shape[-1]), np.cumsum(self.counts)[:-1])
+        gram, shared = self.scores.gram, np.arange(sum(self.counts[:3]))
+        G, f = gram[:, shared[:, None], shared].sum(0), len(formulas)
+        inner = np.linalg.inv(np.eye(POPULATION) + G[:POPULATION, :POPULATION])
+        total = score[..., shared].sum(1)
+        s = total[:, POPULATION:] - total[:, :POPULATION] @ inner @ G[:POPULATION, POPULATION:]
+        G = G[POPULATION:, POPULATION:] - G[POPULATION:, :POPULATION] @ inner @ G[:POPULATION, POPULATION:]
+        logs: list[Any] = []
+        prior = -float(np.log(self.library))
+        if f:
+            scores, powers = s[:, :f].ravel(), np.tile(np.diagonal(G)[:f], len(s))
+            each, _ = single_integrals(scores, powers, np.tile(self.signs, len(s)), np.tile(self.largest, len(s)))
+            logs.append(prior + np.asarray(logsumexp(each.reshape(len(s), f) + self.weight, axis=1)))
+        smooth = []
+        for size in self.unit * np.array([0.1, 0.3, 1.0, 3.0]):
+            spread = np.eye(len(basis)) + size**2 * G[f:, f:]
+            value = 0.5 * size**2 * np.einsum("mk,km->m", s[:, f:], np.linalg.solve(spread, s[:, f:].T))
+            smooth.append(value - 0.5 * np.linalg.slogdet(spread)[1])
+        logs.append(-DECISIONS.unlisted + np.asarray(logsumexp(smooth, axis=0)) - np.log(len(smooth)))
+        rest = score - np.einsum("ncp,mp->mnc", gram[:, :, :POPULATION], total[:, :POPULATION] @ inner)
+        for name in dict.fromkeys(self.own_names):
+            values = []
+            for k in (k for k, other in enumerate(self.own_names) if other == name):
+                power = gram[:, own[k], own[k]]
+                for scale in np.geomspace(1.0, self.own_ratio[k], SCALES):
+                    spread = 1 + scale**2 * power
+                    values.append(np.sum(0.5 * (scale**2 * rest[..., own[k]] ** 2 / spread - np.log(spread)), 1))
+            logs.append(prior + np.asarray(logsumexp(values, axis=0)) - np.log(len(values)))
+        if len(steps):
+            scores, powers = rest[..., steps].ravel(), np.tile(gram[:, steps, steps].ravel(), len(score))
+            ones = np.ones(len(scores))
+            each, _ = single_integrals(scores, powers, ones, ones * self.ratio_of_steps)
+            ratio = logsumexp(each.reshape(*rest.shape[:2], len(steps)), axis=2) - np.log(len(steps))
+            any_ = np.logaddexp(np.log1p(-DECISIONS.jump), np.log(DECISIONS.jump) + ratio)
+            logs.append(prior + any_.sum(1))
+        return np.asarray(logsumexp(logs, axis=0))
+
+
+def p_anything(search: Search, seed: int) -> float:
+    """Probability that the base law alone would give as much evidence of anything missing.
+
+    Scores of campaigns of the base law are drawn at its fitted hyperparameters: they are normal, with the information
+    as their covariance.
+    """
+    statistic = _Statistic(search)
+    gram, score = statistic.scores
+    values, vectors = np.linalg.eigh(gram)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
+    normal = np.random.default_rng([seed, 41]).standard_normal((NUMERICS.bootstrap, *score.shape))
+    drawn = statistic(np.einsum("ncd,mnd->mnc", root, normal, optimize=True))
+    return (1 + int(np.sum(drawn >= statistic(score[None])[0]))) / (1 + NUMERICS.bootstrap)

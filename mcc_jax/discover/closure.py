@@ -1,0 +1,247 @@
+"""What is missing where no listed mechanism explains it: a curve with its band, and a short formula near it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from .evidence import Design, left_by_particle, scales_of, with_amplitudes, without_first
+from .search import UNLISTED, Search
+from .settings import NUMERICS
+
+LETTERS = {
+    "strain": ("e", "peak strain"),
+    "travel": ("g", "displacement / D_e"),
+    "load": ("u", "F / F_peak"),
+    "clock": ("t", "time [s]"),
+    "force": ("F", "force [mN]"),
+}
+"""Coordinates of a formula: letter and meaning."""
+
+ENOUGH = 0.9
+"""Share of what two terms explain from which on one term is enough."""
+
+
+@dataclass(frozen=True)
+class Term:
+    """A term of a formula: a function of one coordinate.
+
+    Attributes:
+        coordinate: which one.
+        text: as it is printed.
+        function: its value.
+    """
+
+    coordinate: str
+    text: str
+    function: Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Closure:
+    """An addition to displacement found from the data, in units of strain (times D_e).
+
+    Attributes:
+        formula: as text, of at most two terms with rounded numbers.
+        coordinate: which coordinate explains most of it.
+        x, added, sd: the curve along it, in units of strain, and its standard error.
+        selection_frequency: share of resamples of the particles in which the same coordinate explains most.
+        resembles: mechanisms whose projected signatures it resembles, with the cosine, best first.
+        span: range of the coordinates over which it was found.
+        correction_um, held_out_um: displacement that it adds at every point, shape (N, points): by all tests, and by
+            the tests without the one it is for.
+    """
+
+    formula: str
+    coordinate: str
+    x: np.ndarray
+    added: np.ndarray
+    sd: np.ndarray
+    selection_frequency: float
+    resembles: tuple[tuple[str, float], ...]
+    span: dict[str, tuple[float, float]]
+    correction_um: np.ndarray
+    held_out_um: np.ndarray
+
+    def to_json(self) -> dict[str, Any]:
+        """As in `discovery.json`."""
+        return {
+            "formula": self.formula,
+            "range": {name: list(pair) for name, pair in self.span.items()},
+            "selection_frequency": self.selection_frequency,
+            "resembles": [[name, round(value, 3)] for name, value in self.resembles],
+            "curve": {
+                "coordinate": LETTERS[self.coordinate][1],
+                "x": self.x.tolist(),
+                "added_over_D": self.added.tolist(),
+                "sd": self.sd.tolist(),
+            },
+        }
+
+
+def terms_of(name: str, low: float, high: float) -> list[Term]:
+    """Readable functions of a coordinate over its range."""
+    letter, reach = LETTERS[name][0], max(high - low, 1e-300)
+    found = [
+        Term(name, letter, lambda x: x),
+        Term(name, f"{letter}^2", lambda x: x**2),
+        Term(name, f"{letter}^3", lambda x: x**3),
+        Term(name, f"sqrt({letter})", lambda x: np.sqrt(np.maximum(x, 0.0))),
+    ]
+    for share in (0.03, 0.1, 0.3):
+        s = _rounded(share * reach)
+        found.append(Term(name, f"(1 - exp(-{letter}/{s:g}))", lambda x, s=s: 1 - np.exp(-np.maximum(x, 0.0) / s)))
+        found.append(Term(name, f"ln(1 + {letter}/{s:g})", lambda x, s=s: np.log1p(np.maximum(x, 0.0) / s)))
+    for k in range(2, 2 * NUMERICS.waves):
+        p = _rounded(2 * reach / k, 3)
+        found.append(Term(name, f"sin(2 pi {letter}/{p:g})", lambda x, p=p: np.sin(2 * np.pi * x / p)))
+        found.append(Term(name, f"cos(2 pi {letter}/{p:g})", lambda x, p=p: np.cos(2 * np.pi * x / p)))
+    for share in (0.2, 0.4, 0.6, 0.8):
+        c, w = _rounded(low + share * reach), _rounded(0.15 * reach)
+        text = f"exp(-(({letter} - {c:g})/{w:g})^2)"
+        found.append(Term(name, text, lambda x, c=c, w=w: np.exp(-(((x - c) / w) ** 2))))
+    return found
+
+
+def _rounded(x: float, digits: int = 2) -> float:
+    return float(f"{x:.{digits}g}")
+
+
+def closure(search: Search, seed: int) -> Closure:
+    """Curve and formula of the smooth discrepancy that was found.
+
+    Args:
+        search: whose leading hypothesis it is.
+        seed: of the resamples of particles.
+    """
+    smooth = search.found[UNLISTED].smooth
+    assert smooth is not None
+    tests = search.base.tests
+    mask, size = np.asarray(tests.mask), np.asarray(tests.effective_diameter)
+    natural = {name: np.asarray(search.natural[name]) for name in LETTERS}
+    span = {name: (float(x[mask].min()), float(x[mask].max())) for name, x in natural.items()}
+    terms = [t for name, (low, high) in span.items() if high > low for t in terms_of(name, low, high)]
+    values = np.stack([t.function(natural[t.coordinate]) * size[:, None] for t in terms], -1)
+    values = np.where(mask[..., None], values, 0.0)
+    scale = np.maximum(np.sqrt((values**2).mean((0, 1))), 1e-300)
+    null = search.null.design
+    free = jnp.asarray(smooth.optimum.free[:8])
+    curve = np.asarray(smooth.curve_um)[..., None]
+    known = np.zeros((*curve.shape[:2], 0)) if search.screen is None else np.asarray(search.screen.columns)
+    every = jnp.concatenate([jnp.asarray(values / scale), jnp.asarray(curve), jnp.asarray(known)], -1)
+    left = np.asarray(left_by_particle(free, with_amplitudes(null, every)).gram)
+    T = len(terms)
+    everyone = np.arange(len(left))
+    chosen, weights = _best_terms(left, null.common.shape[-1], T, everyone)
+    rng = np.random.default_rng([seed, 47])
+    again = [
+        terms[_best_terms(left, null.common.shape[-1], T, rng.choice(everyone, len(everyone)), one=True)[0][0]]
+        for _ in range(20)
+    ]
+    name = terms[chosen[0]].coordinate
+    x = np.linspace(*span[name], NUMERICS.shares)
+    texts = [f"{_rounded(w / scale[k]):+g} {terms[k].text}" for k, w in zip(chosen, weights, strict=True)]
+    letters = dict.fromkeys(terms[k].coordinate for k in chosen)
+    meaning = ", ".join(f"{LETTERS[n][0]} = {LETTERS[n][1]}" for n in letters)
+    added, sd = _along(search, name, x, span[name])
+    return Closure(
+        f"added displacement / D_e = {' '.join(texts)}; {meaning}",
+        name,
+        x,
+        added,
+        sd,
+        float(np.mean([t.coordinate == name for t in again])),
+        _resembling(search, left, null.common.shape[-1], T),
+        span,
+        curve[..., 0],
+        _held_out(smooth.design, np.asarray(smooth.optimum.free), np.asarray(smooth.basis), smooth.first),
+    )
+
+
+def _shared(left: np.ndarray, common: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Information and scores of the amplitudes, what all particles share integrated out."""
+    total, _ = without_first(jnp.asarray(left[rows].sum(0)), common)
+    total = np.asarray(total)
+    return total[:-1, :-1], total[:-1, -1]
+
+
+def _best_terms(
+    left: np.ndarray, common: int, count: int, rows: np.ndarray, *, one: bool = False
+) -> tuple[tuple[int, ...], np.ndarray]:
+    """The term, or the two, that explain most, and their weights."""
+    G, s = _shared(left, common, rows)
+    G, s = G[:count, :count], s[:count]
+    power = np.maximum(np.diagonal(G), 1e-300)
+    single = s**2 / power
+    first = int(np.argmax(single))
+    if one:
+        return (first,), np.array([s[first] / power[first]])
+    best = [int(k) for k in np.argsort(-single)[:24]]
+    pairs = []
+    for i, j in combinations(best, 2):
+        inner = G[np.ix_([i, j], [i, j])]
+        if np.linalg.cond(inner) < 1e6:
+            w = np.linalg.solve(inner, s[[i, j]])
+            pairs.append((float(w @ s[[i, j]]), (i, j), w))
+    if not pairs or single[first] > ENOUGH * max(p[0] for p in pairs):
+        return (first,), np.array([s[first] / power[first]])
+    _, two, w = max(pairs, key=lambda p: p[0])
+    return two, w
+
+
+def _resembling(search: Search, left: np.ndarray, common: int, place: int) -> tuple[tuple[str, float], ...]:
+    """Mechanisms whose projected signatures are like the curve's, with the cosine, best first."""
+    if search.screen is None:
+        return ()
+    G, _ = _shared(left, common, np.arange(len(left)))
+    own = max(G[place, place], 1e-300)
+    cosine = G[place, place + 1 :] / np.sqrt(own * np.maximum(np.diagonal(G)[place + 1 :], 1e-300))
+    signs = search.screen.signs
+    cosine = np.where(signs == 0, np.abs(cosine), cosine * signs)
+    best: dict[str, float] = {}
+    for c, value in zip(search.screen.candidates, cosine, strict=True):
+        best[c.mechanism] = max(best.get(c.mechanism, -1.0), float(value))
+    return tuple(sorted(((n, v) for n, v in best.items() if v > 0.3), key=lambda pair: -pair[1])[:5])
+
+
+def _along(search: Search, name: str, x: np.ndarray, span: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """The discrepancy as a function of one coordinate, in units of strain, and its standard error."""
+    smooth = search.found[UNLISTED].smooth
+    assert smooth is not None
+    tests, N = search.base.tests, 2 * NUMERICS.waves
+    size = np.asarray(tests.effective_diameter)
+    at = np.asarray(search.at[name])
+
+    def functions(u: np.ndarray) -> np.ndarray:
+        return np.stack([np.cos(np.pi * k * u) for k in range(1, N)], -1)
+
+    basis = functions(at) * size[:, None, None] / np.sqrt(N)
+    basis = jnp.where(tests.mask[..., None], jnp.asarray(basis), 0.0)
+    free = jnp.asarray(smooth.optimum.free[:8])
+    left = left_by_particle(free, with_amplitudes(search.null.design, basis))
+    total, _ = without_first(jnp.sum(left.gram, 0), search.null.design.common.shape[-1])
+    G, s = np.asarray(total)[:-1, :-1], np.asarray(total)[:-1, -1]
+    # Weights have the size that the smooth discrepancy was found to have, in units of strain.
+    unit = float(np.sqrt(np.mean((np.asarray(smooth.curve_um) / size[:, None])[np.asarray(tests.mask)] ** 2)))
+    covariance = np.linalg.inv(G + np.eye(len(G)) / max(unit, 1e-12) ** 2)
+    there = functions((x - span[0]) / max(span[1] - span[0], 1e-300)) / np.sqrt(N)
+    sd = np.sqrt(np.maximum(np.einsum("xk,kl,xl->x", there, covariance, there), 0.0))
+    return there @ (covariance @ s), sd
+
+
+def _held_out(design: Design, free: np.ndarray, basis: np.ndarray, first: int) -> np.ndarray:
+    """What the discrepancy adds to every test by the weights that the others make [um]."""
+    left = np.asarray(left_by_particle(jnp.asarray(free), design).gram)
+    _, _, common = scales_of(jnp.asarray(free), design)
+    total, c = left.sum(0), design.common.shape[-1]
+    found = []
+    for i, own in enumerate(left):
+        others = total - own
+        numbers = np.linalg.solve(others[:c, :c] + np.eye(c), others[:c, -1]) * np.asarray(common)
+        found.append(basis[i] @ numbers[first : first + basis.shape[-1]])
+    return np.array(found)

@@ -1,0 +1,177 @@
+"""The columns of a hypothesis around a state, and where the state moves to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..calibrate.compiling import compiled
+from ..calibrate.data import Tests
+from ..calibrate.distributions import nuisance_moments
+from ..calibrate.fitting import linear_data
+from ..calibrate.forward import Forms, Linear, Point
+from ..effects import Variant
+from .base import Base, State
+from .evidence import Design, Kinds, Solution
+from .settings import NUMERICS
+
+AMPLITUDES, MISFITS = 2, 2
+"""Effects of a hypothesis at most, and misfits: every design has room for so many."""
+
+FURTHER = 5 + 2 * AMPLITUDES
+"""Numbers that all particles share: the population's, and further ones of the effects."""
+
+
+def particle_means(beta: Float[Array, " 5"], flatness: Array, power: float) -> Float[Array, "particles 4"]:
+    """Means of the particles' b1, b3, b5, e under the population.
+
+    b1, b3, b5 of the population are those at the campaign's average shape; its mean, as a, is taken in by the prior.
+    """
+    log_eta = jnp.log1p(jnp.maximum(beta[0] * flatness, -0.99))
+    shift = jnp.mean(log_eta)
+    b = beta[2:5][None] + (log_eta - shift)[:, None]
+    e = beta[1] + power * log_eta
+    return jnp.concatenate([b, e[:, None]], 1)
+
+
+@compiled
+def base_columns(state: State, tests: Tests, linear: Linear, prior: tuple[Array, Array], power: float) -> Any:
+    """Columns of the population, and the data less what the priors' means say."""
+    mean, factor = prior
+    flatness = tests.flatness
+    at = particle_means(state.population, flatness, power)
+    slope = jax.jacfwd(lambda b: particle_means(b, flatness, power))(state.population)
+    columns = jnp.einsum("npk,nkb,bc->npc", linear.columns[..., :4], slope, factor)
+    away = at + jnp.einsum("nkb,b->nk", slope, mean - state.population) - state.point.latent
+    data = linear.residual - jnp.einsum("npk,nk->np", linear.columns[..., :4], away)
+    return columns, data
+
+
+@dataclass(frozen=True)
+class More:
+    """Columns of a hypothesis besides those of its formulas.
+
+    Attributes:
+        own, own_spreads: of numbers that every test has of its own, and the priors of their spreads.
+        amplitude, largest, sign: of further amplitudes in units of the smallest plausible one, the largest of each in
+            that unit, and its physical sign.
+        basis: of misfits.
+        group: which misfit each of these columns belongs to, from 1 on.
+        sizes: median and standard deviation of the logarithm of each misfit's size.
+    """
+
+    own: Array | None = None
+    own_spreads: tuple[Any, ...] = ()
+    amplitude: Array | None = None
+    largest: tuple[float, ...] = ()
+    sign: tuple[int, ...] = ()
+    basis: Array | None = None
+    group: Sequence[int] = ()
+    sizes: Sequence[tuple[float, float]] = field(default=())
+
+
+NOTHING_MORE = More()
+
+
+def design_of(base: Base, state: State, variants: tuple[Variant, ...] = (), more: More = NOTHING_MORE) -> Design:
+    """The design of a hypothesis around a state."""
+    tests, model = base.tests, base.model
+    linear = linear_data(state.point, tests, Forms(model.unloading, variants))
+    population, data = base_columns(state, tests, linear, base.population_prior, model.shape_power)
+    zero_mean, zero_sd = np.asarray(model.zero_prior)
+    ones = jnp.where(tests.mask, 1.0, 0.0)
+    data = data - (tests.contact + zero_mean - state.point.zero)[:, None] * ones
+    own = [linear.columns[..., :4], (zero_sd * ones)[..., None], *([] if more.own is None else [more.own])]
+    K, effect, theta = len(variants), linear.columns[..., 4:], state.point.theta
+    units = jnp.asarray(np.array([v.plausible[0] for v in variants]))
+    amplitude = [effect[..., :K] * units[None, None], *([] if more.amplitude is None else [more.amplitude])]
+    data = data + jnp.einsum("npk,nk->np", effect[..., :K], theta[:, :K])
+    common, place = [population], K
+    for v in variants:
+        for n in v.nuisances:
+            mean, sd = nuisance_moments(n)
+            at, column = theta[0, place], effect[..., place]
+            if n.plausible[0] > 0:
+                column, at = column * at, jnp.log(at)
+            data = data - column * (mean - at)
+            common.append((sd * column)[..., None])
+            place += 1
+    basis, group, sizes = more.basis, list(more.group), list(more.sizes)
+    if basis is not None:  # misfits of two names, and as many functions, in every hypothesis that has any
+        basis = padded(basis, NUMERICS.basis)
+        group += [MISFITS] * (NUMERICS.basis - len(group))
+        sizes += [(0.0, 1.0)] * (MISFITS - len(sizes))
+    spreads = more.own_spreads
+    if spreads:
+        own = [*own, jnp.zeros((*tests.mask.shape, NUMERICS.jumps - len(spreads)))]
+        spreads = (*spreads, *[spreads[0]] * (NUMERICS.jumps - len(spreads)))
+    shared = padded(jnp.concatenate(common, -1), FURTHER)
+    group = [0] * FURTHER + group
+    if basis is not None:
+        shared = jnp.concatenate([shared, basis], -1)
+    used = [1.0] * (8 + len(more.own_spreads)) + [0.0] * (len(spreads) - len(more.own_spreads))
+    used += [1.0] * len(more.sizes) + [0.0] * (len(sizes) - len(more.sizes))
+    absent = AMPLITUDES - sum(x.shape[-1] for x in amplitude)
+    noise = base.model.chosen_priors.noise
+    largest = [*(v.plausible[1] / v.plausible[0] for v in variants), *more.largest, *[1.0] * absent]
+    return Design(
+        tests,
+        replace(linear, columns=linear.columns[..., :0]),  # they stand in the design: one shape for all formulas
+        jnp.concatenate(own, -1),
+        shared,
+        padded(jnp.concatenate(amplitude, -1), AMPLITUDES),
+        data,
+        jnp.asarray(base.scale),
+        jnp.asarray(np.array(group, int)),
+        jnp.asarray(np.stack([np.log(np.asarray(noise.median)), np.asarray(noise.log_sd)])),
+        jnp.asarray(np.array(largest, float)),
+        jnp.asarray(np.array([*(v.sign for v in variants), *more.sign, *[0] * absent], float)),
+        jnp.asarray(np.array(sizes, float).reshape(-1, 2)),
+        jnp.asarray(np.array(used, float)),
+        Kinds((*base.spreads, *spreads), model.correlation, model.along),
+    )
+
+
+def padded(columns: Array, size: int) -> Array:
+    """Columns of nothing added, so that few shapes are compiled; their numbers have no say."""
+    return jnp.pad(columns, ((0, 0), (0, 0), (0, size - columns.shape[-1])))
+
+
+def moved(base: Base, state: State, variants: tuple[Variant, ...], solution: Solution) -> State:
+    """The state at a solution; a positive number moves by a factor of e at most, others within what is plausible."""
+    tests, model = base.tests, base.model
+    mean, factor = base.population_prior
+    beta = mean + factor @ solution.common[:5]
+    at, slope = means_and_slope(state.population, tests.flatness, model.shape_power)
+    latent = at + jnp.einsum("nkb,b->nk", slope, beta - state.population) + solution.own[:, :4]
+    zero_mean, zero_sd = np.asarray(model.zero_prior)
+    zero = tests.contact + zero_mean + zero_sd * solution.own[:, 4]
+    numbers: list[Any] = [v.plausible[0] * float(solution.amplitude[k]) for k, v in enumerate(variants)]
+    old, place = np.asarray(state.point.theta[0]), 5
+    for v in variants:
+        for n in v.nuisances:
+            middle, sd = nuisance_moments(n)
+            x, now = middle + sd * float(solution.common[place]), float(old[len(numbers)])
+            if n.plausible[0] > 0:
+                numbers.append(now * np.exp(np.clip(x - np.log(now), -1.0, 1.0)))
+            else:
+                numbers.append(float(np.clip(x, *n.plausible)))
+            place += 1
+    return State(Point(latent, zero, state.point.theta), beta).with_numbers(np.array(numbers))
+
+
+@compiled
+def means_and_slope(beta: Float[Array, " 5"], flatness: Array, power: float) -> tuple[Array, Array]:
+    """Means of the particles' b1, b3, b5, e, and their derivatives by the population."""
+    return particle_means(beta, flatness, power), jax.jacfwd(lambda b: particle_means(b, flatness, power))(beta)
+
+
+def between(one: State, other: State) -> State:
+    """Half the way from one state to another."""
+    return jax.tree.map(lambda x, y: 0.5 * (x + y), one, other)

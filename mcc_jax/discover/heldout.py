@@ -1,0 +1,190 @@
+"""The gap on particles that took no part in finding and fitting what should close it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..calibrate.estimates import finite
+from .evidence import Design, amplitudes, left_by_particle, scales_of, without_first
+from .search import Names, Search
+from .settings import NUMERICS
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Held-out results of every step, the base law first.
+
+    Attributes:
+        labels: what was added at each step; None for the base law.
+        chi2: of every particle, shape (steps, N), under the noise of the law with everything added.
+        points: of every particle.
+        elpd: log predictive density of every particle, shape (steps, N).
+        repeating_um2: mean product of the residuals of two different particles at one share of the path [um^2].
+    """
+
+    labels: tuple[str | None, ...]
+    chi2: np.ndarray
+    points: np.ndarray
+    elpd: np.ndarray
+    repeating_um2: np.ndarray
+
+    @property
+    def chi2_per_dof(self) -> np.ndarray:
+        """Mean chi2 per point of every step."""
+        return self.chi2.sum(1) / self.points.sum()
+
+    def to_json(self) -> dict[str, Any]:
+        """The gap as in `discovery.json`; shares never stand without chi2 per point beside them."""
+        chi2, steps = self.chi2_per_dof, []
+        for k, label in enumerate(self.labels):
+            away = self.elpd[k] - self.elpd[0]
+            each = self.chi2[k] / self.points
+            half = 1.96 * float(np.std(each, ddof=1) / np.sqrt(len(each))) if len(each) > 1 else float("nan")
+            steps.append(
+                {
+                    "added": label,
+                    "chi2_per_dof": finite(float(chi2[k])),
+                    "chi2_interval_95": [finite(float(chi2[k]) - half), finite(float(chi2[k]) + half)],
+                    "systematic_um": finite(float(np.sqrt(max(self.repeating_um2[k], 0.0)))),
+                    "elpd": finite(float(away.sum())),
+                    "elpd_se": finite(float(np.std(away, ddof=1) * np.sqrt(len(away)))) if len(away) > 1 else None,
+                }
+            )
+        return {
+            "floor": 1.0,
+            "heldout": "leave-one-particle-out",
+            "steps": steps,
+            "closed_fraction": _share(float(chi2[0]) - 1.0, float(chi2[-1]) - 1.0),
+            "repeating_closed_fraction": _share(float(self.repeating_um2[0]), float(self.repeating_um2[-1])),
+        }
+
+
+def _share(before: float, after: float) -> float | None:
+    """The share of a gap that is closed, at most all of it; None where there is none to close."""
+    return None if before <= 0 else finite(min(1.0 - max(after, 0.0) / before, 1.0))
+
+
+NOT_ASKED: dict[str, Any] = {
+    "floor": 1.0, "heldout": None, "steps": [], "closed_fraction": None, "repeating_closed_fraction": None,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Contestant:
+    """A hypothesis at fixed hyperparameters, what every particle leaves of it, and its log prior odds."""
+
+    names: Names
+    design: Design
+    free: np.ndarray
+    left: np.ndarray
+    log_integral: np.ndarray
+    log_prior: float
+
+    @classmethod
+    def of(cls, names: Names, design: Design, free: np.ndarray, log_prior: float) -> _Contestant:
+        left = left_by_particle(jnp.asarray(free), design)
+        return cls(names, design, free, np.asarray(left.gram), np.asarray(left.log_integral), log_prior)
+
+    def log_evidence(self, rows: np.ndarray) -> float:
+        """Log marginal likelihood of some particles."""
+        c = self.design.common.shape[-1]
+        gram, integral = without_first(jnp.asarray(self.left[rows].sum(0)), c)
+        value, _, _ = amplitudes(gram, self.design.sign, self.design.largest)
+        return float(self.log_integral[rows].sum() + float(integral) + float(value))
+
+    def numbers(self, rows: np.ndarray) -> np.ndarray:
+        """Common numbers and amplitudes that some particles make, in units of their columns as `scales_of` has them."""
+        c = self.design.common.shape[-1]
+        total = jnp.asarray(self.left[rows].sum(0))
+        gram, _ = without_first(total, c)
+        _, theta, _ = amplitudes(gram, self.design.sign, self.design.largest)
+        theta = np.where(np.asarray(self.design.sign) * np.asarray(theta) < 0, 0.0, np.asarray(theta))
+        full = np.asarray(total)
+        data = full[:c, -1] - full[:c, c:-1] @ theta
+        return np.concatenate([np.linalg.solve(full[:c, :c] + np.eye(c), data), theta])
+
+    def residual(self, row: int, numbers: np.ndarray) -> np.ndarray:
+        """What is left of a particle [um], its own numbers fitted to it."""
+        d = self.design
+        _, own, common = (np.asarray(x) if k else x for k, x in enumerate(scales_of(jnp.asarray(self.free), d)))
+        c = d.common.shape[-1]
+        y = np.asarray(d.data[row]) - np.asarray(d.common[row]) @ (numbers[:c] * common)
+        y = y - np.asarray(d.amplitude[row]) @ numbers[c:]
+        X, mask = np.asarray(d.own[row]) * own, np.asarray(d.tests.mask[row])
+        sd = float(np.exp(self.free[0]))
+        v = np.linalg.solve(X[mask].T @ X[mask] / sd**2 + np.eye(X.shape[1]), X[mask].T @ y[mask] / sd**2)
+        return np.where(mask, y - X @ v, 0.0)
+
+
+def held_out(search: Search, winner: Names) -> HeldOut:
+    """Leave out one particle after the other; choose and fit with the others; see how far it is then from the law.
+
+    Every hypothesis stays linear where all particles have put it, at the hyperparameters they have; which one is
+    chosen, and its numbers, are the others' alone.
+
+    Args:
+        search: all hypotheses.
+        winner: what was found.
+    """
+    fitted = search.found[winner].fitted
+    assert fitted is not None
+    _, optimum, _ = fitted
+    null = search.null
+    logs = search.log_posteriors()
+    contestants = []
+    for names in [*list(logs)[: NUMERICS.contenders], winner]:
+        parts = search.found[names].fitted
+        if names and parts is not None and names not in {c.names for c in contestants}:
+            prior = logs.get(names, 0.0) - search.found[names].log_evidence if names in logs else 0.0
+            contestants.append(_Contestant.of(names, parts[0], parts[1].free, prior + _of_hyperparameters(parts)))
+    # The base law under the winner's noise and spreads: gaps are measured by the noise of what closes them.
+    base = _Contestant.of((), null.design, optimum.free[:8], 0.0)
+    first = next((c for c in contestants if c.names == winner[:1]), None) if len(winner) == 2 else None
+    N = len(search.base.tests)
+    points = np.asarray(search.base.tests.mask).sum(1)
+    labels: tuple[str | None, ...] = (None, *(("formula",) if winner == ("UNLISTED",) else winner))
+    chi2, elpd = np.zeros((len(labels), N)), np.zeros((len(labels), N))
+    residual = np.zeros((len(labels), *base.design.data.shape))
+    everyone = np.arange(N)
+    whole = {id(c): c.log_evidence(everyone) for c in (base, *contestants)}
+    for i in range(N):
+        others = np.delete(everyone, i) if N > 1 else everyone
+        without = {id(c): c.log_evidence(others) for c in (base, *contestants)}
+        best = max(contestants, key=lambda c: without[id(c)] + c.log_prior)
+        steps = [base, *([first or best] if len(winner) == 2 else []), best]
+        for k, c in enumerate(steps):
+            numbers = c.numbers(others)
+            form = np.append(numbers, -1.0)
+            chi2[k, i] = form @ c.left[i] @ form
+            elpd[k, i] = whole[id(c)] - without[id(c)]
+            residual[k, i] = c.residual(i, numbers)
+    return HeldOut(labels, chi2, points.astype(float), elpd, _repeating(search, residual))
+
+
+def _of_hyperparameters(parts: Any) -> float:
+    """What integrating hyperparameters adds to a log evidence at their mode: of all particles, or all but one."""
+    _, optimum, _ = parts
+    return float(optimum.log_evidence - optimum.log_joint)
+
+
+def _repeating(search: Search, residual: np.ndarray) -> np.ndarray:
+    """Mean product of the residuals of two different particles at the same share of the path, at every step."""
+    tests = search.base.tests
+    mask, path = np.asarray(tests.mask), np.asarray(tests.path)
+    shares = (np.arange(NUMERICS.shares) + 0.5) / NUMERICS.shares
+    size = np.asarray(tests.effective_diameter)
+    found = []
+    for one in residual:
+        rows = []
+        for i, r in enumerate(one):
+            at = path[i, mask[i]]
+            rows.append(np.interp(shares, (at - at[0]) / max(at[-1] - at[0], 1e-300), r[mask[i]]) / size[i])
+        common = np.array(rows)
+        count = max(len(common), 2)
+        product = (common.sum(0) ** 2 - (common**2).sum(0)) / (count * (count - 1))
+        found.append(float(product.mean()) * float(np.median(size)) ** 2)
+    return np.array(found)

@@ -1,0 +1,129 @@
+"""How nature's formula may differ from the library's: a Gaussian process in the coordinates of a mechanism."""
+
+from __future__ import annotations
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..calibrate.compiling import compiled
+from ..calibrate.data import Tests
+from ..calibrate.forward import Forms
+from .base import State
+from .settings import NUMERICS
+
+COORDINATES = {
+    "frame_compliance": ("force",),
+    "thermal_drift": ("time",),
+    "creep": ("time", "since", "load", "peak"),
+    "rate_dependence": ("peak", "rate"),
+    "adhesion": ("load", "peak"),
+    "damage": ("peak", "cycles"),
+    "densification_stiffening": ("peak",),
+    "reload_hysteresis": ("load", "reload", "peak"),
+    "ratcheting": ("cycles", "peak"),
+    "finite_hardening_exponent": ("peak",),
+    "unloading_shape": ("load", "peak"),
+    "size_effect": ("size",),
+    "shape_second_order": ("shape",),
+    "pop_in": (),
+    "toe_asperity": ("peak",),
+    "platen_friction": ("peak",),
+    "misalignment": ("peak", "size"),
+    "platen_sink_in": ("peak", "load"),
+    "reverse_plasticity": ("load", "peak"),
+    "humidity": ("humidity", "peak"),
+}
+"""In what a formula of each mechanism may be wrong: what its own formulas depend on."""
+
+ANY = ("peak", "load", "since")
+"""The same of a mechanism that is not of the library."""
+
+
+@compiled
+def coordinates(state: State, tests: Tests, forms: Forms) -> dict[str, Array]:
+    """Coordinates of every point: strain and travel in diameters, force, loads, times, sizes."""
+
+    def one(latent: Array, tests: Tests) -> dict[str, Array]:
+        law = forms.law(latent, jnp.zeros(0))
+        c = law.context(tests.particle, tests.record)
+        time = tests.record.time
+        turned = jnp.concatenate([jnp.ones(1, bool), tests.record.kind[1:] != tests.record.kind[:-1]])
+        begun = jax.lax.cummax(jnp.where(turned, time, -jnp.inf))
+        ones = jnp.ones_like(time)
+        return {
+            "peak": jnp.sqrt(jnp.maximum(c.peak_stress, 0.0)),
+            "strain": c.peak_strain,
+            "load": c.load_share,
+            "force": c.force,
+            "travel": c.displacement / tests.particle.effective_diameter,
+            "time": jnp.log1p(time / 5.0),
+            "since": jnp.log1p((time - begun) / 5.0),
+            "clock": time,
+            "reload": c.progress,
+            "cycles": c.cycles,
+            "rate": jnp.log(jnp.maximum(tests.record.loading_rate, 1e-6)),
+            "size": ones * jnp.log(tests.particle.effective_diameter),
+            "shape": ones * tests.particle.flatness,
+            "humidity": ones * tests.record.relative_humidity,
+        }
+
+    return jax.vmap(one)(state.point.latent, tests)
+
+
+def scaled(at: dict[str, Array], mask: Array) -> dict[str, Array]:
+    """Coordinates between 0 and 1 over the campaign."""
+
+    def one(x: Array) -> Array:
+        low = jnp.min(jnp.where(mask, x, jnp.inf))
+        high = jnp.max(jnp.where(mask, x, -jnp.inf))
+        return jnp.clip((x - low) / jnp.where(high > low, high - low, 1.0), 0.0, 1.0)
+
+    return {name: one(x) for name, x in at.items()}
+
+
+def functions(
+    names: tuple[str, ...], at: dict[str, Array], *, degree: int = NUMERICS.degree, hats: int = NUMERICS.hats
+) -> Array:
+    """Smooth products of cosines and hat functions over some coordinates, shape (N, points, functions).
+
+    Their squares add up to about 1 at every point for the products and for the hats of each coordinate together, so
+    that one scale says how large they are together.
+    """
+    columns = []
+    some = [n for n in names if float(jnp.max(at[n]) - jnp.min(at[n])) > 0]
+    for powers in itertools.product(range(degree + 1), repeat=len(some)):
+        if not 0 < sum(powers) <= degree:
+            continue
+        x = jnp.ones_like(next(iter(at.values())))
+        for n, k in zip(some, powers, strict=True):
+            x = x * jnp.cos(np.pi * k * at[n])
+        columns.append(x)
+    smooth = [x * np.sqrt(1.0 / max(len(columns), 1)) * np.sqrt(2) for x in columns]
+    width, share = 1 / (hats - 1), np.sqrt(len(some))
+    centres = [(n, centre) for n in some for centre in np.linspace(0, 1, hats)]
+    rough = [jnp.maximum(1 - jnp.abs(at[n] - centre) / width, 0.0) / share for n, centre in centres]
+    return jnp.stack([*smooth, *rough], -1) if columns else jnp.zeros((*next(iter(at.values())).shape, 0))
+
+
+def general(at: dict[str, Array], size: Array, mask: Array) -> tuple[Array, int]:
+    """Functions of a smooth discrepancy that no mechanism explains, and how many of them are smooth; the others are
+    periodic.
+
+    It is common to all particles, in proportion to their size, and lives in reduced strain, travel, load and time.
+    """
+    alone = [(name, k) for name in ("strain", "travel", "load", "clock") for k in range(1, 6)]
+    columns = [jnp.cos(np.pi * k * at[name]) for name, k in alone]
+    both = [(i, j) for i in range(1, 3) for j in range(1, 3)]
+    columns += [jnp.cos(np.pi * i * at["peak"]) * jnp.cos(np.pi * j * at["load"]) for i, j in both]
+    smooth = jnp.stack(columns, -1) / np.sqrt(len(columns))
+    waves = []
+    for name in ("travel", "clock"):
+        for k in range(2, NUMERICS.waves):
+            waves += [jnp.cos(2 * np.pi * k * at[name]), jnp.sin(2 * np.pi * k * at[name])]
+    periodic = jnp.stack(waves, -1) / np.sqrt(len(waves))
+    basis = jnp.concatenate([smooth, periodic], -1) * (size / jnp.mean(size))[:, None, None]
+    return jnp.where(mask[..., None], basis, 0.0), len(columns)

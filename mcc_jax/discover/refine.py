@@ -1,0 +1,77 @@
+"""Hypotheses at their own optimum: Gauss-Newton in all numbers, hyperparameters at their mode at every step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..effects import Variant
+from .base import Base, State
+from .design import between, design_of, moved
+from .evidence import Design, Optimum, Solution, optimise, solve
+from .settings import NUMERICS
+
+WORSE = 5.0
+"""Nats by which a Gauss-Newton step may make things worse before half of it is taken back."""
+
+
+@dataclass(frozen=True)
+class Refined:
+    """A hypothesis at its optimum.
+
+    Attributes:
+        variants: its formulas.
+        state: where it is linear, which is where its numbers are.
+        design, optimum, solution: there; evidence and numbers come from the same accepted step.
+    """
+
+    variants: tuple[Variant, ...]
+    state: State
+    design: Design
+    optimum: Optimum
+    solution: Solution
+
+    @property
+    def log_evidence(self) -> float:
+        """Log marginal likelihood."""
+        return self.optimum.log_evidence
+
+    @property
+    def theta(self) -> np.ndarray:
+        """Numbers of the effects."""
+        return np.asarray(self.state.point.theta[0])
+
+
+def refined(base: Base, state: State, variants: tuple[Variant, ...], numbers: np.ndarray, free: np.ndarray) -> Refined:
+    """The optimum of a hypothesis, from a state of the base law on.
+
+    Args:
+        base: tests and priors.
+        state: where particles are.
+        variants: the formulas.
+        numbers: where the effects' numbers are linearised first: amplitudes of zero and further numbers.
+        free: hyperparameters to start from.
+    """
+    state, value = state.with_numbers(numbers), -np.inf
+    before = state
+    design = design_of(base, state, variants)
+    for k in range(NUMERICS.steps):
+        optimum = optimise(design, free, curvature=False)
+        last = k == NUMERICS.steps - 1
+        if optimum.log_joint < value - WORSE and not last:
+            state, value = between(before, state), -np.inf  # what was linear there is not here
+        else:
+            if last and optimum.log_joint < value - WORSE:
+                state = before
+                design = design_of(base, state, variants)
+                break
+            free = optimum.free
+            if last or (k > 1 and abs(optimum.log_joint - value) < NUMERICS.still):
+                break
+            before, value = state, optimum.log_joint
+            state = moved(base, state, variants, solve(jnp.asarray(free), design))
+        design = design_of(base, state, variants)
+    optimum = optimise(design, free)
+    return Refined(variants, state, design, optimum, solve(jnp.asarray(optimum.free), design))

@@ -1,0 +1,170 @@
+"""First-order search: every formula at every value of its grid, singly and in pairs, around the base law."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+from scipy.special import log_ndtr, logsumexp
+
+from ..calibrate.compiling import compiled
+from ..calibrate.data import Tests
+from ..calibrate.distributions import SCALES
+from ..calibrate.forward import Forms
+from ..effects import AbstractEffect, Mechanism
+from ..law import signatures
+from .base import Base, State
+from .candidates import Candidate, candidates_of
+from .design import FURTHER, design_of
+from .evidence import left_by_particle, prior_density, with_amplitudes, without_first
+from .settings import NUMERICS
+
+
+@compiled
+def candidate_columns(state: State, tests: Tests, effects: tuple[AbstractEffect, ...], forms: Forms) -> Array:
+    """Signatures of all candidates at the base law, shape (N, points, candidates)."""
+
+    def one(latent: Array, tests: Tests) -> Array:
+        columns = signatures(forms.law(latent, jnp.zeros(0)), tests.particle, tests.record, effects)
+        return jnp.where(tests.mask[None], columns, 0.0).T
+
+    return jax.vmap(one)(state.point.latent, tests)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """The candidates' scores at some hyperparameters, all else integrated out.
+
+    Attributes:
+        log_null: log marginal likelihood without any, times the hyperparameters' prior.
+        gram: information among candidates, in units of their smallest plausible amplitudes.
+        score: their scores.
+    """
+
+    free: np.ndarray
+    log_null: float
+    gram: np.ndarray
+    score: np.ndarray
+
+
+@dataclass(frozen=True)
+class Screen:
+    """All candidates against the base law.
+
+    Attributes:
+        candidates: the formulas.
+        settings: hyperparameters that were tried.
+        columns: signatures of the candidates, per smallest plausible amplitude.
+    """
+
+    candidates: tuple[Candidate, ...]
+    settings: tuple[Setting, ...]
+    columns: Array
+
+    @property
+    def null(self) -> float:
+        """Log marginal likelihood without any, at its best setting."""
+        return max(s.log_null for s in self.settings)
+
+    @property
+    def signs(self) -> np.ndarray:
+        """Physical signs of the candidates."""
+        return np.array([c.variant.sign for c in self.candidates])
+
+    @property
+    def largest(self) -> np.ndarray:
+        """Largest plausible amplitudes of the candidates over the smallest."""
+        return np.array([c.variant.plausible[1] / c.variant.plausible[0] for c in self.candidates])
+
+    def singles(self) -> tuple[np.ndarray, np.ndarray]:
+        """Log marginal likelihood of each candidate at its best setting, and its amplitude there in natural units."""
+        signs, largest = self.signs, self.largest
+        best = np.full(len(signs), -np.inf)
+        amplitude = np.zeros(len(signs))
+        for s in self.settings:
+            value, mean = single_integrals(s.score, np.diagonal(s.gram), signs, largest)
+            better = s.log_null + value > best
+            best, amplitude = np.where(better, s.log_null + value, best), np.where(better, mean, amplitude)
+        return best, amplitude * np.array([c.variant.plausible[0] for c in self.candidates])
+
+    @property
+    def information(self) -> np.ndarray:
+        """Information on each candidate's amplitude at the first setting, in units of the smallest plausible one."""
+        return np.diagonal(self.settings[0].gram)
+
+    @property
+    def similarity(self) -> np.ndarray:
+        """Correlations of the candidates' projected signatures at the first setting."""
+        root = np.sqrt(np.maximum(self.information, 1e-300))
+        return self.settings[0].gram / root / root[:, None]
+
+
+def single_integrals(
+    score: np.ndarray, information: np.ndarray, signs: np.ndarray, largest: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Log integral over each amplitude alone, and its mean under the best scale."""
+    scale = np.exp(np.linspace(0, 1, SCALES)[:, None] * np.log(largest)[None])
+    precision = information[None] + scale**-2.0
+    mean = score[None] / precision
+    value = 0.5 * score[None] * mean - 0.5 * np.log(precision) - np.log(scale)
+    value += np.where(signs == 0, 0.0, np.log(2) + log_ndtr(signs * mean * np.sqrt(precision)))
+    best = np.argmax(value, 0)
+    return logsumexp(value, axis=0) - np.log(SCALES), mean[best, np.arange(len(score))]
+
+
+def pair_integrals(s: Setting, a: np.ndarray, b: np.ndarray, signs: np.ndarray, largest: np.ndarray) -> np.ndarray:
+    """Log integral over two amplitudes, for many pairs."""
+    found = []
+    for one in np.linspace(0, 1, SCALES):
+        for two in np.linspace(0, 1, SCALES):
+            sa, sb = largest[a] ** one, largest[b] ** two
+            p, q, r = s.gram[a, a] + sa**-2.0, s.gram[b, b] + sb**-2.0, s.gram[a, b]
+            det = np.maximum(p * q - r * r, 1e-12 * p * q)
+            ma, mb = (q * s.score[a] - r * s.score[b]) / det, (p * s.score[b] - r * s.score[a]) / det
+            value = 0.5 * (s.score[a] * ma + s.score[b] * mb) - 0.5 * np.log(det) - np.log(sa * sb)
+            for m, sd, sign in ((ma, np.sqrt(q / det), signs[a]), (mb, np.sqrt(p / det), signs[b])):
+                value = value + np.where(sign == 0, 0.0, np.log(2) + log_ndtr(sign * m / sd))
+            found.append(value)
+    return np.asarray(logsumexp(np.stack(found), axis=0)) - 2 * np.log(SCALES)
+
+
+def signature_columns(base: Base, state: State, candidates: Sequence[Candidate]) -> Array:
+    """Signatures of candidates at the base law, in units of their smallest plausible amplitudes."""
+    effects = tuple(c.effect for c in candidates)
+    columns = candidate_columns(state, base.tests, effects, base.forms)
+    return columns * jnp.asarray(np.array([c.variant.plausible[0] for c in candidates]))[None, None]
+
+
+def screen(
+    base: Base, state: State, free: np.ndarray, library: Mapping[str, Mechanism], *, several: bool = True
+) -> Screen:
+    """Scores of all candidates around the base law, at several settings of noise and spreads.
+
+    Args:
+        base: the tests.
+        state: where the base law fits.
+        free: its hyperparameters, the first setting.
+        library: where the candidates are from.
+        several: whether other settings than the first are wanted.
+    """
+    candidates = candidates_of(library)
+    columns = signature_columns(base, state, candidates)
+    design = with_amplitudes(design_of(base, state), columns)
+    settings = []
+    grid = itertools.product(NUMERICS.noise_factors, NUMERICS.length_factors, NUMERICS.spread_factors)
+    for sd, length, spread in grid if several else [(1.0, 1.0, 1.0)]:
+        at = free.copy()
+        at[2:4] += np.log([sd, length])
+        at[4:8] *= spread
+        left, integral = left_by_particle(jnp.asarray(at), design)
+        total, log_population = without_first(jnp.sum(left, 0), FURTHER)
+        total = np.asarray(total)
+        null = float(np.sum(np.asarray(integral))) + float(log_population) - 0.5 * total[-1, -1]
+        null += float(prior_density(jnp.asarray(at), design))
+        settings.append(Setting(at, null, total[:-1, :-1], total[:-1, -1]))
+    return Screen(candidates, tuple(settings), columns)

@@ -1,0 +1,430 @@
+"""The hypotheses and their log evidence: nothing, one name, two names, or what is on no list."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+from scipy.special import logsumexp
+
+from ..calibrate.compiling import side_by_side
+from ..calibrate.noise import Along, Correlation
+from ..effects import Mechanism
+from .base import Base, State
+from .candidates import candidates_of
+from .design import FURTHER, More, design_of
+from .evidence import (
+    Design,
+    NoiseKind,
+    Optimum,
+    Solution,
+    left_by_particle,
+    optimise,
+    solve,
+    with_amplitudes,
+    with_noise,
+    without_first,
+)
+from .misfit import ANY, COORDINATES, coordinates, functions, general, scaled
+from .own_numbers import OwnNumbers, differing, sudden_steps
+from .refine import Refined, refined
+from .screen import Screen, Setting, pair_integrals, screen, signature_columns, single_integrals
+from .settings import DECISIONS, NUMERICS
+
+Names = tuple[str, ...]
+UNLISTED: Names = ("UNLISTED",)
+OPPOSITE = {frozenset(("damage", "densification_stiffening"))}
+"""One quantity with two signs is no pair."""
+
+SUDDEN = "pop_in"
+"""The mechanism whose sudden steps are looked for at every point of a test."""
+
+
+@dataclass
+class Hypothesis:
+    """What may be missing, with its log evidence in its several forms.
+
+    Attributes:
+        names: of the mechanisms; none for nothing, `UNLISTED` for a discrepancy that none explains.
+        alone: log evidence by formulas of the library alone.
+        with_misfit: where the formulas may be wrong.
+        beside: with a smooth discrepancy beside them.
+        forms: how many of the three were worked out; they have equal prior probabilities but for `Decisions.beside`.
+        best: at the optimum of its best formulas.
+        own: numbers of every test's own instead.
+        sizes: how far the formulas are off, as shares of the effects.
+        formulas: log evidence of each formula that was fitted.
+        other_noise: what another kind of noise adds to its log evidence.
+    """
+
+    names: Names
+    alone: float = -np.inf
+    with_misfit: float = -np.inf
+    beside: float = -np.inf
+    best: Refined | None = None
+    own: OwnNumbers | None = None
+    smooth: Smooth | None = None
+    sizes: tuple[float, ...] = ()
+    formulas: dict[str, float] = field(default_factory=dict)
+    other_noise: float = 0.0
+
+    @property
+    def log_evidence(self) -> float:
+        """Log marginal likelihood, its forms averaged."""
+        if not self.names or self.names == UNLISTED or self.own is not None:
+            return self.alone + self.other_noise
+        forms = [self.alone, self.with_misfit, self.beside - DECISIONS.beside]
+        return float(logsumexp(forms) - np.log(2)) + self.other_noise
+
+    @property
+    def fitted(self) -> tuple[Design, Optimum, Solution] | None:
+        """Design, hyperparameters and numbers of the form in which it is added to the law."""
+        for one in (self.smooth, self.own, self.best):
+            if one is not None:
+                return one.design, one.optimum, one.solution
+        return None
+
+
+@dataclass(frozen=True)
+class Smooth:
+    """A smooth discrepancy common to all particles.
+
+    Attributes:
+        design, optimum, solution: with it.
+        basis: its functions [um].
+        first: place of its weights among the common numbers.
+    """
+
+    design: Design
+    optimum: Optimum
+    solution: Solution
+    basis: Array
+    first: int
+
+    @property
+    def curve_um(self) -> Array:
+        """What it adds to the law's displacement at every point [um]."""
+        weights = self.solution.common[self.first : self.first + self.basis.shape[-1]]
+        return jnp.einsum("npk,k->np", self.basis, weights)
+
+
+class Search:
+    """One search: what all hypotheses share, and what was found.
+
+    Attributes:
+        base: the tests.
+        library: mechanisms that are searched for.
+        null: the base law at its optimum.
+        natural, at: coordinates of all points, in natural units and between 0 and 1.
+        screen: all formulas to first order.
+        found: hypotheses by their names.
+    """
+
+    def __init__(
+        self, base: Base, library: Mapping[str, Mechanism], tell: Callable[[str], None] = lambda _: None
+    ) -> None:
+        self.base, self.library, self.tell = base, library, tell
+        start = optimise(design_of(base, base.state), base.hyperparameters, curvature=False)
+        self.null = refined(base, base.state, (), np.zeros(0), start.free)
+        self.natural = coordinates(self.state, base.tests, base.forms)
+        self.at = scaled(self.natural, base.tests.mask)
+        self.shared = {
+            name: m for name, m in library.items() if name != SUDDEN and not any(v.random_per_test for v in m.variants)
+        }
+        self.screen: Screen | None = None
+        if self.shared:
+            self.screen = screen(base, self.state, self.null.optimum.free, self.shared)
+        # Correlated noise that has swallowed a gap must be small where what explains it begins to be fitted.
+        self.small = self.null.optimum.free.copy()
+        self.small[2] += np.log(0.1)
+        self.fits: dict[tuple[int, ...], Refined] = {}
+        self.found: dict[Names, Hypothesis] = {(): Hypothesis((), self.null.log_evidence, best=self.null)}
+
+    @property
+    def state(self) -> State:
+        """Where the base law fits."""
+        return self.null.state
+
+    # ---- posterior ---------------------------------------------------------------------------------------------------
+
+    def log_posteriors(self) -> dict[Names, float]:
+        """Log evidence and log prior of every hypothesis, best first; pairs must lead by the margin to count."""
+        count = len(self.library)
+        logs = {}
+        for names, one in self.found.items():
+            prior = 0.0
+            if names == UNLISTED:
+                prior = -DECISIONS.unlisted
+            elif len(names) == 1:
+                prior = -np.log(count)
+            elif len(names) == 2:
+                prior = -DECISIONS.pair - np.log(count * (count - 1) / 2)
+            logs[names] = one.log_evidence + prior
+        fewer = max(v for names, v in logs.items() if len(names) < 2)
+        kept = {names: v for names, v in logs.items() if len(names) < 2 or v > fewer + DECISIONS.margin}
+        return dict(sorted(kept.items(), key=lambda item: -item[1]))
+
+    def posterior(self) -> dict[Names, float]:
+        """Probability of every hypothesis, most probable first."""
+        logs = self.log_posteriors()
+        total = float(np.logaddexp.reduce(list(logs.values())))
+        return {names: float(np.exp(v - total)) for names, v in logs.items()}
+
+    # ---- one name ----------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def first_order(self) -> dict[str, dict[str, tuple[float, int]]]:
+        """Log evidence to first order of every formula of every mechanism, and its best candidate."""
+        if self.screen is None:
+            return {}
+        value, _ = self.screen.singles()
+        value = value - self.screen.null + self.null.log_evidence
+        found: dict[str, dict[str, list[int]]] = {}
+        for k, c in enumerate(self.screen.candidates):
+            found.setdefault(c.mechanism, {}).setdefault(c.variant.name, []).append(k)
+        return {
+            m: {
+                f: (float(logsumexp(value[ks]) - np.log(len(ks))), ks[int(np.argmax(value[ks]))])
+                for f, ks in formulas.items()
+            }
+            for m, formulas in found.items()
+        }
+
+    def fit(self, ks: tuple[int, ...]) -> Refined:
+        """Some candidates together at their own optimum, by their formulas."""
+        assert self.screen is not None
+        cs = [self.screen.candidates[k] for k in ks]
+        if ks not in self.fits:
+            numbers = [0.0] * len(cs) + [c.nuisance[n.name] for c in cs for n in c.variant.nuisances]
+            variants = tuple(c.variant for c in cs)
+            self.fits[ks] = refined(self.base, self.state, variants, np.array(numbers), self.small)
+        return self.fits[ks]
+
+    def fit_ahead(self, mechanisms: Sequence[str], most: int) -> None:
+        """Fit the best formulas of some mechanisms, as many at once as there are cores."""
+        wanted = [
+            (k,)
+            for m in mechanisms
+            for _, k in sorted(self.first_order[m].values(), key=lambda one: -one[0])[:most]
+            if (k,) not in self.fits
+        ]
+        side_by_side(self.fit, wanted)
+
+    def single(self, mechanism: str, most: int) -> None:
+        """One mechanism: its best formulas fitted at their own optimum, the others as they are to first order."""
+        ordered = sorted(self.first_order[mechanism].items(), key=lambda item: -item[1][0])
+        values: dict[str, float] = {}
+        best, gain = None, 0.0
+        for f, (first, k) in ordered[:most]:
+            r = self.fit((k,))
+            values[f] = r.log_evidence
+            if best is None or r.log_evidence > best.log_evidence:
+                best, gain = r, r.log_evidence - first
+        assert best is not None
+        for f, (first, _) in ordered[most:]:
+            values[f] = min(first + min(gain, 0.0), best.log_evidence)
+        total = float(logsumexp(list(values.values())) - np.log(len(values)))
+        self.found[(mechanism,)] = Hypothesis((mechanism,), total, best=best, formulas=values)
+
+    def misfit_columns(self, r: Refined, which: int) -> Array:
+        """Columns by which one of the formulas may be wrong: at its amplitude, and towards each of its siblings."""
+        assert self.screen is not None
+        variant = r.variants[which]
+        own = r.design.amplitude[..., which] * float(r.theta[which] / variant.plausible[0])
+        smooth = own[..., None] * functions(COORDINATES.get(variant.mechanism, ANY), self.at)
+        size = float(jnp.sqrt(jnp.sum(own**2)))
+        others = []
+        for f, (_, k) in self.first_order.get(variant.mechanism, {}).items():
+            column = self.screen.columns[..., k]
+            length = float(jnp.sqrt(jnp.sum(column**2)))
+            if f != variant.name and length > 0:
+                likeness = float(jnp.sum(column * own))
+                others.append(column * np.copysign(size / length, likeness) - own)
+        siblings = jnp.stack(others, -1) if others else smooth[..., :0]
+        return jnp.concatenate([smooth, siblings], -1)
+
+    def with_misfit(self, one: Hypothesis) -> None:
+        """Log evidence where every name's formula may be wrong."""
+        r = one.best
+        assert r is not None
+        K = len(r.variants)
+        basis = [self.misfit_columns(r, i)[..., : NUMERICS.basis // K] for i in range(K)]
+        middle = np.log(DECISIONS.misfit)
+        sizes = [(middle, DECISIONS.misfit_log_sd)] * K
+        group = [i + 1 for i in range(K) for _ in range(basis[i].shape[-1])]
+        design = design_of(
+            self.base, r.state, r.variants, More(basis=jnp.concatenate(basis, -1), group=group, sizes=sizes)
+        )
+        optimum = optimise(design, np.append(r.optimum.free, [middle] * K), without=r.optimum)
+        one.with_misfit = optimum.log_evidence
+        one.sizes = tuple(float(x) for x in np.exp(optimum.free[8 : 8 + K]))
+
+    def smooth(self, r: Refined) -> Smooth:
+        """A hypothesis with a smooth discrepancy beside it."""
+        tests = self.base.tests
+        basis, smooth = general(self.at, tests.effective_diameter, tests.mask)
+        size = basis.shape[-1]
+        unit = float(np.log(DECISIONS.general) + self.null.optimum.free[0])
+        group = [1] * smooth + [2] * (size - smooth)
+        sizes = [(unit, DECISIONS.general_log_sd)] * 2
+        design = design_of(self.base, r.state, r.variants, More(basis=basis, group=group, sizes=sizes))
+        optimum = optimise(design, np.append(r.optimum.free, [unit, unit - 1.0]), without=r.optimum)
+        solution = solve(jnp.asarray(optimum.free), design)
+        return Smooth(design, optimum, solution, basis, FURTHER)
+
+    # ---- two names ---------------------------------------------------------------------------------------------------
+
+    def seconds(self, r: Refined) -> list[tuple[float, int]]:
+        """Candidates beside a name, to first order around its optimum, best first."""
+        assert self.screen is not None
+        first, cs = r.variants[0], self.screen.candidates
+        every = jnp.concatenate([r.design.amplitude[..., :1], self.screen.columns], -1)
+        left, _ = left_by_particle(jnp.asarray(r.optimum.free), with_amplitudes(r.design, every))
+        total, _ = without_first(jnp.sum(left, 0), r.design.common.shape[-1])
+        total = np.asarray(total)
+        s = Setting(r.optimum.free, 0.0, total[:-1, :-1], total[:-1, -1])
+        signs = np.append(first.sign, self.screen.signs)
+        largest = np.append(first.plausible[1] / first.plausible[0], self.screen.largest)
+        b = np.arange(1, len(signs))
+        alone, _ = single_integrals(s.score[:1], np.diagonal(s.gram)[:1], signs[:1], largest[:1])
+        value = pair_integrals(s, np.zeros(len(b), int), b, signs, largest) - alone[0]
+        return [
+            (float(value[k]), int(k))
+            for k in np.argsort(-value)
+            if cs[k].mechanism != first.mechanism and frozenset((first.mechanism, cs[k].mechanism)) not in OPPOSITE
+        ]
+
+    def pairs_of(self, leader: Hypothesis) -> None:
+        """The best second names beside a leader, each fitted together with it."""
+        assert self.screen is not None
+        assert leader.best is not None
+        first = next(ks[0] for ks, r in self.fits.items() if r is leader.best)
+        tried: dict[Names, tuple[int, int]] = {}
+        for gain, k in self.seconds(leader.best):
+            names = tuple(sorted((leader.names[0], self.screen.candidates[k].mechanism)))
+            if gain < 0 or len(tried) >= NUMERICS.seconds:
+                break
+            if names not in self.found:
+                tried.setdefault(names, (first, k))
+        side_by_side(self.fit, list(tried.values()))
+        for names, ks in tried.items():
+            r = self.fit(ks)
+            pair = Hypothesis(names, r.log_evidence, best=r)
+            self.found[names] = pair
+            if r.log_evidence > leader.alone:
+                self.with_misfit(pair)
+
+    # ---- all of it ---------------------------------------------------------------------------------------------------
+
+    def run(self) -> Search:
+        """Work all hypotheses out."""
+        nothing = self.null.log_evidence
+        order = self.first_order
+        rank = {m: float(logsumexp([v for v, _ in f.values()]) - np.log(len(f))) for m, f in order.items()}
+        names = sorted(rank, key=lambda m: -rank[m])
+        strong = bool(names) and rank[names[0]] - nothing > NUMERICS.strong
+        self.tell("the serious names, fitted as they are")
+        serious = names[: NUMERICS.contenders]
+        each = NUMERICS.formulas if names and rank[names[0]] - nothing > NUMERICS.very_strong else 1
+        self.fit_ahead(serious, each)
+        for m in serious:
+            self.single(m, each)
+        if strong:
+            leading = [
+                one.names[0] for one in sorted(self.found.values(), key=lambda x: -x.log_evidence)[:2] if one.names
+            ]
+            self.fit_ahead(leading, NUMERICS.all_formulas)
+            for m in leading:
+                self.single(m, NUMERICS.all_formulas)
+        side_by_side(self.with_misfit, [self.found[(m,)] for m in serious])
+        for m in names[NUMERICS.contenders :]:
+            self.found[(m,)] = Hypothesis((m,), rank[m])
+        self.tell("what differs from test to test")
+        for m, mechanism in self.library.items():
+            self.of_their_own(m, mechanism)
+        self.tell("a discrepancy on no list")
+        smooth = self.smooth(self.null)
+        self.found[UNLISTED] = Hypothesis(UNLISTED, smooth.optimum.log_evidence, smooth=smooth)
+        leaders = sorted((x for x in self.found.values() if x.names and x.best is not None), key=lambda x: -x.alone)
+        if leaders and max(x.log_evidence for x in self.found.values()) - nothing > NUMERICS.strong:
+            self.tell("two names")
+            for leader in leaders[:2]:
+                assert leader.best is not None
+                leader.beside = self.smooth(leader.best).optimum.log_evidence
+                self.pairs_of(leader)
+        self.tell("other kinds of noise")
+        self.other_noise()
+        return self
+
+    def of_their_own(self, name: str, mechanism: Mechanism) -> None:
+        """A mechanism whose numbers differ from test to test."""
+        free = self.null.optimum.free
+        if name == SUDDEN:
+            own = sudden_steps(self.base, self.state, free, mechanism.variants[0])
+        elif name in self.shared:
+            return
+        else:
+            candidates = candidates_of({name: mechanism})
+            columns = signature_columns(self.base, self.state, candidates)
+            own = differing(self.base, self.state, free, columns, candidates)
+        value = -np.inf if own is None else own.log_evidence
+        self.found[(name,)] = Hypothesis((name,), value, own=own)
+
+    def other_noise(self) -> None:
+        """Average nothing and the leading hypotheses over kinds of noise, if another kind may explain the gap."""
+        logs = self.log_posteriors()
+        leader = next(iter(logs))
+        if not leader:
+            return
+        kinds = noise_kinds(self.base)
+        values: dict[Names, list[float]] = {(): self.by_noise((), kinds)}
+        if max(values[()]) < logs[leader] - NUMERICS.strong:
+            return
+        for names in list(logs)[: NUMERICS.seconds]:
+            if names and self.found[names].fitted is not None:
+                values[names] = self.by_noise(names, kinds)
+        for names, others in values.items():
+            one = self.found[names]
+            assert one.fitted is not None
+            _, optimum, _ = one.fitted
+            together = [optimum.log_evidence, *others]
+            one.other_noise = float(logsumexp(together) - np.log(len(together)) - optimum.log_evidence)
+
+    def by_noise(self, names: Names, kinds: tuple[NoiseKind, ...]) -> list[float]:
+        """Log evidence of a hypothesis under other kinds of noise, with the curvature that it has under the model's."""
+        fitted = self.found[names].fitted
+        assert fitted is not None
+        design, optimum, _ = fitted
+        found = []
+        for kind in kinds:
+            start = optimum.free.copy()
+            start[3] = float(design.noise[0, 3]) + np.log(kind.length)
+            other = optimise(with_noise(design, kind), start, curvature=False)
+            found.append(optimum.log_evidence + other.log_joint - optimum.log_joint)
+        return found
+
+
+def noise_kinds(base: Base) -> tuple[NoiseKind, ...]:
+    """Kinds of noise besides the model's: smooth along the load, and in time."""
+    tests = base.tests
+    mask = np.asarray(tests.mask)
+
+    def length(x: Any) -> float:
+        return float(np.median(np.where(mask, x, -np.inf).max(1) - np.where(mask, x, np.inf).min(1)))
+
+    of_load, of_time = length(tests.path), length(tests.record.time)
+    model, ratio = base.model, max(of_time, 1e-9) / max(of_load, 1e-9)
+    units = {along: ratio if along is Along.TIME else 1 / ratio for along in Along}
+    kinds = []
+    for correlation, along in (
+        (Correlation.MATERN_32, Along.LOAD),
+        (Correlation.MATERN_32, Along.TIME),
+    ):
+        if (correlation, along) != (model.correlation, model.along):
+            kinds.append(NoiseKind(correlation, along, 1.0 if along is model.along else units[along]))
+    return tuple(kinds)

@@ -1,0 +1,98 @@
+"""The numbers that decide a verdict, each with where it comes from, and those of the numerics, which decide nothing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Decisions:
+    """Prior odds, and what it takes to say something. Logarithms are natural.
+
+    Attributes:
+        level: a verdict other than NO_GAP needs a bootstrap p value below it: one false alarm in twenty campaigns.
+        pair: log prior odds of one name against two, over the number of pairs: e^5 = 150; a second study of
+            prototypes was right in 88 of 106 campaigns with it.
+        margin: nats by which two names must lead everything with at most one: one more than the odds, since what a
+            name's misfit leaves invites a second; 91 of the same 106, true pairs led by 12 to 482.
+        unlisted: log prior odds of a listed name against a smooth discrepancy that no mechanism explains.
+        beside: the same, of a name alone against a name with such a discrepancy beside it.
+        set_mass: names are reported, best first, until they hold this posterior probability together.
+        misfit, misfit_log_sd: size of what a mechanism's formulas miss of its effect, median and standard deviation of
+            the logarithm: 0.03 to 0.3 is what the library's own formulas leave of each other; with a size of 1 every
+            mechanism imitates every other.
+        general, general_log_sd: size of a smooth discrepancy in standard deviations of white noise, likewise.
+        jump: share of the tests in which a sudden step is expected, a priori: where it is looked for once more.
+        place: places of disagreement are told until they hold this share of it.
+        lead: what remains beside a name is told if its log posterior odds exceed this.
+        alike: correlation of projected signatures from which on two mechanisms look alike.
+        detectable: estimate over standard error that is found with 95 % probability at the level: 1.645 for the
+            probability, 2.95 for the best of as many mechanisms as there are.
+        enough: probability of the right name alone from which on a further experiment is proposed without a doubt.
+    """
+
+    level: float = 0.05
+    pair: float = 5.0
+    margin: float = 10.0
+    unlisted: float = 5.0
+    beside: float = 5.0
+    set_mass: float = 0.95
+    misfit: float = 0.1
+    misfit_log_sd: float = 0.8
+    general: float = 3.0
+    general_log_sd: float = 1.5
+    jump: float = 0.25
+    place: float = 0.85
+    lead: float = 3.0
+    alike: float = 0.9
+    detectable: float = 4.6
+    enough: float = 0.9
+
+
+@dataclass(frozen=True)
+class Numerics:
+    """Grids, sizes and numbers of steps: finer ones cost time and change nothing that is told.
+
+    Attributes:
+        noise_factors, length_factors, spread_factors: settings of correlated noise and of spreads, over those of the
+            base fit, at which all formulas are screened. Noise that swallowed a gap hides what explains it.
+        contenders: mechanisms that are fitted at their own optimum.
+        formulas: formulas of each of them where `very_strong`, else one; of the two leading ones up to `all_formulas`.
+        seconds: second names that are tried beside each of the two leading names.
+        strong: nats by which a name must beat nothing before several of its formulas and second names are tried.
+        very_strong: the same, from which on first order cannot be relied on to choose the formula.
+        steps, still: Gauss-Newton steps at most, and the change of the log posterior at which they end.
+        hats, degree: hat functions of each coordinate of a misfit, and total degree of its smooth products.
+        basis: functions of all misfits of a hypothesis together; there is room for so many.
+        waves: periods that a periodic discrepancy may have.
+        bootstrap: campaigns drawn for the p value.
+        places: bins of load in which disagreement is looked for.
+        thinned: places of a sudden step, in each test, in the bootstrap.
+        jumps: sudden steps of one test at most.
+        shares: points of the common path on which the residuals of two tests are multiplied.
+    """
+
+    noise_factors: tuple[float, ...] = (1.0, 0.4, 0.15, 0.05)
+    length_factors: tuple[float, ...] = (1.0, 0.3)
+    spread_factors: tuple[float, ...] = (1.0, 0.5)
+    contenders: int = 5
+    formulas: int = 2
+    all_formulas: int = 8
+    seconds: int = 3
+    strong: float = 8.0
+    very_strong: float = 50.0
+    steps: int = 6
+    still: float = 0.05
+    hats: int = 8
+    degree: int = 2
+    basis: int = 64
+    waves: int = 12
+    bootstrap: int = 400
+    places: int = 5
+    thinned: int = 24
+    jumps: int = 3
+    shares: int = 60
+
+
+DECISIONS = Decisions()
+NUMERICS = Numerics()

@@ -1,0 +1,79 @@
+"""What is said: sentences without private words, formulas that are what they print, shares beside chi2."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from mcc_jax.discover.closure import LETTERS, terms_of
+from mcc_jax.discover.heldout import HeldOut
+from mcc_jax.discover.result import Discovery, Effect
+from mcc_jax.discover.sentences import summary_of
+from mcc_jax.discover.settings import DECISIONS, Decisions
+from mcc_jax.effects import find_variant
+
+EST = {"value": 16_000.0, "sd": 100.0, "interval_95": [15_800.0, 16_200.0]}
+
+
+@pytest.mark.parametrize("name", LETTERS)
+def test_a_term_is_what_it_prints(name):
+    x = np.linspace(0.0, 3.0, 17)
+    letter = LETTERS[name][0]
+    for term in terms_of(name, 0.0, 3.0):
+        text = term.text.replace("^", "**").replace("2 pi", "2*np.pi*1").replace("np.pi*1 ", "np.pi*")
+        for word in ("exp", "ln", "sqrt", "sin", "cos"):
+            text = text.replace(f"{word}(", f"np.{'log' if word == 'ln' else word}(")
+        np.testing.assert_allclose(term.function(x), eval(text, {"np": np, letter: x}), rtol=1e-12, atol=1e-12)
+
+
+def held(before, after):
+    points = np.full(4, 100.0)
+    chi2 = np.array([before * points, after * points])
+    return HeldOut((None, "creep"), chi2, points, np.zeros((2, 4)), np.array([before - 1, after - 1]))
+
+
+def test_a_share_stands_beside_chi2_and_is_of_what_could_be_closed():
+    told = held(3.0, 1.5).to_json()
+    assert told["closed_fraction"] == pytest.approx(0.75)
+    assert [step["chi2_per_dof"] for step in told["steps"]] == [3.0, 1.5]
+    assert held(3.0, 0.9).to_json()["closed_fraction"] == 1.0
+    assert held(0.95, 0.9).to_json()["closed_fraction"] is None
+    json.dumps(told, allow_nan=False)
+
+
+def answer(verdict, **more):
+    effect = Effect(find_variant("platen_sink_in"), {}, 0.01, 0.001, 0.97, 0.002, misfit=0.4)
+    named = verdict in ("NAMED", "SET")
+    sets = ((effect.mechanism, "frame_compliance") if verdict == "SET" else (effect.mechanism,),) if named else ()
+    found = Discovery(
+        verdict, "", None, None, 0, 0.0,
+        effects=(effect,) if named else (), candidate_set=sets, p_any=0.002 if verdict != "NO_GAP" else 0.4,
+        before={"effective_modulus_MPa": EST}, after={"effective_modulus_MPa": EST} if named else {},
+        untestable=({"mechanism": "reload_hysteresis", "needs": "a reload segment"},), **more,
+    )  # fmt: skip
+    return dataclasses.replace(found, summary=summary_of(found))
+
+
+@pytest.mark.parametrize("verdict", ["NO_GAP", "NAMED", "SET"])
+def test_a_summary_is_plain_english(verdict):
+    told = answer(verdict).summary
+    assert "reload hysteresis (needs a reload segment)" in told
+    assert "_" not in told
+    if verdict != "NO_GAP":
+        assert "platen sink in" in told
+        assert "16 GPa" in told
+        assert "off by about 40 %" in told
+    assert ("frame compliance" in told) is (verdict == "SET")
+
+
+def test_named_but_not_closed_is_said():
+    assert "named, not closed" in answer("NAMED", held_out=held(9.0, 2.0)).summary
+    assert "named, not closed" not in answer("NAMED", held_out=held(9.0, 1.0)).summary
+
+
+def test_few_numbers_decide():
+    assert len(dataclasses.fields(Decisions)) <= 17
+    text = Decisions.__doc__ or ""
+    assert all(field.name in text for field in dataclasses.fields(Decisions))
+    assert Decisions() == DECISIONS

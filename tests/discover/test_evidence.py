@@ -1,0 +1,131 @@
+"""The log evidence of a hypothesis: what the multivariate normal distribution says, padded or not."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from campaigns import base_of, cached
+from scipy.integrate import quad
+from scipy.stats import multivariate_normal, norm
+
+from mcc_jax import Model, log_evidence
+from mcc_jax.calibrate.distributions import SCALES
+from mcc_jax.discover.design import More, between, design_of, moved
+from mcc_jax.discover.evidence import (
+    amplitudes,
+    log_joint,
+    log_prior,
+    optimise,
+    residual_of,
+    scales_of,
+    solve,
+    whitened,
+)
+from mcc_jax.discover.refine import refined
+from mcc_jax.effects import find_variant
+
+COMPLIANCE = 0.004
+
+
+@pytest.fixture(scope="module")
+def base():
+    return base_of(cached(f"frame_compliance={COMPLIANCE}"))
+
+
+@pytest.fixture(scope="module")
+def design(base):
+    return design_of(base, base.state)
+
+
+def covariance(design, free):
+    """Of all tests together: noise, every particle's own numbers, and what all share."""
+    _, own, common = scales_of(jnp.asarray(free), design)
+    N, P = design.data.shape
+    mask = np.asarray(design.tests.mask)
+    unit = jnp.broadcast_to(jnp.eye(P), (N, P, P))
+    columns = [np.asarray(whitened(jnp.asarray(free), design, unit[:, :, k])[0]) for k in range(P)]
+    whole = np.zeros((N * P, N * P))
+    for i in range(N):
+        W = np.stack([column[i] for column in columns], 1)[np.ix_(mask[i], mask[i])]
+        at = i * P + np.flatnonzero(mask[i])
+        X = np.asarray(design.own[i])[mask[i]] * np.asarray(own)
+        whole[np.ix_(at, at)] = np.linalg.inv(W.T @ W) + X @ X.T
+    B = (np.asarray(design.common) * np.asarray(common)).reshape(N * P, -1)
+    rows = np.flatnonzero(mask.ravel())
+    return (whole + B @ B.T)[np.ix_(rows, rows)], np.asarray(design.data).ravel()[rows]
+
+
+def test_it_is_the_density_of_the_multivariate_normal(base, design):
+    """Particles first, then what all share: integrals in closed form. Readings of a display add a known constant."""
+    few = jax.tree.map(lambda x: x[:3], (design.tests, design.linear, design.own, design.common, design.amplitude))
+    small = replace(
+        design,
+        tests=few[0], linear=few[1], own=few[2], common=few[3], amplitude=few[4],
+        data=design.data[:3], scale=design.scale[:3],
+    )  # fmt: skip
+    free = base.hyperparameters
+    found = float(log_joint(jnp.asarray(free), small) - log_prior(jnp.asarray(free), small))
+    matrix, data = covariance(small, free)
+    wanted = multivariate_normal(np.zeros(len(data)), matrix, allow_singular=False).logpdf(data)
+    assert found == pytest.approx(wanted, abs=0.5)  # the finite steps of a display
+
+
+@pytest.mark.parametrize("sign", [-1, 0, 1])
+def test_an_amplitude_is_integrated_over_its_mixture_of_half_normals(sign):
+    gram, score, ratio = 0.7, 1.3 * (sign or 1), 50.0
+    left = jnp.asarray([[gram, score], [score, 0.0]])
+    value, _, _ = amplitudes(left, jnp.asarray([float(sign)]), jnp.asarray([ratio]))
+    scales = np.geomspace(1, ratio, SCALES)
+
+    def density(theta):
+        prior = np.mean([norm.pdf(theta, scale=s) for s in scales]) * (2 if sign else 1)
+        return np.exp(score * theta - 0.5 * gram * theta**2) * (prior if sign * theta >= 0 else 0.0)
+
+    total = quad(density, -400, 0, limit=400)[0] + quad(density, 0, 400, limit=400)[0]
+    assert float(value) == pytest.approx(np.log(total), rel=1e-6)
+
+
+def test_columns_of_nothing_have_no_say(base, design):
+    """Room for a misfit that is not there: the same evidence, the same numbers."""
+    nothing = More(basis=jnp.zeros((*design.data.shape, 3)), group=[1] * 3, sizes=[(0.0, 1.0)])
+    roomy = design_of(base, base.state, (), nothing)
+    one, other = optimise(design, base.hyperparameters), optimise(roomy, np.append(base.hyperparameters, 0.0))
+    assert other.log_evidence == pytest.approx(one.log_evidence, abs=0.02)
+    np.testing.assert_allclose(other.free[:8], one.free, atol=0.02)
+    beside = optimise(roomy, np.append(one.free, 0.0), without=one)
+    assert beside.log_evidence == pytest.approx(one.log_evidence, abs=0.02)
+
+
+def test_what_a_solution_leaves_is_what_the_law_leaves_there(base):
+    """One Gauss-Newton step on, the exact residuals are those of the linear model to second order."""
+    variant = find_variant("frame_compliance:linear")
+    state = base.state.with_numbers(np.zeros(1))
+    design = design_of(base, state, (variant,))
+    solution = solve(jnp.asarray(base.hyperparameters), design)
+    there = design_of(base, moved(base, state, (variant,), solution), (variant,))
+    still = residual_of(solve(jnp.asarray(base.hyperparameters), there), there)
+    mask = np.asarray(base.tests.mask)
+    assert np.sqrt(np.mean((np.asarray(residual_of(solution, design)) - np.asarray(still))[mask] ** 2)) < 0.02
+    half = between(state, moved(base, state, (variant,), solution))
+    assert float(half.point.theta[0, 0]) == pytest.approx(0.5 * float(solution.amplitude[0]) * variant.plausible[0])
+
+
+def test_a_formula_is_fitted_at_its_own_optimum(base):
+    variant = find_variant("frame_compliance:linear")
+    nothing = refined(base, base.state, (), np.zeros(0), base.hyperparameters)
+    found = refined(base, nothing.state, (variant,), np.zeros(1), nothing.optimum.free)
+    assert found.log_evidence > nothing.log_evidence + 50
+    assert found.theta[0] == pytest.approx(COMPLIANCE, rel=0.1)
+
+
+@pytest.mark.long
+def test_it_prefers_a_model_as_much_as_importance_sampling_does(base):
+    campaign = cached(f"frame_compliance={COMPLIANCE}")
+    model = Model(modulus_scatter=True)
+    found = [log_evidence(campaign, m).value for m in (model, model.with_effects("frame_compliance:linear"))]
+    nothing = refined(base, base.state, (), np.zeros(0), base.hyperparameters)
+    variant = find_variant("frame_compliance:linear")
+    frame = refined(base, nothing.state, (variant,), np.zeros(1), nothing.optimum.free)
+    assert frame.log_evidence - nothing.log_evidence == pytest.approx(found[1] - found[0], rel=0.1)

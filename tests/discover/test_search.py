@@ -1,0 +1,107 @@
+"""A search over few mechanisms: posterior, sets, places, held-out gap, bootstrap."""
+
+import numpy as np
+import pytest
+from campaigns import base_of, cached
+
+from mcc_jax.campaign import available_data
+from mcc_jax.discover.bootstrap import p_anything
+from mcc_jax.discover.candidates import untestable
+from mcc_jax.discover.heldout import held_out
+from mcc_jax.discover.locate import difference, places, where
+from mcc_jax.discover.search import UNLISTED, Hypothesis, Search
+from mcc_jax.discover.settings import DECISIONS
+from mcc_jax.effects import LIBRARY
+
+FEW = {name: LIBRARY[name] for name in ("frame_compliance", "damage")}
+
+
+def search_of(campaign):
+    base = base_of(campaign)
+    library, _ = untestable(FEW, available_data(campaign))
+    return Search(base, library).run()
+
+
+@pytest.fixture(scope="module")
+def named():
+    return search_of(cached("frame_compliance=0.004"))
+
+
+@pytest.fixture(scope="module")
+def nothing():
+    return search_of(cached(seed=1))
+
+
+def test_a_hidden_effect_leads_and_its_probability_says_so(named):
+    found = named.posterior()
+    assert next(iter(found)) == ("frame_compliance",)
+    assert found[("frame_compliance",)] > 0.9
+    assert sum(found.values()) == pytest.approx(1)
+    assert named.found[("frame_compliance",)].best.theta[0] == pytest.approx(0.004, rel=0.1)
+
+
+def test_the_bootstrap_tells_something_from_nothing(named, nothing):
+    assert p_anything(named, 0) < 0.01
+    assert p_anything(nothing, 0) > 0.05
+    assert nothing.posterior()[()] > 0.5
+
+
+def test_p_values_of_nothing_are_uniform(nothing, monkeypatch):
+    """Scores drawn from the null law itself in place of the observed ones."""
+    from mcc_jax.discover import bootstrap
+
+    plain = bootstrap._Statistic
+    rng = np.random.default_rng(0)
+
+    class Drawn(plain):
+        def __init__(self, search):
+            super().__init__(search)
+            gram = self.scores.gram
+            values, vectors = np.linalg.eigh(gram)
+            root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
+            normal = rng.standard_normal(self.scores.score.shape)
+            self.scores = self.scores._replace(score=np.einsum("ncd,nd->nc", root, normal))
+
+    monkeypatch.setattr(bootstrap, "_Statistic", Drawn)
+    p = np.array([p_anything(nothing, seed) for seed in range(30)])
+    assert 0.3 < p.mean() < 0.7
+    assert np.sum(p < 0.1) <= 8
+
+
+def test_held_out_particles_are_nearer_to_the_law_with_the_effect(named):
+    gap = held_out(named, ("frame_compliance",)).to_json()
+    first, last = gap["steps"]
+    assert (first["added"], last["added"]) == (None, "frame_compliance")
+    assert last["chi2_per_dof"] == pytest.approx(1, abs=0.15)
+    assert first["chi2_per_dof"] > 1.5
+    assert gap["closed_fraction"] > 0.8
+    assert gap["repeating_closed_fraction"] > 0.8
+    assert last["elpd"] > 2 * last["elpd_se"]
+
+
+def test_places_share_the_difference(named):
+    tests = named.base.tests
+    mask = np.asarray(tests.mask)
+    left = np.zeros(mask.shape)
+    left[mask & (np.asarray(tests.record.kind) == 2)] = 1.0  # in holds alone
+    map_ = places(named.base, difference(left, None, mask))
+    told = where(named.base, map_)
+    assert [one["segment"] for one in told] == ["hold"]
+    assert told[0]["share"] == pytest.approx(1)
+    assert sum(p.share for p in map_ if p.share == p.share) == pytest.approx(1)
+
+
+def test_two_names_must_lead_by_the_margin(named):
+    best = max(h.log_evidence for h in named.found.values())
+    pair = ("damage", "frame_compliance")
+    kept = dict(named.found)
+    for lead, there in ((0.5 * DECISIONS.margin, False), (3 * DECISIONS.margin, True)):
+        named.found = {**kept, pair: Hypothesis(pair, alone=best + lead, with_misfit=best + lead)}
+        assert (pair in named.posterior()) is there
+    named.found = kept
+
+
+def test_what_no_mechanism_explains_has_prior_odds_of_its_own(named):
+    logs = named.log_posteriors()
+    smooth = named.found[UNLISTED]
+    assert logs[UNLISTED] == pytest.approx(smooth.log_evidence - DECISIONS.unlisted)
