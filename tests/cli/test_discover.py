@@ -25,6 +25,7 @@ PLACE = {"segment", "load_fraction", "strain", "share", "particles"}
 STEP = {"added", "chi2_per_dof", "systematic_um", "elpd", "elpd_se"}
 ESTIMATE = {"value", "sd", "interval_95"}
 HIDDEN = 0.004
+QUICK = ("--no-experiments", "--no-posterior")
 
 
 def call(*arguments):
@@ -79,7 +80,7 @@ def tests(tmp_path_factory):
 def found(tests, tmp_path_factory):
     """What the command finds in the tests with the frame: its words, and where its files are."""
     out = tmp_path_factory.mktemp("found") / "new"
-    return done(call("discover", tests / "frame", "--out", out, "--no-experiments", "--no-posterior")), out
+    return done(call("discover", tests / "frame", "--out", out, *QUICK)), out
 
 
 @pytest.mark.long
@@ -123,7 +124,7 @@ def test_same_seed_same_file_and_stale_figures_go(found, tests, tmp_path):
     out = tmp_path / "again"
     shutil.copytree(found[1], out)
     (out / "figures" / "mine.png").write_text("a file of the user's")
-    text = done(call("discover", tests / "frame", "--out", out, "--no-experiments", "--no-figures", "--json"))
+    text = done(call("discover", tests / "frame", "--out", out, *QUICK, "--no-figures", "--json"))
     assert text == (out / "discovery.json").read_text(encoding="utf-8")
     assert set(snapshot(out)) == {"discovery.json", "discovery.msgpack", "figures", "figures/mine.png"}
     second = json.loads(text)
