@@ -13,6 +13,7 @@ from .._errors import InputError
 from ..campaign import THRESHOLD_MPA, Campaign, check_tests
 from .fit_result import Fit
 from .fitting import checked_settings, in_own_units, prepare
+from .importance import smoothed
 from .judgement import numbers_in_reach
 from .model import Model
 from .posterior import Posterior, sample
@@ -99,7 +100,6 @@ def compare(campaign: Campaign, models: Sequence[Model | Posterior], *, seed: in
         InputError: for no model, one with robust noise, or posteriors whose tests are not the same.
     """
     import pandas as pd
-    from arviz_stats.base.array import array_stats
     from scipy.special import logsumexp
 
     arguments.instance(models, Sequence, "models", "Give a list of mcc_jax.Model.")
@@ -118,8 +118,8 @@ def compare(campaign: Campaign, models: Sequence[Model | Posterior], *, seed: in
     rows, elpds = [], []
     for one in found:
         lookup = np.moveaxis(one.log_likelihood.reshape(-1, len(one.particles)), 0, -1)
-        smoothed, _ = array_stats.psislw(-lookup, axis=-1)
-        elpds.append(logsumexp(smoothed + lookup, axis=-1))  # of weights that add up to 1
+        # Draws of the posterior without a particle are those of all, weighted by one over its likelihood.
+        elpds.append(np.array([logsumexp(smoothed(-each)[0] + each) for each in lookup]))
         rows.append(
             {
                 "model": ", ".join(one.model.variants) or "no effects",

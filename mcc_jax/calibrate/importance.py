@@ -273,35 +273,34 @@ def unrest(log_weight: np.ndarray) -> np.ndarray:
     return relative.std(0) / np.maximum(relative.mean(0), 1e-300)
 
 
-def pareto_k(log_weight: np.ndarray) -> np.ndarray:
-    """Pareto k of importance weights, draws along the first axis."""
+def smoothed(log_weight: np.ndarray) -> tuple[np.ndarray, float]:
+    """Pareto-smoothed log weights that add up to 1, and k; of a tail that is all alike unsmoothed, and infinite."""
     from arviz_stats.base.array import array_stats
 
+    with np.errstate(all="ignore"), contextlib.suppress(ValueError):
+        found, k = array_stats.psislw(-log_weight, axis=-1)  # of log likelihoods, whose weights are their inverse
+        return np.asarray(found), float(k)
+    return log_weight - np.logaddexp.reduce(log_weight), np.inf
+
+
+def pareto_k(log_weight: np.ndarray) -> np.ndarray:
+    """Pareto k of importance weights, draws along the first axis."""
     columns = np.where(np.isfinite(log_weight), log_weight, -1e10).T
-    result = np.zeros(len(columns))
     # Weights that are all equal have no tail to fit.
-    varied = np.std(columns, axis=1) > 1e-9
-    for row in np.flatnonzero(varied):
-        result[row] = np.inf
-        with np.errstate(all="ignore"), contextlib.suppress(ValueError):  # of a tail whose weights are all the same
-            result[row] = array_stats.psislw(-columns[row], axis=-1)[1]
+    result = np.array([smoothed(one)[1] if np.std(one) > 1e-9 else 0.0 for one in columns])
     return np.where(np.isnan(result), np.inf, result)
 
 
 def smoothed_weights(log_weight: np.ndarray) -> tuple[np.ndarray, float]:
     """Pareto-smoothed importance weights, normalised, and their k."""
-    from arviz_stats.base.array import array_stats
-
     finite_weight = np.where(np.isfinite(log_weight), log_weight, -1e10)
     if np.std(finite_weight) <= 1e-9:
         return np.full(len(finite_weight), 1 / len(finite_weight)), 0.0
-    smooth, k = finite_weight, np.inf
-    with np.errstate(all="ignore"), contextlib.suppress(ValueError):  # of a tail whose weights are all the same
-        smooth, k = array_stats.psislw(-finite_weight, axis=-1)
+    smooth, k = smoothed(finite_weight)
     if not np.isfinite(smooth).all():  # one weight holds all: nothing to smooth
         smooth, k = finite_weight, np.inf
-    weight = np.exp(np.maximum(np.asarray(smooth) - np.max(smooth), -700.0))
-    return weight / weight.sum(), float(k) if np.isfinite(k) else float("inf")
+    weight = np.exp(np.maximum(smooth - np.max(smooth), -700.0))
+    return weight / weight.sum(), k if np.isfinite(k) else float("inf")
 
 
 def effective_share(weight: np.ndarray) -> float:

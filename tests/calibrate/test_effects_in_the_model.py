@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.special import logsumexp
 
 import mcc_jax as mcc
 from mcc_jax.calibrate.fitting import _Fitter
@@ -104,6 +105,15 @@ def test_the_noise_is_that_of_the_instrument(posterior):
     noise = posterior.fit.noise.noise
     assert float(noise.displacement) == pytest.approx(0.08, rel=0.1)
     assert posterior.noise_share < 0.5
+
+
+def test_a_particle_left_out_is_less_probable_than_one_that_was_seen(campaign, posterior):
+    """The expected log density is ArviZ' leave-one-out, by particle, and below that of the tests themselves."""
+    each = posterior.log_likelihood.reshape(-1, len(posterior.particles))
+    elpd = mcc.compare(campaign, [posterior])["elpd"].iloc[0]
+    exact = -(logsumexp(-each, axis=0) - np.log(len(each))).sum()
+    assert elpd == pytest.approx(exact, abs=1.0)
+    assert elpd < (logsumexp(each, axis=0) - np.log(len(each))).sum()
 
 
 @pytest.mark.long
