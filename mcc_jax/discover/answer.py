@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax.numpy as jnp
@@ -12,7 +13,8 @@ from ..calibrate import Posterior
 from ..calibrate.estimates import estimate, finite, summary
 from ..effects import Mechanism
 from .base import Base
-from .evidence import residual_of, whitened
+from .design import POPULATION
+from .evidence import left_by_particle, residual_of, scales_of, whitened
 from .own_numbers import OwnNumbers
 from .result import Effect, Likeness, Residuals
 from .screen import screen
@@ -22,14 +24,12 @@ from .settings import DECISIONS
 
 def population_parameters(search: Search, names: Names) -> dict[str, Any]:
     """The population's parameters under a hypothesis, by the curvature of its linear model."""
-    from .evidence import scales_of
-
     fitted = search.found[names].fitted
     assert fitted is not None
     design, optimum, solution = fitted
     mean, factor = map(np.asarray, search.base.population_prior)
-    beta = mean + factor @ np.asarray(solution.common[:5])
-    sd = np.sqrt(np.diagonal(factor @ _covariance(design, optimum.free)[:5, :5] @ factor.T))
+    beta = mean + factor @ np.asarray(solution.common[:POPULATION])
+    sd = np.sqrt(np.diagonal(factor @ _covariance(design, optimum.free)[:POPULATION, :POPULATION] @ factor.T))
     _, tau, _ = scales_of(jnp.asarray(optimum.free), design)
     shift = float(np.mean(np.log1p(np.maximum(beta[0] * np.asarray(design.tests.flatness), -0.99))))
     means = beta[2:5] - shift
@@ -51,8 +51,6 @@ def population_parameters(search: Search, names: Names) -> dict[str, Any]:
 
 def _covariance(design: Any, free: np.ndarray) -> np.ndarray:
     """Posterior covariance of the common numbers, the amplitudes integrated out with flat priors."""
-    from .evidence import left_by_particle
-
     left = np.asarray(left_by_particle(jnp.asarray(free), design).gram).sum(0)[:-1, :-1]
     c = design.common.shape[-1]
     prior = np.concatenate([np.ones(c), 1 / np.asarray(design.largest) ** 2])
@@ -96,8 +94,6 @@ def _of_their_own(own: OwnNumbers, probability: float, p_any: float) -> Effect:
 
 def with_draws(effect: Effect, posterior: Posterior) -> Effect:
     """The effect with its numbers from the posterior."""
-    from dataclasses import replace
-
     named = posterior.named_population()
     amplitude = named[effect.mechanism]
     further = {n.name: named[f"{effect.mechanism}.{n.name}"] for n in effect.variant.nuisances}

@@ -11,14 +11,12 @@ from scipy.special import logsumexp
 
 from ..calibrate.distributions import SCALES
 from .candidates import candidates_of
+from .design import POPULATION
 from .evidence import left_by_particle, with_amplitudes
 from .misfit import general
 from .screen import signature_columns, single_integrals
 from .search import SUDDEN, Search
 from .settings import DECISIONS, NUMERICS
-
-POPULATION = 5
-"""Numbers of the population, which come first among what all particles share."""
 
 
 class Scores(NamedTuple):

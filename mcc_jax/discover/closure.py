@@ -10,6 +10,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from .design import FURTHER, HYPERPARAMETERS
 from .evidence import Design, left_by_particle, scales_of, with_amplitudes, without_first
 from .search import UNLISTED, Search
 from .settings import NUMERICS
@@ -130,7 +131,7 @@ def closure(search: Search, seed: int) -> Closure:
     values = np.where(mask[..., None], values, 0.0)
     scale = np.maximum(np.sqrt((values**2).mean((0, 1))), 1e-300)
     null = search.null.design
-    free = jnp.asarray(smooth.optimum.free[:8])
+    free = jnp.asarray(smooth.optimum.free[:HYPERPARAMETERS])
     curve = np.asarray(smooth.curve_um)[..., None]
     known = np.zeros((*curve.shape[:2], 0)) if search.screen is None else np.asarray(search.screen.columns)
     every = jnp.concatenate([jnp.asarray(values / scale), jnp.asarray(curve), jnp.asarray(known)], -1)
@@ -159,7 +160,7 @@ def closure(search: Search, seed: int) -> Closure:
         _resembling(search, left, null.common.shape[-1], T),
         span,
         curve[..., 0],
-        _held_out(smooth.design, np.asarray(smooth.optimum.free), np.asarray(smooth.basis), smooth.first),
+        _held_out(smooth.design, np.asarray(smooth.optimum.free), np.asarray(smooth.basis)),
     )
 
 
@@ -222,7 +223,7 @@ def _along(search: Search, name: str, x: np.ndarray, span: tuple[float, float]) 
 
     basis = functions(at) * size[:, None, None] / np.sqrt(N)
     basis = jnp.where(tests.mask[..., None], jnp.asarray(basis), 0.0)
-    free = jnp.asarray(smooth.optimum.free[:8])
+    free = jnp.asarray(smooth.optimum.free[:HYPERPARAMETERS])
     left = left_by_particle(free, with_amplitudes(search.null.design, basis))
     total, _ = without_first(jnp.sum(left.gram, 0), search.null.design.common.shape[-1])
     G, s = np.asarray(total)[:-1, :-1], np.asarray(total)[:-1, -1]
@@ -234,7 +235,7 @@ def _along(search: Search, name: str, x: np.ndarray, span: tuple[float, float]) 
     return there @ (covariance @ s), sd
 
 
-def _held_out(design: Design, free: np.ndarray, basis: np.ndarray, first: int) -> np.ndarray:
+def _held_out(design: Design, free: np.ndarray, basis: np.ndarray) -> np.ndarray:
     """What the discrepancy adds to every test by the weights that the others make [um]."""
     left = np.asarray(left_by_particle(jnp.asarray(free), design).gram)
     _, _, common = scales_of(jnp.asarray(free), design)
@@ -243,5 +244,5 @@ def _held_out(design: Design, free: np.ndarray, basis: np.ndarray, first: int) -
     for i, own in enumerate(left):
         others = total - own
         numbers = np.linalg.solve(others[:c, :c] + np.eye(c), others[:c, -1]) * np.asarray(common)
-        found.append(basis[i] @ numbers[first : first + basis.shape[-1]])
+        found.append(basis[i] @ numbers[FURTHER : FURTHER + basis.shape[-1]])
     return np.array(found)

@@ -24,8 +24,14 @@ from .settings import NUMERICS
 AMPLITUDES, MISFITS = 2, 2
 """Effects of a hypothesis at most, and misfits: every design has room for so many."""
 
-FURTHER = 5 + 2 * AMPLITUDES
+POPULATION = 5
+"""Numbers of the population, which come first among what all particles share."""
+
+FURTHER = POPULATION + 2 * AMPLITUDES
 """Numbers that all particles share: the population's, and further ones of the effects."""
+
+HYPERPARAMETERS = 8
+"""Those of the base law: four of the noise, and the spreads of b1, b3, b5 and e."""
 
 
 def particle_means(beta: Float[Array, " 5"], flatness: Array, power: float) -> Float[Array, "particles 4"]:
@@ -115,7 +121,7 @@ def design_of(base: Base, state: State, variants: tuple[Variant, ...] = (), more
     group = [0] * FURTHER + group
     if basis is not None:
         shared = jnp.concatenate([shared, basis], -1)
-    used = [1.0] * (8 + len(more.own_spreads)) + [0.0] * (len(spreads) - len(more.own_spreads))
+    used = [1.0] * (HYPERPARAMETERS + len(more.own_spreads)) + [0.0] * (len(spreads) - len(more.own_spreads))
     used += [1.0] * len(more.sizes) + [0.0] * (len(sizes) - len(more.sizes))
     absent = AMPLITUDES - sum(x.shape[-1] for x in amplitude)
     noise = base.model.chosen_priors.noise
@@ -147,13 +153,13 @@ def moved(base: Base, state: State, variants: tuple[Variant, ...], solution: Sol
     """The state at a solution; a positive number moves by a factor of e at most, others within what is plausible."""
     tests, model = base.tests, base.model
     mean, factor = base.population_prior
-    beta = mean + factor @ solution.common[:5]
+    beta = mean + factor @ solution.common[:POPULATION]
     at, slope = means_and_slope(state.population, tests.flatness, model.shape_power)
     latent = at + jnp.einsum("nkb,b->nk", slope, beta - state.population) + solution.own[:, :4]
     zero_mean, zero_sd = np.asarray(model.zero_prior)
     zero = tests.contact + zero_mean + zero_sd * solution.own[:, 4]
     numbers: list[Any] = [v.plausible[0] * float(solution.amplitude[k]) for k, v in enumerate(variants)]
-    old, place = np.asarray(state.point.theta[0]), 5
+    old, place = np.asarray(state.point.theta[0]), POPULATION
     for v in variants:
         for n in v.nuisances:
             middle, sd = nuisance_moments(n)

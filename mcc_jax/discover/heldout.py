@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..calibrate.estimates import finite
+from .design import HYPERPARAMETERS
 from .evidence import Design, amplitudes, left_by_particle, scales_of, without_first
-from .search import Names, Search
+from .search import UNLISTED, Names, Search
 from .settings import NUMERICS
 
 
@@ -142,11 +143,11 @@ def held_out(search: Search, winner: Names) -> HeldOut:
             prior = logs.get(names, 0.0) - search.found[names].log_evidence if names in logs else 0.0
             contestants.append(_Contestant.of(names, parts[0], parts[1].free, prior + _of_hyperparameters(parts)))
     # The base law under the winner's noise and spreads: gaps are measured by the noise of what closes them.
-    base = _Contestant.of((), null.design, optimum.free[:8], 0.0)
+    base = _Contestant.of((), null.design, optimum.free[:HYPERPARAMETERS], 0.0)
     first = next((c for c in contestants if c.names == winner[:1]), None) if len(winner) == 2 else None
     N = len(search.base.tests)
     points = np.asarray(search.base.tests.mask).sum(1)
-    labels: tuple[str | None, ...] = (None, *(("formula",) if winner == ("UNLISTED",) else winner))
+    labels: tuple[str | None, ...] = (None, *(("formula",) if winner == UNLISTED else winner))
     chi2, elpd = np.zeros((len(labels), N)), np.zeros((len(labels), N))
     residual = np.zeros((len(labels), *base.design.data.shape))
     everyone = np.arange(N)

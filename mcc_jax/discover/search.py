@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -17,7 +17,7 @@ from ..calibrate.noise import Along, Correlation
 from ..effects import Mechanism
 from .base import Base, State
 from .candidates import candidates_of
-from .design import FURTHER, More, design_of
+from .design import FURTHER, HYPERPARAMETERS, More, design_of
 from .evidence import (
     Design,
     NoiseKind,
@@ -54,11 +54,10 @@ class Hypothesis:
         alone: log evidence by formulas of the library alone.
         with_misfit: where the formulas may be wrong.
         beside: with a smooth discrepancy beside them.
-        forms: how many of the three were worked out; they have equal prior probabilities but for `Decisions.beside`.
         best: at the optimum of its best formulas.
         own: numbers of every test's own instead.
+        smooth: the discrepancy of `UNLISTED`.
         sizes: how far the formulas are off, as shares of the effects.
-        formulas: log evidence of each formula that was fitted.
         other_noise: what another kind of noise adds to its log evidence.
     """
 
@@ -70,12 +69,11 @@ class Hypothesis:
     own: OwnNumbers | None = None
     smooth: Smooth | None = None
     sizes: tuple[float, ...] = ()
-    formulas: dict[str, float] = field(default_factory=dict)
     other_noise: float = 0.0
 
     @property
     def log_evidence(self) -> float:
-        """Log marginal likelihood, its forms averaged."""
+        """Log marginal likelihood, its forms averaged; they are as probable but for `Decisions.beside`."""
         if not self.names or self.names == UNLISTED or self.own is not None:
             return self.alone + self.other_noise
         forms = [self.alone, self.with_misfit, self.beside - DECISIONS.beside]
@@ -96,21 +94,18 @@ class Smooth:
 
     Attributes:
         design, optimum, solution: with it.
-        basis: its functions [um].
-        first: place of its weights among the common numbers.
+        basis: its functions [um], whose weights follow `FURTHER` common numbers.
     """
 
     design: Design
     optimum: Optimum
     solution: Solution
     basis: Array
-    first: int
 
     @property
     def curve_um(self) -> Array:
         """What it adds to the law's displacement at every point [um]."""
-        weights = self.solution.common[self.first : self.first + self.basis.shape[-1]]
-        return jnp.einsum("npk,k->np", self.basis, weights)
+        return jnp.einsum("npk,k->np", self.basis, self.solution.common[FURTHER : FURTHER + self.basis.shape[-1]])
 
 
 class Search:
@@ -205,19 +200,17 @@ class Search:
             self.fits[ks] = refined(self.base, self.state, variants, np.array(numbers), self.small)
         return self.fits[ks]
 
+    def best_first(self, mechanism: str) -> list[tuple[str, tuple[float, int]]]:
+        """The formulas of a mechanism as in `first_order`, best first."""
+        return sorted(self.first_order[mechanism].items(), key=lambda item: -item[1][0])
+
     def fit_ahead(self, mechanisms: Sequence[str], most: int) -> None:
         """Fit the best formulas of some mechanisms, as many at once as there are cores."""
-        wanted = [
-            (k,)
-            for m in mechanisms
-            for _, k in sorted(self.first_order[m].values(), key=lambda one: -one[0])[:most]
-            if (k,) not in self.fits
-        ]
-        side_by_side(self.fit, wanted)
+        side_by_side(self.fit, [(k,) for m in mechanisms for _, (_, k) in self.best_first(m)[:most]])
 
     def single(self, mechanism: str, most: int) -> None:
         """One mechanism: its best formulas fitted at their own optimum, the others as they are to first order."""
-        ordered = sorted(self.first_order[mechanism].items(), key=lambda item: -item[1][0])
+        ordered = self.best_first(mechanism)
         values: dict[str, float] = {}
         best, gain = None, 0.0
         for f, (first, k) in ordered[:most]:
@@ -229,7 +222,7 @@ class Search:
         for f, (first, _) in ordered[most:]:
             values[f] = min(first + min(gain, 0.0), best.log_evidence)
         total = float(logsumexp(list(values.values())) - np.log(len(values)))
-        self.found[(mechanism,)] = Hypothesis((mechanism,), total, best=best, formulas=values)
+        self.found[(mechanism,)] = Hypothesis((mechanism,), total, best=best)
 
     def misfit_columns(self, r: Refined, which: int) -> Array:
         """Columns by which one of the formulas may be wrong: at its amplitude, and towards each of its siblings."""
@@ -262,7 +255,7 @@ class Search:
         )
         optimum = optimise(design, np.append(r.optimum.free, [middle] * K), without=r.optimum)
         one.with_misfit = optimum.log_evidence
-        one.sizes = tuple(float(x) for x in np.exp(optimum.free[8 : 8 + K]))
+        one.sizes = tuple(float(x) for x in np.exp(optimum.free[HYPERPARAMETERS : HYPERPARAMETERS + K]))
 
     def smooth(self, r: Refined) -> Smooth:
         """A hypothesis with a smooth discrepancy beside it."""
@@ -275,7 +268,7 @@ class Search:
         design = design_of(self.base, r.state, r.variants, More(basis=basis, group=group, sizes=sizes))
         optimum = optimise(design, np.append(r.optimum.free, [unit, unit - 1.0]), without=r.optimum)
         solution = solve(jnp.asarray(optimum.free), design)
-        return Smooth(design, optimum, solution, basis, FURTHER)
+        return Smooth(design, optimum, solution, basis)
 
     # ---- two names ---------------------------------------------------------------------------------------------------
 
