@@ -88,7 +88,7 @@ NOTHING_MORE = More()
 def design_of(base: Base, state: State, variants: tuple[Variant, ...] = (), more: More = NOTHING_MORE) -> Design:
     """The design of a hypothesis around a state."""
     tests, model = base.tests, base.model
-    linear = linear_data(state.point, tests, Forms(model.unloading, variants))
+    linear = base.each(linear_data, state.point, Forms(model.unloading, variants))
     population, data = base_columns(state, tests, linear, base.population_prior, model.shape_power)
     zero_mean, zero_sd = np.asarray(model.zero_prior)
     ones = jnp.where(tests.mask, 1.0, 0.0)

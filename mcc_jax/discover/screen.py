@@ -15,7 +15,7 @@ from scipy.special import log_ndtr, logsumexp
 from ..calibrate.compiling import compiled
 from ..calibrate.data import Tests
 from ..calibrate.distributions import SCALES
-from ..calibrate.forward import Forms
+from ..calibrate.forward import Forms, Point
 from ..effects import AbstractEffect, Mechanism
 from ..law import signatures
 from .base import Base, State
@@ -26,14 +26,14 @@ from .settings import NUMERICS
 
 
 @compiled
-def candidate_columns(state: State, tests: Tests, effects: tuple[AbstractEffect, ...], forms: Forms) -> Array:
+def candidate_columns(point: Point, tests: Tests, effects: tuple[AbstractEffect, ...], forms: Forms) -> Array:
     """Signatures of all candidates at the base law, shape (N, points, candidates)."""
 
     def one(latent: Array, tests: Tests) -> Array:
         columns = signatures(forms.law(latent, jnp.zeros(0)), tests.particle, tests.record, effects)
         return jnp.where(tests.mask[None], columns, 0.0).T
 
-    return jax.vmap(one)(state.point.latent, tests)
+    return jax.vmap(one)(point.latent, tests)
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def pair_integrals(s: Setting, a: np.ndarray, b: np.ndarray, signs: np.ndarray, 
 def signature_columns(base: Base, state: State, candidates: Sequence[Candidate]) -> Array:
     """Signatures of candidates at the base law, in units of their smallest plausible amplitudes."""
     effects = tuple(c.effect for c in candidates)
-    columns = candidate_columns(state, base.tests, effects, base.forms)
+    columns = base.each(candidate_columns, state.point, effects, base.forms)
     return columns * jnp.asarray(np.array([c.variant.plausible[0] for c in candidates]))[None, None]
 
 

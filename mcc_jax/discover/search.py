@@ -126,7 +126,7 @@ class Search:
         self.base, self.library, self.tell = base, library, tell
         start = optimise(design_of(base, base.state), base.hyperparameters, curvature=False)
         self.null = refined(base, base.state, (), np.zeros(0), start.free)
-        self.natural = coordinates(self.state, base.tests, base.forms)
+        self.natural = base.each(coordinates, self.state.point, base.forms)
         self.at = scaled(self.natural, base.tests.mask)
         self.shared = {
             name: m for name, m in library.items() if name != SUDDEN and not any(v.random_per_test for v in m.variants)
@@ -239,7 +239,7 @@ class Search:
                 likeness = float(jnp.sum(column * own))
                 others.append(column * np.copysign(size / length, likeness) - own)
         siblings = jnp.stack(others, -1) if others else smooth[..., :0]
-        return jnp.concatenate([smooth, siblings], -1)
+        return jnp.concatenate([siblings, smooth], -1)
 
     def with_misfit(self, one: Hypothesis) -> None:
         """Log evidence where every name's formula may be wrong."""

@@ -56,6 +56,7 @@ class Numerics:
     Attributes:
         noise_factors, length_factors, spread_factors: settings of correlated noise and of spreads, over those of the
             base fit, at which all formulas are screened. Noise that swallowed a gap hides what explains it.
+        block: particles that are linearised at once.
         contenders: mechanisms that are fitted at their own optimum.
         formulas: formulas of each of them where `very_strong`, else one; of the two leading ones up to `all_formulas`.
         seconds: second names that are tried beside each of the two leading names.
@@ -75,6 +76,7 @@ class Numerics:
     noise_factors: tuple[float, ...] = (1.0, 0.4, 0.15, 0.05)
     length_factors: tuple[float, ...] = (1.0, 0.3)
     spread_factors: tuple[float, ...] = (1.0, 0.5)
+    block: int = 4
     contenders: int = 5
     formulas: int = 2
     all_formulas: int = 8
@@ -85,7 +87,7 @@ class Numerics:
     still: float = 0.05
     hats: int = 8
     degree: int = 2
-    basis: int = 64
+    basis: int = 96
     waves: int = 12
     bootstrap: int = 400
     places: int = 5
