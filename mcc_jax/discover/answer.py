@@ -13,13 +13,12 @@ from ..calibrate import Posterior
 from ..calibrate.estimates import estimate, finite, summary
 from ..effects import Mechanism
 from .base import Base
-from .design import POPULATION
 from .evidence import left_by_particle, residual_of, scales_of, whitened
 from .own_numbers import OwnNumbers
 from .result import Effect, Likeness, Residuals
 from .screen import screen
 from .search import UNLISTED, Hypothesis, Names, Search
-from .settings import DECISIONS
+from .settings import DECISIONS, POPULATION, TELLING
 
 
 def population_parameters(search: Search, names: Names) -> dict[str, Any]:
@@ -165,7 +164,7 @@ def ranking_of(search: Search) -> tuple[dict[str, Any], ...]:
                 "variant": c.variant.name,
                 "statistic": finite(float(z[k])),
                 "estimate": finite(float(first.score[k] / information[k] * unit)),
-                "detection_limit": finite(float(DECISIONS.detectable / np.sqrt(information[k]) * unit)),
+                "detection_limit": finite(float(TELLING.detectable / np.sqrt(information[k]) * unit)),
                 "unit": c.variant.unit,
                 "parameter": c.variant.parameter,
                 "probability": weight[c.mechanism] / total,
@@ -225,7 +224,7 @@ def leads_of(search: Search, winner: Names) -> tuple[dict[str, Any], ...]:
     gap = max(alone.log_evidence - search.null.log_evidence, 1e-300)
     found = []
     for names, pair in search.found.items():
-        if len(names) == 2 and winner[0] in names and pair.log_evidence > alone.log_evidence + DECISIONS.lead:
+        if len(names) == 2 and winner[0] in names and pair.log_evidence > alone.log_evidence + TELLING.lead:
             (second,) = set(names) - set(winner)
             share = (pair.log_evidence - alone.log_evidence) / (gap + pair.log_evidence - alone.log_evidence)
             found.append({"mechanism": second, "share": float(share), "resembles": []})

@@ -11,12 +11,11 @@ from scipy.special import logsumexp
 
 from ..calibrate.distributions import SCALES
 from .candidates import candidates_of
-from .design import POPULATION
 from .evidence import left_by_particle, with_amplitudes
 from .misfit import general
 from .screen import signature_columns, single_integrals
 from .search import SUDDEN, Search
-from .settings import DECISIONS, NUMERICS
+from .settings import DECISIONS, NUMERICS, POPULATION
 
 
 class Scores(NamedTuple):

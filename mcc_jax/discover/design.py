@@ -19,19 +19,7 @@ from ..calibrate.forward import Forms, Linear, Point
 from ..effects import Variant
 from .base import Base, State
 from .evidence import Design, Kinds, Solution
-from .settings import NUMERICS
-
-AMPLITUDES, MISFITS = 2, 2
-"""Effects of a hypothesis at most, and misfits: every design has room for so many."""
-
-POPULATION = 5
-"""Numbers of the population, which come first among what all particles share."""
-
-FURTHER = POPULATION + 2 * AMPLITUDES
-"""Numbers that all particles share: the population's, and further ones of the effects."""
-
-HYPERPARAMETERS = 8
-"""Those of the base law: four of the noise, and the spreads of b1, b3, b5 and e."""
+from .settings import AMPLITUDES, FURTHER, HYPERPARAMETERS, MISFITS, NUMERICS, POPULATION
 
 
 def particle_means(beta: Float[Array, " 5"], flatness: Array, power: float) -> Float[Array, "particles 4"]:

@@ -9,10 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..calibrate.estimates import finite
-from .design import HYPERPARAMETERS
 from .evidence import Design, amplitudes, left_by_particle, scales_of, without_first
 from .search import UNLISTED, Names, Search
-from .settings import NUMERICS
+from .settings import HYPERPARAMETERS, NUMERICS
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,6 @@ from .design import between, design_of, moved
 from .evidence import Design, Optimum, Solution, optimise, solve
 from .settings import NUMERICS
 
-WORSE = 5.0
-"""Nats by which a Gauss-Newton step may make things worse before half of it is taken back."""
-
 
 @dataclass(frozen=True)
 class Refined:
@@ -60,10 +57,10 @@ def refined(base: Base, state: State, variants: tuple[Variant, ...], numbers: np
     for k in range(NUMERICS.steps):
         optimum = optimise(design, free, curvature=False)
         last = k == NUMERICS.steps - 1
-        if optimum.log_joint < value - WORSE and not last:
+        if optimum.log_joint < value - NUMERICS.worse and not last:
             state, value = between(before, state), -np.inf  # what was linear there is not here
         else:
-            if last and optimum.log_joint < value - WORSE:
+            if last and optimum.log_joint < value - NUMERICS.worse:
                 state = before
                 design = design_of(base, state, variants)
                 break

@@ -20,9 +20,9 @@ from ..effects import AbstractEffect, Mechanism
 from ..law import signatures
 from .base import Base, State
 from .candidates import Candidate, candidates_of
-from .design import FURTHER, design_of
+from .design import design_of
 from .evidence import left_by_particle, prior_density, with_amplitudes, without_first
-from .settings import NUMERICS
+from .settings import FURTHER, NUMERICS
 
 
 @compiled

@@ -17,7 +17,7 @@ from ..calibrate.noise import Along, Correlation
 from ..effects import Mechanism
 from .base import Base, State
 from .candidates import candidates_of
-from .design import FURTHER, HYPERPARAMETERS, More, design_of
+from .design import More, design_of
 from .evidence import (
     Design,
     NoiseKind,
@@ -34,7 +34,7 @@ from .misfit import ANY, COORDINATES, coordinates, functions, general, scaled
 from .own_numbers import OwnNumbers, differing, sudden_steps
 from .refine import Refined, refined
 from .screen import Screen, Setting, pair_integrals, screen, signature_columns, single_integrals
-from .settings import DECISIONS, NUMERICS
+from .settings import DECISIONS, FURTHER, HYPERPARAMETERS, NUMERICS
 
 Names = tuple[str, ...]
 UNLISTED: Names = ("UNLISTED",)
