@@ -16,7 +16,6 @@ from .base import Base
 from .evidence import left_by_particle, residual_of, scales_of, whitened
 from .own_numbers import OwnNumbers
 from .result import Effect, Likeness, Residuals
-from .screen import screen
 from .search import UNLISTED, Hypothesis, Names, Search
 from .settings import DECISIONS, POPULATION, TELLING
 
@@ -146,7 +145,7 @@ def ranking_of(search: Search) -> tuple[dict[str, Any], ...]:
     own = {m: x for m, x in search.library.items() if m not in search.shared}
     views = [search.screen] if search.screen is not None else []
     if own:
-        views.append(screen(search.base, search.state, search.null.optimum.free, own, several=False))
+        views.append(search.screened(own, several=False))
     entries = {}
     for view in views:
         first = view.settings[0]

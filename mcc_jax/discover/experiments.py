@@ -13,7 +13,7 @@ from ..simulate import Programme
 from .base import Base
 from .candidates import Candidate
 from .plan import Plan, planned_base
-from .screen import Screen, screen
+from .screen import Screen, first_order
 from .search import Search
 from .settings import DECISIONS, NUMERICS, TELLING
 
@@ -71,7 +71,7 @@ def next_experiments(search: Search, names: tuple[str, ...]) -> list[dict[str, A
 
 def _screened(base: Base, plan: Plan, library: Mapping[str, Mechanism]) -> tuple[Screen, int]:
     planned = planned_base(base, plan)
-    return screen(planned, planned.state, base.hyperparameters, library, several=False), len(planned.tests)
+    return first_order(planned, library, base.hyperparameters), len(planned.tests)
 
 
 def _power(search: Search, members: list[str], other: Screen, copies: float) -> float:

@@ -25,7 +25,7 @@ from ..simulate import Programme, simulate_campaign
 from .base import Base, State, base_fit
 from .candidates import untestable
 from .design import particle_means
-from .screen import Screen, screen
+from .screen import Screen, first_order
 from .settings import TELLING
 
 _A_PROGRAMME = "Take mcc_jax.Programme.cycles()."
@@ -224,4 +224,4 @@ def without_effects(model: Model) -> Model:
 def screened(base: Base, library: Mapping[str, Mechanism]) -> tuple[Screen, Sequence[dict[str, str]]]:
     """All formulas that the campaign can be searched for, to first order, and what the others need."""
     testable, missing = untestable(library, available_data(base.campaign))
-    return screen(base, base.state, base.hyperparameters, testable, several=False), missing
+    return first_order(base, testable), missing

@@ -141,7 +141,7 @@ def signature_columns(base: Base, state: State, candidates: Sequence[Candidate])
 
 
 def screen(
-    base: Base, state: State, free: np.ndarray, library: Mapping[str, Mechanism], *, several: bool = True
+    base: Base, state: State, free: np.ndarray, candidates: Sequence[Candidate], columns: Array, *, several: bool = True
 ) -> Screen:
     """Scores of all candidates around the base law, at several settings of noise and spreads.
 
@@ -149,11 +149,10 @@ def screen(
         base: the tests.
         state: where the base law fits.
         free: its hyperparameters, the first setting.
-        library: where the candidates are from.
+        candidates: the formulas.
+        columns: as of `signature_columns`.
         several: whether other settings than the first are wanted.
     """
-    candidates = candidates_of(library)
-    columns = signature_columns(base, state, candidates)
     design = with_amplitudes(design_of(base, state), columns)
     settings = []
     grid = itertools.product(NUMERICS.noise_factors, NUMERICS.length_factors, NUMERICS.spread_factors)
@@ -167,4 +166,12 @@ def screen(
         null = float(np.sum(np.asarray(integral))) + float(log_population) - 0.5 * total[-1, -1]
         null += float(prior_density(jnp.asarray(at), design))
         settings.append(Setting(at, null, total[:-1, :-1], total[:-1, -1]))
-    return Screen(candidates, tuple(settings), columns)
+    return Screen(tuple(candidates), tuple(settings), columns)
+
+
+def first_order(base: Base, library: Mapping[str, Mechanism], free: np.ndarray | None = None) -> Screen:
+    """Scores of a library around the base law at its own hyperparameters, or at others."""
+    candidates = candidates_of(library)
+    columns = signature_columns(base, base.state, candidates)
+    at = base.hyperparameters if free is None else free
+    return screen(base, base.state, at, candidates, columns, several=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -16,7 +16,7 @@ from ..calibrate.compiling import side_by_side
 from ..calibrate.noise import Along, Correlation
 from ..effects import Mechanism
 from .base import Base, State
-from .candidates import candidates_of
+from .candidates import Candidate, candidates_of
 from .design import More, design_of
 from .evidence import (
     Design,
@@ -116,7 +116,8 @@ class Search:
         library: mechanisms that are searched for.
         null: the base law at its optimum.
         natural, at: coordinates of all points, in natural units and between 0 and 1.
-        screen: all formulas to first order.
+        candidates, columns: all formulas and their signatures, in units of their smallest plausible amplitudes.
+        screen: those that all tests share, to first order.
         found: hypotheses by their names.
     """
 
@@ -131,9 +132,9 @@ class Search:
         self.shared = {
             name: m for name, m in library.items() if name != SUDDEN and not any(v.random_per_test for v in m.variants)
         }
-        self.screen: Screen | None = None
-        if self.shared:
-            self.screen = screen(base, self.state, self.null.optimum.free, self.shared)
+        self.candidates = candidates_of(library)
+        self.columns = signature_columns(base, self.state, self.candidates)
+        self.screen = self.screened(self.shared) if self.shared else None
         # Correlated noise that has swallowed a gap must be small where what explains it begins to be fitted.
         self.small = self.null.optimum.free.copy()
         self.small[2] += np.log(0.1)
@@ -144,6 +145,15 @@ class Search:
     def state(self) -> State:
         """Where the base law fits."""
         return self.null.state
+
+    def formulas_of(self, mechanisms: Collection[str]) -> tuple[tuple[Candidate, ...], Array]:
+        """The formulas of some mechanisms, and their signatures."""
+        rows = [k for k, c in enumerate(self.candidates) if c.mechanism in mechanisms]
+        return tuple(self.candidates[k] for k in rows), self.columns[..., np.array(rows)]
+
+    def screened(self, mechanisms: Collection[str], *, several: bool = True) -> Screen:
+        """Some mechanisms to first order, around the base law."""
+        return screen(self.base, self.state, self.null.optimum.free, *self.formulas_of(mechanisms), several=several)
 
     # ---- posterior ---------------------------------------------------------------------------------------------------
 
@@ -362,8 +372,7 @@ class Search:
         elif name in self.shared:
             return
         else:
-            candidates = candidates_of({name: mechanism})
-            columns = signature_columns(self.base, self.state, candidates)
+            candidates, columns = self.formulas_of({name})
             own = differing(self.base, self.state, free, columns, candidates)
         value = -np.inf if own is None else own.log_evidence
         self.found[(name,)] = Hypothesis((name,), value, own=own)
