@@ -58,11 +58,10 @@ def _covariance(design: Any, free: np.ndarray) -> np.ndarray:
 def effects_of(search: Search, names: Names, probabilities: Mapping[str, float], p_any: float) -> tuple[Effect, ...]:
     """The effects of a hypothesis with their numbers."""
     one = search.found[names]
-    if one.own is not None:
-        return (_of_their_own(one.own, probabilities[names[0]], p_any),)
-    if one.best is None:
+    own = () if one.own is None else (_of_their_own(one.own, probabilities[one.own.variant.mechanism], p_any),)
+    r = one.best if one.own is None else one.own.at
+    if r is None:
         return ()
-    r = one.best
     cov = _covariance(r.design, r.optimum.free)
     c = r.design.common.shape[-1]
     place, found = len(r.variants), []
@@ -74,7 +73,7 @@ def effects_of(search: Search, names: Names, probabilities: Mapping[str, float],
         amplitude = float(r.theta[k])
         found.append(Effect(variant, nuisance, amplitude, sd, probabilities[variant.mechanism], p_any, misfit=size))
     order = {name: i for i, name in enumerate(sorted(names, key=lambda n: -search.found[(n,)].log_evidence))}
-    return tuple(sorted(found, key=lambda e: order[e.mechanism]))
+    return tuple(sorted((*found, *own), key=lambda e: order[e.mechanism]))
 
 
 def _of_their_own(own: OwnNumbers, probability: float, p_any: float) -> Effect:
@@ -86,7 +85,8 @@ def _of_their_own(own: OwnNumbers, probability: float, p_any: float) -> Effect:
         sd = float(np.sqrt(max(spread, np.mean([j.sd**2 for j in own.jumps])) / len(size)))
         places = {n.name: float(np.median([j.stress_MPa for j in own.jumps])) for n in own.variant.nuisances}
         return Effect(own.variant, places, float(size.mean()), sd, probability, p_any, True, jumps=own.jumps)
-    amplitude, sd = float(own.solution.amplitude[0]) * unit, float(own.solution.sd[0]) * unit
+    place, solution = len(own.at.variants), own.at.solution  # its amplitude comes after that of a formula beside it
+    amplitude, sd = float(solution.amplitude[place]) * unit, float(solution.sd[place]) * unit
     return Effect(own.variant, own.nuisance, amplitude, sd, probability, p_any, True)
 
 

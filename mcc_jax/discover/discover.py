@@ -133,7 +133,7 @@ def discover(
         return _finished(replace(found, residuals=left, places=map_), findings, started)
     found = _named(found, search, known, tell)
     winner = leader_of(search).names
-    if posterior and found.effects and winner != (SUDDEN,):
+    if posterior and found.effects and SUDDEN not in winner:
         found = _sampled(found, base, threshold_MPa, seed, tell)
     if confirm and len(base.tests) > 2:
         tell("held-out particles")
@@ -213,8 +213,7 @@ def _named(found: Discovery, search: Search, known: Mapping[str, Mechanism], tel
     sets = sets_of(search, winner, effects)
     model = found.model
     assert model is not None
-    if winner != (SUDDEN,):
-        model = model.with_effects(*(e.variant for e in effects))
+    model = model.with_effects(*(e.variant for e in effects if e.mechanism != SUDDEN))
     return replace(
         found,
         verdict="SET" if any(len(names) > 1 for names in sets) else "NAMED",

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..effects import Variant
 from .base import Base, State
-from .design import between, design_of, moved
+from .design import NOTHING_MORE, More, between, design_of, moved
 from .evidence import Design, Optimum, Solution, optimise, solve
 from .settings import NUMERICS
 
@@ -41,7 +41,14 @@ class Refined:
         return np.asarray(self.state.point.theta[0])
 
 
-def refined(base: Base, state: State, variants: tuple[Variant, ...], numbers: np.ndarray, free: np.ndarray) -> Refined:
+def refined(
+    base: Base,
+    state: State,
+    variants: tuple[Variant, ...],
+    numbers: np.ndarray,
+    free: np.ndarray,
+    more: More = NOTHING_MORE,
+) -> Refined:
     """The optimum of a hypothesis, from a state of the base law on.
 
     Args:
@@ -50,10 +57,11 @@ def refined(base: Base, state: State, variants: tuple[Variant, ...], numbers: np
         variants: the formulas.
         numbers: where the effects' numbers are linearised first: amplitudes of zero and further numbers.
         free: hyperparameters to start from.
+        more: columns besides those of the formulas.
     """
     state, value = state.with_numbers(numbers), -np.inf
     before = state
-    design = design_of(base, state, variants)
+    design = design_of(base, state, variants, more)
     for k in range(NUMERICS.steps):
         optimum = optimise(design, free, curvature=False)
         last = k == NUMERICS.steps - 1
@@ -62,13 +70,13 @@ def refined(base: Base, state: State, variants: tuple[Variant, ...], numbers: np
         else:
             if last and optimum.log_joint < value - NUMERICS.worse:
                 state = before
-                design = design_of(base, state, variants)
+                design = design_of(base, state, variants, more)
                 break
             free = optimum.free
             if last or (k > 1 and abs(optimum.log_joint - value) < NUMERICS.still):
                 break
             before, value = state, optimum.log_joint
             state = moved(base, state, variants, solve(jnp.asarray(free), design))
-        design = design_of(base, state, variants)
+        design = design_of(base, state, variants, more)
     optimum = optimise(design, free)
     return Refined(variants, state, design, optimum, solve(jnp.asarray(optimum.free), design))

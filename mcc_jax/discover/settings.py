@@ -96,6 +96,8 @@ class Numerics:
         locations, phases: values tried of a number that differs from test to test: of a place somewhere between two
             that lie far apart, which must be met closely, and of a phase.
         steps, still: Gauss-Newton steps at most, and the change of the log posterior at which they end.
+        drifts: drifts of every test's own that are fitted at their own optimum.
+        little: factor on correlated noise that has swallowed a gap, where what explains it begins to be fitted.
         worse: nats by which a step may make things worse before half of it is taken back.
         hats, degree: hat functions of each coordinate of a misfit, and total degree of its smooth products.
         basis: functions of all misfits of a hypothesis together; there is room for so many.
@@ -122,6 +124,8 @@ class Numerics:
     steps: int = 6
     still: float = 0.05
     worse: float = 5.0
+    drifts: int = 6
+    little: float = 0.1
     locations: int = 32
     phases: int = 14
     hats: int = 8
