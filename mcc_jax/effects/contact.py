@@ -61,12 +61,16 @@ class ElasticToe(ExponentialToe):
         return self.amplitude * context.particle.displacement(share)
 
 
+_FLATTENING = (0.05, 0.1, 0.18, 0.3, 0.55, 1.0, 3.0)
+"""Stresses [MPa]: rough cellulose up to 1, ceramic pebbles 3 and more, a twelfth of what crushes them."""
+
+
 def _toe(name: str, make: type[AbstractEffect], equation: str, explanation: str) -> Variant:
     return Variant(
         "toe_asperity", name, make, "toe_strain", "-", 1, (5e-4, 2e-2), equation, explanation,
         "Greenwood and Williamson (1966), Proc. R. Soc. A 295, 300",
         nuisances=(
-            Nuisance("stress_scale_MPa", (0.1, 0.18, 0.3, 0.55, 1.0), (0.01, 5.0), "stress that flattens most of them"),
+            Nuisance("stress_scale_MPa", _FLATTENING, (0.01, 20.0), "stress that flattens most of them"),
         ),
         needs=(Need.LOW_LOAD,), helps=(Need.RELOAD,),
     )  # fmt: skip
