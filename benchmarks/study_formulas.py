@@ -3,17 +3,16 @@
 Run `python benchmarks/study_formulas.py --write`; it writes `results/formulas.md`.
 
 One simulated campaign holds all that any formula needs. Each formula of the library in turn, at the middle of its
-further numbers and as strong as `LAMBDA` standard deviations of noise once the particles' own numbers and the population
-are integrated out, is taken for nature's and out of the library, to first order. The table:
+further numbers and `LAMBDA` standard deviations of noise strong once the particles' own numbers and the population are
+integrated out, is taken for nature's and out of the library, to first order. The table:
 
 - sd: its strength, less than `LAMBDA` where its largest plausible amplitude gives less;
 - left: what the best sibling, over all of its grid, leaves of it, as a share of its square;
 - in the span: how much of that the misfit explains that `discover` gives to the sibling (`Search.misfit_columns`), its
   coefficients normal with the prior's median size and the amplitude free;
 - rest: what then remains, in sd. Below 3 or so no second name can gain by it.
-
-Bold: more than 0.2 of the length is left, and less than 90 % of that lies in the span. Formulas that agree to first
-order leave nothing. Mechanisms whose numbers differ from test to test have no misfit in `discover`, and no rows here.
+Bold: more than 0.2 of the length is left, and less than 90 % of that lies in the span. Formulas whose numbers differ
+from test to test have no misfit in `discover`, and no rows here.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -75,15 +74,9 @@ def gram(base: Base, columns: Any) -> np.ndarray:
 
 def remaining(products: np.ndarray, precision: np.ndarray) -> float:
     """What normal coefficients of the other columns leave of the first, as a share of its square."""
-    matrix, value = products[1:, 1:] + np.diag(precision), products[1:, 0]
-    x = np.linalg.lstsq(matrix, value, rcond=1e-14)[0]
-    return float((products[0, 0] - 2 * x @ value + x @ products[1:, 1:] @ x) / products[0, 0])
-
-
-def best_of(k: int, others: list[int], products: np.ndarray, sign: int) -> int:
-    """The candidate most like another, of a sign that is physical."""
-    likeness = products[k, others] / np.sqrt(np.maximum(np.diagonal(products)[others], 1e-300))
-    return others[int(np.argmax(np.abs(likeness) if sign == 0 else likeness))]
+    rest, value = products[1:, 1:], products[1:, 0]
+    x = np.linalg.lstsq(rest + np.diag(precision), value, rcond=1e-14)[0]
+    return float((products[0, 0] - 2 * x @ value + x @ rest @ x) / products[0, 0])
 
 
 def in_span(
@@ -95,13 +88,10 @@ def in_span(
     unit = min(LAMBDA / np.sqrt(products[0, 0]), truth.plausible[1] / truth.plausible[0])
     amplitude = unit * products[0, 1] / products[1, 1]
     first_order = {sibling.mechanism: {name: (0.0, j) for name, j in best.items()}}
-    searching = SimpleNamespace(at=at, screen=SimpleNamespace(columns=columns), first_order=first_order)
-    fitted = SimpleNamespace(
-        variants=(sibling,),
-        design=SimpleNamespace(amplitude=columns[..., s : s + 1]),
-        theta=np.array([amplitude * sibling.plausible[0]]),
-    )
-    span = Search.misfit_columns(cast(Any, searching), cast(Any, fitted), 0)[..., : NUMERICS.basis]
+    searching: Any = SimpleNamespace(at=at, screen=SimpleNamespace(columns=columns), first_order=first_order)
+    design, theta = SimpleNamespace(amplitude=columns[..., s : s + 1]), np.array([amplitude * sibling.plausible[0]])
+    fitted: Any = SimpleNamespace(variants=(sibling,), design=design, theta=theta)
+    span = Search.misfit_columns(searching, fitted, 0)[..., : NUMERICS.basis]
     count = span.shape[-1]
     span = padded(span, NUMERICS.basis)
     products = gram(base, jnp.concatenate([unit * columns[..., [k, s]], span], -1))[: 2 + count, : 2 + count]
@@ -117,13 +107,15 @@ def rows_of(base: Base, candidates: list[Candidate]) -> list[Row]:
     columns = signature_columns(base, base.state, every)
     at = scaled(coordinates(base.state, base.tests, base.forms), base.tests.mask)
     products, rows = gram(base, columns), []
+    length = np.sqrt(np.maximum(np.diagonal(products), 1e-300))
     for k, v in enumerate(variants):
+        likeness = products[k] / length if v.sign else np.abs(products[k] / length)
         siblings: dict[str, list[int]] = {}
         for j, other in enumerate(candidates, len(variants)):
             if other.mechanism == v.mechanism and other.variant != v:
                 siblings.setdefault(other.variant.name, []).append(j)
-        best = {name: best_of(k, js, products, v.sign) for name, js in siblings.items()}
-        s = best_of(k, list(best.values()), products, v.sign)
+        best = {name: max(js, key=lambda j: likeness[j]) for name, js in siblings.items()}
+        s = max(best.values(), key=lambda j: likeness[j])
         rows.append(in_span(base, at, columns, (k, s), best, v, every[s].variant))
     return rows
 
@@ -141,7 +133,6 @@ def main() -> None:
     """Draw the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--write", action="store_true")
-    write = parser.parse_args().write
     jax.config.update("jax_enable_x64", True)
     base = base_fit(campaign(), mcc.Model(), threshold_MPa=0.0, tell=lambda _: None)
     assert base.converged
@@ -150,7 +141,7 @@ def main() -> None:
     head = "| mechanism | formula | sd | best sibling | left | in the span | rest [sd] |\n" + "|---" * 7 + "|\n"
     text = head + "".join(map(line, rows_of(base, candidates)))
     print(text)
-    if write:
+    if parser.parse_args().write:
         RESULT.write_text(text)
 
 

@@ -17,7 +17,7 @@ from .variant import Mechanism, Need, Nuisance, Variant
 
 _NORM = 27 / 4
 BISECTIONS = 50
-LAST_CONTACT = 0.1  # radius over that at the peak: there a constant pull has fallen to a half
+LAST_CONTACT = 0.3  # radius over that at the peak: there, at 1 % of the load, half of a constant pull is left
 
 
 # ---- shape of unloading ----------------------------------------------------------------------------------------------
@@ -207,7 +207,7 @@ class ConstantPull(AbstractAdhesion):
     """A pull that does not fade with unloading and is gone with the last of the contact."""
 
     def attraction(self, recovered: Values) -> Values:
-        """(1 - u') phi^2 / (phi^2 + 0.1^2): what counts is how far the law's own force has fallen."""
+        """(1 - u') phi^2 / (phi^2 + 0.3^2): what counts is how far the law's own force has fallen."""
         contact = (1 - recovered) * (1 + recovered)
         return (1 - stress_ratio(recovered)) * contact / (contact + LAST_CONTACT**2)
 
@@ -256,7 +256,7 @@ ADHESION = Mechanism(
                   "The same with the stress of the contact itself.", _COHESIVE, nuisances=(_MOBILISED,)),
         _adhesion("bond_nominal", BondAdhesion, f"g = phi^2 s; {_SECTION}", "As bond, counted over the section.",
                   "Gonzalez (2019)", over_section=True),
-        _adhesion("constant_nominal", ConstantPull, f"g = (1 - u') phi^2 / (phi^2 + 0.1^2); {_SECTION}",
+        _adhesion("constant_nominal", ConstantPull, f"g = (1 - u') phi^2 / (phi^2 + 0.3^2); {_SECTION}",
                   "A pull that stays the same until the last of the contact opens, counted over the section.",
                   "Derjaguin, Muller and Toporov (1975), J. Colloid Interface Sci. 53, 314", over_section=True),
     ),
