@@ -23,17 +23,17 @@ COORDINATES = {
     "damage": ("peak", "cycles"),
     "densification_stiffening": ("peak",),
     "reload_hysteresis": ("load", "reload", "peak"),
-    "ratcheting": ("cycles", "peak"),
+    "ratcheting": ("cycles", "peak", "strain"),
     "finite_hardening_exponent": ("peak",),
     "unloading_shape": ("load", "peak"),
     "size_effect": ("size",),
-    "shape_second_order": ("shape",),
+    "shape_second_order": ("shape", "outline"),
     "pop_in": (),
     "toe_asperity": ("peak",),
-    "platen_friction": ("peak",),
+    "platen_friction": ("peak", "shape"),
     "misalignment": ("peak", "size"),
-    "platen_sink_in": ("peak", "load"),
-    "reverse_plasticity": ("load", "peak"),
+    "platen_sink_in": ("peak", "load", "size"),
+    "reverse_plasticity": ("load", "peak", "reload"),
     "humidity": ("humidity", "peak"),
 }
 """In what a formula of each mechanism may be wrong: what its own formulas depend on."""
@@ -67,6 +67,7 @@ def coordinates(point: Point, tests: Tests, forms: Forms) -> dict[str, Array]:
             "rate": jnp.log(jnp.maximum(tests.record.loading_rate, 1e-6)),
             "size": ones * jnp.log(tests.particle.effective_diameter),
             "shape": ones * tests.particle.flatness,
+            "outline": ones * jnp.abs(jnp.log(tests.particle.D1 / tests.particle.D2)),
             "humidity": ones * tests.record.relative_humidity,
         }
 
