@@ -112,7 +112,7 @@ def functions(
 def hats_of(x: Array, count: int) -> Array:
     """Hat functions, piecewise linear and 1 at one of `count` even places, of a coordinate between 0 and 1."""
     centres = jnp.asarray(np.linspace(0, 1, count))
-    return jnp.maximum(1 - jnp.abs(x[..., None] - centres) * (count - 1), 0.0)
+    return jnp.maximum(1 - jnp.abs(x[..., None] - centres.reshape((1,) * x.ndim + (count,))) * (count - 1), 0.0)
 
 
 def general(at: dict[str, Array], size: Array, mask: Array) -> tuple[Array, int]:
