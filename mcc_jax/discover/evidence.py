@@ -216,6 +216,11 @@ def log_joint(free: Float[Array, " h"], design: Design) -> Array:
     )
 
 
+def filled_up(free: np.ndarray, design: Design) -> np.ndarray:
+    """Hyperparameters with zeros for those that only make up shapes."""
+    return np.concatenate([free, np.zeros(len(design.used) - len(free))])
+
+
 def with_little_noise(free: np.ndarray) -> np.ndarray:
     """Hyperparameters with correlated noise that has not swallowed a gap."""
     at = free.copy()
@@ -301,7 +306,7 @@ def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, witho
 
     count = float(np.asarray(design.tests.mask).sum())
     used = np.asarray(design.used) > 0
-    start = np.concatenate([start, np.zeros(len(used) - len(start))])
+    start = filled_up(start, design)
     spreads = len(design.kinds.spreads)
     expected = np.full(len(start), 2.0)
     expected[:4] = count * np.array([1.5, 0.2, 0.1, 0.02])

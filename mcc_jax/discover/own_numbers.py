@@ -21,7 +21,7 @@ from ..effects import Variant
 from .base import Base, State
 from .candidates import Candidate
 from .design import More, design_of
-from .evidence import Design, Optimum, optimise, scales_of, solve, value_and_gradient, with_little_noise
+from .evidence import Design, Optimum, filled_up, optimise, scales_of, solve, value_and_gradient, with_little_noise
 from .refine import Refined, refined
 from .screen import single_integrals
 from .settings import DECISIONS, HYPERPARAMETERS, NUMERICS
@@ -102,7 +102,10 @@ def differing(base: Base, start: Refined, columns: Array, candidates: Sequence[C
         more = More(ratio * column, (SPREAD,), column, (ratio,), (0,))
         design = design_of(base, start.state, start.variants, more)
         value, at = max(
-            ((float(value_and_gradient(jnp.asarray(x), design)[0]), x) for x in (free, with_little_noise(free))),
+            (
+                (float(value_and_gradient(jnp.asarray(filled_up(x, design)), design)[0]), x)
+                for x in (free, with_little_noise(free))
+            ),
             key=lambda one: one[0],
         )
         tried.append((value, at, c, design, more))
