@@ -91,9 +91,9 @@ def in_span(
     searching: Any = SimpleNamespace(at=at, screen=SimpleNamespace(columns=columns), first_order=first_order)
     design, theta = SimpleNamespace(amplitude=columns[..., s : s + 1]), np.array([amplitude * sibling.plausible[0]])
     fitted: Any = SimpleNamespace(variants=(sibling,), design=design, theta=theta)
-    span = Search.misfit_columns(searching, fitted, 0)[..., : NUMERICS.basis]
+    span = Search.misfit_columns(searching, fitted, 0)[..., : NUMERICS.basis[-1]]
     count = span.shape[-1]
-    span = padded(span, NUMERICS.basis)
+    span = padded(span, NUMERICS.basis[-1])
     products = gram(base, jnp.concatenate([unit * columns[..., [k, s]], span], -1))[: 2 + count, : 2 + count]
     alone = remaining(products[:2, :2], np.zeros(1))
     misfit = remaining(products, np.array([0.0] + [DECISIONS.misfit**-2] * count))

@@ -112,8 +112,8 @@ def design_of(base: Base, state: State, variants: tuple[Variant, ...] = (), more
             place += 1
     basis, group, sizes = more.basis, list(more.group), list(more.sizes)
     if basis is not None:  # misfits of two names, and as many functions, in every hypothesis that has any
-        basis = padded(basis, NUMERICS.basis)
-        group += [MISFITS] * (NUMERICS.basis - len(group))
+        basis = padded(basis, next(size for size in NUMERICS.basis if size >= basis.shape[-1]))
+        group += [MISFITS] * (basis.shape[-1] - len(group))
         sizes += [(0.0, 1.0)] * (MISFITS - len(sizes))
     spreads = more.own_spreads
     if spreads:

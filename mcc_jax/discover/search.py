@@ -258,7 +258,7 @@ class Search:
         r = one.best
         assert r is not None
         K = len(r.variants)
-        basis = [self.misfit_columns(r, i)[..., : NUMERICS.basis // K] for i in range(K)]
+        basis = [self.misfit_columns(r, i)[..., : NUMERICS.basis[-1] // K] for i in range(K)]
         middle = np.log(DECISIONS.misfit)
         sizes = [(middle, DECISIONS.misfit_log_sd)] * K
         group = [i + 1 for i in range(K) for _ in range(basis[i].shape[-1])]

@@ -100,7 +100,7 @@ class Numerics:
         little: factor on correlated noise that has swallowed a gap, where what explains it begins to be fitted.
         worse: nats by which a step may make things worse before half of it is taken back.
         hats, degree: hat functions of each coordinate of a misfit, and total degree of its smooth products.
-        basis: functions of all misfits of a hypothesis together; there is room for so many.
+        basis: functions of all misfits of a hypothesis together; there is room for one of these numbers.
         waves: periods that a periodic discrepancy may have.
         bootstrap: campaigns drawn for the p value.
         places: bins of load in which disagreement is looked for.
@@ -130,7 +130,7 @@ class Numerics:
     phases: int = 14
     hats: int = 8
     degree: int = 2
-    basis: int = 96
+    basis: tuple[int, ...] = (32, 96)
     waves: int = 12
     bootstrap: int = 400
     places: int = 5
