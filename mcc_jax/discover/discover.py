@@ -39,7 +39,7 @@ from .heldout import held_out
 from .locate import difference, places, where
 from .plan import without_effects
 from .result import Discovery, Effect
-from .search import SUDDEN, UNLISTED, Names, Search
+from .search import UNLISTED, Names, Search, differs_from_test_to_test
 from .sentences import summary_of
 from .settings import DECISIONS
 
@@ -133,7 +133,14 @@ def discover(
         return _finished(replace(found, residuals=left, places=map_), findings, started)
     found = _named(found, search, known, tell)
     winner = leader_of(search).names
-    if posterior and found.effects and SUDDEN not in winner:
+    apart = [e.mechanism for e in found.effects if differs_from_test_to_test(e.variant)]
+    if apart:
+        note = (
+            f"{', '.join(apart)} differs from test to test: it is no part of the model found, and amplitudes and "
+            "parameters are those of the linear model at its optimum"
+        )
+        found = replace(found, notes=(*found.notes, note))
+    elif posterior and found.effects:
         found = _sampled(found, base, threshold_MPa, seed, tell)
     if confirm and len(base.tests) > 2:
         tell("held-out particles")
@@ -213,7 +220,7 @@ def _named(found: Discovery, search: Search, known: Mapping[str, Mechanism], tel
     sets = sets_of(search, winner, effects)
     model = found.model
     assert model is not None
-    model = model.with_effects(*(e.variant for e in effects if e.mechanism != SUDDEN))
+    model = model.with_effects(*(e.variant for e in effects if not differs_from_test_to_test(e.variant)))
     return replace(
         found,
         verdict="SET" if any(len(names) > 1 for names in sets) else "NAMED",

@@ -16,7 +16,7 @@ from ..calibrate.compiling import side_by_side
 from ..calibrate.noise import Along, Correlation
 from ..effects import Mechanism, Variant
 from .base import Base, State
-from .candidates import Candidate, candidates_of
+from .candidates import Candidate, candidates_of, located
 from .design import More, design_of
 from .evidence import (
     Design,
@@ -410,16 +410,19 @@ class Search:
         return differing(self.base, start, columns, candidates)
 
     def other_noise(self) -> None:
-        """Average nothing and the leading hypotheses over kinds of noise, if another kind may explain the gap."""
+        """Average the leading hypotheses over kinds of noise, if another kind may explain the gap or a second name."""
         logs = self.log_posteriors()
         leader = next(iter(logs))
         if not leader:
             return
         kinds = noise_kinds(self.base)
         values: dict[Names, list[float]] = {(): self.by_noise((), kinds)}
-        if max(values[()]) < logs[leader] - NUMERICS.strong:
+        wanted = list(logs)[: NUMERICS.seconds]
+        if len(leader) == 2:
+            wanted = [leader, *[names for names in logs if len(names) == 1][: NUMERICS.seconds]]
+        elif max(values[()]) < logs[leader] - NUMERICS.strong:
             return
-        for names in list(logs)[: NUMERICS.seconds]:
+        for names in wanted:
             if names and self.found[names].fitted is not None:
                 values[names] = self.by_noise(names, kinds)
         for names, others in values.items():
@@ -447,6 +450,11 @@ def pair_of(one: str, other: str) -> Names:
     """Two names in their order."""
     first, second = sorted((one, other))
     return first, second
+
+
+def differs_from_test_to_test(variant: Variant) -> bool:
+    """Whether a formula has numbers of every test's own, which no `Model` holds."""
+    return variant.mechanism == SUDDEN or located(variant)
 
 
 def noise_kinds(base: Base) -> tuple[NoiseKind, ...]:
