@@ -35,7 +35,7 @@ class _Statistic:
     def __init__(self, search: Search) -> None:
         base = search.base
         design, screen = search.null.design, search.screen
-        basis, self.smooth = general(search.at, base.tests.effective_diameter, base.tests.mask)
+        basis, _ = general(search.at, base.tests.effective_diameter, base.tests.mask)
         own, self.own_names, self.own_ratio = [], [], []
         for name in search.library:
             if name not in search.shared and name != SUDDEN:

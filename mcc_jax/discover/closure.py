@@ -16,6 +16,7 @@ from .settings import FURTHER, HYPERPARAMETERS, NUMERICS, TELLING
 
 LETTERS = {
     "strain": ("e", "peak strain"),
+    "peak": ("s", "square root of the peak stress [MPa]"),
     "travel": ("g", "displacement / D_e"),
     "load": ("u", "F / F_peak"),
     "clock": ("t", "time [s]"),

@@ -111,7 +111,7 @@ def design_of(base: Base, state: State, variants: tuple[Variant, ...] = (), more
             common.append((sd * column)[..., None])
             place += 1
     basis, group, sizes = more.basis, list(more.group), list(more.sizes)
-    if basis is not None:  # misfits of two names, and as many functions, in every hypothesis that has any
+    if basis is not None:  # room for as many misfits in every hypothesis that has any
         basis = padded(basis, next(size for size in NUMERICS.basis if size >= basis.shape[-1]))
         group += [MISFITS] * (basis.shape[-1] - len(group))
         sizes += [(0.0, 1.0)] * (MISFITS - len(sizes))

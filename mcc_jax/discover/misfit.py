@@ -115,23 +115,25 @@ def hats_of(x: Array, count: int) -> Array:
     return jnp.maximum(1 - jnp.abs(x[..., None] - centres.reshape((1,) * x.ndim + (count,))) * (count - 1), 0.0)
 
 
-def general(at: dict[str, Array], size: Array, mask: Array) -> tuple[Array, int]:
-    """Functions of a discrepancy that no mechanism explains, and how many of them are smooth; the others are periodic.
+def general(at: dict[str, Array], size: Array, mask: Array) -> tuple[Array, list[int]]:
+    """Functions of a discrepancy that no mechanism explains, and of which kind each is: smooth 1, rough 2, periodic 3.
 
-    It is common to all particles, in proportion to their size, and lives in reduced strain, travel, load and time, each
-    smooth and in hat functions, which have the corners that onsets and thresholds make.
+    It is common to all particles, in proportion to their size, and lives in reduced strain, travel, load and time. The
+    rough ones are hat functions, which have the corners of onsets and thresholds; in stress they are fine, since a
+    particle's layers and flaws yield within a narrow range of it.
     """
     places = ("strain", "travel", "load", "clock")
     columns = [jnp.cos(np.pi * k * at[name]) for name in places for k in range(1, 4)]
     both = [(i, j) for i in range(1, 3) for j in range(1, 3)]
     columns += [jnp.cos(np.pi * i * at["peak"]) * jnp.cos(np.pi * j * at["load"]) for i, j in both]
     smooth = jnp.stack(columns, -1) / np.sqrt(len(columns))
-    rough = jnp.concatenate([hats_of(at[name], NUMERICS.hats) for name in places], -1) / np.sqrt(len(places))
-    smooth = jnp.concatenate([smooth, rough], -1)
+    hats = {"peak": NUMERICS.fine_hats, "travel": NUMERICS.hats, "load": NUMERICS.hats, "clock": NUMERICS.hats}
+    rough = jnp.concatenate([hats_of(at[name], count) for name, count in hats.items()], -1) / np.sqrt(len(hats))
     waves = []
     for name in ("travel", "clock"):
         for k in range(2, NUMERICS.waves):
             waves += [jnp.cos(2 * np.pi * k * at[name]), jnp.sin(2 * np.pi * k * at[name])]
     periodic = jnp.stack(waves, -1) / np.sqrt(len(waves))
-    basis = jnp.concatenate([smooth, periodic], -1) * (size / jnp.mean(size))[:, None, None]
-    return jnp.where(mask[..., None], basis, 0.0), smooth.shape[-1]
+    kinds = [kind for kind, some in enumerate((smooth, rough, periodic), 1) for _ in range(some.shape[-1])]
+    basis = jnp.concatenate([smooth, rough, periodic], -1) * (size / jnp.mean(size))[:, None, None]
+    return jnp.where(mask[..., None], basis, 0.0), kinds

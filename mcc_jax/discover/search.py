@@ -74,10 +74,11 @@ class Hypothesis:
 
     @property
     def log_evidence(self) -> float:
-        """Log marginal likelihood, its forms averaged; they are as probable but for `Decisions.beside`."""
+        """Log marginal likelihood, its forms averaged; as probable as each other, but for a
+        discrepancy beside a name, which is a second cause that is on no list."""
         if not self.names or self.names == UNLISTED or self.own is not None:
             return self.alone + self.other_noise
-        forms = [self.alone, self.with_misfit, self.beside - DECISIONS.beside]
+        forms = [self.alone, self.with_misfit, self.beside - DECISIONS.pair - DECISIONS.unlisted]
         return float(logsumexp(forms) - np.log(2)) + self.other_noise
 
     @property
@@ -272,13 +273,13 @@ class Search:
     def smooth(self, r: Refined) -> Smooth:
         """A hypothesis with a smooth discrepancy beside it."""
         tests = self.base.tests
-        basis, smooth = general(self.at, tests.effective_diameter, tests.mask)
-        size = basis.shape[-1]
+        basis, group = general(self.at, tests.effective_diameter, tests.mask)
         unit = float(np.log(DECISIONS.general) + self.null.optimum.free[0])
-        group = [1] * smooth + [2] * (size - smooth)
-        sizes = [(unit, DECISIONS.general_log_sd)] * 2
+        sizes = [(unit, DECISIONS.general_log_sd)] * max(group)
         design = design_of(self.base, r.state, r.variants, More(basis=basis, group=group, sizes=sizes))
-        optimum = optimise(design, np.append(r.optimum.free, [unit, unit - 1.0]), without=r.optimum)
+        optimum = optimise(
+            design, np.append(r.optimum.free, [unit, *[unit - 1.0] * (max(group) - 1)]), without=r.optimum
+        )
         solution = solve(jnp.asarray(optimum.free), design)
         return Smooth(design, optimum, solution, basis)
 

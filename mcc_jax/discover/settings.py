@@ -15,8 +15,8 @@ class Decisions:
             prototypes was right in 88 of 106 campaigns with it.
         margin: nats by which two names must lead everything with at most one: one more than the odds, since what a
             name's misfit leaves invites a second; 91 of the same 106, true pairs led by 12 to 482.
-        unlisted: log prior odds of a listed name against a smooth discrepancy that no mechanism explains.
-        beside: the same, of a name alone against a name with such a discrepancy beside it.
+        unlisted: log prior odds of a listed name against a smooth discrepancy that no mechanism explains; beside a
+            name it costs `pair`, too, as any second cause does.
         set_mass: names are reported, best first, until they hold this posterior probability together.
         misfit, misfit_log_sd: size of what a mechanism's formulas miss of its effect, median and standard deviation of
             the logarithm: 0.03 to 0.3 is what the library's own formulas leave of each other; with a size of 1 every
@@ -30,7 +30,6 @@ class Decisions:
     pair: float = 5.0
     margin: float = 10.0
     unlisted: float = 5.0
-    beside: float = 5.0
     set_mass: float = 0.95
     misfit: float = 0.1
     misfit_log_sd: float = 0.8
@@ -67,7 +66,7 @@ class Telling:
     checks: int = 3
 
 
-AMPLITUDES, MISFITS = 2, 2
+AMPLITUDES, MISFITS = 2, 3
 """Effects of a hypothesis at most, and misfits: every design has room for so many."""
 
 POPULATION = 5
@@ -99,7 +98,8 @@ class Numerics:
         drifts: drifts of every test's own that are fitted at their own optimum.
         little: factor on correlated noise that has swallowed a gap, where what explains it begins to be fitted.
         worse: nats by which a step may make things worse before half of it is taken back.
-        hats, degree: hat functions of each coordinate of a misfit, and total degree of its smooth products.
+        hats, fine_hats, degree: hat functions of each coordinate of a misfit, of stress where no mechanism is known,
+            and total degree of smooth products.
         basis: functions of all misfits of a hypothesis together; there is room for one of these numbers.
         waves: periods that a periodic discrepancy may have.
         bootstrap: campaigns drawn for the p value.
@@ -129,8 +129,9 @@ class Numerics:
     locations: int = 32
     phases: int = 14
     hats: int = 8
+    fine_hats: int = 24
     degree: int = 2
-    basis: tuple[int, ...] = (32, 96)
+    basis: tuple[int, ...] = (32, 112)
     waves: int = 12
     bootstrap: int = 400
     places: int = 5
