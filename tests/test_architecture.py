@@ -16,6 +16,7 @@ LAYERS = {
     "__init__": 99,
     "__main__": 99,
     "_errors": LEAF,
+    "_extras": LEAF,
     "_types": LEAF,
     "_memory": LEAF,
     "_numerics": LEAF,

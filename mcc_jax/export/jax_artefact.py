@@ -12,6 +12,7 @@ import jax.numpy as jnp
 
 from .. import arguments
 from .._errors import InputError
+from .._extras import extra
 from .._types import Scalar
 from ..geometry import Particle
 from ..law import History, MccLaw, Plastic
@@ -87,6 +88,8 @@ def jax_artefact(
     Raises:
         InputError: if float64 is wanted and JAX is in single precision.
     """
+    with extra("export"):
+        import flatbuffers  # noqa: F401
     checked(law, particle)
     functions = signatures(law)
     arguments.choice(which, functions, "which")
