@@ -82,13 +82,15 @@ def test_the_sdist_holds_tests_and_documentation(built):
 
 @pytest.mark.long
 def test_the_wheel_works_in_a_clean_environment(uv, built, tmp_path):
-    """Alone it is the library, with the extra `command` the whole: a campaign goes through it from end to end, with files that only the wheel can have brought."""
+    """Alone it is the library, with the extra `command` the whole: a campaign goes through it from end to end."""
     home = tmp_path / "clean"
     run(uv, "venv", "--python", sys.executable, home)
     programs = home / ("Scripts" if os.name == "nt" else "bin")
     clean = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
     run(uv, "pip", "install", "--python", programs / "python", built[0])
-    law = "import mcc_jax as mcc; print(mcc.drive(mcc.paper_law(), mcc.Particle(200, 190, 180), [0.0, 50.0, 48.0]).force)"
+    law = (
+        "import mcc_jax as mcc; print(mcc.drive(mcc.paper_law(), mcc.Particle(200, 190, 180), [0.0, 50.0, 48.0]).force)"
+    )
     assert "[" in run(programs / "python", "-c", law, cwd=tmp_path, env=clean)
     alone = subprocess.run([programs / "mcc-jax", "demo"], capture_output=True, text=True, env=clean, check=False)
     assert (alone.returncode, alone.stdout) == (2, "")
