@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from .._format import described
+
 
 @dataclass(frozen=True)
 class Decisions:
@@ -47,6 +49,8 @@ class Decisions:
     alike: float = 0.9
     detectable: float = 4.6
     enough: float = 0.9
+
+    __repr__ = described()
 
 
 @dataclass(frozen=True)

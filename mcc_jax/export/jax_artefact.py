@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from .. import arguments
 from .._errors import InputError
 from .._extras import extra
+from .._format import described
 from .._types import Scalar
 from ..geometry import Particle
 from ..law import History, MccLaw, Plastic
@@ -54,6 +55,8 @@ class Artefact:
     name: str
     content: bytes
     signature: dict[str, Any]
+
+    __repr__ = described()
 
 
 def jax_artefact(
