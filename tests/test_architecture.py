@@ -20,6 +20,7 @@ LAYERS = {
     "_types": LEAF,
     "_memory": LEAF,
     "_numerics": LEAF,
+    "_renamed": LEAF,
     "_results": LEAF,
     "_format": 1,
     "_version": LEAF,

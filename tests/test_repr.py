@@ -20,8 +20,6 @@ MOST_LINES, WIDEST = 20, 240
 ABSTRACT = ("AbstractContactLaw", "AbstractEffect", "AbstractModulusAtPeak", "Calibration")
 # What a person does not want to see: whole arrays, types in place of values, addresses.
 GREY = re.compile(r"\barray\(|\b(?:weak_)?[fiu](?:32|64)\[|\bbool\[|object at 0x|<[A-Za-z_.]+>|mappingproxy|nan\b")
-    r"\barray\(|\b(?:weak_)?[fiu](?:32|64)\[|\bbool\[|object at 0x|<[A-Za-z_.]+>|<class|mappingproxy|nan\b"
-)
 
 
 def classes():

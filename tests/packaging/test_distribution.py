@@ -25,7 +25,7 @@ def test_citation_names_this_version_and_the_paper():
 
 
 def test_changelog_has_this_version():
-    text = (ROOT / ".docs" / "pages" / "changelog.md").read_text(encoding="utf-8")
+    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     assert re.search(rf"^## {re.escape(PROJECT['version'])}\b", text, flags=re.M)
 
 
@@ -77,7 +77,7 @@ def test_the_sdist_holds_tests_and_documentation(built):
     with tarfile.open(built[1]) as sdist:
         inside = {name.partition("/")[2] for name in sdist.getnames()}
     assert sources() <= inside
-    assert {"tests/conftest.py", "README.md", "LICENSE", "CITATION.cff", ".docs/mkdocs.yml"} <= inside
+    assert {"tests/conftest.py", "README.md", "LICENSE", "CITATION.cff", "CHANGELOG.md", ".docs/mkdocs.yml"} <= inside
 
 
 @pytest.mark.long
