@@ -30,6 +30,8 @@ def plain(name):
 
 def unit_of(unit):
     """A unit for people; nothing where there is none."""
+    if unit.startswith("1/"):
+        return " per %" if unit == "1/%" else f" {unit[2:]}⁻¹"
     return "" if unit == "-" else " " + unit.replace("um", "µm")
 
 
