@@ -13,7 +13,7 @@ import time
 
 import _report
 
-TARGETS = {"seconds": 300.0, "GiB": 6.0}
+TARGETS = {"seconds": 150.0, "GiB": 4.0}
 
 
 def one_size(count: int, points: int) -> dict:

@@ -2,8 +2,7 @@
 
     uv run python benchmarks/house.py            the working tree
     uv run python benchmarks/house.py COMMIT     that commit beside it
-
-The old engine of discovery is a row of its own outside the totals: it is to be deleted as a whole.
+    uv run python benchmarks/house.py --literals discover     numbers of a package but 0, 1, 2, 1/2
 
 A constant is a number assigned at module level, each member of a tuple once (redesign's way of counting).
 """
@@ -18,8 +17,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = "mcc_jax"
-OUTSIDE = "discover/legacy"
-"""Counted, but in no total."""
+EVERYDAY = {0, 1, 2, -1, 0.5}
+"""Numbers that say nothing about a choice."""
 
 
 def git(*arguments: str) -> str:
@@ -55,7 +54,7 @@ def house(commit: str | None) -> dict[str, tuple[int, int, int, int]]:
     for name, text in sources(commit).items():
         parts = name.split("/")
         of = (parts[1] if len(parts) > 2 else "(root)", "all")
-        for package in (OUTSIDE,) if name.startswith(f"{PACKAGE}/{OUTSIDE}/") else of:
+        for package in of:
             lines, own = text.count("\n"), found[package]
             own[0], own[1], own[2], own[3] = own[0] + lines, own[1] + 1, own[2] + constants(text), max(own[3], lines)
     return {
@@ -63,14 +62,35 @@ def house(commit: str | None) -> dict[str, tuple[int, int, int, int]]:
     }
 
 
+def literals(package: str) -> list[tuple[str, int, str]]:
+    """Every number of a package but everyday ones: file, line, and the line's text; its settings are left out."""
+    found = []
+    for name, text in sorted(sources(None).items()):
+        if name.startswith(f"{PACKAGE}/{package}/") and not name.endswith("/settings.py"):
+            lines = text.splitlines()
+            rows = {
+                part.lineno
+                for part in ast.walk(ast.parse(text))
+                if isinstance(part, ast.Constant) and type(part.value) in (int, float) and part.value not in EVERYDAY
+            }
+            found += [(name, row, lines[row - 1].strip()) for row in sorted(rows)]
+    return found
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("commit", nargs="?")
-    commit = parser.parse_args().commit
+    parser.add_argument("--literals", metavar="PACKAGE")
+    asked = parser.parse_args()
+    if asked.literals:
+        for name, row, text in literals(asked.literals):
+            print(f"{name}:{row}: {text}")
+        return
+    commit = asked.commit
     now = house(None)
     before = house(commit) if commit else {}
     print("| package | lines | files | constants | longest file |\n|---|---|---|---|---|")
-    for name in sorted({*now, *before}, key=lambda n: (n == OUTSIDE, n == "all", n)):
+    for name in sorted({*now, *before}, key=lambda n: (n == "all", n)):
         old, new = before.get(name, (0, 0, 0, 0)), now.get(name, (0, 0, 0, 0))
         cells = [f"{a} -> {b}" if commit else f"{b}" for a, b in zip(old, new, strict=True)]
         print(f"| {name} | {' | '.join(cells)} |")

@@ -7,6 +7,7 @@ import pytest
 import mcc_jax as mcc
 from mcc_jax._archive import encode
 from mcc_jax.calibrate import OldCalibration
+from mcc_jax.discover import Discovery
 from mcc_jax.export import read_calibration, write_export
 from mcc_jax.report import read_results, report_page
 from mcc_jax.simulate import read_effect
@@ -38,6 +39,14 @@ def test_it_comes_back_to_the_last_bit(calibration, tmp_path):
     assert again.to_json() == calibration.to_json()
     assert repr(again) == repr(calibration)
     assert len(repr(again).splitlines()) <= 20
+
+
+def test_a_discovery_beside_it_has_it_as_its_before(calibration, tmp_path):
+    calibration.save(tmp_path)
+    Discovery("NO_GAP", "Nothing is missing.", None, None, 0, 0.0).save(tmp_path)
+    again = mcc.load(tmp_path)
+    assert again.verdict == "NO_GAP"
+    assert encode(again.before) == encode(calibration)
 
 
 def test_its_law_drives_and_is_exported(calibration, tmp_path):

@@ -3,7 +3,7 @@
 `python -m benchmarks.blind.seal --name 2026-11-27-4711` (the last part of a name is its master seed). Campaigns lie in
 `work/NAME/campaigns/KEY/`, answers in `work/NAME/answers.json`, the noiseless differences in `work/NAME/truth/KEY.npz`;
 `sealed/NAME.txt` holds the hash of the answers: commit it before the run. What was made is kept when the command is
-stopped and repeated.
+stopped and repeated. `--subset` makes those campaigns only on which baselines run, too.
 """
 
 from __future__ import annotations
@@ -119,7 +119,10 @@ def main(arguments: list[str] | None = None) -> None:
     """Make and seal."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--name", required=True, help="DATE-SEED")
-    print(seal(parser.parse_args(arguments).name))
+    parser.add_argument("--subset", action="store_true", help="only the campaigns on which baselines run")
+    asked = parser.parse_args(arguments)
+    cases = [case for case in plan(master_of(asked.name)) if case.subset] if asked.subset else None
+    print(seal(asked.name, cases=cases))
 
 
 if __name__ == "__main__":

@@ -175,11 +175,11 @@ class _Mixture:
         self._rng, self._target, self._many = np.random.default_rng(seed), target, many
         self._spreads = np.array(target.signed())
         d = len(target.names)
-        self._signs = np.ones((2 ** len(self._spreads), d))
-        self._signs[:, self._spreads] = list(product((1.0, -1.0), repeat=len(self._spreads)))
+        self._signs = np.array(list(product((1.0, -1.0), repeat=len(self._spreads))))
         # Standard deviations of coordinates differ by many powers of ten, for which SciPy takes a matrix for singular.
         shape = cast(Any, np.eye(d) * (1 - 2 / SAMPLING.freedom))  # its stub takes a number
         self._unit = multivariate_t(np.zeros(d), shape, SAMPLING.freedom)
+        self._constant = float(self._unit.logpdf(np.zeros(d)))
         self._parts: list[tuple[np.ndarray, np.ndarray, int]] = []
         self.free, self._log_density = np.empty((0, d)), np.empty(0)
         self._log_proposals = np.empty((0, 0))
@@ -214,11 +214,17 @@ class _Mixture:
 
     def _proposal(self, free: np.ndarray, centre: np.ndarray, factor: np.ndarray) -> np.ndarray:
         from scipy.linalg import solve_triangular
-        from scipy.special import logsumexp
 
-        every_sign = (free[:, None] * self._signs - centre).reshape(-1, free.shape[1])
-        density = self._unit.logpdf(solve_triangular(factor, every_sign.T, lower=True).T).reshape(len(free), -1)
-        return logsumexp(density, axis=1) - np.sum(np.log(np.diagonal(factor)))
+        inverse = solve_triangular(factor, np.eye(len(factor)), lower=True)
+        spreads = self._spreads
+        # In units of the distribution, what has a sign apart from what has none: all signs in one product of matrices.
+        signed = free[:, spreads].T[:, :, None] * inverse[:, spreads].T[:, None, :]
+        alike = (np.where(np.isin(np.arange(len(factor)), spreads), 0.0, free) - centre) @ inverse.T
+        all_signs = np.tensordot(self._signs, signed, 1) + alike
+        away = 1 + np.einsum("snd,snd->sn", all_signs, all_signs) / (SAMPLING.freedom - 2)
+        least, power = away.min(0), 0.5 * (SAMPLING.freedom + len(factor))
+        density = np.log(((least / away) ** power).sum(0)) - power * np.log(least)
+        return self._constant + density - np.sum(np.log(np.diagonal(factor)))
 
     def _densities(self, part: np.ndarray) -> np.ndarray:
         # Of few particles a gradient takes no time to speak of, and what the mode was found by is compiled already.

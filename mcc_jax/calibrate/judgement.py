@@ -162,6 +162,8 @@ def judged(
     options = options or JudgementOptions()
     found = [*campaign_findings(campaign), *([] if outlying is None else [outlying])]
     modulus = answer["effective_modulus_MPa"]
+    if not answer.get("converged", True):
+        modulus = {**modulus, "interval_95": None}  # not to be believed, so not told
     unknown = unknown_modulus(campaign, modulus, options)
     value = modulus["value"] if unknown is None else None  # what is not known cannot be implausible
     found += [] if unknown is None else [unknown]

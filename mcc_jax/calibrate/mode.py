@@ -169,12 +169,17 @@ def populations(free: Float[Array, "draws d"], target: LogPosterior) -> Populati
 def _gradients(
     free: Float[Array, "rows d"], count: Int[Array, ""], target: LogPosterior
 ) -> tuple[Float[Array, " rows"], Float[Array, "rows d"]]:
-    expand = jax.value_and_grad(lambda one: -target.log_density(one))
+    expand = jax.vmap(jax.value_and_grad(lambda one: -target.log_density(one)))
+    few = FIT.gradients_at_once
 
     def add(i, found):
-        return jax.tree.map(lambda all_rows, one: all_rows.at[i].set(one), found, expand(free[i]))
+        at = i * few
+        new = expand(jax.lax.dynamic_slice_in_dim(free, at, few))
+        return jax.tree.map(
+            lambda all_rows, some: jax.lax.dynamic_update_slice_in_dim(all_rows, some, at, 0), found, new
+        )
 
-    return jax.lax.fori_loop(0, count, add, (jnp.zeros_like(free[:, 0]), jnp.zeros_like(free)))
+    return jax.lax.fori_loop(0, -(-count // few), add, (jnp.zeros_like(free[:, 0]), jnp.zeros_like(free)))
 
 
 def gradients(free: np.ndarray, target: LogPosterior) -> tuple[np.ndarray, np.ndarray]:

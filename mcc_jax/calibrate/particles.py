@@ -27,6 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from .._types import Scalar
 from .compiling import compiled, even_batch, side_by_side
 from .data import Tests
 from .forward import Forms, Point, residuals
@@ -63,14 +64,15 @@ class ExactLikelihood(eqx.Module):
         tests: the measurements.
         filters: their noise.
         marginal: the same tests, summarised.
-        zero_prior: mean and standard deviation of the zeros, from the recorded contact [um].
+        zero_prior: mean and standard deviation of the zeros, from the recorded contact [um]; two numbers, which cutting
+            into blocks leaves alone.
         forms: the law.
     """
 
     tests: Tests
     filters: Whitening
     marginal: Marginal
-    zero_prior: Float[Array, " 2"]
+    zero_prior: tuple[Scalar, Scalar]
     forms: Forms
 
     def some(self, which: Int[Array, " chosen"]) -> ExactLikelihood:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -170,6 +170,8 @@ class OldCalibration(Calibration):
 def load(folder: str | Path) -> Any:
     """What a folder holds: a discovery, else a calibration, else a campaign, as it was saved.
 
+    A discovery beside a calibration has it as its `before`.
+
     A calibration of an older version, of which only `calibration.json` is there, gives its numbers and its law.
 
     Args:
@@ -186,15 +188,22 @@ def load(folder: str | Path) -> Any:
     if not path.is_dir():
         raise InputError("there is no such folder", file=path, remedy=A_FOLDER)
     there = {entry.name for entry in path.iterdir()}
-    for archive in (DISCOVERY_ARCHIVE, ARCHIVE):
-        if archive in there:
-            found = read_archive(path / archive)
-            if not isinstance(found, Saved) or found.archive_file != archive:
-                raise InputError(f"holds a {type(found).__name__}", file=path / archive, remedy=A_FOLDER)
-            return found
+    saved = [_read(path / archive) for archive in (DISCOVERY_ARCHIVE, ARCHIVE) if archive in there]
+    if len(saved) == 2:
+        return replace(saved[0], before=saved[1])
+    if saved:
+        return saved[0]
     tests = {"particles.csv", "curves.csv"} <= there
     if CONTENT in there:
         return OldCalibration(read_result(path / CONTENT, "mcc-jax calibrate"), read_campaign(path) if tests else None)
     if tests:
         return read_campaign(path)
     raise InputError(f"{CONTENT} is missing: holds no result and no campaign", file=path, remedy=A_FOLDER)
+
+
+def _read(archive: Path) -> Any:
+    """What an archive holds, which its name must say."""
+    found = read_archive(archive)
+    if not isinstance(found, Saved) or found.archive_file != archive.name:
+        raise InputError(f"holds a {type(found).__name__}", file=archive, remedy=A_FOLDER)
+    return found

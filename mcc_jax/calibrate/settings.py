@@ -75,7 +75,8 @@ class FitSettings:
         student_steps: how often weights of readings and noise are taken in turn, in each round.
         sharp: posterior standard deviation of the logarithm of a polynomial's coefficient below which one Newton step
             integrates a particle out.
-        gradients: most coordinates that gradients of the population's density are asked for in one go.
+        gradients, gradients_at_once: most coordinates that gradients of the population's density are asked for in one
+            go, and how many of them are worked out side by side, a part of the former without remainder.
         mode_gain: twice the log probability still to gain, by Newton's method, at which the mode is reached.
         attempts: how often the search for the mode begins anew where it stopped.
         outlying: a particle whose noise differs by so many standard deviations keeps its own scale.
@@ -102,6 +103,7 @@ class FitSettings:
     student_steps: int = 4
     sharp: float = 0.03
     gradients: int = 250
+    gradients_at_once: int = 10
     mode_gain: float = 1e-6
     attempts: int = 4
     outlying: float = 5.0

@@ -13,13 +13,11 @@ from ..calibrate import Posterior
 from ..calibrate.estimates import estimate, finite, summary
 from ..effects import Mechanism
 from .base import Base
-from .design import POPULATION
 from .evidence import left_by_particle, residual_of, scales_of, whitened
 from .own_numbers import OwnNumbers
 from .result import Effect, Likeness, Residuals
-from .screen import screen
 from .search import UNLISTED, Hypothesis, Names, Search
-from .settings import DECISIONS
+from .settings import DECISIONS, POPULATION, TELLING
 
 
 def population_parameters(search: Search, names: Names) -> dict[str, Any]:
@@ -60,11 +58,10 @@ def _covariance(design: Any, free: np.ndarray) -> np.ndarray:
 def effects_of(search: Search, names: Names, probabilities: Mapping[str, float], p_any: float) -> tuple[Effect, ...]:
     """The effects of a hypothesis with their numbers."""
     one = search.found[names]
-    if one.own is not None:
-        return (_of_their_own(one.own, probabilities[names[0]], p_any),)
-    if one.best is None:
+    own = () if one.own is None else (_of_their_own(one.own, probabilities[one.own.variant.mechanism], p_any),)
+    r = one.best if one.own is None else one.own.at
+    if r is None:
         return ()
-    r = one.best
     cov = _covariance(r.design, r.optimum.free)
     c = r.design.common.shape[-1]
     place, found = len(r.variants), []
@@ -76,7 +73,7 @@ def effects_of(search: Search, names: Names, probabilities: Mapping[str, float],
         amplitude = float(r.theta[k])
         found.append(Effect(variant, nuisance, amplitude, sd, probabilities[variant.mechanism], p_any, misfit=size))
     order = {name: i for i, name in enumerate(sorted(names, key=lambda n: -search.found[(n,)].log_evidence))}
-    return tuple(sorted(found, key=lambda e: order[e.mechanism]))
+    return tuple(sorted((*found, *own), key=lambda e: order[e.mechanism]))
 
 
 def _of_their_own(own: OwnNumbers, probability: float, p_any: float) -> Effect:
@@ -88,7 +85,8 @@ def _of_their_own(own: OwnNumbers, probability: float, p_any: float) -> Effect:
         sd = float(np.sqrt(max(spread, np.mean([j.sd**2 for j in own.jumps])) / len(size)))
         places = {n.name: float(np.median([j.stress_MPa for j in own.jumps])) for n in own.variant.nuisances}
         return Effect(own.variant, places, float(size.mean()), sd, probability, p_any, True, jumps=own.jumps)
-    amplitude, sd = float(own.solution.amplitude[0]) * unit, float(own.solution.sd[0]) * unit
+    place, solution = len(own.at.variants), own.at.solution  # its amplitude comes after that of a formula beside it
+    amplitude, sd = float(solution.amplitude[place]) * unit, float(solution.sd[place]) * unit
     return Effect(own.variant, own.nuisance, amplitude, sd, probability, p_any, True)
 
 
@@ -147,7 +145,7 @@ def ranking_of(search: Search) -> tuple[dict[str, Any], ...]:
     own = {m: x for m, x in search.library.items() if m not in search.shared}
     views = [search.screen] if search.screen is not None else []
     if own:
-        views.append(screen(search.base, search.state, search.null.optimum.free, own, several=False))
+        views.append(search.screened(own, several=False))
     entries = {}
     for view in views:
         first = view.settings[0]
@@ -165,7 +163,7 @@ def ranking_of(search: Search) -> tuple[dict[str, Any], ...]:
                 "variant": c.variant.name,
                 "statistic": finite(float(z[k])),
                 "estimate": finite(float(first.score[k] / information[k] * unit)),
-                "detection_limit": finite(float(DECISIONS.detectable / np.sqrt(information[k]) * unit)),
+                "detection_limit": finite(float(TELLING.detectable / np.sqrt(information[k]) * unit)),
                 "unit": c.variant.unit,
                 "parameter": c.variant.parameter,
                 "probability": weight[c.mechanism] / total,
@@ -225,7 +223,7 @@ def leads_of(search: Search, winner: Names) -> tuple[dict[str, Any], ...]:
     gap = max(alone.log_evidence - search.null.log_evidence, 1e-300)
     found = []
     for names, pair in search.found.items():
-        if len(names) == 2 and winner[0] in names and pair.log_evidence > alone.log_evidence + DECISIONS.lead:
+        if len(names) == 2 and winner[0] in names and pair.log_evidence > alone.log_evidence + TELLING.lead:
             (second,) = set(names) - set(winner)
             share = (pair.log_evidence - alone.log_evidence) / (gap + pair.log_evidence - alone.log_evidence)
             found.append({"mechanism": second, "share": float(share), "resembles": []})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import equinox as eqx
@@ -12,13 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..calibrate.data import Selection, Tests, ranges_um, root_mean_squares
+from ..calibrate.data import Selection, Tests, longer, ranges_um, root_mean_squares
 from ..calibrate.distributions import SpreadCoordinate
 from ..calibrate.fitting import in_own_units, prepare
 from ..calibrate.forward import Forms, Point, snap
 from ..calibrate.judgement import numbers_in_reach
 from ..calibrate.model import Model
+from ..calibrate.sharding import Blocks, Parts
 from ..campaign import Campaign
+from .settings import NUMERICS
 
 
 class State(eqx.Module):
@@ -91,6 +94,19 @@ class Base:
         mean[3] = (np.log(20 / 9) + mean[2] + 5 * mean[4] + np.log(p.softening.median)) / 6
         factor[3, 2], factor[3, 4], factor[3, 3] = factor[2, 2] / 6, 5 * factor[4, 4] / 6, p.softening.log_sd / 6
         return jnp.asarray(mean), jnp.asarray(factor)
+
+    @cached_property
+    def blocks(self) -> tuple[Blocks, Parts]:
+        """How particles are cut into blocks, and the tests so cut."""
+        count = len(self.tests) + -len(self.tests) % NUMERICS.block
+        blocks = Blocks(count, NUMERICS.block)
+        return blocks, blocks.cut(longer(self.tests, count))
+
+    def each(self, function: Callable[..., Any], point: Point, *shared: Any) -> Any:
+        """A compiled function of points and tests, block by block: it is compiled once for any number of particles."""
+        blocks, tests = self.blocks
+        found = blocks.whole(blocks.each(function, blocks.cut(longer(point, blocks.count)), tests, *shared))
+        return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[: len(self.tests)]), found)
 
     def name_of(self, row: int) -> str:
         """The particle of a row of the tests."""

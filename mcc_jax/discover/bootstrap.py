@@ -10,13 +10,11 @@ import numpy as np
 from scipy.special import logsumexp
 
 from ..calibrate.distributions import SCALES
-from .candidates import candidates_of
-from .design import POPULATION
 from .evidence import left_by_particle, with_amplitudes
 from .misfit import general
-from .screen import signature_columns, single_integrals
+from .screen import single_integrals
 from .search import SUDDEN, Search
-from .settings import DECISIONS, NUMERICS
+from .settings import DECISIONS, NUMERICS, POPULATION
 
 
 class Scores(NamedTuple):
@@ -35,14 +33,14 @@ class _Statistic:
     """The log evidence of anything against nothing, from scores at the base law's hyperparameters."""
 
     def __init__(self, search: Search) -> None:
-        base, state = search.base, search.state
+        base = search.base
         design, screen = search.null.design, search.screen
         basis, self.smooth = general(search.at, base.tests.effective_diameter, base.tests.mask)
         own, self.own_names, self.own_ratio = [], [], []
-        for name, mechanism in search.library.items():
+        for name in search.library:
             if name not in search.shared and name != SUDDEN:
-                candidates = candidates_of({name: mechanism})
-                own.append(signature_columns(base, state, candidates))
+                candidates, columns = search.formulas_of({name})
+                own.append(columns)
                 self.own_names += [name] * len(candidates)
                 self.own_ratio += [c.variant.plausible[1] / c.variant.plausible[0] for c in candidates]
         steps = self._steps(search) if SUDDEN in search.library else jnp.zeros((*basis.shape[:2], 0))

@@ -9,10 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..effects import AbstractEffect, Mechanism, Need, Variant
-
-LOCATIONS, PHASES = 32, 14
-"""Values tried of a number that differs from test to test: of a place somewhere between two that lie far apart, which
-must be met closely, and of a phase."""
+from .settings import NUMERICS
 
 
 @dataclass(frozen=True)
@@ -98,4 +95,8 @@ def _words(variants: Sequence[Variant], present: frozenset[Need]) -> str:
 
 def _spaced(low: float, high: float) -> np.ndarray:
     """Values over a range, by ratio where it spans more than a factor of three."""
-    return np.geomspace(low, high, LOCATIONS) if low > 0 and high > 3 * low else np.linspace(low, high, PHASES)
+    return (
+        np.geomspace(low, high, NUMERICS.locations)
+        if low > 0 and high > 3 * low
+        else np.linspace(low, high, NUMERICS.phases)
+    )

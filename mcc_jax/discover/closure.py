@@ -11,10 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._format import described
-from .design import FURTHER, HYPERPARAMETERS
 from .evidence import Design, left_by_particle, scales_of, with_amplitudes, without_first
 from .search import UNLISTED, Search
-from .settings import NUMERICS
+from .settings import FURTHER, HYPERPARAMETERS, NUMERICS, TELLING
 
 LETTERS = {
     "strain": ("e", "peak strain"),
@@ -24,9 +23,6 @@ LETTERS = {
     "force": ("F", "force [mN]"),
 }
 """Coordinates of a formula: letter and meaning."""
-
-ENOUGH = 0.9
-"""Share of what two terms explain from which on one term is enough."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +188,7 @@ def _best_terms(
         if np.linalg.cond(inner) < 1e6:
             w = np.linalg.solve(inner, s[[i, j]])
             pairs.append((float(w @ s[[i, j]]), (i, j), w))
-    if not pairs or single[first] > ENOUGH * max(p[0] for p in pairs):
+    if not pairs or single[first] > TELLING.one_term * max(p[0] for p in pairs):
         return (first,), np.array([s[first] / power[first]])
     _, two, w = max(pairs, key=lambda p: p[0])
     return two, w

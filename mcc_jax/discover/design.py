@@ -12,26 +12,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..calibrate.compiling import compiled
-from ..calibrate.data import Tests
 from ..calibrate.distributions import nuisance_moments
 from ..calibrate.fitting import linear_data
-from ..calibrate.forward import Forms, Linear, Point
+from ..calibrate.forward import Forms, Point
 from ..effects import Variant
 from .base import Base, State
 from .evidence import Design, Kinds, Solution
-from .settings import NUMERICS
-
-AMPLITUDES, MISFITS = 2, 2
-"""Effects of a hypothesis at most, and misfits: every design has room for so many."""
-
-POPULATION = 5
-"""Numbers of the population, which come first among what all particles share."""
-
-FURTHER = POPULATION + 2 * AMPLITUDES
-"""Numbers that all particles share: the population's, and further ones of the effects."""
-
-HYPERPARAMETERS = 8
-"""Those of the base law: four of the noise, and the spreads of b1, b3, b5 and e."""
+from .settings import AMPLITUDES, FURTHER, HYPERPARAMETERS, MISFITS, NUMERICS, POPULATION
 
 
 def particle_means(beta: Float[Array, " 5"], flatness: Array, power: float) -> Float[Array, "particles 4"]:
@@ -47,16 +34,22 @@ def particle_means(beta: Float[Array, " 5"], flatness: Array, power: float) -> F
 
 
 @compiled
-def base_columns(state: State, tests: Tests, linear: Linear, prior: tuple[Array, Array], power: float) -> Any:
-    """Columns of the population, and the data less what the priors' means say."""
+def base_columns(
+    latent: Array,
+    population: Array,
+    flatness: Array,
+    own: Array,
+    residual: Array,
+    prior: tuple[Array, Array],
+    power: float,
+) -> tuple[Array, Array]:
+    """Columns of the population, and the data less what the priors' means say, from a test's own columns."""
     mean, factor = prior
-    flatness = tests.flatness
-    at = particle_means(state.population, flatness, power)
-    slope = jax.jacfwd(lambda b: particle_means(b, flatness, power))(state.population)
-    columns = jnp.einsum("npk,nkb,bc->npc", linear.columns[..., :4], slope, factor)
-    away = at + jnp.einsum("nkb,b->nk", slope, mean - state.population) - state.point.latent
-    data = linear.residual - jnp.einsum("npk,nk->np", linear.columns[..., :4], away)
-    return columns, data
+    at = particle_means(population, flatness, power)
+    slope = jax.jacfwd(lambda b: particle_means(b, flatness, power))(population)
+    columns = jnp.einsum("npk,nkb,bc->npc", own, slope, factor)
+    away = at + jnp.einsum("nkb,b->nk", slope, mean - population) - latent
+    return columns, residual - jnp.einsum("npk,nk->np", own, away)
 
 
 @dataclass(frozen=True)
@@ -88,13 +81,22 @@ NOTHING_MORE = More()
 def design_of(base: Base, state: State, variants: tuple[Variant, ...] = (), more: More = NOTHING_MORE) -> Design:
     """The design of a hypothesis around a state."""
     tests, model = base.tests, base.model
-    linear = linear_data(state.point, tests, Forms(model.unloading, variants))
-    population, data = base_columns(state, tests, linear, base.population_prior, model.shape_power)
+    linear = base.each(linear_data, state.point, Forms(model.unloading, variants))
+    point, of_particle = state.point, linear.columns[..., :4]
+    population, data = base_columns(
+        point.latent,
+        state.population,
+        tests.flatness,
+        of_particle,
+        linear.residual,
+        base.population_prior,
+        model.shape_power,
+    )
     zero_mean, zero_sd = np.asarray(model.zero_prior)
     ones = jnp.where(tests.mask, 1.0, 0.0)
-    data = data - (tests.contact + zero_mean - state.point.zero)[:, None] * ones
-    own = [linear.columns[..., :4], (zero_sd * ones)[..., None], *([] if more.own is None else [more.own])]
-    K, effect, theta = len(variants), linear.columns[..., 4:], state.point.theta
+    data = data - (tests.contact + zero_mean - point.zero)[:, None] * ones
+    own = [of_particle, (zero_sd * ones)[..., None], *([] if more.own is None else [more.own])]
+    K, effect, theta = len(variants), linear.columns[..., 4:], point.theta
     units = jnp.asarray(np.array([v.plausible[0] for v in variants]))
     amplitude = [effect[..., :K] * units[None, None], *([] if more.amplitude is None else [more.amplitude])]
     data = data + jnp.einsum("npk,nk->np", effect[..., :K], theta[:, :K])

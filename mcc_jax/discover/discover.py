@@ -45,9 +45,6 @@ from .settings import DECISIONS
 
 Tell = Callable[[str], None]
 
-LEAST = 3
-"""Particles that must be left without those that snap through."""
-
 
 def discover(
     campaign: Campaign,
@@ -126,7 +123,7 @@ def discover(
         ranking=ranking,
         untestable=tuple(missing),
         p_any=p_any,
-        before=population_parameters(search, ()),
+        parameters_before=population_parameters(search, ()),
         notes=_notes(base),
         likeness=likeness_of(search, (), ranking),
     )
@@ -136,7 +133,7 @@ def discover(
         return _finished(replace(found, residuals=left, places=map_), findings, started)
     found = _named(found, search, known, tell)
     winner = leader_of(search).names
-    if posterior and found.effects and winner != (SUDDEN,):
+    if posterior and found.effects and SUDDEN not in winner:
         found = _sampled(found, base, threshold_MPa, seed, tell)
     if confirm and len(base.tests) > 2:
         tell("held-out particles")
@@ -186,7 +183,7 @@ def _settled_fit(
     if outlying is not None:
         told.append(replace(outlying, sentence=f"{outlying.sentence}; it takes no part in the search"))
         without = outlying.particles
-    if snapping and len(base.tests) - len({*snapping, *without}) >= LEAST:
+    if snapping and len(base.tests) - len({*snapping, *without}) >= DECISIONS.least:
         text = f"{named(snapping, len(campaign))}: the law snaps through in its loading; it takes no part in the search"
         told.append(Finding("snap-through", "told", text, "", snapping))
         without = (*without, *(name for name in snapping if name not in without))
@@ -206,7 +203,7 @@ def _named(found: Discovery, search: Search, known: Mapping[str, Mechanism], tel
         residuals=left,
         places=map_,
         where=tuple(where(search.base, map_)),
-        after=population_parameters(search, winner),
+        parameters_after=population_parameters(search, winner),
         leads=leads_of(search, winner),
     )
     if winner == UNLISTED:
@@ -216,8 +213,7 @@ def _named(found: Discovery, search: Search, known: Mapping[str, Mechanism], tel
     sets = sets_of(search, winner, effects)
     model = found.model
     assert model is not None
-    if winner != (SUDDEN,):
-        model = model.with_effects(*(e.variant for e in effects))
+    model = model.with_effects(*(e.variant for e in effects if e.mechanism != SUDDEN))
     return replace(
         found,
         verdict="SET" if any(len(names) > 1 for names in sets) else "NAMED",
@@ -241,7 +237,7 @@ def _sampled(found: Discovery, base: Base, threshold_MPa: float, seed: int, tell
         return replace(found, posterior=drawn, notes=(*found.notes, note))
     answer: dict[str, Any] = {k: v for k, v in drawn.answer().items() if k != "converged"}
     effects: tuple[Effect, ...] = tuple(with_draws(effect, drawn) for effect in found.effects)
-    return replace(found, posterior=drawn, effects=effects, after=answer)
+    return replace(found, posterior=drawn, effects=effects, parameters_after=answer)
 
 
 def _notes(base: Base) -> tuple[str, ...]:

@@ -29,6 +29,7 @@ from ..calibrate.distributions import SCALES, SpreadCoordinate
 from ..calibrate.forward import Linear
 from ..calibrate.noise import Along, Correlation, Noise, whitening
 from ..calibrate.small_matrices import eliminate
+from .settings import NUMERICS
 
 
 class Design(eqx.Module):
@@ -215,6 +216,18 @@ def log_joint(free: Float[Array, " h"], design: Design) -> Array:
     )
 
 
+def filled_up(free: np.ndarray, design: Design) -> np.ndarray:
+    """Hyperparameters with zeros for those that only make up shapes."""
+    return np.concatenate([free, np.zeros(len(design.used) - len(free))])
+
+
+def with_little_noise(free: np.ndarray) -> np.ndarray:
+    """Hyperparameters with correlated noise that has not swallowed a gap."""
+    at = free.copy()
+    at[2] += np.log(NUMERICS.little)
+    return at
+
+
 value_and_gradient = compiled(jax.value_and_grad(log_joint))
 left_by_particle = compiled(left_of)
 prior_density = compiled(log_prior)
@@ -293,7 +306,7 @@ def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, witho
 
     count = float(np.asarray(design.tests.mask).sum())
     used = np.asarray(design.used) > 0
-    start = np.concatenate([start, np.zeros(len(used) - len(start))])
+    start = filled_up(start, design)
     spreads = len(design.kinds.spreads)
     expected = np.full(len(start), 2.0)
     expected[:4] = count * np.array([1.5, 0.2, 0.1, 0.02])

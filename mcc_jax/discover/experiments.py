@@ -13,20 +13,9 @@ from ..simulate import Programme
 from .base import Base
 from .candidates import Candidate
 from .plan import Plan, planned_base
-from .screen import Screen, screen
+from .screen import Screen, first_order
 from .search import Search
-from .settings import DECISIONS
-
-EVEN = 0.5
-"""Least probability with which an experiment is proposed: particles are too dear for less than an even chance."""
-
-COPIES = (0.5, 1, 2, 3, 5, 10)
-"""Further particles that are tried, over those of the campaign."""
-
-MOST_PARTICLES = 200
-
-TURNS = 16
-"""Points that turning points may add to a programme's own."""
+from .settings import DECISIONS, NUMERICS, TELLING
 
 
 def menu(points: int) -> tuple[Plan, ...]:
@@ -61,7 +50,7 @@ def next_experiments(search: Search, names: tuple[str, ...]) -> list[dict[str, A
     if len(members) < 2:
         return []
     base = search.base
-    points = max(base.tests.force.shape[1] - TURNS, 32)
+    points = max(base.tests.force.shape[1] - NUMERICS.turns, 32)
     assert search.screen is not None
     options: list[tuple[str, Screen, int]] = [
         ("more particles, tested in the same way", search.screen, len(base.tests))
@@ -70,19 +59,19 @@ def next_experiments(search: Search, names: tuple[str, ...]) -> list[dict[str, A
     options += [(plan.name, *_screened(base, plan, library)) for plan in menu(points)]
     found = []
     for text, other, count in options:
-        tried = [n for n in (round(c * count) for c in COPIES) if 0 < n <= MOST_PARTICLES] or [count]
+        tried = [n for n in (round(c * count) for c in NUMERICS.copies) if 0 < n <= NUMERICS.particles] or [count]
         powers = [_power(search, members, other, n / count) for n in tried]
-        enough = [k for k, p in enumerate(powers) if p >= DECISIONS.enough]
+        enough = [k for k, p in enumerate(powers) if p >= TELLING.enough]
         k = enough[0] if enough else len(tried) - 1
-        if powers[k] >= EVEN:
+        if powers[k] >= TELLING.even:
             found.append({"experiment": text, "separates": members, "particles": tried[k], "power": powers[k]})
-    found.sort(key=lambda one: (-min(one["power"], DECISIONS.enough), one["particles"]))
+    found.sort(key=lambda one: (-min(one["power"], TELLING.enough), one["particles"]))
     return found
 
 
 def _screened(base: Base, plan: Plan, library: Mapping[str, Mechanism]) -> tuple[Screen, int]:
     planned = planned_base(base, plan)
-    return screen(planned, planned.state, base.hyperparameters, library, several=False), len(planned.tests)
+    return first_order(planned, library, base.hyperparameters), len(planned.tests)
 
 
 def _power(search: Search, members: list[str], other: Screen, copies: float) -> float:

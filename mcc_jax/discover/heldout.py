@@ -9,10 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..calibrate.estimates import finite
-from .design import HYPERPARAMETERS
-from .evidence import Design, amplitudes, left_by_particle, scales_of, without_first
+from .evidence import Design, Optimum, amplitudes, left_by_particle, prior_density, scales_of, without_first
 from .search import UNLISTED, Names, Search
-from .settings import NUMERICS
+from .settings import HYPERPARAMETERS, NUMERICS
 
 
 @dataclass(frozen=True)
@@ -141,7 +140,7 @@ def held_out(search: Search, winner: Names) -> HeldOut:
         parts = search.found[names].fitted
         if names and parts is not None and names not in {c.names for c in contestants}:
             prior = logs.get(names, 0.0) - search.found[names].log_evidence if names in logs else 0.0
-            contestants.append(_Contestant.of(names, parts[0], parts[1].free, prior + _of_hyperparameters(parts)))
+            contestants.append(_Contestant.of(names, parts[0], parts[1].free, prior + _of_hyperparameters(*parts[:2])))
     # The base law under the winner's noise and spreads: gaps are measured by the noise of what closes them.
     base = _Contestant.of((), null.design, optimum.free[:HYPERPARAMETERS], 0.0)
     first = next((c for c in contestants if c.names == winner[:1]), None) if len(winner) == 2 else None
@@ -166,10 +165,10 @@ def held_out(search: Search, winner: Names) -> HeldOut:
     return HeldOut(labels, chi2, points.astype(float), elpd, _repeating(search, residual))
 
 
-def _of_hyperparameters(parts: Any) -> float:
-    """What integrating hyperparameters adds to a log evidence at their mode: of all particles, or all but one."""
-    _, optimum, _ = parts
-    return float(optimum.log_evidence - optimum.log_joint)
+def _of_hyperparameters(design: Design, optimum: Optimum) -> float:
+    """What hyperparameters add to a log marginal likelihood at their mode, by all particles: prior and curvature."""
+    prior = float(prior_density(jnp.asarray(optimum.free), design))
+    return prior + optimum.log_evidence - optimum.log_joint
 
 
 def _repeating(search: Search, residual: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..effects.record import HOLD, LOAD, RELOAD, UNLOAD
 from .base import Base
-from .settings import DECISIONS, NUMERICS
+from .settings import NUMERICS, TELLING
 
 KINDS = {LOAD: "loading", HOLD: "hold", UNLOAD: "unloading", RELOAD: "reloading"}
 
@@ -72,7 +72,7 @@ def where(base: Base, places: tuple[Place, ...]) -> list[dict[str, Any]]:
     known = sorted((p for p in places if p.share > 0), key=lambda p: -p.share)
     strain, held, told = _strains(base), 0.0, []
     for place in known:
-        if held >= DECISIONS.place:
+        if held >= TELLING.place:
             break
         held += place.share
         rows = list(place.particles)

@@ -11,8 +11,7 @@ from jaxtyping import Array
 
 from ..calibrate.compiling import compiled
 from ..calibrate.data import Tests
-from ..calibrate.forward import Forms
-from .base import State
+from ..calibrate.forward import Forms, Point
 from .settings import NUMERICS
 
 COORDINATES = {
@@ -24,17 +23,17 @@ COORDINATES = {
     "damage": ("peak", "cycles"),
     "densification_stiffening": ("peak",),
     "reload_hysteresis": ("load", "reload", "peak"),
-    "ratcheting": ("cycles", "peak"),
+    "ratcheting": ("cycles", "peak", "strain"),
     "finite_hardening_exponent": ("peak",),
     "unloading_shape": ("load", "peak"),
     "size_effect": ("size",),
-    "shape_second_order": ("shape",),
+    "shape_second_order": ("shape", "outline"),
     "pop_in": (),
     "toe_asperity": ("peak",),
-    "platen_friction": ("peak",),
+    "platen_friction": ("peak", "shape"),
     "misalignment": ("peak", "size"),
-    "platen_sink_in": ("peak", "load"),
-    "reverse_plasticity": ("load", "peak"),
+    "platen_sink_in": ("peak", "load", "size"),
+    "reverse_plasticity": ("load", "peak", "reload"),
     "humidity": ("humidity", "peak"),
 }
 """In what a formula of each mechanism may be wrong: what its own formulas depend on."""
@@ -44,7 +43,7 @@ ANY = ("peak", "load", "since")
 
 
 @compiled
-def coordinates(state: State, tests: Tests, forms: Forms) -> dict[str, Array]:
+def coordinates(point: Point, tests: Tests, forms: Forms) -> dict[str, Array]:
     """Coordinates of every point: strain and travel in diameters, force, loads, times, sizes."""
 
     def one(latent: Array, tests: Tests) -> dict[str, Array]:
@@ -68,10 +67,11 @@ def coordinates(state: State, tests: Tests, forms: Forms) -> dict[str, Array]:
             "rate": jnp.log(jnp.maximum(tests.record.loading_rate, 1e-6)),
             "size": ones * jnp.log(tests.particle.effective_diameter),
             "shape": ones * tests.particle.flatness,
+            "outline": ones * jnp.abs(jnp.log(tests.particle.D1 / tests.particle.D2)),
             "humidity": ones * tests.record.relative_humidity,
         }
 
-    return jax.vmap(one)(state.point.latent, tests)
+    return jax.vmap(one)(point.latent, tests)
 
 
 def scaled(at: dict[str, Array], mask: Array) -> dict[str, Array]:
@@ -103,27 +103,35 @@ def functions(
             x = x * jnp.cos(np.pi * k * at[n])
         columns.append(x)
     smooth = [x * np.sqrt(1.0 / max(len(columns), 1)) * np.sqrt(2) for x in columns]
-    width, share = 1 / (hats - 1), np.sqrt(len(some))
-    centres = [(n, centre) for n in some for centre in np.linspace(0, 1, hats)]
-    rough = [jnp.maximum(1 - jnp.abs(at[n] - centre) / width, 0.0) / share for n, centre in centres]
-    return jnp.stack([*smooth, *rough], -1) if columns else jnp.zeros((*next(iter(at.values())).shape, 0))
+    if not columns:
+        return jnp.zeros((*next(iter(at.values())).shape, 0))
+    rough = [hats_of(at[n], hats) / np.sqrt(len(some)) for n in some]
+    return jnp.concatenate([jnp.stack(smooth, -1), *rough], -1)
+
+
+def hats_of(x: Array, count: int) -> Array:
+    """Hat functions, piecewise linear and 1 at one of `count` even places, of a coordinate between 0 and 1."""
+    centres = jnp.asarray(np.linspace(0, 1, count))
+    return jnp.maximum(1 - jnp.abs(x[..., None] - centres.reshape((1,) * x.ndim + (count,))) * (count - 1), 0.0)
 
 
 def general(at: dict[str, Array], size: Array, mask: Array) -> tuple[Array, int]:
-    """Functions of a smooth discrepancy that no mechanism explains, and how many of them are smooth; the others are
-    periodic.
+    """Functions of a discrepancy that no mechanism explains, and how many of them are smooth; the others are periodic.
 
-    It is common to all particles, in proportion to their size, and lives in reduced strain, travel, load and time.
+    It is common to all particles, in proportion to their size, and lives in reduced strain, travel, load and time, each
+    smooth and in hat functions, which have the corners that onsets and thresholds make.
     """
-    alone = [(name, k) for name in ("strain", "travel", "load", "clock") for k in range(1, 6)]
-    columns = [jnp.cos(np.pi * k * at[name]) for name, k in alone]
+    places = ("strain", "travel", "load", "clock")
+    columns = [jnp.cos(np.pi * k * at[name]) for name in places for k in range(1, 4)]
     both = [(i, j) for i in range(1, 3) for j in range(1, 3)]
     columns += [jnp.cos(np.pi * i * at["peak"]) * jnp.cos(np.pi * j * at["load"]) for i, j in both]
     smooth = jnp.stack(columns, -1) / np.sqrt(len(columns))
+    rough = jnp.concatenate([hats_of(at[name], NUMERICS.hats) for name in places], -1) / np.sqrt(len(places))
+    smooth = jnp.concatenate([smooth, rough], -1)
     waves = []
     for name in ("travel", "clock"):
         for k in range(2, NUMERICS.waves):
             waves += [jnp.cos(2 * np.pi * k * at[name]), jnp.sin(2 * np.pi * k * at[name])]
     periodic = jnp.stack(waves, -1) / np.sqrt(len(waves))
     basis = jnp.concatenate([smooth, periodic], -1) * (size / jnp.mean(size))[:, None, None]
-    return jnp.where(mask[..., None], basis, 0.0), len(columns)
+    return jnp.where(mask[..., None], basis, 0.0), smooth.shape[-1]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import jax
@@ -21,9 +21,10 @@ from ..effects import Variant
 from .base import Base, State
 from .candidates import Candidate
 from .design import More, design_of
-from .evidence import Design, Optimum, Solution, optimise, scales_of, solve
+from .evidence import Design, Optimum, filled_up, optimise, scales_of, solve, value_and_gradient, with_little_noise
+from .refine import Refined, refined
 from .screen import single_integrals
-from .settings import DECISIONS, NUMERICS
+from .settings import DECISIONS, HYPERPARAMETERS, NUMERICS
 
 SPREAD = NakagamiPrior(1.0, shape=0.25)
 """Prior of a spread over the tests in units of the largest plausible one, open in its order of magnitude."""
@@ -49,66 +50,93 @@ class Jump:
 
 @dataclass(frozen=True)
 class OwnNumbers:
-    """A hypothesis of numbers that each test has of its own.
+    """A hypothesis of numbers that each test has of its own, with a formula that all tests share beside them or none.
 
     Attributes:
         variant, nuisance: the formula and its further numbers.
         log_evidence: log marginal likelihood.
-        design, optimum, solution: at its optimum.
+        at: the hypothesis at its optimum.
+        more: columns of its own numbers.
         jumps: sudden steps, if it is about these.
+        log_prior: of where these are.
     """
 
     variant: Variant
     nuisance: dict[str, float]
     log_evidence: float
-    design: Design
-    optimum: Optimum
-    solution: Solution
+    at: Refined
+    more: More
     jumps: tuple[Jump, ...] = ()
+    log_prior: float = 0.0
+
+    def beside(
+        self, base: Base, state: State, variants: tuple[Variant, ...], numbers: np.ndarray, free: np.ndarray
+    ) -> OwnNumbers:
+        """The same numbers with a formula beside them, at its optimum."""
+        spreads = self.at.optimum.free[HYPERPARAMETERS : HYPERPARAMETERS + len(self.more.own_spreads)]
+        at = refined(base, state, variants, numbers, np.concatenate([free, spreads]), self.more)
+        return replace(self, at=at, log_evidence=at.log_evidence + self.log_prior)
 
 
-def differing(
-    base: Base, state: State, free: np.ndarray, columns: Array, candidates: Sequence[Candidate]
-) -> OwnNumbers | None:
+def solved(design: Design, optimum: Optimum, start: Refined) -> Refined:
+    """A design at its optimum, linear where another hypothesis is."""
+    return Refined(start.variants, start.state, design, optimum, solve(jnp.asarray(optimum.free), design))
+
+
+def differing(base: Base, start: Refined, columns: Array, candidates: Sequence[Candidate]) -> OwnNumbers | None:
     """An amplitude that scatters around a common one, over all formulas of a mechanism; None if none does.
 
     Args:
         base: the tests.
-        state: where the base law fits.
-        free: its hyperparameters.
+        start: the hypothesis beside which they are: the base law, or one with a formula.
         columns: signatures of the formulas in units of their smallest plausible amplitudes.
         candidates: the formulas.
     """
-    values: dict[str, list[float]] = {}
-    best = None
+    free = np.append(start.optimum.free, 1.0)
+    tried: list[tuple[float, np.ndarray, Candidate, Design, More]] = []
     for k, c in enumerate(candidates):
         if not c.variant.random_per_test:
             continue
         ratio = c.variant.plausible[1] / c.variant.plausible[0]
         column = columns[..., k : k + 1]
         more = More(ratio * column, (SPREAD,), column, (ratio,), (0,))
-        design = design_of(base, state, (), more)
-        optimum = optimise(design, np.append(free, 1.0), curvature=False)
-        values.setdefault(c.variant.name, []).append(optimum.log_joint)
-        if best is None or optimum.log_joint > best[0].log_joint:
-            best = optimum, c, design
-    if best is None:
+        design = design_of(base, start.state, start.variants, more)
+        value, at = max(
+            (
+                (float(value_and_gradient(jnp.asarray(filled_up(x, design)), design)[0]), x)
+                for x in (free, with_little_noise(free))
+            ),
+            key=lambda one: one[0],
+        )
+        tried.append((value, at, c, design, more))
+    if not tried:
         return None
-    optimum, c, design = best
+    tried.sort(key=lambda one: -one[0])
+    values: dict[str, list[float]] = {}
+    best: tuple[Optimum, Candidate, Design, More] | None = None
+    for turn, (value, at, c, design, more) in enumerate(tried):
+        if turn < NUMERICS.drifts:
+            optimum = optimise(design, at, curvature=False)
+            value = optimum.log_joint
+            if best is None or value > best[0].log_joint:
+                best = optimum, c, design, more
+        values.setdefault(c.variant.name, []).append(value)
+    assert best is not None
+    optimum, c, design, more = best
     curved = optimise(design, optimum.free)
     each = [logsumexp(v) - np.log(len(v)) for v in values.values()]
     total = float(logsumexp(each) - np.log(len(each))) + curved.log_evidence - optimum.log_joint
-    solution = solve(jnp.asarray(curved.free), design)
-    return OwnNumbers(c.variant, dict(c.nuisance), total, design, curved, solution)
+    return OwnNumbers(c.variant, dict(c.nuisance), total, solved(design, curved, start), more)
 
 
 @compiled
-def step_scores(free: Array, design: Design, common: Array) -> tuple[Array, Array]:
+def step_scores(free: Array, design: Design, common: Array, amplitude: Array) -> tuple[Array, Array]:
     """Score and information of a step of 1 um at every point, each particle's own numbers integrated out."""
     noise, own, _ = scales_of(free, design)
     kinds = design.kinds
     points = design.data.shape[-1]
     residual = design.data - jnp.einsum("npc,c->np", design.common, common)
+    residual -= jnp.einsum("npk,k->np", design.amplitude, amplitude)
 
     def one(scale: Array, tests: Tests, linear: Linear, columns: Array, residual: Array) -> tuple[Array, Array]:
         filtered = whitening(noise, scale, tests, linear, kinds.correlation, kinds.along)
@@ -123,15 +151,14 @@ def step_scores(free: Array, design: Design, common: Array) -> tuple[Array, Arra
     return jax.vmap(one)(design.scale, design.tests, design.linear, design.own, residual)
 
 
-def sudden_steps(base: Base, state: State, free: np.ndarray, variant: Variant) -> OwnNumbers | None:
+def sudden_steps(base: Base, start: Refined, variant: Variant) -> OwnNumbers | None:
     """Sudden steps in some tests, found one after the other: at most `Numerics.jumps` in each.
 
     A test has one with a probability that is itself unknown, uniformly; it may be at any point of its loading.
 
     Args:
         base: the tests.
-        state: where the base law fits.
-        free: its hyperparameters.
+        start: the hypothesis beside which they are: the base law, or one with a formula.
         variant: the formula.
     """
     N, P = np.asarray(base.tests.mask).shape
@@ -140,23 +167,23 @@ def sudden_steps(base: Base, state: State, free: np.ndarray, variant: Variant) -
     unit = high / 3
     columns = np.zeros((N, P, 0))
     found: list[Step] = []
-    at, best = free, None
+    now, best, value = start, None, -np.inf
     for turn in range(NUMERICS.jumps + 1):
-        more = More(jnp.asarray(columns) if turn else None, (SPREAD,) * turn)
-        design = design_of(base, state, (), more)
         if turn:
-            optimum = optimise(design, np.concatenate([free, np.ones(turn)]), curvature=False)
-            value = optimum.log_joint + _log_prior_of_steps(found, loading)
-            if best is not None and value <= best.log_evidence:
+            more = More(jnp.asarray(columns), (SPREAD,) * turn)
+            design = design_of(base, start.state, start.variants, more)
+            optimum = optimise(design, np.concatenate([start.optimum.free, np.ones(turn)]), curvature=False)
+            log_prior = _log_prior_of_steps(found, loading)
+            if optimum.log_joint + log_prior <= value:
                 break
-            at = optimum.free
-            solution = solve(jnp.asarray(at), design)
-            jumps = _jumps(base, found, unit * np.asarray(solution.own)[:, 5:])
-            best = OwnNumbers(variant, {}, float(value), design, optimum, solution, jumps)
+            value = optimum.log_joint + log_prior
+            now = solved(design, optimum, start)
+            jumps = _jumps(base, found, unit * np.asarray(now.solution.own)[:, 5:])
+            best = OwnNumbers(variant, {}, value, now, more, jumps, log_prior)
         if turn == NUMERICS.jumps:
             break
-        s = solve(jnp.asarray(at), design)
-        score, information = map(np.asarray, step_scores(jnp.asarray(at), design, s.common))
+        explained = now.solution.common, now.solution.amplitude
+        score, information = map(np.asarray, step_scores(jnp.asarray(now.optimum.free), now.design, *explained))
         new, added = np.zeros((N, P, 1)), False
         for i in range(N):
             rows = np.flatnonzero(loading[i])[1:]
@@ -172,7 +199,11 @@ def sudden_steps(base: Base, state: State, free: np.ndarray, variant: Variant) -
         if not added:
             break
         columns = np.concatenate([columns, new], -1)
-    return best
+    if best is None:
+        return None
+    # The steps' evidence with its hyperparameters integrated out, as that of every other hypothesis.
+    now = solved(best.at.design, optimise(best.at.design, best.at.optimum.free), start)
+    return replace(best, at=now, log_evidence=now.log_evidence + best.log_prior)
 
 
 class Step(NamedTuple):

@@ -26,8 +26,8 @@ from ..simulate import Programme, simulate_campaign
 from .base import Base, State, base_fit
 from .candidates import untestable
 from .design import particle_means
-from .screen import Screen, screen
-from .settings import DECISIONS
+from .screen import Screen, first_order
+from .settings import TELLING
 
 _A_PROGRAMME = "Take mcc_jax.Programme.cycles()."
 
@@ -154,7 +154,7 @@ def power_of(found: Screen, missing: Sequence[dict[str, str]]) -> Power:
     for name, ks in members.items():
         # The first formula is the common one; the limit is that of the family's first formula that leaves a trace.
         variant = found.candidates[ks[0]].variant
-        limits[name] = float(DECISIONS.detectable / np.sqrt(strength[ks[0]]) * variant.plausible[0])
+        limits[name] = float(TELLING.detectable / np.sqrt(strength[ks[0]]) * variant.plausible[0])
         units[name] = variant.unit
         plausible[name] = variant.plausible
     alike = []
@@ -164,7 +164,7 @@ def power_of(found: Screen, missing: Sequence[dict[str, str]]) -> Power:
             block = both[np.ix_(members[one], members[other])]
             product = found.signs[members[one]][:, None] * found.signs[members[other]][None]
             value = float(np.max(np.where(product == 0, np.abs(block), block * product)))
-            if value >= DECISIONS.alike:
+            if value >= TELLING.alike:
                 alike.append((one, other, value))
     alike.sort(key=lambda item: -item[2])
     return Power(tuple(names), limits, units, plausible, tuple(alike), tuple(missing))
@@ -236,4 +236,4 @@ def without_effects(model: Model) -> Model:
 def screened(base: Base, library: Mapping[str, Mechanism]) -> tuple[Screen, Sequence[dict[str, str]]]:
     """All formulas that the campaign can be searched for, to first order, and what the others need."""
     testable, missing = untestable(library, available_data(base.campaign))
-    return screen(base, base.state, base.hyperparameters, testable, several=False), missing
+    return first_order(base, testable), missing

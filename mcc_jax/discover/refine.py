@@ -9,12 +9,9 @@ import numpy as np
 
 from ..effects import Variant
 from .base import Base, State
-from .design import between, design_of, moved
+from .design import NOTHING_MORE, More, between, design_of, moved
 from .evidence import Design, Optimum, Solution, optimise, solve
 from .settings import NUMERICS
-
-WORSE = 5.0
-"""Nats by which a Gauss-Newton step may make things worse before half of it is taken back."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +41,14 @@ class Refined:
         return np.asarray(self.state.point.theta[0])
 
 
-def refined(base: Base, state: State, variants: tuple[Variant, ...], numbers: np.ndarray, free: np.ndarray) -> Refined:
+def refined(
+    base: Base,
+    state: State,
+    variants: tuple[Variant, ...],
+    numbers: np.ndarray,
+    free: np.ndarray,
+    more: More = NOTHING_MORE,
+) -> Refined:
     """The optimum of a hypothesis, from a state of the base law on.
 
     Args:
@@ -53,25 +57,26 @@ def refined(base: Base, state: State, variants: tuple[Variant, ...], numbers: np
         variants: the formulas.
         numbers: where the effects' numbers are linearised first: amplitudes of zero and further numbers.
         free: hyperparameters to start from.
+        more: columns besides those of the formulas.
     """
     state, value = state.with_numbers(numbers), -np.inf
     before = state
-    design = design_of(base, state, variants)
+    design = design_of(base, state, variants, more)
     for k in range(NUMERICS.steps):
         optimum = optimise(design, free, curvature=False)
         last = k == NUMERICS.steps - 1
-        if optimum.log_joint < value - WORSE and not last:
+        if optimum.log_joint < value - NUMERICS.worse and not last:
             state, value = between(before, state), -np.inf  # what was linear there is not here
         else:
-            if last and optimum.log_joint < value - WORSE:
+            if last and optimum.log_joint < value - NUMERICS.worse:
                 state = before
-                design = design_of(base, state, variants)
+                design = design_of(base, state, variants, more)
                 break
             free = optimum.free
             if last or (k > 1 and abs(optimum.log_joint - value) < NUMERICS.still):
                 break
             before, value = state, optimum.log_joint
             state = moved(base, state, variants, solve(jnp.asarray(free), design))
-        design = design_of(base, state, variants)
+        design = design_of(base, state, variants, more)
     optimum = optimise(design, free)
     return Refined(variants, state, design, optimum, solve(jnp.asarray(optimum.free), design))

@@ -13,7 +13,7 @@ from .._format import described, table
 from ..calibrate import Model, Posterior
 from ..calibrate.estimates import estimate, finite
 from ..calibrate.laws import law_of
-from ..calibrate.results import DISCOVERY_ARCHIVE, Saved
+from ..calibrate.results import DISCOVERY_ARCHIVE, Calibration, Saved
 from ..campaign import Finding
 from ..effects import EQUIVALENCES, AbstractEffect, Variant
 from ..law import MccLaw
@@ -140,7 +140,7 @@ class Discovery(Saved):
         closure: a curve and a formula where no listed mechanism explains the gap.
         held_out: the gap on particles that took no part; None if not asked for.
         p_any: probability of so much evidence of anything if nothing were missing.
-        before, after: the population's parameters without and with the effects.
+        parameters_before, parameters_after: the population's parameters without and with the effects.
         next_experiments: further tests that would probably tell the members of a set apart.
         seed, runtime_s: for the record.
         leads: what remains beside the names and is not added to the law.
@@ -151,6 +151,7 @@ class Discovery(Saved):
         residuals: of every test, without and with what was added; None where the base law was not fitted.
         places: the whole map of disagreement.
         likeness: which mechanisms look alike; None where there was nothing to compare.
+        before: the calibration in whose folder it was saved, as `mcc.load` finds it; None otherwise.
     """
 
     content_file, archive_file = "discovery.json", DISCOVERY_ARCHIVE
@@ -170,8 +171,8 @@ class Discovery(Saved):
     closure: Closure | None = None
     held_out: HeldOut | None = None
     p_any: float = float("nan")
-    before: dict[str, Any] = field(default_factory=dict)
-    after: dict[str, Any] = field(default_factory=dict)
+    parameters_before: dict[str, Any] = field(default_factory=dict)
+    parameters_after: dict[str, Any] = field(default_factory=dict)
     next_experiments: tuple[dict[str, Any], ...] = ()
     leads: tuple[dict[str, Any], ...] = ()
     checks: tuple[dict[str, str], ...] = ()
@@ -181,6 +182,7 @@ class Discovery(Saved):
     residuals: Residuals | None = None
     places: tuple[Place, ...] = ()
     likeness: Likeness | None = None
+    before: Calibration | None = None
 
     def __repr__(self) -> str:
         rows = [("added", repr(effect.build())) for effect in self.effects]
@@ -204,7 +206,7 @@ class Discovery(Saved):
             raise InputError("this discovery has no law: its fit did not converge", remedy="Calibrate first.")
         model = self.base.model
         numbers = {"method": "bayes", "law": {"unloading": model.unloading, "strain_scaling": model.strain_scaling}}
-        law = law_of(numbers | (self.after or self.before), particle)
+        law = law_of(numbers | (self.parameters_after or self.parameters_before), particle)
         return law.with_effects(*(effect.build() for effect in self.effects))
 
     def gap(self) -> dict[str, Any]:
@@ -267,8 +269,8 @@ class Discovery(Saved):
             "closure": None if self.closure is None else self.closure.to_json(),
             "leads": list(self.leads),
             "gap": self.gap(),
-            "parameters_before": self.before,
-            "parameters_after": self.after,
+            "parameters_before": self.parameters_before,
+            "parameters_after": self.parameters_after,
             "posterior": None if self.posterior is None else self._of_posterior(self.posterior),
             "next_experiments": list(self.next_experiments),
             "checks": list(self.checks),

@@ -15,25 +15,25 @@ from scipy.special import log_ndtr, logsumexp
 from ..calibrate.compiling import compiled
 from ..calibrate.data import Tests
 from ..calibrate.distributions import SCALES
-from ..calibrate.forward import Forms
+from ..calibrate.forward import Forms, Point
 from ..effects import AbstractEffect, Mechanism
 from ..law import signatures
 from .base import Base, State
 from .candidates import Candidate, candidates_of
-from .design import FURTHER, design_of
+from .design import design_of
 from .evidence import left_by_particle, prior_density, with_amplitudes, without_first
-from .settings import NUMERICS
+from .settings import FURTHER, NUMERICS
 
 
 @compiled
-def candidate_columns(state: State, tests: Tests, effects: tuple[AbstractEffect, ...], forms: Forms) -> Array:
+def candidate_columns(point: Point, tests: Tests, effects: tuple[AbstractEffect, ...], forms: Forms) -> Array:
     """Signatures of all candidates at the base law, shape (N, points, candidates)."""
 
     def one(latent: Array, tests: Tests) -> Array:
         columns = signatures(forms.law(latent, jnp.zeros(0)), tests.particle, tests.record, effects)
         return jnp.where(tests.mask[None], columns, 0.0).T
 
-    return jax.vmap(one)(state.point.latent, tests)
+    return jax.vmap(one)(point.latent, tests)
 
 
 @dataclass(frozen=True)
@@ -136,12 +136,12 @@ def pair_integrals(s: Setting, a: np.ndarray, b: np.ndarray, signs: np.ndarray, 
 def signature_columns(base: Base, state: State, candidates: Sequence[Candidate]) -> Array:
     """Signatures of candidates at the base law, in units of their smallest plausible amplitudes."""
     effects = tuple(c.effect for c in candidates)
-    columns = candidate_columns(state, base.tests, effects, base.forms)
+    columns = base.each(candidate_columns, state.point, effects, base.forms)
     return columns * jnp.asarray(np.array([c.variant.plausible[0] for c in candidates]))[None, None]
 
 
 def screen(
-    base: Base, state: State, free: np.ndarray, library: Mapping[str, Mechanism], *, several: bool = True
+    base: Base, state: State, free: np.ndarray, candidates: Sequence[Candidate], columns: Array, *, several: bool = True
 ) -> Screen:
     """Scores of all candidates around the base law, at several settings of noise and spreads.
 
@@ -149,11 +149,10 @@ def screen(
         base: the tests.
         state: where the base law fits.
         free: its hyperparameters, the first setting.
-        library: where the candidates are from.
+        candidates: the formulas.
+        columns: as of `signature_columns`.
         several: whether other settings than the first are wanted.
     """
-    candidates = candidates_of(library)
-    columns = signature_columns(base, state, candidates)
     design = with_amplitudes(design_of(base, state), columns)
     settings = []
     grid = itertools.product(NUMERICS.noise_factors, NUMERICS.length_factors, NUMERICS.spread_factors)
@@ -167,4 +166,12 @@ def screen(
         null = float(np.sum(np.asarray(integral))) + float(log_population) - 0.5 * total[-1, -1]
         null += float(prior_density(jnp.asarray(at), design))
         settings.append(Setting(at, null, total[:-1, :-1], total[:-1, -1]))
-    return Screen(candidates, tuple(settings), columns)
+    return Screen(tuple(candidates), tuple(settings), columns)
+
+
+def first_order(base: Base, library: Mapping[str, Mechanism], free: np.ndarray | None = None) -> Screen:
+    """Scores of a library around the base law at its own hyperparameters, or at others."""
+    candidates = candidates_of(library)
+    columns = signature_columns(base, base.state, candidates)
+    at = base.hyperparameters if free is None else free
+    return screen(base, base.state, at, candidates, columns, several=False)

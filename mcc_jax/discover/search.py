@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -14,10 +14,10 @@ from scipy.special import logsumexp
 
 from ..calibrate.compiling import side_by_side
 from ..calibrate.noise import Along, Correlation
-from ..effects import Mechanism
+from ..effects import Mechanism, Variant
 from .base import Base, State
-from .candidates import candidates_of
-from .design import FURTHER, HYPERPARAMETERS, More, design_of
+from .candidates import Candidate, candidates_of
+from .design import More, design_of
 from .evidence import (
     Design,
     NoiseKind,
@@ -27,6 +27,7 @@ from .evidence import (
     optimise,
     solve,
     with_amplitudes,
+    with_little_noise,
     with_noise,
     without_first,
 )
@@ -34,7 +35,7 @@ from .misfit import ANY, COORDINATES, coordinates, functions, general, scaled
 from .own_numbers import OwnNumbers, differing, sudden_steps
 from .refine import Refined, refined
 from .screen import Screen, Setting, pair_integrals, screen, signature_columns, single_integrals
-from .settings import DECISIONS, NUMERICS
+from .settings import DECISIONS, FURTHER, HYPERPARAMETERS, NUMERICS
 
 Names = tuple[str, ...]
 UNLISTED: Names = ("UNLISTED",)
@@ -82,7 +83,7 @@ class Hypothesis:
     @property
     def fitted(self) -> tuple[Design, Optimum, Solution] | None:
         """Design, hyperparameters and numbers of the form in which it is added to the law."""
-        for one in (self.smooth, self.own, self.best):
+        for one in (self.smooth, None if self.own is None else self.own.at, self.best):
             if one is not None:
                 return one.design, one.optimum, one.solution
         return None
@@ -116,7 +117,8 @@ class Search:
         library: mechanisms that are searched for.
         null: the base law at its optimum.
         natural, at: coordinates of all points, in natural units and between 0 and 1.
-        screen: all formulas to first order.
+        candidates, columns: all formulas and their signatures, in units of their smallest plausible amplitudes.
+        screen: those that all tests share, to first order.
         found: hypotheses by their names.
     """
 
@@ -126,17 +128,15 @@ class Search:
         self.base, self.library, self.tell = base, library, tell
         start = optimise(design_of(base, base.state), base.hyperparameters, curvature=False)
         self.null = refined(base, base.state, (), np.zeros(0), start.free)
-        self.natural = coordinates(self.state, base.tests, base.forms)
+        self.natural = base.each(coordinates, self.state.point, base.forms)
         self.at = scaled(self.natural, base.tests.mask)
         self.shared = {
             name: m for name, m in library.items() if name != SUDDEN and not any(v.random_per_test for v in m.variants)
         }
-        self.screen: Screen | None = None
-        if self.shared:
-            self.screen = screen(base, self.state, self.null.optimum.free, self.shared)
-        # Correlated noise that has swallowed a gap must be small where what explains it begins to be fitted.
-        self.small = self.null.optimum.free.copy()
-        self.small[2] += np.log(0.1)
+        self.candidates = candidates_of(library)
+        self.columns = signature_columns(base, self.state, self.candidates)
+        self.screen = self.screened(self.shared) if self.shared else None
+        self.small = with_little_noise(self.null.optimum.free)
         self.fits: dict[tuple[int, ...], Refined] = {}
         self.found: dict[Names, Hypothesis] = {(): Hypothesis((), self.null.log_evidence, best=self.null)}
 
@@ -144,6 +144,15 @@ class Search:
     def state(self) -> State:
         """Where the base law fits."""
         return self.null.state
+
+    def formulas_of(self, mechanisms: Collection[str]) -> tuple[tuple[Candidate, ...], Array]:
+        """The formulas of some mechanisms, and their signatures."""
+        rows = [k for k, c in enumerate(self.candidates) if c.mechanism in mechanisms]
+        return tuple(self.candidates[k] for k in rows), self.columns[..., np.array(rows)]
+
+    def screened(self, mechanisms: Collection[str], *, several: bool = True) -> Screen:
+        """Some mechanisms to first order, around the base law."""
+        return screen(self.base, self.state, self.null.optimum.free, *self.formulas_of(mechanisms), several=several)
 
     # ---- posterior ---------------------------------------------------------------------------------------------------
 
@@ -192,13 +201,16 @@ class Search:
 
     def fit(self, ks: tuple[int, ...]) -> Refined:
         """Some candidates together at their own optimum, by their formulas."""
+        if ks not in self.fits:
+            self.fits[ks] = refined(self.base, self.state, *self.start_of(ks), self.small)
+        return self.fits[ks]
+
+    def start_of(self, ks: tuple[int, ...]) -> tuple[tuple[Variant, ...], np.ndarray]:
+        """The formulas of some candidates, and where their numbers are linearised first."""
         assert self.screen is not None
         cs = [self.screen.candidates[k] for k in ks]
-        if ks not in self.fits:
-            numbers = [0.0] * len(cs) + [c.nuisance[n.name] for c in cs for n in c.variant.nuisances]
-            variants = tuple(c.variant for c in cs)
-            self.fits[ks] = refined(self.base, self.state, variants, np.array(numbers), self.small)
-        return self.fits[ks]
+        numbers = [0.0] * len(cs) + [c.nuisance[n.name] for c in cs for n in c.variant.nuisances]
+        return tuple(c.variant for c in cs), np.array(numbers)
 
     def best_first(self, mechanism: str) -> list[tuple[str, tuple[float, int]]]:
         """The formulas of a mechanism as in `first_order`, best first."""
@@ -239,7 +251,7 @@ class Search:
                 likeness = float(jnp.sum(column * own))
                 others.append(column * np.copysign(size / length, likeness) - own)
         siblings = jnp.stack(others, -1) if others else smooth[..., :0]
-        return jnp.concatenate([smooth, siblings], -1)
+        return jnp.concatenate([siblings, smooth], -1)
 
     def with_misfit(self, one: Hypothesis) -> None:
         """Log evidence where every name's formula may be wrong."""
@@ -272,15 +284,21 @@ class Search:
 
     # ---- two names ---------------------------------------------------------------------------------------------------
 
-    def seconds(self, r: Refined) -> list[tuple[float, int]]:
-        """Candidates beside a name, to first order around its optimum, best first."""
+    def seconds(self, at: Refined, first: Variant, column: Array) -> list[tuple[float, int]]:
+        """Candidates beside a name, to first order around its optimum, best first.
+
+        Args:
+            at: the name at its optimum.
+            first: its formula.
+            column: of its amplitude.
+        """
         assert self.screen is not None
-        first, cs = r.variants[0], self.screen.candidates
-        every = jnp.concatenate([r.design.amplitude[..., :1], self.screen.columns], -1)
-        left, _ = left_by_particle(jnp.asarray(r.optimum.free), with_amplitudes(r.design, every))
-        total, _ = without_first(jnp.sum(left, 0), r.design.common.shape[-1])
+        cs = self.screen.candidates
+        every = jnp.concatenate([column, self.screen.columns], -1)
+        left, _ = left_by_particle(jnp.asarray(at.optimum.free), with_amplitudes(at.design, every))
+        total, _ = without_first(jnp.sum(left, 0), at.design.common.shape[-1])
         total = np.asarray(total)
-        s = Setting(r.optimum.free, 0.0, total[:-1, :-1], total[:-1, -1])
+        s = Setting(at.optimum.free, 0.0, total[:-1, :-1], total[:-1, -1])
         signs = np.append(first.sign, self.screen.signs)
         largest = np.append(first.plausible[1] / first.plausible[0], self.screen.largest)
         b = np.arange(1, len(signs))
@@ -292,25 +310,51 @@ class Search:
             if cs[k].mechanism != first.mechanism and frozenset((first.mechanism, cs[k].mechanism)) not in OPPOSITE
         ]
 
-    def pairs_of(self, leader: Hypothesis) -> None:
-        """The best second names beside a leader, each fitted together with it."""
+    def best_seconds(self, ordered: Sequence[tuple[float, int]], first: str) -> dict[Names, int]:
+        """The best candidate of each of the best second names, and the two names together."""
         assert self.screen is not None
-        assert leader.best is not None
-        first = next(ks[0] for ks, r in self.fits.items() if r is leader.best)
-        tried: dict[Names, tuple[int, int]] = {}
-        for gain, k in self.seconds(leader.best):
-            names = tuple(sorted((leader.names[0], self.screen.candidates[k].mechanism)))
+        tried: dict[Names, int] = {}
+        for gain, k in ordered:
             if gain < 0 or len(tried) >= NUMERICS.seconds:
                 break
-            if names not in self.found:
-                tried.setdefault(names, (first, k))
+            tried.setdefault(pair_of(first, self.screen.candidates[k].mechanism), k)
+        return tried
+
+    def pairs_of(self, leader: Hypothesis) -> None:
+        """The best second names beside a leader, each fitted together with it."""
+        r = leader.best
+        assert r is not None
+        first = next(ks[0] for ks, one in self.fits.items() if one is r)
+        seconds = self.seconds(r, r.variants[0], r.design.amplitude[..., :1])
+        tried = {n: (first, k) for n, k in self.best_seconds(seconds, leader.names[0]).items() if n not in self.found}
         side_by_side(self.fit, list(tried.values()))
         for names, ks in tried.items():
-            r = self.fit(ks)
-            pair = Hypothesis(names, r.log_evidence, best=r)
-            self.found[names] = pair
-            if r.log_evidence > leader.alone:
+            pair = self.found[names] = Hypothesis(names, self.fit(ks).log_evidence, best=self.fit(ks))
+            if pair.alone > leader.alone:
                 self.with_misfit(pair)
+        for m, mechanism in self.library.items():
+            if m not in self.shared:
+                self.keep(pair_of(m, leader.names[0]), self.of_their_own(m, mechanism, r))
+
+    def pairs_of_their_own(self, leader: Hypothesis) -> None:
+        """The best second names beside numbers that differ from test to test."""
+        own = leader.own
+        assert own is not None
+        assert self.screen is not None
+        column = own.at.design.amplitude[..., :1]
+        seconds = self.best_seconds(self.seconds(own.at, own.variant, column), leader.names[0])
+
+        def fit(k: int) -> OwnNumbers:
+            return own.beside(self.base, self.state, *self.start_of((k,)), self.small)
+
+        for names, one in zip(seconds, side_by_side(fit, seconds.values()), strict=True):
+            self.keep(names, one)
+
+    def keep(self, names: Names, own: OwnNumbers | None) -> None:
+        """A hypothesis with numbers of every test's own, if it is the best of its names."""
+        value = -np.inf if own is None else own.log_evidence
+        if names not in self.found or value > self.found[names].log_evidence:
+            self.found[names] = Hypothesis(names, value, own=own)
 
     # ---- all of it ---------------------------------------------------------------------------------------------------
 
@@ -339,7 +383,8 @@ class Search:
             self.found[(m,)] = Hypothesis((m,), rank[m])
         self.tell("what differs from test to test")
         for m, mechanism in self.library.items():
-            self.of_their_own(m, mechanism)
+            if m not in self.shared:
+                self.keep((m,), self.of_their_own(m, mechanism, self.null))
         self.tell("a discrepancy on no list")
         smooth = self.smooth(self.null)
         self.found[UNLISTED] = Hypothesis(UNLISTED, smooth.optimum.log_evidence, smooth=smooth)
@@ -350,23 +395,19 @@ class Search:
                 assert leader.best is not None
                 leader.beside = self.smooth(leader.best).optimum.log_evidence
                 self.pairs_of(leader)
+            first = max((x for x in self.found.values() if len(x.names) == 1), key=lambda x: x.log_evidence)
+            if first.own is not None and self.screen is not None:
+                self.pairs_of_their_own(first)
         self.tell("other kinds of noise")
         self.other_noise()
         return self
 
-    def of_their_own(self, name: str, mechanism: Mechanism) -> None:
-        """A mechanism whose numbers differ from test to test."""
-        free = self.null.optimum.free
+    def of_their_own(self, name: str, mechanism: Mechanism, start: Refined) -> OwnNumbers | None:
+        """A mechanism whose numbers differ from test to test, beside what is there at the start."""
         if name == SUDDEN:
-            own = sudden_steps(self.base, self.state, free, mechanism.variants[0])
-        elif name in self.shared:
-            return
-        else:
-            candidates = candidates_of({name: mechanism})
-            columns = signature_columns(self.base, self.state, candidates)
-            own = differing(self.base, self.state, free, columns, candidates)
-        value = -np.inf if own is None else own.log_evidence
-        self.found[(name,)] = Hypothesis((name,), value, own=own)
+            return sudden_steps(self.base, start, mechanism.variants[0])
+        candidates, columns = self.formulas_of({name})
+        return differing(self.base, start, columns, candidates)
 
     def other_noise(self) -> None:
         """Average nothing and the leading hypotheses over kinds of noise, if another kind may explain the gap."""
@@ -400,6 +441,12 @@ class Search:
             other = optimise(with_noise(design, kind), start, curvature=False)
             found.append(optimum.log_evidence + other.log_joint - optimum.log_joint)
         return found
+
+
+def pair_of(one: str, other: str) -> Names:
+    """Two names in their order."""
+    first, second = sorted((one, other))
+    return first, second
 
 
 def noise_kinds(base: Base) -> tuple[NoiseKind, ...]:

@@ -4,16 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from .settings import DECISIONS
+from .settings import DECISIONS, TELLING
 
 if TYPE_CHECKING:
     from .result import Discovery, Effect
-
-SHOWN = 5
-"""Most jumps that are told one by one."""
-
-CHECKED = 3
-"""Most members of a set of which is told what would show them by themselves."""
 
 
 def _listed(names: list[str]) -> str:
@@ -46,8 +40,10 @@ def summary_of(found: Discovery) -> str:
     if found.leads:
         names = ", ".join(_plain(one["mechanism"]) for one in found.leads)
         sentences.append(f"Beside it, what is left may be {names}; that is not added to the law.")
-    if found.after and found.verdict in ("NAMED", "SET", "UNLISTED"):
-        before, after = (p["effective_modulus_MPa"]["value"] / 1000 for p in (found.before, found.after))
+    if found.parameters_after and found.verdict in ("NAMED", "SET", "UNLISTED"):
+        before, after = (
+            p["effective_modulus_MPa"]["value"] / 1000 for p in (found.parameters_before, found.parameters_after)
+        )
         sentences.append(f"With it the effective modulus is {after:.3g} GPa instead of {before:.3g} GPa.")
     sentences += _next(found)
     if found.untestable:
@@ -88,7 +84,7 @@ def _gap(found: Discovery) -> list[str]:
 def _next(found: Discovery) -> list[str]:
     told = []
     best = found.next_experiments[0] if found.next_experiments else None
-    sure = best is not None and best["power"] >= DECISIONS.enough
+    sure = best is not None and best["power"] >= TELLING.enough
     if best is not None:
         names = _listed([_plain(n) for n in best["separates"]])
         doubt = "" if sure else f"No further test of those tried on paper would surely separate {names}. "
@@ -97,14 +93,14 @@ def _next(found: Discovery) -> list[str]:
             f"with these it would separate {names} with probability {best['power']:.2f}."
         )
     if found.checks and not sure:
-        each = "; ".join(f"{_plain(one['mechanism'])}: {one['check']}" for one in found.checks[:CHECKED])
+        each = "; ".join(f"{_plain(one['mechanism'])}: {one['check']}" for one in found.checks[: TELLING.checks])
         told.append(f"Each would show by itself ({each}).")
     return told
 
 
 def _jumps(found: Discovery, effect: Effect) -> str:
     """The largest sudden steps, one by one."""
-    largest = sorted(effect.jumps, key=lambda jump: -jump.size)[:SHOWN]
+    largest = sorted(effect.jumps, key=lambda jump: -jump.size)[: TELLING.jumps]
     unit = effect.variant.unit
     each = [f"{j.size:.2g} {unit} at {j.stress_MPa:.2g} MPa in {found.name_of(j.particle)}" for j in largest]
     more = len(effect.jumps) - len(largest)

@@ -25,12 +25,7 @@ class Decisions:
             mechanism imitates every other.
         general, general_log_sd: size of a smooth discrepancy in standard deviations of white noise, likewise.
         jump: share of the tests in which a sudden step is expected, a priori: where it is looked for once more.
-        place: places of disagreement are told until they hold this share of it.
-        lead: what remains beside a name is told if its log posterior odds exceed this.
-        alike: correlation of projected signatures from which on two mechanisms look alike.
-        detectable: estimate over standard error that is found with 95 % probability at the level: 1.645 for the
-            probability, 2.95 for the best of as many mechanisms as there are.
-        enough: probability of the right name alone from which on a further experiment is proposed without a doubt.
+        least: particles that must be left before those that snap through are left out.
     """
 
     level: float = 0.05
@@ -44,13 +39,49 @@ class Decisions:
     general: float = 3.0
     general_log_sd: float = 1.5
     jump: float = 0.25
+    least: int = 3
+
+    __repr__ = described()
+
+
+@dataclass(frozen=True)
+class Telling:
+    """What is told beside a verdict; no verdict depends on it.
+
+    Attributes:
+        place: places of disagreement are told until they hold this share of it.
+        lead: what remains beside a name is told if its log posterior odds exceed this.
+        alike: correlation of projected signatures from which on two mechanisms look alike.
+        detectable: estimate over standard error that is found with 95 % probability at the level: 1.645 for the
+            probability, 2.95 for the best of as many mechanisms as there are.
+        enough: probability of the right name alone from which on a further experiment is proposed without a doubt.
+        even: the least with which one is proposed: particles are too dear for less than an even chance.
+        one_term: share of what two terms of a formula explain from which on one term will do.
+        jumps, checks: sudden steps and checks that a summary lists.
+    """
+
     place: float = 0.85
     lead: float = 3.0
     alike: float = 0.9
     detectable: float = 4.6
     enough: float = 0.9
+    even: float = 0.5
+    one_term: float = 0.9
+    jumps: int = 5
+    checks: int = 3
 
-    __repr__ = described()
+
+AMPLITUDES, MISFITS = 2, 2
+"""Effects of a hypothesis at most, and misfits: every design has room for so many."""
+
+POPULATION = 5
+"""Numbers of the population, which come first among what all particles share: a, log modulus, means of b1, b3, b5."""
+
+FURTHER = POPULATION + 2 * AMPLITUDES
+"""Numbers that all particles share: the population's, and further ones of the effects."""
+
+HYPERPARAMETERS = 8
+"""Those of the base law: four of the noise, and the spreads of b1, b3, b5 and e."""
 
 
 @dataclass(frozen=True)
@@ -60,12 +91,18 @@ class Numerics:
     Attributes:
         noise_factors, length_factors, spread_factors: settings of correlated noise and of spreads, over those of the
             base fit, at which all formulas are screened. Noise that swallowed a gap hides what explains it.
+        block: particles that are linearised at once.
         contenders: mechanisms that are fitted at their own optimum.
         formulas: formulas of each of them where `very_strong`, else one; of the two leading ones up to `all_formulas`.
         seconds: second names that are tried beside each of the two leading names.
         strong: nats by which a name must beat nothing before several of its formulas and second names are tried.
         very_strong: the same, from which on first order cannot be relied on to choose the formula.
+        locations, phases: values tried of a number that differs from test to test: of a place somewhere between two
+            that lie far apart, which must be met closely, and of a phase.
         steps, still: Gauss-Newton steps at most, and the change of the log posterior at which they end.
+        drifts: drifts of every test's own that are fitted at their own optimum.
+        little: factor on correlated noise that has swallowed a gap, where what explains it begins to be fitted.
+        worse: nats by which a step may make things worse before half of it is taken back.
         hats, degree: hat functions of each coordinate of a misfit, and total degree of its smooth products.
         basis: functions of all misfits of a hypothesis together; there is room for so many.
         waves: periods that a periodic discrepancy may have.
@@ -74,11 +111,14 @@ class Numerics:
         thinned: places of a sudden step, in each test, in the bootstrap.
         jumps: sudden steps of one test at most.
         shares: points of the common path on which the residuals of two tests are multiplied.
+        copies, particles: further particles that are tried in an experiment, over those of the campaign, and at most.
+        turns: points that turning points may add to a programme's own.
     """
 
     noise_factors: tuple[float, ...] = (1.0, 0.4, 0.15, 0.05)
     length_factors: tuple[float, ...] = (1.0, 0.3)
     spread_factors: tuple[float, ...] = (1.0, 0.5)
+    block: int = 4
     contenders: int = 5
     formulas: int = 2
     all_formulas: int = 8
@@ -87,16 +127,25 @@ class Numerics:
     very_strong: float = 50.0
     steps: int = 6
     still: float = 0.05
+    worse: float = 5.0
+    drifts: int = 6
+    little: float = 0.1
+    locations: int = 32
+    phases: int = 14
     hats: int = 8
     degree: int = 2
-    basis: int = 64
+    basis: int = 96
     waves: int = 12
     bootstrap: int = 400
     places: int = 5
     thinned: int = 24
     jumps: int = 3
     shares: int = 60
+    copies: tuple[float, ...] = (0.5, 1, 2, 3, 5, 10)
+    particles: int = 200
+    turns: int = 16
 
 
 DECISIONS = Decisions()
+TELLING = Telling()
 NUMERICS = Numerics()

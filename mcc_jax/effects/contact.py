@@ -14,17 +14,24 @@ from .variant import Mechanism, Need, Nuisance, Variant
 
 
 class AbstractToe(AbstractEffect):
-    """Asperities that are flattened at low stress; the amplitude is their height over D_e."""
+    """Asperities that are flattened at low stress; the amplitude is their height over D_e.
+
+    Attributes:
+        stress_scale_MPa: stress that flattens most of them.
+        springs: whether they spring back on unloading; else they stay flat.
+    """
 
     stress_scale_MPa: Scalar = eqx.field(converter=scalar)
+    springs: bool = eqx.field(static=True, default=False, kw_only=True)
 
     def flattened(self, stress_share: Values) -> Values:
         """Share flattened at a stress over the scale."""
         raise NotImplementedError
 
     def inside(self, context: Context) -> Values:
-        """D_e d g(sigma_P / s): they stay flat."""
-        share = self.flattened(context.peak_stress / self.stress_scale_MPa)
+        """D_e d g(sigma_P / s), or with the stress of now."""
+        stress = context.stress if self.springs else context.peak_stress
+        share = self.flattened(stress / self.stress_scale_MPa)
         return self.amplitude * context.particle.displacement(share)
 
 
@@ -52,21 +59,22 @@ class LogarithmicToe(AbstractToe):
         return jnp.log1p(stress_share) / jnp.log(10.0)
 
 
-class ElasticToe(ExponentialToe):
-    """Asperities that spring back."""
-
-    def inside(self, context: Context) -> Values:
-        """D_e d (1 - exp(-sigma / s)) with the stress of now."""
-        share = self.flattened(context.stress / self.stress_scale_MPa)
-        return self.amplitude * context.particle.displacement(share)
+_FLATTENING = (0.05, 0.1, 0.18, 0.3, 0.55, 1.0, 3.0)
+"""Stresses [MPa]: rough cellulose up to 1, ceramic pebbles 3 and more, a twelfth of what crushes them."""
 
 
-def _toe(name: str, make: type[AbstractEffect], equation: str, explanation: str) -> Variant:
+def _toe(
+    name: str,
+    make: type[AbstractEffect],
+    equation: str,
+    explanation: str,
+    source: str = "Greenwood and Williamson (1966), Proc. R. Soc. A 295, 300",
+    **fixed: Any,
+) -> Variant:
     return Variant(
-        "toe_asperity", name, make, "toe_strain", "-", 1, (5e-4, 2e-2), equation, explanation,
-        "Greenwood and Williamson (1966), Proc. R. Soc. A 295, 300",
+        "toe_asperity", name, make, "toe_strain", "-", 1, (5e-4, 2e-2), equation, explanation, source, fixed=fixed,
         nuisances=(
-            Nuisance("stress_scale_MPa", (0.1, 0.18, 0.3, 0.55, 1.0), (0.01, 5.0), "stress that flattens most of them"),
+            Nuisance("stress_scale_MPa", _FLATTENING, (0.01, 20.0), "stress that flattens most of them"),
         ),
         needs=(Need.LOW_LOAD,), helps=(Need.RELOAD,),
     )  # fmt: skip
@@ -80,7 +88,11 @@ TOE = Mechanism(
              "Asperities of exponentially distributed height; once flat they stay flat."),
         _toe("hyperbolic", HyperbolicToe, "d = D_e d_t x / (1 + x), x = sigma_P / s", "The toe ends slowly."),
         _toe("logarithmic", LogarithmicToe, "d = D_e d_t lg(1 + sigma_P / s)", "Asperities of all heights."),
-        _toe("elastic", ElasticToe, "d = D_e d_t (1 - exp(-sigma / s))", "The asperities spring back on unloading."),
+        _toe("elastic", ExponentialToe, "d = D_e d_t (1 - exp(-sigma / s))",
+             "The asperities spring back on unloading.", springs=True),
+        _toe("elastic_hyperbolic", HyperbolicToe, "d = D_e d_t x / (1 + x), x = sigma / s",
+             "A rough joint that closes and opens again, as the joints of rock do.",
+             "Bandis, Lumsden and Barton (1983), Int. J. Rock Mech. Min. Sci. 20, 249", springs=True),
     ),
     ("zero of displacement, where the toe lies below all data",),
     check="measure how rough particles and platens are; on a reload asperities stay flat",
@@ -101,11 +113,13 @@ class LevellingTilt(AbstractEffect):
     """Tilt that the rising force takes out: the edge gap closes at a contact of given size."""
 
     radius_share: Scalar = eqx.field(converter=scalar)
+    shrinks: bool = eqx.field(static=True, default=False, kw_only=True)
 
     def inside(self, context: Context) -> Values:
-        """Alpha a_c (1 - exp(-a_P / a_c)), a_c = share D_e."""
+        """Alpha a_c (1 - exp(-a_P / a_c)), a_c = share D_e, or with the contact of now."""
         size = self.radius_share * context.particle.effective_diameter
-        return -self.amplitude * size * jnp.expm1(-context.peak_contact_radius / size)
+        radius = context.contact_radius if self.shrinks else context.peak_contact_radius
+        return -self.amplitude * size * jnp.expm1(-radius / size)
 
 
 def _tilt(name: str, make: type[AbstractEffect], equation: str, explanation: str, **more: Any) -> Variant:
@@ -116,6 +130,8 @@ def _tilt(name: str, make: type[AbstractEffect], equation: str, explanation: str
     )  # fmt: skip
 
 
+_LEVELLED = (Nuisance("radius_share", (0.1, 0.3), (0.02, 2.0), "radius of levelling over D_e"),)
+
 MISALIGNMENT = Mechanism(
     "misalignment",
     "The platens are tilted against each other: the contact first closes a wedge.",
@@ -124,7 +140,10 @@ MISALIGNMENT = Mechanism(
         _tilt("elastic", Tilt, "d = alpha a", "The wedge opens again as the contact shrinks.", fixed={"shrinks": True}),
         _tilt("levelling", LevellingTilt, "d = alpha a_c (1 - exp(-a_P / a_c)), a_c = share D_e",
               "The force levels the platens.",
-              nuisances=(Nuisance("radius_share", (0.1, 0.3), (0.02, 2.0), "radius of levelling over D_e"),)),
+              nuisances=_LEVELLED),
+        _tilt("elastic_levelling", LevellingTilt, "d = alpha a_c (1 - exp(-a / a_c)), a_c = share D_e",
+              "Platens levelled by the force tilt back as the contact shrinks.", nuisances=_LEVELLED,
+              fixed={"shrinks": True}),
     ),
     check="turn the punch by 90 degrees, level the platens, and repeat",
 )  # fmt: skip

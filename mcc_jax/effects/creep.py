@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from .._types import Scalar, Values, scalar
 from .context import Context
 from .effect import AbstractEffect
+from .record import HOLD
 from .variant import Mechanism, Need, Nuisance, Variant
 
 REFERENCE_TIME_S = 100.0
@@ -159,10 +160,57 @@ class ViscoplasticCreep(AbstractIntegral):
         return self.amplitude * context.particle.displacement(strain)
 
 
+class AbstractHoldCreep(AbstractEffect):
+    """Creep under constant load only: it begins anew with every hold, and what crept stays."""
+
+    tau_s: Scalar = eqx.field(converter=scalar)
+
+    def grown(self, seconds: Values) -> Values:
+        """Creep function at a time since the hold began, 0 at 0."""
+        raise NotImplementedError
+
+    def driver(self, context: Context) -> Values:
+        """Stress [MPa] where the load is held, else 0."""
+        return jnp.where(context.record.kind == HOLD, context.stress, 0.0)
+
+    def start(self, like: Scalar) -> tuple[Scalar, Scalar]:
+        """Nothing has crept, nothing is held."""
+        return jnp.zeros_like(like), jnp.zeros_like(like)
+
+    def evolve(
+        self, memory: tuple[Scalar, Scalar], before: Scalar, now: Scalar, seconds: Scalar
+    ) -> tuple[tuple[Scalar, Scalar], Scalar]:
+        """What crept in all holds, and how long the present one has lasted."""
+        crept, held = memory
+        longer = jnp.where(now > 0, held + seconds, 0.0)
+        crept = crept + now * jnp.where(now > 0, self.grown(longer) - self.grown(held), 0.0)
+        return (crept, longer), crept
+
+    def inside(self, context: Context) -> Values:
+        """D_e c times the sum over holds of sigma J(t_hold)."""
+        return self.amplitude * context.particle.displacement(context.memory)
+
+
+class LogarithmicHold(AbstractHoldCreep):
+    """Slower and slower in each hold."""
+
+    def grown(self, seconds: Values) -> Values:
+        """ln(1 + t / tau)."""
+        return jnp.log1p(seconds / self.tau_s)
+
+
+class KelvinHold(AbstractHoldCreep):
+    """A Kelvin-Voigt element under each step of constant load."""
+
+    def grown(self, seconds: Values) -> Values:
+        """1 - exp(-t / tau)."""
+        return -jnp.expm1(-seconds / self.tau_s)
+
+
 def _creep(name: str, make: type[AbstractEffect], equation: str, explanation: str, source: str, **more: Any) -> Variant:
     return Variant(
         "creep", name, make, "creep_compliance_per_MPa", "1/MPa", 1, (2e-5, 2e-3), equation, explanation, source,
-        needs=(Need.UNLOADING,), helps=(Need.HOLD, Need.TWO_RATES), **more,
+        **{"needs": (Need.UNLOADING,), "helps": (Need.HOLD, Need.TWO_RATES), **more},
     )  # fmt: skip
 
 
@@ -193,6 +241,14 @@ CREEP = Mechanism(
         _creep("viscoplastic", ViscoplasticCreep, "d = D_e c sigma_P ln(1 + t_load / tau), t_load = integral of u^8 dt",
                "Permanent creep while the load is near its maximum, logarithmic in the time spent there.",
                "Oyen and Cook (2003); logarithmic indentation creep", nuisances=_tau(1.0, 10.0, 100.0)),
+        _creep("hold_logarithmic", LogarithmicHold, "d = D_e c [sum over holds of sigma ln(1 + t_hold / tau)]",
+               "Creep under constant load only, logarithmic in the time of each hold; it stays.",
+               "Chudoba and Richter (2001), Surf. Coat. Technol. 148, 191", needs=(Need.HOLD,),
+               helps=(Need.SEVERAL_PEAKS,), nuisances=_tau(1.0, 10.0, 100.0)),
+        _creep("hold_kelvin", KelvinHold, "d = D_e c [sum over holds of sigma (1 - exp(-t_hold / tau))]",
+               "A Kelvin-Voigt element that acts in steps: bounded creep in each hold; it stays.",
+               "Findley, Lai and Onaran (1976), ch. 5", needs=(Need.HOLD,), helps=(Need.SEVERAL_PEAKS,),
+               nuisances=_tau(5.0, 20.0, 80.0)),
     ),
     check="hold at the largest load, and repeat at a tenth and at ten times the rate",
 )  # fmt: skip

@@ -138,6 +138,26 @@ class ShakedownRatchet(AbstractRatchet):
         return -self.cycles_to_rest * jnp.expm1(-cycles / self.cycles_to_rest)
 
 
+class PowerRatchet(AbstractRatchet):
+    """More with every reload, as where each one breaks something."""
+
+    exponent: Scalar = eqx.field(converter=scalar)
+
+    def count(self, cycles: Values) -> Values:
+        """N^p."""
+        some = cycles > 0
+        power = jnp.exp(self.exponent * jnp.log(jnp.where(some, cycles, 1.0)))
+        return jnp.where(some, power, 0.0)
+
+
+class PeakRatchet(AbstractRatchet):
+    """The same share of the displacement at the peak with every reload."""
+
+    def inside(self, context: Context) -> Values:
+        """gamma_P r N."""
+        return self.amplitude * context.peak_displacement * context.cycles
+
+
 class ElasticRatchet(AbstractRatchet):
     """The same share of the recoverable displacement with every reload."""
 
@@ -146,12 +166,14 @@ class ElasticRatchet(AbstractRatchet):
         return self.amplitude * context.recoverable * context.cycles
 
 
+_SHAKEDOWN = "Johnson (1985), Contact Mechanics, sec. 9.2; Kadin, Kligerman and Etsion (2006)"
+
+
 def _ratchet(name: str, make: type[AbstractEffect], equation: str, explanation: str, **more: Any) -> Variant:
     return Variant(
         "ratcheting", name, make,
-        **{"parameter": "ratchet_strain", "unit": "-", "plausible": (2e-4, 1e-2), **more},
+        **{"parameter": "ratchet_strain", "unit": "-", "plausible": (2e-4, 1e-2), "source": _SHAKEDOWN, **more},
         sign=1, equation=equation, explanation=explanation,
-        source="Johnson (1985), Contact Mechanics, sec. 9.2; Kadin, Kligerman and Etsion (2006)",
         needs=(Need.RELOAD,), helps=(Need.SECOND_RELOAD,),
     )  # fmt: skip
 
@@ -166,6 +188,12 @@ RATCHETING = Mechanism(
                  nuisances=(Nuisance("cycles_to_rest", (1.0, 3.0), (0.3, 30.0), "reloads until it rests"),)),
         _ratchet("elastic_share", ElasticRatchet, "d = Delta r N", "In proportion to the recoverable displacement.",
                  parameter="ratchet_share", plausible=(5e-3, 0.3)),
+        _ratchet("power", PowerRatchet, "d = D_e r N^p", "More with every reload: it does not shake down.",
+                 source="Monismith, Ogawa and Freeme (1975), Transp. Res. Rec. 537, 1",
+                 nuisances=(Nuisance("exponent", (1.5, 2.0, 3.0), (1.0, 4.0), "power of the number of reloads"),)),
+        _ratchet("peak_share", PeakRatchet, "d = gamma_P r N", "In proportion to the displacement at the peak.",
+                 source="Lemaitre and Chaboche (1990), Mechanics of Solid Materials, ch. 5",
+                 parameter="ratchet_share", plausible=(5e-4, 3e-2)),
     ),
     ("creep, as long as there is one reload only and no hold",),
     check="cycle one particle ten times or more to the same load",

@@ -19,6 +19,7 @@ REFERENCE_FORCE_RATE = 2.0  # mN/s
 REFERENCE_STRESS_RATE = 0.05  # MPa/s
 REFERENCE_STRAIN_RATE = 2e-3  # 1/s
 REFERENCE_STRAIN = 0.2
+LOCKING_STRAIN = 0.5
 MIN_FACTOR = 0.05
 
 
@@ -119,6 +120,16 @@ class CowperSymonds(AbstractStrainRate):
         return 1 + self.amplitude * jnp.exp(self.exponent * jnp.log(rate))
 
 
+class Eyring(AbstractStrainRate):
+    """Thermally activated flow: viscous at low rates, logarithmic at high ones."""
+
+    rate_share: Scalar = eqx.field(converter=scalar, kw_only=True)
+
+    def factor(self, rate: Values) -> Values:
+        """1 + m asinh(rate / r)."""
+        return 1 + self.amplitude * jnp.arcsinh(rate / self.rate_share)
+
+
 class LogForceRateStiffness(LogForceRate):
     """Flow stress and modulus grow together with the rate of force."""
 
@@ -138,6 +149,8 @@ def _rate(name: str, make: type[AbstractEffect], equation: str, explanation: str
 
 
 _RATE = "Roberts and Rowe (1985), Chem. Eng. Sci. 40, 4; Schmalbach et al. (2021), J. Mater. Res."
+_EYRING = "Eyring (1936), J. Chem. Phys. 4, 283; Ree and Eyring (1955), J. Appl. Phys. 26, 793"
+_ACTIVATED = (Nuisance("rate_share", (0.1, 1.0, 10.0), (0.01, 100.0), "strain rate of the crossover over 0.002/s"),)
 _ALONG = ()  # a strain rate varies along one test and from size to size, so that one force rate shows it, if weakly
 
 RATE = Mechanism(
@@ -165,6 +178,12 @@ RATE = Mechanism(
         _rate("flow_and_modulus_log_force_rate", LogForceRateStiffness,
               "sigma(eps) and E (1 + m ln(F' / 2 mN/s)), each at the rate of its own ramp",
               "Flow stress and unloading stiffness grow together.", _RATE),
+        _rate("flow_eyring", Eyring, "sigma(eps) [1 + m asinh(eps' / (r 0.002/s))]",
+              "Thermally activated flow: viscous at low rates, logarithmic at high ones.", _EYRING, needs=_ALONG,
+              nuisances=_ACTIVATED),
+        _rate("yield_eyring", Eyring, "C1 [1 + m asinh(eps' / (r 0.002/s))]",
+              "The same of the yield term C1 only.", _EYRING, needs=_ALONG, nuisances=_ACTIVATED,
+              fixed={"terms": (True, False, False)}),
     ),
     ("size_effect, at one force rate",),
     check="load at two rates or more within one class of sizes",
@@ -262,6 +281,18 @@ FRICTION = Mechanism(
 )  # fmt: skip
 
 
+class LockingFactor(AbstractLoadingFactor):
+    """Pores that close up: little at small strain, steep at large."""
+
+    exponent: Scalar = eqx.field(converter=scalar)
+
+    def factor(self, particle: Particle, strain: Values) -> Values:
+        """1 + b (eps / 0.5)^n."""
+        some = strain > 1e-9
+        power = jnp.exp(self.exponent * jnp.log(jnp.where(some, strain, 1.0) / LOCKING_STRAIN))
+        return 1 + self.amplitude * jnp.where(some, power, 0.0)
+
+
 # ---- hardening exponent ----------------------------------------------------------------------------------------------
 
 
@@ -304,11 +335,28 @@ class LudwikHardening(AbstractEffect):
         return factor, factor, factor
 
 
+class StrainPower(AbstractEffect):
+    """A power of strain in place of strain in every term; the amplitude is 1/m, 1 for Hertz."""
+
+    def loading(self, law: Formulas, particle: Particle, record: Record, strain: Values) -> Factors:
+        """(eps / 0.2)^(j / 2m) on the terms of order j = 1, 3, 5."""
+        safe = jnp.where(strain > 1e-9, strain, 1e-9)
+        first = jnp.exp(0.5 * self.amplitude * jnp.log(safe / REFERENCE_STRAIN))
+        return first, first**3, first**5
+
+
 def _hardening(
-    name: str, make: type[AbstractEffect], equation: str, explanation: str, source: str, **more: Any
+    name: str,
+    make: type[AbstractEffect],
+    equation: str,
+    explanation: str,
+    source: str,
+    *,
+    plausible: tuple[float, float] = (0.01, 0.5),
+    **more: Any,
 ) -> Variant:
     return Variant(
-        "finite_hardening_exponent", name, make, "inverse_exponent", "-", 1, (0.01, 0.5), equation, explanation, source,
+        "finite_hardening_exponent", name, make, "inverse_exponent", "-", 1, plausible, equation, explanation, source,
         helps=(Need.LOW_LOAD,), **more,
     )  # fmt: skip
 
@@ -331,6 +379,9 @@ HARDENING = Mechanism(
         _hardening("ludwik", LudwikHardening, "sigma(eps) [(1 + eps / eps_y) / (1 + 0.2 / eps_y)]^(1/2m)",
                    "Hardening that begins at a yield strain.", "Ludwik (1909); Swift (1952)",
                    nuisances=(Nuisance("yield_strain", (0.01, 0.05), (0.001, 0.3), "strain where hardening sets in"),)),
+        _hardening("every_term", StrainPower, "sigma(0.2 (eps / 0.2)^(1 + 1/2m))",
+                   "A power of strain in place of strain in every term; 1/m = 1 is an elastic contact after Hertz, "
+                   "ceramic pebbles show 1.2 to 1.6.", _STORAKERS, plausible=(0.02, 2.0)),
     ),
     check="repeat between polished platens, or indent a compact of the same powder",
 )  # fmt: skip

@@ -12,6 +12,7 @@ from ..formulas import Formulas, Plastic
 from ..geometry import Particle
 from .context import Context, positive
 from .effect import AbstractEffect, AbstractModulusAtPeak, at_least
+from .loading import LockingFactor
 from .record import REFERENCE_HUMIDITY_PERCENT, Record
 from .variant import Mechanism, Need, Nuisance, Variant
 
@@ -370,13 +371,13 @@ DAMAGE = Mechanism(
 def _dense(name: str, make: type[AbstractEffect], equation: str, explanation: str, source: str, **more: Any) -> Variant:
     return Variant(
         "densification_stiffening", name, make, "stiffening", "-", 1, (0.05, 4.0), equation, explanation, source,
-        needs=(Need.UNLOADING, Need.SEVERAL_PEAKS), helps=(Need.RELOAD,), **more,
+        **{"needs": (Need.UNLOADING, Need.SEVERAL_PEAKS), "helps": (Need.RELOAD,), **more},
     )  # fmt: skip
 
 
 DENSIFICATION = Mechanism(
     "densification_stiffening",
-    "Pores close while the particle is squeezed: the further it went, the stiffer it unloads.",
+    "Pores close while the particle is squeezed: the further it went, the stiffer it is.",
     (
         _dense("exponential", ModulusStrain, "E exp(b eps_P)", "Porosity falls with strain; E = E_0 exp(-b p).",
                "Spriggs (1961), J. Am. Ceram. Soc. 44, 628", fixed={"direction": 1.0}),
@@ -394,6 +395,11 @@ DENSIFICATION = Mechanism(
                "Pores close as Heckel found for tablets, and the modulus follows.",
                "Heckel (1961); Spriggs (1961)",
                nuisances=(Nuisance("heckel_stress_MPa", (3.0, 10.0), (0.5, 100.0), "stress that closes most pores"),)),
+        _dense("locking", LockingFactor, "sigma(eps) [1 + b (eps / 0.5)^n]",
+               "Loading itself stiffens at large strain, where walls of pores meet.",
+               "Rusch (1969), J. Appl. Polym. Sci. 13, 2297; Gibson and Ashby (1997), Cellular Solids, ch. 5",
+               needs=(), helps=(Need.SEVERAL_PEAKS,),
+               nuisances=(Nuisance("exponent", (4.0, 8.0), (2.0, 16.0), "power of strain"),)),
     ),
     ("damage with a negative amplitude",),
     check="cycle one particle to rising peaks, its porosity measured by tomography before and after",

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from .._types import Scalar, Values, scalar
-from ..formulas import PUNCH_AREA, recovery
+from ..formulas import PUNCH_AREA, recovery, stress_ratio
 from .context import Context, contact_of, positive
 from .effect import AbstractEffect
 from .record import RELOAD, reload_progress
@@ -17,6 +17,7 @@ from .variant import Mechanism, Need, Nuisance, Variant
 
 _NORM = 27 / 4
 BISECTIONS = 50
+LAST_CONTACT = 0.3  # radius over that at the peak: there, at 1 % of the load, half of a constant pull is left
 
 
 # ---- shape of unloading ----------------------------------------------------------------------------------------------
@@ -202,6 +203,15 @@ class MobilisedAdhesion(AbstractAdhesion):
         return phi * jnp.sqrt(phi + 1e-12) * opened / (opened + self.mobilised_share**2)
 
 
+class ConstantPull(AbstractAdhesion):
+    """A pull that does not fade with unloading and is gone with the last of the contact."""
+
+    def attraction(self, recovered: Values) -> Values:
+        """(1 - u') phi^2 / (phi^2 + 0.3^2): what counts is how far the law's own force has fallen."""
+        contact = (1 - recovered) * (1 + recovered)
+        return (1 - stress_ratio(recovered)) * contact / (contact + LAST_CONTACT**2)
+
+
 def _adhesion(
     name: str,
     make: type[AbstractEffect],
@@ -246,6 +256,9 @@ ADHESION = Mechanism(
                   "The same with the stress of the contact itself.", _COHESIVE, nuisances=(_MOBILISED,)),
         _adhesion("bond_nominal", BondAdhesion, f"g = phi^2 s; {_SECTION}", "As bond, counted over the section.",
                   "Gonzalez (2019)", over_section=True),
+        _adhesion("constant_nominal", ConstantPull, f"g = (1 - u') phi^2 / (phi^2 + 0.3^2); {_SECTION}",
+                  "A pull that stays the same until the last of the contact opens, counted over the section.",
+                  "Derjaguin, Muller and Toporov (1975), J. Colloid Interface Sci. 53, 314", over_section=True),
     ),
     check="pull off under control of displacement, and repeat with a dry punch that does not stick",
 )  # fmt: skip

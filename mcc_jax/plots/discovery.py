@@ -16,7 +16,7 @@ from matplotlib.patches import Patch
 from .._errors import InputError
 from ..discover import Discovery
 from ..discover.locate import Place
-from ..discover.settings import DECISIONS
+from ..discover.settings import TELLING
 from . import style
 from .curves import plot_before_after
 
@@ -122,7 +122,7 @@ def plot_ranking(found: Discovery) -> Figure:
     figure = style.new_figure(9.4, 1.3 + 0.235 * count)
     ax = figure.subplots()
     beside: style.Look = {"transform": ax.get_yaxis_transform(), "va": "center", "fontsize": style.SMALL}
-    scale = max([1.6 * DECISIONS.detectable, *(abs(e["statistic"]) for e in entries)])
+    scale = max([1.6 * TELLING.detectable, *(abs(e["statistic"]) for e in entries)])
     any_impossible = False
     for row, entry in enumerate(entries):
         name, unit = entry["mechanism"], entry["unit"]
@@ -141,7 +141,7 @@ def plot_ranking(found: Discovery) -> Figure:
     for row, missing in enumerate(found.untestable, start=len(entries)):
         needs = f"needs {missing['needs']}"
         ax.text(0.012 * scale, row, needs, va="center", fontsize=style.SMALL, color=style.GREY, zorder=5, bbox=patch)
-    ax.axvline(DECISIONS.detectable, **_FLOOR)
+    ax.axvline(TELLING.detectable, **_FLOOR)
     ax.set_yticks(range(count), [plain_name(e["mechanism"]) for e in (*entries, *found.untestable)])
     for tick in ax.get_yticklabels()[len(entries) :]:
         tick.set_color(style.GREY)
@@ -235,7 +235,7 @@ def plot_shifts(found: Discovery) -> Figure:
     """What the missing effect had done to the law: its parameters before and after, with 95 % intervals."""
     figure = style.new_figure(9.0, 2.6)
     names = ("$a$ [-]", r"$\bar E$ [GPa]", "mean log $C_1$ [-]", "mean log $C_3$ [-]", "mean log $C_5$ [-]")
-    both = ((0, style.VERMILION, found.before), (1, style.BLUE, found.after))
+    both = ((0, style.VERMILION, found.parameters_before), (1, style.BLUE, found.parameters_after))
     for j, (ax, name) in enumerate(zip(figure.subplots(1, 5), names, strict=True)):
         for x, colour, p in ((x, colour, p) for x, colour, p in both if p):
             estimates = (p["a"], p["effective_modulus_MPa"], *(p[f"log_{c}"]["mean"] for c in ("C1", "C3", "C5")))
@@ -243,15 +243,17 @@ def plot_shifts(found: Discovery) -> Figure:
             ax.plot(x, estimates[j]["value"] * factor, "o", color=colour, markersize=5)
             if estimates[j]["interval_95"] is not None:
                 ax.vlines(x, *(end * factor for end in estimates[j]["interval_95"]), color=colour, linewidth=1.8)
-        ax.set_xlim(-0.6, 1.6 if found.after else 0.6)
-        ax.set_xticks([0, 1] if found.after else [0], ["before", "after"] if found.after else ["law alone"])
+        ax.set_xlim(-0.6, 1.6 if found.parameters_after else 0.6)
+        ax.set_xticks(
+            [0, 1] if found.parameters_after else [0], ["before", "after"] if found.parameters_after else ["law alone"]
+        )
         ax.set_title(name, fontsize=8.5)
         ax.margins(y=0.15)
         ax.locator_params(axis="y", nbins=5)
         ax.grid(axis="y", color="#E6E6E6", linewidth=0.6)
-    moved = found.after and (found.effects or found.closure)
+    moved = found.parameters_after and (found.effects or found.closure)
     title = "What the missing effect had done to the law" if moved else "Parameters of the law"
     handles = [Line2D([], [], color=style.VERMILION, marker="o", label="law alone, 95 %")]
-    if found.after:
+    if found.parameters_after:
         handles.append(Line2D([], [], color=style.BLUE, marker="o", label="with what was added, 95 %"))
     return _finished(figure, found, title=title, handles=handles)

@@ -186,6 +186,12 @@ def test_a_modulus_is_unknown_from_half_its_size_in_error_on(value, share):
         assert "Unload" in found.remedy
 
 
+@pytest.mark.parametrize("converged", [True, False])
+def test_of_a_fit_that_did_not_converge_no_interval_is_told(converged):
+    (found,) = judged(clean(), answer(sd=16_000.0, converged=converged), None, None)
+    assert ("between" in found.sentence) is converged
+
+
 def test_a_method_without_errors_leaves_no_modulus_unknown():
     assert unknown_modulus(clean(), answer(16000.0, None)["effective_modulus_MPa"]) is None
     assert unknown_modulus(clean(), {"value": None, "sd": None, "interval_95": None}) is None

@@ -31,6 +31,17 @@ def test_the_error_is_that_of_the_random_numbers():
     assert np.polyfit(draws[:, 0], found.log_weight, 1)[0] == pytest.approx(1.1, rel=0.01)
 
 
+def test_blocks_of_particles_are_drawn_as_all_at_once(paper_posterior):
+    """Every number of the likelihood stays with the particles of its block; two of none are not cut."""
+    fit, population = paper_posterior.fit, jax.tree.map(lambda x: x[0, ::4], paper_posterior.population)
+    exact, key = drawing.exact_likelihood(fit), jax.random.key(0)
+    whole, blocks = (particles.Drawer(exact, size).all(key, population) for size in (0, 10))
+    for name in ("zero", "log_likelihood"):
+        found, wanted = np.asarray(getattr(blocks, name)), np.asarray(getattr(whole, name))
+        assert found.shape == wanted.shape == (250, 20)
+        np.testing.assert_array_less(np.abs(found.mean(0) - wanted.mean(0)), 0.6 * wanted.std(0), err_msg=name)
+
+
 @pytest.mark.long
 def test_the_shortcuts_agree_with_exact_weights(paper_posterior, monkeypatch):
     monkeypatch.setattr(

@@ -49,7 +49,8 @@ def answer(verdict, **more):
     found = Discovery(
         verdict, "", None, None, 0, 0.0,
         effects=(effect,) if named else (), candidate_set=sets, p_any=0.002 if verdict != "NO_GAP" else 0.4,
-        before={"effective_modulus_MPa": EST}, after={"effective_modulus_MPa": EST} if named else {},
+        parameters_before={"effective_modulus_MPa": EST},
+        parameters_after={"effective_modulus_MPa": EST} if named else {},
         untestable=({"mechanism": "reload_hysteresis", "needs": "a reload segment"},), **more,
     )  # fmt: skip
     return dataclasses.replace(found, summary=summary_of(found))
