@@ -1,4 +1,4 @@
-"""What the build of the pages adds to MkDocs: lists of public names, formulae as MathML, and a look at the result."""
+"""What the build of the pages adds to MkDocs: lists of names, the gallery, formulae as MathML, a look at the result."""
 
 import ast
 import html
@@ -6,16 +6,21 @@ import logging
 import re
 from pathlib import Path
 
+import gallery
 from latex2mathml.converter import convert
+from mkdocs.structure.files import File
 
 PACKAGE = Path(__file__).parents[1] / "mcc_jax"
 LOG = logging.getLogger("mkdocs.hooks.mcc_jax")
 _ELSEWHERE = re.compile(
     r'<(?:script|img|iframe|source)\b[^>]*\bsrc="(?:https?:)?//|<link\b[^>]*\bhref="(?:https?:)?//', re.I
 )
-_LEFT_OVER = re.compile(r'class="arithmatex"|:math:|\.\. math::|^!(?:api|names) ', re.M)
+_LEFT_OVER = re.compile(
+    r'class="arithmatex"|:math:|\.\. math::|^!(?:api|names|file|gallery|which-test|look-alikes)\b', re.M
+)
 _API = re.compile(r"^!api (\S+)$", re.M)
 _NAMES = re.compile(r"^!names (\S+)$", re.M)
+_FILE = re.compile(r"^!file (\S+)$", re.M)
 _FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.S)
 
 
@@ -27,8 +32,19 @@ def public_names(module: str) -> list[tuple[str, str]]:
     return [(a.name, str(n.module)) for n in body if isinstance(n, ast.ImportFrom) for a in n.names]
 
 
+def on_files(files, config, **_):
+    """Add the pictures that are drawn while the pages are built, and kept nowhere else."""
+    for path, content in gallery.files().items():
+        files.append(File.generated(config, path, content=content))
+    return files
+
+
 def on_page_markdown(markdown, **_):
-    """`!api mcc_jax.law` stands for an entry for each name of the module, `!names mcc_jax` for links to them."""
+    """`!api mcc_jax.law` stands for an entry for each name of the module, `!names mcc_jax` for links to them.
+
+    `!gallery`, `!which-test` and `!look-alikes` stand for what `gallery.py` writes of the effects, `!file NAME` for
+    a file at the top of the repository.
+    """
 
     def entries(match):
         return "\n\n".join(f"::: {match[1]}.{name}" for name, _ in public_names(match[1]))
@@ -39,7 +55,8 @@ def on_page_markdown(markdown, **_):
         }
         return "\n".join(f"- [`{name}`][{home}.{name}]" for name, home in sorted(homes.items(), key=lambda i: i[1]))
 
-    return _NAMES.sub(links, _API.sub(entries, markdown))
+    markdown = _FILE.sub(lambda match: (PACKAGE.parent / match[1]).read_text(encoding="utf-8"), markdown)
+    return gallery.filled(_NAMES.sub(links, _API.sub(entries, markdown)))
 
 
 def on_page_content(content, **_):

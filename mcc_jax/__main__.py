@@ -1,6 +1,6 @@
 """`python -m mcc_jax`: the same as the command `mcc-jax`."""
 
-from .cli import main
+from .cli import run
 
 if __name__ == "__main__":
-    main()
+    run()

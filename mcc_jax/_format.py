@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+import enum
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -16,6 +19,7 @@ def number(value: float | int | None, digits: int = 4) -> str:
         return "unknown"
     if value and not 1e-4 <= abs(value) < 1e6:
         mantissa, _, exponent = f"{value:.{digits - 1}e}".partition("e")
+        mantissa = mantissa.rstrip("0").rstrip(".") if "." in mantissa else mantissa
         return f"{mantissa} × 10{_raised(int(exponent))}".replace("-", "−")
     text = f"{value:.{digits}g}"
     if "e" in text:
@@ -95,3 +99,82 @@ def table(title: str, rows: list[tuple[str, str]], most: int = 20) -> str:
     width = max((len(name) for name, _ in rows), default=0)
     lines = [title, *(f"  {name:<{width}}  {text}" for name, text in rows)]
     return "\n".join(lines if len(lines) <= most else [*lines[: most - 1], f"  ... and {len(lines) - most + 1} more"])
+
+
+WIDE, LONG = 100, 70
+"""Characters of an object told in one line, and of one value in a table."""
+
+
+def described(**units: str) -> Any:
+    """A `__repr__` that shows every field with its value in a few words: one line, or a small table.
+
+    Args:
+        units: of fields whose names do not carry them.
+    """
+
+    def __repr__(self: Any) -> str:
+        names = getattr(type(self), "_fields", None) or [f.name for f in dataclasses.fields(self) if f.repr]
+        rows = [(name, in_words(getattr(self, name, None), units.get(name, ""))) for name in names]
+        title = type(self).__name__
+        line = f"{title}({', '.join(f'{name}={text}' for name, text in rows)})"
+        return line if len(line) <= WIDE else table(title, rows)
+
+    return __repr__
+
+
+def in_words(value: Any, unit: str = "") -> str:
+    """Any value in one line: numbers as they are, arrays by size and range, what holds more by its name."""
+    if isinstance(value, bool | np.bool | None):
+        return str(value)
+    if isinstance(value, enum.Enum):
+        return in_words(value.value)
+    if isinstance(value, int | np.integer):
+        return f"{value} {unit}".rstrip()
+    if isinstance(value, float):
+        return f"{number(value)} {unit}".rstrip() if math.isfinite(value) else str(value)
+    if hasattr(value, "_enumeration"):  # of equinox: its text is the error, which is empty where there is none
+        return _cut(str(value._enumeration[value])) or "successful"
+    if is_traced(value) or isinstance(value, str):
+        return _cut(str(value)) or "none"
+    if isinstance(value, bytes):
+        return f"{len(value)} bytes"
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        return _array_in_words(value, unit)
+    if isinstance(value, Mapping):
+        named = ", ".join(f"{key} {in_words(item)}" for key, item in value.items())
+        return (named or "none") if len(named) <= LONG else _cut(f"{len(value)}: {', '.join(map(str, value))}")
+    if isinstance(value, tuple | list) and not hasattr(value, "_fields"):
+        parts = ", ".join(getattr(item, "label", None) or in_words(item) for item in value)
+        if len(parts) <= LONG:
+            return parts or "none"
+        kinds = {type(item).__name__ for item in value if item is not None}
+        return f"{len(value)} of {' and '.join(sorted(kinds))}" if kinds else f"none in {len(value)}"
+    if callable(value) and hasattr(value, "__name__"):
+        return value.__name__
+    first, *more = repr(value).splitlines() or [""]
+    return type(value).__name__ if more or len(first) > LONG else first
+
+
+def _cut(text: str) -> str:
+    text = " ".join(text.split())
+    return text if len(text) <= LONG else f"{text[: LONG - 3]}..."
+
+
+def _array_in_words(value: Any, unit: str) -> str:
+    size = " × ".join(map(str, value.shape))
+    dtype, mark = str(value.dtype), f" {unit}" if unit else ""
+    numeric = dtype.startswith(("float", "int", "uint", "bool", "bfloat"))
+    if not numeric or not getattr(value, "is_fully_addressable", True) or not hasattr(value, "__array__"):
+        return f"{size} of {dtype}".strip()
+    array = np.asarray(value)
+    if array.ndim == 0:
+        return in_words(array.item(), unit)
+    if dtype == "bool":
+        return f"{int(array.sum())} of {size} true"
+    known = array[np.isfinite(array.astype(float))].astype(float)
+    if not known.size:
+        return f"{size} values, none finite" if array.size else "no values"
+    if array.size <= 4:
+        return f"[{', '.join(number(float(x)) if math.isfinite(x) else str(x) for x in array.ravel())}]{mark}"
+    low, high = number(float(known.min())), number(float(known.max()))
+    return f"{size} values, {low} to {high}{mark}" if low != high else f"{size} values, all {low}{mark}"

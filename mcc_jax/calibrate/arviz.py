@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .. import arguments
+from .._extras import extra
 from ..law import MccLaw
 from .compiling import compiled
 from .data import Tests
@@ -268,5 +269,8 @@ def write_posterior(calibration: Posterior, file: str | Path) -> None:
     """
     arguments.instance(calibration, Posterior, "calibration", A_CALIBRATION)
     file = arguments.file_path(file, "file")
+    with extra("netcdf"):
+        import h5netcdf  # noqa: F401
+        import h5py  # noqa: F401
     if jax.process_index() == 0:
         to_arviz(calibration, seed=calibration.seed).to_netcdf(file, engine="h5netcdf")

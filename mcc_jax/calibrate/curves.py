@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
+from .._format import described
 from ..campaign import Campaign, Segment, campaign_segments, particle_batch
 from ..effects import Record
 from ..geometry import Particle
@@ -50,6 +51,8 @@ class FittedCurve:
     typical_um: np.ndarray
     low_um: np.ndarray
     high_um: np.ndarray
+
+    __repr__ = described()
 
     @property
     def rms_um(self) -> float | None:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .. import arguments
+from .._format import described
 from ..campaign import (
     THRESHOLD_MPA,
     Campaign,
@@ -71,6 +72,8 @@ class Tests(eqx.Module):
     force_zero_sd: Float[Array, " particles"] | None = None
     peak_sd: Float[Array, "particles points"] | None = None
     reading_weight: Float[Array, "particles points"] | None = None
+
+    __repr__ = described(displacement="um", contact="um")
 
     @property
     def force(self) -> Float[Array, "*particles points"]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from .. import arguments
 from .._errors import InputError
+from .._format import described
 from ..campaign import THRESHOLD_MPA, Campaign, check_tests
 from .fit_result import Fit
 from .fitting import checked_settings, in_own_units, prepare
@@ -61,6 +62,8 @@ class Evidence:
     value: float
     error: float
     pareto_k: float
+
+    __repr__ = described()
 
 
 def log_evidence(campaign: Campaign | Posterior, model: Model | None = None, *, seed: int = 0) -> Evidence:

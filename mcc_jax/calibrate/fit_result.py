@@ -15,6 +15,8 @@ from jaxtyping import Array, Bool, Float
 from numpyro.infer.util import constrain_fn, potential_energy
 
 from .. import arguments
+from .._format import table, with_sd
+from ..arguments import is_traced
 from .compiling import compiled
 from .data import Tests
 from .forward import Point
@@ -54,6 +56,16 @@ class Fit(eqx.Module):
     mode: Float[Array, " d"]
     covariance: Float[Array, "d d"]
     converged: Bool[np.ndarray, " 3"]
+
+    def __repr__(self) -> str:
+        if is_traced(self.mode):
+            return "Fit while JAX traces it"
+        sd = np.sqrt(np.diag(np.asarray(self.covariance)))
+        numbers = zip(self.names, np.asarray(self.mode), sd, strict=True)
+        rows = [(name, with_sd({"value": float(value), "sd": float(s)})) for name, value, s in numbers]
+        state = "converged" if self.converged.all() else "NOT converged"
+        effects = ", ".join(variant.label for variant in self.model.effects) or "no effects"
+        return table(f"Fit of {len(self.tests)} particles, {effects}, {state}; in unbounded coordinates", rows)
 
     @property
     def target(self) -> LogPosterior:

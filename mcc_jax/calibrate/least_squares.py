@@ -13,6 +13,7 @@ import numpy as np
 
 from .. import arguments
 from .._errors import InputError
+from .._format import described
 from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_tests
 from ..effects import Variant
 from .block_arrow import Parameters, Solution
@@ -57,6 +58,8 @@ class Identifiability:
     singular_values: np.ndarray
     directions: np.ndarray
     names: tuple[str, ...] = SHARED
+
+    __repr__ = described()
 
     @property
     def open(self) -> list[str]:

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from .. import arguments
 from .._errors import InputError
+from .._format import described
 from .._types import Scalar
 from ..effects import Variant, find_variant
 from ..law import StrainScaling, Unloading
@@ -63,6 +64,8 @@ class Model:
     correlation: Correlation
     along: Along
     robust: bool
+
+    __repr__ = described()
 
     def __init__(
         self,

@@ -13,6 +13,7 @@ from jaxtyping import Array
 
 from .. import arguments
 from .._errors import InputError
+from .._format import described
 from ..campaign import PAPER_EFFECTIVE_MODULUS_MPA, PAPER_LOG_C, PAPER_SHAPE_PARAMETER
 from ..effects import Record
 from ..geometry import Particle
@@ -42,6 +43,8 @@ class PredictedCurves:
     displacement_um: np.ndarray
     observed_um: np.ndarray | None
     laws: MccLaw
+
+    __repr__ = described()
 
     def band(self, share: float = 0.95, *, observed: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper end of the central interval that holds `share` of the draws at each force [um].

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from .. import arguments
 from .._errors import InputError
+from .._format import described
 from ..campaign import load_toml_file
 from ..law import Unloading
 
@@ -137,6 +138,8 @@ class Priors:
     noise_length: LogNormalPrior = LogNormalPrior(0.2, 1.0)
     noise_factor: LogNormalPrior = LogNormalPrior(1.0, 0.5)
     changed: tuple[str, ...] = field(default=(), compare=False)
+
+    __repr__ = described()
 
     def __post_init__(self) -> None:
         for f in dataclasses.fields(self):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from .. import arguments
+from .._format import described
 from .reasons import USABLE, below_threshold, far_apart, no_climb, no_loading, too_few
 from .schema import Campaign, Curve
 from .segments import Segment, check_segmented, find_segments
@@ -47,6 +48,8 @@ class LoadingCurve:
 
     stress_MPa: np.ndarray
     strain: np.ndarray
+
+    __repr__ = described()
 
     @property
     def stress_max_MPa(self) -> float:
@@ -155,6 +158,8 @@ class Adjustment:
     strain: float
     why_not: tuple[str | None, ...]
     segments: tuple[tuple[Segment, ...], ...]
+
+    __repr__ = described()
 
     @property
     def kept(self) -> np.ndarray:

@@ -6,6 +6,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from .._format import described
+
 Level = Literal["told", "look", "bad"]
 
 
@@ -28,6 +30,8 @@ class Finding:
     sentence: str
     remedy: str = ""
     particles: tuple[str, ...] = ()
+
+    __repr__ = described()
 
     def __str__(self) -> str:
         return ". ".join(text for text in (self.sentence, self.remedy) if text) + "."

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from .._format import described
 from .curve_features import FeatureOptions
 
 Range = tuple[float, float]
@@ -32,6 +33,8 @@ class SolidClass:
     strain: Range
     pressure_MPa: Range
     weight: float = 0.0
+
+    __repr__ = described()
 
 
 @dataclass(frozen=True)
@@ -118,3 +121,5 @@ class PlausibilityOptions:
     beyond: float = 3.0
     stiffer: float = 3.0
     features: FeatureOptions = field(default_factory=FeatureOptions)
+
+    __repr__ = described()

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from .._format import described
 from .findings import Finding
 from .plausibility import wrong_signs
 from .saturation import SaturationOptions, censor_displacement, censor_force
@@ -84,6 +85,8 @@ class QualityOptions:
     other_stiffness: float = 1.5
     start_share: float = 0.1
     saturation: SaturationOptions = field(default_factory=SaturationOptions)
+
+    __repr__ = described()
 
 
 def check_tests(campaign: Campaign, options: QualityOptions | None = None) -> Campaign:

@@ -11,7 +11,7 @@ import numpy as np
 
 from .. import arguments
 from .._errors import InputError
-from .._format import number, span, table
+from .._format import described, number, span, table
 from .findings import Level
 
 Control = Literal["load", "displacement"]
@@ -133,6 +133,8 @@ class Metadata:
     provenance: str | None = None
     corrections: Sequence[str] = ()
     other: Mapping[str, Any] = field(default_factory=dict)
+
+    __repr__ = described()
 
     def __post_init__(self) -> None:
         if self.control is not None:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .. import arguments
+from .._format import described
 from .schema import Curve
 from .segments import Segment, check_segmented
 from .signal import noise_level
@@ -50,6 +51,8 @@ class TurningOptions:
     apart: float = 6.0
     rounded: float = 3.5
 
+    __repr__ = described()
+
 
 class TurningForces(NamedTuple):
     """The forces of a test as a law is to be compared with them; every array of shape (n,).
@@ -65,6 +68,8 @@ class TurningForces(NamedTuple):
     peak: np.ndarray
     error: np.ndarray
     reading: np.ndarray
+
+    __repr__ = described()
 
 
 def turning_forces(curve: Curve, segments: tuple[Segment, ...], options: TurningOptions | None = None) -> TurningForces:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from .._errors import InputError
+from .._extras import extra
 
 _BOOK = "xl/workbook.xml"
 LARGEST_UNPACKED = 512 * 2**20
@@ -57,16 +58,12 @@ def read_sheet(
     import pandas as pd
 
     _check_size(data, file)
+    with extra("excel", file):
+        import python_calamine  # noqa: F401
     try:
         frames: dict[Any, Any] = pd.read_excel(
             io.BytesIO(data), sheet_name=None, engine="calamine", header=None, dtype=object, na_filter=False
         )
-    except ImportError:
-        raise InputError(
-            "this is an Excel workbook, and the package that reads them is not installed",
-            file=file,
-            remedy="Install it with: pip install 'mcc-jax[excel]', or save the sheet as CSV",
-        ) from None
     # The engine's errors have no common type, and its panics are no Exception.
     except BaseException as error:
         if isinstance(error, KeyboardInterrupt | SystemExit | MemoryError):

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from .. import arguments
 from .._errors import InputError
+from .._format import described
 from ..calibrate import Posterior
 from ..calibrate.population import Population, Scatter, particles_at
 from ..law import MccLaw, Plastic
@@ -40,6 +41,8 @@ class PopulationPacking(NamedTuple):
     draws: np.ndarray
     names: tuple[str, ...]
 
+    __repr__ = described()
+
 
 class Band(NamedTuple):
     """Quantiles of the force on the top punch, one column for each row of the compaction.
@@ -66,6 +69,8 @@ class Band(NamedTuple):
     compaction: Compaction | None = None
     sensitivity: Sensitivity | None = None
     forces: np.ndarray | None = None
+
+    __repr__ = described()
 
 
 def population_packing(

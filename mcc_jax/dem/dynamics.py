@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from .. import arguments
 from .._errors import InputError
+from .._format import described
 from .._numerics import shared
 from .._types import Scalar
 from .edges import PADDING, Edges, carry_history, widened
@@ -40,6 +41,8 @@ class Motion(eqx.Module):
     interaction: Interaction
     drag: Scalar
     gravity: Float[Array, " 3"]
+
+    __repr__ = described(time_step="s", gravity="m/s²")
 
     @classmethod
     def of(
@@ -87,6 +90,8 @@ class Segment(NamedTuple):
     i: Int[Array, " edges"]
     j: Int[Array, " edges"]
     steps: Int[Array, ""]
+
+    __repr__ = described()
 
 
 def step(packing: Packing, motion: Motion, state: State, contacts: Contacts = contact_forces) -> tuple[State, Forces]:

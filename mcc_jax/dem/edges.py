@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .. import arguments
 from .._errors import InputError
+from .._format import described
 from .._types import Flag
 
 PADDING = np.iinfo(np.int64).max
@@ -41,6 +42,8 @@ class Edges(eqx.Module):
     slip: Float[Array, "edges 3"]
     wanted: Int[Array, ""]
     particles: int = eqx.field(static=True)
+
+    __repr__ = described()
 
     @property
     def capacity(self) -> int:

@@ -9,6 +9,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from .. import arguments
+from .._format import described
 from .._numerics import shared
 from .._types import Flag, Scalar, ScalarLike, scalar
 from .edges import Edges
@@ -32,6 +33,8 @@ class Packing(eqx.Module):
     radius: Float[Array, " particles"]
     mass: Float[Array, " particles"]
     sides: HalfContact
+
+    __repr__ = described(radius="m", mass="kg")
 
     @property
     def volume(self) -> Scalar:
@@ -74,6 +77,8 @@ class Interaction(eqx.Module):
     wall_friction: Scalar | None = eqx.field(converter=_friction, default=None)
     tangential_ratio: Scalar = eqx.field(converter=_share, default=0.8)
 
+    __repr__ = described()
+
 
 class WallHistory(eqx.Module):
     """What the contacts with walls remember: dense, one place for each particle and wall.
@@ -85,6 +90,8 @@ class WallHistory(eqx.Module):
 
     overlap_max: Float[Array, "particles walls"]
     slip: Float[Array, "particles walls 3"]
+
+    __repr__ = described()
 
     @classmethod
     def virgin(cls, particles: int, walls: int, dtype: DTypeLike = jnp.float64) -> WallHistory:
@@ -104,6 +111,8 @@ class Forces(eqx.Module):
     force: Vectors
     torque: Vectors
     on_wall: Float[Array, "walls 3"]
+
+    __repr__ = described()
 
 
 class _Body(eqx.Module):

@@ -12,6 +12,7 @@ from jaxtyping import Array
 
 from .. import arguments
 from .._errors import InputError
+from .._format import described
 from .load_steps import TOP, LoadStep, Solver, checked_solver, replay_stacked, stacked
 from .quasistatic import Compaction, compact
 from .sensitivity import PackingOf
@@ -36,6 +37,8 @@ class CompactionFit(NamedTuple):
     misfit: float
     rounds: int
     converged: bool
+
+    __repr__ = described()
 
 
 def fit_compaction(

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .. import arguments
 from .._errors import InputError
+from .._format import described
 from .._types import Scalar
 from .edges import PADDING, Edges, carry_history
 from .equilibrium import settle
@@ -43,6 +44,8 @@ class Solver(eqx.Module):
     max_steps: int = eqx.field(static=True, default=150)
     halvings: int = eqx.field(static=True, default=4)
     skin: float = eqx.field(static=True, default=0.5)
+
+    __repr__ = described()
 
     def __check_init__(self) -> None:
         for spring in self.springs:
@@ -83,6 +86,8 @@ class LoadStep(NamedTuple):
     position: Vectors
     last: bool | Bool[Array, " steps"]
 
+    __repr__ = described()
+
 
 class Replayed(NamedTuple):
     """The load steps again, all of it differentiable but `converged`.
@@ -104,6 +109,8 @@ class Replayed(NamedTuple):
     residual: Float[Array, " steps"]
     proximal: Float[Array, " steps"]
     converged: Bool[Array, " steps"]
+
+    __repr__ = described()
 
 
 def replay_compaction(

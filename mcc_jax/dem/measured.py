@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from .._format import described
 from .._types import Scalar
 from .forces import Packing, overlap_and_normal
 from .pair import pair_split
@@ -39,6 +40,8 @@ class Trajectory(NamedTuple):
     kinetic: np.ndarray
     lists: np.ndarray
     capacity: np.ndarray
+
+    __repr__ = described()
 
 
 class Sample(NamedTuple):

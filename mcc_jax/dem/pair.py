@@ -13,6 +13,7 @@ from jaxtyping import Array
 
 from .. import arguments
 from .._errors import InputError
+from .._format import described
 from .._numerics import shared
 from .._types import Scalar, ScalarLike
 from ..formulas.branch import branch_force
@@ -39,6 +40,8 @@ class ContactEnergy(eqx.Module):
 
     recoverable: Scalar
     dissipated: Scalar
+
+    __repr__ = described(recoverable="J", dissipated="J")
 
 
 def largest_overlap(overlap_max: ScalarLike, overlap: ScalarLike) -> Scalar:

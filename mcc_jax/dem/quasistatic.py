@@ -11,6 +11,7 @@ import numpy as np
 
 from .. import arguments
 from .._errors import InputError
+from .._format import described
 from .._types import Scalar
 from .edges import Edges
 from .equilibrium import Settled, settle
@@ -54,6 +55,8 @@ class Compaction(NamedTuple):
     largest_move: np.ndarray
     contacts: np.ndarray
     beyond_tested: np.ndarray
+
+    __repr__ = described()
 
 
 class _Attempt(NamedTuple):

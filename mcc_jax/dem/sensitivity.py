@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from .. import arguments
 from .._errors import InputError
+from .._format import described
 from .forces import A_PACKING, Packing
 from .load_steps import TOP, LoadStep, Replayed, Solver, replay_stacked, stacked
 from .state import A_STATE, State
@@ -46,6 +47,8 @@ class Sensitivity(NamedTuple):
     residual: np.ndarray
     proximal_share: np.ndarray
     converged: np.ndarray
+
+    __repr__ = described()
 
 
 def rescaled(packing: Packing, log_scale: Float[Array, " 4"]) -> Packing:

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .. import arguments
 from .._errors import InputError
+from .._format import described
 from .._numerics import shared
 from .._types import Flag, Scalar, Values
 from ..effects import AbstractModulusAtPeak
@@ -66,6 +67,8 @@ class HalfContact(eqx.Module):
     power: int = eqx.field(static=True, default=1)
     effects: tuple[AbstractModulusAtPeak, ...] = ()
     radius: Scalar | None = None
+
+    __repr__ = described()
 
     def numbers(self, d: Values) -> Numbers:
         """What the branch from a peak compression [m] depends on: the effects' factor is part of c.

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool
 
 from .. import arguments
 from .._errors import InputError
+from .._format import described
 from .._types import Scalar
 from .edges import Edges, carry_history, list_edges
 from .forces import A_PACKING, Packing, Vectors, WallHistory
@@ -48,6 +49,8 @@ class State(eqx.Module):
     listed_at: Vectors
     skin: Scalar
     time: Scalar
+
+    __repr__ = described(position="m", velocity="m/s", skin="m", time="s")
 
 
 def start(packing: Packing, walls: Walls, position: Any, skin: float, capacity: int | None = None) -> State:

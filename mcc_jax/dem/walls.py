@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from .. import arguments
 from .._errors import InputError
+from .._format import described
 from .._numerics import shared
 from .._types import Scalar, scalar
 
@@ -36,6 +37,8 @@ class Plane(eqx.Module):
     point: Vector = eqx.field(converter=_vector)
     normal: Vector = eqx.field(converter=_vector)
     velocity: Vector = eqx.field(converter=_vector)
+
+    __repr__ = described(point="m", velocity="m/s")
 
     def distance(self, position: Vector) -> Scalar:
         """Distance [m] of a point from the wall, negative behind it."""
@@ -67,6 +70,8 @@ class Cylinder(eqx.Module):
     rim: Scalar = eqx.field(converter=scalar)
     chamfer: Scalar = eqx.field(converter=scalar)
     velocity: Vector = eqx.field(converter=_vector)
+
+    __repr__ = described(radius="m", rim="m", velocity="m/s")
 
     def __check_init__(self) -> None:
         arguments.positive(self.radius, "the radius of a cylinder [m]")

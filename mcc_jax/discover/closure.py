@@ -10,6 +10,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from .._format import described
 from .evidence import Design, left_by_particle, scales_of, with_amplitudes, without_first
 from .search import UNLISTED, Search
 from .settings import FURTHER, HYPERPARAMETERS, NUMERICS, TELLING
@@ -65,6 +66,8 @@ class Closure:
     span: dict[str, tuple[float, float]]
     correction_um: np.ndarray
     held_out_um: np.ndarray
+
+    __repr__ = described()
 
     def to_json(self) -> dict[str, Any]:
         """As in `discovery.json`."""

@@ -13,6 +13,7 @@ from jaxtyping import Array
 
 from .. import arguments
 from .._errors import InputError
+from .._format import described, number, table
 from ..calibrate import Model
 from ..calibrate.data import select
 from ..calibrate.estimates import finite
@@ -45,6 +46,8 @@ class Plan:
 
     name: str
     programmes: Sequence[Programme]
+
+    __repr__ = described()
 
     def __post_init__(self) -> None:
         arguments.instance(self.name, str, "name", "Say in words what is done.")
@@ -111,6 +114,15 @@ class Power:
     plausible: dict[str, tuple[float, float]]
     inseparable: tuple[tuple[str, str, float], ...]
     untestable: tuple[dict[str, str], ...]
+
+    def __repr__(self) -> str:
+        rows = []
+        for name in self.mechanisms:
+            unit = "" if self.units[name] == "-" else f" {self.units[name]}"
+            low, high = (number(value) for value in self.plausible[name])
+            rows.append((name, f"found from {number(self.limits[name], 2)}{unit} on; plausible {low} to {high}"))
+        told = f"{len(rows)} mechanisms can be seen, {len(self.untestable)} cannot"
+        return table(f"Power: {told}, {len(self.inseparable)} pairs look alike", rows)
 
     def to_json(self) -> dict[str, Any]:
         """The contents of `power.json`."""

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from .._errors import InputError
-from .._format import table
+from .._format import described, table
 from ..calibrate import Model, Posterior
 from ..calibrate.estimates import estimate, finite
 from ..calibrate.laws import law_of
@@ -52,6 +52,8 @@ class Effect:
     misfit: float = 0.0
     estimates: dict[str, dict[str, Any]] = field(default_factory=dict)
     jumps: tuple[Jump, ...] = ()
+
+    __repr__ = described()
 
     @property
     def mechanism(self) -> str:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from .._format import described
+
 
 @dataclass(frozen=True)
 class Decisions:
@@ -37,6 +39,8 @@ class Decisions:
     general_log_sd: float = 1.5
     jump: float = 0.25
     least: int = 3
+
+    __repr__ = described()
 
 
 @dataclass(frozen=True)

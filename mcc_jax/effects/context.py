@@ -7,6 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 
+from .._format import described
 from .._types import Values
 from ..formulas import PUNCH_AREA, Formulas, recovery
 from ..geometry import Particle
@@ -48,6 +49,8 @@ class Context(eqx.Module):
     recoverable: Values
     displacement: Values
     memory: Any = None
+
+    __repr__ = described(peak_force="mN", peak_displacement="um", recoverable="um", displacement="um")
 
     @property
     def force(self) -> Values:

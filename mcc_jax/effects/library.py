@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from types import MappingProxyType
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from .. import arguments
@@ -40,7 +40,28 @@ _ALL = (
     HUMIDITY,
 )
 
-LIBRARY: Mapping[str, Mechanism] = MappingProxyType({mechanism.name: mechanism for mechanism in _ALL})
+
+class _Library(Mapping[str, Mechanism]):
+    """Mechanisms by name, which nobody can change."""
+
+    def __init__(self, mechanisms: Iterable[Mechanism]) -> None:
+        self._by_name = {mechanism.name: mechanism for mechanism in mechanisms}
+
+    def __getitem__(self, name: str) -> Mechanism:
+        return self._by_name[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._by_name)
+
+    def __len__(self) -> int:
+        return len(self._by_name)
+
+    def __repr__(self) -> str:
+        formulas = sum(len(mechanism.variants) for mechanism in self.values())
+        return f"{len(self)} mechanisms, {formulas} formulas:\n" + textwrap.fill(", ".join(self), 100)
+
+
+LIBRARY: Mapping[str, Mechanism] = _Library(_ALL)
 """The mechanisms known by name, in a fixed order."""
 
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from .. import arguments
+from .._format import described
 from .._types import Scalar, ScalarLike, Values, scalar
 
 KINDS = ("approach", "load", "hold", "unload", "reload")
@@ -57,6 +58,16 @@ class Record(eqx.Module):
     loading_rate: Values
     relative_humidity: Values
     peak: Values | None = None
+
+    __repr__ = described(
+        force="mN",
+        time="s",
+        unload_from="mN",
+        reload_from="mN",
+        rate="mN/s",
+        loading_rate="mN/s",
+        relative_humidity="%",
+    )
 
     @property
     def at_points(self) -> Record:

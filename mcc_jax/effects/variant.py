@@ -13,6 +13,7 @@ import jax.numpy as jnp
 
 from .. import arguments
 from .._errors import InputError
+from .._format import described, in_words, number, table
 from .._types import ScalarLike, scalar
 from .effect import AbstractEffect
 
@@ -53,6 +54,8 @@ class Nuisance:
     plausible: tuple[float, float]
     explanation: str
     random_per_test: bool = False
+
+    __repr__ = described()
 
     @property
     def middle(self) -> float:
@@ -110,6 +113,28 @@ class Variant:
                     f"{self.mechanism}:{self.name}: the grid of {nuisance.name} leaves its plausible range"
                 )
 
+    def __repr__(self) -> str:
+        sign = {1: "above zero", -1: "below zero", 0: "of either sign"}[self.sign]
+        low, high = (number(value) for value in self.plausible)
+        unit = "" if self.unit == "-" else f" {self.unit}"
+        rows = [
+            ("formula", self.equation),
+            (self.parameter, f"{sign}, plausible from {low} to {high}{unit}"),
+            *(
+                (n.name, f"{in_words(n.plausible[0])} to {in_words(n.plausible[1])}: {n.explanation}")
+                for n in self.nuisances
+            ),
+            ("what happens", self.explanation),
+            ("needs", ", ".join(need.value for need in self.needs) or "nothing special"),
+            ("source", self.source),
+        ]
+        return table(self.label, rows)
+
+    @property
+    def label(self) -> str:
+        """Mechanism and formula as `find_variant` and `with_effects` take them: "creep:logarithmic"."""
+        return f"{self.mechanism}:{self.name}"
+
     @property
     def null(self) -> float:
         """The amplitude at which nothing is added."""
@@ -138,7 +163,7 @@ class Variant:
             name: jnp.asarray(value, strength.dtype) if isinstance(value, int | float) else value
             for name, value in {**known, **nuisance}.items()
         }
-        return replace(self.make(strength, **others, **self.fixed), label=f"{self.mechanism}:{self.name}")
+        return replace(self.make(strength, **others, **self.fixed), label=self.label)
 
     def grid(self) -> list[dict[str, float]]:
         """All combinations of the nuisance parameters' values; one empty dictionary if there are none."""
@@ -177,6 +202,9 @@ class Mechanism:
         if strangers:
             raise InputError(f"the variant {strangers[0]!r} is not one of {self.name}")
 
+    def __repr__(self) -> str:
+        return table(f"{self.name}: {self.explanation}", [(v.name, v.equation) for v in self.variants])
+
     def __iter__(self) -> Iterator[Variant]:
         return iter(self.variants)
 
@@ -205,6 +233,8 @@ class Equivalence:
     names: tuple[str, ...]
     explanation: str
     broken_by: str
+
+    __repr__ = described()
 
 
 EQUIVALENCES = (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
+from .._extras import extra
 from .._version import own_version
 from ..geometry import Particle
 from ..law import TESTED_STRAIN, MccLaw, StrainScaling, Unloading
@@ -78,7 +79,8 @@ def origin_lines(law: MccLaw, particle: Particle | None, origin: Origin) -> list
 
 def render(name: str, **values: Any) -> str:
     """The template of that name with the values put in; a value it wants and does not get is an error."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
+    with extra("export"):
+        from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
         loader=PackageLoader("mcc_jax.export"),

@@ -12,6 +12,8 @@ import jax.numpy as jnp
 
 from .. import arguments
 from .._errors import InputError
+from .._extras import extra
+from .._format import described
 from .._types import Scalar
 from ..geometry import Particle
 from ..law import History, MccLaw, Plastic
@@ -54,6 +56,8 @@ class Artefact:
     content: bytes
     signature: dict[str, Any]
 
+    __repr__ = described()
+
 
 def jax_artefact(
     law: MccLaw,
@@ -87,6 +91,8 @@ def jax_artefact(
     Raises:
         InputError: if float64 is wanted and JAX is in single precision.
     """
+    with extra("export"):
+        import flatbuffers  # noqa: F401
     checked(law, particle)
     functions = signatures(law)
     arguments.choice(which, functions, "which")

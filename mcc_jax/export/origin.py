@@ -8,6 +8,7 @@ from typing import Any
 
 from .. import arguments
 from .._errors import InputError
+from .._format import described
 from ..geometry import Particle
 from ..law import MccLaw
 
@@ -31,6 +32,8 @@ class Origin:
     particle: str | None = None
     geometry: str = "given"
     warnings: tuple[str, ...] = ()
+
+    __repr__ = described()
 
 
 def numbers(law: MccLaw) -> dict[str, float]:

@@ -12,6 +12,7 @@ import numpy as np
 
 from .. import arguments
 from .._errors import InputError
+from .._format import described
 from ..dem import HalfContact, half_contact
 from ..formulas import Formulas, recovery_limit
 from ..formulas.recovery_limit import SHARE
@@ -50,6 +51,8 @@ class CurveTables:
     loading: Table
     unloading: Table
     error: float
+
+    __repr__ = described()
 
 
 def curve_tables(

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from .. import arguments
 from .._errors import InputError
+from .._format import described, value_of
 from .._numerics import compiled_whole, running_max
 from .._types import Flag, Path, Scalar, scalar
 from ..effects import AbstractEffect, AbstractModulusAtPeak, Context, Record, Variant, clean_record, find_variant
@@ -49,6 +50,8 @@ class History(eqx.Module):
     displacement_max: Scalar = eqx.field(converter=scalar)
     memory: Any = None
 
+    __repr__ = described(displacement_max="um")
+
 
 class Energy(eqx.Module):
     """Energy balance of one particle [nJ]; `work = recoverable + dissipated`.
@@ -62,6 +65,19 @@ class Energy(eqx.Module):
     work: Scalar
     recoverable: Scalar
     dissipated: Scalar
+
+    __repr__ = described(work="nJ", recoverable="nJ", dissipated="nJ")
+
+
+def _told(effect: AbstractEffect) -> str:
+    """An effect with the name and the unit of its amplitude, where a formula of the library made it."""
+    try:
+        variant = find_variant(effect.label)
+    except InputError:
+        return repr(effect)
+    unit = "" if variant.unit == "-" else f" {variant.unit}"
+    others = [f"{n.name} {value_of(getattr(effect, n.name))}" for n in variant.nuisances if hasattr(effect, n.name)]
+    return ", ".join([f"{effect.label}: {variant.parameter} {value_of(effect.amplitude)}{unit}", *others])
 
 
 def _effects(value: Any) -> tuple[AbstractEffect, ...]:
@@ -120,7 +136,7 @@ class MccLaw(Formulas, AbstractContactLaw[History]):
     effects: tuple[AbstractEffect, ...] = eqx.field(converter=_effects, default=())
 
     def _rows(self) -> list[tuple[str, str]]:
-        return [*super()._rows(), *(("effect", repr(effect)) for effect in self.effects)]
+        return [*super()._rows(), *(("effect", _told(effect)) for effect in self.effects)]
 
     @property
     def is_valid(self) -> Flag:

@@ -9,6 +9,7 @@ from jax.scipy.stats import norm
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from .. import arguments
+from .._format import described
 from .._types import Scalar, ScalarLike, scalar
 from ..arguments import finite, positive, whole
 from ..formulas.plastic import Plastic
@@ -36,6 +37,8 @@ class LogNormal(eqx.Module):
 
     mean: Scalar = eqx.field(converter=_mean)
     sd: Scalar = eqx.field(converter=_sd)
+
+    __repr__ = described()
 
     def moment(self, order: int) -> Scalar:
         r""":math:`E[C^k] = \exp(k\mu + k^2\tau^2/2)`."""
@@ -69,6 +72,8 @@ class PlasticPopulation(eqx.Module):
     C1: LogNormal
     C3: LogNormal
     C5: LogNormal
+
+    __repr__ = described()
 
     def __check_init__(self) -> None:
         for name in ("C1", "C3", "C5"):

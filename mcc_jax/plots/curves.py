@@ -7,13 +7,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
 from .. import arguments
 from .._errors import InputError
+from .._extras import extra
 from ..calibrate import (
     LeastSquares,
     PaperCalibration,
@@ -27,6 +24,12 @@ from ..discover import Discovery
 from ..effects.record import HOLD, RELOAD, UNLOAD
 from ..geometry import Particle
 from . import style
+
+with extra("plots"):
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
 
 LOADING, UNLOADING = style.BLUE, style.VERMILION
 _DOT: style.Look = {"marker": "o", "linestyle": "", "markersize": 3.5, "markeredgewidth": 0}

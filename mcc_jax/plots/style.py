@@ -11,18 +11,21 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 import numpy as np
-from matplotlib import colormaps, rc_context
-from matplotlib.artist import Artist
-from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import ListedColormap, Normalize
-from matplotlib.figure import Figure
-from matplotlib.font_manager import findfont, get_font
 
 from .. import arguments
 from .._errors import InputError
+from .._extras import extra
 from ..calibrate import LeastSquares, PaperCalibration, Posterior
 from ..campaign import Campaign, Metadata, check_campaign
+
+with extra("plots"):  # every other file of the package imports this one or `curves` first
+    from matplotlib import colormaps, rc_context
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import ListedColormap, Normalize
+    from matplotlib.figure import Figure
+    from matplotlib.font_manager import findfont, get_font
 
 
 @dataclass(frozen=True)

@@ -10,27 +10,30 @@ from pathlib import Path
 from typing import Any
 
 from .. import arguments
+from .._extras import extra
 from .._format import interval, number, percent, probability, with_sd
 from .._version import own_version
 from ..calibrate.curves import KINDS, FittedCurve
 from ..campaign.findings import worst
-from ..plots.style import particle_labels
-from . import pictures as pictures
-from .chart import LOOKS, chart_data, chart_items, chart_scripts
-from .compare import compare
-from .lights import lights, share_inside, tested
 from .read import Results
-from .sentences import (
-    METHODS,
-    calibration_sentences,
-    discovery_sentence,
-    listed,
-    next_steps,
-    plain,
-    quantity,
-    simulated,
-)
-from .tables import measured, parameters, particle_facts, particle_rows
+
+with extra("report"):
+    from ..plots.style import particle_labels
+    from . import pictures as pictures
+    from .chart import LOOKS, chart_data, chart_items, chart_scripts
+    from .compare import compare
+    from .lights import lights, share_inside, tested
+    from .sentences import (
+        METHODS,
+        calibration_sentences,
+        discovery_sentence,
+        listed,
+        next_steps,
+        plain,
+        quantity,
+        simulated,
+    )
+    from .tables import measured, parameters, particle_facts, particle_rows
 
 CAPTIONS = {
     "bands": ("compare", "Measured curves and the central 95 % of what the posterior expects"),
@@ -82,6 +85,9 @@ def report_page(results: Results, *, seed: int = 0, progress: Callable[[str], No
     arguments.instance(results, Results, "results", "Read them with mcc_jax.report.read_results(folder).")
     seed = arguments.seed(seed)
     _require_double()
+    with extra("report"):
+        import bokeh  # noqa: F401
+        import jinja2  # noqa: F401
     tell = progress or (lambda _: None)
     tell("predicting every particle")
     shown = compare(results)

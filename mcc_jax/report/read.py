@@ -12,6 +12,7 @@ from typing import Any
 from .. import arguments
 from .._archive import read_archive
 from .._errors import InputError
+from .._format import described
 from ..calibrate.content import read_result
 from ..calibrate.results import ARCHIVE, Calibration, OldCalibration, PosteriorDraws
 from ..campaign import Campaign, check_tests, file_checksums, read_campaign
@@ -52,6 +53,8 @@ class Results:
     written: datetime.date | None
     cautions: tuple[str, ...]
     missing_campaign: str
+
+    __repr__ = described()
 
     @property
     def posterior(self) -> PosteriorDraws | None:

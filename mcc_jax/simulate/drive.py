@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool
 
 from .. import arguments
 from .._errors import InputError
+from .._format import described
 from .._results import RESULTS
 from .._types import Path
 from ..campaign import Control
@@ -39,6 +40,8 @@ class Response(eqx.Module):
     monotone: Bool[Array, ""]
     state: Any
     result: RESULTS
+
+    __repr__ = described(displacement="um", force="mN")
 
 
 def drive(

@@ -14,6 +14,7 @@ import numpy as np
 
 from .. import arguments
 from .._errors import InputError
+from .._format import number
 from ..effects import LIBRARY, AbstractEffect, Mechanism, Variant, find_variant
 
 _STREAM = 0x0EFF_EC75
@@ -60,6 +61,12 @@ class HiddenEffect:
             least = known[key].plausible[0]
             if not math.isfinite(value) or abs(value) > 1e9 or (least > 0 and value <= 0):
                 raise InputError(f"{name}: {key} must be {'above 0' if least > 0 else 'finite'}, got {value:g}")
+
+    def __repr__(self) -> str:
+        numbers = {self.variant.parameter: self.strength} | {n.name: n.middle for n in self.variant.nuisances}
+        named = ", ".join(f"{name} {number(value)}" for name, value in (numbers | dict(self.nuisance)).items())
+        drawn = f"; drawn for every test: {', '.join(self.random)}" if self.random else ""
+        return f"HiddenEffect {self.variant.label}: {named}{drawn}"
 
     @property
     def strength(self) -> float:

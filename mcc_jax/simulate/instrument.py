@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .. import arguments
+from .._format import described
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,8 @@ class Instrument:
     displacement_resolution_um: float = 0.0
     force_resolution_mN: float = 0.0
     zero_um: float = 0.0
+
+    __repr__ = described()
 
     def __post_init__(self) -> None:
         for name, value in list(vars(self).items()):

@@ -11,6 +11,7 @@ import numpy as np
 
 from .. import arguments
 from .._errors import InputError
+from .._format import number, percent, table
 from ..campaign import Control, load_toml_file
 
 
@@ -87,6 +88,19 @@ class Programme:
         for step in given:
             arguments.instance(step, (Ramp, Hold), "every one of steps", "Give mcc_jax.Ramp or mcc_jax.Hold.")
         object.__setattr__(self, "steps", tuple(given))
+
+    def __repr__(self) -> str:
+        unit, sampling = ("mN/s" if self.control == "load" else "um/s"), f"every {self.interval_s} s"
+        if self.points is not None:
+            sampling = f"{self.points} samples"
+        told = [
+            f"hold {number(step.seconds)} s"
+            if isinstance(step, Hold)
+            else f"to {percent(step.to)} of the peak at {number(step.rate)} {unit}"
+            for step in self.steps
+        ]
+        title = f"Programme under control of {self.control}, {sampling}"
+        return table(title, [(str(i), text) for i, text in enumerate(told, start=1)])
 
     @classmethod
     def cycles(

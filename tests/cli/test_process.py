@@ -1,7 +1,6 @@
 """As a user runs it: a process of its own, with pipes, signals and limits."""
 
 import os
-import pty
 import select
 import signal
 import subprocess
@@ -176,6 +175,8 @@ def test_two_at_once_and_the_lock_of_a_dead_one(tmp_path):
 
 @posix
 def test_progress_on_a_terminal_only(tmp_path):
+    import pty  # not there on Windows, where this test is skipped
+
     ours, theirs = pty.openpty()
     environment = os.environ | {"TERM": "xterm", "COLUMNS": "100"}
     arguments = [*COMMAND, "simulate", "--out", str(tmp_path / "sim"), "--points", "20"]

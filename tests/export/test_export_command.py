@@ -190,7 +190,7 @@ def test_sizes_are_also_found_where_the_demo_puts_its_campaign(tmp_path):
 
 
 def test_help_does_not_import_jax():
-    code = "import sys; sys.argv = ['mcc-jax', 'export', '--help']; from mcc_jax.cli import main\n"
-    code += "try:\n    main()\nexcept SystemExit:\n    assert 'jax' not in sys.modules\n"
+    code = "import sys; sys.argv = ['mcc-jax', 'export', '--help']; from mcc_jax.cli import run\n"
+    code += "try:\n    run()\nexcept SystemExit:\n    assert 'jax' not in sys.modules\n"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "--allow-not-monotone" in done.stdout

@@ -25,7 +25,7 @@ def test_citation_names_this_version_and_the_paper():
 
 
 def test_changelog_has_this_version():
-    text = (ROOT / ".docs" / "pages" / "changelog.md").read_text(encoding="utf-8")
+    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     assert re.search(rf"^## {re.escape(PROJECT['version'])}\b", text, flags=re.M)
 
 
@@ -77,17 +77,25 @@ def test_the_sdist_holds_tests_and_documentation(built):
     with tarfile.open(built[1]) as sdist:
         inside = {name.partition("/")[2] for name in sdist.getnames()}
     assert sources() <= inside
-    assert {"tests/conftest.py", "README.md", "LICENSE", "CITATION.cff", ".docs/mkdocs.yml"} <= inside
+    assert {"tests/conftest.py", "README.md", "LICENSE", "CITATION.cff", "CHANGELOG.md", ".docs/mkdocs.yml"} <= inside
 
 
 @pytest.mark.long
 def test_the_wheel_works_in_a_clean_environment(uv, built, tmp_path):
-    """Installed alone; a campaign goes through it from end to end, with files that only the wheel can have brought."""
+    """Alone it is the library, with the extra `command` the whole: a campaign goes through it from end to end."""
     home = tmp_path / "clean"
     run(uv, "venv", "--python", sys.executable, home)
     programs = home / ("Scripts" if os.name == "nt" else "bin")
-    run(uv, "pip", "install", "--python", programs / "python", built[0])
     clean = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    run(uv, "pip", "install", "--python", programs / "python", built[0])
+    law = (
+        "import mcc_jax as mcc; print(mcc.drive(mcc.paper_law(), mcc.Particle(200, 190, 180), [0.0, 50.0, 48.0]).force)"
+    )
+    assert "[" in run(programs / "python", "-c", law, cwd=tmp_path, env=clean)
+    alone = subprocess.run([programs / "mcc-jax", "demo"], capture_output=True, text=True, env=clean, check=False)
+    assert (alone.returncode, alone.stdout) == (2, "")
+    assert "mcc-jax[command]" in alone.stderr
+    run(uv, "pip", "install", "--python", programs / "python", f"{built[0]}[command]")
 
     def command(*arguments):
         return run(programs / "mcc-jax", *arguments, cwd=tmp_path, env=clean)

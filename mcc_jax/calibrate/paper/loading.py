@@ -9,6 +9,7 @@ import numpy as np
 
 from ... import arguments
 from ..._errors import InputError
+from ..._format import described
 from ...law import LogNormal, PlasticPopulation
 from ..settings import PAPER
 from .master_curve import MasterCurve
@@ -31,6 +32,8 @@ class PlasticFit:
     variances: tuple[float, float, float]
     rms_MPa: float
     at_bound: tuple[str, ...]
+
+    __repr__ = described()
 
 
 def fit_polynomial(strain: np.ndarray, stress_MPa: np.ndarray) -> np.ndarray:

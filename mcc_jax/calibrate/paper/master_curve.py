@@ -8,6 +8,7 @@ import numpy as np
 
 from ... import arguments
 from ..._errors import InputError
+from ..._format import described
 from ...campaign import Adjustment, of_each_particle
 
 
@@ -28,6 +29,8 @@ class StrainTable:
     reached: np.ndarray
     flatness: np.ndarray
     index: np.ndarray
+
+    __repr__ = described()
 
     def shape_factor(self, a: float) -> np.ndarray:
         """eta_p of the n particles."""
@@ -82,6 +85,8 @@ class MasterCurve:
     mean: np.ndarray
     sd: np.ndarray
     count: np.ndarray
+
+    __repr__ = described()
 
 
 def enough(table: StrainTable) -> np.ndarray:

@@ -13,6 +13,7 @@ import optimistix as optx
 from jaxtyping import Array, Float, Int
 
 from ... import arguments
+from ..._format import described
 from ..._types import Scalar
 from ...campaign import Adjustment, Campaign, Curve, Segment, check_campaign, stress_and_strain
 from ...formulas import recovery
@@ -43,6 +44,8 @@ class ElasticBranch:
     strain: np.ndarray
     stress_MPa: np.ndarray
 
+    __repr__ = described()
+
 
 @dataclass(frozen=True)
 class ElasticFit:
@@ -63,6 +66,8 @@ class ElasticFit:
     branches: tuple[ElasticBranch, ...]
     converged: bool
     reason: str
+
+    __repr__ = described()
 
 
 def elastic_branches(

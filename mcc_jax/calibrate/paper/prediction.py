@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ... import arguments
+from ..._format import described
 from ...campaign import (
     Adjustment,
     Campaign,
@@ -48,6 +49,8 @@ class ParticleFit:
     used: np.ndarray
     rms_um: float
     own_rms_um: float
+
+    __repr__ = described()
 
 
 def point_noise_um(curve: Curve) -> float:

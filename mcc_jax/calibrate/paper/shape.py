@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from ... import arguments
 from ..._errors import InputError
+from ..._format import described
 from ..._types import Scalar
 from ..settings import PAPER
 from .master_curve import StrainTable, enough
@@ -44,6 +45,8 @@ class ShapeFit:
     converged: bool
     reason: str
     identifiable: bool
+
+    __repr__ = described()
 
 
 def _weights(stress: np.ndarray, reached: np.ndarray) -> np.ndarray:

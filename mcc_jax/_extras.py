@@ -1,0 +1,57 @@
+"""Packages that only some parts need, by the name of the extra that brings them: one helper, one message."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+
+from ._errors import InputError
+
+EXTRAS = {
+    "command": ("the command mcc-jax needs", ("click", "rich", "platformdirs")),
+    "plots": ("figures need", ("matplotlib",)),
+    "report": ("the report needs", ("matplotlib", "bokeh", "jinja2", "markupsafe")),
+    "export": ("this export needs", ("jinja2", "flatbuffers")),
+    "netcdf": ("writing posterior.nc needs", ("h5netcdf", "h5py")),
+    "excel": ("reading an Excel workbook needs", ("python_calamine",)),
+}
+"""For each extra of `pyproject.toml` what it is for, and the modules of it that this library imports."""
+
+
+class MissingExtraError(InputError, ModuleNotFoundError):
+    """Something is called for that the base installation does not bring; the message says how to get it.
+
+    Args:
+        extra: a name of `EXTRAS`.
+        module: what could not be imported.
+        file: the file that needs it, if one does.
+    """
+
+    def __init__(self, extra: str, module: str, file: str | Path | None = None) -> None:
+        super().__init__(
+            f"{EXTRAS[extra][0]} the package {module}, which is not installed",
+            file=file,
+            remedy=f"Install the extra {extra!r}: python -m pip install 'mcc-jax[{extra}]'",
+        )
+        self.extra, self.name = extra, module
+
+
+@contextlib.contextmanager
+def extra(name: str, file: str | Path | None = None) -> Iterator[None]:
+    """Imports of what an extra brings: `with extra("plots"): from matplotlib import colormaps`.
+
+    Args:
+        name: a name of `EXTRAS`.
+        file: the file that needs it, for the message.
+
+    Raises:
+        MissingExtraError: where a package of the extra is not installed.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        missing = (error.name or "").partition(".")[0]
+        if missing not in EXTRAS[name][1]:  # something else is broken: that is told as it is
+            raise
+        raise MissingExtraError(name, missing, file) from None
