@@ -16,11 +16,22 @@ from ..effects.record import APPROACH, HOLD, KINDS, LOAD, UNLOAD
 from .adjustment import campaign_segments
 from .schema import Campaign, Curve
 from .segments import Segment
+from .signal import straight_line
 from .validate import check_campaign
 
 
 def record_of(curve: Curve, segments: tuple[Segment, ...], *, relative_humidity_percent: float | None = None) -> Record:
     """The record of a measured test.
+
+    See `measured_record`; its arrays are those of JAX.
+    """
+    return jax.tree.map(jnp.asarray, measured_record(curve, segments, relative_humidity_percent=relative_humidity_percent))
+
+
+def measured_record(
+    curve: Curve, segments: tuple[Segment, ...], *, relative_humidity_percent: float | None = None
+) -> Record:
+    """The same as arrays of NumPy, to be put together with those of other tests.
 
     Rates are the slopes of straight lines through whole segments. The forces where branches begin come from straight
     lines through their first points.
@@ -73,12 +84,7 @@ def record_of(curve: Curve, segments: tuple[Segment, ...], *, relative_humidity_
         columns["loading_rate"][: known[0]] = columns["loading_rate"][known[0]]
         columns["rate"][: known[0]] = columns["loading_rate"][known[0]]
     humidity = REFERENCE_HUMIDITY_PERCENT if relative_humidity_percent is None else float(relative_humidity_percent)
-    return Record(
-        jnp.asarray(force),
-        jnp.asarray(time),
-        **{name: jnp.asarray(values) for name, values in columns.items()},
-        relative_humidity=jnp.asarray(humidity, dtype=float),
-    )
+    return Record(force, time, **columns, relative_humidity=np.asarray(humidity, dtype=float))
 
 
 def record_batch(
@@ -99,7 +105,7 @@ def record_batch(
     found = campaign_segments(campaign) if segments is None else segments
     humidity = humidities(campaign)
     records = [
-        record_of(curve, parts, relative_humidity_percent=None if humidity is None else float(humidity[i]))
+        measured_record(curve, parts, relative_humidity_percent=None if humidity is None else float(humidity[i]))
         for i, (curve, parts) in enumerate(zip(campaign.curves, found, strict=True))
     ]
     longest = max(len(curve) for curve in campaign.curves)
@@ -149,9 +155,7 @@ def _first_value(time: np.ndarray, force: np.ndarray) -> float:
     n = min(len(force), 9)
     if n < 3 or np.ptp(time[:n]) <= 0:
         return float(force[0])
-    slope, level = np.polyfit(time[:n] - time[0], force[:n], 1)
-    del slope
-    return float(level)
+    return straight_line(time[:n] - time[0], force[:n])[1]
 
 
 def _slope(time: np.ndarray, force: np.ndarray, before: float) -> float:
@@ -183,7 +187,7 @@ def available_data(campaign: Campaign, segments: tuple[tuple[Segment, ...], ...]
 
     rates, peaks, durations, low = [], [], [], 0
     for curve, parts, diameter in zip(campaign.curves, found, D1 * D2 / D3, strict=True):
-        record = record_of(curve, parts)
+        record = measured_record(curve, parts)
         loading = np.isin(np.asarray(record.kind), (1, 4))
         rates.extend(np.unique(np.asarray(record.loading_rate)[loading]).tolist())
         area = np.pi * diameter**2 / 4 * 1e-3
