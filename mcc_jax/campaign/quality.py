@@ -363,9 +363,7 @@ def _offset_notes(zero: float, error: float, largest: float, options: QualityOpt
     return (Note("zero of force", "told", "force reads {} mN in the air before contact; this was taken off", (zero,)),)
 
 
-def air_until(
-    curve: Curve, control: Control | None, options: QualityOptions
-) -> tuple[int | None, SlowStart | None]:
+def air_until(curve: Curve, control: Control | None, options: QualityOptions) -> tuple[int | None, SlowStart | None]:
     """How many readings were taken before contact; None if too few, and then the slow start, if there is one.
 
     The approach of `find_segments`; where it finds none, a straight and much slower rise in front of the loading is a
@@ -422,7 +420,9 @@ def slow_start(curve: Curve, options: QualityOptions) -> SlowStart | None:
         return None
     clocks = [time[rows] - time[rows].mean() for rows in (ahead, behind)]
     spreads = [max(float(clock @ clock), 1e-300) for clock in clocks]
-    slow, fast = (float(clock @ force[rows]) / s for clock, rows, s in zip(clocks, (ahead, behind), spreads, strict=True))
+    slow, fast = (
+        float(clock @ force[rows]) / s for clock, rows, s in zip(clocks, (ahead, behind), spreads, strict=True)
+    )
     way, on = (float(clock @ path[rows]) / s for clock, rows, s in zip(clocks, (ahead, behind), spreads, strict=True))
     bends = fast - slow > options.drift_said * point_noise(force) * np.hypot(*(1 / np.sqrt(spreads)))
     share, pace = slow / max(fast, 1e-300), way / max(on, 1e-300)

@@ -25,7 +25,9 @@ def record_of(curve: Curve, segments: tuple[Segment, ...], *, relative_humidity_
 
     See `measured_record`; its arrays are those of JAX.
     """
-    return jax.tree.map(jnp.asarray, measured_record(curve, segments, relative_humidity_percent=relative_humidity_percent))
+    return jax.tree.map(
+        jnp.asarray, measured_record(curve, segments, relative_humidity_percent=relative_humidity_percent)
+    )
 
 
 def measured_record(

@@ -19,6 +19,7 @@ import numpy as np
 from .. import arguments
 from .._errors import InputError
 from .excursions import Drive, DriveOptions, Hold
+from .memory import remembered
 from .schema import A_CURVE, Control, Curve
 from .signal import branch_envelope, median, steady_clock, two_lines
 from .validate import check_finite
@@ -112,8 +113,13 @@ def find_segments(
         check_finite(
             getattr(curve, name), f"the {name} of a curve", lambda text, remedy: InputError(text, remedy=remedy)
         )
-    force, displacement = np.asarray(curve.force_mN, float), np.asarray(curve.displacement_um, float)
     options = DriveOptions(smallest_turn, noise_multiple, band, hold_slowness, hold_samples)
+    return remembered(curve, (control, options, contact), lambda: _found(curve, control, options, contact))
+
+
+def _found(curve: Curve, control: Control | None, options: DriveOptions, contact: float) -> tuple[Segment, ...]:
+    """The segments of a curve, see `find_segments`."""
+    force, displacement = np.asarray(curve.force_mN, float), np.asarray(curve.displacement_um, float)
     clock = steady_clock(np.asarray(curve.time_s, float))
     drive = Drive(force, clock, options)
     if not drive.span > 0:
