@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -23,17 +22,16 @@ from .validate import check_campaign
 def record_of(curve: Curve, segments: tuple[Segment, ...], *, relative_humidity_percent: float | None = None) -> Record:
     """The record of a measured test.
 
-    See `measured_record`; its arrays are those of JAX.
+    See `record_columns`; its arrays are those of JAX.
     """
-    return jax.tree.map(
-        jnp.asarray, measured_record(curve, segments, relative_humidity_percent=relative_humidity_percent)
-    )
+    columns = record_columns(curve, segments, relative_humidity_percent=relative_humidity_percent)
+    return Record(**{name: jnp.asarray(values) for name, values in columns.items()})
 
 
-def measured_record(
+def record_columns(
     curve: Curve, segments: tuple[Segment, ...], *, relative_humidity_percent: float | None = None
-) -> Record:
-    """The same as arrays of NumPy, to be put together with those of other tests.
+) -> dict[str, np.ndarray]:
+    """The same as arrays of NumPy by name, to be put together with those of other tests.
 
     Rates are the slopes of straight lines through whole segments. The forces where branches begin come from straight
     lines through their first points.
@@ -86,7 +84,7 @@ def measured_record(
         columns["loading_rate"][: known[0]] = columns["loading_rate"][known[0]]
         columns["rate"][: known[0]] = columns["loading_rate"][known[0]]
     humidity = REFERENCE_HUMIDITY_PERCENT if relative_humidity_percent is None else float(relative_humidity_percent)
-    return Record(force, time, **columns, relative_humidity=np.asarray(humidity, dtype=float))
+    return {"force": force, "time": time, **columns, "relative_humidity": np.asarray(humidity, dtype=float)}
 
 
 def record_batch(
@@ -107,17 +105,16 @@ def record_batch(
     found = campaign_segments(campaign) if segments is None else segments
     humidity = humidities(campaign)
     records = [
-        measured_record(curve, parts, relative_humidity_percent=None if humidity is None else float(humidity[i]))
+        record_columns(curve, parts, relative_humidity_percent=None if humidity is None else float(humidity[i]))
         for i, (curve, parts) in enumerate(zip(campaign.curves, found, strict=True))
     ]
     longest = max(len(curve) for curve in campaign.curves)
     longest += -longest % multiple
 
-    def together(*leaves: Array) -> Array:
-        rows = [np.asarray(leaf) for leaf in leaves]
+    def together(rows: list[np.ndarray]) -> Array:
         return jnp.asarray(np.stack([np.pad(r, (0, longest - len(r)), mode="edge") if r.ndim else r for r in rows]))
 
-    return jax.tree.map(together, *records)
+    return Record(**{name: together([one[name] for one in records]) for name in records[0]})
 
 
 def humidities(campaign: Campaign) -> Float[np.ndarray, " particles"] | None:
@@ -189,9 +186,9 @@ def available_data(campaign: Campaign, segments: tuple[tuple[Segment, ...], ...]
 
     rates, peaks, durations, low = [], [], [], 0
     for curve, parts, diameter in zip(campaign.curves, found, D1 * D2 / D3, strict=True):
-        record = measured_record(curve, parts)
-        loading = np.isin(np.asarray(record.kind), (1, 4))
-        rates.extend(np.unique(np.asarray(record.loading_rate)[loading]).tolist())
+        record = record_columns(curve, parts)
+        loading = np.isin(record["kind"], (1, 4))
+        rates.extend(np.unique(record["loading_rate"][loading]).tolist())
         area = np.pi * diameter**2 / 4 * 1e-3
         peaks.append(float(curve.force_mN.max() / area))
         peaks.extend(
