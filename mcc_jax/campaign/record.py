@@ -22,17 +22,6 @@ from .validate import check_campaign
 def record_of(curve: Curve, segments: tuple[Segment, ...], *, relative_humidity_percent: float | None = None) -> Record:
     """The record of a measured test.
 
-    See `record_columns`; its arrays are those of JAX.
-    """
-    columns = record_columns(curve, segments, relative_humidity_percent=relative_humidity_percent)
-    return Record(**{name: jnp.asarray(values) for name, values in columns.items()})
-
-
-def record_columns(
-    curve: Curve, segments: tuple[Segment, ...], *, relative_humidity_percent: float | None = None
-) -> dict[str, np.ndarray]:
-    """The same as arrays of NumPy by name, to be put together with those of other tests.
-
     Rates are the slopes of straight lines through whole segments. The forces where branches begin come from straight
     lines through their first points.
 
@@ -45,6 +34,14 @@ def record_columns(
     Raises:
         ValueError: if the segments do not cover the curve.
     """
+    columns = record_columns(curve, segments, relative_humidity_percent=relative_humidity_percent)
+    return Record(**{name: jnp.asarray(values) for name, values in columns.items()})
+
+
+def record_columns(
+    curve: Curve, segments: tuple[Segment, ...], *, relative_humidity_percent: float | None = None
+) -> dict[str, np.ndarray]:
+    """The record of a measured test as arrays of NumPy by name, to be put together with others; see `record_of`."""
     arguments.instance(curve, Curve, "curve", "Make one with mcc_jax.Curve(time_s, force_mN, displacement_um).")
     if relative_humidity_percent is not None:
         arguments.number(relative_humidity_percent, "relative_humidity_percent", least=0, most=100)
