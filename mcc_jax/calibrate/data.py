@@ -26,7 +26,7 @@ from ..campaign import (
     turning_forces,
 )
 from ..campaign.reasons import SHOWN, below_threshold, far_apart, no_climb, no_loading, refusal, too_few
-from ..campaign.record import humidities, record_of
+from ..campaign.record import humidities, record_columns
 from ..effects import Record
 from ..geometry import Particle
 from .paper.modulus import MIN_RATIO
@@ -279,14 +279,14 @@ def records_of(
     records, reading, error = [], [], []
     for i, some in zip(places, rows, strict=True):
         own = None if humidity is None else float(humidity[i])
-        record = record_of(campaign.curves[i], segments[i], relative_humidity_percent=own)
+        record = record_columns(campaign.curves[i], segments[i], relative_humidity_percent=own)
         turning = turning_forces(campaign.curves[i], segments[i])
-        record = replace(record, force=jnp.asarray(turning.force), peak=jnp.asarray(turning.peak))
-        chosen = np.pad(some, (0, longest - len(some)), mode="edge")
-        records.append(jax.tree.map(lambda x, at=chosen: np.asarray(x)[at] if np.ndim(x) else np.asarray(x), record))
+        record |= {"force": turning.force, "peak": turning.peak}
+        chosen = np.concatenate((some, np.full(longest - len(some), some[-1])))
+        records.append({name: x[chosen] if x.ndim else x for name, x in record.items()})
         reading.append(turning.reading[chosen])
         error.append(turning.error[chosen])
-    together = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *records)
+    together = Record(**{name: jnp.asarray(np.stack([one[name] for one in records])) for name in records[0]})
     return Records(together, np.stack(reading), np.stack(error))
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .segments import Segment
+from .signal import differences, median
 
 
 @dataclass(frozen=True)
@@ -139,7 +140,7 @@ def _measure(
         fullness=fullness,
         loss=loss,
         loading_s=loading_s,
-        interval_s=float(np.median(np.diff(time))),
+        interval_s=median(differences(time)),
     )
 
 
@@ -148,8 +149,8 @@ def _without_spikes(values: np.ndarray) -> np.ndarray:
     if len(values) < 9:
         return values
     out = values.copy()
-    out[2:-2] = np.median(np.stack([values[i : len(values) - 4 + i] for i in range(5)]), axis=0)
-    out[:2], out[-2:] = np.median(values[:5]), np.median(values[-5:])
+    out[2:-2] = np.partition(np.lib.stride_tricks.sliding_window_view(values, 5), 2, axis=1)[:, 2]
+    out[:2], out[-2:] = median(values[:5]), median(values[-5:])
     return out
 
 
@@ -158,7 +159,7 @@ def _noise(values: np.ndarray) -> float:
     if len(values) < 8:
         return 0.0
     # Second differences of white noise of deviation 1 have variance 1 + 4 + 1.
-    return 1.4826 * float(np.median(np.abs(np.diff(values, 2)))) / np.sqrt(6.0)
+    return 1.4826 * median(np.abs(differences(values, 2))) / np.sqrt(6.0)
 
 
 def _compression_positive(force: np.ndarray) -> tuple[int, np.ndarray]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .signal import branch_envelope, noise_level, turning_points
+from .signal import branch_envelope, median, noise_level, turning_points
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class Drive:
         near_start = self.crossing(left, top - self.band) if has_left else float(at)
         near_stop = self.crossing(right, -(top - self.band)) if has_right else float(at)
         inside = sign * self.values[int(np.ceil(near_start)) : int(near_stop) + 1]
-        level = float(np.median(inside)) if len(inside) else top
+        level = median(inside) if len(inside) else top
         start, before = self._edge(left, level, at, rising=True) if has_left else (float(self.clock[at]), 0.0)
         stop, after = self._edge(right, -level, at, rising=False) if has_right else (float(self.clock[at]), 0.0)
         if stop - start <= self.options.slowness * max(before, after):
@@ -142,7 +142,7 @@ class Drive:
         for first, last in zip(edges[::2], edges[1::2], strict=True):
             # The longest stay of the run begins at the hold itself, or less than one band before.
             best = first + int(np.argmax(stay[first:last]))
-            level = float(np.median(envelope[best : ahead[best]]))
+            level = median(envelope[best : ahead[best]])
             entry, _ = self._edge(branch, level, offset + int(ahead[best]) - 1, rising=True)
             leave, _ = self._edge(branch, level, offset + int(best), rising=False)
             hold = Hold(self.index(entry), self.index(leave), sign * level)

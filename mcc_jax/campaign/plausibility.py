@@ -25,9 +25,10 @@ import numpy as np
 
 from .curve_features import CurveFeatures, curve_features
 from .findings import Finding, worst
+from .memory import remembered
 from .paper import PAPER_LOG_C, PAPER_SHAPE_PARAMETER
 from .plausible_ranges import PlausibilityOptions, Range
-from .schema import Campaign
+from .schema import Campaign, Curve
 from .segments import Segment
 from .slips import (
     Apparent,
@@ -127,18 +128,12 @@ class _Tests:
         rows: list[int] = []
         for i, curve in enumerate(campaign.curves):
             parts = segments[i] if segments is not None and i < len(segments) else ()
-            one = curve_features(
-                curve.time_s, curve.force_mN, curve.displacement_um, segments=parts, options=options.features
-            )
+            one = _features(curve, parts, options)
             if one is None or not (np.isfinite(diameters[i]) & (diameters[i] > 0)).all():
                 continue
             rows.append(i)
             given.append(one)
-            others.append(
-                curve_features(curve.time_s, curve.displacement_um, curve.force_mN, options=options.features)
-                if swapped
-                else None
-            )
+            others.append(_features(curve, None, options) if swapped else None)
         if not rows:
             return None
         names = tuple(campaign.particles[i] for i in rows)
@@ -150,6 +145,18 @@ class _Tests:
 
     def column(self, name: str) -> np.ndarray:
         return np.array([getattr(one, name) for one in self.given], float)
+
+
+def _features(curve: Curve, segments: Sequence[Segment] | None, options: PlausibilityOptions) -> CurveFeatures | None:
+    """The features of a test with its segments, if any are known; None for them with its columns swapped."""
+    time, force, path, seen = curve.time_s, curve.force_mN, curve.displacement_um, options.features
+
+    def find() -> CurveFeatures | None:
+        if segments is None:
+            return curve_features(time, path, force, options=seen)
+        return curve_features(time, force, path, segments=segments, options=seen)
+
+    return remembered(curve, (None if segments is None else tuple(segments), seen), find)
 
 
 # ---- slips of unit, and columns swapped ------------------------------------------------------------------------------

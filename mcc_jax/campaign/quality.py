@@ -23,7 +23,7 @@ from .plausibility import wrong_signs
 from .saturation import SaturationOptions, censor_displacement, censor_force
 from .schema import Campaign, Checked, Control, Curve, Note
 from .segments import find_segments
-from .signal import point_noise, runs, two_lines
+from .signal import differences, median, point_noise, quantile, runs, two_lines
 from .validate import check_campaign
 
 
@@ -171,21 +171,23 @@ def spikes(values: np.ndarray, options: QualityOptions) -> np.ndarray:
     count = len(values)
     if count < 12:
         return np.zeros(count, bool)
-    around = np.lib.stride_tricks.sliding_window_view(np.pad(values, 3, mode="edge"), 7)
-    middle = np.median(around, axis=1)
-    low, high = np.quantile(values, [0.05, 0.95])
-    step = float(np.median(np.abs(np.diff(values))))
+    around = np.lib.stride_tricks.sliding_window_view(_edged(values, 3, 3), 7)
+    middle = np.partition(around, 3, axis=1)[:, 3]
+    low, high = quantile(values, 0.05), quantile(values, 0.95)
+    moves = np.abs(differences(values))
+    step = median(moves)
     # The pace nearby, but not so near that the reading itself shifts the median.
-    pace = np.pad(np.abs(np.diff(middle)), (10, 11), mode="edge")
+    pace = _edged(np.abs(differences(middle)), 10, 11)
     windows = np.lib.stride_tricks.sliding_window_view(pace, 21)[:count]
     local = np.maximum(windows[:, :6].max(axis=1), windows[:, 15:].max(axis=1))
-    least = max(options.spike_noise * point_noise(values), options.spike_range * float(high - low))
+    least = max(options.spike_noise * point_noise(values), options.spike_range * (high - low))
     least = np.maximum(least, options.spike_steps * np.maximum(step, local))
     far = np.abs(values - middle) > np.maximum(least, 1e-300)
     far[[0, 1, -2, -1]] = False  # at the ends the median of the neighbours is no middle
-    moves = np.abs(np.diff(values))
     if moves.any():  # one step of a coarse read-out is none
         far &= np.abs(values - middle) > options.spike_read_out * float(moves[moves > 0].min())
+    if not far.any():
+        return far
     # Three or more in a row are no slip of the read-out but something that happened.
     edges = np.flatnonzero(np.diff(np.concatenate([[0], far.astype(int), [0]])))
     for start, stop in zip(edges[::2], edges[1::2], strict=True):
@@ -194,24 +196,30 @@ def spikes(values: np.ndarray, options: QualityOptions) -> np.ndarray:
     return far
 
 
+def _edged(values: np.ndarray, before: int, behind: int) -> np.ndarray:
+    """Numbers with their first and last one repeated."""
+    return np.concatenate((np.full(before, values[0]), values, np.full(behind, values[-1])))
+
+
 def stuck(values: np.ndarray, options: QualityOptions) -> np.ndarray:
     """Which readings only repeat the one before, and are made up for by a jump behind them; booleans."""
     found = np.zeros(len(values), bool)
-    stretches = runs(values)
-    lengths = np.array([stop - start for start, stop in stretches])
-    least = max(options.stuck_readings, 3 * float(np.quantile(lengths, 0.9)))
-    if len(stretches) < 8 or lengths.max() < least:
+    starts, stops = runs(values)
+    lengths = stops - starts
+    least = max(options.stuck_readings, 3 * quantile(lengths, 0.9))
+    if len(lengths) < 8 or lengths.max() < least:
         return found
-    steps = np.abs(np.diff(values))
-    typical = float(np.median(steps[steps > 0]))
-    for start, stop in stretches:
-        if stop - start < least or start == 0 or stop >= len(values):
+    steps = np.abs(differences(values))
+    typical = median(steps[steps > 0])
+    long = lengths >= least
+    for start, stop in zip(starts[long].tolist(), stops[long].tolist(), strict=True):
+        if start == 0 or stop >= len(values):
             continue
         before, after = steps[max(start - 20, 0) : start - 1], steps[stop : stop + 20]
         near = np.concatenate([before, after])
         if not len(near):
             continue
-        pace = float(np.median(near))
+        pace = median(near)
         jump = steps[stop - 1]
         if jump > options.stuck_catch_up * (stop - start) * pace and jump > options.stuck_jump * max(
             typical, float(np.max(near))
@@ -223,9 +231,9 @@ def stuck(values: np.ndarray, options: QualityOptions) -> np.ndarray:
 def begins_at_peak(curve: Curve, options: QualityOptions) -> bool:
     """Whether a record has lost its loading: it begins at its largest force and unloads."""
     force = curve.force_mN
-    largest, first = float(force.max()), float(np.median(force[:3]))
+    largest, first = float(force.max()), median(force[:3])
     # One that ends there as well never unloads; one with the sign of its force reversed has no largest force.
-    return first > 0.5 * float(-force.min()) and first >= options.begins_at * largest > 2 * float(np.median(force[-3:]))
+    return first > 0.5 * float(-force.min()) and first >= options.begins_at * largest > 2 * median(force[-3:])
 
 
 def breakage(curve: Curve, options: QualityOptions) -> tuple[int, float] | None:
@@ -244,10 +252,11 @@ def breakage(curve: Curve, options: QualityOptions) -> tuple[int, float] | None:
     noise = point_noise(path)
     travel = max(float(np.ptp(path)), 1e-300)
     back = max(4 * noise, 1e-3 * travel)
-    steps = np.abs(np.diff(force))
-    interval = np.diff(time)
-    moving = steps > 0.05 * max(float(np.median(steps)), 1e-300)
-    pace = float(np.median(steps[moving] / np.maximum(interval[moving], 1e-300))) if moving.any() else 0.0
+    steps = np.abs(differences(force))
+    interval = differences(time)
+    moving = steps > 0.05 * max(median(steps), 1e-300)
+    pace = median(steps[moving] / np.maximum(interval[moving], 1e-300)) if moving.any() else 0.0
+    least = options.loss_noise * point_noise(force)
     first: tuple[int, float] | None = None
     for width in range(1, options.loss_readings + 1):
         drop = force[:-width] - force[width:]
@@ -255,9 +264,7 @@ def breakage(curve: Curve, options: QualityOptions) -> tuple[int, float] | None:
             share = drop / np.maximum(reached[:-width], 1e-300)
         fast = drop > options.loss_pace * pace * (time[width:] - time[:-width])
         sudden = (share > options.loss_of_force) & fast & (path[width:] - path[:-width] > -back)
-        sudden &= (reached[:-width] > options.loss_from * reached[-1]) & (
-            drop > options.loss_noise * point_noise(force)
-        )
+        sudden &= (reached[:-width] > options.loss_from * reached[-1]) & (drop > least)
         for i in np.flatnonzero(sudden):
             if first is not None and i >= first[0]:
                 break
@@ -297,9 +304,9 @@ def zero_of_force(curve: Curve, control: Control | None, options: QualityOptions
     autoregressive process of order 1). With a drift it is their straight line over time up to contact, and the line's
     value there from then on; what the drift did during the test nobody knows, so its change in the air is the error.
     """
-    contact = air_until(curve, control, options)
+    contact, ahead = air_until(curve, control, options)
     if contact is None:
-        return _perhaps_drift(curve, options)
+        return _perhaps_drift(curve, ahead, options)
     # The last readings before the platens touch may already feel the first asperities.
     stop = max(options.air_readings, int(0.9 * contact))
     air, when = curve.force_mN[:stop], curve.time_s[:stop]
@@ -331,9 +338,8 @@ def zero_of_force(curve: Curve, control: Control | None, options: QualityOptions
     return ZeroOfForce(flat, mean, float(error), _offset_notes(mean, error, largest, options))
 
 
-def _perhaps_drift(curve: Curve, options: QualityOptions) -> ZeroOfForce | None:
+def _perhaps_drift(curve: Curve, ahead: SlowStart | None, options: QualityOptions) -> ZeroOfForce | None:
     """A rise in front of the loading which is too quick to be taken for a drift, and too straight for a contact."""
-    ahead = slow_start(curve, options)
     if ahead is None or abs(ahead.change) <= options.air_share * float(np.ptp(curve.force_mN)):
         return None
     note = Note(
@@ -360,8 +366,8 @@ def _offset_notes(zero: float, error: float, largest: float, options: QualityOpt
     return (Note("zero of force", "told", "force reads {} mN in the air before contact; this was taken off", (zero,)),)
 
 
-def air_until(curve: Curve, control: Control | None, options: QualityOptions) -> int | None:
-    """How many readings were taken before contact; None if too few.
+def air_until(curve: Curve, control: Control | None, options: QualityOptions) -> tuple[int | None, SlowStart | None]:
+    """How many readings were taken before contact; None if too few, and then the slow start, if there is one.
 
     The approach of `find_segments`; where it finds none, a straight and much slower rise in front of the loading is a
     drift of the load cell, and the approach is looked for again without it.
@@ -375,12 +381,12 @@ def air_until(curve: Curve, control: Control | None, options: QualityOptions) ->
 
     contact = found(curve)
     if contact is not None:
-        return contact
+        return contact, None
     ahead = slow_start(curve, options)
     if ahead is None or ahead.share > options.drift_slower:
-        return None
+        return None, ahead
     time = np.minimum(curve.time_s, curve.time_s[ahead.stop - 1])
-    return found(replace(curve, force_mN=curve.force_mN - ahead.line(time)))
+    return found(replace(curve, force_mN=curve.force_mN - ahead.line(time))), ahead
 
 
 @dataclass(frozen=True)
@@ -412,25 +418,25 @@ def slow_start(curve: Curve, options: QualityOptions) -> SlowStart | None:
     kink = two_lines(time[: first + 1], force[: first + 1])
     if kink <= options.air_readings or kink > first - 3:
         return None
-    ahead, behind = np.arange(kink), np.arange(kink, first + 1)
+    ahead, behind = slice(kink), slice(kink, first + 1)
     if not (time[kink - 1] > time[0] and time[first] > time[kink]):
         return None
-    slow, fast, way, on = (
-        np.polynomial.Polynomial.fit(time[rows], values[rows], 1)
-        for rows, values in ((ahead, force), (behind, force), (ahead, path), (behind, path))
+    clocks = [time[rows] - time[rows].mean() for rows in (ahead, behind)]
+    spreads = [max(float(clock @ clock), 1e-300) for clock in clocks]
+    slow, fast = (
+        float(clock @ force[rows]) / s for clock, rows, s in zip(clocks, (ahead, behind), spreads, strict=True)
     )
-    left = force[ahead] - slow(time[ahead])
-    straight = np.std(left) <= 2 * point_noise(force[ahead]) + 1e-12 * float(np.ptp(force))
-    errors = [
-        point_noise(force) / np.sqrt(max(np.sum((time[r] - time[r].mean()) ** 2), 1e-300)) for r in (ahead, behind)
-    ]
-    bends = fast.deriv()(0.0) - slow.deriv()(0.0) > options.drift_said * np.hypot(*errors)
-    share, pace = (float(a.deriv()(0.0) / max(b.deriv()(0.0), 1e-300)) for a, b in ((slow, fast), (way, on)))
-    if not straight or not bends or share > options.drift_like:
+    way, on = (float(clock @ path[rows]) / s for clock, rows, s in zip(clocks, (ahead, behind), spreads, strict=True))
+    bends = fast - slow > options.drift_said * point_noise(force) * np.hypot(*(1 / np.sqrt(spreads)))
+    share, pace = slow / max(fast, 1e-300), way / max(on, 1e-300)
+    if not bends or share > options.drift_like:
         return None
     if pace > 0 and share > 0 and 1 / options.other_stiffness < share / pace < options.other_stiffness:
         return None
-    return SlowStart(slow, kink, float(slow(time[kink - 1]) - slow(time[0])), share)
+    line = np.polynomial.Polynomial.fit(time[ahead], force[ahead], 1)
+    if np.std(force[ahead] - line(time[ahead])) > 2 * point_noise(force[ahead]) + 1e-12 * float(np.ptp(force)):
+        return None
+    return SlowStart(line, kink, float(line(time[kink - 1]) - line(time[0])), share)
 
 
 # ---- words -----------------------------------------------------------------------------------------------------------

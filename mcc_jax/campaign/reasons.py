@@ -120,15 +120,16 @@ def far_apart(stress_MPa: Sequence[float | None], strain: Sequence[float | None]
         strain: the range of displacement of each, in shares of its effective diameter; None likewise.
     """
     found: list[str | None] = []
+    stresses, strains = (np.sort([v for v in values if v is not None]) for values in (stress_MPa, strain))
     for i in range(len(stress_MPa)):
-        stress, usual = _apart(stress_MPa, i)
+        stress, usual = _apart(stress_MPa[i], stresses)
         if stress is not None:
             found.append(
                 f"reaches {stress:.3g} MPa where the others reach {usual:.3g} MPa; "
                 "check its unit of force and its diameters (they turn force into stress), or leave the particle out"
             )
             continue
-        share, usual = _apart(strain, i)
+        share, usual = _apart(strain[i], strains)
         found.append(
             None
             if share is None
@@ -138,13 +139,18 @@ def far_apart(stress_MPa: Sequence[float | None], strain: Sequence[float | None]
     return found
 
 
-def _apart(values: Sequence[float | None], i: int) -> tuple[float | None, float]:
-    """A particle's value if it is far from the median of the others', else None; and that median."""
-    own = values[i]
-    others = [v for k, v in enumerate(values) if k != i and v is not None]
-    if own is None or not others:
+def _apart(own: float | None, ordered: np.ndarray) -> tuple[float | None, float]:
+    """A particle's value if it is far from the median of the others', else None; and that median.
+
+    Args:
+        own: its value.
+        ordered: the values of all particles, its own among them, in order.
+    """
+    if own is None or len(ordered) < 2:
         return None, 0.0
-    usual = float(np.median(others))
+    at, rest = int(np.searchsorted(ordered, own)), len(ordered) - 1
+    low, high = (float(ordered[k + (k >= at)]) for k in ((rest - 1) // 2, rest // 2))
+    usual = (low + high) / 2
     return None if usual / USABLE.far_apart <= own <= usual * USABLE.far_apart else own, usual
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -16,6 +15,7 @@ from ..effects.record import APPROACH, HOLD, KINDS, LOAD, UNLOAD
 from .adjustment import campaign_segments
 from .schema import Campaign, Curve
 from .segments import Segment
+from .signal import straight_line
 from .validate import check_campaign
 
 
@@ -34,6 +34,14 @@ def record_of(curve: Curve, segments: tuple[Segment, ...], *, relative_humidity_
     Raises:
         ValueError: if the segments do not cover the curve.
     """
+    columns = record_columns(curve, segments, relative_humidity_percent=relative_humidity_percent)
+    return Record(**{name: jnp.asarray(values) for name, values in columns.items()})
+
+
+def record_columns(
+    curve: Curve, segments: tuple[Segment, ...], *, relative_humidity_percent: float | None = None
+) -> dict[str, np.ndarray]:
+    """The record of a measured test as arrays of NumPy by name, to be put together with others; see `record_of`."""
     arguments.instance(curve, Curve, "curve", "Make one with mcc_jax.Curve(time_s, force_mN, displacement_um).")
     if relative_humidity_percent is not None:
         arguments.number(relative_humidity_percent, "relative_humidity_percent", least=0, most=100)
@@ -73,12 +81,7 @@ def record_of(curve: Curve, segments: tuple[Segment, ...], *, relative_humidity_
         columns["loading_rate"][: known[0]] = columns["loading_rate"][known[0]]
         columns["rate"][: known[0]] = columns["loading_rate"][known[0]]
     humidity = REFERENCE_HUMIDITY_PERCENT if relative_humidity_percent is None else float(relative_humidity_percent)
-    return Record(
-        jnp.asarray(force),
-        jnp.asarray(time),
-        **{name: jnp.asarray(values) for name, values in columns.items()},
-        relative_humidity=jnp.asarray(humidity, dtype=float),
-    )
+    return {"force": force, "time": time, **columns, "relative_humidity": np.asarray(humidity, dtype=float)}
 
 
 def record_batch(
@@ -99,17 +102,16 @@ def record_batch(
     found = campaign_segments(campaign) if segments is None else segments
     humidity = humidities(campaign)
     records = [
-        record_of(curve, parts, relative_humidity_percent=None if humidity is None else float(humidity[i]))
+        record_columns(curve, parts, relative_humidity_percent=None if humidity is None else float(humidity[i]))
         for i, (curve, parts) in enumerate(zip(campaign.curves, found, strict=True))
     ]
     longest = max(len(curve) for curve in campaign.curves)
     longest += -longest % multiple
 
-    def together(*leaves: Array) -> Array:
-        rows = [np.asarray(leaf) for leaf in leaves]
+    def together(rows: list[np.ndarray]) -> Array:
         return jnp.asarray(np.stack([np.pad(r, (0, longest - len(r)), mode="edge") if r.ndim else r for r in rows]))
 
-    return jax.tree.map(together, *records)
+    return Record(**{name: together([one[name] for one in records]) for name in records[0]})
 
 
 def humidities(campaign: Campaign) -> Float[np.ndarray, " particles"] | None:
@@ -149,9 +151,7 @@ def _first_value(time: np.ndarray, force: np.ndarray) -> float:
     n = min(len(force), 9)
     if n < 3 or np.ptp(time[:n]) <= 0:
         return float(force[0])
-    slope, level = np.polyfit(time[:n] - time[0], force[:n], 1)
-    del slope
-    return float(level)
+    return straight_line(time[:n] - time[0], force[:n])[1]
 
 
 def _slope(time: np.ndarray, force: np.ndarray, before: float) -> float:
@@ -183,9 +183,9 @@ def available_data(campaign: Campaign, segments: tuple[tuple[Segment, ...], ...]
 
     rates, peaks, durations, low = [], [], [], 0
     for curve, parts, diameter in zip(campaign.curves, found, D1 * D2 / D3, strict=True):
-        record = record_of(curve, parts)
-        loading = np.isin(np.asarray(record.kind), (1, 4))
-        rates.extend(np.unique(np.asarray(record.loading_rate)[loading]).tolist())
+        record = record_columns(curve, parts)
+        loading = np.isin(record["kind"], (1, 4))
+        rates.extend(np.unique(record["loading_rate"][loading]).tolist())
         area = np.pi * diameter**2 / 4 * 1e-3
         peaks.append(float(curve.force_mN.max() / area))
         peaks.extend(

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .schema import Curve, Note
-from .signal import point_noise, runs
+from .signal import differences, point_noise, quantile, runs
 
 
 @dataclass(frozen=True)
@@ -97,14 +97,14 @@ def plateaus(
     count = len(values)
     if count < 12:
         return []
-    stretches = runs(values)
-    largest = values.max()
-    at_end = [(start, stop) for start, stop in stretches if values[start] == largest]
-    elsewhere = [stop - start for start, stop in stretches if values[start] != largest]
-    if not at_end or not elsewhere:
+    starts, stops = runs(values)
+    last = values[starts] == values.max()
+    at_end = list(zip(starts[last].tolist(), stops[last].tolist(), strict=True))
+    elsewhere = (stops - starts)[~last]
+    if not at_end or not len(elsewhere):
         return []
-    usual = float(np.quantile(elsewhere, 0.9))
-    moves = np.abs(np.diff(values))
+    usual = quantile(elsewhere, 0.9)
+    moves = np.abs(differences(values))
     step = float(moves[moves > 0].min())
     found = []
     for start, stop in at_end:

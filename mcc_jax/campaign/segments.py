@@ -19,8 +19,9 @@ import numpy as np
 from .. import arguments
 from .._errors import InputError
 from .excursions import Drive, DriveOptions, Hold
+from .memory import remembered
 from .schema import A_CURVE, Control, Curve
-from .signal import branch_envelope, steady_clock, two_lines
+from .signal import branch_envelope, median, steady_clock, two_lines
 from .validate import check_finite
 
 SegmentKind = Literal["approach", "load", "hold", "unload", "reload"]
@@ -112,8 +113,13 @@ def find_segments(
         check_finite(
             getattr(curve, name), f"the {name} of a curve", lambda text, remedy: InputError(text, remedy=remedy)
         )
-    force, displacement = np.asarray(curve.force_mN, float), np.asarray(curve.displacement_um, float)
     options = DriveOptions(smallest_turn, noise_multiple, band, hold_slowness, hold_samples)
+    return remembered(curve, (control, options, contact), lambda: _found(curve, control, options, contact))
+
+
+def _found(curve: Curve, control: Control | None, options: DriveOptions, contact: float) -> tuple[Segment, ...]:
+    """The segments of a curve, see `find_segments`."""
+    force, displacement = np.asarray(curve.force_mN, float), np.asarray(curve.displacement_um, float)
     clock = steady_clock(np.asarray(curve.time_s, float))
     drive = Drive(force, clock, options)
     if not drive.span > 0:
@@ -184,8 +190,8 @@ def _relaxes(hold: Hold, force: Drive) -> bool:
     """Whether the force decays towards rest in a stretch of constant displacement."""
     part = force.values[hold.start : hold.stop]
     third = max(len(part) // 3, 1)
-    begin = float(np.median(part[: max(third // 3, 1)]))
-    middle, end = float(np.median(part[third : 2 * third])), float(np.median(part[-third:]))
+    begin = median(part[: max(third // 3, 1)])
+    middle, end = (median(some) if len(some) else np.nan for some in (part[third : 2 * third], part[-third:]))
     if begin - end < max(0.01 * force.span, 3 * force.noise) or begin - end > 0.6 * (begin - force.values.min()):
         return False
     # Stiff unloading also leaves the displacement as it was, but it goes on at the pace of a ramp.
@@ -209,7 +215,7 @@ def _sags(holds: list[Hold], force: Drive) -> bool:
     for hold in holds:
         third = max((hold.stop - hold.start) // 3, 1)
         part = force.values[hold.start : hold.stop]
-        fall = float(np.median(part[:third]) - np.median(part[-third:]))
+        fall = median(part[:third]) - median(part[-third:])
         count += fall > max(6 * force.noise / np.sqrt(third), 0.2 * force.band)
     return bool(2 * count > len(holds))
 
@@ -231,7 +237,7 @@ def _contact_onset(force: Drive, displacement: np.ndarray, clock: np.ndarray, co
     if peak is None:
         return 0
     before = values[: peak + 1]
-    base = float(np.median(before[before <= before.min() + rise / 2]))
+    base = median(before[before <= before.min() + rise / 2])
     onset = 0
     while True:
         stop = int(np.flatnonzero(before <= base + rise)[-1]) + 1

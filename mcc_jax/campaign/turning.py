@@ -16,7 +16,7 @@ from .. import arguments
 from .._format import described
 from .schema import Curve
 from .segments import Segment, check_segmented
-from .signal import noise_level
+from .signal import median, noise_level, straight_line
 
 
 @dataclass(frozen=True)
@@ -107,9 +107,10 @@ def turning_forces(curve: Curve, segments: tuple[Segment, ...], options: Turning
                 peak[elastic], error[elastic] = before, before_error
             continue
         if level is None:  # the record begins behind its peak
-            ends = np.polyfit(time[rows][: options.most] - time[part.start], raw[rows][: options.most], 1)
-            enough = len(raw[rows]) >= options.least
-            level, level_error = (float(max(ends[1], raw[part.start])) if enough else float(raw[part.start])), 1.0
+            level, level_error = float(raw[part.start]), 1.0
+            if len(raw[rows]) >= options.least:
+                clock = time[rows][: options.most] - time[part.start]
+                level = max(straight_line(clock, raw[rows][: options.most])[1], level)
         peak[rows], error[rows] = level, level_error
         force[rows] = np.minimum(raw[rows], level)
         if part.kind == "reload" and k + 1 < len(segments) and segments[k + 1].kind == "load":
@@ -180,8 +181,7 @@ def _level(
 def _meeting(rising: _Curve, falling: _Curve, step: float) -> float:
     """When the ramps before and behind a turning point come closest to each other, from the turning reading on."""
     instants = np.linspace(-step, step, 41)
-    gap = [abs(rising.at(t)[0] - falling.at(t)[0]) for t in instants]
-    return float(instants[int(np.argmin(gap))])
+    return float(instants[int(np.argmin(np.abs(rising.along(instants) - falling.along(instants))))])
 
 
 def _run(near: np.ndarray, start: int, stop: int, direction: int, most: int) -> np.ndarray:
@@ -197,8 +197,8 @@ def _held(time: np.ndarray, raw: np.ndarray, part: Segment, noise: float, option
     A hold begins and ends with readings of the ramps beside it that come close to it: they lie apart from the others.
     """
     force = raw[part.start : part.stop]
-    away = np.abs(force - np.median(force))
-    sd = 1.4826 * float(np.median(away))
+    away = np.abs(force - median(force))
+    sd = 1.4826 * median(away)
     rows = part.start + np.flatnonzero(away <= options.inside * sd)
     if len(rows) < options.least:  # too few to tell what they scatter about: those as high as the highest
         return part.start + np.flatnonzero(force >= force.max() - options.inside * noise)
@@ -238,6 +238,10 @@ class _Curve(NamedTuple):
     def at(self, time: float) -> tuple[float, float]:
         x = (time / self.unit) ** np.arange(len(self.values))
         return float(x @ self.values), float(x @ self.covariance @ x)
+
+    def along(self, time: np.ndarray) -> np.ndarray:
+        """Its values at several times."""
+        return np.asarray((time[:, None] / self.unit) ** np.arange(len(self.values)) @ self.values)
 
     def slope(self, time: float) -> float:
         k = np.arange(1, len(self.values))
