@@ -231,9 +231,7 @@ def _answer(content: Mapping[str, Any]) -> str:
     else:
         parts.append(f"the modulus is {_pair(modulus, 1e-3)} GPa")
     parts.append(f"a {_pair(content['a'])}")
-    return (
-        " and ".join(parts) + ("" if content.get("converged", True) else " (not converged)") + content.get("remark", "")
-    )
+    return " and ".join(parts) + ("" if content.get("converged", True) else " (not converged)")
 
 
 def _pair(estimate: Mapping[str, Any], factor: float = 1.0) -> str:

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, NamedTuple, get_args
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from .. import arguments
@@ -21,17 +20,16 @@ from .data import Selection, compared_rows, own_misfit, ranges_um, root_mean_squ
 from .draws import Draws, draw_fast, draw_joint
 from .effects import effect_entries, effect_numbers
 from .estimates import estimate, finite, force_zero, log_estimate, misfit_note, missed, noise_note, summary
-from .fit_result import Fit, population_of
+from .fit_result import Fit
 from .fitting import checked_settings, in_own_units, prepare
 from .judgement import at_noise_level, judged, noise_share, numbers_in_reach, unlike_others
 from .least_squares import least_squares
-from .mode import LogPosterior, most_probable
 from .model import Model
 from .particles import Length
 from .population import COEFFICIENTS, Population
 from .predict import predict_measured
 from .results import PosteriorDraws
-from .settings import JUDGEMENT, SAMPLING
+from .settings import SAMPLING
 
 Mode = Literal["fast", "joint"]
 
@@ -368,8 +366,6 @@ def sample(
     outlying = unlike_others(calibration.particles, calibration.rms_um(), ranges_um(tests))
 
     def again(some: Campaign) -> dict[str, Any]:
-        if fast and len(selection.kept) > JUDGEMENT.again:
-            return _left_out(calibration, fit, some)
         settings: dict[str, Any] = {"threshold_MPa": threshold_MPa, "mode": mode, "seed": seed, "block": block}
         few: dict[str, Any] = {"chains": chains, "warmup": warmup, "draws": draws}
         return sample(some, model, without_flagged=False, **settings, **few).answer()
@@ -381,37 +377,6 @@ def sample(
         told.append(_moved_by_effects(campaign, model, calibration, threshold_MPa))
     notes = (*calibration.notes, *(one for one in told if one is not None))
     return replace(calibration, findings=findings, notes=notes, runtime_s=time.perf_counter() - started)
-
-
-def _left_out(calibration: Posterior, fit: Fit, some: Campaign) -> dict[str, Any]:
-    """The answer with only some of its particles, as far as the fit tells: moved by as much as its mode moves.
-
-    Noise and every particle's summary stay what they are with all.
-
-    Args:
-        calibration: of all particles.
-        fit: the same fit, with copies that only fill up.
-        some: the particles that stay.
-    """
-    stay = set(some.particles)
-    weight = np.array(fit.marginal.weight)
-    weight[: len(calibration.particles)] = [name in stay for name in calibration.particles]
-    target = LogPosterior(fit.model, replace(fit.marginal, weight=jnp.asarray(weight)))
-    mode, covariance, found = most_probable(fit.mode, target)
-    before, after = fit.population, population_of(mode, target)
-    wider = dict(zip(fit.names, np.sqrt(np.diagonal(covariance) / np.diagonal(fit.covariance)), strict=True))
-    answer = calibration.answer()
-    a, modulus = answer["a"], answer["effective_modulus_MPa"]
-    stiffer = float(np.exp(after.log_modulus - before.log_modulus))
-    return {
-        "converged": found,
-        "remark": " (noise and particles as with all)",
-        "a": {"value": a["value"] + float(after.a - before.a), "sd": a["sd"] * float(wider["a"])},
-        "effective_modulus_MPa": {
-            "value": modulus["value"] * stiffer,
-            "sd": modulus["sd"] * stiffer * float(wider["log_modulus"]),
-        },
-    }
 
 
 def _moved_by_effects(campaign: Campaign, model: Model, calibration: Posterior, threshold_MPa: float) -> str | None:

@@ -197,12 +197,9 @@ class JudgementSettings:
             law's own data and a tester's noise it stays below 0.01.
         noise_share: share of the residual's variance that correlated noise holds: at half it is as large as read-out
             noise.
-        again: a campaign of up to so many particles is calibrated once more without flagged ones; of more, whose every
-            particle says little and costs much, the most probable population is found without their summaries.
     """
 
     misfit: float = 0.05
-    again: int = 500
     noise_share: float = 0.5
 
 
