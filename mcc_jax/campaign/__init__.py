@@ -26,9 +26,9 @@ from .plausibility import check_plausibility as check_plausibility
 from .plausibility import other_material as other_material
 from .plausible_ranges import PlausibilityOptions as PlausibilityOptions
 from .plausible_ranges import SolidClass as SolidClass
-from .quality import QualityOptions as QualityOptions
 from .quality import campaign_findings as campaign_findings
 from .quality import check_tests as check_tests
+from .quality_options import QualityOptions as QualityOptions
 from .readers import read_diameters as read_diameters
 from .readers import read_tester_file as read_tester_file
 from .record import available_data as available_data

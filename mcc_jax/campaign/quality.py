@@ -13,80 +13,18 @@ A test in which nothing is found stays what it is, to the last bit.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
-from .._format import described
 from .findings import Finding
+from .force_zero import zero_of_force
 from .plausibility import wrong_signs
-from .saturation import SaturationOptions, censor_displacement, censor_force
+from .quality_options import QualityOptions
+from .saturation import censor_displacement, censor_force
 from .schema import Campaign, Checked, Control, Curve, Note
-from .segments import find_segments
-from .signal import differences, median, point_noise, quantile, runs, two_lines
+from .signal import differences, median, point_noise, quantile, runs
 from .validate import check_campaign
-
-
-@dataclass(frozen=True)
-class QualityOptions:
-    """What counts as a fault of the tester. Each number is chosen so that no honest record can reach it.
-
-    Attributes:
-        spike_noise: a reading is a spike from so many standard deviations of the noise on. Of 1e6 normal readings the
-            farthest lies at 5; the rest is for noise that is not normal.
-        spike_steps: and from so many times the step between neighbouring readings on: a turning point of a ramp lies
-            within 3 steps of the median of the seven readings around it, and every half of a cycle has some readings.
-        spike_read_out: and from so many of the smallest steps of the read-out on.
-        spike_range: and from this share of the channel's range (5 to 95 %) on.
-        stuck_readings: readings that repeat, at least; also three times as many as the channel repeats elsewhere, which
-            is what a coarse read-out does.
-        stuck_catch_up: share of the ramp's progress in that time which the jump behind them makes up for, at least.
-        begins_at: a record begins at its largest force if its first readings reach this share of it.
-        stuck_jump: and this jump is so many times larger than any step near it, at least: a coarse read-out jumps by
-            one step at a time.
-        loss_of_force: share of the largest force that a breaking particle loses, at least. Settling and rotation of
-            ceramic pebbles lose up to a tenth at once.
-        loss_readings: within so many readings, at most.
-        loss_pace: and so many times faster than the force changes elsewhere, at least.
-        loss_from: and from this share of the largest force on: below it, the platens bounce on asperities.
-        loss_noise: and so many standard deviations of the noise, at least.
-        air_readings: readings in the air, at least: fewer do not give the zero's error.
-        air_said: an offset is told from so many standard deviations on,
-        air_share: and from this share of the largest force on: below it no answer moves by a tenth of its error.
-        drift_said: a drift in the air is told from so many standard deviations of its slope on, and from `air_share`.
-        drift_slower: a straight rise in front of the loading is a drift if its slope is this share of the loading's, at
-            most, as is any straight fall; the first contact of asperities is not straight.
-        drift_like: up to this share it may be one, and is told.
-        other_stiffness: if force over displacement is not another one there, by this factor, only the tester's speed
-            was.
-        start_share: of the largest force, in front of which such a rise is looked for: farther on loading itself bends.
-        saturation: when a channel counts as saturated.
-    """
-
-    spike_noise: float = 15.0
-    spike_steps: float = 5.0
-    spike_read_out: float = 2.5
-    spike_range: float = 0.02
-    stuck_readings: int = 6
-    stuck_catch_up: float = 0.5
-    stuck_jump: float = 2.5
-    begins_at: float = 0.95
-    loss_of_force: float = 0.25
-    loss_readings: int = 3
-    loss_pace: float = 5.0
-    loss_from: float = 0.05
-    loss_noise: float = 10.0
-    air_readings: int = 5
-    air_said: float = 3.0
-    air_share: float = 1e-3
-    drift_said: float = 5.0
-    drift_slower: float = 0.1
-    drift_like: float = 0.7
-    other_stiffness: float = 1.5
-    start_share: float = 0.1
-    saturation: SaturationOptions = field(default_factory=SaturationOptions)
-
-    __repr__ = described()
 
 
 def check_tests(campaign: Campaign, options: QualityOptions | None = None) -> Campaign:
@@ -278,165 +216,6 @@ def breakage(curve: Curve, options: QualityOptions) -> tuple[int, float] | None:
     if first is None or first[0] < 8:
         return None
     return first
-
-
-@dataclass(frozen=True)
-class ZeroOfForce:
-    """What the force channel reads without contact.
-
-    Attributes:
-        path: what to take off at each reading [mN]; constant from contact on.
-        value: the zero at contact [mN].
-        sd: its standard deviation [mN].
-        notes: what there is to say of it.
-    """
-
-    path: np.ndarray
-    value: float
-    sd: float
-    notes: tuple[Note, ...] = ()
-
-
-def zero_of_force(curve: Curve, control: Control | None, options: QualityOptions) -> ZeroOfForce | None:
-    """The force that is read in the air before contact; None if there are no such readings.
-
-    Without a drift it is the readings' mean, with the error of a mean of readings that hang together (as of an
-    autoregressive process of order 1). With a drift it is their straight line over time up to contact, and the line's
-    value there from then on; what the drift did during the test nobody knows, so its change in the air is the error.
-    """
-    contact, ahead = air_until(curve, control, options)
-    if contact is None:
-        return _perhaps_drift(curve, ahead, options)
-    # The last readings before the platens touch may already feel the first asperities.
-    stop = max(options.air_readings, int(0.9 * contact))
-    air, when = curve.force_mN[:stop], curve.time_s[:stop]
-    mean, sd = float(np.mean(air)), float(np.std(air, ddof=1))
-    largest = max(float(np.max(curve.force_mN) - mean), 1e-300)
-    flat = np.full(len(curve), mean)
-    centred = when - when.mean()
-    spread = float(np.sum(centred**2))
-    if not (sd > 0 and spread > 0):
-        return ZeroOfForce(flat, mean, 0.0, _offset_notes(mean, 0.0, largest, options))
-    slope = float(np.sum(centred * air) / spread)
-    left = air - mean - slope * centred
-    slope_sd = float(np.std(left, ddof=2) / np.sqrt(spread)) * _inflation(left)
-    change = slope * float(when[-1] - when[0])
-    if abs(slope) > options.drift_said * slope_sd and abs(change) > options.air_share * largest:
-        at = np.minimum(curve.time_s, curve.time_s[contact - 1]) - when.mean()
-        path = mean + slope * at
-        error = float(np.hypot(np.std(left, ddof=2) / np.sqrt(len(air)), abs(change) / np.sqrt(12)))
-        note = Note(
-            "zero of force",
-            "look",
-            "force drifts by {} mN in the air before contact; the zero at contact ({} mN) was taken off, with this "
-            "drift as its error",
-            (abs(change), float(path[-1])),
-            "Let the load cell settle before a test",
-        )
-        return ZeroOfForce(path, float(path[-1]), error, (note,))
-    error = sd / np.sqrt(len(air)) * _inflation(air - mean)
-    return ZeroOfForce(flat, mean, float(error), _offset_notes(mean, error, largest, options))
-
-
-def _perhaps_drift(curve: Curve, ahead: SlowStart | None, options: QualityOptions) -> ZeroOfForce | None:
-    """A rise in front of the loading which is too quick to be taken for a drift, and too straight for a contact."""
-    if ahead is None or abs(ahead.change) <= options.air_share * float(np.ptp(curve.force_mN)):
-        return None
-    note = Note(
-        "zero of force",
-        "look",
-        "force goes straight by {} mN in front of the loading; it is counted as contact, but would be a drift of the "
-        "load cell if the platens did not touch yet",
-        (ahead.change,),
-        "Cut these readings off if the platens did not touch yet, and let the load cell settle before a test",
-    )
-    return ZeroOfForce(np.zeros(len(curve)), 0.0, 0.0, (note,))
-
-
-def _inflation(scatter: np.ndarray) -> float:
-    """How much larger the error of a mean is since readings hang together, by their lag-1 correlation."""
-    lag = float(np.sum(scatter[1:] * scatter[:-1]) / max(np.sum(scatter**2), 1e-300))
-    lag = min(max(lag, 0.0), 0.9)
-    return float(np.sqrt((1 + lag) / (1 - lag)))
-
-
-def _offset_notes(zero: float, error: float, largest: float, options: QualityOptions) -> tuple[Note, ...]:
-    if abs(zero) <= options.air_said * error or abs(zero) <= options.air_share * largest:
-        return ()
-    return (Note("zero of force", "told", "force reads {} mN in the air before contact; this was taken off", (zero,)),)
-
-
-def air_until(curve: Curve, control: Control | None, options: QualityOptions) -> tuple[int | None, SlowStart | None]:
-    """How many readings were taken before contact; None if too few, and then the slow start, if there is one.
-
-    The approach of `find_segments`; where it finds none, a straight and much slower rise in front of the loading is a
-    drift of the load cell, and the approach is looked for again without it.
-    """
-
-    def found(curve: Curve) -> int | None:
-        segments = find_segments(curve, control=control)
-        first = segments[0]
-        enough = first.kind == "approach" and len(segments) > 1 and len(first) > options.air_readings
-        return first.stop if enough else None
-
-    contact = found(curve)
-    if contact is not None:
-        return contact, None
-    ahead = slow_start(curve, options)
-    if ahead is None or ahead.share > options.drift_slower:
-        return None, ahead
-    time = np.minimum(curve.time_s, curve.time_s[ahead.stop - 1])
-    return found(replace(curve, force_mN=curve.force_mN - ahead.line(time))), ahead
-
-
-@dataclass(frozen=True)
-class SlowStart:
-    """A straight course of force over time in front of the loading.
-
-    Attributes:
-        line: the force over time [mN].
-        stop: how many readings it has.
-        change: of force along it [mN].
-        share: its slope as a share of the loading's; negative where it falls.
-    """
-
-    line: np.polynomial.Polynomial
-    stop: int
-    change: float
-    share: float
-
-
-def slow_start(curve: Curve, options: QualityOptions) -> SlowStart | None:
-    """A straight and slower course of force in front of the loading, of a load cell that drifts; None without one.
-
-    A slower speed of the tester alone bends force and displacement alike: it is none.
-    """
-    force, time, path = curve.force_mN, curve.time_s, curve.displacement_um
-    first = int(np.argmax(force > force[0] + options.start_share * (force.max() - force[0])))
-    if first < 2 * options.air_readings + 4:
-        return None
-    kink = two_lines(time[: first + 1], force[: first + 1])
-    if kink <= options.air_readings or kink > first - 3:
-        return None
-    ahead, behind = slice(kink), slice(kink, first + 1)
-    if not (time[kink - 1] > time[0] and time[first] > time[kink]):
-        return None
-    clocks = [time[rows] - time[rows].mean() for rows in (ahead, behind)]
-    spreads = [max(float(clock @ clock), 1e-300) for clock in clocks]
-    slow, fast = (
-        float(clock @ force[rows]) / s for clock, rows, s in zip(clocks, (ahead, behind), spreads, strict=True)
-    )
-    way, on = (float(clock @ path[rows]) / s for clock, rows, s in zip(clocks, (ahead, behind), spreads, strict=True))
-    bends = fast - slow > options.drift_said * point_noise(force) * np.hypot(*(1 / np.sqrt(spreads)))
-    share, pace = slow / max(fast, 1e-300), way / max(on, 1e-300)
-    if not bends or share > options.drift_like:
-        return None
-    if pace > 0 and share > 0 and 1 / options.other_stiffness < share / pace < options.other_stiffness:
-        return None
-    line = np.polynomial.Polynomial.fit(time[ahead], force[ahead], 1)
-    if np.std(force[ahead] - line(time[ahead])) > 2 * point_noise(force[ahead]) + 1e-12 * float(np.ptp(force)):
-        return None
-    return SlowStart(line, kink, float(line(time[kink - 1]) - line(time[0])), share)
 
 
 # ---- words -----------------------------------------------------------------------------------------------------------
