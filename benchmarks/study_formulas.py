@@ -29,12 +29,12 @@ import numpy as np
 import mcc_jax as mcc
 from mcc_jax.discover.base import Base, base_fit
 from mcc_jax.discover.candidates import Candidate, candidates_of, located
-from mcc_jax.discover.design import FURTHER, design_of, padded
+from mcc_jax.discover.design import design_of, padded
 from mcc_jax.discover.evidence import left_by_particle, with_amplitudes, without_first
 from mcc_jax.discover.misfit import coordinates, scaled
 from mcc_jax.discover.screen import signature_columns
 from mcc_jax.discover.search import Search
-from mcc_jax.discover.settings import DECISIONS, NUMERICS
+from mcc_jax.discover.settings import DECISIONS, FURTHER, NUMERICS
 from mcc_jax.effects import LIBRARY, Variant
 
 RESULT = Path(__file__).parent / "results" / "formulas.md"
@@ -105,7 +105,7 @@ def rows_of(base: Base, candidates: list[Candidate]) -> list[Row]:
     variants = list(dict.fromkeys(c.variant for c in candidates))
     every = [Candidate(v, {n.name: n.middle for n in v.nuisances}) for v in variants] + candidates
     columns = signature_columns(base, base.state, every)
-    at = scaled(coordinates(base.state, base.tests, base.forms), base.tests.mask)
+    at = scaled(base.each(coordinates, base.state.point, base.forms), base.tests.mask)
     products, rows = gram(base, columns), []
     length = np.sqrt(np.maximum(np.diagonal(products), 1e-300))
     for k, v in enumerate(variants):

@@ -11,7 +11,6 @@ from scipy.special import logsumexp
 
 from ..calibrate.distributions import SCALES
 from .evidence import left_by_particle, with_amplitudes
-from .misfit import general
 from .screen import single_integrals
 from .search import SUDDEN, Search
 from .settings import DECISIONS, NUMERICS, POPULATION
@@ -33,9 +32,8 @@ class _Statistic:
     """The log evidence of anything against nothing, from scores at the base law's hyperparameters."""
 
     def __init__(self, search: Search) -> None:
-        base = search.base
         design, screen = search.null.design, search.screen
-        basis, _ = general(search.at, base.tests.effective_diameter, base.tests.mask)
+        basis, _ = search.discrepancy
         own, self.own_names, self.own_ratio = [], [], []
         for name in search.library:
             if name not in search.shared and name != SUDDEN:

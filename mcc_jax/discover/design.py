@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from ..calibrate.compiling import compiled
 from ..calibrate.distributions import nuisance_moments
 from ..calibrate.fitting import linear_data
-from ..calibrate.forward import Forms, Point
+from ..calibrate.forward import Forms, Linear, Point
 from ..effects import Variant
 from .base import Base, State
 from .evidence import Design, Kinds, Solution
@@ -78,10 +78,21 @@ class More:
 NOTHING_MORE = More()
 
 
-def design_of(base: Base, state: State, variants: tuple[Variant, ...] = (), more: More = NOTHING_MORE) -> Design:
-    """The design of a hypothesis around a state."""
+def linear_at(base: Base, state: State, variants: tuple[Variant, ...]) -> Linear:
+    """The tests linearised at a state."""
+    return base.each(linear_data, state.point, Forms(base.model.unloading, variants))
+
+
+def design_of(
+    base: Base,
+    state: State,
+    variants: tuple[Variant, ...] = (),
+    more: More = NOTHING_MORE,
+    linear: Linear | None = None,
+) -> Design:
+    """The design of a hypothesis around a state, from the tests linearised there if they are already."""
     tests, model = base.tests, base.model
-    linear = base.each(linear_data, state.point, Forms(model.unloading, variants))
+    linear = linear_at(base, state, variants) if linear is None else linear
     point, of_particle = state.point, linear.columns[..., :4]
     population, data = base_columns(
         point.latent,

@@ -20,7 +20,7 @@ from ..calibrate.priors import NakagamiPrior
 from ..effects import Variant
 from .base import Base, State
 from .candidates import Candidate
-from .design import More, design_of
+from .design import More, design_of, linear_at
 from .evidence import Design, Optimum, filled_up, optimise, scales_of, solve, value_and_gradient, with_little_noise
 from .refine import Refined, refined
 from .screen import single_integrals
@@ -93,6 +93,7 @@ def differing(base: Base, start: Refined, columns: Array, candidates: Sequence[C
         candidates: the formulas.
     """
     free = np.append(start.optimum.free, 1.0)
+    linear = linear_at(base, start.state, start.variants)
     tried: list[tuple[float, np.ndarray, Candidate, Design, More]] = []
     for k, c in enumerate(candidates):
         if not c.variant.random_per_test:
@@ -100,7 +101,7 @@ def differing(base: Base, start: Refined, columns: Array, candidates: Sequence[C
         ratio = c.variant.plausible[1] / c.variant.plausible[0]
         column = columns[..., k : k + 1]
         more = More(ratio * column, (SPREAD,), column, (ratio,), (0,))
-        design = design_of(base, start.state, start.variants, more)
+        design = design_of(base, start.state, start.variants, more, linear)
         value, at = max(
             (
                 (float(value_and_gradient(jnp.asarray(filled_up(x, design)), design)[0]), x)

@@ -270,10 +270,15 @@ class Search:
         one.with_misfit = optimum.log_evidence
         one.sizes = tuple(float(x) for x in np.exp(optimum.free[HYPERPARAMETERS : HYPERPARAMETERS + K]))
 
+    @cached_property
+    def discrepancy(self) -> tuple[Array, list[int]]:
+        """Functions of what no mechanism explains, and of which kind each is."""
+        tests = self.base.tests
+        return general(self.at, tests.effective_diameter, tests.mask)
+
     def smooth(self, r: Refined) -> Smooth:
         """A hypothesis with a smooth discrepancy beside it."""
-        tests = self.base.tests
-        basis, group = general(self.at, tests.effective_diameter, tests.mask)
+        basis, group = self.discrepancy
         unit = float(np.log(DECISIONS.general) + self.null.optimum.free[0])
         sizes = [(unit, DECISIONS.general_log_sd)] * max(group)
         design = design_of(self.base, r.state, r.variants, More(basis=basis, group=group, sizes=sizes))

@@ -244,9 +244,8 @@ def plot_shifts(found: Discovery) -> Figure:
             if estimates[j]["interval_95"] is not None:
                 ax.vlines(x, *(end * factor for end in estimates[j]["interval_95"]), color=colour, linewidth=1.8)
         ax.set_xlim(-0.6, 1.6 if found.parameters_after else 0.6)
-        ax.set_xticks(
-            [0, 1] if found.parameters_after else [0], ["before", "after"] if found.parameters_after else ["law alone"]
-        )
+        labels = ["before", "after"] if found.parameters_after else ["law alone"]
+        ax.set_xticks(range(len(labels)), labels)
         ax.set_title(name, fontsize=8.5)
         ax.margins(y=0.15)
         ax.locator_params(axis="y", nbins=5)
