@@ -34,6 +34,7 @@ from .forward import Linear, Point, snap
 from .noise import Along, Correlation, Noise, Whitening, whitening
 from .population import Population, Scatter, moments, particles_at
 from .small_matrices import Cholesky, eliminate
+from .straightening import Straight, coordinates
 
 FARTHEST = 4.0
 """Exponents are cut here: a coefficient e^4 times its fitted value is nowhere near any test."""
@@ -45,8 +46,8 @@ MIN_SHARE = 0.05
 class Marginal(eqx.Module):
     r"""The tests around a point, zeros integrated out.
 
-    With u the numbers (kappa, amplitudes and further numbers less those of the point, the positive ones in the
-    logarithm, and the products of these by which a law with effects bends), the log likelihood of a test is
+    With u the numbers (kappa, amplitudes and further numbers in the coordinates of `straightening`, and the products of
+    these by which a law with effects bends), the log likelihood of a test is
 
     .. math:: L - n\lambda - \tfrac12 e^{-2\lambda} (u, -1)^T G (u, -1)
 
@@ -55,6 +56,7 @@ class Marginal(eqx.Module):
 
     Attributes:
         point: around what.
+        straight: coordinates of the effects' numbers.
         gram: G, shape (N, Q, Q); the residual is its last column.
         log_scale: L: noise's determinant and the zero's integral.
         count: n, number of points.
@@ -65,6 +67,7 @@ class Marginal(eqx.Module):
     """
 
     point: Point
+    straight: Straight
     gram: Float[Array, "particles q q"]
     log_scale: Float[Array, " particles"]
     count: Float[Array, " particles"]
@@ -87,12 +90,11 @@ class Marginal(eqx.Module):
         jacobian = slope[..., None] * at.factor
         numbers, own = at.theta.shape[1], at.factor.shape[-1]
         if numbers:
+            places = self.scatter.positive
+            away, factor = jax.vmap(lambda *one: coordinates(*one, places))(at.theta, self.point.theta, self.straight)
             jacobian = jnp.pad(jacobian, ((0, 0), (0, numbers), (0, len(self.scatter.varying))))
             for j, (k, _) in enumerate(self.scatter.varying):
-                jacobian = jacobian.at[:, 4 + k, own + j].set(at.slope[:, j])
-            away, start = at.theta - self.point.theta, self.point.theta
-            for k in self.scatter.positive:
-                away = away.at[:, k].set(start[:, k] * jnp.log(at.theta[:, k] / start[:, k]))
+                jacobian = jacobian.at[:, 4 + k, own + j].set(at.slope[:, j] * factor[:, k])
             u = jnp.concatenate([u, away], 1)
         if u.shape[1] < self.gram.shape[-1] - 1:
             u, jacobian = with_products(u, jacobian)
@@ -277,6 +279,7 @@ class Summaries(NamedTuple):
 @compiled
 def summarise(
     point: Point,
+    straight: Straight,
     tests: Tests,
     linear: Linear,
     noise: Noise,
@@ -289,8 +292,9 @@ def summarise(
 
     Args:
         point: around what.
+        straight: coordinates of the effects' numbers.
         tests: the measurements.
-        linear: the tests linearised there.
+        linear: the tests linearised there, in these coordinates.
         noise: the noise.
         zero_prior: mean and standard deviation of the zeros, from the recorded contact [um].
         scatter: what differs from particle to particle.
@@ -324,6 +328,7 @@ def summarise(
     log_scale = log_integral - 0.5 * (log_det + float(np.log(2 * np.pi)) * jnp.sum(ones, 1))
     marginal = Marginal(
         point=point,
+        straight=straight,
         gram=left,
         log_scale=log_scale,
         count=points - 1,

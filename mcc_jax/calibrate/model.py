@@ -262,7 +262,8 @@ class Model:
     def scatter(self) -> Scatter:
         """What differs from particle to particle."""
         varying = tuple((k, self._signed(self.effects[k])) for k in self.varying_places.values())
-        positive = tuple(len(self.effects) + int(k) for k in np.flatnonzero(self.forms.positive))
+        owners = [k for k, v in enumerate(self.effects) for _ in v.nuisances]
+        positive = tuple((len(self.effects) + int(k), owners[k]) for k in np.flatnonzero(self.forms.positive))
         return Scatter(self.modulus_scatter, self.shape_scatter, self.shape_power, varying, positive)
 
     @property

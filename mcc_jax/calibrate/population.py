@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._types import Scalar
+from .straightening import Places
 
 COEFFICIENTS = ("C1", "C3", "C5")
 
@@ -51,7 +52,7 @@ class Scatter(eqx.Module):
         power: power with which the shape factor enters unloading.
         varying: of each amplitude that differs from particle to particle its place, and whether both signs are
             physical.
-        positive: places of the effects' numbers that must be positive: they bend least as logarithms.
+        positive: of each of the effects' numbers that must be positive its place, and that of its amplitude.
         newton: Newton steps from the linear solution to the most probable deviations; none are needed where the tests
             pin all coefficients down.
     """
@@ -60,7 +61,7 @@ class Scatter(eqx.Module):
     shape: bool = eqx.field(static=True, default=False)
     power: float = eqx.field(static=True, default=0.0)
     varying: tuple[tuple[int, bool], ...] = eqx.field(static=True, default=())
-    positive: tuple[int, ...] = eqx.field(static=True, default=())
+    positive: Places = eqx.field(static=True, default=())
     newton: int = eqx.field(static=True, default=4)
 
     @property

@@ -72,6 +72,9 @@ class FitSettings:
             effects have to be linearised anew.
         still: log density still to gain at which effects are not linearised anew: a tenth of a standard deviation.
         halvings: how often a step of a model with effects is halved, at most, until it raises the density.
+        widest: largest standard deviation of the logarithm of an effect's positive number over which the law's bend is
+            taken: beyond, it is the correction by the exact likelihood that counts.
+        steepest: largest shear or power of the coordinates of an effect's numbers (`straightening`).
         student_steps: how often weights of readings and noise are taken in turn, in each round.
         sharp: posterior standard deviation of the logarithm of a polynomial's coefficient below which one Newton step
             integrates a particle out.
@@ -100,6 +103,8 @@ class FitSettings:
     most_rounds: int = 20
     still: float = 0.005
     halvings: int = 8
+    widest: float = 1.0
+    steepest: float = 3.0
     student_steps: int = 4
     sharp: float = 0.03
     gradients: int = 250

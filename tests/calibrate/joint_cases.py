@@ -18,6 +18,7 @@ from mcc_jax.calibrate.forward import Linear
 from mcc_jax.calibrate.marginal import Marginal
 from mcc_jax.calibrate.noise import Along, Correlation
 from mcc_jax.calibrate.population import Population
+from mcc_jax.calibrate.straightening import Straight
 from mcc_jax.campaign import particle_batch
 from mcc_jax.effects import Record
 
@@ -109,6 +110,7 @@ def random_marginal(rng, scatter, point, flatness, *, scale=1.0):
     square = 20 + 5 * rng.random((count, 1, 1)) + np.einsum("npk,npq,nqk->nk", score, np.linalg.inv(A), score)[:, None]
     return Marginal(
         point=point,
+        straight=Straight.of(count, *2 * (np.zeros(size - 4),)),
         gram=jnp.asarray(np.block([[A, score], [np.swapaxes(score, 1, 2), square]])),
         log_scale=jnp.asarray(rng.standard_normal(count)),
         count=jnp.asarray(np.floor(20 + 5 * rng.random(count))),

@@ -27,6 +27,7 @@ from mcc_jax.calibrate.forward import Point
 from mcc_jax.calibrate.marginal import Marginal, summarise
 from mcc_jax.calibrate.noise import Along, Correlation, Noise
 from mcc_jax.calibrate.population import Scatter, moments
+from mcc_jax.calibrate.straightening import Straight
 from mcc_jax.campaign import particle_batch
 
 pytestmark = pytest.mark.long  # minutes of compiling; the quick run has the model end to end
@@ -300,7 +301,15 @@ def test_summaries_of_linear_tests_are_exact(known):
     point = Point(jnp.asarray(latent), jnp.asarray(rng.standard_normal(3)), jnp.asarray(np.tile(theta, (3, 1))))
     noise = Noise.of(four, jnp.asarray([0.5, 1.0, 2.0]))
     marginal = summarise(
-        point, tests, linear, noise, jnp.asarray(zero_prior), scatter, Correlation.EXPONENTIAL, Along.LOAD
+        point,
+        Straight.of(3, *2 * (np.zeros(2),)),
+        tests,
+        linear,
+        noise,
+        jnp.asarray(zero_prior),
+        scatter,
+        Correlation.EXPONENTIAL,
+        Along.LOAD,
     ).marginal
     log_eta = np.log(1 + 1.2 * np.asarray(tests.flatness))
     effects = {"theta": theta + 0.3, "theta_scatter": np.array([0.6])}
