@@ -20,7 +20,8 @@ from .data import Selection, Tests, select
 from .distributions import SpreadCoordinate
 from .expectation import careful_enough, expect
 from .fit_result import Fit, population_of
-from .forward import Forms, Linear, Point, linearise
+from .forward import Point
+from .linearisation import Linearisation, linear_data
 from .marginal import Marginal, summarise
 from .mode import LogPosterior, gradients, most_probable
 from .model import Model, check_prior_of_a
@@ -31,13 +32,6 @@ from .priors import Priors
 from .settings import FIT
 from .sharding import Blocks, Parts, block_size, count_of, filled_up, require_same
 from .starts import start_of_effects
-from .straightening import Straight, moved, products, step_of
-
-
-@compiled
-def linear_data(point: Point, tests: Tests, forms: Forms) -> Linear:
-    """All tests linearised, how noise of force moves them included."""
-    return linearise(point, tests, forms)
 
 
 def prepare(
@@ -128,13 +122,6 @@ def beyond_numbers(campaign: Campaign, selection: Selection) -> InputError:
     )
 
 
-@compiled
-def _sheared(linear: Linear, slope: Float[Array, "particles numbers numbers"]) -> Linear:
-    """The same by coordinates of the effects' numbers, from the derivatives of these by them."""
-    own = jnp.einsum("npk,nkl->npl", linear.columns[..., 4:], slope)
-    return replace(linear, columns=jnp.concatenate([linear.columns[..., :4], own], -1))
-
-
 class _Fitter:
     """The turns of a fit: what stays the same in all of them."""
 
@@ -143,82 +130,16 @@ class _Fitter:
         if model.robust:
             self.tests = replace(tests, reading_weight=jnp.asarray(np.ones(tests.mask.shape)))
         self.count, self.own = count_of(tests), blocks.cut(self.tests)
+        self.linear = Linearisation(self.tests, model, blocks)
         self.weighted = self.tests, self.own
         self.flatness = tests.flatness
         self.varying = tuple(k for k, _ in model.scatter.varying)
-        still = np.zeros(len(model.forms.names))
-        self.straight = Straight.of(len(tests), still, still)
-
-    def linear(self, point: Point, sd: np.ndarray | None = None) -> Parts:
-        """All tests linearised; with effects and how they bend over a standard deviation of each number, if given.
-
-        Args:
-            point: around what.
-            sd: standard deviations of the effects' numbers, of the logarithms of positive ones; with them their
-                coordinates are straightened, too.
-        """
-        if sd is not None:
-            self.straight = self.straightened(point, sd)
-        numbers = point.theta.shape[1]
-        if not numbers:
-            return self.blocks.each(linear_data, self.blocks.cut(point), self.own, self.model.forms)
-        found = self._moved(point, np.zeros(numbers))
-        bends = [self._bend(point, k, 0.0 if sd is None else float(sd[k])) for k in range(numbers)]
-        waves = (replace(w, bends=jnp.concatenate(each, -1)) for w, *each in zip(found.waves, *bends, strict=True))
-        return Parts(tuple(waves), found.axis)
-
-    def straightened(self, point: Point, sd: np.ndarray) -> Straight:
-        """Coordinates in which the prediction bends least (`straightening`), over these standard deviations."""
-        still = np.zeros(point.theta.shape[1])
-        shear, power = still.copy(), still.copy()
-        start, weight = np.asarray(point.theta), np.ones(len(self.tests))
-        weight[self.count :] = 0.0
-        self.straight = Straight.of(len(self.tests), still, still)
-
-        def gram(away: np.ndarray) -> np.ndarray:
-            linear = self._moved(point, away)
-            return np.asarray(
-                self.blocks.whole(self.blocks.each(products, Parts(tuple(w.columns for w in linear.waves))))
-            )
-
-        here = gram(still)
-        for k, owner in self.model.scatter.positive:
-            size = weight @ (start[:, owner] ** 2 * here[:, owner, owner])
-            shear[k] = start[0, k] * (weight @ (start[:, owner] * here[:, owner, k])) / size if size > 0 else 0.0
-        shear = np.clip(shear, -FIT.steepest, FIT.steepest)
-        self.straight = Straight.of(len(self.tests), shear, power)
-        for k, _ in self.model.scatter.positive:
-            step = np.where(np.arange(len(still)) == k, start[0, k] * sd[k], 0.0)
-            up, down = (weight @ gram(by)[:, k, k] for by in (step, -step))
-            power[k] = np.log(up / down) / (4 * sd[k]) if min(up, down) > 0 else 0.0
-        return Straight.of(len(self.tests), shear, np.clip(power, -FIT.steepest, FIT.steepest))
-
-    def _moved(self, point: Point, away: np.ndarray) -> Parts:
-        """All tests linearised where the effects' numbers have these coordinates, by these coordinates."""
-        theta, slope = moved(jnp.asarray(away), point.theta, self.straight, self.model.scatter.positive)
-        there = self.blocks.cut((replace(point, theta=theta), slope))
-        found = self.blocks.each(linear_data, Parts(tuple(p for p, _ in there.waves)), self.own, self.model.forms)
-        waves = (_sheared(linear, by) for linear, (_, by) in zip(found.waves, there.waves, strict=True))
-        return Parts(tuple(waves), found.axis)
-
-    def _bend(self, point: Point, number: int, step: float) -> list[Array]:
-        """Derivative of all columns by one of the effects' numbers, as in `Marginal`, by differences over a step; 0 for
-        a step of 0."""
-        size = point.theta.shape[1]
-        if not step:
-            return [jnp.zeros((*wave.mask.shape, 4 + size)) for wave in self.own.waves]
-        ends = np.array([step, -step])
-        if number in dict(self.model.scatter.positive):
-            power = float(self.straight.power[0, number])
-            ends = np.array([step_of(x, float(point.theta[0, number]), power) for x in ends])
-        up, down = (self._moved(point, np.where(np.arange(size) == number, end, 0.0)).waves for end in ends)
-        return [(a.columns - b.columns) / (ends[0] - ends[1]) for a, b in zip(up, down, strict=True)]
 
     def summaries(self, point: Point, linear: Parts, noise: Noise) -> tuple[Marginal, Parts, Array]:
         """All particles' summaries, this process's own filters, and the white noise of equal weight."""
         m, cut = self.model, self.blocks.cut
         kinds = m.zero_prior, m.scatter, m.correlation, m.along
-        places = cut(point), cut(self.straight)
+        places = cut(point), cut(self.linear.straight)
         found = self.blocks.each(summarise, *places, self.weighted[1], linear, cut(noise), *kinds)
         marginal, filters, white = (Parts(tuple(wave[k] for wave in found.waves)) for k in range(3))
         return self.blocks.whole(marginal), filters, self.blocks.whole(white)
@@ -332,7 +253,7 @@ class _Fitter:
         while True:
             free = ends[0] + share * (ends[1] - ends[0])
             point = self.together(white, before, target, free)
-            linear = self.linear(point)
+            linear = self.linear.at(point)
             marginal = replace(self.summaries(point, linear, noise)[0], scatter=target.marginal.scatter)
             share /= 2
             if _density(free, replace(target, marginal=marginal)) > least or share < 0.5**FIT.halvings:
@@ -378,12 +299,12 @@ def fit_tests(
     noise = NoiseFit(Noise.of(four, jnp.asarray(np.ones(N))), *unknown, True)
     start = _start(np.asarray(point.latent)[:count], np.asarray(fitter.flatness)[:count], model)
     if effects:
-        found = start_of_effects(point, tests, fitter.linear(point), noise.noise, model, blocks)
+        found = start_of_effects(point, tests, fitter.linear.at(point), noise.noise, model, blocks)
         start |= found.sites
         point = replace(point, theta=jnp.asarray(np.broadcast_to(found.theta, point.theta.shape)))
     free = None
     turn, uncertainty = 0, True
-    linear = fitter.linear(point)
+    linear = fitter.linear.at(point)
     while True:
         last = turn >= (max(rounds, FIT.most_rounds) if effects else rounds)
         if not correlated:
@@ -427,10 +348,10 @@ def fit_tests(
             point, linear, free = fitter.step(white, noise.noise, point, target, (before, free))
         else:
             point = fitter.together(white, point, target, free)
-            linear = fitter.linear(point)
+            linear = fitter.linear.at(point)
     if effects:
         # Once more, with how the law bends over what is still open of the effects' numbers.
-        linear = fitter.linear(point, _widths(free, covariance, target))
+        linear = fitter.linear.at(point, _widths(free, covariance, target))
         marginal, filtered, white = fitter.summaries(point, linear, noise.noise)
         target = careful_enough(free, LogPosterior(model, marginal), count)
         free, covariance, mode_converged = most_probable(free, target)

@@ -19,6 +19,7 @@ References:
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -90,8 +91,8 @@ class Marginal(eqx.Module):
         jacobian = slope[..., None] * at.factor
         numbers, own = at.theta.shape[1], at.factor.shape[-1]
         if numbers:
-            places = self.scatter.positive
-            away, factor = jax.vmap(lambda *one: coordinates(*one, places))(at.theta, self.point.theta, self.straight)
+            there = jax.vmap(partial(coordinates, places=self.scatter.positive))
+            away, factor = there(at.theta, self.point.theta, self.straight)
             jacobian = jnp.pad(jacobian, ((0, 0), (0, numbers), (0, len(self.scatter.varying))))
             for j, (k, _) in enumerate(self.scatter.varying):
                 jacobian = jacobian.at[:, 4 + k, own + j].set(at.slope[:, j] * factor[:, k])

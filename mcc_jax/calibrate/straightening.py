@@ -115,6 +115,6 @@ def moved(
 
 
 @compiled
-def products(columns: Float[Array, "particles points numbers"]) -> Float[Array, "particles numbers numbers"]:
+def products(columns: Float[Array, "particles points columns"]) -> Float[Array, "particles numbers numbers"]:
     """Sums over the points of the products of an effect's columns."""
     return jnp.einsum("npk,npl->nkl", columns[..., 4:], columns[..., 4:])

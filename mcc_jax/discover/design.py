@@ -13,8 +13,8 @@ from jaxtyping import Array, Float
 
 from ..calibrate.compiling import compiled
 from ..calibrate.distributions import nuisance_moments
-from ..calibrate.fitting import linear_data
 from ..calibrate.forward import Forms, Linear, Point
+from ..calibrate.linearisation import linear_data
 from ..effects import Variant
 from .base import Base, State
 from .evidence import Design, Kinds, Solution
