@@ -13,9 +13,9 @@ if TYPE_CHECKING:
 SEALED = "sealed.json"
 
 STRENGTHS = {
-    "creep": (3e-4, 6e-4),
-    "frame_compliance": (2e-3, 4e-3),
     "reload_hysteresis": (0.15, 0.3),
+    "frame_compliance": (2e-3, 4e-3),
+    "creep": (3e-4, 6e-4),
     "unloading_shape": (0.08, 0.15),
 }
 """What may be hidden, and between which amplitudes: effects that eight particles show beyond doubt.

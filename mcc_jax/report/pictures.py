@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 from matplotlib import rc_context
+from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
@@ -78,8 +79,21 @@ class Telling:
 @rc_context(RC)
 def telling_pictures(told: Telling) -> list[tuple[str, str]]:
     """Force over displacement, a part of it enlarged; and what each law leaves over time. With each, what it shows."""
-    figure = new_figure(5.4, 4.0)
-    ax = figure.subplots()
+    found = []
+    for draw, words in (
+        (draw_enlarged, "Force over displacement, enlarged where law and test differ most"),
+        (draw_left_over, "Measured less predicted displacement over time"),
+    ):
+        figure = new_figure(5.4, 4.0)
+        handles = draw(figure.subplots(), told)
+        figure.legend(handles=handles, loc="outside upper center", ncols=3)
+        figure.set_layout_engine("constrained")
+        found.append((_svg(figure), f"{words}: {told.caption}"))
+    return found
+
+
+def draw_enlarged(ax: Axes, told: Telling) -> list[Any]:
+    """Force over displacement where law and test differ most, in a corner the whole test; what stands in a legend."""
     near = told.near
     _force_over_displacement(ax, told, size=4.5)
     across, up = told.displacement_um[near], told.force_mN[near]
@@ -94,28 +108,26 @@ def telling_pictures(told: Telling) -> list[tuple[str, str]]:
     inset.set_title("the whole test, and where this is", fontsize=7.5, color=GREY, pad=2, loc="center")
     corner = across.min(), up.min()
     inset.add_patch(Rectangle(corner, np.ptp(across), np.ptp(up), fill=False, edgecolor=BLACK, linewidth=1.1, zorder=9))
-    handles = [
-        Line2D([], [], marker="o", linestyle="", markersize=4.5, color=PALE, markeredgecolor=GREY, label="measured")
-    ]
-    handles += [Line2D([], [], color=colour, linestyle=line, label=label) for _, colour, line, label in told.laws]
-    figure.legend(handles=handles, loc="outside upper center", ncols=3)
-    figure.set_layout_engine("constrained")
-    first = _svg(figure), f"Force over displacement, enlarged where law and test differ most: {told.caption}"
-    figure = new_figure(5.4, 4.0)
-    ax = figure.subplots()
+    dots = Line2D([], [], marker="o", linestyle="", markersize=4.5, color=PALE, markeredgecolor=GREY, label="measured")
+    return [dots, *(Line2D([], [], color=colour, linestyle=line, label=label) for _, colour, line, label in told.laws)]
+
+
+def draw_left_over(ax: Axes, told: Telling) -> list[Any]:
+    """What each law leaves over time, beside the noise; what stands in a legend."""
+    handles: list[Any] = []
     if told.noise_um is not None:
-        ax.fill_between(
-            told.time_s, -told.noise_um, told.noise_um, color=ORANGE, alpha=0.45, linewidth=0, label="noise"
+        handles.append(
+            ax.fill_between(
+                told.time_s, -told.noise_um, told.noise_um, color=ORANGE, alpha=0.45, linewidth=0, label="noise"
+            )
         )
     ax.axhline(0.0, color=GREY, linewidth=0.7)
     for away, colour, line, label in told.laws:
-        ax.plot(told.time_s, away, color=colour, linestyle=line, linewidth=1.3, label=label)
+        handles += ax.plot(told.time_s, away, color=colour, linestyle=line, linewidth=1.3, label=label)
     ax.set_xlabel("time [s]")
     ax.set_ylabel("measured − law [µm]")
     ax.margins(x=0.01)
-    figure.legend(loc="outside upper center", ncols=3)
-    figure.set_layout_engine("constrained")
-    return [first, (_svg(figure), f"Measured less predicted displacement over time: {told.caption}")]
+    return handles
 
 
 def _emptiest(across: np.ndarray, up: np.ndarray) -> tuple[float, float, float, float]:
@@ -128,7 +140,7 @@ def _emptiest(across: np.ndarray, up: np.ndarray) -> tuple[float, float, float, 
     return 0.03 + 0.94 * left, 0.03 + 0.9 * low, 0.94 * wide, 0.9 * high
 
 
-def _force_over_displacement(ax: Any, told: Telling, size: float) -> None:
+def _force_over_displacement(ax: Axes, told: Telling, size: float) -> None:
     ax.plot(
         told.displacement_um, told.force_mN, "o", markersize=size, color=PALE, markeredgecolor=GREY, markeredgewidth=0.4
     )

@@ -37,7 +37,7 @@ def story(results: Results, shown: Sequence[FittedCurve]) -> Story:
     """The first screen of what a folder holds."""
     found = results.discovery
     if found is not None:
-        told = _of_discovery(results.found) if results.found is not None else None
+        told = telling_test(results.found) if results.found is not None else None
         told = told or _of_fit(shown)
         return Story(discovery_sentence(found), *_drawn(told), _gap_tiles(found))
     if results.calibration is not None:
@@ -54,7 +54,7 @@ def _drawn(told: Telling | None) -> tuple[list[tuple[str, str]], str]:
     return ([], "") if told is None else (telling_pictures(told), told.caption)
 
 
-def _of_discovery(found: Discovery) -> Telling | None:
+def telling_test(found: Discovery) -> Telling | None:
     """The test whose gap closes most, or where nothing was added the one that the law fits worst."""
     left, base = found.residuals, found.base
     if left is None or base is None:
