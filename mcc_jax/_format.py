@@ -44,9 +44,13 @@ def with_sd(estimate: dict[str, Any], factor: float = 1.0) -> str:
         return number(None if value is None else value * factor)
     value, sd = value * factor, sd * factor
     places = decimals(value, sd)
+    if places is not None:
+        return f"{value:.{places}f} ± {sd:.{places}f}".replace("-", "−")
+    power = math.floor(math.log10(max(abs(value), sd)))
+    places = decimals(1.0, sd / 10.0**power)
     if places is None:
         return f"{number(value)} ± {number(sd, 2)}"
-    return f"{value:.{places}f} ± {sd:.{places}f}".replace("-", "−")
+    return f"({value / 10.0**power:.{places}f} ± {sd / 10.0**power:.{places}f}) × 10{_raised(power)}".replace("-", "−")
 
 
 def interval(estimate: dict[str, Any], factor: float = 1.0) -> str | None:

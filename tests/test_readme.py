@@ -16,6 +16,13 @@ from mcc_jax.simulate import Instrument, paper_campaign
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+HOW_TO = ROOT / ".docs" / "pages" / "how-to"
+PAGES = {name: (HOW_TO / f"{name}.md").read_text(encoding="utf-8") for name in ("commands", "discover", "devices")}
+RESULTS = ROOT / "benchmarks" / "results"
+
+
+def test_readme_is_one_page():
+    assert len(README.splitlines()) <= 120
 
 
 def test_python_blocks_run(capsys):
@@ -26,18 +33,75 @@ def test_python_blocks_run(capsys):
     assert capsys.readouterr().out.strip()
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"^```{language}[^\n]*\n(.*?)^```$", README, flags=re.M | re.S)
+def blocks(language: str, text: str = README) -> list[str]:
+    return re.findall(rf"^```{language}[^\n]*\n(.*?)^```$", text, flags=re.M | re.S)
 
 
 def test_every_block_is_of_a_kind_that_is_run():
-    """Python, the two commands of the set-up (CI), commands, a file of priors (the docs' page), and the layout."""
+    """Python, the two commands of the set-up (CI), and commands."""
     for block in blocks(""):
-        first = block.splitlines()[0]
-        assert first.startswith(
-            ("import ", "# run.py", "python3 -m pip install uv", "uv run mcc-jax", "[a]", "mcc_jax/")
-        )
+        assert block.splitlines()[0].startswith(("import ", "python3 -m pip install uv", "uv run mcc-jax"))
     assert len(re.findall(r"^```", README, flags=re.M)) == 2 * len(blocks(""))
+
+
+def cell(file: str, keys: tuple[str, ...], column: str) -> str:
+    """What stands in a column of the first table that has it, in the first row that begins with the keys."""
+    header: list[str] = []
+    for line in (RESULTS / file).read_text(encoding="utf-8").splitlines():
+        cells = [part.strip() for part in line.strip().strip("|").split(" | ")] if line.startswith("|") else []
+        header = [] if not cells else header or cells
+        if column in header and tuple(cells[: len(keys)]) == keys:
+            return cells[header.index(column)]
+    raise AssertionError(f"{file} has no row {keys} with a column {column}")
+
+
+EXACT = "top-1, exact formula, lambda="
+LAMMPS = ("1000", "whole stroke", "CPU")
+CLAIMS = [
+    *(("right name", "blind_runs.md", (f"{EXACT}{size}, P0",), "observed") for size in (3, 5, 10, 20)),
+    *(("bar for 5 and 10", "blind_runs.md", (f"{EXACT}{size}, P0",), "gate") for size in (5, 10)),
+    ("false alarm", "blind_runs.md", ("false alarm, clean null",), "observed"),
+    ("false alarm", "blind_runs.md", ("false alarm, clean null",), "gate"),
+    ("the only name", "blind_second.md", ("the three together", "the only effect named is the true one"), "campaigns"),
+    ("posterior", "calibrate.md", ("posterior, warm [s]",), "value"),
+    ("posterior", "calibrate.md", ("posterior from a new process, nothing compiled before [s]",), "value"),
+    ("NumPyro", "calibrate.md", ("textbook, NumPyro, centred",), "seconds"),
+    ("PyMC", "calibrate.md", ("textbook, PyMC and nutpie, centred",), "seconds"),
+    ("least squares", "calibrate.md", ("mcc_jax, the least squares alone",), "seconds"),
+    ("SciPy", "calibrate.md", ("scipy.optimize.least_squares",), "seconds"),
+    ("lmfit", "calibrate.md", ("lmfit.minimize",), "seconds"),
+    ("million contacts", "law.md", ("contacts", "step"), "median [ms]"),
+    ("numba", "law.md", ("contacts", "numba"), "median [ms]"),
+    ("fastmath", "law.md", ("contacts", "numba fastmath"), "median [ms]"),
+    *(("LAMMPS", "dem_lammps.md", LAMMPS, f"{code} [particle-steps/s]") for code in ("mcc", "MDR", "Hertz")),
+]
+"""A word of a row of README's scoreboard, and where its number stands: table, first cells of the row, column."""
+
+
+def drifted(readme: str) -> list[str]:
+    """Every claim of a README whose number is not that of its table."""
+    found = []
+    for word, file, keys, column in CLAIMS:
+        (row,) = [line for line in readme.splitlines() if line.startswith("| ") and word in line]
+        told = cell(file, keys, column).split("%")[0].split(" (")[0].lstrip("<>=")
+        if not re.search(rf"(?<![\d.]){re.escape(told)}(?!\d|\.\d)", row):
+            found.append(f"{file} {keys} {column}: {told} is not in {row}")
+    return found
+
+
+def test_the_scoreboard_says_what_the_tables_say():
+    assert drifted(README) == []
+    for number in ("88.8", "3.6 %", "105 of", "1.28 s", "0.0197", "4.96", "1.65e+06"):
+        assert README.count(number) == 1
+        assert len(drifted(README.replace(number, "7777"))) == 1, number
+
+
+def test_the_peers_of_the_scoreboard_did_not_converge():
+    for name in ("textbook, NumPyro, centred", "textbook, PyMC and nutpie, centred"):
+        assert cell("calibrate.md", (name,), "converged") == "FAIL"
+    assert re.search(r"\| session27 \| 396 of 396", (RESULTS / "blind_runs.md").read_text(encoding="utf-8"))
+    scored = re.findall(r"^\| session\d+ \| (\d+) of", (RESULTS / "blind_runs.md").read_text("utf-8"), flags=re.M)
+    assert f"{sum(map(int, scored))} sealed campaigns" in README
 
 
 def exports(folder: Path, campaign: Campaign) -> None:
@@ -54,7 +118,16 @@ def exports(folder: Path, campaign: Campaign) -> None:
 
 
 @pytest.mark.notebook
-@pytest.mark.parametrize("block", [b for b in blocks("") if b.startswith("uv run mcc-jax")], ids=lambda b: b.split()[3])
+@pytest.mark.parametrize(
+    "block",
+    [
+        b
+        for text in (README, PAGES["commands"], PAGES["discover"])
+        for b in blocks("", text)
+        if b.startswith("uv run mcc")
+    ],
+    ids=lambda b: f"{b.split()[3]}-{len(b.splitlines())}",
+)
 def test_commands_run_as_printed(block, tmp_path, monkeypatch):
     from mcc_jax.cli.main import cli
 
@@ -69,7 +142,7 @@ def test_commands_run_as_printed(block, tmp_path, monkeypatch):
 
 @pytest.mark.notebook
 def test_the_script_for_several_processes_runs_as_printed(tmp_path):
-    (script,) = [b for b in blocks("python") if b.startswith("# run.py")]
+    (script,) = [b for b in blocks("text", PAGES["devices"]) if b.startswith("# run.py")]
     (tmp_path / "run.py").write_text(script, encoding="utf-8")
     write_campaign(paper_campaign(0, instrument=Instrument(displacement_noise_um=0.02)), tmp_path / "tests")
     runs = [
@@ -84,7 +157,7 @@ def test_the_script_for_several_processes_runs_as_printed(tmp_path):
 def test_every_command_shown_exists():
     from mcc_jax.cli.main import cli
 
-    shown = set(re.findall(r"mcc-jax ([a-z]+)", README))
+    shown = set(re.findall(r"mcc-jax ([a-z]+)", README + "".join(PAGES.values())))
     assert {"demo", "convert", "calibrate", "simulate", "discover"} <= shown
     assert shown <= set(cli.commands), shown - set(cli.commands)
 

@@ -240,22 +240,19 @@ def main_numbers(content: dict[str, Any]) -> list[tuple[str, str]]:
     """Name and value of what matters most in a `calibration.json`."""
     modulus = content["effective_modulus_MPa"]
     rows = [
-        ("shape parameter a", _estimate(content["a"])),
+        ("shape parameter a", estimate_text(content["a"])),
         (
             "effective modulus",
-            "unknown" if modulus["value"] is None or _modulus_open(content) else f"{_estimate(modulus, 1e-3)} GPa",
+            "unknown" if modulus["value"] is None or _modulus_open(content) else f"{estimate_text(modulus, 1e-3)} GPa",
         ),
     ]
     for name in ("C1", "C3", "C5"):
-        mean = content[f"log_{name}"]["mean"]
-        median = _exp(mean["value"])
-        spread = None if mean["sd"] is None or median is None else median * mean["sd"]
-        rows.append((f"{name}, median", _estimate({"value": median, "sd": spread})))
-        rows.append((f"{name}, sd of its logarithm", _estimate(content[f"log_{name}"]["sd"])))
+        rows.append((f"{name}, median", median_text(content[f"log_{name}"]["mean"])))
+        rows.append((f"{name}, sd of its logarithm", estimate_text(content[f"log_{name}"]["sd"])))
     for effect in content["effects"]:
         label = f"{effect['mechanism']}, {effect['variant']}"
-        rows += [(f"{label}: {name}", _estimate(value)) for name, value in effect["parameters"].items()]
-    rows.append(("yield stress sigma_y", f"{_estimate(content['yield_stress_MPa'])} MPa"))
+        rows += [(f"{label}: {name}", estimate_text(value)) for name, value in effect["parameters"].items()]
+    rows.append(("yield stress sigma_y", f"{estimate_text(content['yield_stress_MPa'])} MPa"))
     return rows
 
 
@@ -265,7 +262,13 @@ def _modulus_open(content: dict[str, Any]) -> bool:
     return any(one["check"] == MODULUS_OPEN for one in content.get("findings", []))
 
 
-def _estimate(estimate: dict[str, Any], factor: float = 1.0) -> str:
+def median_text(log: dict[str, Any]) -> str:
+    """The exponential of an estimate of a logarithm, with its standard deviation."""
+    median = _exp(log["value"])
+    return estimate_text({"value": median, "sd": None if log["sd"] is None or median is None else median * log["sd"]})
+
+
+def estimate_text(estimate: dict[str, Any], factor: float = 1.0) -> str:
     """A value with its standard deviation, which decides the digits of both."""
     value, sd = estimate["value"], estimate["sd"]
     if value is None or sd is None or not sd > 0:

@@ -24,6 +24,8 @@ class HeldOut:
         points: of every particle.
         elpd: log predictive density of every particle, shape (steps, N).
         repeating_um2: mean product of the residuals of two different particles at one share of the path [um^2].
+        residual_um: measured less predicted displacement of every particle [um], shape (steps, N, points); None of
+            results of older versions.
     """
 
     labels: tuple[str | None, ...]
@@ -31,6 +33,7 @@ class HeldOut:
     points: np.ndarray
     elpd: np.ndarray
     repeating_um2: np.ndarray
+    residual_um: np.ndarray | None = None
 
     @property
     def chi2_per_dof(self) -> np.ndarray:
@@ -162,7 +165,7 @@ def held_out(search: Search, winner: Names) -> HeldOut:
             chi2[k, i] = form @ c.left[i] @ form
             elpd[k, i] = whole[id(c)] - without[id(c)]
             residual[k, i] = c.residual(i, numbers)
-    return HeldOut(labels, chi2, points.astype(float), elpd, _repeating(search, residual))
+    return HeldOut(labels, chi2, points.astype(float), elpd, _repeating(search, residual), residual)
 
 
 def _of_hyperparameters(design: Design, optimum: Optimum) -> float:

@@ -23,6 +23,14 @@ GOOD_MISFIT = 0.01
 GOOD_NOISE_SHARE = 0.2
 INSIDE = (0.90, 0.99)
 NOT_MONOTONE = 0.05
+ANSWERS = {
+    "NO_GAP": "Nothing missing",
+    "NAMED": "Missing and named",
+    "SET": "Missing, several candidates",
+    "UNLISTED": "Missing, unlisted",
+    "FIT_NOT_CONVERGED": "Cannot ask",
+}
+"""What a verdict says, in words."""
 FEW_PARTICLES = 6
 """Fewer say little of the scatter between particles."""
 
@@ -249,7 +257,7 @@ def _discovery(content: dict[str, Any]) -> Light:
     }
     verdict = content["verdict"]
     return Light(
-        level.get(verdict, "look"), "Law is complete", f"verdict {verdict}", "verdict NO_GAP", meaning[verdict]
+        level.get(verdict, "look"), "Law is complete", ANSWERS[verdict], ANSWERS["NO_GAP"].lower(), meaning[verdict]
     )
 
 

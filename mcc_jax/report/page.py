@@ -22,17 +22,17 @@ with extra("report"):
     from . import pictures as pictures
     from .chart import LOOKS, chart_data, chart_items, chart_scripts
     from .compare import compare
-    from .lights import lights, share_inside, tested
+    from .lights import ANSWERS, lights, share_inside, tested
     from .sentences import (
         METHODS,
         calibration_sentences,
-        discovery_sentence,
         listed,
         next_steps,
         plain,
         quantity,
         simulated,
     )
+    from .story import story
     from .tables import measured, parameters, particle_facts, particle_rows
 
 CAPTIONS = {
@@ -61,14 +61,6 @@ CAPTIONS = {
     "discovery_shifts": ("discovery", "What the missing effect had done to the parameters"),
 }
 """Section and caption of every figure, by its stem."""
-
-VERDICTS = {
-    "NO_GAP": ("good", "Nothing missing"),
-    "NAMED": ("look", "Missing and named"),
-    "SET": ("look", "Missing, several candidates"),
-    "UNLISTED": ("look", "Missing, unlisted"),
-    "FIT_NOT_CONVERGED": ("bad", "Cannot ask"),
-}
 
 
 def report_page(results: Results, *, seed: int = 0, progress: Callable[[str], None] | None = None) -> str:
@@ -142,6 +134,8 @@ def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
         "results": results,
         "version": own_version(),
         "simulated": simulated(results),
+        "sections": _sections(results, shown, checks),
+        "story": story(results, shown),
         "cards": _cards(results, checks),
         "summary": _summary(results),
         "next_steps": next_steps(results, folder),
@@ -160,7 +154,8 @@ def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
         "grid": pictures.grid(shown),
         "marginals": [] if results.posterior is None else pictures.marginals(results.posterior),
         "lights": checks,
-        "verdicts": VERDICTS,
+        "answers": ANSWERS,
+        "verdict_level": next((one.level for one in checks if one.check == "Law is complete"), "unknown"),
         "steps": [] if results.discovery is None else _steps(results.discovery["gap"]),
         "shift_pictures": []
         if results.discovery is None
@@ -200,7 +195,7 @@ def _cards(results: Results, checks: list[Any]) -> list[dict[str, str]]:
                 "level": "good" if done and trusted else "bad",
                 "title": "Calibration",
                 "answer": "Not converged" if not done else "Converged" if trusted else "Not to be trusted",
-                "line": f"{used} of {len(content['particles'])} particles, method {content['method']}",
+                "line": f"{used} of {len(content['particles'])} particles, by {METHODS[content['method']]}",
             }
         )
         good, look, bad = (sum(c.level == level for c in checks) for level in ("good", "look", "bad"))
@@ -210,26 +205,31 @@ def _cards(results: Results, checks: list[Any]) -> list[dict[str, str]]:
                 "level": "bad" if bad else "look" if look else "good",
                 "title": "Checks",
                 "answer": f"{good} of {len(checks)} fine" if trusted else "Numbers cannot be true",
-                "line": f"{listed(words)}, see Diagnostics" if words else "nothing stands out",
+                "line": f"{listed(words)}, see Checks" if words else "nothing stands out",
             }
         )
-    if results.discovery is not None:
-        level, answer = VERDICTS[results.discovery["verdict"]]
-        names = [plain(effect["mechanism"]) for effect in results.discovery["effects"]]
-        line = listed(names) if names else f"verdict {results.discovery['verdict']}"
-        found.append({"level": level, "title": "Discovery", "answer": answer, "line": line})
     return found
 
 
 def _summary(results: Results) -> list[str]:
-    found = []
-    if results.calibration is not None:
-        found += calibration_sentences(results.calibration)
-    if results.discovery is not None:
-        found.append(discovery_sentence(results.discovery))
-    if not found and results.campaign is not None:
-        found.append(f"{len(results.campaign)} tests were measured; nothing has been calibrated on them yet.")
-    return found
+    """What stands below the first screen, in sentences."""
+    return [] if results.calibration is None else calibration_sentences(results.calibration)
+
+
+def _sections(results: Results, shown: list[FittedCurve], checks: list[Any]) -> list[tuple[str, str]]:
+    """Name and title of every section that has something to show: particles, parameters, checks, details."""
+    calibrated = results.calibration is not None
+    there = (
+        ("compare", "Particles", bool(shown)),
+        ("law", "Law and parameters", True),
+        ("posterior", "Posterior", calibrated),
+        ("diagnostics", "Checks", bool(checks)),
+        ("discovery", "Discovery in detail", results.discovery is not None),
+        ("measured", "What was measured", results.campaign is not None or calibrated),
+        ("settings", "Settings and data", True),
+        ("cite", "How to cite", True),
+    )
+    return [(name, title) for name, title, here in there if here]
 
 
 def _steps(gap: dict[str, Any]) -> list[dict[str, Any]]:

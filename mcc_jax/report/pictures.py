@@ -1,13 +1,17 @@
-"""Pictures that stand still: every particle at a glance, and the posterior's marginals, as SVG."""
+"""Pictures that stand still: the most telling test, every particle at a glance, the posterior's marginals, as SVG."""
 
 from __future__ import annotations
 
 import base64
 import io
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
 
 from ..calibrate.curves import FittedCurve
 from ..calibrate.results import PosteriorDraws
@@ -28,6 +32,122 @@ PANELS = {
     "C5_median": ("C₅, median particle [-]", 1.0),
     "C5_spread": ("sd of log C₅ [-]", 1.0),
 }
+
+
+@dataclass(frozen=True)
+class Telling:
+    """The test that shows best what was found.
+
+    Attributes:
+        time_s, force_mN, displacement_um: measured.
+        before_um, after_um: measured less predicted displacement by the law alone, and with what was added to it.
+        noise_um: standard deviation of the noise.
+        added: what the law with the addition is called.
+        caption: what is shown, in words.
+    """
+
+    time_s: np.ndarray
+    force_mN: np.ndarray
+    displacement_um: np.ndarray
+    before_um: np.ndarray
+    after_um: np.ndarray | None
+    noise_um: np.ndarray | None
+    added: str
+    caption: str
+
+    @property
+    def laws(self) -> list[tuple[np.ndarray, str, Literal["-", "--"], str]]:
+        """Measured less predicted, colour, line and label of every law that is drawn."""
+        alone = "law alone" if self.added else "law"
+        found: list[tuple[np.ndarray, str, Literal["-", "--"], str]] = [
+            (self.before_um, VERMILION, "--" if self.added else "-", alone)
+        ]
+        if self.after_um is not None:
+            found.append((self.after_um, BLUE, "-", self.added))
+        return found
+
+    @property
+    def near(self) -> np.ndarray:
+        """Which readings stand in the enlarged part: a strip of displacement, where law and test differ most in all."""
+        gap = np.abs(self.before_um - (0.0 if self.after_um is None else self.after_um))
+        width = max(10 * float(np.quantile(gap, 0.9)), 0.06 * float(np.ptp(self.displacement_um)))
+        left = self.displacement_um[:, None]
+        inside = (self.displacement_um >= left) & (self.displacement_um <= left + width)
+        return inside[int(np.argmax(inside @ gap**2))]
+
+
+@rc_context(RC)
+def telling_pictures(told: Telling) -> list[tuple[str, str]]:
+    """Force over displacement, a part of it enlarged; and what each law leaves over time. With each, what it shows."""
+    found = []
+    for draw, words in (
+        (draw_enlarged, "Force over displacement, enlarged where law and test differ most"),
+        (draw_left_over, "Measured less predicted displacement over time"),
+    ):
+        figure = new_figure(5.4, 4.0)
+        handles = draw(figure.subplots(), told)
+        figure.legend(handles=handles, loc="outside upper center", ncols=3)
+        figure.set_layout_engine("constrained")
+        found.append((_svg(figure), f"{words}: {told.caption}"))
+    return found
+
+
+def draw_enlarged(ax: Axes, told: Telling) -> list[Any]:
+    """Force over displacement where law and test differ most, in a corner the whole test; what stands in a legend."""
+    near = told.near
+    _force_over_displacement(ax, told, size=4.5)
+    across, up = told.displacement_um[near], told.force_mN[near]
+    ax.set_xlim(across.min() - 0.05 * np.ptp(across), across.max() + 0.05 * np.ptp(across))
+    ax.set_ylim(up.min() - 0.05 * np.ptp(up), up.max() + 0.05 * np.ptp(up))
+    ax.set_xlabel("displacement [µm]")
+    ax.set_ylabel("force [mN]")
+    inset = ax.inset_axes(_emptiest(across, up))
+    _force_over_displacement(inset, told, size=1.2)
+    inset.set(xticks=[], yticks=[])
+    inset.spines[["top", "right"]].set_visible(True)
+    inset.set_title("the whole test, and where this is", fontsize=7.5, color=GREY, pad=2, loc="center")
+    corner = across.min(), up.min()
+    inset.add_patch(Rectangle(corner, np.ptp(across), np.ptp(up), fill=False, edgecolor=BLACK, linewidth=1.1, zorder=9))
+    dots = Line2D([], [], marker="o", linestyle="", markersize=4.5, color=PALE, markeredgecolor=GREY, label="measured")
+    return [dots, *(Line2D([], [], color=colour, linestyle=line, label=label) for _, colour, line, label in told.laws)]
+
+
+def draw_left_over(ax: Axes, told: Telling) -> list[Any]:
+    """What each law leaves over time, beside the noise; what stands in a legend."""
+    handles: list[Any] = []
+    if told.noise_um is not None:
+        handles.append(
+            ax.fill_between(
+                told.time_s, -told.noise_um, told.noise_um, color=ORANGE, alpha=0.45, linewidth=0, label="noise"
+            )
+        )
+    ax.axhline(0.0, color=GREY, linewidth=0.7)
+    for away, colour, line, label in told.laws:
+        handles += ax.plot(told.time_s, away, color=colour, linestyle=line, linewidth=1.3, label=label)
+    ax.set_xlabel("time [s]")
+    ax.set_ylabel("measured − law [µm]")
+    ax.margins(x=0.01)
+    return handles
+
+
+def _emptiest(across: np.ndarray, up: np.ndarray) -> tuple[float, float, float, float]:
+    """The corner of a panel in which the fewest points lie, for a small panel: left, bottom, width, height."""
+    wide, high = 0.36, 0.34
+    x, y = ((column - column.min()) / max(float(np.ptp(column)), 1e-300) for column in (across, up))
+    corners = [(left, low) for low in (0.0, 1.0 - high) for left in (0.0, 1.0 - wide)]
+    lying = [np.sum((x >= a) & (x <= a + wide) & (y >= b) & (y <= b + high)) for a, b in corners]
+    left, low = corners[int(np.argmin(lying))]
+    return 0.03 + 0.94 * left, 0.03 + 0.9 * low, 0.94 * wide, 0.9 * high
+
+
+def _force_over_displacement(ax: Axes, told: Telling, size: float) -> None:
+    ax.plot(
+        told.displacement_um, told.force_mN, "o", markersize=size, color=PALE, markeredgecolor=GREY, markeredgewidth=0.4
+    )
+    for away, colour, line, _ in told.laws:
+        ax.plot(
+            told.displacement_um - away, told.force_mN, color=colour, linestyle=line, linewidth=1.4 if size > 2 else 0.7
+        )
 
 
 def data_uri(picture: bytes, kind: str = "png") -> str:

@@ -14,8 +14,9 @@ from .._archive import read_archive
 from .._errors import InputError
 from .._format import described
 from ..calibrate.content import read_result
-from ..calibrate.results import ARCHIVE, Calibration, OldCalibration, PosteriorDraws
+from ..calibrate.results import ARCHIVE, DISCOVERY_ARCHIVE, Calibration, OldCalibration, PosteriorDraws
 from ..campaign import Campaign, check_tests, file_checksums, read_campaign
+from ..discover import Discovery
 from ..files import read_regular
 
 CALIBRATION, DISCOVERY, CAMPAIGN = "calibration.json", "discovery.json", "campaign"
@@ -37,6 +38,7 @@ class Results:
         calibration: contents of `calibration.json`.
         discovery: contents of `discovery.json`.
         saved: the calibration itself, as `mcc_jax.load` gives it, or its numbers alone where nothing else is left.
+        found: the discovery itself, where it was saved.
         figures: files of `figures/` that the two results name as theirs, by stem.
         written: the day of the newest result.
         cautions: where parts contradict each other.
@@ -49,6 +51,7 @@ class Results:
     calibration: dict[str, Any] | None
     discovery: dict[str, Any] | None
     saved: Calibration | None
+    found: Discovery | None
     figures: Mapping[str, bytes]
     written: datetime.date | None
     cautions: tuple[str, ...]
@@ -65,10 +68,10 @@ class Results:
     def missing(self) -> tuple[str, ...]:
         """What is not there, and how to get it."""
         parts = (
-            (self.campaign, "the tests; name their folder with --campaign"),
-            (self.calibration, "a calibration; mcc-jax calibrate makes one"),
-            (self.posterior, "a posterior; mcc-jax calibrate makes one"),
-            (self.discovery, "a discovery; mcc-jax discover makes one"),
+            (self.campaign, "the tests (name their folder with --campaign CAMPAIGN)"),
+            (self.calibration, "a calibration (mcc-jax calibrate makes one)"),
+            (self.posterior, "a posterior (mcc-jax calibrate makes one)"),
+            (self.discovery, "a discovery (mcc-jax discover makes one)"),
         )
         return tuple(text for part, text in parts if part is None)
 
@@ -113,11 +116,17 @@ def read_results(folder: str | Path, campaign: str | Path | None = None, *, name
     cautions = list(_cautions(data, checksums, calibration, discovery))
     saved = None if calibration is None else OldCalibration(calibration, data)
     if calibration is not None and ARCHIVE in there:
-        found = read_archive(path / ARCHIVE)
-        if isinstance(found, Calibration) and _belongs(found, calibration):
-            saved, data = found, found.campaign if data is None else data
+        kept = read_archive(path / ARCHIVE)
+        if isinstance(kept, Calibration) and _belongs(kept, calibration):
+            saved, data = kept, kept.campaign if data is None else data
         else:
             cautions.append(f"{ARCHIVE} is not of the {CALIBRATION} beside it, and is left out")
+    found = None
+    if discovery is not None and DISCOVERY_ARCHIVE in there:
+        found = read_archive(path / DISCOVERY_ARCHIVE)
+        if not isinstance(found, Discovery) or found.to_json()["summary"] != discovery["summary"]:
+            found = None
+            cautions.append(f"{DISCOVERY_ARCHIVE} is not of the {DISCOVERY} beside it, and is left out")
     return Results(
         name or path.resolve().name or str(path),
         data,
@@ -125,6 +134,7 @@ def read_results(folder: str | Path, campaign: str | Path | None = None, *, name
         calibration,
         discovery,
         saved,
+        found,
         _figures(path, [content for _, content in results]),
         _newest([path / n for n, _ in results]),
         tuple(cautions),

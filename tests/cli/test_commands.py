@@ -1,4 +1,5 @@
 import dataclasses
+import hashlib
 import json
 import math
 from collections import Counter
@@ -9,8 +10,10 @@ from asserting import snapshot
 from helpers import TESTERS
 
 from mcc_jax.campaign import PAPER_DIAMETERS_UM, find_segments, read_campaign
+from mcc_jax.cli.demo import NOTHING
 from mcc_jax.cli.main import cli
 from mcc_jax.cli.options import STRAIN_SCALING, UNLOADING
+from mcc_jax.cli.sealed import SEALED, STRENGTHS, compared, sealed_answer
 from mcc_jax.law import StrainScaling, Unloading
 from mcc_jax.simulate import Instrument, paper_campaign
 
@@ -72,41 +75,90 @@ def test_every_command_has_help_with_an_example(run, command):
 
 
 @pytest.mark.long  # `.ci/run` runs the demo as its users do
-def test_demo_does_the_whole_job(run, tmp_path):
+def test_demo_hides_an_effect_and_finds_it_and_finds_none_where_none_is(run, tmp_path):
     out = tmp_path / "new" / "demo"
     text = done(run("demo", "--out", out))
     assert "SIMULATED" in text
-    for number in ("1.43", "16 GPa", "6.704", "3.009", "2.66", "0.4085 MPa"):
+    for number in ("1.43", "16 GPa", "6.704", "3.009", "2.66"):
         assert number in text
-    content = json.loads((out / "calibration.json").read_text(encoding="utf-8"))
-    check_contract(content)
-    assert content["converged"] is True
-    assert len(content["figures"]) >= 6
-    found = json.loads((out / "discovery.json").read_text(encoding="utf-8"))
-    assert found["verdict"] == "NO_GAP"
-    assert "Discovery (NO_GAP): nothing is missing" in text
-    assert {"figures/discovery_where.png", "figures/discovery_ranking.png"} <= set(found["figures"])
-    expected = {
-        "report.html",
-        "calibration.json",
-        "calibration.msgpack",
-        "discovery.json",
-        "campaign",
-        "figures",
-        *content["figures"],
-        *found["figures"],
-    }
-    expected |= {f"campaign/{name}" for name in ("particles.csv", "curves.csv", "campaign.toml")}
-    expected |= {"posterior.nc", "calibration.msgpack", "discovery.msgpack"}
-    assert set(snapshot(out)) == expected
-    for name in (*content["figures"], *found["figures"]):
-        assert (out / name).read_bytes().startswith(b"\x89PNG")
-    for warning in content["warnings"]:
-        assert warning[1:20] in text
-    assert read_campaign(out / "campaign").particles == tuple(str(i) for i in range(1, 21))
-    assert "of the 20 particles of particles.csv" in done(run("export", out, "--format", "json", "--out", out / "law"))
-    card = json.loads((out / "law" / "parameters.json").read_text())
-    assert card["parameters"]["effective_modulus_MPa"].items() >= content["effective_modulus_MPa"].items()
+    sealed = (out / SEALED).read_bytes()
+    assert hashlib.sha256(sealed).hexdigest() in text.splitlines()[1]
+    hidden = json.loads(sealed)
+    assert hidden["nonce"] in text
+    assert "The name agrees" in text
+    assert "FALSE ALARM" not in text
+    for folder, verdict in ((out, "NAMED"), (out / NOTHING, "NO_GAP")):
+        content = json.loads((folder / "calibration.json").read_text(encoding="utf-8"))
+        check_contract(content)
+        assert content["converged"] is True
+        assert len(content["figures"]) >= 5
+        found = json.loads((folder / "discovery.json").read_text(encoding="utf-8"))
+        assert found["verdict"] == verdict
+        assert [e["mechanism"] for e in found["effects"]] == [hidden["mechanism"]][: len(found["effects"])]
+        assert {"figures/discovery_where.png", "figures/discovery_ranking.png"} <= set(found["figures"])
+        expected = {"report.html", "calibration.json", "discovery.json", "campaign", "figures"}
+        expected |= {f"campaign/{name}" for name in ("particles.csv", "curves.csv", "campaign.toml")}
+        expected |= {"posterior.nc", "calibration.msgpack", "discovery.msgpack", *content["figures"], *found["figures"]}
+        names = {name for name in snapshot(folder) if not name.startswith(NOTHING)}
+        assert names == expected | ({SEALED} if folder == out else set())
+        for name in (*content["figures"], *found["figures"]):
+            assert (folder / name).read_bytes().startswith(b"\x89PNG")
+        campaign = read_campaign(folder / "campaign")
+        assert campaign.particles == tuple(str(i) for i in range(1, 9))
+        assert campaign.columns == {}  # nothing beside the tests tells what is hidden
+        assert hidden["mechanism"] not in (folder / "campaign" / "campaign.toml").read_text()
+    gap = json.loads((out / "discovery.json").read_text())["gap"]
+    assert gap["closed_fraction"] > 0.9
+    assert gap["steps"][0]["chi2_per_dof"] > 3
+    assert gap["steps"][-1]["chi2_per_dof"] == pytest.approx(1.0, abs=0.2)
+    assert "of the 8 particles of particles.csv" in done(run("export", out, "--format", "json", "--out", out / "law"))
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_the_seal_fixes_what_is_hidden(seed):
+    one, again = sealed_answer(seed), sealed_answer(seed)
+    assert one.text == again.text
+    answer = json.loads(one.text)
+    low, high = STRENGTHS[answer["mechanism"]]
+    assert low <= one.effect.strength <= high
+    assert answer["parameters"][one.effect.variant.parameter] == one.effect.strength
+    assert hashlib.sha256(one.text.encode()).hexdigest() == one.sha256
+    assert one.sha256 != sealed_answer(seed + 1).sha256
+
+
+def test_every_effect_of_the_demo_is_hidden_by_some_seed():
+    assert {json.loads(sealed_answer(seed).text)["mechanism"] for seed in range(30)} == set(STRENGTHS)
+
+
+FOUND = {
+    "verdict": "NAMED",
+    "candidate_set": [["creep"]],
+    "effects": [
+        {
+            "mechanism": "creep",
+            "variant": "kelvin_voigt",
+            "parameters": {"c": {"value": 1.1, "sd": 0.1, "interval_95": [0.9, 1.3]}},
+        }
+    ],
+}
+HIDDEN = {"mechanism": "creep", "variant": "kelvin_voigt", "parameters": {"c": 1.0}}
+
+
+@pytest.mark.parametrize(
+    ("answer", "found", "right", "words"),
+    [
+        ({}, {}, True, "off by +10.0 %, 1.0 standard deviations; the true one lies inside"),
+        ({"parameters": {"c": 2.0}}, {}, True, "the true one lies OUTSIDE"),
+        ({"variant": "logarithmic"}, {}, True, "the formula is another (kelvin voigt, hidden was logarithmic)"),
+        ({"mechanism": "frame_compliance"}, {}, False, "WRONG: hidden was frame compliance, found was creep"),
+        ({}, {"candidate_set": [["creep", "thermal_drift"]]}, True, "cannot tell it from thermal drift"),
+        ({}, {"verdict": "NO_GAP", "effects": []}, False, "found was no name (verdict NO_GAP)"),
+    ],
+)
+def test_the_demo_says_how_the_discovery_did(answer, found, right, words):
+    agrees, sentence = compared(HIDDEN | answer, FOUND | found)
+    assert agrees is right
+    assert words in sentence
 
 
 def test_simulate_then_calibrate_twice_gives_the_same(run, simulated, tmp_path):

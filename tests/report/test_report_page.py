@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from reading_html import Page
-from results_folder import ARCHIVE, MODULUS, NAMES, NOISE, calibration
+from results_folder import ARCHIVE, MODULUS, NAMES, NOISE, calibration, discovery
 from results_folder import C as COEFFICIENTS
 
 from mcc_jax._format import interval, number, with_sd
@@ -20,9 +20,18 @@ from mcc_jax.report import read_results, report_page
 from mcc_jax.report.chart import chart_data, chart_items
 from mcc_jax.report.compare import PageOptions, compare
 from mcc_jax.report.lights import lights, share_inside
-from mcc_jax.report.sentences import calibration_sentences, next_steps
+from mcc_jax.report.pictures import Telling, telling_pictures
+from mcc_jax.report.sentences import calibration_sentences, discovery_sentence, next_steps
 
 SECTIONS = {"summary", "measured", "law", "compare", "posterior", "diagnostics", "discovery", "settings", "cite"}
+ALWAYS = {"summary", "law", "settings", "cite"}
+OF_PART = {
+    "campaign": {"compare", "measured"},
+    "calibration": {"posterior", "measured", "diagnostics"},
+    "posterior": {"compare", "measured"},
+    "discovery": {"discovery", "diagnostics"},
+}
+"""Sections that stand in a page only where there is something to show."""
 PARTS = {
     "campaign": ("particles.csv", "curves.csv", "campaign.toml"),
     "calibration": ("calibration.json",),
@@ -221,7 +230,8 @@ def test_what_is_missing_is_said_with_the_command_that_makes_it(folder, parts):
     saved = {"campaign"} if "posterior" in parts else set()  # a saved calibration holds its tests
     assert len(found.missing) == len(set(PARTS) - set(parts) - saved)
     read = Page(report_page(found))
-    assert set(read.sections) == SECTIONS
+    assert set(read.sections) == ALWAYS.union(*(OF_PART[part] for part in parts))
+    assert {link[1:] for link in read.links if link.startswith("#")} <= set(read.ids)
     for name, text in read.sections.items():
         assert len(text.split()) > 10, (name, text)
     commands = {"campaign": "--campaign CAMPAIGN", "discovery": "mcc-jax discover", "posterior": "mcc-jax calibrate"}
@@ -250,6 +260,58 @@ def test_every_verdict_is_told(folder, verdict, words):
     assert words in text
     assert verdict in text
     assert ("0.1 * x**2" in text) == (verdict == "UNLISTED")
+
+
+def test_the_first_screen_tells_verdict_gap_and_modulus(page):
+    """A share of the gap never stands alone: chi2 per point is beside it wherever the share is told."""
+    read = Page(page)
+    assert list(read.sections) == [name for name in ORDER if name in read.sections]
+    top = read.sections["summary"]
+    for text in (
+        "Missing in the law is frame compliance",
+        "16.000000 ± 0.000010 GPa",
+        "9.000 ± 0.050 GPa",
+        "78 % higher",
+    ):
+        assert text in top, text
+    assert top.index("Missing in the law") < top.index("Gap closed") < top.index("Effective modulus")
+    for section in ("summary", "discovery"):
+        text = " ".join(read.sections[section].split())
+        place = text.index("99 %")
+        assert "χ² per point" in text[place : place + 200]
+        assert "falls from 2 to 2" in text[place : place + 300]
+    assert not [word for word in UNDERSCORED.findall(read.text) if word not in ALLOWED]
+
+
+ORDER = ("summary", "compare", "law", "posterior", "diagnostics", "discovery", "measured", "settings", "cite")
+UNDERSCORED = re.compile(r"[A-Za-z]+_[A-Za-z_]+")
+# The package, a formula, a column that a user must call so, and verdicts as the files have them.
+ALLOWED = {"mcc_jax", "D_e", "relative_humidity_percent", "NO_GAP", "FIT_NOT_CONVERGED"}
+
+
+def telling(gap_at, points=60):
+    """A test of rising load whose law is wrong in one place."""
+    rows = np.arange(points, dtype=float)
+    before = np.where(np.abs(rows - gap_at) < 4, 0.5, 0.0)
+    return Telling(rows, rows**2, rows, before, np.zeros(points), None, "law with creep", "Particle 1.")
+
+
+@pytest.mark.parametrize("gap_at", [5, 30, 55])
+def test_the_enlarged_part_holds_the_largest_gap(gap_at):
+    told = telling(gap_at)
+    assert told.near[gap_at]
+    assert told.near.sum() < 20
+    assert [label for *_, label in told.laws] == ["law alone", "law with creep"]
+    assert all(
+        source.startswith("data:image/svg+xml") and "Particle 1" in words for source, words in telling_pictures(told)
+    )
+
+
+@pytest.mark.parametrize(("chi2", "words"), [(1.02, "agree within the noise"), (1.4, "part stays")])
+def test_a_gap_is_called_closed_only_where_chi2_says_so(chi2, words):
+    content = discovery(verdict="NAMED")
+    content["gap"]["steps"][-1]["chi2_per_dof"] = chi2
+    assert words in discovery_sentence(content)
 
 
 @pytest.mark.parametrize(("power", "words"), [(0.95, "Measure: a hold"), (0.3, "would surely separate")])
@@ -395,5 +457,6 @@ def test_digits_follow_the_uncertainty():
     assert with_sd({"value": 16012.7, "sd": 10.3}, 1e-3) == "16.013 ± 0.010"
     assert with_sd({"value": -3.0, "sd": None}) == "−3"
     assert with_sd({"value": None, "sd": None}) == "unknown"
+    assert with_sd({"value": 5.785e-4, "sd": 2.5e-6}) == "(5.785 ± 0.025) × 10⁻⁴"
     assert interval({"interval_95": [1.42597, 1.43206]}) == "1.4260 to 1.4321"
     assert interval({"interval_95": None}) is None
