@@ -11,10 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..calibrate.compiling import compiled
+from ..calibrate.compiling import compiled, compiled_quickly
 from ..calibrate.distributions import nuisance_moments
-from ..calibrate.fitting import linear_data
-from ..calibrate.forward import Forms, Linear, Point
+from ..calibrate.forward import Forms, Linear, Point, linearise
 from ..effects import Variant
 from .base import Base, State
 from .evidence import Design, Kinds, Solution
@@ -52,6 +51,9 @@ def base_columns(
     return columns, residual - jnp.einsum("npk,nk->np", own, away)
 
 
+linearised = compiled_quickly(linearise)
+
+
 @dataclass(frozen=True)
 class More:
     """Columns of a hypothesis besides those of its formulas.
@@ -80,7 +82,7 @@ NOTHING_MORE = More()
 
 def linear_at(base: Base, state: State, variants: tuple[Variant, ...]) -> Linear:
     """The tests linearised at a state."""
-    return base.each(linear_data, state.point, Forms(base.model.unloading, variants))
+    return base.each(linearised, state.point, Forms(base.model.unloading, variants))
 
 
 def design_of(

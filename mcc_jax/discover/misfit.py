@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..calibrate.compiling import compiled
+from ..calibrate.compiling import compiled_quickly
 from ..calibrate.data import Tests
 from ..calibrate.forward import Forms, Point
 from .settings import NUMERICS
@@ -42,7 +42,7 @@ ANY = ("peak", "load", "since")
 """The same of a mechanism that is not of the library."""
 
 
-@compiled
+@compiled_quickly
 def coordinates(point: Point, tests: Tests, forms: Forms) -> dict[str, Array]:
     """Coordinates of every point: strain and travel in diameters, force, loads, times, sizes."""
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array
 from scipy.special import log_ndtr, logsumexp
 
-from ..calibrate.compiling import compiled
+from ..calibrate.compiling import compiled_quickly
 from ..calibrate.data import Tests
 from ..calibrate.distributions import SCALES
 from ..calibrate.forward import Forms, Point
@@ -25,7 +25,7 @@ from .evidence import left_by_particle, prior_density, with_amplitudes, without_
 from .settings import FURTHER, NUMERICS
 
 
-@compiled
+@compiled_quickly
 def candidate_columns(point: Point, tests: Tests, effects: tuple[AbstractEffect, ...], forms: Forms) -> Array:
     """Signatures of all candidates at the base law, shape (N, points, candidates)."""
 
