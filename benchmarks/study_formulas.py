@@ -23,7 +23,6 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import mcc_jax as mcc
@@ -68,8 +67,8 @@ def campaign() -> mcc.Campaign:
 def gram(base: Base, columns: Any) -> np.ndarray:
     """Products of columns in units of noise, particles' own numbers and the population integrated out."""
     design = with_amplitudes(design_of(base, base.state), columns)
-    left, _ = left_by_particle(jnp.asarray(base.hyperparameters), design)
-    return np.asarray(without_first(jnp.sum(left, 0), FURTHER)[0])[:-1, :-1]
+    left, _ = left_by_particle(base.hyperparameters, design)
+    return without_first(left.sum(0), FURTHER)[0][:-1, :-1]
 
 
 def remaining(products: np.ndarray, precision: np.ndarray) -> float:
@@ -94,7 +93,7 @@ def in_span(
     span = Search.misfit_columns(searching, fitted, 0)[..., : NUMERICS.basis[-1]]
     count = span.shape[-1]
     span = padded(span, NUMERICS.basis[-1])
-    products = gram(base, jnp.concatenate([unit * columns[..., [k, s]], span], -1))[: 2 + count, : 2 + count]
+    products = gram(base, np.concatenate([unit * columns[..., [k, s]], span], -1))[: 2 + count, : 2 + count]
     alone = remaining(products[:2, :2], np.zeros(1))
     misfit = remaining(products, np.array([0.0] + [DECISIONS.misfit**-2] * count))
     return Row(truth, sibling.name, float(np.sqrt(products[0, 0])), alone, misfit)
@@ -105,7 +104,10 @@ def rows_of(base: Base, candidates: list[Candidate]) -> list[Row]:
     variants = list(dict.fromkeys(c.variant for c in candidates))
     every = [Candidate(v, {n.name: n.middle for n in v.nuisances}) for v in variants] + candidates
     columns = signature_columns(base, base.state, every)
-    at = scaled(base.each(coordinates, base.state.point, base.forms), base.tests.mask)
+    at = scaled(
+        {k: np.asarray(x) for k, x in base.each(coordinates, base.state.point, base.forms).items()},
+        np.asarray(base.tests.mask),
+    )
     products, rows = gram(base, columns), []
     length = np.sqrt(np.maximum(np.diagonal(products), 1e-300))
     for k, v in enumerate(variants):

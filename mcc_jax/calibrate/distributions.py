@@ -36,25 +36,35 @@ class SpreadCoordinate(dist.Distribution):
         self.prior, self.power = prior, 1 / (2 * prior.shape)
         super().__init__(batch_shape=(), event_shape=())
 
+    @property
+    def unit(self) -> float:
+        """The spread where sinh |x| is 1."""
+        return KNEE * self.prior.sd
+
+    @property
+    def constant(self) -> float:
+        """The log density at 0."""
+        m, s = self.prior.shape, self.prior.sd
+        return -math.lgamma(m) - m * math.log(2 * s**2) + 2 * m * math.log(self.unit) + math.log(self.power)
+
     def spread(self, coordinate: Array) -> Array:
         """The spread at a coordinate."""
-        return KNEE * self.prior.sd * jnp.sinh(jnp.abs(coordinate)) ** self.power
+        return self.unit * jnp.sinh(jnp.abs(coordinate)) ** self.power
 
     def coordinate(self, spread: Array | float) -> Array:
         """The coordinate, >= 0, of a spread."""
-        return jnp.arcsinh((spread / (KNEE * self.prior.sd)) ** (1 / self.power))
+        return jnp.arcsinh((spread / self.unit) ** (1 / self.power))
 
     def log_prob(self, value: Any, intermediates: Any = None) -> Array:
         """Log density of the coordinate."""
-        m, s = self.prior.shape, self.prior.sd
-        constant = -math.lgamma(m) - m * math.log(2 * s**2) + 2 * m * math.log(KNEE * s) + math.log(self.power)
-        return constant - 0.5 * (self.spread(value) / s) ** 2 + jnp.log(jnp.cosh(value))
+        spread = self.spread(value) / self.prior.sd
+        return self.constant - 0.5 * spread**2 + jnp.log(jnp.cosh(value))
 
     def sample(self, key: Any, sample_shape: tuple[int, ...] = ()) -> Array:
         """Draws of the coordinate."""
         size, sign = jax.random.split(key)
         tau = self.prior.sd * jnp.sqrt(2 * jax.random.gamma(size, self.prior.shape, sample_shape))
-        x = jnp.arcsinh((tau / (KNEE * self.prior.sd)) ** (1 / self.power))
+        x = jnp.arcsinh((tau / self.unit) ** (1 / self.power))
         return jnp.where(jax.random.bernoulli(sign, 0.5, sample_shape), x, -x)
 
 

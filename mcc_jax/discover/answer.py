@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from ..calibrate import Posterior
@@ -28,7 +27,7 @@ def population_parameters(search: Search, names: Names) -> dict[str, Any]:
     mean, factor = map(np.asarray, search.base.population_prior)
     beta = mean + factor @ np.asarray(solution.common[:POPULATION])
     sd = np.sqrt(np.diagonal(factor @ _covariance(design, optimum.free)[:POPULATION, :POPULATION] @ factor.T))
-    _, tau, _ = scales_of(jnp.asarray(optimum.free), design)
+    tau, _ = scales_of(optimum.free, design)
     shift = float(np.mean(np.log1p(np.maximum(beta[0] * np.asarray(design.tests.flatness), -0.99))))
     means = beta[2:5] - shift
 
@@ -49,7 +48,7 @@ def population_parameters(search: Search, names: Names) -> dict[str, Any]:
 
 def _covariance(design: Any, free: np.ndarray) -> np.ndarray:
     """Posterior covariance of the common numbers, the amplitudes integrated out with flat priors."""
-    left = np.asarray(left_by_particle(jnp.asarray(free), design).gram).sum(0)[:-1, :-1]
+    left = left_by_particle(free, design).gram.sum(0)[:-1, :-1]
     c = design.common.shape[-1]
     prior = np.concatenate([np.ones(c), 1 / np.asarray(design.largest) ** 2])
     return np.linalg.inv(left + np.diag(prior))
@@ -198,9 +197,8 @@ def residuals_of(search: Search, winner: Names | None) -> Residuals:
     assert fitted is not None
     design, optimum, solution = fitted
     after = residual_of(solution, design)
-    free = jnp.asarray(optimum.free)
-    white_before, _ = whitened(free, design, before)
-    white_after, sd = whitened(free, design, after)
+    white_before, _ = whitened(optimum.free, design, before)
+    white_after, sd = whitened(optimum.free, design, after)
     mask = np.asarray(base.tests.mask)
     return Residuals(
         np.asarray(base.tests.record.time),

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from scipy.special import logsumexp
 
@@ -41,12 +40,12 @@ class _Statistic:
                 own.append(columns)
                 self.own_names += [name] * len(candidates)
                 self.own_ratio += [c.variant.plausible[1] / c.variant.plausible[0] for c in candidates]
-        steps = self._steps(search) if SUDDEN in search.library else jnp.zeros((*basis.shape[:2], 0))
-        formulas = jnp.zeros((*basis.shape[:2], 0)) if screen is None else screen.columns
+        steps = self._steps(search) if SUDDEN in search.library else np.zeros((*basis.shape[:2], 0))
+        formulas = np.zeros((*basis.shape[:2], 0)) if screen is None else screen.columns
         self.counts = [POPULATION, formulas.shape[-1], basis.shape[-1], len(self.own_names), steps.shape[-1]]
-        every = jnp.concatenate([design.common[..., :POPULATION], formulas, basis, *own, steps], -1)
+        every = np.concatenate([design.common[..., :POPULATION], formulas, basis, *own, steps], -1)
         nothing = with_amplitudes(replace(design, common=every[..., :0], group=design.group[:0]), every)
-        left = np.asarray(left_by_particle(jnp.asarray(search.null.optimum.free), nothing).gram)
+        left = left_by_particle(search.null.optimum.free, nothing).gram
         self.scores = Scores(left[:, :-1, :-1], left[:, :-1, -1])
         self.library = len(search.library)
         self.unit = float(DECISIONS.general * np.exp(search.null.optimum.free[0]))
@@ -62,7 +61,7 @@ class _Statistic:
             self.weight = -np.log([mechanisms[n[0]] * grid[n] for n in names])
 
     @staticmethod
-    def _steps(search: Search):
+    def _steps(search: Search) -> np.ndarray:
         """Steps at some points of every test's loading."""
         loading = np.asarray(search.base.tests.loading & search.base.tests.mask)
         mask = np.asarray(search.base.tests.mask)
@@ -71,7 +70,7 @@ class _Statistic:
             if len(rows) > 1:
                 for k, j in enumerate(rows[np.linspace(1, len(rows) - 1, NUMERICS.thinned).astype(int)]):
                     columns[i, j:, k] = np.where(mask[i, j:], search.library[SUDDEN].variants[0].plausible[0], 0.0)
-        return jnp.asarray(columns)
+        return columns
 
     def __call__(self, score: np.ndarray) -> np.ndarray:
         """Log evidence ratios of campaigns, from scores of shape (campaigns, N, columns)."""

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from .._format import described
@@ -131,11 +130,11 @@ def closure(search: Search, seed: int) -> Closure:
     values = np.where(mask[..., None], values, 0.0)
     scale = np.maximum(np.sqrt((values**2).mean((0, 1))), 1e-300)
     null = search.null.design
-    free = jnp.asarray(smooth.optimum.free[:HYPERPARAMETERS])
-    curve = np.asarray(smooth.curve_um)[..., None]
-    known = np.zeros((*curve.shape[:2], 0)) if search.screen is None else np.asarray(search.screen.columns)
-    every = jnp.concatenate([jnp.asarray(values / scale), jnp.asarray(curve), jnp.asarray(known)], -1)
-    left = np.asarray(left_by_particle(free, with_amplitudes(null, every)).gram)
+    free = smooth.optimum.free[:HYPERPARAMETERS]
+    curve = smooth.curve_um[..., None]
+    known = np.zeros((*curve.shape[:2], 0)) if search.screen is None else search.screen.columns
+    every = np.concatenate([values / scale, curve, known], -1)
+    left = left_by_particle(free, with_amplitudes(null, every)).gram
     T = len(terms)
     everyone = np.arange(len(left))
     chosen, weights = _best_terms(left, null.common.shape[-1], T, everyone)
@@ -160,14 +159,13 @@ def closure(search: Search, seed: int) -> Closure:
         _resembling(search, left, null.common.shape[-1], T),
         span,
         curve[..., 0],
-        _held_out(smooth.design, np.asarray(smooth.optimum.free), np.asarray(smooth.basis)),
+        _held_out(smooth.design, smooth.optimum.free, smooth.basis),
     )
 
 
 def _shared(left: np.ndarray, common: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Information and scores of the amplitudes, what all particles share integrated out."""
-    total, _ = without_first(jnp.asarray(left[rows].sum(0)), common)
-    total = np.asarray(total)
+    total, _ = without_first(left[rows].sum(0), common)
     return total[:-1, :-1], total[:-1, -1]
 
 
@@ -222,13 +220,13 @@ def _along(search: Search, name: str, x: np.ndarray, span: tuple[float, float]) 
         return np.stack([np.cos(np.pi * k * u) for k in range(1, N)], -1)
 
     basis = functions(at) * size[:, None, None] / np.sqrt(N)
-    basis = jnp.where(tests.mask[..., None], jnp.asarray(basis), 0.0)
-    free = jnp.asarray(smooth.optimum.free[:HYPERPARAMETERS])
+    basis = np.where(np.asarray(tests.mask)[..., None], basis, 0.0)
+    free = smooth.optimum.free[:HYPERPARAMETERS]
     left = left_by_particle(free, with_amplitudes(search.null.design, basis))
-    total, _ = without_first(jnp.sum(left.gram, 0), search.null.design.common.shape[-1])
-    G, s = np.asarray(total)[:-1, :-1], np.asarray(total)[:-1, -1]
+    total, _ = without_first(left.gram.sum(0), search.null.design.common.shape[-1])
+    G, s = total[:-1, :-1], total[:-1, -1]
     # Weights have the size that the smooth discrepancy was found to have, in units of strain.
-    unit = float(np.sqrt(np.mean((np.asarray(smooth.curve_um) / size[:, None])[np.asarray(tests.mask)] ** 2)))
+    unit = float(np.sqrt(np.mean((smooth.curve_um / size[:, None])[np.asarray(tests.mask)] ** 2)))
     covariance = np.linalg.inv(G + np.eye(len(G)) / max(unit, 1e-12) ** 2)
     there = functions((x - span[0]) / max(span[1] - span[0], 1e-300)) / np.sqrt(N)
     sd = np.sqrt(np.maximum(np.einsum("xk,kl,xl->x", there, covariance, there), 0.0))
@@ -237,12 +235,12 @@ def _along(search: Search, name: str, x: np.ndarray, span: tuple[float, float]) 
 
 def _held_out(design: Design, free: np.ndarray, basis: np.ndarray) -> np.ndarray:
     """What the discrepancy adds to every test by the weights that the others make [um]."""
-    left = np.asarray(left_by_particle(jnp.asarray(free), design).gram)
-    _, _, common = scales_of(jnp.asarray(free), design)
+    left = left_by_particle(free, design).gram
+    _, common = scales_of(free, design)
     total, c = left.sum(0), design.common.shape[-1]
     found = []
     for i, own in enumerate(left):
         others = total - own
-        numbers = np.linalg.solve(others[:c, :c] + np.eye(c), others[:c, -1]) * np.asarray(common)
+        numbers = np.linalg.solve(others[:c, :c] + np.eye(c), others[:c, -1]) * common
         found.append(basis[i] @ numbers[FURTHER : FURTHER + basis.shape[-1]])
     return np.array(found)

@@ -11,10 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..calibrate.compiling import compiled
+from ..calibrate.compiling import compiled, compiled_quickly
 from ..calibrate.distributions import nuisance_moments
-from ..calibrate.forward import Forms, Linear, Point
-from ..calibrate.linearisation import linear_data
+from ..calibrate.forward import Forms, Linear, Point, linearise
 from ..effects import Variant
 from .base import Base, State
 from .evidence import Design, Kinds, Solution
@@ -52,6 +51,9 @@ def base_columns(
     return columns, residual - jnp.einsum("npk,nk->np", own, away)
 
 
+linearised = compiled_quickly(linearise)
+
+
 @dataclass(frozen=True)
 class More:
     """Columns of a hypothesis besides those of its formulas.
@@ -65,12 +67,12 @@ class More:
         sizes: median and standard deviation of the logarithm of each misfit's size.
     """
 
-    own: Array | None = None
+    own: np.ndarray | None = None
     own_spreads: tuple[Any, ...] = ()
-    amplitude: Array | None = None
+    amplitude: np.ndarray | None = None
     largest: tuple[float, ...] = ()
     sign: tuple[int, ...] = ()
-    basis: Array | None = None
+    basis: np.ndarray | None = None
     group: Sequence[int] = ()
     sizes: Sequence[tuple[float, float]] = field(default=())
 
@@ -80,7 +82,7 @@ NOTHING_MORE = More()
 
 def linear_at(base: Base, state: State, variants: tuple[Variant, ...]) -> Linear:
     """The tests linearised at a state."""
-    return base.each(linear_data, state.point, Forms(base.model.unloading, variants))
+    return base.each(linearised, state.point, Forms(base.model.unloading, variants))
 
 
 def design_of(
@@ -93,31 +95,32 @@ def design_of(
     """The design of a hypothesis around a state, from the tests linearised there if they are already."""
     tests, model = base.tests, base.model
     linear = linear_at(base, state, variants) if linear is None else linear
-    point, of_particle = state.point, linear.columns[..., :4]
+    point, columns = state.point, np.asarray(linear.columns)
+    of_particle, effect = columns[..., :4], columns[..., 4:]
     population, data = base_columns(
         point.latent,
         state.population,
         tests.flatness,
-        of_particle,
+        linear.columns[..., :4],
         linear.residual,
         base.population_prior,
         model.shape_power,
     )
     zero_mean, zero_sd = np.asarray(model.zero_prior)
-    ones = jnp.where(tests.mask, 1.0, 0.0)
-    data = data - (tests.contact + zero_mean - point.zero)[:, None] * ones
+    ones = np.where(tests.mask, 1.0, 0.0)
+    data = np.asarray(data) - (np.asarray(tests.contact) + zero_mean - np.asarray(point.zero))[:, None] * ones
     own = [of_particle, (zero_sd * ones)[..., None], *([] if more.own is None else [more.own])]
-    K, effect, theta = len(variants), linear.columns[..., 4:], point.theta
-    units = jnp.asarray(np.array([v.plausible[0] for v in variants]))
-    amplitude = [effect[..., :K] * units[None, None], *([] if more.amplitude is None else [more.amplitude])]
-    data = data + jnp.einsum("npk,nk->np", effect[..., :K], theta[:, :K])
-    common, place = [population], K
+    K, theta = len(variants), np.asarray(point.theta)
+    units = np.array([v.plausible[0] for v in variants])
+    amplitude = [effect[..., :K] * units, *([] if more.amplitude is None else [more.amplitude])]
+    data = data + np.einsum("npk,nk->np", effect[..., :K], theta[:, :K])
+    common, place = [np.asarray(population)], K
     for v in variants:
         for n in v.nuisances:
             mean, sd = nuisance_moments(n)
             at, column = theta[0, place], effect[..., place]
             if n.plausible[0] > 0:
-                column, at = column * at, jnp.log(at)
+                column, at = column * at, np.log(at)
             data = data - column * (mean - at)
             common.append((sd * column)[..., None])
             place += 1
@@ -128,12 +131,12 @@ def design_of(
         sizes += [(0.0, 1.0)] * (MISFITS - len(sizes))
     spreads = more.own_spreads
     if spreads:
-        own = [*own, jnp.zeros((*tests.mask.shape, NUMERICS.jumps - len(spreads)))]
+        own = [*own, np.zeros((*tests.mask.shape, NUMERICS.jumps - len(spreads)))]
         spreads = (*spreads, *[spreads[0]] * (NUMERICS.jumps - len(spreads)))
-    shared = padded(jnp.concatenate(common, -1), FURTHER)
+    shared = padded(np.concatenate(common, -1), FURTHER)
     group = [0] * FURTHER + group
     if basis is not None:
-        shared = jnp.concatenate([shared, basis], -1)
+        shared = np.concatenate([shared, basis], -1)
     used = [1.0] * (HYPERPARAMETERS + len(more.own_spreads)) + [0.0] * (len(spreads) - len(more.own_spreads))
     used += [1.0] * len(more.sizes) + [0.0] * (len(sizes) - len(more.sizes))
     absent = AMPLITUDES - sum(x.shape[-1] for x in amplitude)
@@ -142,35 +145,35 @@ def design_of(
     return Design(
         tests,
         replace(linear, columns=linear.columns[..., :0]),  # they stand in the design: one shape for all formulas
-        jnp.concatenate(own, -1),
+        np.concatenate(own, -1),
         shared,
-        padded(jnp.concatenate(amplitude, -1), AMPLITUDES),
+        padded(np.concatenate(amplitude, -1), AMPLITUDES),
         data,
-        jnp.asarray(base.scale),
-        jnp.asarray(np.array(group, int)),
-        jnp.asarray(np.stack([np.log(np.asarray(noise.median)), np.asarray(noise.log_sd)])),
-        jnp.asarray(np.array(largest, float)),
-        jnp.asarray(np.array([*(v.sign for v in variants), *more.sign, *[0] * absent], float)),
-        jnp.asarray(np.array(sizes, float).reshape(-1, 2)),
-        jnp.asarray(np.array(used, float)),
+        base.scale,
+        np.array(group, int),
+        np.stack([np.log(np.asarray(noise.median)), np.asarray(noise.log_sd)]),
+        np.array(largest, float),
+        np.array([*(v.sign for v in variants), *more.sign, *[0] * absent], float),
+        np.array(sizes, float).reshape(-1, 2),
+        np.array(used, float),
         Kinds((*base.spreads, *spreads), model.correlation, model.along),
     )
 
 
-def padded(columns: Array, size: int) -> Array:
-    """Columns of nothing added, so that few shapes are compiled; their numbers have no say."""
-    return jnp.pad(columns, ((0, 0), (0, 0), (0, size - columns.shape[-1])))
+def padded(columns: np.ndarray, size: int) -> np.ndarray:
+    """Columns of nothing added, so that hypotheses have one shape; their numbers have no say."""
+    return np.pad(columns, ((0, 0), (0, 0), (0, size - columns.shape[-1])))
 
 
 def moved(base: Base, state: State, variants: tuple[Variant, ...], solution: Solution) -> State:
     """The state at a solution; a positive number moves by a factor of e at most, others within what is plausible."""
     tests, model = base.tests, base.model
-    mean, factor = base.population_prior
+    mean, factor = map(np.asarray, base.population_prior)
     beta = mean + factor @ solution.common[:POPULATION]
-    at, slope = means_and_slope(state.population, tests.flatness, model.shape_power)
-    latent = at + jnp.einsum("nkb,b->nk", slope, beta - state.population) + solution.own[:, :4]
+    at, slope = map(np.asarray, means_and_slope(state.population, tests.flatness, model.shape_power))
+    latent = at + slope @ (beta - np.asarray(state.population)) + solution.own[:, :4]
     zero_mean, zero_sd = np.asarray(model.zero_prior)
-    zero = tests.contact + zero_mean + zero_sd * solution.own[:, 4]
+    zero = np.asarray(tests.contact) + zero_mean + zero_sd * solution.own[:, 4]
     numbers: list[Any] = [v.plausible[0] * float(solution.amplitude[k]) for k, v in enumerate(variants)]
     old, place = np.asarray(state.point.theta[0]), POPULATION
     for v in variants:
@@ -182,7 +185,8 @@ def moved(base: Base, state: State, variants: tuple[Variant, ...], solution: Sol
             else:
                 numbers.append(float(np.clip(x, *n.plausible)))
             place += 1
-    return State(Point(latent, zero, state.point.theta), beta).with_numbers(np.array(numbers))
+    point = Point(jnp.asarray(latent), jnp.asarray(zero), state.point.theta)
+    return State(point, jnp.asarray(beta)).with_numbers(np.array(numbers))
 
 
 @compiled

@@ -14,25 +14,27 @@ their posterior mode, and their curvature is integrated by Laplace's method.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import log_ndtr, logsumexp
 from jaxtyping import Array, Float
+from scipy.special import log_ndtr
 
 from ..calibrate.compiling import compiled
 from ..calibrate.data import Tests
 from ..calibrate.distributions import SCALES, SpreadCoordinate
 from ..calibrate.forward import Linear
 from ..calibrate.noise import Along, Correlation, Noise, whitening
-from ..calibrate.small_matrices import eliminate
 from .settings import NUMERICS
 
+LOG_2PI = float(np.log(2 * np.pi))
 
-class Design(eqx.Module):
+
+@dataclass(frozen=True)
+class Design:
     """The columns of a hypothesis around a state, every number in units of its prior's standard deviation.
 
     Attributes:
@@ -52,18 +54,23 @@ class Design(eqx.Module):
 
     tests: Tests
     linear: Linear
-    own: Float[Array, "particles points o"]
-    common: Float[Array, "particles points c"]
-    amplitude: Float[Array, "particles points k"]
-    data: Float[Array, "particles points"]
-    scale: Float[Array, " particles"]
-    group: Any
-    noise: Float[Array, "2 4"]
-    largest: Float[Array, " k"]
-    sign: Float[Array, " k"]
-    misfits: Float[Array, "g 2"]
-    used: Float[Array, " h"]
-    kinds: Kinds = eqx.field(static=True)
+    own: Float[np.ndarray, "particles points o"]
+    common: Float[np.ndarray, "particles points c"]
+    amplitude: Float[np.ndarray, "particles points k"]
+    data: Float[np.ndarray, "particles points"]
+    scale: Float[np.ndarray, " particles"]
+    group: np.ndarray
+    noise: Float[np.ndarray, "2 4"]
+    largest: Float[np.ndarray, " k"]
+    sign: Float[np.ndarray, " k"]
+    misfits: Float[np.ndarray, "g 2"]
+    used: Float[np.ndarray, " h"]
+    kinds: Kinds
+
+    @cached_property
+    def columns(self) -> Columns:
+        """All columns, the data last."""
+        return Columns(np.concatenate([self.own, self.common, self.amplitude, self.data[..., None]], -1), self)
 
 
 @dataclass(frozen=True)
@@ -98,122 +105,306 @@ class NoiseKind:
 def with_noise(design: Design, kind: NoiseKind) -> Design:
     """The design with noise of another kind."""
     kinds = replace(design.kinds, correlation=kind.correlation, along=kind.along)
-    return replace(design, noise=design.noise.at[0, 3].add(float(np.log(kind.length))), kinds=kinds)
+    noise = design.noise.copy()
+    noise[0, 3] += np.log(kind.length)
+    return replace(design, noise=noise, kinds=kinds)
 
 
-def with_amplitudes(design: Design, columns: Array) -> Design:
+def with_amplitudes(design: Design, columns: np.ndarray) -> Design:
     """The design with other amplitudes, of either sign, whose priors nobody asks for."""
     count = columns.shape[-1]
-    return replace(design, amplitude=columns, sign=jnp.zeros(count), largest=jnp.ones(count))
+    return replace(design, amplitude=np.asarray(columns), sign=np.zeros(count), largest=np.ones(count))
+
+
+# ---- noise: all that is compiled, a few columns at a time, so that one program serves all hypotheses -----------------
+
+
+class White(NamedTuple):
+    """Columns freed of the noise.
+
+    Attributes:
+        columns: independent and of variance 1.
+        log_density: of the noise at 0.
+        reading: sum of squares that reading a display alone brings about.
+        sd: of each point given those before it.
+    """
+
+    columns: Any
+    log_density: Any
+    reading: Any
+    sd: Any
+
+
+@compiled
+def white_of(
+    logs: Float[Array, " 4"],
+    scale: Array,
+    tests: Tests,
+    linear: Linear,
+    columns: Float[Array, "particles points few"],
+    correlation: Correlation,
+) -> White:
+    """Whiten columns of all tests, at the logarithms of the noise's four numbers."""
+    noise = Noise.from_logs(logs, scale)
+
+    def one(scale: Array, tests: Tests, linear: Linear, columns: Array) -> White:
+        filtered = whitening(noise, scale, tests, linear, correlation, Along.LOAD)
+        constant = filtered.log_det + jnp.sum(jnp.where(tests.mask, LOG_2PI, 0.0))
+        return White(filtered(columns), -0.5 * constant, filtered.reading, filtered.solver.factor.diag.d)
+
+    return jax.vmap(one)(scale, tests, linear, columns)
+
+
+@compiled
+def slope_of(weights: tuple[Array, Array, Array], logs: Float[Array, " 4"], *given: Any) -> Float[Array, " 4"]:
+    """Derivatives of a weighted sum of what `white_of` gives by the logarithms of the noise's four numbers."""
+    _, back = jax.vjp(lambda at: white_of.__wrapped__(at, *given)[:3], logs)  # pyright: ignore[reportFunctionMemberAccess]
+    return back(weights)[0]
+
+
+class Columns:
+    """Columns of a design cut into pieces of one shape; those of nothing, which make up room, are left out."""
+
+    def __init__(self, columns: np.ndarray, design: Design) -> None:
+        self.shape = columns.shape
+        self.some = np.flatnonzero(np.any(columns != 0, axis=(0, 1)))
+        kept = columns[..., self.some]
+        room = np.pad(kept, ((0, 0), (0, 0), (0, -max(kept.shape[-1], 1) % NUMERICS.columns)))
+        self.pieces = [jnp.asarray(piece) for piece in np.split(room, room.shape[-1] // NUMERICS.columns, -1)]
+        tests, kinds = design.tests, design.kinds
+        if kinds.along is Along.TIME:  # one program for both
+            tests = replace(tests, path=tests.record.time)
+        self.arrays, self.correlation = (jnp.asarray(design.scale), tests, design.linear), kinds.correlation
+
+    def _given(self, free: np.ndarray, piece: Array) -> tuple[Any, ...]:
+        return jnp.asarray(free[:4]), *self.arrays, piece, self.correlation
+
+    def white(self, free: np.ndarray) -> White:
+        """Whitened at the hyperparameters."""
+        found = [jax.tree.map(np.asarray, white_of(*self._given(free, piece))) for piece in self.pieces]
+        columns = np.zeros(self.shape)
+        columns[..., self.some] = np.concatenate([one.columns for one in found], -1)[..., : len(self.some)]
+        return found[0]._replace(columns=columns)
+
+    def slope(self, free: np.ndarray, of_white: np.ndarray, of_reading: float) -> np.ndarray:
+        """Derivatives of something by the noise's numbers, from those by the whitened columns and by the readings; the
+        noise's log density is part of it."""
+        room = np.zeros((*self.shape[:2], len(self.pieces) * NUMERICS.columns))
+        room[..., : len(self.some)] = of_white[..., self.some]
+        each, ones = np.split(room, len(self.pieces), -1), np.ones(self.shape[0])
+        total = np.zeros(4)
+        for k, piece in enumerate(self.pieces):
+            once = ones if k == 0 else 0.0 * ones
+            weights = jnp.asarray(each[k]), jnp.asarray(once), jnp.asarray(of_reading * once)
+            total += np.asarray(slope_of(weights, *self._given(free, piece)))
+        return total
+
+
+# ---- evidence --------------------------------------------------------------------------------------------------------
 
 
 class Left(NamedTuple):
     """What the particles leave: Gram matrices of the common columns, the amplitudes and the data, and log integrals."""
 
-    gram: Float[Array, "particles r r"]
-    log_integral: Float[Array, " particles"]
+    gram: Float[np.ndarray, "particles r r"]
+    log_integral: Float[np.ndarray, " particles"]
 
 
-def scales_of(free: Float[Array, " h"], design: Design) -> tuple[Noise, Array, Array]:
-    """Noise, scales of the own columns and of the common ones, at the hyperparameters.
+class Spreads(NamedTuple):
+    """Spreads at their coordinates and the log densities of the coordinates, of either sign together, with slopes."""
+
+    value: np.ndarray
+    slope: np.ndarray
+    log_prob: np.ndarray
+    log_prob_slope: np.ndarray
+
+
+def spreads_of(x: np.ndarray, priors: tuple[Any, ...]) -> Spreads:
+    """The spreads at their coordinates."""
+    each = [SpreadCoordinate(prior) for prior in priors]
+    power, unit, constant = (
+        np.array([getattr(one, name) for one in each], float) for name in ("power", "unit", "constant")
+    )
+    sd = np.array([prior.sd for prior in priors], float)
+    size = np.abs(x)
+    value = unit * np.sinh(size) ** power
+    slope = unit * power * np.sinh(np.maximum(size, 1e-300)) ** (power - 1) * np.cosh(size) * np.sign(x)
+    log_prob = constant + np.log(2) - 0.5 * (value / sd) ** 2 + np.logaddexp(x, -x) - np.log(2)
+    return Spreads(value, slope, log_prob, np.tanh(x) - value / sd**2 * slope)
+
+
+def scales_of(free: np.ndarray, design: Design) -> tuple[np.ndarray, np.ndarray]:
+    """Scales of the own columns and of the common ones, at the hyperparameters.
 
     They are logarithms of the noise's four numbers, the spreads' coordinates, and logarithms of the misfits' scales.
     """
     spreads = design.kinds.spreads
-    noise = Noise.from_logs(free[:4], design.scale)
-    x = free[4 : 4 + len(spreads)]
-    tau = [SpreadCoordinate(prior).spread(x[j]) for j, prior in enumerate(spreads)]
-    own = jnp.stack([*tau[:4], jnp.ones(()), *tau[4:]])
-    misfit = jnp.concatenate([jnp.ones(1), jnp.exp(free[4 + len(spreads) :])])
-    return noise, own, misfit[design.group]
+    tau = spreads_of(free[4 : 4 + len(spreads)], spreads).value
+    misfit = np.append(1.0, np.exp(free[4 + len(spreads) :]))
+    return np.concatenate([tau[:4], [1.0], tau[4:]]), misfit[design.group]
 
 
-def grams(free: Float[Array, " h"], design: Design) -> tuple[Array, Array]:
-    """Gram matrix of every test's whitened and scaled columns, and its noise's log density at 0."""
-    noise, own, common = scales_of(free, design)
-    kinds = design.kinds
-    columns = jnp.concatenate([design.own, design.common, design.amplitude, design.data[..., None]], -1)
-    factor = jnp.concatenate([own, common, jnp.ones(design.amplitude.shape[-1] + 1)])
-
-    def one(scale: Array, tests: Tests, linear: Linear, columns: Array) -> tuple[Array, Array]:
-        filtered = whitening(noise, scale, tests, linear, kinds.correlation, kinds.along)
-        white = filtered(columns) * factor[None]
-        gram = (white.T @ white).at[-1, -1].add(filtered.reading)
-        count = jnp.sum(jnp.where(tests.mask, 1.0, 0.0))
-        return gram, -0.5 * (filtered.log_det + count * float(np.log(2 * np.pi)))
-
-    return jax.vmap(one)(design.scale, design.tests, design.linear, columns)
+def _factor(free: np.ndarray, design: Design) -> np.ndarray:
+    return np.concatenate([*scales_of(free, design), np.ones(design.amplitude.shape[-1] + 1)])
 
 
-def left_of(free: Float[Array, " h"], design: Design) -> Left:
+def _gram(white: White, factor: np.ndarray) -> np.ndarray:
+    scaled = white.columns * factor
+    gram = np.swapaxes(scaled, 1, 2) @ scaled
+    gram[:, -1, -1] += white.reading
+    return gram
+
+
+def left_by_particle(free: np.ndarray, design: Design) -> Left:
     """Integrate every particle's own numbers out."""
-    gram, log_density = grams(free, design)
-    left, log_integral = without_first(gram, design.own.shape[-1])
-    return Left(left, log_integral + log_density)
+    white = design.columns.white(free)
+    left, log_integral = without_first(_gram(white, _factor(free, design)), design.own.shape[-1])
+    return Left(left, log_integral + white.log_density)
 
 
-def without_first(gram: Array, count: int) -> tuple[Array, Array]:
+def _root(matrix: np.ndarray) -> np.ndarray:
+    """The lower root of positive definite matrices; no numbers where they are none."""
+    try:
+        return np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        return np.full(matrix.shape, np.nan)
+
+
+class Integrated(NamedTuple):
+    """What is left of quadratic forms after the first numbers, which are standard normal, are integrated out.
+
+    Attributes:
+        left: the form in the others.
+        log_integral: what the integral adds.
+        root: of the precision of the first numbers.
+        weights: how they answer to the others.
+    """
+
+    left: np.ndarray
+    log_integral: Any
+    root: np.ndarray
+    weights: np.ndarray
+
+    def slope(self, of_left: np.ndarray) -> np.ndarray:
+        """Derivatives by the form before, of something and the log integral, from those by what is left."""
+        down = -np.swapaxes(self.weights, -1, -2)
+        beside = down @ of_left
+        eye = np.eye(self.root.shape[-1])
+        half = np.linalg.solve(self.root, np.broadcast_to(eye, self.root.shape))
+        inner = beside @ np.swapaxes(down, -1, -2) - 0.5 * np.swapaxes(half, -1, -2) @ half
+        outer = np.broadcast_to(of_left, (*inner.shape[:-2], *of_left.shape[-2:]))
+        return np.concatenate(
+            [np.concatenate([inner, beside], -1), np.concatenate([np.swapaxes(beside, -1, -2), outer], -1)], -2
+        )
+
+
+def _integrated(gram: np.ndarray, count: int) -> Integrated:
+    root = _root(gram[..., :count, :count] + np.eye(count))
+    half = np.linalg.solve(root, gram[..., :count, count:])
+    turned = np.swapaxes(half, -1, -2)
+    log_integral = -np.sum(np.log(np.diagonal(root, axis1=-2, axis2=-1)), -1)
+    weights = np.swapaxes(np.linalg.solve(np.swapaxes(root, -1, -2), half), -1, -2)
+    return Integrated(gram[..., count:, count:] - turned @ half, log_integral, root, weights)
+
+
+def without_first(gram: np.ndarray, count: int) -> tuple[np.ndarray, Any]:
     """Integrate the first columns out, whose numbers are standard normal: what is left of the form, log integral."""
-    return eliminate(gram, range(count), jnp.ones((*gram.shape[:-2], count)), written_out=False)
+    found = _integrated(gram, count)
+    return found.left, found.log_integral
 
 
-def amplitudes(left: Array, sign: Array, largest: Array) -> tuple[Array, Array, Array]:
-    """Log integral over amplitudes, and their mean and standard deviation under the best scales.
+class Amplitudes(NamedTuple):
+    """Log integral over amplitudes, their mean and standard deviation under the best scales, and the integral's
+    derivatives by the quadratic form."""
+
+    log_integral: float
+    mean: np.ndarray
+    sd: np.ndarray
+    slope: np.ndarray
+
+
+def amplitudes(left: np.ndarray, sign: np.ndarray, largest: np.ndarray) -> Amplitudes:
+    """Integrate amplitudes out.
 
     Each has an equal mixture of half-normal priors (normal where both signs are physical), whose scales are spread
     evenly in the logarithm from 1 to `largest`. Where several are cut, the corner's probability is taken for the
     product of the single ones.
     """
-    count = len(sign)
-    if not count:
-        return -0.5 * left[-1, -1], jnp.zeros(0), jnp.zeros(0)
-    gram, score = left[:-1, :-1], left[:-1, -1]
-    steps = jnp.asarray(np.linspace(0, 1, SCALES))
-    axes = jnp.meshgrid(*(steps for _ in range(count)), indexing="ij")
-    scale = jnp.exp(jnp.stack([a.ravel() for a in axes], -1) * jnp.log(largest)[None])
+    count, gram, score = len(sign), left[:-1, :-1], left[:-1, -1]
+    axes = np.meshgrid(*[np.linspace(0, 1, SCALES)] * count, indexing="ij")
+    scale = np.exp(np.stack([a.ravel() for a in axes], -1) * np.log(largest)) if count else np.ones((1, 0))
+    root = _root(gram + np.eye(count) * scale[:, None, :] ** -2.0)
+    half = np.linalg.solve(root, np.broadcast_to(np.eye(count), root.shape))
+    covariance = np.swapaxes(half, 1, 2) @ half
+    mean, sd = covariance @ score, np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    z = sign * mean / sd
+    cut = np.where(sign == 0, 0.0, np.log(2) + log_ndtr(z))
+    value = 0.5 * mean @ score + np.sum(np.log(np.diagonal(half, axis1=1, axis2=2)) - np.log(scale) + cut, 1)
+    total = float(np.logaddexp.reduce(value))
+    weight = np.exp(value - total)[:, None, None]
+    # Of mean and standard deviation by the form: the covariance's change is -C dG C, the mean's C ds - C dG m.
+    ratio = np.where(sign == 0, 0.0, np.exp(-0.5 * z**2 - 0.5 * LOG_2PI - log_ndtr(z)))
+    by_mean = (covariance @ (ratio * sign / sd)[..., None])[..., 0]
+    by_variance = (covariance * (ratio * z / (2 * sd**2))[:, None, :]) @ covariance
+    outer = (mean[:, :, None] * (mean + 2 * by_mean)[:, None, :]).transpose(0, 2, 1)
+    by_gram = np.sum(weight * (-0.5 * (outer + covariance) + by_variance), 0)
+    by_score = np.sum(weight[..., 0] * (mean + by_mean), 0)
+    slope = np.full(left.shape, -0.5)
+    slope[:-1, :-1] = (by_gram + by_gram.T) / 2
+    slope[:-1, -1] = slope[-1, :-1] = by_score / 2
+    best = int(np.argmax(value))
+    return Amplitudes(total - count * float(np.log(SCALES)) - 0.5 * left[-1, -1], mean[best], sd[best], slope)
 
-    def one(s: Array) -> tuple[Array, Array, Array]:
-        precision = gram + jnp.diag(s**-2.0)
-        root = jnp.linalg.cholesky(precision)
-        covariance = jax.scipy.linalg.cho_solve((root, True), jnp.eye(count))
-        mean = covariance @ score
-        sd = jnp.sqrt(jnp.diagonal(covariance))
-        value = 0.5 * score @ mean - jnp.sum(jnp.log(jnp.diagonal(root))) - jnp.sum(jnp.log(s))
-        cut = jnp.where(sign == 0, 0.0, float(np.log(2)) + log_ndtr(sign * mean / sd))
-        return value + jnp.sum(cut), mean, sd
 
-    value, mean, sd = jax.vmap(one)(scale)
-    best = jnp.argmax(value)
-    total = logsumexp(value) - count * float(np.log(SCALES)) - 0.5 * left[-1, -1]
-    return total, mean[best], sd[best]
-
-
-def log_prior(free: Float[Array, " h"], design: Design) -> Array:
+def log_prior(free: np.ndarray, design: Design) -> float:
     """Log prior of the hyperparameters, of a spread's coordinate of either sign together; of those that only make up
     shapes it is standard normal, which Laplace's method integrates to 1."""
-    spreads = design.kinds.spreads
-    log_2pi = float(np.log(2 * np.pi))
-    z = (free[:4] - design.noise[0]) / design.noise[1]
-    each = [-0.5 * z**2 - jnp.log(design.noise[1]) - 0.5 * log_2pi]
-    if spreads:
-        of_spreads = [SpreadCoordinate(prior).log_prob(free[4 + j]) for j, prior in enumerate(spreads)]
-        each.append(float(np.log(2)) + jnp.stack(of_spreads))
-    m = (free[4 + len(spreads) :] - design.misfits[:, 0]) / design.misfits[:, 1]
-    each.append(-0.5 * m**2 - jnp.log(design.misfits[:, 1]) - 0.5 * log_2pi)
-    nothing = -0.5 * free**2 - 0.5 * log_2pi
-    return jnp.sum(jnp.where(design.used > 0, jnp.concatenate(each), nothing))
+    return _prior(free, design)[0]
 
 
-def log_joint(free: Float[Array, " h"], design: Design) -> Array:
+def _prior(free: np.ndarray, design: Design) -> tuple[float, np.ndarray]:
+    """The log prior and its derivatives."""
+    count = 4 + len(design.kinds.spreads)
+    spreads = spreads_of(free[4:count], design.kinds.spreads)
+    means = np.concatenate([design.noise[0], design.misfits[:, 0]])
+    sds = np.concatenate([design.noise[1], design.misfits[:, 1]])
+    z = (np.concatenate([free[:4], free[count:]]) - means) / sds
+    normal, slope = -0.5 * z**2 - np.log(sds) - 0.5 * LOG_2PI, -z / sds
+    each = np.concatenate([normal[:4], spreads.log_prob, normal[4:]])
+    slopes = np.concatenate([slope[:4], spreads.log_prob_slope, slope[4:]])
+    used = design.used > 0
+    nothing = -0.5 * free**2 - 0.5 * LOG_2PI
+    return float(np.sum(np.where(used, each, nothing))), np.where(used, slopes, -free)
+
+
+def value_and_gradient(free: np.ndarray, design: Design) -> tuple[float, np.ndarray]:
+    """Log marginal likelihood at the hyperparameters, times their prior, and its derivatives."""
+    spreads, o, c = design.kinds.spreads, design.own.shape[-1], design.common.shape[-1]
+    with np.errstate(all="ignore"):  # of steps into numbers beyond arithmetic
+        white, factor = design.columns.white(free), _factor(free, design)
+        gram = _gram(white, factor)
+        by_particle = _integrated(gram, o)
+        shared = _integrated(by_particle.left.sum(0), c)
+        effects = amplitudes(shared.left, design.sign, design.largest)
+        prior, slope = _prior(free, design)
+        integrals = by_particle.log_integral + white.log_density
+        value = float(integrals.sum() + shared.log_integral) + effects.log_integral + prior
+        of_gram = by_particle.slope(shared.slope(effects.slope))
+        slope[:4] += design.columns.slope(free, (white.columns * factor) @ (2 * of_gram) * factor, of_gram[0, -1, -1])
+        of_log = 2 * np.sum(of_gram * gram, (0, 2))  # derivatives by the logarithms of the columns' scales
+        spread = spreads_of(free[4 : 4 + len(spreads)], spreads)
+        own = np.delete(of_log[:o], 4)
+        slope[4 : 4 + len(spreads)] += own * spread.slope / np.maximum(spread.value, 1e-300)
+        slope[4 + len(spreads) :] += np.bincount(design.group, of_log[o : o + c], len(design.misfits) + 1)[1:]
+    return value, slope
+
+
+def log_joint(free: np.ndarray, design: Design) -> float:
     """Log marginal likelihood at the hyperparameters, times their prior."""
-    left = left_of(free, design)
-    gram, integral = without_first(jnp.sum(left.gram, 0), design.common.shape[-1])
-    return (
-        jnp.sum(left.log_integral)
-        + integral
-        + amplitudes(gram, design.sign, design.largest)[0]
-        + log_prior(free, design)
-    )
+    left = left_by_particle(free, design)
+    gram, integral = without_first(left.gram.sum(0), design.common.shape[-1])
+    effects = amplitudes(gram, design.sign, design.largest)
+    return float(left.log_integral.sum() + integral) + effects.log_integral + log_prior(free, design)
 
 
 def filled_up(free: np.ndarray, design: Design) -> np.ndarray:
@@ -228,11 +419,6 @@ def with_little_noise(free: np.ndarray) -> np.ndarray:
     return at
 
 
-value_and_gradient = compiled(jax.value_and_grad(log_joint))
-left_by_particle = compiled(left_of)
-prior_density = compiled(log_prior)
-
-
 class Solution(NamedTuple):
     """Posterior means at the hyperparameters.
 
@@ -242,35 +428,24 @@ class Solution(NamedTuple):
         amplitude, sd: of the amplitudes.
     """
 
-    own: Float[Array, "particles o"]
-    common: Float[Array, " c"]
-    amplitude: Float[Array, " k"]
-    sd: Float[Array, " k"]
+    own: Float[np.ndarray, "particles o"]
+    common: Float[np.ndarray, " c"]
+    amplitude: Float[np.ndarray, " k"]
+    sd: Float[np.ndarray, " k"]
 
 
-def _solved(matrix: Array, values: Array) -> Array:
-    """The solution of positive definite equations."""
-    root = jnp.linalg.cholesky(matrix)
-    half = jax.scipy.linalg.solve_triangular(root, values, lower=True)
-    return jax.scipy.linalg.solve_triangular(root, half, lower=True, trans=1)
-
-
-@compiled
-def solve(free: Float[Array, " h"], design: Design) -> Solution:
+def solve(free: np.ndarray, design: Design) -> Solution:
     """Posterior means of all numbers, an amplitude of a forbidden sign at zero."""
-    _, own, common = scales_of(free, design)
-    gram, _ = grams(free, design)
+    own, common = scales_of(free, design)
     o, c = design.own.shape[-1], design.common.shape[-1]
-    left, _ = without_first(gram, o)
-    total = jnp.sum(left, 0)
-    after, _ = without_first(total, c)
-    _, theta, sd = amplitudes(after, design.sign, design.largest)
-    theta = jnp.where(design.sign * theta < 0, 0.0, theta)
-    data = total[:c, -1] - total[:c, c:-1] @ theta
-    epsilon = _solved(total[:c, :c] + jnp.eye(c), data[:, None])[:, 0]
-    rest = gram[:, :o, -1] - gram[:, :o, o + c : -1] @ theta - gram[:, :o, o : o + c] @ epsilon
-    v = _solved(gram[:, :o, :o] + jnp.eye(o)[None], rest[..., None])[..., 0]
-    return Solution(v * own[None], epsilon * common, theta, sd)
+    by_particle = _integrated(_gram(design.columns.white(free), _factor(free, design)), o)
+    shared = _integrated(by_particle.left.sum(0), c)
+    _, theta, sd, _ = amplitudes(shared.left, design.sign, design.largest)
+    theta = np.where(design.sign * theta < 0, 0.0, theta)
+    numbers = np.append(-theta, 1.0)
+    epsilon = numbers @ shared.weights
+    v = np.concatenate([-epsilon, numbers]) @ by_particle.weights
+    return Solution(v * own, epsilon * common, theta, sd)
 
 
 @dataclass(frozen=True)
@@ -314,10 +489,10 @@ def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, witho
     scale = 1 / np.sqrt(np.where(used, expected, 1.0))
 
     def down(x: np.ndarray) -> tuple[float, np.ndarray]:
-        value, slope = value_and_gradient(jnp.asarray(x * scale), design)
-        if not (np.isfinite(float(value)) and np.isfinite(np.asarray(slope)).all()):
+        value, slope = value_and_gradient(x * scale, design)
+        if not (np.isfinite(value) and np.isfinite(slope).all()):
             return 1e30, np.zeros(len(x))  # a step into numbers beyond arithmetic is taken back
-        return -float(value), -np.asarray(slope) * scale
+        return -value, -slope * scale
 
     options = {"ftol": 1e-9, "gtol": 0.1, "maxiter": 40}
     found = minimize(down, start / scale, jac=True, method="L-BFGS-B", options=options)
@@ -344,23 +519,14 @@ def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, witho
     return Optimum(free, float(evidence), joint, int(found.nfev))
 
 
-@compiled
-def residual_of(solution: Solution, design: Design) -> Float[Array, "particles points"]:
+def residual_of(solution: Solution, design: Design) -> Float[np.ndarray, "particles points"]:
     """What a solution leaves of the data [um]."""
-    taken = jnp.einsum("npo,no->np", design.own, solution.own)
-    taken += jnp.einsum("npc,c->np", design.common, solution.common)
-    return design.data - taken - jnp.einsum("npk,k->np", design.amplitude, solution.amplitude)
+    own = np.einsum("npo,no->np", design.own, solution.own)
+    return design.data - own - design.common @ solution.common - design.amplitude @ solution.amplitude
 
 
-@compiled
-def whitened(free: Float[Array, " h"], design: Design, values: Array) -> tuple[Array, Array]:
+def whitened(free: np.ndarray, design: Design, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Values over the points [um], independent and of variance 1, and the standard deviation of each point given those
     before it."""
-    noise, _, _ = scales_of(free, design)
-    kinds = design.kinds
-
-    def one(scale: Array, tests: Tests, linear: Linear, values: Array) -> tuple[Array, Array]:
-        filtered = whitening(noise, scale, tests, linear, kinds.correlation, kinds.along)
-        return filtered(values[:, None])[:, 0], filtered.solver.factor.diag.d
-
-    return jax.vmap(one)(design.scale, design.tests, design.linear, values)
+    white = Columns(values[..., None], design).white(free)
+    return white.columns[..., 0], white.sd

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from ..calibrate.estimates import finite
-from .evidence import Design, Optimum, amplitudes, left_by_particle, prior_density, scales_of, without_first
+from .evidence import Design, Optimum, amplitudes, left_by_particle, log_prior, scales_of, without_first
 from .search import UNLISTED, Names, Search
 from .settings import HYPERPARAMETERS, NUMERICS
 
@@ -89,35 +88,33 @@ class _Contestant:
 
     @classmethod
     def of(cls, names: Names, design: Design, free: np.ndarray, log_prior: float) -> _Contestant:
-        left = left_by_particle(jnp.asarray(free), design)
-        return cls(names, design, free, np.asarray(left.gram), np.asarray(left.log_integral), log_prior)
+        left = left_by_particle(free, design)
+        return cls(names, design, free, left.gram, left.log_integral, log_prior)
 
     def log_evidence(self, rows: np.ndarray) -> float:
         """Log marginal likelihood of some particles."""
         c = self.design.common.shape[-1]
-        gram, integral = without_first(jnp.asarray(self.left[rows].sum(0)), c)
-        value, _, _ = amplitudes(gram, self.design.sign, self.design.largest)
-        return float(self.log_integral[rows].sum() + float(integral) + float(value))
+        gram, integral = without_first(self.left[rows].sum(0), c)
+        value = amplitudes(gram, self.design.sign, self.design.largest).log_integral
+        return float(self.log_integral[rows].sum() + integral + value)
 
     def numbers(self, rows: np.ndarray) -> np.ndarray:
         """Common numbers and amplitudes that some particles make, in units of their columns as `scales_of` has them."""
         c = self.design.common.shape[-1]
-        total = jnp.asarray(self.left[rows].sum(0))
+        total = self.left[rows].sum(0)
         gram, _ = without_first(total, c)
-        _, theta, _ = amplitudes(gram, self.design.sign, self.design.largest)
-        theta = np.where(np.asarray(self.design.sign) * np.asarray(theta) < 0, 0.0, np.asarray(theta))
-        full = np.asarray(total)
-        data = full[:c, -1] - full[:c, c:-1] @ theta
-        return np.concatenate([np.linalg.solve(full[:c, :c] + np.eye(c), data), theta])
+        theta = amplitudes(gram, self.design.sign, self.design.largest).mean
+        theta = np.where(self.design.sign * theta < 0, 0.0, theta)
+        data = total[:c, -1] - total[:c, c:-1] @ theta
+        return np.concatenate([np.linalg.solve(total[:c, :c] + np.eye(c), data), theta])
 
     def residual(self, row: int, numbers: np.ndarray) -> np.ndarray:
         """What is left of a particle [um], its own numbers fitted to it."""
         d = self.design
-        _, own, common = (np.asarray(x) if k else x for k, x in enumerate(scales_of(jnp.asarray(self.free), d)))
+        own, common = scales_of(self.free, d)
         c = d.common.shape[-1]
-        y = np.asarray(d.data[row]) - np.asarray(d.common[row]) @ (numbers[:c] * common)
-        y = y - np.asarray(d.amplitude[row]) @ numbers[c:]
-        X, mask = np.asarray(d.own[row]) * own, np.asarray(d.tests.mask[row])
+        y = d.data[row] - d.common[row] @ (numbers[:c] * common) - d.amplitude[row] @ numbers[c:]
+        X, mask = d.own[row] * own, np.asarray(d.tests.mask[row])
         sd = float(np.exp(self.free[0]))
         v = np.linalg.solve(X[mask].T @ X[mask] / sd**2 + np.eye(X.shape[1]), X[mask].T @ y[mask] / sd**2)
         return np.where(mask, y - X @ v, 0.0)
@@ -170,8 +167,7 @@ def held_out(search: Search, winner: Names) -> HeldOut:
 
 def _of_hyperparameters(design: Design, optimum: Optimum) -> float:
     """What hyperparameters add to a log marginal likelihood at their mode, by all particles: prior and curvature."""
-    prior = float(prior_density(jnp.asarray(optimum.free), design))
-    return prior + optimum.log_evidence - optimum.log_joint
+    return log_prior(optimum.free, design) + optimum.log_evidence - optimum.log_joint
 
 
 def _repeating(search: Search, residual: np.ndarray) -> np.ndarray:

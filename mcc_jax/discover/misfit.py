@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..calibrate.compiling import compiled
+from ..calibrate.compiling import compiled_quickly
 from ..calibrate.data import Tests
 from ..calibrate.forward import Forms, Point
 from .settings import NUMERICS
@@ -42,7 +42,7 @@ ANY = ("peak", "load", "since")
 """The same of a mechanism that is not of the library."""
 
 
-@compiled
+@compiled_quickly
 def coordinates(point: Point, tests: Tests, forms: Forms) -> dict[str, Array]:
     """Coordinates of every point: strain and travel in diameters, force, loads, times, sizes."""
 
@@ -74,48 +74,48 @@ def coordinates(point: Point, tests: Tests, forms: Forms) -> dict[str, Array]:
     return jax.vmap(one)(point.latent, tests)
 
 
-def scaled(at: dict[str, Array], mask: Array) -> dict[str, Array]:
+def scaled(at: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]:
     """Coordinates between 0 and 1 over the campaign."""
 
-    def one(x: Array) -> Array:
-        low = jnp.min(jnp.where(mask, x, jnp.inf))
-        high = jnp.max(jnp.where(mask, x, -jnp.inf))
-        return jnp.clip((x - low) / jnp.where(high > low, high - low, 1.0), 0.0, 1.0)
+    def one(x: np.ndarray) -> np.ndarray:
+        low = np.min(np.where(mask, x, np.inf))
+        high = np.max(np.where(mask, x, -np.inf))
+        return np.clip((x - low) / np.where(high > low, high - low, 1.0), 0.0, 1.0)
 
     return {name: one(x) for name, x in at.items()}
 
 
 def functions(
-    names: tuple[str, ...], at: dict[str, Array], *, degree: int = NUMERICS.degree, hats: int = NUMERICS.hats
-) -> Array:
+    names: tuple[str, ...], at: dict[str, np.ndarray], *, degree: int = NUMERICS.degree, hats: int = NUMERICS.hats
+) -> np.ndarray:
     """Smooth products of cosines and hat functions over some coordinates, shape (N, points, functions).
 
     Their squares add up to about 1 at every point for the products and for the hats of each coordinate together, so
     that one scale says how large they are together.
     """
     columns = []
-    some = [n for n in names if float(jnp.max(at[n]) - jnp.min(at[n])) > 0]
+    some = [n for n in names if float(np.max(at[n]) - np.min(at[n])) > 0]
     for powers in itertools.product(range(degree + 1), repeat=len(some)):
         if not 0 < sum(powers) <= degree:
             continue
-        x = jnp.ones_like(next(iter(at.values())))
+        x = np.ones_like(next(iter(at.values())))
         for n, k in zip(some, powers, strict=True):
-            x = x * jnp.cos(np.pi * k * at[n])
+            x = x * np.cos(np.pi * k * at[n])
         columns.append(x)
     smooth = [x * np.sqrt(1.0 / max(len(columns), 1)) * np.sqrt(2) for x in columns]
     if not columns:
-        return jnp.zeros((*next(iter(at.values())).shape, 0))
+        return np.zeros((*next(iter(at.values())).shape, 0))
     rough = [hats_of(at[n], hats) / np.sqrt(len(some)) for n in some]
-    return jnp.concatenate([jnp.stack(smooth, -1), *rough], -1)
+    return np.concatenate([np.stack(smooth, -1), *rough], -1)
 
 
-def hats_of(x: Array, count: int) -> Array:
+def hats_of(x: np.ndarray, count: int) -> np.ndarray:
     """Hat functions, piecewise linear and 1 at one of `count` even places, of a coordinate between 0 and 1."""
-    centres = jnp.asarray(np.linspace(0, 1, count))
-    return jnp.maximum(1 - jnp.abs(x[..., None] - centres.reshape((1,) * x.ndim + (count,))) * (count - 1), 0.0)
+    centres = np.linspace(0, 1, count)
+    return np.maximum(1 - np.abs(x[..., None] - centres.reshape((1,) * x.ndim + (count,))) * (count - 1), 0.0)
 
 
-def general(at: dict[str, Array], size: Array, mask: Array) -> tuple[Array, list[int]]:
+def general(at: dict[str, np.ndarray], size: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, list[int]]:
     """Functions of a discrepancy that no mechanism explains, and of which kind each is: smooth 1, rough 2, periodic 3.
 
     It is common to all particles, in proportion to their size, and lives in reduced strain, travel, load and time. The
@@ -123,17 +123,17 @@ def general(at: dict[str, Array], size: Array, mask: Array) -> tuple[Array, list
     particle's layers and flaws yield within a narrow range of it.
     """
     places = ("strain", "travel", "load", "clock")
-    columns = [jnp.cos(np.pi * k * at[name]) for name in places for k in range(1, 4)]
+    columns = [np.cos(np.pi * k * at[name]) for name in places for k in range(1, 4)]
     both = [(i, j) for i in range(1, 3) for j in range(1, 3)]
-    columns += [jnp.cos(np.pi * i * at["peak"]) * jnp.cos(np.pi * j * at["load"]) for i, j in both]
-    smooth = jnp.stack(columns, -1) / np.sqrt(len(columns))
+    columns += [np.cos(np.pi * i * at["peak"]) * np.cos(np.pi * j * at["load"]) for i, j in both]
+    smooth = np.stack(columns, -1) / np.sqrt(len(columns))
     hats = {"peak": NUMERICS.fine_hats, "travel": NUMERICS.hats, "load": NUMERICS.hats, "clock": NUMERICS.hats}
-    rough = jnp.concatenate([hats_of(at[name], count) for name, count in hats.items()], -1) / np.sqrt(len(hats))
+    rough = np.concatenate([hats_of(at[name], count) for name, count in hats.items()], -1) / np.sqrt(len(hats))
     waves = []
     for name in ("travel", "clock"):
         for k in range(2, NUMERICS.waves):
-            waves += [jnp.cos(2 * np.pi * k * at[name]), jnp.sin(2 * np.pi * k * at[name])]
-    periodic = jnp.stack(waves, -1) / np.sqrt(len(waves))
+            waves += [np.cos(2 * np.pi * k * at[name]), np.sin(2 * np.pi * k * at[name])]
+    periodic = np.stack(waves, -1) / np.sqrt(len(waves))
     kinds = [kind for kind, some in enumerate((smooth, rough, periodic), 1) for _ in range(some.shape[-1])]
-    basis = jnp.concatenate([smooth, rough, periodic], -1) * (size / jnp.mean(size))[:, None, None]
-    return jnp.where(mask[..., None], basis, 0.0), kinds
+    basis = np.concatenate([smooth, rough, periodic], -1) * (size / np.mean(size))[:, None, None]
+    return np.where(mask[..., None], basis, 0.0), kinds

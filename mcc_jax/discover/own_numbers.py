@@ -6,22 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 from scipy.special import betaln, expit, logsumexp
 
-from ..calibrate.compiling import compiled
-from ..calibrate.data import Tests
-from ..calibrate.forward import Linear
-from ..calibrate.noise import whitening
 from ..calibrate.priors import NakagamiPrior
 from ..effects import Variant
 from .base import Base, State
 from .candidates import Candidate
 from .design import More, design_of, linear_at
-from .evidence import Design, Optimum, filled_up, optimise, scales_of, solve, value_and_gradient, with_little_noise
+from .evidence import Columns, Design, Optimum, filled_up, log_joint, optimise, scales_of, solve, with_little_noise
 from .refine import Refined, refined
 from .screen import single_integrals
 from .settings import DECISIONS, HYPERPARAMETERS, NUMERICS
@@ -80,10 +73,10 @@ class OwnNumbers:
 
 def solved(design: Design, optimum: Optimum, start: Refined) -> Refined:
     """A design at its optimum, linear where another hypothesis is."""
-    return Refined(start.variants, start.state, design, optimum, solve(jnp.asarray(optimum.free), design))
+    return Refined(start.variants, start.state, design, optimum, solve(optimum.free, design))
 
 
-def differing(base: Base, start: Refined, columns: Array, candidates: Sequence[Candidate]) -> OwnNumbers | None:
+def differing(base: Base, start: Refined, columns: np.ndarray, candidates: Sequence[Candidate]) -> OwnNumbers | None:
     """An amplitude that scatters around a common one, over all formulas of a mechanism; None if none does.
 
     Args:
@@ -103,10 +96,7 @@ def differing(base: Base, start: Refined, columns: Array, candidates: Sequence[C
         more = More(ratio * column, (SPREAD,), column, (ratio,), (0,))
         design = design_of(base, start.state, start.variants, more, linear)
         value, at = max(
-            (
-                (float(value_and_gradient(jnp.asarray(filled_up(x, design)), design)[0]), x)
-                for x in (free, with_little_noise(free))
-            ),
+            ((log_joint(filled_up(x, design), design), x) for x in (free, with_little_noise(free))),
             key=lambda one: one[0],
         )
         tried.append((value, at, c, design, more))
@@ -130,26 +120,21 @@ def differing(base: Base, start: Refined, columns: Array, candidates: Sequence[C
     return OwnNumbers(c.variant, dict(c.nuisance), total, solved(design, curved, start), more)
 
 
-@compiled
-def step_scores(free: Array, design: Design, common: Array, amplitude: Array) -> tuple[Array, Array]:
+def step_scores(now: Refined) -> tuple[np.ndarray, np.ndarray]:
     """Score and information of a step of 1 um at every point, each particle's own numbers integrated out."""
-    noise, own, _ = scales_of(free, design)
-    kinds = design.kinds
-    points = design.data.shape[-1]
-    residual = design.data - jnp.einsum("npc,c->np", design.common, common)
-    residual -= jnp.einsum("npk,k->np", design.amplitude, amplitude)
-
-    def one(scale: Array, tests: Tests, linear: Linear, columns: Array, residual: Array) -> tuple[Array, Array]:
-        filtered = whitening(noise, scale, tests, linear, kinds.correlation, kinds.along)
-        steps = jnp.where(tests.mask[:, None], jnp.tril(jnp.ones((points, points))), 0.0)
-        white = filtered(jnp.concatenate([columns * own[None], steps, residual[:, None]], -1))
-        o = columns.shape[-1]
-        root = jnp.linalg.cholesky(white[:, :o].T @ white[:, :o] + jnp.eye(o))
-        half = jax.scipy.linalg.solve_triangular(root, white[:, :o].T @ white[:, o:], lower=True)
-        score = white[:, o:-1].T @ white[:, -1] - half[:, :-1].T @ half[:, -1]
-        return score, jnp.sum(white[:, o:-1] ** 2, 0) - jnp.sum(half[:, :-1] ** 2, 0)
-
-    return jax.vmap(one)(design.scale, design.tests, design.linear, design.own, residual)
+    design, free = now.design, now.optimum.free
+    _, P, o = design.own.shape
+    own, _ = scales_of(free, design)
+    residual = design.data - design.common @ now.solution.common - design.amplitude @ now.solution.amplitude
+    steps = np.where(np.asarray(design.tests.mask)[..., None], np.tril(np.ones((P, P))), 0.0)
+    white = Columns(np.concatenate([design.own * own, steps, residual[..., None]], -1), design).white(free).columns
+    turned = np.swapaxes(white[..., :o], 1, 2)
+    root = np.linalg.cholesky(turned @ white[..., :o] + np.eye(o))
+    half = np.linalg.solve(root, turned @ white[..., o:])
+    score = np.einsum("npk,np->nk", white[..., o:-1], white[..., -1]) - np.einsum(
+        "nok,no->nk", half[..., :-1], half[..., -1]
+    )
+    return score, np.sum(white[..., o:-1] ** 2, 1) - np.sum(half[..., :-1] ** 2, 1)
 
 
 def sudden_steps(base: Base, start: Refined, variant: Variant) -> OwnNumbers | None:
@@ -171,7 +156,7 @@ def sudden_steps(base: Base, start: Refined, variant: Variant) -> OwnNumbers | N
     now, best, value = start, None, -np.inf
     for turn in range(NUMERICS.jumps + 1):
         if turn:
-            more = More(jnp.asarray(columns), (SPREAD,) * turn)
+            more = More(columns, (SPREAD,) * turn)
             design = design_of(base, start.state, start.variants, more)
             optimum = optimise(design, np.concatenate([start.optimum.free, np.ones(turn)]), curvature=False)
             log_prior = _log_prior_of_steps(found, loading)
@@ -183,8 +168,7 @@ def sudden_steps(base: Base, start: Refined, variant: Variant) -> OwnNumbers | N
             best = OwnNumbers(variant, {}, value, now, more, jumps, log_prior)
         if turn == NUMERICS.jumps:
             break
-        explained = now.solution.common, now.solution.amplitude
-        score, information = map(np.asarray, step_scores(jnp.asarray(now.optimum.free), now.design, *explained))
+        score, information = step_scores(now)
         new, added = np.zeros((N, P, 1)), False
         for i in range(N):
             rows = np.flatnonzero(loading[i])[1:]

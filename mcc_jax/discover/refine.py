@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import jax.numpy as jnp
 import numpy as np
 
 from ..effects import Variant
@@ -76,7 +75,7 @@ def refined(
             if last or (k > 1 and abs(optimum.log_joint - value) < NUMERICS.still):
                 break
             before, value = state, optimum.log_joint
-            state = moved(base, state, variants, solve(jnp.asarray(free), design))
+            state = moved(base, state, variants, solve(free, design))
         design = design_of(base, state, variants, more)
     optimum = optimise(design, free)
-    return Refined(variants, state, design, optimum, solve(jnp.asarray(optimum.free), design))
+    return Refined(variants, state, design, optimum, solve(optimum.free, design))

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array
 from scipy.special import log_ndtr, logsumexp
 
-from ..calibrate.compiling import compiled
+from ..calibrate.compiling import compiled_quickly
 from ..calibrate.data import Tests
 from ..calibrate.distributions import SCALES
 from ..calibrate.forward import Forms, Point
@@ -21,11 +21,11 @@ from ..law import signatures
 from .base import Base, State
 from .candidates import Candidate, candidates_of
 from .design import design_of
-from .evidence import left_by_particle, prior_density, with_amplitudes, without_first
+from .evidence import left_by_particle, log_prior, with_amplitudes, without_first
 from .settings import FURTHER, NUMERICS
 
 
-@compiled
+@compiled_quickly
 def candidate_columns(point: Point, tests: Tests, effects: tuple[AbstractEffect, ...], forms: Forms) -> Array:
     """Signatures of all candidates at the base law, shape (N, points, candidates)."""
 
@@ -64,7 +64,7 @@ class Screen:
 
     candidates: tuple[Candidate, ...]
     settings: tuple[Setting, ...]
-    columns: Array
+    columns: np.ndarray
 
     @property
     def null(self) -> float:
@@ -133,15 +133,21 @@ def pair_integrals(s: Setting, a: np.ndarray, b: np.ndarray, signs: np.ndarray, 
     return np.asarray(logsumexp(np.stack(found), axis=0)) - 2 * np.log(SCALES)
 
 
-def signature_columns(base: Base, state: State, candidates: Sequence[Candidate]) -> Array:
+def signature_columns(base: Base, state: State, candidates: Sequence[Candidate]) -> np.ndarray:
     """Signatures of candidates at the base law, in units of their smallest plausible amplitudes."""
     effects = tuple(c.effect for c in candidates)
     columns = base.each(candidate_columns, state.point, effects, base.forms)
-    return columns * jnp.asarray(np.array([c.variant.plausible[0] for c in candidates]))[None, None]
+    return np.asarray(columns) * np.array([c.variant.plausible[0] for c in candidates])
 
 
 def screen(
-    base: Base, state: State, free: np.ndarray, candidates: Sequence[Candidate], columns: Array, *, several: bool = True
+    base: Base,
+    state: State,
+    free: np.ndarray,
+    candidates: Sequence[Candidate],
+    columns: np.ndarray,
+    *,
+    several: bool = True,
 ) -> Screen:
     """Scores of all candidates around the base law, at several settings of noise and spreads.
 
@@ -160,11 +166,9 @@ def screen(
         at = free.copy()
         at[2:4] += np.log([sd, length])
         at[4:8] *= spread
-        left, integral = left_by_particle(jnp.asarray(at), design)
-        total, log_population = without_first(jnp.sum(left, 0), FURTHER)
-        total = np.asarray(total)
-        null = float(np.sum(np.asarray(integral))) + float(log_population) - 0.5 * total[-1, -1]
-        null += float(prior_density(jnp.asarray(at), design))
+        left, integral = left_by_particle(at, design)
+        total, log_population = without_first(left.sum(0), FURTHER)
+        null = float(np.sum(integral) + log_population) - 0.5 * total[-1, -1] + log_prior(at, design)
         settings.append(Setting(at, null, total[:-1, :-1], total[:-1, -1]))
     return Screen(tuple(candidates), tuple(settings), columns)
 

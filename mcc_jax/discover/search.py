@@ -7,9 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 from scipy.special import logsumexp
 
 from ..calibrate.compiling import side_by_side
@@ -102,12 +100,12 @@ class Smooth:
     design: Design
     optimum: Optimum
     solution: Solution
-    basis: Array
+    basis: np.ndarray
 
     @property
-    def curve_um(self) -> Array:
+    def curve_um(self) -> np.ndarray:
         """What it adds to the law's displacement at every point [um]."""
-        return jnp.einsum("npk,k->np", self.basis, self.solution.common[FURTHER : FURTHER + self.basis.shape[-1]])
+        return self.basis @ self.solution.common[FURTHER : FURTHER + self.basis.shape[-1]]
 
 
 class Search:
@@ -129,8 +127,8 @@ class Search:
         self.base, self.library, self.tell = base, library, tell
         start = optimise(design_of(base, base.state), base.hyperparameters, curvature=False)
         self.null = refined(base, base.state, (), np.zeros(0), start.free)
-        self.natural = base.each(coordinates, self.state.point, base.forms)
-        self.at = scaled(self.natural, base.tests.mask)
+        self.natural = {k: np.asarray(x) for k, x in base.each(coordinates, self.state.point, base.forms).items()}
+        self.at = scaled(self.natural, np.asarray(base.tests.mask))
         self.shared = {
             name: m for name, m in library.items() if name != SUDDEN and not any(v.random_per_test for v in m.variants)
         }
@@ -146,7 +144,7 @@ class Search:
         """Where the base law fits."""
         return self.null.state
 
-    def formulas_of(self, mechanisms: Collection[str]) -> tuple[tuple[Candidate, ...], Array]:
+    def formulas_of(self, mechanisms: Collection[str]) -> tuple[tuple[Candidate, ...], np.ndarray]:
         """The formulas of some mechanisms, and their signatures."""
         rows = [k for k, c in enumerate(self.candidates) if c.mechanism in mechanisms]
         return tuple(self.candidates[k] for k in rows), self.columns[..., np.array(rows)]
@@ -237,22 +235,22 @@ class Search:
         total = float(logsumexp(list(values.values())) - np.log(len(values)))
         self.found[(mechanism,)] = Hypothesis((mechanism,), total, best=best)
 
-    def misfit_columns(self, r: Refined, which: int) -> Array:
+    def misfit_columns(self, r: Refined, which: int) -> np.ndarray:
         """Columns by which one of the formulas may be wrong: at its amplitude, and towards each of its siblings."""
         assert self.screen is not None
         variant = r.variants[which]
         own = r.design.amplitude[..., which] * float(r.theta[which] / variant.plausible[0])
         smooth = own[..., None] * functions(COORDINATES.get(variant.mechanism, ANY), self.at)
-        size = float(jnp.sqrt(jnp.sum(own**2)))
+        size = float(np.sqrt(np.sum(own**2)))
         others = []
         for f, (_, k) in self.first_order.get(variant.mechanism, {}).items():
             column = self.screen.columns[..., k]
-            length = float(jnp.sqrt(jnp.sum(column**2)))
+            length = float(np.sqrt(np.sum(column**2)))
             if f != variant.name and length > 0:
-                likeness = float(jnp.sum(column * own))
+                likeness = float(np.sum(column * own))
                 others.append(column * np.copysign(size / length, likeness) - own)
-        siblings = jnp.stack(others, -1) if others else smooth[..., :0]
-        return jnp.concatenate([siblings, smooth], -1)
+        siblings = np.stack(others, -1) if others else smooth[..., :0]
+        return np.concatenate([siblings, smooth], -1)
 
     def with_misfit(self, one: Hypothesis) -> None:
         """Log evidence where every name's formula may be wrong."""
@@ -264,17 +262,17 @@ class Search:
         sizes = [(middle, DECISIONS.misfit_log_sd)] * K
         group = [i + 1 for i in range(K) for _ in range(basis[i].shape[-1])]
         design = design_of(
-            self.base, r.state, r.variants, More(basis=jnp.concatenate(basis, -1), group=group, sizes=sizes)
+            self.base, r.state, r.variants, More(basis=np.concatenate(basis, -1), group=group, sizes=sizes)
         )
         optimum = optimise(design, np.append(r.optimum.free, [middle] * K), without=r.optimum)
         one.with_misfit = optimum.log_evidence
         one.sizes = tuple(float(x) for x in np.exp(optimum.free[HYPERPARAMETERS : HYPERPARAMETERS + K]))
 
     @cached_property
-    def discrepancy(self) -> tuple[Array, list[int]]:
+    def discrepancy(self) -> tuple[np.ndarray, list[int]]:
         """Functions of what no mechanism explains, and of which kind each is."""
         tests = self.base.tests
-        return general(self.at, tests.effective_diameter, tests.mask)
+        return general(self.at, np.asarray(tests.effective_diameter), np.asarray(tests.mask))
 
     def smooth(self, r: Refined) -> Smooth:
         """A hypothesis with a smooth discrepancy beside it."""
@@ -285,12 +283,12 @@ class Search:
         optimum = optimise(
             design, np.append(r.optimum.free, [unit, *[unit - 1.0] * (max(group) - 1)]), without=r.optimum
         )
-        solution = solve(jnp.asarray(optimum.free), design)
+        solution = solve(optimum.free, design)
         return Smooth(design, optimum, solution, basis)
 
     # ---- two names ---------------------------------------------------------------------------------------------------
 
-    def seconds(self, at: Refined, first: Variant, column: Array) -> list[tuple[float, int]]:
+    def seconds(self, at: Refined, first: Variant, column: np.ndarray) -> list[tuple[float, int]]:
         """Candidates beside a name, to first order around its optimum, best first.
 
         Args:
@@ -300,10 +298,9 @@ class Search:
         """
         assert self.screen is not None
         cs = self.screen.candidates
-        every = jnp.concatenate([column, self.screen.columns], -1)
-        left, _ = left_by_particle(jnp.asarray(at.optimum.free), with_amplitudes(at.design, every))
-        total, _ = without_first(jnp.sum(left, 0), at.design.common.shape[-1])
-        total = np.asarray(total)
+        every = np.concatenate([column, self.screen.columns], -1)
+        left, _ = left_by_particle(at.optimum.free, with_amplitudes(at.design, every))
+        total, _ = without_first(left.sum(0), at.design.common.shape[-1])
         s = Setting(at.optimum.free, 0.0, total[:-1, :-1], total[:-1, -1])
         signs = np.append(first.sign, self.screen.signs)
         largest = np.append(first.plausible[1] / first.plausible[0], self.screen.largest)

@@ -105,6 +105,7 @@ class Numerics:
         hats, fine_hats, degree: hat functions of each coordinate of a misfit, of stress where no mechanism is known,
             and total degree of smooth products.
         basis: functions of all misfits of a hypothesis together; there is room for one of these numbers.
+        columns: that are freed of the noise at once.
         waves: periods that a periodic discrepancy may have.
         bootstrap: campaigns drawn for the p value.
         places: bins of load in which disagreement is looked for.
@@ -136,6 +137,7 @@ class Numerics:
     fine_hats: int = 24
     degree: int = 2
     basis: tuple[int, ...] = (32, 112)
+    columns: int = 18
     waves: int = 12
     bootstrap: int = 400
     places: int = 5

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from campaigns import base_of, cached
@@ -21,6 +20,7 @@ from mcc_jax.discover.evidence import (
     residual_of,
     scales_of,
     solve,
+    value_and_gradient,
     whitened,
 )
 from mcc_jax.discover.refine import refined
@@ -41,11 +41,11 @@ def design(base):
 
 def covariance(design, free):
     """Of all tests together: noise, every particle's own numbers, and what all share."""
-    _, own, common = scales_of(jnp.asarray(free), design)
+    own, common = scales_of(free, design)
     N, P = design.data.shape
     mask = np.asarray(design.tests.mask)
-    unit = jnp.broadcast_to(jnp.eye(P), (N, P, P))
-    columns = [np.asarray(whitened(jnp.asarray(free), design, unit[:, :, k])[0]) for k in range(P)]
+    unit = np.broadcast_to(np.eye(P), (N, P, P))
+    columns = [whitened(free, design, unit[:, :, k])[0] for k in range(P)]
     whole = np.zeros((N * P, N * P))
     for i in range(N):
         W = np.stack([column[i] for column in columns], 1)[np.ix_(mask[i], mask[i])]
@@ -59,14 +59,10 @@ def covariance(design, free):
 
 def test_it_is_the_density_of_the_multivariate_normal(base, design):
     """Particles first, then what all share: integrals in closed form. Readings of a display add a known constant."""
-    few = jax.tree.map(lambda x: x[:3], (design.tests, design.linear, design.own, design.common, design.amplitude))
-    small = replace(
-        design,
-        tests=few[0], linear=few[1], own=few[2], common=few[3], amplitude=few[4],
-        data=design.data[:3], scale=design.scale[:3],
-    )  # fmt: skip
+    names = ("tests", "linear", "own", "common", "amplitude", "data", "scale")
+    small = replace(design, **{name: jax.tree.map(lambda x: x[:3], getattr(design, name)) for name in names})
     free = base.hyperparameters
-    found = float(log_joint(jnp.asarray(free), small) - log_prior(jnp.asarray(free), small))
+    found = log_joint(free, small) - log_prior(free, small)
     matrix, data = covariance(small, free)
     wanted = multivariate_normal(np.zeros(len(data)), matrix, allow_singular=False).logpdf(data)
     assert found == pytest.approx(wanted, abs=0.5)  # the finite steps of a display
@@ -75,8 +71,8 @@ def test_it_is_the_density_of_the_multivariate_normal(base, design):
 @pytest.mark.parametrize("sign", [-1, 0, 1])
 def test_an_amplitude_is_integrated_over_its_mixture_of_half_normals(sign):
     gram, score, ratio = 0.7, 1.3 * (sign or 1), 50.0
-    left = jnp.asarray([[gram, score], [score, 0.0]])
-    value, _, _ = amplitudes(left, jnp.asarray([float(sign)]), jnp.asarray([ratio]))
+    left = np.array([[gram, score], [score, 0.0]])
+    value = amplitudes(left, np.array([float(sign)]), np.array([ratio])).log_integral
     scales = np.geomspace(1, ratio, SCALES)
 
     def density(theta):
@@ -84,12 +80,27 @@ def test_an_amplitude_is_integrated_over_its_mixture_of_half_normals(sign):
         return np.exp(score * theta - 0.5 * gram * theta**2) * (prior if sign * theta >= 0 else 0.0)
 
     total = quad(density, -400, 0, limit=400)[0] + quad(density, 0, 400, limit=400)[0]
-    assert float(value) == pytest.approx(np.log(total), rel=1e-6)
+    assert value == pytest.approx(np.log(total), rel=1e-6)
+
+
+def test_its_derivatives_are_those_of_differences(base, design):
+    """By the noise, the spreads, and a misfit's scale, with two amplitudes of which one is cut."""
+    variants = find_variant("frame_compliance:linear"), find_variant("thermal_drift:linear")
+    rng, mask = np.random.default_rng(1), np.asarray(base.tests.mask)
+    basis = rng.normal(scale=0.1, size=(*mask.shape, 3)) * mask[..., None]
+    more = More(basis=basis, group=[1, 1, 2], sizes=[(-1.0, 1.0), (-2.0, 0.8)])
+    two = design_of(base, base.state.with_numbers(np.zeros(2)), variants, more)
+    for one, free in ((design, base.hyperparameters), (two, np.append(base.hyperparameters, [-1.0, -2.0, 0.3]))):
+        value, slope = value_and_gradient(free, one)
+        assert value == pytest.approx(log_joint(free, one), rel=1e-12)
+        steps = 1e-5 * np.eye(len(free))
+        wanted = [(log_joint(free + e, one) - log_joint(free - e, one)) / 2e-5 for e in steps]
+        np.testing.assert_allclose(slope, wanted, rtol=1e-4, atol=1e-3)
 
 
 def test_columns_of_nothing_have_no_say(base, design):
     """Room for a misfit that is not there: the same evidence, the same numbers."""
-    nothing = More(basis=jnp.zeros((*design.data.shape, 3)), group=[1] * 3, sizes=[(0.0, 1.0)])
+    nothing = More(basis=np.zeros((*design.data.shape, 3)), group=[1] * 3, sizes=[(0.0, 1.0)])
     roomy = design_of(base, base.state, (), nothing)
     one, other = optimise(design, base.hyperparameters), optimise(roomy, np.append(base.hyperparameters, 0.0))
     assert other.log_evidence == pytest.approx(one.log_evidence, abs=0.02)
@@ -103,11 +114,11 @@ def test_what_a_solution_leaves_is_what_the_law_leaves_there(base):
     variant = find_variant("frame_compliance:linear")
     state = base.state.with_numbers(np.zeros(1))
     design = design_of(base, state, (variant,))
-    solution = solve(jnp.asarray(base.hyperparameters), design)
+    solution = solve(base.hyperparameters, design)
     there = design_of(base, moved(base, state, (variant,), solution), (variant,))
-    still = residual_of(solve(jnp.asarray(base.hyperparameters), there), there)
+    still = residual_of(solve(base.hyperparameters, there), there)
     mask = np.asarray(base.tests.mask)
-    assert np.sqrt(np.mean((np.asarray(residual_of(solution, design)) - np.asarray(still))[mask] ** 2)) < 0.02
+    assert np.sqrt(np.mean((residual_of(solution, design) - still)[mask] ** 2)) < 0.02
     half = between(state, moved(base, state, (variant,), solution))
     assert float(half.point.theta[0, 0]) == pytest.approx(0.5 * float(solution.amplitude[0]) * variant.plausible[0])
 
