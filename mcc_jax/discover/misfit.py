@@ -12,6 +12,7 @@ from jaxtyping import Array
 from ..calibrate.compiling import compiled_quickly
 from ..calibrate.data import Tests
 from ..calibrate.forward import Forms, Point
+from ..effects.record import UNLOAD
 from .settings import NUMERICS
 
 COORDINATES = {
@@ -61,6 +62,7 @@ def coordinates(point: Point, tests: Tests, forms: Forms) -> dict[str, Array]:
             "travel": c.displacement / tests.particle.effective_diameter,
             "time": jnp.log1p(time / 5.0),
             "since": jnp.log1p((time - begun) / 5.0),
+            "unloading": jnp.where(tests.record.kind == UNLOAD, 1.0, 0.0),
             "clock": time,
             "reload": c.progress,
             "cycles": c.cycles,
@@ -119,16 +121,26 @@ def general(at: dict[str, np.ndarray], size: np.ndarray, mask: np.ndarray) -> tu
     """Functions of a discrepancy that no mechanism explains, and of which kind each is: smooth 1, rough 2, periodic 3.
 
     It is common to all particles, in proportion to their size, and lives in reduced strain, travel, load and time. The
-    rough ones are hat functions, which have the corners of onsets and thresholds; in stress they are fine, since a
-    particle's layers and flaws yield within a narrow range of it.
+    rough ones are hat functions, which have the corners of onsets and thresholds; in stress and strain they are fine, since
+    layers and flaws yield, and pores close, within a narrow range of these. Those of the time since unloading began are fine
+    where it begins: what a drive loses at a reversal, it loses at once.
     """
     places = ("strain", "travel", "load", "clock")
     columns = [np.cos(np.pi * k * at[name]) for name in places for k in range(1, 4)]
     both = [(i, j) for i in range(1, 3) for j in range(1, 3)]
     columns += [np.cos(np.pi * i * at["peak"]) * np.cos(np.pi * j * at["load"]) for i, j in both]
+    columns += [np.cos(np.pi * k * at["since"]) * at["unloading"] for k in range(4)]
     smooth = np.stack(columns, -1) / np.sqrt(len(columns))
-    hats = {"peak": NUMERICS.fine_hats, "travel": NUMERICS.hats, "load": NUMERICS.hats, "clock": NUMERICS.hats}
-    rough = np.concatenate([hats_of(at[name], count) for name, count in hats.items()], -1) / np.sqrt(len(hats))
+    hats = {
+        "peak": NUMERICS.fine_hats,
+        "strain": NUMERICS.fine_hats,
+        "travel": NUMERICS.hats,
+        "load": NUMERICS.hats,
+        "clock": NUMERICS.hats,
+    }
+    turned = hats_of(at["since"], NUMERICS.hats) * at["unloading"][..., None]
+    fine = [*(hats_of(at[name], count) for name, count in hats.items()), turned]
+    rough = np.concatenate(fine, -1) / np.sqrt(len(fine))
     waves = []
     for name in ("travel", "clock"):
         for k in range(2, NUMERICS.waves):

@@ -136,7 +136,7 @@ class Numerics:
     hats: int = 8
     fine_hats: int = 24
     degree: int = 2
-    basis: tuple[int, ...] = (32, 112)
+    basis: tuple[int, ...] = (32, 144)
     columns: int = 18
     waves: int = 12
     bootstrap: int = 400
