@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -66,8 +65,6 @@ def eliminate(
     own: Sequence[int],
     precision: Float[Array, "*batch o"],
     mean: Float[Array, "*batch o"] | float = 0.0,
-    *,
-    written_out: bool = True,
 ) -> tuple[Float[Array, "*batch r r"], Float[Array, "*batch"]]:
     r"""Integrate numbers with a normal prior out of a Gaussian likelihood: a Schur complement.
 
@@ -81,7 +78,6 @@ def eliminate(
         own: which columns are integrated out.
         precision: P, of each of them.
         mean: m.
-        written_out: factor entry by entry, which suits many small matrices; else leave it to LAPACK.
 
     Returns:
         G', over the columns that are left, and L.
@@ -91,14 +87,9 @@ def eliminate(
     mean = jnp.broadcast_to(jnp.asarray(mean), precision.shape)
     inner = gram[..., inside[:, None], inside[None]] + jnp.vectorize(jnp.diag, signature="(n)->(n,n)")(precision)
     border = gram[..., inside[:, None], rest[None]].at[..., -1].add(precision * mean)
-    if not written_out:
-        root = jnp.linalg.cholesky(inner)
-        half = jax.scipy.linalg.solve_triangular(root, border, lower=True)
-        log_det = 2 * jnp.sum(jnp.log(jnp.diagonal(root, axis1=-2, axis2=-1)), -1)
-    else:
-        factor = Cholesky(inner[..., None, :, :])
-        half = jnp.swapaxes(factor.forward(jnp.swapaxes(border, -1, -2)), -1, -2)
-        log_det = factor.log_det()[..., 0]
+    factor = Cholesky(inner[..., None, :, :])
+    half = jnp.swapaxes(factor.forward(jnp.swapaxes(border, -1, -2)), -1, -2)
+    log_det = factor.log_det()[..., 0]
     left = gram[..., rest[:, None], rest[None]] - jnp.einsum("...pi,...pj->...ij", half, half)
     left = left.at[..., -1, -1].add(jnp.sum(precision * mean**2, -1))
     return left, 0.5 * (jnp.sum(jnp.log(precision), -1) - log_det)

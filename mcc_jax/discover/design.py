@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from ..calibrate.compiling import compiled, compiled_quickly
 from ..calibrate.distributions import nuisance_moments
+from ..calibrate.fitting import linear_data
 from ..calibrate.forward import Forms, Linear, Point, linearise
 from ..effects import Variant
 from .base import Base, State
@@ -51,7 +52,7 @@ def base_columns(
     return columns, residual - jnp.einsum("npk,nk->np", own, away)
 
 
-linearised = compiled_quickly(linearise)
+linearised_by_few = compiled_quickly(linearise)
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,8 @@ NOTHING_MORE = More()
 
 def linear_at(base: Base, state: State, variants: tuple[Variant, ...]) -> Linear:
     """The tests linearised at a state."""
-    return base.each(linearised, state.point, Forms(base.model.unloading, variants))
+    function = linearised_by_few if base.blocks[0].number <= NUMERICS.few_blocks else linear_data
+    return base.each(function, state.point, Forms(base.model.unloading, variants))
 
 
 def design_of(

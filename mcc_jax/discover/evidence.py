@@ -6,9 +6,9 @@ Around the state every test i is
 
 with the particle's own deviations v, zero and further numbers w, what all particles share: population, further numbers
 of the effects and weights of a misfit (epsilon, g), and the amplitudes theta. All but the amplitudes are standard
-normal, once their scales T, S, R are taken into the columns. They are integrated out in closed form, particles first
-(`eliminate`); an amplitude's prior is a mixture of half-normals, whose integral is closed, too. Scales and noise are at
-their posterior mode, and their curvature is integrated by Laplace's method.
+normal, once their scales T, S, R are taken into the columns. They are integrated out in closed form, particles first;
+an amplitude's prior is a mixture of half-normals, whose integral is closed, too. Scales and noise are at their
+posterior mode, and their curvature is integrated by Laplace's method.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Design:
 
 @dataclass(frozen=True)
 class Kinds:
-    """What a compiled evidence depends on besides the shapes of its arrays.
+    """Of what kind noise and spreads are.
 
     Attributes:
         spreads: priors of the spreads of b1, b3, b5, e, and of further own numbers.
@@ -168,9 +168,12 @@ class Columns:
     def __init__(self, columns: np.ndarray, design: Design) -> None:
         self.shape = columns.shape
         self.some = np.flatnonzero(np.any(columns != 0, axis=(0, 1)))
-        kept = columns[..., self.some]
-        room = np.pad(kept, ((0, 0), (0, 0), (0, -max(kept.shape[-1], 1) % NUMERICS.columns)))
-        self.pieces = [jnp.asarray(piece) for piece in np.split(room, room.shape[-1] // NUMERICS.columns, -1)]
+        least, most = NUMERICS.columns
+        size = min(max(NUMERICS.entries // (self.shape[0] * self.shape[1]), least), most)
+        count = -(-max(len(self.some), 1) // size)
+        room = np.zeros((*self.shape[:2], count * size))
+        room[..., : len(self.some)] = columns[..., self.some]
+        self.pieces = [jnp.asarray(piece) for piece in np.split(room, count, -1)]
         tests, kinds = design.tests, design.kinds
         if kinds.along is Along.TIME:  # one program for both
             tests = replace(tests, path=tests.record.time)
@@ -189,7 +192,7 @@ class Columns:
     def slope(self, free: np.ndarray, of_white: np.ndarray, of_reading: float) -> np.ndarray:
         """Derivatives of something by the noise's numbers, from those by the whitened columns and by the readings; the
         noise's log density is part of it."""
-        room = np.zeros((*self.shape[:2], len(self.pieces) * NUMERICS.columns))
+        room = np.zeros((*self.shape[:2], sum(piece.shape[-1] for piece in self.pieces)))
         room[..., : len(self.some)] = of_white[..., self.some]
         each, ones = np.split(room, len(self.pieces), -1), np.ones(self.shape[0])
         total = np.zeros(4)

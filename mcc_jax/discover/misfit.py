@@ -121,9 +121,9 @@ def general(at: dict[str, np.ndarray], size: np.ndarray, mask: np.ndarray) -> tu
     """Functions of a discrepancy that no mechanism explains, and of which kind each is: smooth 1, rough 2, periodic 3.
 
     It is common to all particles, in proportion to their size, and lives in reduced strain, travel, load and time. The
-    rough ones are hat functions, which have the corners of onsets and thresholds; in stress and strain they are fine, since
-    layers and flaws yield, and pores close, within a narrow range of these. Those of the time since unloading began are fine
-    where it begins: what a drive loses at a reversal, it loses at once.
+    rough ones are hat functions, which have the corners of onsets and thresholds. In stress and strain they are fine:
+    layers and flaws yield, and pores close, within a narrow range of these. Those of the time since unloading began are
+    fine where it begins: what a drive loses at a reversal, it loses at once.
     """
     places = ("strain", "travel", "load", "clock")
     columns = [np.cos(np.pi * k * at[name]) for name in places for k in range(1, 4)]

@@ -102,10 +102,12 @@ class Numerics:
         drifts: drifts of every test's own that are fitted at their own optimum.
         little: factor on correlated noise that has swallowed a gap, where what explains it begins to be fitted.
         worse: nats by which a step may make things worse before half of it is taken back.
-        hats, fine_hats, degree: hat functions of each coordinate of a misfit, of stress where no mechanism is known,
-            and total degree of smooth products.
+        hats, fine_hats, degree: hat functions of each coordinate of a misfit, of stress and strain where no mechanism is
+            known, and total degree of smooth products.
         basis: functions of all misfits of a hypothesis together; there is room for one of these numbers.
-        columns: that are freed of the noise at once.
+        columns, entries: columns that are freed of the noise at once, at least and at most, and about how many numbers
+            they hold together, so that they stay in a processor's own memory.
+        few_blocks: of particles; up to so many, formulas are compiled with less optimisation and run for longer.
         waves: periods that a periodic discrepancy may have.
         bootstrap: campaigns drawn for the p value.
         places: bins of load in which disagreement is looked for.
@@ -137,7 +139,9 @@ class Numerics:
     fine_hats: int = 24
     degree: int = 2
     basis: tuple[int, ...] = (32, 144)
-    columns: int = 18
+    columns: tuple[int, int] = (6, 18)
+    entries: int = 270_000
+    few_blocks: int = 8
     waves: int = 12
     bootstrap: int = 400
     places: int = 5
