@@ -142,7 +142,6 @@ def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
         "facts": [] if results.campaign is None else measured(results.campaign),
         "rows": particle_rows(results),
         "parameters": [] if results.calibration is None else parameters(results.calibration),
-        "sentences": [] if results.calibration is None else calibration_sentences(results.calibration),
         "methods": METHODS,
         "shown": shown,
         "bands": share_inside(shown) is not None,
@@ -213,7 +212,10 @@ def _cards(results: Results, checks: list[Any]) -> list[dict[str, str]]:
 
 def _summary(results: Results) -> list[str]:
     """What stands below the first screen, in sentences."""
-    return [] if results.calibration is None else calibration_sentences(results.calibration)
+    if results.calibration is None:
+        return []
+    alone = results.discovery is not None and results.discovery["effects"] and not results.calibration.get("effects")
+    return calibration_sentences(results.calibration, "the law alone" if alone else "the law")
 
 
 def _sections(results: Results, shown: list[FittedCurve], checks: list[Any]) -> list[tuple[str, str]]:

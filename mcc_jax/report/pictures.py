@@ -20,6 +20,8 @@ from ..plots.style import BLACK, BLUE, GREY, ORANGE, PALE, RC, SKY, VERMILION, n
 GRID = 30
 """At most so many particles stand in the grid; of more, those with the largest misfit."""
 
+FEWEST = 12
+"""At least so many readings stand in the enlarged part of a test that has them."""
 GRID_COLUMNS = 5
 BINS = 40
 PANELS = {
@@ -72,8 +74,12 @@ class Telling:
         gap = np.abs(self.before_um - (0.0 if self.after_um is None else self.after_um))
         width = max(10 * float(np.quantile(gap, 0.9)), 0.06 * float(np.ptp(self.displacement_um)))
         left = self.displacement_um[:, None]
-        inside = (self.displacement_um >= left) & (self.displacement_um <= left + width)
-        return inside[int(np.argmax(inside @ gap**2))]
+        while True:
+            inside = (self.displacement_um >= left) & (self.displacement_um <= left + width)
+            found = inside[int(np.argmax(inside @ gap**2))]
+            if found.sum() >= FEWEST or not width < np.ptp(self.displacement_um):
+                return found
+            width *= 1.5
 
 
 @rc_context(RC)

@@ -38,11 +38,11 @@ class Results:
         calibration: contents of `calibration.json`.
         discovery: contents of `discovery.json`.
         saved: the calibration itself, as `mcc_jax.load` gives it, or its numbers alone where nothing else is left.
-        found: the discovery itself, where it was saved.
         figures: files of `figures/` that the two results name as theirs, by stem.
         written: the day of the newest result.
         cautions: where parts contradict each other.
         missing_campaign: why there is no campaign, if there is none.
+        found: the discovery itself, where it was saved.
     """
 
     name: str
@@ -51,11 +51,11 @@ class Results:
     calibration: dict[str, Any] | None
     discovery: dict[str, Any] | None
     saved: Calibration | None
-    found: Discovery | None
     figures: Mapping[str, bytes]
     written: datetime.date | None
     cautions: tuple[str, ...]
     missing_campaign: str
+    found: Discovery | None = None
 
     __repr__ = described()
 
@@ -134,11 +134,11 @@ def read_results(folder: str | Path, campaign: str | Path | None = None, *, name
         calibration,
         discovery,
         saved,
-        found,
         _figures(path, [content for _, content in results]),
         _newest([path / n for n, _ in results]),
         tuple(cautions),
         why,
+        found,
     )
 
 

@@ -48,11 +48,16 @@ def simulated(results: Results) -> bool:
     return results.campaign is not None and is_simulated(results.campaign.metadata)
 
 
-def calibration_sentences(content: dict[str, Any]) -> list[str]:
-    """The calibration in a few sentences."""
+def calibration_sentences(content: dict[str, Any], law: str = "the law") -> list[str]:
+    """The calibration in a few sentences.
+
+    Args:
+        content: contents of `calibration.json`.
+        law: what to call it: beside effects that were found it is "the law alone".
+    """
     count, used = len(content["particles"]), sum(entry["kept"] for entry in content["particles"])
     found = [
-        f"The law was calibrated on {used} of {count} particles by {METHODS[content['method']]}"
+        f"{law.capitalize()} was calibrated on {used} of {count} particles by {METHODS[content['method']]}"
         + ("." if content["converged"] else "; it did NOT converge, so its numbers may not be relied on.")
     ]
     sure = SURE.get(content["method"])
@@ -68,11 +73,11 @@ def calibration_sentences(content: dict[str, Any]) -> list[str]:
             if content[key]["interval_95"] is not None
         ]
         if known:
-            found.append(f"Given the law and these tests, {listed(known)}, each {sure}.")
+            found.append(f"Given {law} and these tests, {listed(known)}, each {sure}.")
     misfit = content["diagnostics"].get("own_misfit")
     if misfit is not None:
         found.append(
-            f"With its own C₁, C₃, C₅ the law follows a particle's displacement to {percent(misfit)} of its range "
+            f"With its own C₁, C₃, C₅ {law} follows a particle's displacement to {percent(misfit)} of its range "
             "(median over the particles)."
         )
     return found

@@ -126,6 +126,13 @@ def test_pages_load_nothing_from_elsewhere(page):
     assert not re.search(r"!\[[^\]]*\]\(https?:|<(?:script|link|img|iframe)\b", ALL[page])
 
 
+@pytest.mark.parametrize("page", [page for page in ALL if page.startswith("how-to/")])
+def test_every_how_to_has_a_picture_that_is_there(page):
+    shown = re.findall(r"^!\[([^\]]+)\]\(([^)]+)\)$", ALL[page], flags=re.M)
+    assert shown
+    assert all((PAGES / page).parent.joinpath(file).stat().st_size < 130_000 for _, file in shown)
+
+
 def test_every_public_module_has_its_page():
     import mcc_jax
 

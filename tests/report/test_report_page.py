@@ -301,6 +301,7 @@ def test_the_enlarged_part_holds_the_largest_gap(gap_at):
     told = telling(gap_at)
     assert told.near[gap_at]
     assert told.near.sum() < 20
+    assert telling(2, points=4).near.sum() > 1  # of a record with few readings more is shown, never one
     assert [label for *_, label in told.laws] == ["law alone", "law with creep"]
     assert all(
         source.startswith("data:image/svg+xml") and "Particle 1" in words for source, words in telling_pictures(told)
