@@ -121,9 +121,9 @@ def general(at: dict[str, np.ndarray], size: np.ndarray, mask: np.ndarray) -> tu
     """Functions of a discrepancy that no mechanism explains, and of which kind each is: smooth 1, rough 2, periodic 3.
 
     It is common to all particles, in proportion to their size, and lives in reduced strain, travel, load and time. The
-    rough ones are hat functions, which have the corners of onsets and thresholds. In stress and strain they are fine:
-    layers and flaws yield, and pores close, within a narrow range of these. Those of the time since unloading began are
-    fine where it begins: what a drive loses at a reversal, it loses at once.
+    rough ones are hat functions, which have the corners of onsets and thresholds. In stress they are fine: a particle's
+    layers and flaws yield within a narrow range of it. Those of the time since unloading began are fine where it
+    begins: what a drive loses at a reversal, it loses at once.
     """
     places = ("strain", "travel", "load", "clock")
     columns = [np.cos(np.pi * k * at[name]) for name in places for k in range(1, 4)]
@@ -131,13 +131,7 @@ def general(at: dict[str, np.ndarray], size: np.ndarray, mask: np.ndarray) -> tu
     columns += [np.cos(np.pi * i * at["peak"]) * np.cos(np.pi * j * at["load"]) for i, j in both]
     columns += [np.cos(np.pi * k * at["since"]) * at["unloading"] for k in range(4)]
     smooth = np.stack(columns, -1) / np.sqrt(len(columns))
-    hats = {
-        "peak": NUMERICS.fine_hats,
-        "strain": NUMERICS.fine_hats,
-        "travel": NUMERICS.hats,
-        "load": NUMERICS.hats,
-        "clock": NUMERICS.hats,
-    }
+    hats = {"peak": NUMERICS.fine_hats, "travel": NUMERICS.hats, "load": NUMERICS.hats, "clock": NUMERICS.hats}
     turned = hats_of(at["since"], NUMERICS.hats) * at["unloading"][..., None]
     fine = [*(hats_of(at[name], count) for name, count in hats.items()), turned]
     rough = np.concatenate(fine, -1) / np.sqrt(len(fine))

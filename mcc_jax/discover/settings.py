@@ -102,8 +102,8 @@ class Numerics:
         drifts: drifts of every test's own that are fitted at their own optimum.
         little: factor on correlated noise that has swallowed a gap, where what explains it begins to be fitted.
         worse: nats by which a step may make things worse before half of it is taken back.
-        hats, fine_hats, degree: hat functions of each coordinate of a misfit, of stress and strain where no mechanism is
-            known, and total degree of smooth products.
+        hats, fine_hats, degree: hat functions of each coordinate of a misfit, of stress where no mechanism is known,
+            and total degree of smooth products.
         basis: functions of all misfits of a hypothesis together; there is room for one of these numbers.
         columns, entries: columns that are freed of the noise at once, at least and at most, and about how many numbers
             they hold together, so that they stay in a processor's own memory.
@@ -138,7 +138,7 @@ class Numerics:
     hats: int = 8
     fine_hats: int = 24
     degree: int = 2
-    basis: tuple[int, ...] = (32, 144)
+    basis: tuple[int, ...] = (32, 116)
     columns: tuple[int, int] = (6, 18)
     entries: int = 270_000
     few_blocks: int = 8
