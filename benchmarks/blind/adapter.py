@@ -26,7 +26,12 @@ KEPT = (
 """Keys of `discovery.json` that an outcome keeps."""
 
 
-def in_process(folder: Path, *, seed: int = 0) -> dict[str, Any]:
+def quick(folder: Path, *, seed: int = 0) -> dict[str, Any]:
+    """`in_process` without held-out search and posterior: names and places, a third of the time, no gap."""
+    return in_process(folder, seed=seed, confirm=False, posterior=False)
+
+
+def in_process(folder: Path, *, seed: int = 0, **options: Any) -> dict[str, Any]:
     """`mcc_jax.discover.discover` in this process: campaigns share what is compiled."""
     import jax
 
@@ -34,7 +39,7 @@ def in_process(folder: Path, *, seed: int = 0) -> dict[str, Any]:
     from mcc_jax.campaign import read_campaign
 
     discover = importlib.import_module("mcc_jax.discover").discover
-    wanted = {"seed": seed, "experiments": False}
+    wanted = {"seed": seed, "experiments": False, **options}
     offered = inspect.signature(discover).parameters
     found = discover(read_campaign(folder), **{name: value for name, value in wanted.items() if name in offered})
     data = found.to_json()
