@@ -28,8 +28,9 @@ import numpy as np
 import mcc_jax as mcc
 from mcc_jax.discover.base import Base, base_fit
 from mcc_jax.discover.candidates import Candidate, candidates_of, located
+from mcc_jax.discover.columns import with_amplitudes
 from mcc_jax.discover.design import design_of, padded
-from mcc_jax.discover.evidence import left_by_particle, with_amplitudes, without_first
+from mcc_jax.discover.evidence import left_by_particle, without_first
 from mcc_jax.discover.misfit import coordinates, scaled
 from mcc_jax.discover.screen import signature_columns
 from mcc_jax.discover.search import Search

@@ -14,7 +14,7 @@ from .forward import Forms, Linear, Point, linearise
 from .model import Model
 from .settings import FIT
 from .sharding import Blocks, Parts, count_of
-from .straightening import Straight, moved, products, step_of
+from .straightening import Straight, box_cox, moved, products
 
 
 @compiled
@@ -103,7 +103,6 @@ class Linearisation:
             return [jnp.zeros((*wave.mask.shape, 4 + size)) for wave in self._own.waves]
         ends = np.array([step, -step])
         if number in dict(self._model.scatter.positive):
-            power = float(self.straight.power[0, number])
-            ends = np.array([step_of(x, float(point.theta[0, number]), power) for x in ends])
+            ends = np.asarray(point.theta[0, number] * box_cox(jnp.asarray(ends), self.straight.power[0, number]))
         up, down = (self._moved(point, np.where(np.arange(size) == number, end, 0.0)).waves for end in ends)
         return [(a.columns - b.columns) / (ends[0] - ends[1]) for a, b in zip(up, down, strict=True)]

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._types import Scalar
+from .._types import Scalar, Values
 from .compiling import compiled
 
 Places = tuple[tuple[int, int], ...]
@@ -64,7 +64,7 @@ def coordinates(
     away, factor = theta - at, jnp.ones_like(theta)
     for k, amplitude in places:
         x, q = jnp.log(theta[k] / at[k]), straight.power[k]
-        away = away.at[k].set(at[k] * _box_cox(x, q))
+        away = away.at[k].set(at[k] * box_cox(x, q))
         factor = factor.at[amplitude].multiply(jnp.exp(jnp.clip(straight.shear[k] * x, -FARTHEST, FARTHEST)))
     amplitudes = sorted({amplitude for _, amplitude in places})
     for k in amplitudes:
@@ -87,16 +87,11 @@ def numbers(
     return theta
 
 
-def _box_cox(x: Scalar, power: Scalar) -> Scalar:
-    """(e^(q x) - 1) / q."""
+def box_cox(x: Values, power: Scalar) -> Values:
+    """How far v goes, per unit of the number, where it changes by the factor e^x: (e^(q x) - 1) / q."""
     linear = jnp.abs(power) < 1e-6
     safe = jnp.where(linear, 1.0, power)
     return jnp.where(linear, x, jnp.expm1(jnp.clip(safe * x, -FARTHEST, FARTHEST)) / safe)
-
-
-def step_of(x: float, at: float, power: float) -> float:
-    """How far v goes where a positive number changes by the factor e^x."""
-    return at * (np.expm1(power * x) / power if abs(power) >= 1e-6 else x)
 
 
 @compiled

@@ -9,7 +9,8 @@ import numpy as np
 from scipy.special import logsumexp
 
 from ..calibrate.distributions import SCALES
-from .evidence import left_by_particle, with_amplitudes
+from .columns import with_amplitudes
+from .evidence import left_by_particle
 from .screen import single_integrals
 from .search import SUDDEN, Search
 from .settings import DECISIONS, NUMERICS, POPULATION

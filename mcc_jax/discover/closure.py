@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from .._format import described
-from .evidence import Design, left_by_particle, scales_of, with_amplitudes, without_first
+from .columns import Design, with_amplitudes
+from .evidence import left_by_particle, scales_of, without_first
 from .search import UNLISTED, Search
 from .settings import FURTHER, HYPERPARAMETERS, NUMERICS, TELLING
 

@@ -17,7 +17,8 @@ from ..calibrate.fitting import linear_data
 from ..calibrate.forward import Forms, Linear, Point, linearise
 from ..effects import Variant
 from .base import Base, State
-from .evidence import Design, Kinds, Solution
+from .columns import Design, Kinds
+from .evidence import Solution
 from .settings import AMPLITUDES, FURTHER, HYPERPARAMETERS, MISFITS, NUMERICS, POPULATION
 
 

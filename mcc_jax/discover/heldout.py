@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from ..calibrate.estimates import finite
-from .evidence import Design, Optimum, amplitudes, left_by_particle, log_prior, scales_of, without_first
+from .columns import Design
+from .evidence import Optimum, amplitudes, left_by_particle, log_prior, scales_of, without_first
 from .search import UNLISTED, Names, Search
 from .settings import HYPERPARAMETERS, NUMERICS
 

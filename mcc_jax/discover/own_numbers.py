@@ -13,8 +13,9 @@ from ..calibrate.priors import NakagamiPrior
 from ..effects import Variant
 from .base import Base, State
 from .candidates import Candidate
+from .columns import Columns, Design
 from .design import More, design_of, linear_at
-from .evidence import Columns, Design, Optimum, filled_up, log_joint, optimise, scales_of, solve, with_little_noise
+from .evidence import Optimum, filled_up, log_joint, optimise, scales_of, solve, with_little_noise
 from .refine import Refined, refined
 from .screen import single_integrals
 from .settings import DECISIONS, HYPERPARAMETERS, NUMERICS

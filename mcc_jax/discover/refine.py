@@ -8,8 +8,9 @@ import numpy as np
 
 from ..effects import Variant
 from .base import Base, State
+from .columns import Design
 from .design import NOTHING_MORE, More, between, design_of, moved
-from .evidence import Design, Optimum, Solution, optimise, solve
+from .evidence import Optimum, Solution, optimise, solve
 from .settings import NUMERICS
 
 

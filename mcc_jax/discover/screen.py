@@ -20,8 +20,9 @@ from ..effects import AbstractEffect, Mechanism
 from ..law import signatures
 from .base import Base, State
 from .candidates import Candidate, candidates_of
+from .columns import with_amplitudes
 from .design import design_of
-from .evidence import left_by_particle, log_prior, with_amplitudes, without_first
+from .evidence import left_by_particle, log_prior, without_first
 from .settings import FURTHER, NUMERICS
 
 

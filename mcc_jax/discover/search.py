@@ -15,20 +15,9 @@ from ..calibrate.noise import Along, Correlation
 from ..effects import Mechanism, Variant
 from .base import Base, State
 from .candidates import Candidate, candidates_of, located
+from .columns import Design, NoiseKind, with_amplitudes, with_noise
 from .design import More, design_of
-from .evidence import (
-    Design,
-    NoiseKind,
-    Optimum,
-    Solution,
-    left_by_particle,
-    optimise,
-    solve,
-    with_amplitudes,
-    with_little_noise,
-    with_noise,
-    without_first,
-)
+from .evidence import Optimum, Solution, left_by_particle, optimise, solve, with_little_noise, without_first
 from .misfit import ANY, COORDINATES, coordinates, functions, general, scaled
 from .own_numbers import OwnNumbers, differing, sudden_steps
 from .refine import Refined, refined

@@ -76,7 +76,7 @@ def _gap(found: Discovery) -> list[str]:
         f"On held-out particles it closes {100 * gap['closed_fraction']:.0f} % of the gap "
         f"(chi2 per point {first:.3g} before, {last:.3g} after; 1 is noise alone)."
     ]
-    if open_still is not None and open_still > 1.05:
+    if open_still is not None and open_still > 1 + TELLING.within:
         told.append("The gap is named, not closed: the formula does not describe all of it.")
     return told
 

@@ -57,6 +57,7 @@ class Telling:
         even: the least with which one is proposed: particles are too dear for less than an even chance.
         one_term: share of what two terms of a formula explain from which on one term will do.
         jumps, checks: sudden steps and checks that a summary lists.
+        within: so far over 1 the lower end of chi2 per point may lie where a gap is called closed.
     """
 
     place: float = 0.85
@@ -68,6 +69,7 @@ class Telling:
     one_term: float = 0.9
     jumps: int = 5
     checks: int = 3
+    within: float = 0.05
 
 
 AMPLITUDES, MISFITS = 2, 3

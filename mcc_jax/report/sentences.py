@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from .._format import interval, number, percent, probability
+from ..discover.settings import TELLING
 from ..plots.style import is_simulated
 from .read import Results
 
@@ -17,12 +18,6 @@ SURE = {
     "bayes": "with 95 % probability",
     "least-squares": "as the 95 % confidence interval",
 }
-
-WITHIN = 0.05
-"""So far over 1 the lower end of chi2 per point may lie where a gap is called closed, as in the summary itself."""
-
-LIKELY = 0.9
-"""Probability from which on a further test is recommended without a doubt."""
 
 
 def plain(name: str) -> str:
@@ -108,7 +103,7 @@ def _gap(gap: dict[str, Any]) -> str:
             pass
         case _:
             low = last["chi2_per_dof"]
-    if low is not None and low <= 1 + WITHIN:
+    if low is not None and low <= 1 + TELLING.within:
         return "; with it law and tests agree within the noise"
     return "; with it part of the gap closes, and part stays"
 
@@ -152,7 +147,7 @@ def _after(found: dict[str, Any]) -> list[tuple[str, str]]:
         best = found["next_experiments"][0]
         names, power = listed([plain(n) for n in best["separates"]]), probability(best["power"])
         test = f"{best['experiment']}, {number(best['particles'])} further particles"
-        if best["power"] >= LIKELY:
+        if best["power"] >= TELLING.enough:
             return [(f"Measure: {test}. It would separate {names} with probability {power}.", "")]
         doubt = f"No further test of those tried on paper would surely separate {names}."
         return [(f"{doubt} The best: {test}, would do so with probability {power}.", "")]

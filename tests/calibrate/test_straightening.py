@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcc_jax.calibrate.straightening import Straight, coordinates, numbers, step_of
+from mcc_jax.calibrate.straightening import Straight, box_cox, coordinates, numbers
 
 PLACES = ((1, 0), (2, 0))
 AT = np.array([0.02, 30.0, 2.0, 0.3])
@@ -67,4 +67,5 @@ def test_a_step_is_that_of_the_coordinate():
         straight = row(np.zeros(2), np.array([0.0, power]))
         theta = jnp.asarray(np.array([1.0, 5.0 * np.exp(0.4)]))
         away = coordinates(theta, jnp.asarray(np.array([1.0, 5.0])), straight, ((1, 0),))[0]
-        assert step_of(0.4, 5.0, power) == pytest.approx(float(away[1]), rel=1e-6)
+        step = 5.0 * box_cox(jnp.asarray(0.4), jnp.asarray(power))
+        assert float(step) == pytest.approx(float(away[1]), rel=1e-6)

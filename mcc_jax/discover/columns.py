@@ -1,0 +1,191 @@
+"""The columns of a hypothesis, and what is left of them once the noise is taken out.
+
+The noise's filter is all that is compiled of a hypothesis's evidence: for a few columns at a time, so that one program
+serves all hypotheses.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..calibrate.compiling import compiled
+from ..calibrate.data import Tests
+from ..calibrate.forward import Linear
+from ..calibrate.noise import Along, Correlation, Noise, whitening
+from .settings import NUMERICS
+
+LOG_2PI = float(np.log(2 * np.pi))
+
+
+@dataclass(frozen=True)
+class Design:
+    """The columns of a hypothesis around a state, every number in units of its prior's standard deviation.
+
+    Attributes:
+        tests, linear: the tests, and how noise of force moves them.
+        own: columns of each particle's own numbers: b1, b3, b5, e (per unit), the zero, further ones.
+        common: of what all particles share: the population's five, further numbers of effects, misfits.
+        amplitude: of the amplitudes, per unit of `unit`.
+        data: what is explained [um].
+        scale: each particle's own factor on the noise.
+        group: which scale a common column has: 0 where it is fixed at 1, else its place among `misfits`.
+        noise: prior of the four numbers of the noise: means and standard deviations of the logarithms, shape (2, 4).
+        largest: largest scale of each amplitude's prior in its unit, over the smallest, which is the unit.
+        spreads: scale and shape of the priors of the spreads of b1, b3, b5, e and of further own numbers.
+        misfits: median and standard deviation of the logarithm of each misfit's scale.
+        used: 1 for hyperparameters of the hypothesis, 0 for those that only make up shapes.
+    """
+
+    tests: Tests
+    linear: Linear
+    own: Float[np.ndarray, "particles points o"]
+    common: Float[np.ndarray, "particles points c"]
+    amplitude: Float[np.ndarray, "particles points k"]
+    data: Float[np.ndarray, "particles points"]
+    scale: Float[np.ndarray, " particles"]
+    group: np.ndarray
+    noise: Float[np.ndarray, "2 4"]
+    largest: Float[np.ndarray, " k"]
+    sign: Float[np.ndarray, " k"]
+    misfits: Float[np.ndarray, "g 2"]
+    used: Float[np.ndarray, " h"]
+    kinds: Kinds
+
+    @cached_property
+    def columns(self) -> Columns:
+        """All columns, the data last."""
+        return Columns(np.concatenate([self.own, self.common, self.amplitude, self.data[..., None]], -1), self)
+
+
+@dataclass(frozen=True)
+class Kinds:
+    """Of what kind noise and spreads are.
+
+    Attributes:
+        spreads: priors of the spreads of b1, b3, b5, e, and of further own numbers.
+        correlation, along: of the noise.
+    """
+
+    spreads: tuple[Any, ...]
+    correlation: Correlation
+    along: Along
+
+
+@dataclass(frozen=True)
+class NoiseKind:
+    """How the noise that is not white hangs together.
+
+    Attributes:
+        correlation: how rough it is.
+        along: what it runs along.
+        length: its length's prior median over the model's own, whose unit may be another.
+    """
+
+    correlation: Correlation
+    along: Along
+    length: float = 1.0
+
+
+def with_noise(design: Design, kind: NoiseKind) -> Design:
+    """The design with noise of another kind."""
+    kinds = replace(design.kinds, correlation=kind.correlation, along=kind.along)
+    noise = design.noise.copy()
+    noise[0, 3] += np.log(kind.length)
+    return replace(design, noise=noise, kinds=kinds)
+
+
+def with_amplitudes(design: Design, columns: np.ndarray) -> Design:
+    """The design with other amplitudes, of either sign, whose priors nobody asks for."""
+    count = columns.shape[-1]
+    return replace(design, amplitude=np.asarray(columns), sign=np.zeros(count), largest=np.ones(count))
+
+
+class White(NamedTuple):
+    """Columns freed of the noise.
+
+    Attributes:
+        columns: independent and of variance 1.
+        log_density: of the noise at 0.
+        reading: sum of squares that reading a display alone brings about.
+        sd: of each point given those before it.
+    """
+
+    columns: Any
+    log_density: Any
+    reading: Any
+    sd: Any
+
+
+@compiled
+def white_of(
+    logs: Float[Array, " 4"],
+    scale: Array,
+    tests: Tests,
+    linear: Linear,
+    columns: Float[Array, "particles points few"],
+    correlation: Correlation,
+) -> White:
+    """Whiten columns of all tests, at the logarithms of the noise's four numbers."""
+    noise = Noise.from_logs(logs, scale)
+
+    def one(scale: Array, tests: Tests, linear: Linear, columns: Array) -> White:
+        filtered = whitening(noise, scale, tests, linear, correlation, Along.LOAD)
+        constant = filtered.log_det + jnp.sum(jnp.where(tests.mask, LOG_2PI, 0.0))
+        return White(filtered(columns), -0.5 * constant, filtered.reading, filtered.solver.factor.diag.d)
+
+    return jax.vmap(one)(scale, tests, linear, columns)
+
+
+@compiled
+def slope_of(weights: tuple[Array, Array, Array], logs: Float[Array, " 4"], *given: Any) -> Float[Array, " 4"]:
+    """Derivatives of a weighted sum of what `white_of` gives by the logarithms of the noise's four numbers."""
+    _, back = jax.vjp(lambda at: white_of.__wrapped__(at, *given)[:3], logs)  # pyright: ignore[reportFunctionMemberAccess]
+    return back(weights)[0]
+
+
+class Columns:
+    """Columns of a design cut into pieces of one shape; those of nothing, which make up room, are left out."""
+
+    def __init__(self, columns: np.ndarray, design: Design) -> None:
+        self.shape = columns.shape
+        self.some = np.flatnonzero(np.any(columns != 0, axis=(0, 1)))
+        least, most = NUMERICS.columns
+        size = min(max(NUMERICS.entries // (self.shape[0] * self.shape[1]), least), most)
+        count = -(-max(len(self.some), 1) // size)
+        room = np.zeros((*self.shape[:2], count * size))
+        room[..., : len(self.some)] = columns[..., self.some]
+        self.pieces = [jnp.asarray(piece) for piece in np.split(room, count, -1)]
+        tests, kinds = design.tests, design.kinds
+        if kinds.along is Along.TIME:  # one program for both
+            tests = replace(tests, path=tests.record.time)
+        self.arrays, self.correlation = (jnp.asarray(design.scale), tests, design.linear), kinds.correlation
+
+    def _given(self, free: np.ndarray, piece: Array) -> tuple[Any, ...]:
+        return jnp.asarray(free[:4]), *self.arrays, piece, self.correlation
+
+    def white(self, free: np.ndarray) -> White:
+        """Whitened at the hyperparameters."""
+        found = [jax.tree.map(np.asarray, white_of(*self._given(free, piece))) for piece in self.pieces]
+        columns = np.zeros(self.shape)
+        columns[..., self.some] = np.concatenate([one.columns for one in found], -1)[..., : len(self.some)]
+        return found[0]._replace(columns=columns)
+
+    def slope(self, free: np.ndarray, of_white: np.ndarray, of_reading: float) -> np.ndarray:
+        """Derivatives of something by the noise's numbers, from those by the whitened columns and by the readings; the
+        noise's log density is part of it."""
+        room = np.zeros((*self.shape[:2], sum(piece.shape[-1] for piece in self.pieces)))
+        room[..., : len(self.some)] = of_white[..., self.some]
+        each, ones = np.split(room, len(self.pieces), -1), np.ones(self.shape[0])
+        total = np.zeros(4)
+        for k, piece in enumerate(self.pieces):
+            once = ones if k == 0 else 0.0 * ones
+            weights = jnp.asarray(each[k]), jnp.asarray(once), jnp.asarray(of_reading * once)
+            total += np.asarray(slope_of(weights, *self._given(free, piece)))
+        return total
