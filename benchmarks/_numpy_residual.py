@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+
+from mcc_jax.calibrate.settings import FIT
 
 FIELDS = ("D1", "D2", "D3")
 
@@ -21,17 +25,11 @@ def numpy_residual(tests, settings):
     ratio = np.minimum(stress / np.maximum(highest, 1e-300), 1)
     recovered = kepler(ratio)
     measured, mask, contact = (np.asarray(v) for v in (tests.displacement, tests.mask, tests.contact))
-    decay, gain, weight = (np.asarray(getattr(settings.whitening, n)) for n in ("decay", "gain", "weight"))
-    peak, branch = (np.asarray(getattr(settings.whitening, n)) for n in ("peak", "branch"))
-    flat_branch = (np.arange(len(force))[:, None] * force.shape[1] + branch).ravel()
-
-    def by_branch(values):
-        sums = np.bincount(flat_branch, weights=values.ravel(), minlength=force.size)
-        return sums[flat_branch].reshape(force.shape)
-
-    power = by_branch(peak**2)
-    shrink = peak * (1 - 1 / np.sqrt(1 + power)) / np.where(power > 0, power, 1.0)
-    tau, zero_sd = np.maximum(np.asarray(settings.tau), 1e-4), float(settings.zero_sd)
+    # The noise is whitened by a linear map: written out, it costs SciPy and lmfit least.
+    with jax.numpy_dtype_promotion("standard"):
+        maps = np.asarray(jax.vmap(lambda one: one(jnp.eye(force.shape[1])))(settings.whitening))
+    tau = np.maximum(np.asarray(settings.population.tau), FIT.least_spread)
+    mean_zero, zero_sd = (float(v) for v in settings.zero_prior)
     count = len(force)
 
     def residual(flat):
@@ -44,16 +42,9 @@ def numpy_residual(tests, settings):
         limit = x * least / np.maximum(tangent, least)  # no contact gives back more than it took
         predicted = diameter * (x - np.minimum(np.sqrt(secant / (4.12 * np.exp(e))), limit) * recovered)
         r = np.where(mask, measured - predicted - zero[:, None], 0.0)
-        white = np.empty_like(r)
-        expected = np.zeros(count)
-        for k in range(r.shape[1]):
-            expected *= decay[:, k]
-            surprise = r[:, k] - expected
-            expected = expected + gain[:, k] * surprise
-            white[:, k] = surprise * weight[:, k]
-        white = white - shrink * by_branch(peak * white)
+        white = np.einsum("nij,nj->ni", maps, r)
         pooled = (b - np.array(mu) - np.log(1 + a * flatness)[:, None]) / tau
-        return np.concatenate([white[mask], pooled.ravel(), (zero - contact) / zero_sd])
+        return np.concatenate([white[mask], pooled.ravel(), (zero - contact - mean_zero) / zero_sd])
 
     return residual
 
