@@ -29,12 +29,12 @@ import mcc_jax as mcc
 from mcc_jax.discover.base import Base, base_fit
 from mcc_jax.discover.candidates import Candidate, candidates_of, located
 from mcc_jax.discover.columns import with_amplitudes
-from mcc_jax.discover.design import design_of, padded
+from mcc_jax.discover.design import design_of
 from mcc_jax.discover.evidence import left_by_particle, without_first
 from mcc_jax.discover.misfit import coordinates, scaled
 from mcc_jax.discover.screen import signature_columns
 from mcc_jax.discover.search import Search
-from mcc_jax.discover.settings import DECISIONS, FURTHER, NUMERICS
+from mcc_jax.discover.settings import DECISIONS
 from mcc_jax.effects import LIBRARY, Variant
 
 RESULT = Path(__file__).parent / "results" / "formulas.md"
@@ -69,7 +69,7 @@ def gram(base: Base, columns: Any) -> np.ndarray:
     """Products of columns in units of noise, particles' own numbers and the population integrated out."""
     design = with_amplitudes(design_of(base, base.state), columns)
     left, _ = left_by_particle(base.hyperparameters, design)
-    return without_first(left.sum(0), FURTHER)[0][:-1, :-1]
+    return without_first(left.sum(0), design.common.shape[-1])[0][:-1, :-1]
 
 
 def remaining(products: np.ndarray, precision: np.ndarray) -> float:
@@ -91,10 +91,9 @@ def in_span(
     searching: Any = SimpleNamespace(at=at, screen=SimpleNamespace(columns=columns), first_order=first_order)
     design, theta = SimpleNamespace(amplitude=columns[..., s : s + 1]), np.array([amplitude * sibling.plausible[0]])
     fitted: Any = SimpleNamespace(variants=(sibling,), design=design, theta=theta)
-    span = Search.misfit_columns(searching, fitted, 0)[..., : NUMERICS.basis[-1]]
+    span = Search.misfit_columns(searching, fitted, 0)
     count = span.shape[-1]
-    span = padded(span, NUMERICS.basis[-1])
-    products = gram(base, np.concatenate([unit * columns[..., [k, s]], span], -1))[: 2 + count, : 2 + count]
+    products = gram(base, np.concatenate([unit * columns[..., [k, s]], span], -1))
     alone = remaining(products[:2, :2], np.zeros(1))
     misfit = remaining(products, np.array([0.0] + [DECISIONS.misfit**-2] * count))
     return Row(truth, sibling.name, float(np.sqrt(products[0, 0])), alone, misfit)

@@ -13,7 +13,7 @@ from .._format import described
 from .columns import Design, with_amplitudes
 from .evidence import left_by_particle, scales_of, without_first
 from .search import UNLISTED, Search
-from .settings import FURTHER, HYPERPARAMETERS, NUMERICS, TELLING
+from .settings import HYPERPARAMETERS, NUMERICS, TELLING
 
 LETTERS = {
     "strain": ("e", "peak strain"),
@@ -243,5 +243,5 @@ def _held_out(design: Design, free: np.ndarray, basis: np.ndarray) -> np.ndarray
     for i, own in enumerate(left):
         others = total - own
         numbers = np.linalg.solve(others[:c, :c] + np.eye(c), others[:c, -1]) * common
-        found.append(basis[i] @ numbers[FURTHER : FURTHER + basis.shape[-1]])
+        found.append(basis[i] @ numbers[design.of_misfits])
     return np.array(found)

@@ -40,7 +40,6 @@ class Design:
         largest: largest scale of each amplitude's prior in its unit, over the smallest, which is the unit.
         spreads: scale and shape of the priors of the spreads of b1, b3, b5, e and of further own numbers.
         misfits: median and standard deviation of the logarithm of each misfit's scale.
-        used: 1 for hyperparameters of the hypothesis, 0 for those that only make up shapes.
     """
 
     tests: Tests
@@ -55,13 +54,17 @@ class Design:
     largest: Float[np.ndarray, " k"]
     sign: Float[np.ndarray, " k"]
     misfits: Float[np.ndarray, "g 2"]
-    used: Float[np.ndarray, " h"]
     kinds: Kinds
 
     @cached_property
     def columns(self) -> Columns:
         """All columns, the data last."""
         return Columns(np.concatenate([self.own, self.common, self.amplitude, self.data[..., None]], -1), self)
+
+    @property
+    def of_misfits(self) -> np.ndarray:
+        """Which of the common columns are those of misfits."""
+        return np.flatnonzero(self.group)
 
 
 @dataclass(frozen=True)
@@ -151,7 +154,7 @@ def slope_of(weights: tuple[Array, Array, Array], logs: Float[Array, " 4"], *giv
 
 
 class Columns:
-    """Columns of a design cut into pieces of one shape; those of nothing, which make up room, are left out."""
+    """Columns of a design cut into pieces of one shape; those of nothing are left out."""
 
     def __init__(self, columns: np.ndarray, design: Design) -> None:
         self.shape = columns.shape

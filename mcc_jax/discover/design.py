@@ -19,7 +19,7 @@ from ..effects import Variant
 from .base import Base, State
 from .columns import Design, Kinds
 from .evidence import Solution
-from .settings import AMPLITUDES, FURTHER, HYPERPARAMETERS, MISFITS, NUMERICS, POPULATION
+from .settings import NUMERICS, POPULATION
 
 
 def particle_means(beta: Float[Array, " 5"], flatness: Array, power: float) -> Float[Array, "particles 4"]:
@@ -127,45 +127,24 @@ def design_of(
             data = data - column * (mean - at)
             common.append((sd * column)[..., None])
             place += 1
-    basis, group, sizes = more.basis, list(more.group), list(more.sizes)
-    if basis is not None:  # room for as many misfits in every hypothesis that has any
-        basis = padded(basis, next(size for size in NUMERICS.basis if size >= basis.shape[-1]))
-        group += [MISFITS] * (basis.shape[-1] - len(group))
-        sizes += [(0.0, 1.0)] * (MISFITS - len(sizes))
-    spreads = more.own_spreads
-    if spreads:
-        own = [*own, np.zeros((*tests.mask.shape, NUMERICS.jumps - len(spreads)))]
-        spreads = (*spreads, *[spreads[0]] * (NUMERICS.jumps - len(spreads)))
-    shared = padded(np.concatenate(common, -1), FURTHER)
-    group = [0] * FURTHER + group
-    if basis is not None:
-        shared = np.concatenate([shared, basis], -1)
-    used = [1.0] * (HYPERPARAMETERS + len(more.own_spreads)) + [0.0] * (len(spreads) - len(more.own_spreads))
-    used += [1.0] * len(more.sizes) + [0.0] * (len(sizes) - len(more.sizes))
-    absent = AMPLITUDES - sum(x.shape[-1] for x in amplitude)
+    shared = np.concatenate([*common, *([] if more.basis is None else [more.basis])], -1)
     noise = base.model.chosen_priors.noise
-    largest = [*(v.plausible[1] / v.plausible[0] for v in variants), *more.largest, *[1.0] * absent]
+    largest = [*(v.plausible[1] / v.plausible[0] for v in variants), *more.largest]
     return Design(
         tests,
         replace(linear, columns=linear.columns[..., :0]),  # they stand in the design: one shape for all formulas
         np.concatenate(own, -1),
         shared,
-        padded(np.concatenate(amplitude, -1), AMPLITUDES),
+        np.concatenate(amplitude, -1),
         data,
         base.scale,
-        np.array(group, int),
+        np.array([0] * (shared.shape[-1] - len(more.group)) + list(more.group), int),
         np.stack([np.log(np.asarray(noise.median)), np.asarray(noise.log_sd)]),
         np.array(largest, float),
-        np.array([*(v.sign for v in variants), *more.sign, *[0] * absent], float),
-        np.array(sizes, float).reshape(-1, 2),
-        np.array(used, float),
-        Kinds((*base.spreads, *spreads), model.correlation, model.along),
+        np.array([*(v.sign for v in variants), *more.sign], float),
+        np.array(more.sizes, float).reshape(-1, 2),
+        Kinds((*base.spreads, *more.own_spreads), model.correlation, model.along),
     )
-
-
-def padded(columns: np.ndarray, size: int) -> np.ndarray:
-    """Columns of nothing added, so that hypotheses have one shape; their numbers have no say."""
-    return np.pad(columns, ((0, 0), (0, 0), (0, size - columns.shape[-1])))
 
 
 def moved(base: Base, state: State, variants: tuple[Variant, ...], solution: Solution) -> State:

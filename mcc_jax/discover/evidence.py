@@ -179,8 +179,7 @@ def amplitudes(left: np.ndarray, sign: np.ndarray, largest: np.ndarray) -> Ampli
 
 
 def log_prior(free: np.ndarray, design: Design) -> float:
-    """Log prior of the hyperparameters, of a spread's coordinate of either sign together; of those that only make up
-    shapes it is standard normal, which Laplace's method integrates to 1."""
+    """Log prior of the hyperparameters, of a spread's coordinate of either sign together."""
     return _prior(free, design)[0]
 
 
@@ -194,9 +193,7 @@ def _prior(free: np.ndarray, design: Design) -> tuple[float, np.ndarray]:
     normal, slope = -0.5 * z**2 - np.log(sds) - 0.5 * LOG_2PI, -z / sds
     each = np.concatenate([normal[:4], spreads.log_prob, normal[4:]])
     slopes = np.concatenate([slope[:4], spreads.log_prob_slope, slope[4:]])
-    used = design.used > 0
-    nothing = -0.5 * free**2 - 0.5 * LOG_2PI
-    return float(np.sum(np.where(used, each, nothing))), np.where(used, slopes, -free)
+    return float(np.sum(each)), slopes
 
 
 def value_and_gradient(free: np.ndarray, design: Design) -> tuple[float, np.ndarray]:
@@ -227,11 +224,6 @@ def log_joint(free: np.ndarray, design: Design) -> float:
     gram, integral = without_first(left.gram.sum(0), design.common.shape[-1])
     effects = amplitudes(gram, design.sign, design.largest)
     return float(left.log_integral.sum() + integral) + effects.log_integral + log_prior(free, design)
-
-
-def filled_up(free: np.ndarray, design: Design) -> np.ndarray:
-    """Hyperparameters with zeros for those that only make up shapes."""
-    return np.concatenate([free, np.zeros(len(design.used) - len(free))])
 
 
 def with_little_noise(free: np.ndarray) -> np.ndarray:
@@ -292,7 +284,7 @@ def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, witho
 
     Args:
         design: of a hypothesis.
-        start: hyperparameters to begin with; those that only make up shapes may be left out.
+        start: hyperparameters to begin with.
         curvature: whether they are integrated out; if not, `log_evidence` is the log posterior at the mode.
         without: the optimum without misfits, whose curvature is taken for that of the hyperparameters it has.
 
@@ -302,13 +294,11 @@ def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, witho
     from scipy.optimize import minimize
 
     count = float(np.asarray(design.tests.mask).sum())
-    used = np.asarray(design.used) > 0
-    start = filled_up(start, design)
     spreads = len(design.kinds.spreads)
     expected = np.full(len(start), 2.0)
     expected[:4] = count * np.array([1.5, 0.2, 0.1, 0.02])
     expected[4 : 4 + spreads] = 2.0 * len(design.tests)
-    scale = 1 / np.sqrt(np.where(used, expected, 1.0))
+    scale = 1 / np.sqrt(expected)
 
     def down(x: np.ndarray) -> tuple[float, np.ndarray]:
         value, slope = value_and_gradient(x * scale, design)
@@ -323,7 +313,7 @@ def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, witho
         raise FloatingPointError("the evidence of a hypothesis is no number")
     evidence, free = joint, found.x * scale
     if curvature:
-        wanted = np.flatnonzero(used)
+        wanted = np.arange(len(start))
         if without is not None:
             wanted = wanted[wanted >= 4 + spreads]
             evidence += without.log_evidence - without.log_joint
@@ -334,10 +324,6 @@ def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, witho
         hessian = (np.array(columns) + np.array(columns).T) / 2
         values = np.maximum(np.linalg.eigvalsh(hessian), 1e-3)
         evidence += 0.5 * len(wanted) * np.log(2 * np.pi) - 0.5 * np.sum(np.log(values)) + np.sum(np.log(scale[wanted]))
-        if without is None:  # of those that only make up shapes
-            evidence += 0.5 * np.sum(~used) * np.log(2 * np.pi)
-        else:
-            evidence += 0.5 * (np.sum(~used) - np.sum(~used[: 4 + spreads])) * np.log(2 * np.pi)
     return Optimum(free, float(evidence), joint, int(found.nfev))
 
 

@@ -60,6 +60,7 @@ def coordinates(point: Point, tests: Tests, forms: Forms) -> dict[str, Array]:
             "load": c.load_share,
             "force": c.force,
             "travel": c.displacement / tests.particle.effective_diameter,
+            "drive": c.displacement,
             "time": jnp.log1p(time / 5.0),
             "since": jnp.log1p((time - begun) / 5.0),
             "unloading": jnp.where(tests.record.kind == UNLOAD, 1.0, 0.0),
@@ -117,29 +118,43 @@ def hats_of(x: np.ndarray, count: int) -> np.ndarray:
     return np.maximum(1 - np.abs(x[..., None] - centres.reshape((1,) * x.ndim + (count,))) * (count - 1), 0.0)
 
 
-def general(at: dict[str, np.ndarray], size: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, list[int]]:
-    """Functions of a discrepancy that no mechanism explains, and of which kind each is: smooth 1, rough 2, periodic 3.
+def splines(x: np.ndarray, count: int) -> np.ndarray:
+    """Cosines of a coordinate between 0 and 1, as a smoothing spline weighs them, with a variance of about 1 together.
 
-    It is common to all particles, in proportion to their size, and lives in reduced strain, travel, load and time. The
-    rough ones are hat functions, which have the corners of onsets and thresholds. In stress they are fine: a particle's
-    layers and flaws yield within a narrow range of it. Those of the time since unloading began are fine where it
-    begins: what a drive loses at a reversal, it loses at once.
+    Their standard deviations fall with the square of the frequency (Wahba 1990): smooth curves cost little, and steps
+    of the slope, at onsets and thresholds, are still reached.
     """
-    places = ("strain", "travel", "load", "clock")
-    columns = [np.cos(np.pi * k * at[name]) for name in places for k in range(1, 4)]
-    both = [(i, j) for i in range(1, 3) for j in range(1, 3)]
-    columns += [np.cos(np.pi * i * at["peak"]) * np.cos(np.pi * j * at["load"]) for i, j in both]
-    columns += [np.cos(np.pi * k * at["since"]) * at["unloading"] for k in range(4)]
-    smooth = np.stack(columns, -1) / np.sqrt(len(columns))
-    hats = {"peak": NUMERICS.fine_hats, "travel": NUMERICS.hats, "load": NUMERICS.hats, "clock": NUMERICS.hats}
-    turned = hats_of(at["since"], NUMERICS.hats) * at["unloading"][..., None]
-    fine = [*(hats_of(at[name], count) for name, count in hats.items()), turned]
-    rough = np.concatenate(fine, -1) / np.sqrt(len(fine))
-    waves = []
-    for name in ("travel", "clock"):
-        for k in range(2, NUMERICS.waves):
-            waves += [np.cos(2 * np.pi * k * at[name]), np.sin(2 * np.pi * k * at[name])]
-    periodic = np.stack(waves, -1) / np.sqrt(len(waves))
-    kinds = [kind for kind, some in enumerate((smooth, rough, periodic), 1) for _ in range(some.shape[-1])]
-    basis = np.concatenate([smooth, rough, periodic], -1) * (size / np.mean(size))[:, None, None]
-    return np.where(mask[..., None], basis, 0.0), kinds
+    k = np.arange(1, count + 1)
+    weight = k**-2.0 * np.sqrt(2 / np.sum(k**-4.0))
+    return weight * np.cos(np.pi * k * x[..., None])
+
+
+def waves(x: np.ndarray, count: int = NUMERICS.waves) -> np.ndarray:
+    """Sines and cosines of two periods and more over a coordinate between 0 and 1, with a variance of 1 together."""
+    angle = 2 * np.pi * np.arange(2, count) * x[..., None]
+    return np.concatenate([np.cos(angle), np.sin(angle)], -1) / np.sqrt(count - 2)
+
+
+def general(at: dict[str, np.ndarray], size: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, list[int]]:
+    """Functions of a discrepancy that no mechanism explains, and of which part each is, from 1 on.
+
+    It is a sum of Gaussian processes, each in one coordinate and with a scale of its own, so that coordinates that
+    explain nothing cost next to nothing (automatic relevance determination; Duvenaud et al. 2011). All are common to
+    all particles and in proportion to their size, but for what a drive does, which depends on micrometres alone. In
+    stress they are fine: a particle's layers and flaws yield within a narrow range of it. What a drive loses at a
+    reversal, it loses at once: there the time since unloading began is a coordinate.
+    """
+    turned = at["unloading"][..., None]
+    products = splines(at["peak"], 3)[..., :, None] * splines(at["load"], 3)[..., None, :]
+    parts = [
+        splines(at["peak"], NUMERICS.fine_splines),
+        *(splines(at[name], NUMERICS.splines) for name in ("travel", "load", "clock")),
+        np.concatenate([turned, splines(at["since"], NUMERICS.hats) * turned], -1),
+        products.reshape(*products.shape[:-2], -1),
+        waves(at["travel"]),
+        waves(at["clock"]),
+    ]
+    reduced = np.concatenate(parts, -1) * (size / np.mean(size))[:, None, None]
+    parts.append(waves(at["drive"], NUMERICS.drive_waves))
+    groups = [k for k, part in enumerate(parts, 1) for _ in range(part.shape[-1])]
+    return np.where(mask[..., None], np.concatenate([reduced, parts[-1]], -1), 0.0), groups

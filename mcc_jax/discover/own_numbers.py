@@ -15,7 +15,7 @@ from .base import Base, State
 from .candidates import Candidate
 from .columns import Columns, Design
 from .design import More, design_of, linear_at
-from .evidence import Optimum, filled_up, log_joint, optimise, scales_of, solve, with_little_noise
+from .evidence import Optimum, log_joint, optimise, scales_of, solve, with_little_noise
 from .refine import Refined, refined
 from .screen import single_integrals
 from .settings import DECISIONS, HYPERPARAMETERS, NUMERICS
@@ -97,7 +97,7 @@ def differing(base: Base, start: Refined, columns: np.ndarray, candidates: Seque
         more = More(ratio * column, (SPREAD,), column, (ratio,), (0,))
         design = design_of(base, start.state, start.variants, more, linear)
         value, at = max(
-            ((log_joint(filled_up(x, design), design), x) for x in (free, with_little_noise(free))),
+            ((log_joint(x, design), x) for x in (free, with_little_noise(free))),
             key=lambda one: one[0],
         )
         tried.append((value, at, c, design, more))

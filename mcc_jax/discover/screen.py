@@ -23,7 +23,7 @@ from .candidates import Candidate, candidates_of
 from .columns import with_amplitudes
 from .design import design_of
 from .evidence import left_by_particle, log_prior, without_first
-from .settings import FURTHER, NUMERICS
+from .settings import NUMERICS
 
 
 @compiled_quickly
@@ -168,7 +168,7 @@ def screen(
         at[2:4] += np.log([sd, length])
         at[4:8] *= spread
         left, integral = left_by_particle(at, design)
-        total, log_population = without_first(left.sum(0), FURTHER)
+        total, log_population = without_first(left.sum(0), design.common.shape[-1])
         null = float(np.sum(integral) + log_population) - 0.5 * total[-1, -1] + log_prior(at, design)
         settings.append(Setting(at, null, total[:-1, :-1], total[:-1, -1]))
     return Screen(tuple(candidates), tuple(settings), columns)

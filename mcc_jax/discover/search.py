@@ -22,7 +22,7 @@ from .misfit import ANY, COORDINATES, coordinates, functions, general, scaled
 from .own_numbers import OwnNumbers, differing, sudden_steps
 from .refine import Refined, refined
 from .screen import Screen, Setting, pair_integrals, screen, signature_columns, single_integrals
-from .settings import DECISIONS, FURTHER, HYPERPARAMETERS, NUMERICS
+from .settings import DECISIONS, HYPERPARAMETERS, NUMERICS
 
 Names = tuple[str, ...]
 UNLISTED: Names = ("UNLISTED",)
@@ -83,7 +83,7 @@ class Smooth:
 
     Attributes:
         design, optimum, solution: with it.
-        basis: its functions [um], whose weights follow `FURTHER` common numbers.
+        basis: its functions [um].
     """
 
     design: Design
@@ -94,7 +94,7 @@ class Smooth:
     @property
     def curve_um(self) -> np.ndarray:
         """What it adds to the law's displacement at every point [um]."""
-        return self.basis @ self.solution.common[FURTHER : FURTHER + self.basis.shape[-1]]
+        return self.basis @ self.solution.common[self.design.of_misfits]
 
 
 class Search:
@@ -246,7 +246,7 @@ class Search:
         r = one.best
         assert r is not None
         K = len(r.variants)
-        basis = [self.misfit_columns(r, i)[..., : NUMERICS.basis[-1] // K] for i in range(K)]
+        basis = [self.misfit_columns(r, i) for i in range(K)]
         middle = np.log(DECISIONS.misfit)
         sizes = [(middle, DECISIONS.misfit_log_sd)] * K
         group = [i + 1 for i in range(K) for _ in range(basis[i].shape[-1])]
@@ -259,7 +259,7 @@ class Search:
 
     @cached_property
     def discrepancy(self) -> tuple[np.ndarray, list[int]]:
-        """Functions of what no mechanism explains, and of which kind each is."""
+        """Functions of what no mechanism explains, and of which part each is."""
         tests = self.base.tests
         return general(self.at, np.asarray(tests.effective_diameter), np.asarray(tests.mask))
 
@@ -267,11 +267,10 @@ class Search:
         """A hypothesis with a smooth discrepancy beside it."""
         basis, group = self.discrepancy
         unit = float(np.log(DECISIONS.general) + self.null.optimum.free[0])
-        sizes = [(unit, DECISIONS.general_log_sd)] * max(group)
-        design = design_of(self.base, r.state, r.variants, More(basis=basis, group=group, sizes=sizes))
-        optimum = optimise(
-            design, np.append(r.optimum.free, [unit, *[unit - 1.0] * (max(group) - 1)]), without=r.optimum
-        )
+        parts = max(group)
+        more = More(basis=basis, group=group, sizes=[(unit, DECISIONS.general_log_sd)] * parts)
+        design = design_of(self.base, r.state, r.variants, more)
+        optimum = optimise(design, np.append(r.optimum.free, [unit - 1.0] * parts), without=r.optimum)
         solution = solve(optimum.free, design)
         return Smooth(design, optimum, solution, basis)
 

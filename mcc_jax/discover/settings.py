@@ -72,14 +72,8 @@ class Telling:
     within: float = 0.05
 
 
-AMPLITUDES, MISFITS = 2, 3
-"""Effects of a hypothesis at most, and misfits: every design has room for so many."""
-
 POPULATION = 5
 """Numbers of the population, which come first among what all particles share: a, log modulus, means of b1, b3, b5."""
-
-FURTHER = POPULATION + 2 * AMPLITUDES
-"""Numbers that all particles share: the population's, and further ones of the effects."""
 
 HYPERPARAMETERS = 8
 """Those of the base law: four of the noise, and the spreads of b1, b3, b5 and e."""
@@ -104,13 +98,13 @@ class Numerics:
         drifts: drifts of every test's own that are fitted at their own optimum.
         little: factor on correlated noise that has swallowed a gap, where what explains it begins to be fitted.
         worse: nats by which a step may make things worse before half of it is taken back.
-        hats, fine_hats, degree: hat functions of each coordinate of a misfit, of stress where no mechanism is known,
-            and total degree of smooth products.
-        basis: functions of all misfits of a hypothesis together; there is room for one of these numbers.
+        hats, degree: hat functions of each coordinate of a misfit, and total degree of smooth products.
+        splines, fine_splines: cosines of each coordinate of a discrepancy that no mechanism explains, and of stress.
         columns, entries: columns that are freed of the noise at once, at least and at most, and about how many numbers
             they hold together, so that they stay in a processor's own memory.
         few_blocks: of particles; up to so many, formulas are compiled with less optimisation and run for longer.
-        waves: periods that a periodic discrepancy may have.
+        waves, drive_waves: periods that a periodic discrepancy may have over the range of travel and of time, and over
+            that of micrometres, which is the widest among particles of several sizes.
         bootstrap: campaigns drawn for the p value.
         places: bins of load in which disagreement is looked for.
         thinned: places of a sudden step, in each test, in the bootstrap.
@@ -138,13 +132,14 @@ class Numerics:
     locations: int = 32
     phases: int = 14
     hats: int = 8
-    fine_hats: int = 24
+    splines: int = 12
+    fine_splines: int = 24
     degree: int = 2
-    basis: tuple[int, ...] = (32, 116)
     columns: tuple[int, int] = (6, 18)
     entries: int = 270_000
     few_blocks: int = 8
     waves: int = 12
+    drive_waves: int = 26
     bootstrap: int = 400
     places: int = 5
     thinned: int = 24
