@@ -58,7 +58,7 @@ def effects_of(search: Search, names: Names, probabilities: Mapping[str, float],
     """The effects of a hypothesis with their numbers."""
     one = search.found[names]
     own = () if one.own is None else (_of_their_own(one.own, probabilities[one.own.variant.mechanism], p_any),)
-    r = one.best if one.own is None else one.own.at
+    r = one.formulas
     if r is None:
         return ()
     cov = _covariance(r.design, r.optimum.free)

@@ -33,7 +33,8 @@ class _Statistic:
 
     def __init__(self, search: Search) -> None:
         design, screen = search.null.design, search.screen
-        basis, _ = search.discrepancy
+        basis, parts = search.discrepancy
+        self.parts = np.array(parts)
         own, self.own_names, self.own_ratio = [], [], []
         for name in search.library:
             if name not in search.shared and name != SUDDEN:
@@ -75,7 +76,7 @@ class _Statistic:
 
     def __call__(self, score: np.ndarray) -> np.ndarray:
         """Log evidence ratios of campaigns, from scores of shape (campaigns, N, columns)."""
-        _, formulas, basis, own, steps = np.split(np.arange(score.shape[-1]), np.cumsum(self.counts)[:-1])
+        _, formulas, _, own, steps = np.split(np.arange(score.shape[-1]), np.cumsum(self.counts)[:-1])
         gram, shared = self.scores.gram, np.arange(sum(self.counts[:3]))
         G, f = gram[:, shared[:, None], shared].sum(0), len(formulas)
         inner = np.linalg.inv(np.eye(POPULATION) + G[:POPULATION, :POPULATION])
@@ -89,10 +90,13 @@ class _Statistic:
             each, _ = single_integrals(scores, powers, np.tile(self.signs, len(s)), np.tile(self.largest, len(s)))
             logs.append(prior + np.asarray(logsumexp(each.reshape(len(s), f) + self.weight, axis=1)))
         smooth = []
-        for size in self.unit * np.array([0.1, 0.3, 1.0, 3.0]):
-            spread = np.eye(len(basis)) + size**2 * G[f:, f:]
-            value = 0.5 * size**2 * np.einsum("mk,km->m", s[:, f:], np.linalg.solve(spread, s[:, f:].T))
-            smooth.append(value - 0.5 * np.linalg.slogdet(spread)[1])
+        for part in np.unique(self.parts):  # at first order one part of the discrepancy at a time
+            at = f + np.flatnonzero(self.parts == part)
+            inside, scores = G[np.ix_(at, at)], s[:, at]
+            for size in self.unit * np.array([0.1, 0.3, 1.0, 3.0]):
+                spread = np.eye(len(at)) + size**2 * inside
+                value = 0.5 * size**2 * np.einsum("mk,km->m", scores, np.linalg.solve(spread, scores.T))
+                smooth.append(value - 0.5 * np.linalg.slogdet(spread)[1])
         logs.append(-DECISIONS.unlisted + np.asarray(logsumexp(smooth, axis=0)) - np.log(len(smooth)))
         rest = score - np.einsum("ncp,mp->mnc", gram[:, :, :POPULATION], total[:, :POPULATION] @ inner)
         for name in dict.fromkeys(self.own_names):

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from ..calibrate.compiling import compiled
 from ..calibrate.data import Tests
 from ..calibrate.forward import Linear
+from ..calibrate.model import Model
 from ..calibrate.noise import Along, Correlation, Noise, whitening
 from .settings import NUMERICS
 
@@ -81,27 +82,10 @@ class Kinds:
     along: Along
 
 
-@dataclass(frozen=True)
-class NoiseKind:
-    """How the noise that is not white hangs together.
-
-    Attributes:
-        correlation: how rough it is.
-        along: what it runs along.
-        length: its length's prior median over the model's own, whose unit may be another.
-    """
-
-    correlation: Correlation
-    along: Along
-    length: float = 1.0
-
-
-def with_noise(design: Design, kind: NoiseKind) -> Design:
-    """The design with noise of another kind."""
-    kinds = replace(design.kinds, correlation=kind.correlation, along=kind.along)
-    noise = design.noise.copy()
-    noise[0, 3] += np.log(kind.length)
-    return replace(design, noise=noise, kinds=kinds)
+def with_noise(design: Design, model: Model) -> Design:
+    """The design with the noise of a model."""
+    prior, kinds = model.chosen_priors.noise, replace(design.kinds, correlation=model.correlation, along=model.along)
+    return replace(design, noise=np.stack([np.log(np.asarray(prior.median)), np.asarray(prior.log_sd)]), kinds=kinds)
 
 
 def with_amplitudes(design: Design, columns: np.ndarray) -> Design:

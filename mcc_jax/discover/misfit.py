@@ -24,7 +24,7 @@ COORDINATES = {
     "damage": ("peak", "cycles"),
     "densification_stiffening": ("peak",),
     "reload_hysteresis": ("load", "reload", "peak"),
-    "ratcheting": ("cycles", "peak", "strain"),
+    "ratcheting": ("cycles", "peak", "reload"),
     "finite_hardening_exponent": ("peak",),
     "unloading_shape": ("load", "peak"),
     "size_effect": ("size",),
@@ -148,7 +148,7 @@ def general(at: dict[str, np.ndarray], size: np.ndarray, mask: np.ndarray) -> tu
     products = splines(at["peak"], 3)[..., :, None] * splines(at["load"], 3)[..., None, :]
     parts = [
         splines(at["peak"], NUMERICS.fine_splines),
-        *(splines(at[name], NUMERICS.splines) for name in ("travel", "load", "clock")),
+        *(splines(at[name], NUMERICS.splines) for name in ("strain", "travel", "load", "clock")),
         np.concatenate([turned, splines(at["since"], NUMERICS.hats) * turned], -1),
         products.reshape(*products.shape[:-2], -1),
         waves(at["travel"]),

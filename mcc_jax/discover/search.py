@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from scipy.special import logsumexp
 
 from ..calibrate.compiling import side_by_side
+from ..calibrate.model import Model
 from ..calibrate.noise import Along, Correlation
 from ..effects import Mechanism, Variant
 from .base import Base, State
 from .candidates import Candidate, candidates_of, located
-from .columns import Design, NoiseKind, with_amplitudes, with_noise
-from .design import More, design_of
+from .columns import Design, with_amplitudes, with_noise
+from .design import NOTHING_MORE, More, design_of
 from .evidence import Optimum, Solution, left_by_particle, optimise, solve, with_little_noise, without_first
 from .misfit import ANY, COORDINATES, coordinates, functions, general, scaled
 from .own_numbers import OwnNumbers, differing, sudden_steps
 from .refine import Refined, refined
 from .screen import Screen, Setting, pair_integrals, screen, signature_columns, single_integrals
-from .settings import DECISIONS, HYPERPARAMETERS, NUMERICS
+from .settings import DECISIONS, NUMERICS
 
 Names = tuple[str, ...]
 UNLISTED: Names = ("UNLISTED",)
@@ -63,7 +63,7 @@ class Hypothesis:
     def log_evidence(self) -> float:
         """Log marginal likelihood, its forms averaged; as probable as each other, but for a
         discrepancy beside a name, which is a second cause that is on no list."""
-        if not self.names or self.names == UNLISTED or self.own is not None:
+        if not self.names or self.names == UNLISTED or (self.own is not None and not np.isfinite(self.with_misfit)):
             return self.alone + self.other_noise
         forms = [self.alone, self.with_misfit, self.beside - DECISIONS.pair - DECISIONS.unlisted]
         return float(logsumexp(forms) - np.log(2)) + self.other_noise
@@ -71,10 +71,13 @@ class Hypothesis:
     @property
     def fitted(self) -> tuple[Design, Optimum, Solution] | None:
         """Design, hyperparameters and numbers of the form in which it is added to the law."""
-        for one in (self.smooth, None if self.own is None else self.own.at, self.best):
-            if one is not None:
-                return one.design, one.optimum, one.solution
-        return None
+        one = self.smooth or self.formulas
+        return None if one is None else (one.design, one.optimum, one.solution)
+
+    @property
+    def formulas(self) -> Refined | None:
+        """Its formulas at their optimum, beside numbers of every test's own if it has any."""
+        return self.best if self.own is None else self.own.at
 
 
 @dataclass(frozen=True)
@@ -113,8 +116,9 @@ class Search:
     def __init__(
         self, base: Base, library: Mapping[str, Mechanism], tell: Callable[[str], None] = lambda _: None
     ) -> None:
-        self.base, self.library, self.tell = base, library, tell
-        start = optimise(design_of(base, base.state), base.hyperparameters, curvature=False)
+        self.library, self.tell = library, tell
+        base, start = with_likely_noise(base)
+        self.base = base
         self.null = refined(base, base.state, (), np.zeros(0), start.free)
         self.natural = {k: np.asarray(x) for k, x in base.each(coordinates, self.state.point, base.forms).items()}
         self.at = scaled(self.natural, np.asarray(base.tests.mask))
@@ -243,19 +247,20 @@ class Search:
 
     def with_misfit(self, one: Hypothesis) -> None:
         """Log evidence where every name's formula may be wrong."""
-        r = one.best
+        r = one.formulas
         assert r is not None
-        K = len(r.variants)
+        K, more, log_prior = len(r.variants), NOTHING_MORE, 0.0
+        if one.own is not None:
+            more, log_prior = one.own.more, one.own.log_prior
         basis = [self.misfit_columns(r, i) for i in range(K)]
         middle = np.log(DECISIONS.misfit)
         sizes = [(middle, DECISIONS.misfit_log_sd)] * K
         group = [i + 1 for i in range(K) for _ in range(basis[i].shape[-1])]
-        design = design_of(
-            self.base, r.state, r.variants, More(basis=np.concatenate(basis, -1), group=group, sizes=sizes)
-        )
+        more = replace(more, basis=np.concatenate(basis, -1), group=group, sizes=sizes)
+        design = design_of(self.base, r.state, r.variants, more)
         optimum = optimise(design, np.append(r.optimum.free, [middle] * K), without=r.optimum)
-        one.with_misfit = optimum.log_evidence
-        one.sizes = tuple(float(x) for x in np.exp(optimum.free[HYPERPARAMETERS : HYPERPARAMETERS + K]))
+        one.with_misfit = optimum.log_evidence + log_prior
+        one.sizes = tuple(float(x) for x in np.exp(optimum.free[-K:]))
 
     @cached_property
     def discrepancy(self) -> tuple[np.ndarray, list[int]]:
@@ -320,19 +325,21 @@ class Search:
         tried = {n: (first, k) for n, k in self.best_seconds(seconds, leader.names[0]).items() if n not in self.found}
         side_by_side(self.fit, list(tried.values()))
         for names, ks in tried.items():
-            pair = self.found[names] = Hypothesis(names, self.fit(ks).log_evidence, best=self.fit(ks))
-            if pair.alone > leader.alone:
-                self.with_misfit(pair)
+            self.found[names] = Hypothesis(names, self.fit(ks).log_evidence, best=self.fit(ks))
+            self.with_misfit_if_better(self.found[names], leader)
         for m, mechanism in self.library.items():
             if m not in self.shared:
-                self.keep(pair_of(m, leader.names[0]), self.of_their_own(m, mechanism, r))
+                names = pair_of(m, leader.names[0])
+                self.keep(names, self.of_their_own(m, mechanism, r))
+                self.with_misfit_if_better(self.found[names], leader)
 
     def pairs_of_their_own(self, leader: Hypothesis) -> None:
         """The best second names beside numbers that differ from test to test."""
         own = leader.own
         assert own is not None
         assert self.screen is not None
-        column = own.at.design.amplitude[..., :1]
+        # Sudden steps have no amplitude that all tests share.
+        column = np.concatenate([own.at.design.amplitude, np.zeros((*own.at.design.data.shape, 1))], -1)[..., :1]
         seconds = self.best_seconds(self.seconds(own.at, own.variant, column), leader.names[0])
 
         def fit(k: int) -> OwnNumbers:
@@ -340,6 +347,12 @@ class Search:
 
         for names, one in zip(seconds, side_by_side(fit, seconds.values()), strict=True):
             self.keep(names, one)
+            self.with_misfit_if_better(self.found[names], leader)
+
+    def with_misfit_if_better(self, pair: Hypothesis, leader: Hypothesis) -> None:
+        """The formulas of a pair may be wrong, too, where it explains more than the leader alone."""
+        if pair.alone > leader.alone and pair.formulas is not None and pair.formulas.variants:
+            self.with_misfit(pair)
 
     def keep(self, names: Names, own: OwnNumbers | None) -> None:
         """A hypothesis with numbers of every test's own, if it is the best of its names."""
@@ -406,11 +419,11 @@ class Search:
         leader = next(iter(logs))
         if not leader:
             return
-        kinds = noise_kinds(self.base)
+        kinds = noise_models(self.base)
         values: dict[Names, list[float]] = {(): self.by_noise((), kinds)}
         wanted = list(logs)[: NUMERICS.seconds]
         if len(leader) == 2:
-            wanted = [leader, *[names for names in logs if len(names) == 1][: NUMERICS.seconds]]
+            wanted += [names for names in logs if len(names) == 1][: NUMERICS.seconds]
         elif max(values[()]) < logs[leader] - NUMERICS.strong:
             return
         for names in wanted:
@@ -423,16 +436,14 @@ class Search:
             together = [optimum.log_evidence, *others]
             one.other_noise = float(logsumexp(together) - np.log(len(together)) - optimum.log_evidence)
 
-    def by_noise(self, names: Names, kinds: tuple[NoiseKind, ...]) -> list[float]:
+    def by_noise(self, names: Names, models: tuple[Model, ...]) -> list[float]:
         """Log evidence of a hypothesis under other kinds of noise, with the curvature that it has under the model's."""
         fitted = self.found[names].fitted
         assert fitted is not None
         design, optimum, _ = fitted
         found = []
-        for kind in kinds:
-            start = optimum.free.copy()
-            start[3] = float(design.noise[0, 3]) + np.log(kind.length)
-            other = optimise(with_noise(design, kind), start, curvature=False)
+        for model in models:
+            other = with_other_noise(design, optimum.free, model)
             found.append(optimum.log_evidence + other.log_joint - optimum.log_joint)
         return found
 
@@ -448,22 +459,44 @@ def differs_from_test_to_test(variant: Variant) -> bool:
     return variant.mechanism == SUDDEN or located(variant)
 
 
-def noise_kinds(base: Base) -> tuple[NoiseKind, ...]:
-    """Kinds of noise besides the model's: smooth along the load, and in time."""
-    tests = base.tests
-    mask = np.asarray(tests.mask)
+def with_other_noise(design: Design, free: np.ndarray, model: Model) -> Optimum:
+    """The mode of the hyperparameters under the noise of a model, from the mode under another."""
+    other, start = with_noise(design, model), free.copy()
+    start[3] = other.noise[0, 3]  # the length's unit may be another
+    return optimise(other, start, curvature=False)
 
-    def length(x: Any) -> float:
-        return float(np.median(np.where(mask, x, -np.inf).max(1) - np.where(mask, x, np.inf).min(1)))
 
-    of_load, of_time = length(tests.path), length(tests.record.time)
-    model, ratio = base.model, max(of_time, 1e-9) / max(of_load, 1e-9)
-    units = {along: ratio if along is Along.TIME else 1 / ratio for along in Along}
-    kinds = []
-    for correlation, along in (
-        (Correlation.MATERN_32, Along.LOAD),
-        (Correlation.MATERN_32, Along.TIME),
-    ):
+def with_likely_noise(base: Base) -> tuple[Base, Optimum]:
+    """The base law at its mode, under the kind of noise that the tests prefer: the model's own unless clearly not.
+
+    A search under noise that the tests are not of fits formulas to what the noise leaves.
+    """
+    design = design_of(base, base.state)
+    own = optimise(design, base.hyperparameters, curvature=False)
+    others = [(with_other_noise(design, own.free, model), model) for model in noise_models(base)]
+    best, model = max(others, key=lambda one: one[0].log_joint)
+    if best.log_joint > own.log_joint + NUMERICS.strong:
+        return replace(base, model=model), best
+    return base, own
+
+
+def noise_models(base: Base) -> tuple[Model, ...]:
+    """The model with other kinds of noise: rough or smooth along the load, or smooth in time.
+
+    The prior of its length keeps its share of a test.
+    """
+    tests, model = base.tests, base.model
+    mask, prior = np.asarray(tests.mask), model.chosen_priors
+
+    def length(along: Along) -> float:
+        x = tests.path if along is Along.LOAD else tests.record.time
+        return max(float(np.median(np.where(mask, x, -np.inf).max(1) - np.where(mask, x, np.inf).min(1))), 1e-9)
+
+    models = []
+    rough, smooth = Correlation.EXPONENTIAL, Correlation.MATERN_32
+    for correlation, along in ((rough, Along.LOAD), (smooth, Along.LOAD), (smooth, Along.TIME)):
         if (correlation, along) != (model.correlation, model.along):
-            kinds.append(NoiseKind(correlation, along, 1.0 if along is model.along else units[along]))
-    return tuple(kinds)
+            median = prior.noise_length.median * length(along) / length(model.along)
+            priors = replace(prior, noise_length=replace(prior.noise_length, median=median))
+            models.append(replace(model, correlation=correlation, along=along, priors=priors))
+    return tuple(models)
