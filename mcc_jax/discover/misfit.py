@@ -12,7 +12,7 @@ from jaxtyping import Array
 from ..calibrate.compiling import compiled_quickly
 from ..calibrate.data import Tests
 from ..calibrate.forward import Forms, Point
-from ..effects.record import UNLOAD
+from ..effects.record import RELOAD, UNLOAD
 from .settings import NUMERICS
 
 COORDINATES = {
@@ -64,6 +64,7 @@ def coordinates(point: Point, tests: Tests, forms: Forms) -> dict[str, Array]:
             "time": jnp.log1p(time / 5.0),
             "since": jnp.log1p((time - begun) / 5.0),
             "unloading": jnp.where(tests.record.kind == UNLOAD, 1.0, 0.0),
+            "reloading": jnp.where(tests.record.kind == RELOAD, 1.0, 0.0),
             "clock": time,
             "reload": c.progress,
             "cycles": c.cycles,
@@ -142,19 +143,22 @@ def general(at: dict[str, np.ndarray], size: np.ndarray, mask: np.ndarray) -> tu
     explain nothing cost next to nothing (automatic relevance determination; Duvenaud et al. 2011). All are common to
     all particles and in proportion to their size, but for what a drive does, which depends on micrometres alone. In
     stress they are fine: a particle's layers and flaws yield within a narrow range of it. What a drive loses at a
-    reversal, it loses at once: there the time since unloading began is a coordinate.
+    reversal, it loses at once: there the time since the reversal is a coordinate, and reloading has parts of its own.
     """
-    turned = at["unloading"][..., None]
+    since = splines(at["since"], NUMERICS.hats)
+    turned = [
+        np.concatenate([at[way][..., None], since * at[way][..., None]], -1) for way in ("unloading", "reloading")
+    ]
     products = splines(at["peak"], 3)[..., :, None] * splines(at["load"], 3)[..., None, :]
-    parts = [
+    reduced = [
         splines(at["peak"], NUMERICS.fine_splines),
         *(splines(at[name], NUMERICS.splines) for name in ("strain", "travel", "load", "clock")),
-        np.concatenate([turned, splines(at["since"], NUMERICS.hats) * turned], -1),
+        splines(at["load"], NUMERICS.splines) * at["reloading"][..., None],
         products.reshape(*products.shape[:-2], -1),
         waves(at["travel"]),
         waves(at["clock"]),
     ]
-    reduced = np.concatenate(parts, -1) * (size / np.mean(size))[:, None, None]
-    parts.append(waves(at["drive"], NUMERICS.drive_waves))
+    share = (size / np.mean(size))[:, None, None]
+    parts = [*(part * share for part in reduced), *turned, waves(at["drive"], NUMERICS.drive_waves)]
     groups = [k for k, part in enumerate(parts, 1) for _ in range(part.shape[-1])]
-    return np.where(mask[..., None], np.concatenate([reduced, parts[-1]], -1), 0.0), groups
+    return np.where(mask[..., None], np.concatenate(parts, -1), 0.0), groups
