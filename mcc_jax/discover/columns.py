@@ -40,7 +40,7 @@ class Design:
         noise: prior of the four numbers of the noise: means and standard deviations of the logarithms, shape (2, 4).
         largest: largest scale of each amplitude's prior in its unit, over the smallest, which is the unit.
         spreads: scale and shape of the priors of the spreads of b1, b3, b5, e and of further own numbers.
-        misfits: median and standard deviation of the logarithm of each misfit's scale.
+        misfits: of the logarithm of each misfit's scale: median, standard deviation, and the most it can be.
     """
 
     tests: Tests
@@ -54,7 +54,7 @@ class Design:
     noise: Float[np.ndarray, "2 4"]
     largest: Float[np.ndarray, " k"]
     sign: Float[np.ndarray, " k"]
-    misfits: Float[np.ndarray, "g 2"]
+    misfits: Float[np.ndarray, "g 3"]
     kinds: Kinds
 
     @cached_property

@@ -66,7 +66,7 @@ class More:
             that unit, and its physical sign.
         basis: of misfits.
         group: which misfit each of these columns belongs to, from 1 on.
-        sizes: median and standard deviation of the logarithm of each misfit's size.
+        sizes: of the logarithm of each misfit's size: median, standard deviation, and the most it can be.
     """
 
     own: np.ndarray | None = None
@@ -76,7 +76,7 @@ class More:
     sign: tuple[int, ...] = ()
     basis: np.ndarray | None = None
     group: Sequence[int] = ()
-    sizes: Sequence[tuple[float, float]] = field(default=())
+    sizes: Sequence[tuple[float, float, float]] = field(default=())
 
 
 NOTHING_MORE = More()
@@ -142,7 +142,7 @@ def design_of(
         np.stack([np.log(np.asarray(noise.median)), np.asarray(noise.log_sd)]),
         np.array(largest, float),
         np.array([*(v.sign for v in variants), *more.sign], float),
-        np.array(more.sizes, float).reshape(-1, 2),
+        np.array(more.sizes, float).reshape(-1, 3),
         Kinds((*base.spreads, *more.own_spreads), model.correlation, model.along),
     )
 

@@ -307,22 +307,25 @@ def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, witho
         return -value, -slope * scale
 
     options = {"ftol": 1e-9, "gtol": 0.1, "maxiter": 40}
-    found = minimize(down, start / scale, jac=True, method="L-BFGS-B", options=options)
+    most = np.concatenate([np.full(4 + spreads, np.inf), design.misfits[:, 2]])
+    bounds = [(None, None if np.isinf(x) else x) for x in most / scale]
+    found = minimize(down, np.minimum(start, most) / scale, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
     joint = -float(found.fun)
     if joint < -1e29:
         raise FloatingPointError("the evidence of a hypothesis is no number")
     evidence, free = joint, found.x * scale
     if curvature:
-        wanted = np.arange(len(start))
+        bound = free >= most - 1e-6
+        evidence -= float(np.sum(np.log(np.maximum(-found.jac[bound] / scale[bound], 1.0))))  # an exponential, cut off
+        wanted = np.flatnonzero(~bound)
         if without is not None:
             wanted = wanted[wanted >= 4 + spreads]
             evidence += without.log_evidence - without.log_joint
-        columns = []
-        for j in wanted:
+        columns = np.zeros((len(wanted), len(wanted)))
+        for row, j in enumerate(wanted):
             e = np.where(np.arange(len(start)) == j, 0.3, 0.0)
-            columns.append((down(found.x + e)[1] - down(found.x - e)[1])[wanted] / 0.6)
-        hessian = (np.array(columns) + np.array(columns).T) / 2
-        values = np.maximum(np.linalg.eigvalsh(hessian), 1e-3)
+            columns[row] = (down(found.x + e)[1] - down(found.x - e)[1])[wanted] / 0.6
+        values = np.maximum(np.linalg.eigvalsh((columns + columns.T) / 2), 1e-3)
         evidence += 0.5 * len(wanted) * np.log(2 * np.pi) - 0.5 * np.sum(np.log(values)) + np.sum(np.log(scale[wanted]))
     return Optimum(free, float(evidence), joint, int(found.nfev))
 

@@ -254,7 +254,7 @@ class Search:
             more, log_prior = one.own.more, one.own.log_prior
         basis = [self.misfit_columns(r, i) for i in range(K)]
         middle = np.log(DECISIONS.misfit)
-        sizes = [(middle, DECISIONS.misfit_log_sd)] * K
+        sizes = [(middle, DECISIONS.misfit_log_sd, float(np.log(DECISIONS.misfit_most)))] * K
         group = [i + 1 for i in range(K) for _ in range(basis[i].shape[-1])]
         more = replace(more, basis=np.concatenate(basis, -1), group=group, sizes=sizes)
         design = design_of(self.base, r.state, r.variants, more)
@@ -273,7 +273,7 @@ class Search:
         basis, group = self.discrepancy
         unit = float(np.log(DECISIONS.general) + self.null.optimum.free[0])
         parts = max(group)
-        more = More(basis=basis, group=group, sizes=[(unit, DECISIONS.general_log_sd)] * parts)
+        more = More(basis=basis, group=group, sizes=[(unit, DECISIONS.general_log_sd, np.inf)] * parts)
         design = design_of(self.base, r.state, r.variants, more)
         optimum = optimise(design, np.append(r.optimum.free, [unit - 1.0] * parts), without=r.optimum)
         solution = solve(optimum.free, design)

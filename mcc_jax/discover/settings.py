@@ -20,9 +20,9 @@ class Decisions:
         unlisted: log prior odds of a listed name against a smooth discrepancy that no mechanism explains; beside a
             name it costs `pair`, too, as any second cause does.
         set_mass: names are reported, best first, until they hold this posterior probability together.
-        misfit, misfit_log_sd: size of what a mechanism's formulas miss of its effect, median and standard deviation of
-            the logarithm: 0.03 to 0.3 is what the library's own formulas leave of each other; with a size of 1 every
-            mechanism imitates every other.
+        misfit, misfit_log_sd, misfit_most: size of what a mechanism's formulas miss of its effect, median, standard
+            deviation of the logarithm, and the most: 0.03 to 0.3 is what the library's own formulas leave of each
+            other; with a size of 1 every mechanism imitates every other, and strong effects would have it.
         general, general_log_sd: size of a smooth discrepancy in standard deviations of white noise, likewise.
         jump: share of the tests in which a sudden step is expected, a priori: where it is looked for once more.
         least: particles that must be left before those that snap through are left out.
@@ -35,6 +35,7 @@ class Decisions:
     set_mass: float = 0.95
     misfit: float = 0.1
     misfit_log_sd: float = 0.8
+    misfit_most: float = 0.3
     general: float = 3.0
     general_log_sd: float = 1.5
     jump: float = 0.25

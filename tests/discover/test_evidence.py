@@ -88,7 +88,7 @@ def test_its_derivatives_are_those_of_differences(base, design):
     variants = find_variant("frame_compliance:linear"), find_variant("thermal_drift:linear")
     rng, mask = np.random.default_rng(1), np.asarray(base.tests.mask)
     basis = rng.normal(scale=0.1, size=(*mask.shape, 3)) * mask[..., None]
-    more = More(basis=basis, group=[1, 1, 2], sizes=[(-1.0, 1.0), (-2.0, 0.8)])
+    more = More(basis=basis, group=[1, 1, 2], sizes=[(-1.0, 1.0, np.inf), (-2.0, 0.8, np.inf)])
     two = design_of(base, base.state.with_numbers(np.zeros(2)), variants, more)
     for one, free in ((design, base.hyperparameters), (two, np.append(base.hyperparameters, [-1.0, -2.0]))):
         value, slope = value_and_gradient(free, one)
@@ -100,7 +100,7 @@ def test_its_derivatives_are_those_of_differences(base, design):
 
 def test_columns_of_nothing_have_no_say(base, design):
     """Room for a misfit that is not there: the same evidence, the same numbers."""
-    nothing = More(basis=np.zeros((*design.data.shape, 3)), group=[1] * 3, sizes=[(0.0, 1.0)])
+    nothing = More(basis=np.zeros((*design.data.shape, 3)), group=[1] * 3, sizes=[(0.0, 1.0, np.inf)])
     roomy = design_of(base, base.state, (), nothing)
     one, other = optimise(design, base.hyperparameters), optimise(roomy, np.append(base.hyperparameters, 0.0))
     assert other.log_evidence == pytest.approx(one.log_evidence, abs=0.02)
