@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from ..calibrate.compiling import compiled_quickly
 from ..calibrate.data import Tests
-from ..calibrate.forward import Forms, Point
+from ..calibrate.forward import Forms, Linear, Point
 from ..effects.record import RELOAD, UNLOAD
 from .settings import NUMERICS
 
@@ -59,6 +59,7 @@ def coordinates(point: Point, tests: Tests, forms: Forms) -> dict[str, Array]:
             "strain": c.peak_strain,
             "load": c.load_share,
             "force": c.force,
+            "peak_force": c.peak_force,
             "travel": c.displacement / tests.particle.effective_diameter,
             "drive": c.displacement,
             "time": jnp.log1p(time / 5.0),
@@ -86,7 +87,11 @@ def scaled(at: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]
         high = np.max(np.where(mask, x, -np.inf))
         return np.clip((x - low) / np.where(high > low, high - low, 1.0), 0.0, 1.0)
 
-    return {name: one(x) for name, x in at.items()}
+    found = {name: one(x) for name, x in at.items()}
+    high = float(np.max(np.where(mask, at["peak_force"], 0.0)))
+    for name in ("force", "peak_force"):  # of one scale
+        found[name] = np.clip(at[name] / max(high, 1e-300), 0.0, 1.0)
+    return found
 
 
 def functions(
@@ -136,15 +141,24 @@ def waves(x: np.ndarray, count: int = NUMERICS.waves) -> np.ndarray:
     return np.concatenate([np.cos(angle), np.sin(angle)], -1) / np.sqrt(count - 2)
 
 
-def general(at: dict[str, np.ndarray], size: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, list[int]]:
+def general(at: dict[str, np.ndarray], tests: Tests, linear: Linear) -> tuple[np.ndarray, list[int]]:
     """Functions of a discrepancy that no mechanism explains, and of which part each is, from 1 on.
 
     It is a sum of Gaussian processes, each in one coordinate and with a scale of its own, so that coordinates that
     explain nothing cost next to nothing (automatic relevance determination; Duvenaud et al. 2011). All are common to
-    all particles and in proportion to their size, but for what a drive does, which depends on micrometres alone. In
-    stress they are fine: a particle's layers and flaws yield within a narrow range of it. What a drive loses at a
-    reversal, it loses at once: there the time since the reversal is a coordinate, and reloading has parts of its own.
+    all particles and in proportion to their size, but for what a tester does, which depends on micrometres and
+    millinewtons alone. In stress they are fine: a particle's layers and flaws yield within a narrow range of it. What a
+    drive loses at a reversal, it loses at once: there the time since the reversal is a coordinate, and reloading has
+    parts of its own. A stress that the loading curve lacks, and a force that the cell gets wrong, move every particle
+    as far as it is soft.
+
+    Args:
+        at: coordinates of all points, between 0 and 1.
+        tests: the tests.
+        linear: how displacement moves with force.
     """
+    mask, size = np.asarray(tests.mask), np.asarray(tests.effective_diameter)
+    share = (size / np.mean(size))[:, None, None]
     since = splines(at["since"], NUMERICS.hats)
     turned = [
         np.concatenate([at[way][..., None], since * at[way][..., None]], -1) for way in ("unloading", "reloading")
@@ -158,7 +172,21 @@ def general(at: dict[str, np.ndarray], size: np.ndarray, mask: np.ndarray) -> tu
         waves(at["travel"]),
         waves(at["clock"]),
     ]
-    share = (size / np.mean(size))[:, None, None]
-    parts = [*(part * share for part in reduced), *turned, waves(at["drive"], NUMERICS.drive_waves)]
+    by_force, by_peak = (np.where(mask, x, 0.0)[..., None] for x in (linear.by_force, linear.by_peak))
+    yielding = np.where(np.asarray(tests.loading)[..., None], by_force, by_peak)
+    stress = splines(at["strain"], NUMERICS.splines) * yielding * size[:, None, None] ** 2
+    cell = by_force * cell_errors(at["force"]) + by_peak * cell_errors(at["peak_force"])
+    parts = [*(part * share for part in reduced), of_unit(stress, mask), of_unit(cell, mask)]
+    parts += [*turned, waves(at["drive"], NUMERICS.drive_waves)]
     groups = [k for k, part in enumerate(parts, 1) for _ in range(part.shape[-1])]
     return np.where(mask[..., None], np.concatenate(parts, -1), 0.0), groups
+
+
+def cell_errors(force: np.ndarray) -> np.ndarray:
+    """Smooth and periodic errors of a load cell."""
+    return np.concatenate([splines(force, NUMERICS.splines), waves(force)], -1)
+
+
+def of_unit(part: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Functions with a variance of 1 together, over all points that count."""
+    return part / max(float(np.sqrt(np.mean(np.sum(part[mask] ** 2, -1)))), 1e-300)

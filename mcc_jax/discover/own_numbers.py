@@ -63,6 +63,13 @@ class OwnNumbers:
     jumps: tuple[Jump, ...] = ()
     log_prior: float = 0.0
 
+    @property
+    def curve_um(self) -> np.ndarray:
+        """What its own numbers add to every test [um]."""
+        solution, K = self.at.solution, len(self.at.variants)
+        own = np.einsum("npo,no->np", self.at.design.own[..., 5:], solution.own[:, 5:])
+        return own + self.at.design.amplitude[..., K:] @ solution.amplitude[K:]
+
     def beside(
         self, base: Base, state: State, variants: tuple[Variant, ...], numbers: np.ndarray, free: np.ndarray
     ) -> OwnNumbers:

@@ -249,13 +249,15 @@ class Search:
         """Log evidence where every name's formula may be wrong."""
         r = one.formulas
         assert r is not None
-        K, more, log_prior = len(r.variants), NOTHING_MORE, 0.0
+        basis, more, log_prior = [self.misfit_columns(r, i) for i in range(len(r.variants))], NOTHING_MORE, 0.0
         if one.own is not None:
             more, log_prior = one.own.more, one.own.log_prior
-        basis = [self.misfit_columns(r, i) for i in range(K)]
-        middle = np.log(DECISIONS.misfit)
+            if not one.own.jumps:
+                which = COORDINATES.get(one.own.variant.mechanism, ANY)
+                basis.append(one.own.curve_um[..., None] * functions(which, self.at))
+        K, middle = len(basis), np.log(DECISIONS.misfit)
         sizes = [(middle, DECISIONS.misfit_log_sd, float(np.log(DECISIONS.misfit_most)))] * K
-        group = [i + 1 for i in range(K) for _ in range(basis[i].shape[-1])]
+        group = [i for i, columns in enumerate(basis, 1) for _ in range(columns.shape[-1])]
         more = replace(more, basis=np.concatenate(basis, -1), group=group, sizes=sizes)
         design = design_of(self.base, r.state, r.variants, more)
         optimum = optimise(design, np.append(r.optimum.free, [middle] * K), without=r.optimum)
@@ -265,8 +267,7 @@ class Search:
     @cached_property
     def discrepancy(self) -> tuple[np.ndarray, list[int]]:
         """Functions of what no mechanism explains, and of which part each is."""
-        tests = self.base.tests
-        return general(self.at, np.asarray(tests.effective_diameter), np.asarray(tests.mask))
+        return general(self.at, self.base.tests, self.null.design.linear)
 
     def smooth(self, r: Refined) -> Smooth:
         """A hypothesis with a smooth discrepancy beside it."""
@@ -351,7 +352,7 @@ class Search:
 
     def with_misfit_if_better(self, pair: Hypothesis, leader: Hypothesis) -> None:
         """The formulas of a pair may be wrong, too, where it explains more than the leader alone."""
-        if pair.alone > leader.alone and pair.formulas is not None and pair.formulas.variants:
+        if pair.alone > leader.alone:
             self.with_misfit(pair)
 
     def keep(self, names: Names, own: OwnNumbers | None) -> None:
@@ -389,6 +390,8 @@ class Search:
         for m, mechanism in self.library.items():
             if m not in self.shared:
                 self.keep((m,), self.of_their_own(m, mechanism, self.null))
+                if (own := self.found[m,].own) is not None and not own.jumps:
+                    self.with_misfit(self.found[m,])
         self.tell("a discrepancy on no list")
         smooth = self.smooth(self.null)
         self.found[UNLISTED] = Hypothesis(UNLISTED, smooth.optimum.log_evidence, smooth=smooth)
