@@ -30,7 +30,7 @@ from mcc_jax.discover.base import Base, base_fit
 from mcc_jax.discover.candidates import Candidate, candidates_of, located
 from mcc_jax.discover.columns import with_amplitudes
 from mcc_jax.discover.design import design_of
-from mcc_jax.discover.evidence import left_by_particle, without_first
+from mcc_jax.discover.evidence import left_by_particle, visible, without_first
 from mcc_jax.discover.misfit import coordinates, scaled
 from mcc_jax.discover.screen import signature_columns
 from mcc_jax.discover.search import Search
@@ -91,7 +91,9 @@ def in_span(
     searching: Any = SimpleNamespace(at=at, screen=SimpleNamespace(columns=columns), first_order=first_order)
     design, theta = SimpleNamespace(amplitude=columns[..., s : s + 1]), np.array([amplitude * sibling.plausible[0]])
     fitted: Any = SimpleNamespace(variants=(sibling,), design=design, theta=theta)
-    span = Search.misfit_columns(searching, fitted, 0)
+    here = design_of(base, base.state)
+    seen = visible(base.hyperparameters, here, columns[..., s])
+    span = seen * Search.misfit_columns(searching, fitted, 0)
     count = span.shape[-1]
     products = gram(base, np.concatenate([unit * columns[..., [k, s]], span], -1))
     alone = remaining(products[:2, :2], np.zeros(1))

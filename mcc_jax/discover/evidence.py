@@ -21,7 +21,7 @@ from jaxtyping import Float
 from scipy.special import log_ndtr
 
 from ..calibrate.distributions import SCALES, SpreadCoordinate
-from .columns import LOG_2PI, Columns, Design, White
+from .columns import LOG_2PI, Columns, Design, White, with_amplitudes
 from .settings import NUMERICS
 
 
@@ -328,6 +328,14 @@ def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, witho
         values = np.maximum(np.linalg.eigvalsh((columns + columns.T) / 2), 1e-3)
         evidence += 0.5 * len(wanted) * np.log(2 * np.pi) - 0.5 * np.sum(np.log(values)) + np.sum(np.log(scale[wanted]))
     return Optimum(free, float(evidence), joint, int(found.nfev))
+
+
+def visible(free: np.ndarray, design: Design, curve: np.ndarray) -> float:
+    """What the particles' own numbers and the population leave of a curve [um], as a share of it, in units of noise."""
+    whole = float(np.sum(whitened(free, design, curve)[0] ** 2))
+    left = left_by_particle(free, with_amplitudes(design, curve[..., None])).gram.sum(0)
+    seen = float(without_first(left, design.common.shape[-1])[0][0, 0])
+    return float(np.sqrt(np.clip(seen / max(whole, 1e-300), 0.0, 1.0)))
 
 
 def residual_of(solution: Solution, design: Design) -> Float[np.ndarray, "particles points"]:

@@ -17,7 +17,7 @@ from .base import Base, State
 from .candidates import Candidate, candidates_of, located
 from .columns import Design, with_amplitudes, with_noise
 from .design import NOTHING_MORE, More, design_of
-from .evidence import Optimum, Solution, left_by_particle, optimise, solve, with_little_noise, without_first
+from .evidence import Optimum, Solution, left_by_particle, optimise, solve, visible, with_little_noise, without_first
 from .misfit import ANY, COORDINATES, coordinates, functions, general, scaled
 from .own_numbers import OwnNumbers, differing, sudden_steps
 from .refine import Refined, refined
@@ -61,12 +61,10 @@ class Hypothesis:
 
     @property
     def log_evidence(self) -> float:
-        """Log marginal likelihood, its forms averaged; as probable as each other, but for a
-        discrepancy beside a name, which is a second cause that is on no list."""
+        """Log marginal likelihood, averaged over its formulas alone and with their misfit."""
         if not self.names or self.names == UNLISTED or (self.own is not None and not np.isfinite(self.with_misfit)):
             return self.alone + self.other_noise
-        forms = [self.alone, self.with_misfit, self.beside - DECISIONS.pair - DECISIONS.unlisted]
-        return float(logsumexp(forms) - np.log(2)) + self.other_noise
+        return float(np.logaddexp(self.alone, self.with_misfit) - np.log(2)) + self.other_noise
 
     @property
     def fitted(self) -> tuple[Design, Optimum, Solution] | None:
@@ -161,6 +159,12 @@ class Search:
             elif len(names) == 2:
                 prior = -DECISIONS.pair - np.log(count * (count - 1) / 2)
             logs[names] = one.log_evidence + prior
+        for names, one in self.found.items():
+            if len(names) == 1 and np.isfinite(one.beside):
+                # Two causes, of which one is on no list: they count for the one that explains more by itself.
+                both = one.beside + one.other_noise - np.log(2 * count) - DECISIONS.pair - DECISIONS.unlisted
+                larger = names if logs[names] >= logs[UNLISTED] else UNLISTED
+                logs[larger] = float(np.logaddexp(logs[larger], both))
         fewer = max(v for names, v in logs.items() if len(names) < 2)
         kept = {names: v for names, v in logs.items() if len(names) < 2 or v > fewer + DECISIONS.margin}
         return dict(sorted(kept.items(), key=lambda item: -item[1]))
@@ -250,11 +254,16 @@ class Search:
         r = one.formulas
         assert r is not None
         basis, more, log_prior = [self.misfit_columns(r, i) for i in range(len(r.variants))], NOTHING_MORE, 0.0
+        curves = list(np.moveaxis(r.design.amplitude[..., : len(r.variants)], -1, 0))
         if one.own is not None:
             more, log_prior = one.own.more, one.own.log_prior
             if not one.own.jumps:
                 which = COORDINATES.get(one.own.variant.mechanism, ANY)
-                basis.append(one.own.curve_um[..., None] * functions(which, self.at))
+                curves.append(one.own.curve_um)
+                basis.append(curves[-1][..., None] * functions(which, self.at))
+        # A formula is wrong by a share of what can be seen of it: most of some is like a particle's own numbers.
+        free = r.optimum.free
+        basis = [visible(free, r.design, curve) * columns for curve, columns in zip(curves, basis, strict=True)]
         K, middle = len(basis), np.log(DECISIONS.misfit)
         sizes = [(middle, DECISIONS.misfit_log_sd, float(np.log(DECISIONS.misfit_most)))] * K
         group = [i for i, columns in enumerate(basis, 1) for _ in range(columns.shape[-1])]
