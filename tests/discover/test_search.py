@@ -1,5 +1,7 @@
 """A search over few mechanisms: posterior, sets, places, held-out gap, bootstrap."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from campaigns import base_of, cached
@@ -102,6 +104,23 @@ def test_two_names_must_lead_by_the_margin(named):
 
 
 def test_what_no_mechanism_explains_has_prior_odds_of_its_own(named):
+    kept = dict(named.found)
+    named.found = {n: replace(h, beside=-np.inf) for n, h in kept.items()}
     logs = named.log_posteriors()
-    smooth = named.found[UNLISTED]
-    assert logs[UNLISTED] == pytest.approx(smooth.log_evidence - DECISIONS.unlisted)
+    assert logs[UNLISTED] == pytest.approx(kept[UNLISTED].log_evidence - DECISIONS.unlisted)
+    named.found = kept
+
+
+def test_a_name_beside_a_discrepancy_counts_for_what_explains_more(named):
+    kept = dict(named.found)
+    smooth = kept[UNLISTED].log_evidence
+    for own, larger in ((smooth - 50, UNLISTED), (smooth + 50, ("damage",))):
+        damage = Hypothesis(("damage",), alone=own, with_misfit=own)
+        others = {n: replace(h, beside=-np.inf) for n, h in kept.items()}
+        logs = []
+        for beside in (-np.inf, smooth + 200):
+            named.found = {**others, ("damage",): replace(damage, beside=beside)}
+            logs.append(named.log_posteriors())
+        assert logs[1][larger] > logs[0][larger] + 50
+        assert [n for n in logs[0] if logs[0][n] != logs[1][n]] == [larger]
+    named.found = kept
