@@ -13,6 +13,7 @@ posterior mode, and their curvature is integrated by Laplace's method.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -218,6 +219,33 @@ def value_and_gradient(free: np.ndarray, design: Design) -> tuple[float, np.ndar
     return value, slope
 
 
+class OfMisfits:
+    """The log joint density as a function of the misfits' scales alone: at fixed noise and spreads it costs nothing."""
+
+    def __init__(self, free: np.ndarray, design: Design) -> None:
+        o, c = design.own.shape[-1], design.common.shape[-1]
+        self.design, self.fixed = design, free[: 4 + len(design.kinds.spreads)]
+        white, factor = design.columns.white(free), _factor(free, design)
+        factor[o : o + c] = 1.0
+        by_particle = _integrated(_gram(white, factor), o)
+        self.gram, self.integrals = by_particle.left.sum(0), float((by_particle.log_integral + white.log_density).sum())
+
+    def __call__(self, logs: np.ndarray) -> tuple[float, np.ndarray]:
+        """Value and derivatives at the logarithms of the scales."""
+        design, c = self.design, self.design.common.shape[-1]
+        free = np.concatenate([self.fixed, logs])
+        factor = np.ones(len(self.gram))
+        factor[:c] = scales_of(free, design)[1]
+        with np.errstate(all="ignore"):
+            gram = self.gram * factor * factor[:, None]
+            shared = _integrated(gram, c)
+            effects = amplitudes(shared.left, design.sign, design.largest)
+            prior, slope = _prior(free, design)
+            of_log = 2 * np.sum(shared.slope(effects.slope) * gram, 0)[:c]
+        value = self.integrals + float(shared.log_integral) + effects.log_integral + prior
+        return value, slope[len(self.fixed) :] + np.bincount(design.group, of_log, len(logs) + 1)[1:]
+
+
 def log_joint(free: np.ndarray, design: Design) -> float:
     """Log marginal likelihood at the hyperparameters, times their prior."""
     left = left_by_particle(free, design)
@@ -279,6 +307,16 @@ class Optimum:
     evaluations: int
 
 
+def _upside_down(
+    function: Callable[..., tuple[float, np.ndarray]], at: np.ndarray, scale: np.ndarray, *given: Any
+) -> tuple[float, np.ndarray]:
+    """A function to be minimised in scaled coordinates; a step into numbers beyond arithmetic is taken back."""
+    value, slope = function(at, *given)
+    if not (np.isfinite(value) and np.isfinite(slope).all()):
+        return 1e30, np.zeros(len(at))
+    return -value, -slope * scale
+
+
 def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, without: Optimum | None = None) -> Optimum:
     """The mode of the hyperparameters by L-BFGS, in coordinates scaled by their expected curvature.
 
@@ -300,31 +338,54 @@ def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, witho
     expected[4 : 4 + spreads] = 2.0 * len(design.tests)
     scale = 1 / np.sqrt(expected)
 
-    def down(x: np.ndarray) -> tuple[float, np.ndarray]:
-        value, slope = value_and_gradient(x * scale, design)
-        if not (np.isfinite(value) and np.isfinite(slope).all()):
-            return 1e30, np.zeros(len(x))  # a step into numbers beyond arithmetic is taken back
-        return -value, -slope * scale
-
-    options = {"ftol": 1e-9, "gtol": 0.1, "maxiter": 40}
-    most = np.concatenate([np.full(4 + spreads, np.inf), design.misfits[:, 2]])
+    first = 4 + spreads
+    options: Any = {"ftol": 1e-7, "gtol": 0.1, "maxiter": 40}
+    most = np.concatenate([np.full(first, np.inf), design.misfits[:, 2]])
     bounds = [(None, None if np.isinf(x) else x) for x in most / scale]
-    found = minimize(down, np.minimum(start, most) / scale, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-    joint = -float(found.fun)
+    best = np.minimum(start, most) / scale
+
+    def of_misfits(x: np.ndarray, design: Design) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:
+        """Of the scales of misfits alone, upside down."""
+        some = OfMisfits(x * scale, design)
+        return lambda y: _upside_down(some, y * scale[first:], scale[first:])
+
+    def down(x: np.ndarray) -> tuple[float, np.ndarray]:
+        # Scales of misfits cost nothing while noise and spreads stay: they follow, and at their mode have no slope.
+        best[:first] = x
+        if len(design.misfits):
+            best[first:] = minimize(
+                of_misfits(best, design), best[first:], jac=True, method="L-BFGS-B", bounds=bounds[first:],
+                options=options,
+            ).x  # fmt: skip
+        value, slope = _upside_down(value_and_gradient, best * scale, scale, design)
+        if value < least[0]:
+            least[:] = value, best.copy(), slope
+        return value, slope[:first]
+
+    least: list[Any] = [1e30, best, np.zeros(len(start))]
+    found = minimize(down, best[:first].copy(), jac=True, method="L-BFGS-B", options=options)
+    value, x, jac = least
+    joint = -float(value)
     if joint < -1e29:
         raise FloatingPointError("the evidence of a hypothesis is no number")
-    evidence, free = joint, found.x * scale
+    evidence, free = joint, x * scale
     if curvature:
         bound = free >= most - 1e-6
-        evidence -= float(np.sum(np.log(np.maximum(-found.jac[bound] / scale[bound], 1.0))))  # an exponential, cut off
-        wanted = np.flatnonzero(~bound)
+        evidence -= float(np.sum(np.log(np.maximum(-jac[bound] / scale[bound], 1.0))))  # an exponential, cut off
+        wanted, some = np.flatnonzero(~bound), of_misfits(x, design)
         if without is not None:
-            wanted = wanted[wanted >= 4 + spreads]
+            wanted = wanted[wanted >= first]
             evidence += without.log_evidence - without.log_joint
+
+        def slope(x: np.ndarray) -> np.ndarray:
+            if without is None:
+                return _upside_down(value_and_gradient, x * scale, scale, design)[1]
+            return np.concatenate([np.zeros(first), some(x[first:])[1]])
+
         columns = np.zeros((len(wanted), len(wanted)))
         for row, j in enumerate(wanted):
             e = np.where(np.arange(len(start)) == j, 0.3, 0.0)
-            columns[row] = (down(found.x + e)[1] - down(found.x - e)[1])[wanted] / 0.6
+            columns[row] = (slope(x + e) - slope(x - e))[wanted] / 0.6
         values = np.maximum(np.linalg.eigvalsh((columns + columns.T) / 2), 1e-3)
         evidence += 0.5 * len(wanted) * np.log(2 * np.pi) - 0.5 * np.sum(np.log(values)) + np.sum(np.log(scale[wanted]))
     return Optimum(free, float(evidence), joint, int(found.nfev))
