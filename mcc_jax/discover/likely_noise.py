@@ -1,0 +1,58 @@
+"""Kinds of noise, which are part of every hypothesis: which one the tests prefer, and what another would do."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..calibrate.model import Model
+from ..calibrate.noise import Along, Correlation
+from .base import Base
+from .columns import Design, with_noise
+from .design import design_of
+from .evidence import Optimum, optimise
+from .settings import NUMERICS
+
+
+def with_other_noise(design: Design, free: np.ndarray, model: Model) -> Optimum:
+    """The mode of the hyperparameters under the noise of a model, from the mode under another."""
+    other, start = with_noise(design, model), free.copy()
+    start[3] = other.noise[0, 3]  # the length's unit may be another
+    return optimise(other, start, curvature=False)
+
+
+def with_likely_noise(base: Base) -> tuple[Base, Optimum]:
+    """The base law at its mode, under the kind of noise that the tests prefer: the model's own unless clearly not.
+
+    A search under noise that the tests are not of fits formulas to what the noise leaves.
+    """
+    design = design_of(base, base.state)
+    own = optimise(design, base.hyperparameters, curvature=False)
+    others = [(with_other_noise(design, own.free, model), model) for model in noise_models(base)]
+    best, model = max(others, key=lambda one: one[0].log_joint)
+    if best.log_joint > own.log_joint + NUMERICS.strong:
+        return replace(base, model=model), best
+    return base, own
+
+
+def noise_models(base: Base) -> tuple[Model, ...]:
+    """The model with other kinds of noise: rough or smooth along the load, or smooth in time.
+
+    The prior of its length keeps its share of a test.
+    """
+    tests, model = base.tests, base.model
+    mask, prior = np.asarray(tests.mask), model.chosen_priors
+
+    def length(along: Along) -> float:
+        x = tests.path if along is Along.LOAD else tests.record.time
+        return max(float(np.median(np.where(mask, x, -np.inf).max(1) - np.where(mask, x, np.inf).min(1))), 1e-9)
+
+    models = []
+    rough, smooth = Correlation.EXPONENTIAL, Correlation.MATERN_32
+    for correlation, along in ((rough, Along.LOAD), (smooth, Along.LOAD), (smooth, Along.TIME)):
+        if (correlation, along) != (model.correlation, model.along):
+            median = prior.noise_length.median * length(along) / length(model.along)
+            priors = replace(prior, noise_length=replace(prior.noise_length, median=median))
+            models.append(replace(model, correlation=correlation, along=along, priors=priors))
+    return tuple(models)
