@@ -92,7 +92,7 @@ def in_span(
     design, theta = SimpleNamespace(amplitude=columns[..., s : s + 1]), np.array([amplitude * sibling.plausible[0]])
     fitted: Any = SimpleNamespace(variants=(sibling,), design=design, theta=theta)
     here = design_of(base, base.state)
-    seen = visible(base.hyperparameters, here, columns[..., s])
+    seen = visible(base.hyperparameters, here, columns[..., s : s + 1])[0]
     span = seen * Search.misfit_columns(searching, fitted, 0)
     count = span.shape[-1]
     products = gram(base, np.concatenate([unit * columns[..., [k, s]], span], -1))

@@ -84,8 +84,14 @@ class Kinds:
 
 def with_noise(design: Design, model: Model) -> Design:
     """The design with the noise of a model."""
-    prior, kinds = model.chosen_priors.noise, replace(design.kinds, correlation=model.correlation, along=model.along)
-    return replace(design, noise=np.stack([np.log(np.asarray(prior.median)), np.asarray(prior.log_sd)]), kinds=kinds)
+    kinds = replace(design.kinds, correlation=model.correlation, along=model.along)
+    return replace(design, noise=prior_of_noise(model), kinds=kinds)
+
+
+def prior_of_noise(model: Model) -> np.ndarray:
+    """As `Design.noise` has it."""
+    prior = model.chosen_priors.noise
+    return np.stack([np.log(np.asarray(prior.median)), np.asarray(prior.log_sd)])
 
 
 def with_amplitudes(design: Design, columns: np.ndarray) -> Design:
@@ -142,6 +148,7 @@ class Columns:
 
     def __init__(self, columns: np.ndarray, design: Design) -> None:
         self.shape = columns.shape
+        self._last: tuple[tuple[float, ...], White] | None = None
         self.some = np.flatnonzero(np.any(columns != 0, axis=(0, 1)))
         least, most = NUMERICS.columns
         size = min(max(NUMERICS.entries // (self.shape[0] * self.shape[1]), least), most)
@@ -158,11 +165,16 @@ class Columns:
         return jnp.asarray(free[:4]), *self.arrays, piece, self.correlation
 
     def white(self, free: np.ndarray) -> White:
-        """Whitened at the hyperparameters."""
+        """Whitened at the hyperparameters; those of the last call are kept, since most are asked for more than once."""
+        noise = tuple(map(float, free[:4]))
+        if self._last is not None and self._last[0] == noise:
+            return self._last[1]
         found = [jax.tree.map(np.asarray, white_of(*self._given(free, piece))) for piece in self.pieces]
         columns = np.zeros(self.shape)
         columns[..., self.some] = np.concatenate([one.columns for one in found], -1)[..., : len(self.some)]
-        return found[0]._replace(columns=columns)
+        white = found[0]._replace(columns=columns)
+        self._last = noise, white
+        return white
 
     def slope(self, free: np.ndarray, of_white: np.ndarray, of_reading: float) -> np.ndarray:
         """Derivatives of something by the noise's numbers, from those by the whitened columns and by the readings; the

@@ -17,7 +17,7 @@ from ..calibrate.fitting import linear_data
 from ..calibrate.forward import Forms, Linear, Point, linearise
 from ..effects import Variant
 from .base import Base, State
-from .columns import Design, Kinds
+from .columns import Design, Kinds, prior_of_noise
 from .evidence import Solution
 from .settings import NUMERICS, POPULATION
 
@@ -128,7 +128,6 @@ def design_of(
             common.append((sd * column)[..., None])
             place += 1
     shared = np.concatenate([*common, *([] if more.basis is None else [more.basis])], -1)
-    noise = base.model.chosen_priors.noise
     largest = [*(v.plausible[1] / v.plausible[0] for v in variants), *more.largest]
     return Design(
         tests,
@@ -139,7 +138,7 @@ def design_of(
         data,
         base.scale,
         np.array([0] * (shared.shape[-1] - len(more.group)) + list(more.group), int),
-        np.stack([np.log(np.asarray(noise.median)), np.asarray(noise.log_sd)]),
+        prior_of_noise(model),
         np.array(largest, float),
         np.array([*(v.sign for v in variants), *more.sign], float),
         np.array(more.sizes, float).reshape(-1, 3),

@@ -344,7 +344,7 @@ def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, witho
     bounds = [(None, None if np.isinf(x) else x) for x in most / scale]
     best = np.minimum(start, most) / scale
 
-    def of_misfits(x: np.ndarray, design: Design) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:
+    def of_misfits(x: np.ndarray) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:
         """Of the scales of misfits alone, upside down."""
         some = OfMisfits(x * scale, design)
         return lambda y: _upside_down(some, y * scale[first:], scale[first:])
@@ -354,7 +354,7 @@ def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, witho
         best[:first] = x
         if len(design.misfits):
             best[first:] = minimize(
-                of_misfits(best, design), best[first:], jac=True, method="L-BFGS-B", bounds=bounds[first:],
+                of_misfits(best), best[first:], jac=True, method="L-BFGS-B", bounds=bounds[first:],
                 options=options,
             ).x  # fmt: skip
         value, slope = _upside_down(value_and_gradient, best * scale, scale, design)
@@ -372,13 +372,13 @@ def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, witho
     if curvature:
         bound = free >= most - 1e-6
         evidence -= float(np.sum(np.log(np.maximum(-jac[bound] / scale[bound], 1.0))))  # an exponential, cut off
-        wanted, some = np.flatnonzero(~bound), of_misfits(x, design)
+        wanted, some = np.flatnonzero(~bound), None
         if without is not None:
-            wanted = wanted[wanted >= first]
+            wanted, some = wanted[wanted >= first], of_misfits(x)
             evidence += without.log_evidence - without.log_joint
 
         def slope(x: np.ndarray) -> np.ndarray:
-            if without is None:
+            if some is None:
                 return _upside_down(value_and_gradient, x * scale, scale, design)[1]
             return np.concatenate([np.zeros(first), some(x[first:])[1]])
 
@@ -391,12 +391,13 @@ def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, witho
     return Optimum(free, float(evidence), joint, int(found.nfev))
 
 
-def visible(free: np.ndarray, design: Design, curve: np.ndarray) -> float:
-    """What the particles' own numbers and the population leave of a curve [um], as a share of it, in units of noise."""
-    whole = float(np.sum(whitened(free, design, curve)[0] ** 2))
-    left = left_by_particle(free, with_amplitudes(design, curve[..., None])).gram.sum(0)
-    seen = float(without_first(left, design.common.shape[-1])[0][0, 0])
-    return float(np.sqrt(np.clip(seen / max(whole, 1e-300), 0.0, 1.0)))
+def visible(free: np.ndarray, design: Design, curves: np.ndarray) -> np.ndarray:
+    """What the particles' own numbers and the population leave of each curve [um], as a share, in units of noise."""
+    with_curves = with_amplitudes(design, curves)
+    gram = _gram(with_curves.columns.white(free), _factor(free, with_curves))
+    whole = np.diagonal(gram.sum(0))[-1 - curves.shape[-1] : -1]
+    left, _ = without_first(without_first(gram, design.own.shape[-1])[0].sum(0), design.common.shape[-1])
+    return np.sqrt(np.clip(np.diagonal(left)[:-1] / np.maximum(whole, 1e-300), 0.0, 1.0))
 
 
 def residual_of(solution: Solution, design: Design) -> Float[np.ndarray, "particles points"]:

@@ -262,8 +262,8 @@ class Search:
                 curves.append(one.own.curve_um)
                 basis.append(curves[-1][..., None] * functions(which, self.at))
         # A formula is wrong by a share of what can be seen of it: most of some is like a particle's own numbers.
-        free = r.optimum.free
-        basis = [visible(free, r.design, curve) * columns for curve, columns in zip(curves, basis, strict=True)]
+        seen = visible(r.optimum.free, r.design, np.stack(curves, -1))
+        basis = [share * columns for share, columns in zip(seen, basis, strict=True)]
         K, middle = len(basis), np.log(DECISIONS.misfit)
         sizes = [(middle, DECISIONS.misfit_log_sd, float(np.log(DECISIONS.misfit_most)))] * K
         group = [i for i, columns in enumerate(basis, 1) for _ in range(columns.shape[-1])]
@@ -361,7 +361,7 @@ class Search:
 
     def with_misfit_if_better(self, pair: Hypothesis, leader: Hypothesis) -> None:
         """The formulas of a pair may be wrong, too, where it explains more than the leader alone."""
-        if pair.alone > leader.alone:
+        if pair.alone > leader.alone and not np.isfinite(pair.with_misfit):
             self.with_misfit(pair)
 
     def keep(self, names: Names, own: OwnNumbers | None) -> None:
