@@ -7,43 +7,87 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.special import ndtr
 
 from ..calibrate import Posterior
 from ..calibrate.estimates import estimate, finite, summary
 from ..effects import Mechanism
 from .base import Base
-from .evidence import left_by_particle, residual_of, scales_of, whitened
+from .evidence import left_by_particle, residual_of, scales_of, solve, whitened
 from .own_numbers import OwnNumbers
 from .result import Effect, Likeness, Residuals
 from .search import UNLISTED, Hypothesis, Names, Search
 from .settings import DECISIONS, POPULATION, TELLING
 
 
-def population_parameters(search: Search, names: Names) -> dict[str, Any]:
-    """The population's parameters under a hypothesis, by the curvature of its linear model."""
-    fitted = search.found[names].fitted
-    assert fitted is not None
-    design, optimum, solution = fitted
-    mean, factor = map(np.asarray, search.base.population_prior)
-    beta = mean + factor @ np.asarray(solution.common[:POPULATION])
-    sd = np.sqrt(np.diagonal(factor @ _covariance(design, optimum.free)[:POPULATION, :POPULATION] @ factor.T))
-    tau, _ = scales_of(optimum.free, design)
-    shift = float(np.mean(np.log1p(np.maximum(beta[0] * np.asarray(design.tests.flatness), -0.99))))
-    means = beta[2:5] - shift
+def population_parameters(search: Search, probabilities: Mapping[Names, float]) -> dict[str, Any]:
+    """The population's parameters, averaged over hypotheses (Bayesian model averaging, Hoeting et al. 1999).
 
-    def entry(value: float, width: float) -> dict[str, Any]:
-        return estimate(value, width, (value - 1.96 * width, value + 1.96 * width))
+    Args:
+        search: the hypotheses.
+        probabilities: of those that are averaged over; their sum need not be 1.
+    """
+    each = [_population(search, names) for names in probabilities]
+    weights = np.array(list(probabilities.values())) / sum(probabilities.values())
+    mean, sd, tau = (np.array(parts) for parts in zip(*each, strict=True))
+    middle = weights @ mean
+    wide = np.sqrt(weights @ (sd**2 + (mean - middle) ** 2))
+    low, high = (_quantiles(q, weights, mean, sd) for q in (0.025, 0.975))
+    spread, modulus = weights @ tau, float(np.exp(middle[1]))
 
-    modulus = float(np.exp(beta[1]))
-    low, high = (modulus * float(np.exp(sign * 1.96 * sd[1])) for sign in (-1, 1))
+    def entry(j: int) -> dict[str, Any]:
+        return estimate(float(middle[j]), float(wide[j]), (low[j], high[j]))
+
     return {
-        "a": entry(float(beta[0]), float(sd[0])),
-        "effective_modulus_MPa": estimate(modulus, modulus * float(sd[1]), (low, high)),
+        "a": entry(0),
+        "effective_modulus_MPa": estimate(
+            modulus, modulus * float(wide[1]), (float(np.exp(low[1])), float(np.exp(high[1])))
+        ),
         **{
-            f"log_{name}": {"mean": entry(float(means[j]), float(sd[2 + j])), "sd": estimate(float(tau[j]))}
+            f"log_{name}": {"mean": entry(2 + j), "sd": estimate(float(spread[j]))}
             for j, name in enumerate(("C1", "C3", "C5"))
         },
     }
+
+
+def likely(search: Search) -> dict[Names, float]:
+    """The most probable hypotheses that are fitted, as many as hold what a set must."""
+    found: dict[Names, float] = {}
+    for names, probability in search.posterior().items():
+        if sum(found.values()) < DECISIONS.set_mass and search.found[names].fitted is not None:
+            found[names] = probability
+    return found
+
+
+def _population(search: Search, names: Names) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Means of a, log modulus and of log C1, C3, C5 under a hypothesis, their errors, and the spreads of the latter.
+
+    Errors are those of the linear model. Where the formulas are off, so is the law that would answer for it: the misfit
+    is integrated out, too, and widens the errors (Brynjarsdottir and O'Hagan 2014).
+    """
+    one = search.found[names]
+    assert one.fitted is not None
+    design, optimum, solution = one.fitted
+    free = optimum.free
+    if one.is_off and one.misfit_at is not None:
+        design, free = search.misfit_design(one), one.misfit_at
+        solution = solve(free, design)
+    mean, factor = map(np.asarray, search.base.population_prior)
+    beta = mean + factor @ np.asarray(solution.common[:POPULATION])
+    sd = np.sqrt(np.diagonal(factor @ _covariance(design, free)[:POPULATION, :POPULATION] @ factor.T))
+    beta[2:] -= np.mean(np.log1p(np.maximum(beta[0] * np.asarray(design.tests.flatness), -0.99)))
+    return beta, sd, np.asarray(scales_of(free, design)[0])[:3]
+
+
+def _quantiles(q: float, weights: np.ndarray, mean: np.ndarray, sd: np.ndarray) -> list[float]:
+    """Quantiles of mixtures of normal distributions, one a column."""
+    from scipy.optimize import root_scalar
+
+    def below(x: float, j: int) -> float:
+        return float(weights @ ndtr((x - mean[:, j]) / sd[:, j])) - q
+
+    low, high = np.min(mean - 9 * sd, 0), np.max(mean + 9 * sd, 0)
+    return [root_scalar(below, args=(j,), bracket=(low[j], high[j])).root for j in range(mean.shape[1])]
 
 
 def _covariance(design: Any, free: np.ndarray) -> np.ndarray:
@@ -68,7 +112,7 @@ def effects_of(search: Search, names: Names, probabilities: Mapping[str, float],
         nuisance = {n.name: float(r.theta[place + i]) for i, n in enumerate(variant.nuisances)}
         place += len(nuisance)
         sd = float(np.sqrt(cov[c + k, c + k])) * variant.plausible[0]
-        size = one.sizes[k] if k < len(one.sizes) and one.with_misfit > one.alone else 0.0
+        size = one.sizes[k] if k < len(one.sizes) and one.is_off else 0.0
         amplitude = float(r.theta[k])
         found.append(Effect(variant, nuisance, amplitude, sd, probabilities[variant.mechanism], p_any, misfit=size))
     order = {name: i for i, name in enumerate(sorted(names, key=lambda n: -search.found[(n,)].log_evidence))}

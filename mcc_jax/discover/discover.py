@@ -21,6 +21,7 @@ from .answer import (
     effects_of,
     leader_of,
     leads_of,
+    likely,
     likeness_of,
     name_probabilities,
     population_parameters,
@@ -123,7 +124,7 @@ def discover(
         ranking=ranking,
         untestable=tuple(missing),
         p_any=p_any,
-        parameters_before=population_parameters(search, ()),
+        parameters_before=population_parameters(search, {(): 1.0}),
         notes=_notes(base),
         likeness=likeness_of(search, (), ranking),
     )
@@ -210,7 +211,7 @@ def _named(found: Discovery, search: Search, known: Mapping[str, Mechanism], tel
         residuals=left,
         places=map_,
         where=tuple(where(search.base, map_)),
-        parameters_after=population_parameters(search, winner),
+        parameters_after=population_parameters(search, likely(search)),
         leads=leads_of(search, winner),
     )
     if winner == UNLISTED:
@@ -244,6 +245,13 @@ def _sampled(found: Discovery, base: Base, threshold_MPa: float, seed: int, tell
         return replace(found, posterior=drawn, notes=(*found.notes, note))
     answer: dict[str, Any] = {k: v for k, v in drawn.answer().items() if k != "converged"}
     effects: tuple[Effect, ...] = tuple(with_draws(effect, drawn) for effect in found.effects)
+    if found.verdict == "SET" or any(effect.misfit for effect in effects):
+        # The draws take the leading formula for true: their errors would be too small.
+        note = (
+            "parameters and their errors allow for what else may be missing and for how far the formula is off; the "
+            "posterior's draws take the formula as it stands"
+        )
+        return replace(found, posterior=drawn, effects=effects, notes=(*found.notes, note))
     return replace(found, posterior=drawn, effects=effects, parameters_after=answer)
 
 

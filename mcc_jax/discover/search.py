@@ -46,6 +46,7 @@ class Hypothesis:
         own: numbers of every test's own instead.
         smooth: the discrepancy of `UNLISTED`.
         sizes: how far the formulas are off, as shares of the effects.
+        misfit_at: hyperparameters with their misfit, at the mode.
         other_noise: what another kind of noise adds to its log evidence.
     """
 
@@ -57,6 +58,7 @@ class Hypothesis:
     own: OwnNumbers | None = None
     smooth: Smooth | None = None
     sizes: tuple[float, ...] = ()
+    misfit_at: np.ndarray | None = None
     other_noise: float = 0.0
 
     @property
@@ -71,6 +73,11 @@ class Hypothesis:
         """Design, hyperparameters and numbers of the form in which it is added to the law."""
         one = self.smooth or self.formulas
         return None if one is None else (one.design, one.optimum, one.solution)
+
+    @property
+    def is_off(self) -> bool:
+        """Whether the tests prefer its formulas with a misfit."""
+        return self.with_misfit > self.alone
 
     @property
     def formulas(self) -> Refined | None:
@@ -249,14 +256,14 @@ class Search:
         siblings = np.stack(others, -1) if others else smooth[..., :0]
         return np.concatenate([siblings, smooth], -1)
 
-    def with_misfit(self, one: Hypothesis) -> None:
-        """Log evidence where every name's formula may be wrong."""
+    def misfit_design(self, one: Hypothesis) -> Design:
+        """A hypothesis where every name's formula may be wrong."""
         r = one.formulas
         assert r is not None
-        basis, more, log_prior = [self.misfit_columns(r, i) for i in range(len(r.variants))], NOTHING_MORE, 0.0
+        basis, more = [self.misfit_columns(r, i) for i in range(len(r.variants))], NOTHING_MORE
         curves = list(np.moveaxis(r.design.amplitude[..., : len(r.variants)], -1, 0))
         if one.own is not None:
-            more, log_prior = one.own.more, one.own.log_prior
+            more = one.own.more
             if not one.own.jumps:
                 which = COORDINATES.get(one.own.variant.mechanism, ANY)
                 curves.append(one.own.curve_um)
@@ -264,14 +271,20 @@ class Search:
         # A formula is wrong by a share of what can be seen of it: most of some is like a particle's own numbers.
         seen = visible(r.optimum.free, r.design, np.stack(curves, -1))
         basis = [share * columns for share, columns in zip(seen, basis, strict=True)]
-        K, middle = len(basis), np.log(DECISIONS.misfit)
-        sizes = [(middle, DECISIONS.misfit_log_sd, float(np.log(DECISIONS.misfit_most)))] * K
+        sizes = [(np.log(DECISIONS.misfit), DECISIONS.misfit_log_sd, float(np.log(DECISIONS.misfit_most)))] * len(basis)
         group = [i for i, columns in enumerate(basis, 1) for _ in range(columns.shape[-1])]
         more = replace(more, basis=np.concatenate(basis, -1), group=group, sizes=sizes)
-        design = design_of(self.base, r.state, r.variants, more)
-        optimum = optimise(design, np.append(r.optimum.free, [middle] * K), without=r.optimum)
-        one.with_misfit = optimum.log_evidence + log_prior
-        one.sizes = tuple(float(x) for x in np.exp(optimum.free[-K:]))
+        return design_of(self.base, r.state, r.variants, more)
+
+    def with_misfit(self, one: Hypothesis) -> None:
+        """Log evidence where every name's formula may be wrong."""
+        r, design = one.formulas, self.misfit_design(one)
+        assert r is not None
+        middle = design.misfits[:, 0]
+        optimum = optimise(design, np.append(r.optimum.free, middle), without=r.optimum)
+        one.with_misfit = optimum.log_evidence + (0.0 if one.own is None else one.own.log_prior)
+        one.sizes = tuple(float(x) for x in np.exp(optimum.free[-len(middle) :]))
+        one.misfit_at = optimum.free
 
     @cached_property
     def discrepancy(self) -> tuple[np.ndarray, list[int]]:
@@ -335,13 +348,39 @@ class Search:
         tried = {n: (first, k) for n, k in self.best_seconds(seconds, leader.names[0]).items() if n not in self.found}
         side_by_side(self.fit, list(tried.values()))
         for names, ks in tried.items():
-            self.found[names] = Hypothesis(names, self.fit(ks).log_evidence, best=self.fit(ks))
+            alone = self.fit(ks).log_evidence - self.log_combinations(names)
+            self.found[names] = Hypothesis(names, alone, best=self.fit(ks))
             self.with_misfit_if_better(self.found[names], leader)
         for m, mechanism in self.library.items():
             if m not in self.shared:
                 names = pair_of(m, leader.names[0])
                 self.keep(names, self.of_their_own(m, mechanism, r))
                 self.with_misfit_if_better(self.found[names], leader)
+
+    def other_formulas(self, pair: Hypothesis) -> None:
+        """A pair by the other formulas of either name, each beside the best of the other, at their own optimum."""
+        assert pair.best is not None
+        assert self.screen is not None
+        held = next(ks for ks, one in self.fits.items() if one is pair.best)
+        wanted = []
+        for k, other in (held, held[::-1]):
+            mechanism = self.screen.candidates[other].mechanism
+            beside = self.fit((k,))
+            tried = {self.screen.candidates[other].variant.name}
+            for _, j in self.seconds(beside, beside.variants[0], beside.design.amplitude[..., :1]):
+                c = self.screen.candidates[j]
+                if c.mechanism == mechanism and c.variant.name not in tried and len(tried) < NUMERICS.all_formulas:
+                    tried.add(c.variant.name)
+                    wanted.append((k, j))
+        every = [pair.best, *side_by_side(self.fit, wanted)]
+        pair.best = max(every, key=lambda r: r.log_evidence)
+        pair.alone = float(np.logaddexp.reduce([r.log_evidence for r in every])) - self.log_combinations(pair.names)
+        if pair.best is not every[0]:
+            self.with_misfit(pair)
+
+    def log_combinations(self, names: Names) -> float:
+        """Log number of ways in which formulas of some mechanisms go together: each is as probable, a priori."""
+        return float(np.sum(np.log([len(self.first_order[m]) for m in names])))
 
     def pairs_of_their_own(self, leader: Hypothesis) -> None:
         """The best second names beside numbers that differ from test to test."""
@@ -414,6 +453,11 @@ class Search:
             first = max((x for x in self.found.values() if len(x.names) == 1), key=lambda x: x.log_evidence)
             if first.own is not None and self.screen is not None:
                 self.pairs_of_their_own(first)
+            pairs = [
+                x for x in self.found.values() if len(x.names) == 2 and x.best and x.log_evidence > first.log_evidence
+            ]
+            for pair in sorted(pairs, key=lambda x: -x.log_evidence)[:2]:
+                self.other_formulas(pair)
         self.tell("other kinds of noise")
         self.other_noise()
         return self
