@@ -225,6 +225,14 @@ class SiebelFriction(AbstractLoadingFactor):
         return 1 + 2 / 3 * self.amplitude * _slenderness(particle, strain)
 
 
+class SphereFriction(AbstractLoadingFactor):
+    """Friction hill to first order over the height of a sphere of the same size, whatever the particle's shape."""
+
+    def factor(self, particle: Particle, strain: Values) -> Values:
+        """1 + (2 mu / 3) sqrt(PUNCH_AREA eps) / (1 - eps)."""
+        return 1 + 2 / 3 * self.amplitude * root(PUNCH_AREA * strain) / at_least_of(1 - strain, 0.1)
+
+
 class SlabFriction(AbstractLoadingFactor):
     """Friction hill of a compressed disc with exponential pressure."""
 
@@ -268,6 +276,9 @@ FRICTION = Mechanism(
     (
         _friction("siebel", SiebelFriction, "sigma(eps) [1 + (2 mu / 3) a / h]",
                   "Mean pressure of the friction hill on a disc of radius a and height h.", "Siebel (1923)"),
+        _friction("sphere", SphereFriction, "sigma(eps) [1 + (2 mu / 3) a / (D_e (1 - eps))]",
+                  "The same over the height of a sphere of the particle's size: as if its shape played no part.",
+                  "Siebel (1923)"),
         _friction("exponential_hill", SlabFriction, "sigma(eps) 2 (e^k - k - 1) / k^2, k = 2 mu a / h",
                   "The slab method with Coulomb friction.", "Hosford and Caddell, Metal Forming, ch. 7"),
         _friction("sticking", StickingFriction, "sigma(eps) [1 + mu (a / h)^2]",
