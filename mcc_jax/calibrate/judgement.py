@@ -134,6 +134,11 @@ def unknown_modulus(
     return Finding(MODULUS_OPEN, "look", f"The tests do not tell the modulus{between}{why}", remedy)
 
 
+def modulus_is_open(content: Mapping[str, Any]) -> bool:
+    """Whether the tests leave the modulus open, from the findings of a `calibration.json`."""
+    return any(one["check"] == MODULUS_OPEN for one in content.get("findings", []))
+
+
 UNLOAD = "Unload the particles before the test ends, and record the unloading with as many readings as the loading"
 
 

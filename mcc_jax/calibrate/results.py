@@ -23,6 +23,7 @@ from .content import read_result
 from .curves import FittedCurve, fitted_curves
 from .data import Selection
 from .fit_result import Fit
+from .judgement import modulus_is_open
 from .laws import law_of
 from .model import Model
 from .population import COEFFICIENTS, Population
@@ -81,7 +82,8 @@ class Calibration(Saved):
         title = f"{type(self).__name__} of {used} of {len(content['particles'])} particles, "
         title += "converged" if content["converged"] else "NOT converged"
         rows = [("shape parameter a", with_sd(content["a"]))]
-        rows.append(("effective modulus", f"{with_sd(content['effective_modulus_MPa'], 1e-3)} GPa"))
+        modulus = f"{with_sd(content['effective_modulus_MPa'], 1e-3)} GPa"
+        rows.append(("effective modulus", "these tests do not tell it" if modulus_is_open(content) else modulus))
         for name in COEFFICIENTS:
             log = content[f"log_{name}"]
             rows.append((f"log {name}", f"mean {with_sd(log['mean'])}, sd between particles {with_sd(log['sd'])}"))

@@ -238,12 +238,16 @@ def _draw(calibration: Calibration) -> Mapping[str, Any]:
 
 def main_numbers(content: dict[str, Any]) -> list[tuple[str, str]]:
     """Name and value of what matters most in a `calibration.json`."""
+    from ..calibrate.judgement import modulus_is_open
+
     modulus = content["effective_modulus_MPa"]
     rows = [
         ("shape parameter a", estimate_text(content["a"])),
         (
             "effective modulus",
-            "unknown" if modulus["value"] is None or _modulus_open(content) else f"{estimate_text(modulus, 1e-3)} GPa",
+            "unknown"
+            if modulus["value"] is None or modulus_is_open(content)
+            else f"{estimate_text(modulus, 1e-3)} GPa",
         ),
     ]
     for name in ("C1", "C3", "C5"):
@@ -254,12 +258,6 @@ def main_numbers(content: dict[str, Any]) -> list[tuple[str, str]]:
         rows += [(f"{label}: {name}", estimate_text(value)) for name, value in effect["parameters"].items()]
     rows.append(("yield stress sigma_y", f"{estimate_text(content['yield_stress_MPa'])} MPa"))
     return rows
-
-
-def _modulus_open(content: dict[str, Any]) -> bool:
-    from ..calibrate.judgement import MODULUS_OPEN
-
-    return any(one["check"] == MODULUS_OPEN for one in content.get("findings", []))
 
 
 def median_text(log: dict[str, Any]) -> str:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from .._format import interval, with_sd
+from ..calibrate.judgement import JudgementOptions
 from .settings import DECISIONS, TELLING
 
 if TYPE_CHECKING:
@@ -41,15 +43,22 @@ def summary_of(found: Discovery) -> str:
         names = ", ".join(_plain(one["mechanism"]) for one in found.leads)
         sentences.append(f"Beside it, what is left may be {names}; that is not added to the law.")
     if found.parameters_after and found.verdict in ("NAMED", "SET", "UNLISTED"):
-        before, after = (
-            p["effective_modulus_MPa"]["value"] / 1000 for p in (found.parameters_before, found.parameters_after)
+        sentences.append(
+            _modulus(*(p["effective_modulus_MPa"] for p in (found.parameters_before, found.parameters_after)))
         )
-        sentences.append(f"With it the effective modulus is {after:.3g} GPa instead of {before:.3g} GPa.")
     sentences += _next(found)
     if found.untestable:
         needs = "; ".join(f"{_plain(u['mechanism'])} (needs {u['needs']})" for u in found.untestable)
         sentences.append(f"These tests say nothing about {needs}.")
     return " ".join(sentences)
+
+
+def _modulus(before: dict[str, Any], after: dict[str, Any]) -> str:
+    """What the addition did to the modulus."""
+    if after["sd"] >= JudgementOptions().unknown * after["value"]:
+        return f"With it these tests do not tell the effective modulus (95 % interval {interval(after, 1e-3)} GPa)."
+    now, was = with_sd(after, 1e-3), with_sd(before, 1e-3)
+    return f"With it the effective modulus is {now} GPa instead of {was} GPa."
 
 
 def _verdict(found: Discovery, count: int) -> str:

@@ -230,7 +230,7 @@ class SphereFriction(AbstractLoadingFactor):
 
     def factor(self, particle: Particle, strain: Values) -> Values:
         """1 + (2 mu / 3) sqrt(PUNCH_AREA eps) / (1 - eps)."""
-        return 1 + 2 / 3 * self.amplitude * root(PUNCH_AREA * strain) / at_least_of(1 - strain, 0.1)
+        return 1 + 2 / 3 * self.amplitude * root(PUNCH_AREA * strain) / at_least(1 - strain, 0.1)
 
 
 class SlabFriction(AbstractLoadingFactor):

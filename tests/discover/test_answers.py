@@ -63,7 +63,7 @@ def test_a_summary_is_plain_english(verdict):
     assert "_" not in told
     if verdict != "NO_GAP":
         assert "platen sink in" in told
-        assert "16 GPa" in told
+        assert "16.00 ± 0.10 GPa" in told
         assert "off by about 40 %" in told
     assert ("frame compliance" in told) is (verdict == "SET")
 
