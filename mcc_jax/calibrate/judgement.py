@@ -231,7 +231,7 @@ def _without(
 def _answer(content: Mapping[str, Any]) -> str:
     parts = []
     modulus = content["effective_modulus_MPa"]
-    if modulus["value"] is None:
+    if modulus["value"] is None or (modulus["sd"] or 0.0) >= JudgementOptions().unknown * abs(modulus["value"]):
         parts.append("the modulus is unknown")
     else:
         parts.append(f"the modulus is {_pair(modulus, 1e-3)} GPa")
