@@ -63,12 +63,17 @@ def refined(
     before = state
     design = design_of(base, state, variants, more)
     for k in range(NUMERICS.steps):
-        optimum = optimise(design, free, curvature=False)
+        try:
+            optimum = optimise(design, free, curvature=False)
+        except FloatingPointError:
+            if k == 0:
+                raise
+            optimum = None  # a step beyond arithmetic is as bad as can be
         last = k == NUMERICS.steps - 1
-        if optimum.log_joint < value - NUMERICS.worse and not last:
+        if not last and (optimum is None or optimum.log_joint < value - NUMERICS.worse):
             state, value = between(before, state), -np.inf  # what was linear there is not here
         else:
-            if last and optimum.log_joint < value - NUMERICS.worse:
+            if optimum is None or (last and optimum.log_joint < value - NUMERICS.worse):
                 state = before
                 design = design_of(base, state, variants, more)
                 break
