@@ -29,10 +29,16 @@ def _serve(pipe: Connection, solver: str, seed: int) -> None:
             wrong = adapter.problem(discovery)
             outcome = {"status": "invalid" if wrong else "ok", "error": wrong, "discovery": adapter.kept(discovery)}
         except Exception as error:
-            lines = traceback.format_exc().splitlines()[-6:]
-            outcome = {"status": "crash", "error": f"{type(error).__name__}: {error}", "trace": lines}
+            outcome = {"status": "crash", **_crash(error, Path(task))}
         pipe.send({"wall_s": time.perf_counter() - began, "cold": cold, "discovery": None, **outcome})
         cold = False
+
+
+def _crash(error: Exception, folder: Path) -> dict[str, Any]:
+    """What an error says and where it came from, without a path of this machine: outcomes are committed."""
+    said = f"{type(error).__name__}: {error}".replace(f"{folder.parent}/", "")
+    last = traceback.extract_tb(error.__traceback__)[-3:]
+    return {"error": said, "trace": [f"{Path(at.filename).name}, line {at.lineno}, in {at.name}" for at in last]}
 
 
 class Worker:

@@ -117,9 +117,9 @@ def unknown_modulus(
         options: see `JudgementOptions`.
     """
     options = options or JudgementOptions()
-    value, sd, interval = modulus["value"], modulus["sd"], modulus.get("interval_95")
-    if value is None or sd is None or sd < options.unknown * abs(value):
+    if not told_by_no_test(modulus, options):
         return None
+    interval = modulus.get("interval_95")
     between = "" if interval is None else f" (between {1e-3 * interval[0]:.2g} and {1e-3 * interval[1]:.2g} GPa)"
     # Of several channels at the end of their range it is that of the displacement which hides unloading.
     ends = [
@@ -132,6 +132,12 @@ def unknown_modulus(
     else:
         why, remedy = ": too little of their unloading can be compared with the law", UNLOAD
     return Finding(MODULUS_OPEN, "look", f"The tests do not tell the modulus{between}{why}", remedy)
+
+
+def told_by_no_test(modulus: Mapping[str, Any], options: JudgementOptions | None = None) -> bool:
+    """Whether an estimate of the modulus is so wide that it tells nothing; not where the method gives no error."""
+    value, sd = modulus["value"], modulus["sd"]
+    return value is not None and sd is not None and sd >= (options or JudgementOptions()).unknown * abs(value)
 
 
 def modulus_is_open(content: Mapping[str, Any]) -> bool:
@@ -231,7 +237,7 @@ def _without(
 def _answer(content: Mapping[str, Any]) -> str:
     parts = []
     modulus = content["effective_modulus_MPa"]
-    if modulus["value"] is None or (modulus["sd"] or 0.0) >= JudgementOptions().unknown * abs(modulus["value"]):
+    if modulus["value"] is None or told_by_no_test(modulus):
         parts.append("the modulus is unknown")
     else:
         parts.append(f"the modulus is {_pair(modulus, 1e-3)} GPa")

@@ -241,14 +241,10 @@ def main_numbers(content: dict[str, Any]) -> list[tuple[str, str]]:
     from ..calibrate.judgement import modulus_is_open
 
     modulus = content["effective_modulus_MPa"]
+    unknown = modulus["value"] is None or modulus_is_open(content)
     rows = [
         ("shape parameter a", estimate_text(content["a"])),
-        (
-            "effective modulus",
-            "unknown"
-            if modulus["value"] is None or modulus_is_open(content)
-            else f"{estimate_text(modulus, 1e-3)} GPa",
-        ),
+        ("effective modulus", "unknown" if unknown else f"{estimate_text(modulus, 1e-3)} GPa"),
     ]
     for name in ("C1", "C3", "C5"):
         rows.append((f"{name}, median", median_text(content[f"log_{name}"]["mean"])))

@@ -45,7 +45,6 @@ class Hypothesis:
         best: at the optimum of its best formulas.
         own: numbers of every test's own instead.
         smooth: the discrepancy of `UNLISTED`.
-        sizes: how far the formulas are off, as shares of the effects.
         misfit_at: hyperparameters with their misfit, at the mode.
         other_noise: what another kind of noise adds to its log evidence.
     """
@@ -57,7 +56,6 @@ class Hypothesis:
     best: Refined | None = None
     own: OwnNumbers | None = None
     smooth: Smooth | None = None
-    sizes: tuple[float, ...] = ()
     misfit_at: np.ndarray | None = None
     other_noise: float = 0.0
 
@@ -78,6 +76,14 @@ class Hypothesis:
     def is_off(self) -> bool:
         """Whether the tests prefer its formulas with a misfit."""
         return self.with_misfit > self.alone
+
+    @property
+    def sizes(self) -> tuple[float, ...]:
+        """How far the formulas are off, as shares of the effects: scales that follow the other hyperparameters."""
+        if self.misfit_at is None:
+            return ()
+        assert self.formulas is not None
+        return tuple(float(x) for x in np.exp(self.misfit_at[len(self.formulas.optimum.free) :]))
 
     @property
     def formulas(self) -> Refined | None:
@@ -208,6 +214,10 @@ class Search:
             self.fits[ks] = refined(self.base, self.state, *self.start_of(ks), self.small)
         return self.fits[ks]
 
+    def fitted_as(self, r: Refined) -> tuple[int, ...]:
+        """The candidates that were fitted together."""
+        return next(ks for ks, one in self.fits.items() if one is r)
+
     def start_of(self, ks: tuple[int, ...]) -> tuple[tuple[Variant, ...], np.ndarray]:
         """The formulas of some candidates, and where their numbers are linearised first."""
         assert self.screen is not None
@@ -280,10 +290,8 @@ class Search:
         """Log evidence where every name's formula may be wrong."""
         r, design = one.formulas, self.misfit_design(one)
         assert r is not None
-        middle = design.misfits[:, 0]
-        optimum = optimise(design, np.append(r.optimum.free, middle), without=r.optimum)
+        optimum = optimise(design, np.append(r.optimum.free, design.misfits[:, 0]), without=r.optimum)
         one.with_misfit = optimum.log_evidence + (0.0 if one.own is None else one.own.log_prior)
-        one.sizes = tuple(float(x) for x in np.exp(optimum.free[-len(middle) :]))
         one.misfit_at = optimum.free
 
     @cached_property
@@ -343,7 +351,7 @@ class Search:
         """The best second names beside a leader, each fitted together with it."""
         r = leader.best
         assert r is not None
-        first = next(ks[0] for ks, one in self.fits.items() if one is r)
+        (first,) = self.fitted_as(r)
         seconds = self.seconds(r, r.variants[0], r.design.amplitude[..., :1])
         tried = {n: (first, k) for n, k in self.best_seconds(seconds, leader.names[0]).items() if n not in self.found}
         side_by_side(self.fit, list(tried.values()))
@@ -361,7 +369,7 @@ class Search:
         """A pair by the other formulas of either name, each beside the best of the other, at their own optimum."""
         assert pair.best is not None
         assert self.screen is not None
-        held = next(ks for ks, one in self.fits.items() if one is pair.best)
+        held = self.fitted_as(pair.best)
         wanted = []
         for k, other in (held, held[::-1]):
             mechanism = self.screen.candidates[other].mechanism

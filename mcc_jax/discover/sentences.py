@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from .._format import interval, with_sd
-from ..calibrate.judgement import JudgementOptions
+from ..calibrate.judgement import told_by_no_test
 from .settings import DECISIONS, TELLING
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def summary_of(found: Discovery) -> str:
 
 def _modulus(before: dict[str, Any], after: dict[str, Any]) -> str:
     """What the addition did to the modulus."""
-    if after["sd"] >= JudgementOptions().unknown * after["value"]:
+    if told_by_no_test(after):
         return f"With it these tests do not tell the effective modulus (95 % interval {interval(after, 1e-3)} GPa)."
     now, was = with_sd(after, 1e-3), with_sd(before, 1e-3)
     return f"With it the effective modulus is {now} GPa instead of {was} GPa."
