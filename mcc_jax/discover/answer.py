@@ -14,9 +14,10 @@ from ..calibrate.estimates import estimate, finite, summary
 from ..effects import Mechanism
 from .base import Base
 from .evidence import left_by_particle, residual_of, scales_of, solve, whitened
+from .hypothesis import UNLISTED, Hypothesis, Names
 from .own_numbers import OwnNumbers
 from .result import Effect, Likeness, Residuals
-from .search import UNLISTED, Hypothesis, Names, Search
+from .search import Search
 from .settings import DECISIONS, POPULATION, TELLING
 
 

@@ -12,7 +12,8 @@ import numpy as np
 from .._format import described
 from .columns import Design, with_amplitudes
 from .evidence import left_by_particle, scales_of, without_first
-from .search import UNLISTED, Search
+from .hypothesis import UNLISTED
+from .search import Search
 from .settings import HYPERPARAMETERS, NUMERICS, TELLING
 
 LETTERS = {

@@ -37,10 +37,11 @@ from .candidates import untestable
 from .closure import closure
 from .experiments import next_experiments
 from .heldout import held_out
+from .hypothesis import UNLISTED, Names
 from .locate import difference, places, where
 from .plan import without_effects
 from .result import Discovery, Effect
-from .search import UNLISTED, Names, Search, differs_from_test_to_test
+from .search import Search, differs_from_test_to_test
 from .sentences import summary_of
 from .settings import DECISIONS
 

@@ -10,7 +10,8 @@ import numpy as np
 from ..calibrate.estimates import finite
 from .columns import Design
 from .evidence import Optimum, amplitudes, left_by_particle, log_prior, scales_of, without_first
-from .search import UNLISTED, Names, Search
+from .hypothesis import UNLISTED, Names
+from .search import Search
 from .settings import HYPERPARAMETERS, NUMERICS
 
 

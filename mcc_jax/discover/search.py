@@ -1,9 +1,9 @@
-"""The hypotheses and their log evidence: nothing, one name, two names, or what is on no list."""
+"""The search through all hypotheses: nothing, one name, two names, or what is on no list."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -16,7 +16,8 @@ from .base import Base, State
 from .candidates import Candidate, candidates_of, located
 from .columns import Design, with_amplitudes
 from .design import NOTHING_MORE, More, design_of
-from .evidence import Optimum, Solution, left_by_particle, optimise, solve, visible, with_little_noise, without_first
+from .evidence import left_by_particle, optimise, solve, visible, with_little_noise, without_first
+from .hypothesis import UNLISTED, Hypothesis, Names, Smooth
 from .likely_noise import noise_models, with_likely_noise, with_other_noise
 from .misfit import ANY, COORDINATES, coordinates, functions, general, scaled
 from .own_numbers import OwnNumbers, differing, sudden_steps
@@ -24,91 +25,11 @@ from .refine import Refined, refined
 from .screen import Screen, Setting, pair_integrals, screen, signature_columns, single_integrals
 from .settings import DECISIONS, NUMERICS
 
-Names = tuple[str, ...]
-UNLISTED: Names = ("UNLISTED",)
 OPPOSITE = {frozenset(("damage", "densification_stiffening"))}
 """One quantity with two signs is no pair."""
 
 SUDDEN = "pop_in"
 """The mechanism whose sudden steps are looked for at every point of a test."""
-
-
-@dataclass
-class Hypothesis:
-    """What may be missing, with its log evidence in its several forms.
-
-    Attributes:
-        names: of the mechanisms; none for nothing, `UNLISTED` for a discrepancy that none explains.
-        alone: log evidence by formulas of the library alone.
-        with_misfit: where the formulas may be wrong.
-        beside: with a smooth discrepancy beside them.
-        best: at the optimum of its best formulas.
-        own: numbers of every test's own instead.
-        smooth: the discrepancy of `UNLISTED`.
-        misfit_at: hyperparameters with their misfit, at the mode.
-        other_noise: what another kind of noise adds to its log evidence.
-    """
-
-    names: Names
-    alone: float = -np.inf
-    with_misfit: float = -np.inf
-    beside: float = -np.inf
-    best: Refined | None = None
-    own: OwnNumbers | None = None
-    smooth: Smooth | None = None
-    misfit_at: np.ndarray | None = None
-    other_noise: float = 0.0
-
-    @property
-    def log_evidence(self) -> float:
-        """Log marginal likelihood, averaged over its formulas alone and with their misfit."""
-        if not self.names or self.names == UNLISTED or (self.own is not None and not np.isfinite(self.with_misfit)):
-            return self.alone + self.other_noise
-        return float(np.logaddexp(self.alone, self.with_misfit) - np.log(2)) + self.other_noise
-
-    @property
-    def fitted(self) -> tuple[Design, Optimum, Solution] | None:
-        """Design, hyperparameters and numbers of the form in which it is added to the law."""
-        one = self.smooth or self.formulas
-        return None if one is None else (one.design, one.optimum, one.solution)
-
-    @property
-    def is_off(self) -> bool:
-        """Whether the tests prefer its formulas with a misfit."""
-        return self.with_misfit > self.alone
-
-    @property
-    def sizes(self) -> tuple[float, ...]:
-        """How far the formulas are off, as shares of the effects: scales that follow the other hyperparameters."""
-        if self.misfit_at is None:
-            return ()
-        assert self.formulas is not None
-        return tuple(float(x) for x in np.exp(self.misfit_at[len(self.formulas.optimum.free) :]))
-
-    @property
-    def formulas(self) -> Refined | None:
-        """Its formulas at their optimum, beside numbers of every test's own if it has any."""
-        return self.best if self.own is None else self.own.at
-
-
-@dataclass(frozen=True)
-class Smooth:
-    """A smooth discrepancy common to all particles.
-
-    Attributes:
-        design, optimum, solution: with it.
-        basis: its functions [um].
-    """
-
-    design: Design
-    optimum: Optimum
-    solution: Solution
-    basis: np.ndarray
-
-    @property
-    def curve_um(self) -> np.ndarray:
-        """What it adds to the law's displacement at every point [um]."""
-        return self.basis @ self.solution.common[self.design.of_misfits]
 
 
 class Search:

@@ -10,8 +10,9 @@ from mcc_jax.campaign import available_data
 from mcc_jax.discover.bootstrap import p_anything
 from mcc_jax.discover.candidates import untestable
 from mcc_jax.discover.heldout import held_out
+from mcc_jax.discover.hypothesis import UNLISTED, Hypothesis
 from mcc_jax.discover.locate import difference, places, where
-from mcc_jax.discover.search import UNLISTED, Hypothesis, Search
+from mcc_jax.discover.search import Search
 from mcc_jax.discover.settings import DECISIONS
 from mcc_jax.effects import LIBRARY
 
