@@ -144,7 +144,7 @@ def posterior(repeats: int, budget: float) -> tuple[list[dict], list[dict]]:
     verdicts = [
         _report.verdict("posterior from a new process, nothing compiled before [s]", cold, 15.0),
         _report.verdict("posterior from a new process, compiled by an earlier one [s]", again, 15.0),
-        _report.verdict("posterior, warm [s]", warm, 2.0),
+        _report.verdict("posterior, warm [s]", warm, 1.5),
         _report.verdict("smallest bulk ESS", float(least), 2000, at_least=True),
         _report.verdict("divergences", divergences, 0),
     ]
