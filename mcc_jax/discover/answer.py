@@ -66,13 +66,8 @@ def _population(search: Search, names: Names) -> tuple[np.ndarray, np.ndarray, n
     Errors are those of the linear model. Where the formulas are off, so is the law that would answer for it: the misfit
     is integrated out, too, and widens the errors (Brynjarsdottir and O'Hagan 2014).
     """
-    one = search.found[names]
-    assert one.fitted is not None
-    design, optimum, solution = one.fitted
-    free = optimum.free
-    if one.is_off and one.misfit_at is not None:
-        design, free = search.misfit_design(one), one.misfit_at
-        solution = solve(free, design)
+    design, free = search.likely_form(search.found[names])
+    solution = solve(free, design)
     mean, factor = map(np.asarray, search.base.population_prior)
     beta = mean + factor @ np.asarray(solution.common[:POPULATION])
     sd = np.sqrt(np.diagonal(factor @ _covariance(design, free)[:POPULATION, :POPULATION] @ factor.T))

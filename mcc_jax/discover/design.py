@@ -78,6 +78,11 @@ class More:
     group: Sequence[int] = ()
     sizes: Sequence[tuple[float, float, float]] = field(default=())
 
+    def with_own(self, columns: np.ndarray, spreads: Sequence[Any]) -> More:
+        """Further numbers that every test has of its own, beside those there are."""
+        own = columns if self.own is None else np.concatenate([self.own, columns], -1)
+        return replace(self, own=own, own_spreads=(*self.own_spreads, *spreads))
+
 
 NOTHING_MORE = More()
 

@@ -374,18 +374,21 @@ def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, witho
         evidence -= float(np.sum(np.log(np.maximum(-jac[bound] / scale[bound], 1.0))))  # an exponential, cut off
         wanted, some = np.flatnonzero(~bound), None
         if without is not None:
-            wanted, some = wanted[wanted >= first], of_misfits(x)
+            wanted, some = wanted[wanted >= len(without.free)], of_misfits(x)
             evidence += without.log_evidence - without.log_joint
 
-        def slope(x: np.ndarray) -> np.ndarray:
-            if some is None:
+        def slope(x: np.ndarray, j: int) -> np.ndarray:
+            if some is None or j < first:
                 return _upside_down(value_and_gradient, x * scale, scale, design)[1]
-            return np.concatenate([np.zeros(first), some(x[first:])[1]])
+            return np.append(np.zeros(first), some(x[first:])[1])
 
         columns = np.zeros((len(wanted), len(wanted)))
-        for row, j in enumerate(wanted):
+        for row, j in enumerate(wanted.tolist()):
             e = np.where(np.arange(len(start)) == j, 0.3, 0.0)
-            columns[row] = (slope(x + e) - slope(x - e))[wanted] / 0.6
+            columns[row] = (slope(x + e, j) - slope(x - e, j))[wanted] / 0.6
+        if some is not None:  # the rows of misfits know nothing of the others
+            rest = int(np.sum(wanted < first))
+            columns[rest:, :rest] = columns[:rest, rest:].T
         values = np.maximum(np.linalg.eigvalsh((columns + columns.T) / 2), 1e-3)
         evidence += 0.5 * len(wanted) * np.log(2 * np.pi) - 0.5 * np.sum(np.log(values)) + np.sum(np.log(scale[wanted]))
     return Optimum(free, float(evidence), joint, int(found.nfev))

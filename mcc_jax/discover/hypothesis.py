@@ -28,7 +28,8 @@ class Hypothesis:
         own: numbers of every test's own instead.
         smooth: the discrepancy of `UNLISTED`.
         misfit_at: hyperparameters with their misfit, at the mode.
-        other_noise: what another kind of noise adds to its log evidence.
+        other_noise: what other kinds of noise add to its log evidence.
+        under_other_noise: design and hyperparameters under another kind of noise, where the tests prefer it.
     """
 
     names: Names
@@ -40,6 +41,7 @@ class Hypothesis:
     smooth: Smooth | None = None
     misfit_at: np.ndarray | None = None
     other_noise: float = 0.0
+    under_other_noise: tuple[Design, np.ndarray] | None = None
 
     @property
     def log_evidence(self) -> float:
@@ -64,8 +66,9 @@ class Hypothesis:
         """How far the formulas are off, as shares of the effects: scales that follow the other hyperparameters."""
         if self.misfit_at is None:
             return ()
-        assert self.formulas is not None
-        return tuple(float(x) for x in np.exp(self.misfit_at[len(self.formulas.optimum.free) :]))
+        one = self.formulas
+        assert one is not None
+        return tuple(float(x) for x in np.exp(self.misfit_at[len(one.optimum.free) + len(one.variants) :]))
 
     @property
     def formulas(self) -> Refined | None:

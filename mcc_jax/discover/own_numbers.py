@@ -112,20 +112,21 @@ def differing(base: Base, start: Refined, columns: np.ndarray, candidates: Seque
         return None
     tried.sort(key=lambda one: -one[0])
     values: dict[str, list[float]] = {}
-    best: tuple[Optimum, Candidate, Design, More] | None = None
+    best: tuple[Optimum, Candidate, More] | None = None
     for turn, (value, at, c, design, more) in enumerate(tried):
         if turn < NUMERICS.drifts:
             optimum = optimise(design, at, curvature=False)
             value = optimum.log_joint
             if best is None or value > best[0].log_joint:
-                best = optimum, c, design, more
+                best = optimum, c, more
         values.setdefault(c.variant.name, []).append(value)
     assert best is not None
-    optimum, c, design, more = best
-    curved = optimise(design, optimum.free)
+    optimum, c, more = best
+    # Numbers of its own may be as large as anything else: what was linear without them is not with them.
+    at = refined(base, start.state, start.variants, start.theta, optimum.free, more)
     each = [logsumexp(v) - np.log(len(v)) for v in values.values()]
-    total = float(logsumexp(each) - np.log(len(each))) + curved.log_evidence - optimum.log_joint
-    return OwnNumbers(c.variant, dict(c.nuisance), total, solved(design, curved, start), more)
+    total = float(logsumexp(each) - np.log(len(each))) + at.log_evidence - optimum.log_joint
+    return OwnNumbers(c.variant, dict(c.nuisance), total, at, more)
 
 
 def step_scores(now: Refined) -> tuple[np.ndarray, np.ndarray]:
@@ -194,9 +195,8 @@ def sudden_steps(base: Base, start: Refined, variant: Variant) -> OwnNumbers | N
         columns = np.concatenate([columns, new], -1)
     if best is None:
         return None
-    # The steps' evidence with its hyperparameters integrated out, as that of every other hypothesis.
-    now = solved(best.at.design, optimise(best.at.design, best.at.optimum.free), start)
-    return replace(best, at=now, log_evidence=now.log_evidence + best.log_prior)
+    at = refined(base, start.state, start.variants, start.theta, best.at.optimum.free, best.more)
+    return replace(best, at=at, log_evidence=at.log_evidence + best.log_prior)
 
 
 class Step(NamedTuple):

@@ -40,6 +40,12 @@ class Refined:
         """Numbers of the effects."""
         return np.asarray(self.state.point.theta[0])
 
+    @property
+    def curves_um(self) -> np.ndarray:
+        """What every formula adds to the displacement of every test, to first order [um]."""
+        units = np.array([v.plausible[0] for v in self.variants])
+        return self.design.amplitude[..., : len(units)] * (self.theta[: len(units)] / units)
+
 
 def refined(
     base: Base,

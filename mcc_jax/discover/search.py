@@ -11,12 +11,13 @@ from scipy.special import logsumexp
 
 from ..calibrate.compiling import side_by_side
 from ..calibrate.model import Model
+from ..calibrate.priors import NakagamiPrior
 from ..effects import Mechanism, Variant
 from .base import Base, State
 from .candidates import Candidate, candidates_of, located
-from .columns import Design, with_amplitudes
+from .columns import Design, with_amplitudes, with_noise
 from .design import NOTHING_MORE, More, design_of
-from .evidence import left_by_particle, optimise, solve, visible, with_little_noise, without_first
+from .evidence import left_by_particle, log_joint, optimise, solve, visible, with_little_noise, without_first
 from .hypothesis import UNLISTED, Hypothesis, Names, Smooth
 from .likely_noise import noise_models, with_likely_noise, with_other_noise
 from .misfit import ANY, COORDINATES, coordinates, functions, general, scaled
@@ -174,7 +175,7 @@ class Search:
         """Columns by which one of the formulas may be wrong: at its amplitude, and towards each of its siblings."""
         assert self.screen is not None
         variant = r.variants[which]
-        own = r.design.amplitude[..., which] * float(r.theta[which] / variant.plausible[0])
+        own = r.curves_um[..., which]
         smooth = own[..., None] * functions(COORDINATES.get(variant.mechanism, ANY), self.at)
         size = float(np.sqrt(np.sum(own**2)))
         others = []
@@ -188,11 +189,11 @@ class Search:
         return np.concatenate([siblings, smooth], -1)
 
     def misfit_design(self, one: Hypothesis) -> Design:
-        """A hypothesis where every name's formula may be wrong."""
+        """A hypothesis where every name's formula may be wrong, and its amplitude differ from particle to particle."""
         r = one.formulas
         assert r is not None
         basis, more = [self.misfit_columns(r, i) for i in range(len(r.variants))], NOTHING_MORE
-        curves = list(np.moveaxis(r.design.amplitude[..., : len(r.variants)], -1, 0))
+        curves = list(np.moveaxis(r.curves_um, -1, 0))
         if one.own is not None:
             more = one.own.more
             if not one.own.jumps:
@@ -204,6 +205,7 @@ class Search:
         basis = [share * columns for share, columns in zip(seen, basis, strict=True)]
         sizes = [(np.log(DECISIONS.misfit), DECISIONS.misfit_log_sd, float(np.log(DECISIONS.misfit_most)))] * len(basis)
         group = [i for i, columns in enumerate(basis, 1) for _ in range(columns.shape[-1])]
+        more = more.with_own(r.curves_um, [NakagamiPrior(DECISIONS.scatter)] * len(r.variants))
         more = replace(more, basis=np.concatenate(basis, -1), group=group, sizes=sizes)
         return design_of(self.base, r.state, r.variants, more)
 
@@ -211,7 +213,8 @@ class Search:
         """Log evidence where every name's formula may be wrong."""
         r, design = one.formulas, self.misfit_design(one)
         assert r is not None
-        optimum = optimise(design, np.append(r.optimum.free, design.misfits[:, 0]), without=r.optimum)
+        start = [r.optimum.free, np.ones(len(r.variants)), design.misfits[:, 0]]
+        optimum = optimise(design, np.concatenate(start), without=r.optimum)
         one.with_misfit = optimum.log_evidence + (0.0 if one.own is None else one.own.log_prior)
         one.misfit_at = optimum.free
 
@@ -409,28 +412,33 @@ class Search:
         wanted = list(logs)[: NUMERICS.seconds]
         if len(leader) == 2:
             wanted += [names for names in logs if len(names) == 1][: NUMERICS.seconds]
-        elif max(values[()]) < logs[leader] - NUMERICS.strong:
+        elif logs[()] + max(values[()]) < logs[leader] - NUMERICS.strong:
             return
         for names in wanted:
             if names and self.found[names].fitted is not None:
                 values[names] = self.by_noise(names, kinds)
         for names, others in values.items():
-            one = self.found[names]
-            assert one.fitted is not None
-            _, optimum, _ = one.fitted
-            together = [optimum.log_evidence, *others]
-            one.other_noise = float(logsumexp(together) - np.log(len(together)) - optimum.log_evidence)
+            self.found[names].other_noise = float(logsumexp([0.0, *others]) - np.log(1 + len(others)))
 
     def by_noise(self, names: Names, models: tuple[Model, ...]) -> list[float]:
-        """Log evidence of a hypothesis under other kinds of noise, with the curvature that it has under the model's."""
-        fitted = self.found[names].fitted
-        assert fitted is not None
-        design, optimum, _ = fitted
-        found = []
-        for model in models:
-            other = with_other_noise(design, optimum.free, model)
-            found.append(optimum.log_evidence + other.log_joint - optimum.log_joint)
-        return found
+        """What other kinds of noise add to a hypothesis in its likelier form, of the same curvature."""
+        one = self.found[names]
+        design, free = self.likely_form(one)
+        own = log_joint(free, design)
+        found = [(with_other_noise(design, free, model), model) for model in models]
+        best, model = max(found, key=lambda pair: pair[0].log_joint)
+        if best.log_joint > own:
+            one.under_other_noise = with_noise(design, model), best.free
+        return [other.log_joint - own for other, _ in found]
+
+    def likely_form(self, one: Hypothesis) -> tuple[Design, np.ndarray]:
+        """A hypothesis with or without its misfit and under the kind of noise that the tests prefer, at the mode."""
+        if one.under_other_noise is not None:
+            return one.under_other_noise
+        if one.is_off and one.misfit_at is not None:
+            return self.misfit_design(one), one.misfit_at
+        assert one.fitted is not None
+        return one.fitted[0], one.fitted[1].free
 
 
 def pair_of(one: str, other: str) -> Names:

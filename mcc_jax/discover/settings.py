@@ -23,6 +23,8 @@ class Decisions:
         misfit, misfit_log_sd, misfit_most: size of what a mechanism's formulas miss of its effect, median, standard
             deviation of the logarithm, and the most: 0.03 to 0.3 is what the library's own formulas leave of each
             other; with a size of 1 every mechanism imitates every other, and strong effects would have it.
+        scatter: scale of the half-normal prior of how much an amplitude differs from particle to particle, as a share
+            of it: toes need 0.1 (`misfit` and this are integrated out together).
         general, general_log_sd: size of a smooth discrepancy in standard deviations of white noise, likewise.
         jump: share of the tests in which a sudden step is expected, a priori: where it is looked for once more.
         least: particles that must be left before those that snap through are left out.
@@ -36,6 +38,7 @@ class Decisions:
     misfit: float = 0.1
     misfit_log_sd: float = 0.8
     misfit_most: float = 0.3
+    scatter: float = 0.1
     general: float = 3.0
     general_log_sd: float = 1.5
     jump: float = 0.25

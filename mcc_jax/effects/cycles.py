@@ -150,6 +150,15 @@ class PowerRatchet(AbstractRatchet):
         return jnp.where(some, power, 0.0)
 
 
+class LateRatchet(AbstractRatchet):
+    """Most of it close to the peak, as where stress must exceed a limit that scatters within the particle."""
+
+    def inside(self, context: Context) -> Values:
+        """D_e r (N + w^2), of whole reloads N and the share w of the present one."""
+        count = context.record.progress + context.progress**2
+        return self.amplitude * context.particle.displacement(count)
+
+
 class PeakRatchet(AbstractRatchet):
     """The same share of the displacement at the peak with every reload."""
 
@@ -191,6 +200,9 @@ RATCHETING = Mechanism(
         _ratchet("power", PowerRatchet, "d = D_e r N^p", "More with every reload: it does not shake down.",
                  source="Monismith, Ogawa and Freeme (1975), Transp. Res. Rec. 537, 1",
                  nuisances=(Nuisance("exponent", (1.5, 2.0, 3.0), (1.0, 4.0), "power of the number of reloads"),)),
+        _ratchet("late", LateRatchet, "d = D_e r (N + w^2), w = (F - F_r) / (F_P - F_r)",
+                 "Most of it close to the peak of a reload.",
+                 source="Lemaitre and Chaboche (1990), Mechanics of Solid Materials, ch. 5"),
         _ratchet("peak_share", PeakRatchet, "d = gamma_P r N", "In proportion to the displacement at the peak.",
                  source="Lemaitre and Chaboche (1990), Mechanics of Solid Materials, ch. 5",
                  parameter="ratchet_share", plausible=(5e-4, 3e-2)),

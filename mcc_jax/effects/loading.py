@@ -334,6 +334,17 @@ class FiniteHardeningBoth(FiniteHardening):
         return context.recoverable * (recovery(share) - recovery(jnp.where(moved < 1, moved, 1.0)))
 
 
+class FiniteHardeningContact(FiniteHardening):
+    """The same exponent on the contact while it opens: (a / a_P)^2 = 1 - s^(2 (1 + 1/2m))."""
+
+    def inside(self, context: Context) -> Values:
+        """Delta [s - s^(1 / (1 + 1/2m))]."""
+        share = context.recovered_share
+        some = share > 0
+        power = jnp.exp(jnp.log(jnp.where(some, share, 1.0)) / (1 + 0.5 * self.amplitude))
+        return context.recoverable * jnp.where(some, share - power, 0.0)
+
+
 class LudwikHardening(AbstractEffect):
     """Hardening that sets in at a yield strain; the amplitude is 1/m."""
 
@@ -387,6 +398,9 @@ HARDENING = Mechanism(
                    "sigma(eps) (eps / 0.2)^(1/2m); on unloading u^(1/(1 + 1/2m)) for u",
                    "The power acts on loading and on the pressure that unloading releases.",
                    "Olsson and Larsson (2013)", fixed={"terms": (True, True, True)}),
+        _hardening("linear_term_and_unloading", FiniteHardeningContact,
+                   "C1 eta eps (eps / 0.2)^(1/2m); on unloading (a / a_P)^2 = 1 - s^(2 (1 + 1/2m))",
+                   "The similarity solution in place of the linear term, and while the contact opens.", _STORAKERS),
         _hardening("ludwik", LudwikHardening, "sigma(eps) [(1 + eps / eps_y) / (1 + 0.2 / eps_y)]^(1/2m)",
                    "Hardening that begins at a yield strain.", "Ludwik (1909); Swift (1952)",
                    nuisances=(Nuisance("yield_strain", (0.01, 0.05), (0.001, 0.3), "strain where hardening sets in"),)),

@@ -232,7 +232,7 @@ def test_ratcheting_counts_reloads():
         steps = np.diff(added[[20, 60, 100, 140]])
         assert (np.diff(added) >= -1e-10).all()
         assert (steps > 1e-3).all()
-        if variant.name in ("linear", "elastic_share", "peak_share"):
+        if variant.name in ("linear", "elastic_share", "peak_share", "late"):
             np.testing.assert_allclose(steps, steps[0], rtol=1e-9)
         elif variant.name == "power":
             np.testing.assert_allclose(steps, steps[0] * np.array([1, 3, 5]), rtol=1e-9)
