@@ -100,6 +100,11 @@ def with_amplitudes(design: Design, columns: np.ndarray) -> Design:
     return replace(design, amplitude=np.asarray(columns), sign=np.zeros(count), largest=np.ones(count))
 
 
+def without_further(design: Design) -> Design:
+    """The design without numbers of every test's own beyond b1, b3, b5, e and the zero."""
+    return replace(design, own=design.own[..., :5], kinds=replace(design.kinds, spreads=design.kinds.spreads[:4]))
+
+
 class White(NamedTuple):
     """Columns freed of the noise.
 

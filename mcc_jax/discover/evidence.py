@@ -339,7 +339,7 @@ def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, witho
     scale = 1 / np.sqrt(expected)
 
     first = 4 + spreads
-    options: Any = {"ftol": 1e-7, "gtol": 0.1, "maxiter": 40}
+    options: Any = {"ftol": 1e-7, "gtol": NUMERICS.flat, "maxiter": NUMERICS.evaluations}
     most = np.concatenate([np.full(first, np.inf), design.misfits[:, 2]])
     bounds = [(None, None if np.isinf(x) else x) for x in most / scale]
     best = np.minimum(start, most) / scale
@@ -380,16 +380,21 @@ def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, witho
         def slope(x: np.ndarray, j: int) -> np.ndarray:
             if some is None or j < first:
                 return _upside_down(value_and_gradient, x * scale, scale, design)[1]
-            return np.append(np.zeros(first), some(x[first:])[1])
+            return np.append(jac[:first], some(x[first:])[1])
 
         columns = np.zeros((len(wanted), len(wanted)))
         for row, j in enumerate(wanted.tolist()):
-            e = np.where(np.arange(len(start)) == j, 0.3, 0.0)
-            columns[row] = (slope(x + e, j) - slope(x - e, j))[wanted] / 0.6
+            e = np.where(np.arange(len(start)) == j, NUMERICS.aside, 0.0)
+            columns[row] = (slope(x + e, j) - jac)[wanted] / NUMERICS.aside
         if some is not None:  # the rows of misfits know nothing of the others
             rest = int(np.sum(wanted < first))
             columns[rest:, :rest] = columns[:rest, rest:].T
-        values = np.maximum(np.linalg.eigvalsh((columns + columns.T) / 2), 1e-3)
+        values, vectors = np.linalg.eigh((columns + columns.T) / 2)
+        values = np.maximum(values, 1e-3)
+        # A spread's coordinate stands for either sign: close to none, both are the same.
+        of_spreads = (wanted >= 4) & (wanted < first)
+        sd = np.sqrt(np.sum(vectors**2 / values, 1))
+        evidence += float(np.sum(log_ndtr(np.abs(x[wanted]) / sd)[of_spreads]))
         evidence += 0.5 * len(wanted) * np.log(2 * np.pi) - 0.5 * np.sum(np.log(values)) + np.sum(np.log(scale[wanted]))
     return Optimum(free, float(evidence), joint, int(found.nfev))
 

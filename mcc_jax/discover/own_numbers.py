@@ -52,7 +52,6 @@ class OwnNumbers:
         at: the hypothesis at its optimum.
         more: columns of its own numbers.
         jumps: sudden steps, if it is about these.
-        log_prior: of where these are.
     """
 
     variant: Variant
@@ -61,7 +60,6 @@ class OwnNumbers:
     at: Refined
     more: More
     jumps: tuple[Jump, ...] = ()
-    log_prior: float = 0.0
 
     @property
     def curve_um(self) -> np.ndarray:
@@ -76,7 +74,12 @@ class OwnNumbers:
         """The same numbers with a formula beside them, at its optimum."""
         spreads = self.at.optimum.free[HYPERPARAMETERS : HYPERPARAMETERS + len(self.more.own_spreads)]
         at = refined(base, state, variants, numbers, np.concatenate([free, spreads]), self.more)
-        return replace(self, at=at, log_evidence=at.log_evidence + self.log_prior)
+        return replace(self, at=at, log_evidence=at.log_evidence + self.of_choices)
+
+    @property
+    def of_choices(self) -> float:
+        """What having chosen a formula, its further numbers or places of steps costs in log evidence."""
+        return self.log_evidence - self.at.log_evidence
 
 
 def solved(design: Design, optimum: Optimum, start: Refined) -> Refined:
@@ -112,18 +115,21 @@ def differing(base: Base, start: Refined, columns: np.ndarray, candidates: Seque
         return None
     tried.sort(key=lambda one: -one[0])
     values: dict[str, list[float]] = {}
-    best: tuple[Optimum, Candidate, More] | None = None
+    best: tuple[Optimum, Candidate, Design, More] | None = None
     for turn, (value, at, c, design, more) in enumerate(tried):
         if turn < NUMERICS.drifts:
             optimum = optimise(design, at, curvature=False)
             value = optimum.log_joint
             if best is None or value > best[0].log_joint:
-                best = optimum, c, more
+                best = optimum, c, design, more
         values.setdefault(c.variant.name, []).append(value)
     assert best is not None
-    optimum, c, more = best
-    # Numbers of its own may be as large as anything else: what was linear without them is not with them.
-    at = refined(base, start.state, start.variants, start.theta, optimum.free, more)
+    optimum, c, design, more = best
+    if optimum.log_joint > start.optimum.log_joint:
+        # Numbers of its own may be as large as anything else: what was linear without them is not with them.
+        at = refined(base, start.state, start.variants, start.theta, optimum.free, more)
+    else:
+        at = solved(design, optimise(design, optimum.free), start)
     each = [logsumexp(v) - np.log(len(v)) for v in values.values()]
     total = float(logsumexp(each) - np.log(len(each))) + at.log_evidence - optimum.log_joint
     return OwnNumbers(c.variant, dict(c.nuisance), total, at, more)
@@ -162,7 +168,7 @@ def sudden_steps(base: Base, start: Refined, variant: Variant) -> OwnNumbers | N
     unit = high / 3
     columns = np.zeros((N, P, 0))
     found: list[Step] = []
-    now, best, value = start, None, -np.inf
+    now, best, value, steps = start, None, -np.inf, list[Step]()
     for turn in range(NUMERICS.jumps + 1):
         if turn:
             more = More(columns, (SPREAD,) * turn)
@@ -173,8 +179,7 @@ def sudden_steps(base: Base, start: Refined, variant: Variant) -> OwnNumbers | N
                 break
             value = optimum.log_joint + log_prior
             now = solved(design, optimum, start)
-            jumps = _jumps(base, found, unit * np.asarray(now.solution.own)[:, 5:])
-            best = OwnNumbers(variant, {}, value, now, more, jumps, log_prior)
+            best, steps = OwnNumbers(variant, {}, value, now, more), list(found)
         if turn == NUMERICS.jumps:
             break
         score, information = step_scores(now)
@@ -196,7 +201,8 @@ def sudden_steps(base: Base, start: Refined, variant: Variant) -> OwnNumbers | N
     if best is None:
         return None
     at = refined(base, start.state, start.variants, start.theta, best.at.optimum.free, best.more)
-    return replace(best, at=at, log_evidence=at.log_evidence + best.log_prior)
+    jumps = _jumps(base, steps, unit * at.solution.own[:, 5:])
+    return replace(best, at=at, log_evidence=at.log_evidence + best.of_choices, jumps=jumps) if jumps else None
 
 
 class Step(NamedTuple):

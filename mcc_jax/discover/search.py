@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import logsumexp
 
 from ..calibrate.compiling import side_by_side
+from ..calibrate.distributions import SpreadCoordinate
 from ..calibrate.model import Model
 from ..calibrate.priors import NakagamiPrior
 from ..effects import Mechanism, Variant
 from .base import Base, State
 from .candidates import Candidate, candidates_of, located
-from .columns import Design, with_amplitudes, with_noise
+from .columns import Design, with_amplitudes, with_noise, without_further
 from .design import NOTHING_MORE, More, design_of
 from .evidence import left_by_particle, log_joint, optimise, solve, visible, with_little_noise, without_first
 from .hypothesis import UNLISTED, Hypothesis, Names, Smooth
@@ -24,13 +26,16 @@ from .misfit import ANY, COORDINATES, coordinates, functions, general, scaled
 from .own_numbers import OwnNumbers, differing, sudden_steps
 from .refine import Refined, refined
 from .screen import Screen, Setting, pair_integrals, screen, signature_columns, single_integrals
-from .settings import DECISIONS, NUMERICS
+from .settings import DECISIONS, HYPERPARAMETERS, NUMERICS
 
 OPPOSITE = {frozenset(("damage", "densification_stiffening"))}
 """One quantity with two signs is no pair."""
 
 SUDDEN = "pop_in"
 """The mechanism whose sudden steps are looked for at every point of a test."""
+
+SCATTER = NakagamiPrior(DECISIONS.scatter)
+"""Prior of the spread of an amplitude over the particles, as a share of it."""
 
 
 class Search:
@@ -97,7 +102,7 @@ class Search:
         for names, one in self.found.items():
             if len(names) == 1 and np.isfinite(one.beside):
                 # Two causes, of which one is on no list: they count for the one that explains more by itself.
-                both = one.beside + one.other_noise - np.log(2 * count) - DECISIONS.pair - DECISIONS.unlisted
+                both = one.beside + min(one.other_noise, 0.0) - np.log(2 * count) - DECISIONS.pair - DECISIONS.unlisted
                 larger = names if logs[names] >= logs[UNLISTED] else UNLISTED
                 logs[larger] = float(np.logaddexp(logs[larger], both))
         fewer = max(v for names, v in logs.items() if len(names) < 2)
@@ -193,19 +198,18 @@ class Search:
         r = one.formulas
         assert r is not None
         basis, more = [self.misfit_columns(r, i) for i in range(len(r.variants))], NOTHING_MORE
-        curves = list(np.moveaxis(r.curves_um, -1, 0))
+        # A formula is wrong by a share of what can be seen of it: most of some is like a particle's own numbers.
+        seen = list(visible(r.optimum.free, r.design, r.curves_um))
         if one.own is not None:
             more = one.own.more
             if not one.own.jumps:
-                which = COORDINATES.get(one.own.variant.mechanism, ANY)
-                curves.append(one.own.curve_um)
-                basis.append(curves[-1][..., None] * functions(which, self.at))
-        # A formula is wrong by a share of what can be seen of it: most of some is like a particle's own numbers.
-        seen = visible(r.optimum.free, r.design, np.stack(curves, -1))
+                curve = one.own.curve_um[..., None]
+                basis.append(curve * functions(COORDINATES.get(one.own.variant.mechanism, ANY), self.at))
+                seen.extend(visible(r.optimum.free[:HYPERPARAMETERS], without_further(r.design), curve))
         basis = [share * columns for share, columns in zip(seen, basis, strict=True)]
         sizes = [(np.log(DECISIONS.misfit), DECISIONS.misfit_log_sd, float(np.log(DECISIONS.misfit_most)))] * len(basis)
         group = [i for i, columns in enumerate(basis, 1) for _ in range(columns.shape[-1])]
-        more = more.with_own(r.curves_um, [NakagamiPrior(DECISIONS.scatter)] * len(r.variants))
+        more = more.with_own(r.curves_um, [SCATTER] * len(r.variants))
         more = replace(more, basis=np.concatenate(basis, -1), group=group, sizes=sizes)
         return design_of(self.base, r.state, r.variants, more)
 
@@ -213,9 +217,10 @@ class Search:
         """Log evidence where every name's formula may be wrong."""
         r, design = one.formulas, self.misfit_design(one)
         assert r is not None
-        start = [r.optimum.free, np.ones(len(r.variants)), design.misfits[:, 0]]
+        some = float(SpreadCoordinate(SCATTER).coordinate(SCATTER.sd))
+        start = [r.optimum.free, [some] * len(r.variants), design.misfits[:, 0]]
         optimum = optimise(design, np.concatenate(start), without=r.optimum)
-        one.with_misfit = optimum.log_evidence + (0.0 if one.own is None else one.own.log_prior)
+        one.with_misfit = optimum.log_evidence + (0.0 if one.own is None else one.own.of_choices)
         one.misfit_at = optimum.free
 
     @cached_property
@@ -337,8 +342,11 @@ class Search:
 
     def keep(self, names: Names, own: OwnNumbers | None) -> None:
         """A hypothesis with numbers of every test's own, if it is the best of its names."""
-        value = -np.inf if own is None else own.log_evidence
-        if names not in self.found or value > self.found[names].log_evidence:
+        value = -np.inf
+        if own is not None:  # beside them one formula of several, each as probable a priori
+            value = own.log_evidence - self.log_combinations(tuple(m for m in names if m in self.first_order))
+            own = replace(own, log_evidence=value)
+        if names not in self.found or value > self.found[names].alone:
             self.found[names] = Hypothesis(names, value, own=own)
 
     # ---- all of it ---------------------------------------------------------------------------------------------------
@@ -408,28 +416,30 @@ class Search:
         if not leader:
             return
         kinds = noise_models(self.base)
-        values: dict[Names, list[float]] = {(): self.by_noise((), kinds)}
+        values: dict[Names, OtherNoise] = {(): self.by_noise((), kinds)}
         wanted = list(logs)[: NUMERICS.seconds]
         if len(leader) == 2:
             wanted += [names for names in logs if len(names) == 1][: NUMERICS.seconds]
-        elif logs[()] + max(values[()]) < logs[leader] - NUMERICS.strong:
+        elif logs[()] + max(values[()].gains) < logs[leader] - NUMERICS.strong:
             return
         for names in wanted:
-            if names and self.found[names].fitted is not None:
+            if names not in values and self.found[names].fitted is not None:
                 values[names] = self.by_noise(names, kinds)
-        for names, others in values.items():
-            self.found[names].other_noise = float(logsumexp([0.0, *others]) - np.log(1 + len(others)))
+        for names, one in self.found.items():
+            # What was not worked out counts as if no other kind explained it better.
+            gains = values[names].gains if names in values else []
+            one.other_noise = float(logsumexp([0.0, *gains]) - np.log(1 + len(kinds)))
+            if names in values:
+                one.under_other_noise = values[names].best
 
-    def by_noise(self, names: Names, models: tuple[Model, ...]) -> list[float]:
-        """What other kinds of noise add to a hypothesis in its likelier form, of the same curvature."""
-        one = self.found[names]
-        design, free = self.likely_form(one)
+    def by_noise(self, names: Names, models: tuple[Model, ...]) -> OtherNoise:
+        """A hypothesis in its likelier form under other kinds of noise, of the same curvature."""
+        design, free = self.likely_form(self.found[names])
         own = log_joint(free, design)
         found = [(with_other_noise(design, free, model), model) for model in models]
         best, model = max(found, key=lambda pair: pair[0].log_joint)
-        if best.log_joint > own:
-            one.under_other_noise = with_noise(design, model), best.free
-        return [other.log_joint - own for other, _ in found]
+        form = (with_noise(design, model), best.free) if best.log_joint > own else None
+        return OtherNoise([other.log_joint - own for other, _ in found], form)
 
     def likely_form(self, one: Hypothesis) -> tuple[Design, np.ndarray]:
         """A hypothesis with or without its misfit and under the kind of noise that the tests prefer, at the mode."""
@@ -439,6 +449,13 @@ class Search:
             return self.misfit_design(one), one.misfit_at
         assert one.fitted is not None
         return one.fitted[0], one.fitted[1].free
+
+
+class OtherNoise(NamedTuple):
+    """What other kinds of noise add to a log evidence; design and hyperparameters under the best, if it is better."""
+
+    gains: list[float]
+    best: tuple[Design, np.ndarray] | None
 
 
 def pair_of(one: str, other: str) -> Names:

@@ -99,6 +99,9 @@ class Numerics:
         locations, phases: values tried of a number that differs from test to test: of a place somewhere between two
             that lie far apart, which must be met closely, and of a phase.
         steps, still: Gauss-Newton steps at most, and the change of the log posterior at which they end.
+        flat, evaluations: slope of the log posterior, per expected standard deviation of a hyperparameter, at which its
+            mode is reached (0.2 is 0.02 nats away), and iterations at most.
+        aside: how far from there, in the same unit, slopes are compared for its curvature.
         drifts: drifts of every test's own that are fitted at their own optimum.
         little: factor on correlated noise that has swallowed a gap, where what explains it begins to be fitted.
         worse: nats by which a step may make things worse before half of it is taken back.
@@ -130,6 +133,9 @@ class Numerics:
     very_strong: float = 50.0
     steps: int = 6
     still: float = 0.05
+    flat: float = 0.2
+    evaluations: int = 40
+    aside: float = 0.1
     worse: float = 5.0
     drifts: int = 6
     little: float = 0.1

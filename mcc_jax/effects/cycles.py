@@ -153,10 +153,10 @@ class PowerRatchet(AbstractRatchet):
 class LateRatchet(AbstractRatchet):
     """Most of it close to the peak, as where stress must exceed a limit that scatters within the particle."""
 
-    def inside(self, context: Context) -> Values:
-        """D_e r (N + w^2), of whole reloads N and the share w of the present one."""
-        count = context.record.progress + context.progress**2
-        return self.amplitude * context.particle.displacement(count)
+    def count(self, cycles: Values) -> Values:
+        """n + w^2, of whole reloads n and the share w of one more."""
+        whole = jnp.floor(cycles)
+        return whole + (cycles - whole) ** 2
 
 
 class PeakRatchet(AbstractRatchet):
@@ -200,7 +200,7 @@ RATCHETING = Mechanism(
         _ratchet("power", PowerRatchet, "d = D_e r N^p", "More with every reload: it does not shake down.",
                  source="Monismith, Ogawa and Freeme (1975), Transp. Res. Rec. 537, 1",
                  nuisances=(Nuisance("exponent", (1.5, 2.0, 3.0), (1.0, 4.0), "power of the number of reloads"),)),
-        _ratchet("late", LateRatchet, "d = D_e r (N + w^2), w = (F - F_r) / (F_P - F_r)",
+        _ratchet("late", LateRatchet, "d = D_e r (n + w^2), N = n + w",
                  "Most of it close to the peak of a reload.",
                  source="Lemaitre and Chaboche (1990), Mechanics of Solid Materials, ch. 5"),
         _ratchet("peak_share", PeakRatchet, "d = gamma_P r N", "In proportion to the displacement at the peak.",

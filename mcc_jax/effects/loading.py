@@ -335,7 +335,7 @@ class FiniteHardeningBoth(FiniteHardening):
 
 
 class FiniteHardeningContact(FiniteHardening):
-    """The same exponent on the contact while it opens: (a / a_P)^2 = 1 - s^(2 (1 + 1/2m))."""
+    """The same exponent on the recovered share: to first order, an exponent 2 (1 + 1/2m) in place of 2 on unloading."""
 
     def inside(self, context: Context) -> Values:
         """Delta [s - s^(1 / (1 + 1/2m))]."""
@@ -399,8 +399,8 @@ HARDENING = Mechanism(
                    "The power acts on loading and on the pressure that unloading releases.",
                    "Olsson and Larsson (2013)", fixed={"terms": (True, True, True)}),
         _hardening("linear_term_and_unloading", FiniteHardeningContact,
-                   "C1 eta eps (eps / 0.2)^(1/2m); on unloading (a / a_P)^2 = 1 - s^(2 (1 + 1/2m))",
-                   "The similarity solution in place of the linear term, and while the contact opens.", _STORAKERS),
+                   "C1 eta eps (eps / 0.2)^(1/2m); on unloading s^(1/(1 + 1/2m)) for s",
+                   "The similarity solution in place of the linear term, and to first order on unloading.", _STORAKERS),
         _hardening("ludwik", LudwikHardening, "sigma(eps) [(1 + eps / eps_y) / (1 + 0.2 / eps_y)]^(1/2m)",
                    "Hardening that begins at a yield strain.", "Ludwik (1909); Swift (1952)",
                    nuisances=(Nuisance("yield_strain", (0.01, 0.05), (0.001, 0.3), "strain where hardening sets in"),)),
