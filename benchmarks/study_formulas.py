@@ -18,6 +18,7 @@ from test to test have no misfit in `discover`, and no rows here.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -51,7 +52,7 @@ class Row(NamedTuple):
     misfit: float
 
 
-def campaign() -> mcc.Campaign:
+def campaign(effects: Sequence[mcc.HiddenEffect] = ()) -> mcc.Campaign:
     """Sizes, shapes, rooms, rates, holds; rising peaks and cycles between the same two loads."""
     R, H = mcc.Ramp, mcc.Hold
     steps = [R(0.4, 1.0), H(20.0), R(0.1, 4.0), R(0.4, 4.0), R(0.7, 8.0), H(60.0), R(0.0, 2.0), H(20.0)]
@@ -60,6 +61,7 @@ def campaign() -> mcc.Campaign:
         4,
         instrument=mcc.Instrument(0.05, 0.05),
         programme=mcc.Programme("load", steps, points=300),
+        effects=effects,
         relative_humidity_percent=np.resize([15.0, 75.0, 45.0, 30.0, 60.0, 70.0, 25.0], 20),
     )
     return tests.without(*tests.particles[PARTICLES:])

@@ -101,8 +101,9 @@ def effects_of(search: Search, names: Names, probabilities: Mapping[str, float],
     r = one.formulas
     if r is None:
         return ()
-    cov = _covariance(r.design, r.optimum.free)
-    c = r.design.common.shape[-1]
+    # As wide as with the misfit and the scatter that the tests prefer, as the parameters beside it are.
+    design, free = search.likely_form(one)
+    cov, c = _covariance(design, free), design.common.shape[-1]
     place, found = len(r.variants), []
     for k, variant in enumerate(r.variants):
         nuisance = {n.name: float(r.theta[place + i]) for i, n in enumerate(variant.nuisances)}

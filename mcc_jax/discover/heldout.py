@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from ..calibrate.estimates import finite
 from .columns import Design
-from .evidence import Optimum, amplitudes, left_by_particle, log_prior, scales_of, without_first
+from .evidence import amplitudes, left_by_particle, scales_of, without_first
 from .hypothesis import UNLISTED, Names
 from .search import Search
 from .settings import HYPERPARAMETERS, NUMERICS
@@ -86,12 +86,12 @@ class _Contestant:
     free: np.ndarray
     left: np.ndarray
     log_integral: np.ndarray
-    log_prior: float
+    log_prior: float = 0.0
 
     @classmethod
-    def of(cls, names: Names, design: Design, free: np.ndarray, log_prior: float) -> _Contestant:
+    def of(cls, names: Names, design: Design, free: np.ndarray) -> _Contestant:
         left = left_by_particle(free, design)
-        return cls(names, design, free, left.gram, left.log_integral, log_prior)
+        return cls(names, design, free, left.gram, left.log_integral)
 
     def log_evidence(self, rows: np.ndarray) -> float:
         """Log marginal likelihood of some particles."""
@@ -132,26 +132,25 @@ def held_out(search: Search, winner: Names) -> HeldOut:
         search: all hypotheses.
         winner: what was found.
     """
-    fitted = search.found[winner].fitted
-    assert fitted is not None
-    _, optimum, _ = fitted
-    null = search.null
+    null, everyone = search.null, np.arange(len(search.base.tests))
     logs = search.log_posteriors()
-    contestants = []
+    contestants: list[_Contestant] = []
     for names in [*list(logs)[: NUMERICS.contenders], winner]:
-        parts = search.found[names].fitted
-        if names and parts is not None and names not in {c.names for c in contestants}:
-            prior = logs.get(names, 0.0) - search.found[names].log_evidence if names in logs else 0.0
-            contestants.append(_Contestant.of(names, parts[0], parts[1].free, prior + _of_hyperparameters(*parts[:2])))
+        one = search.found[names]
+        if names and one.fitted is not None and names not in {c.names for c in contestants}:
+            c = _Contestant.of(names, *search.likely_form(one, misfit=False))
+            # Prior odds, hyperparameters and misfit weigh as they do for all particles.
+            contestants.append(replace(c, log_prior=logs.get(names, one.log_evidence) - c.log_evidence(everyone)))
     # The base law under the winner's noise and spreads: gaps are measured by the noise of what closes them.
-    base = _Contestant.of((), null.design, optimum.free[:HYPERPARAMETERS], 0.0)
+    design, free = search.likely_form(search.found[winner], misfit=False)
+    kinds = replace(null.design.kinds, correlation=design.kinds.correlation, along=design.kinds.along)
+    base = _Contestant.of((), replace(null.design, kinds=kinds), free[:HYPERPARAMETERS])
     first = next((c for c in contestants if c.names == winner[:1]), None) if len(winner) == 2 else None
-    N = len(search.base.tests)
+    N = len(everyone)
     points = np.asarray(search.base.tests.mask).sum(1)
     labels: tuple[str | None, ...] = (None, *(("formula",) if winner == UNLISTED else winner))
     chi2, elpd = np.zeros((len(labels), N)), np.zeros((len(labels), N))
     residual = np.zeros((len(labels), *base.design.data.shape))
-    everyone = np.arange(N)
     whole = {id(c): c.log_evidence(everyone) for c in (base, *contestants)}
     for i in range(N):
         others = np.delete(everyone, i) if N > 1 else everyone
@@ -165,11 +164,6 @@ def held_out(search: Search, winner: Names) -> HeldOut:
             elpd[k, i] = whole[id(c)] - without[id(c)]
             residual[k, i] = c.residual(i, numbers)
     return HeldOut(labels, chi2, points.astype(float), elpd, _repeating(search, residual), residual)
-
-
-def _of_hyperparameters(design: Design, optimum: Optimum) -> float:
-    """What hyperparameters add to a log marginal likelihood at their mode, by all particles: prior and curvature."""
-    return log_prior(optimum.free, design) + optimum.log_evidence - optimum.log_joint
 
 
 def _repeating(search: Search, residual: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..calibrate.model import Model
 from .columns import Design
 from .evidence import Optimum, Solution
 from .own_numbers import OwnNumbers
@@ -29,7 +30,7 @@ class Hypothesis:
         smooth: the discrepancy of `UNLISTED`.
         misfit_at: hyperparameters with their misfit, at the mode.
         other_noise: what other kinds of noise add to its log evidence.
-        under_other_noise: design and hyperparameters under another kind of noise, where the tests prefer it.
+        under_other_noise: another kind of noise, where the tests prefer it, and the hyperparameters there.
     """
 
     names: Names
@@ -41,7 +42,7 @@ class Hypothesis:
     smooth: Smooth | None = None
     misfit_at: np.ndarray | None = None
     other_noise: float = 0.0
-    under_other_noise: tuple[Design, np.ndarray] | None = None
+    under_other_noise: tuple[Model, np.ndarray] | None = None
 
     @property
     def log_evidence(self) -> float:

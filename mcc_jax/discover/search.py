@@ -438,24 +438,32 @@ class Search:
         own = log_joint(free, design)
         found = [(with_other_noise(design, free, model), model) for model in models]
         best, model = max(found, key=lambda pair: pair[0].log_joint)
-        form = (with_noise(design, model), best.free) if best.log_joint > own else None
-        return OtherNoise([other.log_joint - own for other, _ in found], form)
+        return OtherNoise(
+            [other.log_joint - own for other, _ in found], (model, best.free) if best.log_joint > own else None
+        )
 
-    def likely_form(self, one: Hypothesis) -> tuple[Design, np.ndarray]:
-        """A hypothesis with or without its misfit and under the kind of noise that the tests prefer, at the mode."""
-        if one.under_other_noise is not None:
-            return one.under_other_noise
-        if one.is_off and one.misfit_at is not None:
-            return self.misfit_design(one), one.misfit_at
+    def likely_form(self, one: Hypothesis, *, misfit: bool = True) -> tuple[Design, np.ndarray]:
+        """A hypothesis under the kind of noise that the tests prefer, at the mode.
+
+        Args:
+            one: the hypothesis.
+            misfit: with its misfit, if the tests prefer that, too; if not, noise is still that of the likelier form.
+        """
         assert one.fitted is not None
-        return one.fitted[0], one.fitted[1].free
+        design, free = one.fitted[0], one.fitted[1].free
+        if misfit and one.is_off and one.misfit_at is not None:
+            design, free = self.misfit_design(one), one.misfit_at
+        if one.under_other_noise is not None:
+            model, at = one.under_other_noise
+            design, free = with_noise(design, model), at[: len(free)]
+        return design, free
 
 
 class OtherNoise(NamedTuple):
-    """What other kinds of noise add to a log evidence; design and hyperparameters under the best, if it is better."""
+    """What other kinds of noise add to a log evidence; the best and the hyperparameters there, if it is better."""
 
     gains: list[float]
-    best: tuple[Design, np.ndarray] | None
+    best: tuple[Model, np.ndarray] | None
 
 
 def pair_of(one: str, other: str) -> Names:
