@@ -55,7 +55,7 @@ def cell(file: str, keys: tuple[str, ...], column: str) -> str:
     raise AssertionError(f"{file} has no row {keys} with a column {column}")
 
 
-BLIND = "blind/2026-11-27-71303/score.md"
+BLIND = "blind/2026-11-27-84117/score.md"
 SEALED = {
     "right name alone": "right name alone, lambda >= 10",
     "both named": "two effects, both named, lambda >= 20, correlation < 0.8",
