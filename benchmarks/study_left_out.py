@@ -23,6 +23,7 @@ from scipy.stats import beta
 from study_formulas import PARTICLES, campaign, gram
 
 import mcc_jax as mcc
+from mcc_jax.discover import discover
 from mcc_jax.discover.base import base_fit
 from mcc_jax.discover.candidates import Candidate, located
 from mcc_jax.discover.screen import signature_columns
@@ -40,7 +41,7 @@ def answer(variant: Variant, unit: float) -> dict[str, Any]:
     others = tuple(v for v in mechanism.variants if v != variant)
     library = {**LIBRARY, variant.mechanism: replace(mechanism, variants=others)}
     begun = time.perf_counter()
-    found = mcc.discover(campaign((hidden,)), library=library, posterior=False, confirm=False, experiments=False)
+    found = discover(campaign((hidden,)), library=library, posterior=False, confirm=False, experiments=False)
     told = [[e.mechanism, e.variant.name, round(e.misfit, 3)] for e in found.effects]
     return {"verdict": found.verdict, "told": told, "seconds": time.perf_counter() - begun}
 

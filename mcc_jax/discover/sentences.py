@@ -30,6 +30,12 @@ def summary_of(found: Discovery) -> str:
         sentences.append(f"It is {_plain(effect.mechanism)} with probability {effect.probability:.2f} ({value}).")
         if effect.jumps:
             sentences.append(_jumps(found, effect))
+        elif abs(effect.amplitude) > effect.variant.plausible[1]:
+            most = f"{effect.variant.plausible[1]:g}{unit}"
+            sentences.append(
+                f"That is more than is plausible (at most {most}): something else may be in it, and the parameters "
+                "beside it are as doubtful."
+            )
         rivals = [_plain(n) for n in names if n != effect.mechanism]
         if rivals:
             sentences.append(f"These tests cannot tell it from {_listed(rivals)}.")

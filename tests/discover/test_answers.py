@@ -42,8 +42,8 @@ def test_a_share_stands_beside_chi2_and_is_of_what_could_be_closed():
     json.dumps(told, allow_nan=False)
 
 
-def answer(verdict, **more):
-    effect = Effect(find_variant("platen_sink_in"), {}, 0.01, 0.001, 0.97, 0.002, misfit=0.4)
+def answer(verdict, amplitude=1e-4, **more):
+    effect = Effect(find_variant("platen_sink_in"), {}, amplitude, 0.001, 0.97, 0.002, misfit=0.4)
     named = verdict in ("NAMED", "SET")
     sets = ((effect.mechanism, "frame_compliance") if verdict == "SET" else (effect.mechanism,),) if named else ()
     found = Discovery(
@@ -66,6 +66,12 @@ def test_a_summary_is_plain_english(verdict):
         assert "16.00 ± 0.10 GPa" in told
         assert "off by about 40 %" in told
     assert ("frame compliance" in told) is (verdict == "SET")
+
+
+def test_an_amplitude_beyond_reason_is_said():
+    most = find_variant("platen_sink_in").plausible[1]
+    assert "more than is plausible" in answer("NAMED", 1.1 * most).summary
+    assert "more than is plausible" not in answer("NAMED", 0.9 * most).summary
 
 
 def test_named_but_not_closed_is_said():
