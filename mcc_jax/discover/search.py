@@ -429,7 +429,7 @@ class Search:
             # What was not worked out counts as if no other kind explained it better.
             gains = values[names].gains if names in values else []
             one.other_noise = float(logsumexp([0.0, *gains]) - np.log(1 + len(kinds)))
-            if names in values:
+            if names and names in values:  # the law alone stays what it was calibrated as
                 one.under_other_noise = values[names].best
 
     def by_noise(self, names: Names, models: tuple[Model, ...]) -> OtherNoise:
