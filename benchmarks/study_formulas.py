@@ -103,10 +103,15 @@ def in_span(
     return Row(truth, sibling.name, float(np.sqrt(products[0, 0])), alone, misfit)
 
 
+def at_their_middle(variants: Sequence[Variant]) -> list[Candidate]:
+    """Formulas at the middle of their further numbers."""
+    return [Candidate(v, {n.name: n.middle for n in v.nuisances}) for v in variants]
+
+
 def rows_of(base: Base, candidates: list[Candidate]) -> list[Row]:
     """Every formula at the middle of its further numbers, left out in turn."""
     variants = list(dict.fromkeys(c.variant for c in candidates))
-    every = [Candidate(v, {n.name: n.middle for n in v.nuisances}) for v in variants] + candidates
+    every = [*at_their_middle(variants), *candidates]
     columns = signature_columns(base, base.state, every)
     at = scaled(
         {k: np.asarray(x) for k, x in base.each(coordinates, base.state.point, base.forms).items()},

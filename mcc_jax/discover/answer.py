@@ -66,7 +66,7 @@ def _population(search: Search, names: Names) -> tuple[np.ndarray, np.ndarray, n
     Errors are those of the linear model. Where the formulas are off, so is the law that would answer for it: the misfit
     is integrated out, too, and widens the errors (Brynjarsdottir and O'Hagan 2014).
     """
-    design, free = search.likely_form(search.found[names])
+    design, free = search.found[names].likely_form()
     solution = solve(free, design)
     mean, factor = map(np.asarray, search.base.population_prior)
     beta = mean + factor @ np.asarray(solution.common[:POPULATION])
@@ -102,7 +102,7 @@ def effects_of(search: Search, names: Names, probabilities: Mapping[str, float],
     if r is None:
         return ()
     # As wide as with the misfit and the scatter that the tests prefer, as the parameters beside it are.
-    design, free = search.likely_form(one)
+    design, free = one.likely_form()
     cov, c = _covariance(design, free), design.common.shape[-1]
     place, found = len(r.variants), []
     for k, variant in enumerate(r.variants):

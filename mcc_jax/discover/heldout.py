@@ -79,19 +79,17 @@ NOT_ASKED: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class _Contestant:
-    """A hypothesis at fixed hyperparameters, what every particle leaves of it, and its log prior odds."""
+    """A hypothesis at fixed hyperparameters, and what every particle leaves of it."""
 
-    names: Names
     design: Design
     free: np.ndarray
     left: np.ndarray
     log_integral: np.ndarray
-    log_prior: float = 0.0
 
     @classmethod
-    def of(cls, names: Names, design: Design, free: np.ndarray) -> _Contestant:
+    def of(cls, design: Design, free: np.ndarray) -> _Contestant:
         left = left_by_particle(free, design)
-        return cls(names, design, free, left.gram, left.log_integral)
+        return cls(design, free, left.gram, left.log_integral)
 
     def log_evidence(self, rows: np.ndarray) -> float:
         """Log marginal likelihood of some particles."""
@@ -134,34 +132,34 @@ def held_out(search: Search, winner: Names) -> HeldOut:
     """
     null, everyone = search.null, np.arange(len(search.base.tests))
     logs = search.log_posteriors()
-    contestants: list[_Contestant] = []
-    for names in [*list(logs)[: NUMERICS.contenders], winner]:
-        one = search.found[names]
-        if names and one.fitted is not None and names not in {c.names for c in contestants}:
-            c = _Contestant.of(names, *search.likely_form(one, misfit=False))
-            # Prior odds, hyperparameters and misfit weigh as they do for all particles.
-            contestants.append(replace(c, log_prior=logs.get(names, one.log_evidence) - c.log_evidence(everyone)))
+    contestants: dict[Names, _Contestant] = {}
+    for names in dict.fromkeys([*list(logs)[: NUMERICS.contenders], winner]):
+        if names and search.found[names].fitted is not None:
+            contestants[names] = _Contestant.of(*search.found[names].likely_form(misfit=False))
     # The base law under the winner's noise and spreads: gaps are measured by the noise of what closes them.
-    design, free = search.likely_form(search.found[winner], misfit=False)
-    kinds = replace(null.design.kinds, correlation=design.kinds.correlation, along=design.kinds.along)
-    base = _Contestant.of((), replace(null.design, kinds=kinds), free[:HYPERPARAMETERS])
-    first = next((c for c in contestants if c.names == winner[:1]), None) if len(winner) == 2 else None
+    found = contestants[winner]
+    kinds = replace(null.design.kinds, correlation=found.design.kinds.correlation, along=found.design.kinds.along)
+    base = _Contestant.of(replace(null.design, kinds=kinds), found.free[:HYPERPARAMETERS])
+    every = {(): base, **contestants}
+    whole = {names: c.log_evidence(everyone) for names, c in every.items()}
+    # Prior odds, hyperparameters and misfit weigh as they do for all particles.
+    weight = {names: logs.get(names, search.found[names].log_evidence) - whole[names] for names in contestants}
     N = len(everyone)
     points = np.asarray(search.base.tests.mask).sum(1)
     labels: tuple[str | None, ...] = (None, *(("formula",) if winner == UNLISTED else winner))
     chi2, elpd = np.zeros((len(labels), N)), np.zeros((len(labels), N))
     residual = np.zeros((len(labels), *base.design.data.shape))
-    whole = {id(c): c.log_evidence(everyone) for c in (base, *contestants)}
     for i in range(N):
         others = np.delete(everyone, i) if N > 1 else everyone
-        without = {id(c): c.log_evidence(others) for c in (base, *contestants)}
-        best = max(contestants, key=lambda c: without[id(c)] + c.log_prior)
-        steps = [base, *([first or best] if len(winner) == 2 else []), best]
-        for k, c in enumerate(steps):
+        without = {names: c.log_evidence(others) for names, c in every.items()}
+        best = max(contestants, key=lambda names: without[names] + weight[names])
+        first = winner[:1] if winner[:1] in contestants else best
+        for k, names in enumerate([(), *([first] if len(winner) == 2 else []), best]):
+            c = every[names]
             numbers = c.numbers(others)
             form = np.append(numbers, -1.0)
             chi2[k, i] = form @ c.left[i] @ form
-            elpd[k, i] = whole[id(c)] - without[id(c)]
+            elpd[k, i] = whole[names] - without[names]
             residual[k, i] = c.residual(i, numbers)
     return HeldOut(labels, chi2, points.astype(float), elpd, _repeating(search, residual), residual)
 

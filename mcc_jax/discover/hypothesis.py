@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..calibrate.model import Model
-from .columns import Design
+from .columns import Design, with_noise
 from .evidence import Optimum, Solution
 from .own_numbers import OwnNumbers
 from .refine import Refined
@@ -28,7 +28,7 @@ class Hypothesis:
         best: at the optimum of its best formulas.
         own: numbers of every test's own instead.
         smooth: the discrepancy of `UNLISTED`.
-        misfit_at: hyperparameters with their misfit, at the mode.
+        misfit_form: design and hyperparameters with their misfit, at the mode.
         other_noise: what other kinds of noise add to its log evidence.
         under_other_noise: another kind of noise, where the tests prefer it, and the hyperparameters there.
     """
@@ -40,7 +40,7 @@ class Hypothesis:
     best: Refined | None = None
     own: OwnNumbers | None = None
     smooth: Smooth | None = None
-    misfit_at: np.ndarray | None = None
+    misfit_form: tuple[Design, np.ndarray] | None = None
     other_noise: float = 0.0
     under_other_noise: tuple[Model, np.ndarray] | None = None
 
@@ -65,16 +65,31 @@ class Hypothesis:
     @property
     def sizes(self) -> tuple[float, ...]:
         """How far the formulas are off, as shares of the effects: scales that follow the other hyperparameters."""
-        if self.misfit_at is None:
+        if self.misfit_form is None:
             return ()
         one = self.formulas
         assert one is not None
-        return tuple(float(x) for x in np.exp(self.misfit_at[len(one.optimum.free) + len(one.variants) :]))
+        return tuple(float(x) for x in np.exp(self.misfit_form[1][len(one.optimum.free) + len(one.variants) :]))
 
     @property
     def formulas(self) -> Refined | None:
         """Its formulas at their optimum, beside numbers of every test's own if it has any."""
         return self.best if self.own is None else self.own.at
+
+    def likely_form(self, *, misfit: bool = True) -> tuple[Design, np.ndarray]:
+        """Design and hyperparameters under the kind of noise that the tests prefer, at the mode.
+
+        Args:
+            misfit: with its misfit, if the tests prefer that, too; if not, noise is still that of the likelier form.
+        """
+        assert self.fitted is not None
+        design, free = self.fitted[0], self.fitted[1].free
+        if misfit and self.is_off and self.misfit_form is not None:
+            design, free = self.misfit_form
+        if self.under_other_noise is not None:
+            model, at = self.under_other_noise
+            design, free = with_noise(design, model), at[: len(free)]
+        return design, free
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from ..calibrate.priors import NakagamiPrior
 from ..effects import Mechanism, Variant
 from .base import Base, State
 from .candidates import Candidate, candidates_of, located
-from .columns import Design, with_amplitudes, with_noise, without_further
+from .columns import Design, with_amplitudes, without_further
 from .design import NOTHING_MORE, More, design_of
 from .evidence import left_by_particle, log_joint, optimise, solve, visible, with_little_noise, without_first
 from .hypothesis import UNLISTED, Hypothesis, Names, Smooth
@@ -221,7 +221,7 @@ class Search:
         start = [r.optimum.free, [some] * len(r.variants), design.misfits[:, 0]]
         optimum = optimise(design, np.concatenate(start), without=r.optimum)
         one.with_misfit = optimum.log_evidence + (0.0 if one.own is None else one.own.of_choices)
-        one.misfit_at = optimum.free
+        one.misfit_form = replace(design), optimum.free  # a copy, without its whitened columns
 
     @cached_property
     def discrepancy(self) -> tuple[np.ndarray, list[int]]:
@@ -429,34 +429,18 @@ class Search:
             # What was not worked out counts as if no other kind explained it better.
             gains = values[names].gains if names in values else []
             one.other_noise = float(logsumexp([0.0, *gains]) - np.log(1 + len(kinds)))
-            if names and names in values:  # the law alone stays what it was calibrated as
+            if names and names in values:  # the law alone keeps the noise of the search
                 one.under_other_noise = values[names].best
 
     def by_noise(self, names: Names, models: tuple[Model, ...]) -> OtherNoise:
         """A hypothesis in its likelier form under other kinds of noise, of the same curvature."""
-        design, free = self.likely_form(self.found[names])
+        design, free = self.found[names].likely_form()
         own = log_joint(free, design)
         found = [(with_other_noise(design, free, model), model) for model in models]
         best, model = max(found, key=lambda pair: pair[0].log_joint)
         return OtherNoise(
             [other.log_joint - own for other, _ in found], (model, best.free) if best.log_joint > own else None
         )
-
-    def likely_form(self, one: Hypothesis, *, misfit: bool = True) -> tuple[Design, np.ndarray]:
-        """A hypothesis under the kind of noise that the tests prefer, at the mode.
-
-        Args:
-            one: the hypothesis.
-            misfit: with its misfit, if the tests prefer that, too; if not, noise is still that of the likelier form.
-        """
-        assert one.fitted is not None
-        design, free = one.fitted[0], one.fitted[1].free
-        if misfit and one.is_off and one.misfit_at is not None:
-            design, free = self.misfit_design(one), one.misfit_at
-        if one.under_other_noise is not None:
-            model, at = one.under_other_noise
-            design, free = with_noise(design, model), at[: len(free)]
-        return design, free
 
 
 class OtherNoise(NamedTuple):
