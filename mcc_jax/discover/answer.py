@@ -13,6 +13,8 @@ from ..calibrate import Posterior
 from ..calibrate.estimates import estimate, finite, summary
 from ..effects import Mechanism
 from .base import Base
+from .columns import Design
+from .design import design_of
 from .evidence import left_by_particle, residual_of, scales_of, solve, whitened
 from .hypothesis import UNLISTED, Hypothesis, Names
 from .own_numbers import OwnNumbers
@@ -21,15 +23,24 @@ from .search import Search
 from .settings import DECISIONS, POPULATION, TELLING
 
 
-def population_parameters(search: Search, probabilities: Mapping[Names, float]) -> dict[str, Any]:
+def parameters_alone(base: Base) -> dict[str, Any]:
+    """The population's parameters by the law alone, under the model's own noise: those of a calibration."""
+    return _averaged([_population(base, design_of(base, base.state), base.hyperparameters)], np.ones(1))
+
+
+def parameters_with(search: Search, probabilities: Mapping[Names, float]) -> dict[str, Any]:
     """The population's parameters, averaged over hypotheses (Bayesian model averaging, Hoeting et al. 1999).
 
     Args:
         search: the hypotheses.
         probabilities: of those that are averaged over; their sum need not be 1.
     """
-    each = [_population(search, names) for names in probabilities]
-    weights = np.array(list(probabilities.values())) / sum(probabilities.values())
+    each = [_population(search.base, *search.found[names].likely_form()) for names in probabilities]
+    return _averaged(each, np.array(list(probabilities.values())) / sum(probabilities.values()))
+
+
+def _averaged(each: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], weights: np.ndarray) -> dict[str, Any]:
+    """Parameters by name from means, errors and spreads, which are weighted."""
     mean, sd, tau = (np.array(parts) for parts in zip(*each, strict=True))
     middle = weights @ mean
     wide = np.sqrt(weights @ (sd**2 + (mean - middle) ** 2))
@@ -60,15 +71,14 @@ def likely(search: Search) -> dict[Names, float]:
     return found
 
 
-def _population(search: Search, names: Names) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _population(base: Base, design: Design, free: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Means of a, log modulus and of log C1, C3, C5 under a hypothesis, their errors, and the spreads of the latter.
 
     Errors are those of the linear model. Where the formulas are off, so is the law that would answer for it: the misfit
     is integrated out, too, and widens the errors (Brynjarsdottir and O'Hagan 2014).
     """
-    design, free = search.found[names].likely_form()
     solution = solve(free, design)
-    mean, factor = map(np.asarray, search.base.population_prior)
+    mean, factor = map(np.asarray, base.population_prior)
     beta = mean + factor @ np.asarray(solution.common[:POPULATION])
     sd = np.sqrt(np.diagonal(factor @ _covariance(design, free)[:POPULATION, :POPULATION] @ factor.T))
     beta[2:] -= np.mean(np.log1p(np.maximum(beta[0] * np.asarray(design.tests.flatness), -0.99)))
@@ -86,7 +96,7 @@ def _quantiles(q: float, weights: np.ndarray, mean: np.ndarray, sd: np.ndarray) 
     return [root_scalar(below, args=(j,), bracket=(low[j], high[j])).root for j in range(mean.shape[1])]
 
 
-def _covariance(design: Any, free: np.ndarray) -> np.ndarray:
+def _covariance(design: Design, free: np.ndarray) -> np.ndarray:
     """Posterior covariance of the common numbers, the amplitudes integrated out with flat priors."""
     left = left_by_particle(free, design).gram.sum(0)[:-1, :-1]
     c = design.common.shape[-1]

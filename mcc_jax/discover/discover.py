@@ -24,7 +24,8 @@ from .answer import (
     likely,
     likeness_of,
     name_probabilities,
-    population_parameters,
+    parameters_alone,
+    parameters_with,
     ranking_of,
     residuals_of,
     sets_of,
@@ -125,7 +126,7 @@ def discover(
         ranking=ranking,
         untestable=tuple(missing),
         p_any=p_any,
-        parameters_before=population_parameters(search, {(): 1.0}),
+        parameters_before=parameters_alone(base),
         notes=_notes(base),
         likeness=likeness_of(search, (), ranking),
     )
@@ -212,7 +213,7 @@ def _named(found: Discovery, search: Search, known: Mapping[str, Mechanism], tel
         residuals=left,
         places=map_,
         where=tuple(where(search.base, map_)),
-        parameters_after=population_parameters(search, likely(search)),
+        parameters_after=parameters_with(search, likely(search)),
         leads=leads_of(search, winner),
     )
     if winner == UNLISTED:

@@ -140,7 +140,8 @@ class Discovery(Saved):
         closure: a curve and a formula where no listed mechanism explains the gap.
         held_out: the gap on particles that took no part; None if not asked for.
         p_any: probability of so much evidence of anything if nothing were missing.
-        parameters_before, parameters_after: the population's parameters without and with the effects.
+        parameters_before, parameters_after: the population's parameters by the law alone, as a calibration has them,
+            and with the effects.
         next_experiments: further tests that would probably tell the members of a set apart.
         seed, runtime_s: for the record.
         leads: what remains beside the names and is not added to the law.
