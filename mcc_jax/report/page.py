@@ -188,23 +188,23 @@ def _cards(results: Results, checks: list[Any]) -> list[dict[str, str]]:
     if results.calibration is not None:
         content = results.calibration
         used = sum(entry["kept"] for entry in content["particles"])
+        alone = " of the law alone" if _law_alone(results) else ""
         done, trusted = content["converged"], worst(tested(results)) != "bad"
         found.append(
             {
                 "level": "good" if done and trusted else "bad",
-                "title": "Calibration",
+                "title": f"Calibration{alone}",
                 "answer": "Not converged" if not done else "Converged" if trusted else "Not to be trusted",
                 "line": f"{used} of {len(content['particles'])} particles, by {METHODS[content['method']]}",
             }
         )
-        good, look, bad = (sum(c.level == level for c in checks) for level in ("good", "look", "bad"))
-        words = [f"{bad} with a problem"] * (bad > 0) + [f"{look} to look at"] * (look > 0)
+        good, look, bad = ([f"“{c.check}”" for c in checks if c.level == one] for one in ("good", "look", "bad"))
         found.append(
             {
                 "level": "bad" if bad else "look" if look else "good",
-                "title": "Checks",
-                "answer": f"{good} of {len(checks)} fine" if trusted else "Numbers cannot be true",
-                "line": f"{listed(words)}, see Checks" if words else "nothing stands out",
+                "title": f"Checks{alone}",
+                "answer": f"{len(good)} of {len(checks)} fine" if trusted else "Numbers cannot be true",
+                "line": f"Not fine: {listed([*bad, *look])}" if bad or look else "nothing stands out",
             }
         )
     return found
@@ -214,8 +214,13 @@ def _summary(results: Results) -> list[str]:
     """What stands below the first screen, in sentences."""
     if results.calibration is None:
         return []
-    alone = results.discovery is not None and results.discovery["effects"] and not results.calibration.get("effects")
-    return calibration_sentences(results.calibration, "the law alone" if alone else "the law")
+    return calibration_sentences(results.calibration, "the law alone" if _law_alone(results) else "the law")
+
+
+def _law_alone(results: Results) -> bool:
+    """Whether the calibration is of the law without the effects that were found to be missing in it."""
+    found, calibration = results.discovery, results.calibration
+    return bool(found and found["effects"] and calibration and not calibration.get("effects"))
 
 
 def _sections(results: Results, shown: list[FittedCurve], checks: list[Any]) -> list[tuple[str, str]]:

@@ -12,6 +12,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
+from matplotlib.transforms import ScaledTranslation
 
 from ..calibrate.curves import FittedCurve
 from ..calibrate.results import PosteriorDraws
@@ -46,6 +47,7 @@ class Telling:
         noise_um: standard deviation of the noise.
         added: what the law with the addition is called.
         caption: what is shown, in words.
+        simulated: whether the test was computed, not measured.
     """
 
     time_s: np.ndarray
@@ -56,6 +58,12 @@ class Telling:
     noise_um: np.ndarray | None
     added: str
     caption: str
+    simulated: bool = False
+
+    @property
+    def test(self) -> str:
+        """What the test is called."""
+        return "simulated test" if self.simulated else "measured"
 
     @property
     def laws(self) -> list[tuple[np.ndarray, str, Literal["-", "--"], str]]:
@@ -90,9 +98,10 @@ def telling_pictures(told: Telling) -> list[tuple[str, str]]:
         (draw_enlarged, "Force over displacement, enlarged where law and test differ most"),
         (draw_left_over, "Measured less predicted displacement over time"),
     ):
-        figure = new_figure(5.4, 4.0)
+        # No wider than a phone: its type is read there at the size in which it is set.
+        figure = new_figure(4.6, 3.6)
         handles = draw(figure.subplots(), told)
-        figure.legend(handles=handles, loc="outside upper center", ncols=3)
+        figure.legend(handles=handles, loc="outside upper center", ncols=3, columnspacing=1.2, handlelength=1.6)
         figure.set_layout_engine("constrained")
         found.append((_svg(figure), f"{words}: {told.caption}"))
     return found
@@ -111,10 +120,11 @@ def draw_enlarged(ax: Axes, told: Telling) -> list[Any]:
     _force_over_displacement(inset, told, size=1.2)
     inset.set(xticks=[], yticks=[])
     inset.spines[["top", "right"]].set_visible(True)
-    inset.set_title("the whole test, and where this is", fontsize=7.5, color=GREY, pad=2, loc="center")
+    inset.set_title("the whole test", fontsize=8.5, color=BLACK, pad=2, loc="center")
     corner = across.min(), up.min()
     inset.add_patch(Rectangle(corner, np.ptp(across), np.ptp(up), fill=False, edgecolor=BLACK, linewidth=1.1, zorder=9))
-    dots = Line2D([], [], marker="o", linestyle="", markersize=4.5, color=PALE, markeredgecolor=GREY, label="measured")
+    _arrows(ax, told)
+    dots = Line2D([], [], marker="o", linestyle="", markersize=4.5, color=PALE, markeredgecolor=GREY, label=told.test)
     return [dots, *(Line2D([], [], color=colour, linestyle=line, label=label) for _, colour, line, label in told.laws)]
 
 
@@ -124,16 +134,38 @@ def draw_left_over(ax: Axes, told: Telling) -> list[Any]:
     if told.noise_um is not None:
         handles.append(
             ax.fill_between(
-                told.time_s, -told.noise_um, told.noise_um, color=ORANGE, alpha=0.45, linewidth=0, label="noise"
+                told.time_s,
+                -told.noise_um,
+                told.noise_um,
+                color=ORANGE,
+                alpha=0.45,
+                linewidth=0,
+                label="noise (± 1 sd)",
             )
         )
     ax.axhline(0.0, color=GREY, linewidth=0.7)
     for away, colour, line, label in told.laws:
         handles += ax.plot(told.time_s, away, color=colour, linestyle=line, linewidth=1.3, label=label)
     ax.set_xlabel("time [s]")
-    ax.set_ylabel("measured − law [µm]")
+    ax.set_ylabel("test − law [µm]")
     ax.margins(x=0.01)
     return handles
+
+
+def _arrows(ax: Axes, told: Telling) -> None:
+    """Which way the test goes: an arrow beside the loading and the release that cover most force in sight."""
+    near, rising = told.near, np.append(np.diff(told.force_mN), 0.0) > 0
+    for up, above in ((True, (-7, 7)), (False, (9, -5))):
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], (near & (rising == up)).astype(int), [0]])))
+        runs = [slice(a, b) for a, b in edges.reshape(-1, 2) if b - a > 2]
+        if not runs:
+            continue
+        run = max(runs, key=lambda r: float(np.ptp(told.force_mN[r])))
+        place = run.start + (run.stop - 1 - run.start) * np.array([0.4, 0.7])
+        start, end = ((told.displacement_um[k], told.force_mN[k]) for k in place.astype(int))
+        beside = ax.transData + ScaledTranslation(above[0] / 72, above[1] / 72, ax.figure.dpi_scale_trans)
+        look = {"arrowstyle": "-|>", "color": GREY, "linewidth": 1.0}
+        ax.annotate("", end, start, xycoords=beside, textcoords=beside, arrowprops=look)
 
 
 def _emptiest(across: np.ndarray, up: np.ndarray) -> tuple[float, float, float, float]:

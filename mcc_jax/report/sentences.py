@@ -90,7 +90,7 @@ def discovery_sentence(content: dict[str, Any]) -> str:
         return f"Something is missing that no listed mechanism explains{gap}."
     names = listed([plain(effect["mechanism"]) for effect in content["effects"]])
     sure = ", or what these tests cannot tell from it" if verdict == "SET" else ""
-    return f"Missing in the law is {names}{sure}{gap}."
+    return f"The law misses {names}{sure}{gap}."
 
 
 def _gap(gap: dict[str, Any]) -> str:
@@ -104,8 +104,8 @@ def _gap(gap: dict[str, Any]) -> str:
         case _:
             low = last["chi2_per_dof"]
     if low is not None and low <= 1 + TELLING.within:
-        return "; with it law and tests agree within the noise"
-    return "; with it part of the gap closes, and part stays"
+        return "; with it added, law and tests agree within the noise"
+    return "; with it added, part of the gap closes, and part stays"
 
 
 def next_steps(results: Results, folder: str) -> list[tuple[str, str]]:

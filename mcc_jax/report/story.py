@@ -11,6 +11,7 @@ import numpy as np
 from .._format import number, percent, probability, with_sd
 from ..calibrate.curves import FittedCurve
 from ..discover import Discovery
+from ..plots.style import is_simulated
 from .pictures import Telling, telling_pictures
 from .read import Results
 from .sentences import discovery_sentence, listed, plain, quantity
@@ -71,18 +72,17 @@ def telling_test(found: Discovery) -> Telling | None:
     curve, used = base.campaign.curves[i], left.used[j, : len(rows)]
     rows = np.asarray(rows)[used]
     name = listed([plain(effect.mechanism) for effect in found.effects]) if found.effects else "the formula found"
-    off = f"{number(float(rms[0][j]), 2)} µm"
+    off, which = f"{number(float(rms[0][j]), 2)} µm", "of all particles this one fits worst"
     if added:
+        middle = [f"{number(float(np.median(one)), 2)} µm" for one in rms]
         off += f" before and {number(float(rms[1][j]), 2)} µm after {name} was added"
-    caption = (
-        f"Particle {base.campaign.particles[i]}, {source}. On average the law is off by {off}"
-        f"{'; of all particles this one gains most' if added else ': of all particles this one fits worst'}."
-    )
+        which = f"of all particles this one gains most (median of all: {middle[0]} before, {middle[1]} after)"
+    caption = f"Particle {base.campaign.particles[i]}, {source}. On average the law is off by {off}; {which}."
     columns = (column[j, : len(used)][used] for column in (before, after, left.noise))
     one, two, noise = columns
     return Telling(
         curve.time_s[rows], curve.force_mN[rows], curve.displacement_um[rows], one, two if added else None, noise,
-        f"law with {name}" if added else "", caption,
+        f"law with {name}" if added else "", caption, is_simulated(base.campaign.metadata),
     )  # fmt: skip
 
 
@@ -110,8 +110,8 @@ def _gap_tiles(found: dict[str, Any]) -> list[tuple[str, str, str]]:
     if gap["closed_fraction"] is not None:
         before, after = (number(gap["steps"][i]["chi2_per_dof"], 3) for i in (0, -1))
         meaning = (
-            f"of what the law alone missed on particles that took no part. χ² per point (how far measured and law are "
-            f"apart, in units of the noise) falls from {before} to {after}; 1 is noise alone."
+            f"of what the law alone missed on held-out particles, of which only own C₁, C₃, C₅, modulus and zero "
+            f"are fitted. χ² per point (misfit in units of the noise) falls from {before} to {after}; 1 is noise alone."
         )
         tiles.append(("Gap closed", percent(gap["closed_fraction"], 3), meaning))
     pair = [side.get("effective_modulus_MPa") for side in (found["parameters_before"], found["parameters_after"])]
@@ -124,8 +124,8 @@ def _gap_tiles(found: dict[str, Any]) -> list[tuple[str, str, str]]:
     for effect in found["effects"]:
         for name, value in list(effect["parameters"].items())[:1]:
             meaning = (
-                f"{quantity(name)}, ± one standard deviation. That it is this effect has probability "
-                f"{probability(effect['probability'])}."
+                f"{quantity(name)}, ± one standard deviation. That it is this one, of {len(found['ranking'])} effects "
+                f"compared, has probability {probability(effect['probability'])}."
             )
             tiles.append((plain(effect["mechanism"]).capitalize(), with_sd(value), meaning))
     if found["verdict"] == "NO_GAP":
