@@ -6,13 +6,15 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.stats import binomtest
 
 from ..calibrate.estimates import finite
+from ..calibrate.settings import JUDGEMENT
 from .columns import Design
 from .evidence import amplitudes, left_by_particle, scales_of, without_first
 from .hypothesis import UNLISTED, Names
 from .search import Search
-from .settings import HYPERPARAMETERS, NUMERICS
+from .settings import DECISIONS, HYPERPARAMETERS, NUMERICS
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,34 @@ class HeldOut:
     def chi2_per_dof(self) -> np.ndarray:
         """Mean chi2 per point of every step."""
         return self.chi2.sum(1) / self.points.sum()
+
+    def objection(self, used: np.ndarray, range_um: np.ndarray) -> str | None:
+        """Why what was found cannot be the answer, going by held-out particles; None if nothing speaks against it.
+
+        That it does not help enough is no objection: weak effects hardly do. That it harms is one, by the log
+        predictive density against its standard error (Vehtari, Gelman and Gabry 2017) or by the sign test of the
+        particles' root mean square residuals; and so is a law that with it still misses tests by far.
+
+        Args:
+            used: points that count, shape (N, points).
+            range_um: of every test's displacement [um], shape (N,).
+        """
+        away = self.elpd[-1] - self.elpd[0]
+        error = float(np.std(away, ddof=1) * np.sqrt(len(away)))
+        if away.sum() < -DECISIONS.contradicted * error:
+            return f"all together are predicted worse with it (log predictive density {away.sum():.3g} +- {error:.2g})"
+        if self.residual_um is None:
+            return None
+        count = np.maximum(used.sum(1), 1)
+        before, after = (np.sqrt(np.sum(np.where(used, self.residual_um[k], 0.0) ** 2, 1) / count) for k in (0, -1))
+        worse = int(np.sum(after > before))
+        if binomtest(worse, len(after), alternative="greater").pvalue < DECISIONS.level:
+            middle = f"medians {np.median(before):.2g} um without it, {np.median(after):.2g} um with it"
+            return f"{worse} of {len(after)} lie further from the law with it than without ({middle})"
+        off = float(np.median(after / range_um))
+        if off > JUDGEMENT.misfit:
+            return f"the law with it still misses them by {100 * off:.2g} % of their range (median)"
+        return None
 
     def to_json(self) -> dict[str, Any]:
         """The gap as in `discovery.json`; shares never stand without chi2 per point beside them."""

@@ -27,6 +27,8 @@ class Decisions:
             of it: toes need 0.1 (`misfit` and this are integrated out together).
         general, general_log_sd: size of a smooth discrepancy in standard deviations of white noise, likewise.
         jump: share of the tests in which a sudden step is expected, a priori: where it is looked for once more.
+        contradicted: standard errors by which held-out particles must be predicted worse with what was found before it
+            is taken back: beyond two a difference is hardly chance.
         least: particles that must be left before those that snap through are left out.
     """
 
@@ -42,6 +44,7 @@ class Decisions:
     general: float = 3.0
     general_log_sd: float = 1.5
     jump: float = 0.25
+    contradicted: float = 2.0
     least: int = 3
 
     __repr__ = described()

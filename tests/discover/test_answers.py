@@ -42,6 +42,34 @@ def test_a_share_stands_beside_chi2_and_is_of_what_could_be_closed():
     json.dumps(told, allow_nan=False)
 
 
+@pytest.mark.parametrize(
+    ("residual_um", "elpd", "said"),
+    [
+        ((0.2, 0.1), 5.0, None),
+        ((0.2, 0.1), -50.0, "predicted worse"),
+        ((0.1, 0.2), 5.0, "8 of 8 lie further"),
+        ((0.9, 0.8), 5.0, "misses them by 8 % of their range"),
+    ],
+)
+def test_what_held_out_particles_contradict_is_no_answer(residual_um, elpd, said):
+    gain = elpd * (1 + 0.1 * np.arange(8))
+    residual = np.broadcast_to(np.array(residual_um)[:, None, None], (2, 8, 50))
+    points, zeros = np.full(8, 50.0), np.zeros(8)
+    held = HeldOut((None, "creep"), np.ones((2, 8)), points, np.array([zeros, gain]), np.ones(2), residual)
+    objection = held.objection(np.ones((8, 50), bool), np.full(8, 10.0))
+    assert objection is None if said is None else said in objection
+
+
+def test_a_weak_effect_that_hardly_helps_is_not_contradicted():
+    rng = np.random.default_rng(0)
+    residual = np.ones((2, 20, 50))
+    residual[1] += 0.01 * rng.choice([-1, 1], (20, 1))
+    held = HeldOut(
+        (None, "creep"), np.ones((2, 20)), np.full(20, 50.0), rng.normal(0, 1, (2, 20)), np.ones(2), residual
+    )
+    assert held.objection(np.ones((20, 50), bool), np.full(20, 100.0)) is None
+
+
 def answer(verdict, amplitude=1e-4, **more):
     effect = Effect(find_variant("platen_sink_in"), {}, amplitude, 0.001, 0.97, 0.002, misfit=0.4)
     named = verdict in ("NAMED", "SET")
