@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtr
+from scipy.stats import t as student
 
 from ..calibrate import Posterior
 from ..calibrate.estimates import estimate, finite, summary
@@ -25,7 +25,9 @@ from .settings import DECISIONS, POPULATION, TELLING
 
 def parameters_alone(base: Base) -> dict[str, Any]:
     """The population's parameters by the law alone, under the model's own noise: those of a calibration."""
-    return _averaged([_population(base, design_of(base, base.state), base.hyperparameters)], np.ones(1))
+    return _averaged(
+        [_population(base, design_of(base, base.state), base.hyperparameters)], np.ones(1), len(base.tests)
+    )
 
 
 def parameters_with(search: Search, probabilities: Mapping[Names, float]) -> dict[str, Any]:
@@ -36,15 +38,25 @@ def parameters_with(search: Search, probabilities: Mapping[Names, float]) -> dic
         probabilities: of those that are averaged over; their sum need not be 1.
     """
     each = [_population(search.base, *search.found[names].likely_form()) for names in probabilities]
-    return _averaged(each, np.array(list(probabilities.values())) / sum(probabilities.values()))
+    weights = np.array(list(probabilities.values())) / sum(probabilities.values())
+    return _averaged(each, weights, len(search.base.tests))
 
 
-def _averaged(each: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], weights: np.ndarray) -> dict[str, Any]:
-    """Parameters by name from means, errors and spreads, which are weighted."""
+def _averaged(
+    each: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], weights: np.ndarray, particles: int
+) -> dict[str, Any]:
+    """Parameters by name from means, errors and spreads, which are weighted.
+
+    The mean of log C over particles whose spread is estimated from the same particles follows Student's t with one
+    degree of freedom less than there are particles; a and the modulus, which no spread of particles limits, are normal.
+    """
     mean, sd, tau = (np.array(parts) for parts in zip(*each, strict=True))
+    freedom = np.array([np.inf, np.inf, *3 * [max(particles - 1.0, 1.0)]])
+    # Of three degrees of freedom and more Student's t has a standard deviation.
+    wider = np.where(freedom > 2, student.std(freedom), 1.0)
     middle = weights @ mean
-    wide = np.sqrt(weights @ (sd**2 + (mean - middle) ** 2))
-    low, high = (_quantiles(q, weights, mean, sd) for q in (0.025, 0.975))
+    wide = np.sqrt(weights @ ((sd * wider) ** 2 + (mean - middle) ** 2))
+    low, high = (_quantiles(q, weights, mean, sd, freedom) for q in (0.025, 0.975))
     spread, modulus = weights @ tau, float(np.exp(middle[1]))
 
     def entry(j: int) -> dict[str, Any]:
@@ -85,14 +97,15 @@ def _population(base: Base, design: Design, free: np.ndarray) -> tuple[np.ndarra
     return beta, sd, np.asarray(scales_of(free, design)[0])[:3]
 
 
-def _quantiles(q: float, weights: np.ndarray, mean: np.ndarray, sd: np.ndarray) -> list[float]:
-    """Quantiles of mixtures of normal distributions, one a column."""
+def _quantiles(q: float, weights: np.ndarray, mean: np.ndarray, sd: np.ndarray, freedom: np.ndarray) -> list[float]:
+    """Quantiles of mixtures of Student's t distributions (normal ones of infinite freedom), one a column."""
     from scipy.optimize import root_scalar
 
     def below(x: float, j: int) -> float:
-        return float(weights @ ndtr((x - mean[:, j]) / sd[:, j])) - q
+        return float(weights @ student.cdf((x - mean[:, j]) / sd[:, j], freedom[j])) - q
 
-    low, high = np.min(mean - 9 * sd, 0), np.max(mean + 9 * sd, 0)
+    far = student.ppf(0.999, freedom) * sd
+    low, high = np.min(mean - far, 0), np.max(mean + far, 0)
     return [root_scalar(below, args=(j,), bracket=(low[j], high[j])).root for j in range(mean.shape[1])]
 
 

@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 
+from mcc_jax.discover.answer import _averaged
 from mcc_jax.discover.closure import LETTERS, terms_of
 from mcc_jax.discover.heldout import HeldOut
 from mcc_jax.discover.result import Discovery, Effect
@@ -40,6 +41,14 @@ def test_a_share_stands_beside_chi2_and_is_of_what_could_be_closed():
     assert held(3.0, 0.9).to_json()["closed_fraction"] == 1.0
     assert held(0.95, 0.9).to_json()["closed_fraction"] is None
     json.dumps(told, allow_nan=False)
+
+
+def test_the_mean_of_few_particles_follows_student_t():
+    one = np.arange(1.0, 6.0), np.full(5, 0.1), np.full(3, 0.3)
+    found = _averaged([one], np.ones(1), 5)
+    assert found["a"]["interval_95"] == pytest.approx([1 - 0.196, 1 + 0.196], abs=1e-4)
+    assert found["log_C1"]["mean"]["interval_95"] == pytest.approx([3 - 0.27764, 3 + 0.27764], abs=1e-4)
+    assert found["log_C1"]["mean"]["sd"] == pytest.approx(0.1 * 2**0.5)
 
 
 @pytest.mark.parametrize(

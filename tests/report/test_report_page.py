@@ -245,7 +245,7 @@ def test_what_is_missing_is_said_with_the_command_that_makes_it(folder, parts):
     ("verdict", "words"),
     [
         ("NO_GAP", "Nothing is missing in the law"),
-        ("NAMED", "Missing in the law is frame compliance"),
+        ("NAMED", "The law misses frame compliance"),
         ("SET", "or what these tests cannot tell from it"),
         ("UNLISTED", "no listed mechanism explains"),
         ("FIT_NOT_CONVERGED", "could not be fitted well enough"),
@@ -268,13 +268,13 @@ def test_the_first_screen_tells_verdict_gap_and_modulus(page):
     assert list(read.sections) == [name for name in ORDER if name in read.sections]
     top = read.sections["summary"]
     for text in (
-        "Missing in the law is frame compliance",
+        "The law misses frame compliance",
         "16.000000 ± 0.000010 GPa",
         "9.000 ± 0.050 GPa",
         "78 % higher",
     ):
         assert text in top, text
-    assert top.index("Missing in the law") < top.index("Gap closed") < top.index("Effective modulus")
+    assert top.index("The law misses") < top.index("Gap closed") < top.index("Effective modulus")
     for section in ("summary", "discovery"):
         text = " ".join(read.sections[section].split())
         place = text.index("99 %")
