@@ -105,20 +105,23 @@ def _law_alone():
 
 
 def picture(mechanism):
-    """A mechanism's first formula on a test with holds and a reload: the whole curve, and what is added to it."""
+    """Strength, and two pictures of a mechanism's first formula in a test with holds and a reload.
+
+    The whole curve, and what is added to it: two, so that a phone shows one below the other.
+    """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     law, (strength, curve) = _law_alone(), _shown(mechanism.variants[0])
     with rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
-        figure = Figure(figsize=(7.6, 2.7), layout="constrained")
-        left, right = figure.subplots(1, 2)
-        left.plot(law.displacement_um, law.force_mN, color=GREY, lw=1.3, label="law alone")
-        left.plot(curve.displacement_um, curve.force_mN, color=VERMILION, lw=1.3, label="with the effect")
+        figures = [Figure(figsize=(3.8, 2.7), layout="constrained") for _ in range(2)]
+        left, right = (figure.subplots() for figure in figures)
+        left.plot(law.displacement_um, law.force_mN, "--", color=VERMILION, lw=1.3, label="law alone")
+        left.plot(curve.displacement_um, curve.force_mN, color=BLUE, lw=1.3, label="with the effect")
         left.set(xlabel="displacement / µm", ylabel="force / mN")
         left.legend(frameon=False, fontsize=8, loc="upper left")
         added = curve.displacement_um - law.displacement_um
-        right.plot(curve.time_s, added, color=VERMILION, lw=1.3)
+        right.plot(curve.time_s, added, color=BLUE, lw=1.3)
         right.axhline(0, color=GREY, lw=0.6)
         low, high = min(added.min(), 0.0), max(added.max(), 0.0)
         room = 0.12 * (high - low)
@@ -129,17 +132,19 @@ def picture(mechanism):
         force.set_ylim(0, 1.15 * law.force_mN.max())
         force.set_yticks([])
         force.spines["right"].set_visible(False)
-        force.text(0.99, 0.99, "grey: force", transform=force.transAxes, ha="right", va="top", fontsize=8, color=GREY)
+        look = {"ha": "right", "va": "top", "fontsize": 8, "color": "0.3"}
+        force.text(0.99, 0.99, "grey: force, from 0 at the bottom", transform=force.transAxes, **look)
         right.set_zorder(force.get_zorder() + 1)
         right.patch.set_visible(False)
-        stream = io.BytesIO()
-        figure.savefig(stream, format="png", dpi=110, metadata={"Software": None})
-    return strength, stream.getvalue()
+        streams = [io.BytesIO() for _ in figures]
+        for figure, stream in zip(figures, streams, strict=True):
+            figure.savefig(stream, format="png", dpi=140, metadata={"Software": None})
+    return strength, *(stream.getvalue() for stream in streams)
 
 
 @cache
 def pictures():
-    """Of every mechanism: the strength that is drawn, and the picture."""
+    """Of every mechanism: the strength that is drawn, and its two pictures."""
     from mcc_jax.effects import LIBRARY
 
     return {name: picture(mechanism) for name, mechanism in LIBRARY.items()}
@@ -163,7 +168,7 @@ def entry(mechanism):
     facts = [
         f"| Number | `{first.parameter}`, {_range(first)} |",
         f"| Sign | {_sign(first)} |",
-        f"| The tests must hold | {_listed(need.value for need in first.needs) or 'nothing special'} |",
+        f"| The tests need | {_listed(need.value for need in first.needs) or 'nothing special'} |",
     ]
     if first.helps:
         facts.append(f"| Easier to tell with | {_listed(need.value for need in first.helps)} |")
@@ -184,11 +189,14 @@ def entry(mechanism):
             "",
             f"`{name}`. {mechanism.explanation}",
             "",
-            f"![A test without and with {plain(name)}, and what it adds over time](../{FOLDER}/{name}.png)",
+            '<div class="two" markdown>',
+            f"![A test without and with {plain(name)}](../{FOLDER}/{name}.png)",
+            f"![What {plain(name)} adds over time](../{FOLDER}/{name}-added.png)",
+            "</div>",
             "",
             f"*Drawn: {_code(first)} with {strength}.*",
             "",
-            "| | |",
+            "| In short | |",
             "|---|---|",
             *facts,
             "",
@@ -379,7 +387,9 @@ def _broken(title):
 
 def files():
     """Every picture by its path in the pages."""
-    found = {f"{FOLDER}/{name}.png": content for name, (_, content) in pictures().items()}
+    found = {}
+    for name, (_, curve, added) in pictures().items():
+        found |= {f"{FOLDER}/{name}.png": curve, f"{FOLDER}/{name}-added.png": added}
     return found | {"images/which-test.png": which_test_picture()}
 
 

@@ -103,9 +103,9 @@ def found():
     told = telling_test(answer)
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.2, 3.9), layout="constrained")
     handles = draw_enlarged(left, told)
-    left.set_title("One particle, crushed and released: the law alone misses the loop", fontsize=9, loc="left")
+    left.set_title("One particle crushed and released: the law alone misses the loop", fontsize=9, loc="left")
     noise = draw_left_over(right, told)[0]
-    right.set_title(f"The gap closes: χ² per point {before:.0f} → {after:.1f} (noise alone: 1)", fontsize=9, loc="left")
+    right.set_title(f"Creep closes the gap: χ² per point {before:.0f} → {after:.1f} (noise: 1)", fontsize=9, loc="left")
     for ax in (left, right):
         ax.spines[["top", "right"]].set_visible(False)
     figure.legend(handles=[*handles, noise], loc="outside lower center", ncols=4, frameon=False)

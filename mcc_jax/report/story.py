@@ -119,13 +119,16 @@ def _gap_tiles(found: dict[str, Any]) -> list[tuple[str, str, str]]:
         before, after = pair
         change = 100 * (after["value"] / before["value"] - 1)
         way = "higher" if change > 0 else "lower"
-        meaning = f"instead of {with_sd(before, 1e-3)} GPa by the law alone: {number(abs(change), 2)} % {way}."
+        meaning = (
+            f"instead of {with_sd(before, 1e-3)} GPa by the law alone, where it may differ between particles: "
+            f"{number(abs(change), 2)} % {way}."
+        )
         tiles.append(("Effective modulus", f"{with_sd(after, 1e-3)} GPa", meaning))
     for effect in found["effects"]:
         for name, value in list(effect["parameters"].items())[:1]:
             meaning = (
                 f"{quantity(name)}, ± one standard deviation. That it is this one, of {len(found['ranking'])} effects "
-                f"compared, has probability {probability(effect['probability'])}."
+                f"that these tests could show, has probability {probability(effect['probability'])}."
             )
             tiles.append((plain(effect["mechanism"]).capitalize(), with_sd(value), meaning))
     if found["verdict"] == "NO_GAP":

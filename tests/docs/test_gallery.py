@@ -65,14 +65,21 @@ def test_every_mechanism_stands_in_the_tables(docs):
 def test_an_entry_says_everything_and_shows_a_picture(docs, monkeypatch):
     gallery = docs("gallery")
     creep = LIBRARY["creep"]
-    strength, picture = gallery.picture(creep)
-    monkeypatch.setattr(gallery, "pictures", lambda: {"creep": (strength, picture)})
+    strength, *pictures = gallery.picture(creep)
+    monkeypatch.setattr(gallery, "pictures", lambda: {"creep": (strength, *pictures)})
     entry = gallery.entry(creep)
-    assert picture.startswith(b"\x89PNG")
-    assert len(picture) < 80_000
+    for picture in pictures:
+        assert picture.startswith(b"\x89PNG")
+        assert len(picture) < 60_000
     low, high = creep.variants[0].plausible
     assert low <= strength <= high
-    said = [creep.explanation, creep.check, creep.variants[0].parameter, "images/effects/creep.png"]
+    said = [
+        creep.explanation,
+        creep.check,
+        creep.variants[0].parameter,
+        "images/effects/creep.png",
+        "images/effects/creep-added.png",
+    ]
     said += [
         text for variant in creep for text in (f"`{variant.name}`", variant.explanation, variant.source.rstrip("."))
     ]
