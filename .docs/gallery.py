@@ -166,7 +166,7 @@ def entry(mechanism):
     first, name = mechanism.variants[0], mechanism.name
     strength = f"{written(pictures()[name][0])}{unit_of(first.unit)}"
     facts = [
-        f"| Number | `{first.parameter}`, {_range(first)} |",
+        f"| Parameter | `{first.parameter}`, {_range(first)} |",
         f"| Sign | {_sign(first)} |",
         f"| The tests need | {_listed(need.value for need in first.needs) or 'nothing special'} |",
     ]
@@ -194,7 +194,7 @@ def entry(mechanism):
             f"![What {plain(name)} adds over time](../{FOLDER}/{name}-added.png)",
             "</div>",
             "",
-            f"*Drawn: {_code(first)} with {strength}.*",
+            f"*Drawn: {_code(first)} with {strength}, strong so that it shows.*",
             "",
             "| In short | |",
             "|---|---|",

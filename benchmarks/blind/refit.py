@@ -2,14 +2,17 @@
 
 `python -m benchmarks.blind.refit NAME [--part i/n]` writes `benchmarks/results/blind/NAME/kinds.json` (a part writes
 `kinds_i_of_n.json`), one campaign after the other, and goes on where it stopped. Kinds: "search failure" (a listed
-formula of the truth has more evidence than the winner), "library gap" (it has less), "ambiguous" (they are within a few
-nats), "not compared" (UNLISTED has no evidence of its own here; FIT_NOT_CONVERGED and crashes).
+formula of the truth has more evidence than the winner, by more than its prior odds cost), "prior odds" (more evidence,
+but not by so much: the best of as many formulas as there are must lead nothing by the logarithm of their number, and
+two names one by the margin), "library gap" (it has less), "ambiguous" (they are within a few nats),
+"not compared" (UNLISTED has no evidence of its own here; FIT_NOT_CONVERGED and crashes).
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 from collections.abc import Callable, Sequence
 from itertools import product
 from pathlib import Path
@@ -25,10 +28,10 @@ Evidence = Callable[[Sequence[str]], float]
 """Log evidence of the law with effects, each "mechanism:variant"."""
 
 
-def kind_of(truth: float, winner: float) -> str:
-    """The kind of a wrong verdict, from the log evidences of the truth and of the winner."""
+def kind_of(truth: float, winner: float, odds: float = 0.0) -> str:
+    """The kind of a wrong verdict, from log evidences of truth and winner, and log prior odds against the truth."""
     if truth - winner > SETTINGS.scoring.ambiguous_nats:
-        return "search failure"
+        return "search failure" if truth - winner > odds else "prior odds"
     return "library gap" if winner - truth > SETTINGS.scoring.ambiguous_nats else "ambiguous"
 
 
@@ -36,13 +39,19 @@ def judge(outcome: Outcome, formulas: dict[str, list[str]], evidence: Evidence) 
     """The kind of one wrong verdict; `formulas` are the library's by mechanism."""
     if outcome.verdict not in ("NO_GAP", "NAMED", "SET"):
         return {"kind": "not compared", "verdict": outcome.verdict}
-    winner = evidence([f"{e['mechanism']}:{e['variant']}" for e in outcome.found["effects"]])
+    from mcc_jax.discover.settings import DECISIONS
+
+    named = outcome.found["effects"]
+    winner = evidence([f"{e['mechanism']}:{e['variant']}" for e in named])
+    odds = 0.0 if len(named) >= len(outcome.truth) else DECISIONS.margin
+    if not named and len(outcome.truth) == 1:
+        odds = math.log(sum(map(len, formulas.values())))
     ways = list(product(*([f"{m}:{v}" for v in formulas[m]] for m in outcome.truth)))
     step = max(1, -(-len(ways) // SETTINGS.baselines.combinations)) if len(outcome.truth) > 1 else 1
     tried = {" + ".join(way): evidence(way) for way in ways[::step]}
     best = max(tried, key=lambda way: tried[way]) if tried else ""
     truth = tried.get(best, evidence(()))
-    return {"kind": kind_of(truth, winner), "truth": best, "evidence_truth": truth, "evidence_winner": winner}
+    return {"kind": kind_of(truth, winner, odds), "truth": best, "evidence_truth": truth, "evidence_winner": winner}
 
 
 def evidence_of(folder: Path, seed: int = 0) -> Evidence:

@@ -68,7 +68,8 @@ def calibration_sentences(content: dict[str, Any], law: str = "the law") -> list
             if content[key]["interval_95"] is not None
         ]
         if known:
-            given = f"If {law} were complete" if law != "the law" else "Given the law and these tests"
+            same = "" if content.get("modulus_scatter") else " and all particles had one modulus"
+            given = f"If {law} were complete{same}" if law != "the law" else "Given the law and these tests"
             found.append(f"{given}, {listed(known)}, each {sure}.")
     misfit = content["diagnostics"].get("own_misfit")
     if misfit is not None:

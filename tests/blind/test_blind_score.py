@@ -182,11 +182,15 @@ def test_kinds_of_wrong_verdicts():
     assert refit.kind_of(10.0, 0.0) == "search failure"
     assert refit.kind_of(0.0, 10.0) == "library gap"
     assert refit.kind_of(1.0, 0.0) == "ambiguous"
+    assert refit.kind_of(10.0, 0.0, odds=12.0) == "prior odds"
     values = {(): 0.0, ("creep:a",): 5.0, ("creep:b",): 20.0, ("damage:v",): 12.0}
     formulas = {"creep": ["a", "b"], "damage": ["v"]}
     wrong = outcome("single", "NAMED", [("damage", 1)], [("creep", 30.0)])
     found = refit.judge(wrong, formulas, lambda names: values[tuple(names)])
     assert (found["kind"], found["truth"], found["evidence_winner"]) == ("search failure", "creep:b", 12.0)
+    half = outcome("pair", "NAMED", [("damage", 1)], [("creep", 30.0), ("damage", 30.0)])
+    found = refit.judge(half, formulas, lambda names: 12.0 + 5.0 * (len(names) - 1))
+    assert found["kind"] == "prior odds"
     lost = outcome("single", "UNLISTED", (), [("creep", 30.0)])
     assert refit.judge(lost, formulas, lambda names: 0.0)["kind"] == "not compared"
 
