@@ -33,6 +33,8 @@ class JudgementOptions:
         share: of the particles, at most, can be unlike all others; more are a mixture.
         least: particles, at least, to know what is usual.
         answers: so many sets of flagged particles are left out in turn to tell the answer without them, at most.
+        few: flagged particles are left out for such an answer if they are at least this share of all: fewer than one
+            in a hundred hardly move what all share, and the answer would cost a whole calibration of many particles.
         left: particles, at least, that an answer without the flagged ones rests on.
         unknown: the modulus counts as unknown if its standard deviation is at least this share of it: the 95 % interval
             then spans a factor of seven, nearly that of the prior (50), in which most solids lie.
@@ -43,6 +45,7 @@ class JudgementOptions:
     share: float = 0.2
     least: int = 5
     answers: int = 4
+    few: float = 0.01
     left: int = 3
     unknown: float = 0.5
 
@@ -184,8 +187,9 @@ def judged(
     answers: dict[tuple[str, ...], str] = {}
     told = []
     for one in found:
-        few = 0 < len(one.particles) <= len(campaign) / 2 and len(campaign) - len(one.particles) >= options.left
-        if one.level != "told" and few:
+        count = len(one.particles)
+        some = options.few * len(campaign) <= count <= len(campaign) / 2 and count > 0
+        if one.level != "told" and some and len(campaign) - count >= options.left:
             if one.particles not in answers and len(answers) < options.answers:
                 answers[one.particles] = _without(campaign, answer, one.particles, again)
             other = answers.get(one.particles)

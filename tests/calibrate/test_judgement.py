@@ -167,6 +167,15 @@ def test_a_flag_of_most_particles_is_not_answered_without_them():
     assert found.check == "saturation"
 
 
+def test_few_flagged_particles_of_many_are_told_without_another_calibration():
+    campaign = check_tests(faulty.broken(clean(), only=("2",)))
+    one = 1 / len(campaign)
+    (found,) = judged(campaign, answer(), None, lambda some: answer(), JudgementOptions(few=0.99 * one))
+    assert "without it" in found.sentence
+    told = judged(campaign, answer(), None, lambda some: pytest.fail("too dear"), JudgementOptions(few=1.01 * one))
+    assert [one.check for one in told] == ["breakage"]
+
+
 def test_an_answer_that_cannot_be_had_is_said():
     campaign = check_tests(faulty.broken(clean(), only=("2",)))
 
