@@ -55,7 +55,9 @@ def solve(
     number, parts = part
     folder = results / (f"{name}-{label}" if label else name)
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "run.json").write_text(json.dumps({"campaigns": name, "solver": solver, "seed": seed}) + "\n")
+    # Not the path of this machine: the label says which checkout.
+    kept = "checkout" if solver.startswith("checkout:") else solver
+    (folder / "run.json").write_text(json.dumps({"campaigns": name, "solver": kept, "seed": seed}) + "\n")
     done = read_outcomes(folder)
     queue = [(key, work / name / "campaigns" / key) for key in wanted[number - 1 :: parts] if key not in done]
     began = time.monotonic()
