@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import t as student
 
 from ..calibrate import Posterior
 from ..calibrate.estimates import estimate, finite, summary
@@ -50,6 +49,8 @@ def _averaged(
     The mean of log C over particles whose spread is estimated from the same particles follows Student's t with one
     degree of freedom less than there are particles; a and the modulus, which no spread of particles limits, are normal.
     """
+    from scipy.stats import t as student
+
     mean, sd, tau = (np.array(parts) for parts in zip(*each, strict=True))
     freedom = np.array([np.inf, np.inf, *3 * [max(particles - 1.0, 1.0)]])
     # Of three degrees of freedom and more Student's t has a standard deviation.
@@ -100,6 +101,7 @@ def _population(base: Base, design: Design, free: np.ndarray) -> tuple[np.ndarra
 def _quantiles(q: float, weights: np.ndarray, mean: np.ndarray, sd: np.ndarray, freedom: np.ndarray) -> list[float]:
     """Quantiles of mixtures of Student's t distributions (normal ones of infinite freedom), one a column."""
     from scipy.optimize import root_scalar
+    from scipy.stats import t as student
 
     def below(x: float, j: int) -> float:
         return float(weights @ student.cdf((x - mean[:, j]) / sd[:, j], freedom[j])) - q

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest
 
 from ..calibrate.estimates import finite
 from ..calibrate.settings import JUDGEMENT
@@ -54,6 +53,8 @@ class HeldOut:
             used: points that count, shape (N, points).
             range_um: of every test's displacement [um], shape (N,).
         """
+        from scipy.stats import binomtest
+
         away = self.elpd[-1] - self.elpd[0]
         error = float(np.std(away, ddof=1) * np.sqrt(len(away)))
         if away.sum() < -DECISIONS.contradicted * error:
