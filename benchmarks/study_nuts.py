@@ -2,7 +2,7 @@
 
 Run `python benchmarks/study_nuts.py --law base|creep|varying [--particles 6]`; `--table` draws the table of all runs.
 
-One campaign (seed 0; 6 particles, or as many as are asked for), 4 chains of 300 + 1000 draws each. `creep` has one
+One campaign (seed 0; 6 particles, or as many as are asked for), 4 chains of 1000 + 1000 draws each. `creep` has one
 shared effect, amplitude and time; `varying` lets its amplitude differ from test to test. Differences are of the sites
 of the contract, to `mcc.sample`, in its standard deviations (median over sites) and in Monte Carlo standard errors of
 the difference (largest), of means and of standard deviations. Draws of `mcc.sample`, resampled by weight, count for
@@ -25,7 +25,7 @@ from numpyro.infer import MCMC
 import mcc_jax as mcc
 
 RESULTS = Path(__file__).parent / "results"
-WARMUP, DRAWS, CHAINS = 300, 1000, 4
+WARMUP, DRAWS, CHAINS = 1000, 1000, 4
 
 
 def case(law: str, particles: int) -> tuple[mcc.Campaign, mcc.Model]:

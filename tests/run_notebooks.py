@@ -61,7 +61,9 @@ def _small(picture: str) -> str:
 
 def write(notebook: Path, content: nbformat.NotebookNode) -> None:
     """Write a notebook as the others are written."""
-    text = json.dumps(nbformat.from_dict(content), indent=1, ensure_ascii=False, sort_keys=True)
+    # A line of text a line of the file, so that a comparison of two versions reads.
+    lines = nbformat.v4.rwbase.split_lines(nbformat.from_dict(content))
+    text = json.dumps(lines, indent=1, ensure_ascii=False, sort_keys=True)
     notebook.write_text(text + "\n", encoding="utf-8")
 
 
