@@ -12,6 +12,7 @@ from pathlib import Path
 
 import nbformat
 from nbclient import NotebookClient
+from nbformat.v4.rwbase import split_lines
 from PIL import Image
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
@@ -62,7 +63,7 @@ def _small(picture: str) -> str:
 def write(notebook: Path, content: nbformat.NotebookNode) -> None:
     """Write a notebook as the others are written."""
     # A line of text a line of the file, so that a comparison of two versions reads.
-    lines = nbformat.v4.rwbase.split_lines(nbformat.from_dict(content))
+    lines = split_lines(nbformat.from_dict(content))
     text = json.dumps(lines, indent=1, ensure_ascii=False, sort_keys=True)
     notebook.write_text(text + "\n", encoding="utf-8")
 
