@@ -13,6 +13,7 @@ formed: tinygp factors its quasiseparable part in linear time, and each branch's
 from __future__ import annotations
 
 import enum
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -181,10 +182,16 @@ def _shrink(power: Array) -> Array:
     return 1 / (root * (1 + root))
 
 
+_TRACING = threading.RLock()
+
+
 @contextmanager
 def standard_promotion() -> Iterator[None]:
-    """NumPyro and tinygp count on JAX's usual promotion of types and ranks, whatever the caller's settings are."""
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+    """NumPyro and tinygp count on JAX's usual promotion of types and ranks, whatever the caller's settings are.
+
+    And NumPyro keeps the handlers in force in one list for all threads: a model is traced by one thread at a time.
+    """
+    with _TRACING, jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         yield
 
 

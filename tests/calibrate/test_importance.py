@@ -1,15 +1,18 @@
 """Independent weighted draws of the population: of known densities, against NUTS, and what happens where they fail."""
 
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array
 
-from mcc_jax import paper_campaign, sample
+from mcc_jax import Model, paper_campaign, sample
 from mcc_jax.calibrate import draws as drawing
 from mcc_jax.calibrate.importance import sample_weighted
-from mcc_jax.calibrate.mode import LogPosterior
+from mcc_jax.calibrate.mode import LogPosterior, prior_populations
 
 SIGNED = (5, 6, 7)
 
@@ -73,3 +76,18 @@ def test_nuts_takes_over_where_weights_are_not_good_enough(paper_posterior, monk
         found, sd = sampled.named_population()[name], wanted.std()
         assert abs(found.mean() - wanted.mean()) < 0.1 * sd, name
         assert found.std() == pytest.approx(sd, rel=0.1), name
+
+
+def test_threads_may_trace_the_model_side_by_side():
+    """As the pieces of a proposal do; NumPyro keeps its handlers in one list for all threads."""
+    keys, interval = jax.random.split(jax.random.key(0), 2), sys.getswitchinterval()
+
+    def trace(count):
+        return jax.eval_shape(lambda k: prior_populations.__wrapped__(k, Model(), jnp.zeros(count)), keys).a.shape
+
+    sys.setswitchinterval(1e-5)
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            assert set(pool.map(trace, range(2, 42))) == {(2,)}
+    finally:
+        sys.setswitchinterval(interval)
