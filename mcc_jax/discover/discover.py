@@ -7,11 +7,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from .. import arguments
 from .._errors import InputError
 from ..calibrate import Model, Posterior, sample
+from ..calibrate.data import root_mean_squares
 from ..calibrate.fitting import checked_settings
 from ..calibrate.judgement import numbers_in_reach, unlike_others
 from ..campaign import Campaign, Finding, available_data, campaign_findings, check_plausibility, check_tests
@@ -133,17 +132,17 @@ def discover(
         likeness=likeness_of(search, (), ranking),
     )
     if nothing:
-        left = residuals_of(search, None)
-        map_ = places(base, difference(left.before, None, left.used))
-        return _finished(replace(found, residuals=left, places=map_), findings, started)
-    found = _named(found, search, known, tell)
+        return _finished(_of_law_alone(found, search), findings, started)
+    winner = leader_of(search).names
     if confirm and len(base.tests) > 2:
         tell("held-out particles")
-        found = replace(found, held_out=held_out(search, leader_of(search).names))
-        assert found.held_out is not None
-        objection = found.held_out.objection(np.asarray(base.tests.mask), base.range_um)
+        held = held_out(search, winner)
+        found = replace(found, held_out=held)
+        assert held.residual_um is not None
+        objection = held.objection([root_mean_squares(base.tests, one) for one in held.residual_um], base.range_um)
         if objection is not None:
-            return _finished(_taken_back(found, search, objection), findings, started)
+            return _finished(_taken_back(_of_law_alone(found, search), winner, objection), findings, started)
+    found = _named(found, search, known, tell)
     apart = [e.mechanism for e in found.effects if differs_from_test_to_test(e.variant)]
     if apart:
         note = (
@@ -240,30 +239,22 @@ def _named(found: Discovery, search: Search, known: Mapping[str, Mechanism], tel
     )
 
 
-def _taken_back(found: Discovery, search: Search, objection: str) -> Discovery:
-    """No answer: the law misses these tests, and what would explain it does not hold on held-out particles."""
-    names = " and ".join(e.mechanism.replace("_", " ") for e in found.effects) or "a formula of its own"
+def _of_law_alone(found: Discovery, search: Search) -> Discovery:
+    """The answer with what the law alone leaves, and where."""
     left = residuals_of(search, None)
+    return replace(found, residuals=left, places=places(search.base, difference(left.before, None, left.used)))
+
+
+def _taken_back(found: Discovery, winner: Names, objection: str) -> Discovery:
+    """No answer: the law misses these tests, and what would explain it does not hold on held-out particles."""
+    names = "a formula of its own" if winner == UNLISTED else " and ".join(winner).replace("_", " ")
     summary = (
         f"The law does not describe these tests, and nothing was found that does. What explains most is {names}, but "
         f"of particles that took no part {objection}. Look at the tests one by one: records that run on through slips "
         "or breakage, particles of several kinds, or another material than the law was made for would do this; leave "
         "out what is no test of one particle, and discover again."
     )
-    return replace(
-        found,
-        verdict="FIT_NOT_CONVERGED",
-        summary=summary,
-        model=search.base.model,
-        effects=(),
-        candidate_set=(),
-        closure=None,
-        leads=(),
-        checks=(),
-        parameters_after={},
-        residuals=left,
-        places=places(search.base, difference(left.before, None, left.used)),
-    )
+    return replace(found, verdict="FIT_NOT_CONVERGED", summary=summary)
 
 
 def _sampled(found: Discovery, base: Base, threshold_MPa: float, seed: int, tell: Tell) -> Discovery:

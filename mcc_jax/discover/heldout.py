@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -42,7 +43,7 @@ class HeldOut:
         """Mean chi2 per point of every step."""
         return self.chi2.sum(1) / self.points.sum()
 
-    def objection(self, used: np.ndarray, range_um: np.ndarray) -> str | None:
+    def objection(self, rms_um: Sequence[np.ndarray], range_um: np.ndarray) -> str | None:
         """Why what was found cannot be the answer, going by held-out particles; None if nothing speaks against it.
 
         That it does not help enough is no objection: weak effects hardly do. That it harms is one, by the log
@@ -50,7 +51,7 @@ class HeldOut:
         particles' root mean square residuals; and so is a law that with it still misses tests by far.
 
         Args:
-            used: points that count, shape (N, points).
+            rms_um: root mean square residual of every particle at every step [um], shape (N,) each.
             range_um: of every test's displacement [um], shape (N,).
         """
         from scipy.stats import binomtest
@@ -59,10 +60,7 @@ class HeldOut:
         error = float(np.std(away, ddof=1) * np.sqrt(len(away)))
         if away.sum() < -DECISIONS.contradicted * error:
             return f"all together are predicted worse with it (log predictive density {away.sum():.3g} +- {error:.2g})"
-        if self.residual_um is None:
-            return None
-        count = np.maximum(used.sum(1), 1)
-        before, after = (np.sqrt(np.sum(np.where(used, self.residual_um[k], 0.0) ** 2, 1) / count) for k in (0, -1))
+        before, after = rms_um[0], rms_um[-1]
         worse = int(np.sum(after > before))
         if binomtest(worse, len(after), alternative="greater").pvalue < DECISIONS.level:
             middle = f"medians {np.median(before):.2g} um without it, {np.median(after):.2g} um with it"

@@ -8,7 +8,9 @@ import pytest
 
 from mcc_jax.discover.answer import _averaged
 from mcc_jax.discover.closure import LETTERS, terms_of
+from mcc_jax.discover.discover import _taken_back
 from mcc_jax.discover.heldout import HeldOut
+from mcc_jax.discover.hypothesis import UNLISTED
 from mcc_jax.discover.result import Discovery, Effect
 from mcc_jax.discover.sentences import summary_of
 from mcc_jax.discover.settings import DECISIONS, Decisions
@@ -62,21 +64,16 @@ def test_the_mean_of_few_particles_follows_student_t():
 )
 def test_what_held_out_particles_contradict_is_no_answer(residual_um, elpd, said):
     gain = elpd * (1 + 0.1 * np.arange(8))
-    residual = np.broadcast_to(np.array(residual_um)[:, None, None], (2, 8, 50))
-    points, zeros = np.full(8, 50.0), np.zeros(8)
-    held = HeldOut((None, "creep"), np.ones((2, 8)), points, np.array([zeros, gain]), np.ones(2), residual)
-    objection = held.objection(np.ones((8, 50), bool), np.full(8, 10.0))
+    held = HeldOut((None, "creep"), np.ones((2, 8)), np.full(8, 50.0), np.array([np.zeros(8), gain]), np.ones(2))
+    objection = held.objection([np.full(8, rms) for rms in residual_um], np.full(8, 10.0))
     assert objection is None if said is None else said in objection
 
 
 def test_a_weak_effect_that_hardly_helps_is_not_contradicted():
     rng = np.random.default_rng(0)
-    residual = np.ones((2, 20, 50))
-    residual[1] += 0.01 * rng.choice([-1, 1], (20, 1))
-    held = HeldOut(
-        (None, "creep"), np.ones((2, 20)), np.full(20, 50.0), rng.normal(0, 1, (2, 20)), np.ones(2), residual
-    )
-    assert held.objection(np.ones((20, 50), bool), np.full(20, 100.0)) is None
+    after = 1 + 0.01 * rng.choice([-1, 1], 20)
+    held = HeldOut((None, "creep"), np.ones((2, 20)), np.full(20, 50.0), rng.normal(0, 1, (2, 20)), np.ones(2))
+    assert held.objection([np.ones(20), after], np.full(20, 100.0)) is None
 
 
 def answer(verdict, amplitude=1e-4, **more):
@@ -91,6 +88,18 @@ def answer(verdict, amplitude=1e-4, **more):
         untestable=({"mechanism": "reload_hysteresis", "needs": "a reload segment"},), **more,
     )  # fmt: skip
     return dataclasses.replace(found, summary=summary_of(found))
+
+
+@pytest.mark.parametrize(
+    ("winner", "words"), [(("pop_in", "creep"), "pop in and creep"), (UNLISTED, "formula of its own")]
+)
+def test_what_is_taken_back_is_said_and_is_no_part_of_the_law(winner, words):
+    told = _taken_back(answer("NO_GAP"), winner, "8 of 8 lie further from the law")
+    assert told.verdict == "FIT_NOT_CONVERGED"
+    assert (told.effects, told.parameters_after, told.closure) == ((), {}, None)
+    assert words in told.summary
+    assert "8 of 8" in told.summary
+    assert "_" not in told.summary
 
 
 @pytest.mark.parametrize("verdict", ["NO_GAP", "NAMED", "SET"])
