@@ -2,11 +2,11 @@
 
 Run `python benchmarks/study_nuts.py --law base|creep|varying [--particles 6]`; `--table` draws the table of all runs.
 
-One campaign (seed 0; 6 particles, or as many as are asked for), 4 chains of 1000 + 1000 draws each (300 + 1000 in the
-rows other than `base` with 6). `creep` has one shared effect, amplitude and time; `varying` lets its amplitude differ
-from test to test. Differences are of the sites of the contract, to `mcc.sample`, in its standard deviations (median
-over sites) and in Monte Carlo standard errors of the difference (largest), of means and of standard deviations. Draws
-of `mcc.sample`, resampled by weight, count for as many as its effective number.
+One campaign (seed 0; 6 particles, or as many as are asked for), 4 chains of 1000 + 1000 draws each. `creep` has one
+shared effect, amplitude and time; `varying` lets its amplitude differ from test to test. Differences are of the sites
+of the contract, to `mcc.sample`, in its standard deviations (median over sites) and in Monte Carlo standard errors of
+the difference (largest), of means and of standard deviations. Draws of `mcc.sample`, resampled by weight, count for
+as many as its effective number.
 """
 
 from __future__ import annotations
