@@ -29,7 +29,7 @@ from .noise import Noise, NoiseFit, estimate_noise, particle_scales, squared_inn
 from .paper.prediction import point_noise_um
 from .particle_fit import ParticleFits, fit_particles, linear_starts
 from .priors import Priors
-from .settings import FIT
+from .settings import FIT, SELECTION
 from .sharding import Blocks, Parts, block_size, count_of, filled_up, require_same
 from .starts import start_of_effects
 
@@ -41,6 +41,7 @@ def prepare(
     *,
     fill_up: bool = True,
     block: int | None = None,
+    most_points: int = SELECTION.most_points,
     tell: Callable[[str], None] = lambda _: None,
     **settings: Any,
 ) -> tuple[Selection, Fit, int]:
@@ -52,6 +53,7 @@ def prepare(
         threshold_MPa: points below this stress on loading do not count [MPa].
         fill_up: let copies that count for nothing make up whole blocks; if False, all particles are one block.
         block: particles of a block; by default `block_size` of their number.
+        most_points: records longer than this are thinned.
         tell: called with the name of each step.
         settings: of `fit_tests`.
 
@@ -66,7 +68,7 @@ def prepare(
         raise ValueError(f"a block must have at least one particle, got {block}")
     make_room()
     tell("selecting points")
-    selection = select(campaign, threshold_MPa=threshold_MPa)
+    selection = select(campaign, threshold_MPa=threshold_MPa, most_points=most_points)
     require_same(selection.tests)
     size = (block or block_size(len(selection.tests))) if fill_up else len(selection.tests)
     tests = filled_up(selection.tests, size) if fill_up else selection.tests
