@@ -61,6 +61,8 @@ CAPTIONS = {
     "discovery_shifts": ("discovery", "What the missing effect had done to the parameters"),
 }
 """Section and caption of every figure, by its stem."""
+WITHIN_A_NUMBER = re.compile(r"(?<=[\d)]) (?=[±×%]|(?:µm|[GM]Pa|mN|s)\b)|(?<=[±×]) (?=[\d(])")
+"""Blanks at which a line must not break: before a unit, and around the sign of a standard deviation or a power."""
 
 
 def report_page(results: Results, *, seed: int = 0, progress: Callable[[str], None] | None = None) -> str:
@@ -105,6 +107,7 @@ def _environment() -> Any:
         loader=PackageLoader("mcc_jax.report"),
         autoescape=True,
         undefined=StrictUndefined,
+        finalize=_unbroken,
         trim_blocks=True,
         lstrip_blocks=True,
     )
@@ -121,6 +124,11 @@ def _environment() -> Any:
         "listed": listed,
     }
     return found
+
+
+def _unbroken(value: Any) -> Any:
+    """What a template prints, with every number in one piece; our own scripts and styles as they are."""
+    return WITHIN_A_NUMBER.sub("\N{NO-BREAK SPACE}", value) if type(value) is str else value
 
 
 def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:

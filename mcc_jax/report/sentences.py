@@ -62,7 +62,7 @@ def calibration_sentences(content: dict[str, Any], law: str = "the law") -> list
         known = [
             f"{name} lies between {interval(content[key], factor)}{unit}".replace(" to ", " and ")
             for name, key, factor, unit in (
-                ("the shape parameter a", "a", 1.0, ""),
+                ("the shape parameter a, how much more flat particles are strained than spheres,", "a", 1.0, ""),
                 ("the effective modulus", "effective_modulus_MPa", 1e-3, " GPa"),
             )
             if content[key]["interval_95"] is not None
@@ -74,7 +74,7 @@ def calibration_sentences(content: dict[str, Any], law: str = "the law") -> list
     misfit = content["diagnostics"].get("own_misfit")
     if misfit is not None:
         found.append(
-            f"With its own C₁, C₃, C₅ {law} follows a particle's displacement to {percent(misfit)} of its range "
+            f"With its own curve of loading (coefficients C₁, C₃, C₅) {law} follows a particle's displacement to {percent(misfit)} of its range "
             "(median over the particles)."
         )
     return found
