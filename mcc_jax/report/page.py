@@ -20,20 +20,11 @@ from .read import Results
 with extra("report"):
     from ..plots.style import particle_labels
     from . import pictures as pictures
-    from .chart import LOOKS, chart_data, chart_items, chart_scripts
-    from .compare import compare
-    from .lights import ANSWERS, lights, share_inside, tested
-    from .sentences import (
-        METHODS,
-        calibration_sentences,
-        listed,
-        next_steps,
-        plain,
-        quantity,
-        simulated,
-    )
+    from .chart import LOOKS, chart_data, chart_items, chart_scripts, compare
+    from .lights import COMPLETE, lights, share_inside, tested
+    from .sentences import METHODS, calibration_sentences, listed, next_steps, plain, quantity, simulated
     from .story import story
-    from .tables import measured, parameters, particle_facts, particle_rows
+    from .tables import changes, measured, parameters, particle_facts, particle_rows
 
 CAPTIONS = {
     "bands": ("compare", "Measured curves and the central 95 % of what the posterior expects"),
@@ -133,7 +124,7 @@ def _unbroken(value: Any) -> Any:
 
 def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
     """What the templates show."""
-    from markupsafe import Markup
+    from markupsafe import Markup, escape
 
     labels = particle_labels([one.name for one in shown], 40)
     folder = shlex.quote(results.name)
@@ -146,7 +137,8 @@ def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
         "story": story(results, shown),
         "cards": _cards(results, checks),
         "summary": _summary(results),
-        "next_steps": next_steps(results, folder),
+        # A command is copied: its blanks stay as they are.
+        "next_steps": [(text, escape(command)) for text, command in next_steps(results, folder)],
         "facts": [] if results.campaign is None else measured(results.campaign),
         "rows": particle_rows(results),
         "parameters": [] if results.calibration is None else parameters(results.calibration),
@@ -156,23 +148,22 @@ def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
         "labels": labels,
         "looks": {word: (marker, colour) for marker, colour, word in (LOOKS[kind] for kind in KINDS)},
         "seen": sorted({LOOKS[KINDS[k]][2] for one in shown for k in set(one.kind.tolist())}),
-        "chart": _chart(results, shown, labels) if shown else None,
+        "chart": {"bokeh": chart_items(), "data": chart_data(shown, labels, particle_facts(results, shown))}
+        if shown
+        else None,
         "bokeh": Markup(_closed(chart_scripts())) if shown else "",
         "grid": pictures.grid(shown),
         "marginals": [] if results.posterior is None else pictures.marginals(results.posterior),
         "lights": checks,
-        "answers": ANSWERS,
-        "verdict_level": next((one.level for one in checks if one.check == "Law is complete"), "unknown"),
+        "verdict": next((one for one in checks if one.check == COMPLETE), None),
         "steps": [] if results.discovery is None else _steps(results.discovery["gap"]),
-        "shift_pictures": []
-        if results.discovery is None
-        else pictures.shifts(results.discovery["parameters_before"], results.discovery["parameters_after"]),
+        "changes": [] if results.discovery is None else changes(results.discovery),
         "before_after": CAPTIONS["discovery_before_after"][1],
         "figures_of": _figures(results),
         "folder": folder,
         "style": Markup(_source("style.css")),
         "script": Markup(_closed(_source("page.js"))),
-        "versions": next((v for _, c in results.results if (v := c["provenance"]["versions"])), {}),
+        "versions": next((v for _, c in results.results.items() if (v := c["provenance"]["versions"])), {}),
     }
 
 
@@ -183,11 +174,6 @@ def _source(name: str) -> str:
 def _closed(script: str) -> str:
     """A script that cannot end its element early."""
     return re.sub(r"</(script)", r"<\\/\1", script, flags=re.IGNORECASE)
-
-
-def _chart(results: Results, shown: list[FittedCurve], labels: list[str]) -> dict[str, Any]:
-    facts = particle_facts(results, [s.name for s in shown], [s.rms_um for s in shown], [s.why_not for s in shown])
-    return {"bokeh": chart_items(), "data": chart_data(shown, labels, facts)}
 
 
 def _cards(results: Results, checks: list[Any]) -> list[dict[str, str]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from typing import Any
 
 from .._format import interval, number, percent, probability
@@ -74,8 +75,8 @@ def calibration_sentences(content: dict[str, Any], law: str = "the law") -> list
     misfit = content["diagnostics"].get("own_misfit")
     if misfit is not None:
         found.append(
-            f"With its own curve of loading (coefficients C₁, C₃, C₅) {law} follows a particle's displacement to {percent(misfit)} of its range "
-            "(median over the particles)."
+            f"With its own curve of loading (coefficients C₁, C₃, C₅) {law} follows a particle's displacement to "
+            f"{percent(misfit)} of its range (median over the particles)."
         )
     return found
 
@@ -157,7 +158,17 @@ def _after(found: dict[str, Any]) -> list[tuple[str, str]]:
         first = found["checks"][0]
         return [(f"Check directly. For {plain(first['mechanism'])}: {first['check']}. For the others, see below.", "")]
     if verdict in ("NAMED", "SET", "UNLISTED"):
-        return [("Use the law together with what was added (parameters “after” below), not alone.", "")]
+        use = "Use the law together with what was added (parameters “after” below), not alone"
+        named = [":".join(filter(None, (effect["mechanism"], effect["variant"]))) for effect in found["effects"]]
+        if not named or found["closure"]:
+            return [(f"{use}.", "")]
+        options = " ".join(f"--effect {shlex.quote(name)}" for name in named)
+        return [
+            (
+                f"{use}. All about it, from every particle's curve to the checks:",
+                f"mcc-jax calibrate CAMPAIGN {options} --out with-effect",
+            )
+        ]
     if verdict == "NO_GAP" and found["untestable"]:
         needs = sorted({entry["needs"] for entry in found["untestable"]})
         return [(f"To learn about more mechanisms, the tests need {listed(needs)}.", "")]

@@ -110,8 +110,8 @@ def _gap_tiles(found: dict[str, Any]) -> list[tuple[str, str, str]]:
     if gap["closed_fraction"] is not None:
         before, after = (number(gap["steps"][i]["chi2_per_dof"], 3) for i in (0, -1))
         meaning = (
-            f"of what the law alone missed on held-out particles, of which only their own curve of loading, modulus "
-            f"and zero are fitted. χ² per point (misfit in units of the noise) falls from {before} to {after}; 1 is noise alone."
+            f"of what the law alone missed on held-out particles: χ² per point (misfit in units of the noise) falls "
+            f"from {before} to {after}; 1 is noise alone."
         )
         tiles.append(("Gap closed", percent(gap["closed_fraction"], 3), meaning))
     pair = [side.get("effective_modulus_MPa") for side in (found["parameters_before"], found["parameters_after"])]
