@@ -117,7 +117,7 @@ def picture(mechanism):
         figures = [Figure(figsize=(3.8, 2.7), layout="constrained") for _ in range(2)]
         left, right = (figure.subplots() for figure in figures)
         # Broad and pale below narrow and dark: dashes of a path that goes back on itself would fill each other's gaps.
-        left.plot(law.displacement_um, law.force_mN, color=VERMILION, alpha=0.5, lw=3.5, label="law alone")
+        left.plot(law.displacement_um, law.force_mN, color=VERMILION, alpha=0.6, lw=2.8, label="law alone")
         left.plot(curve.displacement_um, curve.force_mN, color=BLUE, lw=1.3, label="with the effect")
         left.set(xlabel="displacement / µm", ylabel="force / mN")
         left.legend(frameon=False, fontsize=8, loc="upper left")

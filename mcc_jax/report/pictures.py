@@ -73,7 +73,7 @@ class Telling:
         """
         if self.after_um is None:
             return [(self.before_um, {"color": VERMILION, "linewidth": 1.4, "label": "law"})]
-        alone: Look = {"color": VERMILION, "alpha": 0.5, "linewidth": 3.5, "label": "law alone"}
+        alone: Look = {"color": VERMILION, "alpha": 0.6, "linewidth": 2.8, "label": "law alone"}
         return [(self.before_um, alone), (self.after_um, {"color": BLUE, "linewidth": 1.4, "label": self.added})]
 
     @property

@@ -138,8 +138,8 @@ def next_steps(results: Results, folder: str) -> list[tuple[str, str]]:
 def _mend(found: dict[str, Any] | None) -> str:
     if found is not None and found["effects"]:
         return (
-            "The law alone does not fit these tests, which may be why its calibration did not converge: use the "
-            "parameters “after” under Discovery, and see what failed under Checks."
+            "The law alone does not fit these tests, which may be why its calibration did not converge; what failed "
+            "stands under Checks."
         )
     return "Mend the checks that failed under Checks before anything else."
 

@@ -100,21 +100,20 @@ def parameters(content: dict[str, Any]) -> list[dict[str, str]]:
     return rows
 
 
-def changes(found: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """What a discovery did to the parameters: name, and value with its uncertainty before and after."""
+def changes(found: dict[str, Any]) -> list[tuple[str, list[tuple[str, str | None]]]]:
+    """What a discovery did to the parameters: name, and before and after the value with its uncertainty and interval."""
     sides = found["parameters_before"], found["parameters_after"]
     rows = []
     for name, label, factor in (
-        ("a", "Shape parameter a", 1.0),
-        ("effective_modulus_MPa", "Effective modulus Ē [GPa]", 1e-3),
-        *((f"log_C{k}", f"C{'₀₁₂₃₄₅'[k]} of the median particle", 1.0) for k in (1, 3, 5)),
+        ("a", "a", 1.0),
+        ("effective_modulus_MPa", "Ē [GPa]", 1e-3),
+        *((f"log_C{k}", f"C{'₀₁₂₃₄₅'[k]}", 1.0) for k in (1, 3, 5)),
     ):
         pair = [one.get("mean", one) for side in sides if (one := side.get(name)) is not None]
         if name.startswith("log_"):
             pair = [_exponential(one) for one in pair]
         if len(pair) == 2 and all(one["value"] is not None for one in pair):
-            ends = [f" ({told})" if (told := interval(one, factor)) else "" for one in pair]
-            rows.append((label, *(with_sd(one, factor) + end for one, end in zip(pair, ends, strict=True))))
+            rows.append((label, [(with_sd(one, factor), interval(one, factor)) for one in pair]))
     return rows
 
 
