@@ -15,7 +15,7 @@ from .._format import described
 from .._types import Scalar
 from .edges import Edges
 from .equilibrium import Settled, settle
-from .forces import Packing, Vectors, WallHistory
+from .forces import Packing
 from .load_steps import BOTTOM, TOP, LoadStep, Solver, checked_solver, die_walls, lowered
 from .measured import measured
 from .state import A_STATE, State, check_packing, check_state, listed, start
@@ -216,14 +216,8 @@ def _attempt(packing: Packing, state: State, height: float, solver: Solver) -> _
     return _Attempt(end, settled, bool(settled.converged), complete, spring, held.proximal, evaluations, share, move)
 
 
-@eqx.filter_jit
-def _settle(held: Held, guess: Vectors, rtol: Scalar, max_steps: int) -> Settled:
-    return settle(held, guess, rtol, max_steps)
-
-
-@eqx.filter_jit
-def _remembered(held: Held, position: Vectors) -> tuple[Edges, WallHistory]:
-    return remembered(held, position)
+_settle = eqx.filter_jit(settle)
+_remembered = eqx.filter_jit(remembered)
 
 
 def _unlisted(packing: Packing, old: Edges, fresh: State) -> bool:

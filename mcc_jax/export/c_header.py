@@ -1,4 +1,4 @@
-"""The law as a C99 header, and text from the templates beside it."""
+"""The law as a C99 header, and how to put it into LAMMPS and Yade: text from the templates beside it."""
 
 from __future__ import annotations
 
@@ -31,53 +31,83 @@ def c_header(law: MccLaw, particle: Particle | None = None, *, origin: Origin | 
             passed on; `read_calibration` refuses it, and so should you unless you know what a pair of them means.
     """
     origin = checked(law, particle, origin, needed=False)
-    values = numbers(law)
-    return render(
+    return _render(
         "mcc_law.h.j2",
         parameters=parameters_in_c(law),
         factor=factor_in_c(law, particle),
-        effects=quoted(", ".join(effect.name for effect in law.effects))[1:-1],
+        effects=_quoted(", ".join(effect.name for effect in law.effects))[1:-1],
         version=own_version(),
-        origin=origin_lines(law, particle, origin),
+        origin=_origin_lines(law, particle, origin),
         strain_max=TESTED_STRAIN,
-        forms=[
-            {
-                "name": form.name,
-                "constant": repr(form.constant),
-                "power": form.stress_power,
-            }
-            for form in Unloading
-        ],
+        forms=[{"name": one.name, "constant": repr(one.constant), "power": one.stress_power} for one in Unloading],
         scalings=[{"name": scaling.name, "power": scaling.power} for scaling in StrainScaling],
         form=law.unloading.name,
         scaling=law.strain_scaling.name,
-        modulus=repr(values["effective_modulus_MPa"] * 1e6),
-        **{name: repr(values[name]) for name in ("C1", "C3", "C5", "a")},
+        **_values(law),
     )
 
 
-def origin_lines(law: MccLaw, particle: Particle | None, origin: Origin) -> list[str]:
+def lammps_recipe(law: MccLaw, particle: Particle, *, origin: Origin | None = None) -> str:
+    """Markdown: a normal model for LAMMPS' `pair_style granular` around the header of `c_header`, with the values.
+
+    Args:
+        law: the law.
+        particle: the particle of the golden table beside it.
+        origin: where the law comes from.
+
+    Raises:
+        InputError: if the law or the particle is not usable, or the law has an effect that `c_header` refuses.
+    """
+    return _recipe("lammps.md.j2", law, particle, origin)
+
+
+def yade_recipe(law: MccLaw, particle: Particle, *, origin: Origin | None = None) -> str:
+    """Markdown: material, `Ip2` and `Law2` functors for Yade around the header of `c_header`, with the values.
+
+    Arguments and errors as of `lammps_recipe`.
+    """
+    return _recipe("yade.md.j2", law, particle, origin)
+
+
+def _recipe(name: str, law: MccLaw, particle: Particle, origin: Origin | None) -> str:
+    origin = checked(law, particle, origin)
+    return _render(
+        name,
+        version=own_version(),
+        factor=factor_in_c(law, particle),
+        origin=[f"- {line}" for line in _origin_lines(law, particle, origin)],
+        **_values(law),
+    )
+
+
+def _values(law: MccLaw) -> dict[str, str]:
+    """The five numbers of a law as C writes them, SI."""
+    values = numbers(law)
+    return {"modulus": repr(values.pop("effective_modulus_MPa") * 1e6), **{k: repr(v) for k, v in values.items()}}
+
+
+def _origin_lines(law: MccLaw, particle: Particle | None, origin: Origin) -> list[str]:
     """Where the values come from, a fact a line."""
     lines = [f"Unloading {law.unloading.value}, strain scaling {law.strain_scaling.value}."]
-    lines += [quoted(line)[1:-1] for line in in_words(law)]
+    lines += [_quoted(line)[1:-1] for line in in_words(law)]
     if origin.calibration is not None:
         c = origin.calibration
         lines.append(
-            f"From {quoted(str(c['file']))}, method {quoted(str(c['method']))}, sha256 {str(c['sha256'])[:16]}..."
+            f"From {_quoted(str(c['file']))}, method {_quoted(str(c['method']))}, sha256 {str(c['sha256'])[:16]}..."
         )
         if not c["converged"]:
             lines.append("WARNING: that calibration did not converge.")
-    whose = "the population (medians)" if origin.particle is None else f"particle {quoted(origin.particle)}"
+    whose = "the population (medians)" if origin.particle is None else f"particle {_quoted(origin.particle)}"
     lines.append(f"Coefficients of {whose}.")
     if particle is not None:
         sizes = ", ".join(f"{float(d):.6g}" for d in (particle.D1, particle.D2, particle.D3))
-        lines.append(f"Particle of the golden table: D1, D2, D3 = {sizes} um ({quoted(origin.geometry)}).")
+        lines.append(f"Particle of the golden table: D1, D2, D3 = {sizes} um ({_quoted(origin.geometry)}).")
     if not bool(law.is_monotone):
         lines.append("WARNING: the loading curve is not monotone; a pair of such contacts has several solutions.")
     return lines
 
 
-def render(name: str, **values: Any) -> str:
+def _render(name: str, **values: Any) -> str:
     """The template of that name with the values put in; a value it wants and does not get is an error."""
     with extra("export"):
         from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -93,6 +123,6 @@ def render(name: str, **values: Any) -> str:
     return environment.get_template(name).render(**values)
 
 
-def quoted(text: str) -> str:
+def _quoted(text: str) -> str:
     """Any text in one line of ASCII that ends no comment, string or code block, wherever it is put."""
     return json.dumps(text, ensure_ascii=True).replace("*", "\\u002a").replace("`", "\\u0060").replace("?", "\\u003f")
