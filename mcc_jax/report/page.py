@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shlex
 from collections.abc import Callable
@@ -14,6 +15,7 @@ from .._extras import extra
 from .._format import interval, number, percent, probability, with_sd
 from .._version import own_version
 from ..calibrate.curves import KINDS, FittedCurve
+from ..campaign import PAPER_EFFECTIVE_MODULUS_MPA, PAPER_LOG_C, PAPER_SHAPE_PARAMETER
 from ..campaign.findings import worst
 from .read import Results
 
@@ -24,7 +26,7 @@ with extra("report"):
     from .lights import COMPLETE, lights, share_inside, tested
     from .sentences import METHODS, calibration_sentences, listed, next_steps, plain, quantity, simulated
     from .story import story
-    from .tables import changes, measured, parameters, particle_facts, particle_rows
+    from .tables import changes, exponential, measured, particle_facts, particle_rows, spread
 
 CAPTIONS = {
     "bands": ("compare", "Measured curves and the central 95 % of what the posterior expects"),
@@ -104,7 +106,7 @@ def _environment() -> Any:
     )
     # Bokeh wants a model before what refers to it.
     found.policies["json.dumps_kwargs"] = {"sort_keys": False, "allow_nan": False, "separators": (",", ":")}
-    found.globals["plain_name"] = quantity
+    found.globals |= {"plain_name": quantity, "exp": math.exp}
     found.filters |= {
         "number": number,
         "percent": percent,
@@ -113,6 +115,8 @@ def _environment() -> Any:
         "interval": interval,
         "plain": plain,
         "listed": listed,
+        "exponential": exponential,
+        "spread": spread,
     }
     return found
 
@@ -141,7 +145,7 @@ def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
         "next_steps": [(text, escape(command)) for text, command in next_steps(results, folder)],
         "facts": [] if results.campaign is None else measured(results.campaign),
         "rows": particle_rows(results),
-        "parameters": [] if results.calibration is None else parameters(results.calibration),
+        "paper": {"a": PAPER_SHAPE_PARAMETER, "modulus_MPa": PAPER_EFFECTIVE_MODULUS_MPA, "log_C": PAPER_LOG_C},
         "methods": METHODS,
         "shown": shown,
         "bands": share_inside(shown) is not None,
@@ -156,7 +160,6 @@ def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
         "marginals": [] if results.posterior is None else pictures.marginals(results.posterior),
         "lights": checks,
         "verdict": next((one for one in checks if one.check == COMPLETE), None),
-        "steps": [] if results.discovery is None else _steps(results.discovery["gap"]),
         "changes": [] if results.discovery is None else changes(results.discovery),
         "before_after": CAPTIONS["discovery_before_after"][1],
         "figures_of": _figures(results),
@@ -231,22 +234,6 @@ def _sections(results: Results, shown: list[FittedCurve], checks: list[Any]) -> 
         ("cite", "How to cite", True),
     )
     return [(name, title) for name, title, here in there if here]
-
-
-def _steps(gap: dict[str, Any]) -> list[dict[str, Any]]:
-    """The systematic gap on held-out particles at every step, with the length of its bar in per cent."""
-    known = [step for step in gap["steps"] if step["systematic_um"] is not None]
-    if len(known) < 2:
-        return []
-    most = max(step["systematic_um"] for step in known) or 1.0
-    return [
-        {
-            "name": "law alone" if step["added"] is None else f"with {plain(step['added'])}",
-            "value": number(step["systematic_um"], 2),
-            "length": round(100 * step["systematic_um"] / most, 1),
-        }
-        for step in known
-    ]
 
 
 def _figures(results: Results) -> dict[str, list[tuple[str, str]]]:

@@ -182,8 +182,6 @@ def data_uri(picture: bytes, kind: str = "png") -> str:
 
 
 def _svg(figure: Any) -> str:
-    from matplotlib import rc_context
-
     stream = io.BytesIO()
     # The same ids and no date: one input, one page. Text stays text, and small.
     with rc_context({"svg.hashsalt": "mcc_jax", "svg.fonttype": "none"}):

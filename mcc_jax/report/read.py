@@ -144,19 +144,14 @@ def read_results(folder: str | Path, campaign: str | Path | None = None, *, name
 
 def _listed(path: Path) -> set[str]:
     try:
-        if not path.exists():
-            raise InputError(
-                "there is no such folder", file=path, remedy="Give a folder of results; mcc-jax demo makes one"
-            )
-        if not path.is_dir():
-            raise InputError(
-                "is a file, not a folder of results", file=path, remedy="Give the folder that calibrate wrote into"
-            )
         return {entry.name for entry in path.iterdir() if not entry.name.startswith(".")}
+    except FileNotFoundError:
+        problem, remedy = "there is no such folder", "Give a folder of results; mcc-jax demo makes one"
+    except NotADirectoryError:
+        problem, remedy = "is a file, not a folder of results", "Give the folder that calibrate wrote into"
     except OSError as error:
-        raise InputError(
-            f"cannot be read: {error.strerror or error}", file=path, remedy="Check the permissions"
-        ) from None
+        problem, remedy = f"cannot be read: {error.strerror or error}", "Check the permissions"
+    raise InputError(problem, file=path, remedy=remedy)
 
 
 def _find(

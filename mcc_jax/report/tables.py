@@ -1,4 +1,4 @@
-"""The tables of the page: facts of the campaign, parameters, particles."""
+"""What the tables of the page show: facts of the campaign, parameters, particles."""
 
 from __future__ import annotations
 
@@ -11,16 +11,9 @@ import numpy as np
 
 from .._format import interval, number, span, with_sd
 from ..calibrate.curves import FittedCurve
-from ..campaign import (
-    PAPER_EFFECTIVE_MODULUS_MPA,
-    PAPER_LOG_C,
-    PAPER_SHAPE_PARAMETER,
-    Campaign,
-    campaign_segments,
-    effective_diameter_um,
-)
+from ..campaign import Campaign, campaign_segments, effective_diameter_um
 from .read import Results
-from .sentences import plain, quantity
+from .sentences import plain
 
 KINDS = {"approach": "approach", "load": "loading", "hold": "hold", "unload": "unloading", "reload": "reloading"}
 
@@ -56,52 +49,8 @@ def measured(campaign: Campaign) -> list[tuple[str, str]]:
     ]
 
 
-def parameters(content: dict[str, Any]) -> list[dict[str, str]]:
-    """Rows of the table of parameters: symbol, name, meaning, value, interval, and the paper's value."""
-
-    def row(symbol: str, name: str, meaning: str, estimate: dict[str, Any], paper: str, factor: float = 1.0):
-        told = {"value": with_sd(estimate, factor), "interval": interval(estimate, factor) or "none given"}
-        return {"symbol": symbol[:1], "sub": symbol[1:], "name": name, "meaning": meaning, "paper": paper, **told}
-
-    form = content["law"]["unloading"]
-    shape = (
-        "How much more a flat particle is strained than a sphere under the same displacement; 0 would mean that shape "
-        "does not matter."
-    )
-    stiffness = (
-        f"How stiffly a particle springs back on unloading. It belongs to the form “{form}” of the law only. Where "
-        "that form would return more energy than it took (printed: peak strains below about 0.01), the recovered "
-        "strain is limited."
-    )
-    paper = f"{PAPER_EFFECTIVE_MODULUS_MPA / 1e3:g}" if form == "printed" else "other form"
-    rows = [
-        row("a", "Shape parameter", shape, content["a"], number(PAPER_SHAPE_PARAMETER)),
-        row("Ē", "Effective modulus [GPa]", stiffness, content["effective_modulus_MPa"], paper, 1e-3),
-    ]
-    meanings = {
-        "C1": "Initial slope of stress over scaled strain [MPa]: how hard the first squeeze is.",
-        "C3": "Softening in the middle of the curve, entering as a cube.",
-        "C5": "Stiffening at large strain, entering as a fifth power.",
-    }
-    for name, meaning in meanings.items():
-        mean, sd = (content[f"log_{name}"][part] for part in ("mean", "sd"))
-        paper_mean, paper_sd = PAPER_LOG_C[name]
-        rows.append(row(name, "Median particle", meaning, _exponential(mean), number(math.exp(paper_mean))))
-        spread = _spread(mean["value"], sd["value"])
-        rows.append(row(f"τ{name[1]}", f"Spread of log {name}", spread, sd, number(paper_sd)))
-    for effect in content.get("effects", ()):
-        meaning = f"An effect in the law beside the formulas above: {effect['equation']}"
-        for name, value in effect["parameters"].items():
-            label = f"{plain(effect['mechanism']).capitalize()}: {quantity(name)}"
-            rows.append(row("", label, meaning, value, "not in it"))
-    if "yield_stress_MPa" in content:
-        meaning = "Mean of C₁ over 17.16: where a sphere of this material begins to yield."
-        rows.append(row("σy", "Yield stress [MPa]", meaning, content["yield_stress_MPa"], "0.4085"))
-    return rows
-
-
 def changes(found: dict[str, Any]) -> list[tuple[str, list[tuple[str, str | None]]]]:
-    """What a discovery did to the parameters: name, and before and after the value with its uncertainty and interval."""
+    """What a discovery did to the parameters: name, and before and after the value with its uncertainty, and interval."""
     sides = found["parameters_before"], found["parameters_after"]
     rows = []
     for name, label, factor in (
@@ -111,13 +60,13 @@ def changes(found: dict[str, Any]) -> list[tuple[str, list[tuple[str, str | None
     ):
         pair = [one.get("mean", one) for side in sides if (one := side.get(name)) is not None]
         if name.startswith("log_"):
-            pair = [_exponential(one) for one in pair]
+            pair = [exponential(one) for one in pair]
         if len(pair) == 2 and all(one["value"] is not None for one in pair):
             rows.append((label, [(with_sd(one, factor), interval(one, factor)) for one in pair]))
     return rows
 
 
-def _exponential(estimate: dict[str, Any]) -> dict[str, Any]:
+def exponential(estimate: dict[str, Any]) -> dict[str, Any]:
     """The estimate of exp of what is estimated."""
 
     def exp(value: float | int) -> float:
@@ -132,7 +81,9 @@ def _exponential(estimate: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _spread(mean: float | int | None, sd: float | int | None) -> str:
+def spread(log: dict[str, Any]) -> str:
+    """How much particles differ in a coefficient, in words: of mean and standard deviation of its logarithm."""
+    mean, sd = log["mean"]["value"], log["sd"]["value"]
     if mean is None or sd is None or not abs(mean) + abs(sd) < 300:
         return "How much particles differ; these data do not tell."
     if sd < 1e-3:
