@@ -196,18 +196,15 @@ def stacked_lists[Recorded: Any](tape: Sequence[Recorded]) -> Recorded:
     return type(tape[0])(*(jnp.asarray(np.stack(column)) for column in zip(*map(padded, tape), strict=True)))
 
 
+def lengthened[Rows: eqx.Module](tree: Rows, rows: int) -> Rows:
+    """The same with as many rows in every array that has some, the new ones 0."""
+    return jax.tree.map(lambda x: jnp.pad(x, [(0, rows - len(x))] + [(0, 0)] * (x.ndim - 1)) if x.ndim else x, tree)
+
+
 def widened(edges: Edges, capacity: int) -> Edges:
     """The same list with room for more."""
-    spare = capacity - edges.capacity
-    return Edges(
-        jnp.pad(edges.key, (0, spare), constant_values=PADDING),
-        jnp.pad(edges.i, (0, spare)),
-        jnp.pad(edges.j, (0, spare)),
-        jnp.pad(edges.overlap_max, (0, spare)),
-        jnp.pad(edges.slip, ((0, spare), (0, 0))),
-        edges.wanted,
-        edges.particles,
-    )
+    key = jnp.pad(edges.key, (0, capacity - edges.capacity), constant_values=PADDING)
+    return eqx.tree_at(lambda e: e.key, lengthened(edges, capacity), key)
 
 
 @jax.jit
