@@ -107,11 +107,7 @@ def relaxed(packing: Packing, walls: Walls, position: Any, solver: Solver | None
 
 
 def compact(
-    packing: Packing,
-    state: State,
-    heights: Any,
-    solver: Solver | None = None,
-    tape: list[LoadStep] | None = None,
+    packing: Packing, state: State, heights: Any, solver: Solver | None = None, tape: list[LoadStep] | None = None
 ) -> tuple[State, Compaction]:
     r"""Move the top punch from height to height, down or up, without friction and without inertia.
 
@@ -202,9 +198,7 @@ def _attempt(packing: Packing, state: State, height: float, solver: Solver) -> _
     held, settled = best
     edges, wall_history = _remembered(held, settled.position)
     end = eqx.tree_at(
-        lambda s: (s.position, s.edges, s.wall_history, s.walls),
-        state,
-        (settled.position, edges, wall_history, walls),
+        lambda s: (s.position, s.edges, s.wall_history, s.walls), state, (settled.position, edges, wall_history, walls)
     )
     moved = np.asarray(settled.position - state.position)
     springs, top = float(held.proximal) * np.abs(moved[:, 2]).sum(), float(settled.balance.on_wall[TOP])

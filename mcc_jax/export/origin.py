@@ -129,11 +129,7 @@ def check(law: MccLaw, particle: Particle, *, allow_not_monotone: bool = False) 
 
 
 def read_calibration(
-    folder: str | Path,
-    *,
-    particle: str | None = None,
-    diameters: str | None = None,
-    allow_not_monotone: bool = False,
+    folder: str | Path, *, particle: str | None = None, diameters: str | None = None, allow_not_monotone: bool = False
 ) -> tuple[MccLaw, Particle, Origin]:
     """The law that a calibration or a discovery found, for the population or one particle, and a particle for it.
 

@@ -91,10 +91,7 @@ CHECKS = {
         "Measured points inside the band that should hold 95 % of them. Fewer: the law misses something, or the noise "
         "is larger than estimated. More: the noise is smaller.",
     ),
-    "Same data": (
-        "checksums agree",
-        "The data shown here are those that were calibrated. If not: calibrate again.",
-    ),
+    "Same data": ("checksums agree", "The data shown here are those that were calibrated. If not: calibrate again."),
 }
 """What every check should be, and what it means."""
 
@@ -111,11 +108,7 @@ VERDICTS: dict[str, tuple[Level, str, str]] = {
         "Missing, several candidates",
         "The law alone is incomplete, and these tests cannot tell several causes apart.",
     ),
-    "UNLISTED": (
-        "look",
-        "Missing, unlisted",
-        "The law alone is incomplete, and no listed mechanism explains it.",
-    ),
+    "UNLISTED": ("look", "Missing, unlisted", "The law alone is incomplete, and no listed mechanism explains it."),
     "FIT_NOT_CONVERGED": ("bad", "Cannot ask", "The law could not be fitted well enough to ask what it lacks."),
 }
 """Level of a verdict, what it says in words, and what that means."""

@@ -15,10 +15,7 @@ METHODS = {
     "least-squares": "joint least squares of all tests at once (Optimistix)",
     "paper": "the paper's own steps, one after the other",
 }
-SURE = {
-    "bayes": "with 95 % probability",
-    "least-squares": "as the 95 % confidence interval",
-}
+SURE = {"bayes": "with 95 % probability", "least-squares": "as the 95 % confidence interval"}
 
 
 def plain(name: str) -> str:
