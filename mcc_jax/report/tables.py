@@ -50,7 +50,7 @@ def measured(campaign: Campaign) -> list[tuple[str, str]]:
 
 
 def changes(found: dict[str, Any]) -> list[tuple[str, list[tuple[str, str | None]]]]:
-    """What a discovery did to the parameters: name, and before and after the value with its uncertainty, the interval."""
+    """What a discovery did to the parameters: name, and before and after the value with its error, and its interval."""
     sides = found["parameters_before"], found["parameters_after"]
     rows = []
     for name, label, factor in (
