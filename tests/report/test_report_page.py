@@ -295,6 +295,11 @@ def telling(gap_at, points=60):
     return Telling(rows, rows**2, rows, before, np.zeros(points), None, "law with creep", "Particle 1.")
 
 
+def test_parameters_before_and_after_stand_there_as_numbers(page):
+    told = "".join(Page(page).sections["discovery"].split())
+    assert "Ē[GPa]9.000±0.0508.902to9.09816.000000±0.000010" in told
+
+
 def test_no_line_breaks_within_a_number_and_commands_can_be_copied(folder):
     results = dataclasses.replace(read_results(folder), name="tests of 5 mN")
     page = report_page(results).replace("\N{NO-BREAK SPACE}", "~")
