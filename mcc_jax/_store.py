@@ -48,13 +48,11 @@ def results(directory: Path) -> Iterator[Stage]:
 
     If it does not, or they cannot be moved, the folder is as it was, and folders made for it are gone. Only files that
     the run wrote, or named as stale, are touched. The folder is locked meanwhile. A process killed before the results
-    are complete leaves the folder as it was; one killed while they are moved leaves the rest to the next run.
+    are complete leaves the folder as it was; one killed while they are moved leaves the rest to the next run. Raises
+    `InputError` if the folder cannot be written, or another run is writing there.
 
     Args:
         directory: the folder, made with its parents if need be.
-
-    Raises:
-        InputError: if the folder cannot be written, or another run is writing there.
     """
     made: list[Path] = []
     try:

@@ -12,8 +12,7 @@ from ._errors import InputError
 def check_text(content: Any, file: Path, remedy: str) -> None:
     """Refuse a JSON value that holds lone surrogates, which JSON can write and no file can hold.
 
-    Raises:
-        InputError: naming the file.
+    Raises `InputError` naming the file.
     """
     try:
         json.dumps(content, ensure_ascii=False).encode("utf-8")

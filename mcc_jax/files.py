@@ -73,6 +73,8 @@ LIMITS = FileLimits()
 def open_regular(path: str | os.PathLike[str], most_bytes: int, remedy: str) -> Iterator[BufferedReader]:
     """Open a regular file for reading bytes; anything else is refused by name without being opened.
 
+    Raises `InputError` if there is none, it is no regular file, it is too large, or it cannot be opened.
+
     Args:
         path: the file; links are followed.
         most_bytes: the largest size allowed [bytes].
@@ -80,9 +82,6 @@ def open_regular(path: str | os.PathLike[str], most_bytes: int, remedy: str) -> 
 
     Yields:
         The open file.
-
-    Raises:
-        InputError: if there is none, it is no regular file, it is too large, or it cannot be opened.
     """
     file = Path(path)
     handle = -1
@@ -115,10 +114,8 @@ def read_regular(path: str | os.PathLike[str], most_bytes: int, remedy: str) -> 
 def read_table_bytes(path: str | os.PathLike[str], limits: FileLimits = LIMITS) -> bytes:
     """The bytes of a text table or a tester's export, refused at the first row or cell that is too long.
 
-    What begins as no text does (a zip archive, for instance) is bounded in its size alone.
-
-    Raises:
-        InputError: if it cannot be read, or is too large as a whole or in one row or cell.
+    What begins as no text does (a zip archive, for instance) is bounded in its size alone. Raises `InputError` if it
+    cannot be read, or is too large as a whole or in one row or cell.
     """
     file = Path(path)
     parts: list[bytes] = []
@@ -180,10 +177,7 @@ def check_toml(text: str, file: str | Path, limits: FileLimits = LIMITS) -> None
     """Refuse TOML whose keys or lists are nested so deep that parsing them takes gigabytes.
 
     The work of Python's parser goes with the square of the number of parts of a key. Text and comments are passed over;
-    what is no TOML otherwise is left for the parser to refuse.
-
-    Raises:
-        InputError: naming the line.
+    what is no TOML otherwise is left for the parser to refuse. Raises `InputError` naming the line.
     """
     most = limits.settings_depth
     depth = dots = at = 0

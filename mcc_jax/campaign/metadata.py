@@ -27,11 +27,7 @@ _BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 
 def load_toml(text: str, file: Path) -> dict[str, Any]:
-    """Parse TOML.
-
-    Raises:
-        InputError: naming the line with the mistake.
-    """
+    """Parse TOML. Raises `InputError` naming the line with the mistake."""
     check_toml(text, file)
     try:
         entries = tomllib.loads(text)
@@ -90,8 +86,7 @@ def load_toml_file(path: str | Path, what: str) -> dict[str, Any]:
 def read_settings(file: Path, limits: FileLimits = LIMITS) -> str:
     """The text of a TOML file, which may be empty.
 
-    Raises:
-        InputError: if it cannot be read, is too large, or is no UTF-8 text.
+    Raises `InputError` if it cannot be read, is too large, or is no UTF-8 text.
     """
     data = read_regular(file, limits.settings_bytes, "Keep settings alone in it; readings belong in a table")
     return decode(data, file, "plain text in UTF-8")
@@ -100,12 +95,11 @@ def read_settings(file: Path, limits: FileLimits = LIMITS) -> str:
 def parse_metadata(text: str, file: Path) -> Metadata:
     """The metadata that a `campaign.toml` holds; keys it does not know go to `other`.
 
+    Raises `InputError` if it is not TOML, or a known key has a wrong type, value or unit.
+
     Args:
         text: the file's text.
         file: for messages.
-
-    Raises:
-        InputError: if it is not TOML, or a known key has a wrong type, value or unit.
     """
     entries = load_toml(text, file)
     for key in entries:
@@ -153,12 +147,11 @@ def _positive(entries: dict[str, Any], quantity: str, file: Path) -> float | Non
 def format_metadata(metadata: Metadata, file: Path) -> str:
     """The text of a `campaign.toml` that reads back as the same metadata.
 
+    Raises `InputError` if `other` holds what TOML cannot, or a key that has a meaning of its own.
+
     Args:
         metadata: what to write.
         file: for messages.
-
-    Raises:
-        InputError: if `other` holds what TOML cannot, or a key that has a meaning of its own.
     """
     known = {
         "control": metadata.control,

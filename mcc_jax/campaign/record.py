@@ -92,7 +92,7 @@ def record_batch(
     Args:
         campaign: the tests.
         segments: the segments of each; found anew if None.
-        multiple: round the length up to a multiple of this, as in `mcc_jax.campaign.batch`.
+        multiple: round the length up to a multiple of this.
 
     Raises:
         InputError: if the campaign cannot be used, or the column of humidities holds what is no number.

@@ -55,8 +55,7 @@ def binary_kind(data: bytes) -> str | None:
 def read_bytes(file: Path, limits: FileLimits = LIMITS) -> bytes:
     """The bytes of a table or a tester's export.
 
-    Raises:
-        InputError: if it cannot be read, is empty or too large; see `mcc_jax.files`.
+    Raises `InputError` if it cannot be read, is empty or too large; see `mcc_jax.files`.
     """
     data = read_table_bytes(file, limits)
     if not data.strip(b" \t\r\n\xef\xbb\xbf"):
@@ -65,11 +64,7 @@ def read_bytes(file: Path, limits: FileLimits = LIMITS) -> bytes:
 
 
 def decode(data: bytes, file: Path, wanted: str = "plain CSV text in UTF-8") -> str:
-    """UTF-8 text, without a byte order mark.
-
-    Raises:
-        InputError: if it is compressed, binary or in another encoding.
-    """
+    """UTF-8 text, without a byte order mark. Raises `InputError` if it is compressed, binary or in another encoding."""
     kind = binary_kind(data)
     if kind is not None:
         raise InputError(f"the file is {kind}, not text", file=file, remedy=f"Save it as {wanted}")
@@ -79,9 +74,8 @@ def decode(data: bytes, file: Path, wanted: str = "plain CSV text in UTF-8") -> 
         # The decoder may count from behind the byte order mark; the bytes it saw are in the exception.
         before = bytes(error.object[: error.start])
         row = 1 + before.count(b"\n") + before.replace(b"\r\n", b"").count(b"\r")
-        raise InputError(
-            f"the byte 0x{error.object[error.start]:02x} is not UTF-8", file=file, row=row, remedy="Save it as UTF-8"
-        ) from None
+        problem = f"the byte 0x{error.object[error.start]:02x} is not UTF-8"
+        raise InputError(problem, file=file, row=row, remedy="Save it as UTF-8") from None
 
 
 def same_text(text: str) -> str:
@@ -121,11 +115,10 @@ class Table:
     def refuse_groups(self, columns: Sequence[int]) -> None:
         """Refuse numbers that look as if the decimal mark parted thousands; see `Grouping`.
 
+        Raises `InputError` naming the cell.
+
         Args:
             columns: those whose numbers have one decimal mark; those with one unit are judged together.
-
-        Raises:
-            InputError: naming the cell.
         """
         mark = self.decimal_mark(columns)
         by_unit: dict[str, Grouping] = {}
@@ -136,40 +129,23 @@ class Table:
         for grouping in by_unit.values():
             if (found := grouping.found()) is not None:
                 (row, column), problem = found
-                raise InputError(
-                    problem,
-                    file=self.file,
-                    row=row,
-                    column=self.header[column],
-                    remedy="Write numbers without marks between the thousands, or all with as many decimals",
-                )
+                remedy = "Write numbers without marks between the thousands, or all with as many decimals"
+                raise InputError(problem, file=self.file, row=row, column=self.header[column], remedy=remedy)
 
     def numbers(self, columns: Sequence[int]) -> list[np.ndarray]:
-        """The cells of some columns as finite numbers, all with the same decimal mark.
+        """The cells of some columns as finite numbers, all with one decimal mark; the first that is none is named."""
+        mark, cells = self.decimal_mark(columns), list(zip(self.rows, self.records, strict=True))
+        return [np.array([self._number(record[i], mark, row, i) for row, record in cells]) for i in columns]
 
-        Raises:
-            InputError: at the first cell of a column that is none.
-        """
-        mark = self.decimal_mark(columns)
-        return [self._numbers(column, mark) for column in columns]
-
-    def _numbers(self, column: int, mark: str) -> np.ndarray:
-        values = np.empty(len(self.records))
-        for i, record in enumerate(self.records):
-            try:
-                values[i] = parse_number(record[column], mark)
-            except ValueError as error:
-                point = "a decimal point" if mark == "." else "a decimal comma, as in the other rows,"
-                if thousands_mark(record[column], mark):
-                    point += " and no mark between the thousands"
-                raise InputError(
-                    str(error),
-                    file=self.file,
-                    row=self.rows[i],
-                    column=self.header[column],
-                    remedy=f"Write a number with {point}, or remove the row",
-                ) from None
-        return values
+    def _number(self, cell: str, mark: str, row: int, column: int) -> float:
+        try:
+            return parse_number(cell, mark)
+        except ValueError as error:
+            point = "a decimal point" if mark == "." else "a decimal comma, as in the other rows,"
+            if thousands_mark(cell, mark):
+                point += " and no mark between the thousands"
+            remedy = f"Write a number with {point}, or remove the row"
+            raise InputError(str(error), file=self.file, row=row, column=self.header[column], remedy=remedy) from None
 
 
 def parse_number(cell: str, decimal_mark: str = ".", thousands: str = "") -> float:
@@ -275,13 +251,11 @@ def delimiter_of(header: str) -> str:
 def parse_header(cells: list[str], file: Path) -> tuple[str, ...]:
     """Names of the columns, without blanks around them.
 
-    Raises:
-        InputError: if the delimiter is none of those known, a name is empty or stands there twice.
+    Raises `InputError` if the delimiter is none of those known, a name is empty or stands there twice.
     """
     if len(cells) == 1 and "|" in cells[0]:
-        raise InputError(
-            "the columns are separated by '|'", file=file, row=1, remedy="Use commas, semicolons or tabs instead"
-        )
+        problem = "the columns are separated by '|'"
+        raise InputError(problem, file=file, row=1, remedy="Use commas, semicolons or tabs instead")
     header = tuple(cell.strip().strip("\ufeff").strip() for cell in cells)
     for i, name in enumerate(header):
         if not name:
@@ -311,37 +285,35 @@ def ragged(count: int, header: tuple[str, ...], file: Path, row: int, delimiter:
 def make_table(found: Iterable[tuple[int, list[str]]], file: Path, delimiter: str = ",") -> Table:
     """A table from rows that are already split; rows whose cells are all empty are passed over.
 
-    Empty cells behind the last column that has a name hold nothing and are passed over, too.
+    Empty cells behind the last column that has a name hold nothing and are passed over, too. Raises `InputError` if a
+    row has another number of cells than the header, or there are no rows.
 
     Args:
         found: number of the row and its cells, the header first.
         file: for messages.
         delimiter: what parts the columns.
-
-    Raises:
-        InputError: if a row has another number of cells than the header, or there are no rows.
     """
     full = [(row, cells) for row, cells in found if any(cell.strip() for cell in cells)]
     if not full:
         raise InputError("the file is empty", file=file, remedy="Export it again")
     names = full[0][1]
-    width = _filled(names)
+    width = filled(names)
     # A column without a name that holds something is a mistake, which the header's check names.
-    if any(len(names) >= len(cells) > width and _filled(cells) > width for _, cells in full[1:]):
+    if any(len(names) >= len(cells) > width and filled(cells) > width for _, cells in full[1:]):
         width = len(names)
     header = parse_header(names[:width], file)
     if len(full) == 1:
         raise InputError("there is a header but no row of data", file=file, row=1, remedy="Export it again")
     for row, cells in full[1:]:
-        if len(cells) < width or _filled(cells) > width:
-            raise ragged(len(cells) if len(cells) < width else _filled(cells), header, file, row, delimiter)
+        if len(cells) < width or filled(cells) > width:
+            raise ragged(len(cells) if len(cells) < width else filled(cells), header, file, row, delimiter)
     return Table(file, header, [cells[:width] for _, cells in full[1:]], [row for row, _ in full[1:]], delimiter)
 
 
 _SEPARATOR = re.compile(r'"?sep=([,;\t])"?[,;\t]*(?:\r\n|\r|\n)', re.IGNORECASE)
 
 
-def _filled(cells: list[str]) -> int:
+def filled(cells: list[str]) -> int:
     """The number of cells up to the last one that holds something."""
     return next((i for i in range(len(cells), 0, -1) if cells[i - 1].strip()), 0)
 
@@ -349,8 +321,7 @@ def _filled(cells: list[str]) -> int:
 def parse_table(text: str, file: Path) -> Table:
     """The whole of a table; rows that are wholly empty are passed over.
 
-    Raises:
-        InputError: if quotes do not close, a row has another number of cells than the header, or there are no rows.
+    Raises `InputError` if quotes do not close, a row has another number of cells than the header, or there are no rows.
     """
     row, told = 1, _SEPARATOR.match(text)
     if told is not None:  # a line by which a spreadsheet is told what parts the columns
@@ -364,9 +335,8 @@ def parse_table(text: str, file: Path) -> Table:
             found.append((row, record))
             row = reader.line_num + above
     except csv.Error as error:
-        raise InputError(
-            f"quotes or cells are damaged ({error})", file=file, row=row, remedy="Close every double quote"
-        ) from None
+        problem = f"quotes or cells are damaged ({error})"
+        raise InputError(problem, file=file, row=row, remedy="Close every double quote") from None
     return make_table(found, file, delimiter)
 
 

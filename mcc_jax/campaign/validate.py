@@ -1,9 +1,10 @@
-"""What every campaign must satisfy, whether read from files or made in memory."""
+"""What every campaign must satisfy, read from files, made in memory or joined from several."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 from .. import arguments
 from .._errors import InputError
 from .columns import LARGEST_MAGNITUDE
-from .schema import Campaign
+from .schema import Campaign, Metadata
 
 SMALLEST_DIAMETER_UM = 1e-6
 _TAKEN = ("particle", "D1_um", "D2_um", "D3_um")
@@ -23,15 +24,14 @@ def check_magnitudes(
 ) -> None:
     """Refuse values that are too large to be measured, and diameters that are not positive.
 
+    Raises `InputError` at the first such value.
+
     Args:
         values: in canonical units, shape (n,).
         file: for messages.
         rows: the row each value stands in.
         column: for messages.
         diameter: whether the values are diameters.
-
-    Raises:
-        InputError: at the first such value.
     """
     bad = ~(np.abs(values) <= LARGEST_MAGNITUDE)
     if diameter:
@@ -124,3 +124,71 @@ def _check_curve(
     back = np.flatnonzero(np.diff(parts["time"]) < 0)
     if len(back):
         raise fail(f"the time of particle {name!r} goes back at sample {int(back[0]) + 2}")
+
+
+_ALIKE = ("control", "punch_diameter_um", "corrections")
+_COARSEST = ("force_resolution_mN", "displacement_resolution_um")
+
+
+def join_campaigns(first: Campaign, *further: Campaign) -> Campaign:
+    """The tests of several campaigns as one, for instance those that a discovery proposed beside those it had.
+
+    Programmes of load may differ. What is read from `campaign.toml` must agree where the law or the search depend on
+    it; of resolutions the coarsest counts, provenances stand one after the other, and of further entries with one name
+    the first campaign's stays.
+
+    Args:
+        first: a campaign; its particles come first.
+        further: other ones, of the same material.
+
+    Raises:
+        InputError: if two particles have the same name, a column is not in all campaigns, or control, punch or
+            corrections differ.
+    """
+    campaigns = tuple(check_campaign(one, f"campaign {i}") for i, one in enumerate((first, *further), start=1))
+    for other in further:
+        _check_alike(first, other)
+    names = [name for campaign in campaigns for name in campaign.particles]
+    twice = [name for name, count in Counter(names).items() if count > 1]
+    if twice:
+        at = next(c for c in reversed(campaigns) if twice[0] in c.particles)
+        problem, remedy = (
+            f"the particle {twice[0]!r} is in another of the campaigns, too",
+            "Give every particle a name of its own",
+        )
+        raise InputError(problem, file=at.source or None, column="particle", remedy=remedy)
+    joined = {name: tuple(v for c in campaigns for v in c.columns[name]) for name in first.columns}
+    return Campaign(
+        tuple(names),
+        np.concatenate([campaign.diameters_um for campaign in campaigns]),
+        tuple(curve for campaign in campaigns for curve in campaign.curves),
+        joined,
+        _metadata([campaign.metadata for campaign in campaigns]),
+        ", ".join(dict.fromkeys(campaign.source for campaign in campaigns if campaign.source)),
+    )
+
+
+def _check_alike(first: Campaign, other: Campaign) -> None:
+    for name in sorted(first.columns.keys() ^ other.columns.keys()):
+        lacking = other if name in first.columns else first
+        problem, remedy = (
+            "the column is in another of the campaigns only",
+            "Enter it for all particles, or leave it out everywhere",
+        )
+        raise InputError(problem, file=lacking.source or None, column=name, remedy=remedy)
+    for name in _ALIKE:
+        one, another = getattr(first.metadata, name), getattr(other.metadata, name)
+        if one != another:
+            problem = f"{name} is {another!r} here and {one!r} in the first campaign"
+            remedy = "Such tests are not of one kind; judge them apart, or correct the entry"
+            raise InputError(problem, file=other.source or None, remedy=remedy)
+
+
+def _metadata(each: list[Metadata]) -> Metadata:
+    coarsest = {}
+    for name in _COARSEST:
+        known = [value for m in each if (value := getattr(m, name)) is not None]
+        coarsest[name] = max(known, default=None)
+    told = dict.fromkeys(m.provenance for m in each if m.provenance)
+    other = {name: value for m in reversed(each) for name, value in m.other.items()}
+    return replace(each[0], **coarsest, provenance="; ".join(told) or None, other=other)

@@ -44,6 +44,8 @@ def read_sheet(
 ) -> list[tuple[int, list[str]]]:
     """The rows of a sheet: the number of each and its cells as text, numbers with all their digits.
 
+    Raises `InputError` if it is damaged or too large, the sheet is not there or not told, or calamine is not installed.
+
     Args:
         data: the workbook's bytes.
         file: for messages.
@@ -51,9 +53,6 @@ def read_sheet(
         preferred: the name of the sheet to take, if there is one, where `sheet` is None.
         decimal_mark: how numbers are written; "." or ",".
         how: how a sheet is chosen, for the message where there are several; one sentence.
-
-    Raises:
-        InputError: if it is damaged or too large, the sheet is not there or not told, or calamine is not installed.
     """
     import pandas as pd
 

@@ -104,8 +104,7 @@ def discover(
 def require_mechanisms(names: tuple[str, ...]) -> None:
     """Refuse to exclude what does not exist, before anything is computed.
 
-    Raises:
-        InputError: naming the mechanisms there are.
+    Raises `InputError` naming the mechanisms there are.
     """
     from ..effects import LIBRARY
 

@@ -46,11 +46,7 @@ def session(steps: int) -> Iterator[Tell]:
 
 
 def require_device() -> None:
-    """Start JAX on the device that it was told to use.
-
-    Raises:
-        InputError: if there is none of that kind.
-    """
+    """Start JAX on the device that it was told to use. Raises `InputError` if there is none of that kind."""
     import jax
 
     try:

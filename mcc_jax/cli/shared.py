@@ -27,8 +27,7 @@ PACKAGES = ("jax", "jaxlib", "equinox", "optimistix", "numpyro", "arviz", "numpy
 def read_without(folder: Path, left_out: tuple[str, ...], tell: Tell) -> Campaign:
     """The campaign in a folder without the particles of `--leave-out`.
 
-    Raises:
-        InputError: if it cannot be read, for a name that is not there, or if none is left.
+    Raises `InputError` if it cannot be read, for a name that is not there, or if none is left.
     """
     from ..campaign import read_campaign
 
@@ -40,11 +39,7 @@ def read_without(folder: Path, left_out: tuple[str, ...], tell: Tell) -> Campaig
 
 
 def require_particle(name: str, campaign: Campaign, option: str) -> None:
-    """Refuse a particle that is not there, before anything is computed.
-
-    Raises:
-        InputError: naming those that are.
-    """
+    """Refuse a particle that is not there, before anything is computed. Raises `InputError` naming those that are."""
     names = campaign.particles
     if name not in names:
         remedy = f"{option} takes one of: {', '.join(names[:12])}{', ...' if len(names) > 12 else ''}"
@@ -54,8 +49,7 @@ def require_particle(name: str, campaign: Campaign, option: str) -> None:
 def joint_model(options: Mapping[str, Any], *, modulus_scatter: bool = True, shape_scatter: bool = False) -> Model:
     """The model that `--unloading`, `--strain-scaling` and `--priors` describe.
 
-    Raises:
-        InputError: for a file of priors that cannot be used.
+    Raises `InputError` for a file of priors that cannot be used.
     """
     from ..calibrate import Model, read_priors
     from ..law import StrainScaling, Unloading

@@ -204,8 +204,7 @@ def _sizes(file: Path | None) -> Sizes:
 def _laws(options: Mapping[str, Any], sizes: Sizes) -> MccLaw:
     """One law per particle, of fixed or drawn coefficients.
 
-    Raises:
-        InputError: if `a` leaves a particle without stress.
+    Raises `InputError` if `a` leaves a particle without stress.
     """
     import equinox as eqx
     import jax
@@ -254,11 +253,7 @@ def _programme(options: Mapping[str, Any]) -> Programme:
 
 
 def _peaks(options: Mapping[str, Any], programme: Programme, laws: MccLaw, sizes: Sizes) -> np.ndarray:
-    """Each particle's peak [mN or um], shape (N,).
-
-    Raises:
-        InputError: if the programme is unfit for what was given.
-    """
+    """Each particle's peak [mN or um], shape (N,). Raises `InputError` if the programme is unfit for what was given."""
     import equinox as eqx
     import jax.numpy as jnp
     import numpy as np
@@ -287,11 +282,7 @@ def _peaks(options: Mapping[str, Any], programme: Programme, laws: MccLaw, sizes
 
 
 def _check_size(programme: Programme, peaks: np.ndarray, file: Path | None) -> None:
-    """Refuse what would fill memory or disk.
-
-    Raises:
-        InputError: if so.
-    """
+    """Refuse what would fill memory or disk."""
     from ..simulate import Ramp
 
     rows = 0.0
@@ -318,8 +309,7 @@ def _check_size(programme: Programme, peaks: np.ndarray, file: Path | None) -> N
 def _hidden_effects(texts: Sequence[str], sizes: Sizes) -> tuple[HiddenEffect, ...]:
     """The effects of the option --effect.
 
-    Raises:
-        InputError: naming the valid choices, or what an effect needs of the table of particles.
+    Raises `InputError` naming the valid choices, or what an effect needs of the table of particles.
     """
     from ..effects import HUMIDITY_COLUMN, Need
     from ..simulate import read_effect
@@ -350,8 +340,7 @@ def _campaign(
 ) -> Campaign:
     """The campaign, with the further columns of the particles' table.
 
-    Raises:
-        InputError: if the law or the programme give no usable curves.
+    Raises `InputError` if the law or the programme give no usable curves.
     """
     from ..campaign import check_campaign
     from ..campaign.record import humidity_column

@@ -166,11 +166,7 @@ def batched_humidity(values: np.ndarray | None, count: int, reference: float) ->
 
 
 def hidden_effects(effects: Any) -> tuple[HiddenEffect, ...]:
-    """Several hidden effects; one alone is a tuple of one.
-
-    Raises:
-        InputError: if one of them is none.
-    """
+    """Several hidden effects; one alone is a tuple of one. Raises `InputError` if one of them is none."""
     if isinstance(effects, HiddenEffect):
         return (effects,)
     remedy = 'Make each with mcc_jax.simulate.read_effect("creep").'
@@ -182,8 +178,7 @@ def hidden_effects(effects: Any) -> tuple[HiddenEffect, ...]:
 def humidities_of(values: Any, count: int) -> np.ndarray:
     """Relative humidity of every test [%], shape (N,).
 
-    Raises:
-        InputError: if there are not as many as tests, or one is not between 0 and 100.
+    Raises `InputError` if there are not as many as tests, or one is not between 0 and 100.
     """
     found = arguments.floats(values, "relative_humidity_percent", shape="one number from 0 to 100 for every test")
     if found.shape != (count,) or not ((found >= 0) & (found <= 100)).all():

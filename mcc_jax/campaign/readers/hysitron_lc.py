@@ -29,11 +29,7 @@ def matches(lines: list[str]) -> bool:
 
 
 def read(lines: list[str], file: Path) -> Tests:
-    """The one test of the file, named by the file.
-
-    Raises:
-        InputError: if samples or columns are missing or damaged.
-    """
+    """The one test of the file, named by the file. Raises `InputError` if samples or columns are missing or damaged."""
     head = next(i for i, line in enumerate(lines) if line.startswith("Depth (nm)"))
     count_row, announced = next((i + 1, int(m[1])) for i, line in enumerate(lines) if (m := _COUNT.fullmatch(line)))
     names = [_normal(name) for name in lines[head].split("\t")]

@@ -74,11 +74,7 @@ class Sheet(Rows):
 
 
 def read_rows(data: bytes, file: Path, mapping: MappingFile) -> Rows:
-    """The rows of a file, a table of text or a sheet of a workbook.
-
-    Raises:
-        InputError: if it is neither.
-    """
+    """The rows of a file, a table of text or a sheet of a workbook. Raises `InputError` if it is neither."""
     if is_workbook(data):
         how = f'Write sheet = "..." in {mapping.file.name}'
         rows = read_sheet(data, file, mapping.sheet, decimal_mark=mapping.decimal_mark, how=how)

@@ -33,19 +33,14 @@ def matches(lines: list[str]) -> bool:
 
 
 def read(lines: list[str], file: Path) -> Tests:
-    """One text file.
-
-    Raises:
-        InputError: if a row is damaged.
-    """
+    """One text file. Raises `InputError` if a row is damaged."""
     return Tests({file.stem: _curve(lines, file, file.stem)}, "Micro Materials text")
 
 
 def read_zip(data: bytes, file: Path) -> Tests:
     """An archive of text files, one test each.
 
-    Raises:
-        InputError: if the archive or a file in it is damaged, encrypted, nested, too large or no such test.
+    Raises `InputError` if the archive or a file in it is damaged, encrypted, nested, too large or no such test.
     """
     curves: dict[str, Curve] = {}
     for path, content in _entries(data, file):

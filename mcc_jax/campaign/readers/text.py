@@ -42,8 +42,7 @@ class Tests:
 def decode_lines(data: bytes, encoding: str | None = None, file: Path | None = None) -> list[str]:
     """The lines of a tester's file; by default UTF-8 or, as most testers write, Latin-1.
 
-    Raises:
-        InputError: if the file is not in the encoding given.
+    Raises `InputError` if the file is not in the encoding given.
     """
     if encoding is None:
         try:
@@ -63,7 +62,7 @@ def decode_lines(data: bytes, encoding: str | None = None, file: Path | None = N
 def number_block(
     lines: Sequence[str], first: int, stop: int, names: Sequence[str], file: Path, decimal_mark: str = "."
 ) -> np.ndarray:
-    """Tab-separated numbers, shape (rows, columns).
+    """Tab-separated numbers, shape (rows, columns). Raises `InputError` at the first row or cell that is damaged.
 
     Args:
         lines: all lines of the file.
@@ -72,9 +71,6 @@ def number_block(
         names: the columns' names.
         file: for messages.
         decimal_mark: "." or ",".
-
-    Raises:
-        InputError: at the first row or cell that is damaged.
     """
     block = np.empty((stop - first, len(names)))
     for i in range(first, stop):
@@ -101,8 +97,7 @@ def checked_curve(
 ) -> Curve:
     """A curve whose time never goes back and that has at least two samples.
 
-    Raises:
-        InputError: naming the row; `row` is that of the first sample.
+    Raises `InputError` naming the row; `row` is that of the first sample.
     """
     if len(time) < 2:
         raise InputError(
@@ -127,8 +122,7 @@ def cut_off(problem: str, file: Path, row: int | None = None) -> InputError:
 def refuse_twice(names: Sequence[str], file: Path, row: int) -> None:
     """Refuse a header that names two columns alike: one of them would be lost.
 
-    Raises:
-        InputError: naming the column.
+    Raises `InputError` naming the column.
     """
     name, count = Counter(names).most_common(1)[0]
     if count > 1:
