@@ -49,11 +49,12 @@ def _check_sizes(value: Any, file: Path, key: str = "", depth: int = 0) -> None:
     if isinstance(value, int) and not -(2**63) <= value < 2**63:
         problem = "holds an integer of more than 64 bits"
         raise InputError(problem, file=file, column=key, remedy="Write it with a decimal point")
-    inside = (
-        value.items() if isinstance(value, dict) else ((key, item) for item in value) if isinstance(value, list) else ()
-    )
-    for name, item in inside:
-        _check_sizes(item, file, name, depth + 1)
+    if isinstance(value, dict):
+        for name, item in value.items():
+            _check_sizes(item, file, name, depth + 1)
+    elif isinstance(value, list):
+        for item in value:
+            _check_sizes(item, file, key, depth + 1)
 
 
 def load_toml_file(path: str | Path, what: str) -> dict[str, Any]:

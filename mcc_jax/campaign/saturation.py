@@ -14,6 +14,7 @@ the fit and the noise of the turning point give the force's standard deviation.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -54,8 +55,7 @@ class SaturationOptions:
     trusted: float = 0.25
 
 
-@dataclass(frozen=True)
-class CensoredForce:
+class CensoredForce(NamedTuple):
     """A test whose force channel saturated.
 
     Attributes:
@@ -77,15 +77,7 @@ class CensoredForce:
 def plateaus(
     values: np.ndarray, other: np.ndarray, time: np.ndarray, noise: float, options: SaturationOptions
 ) -> list[tuple[int, int]]:
-    """Stretches [start, stop) at the largest value of a channel during which the other channel goes on.
-
-    Args:
-        values: the channel, shape (n,).
-        other: the other channel.
-        time: when [s].
-        noise: standard deviation of the other channel's readings.
-        options: what counts.
-    """
+    """Stretches [start, stop) at the largest value of a channel during which the other, of this noise, goes on."""
     count = len(values)
     if count < 12:
         return []
@@ -126,11 +118,8 @@ def plateaus(
 
 
 def censor_force(curve: Curve, options: SaturationOptions | None = None) -> CensoredForce | None:
-    """The test with the turning points that its force channel did not see; None if the channel did not saturate.
-
-    Args:
-        curve: the test, its zero of force taken off.
-        options: what counts.
+    """The test, its zero of force taken off, with the turning points that its force channel did not see; None if there
+    are none.
     """
     options = options or SaturationOptions()
     force, path = curve.force_mN, curve.displacement_um
@@ -227,7 +216,7 @@ def _turning(part: np.ndarray, top: int, noise: float) -> float:
 
 @dataclass(frozen=True)
 class _Loading:
-    """Loading in the law's form, F = k1 x - k3 x^3 + k5 x^5 of x = d / scale - zero, fitted below the end of the range."""
+    """Loading in the law's form, F = k1 x - k3 x^3 + k5 x^5, x = d / scale - zero, fitted below the range's end."""
 
     parameters: np.ndarray  # zero, k1, k3, k5
     covariance: np.ndarray
