@@ -47,7 +47,7 @@ SIGNAL = SignalOptions()
 
 
 def noise_level(values: np.ndarray, span: float) -> float:
-    """Standard deviation of the noise of a signal of shape (n,) and this range: differences that no smooth course shows,
+    """Standard deviation of the noise of a signal of shape (n,) and this range: differences that no smooth course has,
     plus rounding.
 
     A signal that turns every few samples, of hundreds of quick cycles, is not smooth: there the noise is no more than

@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 
 from .._store import results
-from .options import Location, out_option, seed_option
+from . import options as common
 from .session import say, say_table, session
 
 SHOWN = 12
@@ -19,8 +19,8 @@ KINDS = ("approach", "load", "hold", "unload", "reload")
 
 
 @click.command(short_help="Turn a tester's file, or a folder of them, into a campaign.")
-@click.argument("file", type=Location(), metavar="FILE|FOLDER")
-@out_option(required=True)
+@click.argument("file", type=common.Location(), metavar="FILE|FOLDER")
+@common.out(required=True)
 @click.option(
     "--diameters",
     metavar="D1,D2,D3|FILE",
@@ -29,7 +29,7 @@ KINDS = ("approach", "load", "hold", "unload", "reload")
 )
 @click.option(
     "--mapping",
-    type=Location(),
+    type=common.Location(),
     multiple=True,
     metavar="FILE",
     help="TOML file that says what stands where, for any other text table or Excel workbook; repeatable, for a FOLDER "
@@ -41,7 +41,7 @@ KINDS = ("approach", "load", "hold", "unload", "reload")
     metavar="NAME",
     help='A file of FOLDER to leave out; may hold "*" and "?"; repeatable.',
 )
-@seed_option("Recorded in campaign.toml; converting itself draws no random number.")
+@common.seed("Recorded in campaign.toml; converting itself draws no random number.")
 def convert(
     file: Path, out: Path, diameters: str | None, mapping: tuple[Path, ...], skip: tuple[str, ...], seed: int
 ) -> None:

@@ -20,9 +20,8 @@ from .._errors import InputError
 from .calibrate import calibrate
 from .convert import convert
 from .demo import demo
-from .discover import discover
+from .discover import discover, power
 from .export import export
-from .power import power
 from .report import report
 from .session import BAD_INPUT, DEFECT, DONE, INTERRUPTED, PROGRAM
 from .simulate import simulate

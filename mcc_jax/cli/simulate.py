@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -13,7 +13,7 @@ import click
 
 from .._errors import InputError
 from .._store import results
-from .options import Interval, Levels, Location, Number, law_options, out_option, seed_option
+from . import options as common
 from .session import say, session
 
 if TYPE_CHECKING:
@@ -25,54 +25,54 @@ if TYPE_CHECKING:
 
 MAX_ROWS = 10_000_000
 LONGEST_S = 1e12
-POSITIVE, NOT_NEGATIVE = {"least": 0, "above": True}, {"least": 0}
+POSITIVE, NOT_NEGATIVE = common.number(0, above=True), common.number(0)
 
 
-def _number(name: str, unit: str, limits: dict[str, Any], text: str, **settings: Any) -> Any:
-    return click.option(
-        name, name.lstrip("-").replace("-", "_"), type=Number(**limits, metavar=unit), help=text, **settings
-    )
+def _option(name: str, unit: str, kind: Callable[[Any], Any] | click.ParamType, text: str, **settings: Any) -> Any:
+    return click.option(name, name[2:].replace("-", "_"), type=kind, metavar=unit, help=text, **settings)
 
 
 def _zero(name: str, unit: str, text: str) -> Any:
-    return _number(name, unit, NOT_NEGATIVE, text, default=0.0, show_default=True)
+    return _option(name, unit, NOT_NEGATIVE, text, default=0.0, show_default=True)
 
 
 @click.command(short_help="Test particles in the computer.")
-@out_option(required=True)
-@click.option(
+@common.out(required=True)
+@_option(
     "--particles",
-    type=Location(),
-    metavar="FILE",
-    help="CSV table with particle,D1_um,D2_um,D3_um; further columns are kept.  [default: the paper's Table 1]",
+    "FILE",
+    common.Location(),
+    "CSV table with particle,D1_um,D2_um,D3_um; further columns are kept.  [default: the paper's Table 1]",
 )
-@click.option("--programme", type=Location(), metavar="FILE", help="TOML file with the steps of the test; see above.")
+@_option("--programme", "FILE", common.Location(), "TOML file with the steps of the test; see above.")
 @click.option("--control", type=click.Choice(["load", "displacement"]), help="Controlled quantity.  [default: load]")
-@_number("--rate", "mN/s|um/s", POSITIVE, "Rate in mN/s or, under displacement control, um/s.  [default: 2]")
-@click.option("--levels", type=Levels(), help="Peak of each cycle as a share of the particle's peak.  [default: 1]")
-@_number("--unload-to", "SHARE", NOT_NEGATIVE, "Share at which reloading starts.  [default: 0]")
-@_number("--hold-s", "s", POSITIVE, "Hold at every level.  [default: none]")
-@click.option("--points", type=click.IntRange(2, 1_000_000), metavar="N", help="Samples of a test.  [default: 300]")
-@_number("--interval-s", "s", POSITIVE, "Time between samples, instead of --points.")
-@click.option(
+@_option("--rate", "mN/s|um/s", POSITIVE, "Rate in mN/s or, under displacement control, um/s.  [default: 2]")
+@_option("--levels", "L1,L2,...", common.levels, "Peak of each cycle as a share of the particle's peak.  [default: 1]")
+@_option("--unload-to", "SHARE", NOT_NEGATIVE, "Share at which reloading starts.  [default: 0]")
+@_option("--hold-s", "s", POSITIVE, "Hold at every level.  [default: none]")
+@_option("--points", "N", click.IntRange(2, 1_000_000), "Samples of a test.  [default: 300]")
+@_option("--interval-s", "s", POSITIVE, "Time between samples, instead of --points.")
+@_option(
     "--peak-stress",
-    type=Interval("MPa|LOW:HIGH"),
-    help="Stress at each particle's peak, or a range to draw from.  [default: 7:16]",
+    "MPa|LOW:HIGH",
+    common.interval,
+    "Stress at each particle's peak, or a range to draw from.  [default: 7:16]",
 )
-@click.option(
+@_option(
     "--peak-strain",
-    type=Interval("STRAIN|LOW:HIGH"),
-    help="Strain displacement/D_e at the peak instead; displacement control only.",
+    "STRAIN|LOW:HIGH",
+    common.interval,
+    "Strain displacement/D_e at the peak instead; displacement control only.",
 )
 @click.option(
     "--shared-material", is_flag=True, help="Give all particles the mean law of Table 2 instead of draws from it."
 )
-@_number("--C1", "C1", POSITIVE, "Fix C1 for all particles.  [default: drawn from Table 2]")
-@_number("--C3", "C3", NOT_NEGATIVE, "Fix C3 likewise.")
-@_number("--C5", "C5", POSITIVE, "Fix C5 likewise.")
-@_number("--a", "A", {}, "Shape parameter.", default=1.43, show_default=True)
-@_number("--effective-modulus", "MPa", POSITIVE, "Effective modulus.", default=16000.0, show_default=True)
-@law_options
+@_option("--C1", "C1", POSITIVE, "Fix C1 for all particles.  [default: drawn from Table 2]")
+@_option("--C3", "C3", NOT_NEGATIVE, "Fix C3 likewise.")
+@_option("--C5", "C5", POSITIVE, "Fix C5 likewise.")
+@_option("--a", "A", common.number(), "Shape parameter.", default=1.43, show_default=True)
+@_option("--effective-modulus", "MPa", POSITIVE, "Effective modulus.", default=16000.0, show_default=True)
+@common.law
 @click.option(
     "--effect",
     "effects",
@@ -85,7 +85,7 @@ def _zero(name: str, unit: str, text: str) -> Any:
 @_zero("--resolution-um", "um", "Smallest step of displacement.")
 @_zero("--resolution-mN", "mN", "Smallest step of force.")
 @_zero("--zero-um", "um", "Standard deviation of each test's zero of displacement.")
-@seed_option()
+@common.seed()
 def simulate(out: Path, **options: Any) -> None:
     """Put particles through a test programme in the computer and write the campaign into DIR.
 
@@ -207,19 +207,16 @@ def _laws(options: Mapping[str, Any], sizes: Sizes) -> MccLaw:
     Raises `InputError` if `a` leaves a particle without stress.
     """
     import equinox as eqx
-    import jax
     import jax.numpy as jnp
 
     from ..campaign import of_each_particle
     from ..geometry import plastic_shape_factor
     from ..law import StrainScaling, Unloading
-    from ..simulate import law_for_each, paper_population
+    from ..simulate import law_for_each
+    from ..simulate.campaign import draw_plastic
 
-    count, population, a = len(sizes.names), paper_population(), options["a"]
-    if options["shared_material"]:
-        plastic = jax.tree.map(lambda x: jnp.broadcast_to(x, (count,)), population.mean_law)
-    else:
-        plastic = population.sample(jax.random.key(options["seed"]), count)
+    count, a = len(sizes.names), options["a"]
+    plastic = draw_plastic(count, options["seed"], shared=options["shared_material"])
     for name in ("C1", "C3", "C5"):
         if options[name] is not None:
             plastic = eqx.tree_at(lambda p, n=name: getattr(p, n), plastic, jnp.full(count, options[name]))
@@ -255,12 +252,12 @@ def _programme(options: Mapping[str, Any]) -> Programme:
 def _peaks(options: Mapping[str, Any], programme: Programme, laws: MccLaw, sizes: Sizes) -> np.ndarray:
     """Each particle's peak [mN or um], shape (N,). Raises `InputError` if the programme is unfit for what was given."""
     import equinox as eqx
-    import jax.numpy as jnp
     import numpy as np
 
     from ..campaign import particle_batch
     from ..geometry import Particle
     from ..simulate import PAPER_PEAK_STRESS_MPA
+    from ..simulate.campaign import draw_evenly, peaks_at_stress
 
     strained = options["peak_strain"] is not None
     if strained and programme.control != "displacement":
@@ -269,16 +266,12 @@ def _peaks(options: Mapping[str, Any], programme: Programme, laws: MccLaw, sizes
             file=options["programme"],
             remedy="Give --peak-stress",
         )
-    # The same draws as `paper_campaign` makes.
-    rng = np.random.default_rng(np.random.SeedSequence(options["seed"]).generate_state(4))
-    low, high = options["peak_strain"] or options["peak_stress"] or PAPER_PEAK_STRESS_MPA
-    drawn = jnp.asarray(rng.uniform(low, high, len(sizes.names)))
+    between = options["peak_strain"] or options["peak_stress"] or PAPER_PEAK_STRESS_MPA
+    drawn = draw_evenly(between, len(sizes.names), options["seed"])
     particles = particle_batch(sizes.diameters_um)
-    if programme.control == "displacement" and not strained:
-        strain = eqx.filter_vmap(lambda law, particle, s: law.plastic.strain(s) / law.shape_factor(particle))
-        drawn = strain(laws, particles, drawn)
-    quantity = Particle.force if programme.control == "load" else Particle.displacement
-    return np.asarray(eqx.filter_vmap(quantity)(particles, drawn))
+    if strained:
+        return np.asarray(eqx.filter_vmap(Particle.displacement)(particles, drawn))
+    return peaks_at_stress(laws, particles, drawn, programme.control)
 
 
 def _check_size(programme: Programme, peaks: np.ndarray, file: Path | None) -> None:

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from .. import arguments
 from .._errors import InputError
@@ -21,6 +22,7 @@ from ..campaign import (
     PAPER_LOG_C,
     PAPER_SHAPE_PARAMETER,
     Campaign,
+    Control,
     Curve,
     Metadata,
     particle_batch,
@@ -49,6 +51,29 @@ def paper_law(
     return MccLaw(
         paper_population().mean_law, PAPER_SHAPE_PARAMETER, PAPER_EFFECTIVE_MODULUS_MPA, unloading, strain_scaling
     )
+
+
+def draw_plastic(count: int, seed: int, *, shared: bool) -> Plastic:
+    """Coefficients of so many particles, drawn from Table 2; `shared`: the mean law's for all."""
+    population = paper_population()
+    if shared:
+        return jax.tree.map(lambda x: jnp.broadcast_to(x, (count,)), population.mean_law)
+    return population.sample(jax.random.key(seed), count)
+
+
+def draw_evenly(between: Sequence[float] | np.ndarray, count: int, seed: int) -> Array:
+    """So many numbers from a range; a stream apart from those of coefficients and noise."""
+    rng = np.random.default_rng(np.random.SeedSequence(seed).generate_state(4))
+    low, high = between
+    return jnp.asarray(rng.uniform(low, high, count))
+
+
+def peaks_at_stress(laws: MccLaw, particles: Particle, stress_MPa: Array, control: Control) -> np.ndarray:
+    """Force [mN] or displacement [um], as is controlled, at which each particle reaches its stress, shape (N,)."""
+    if control == "load":
+        return np.asarray(eqx.filter_vmap(Particle.force)(particles, stress_MPa))
+    strain = eqx.filter_vmap(lambda law, particle, s: law.plastic.strain(s) / law.shape_factor(particle))
+    return np.asarray(eqx.filter_vmap(Particle.displacement)(particles, strain(laws, particles, stress_MPa)))
 
 
 def law_for_each(
@@ -240,22 +265,12 @@ def paper_campaign(
     if between.shape != (2,) or not (0 < between[0] <= between[1] < np.inf):
         raise InputError(f"peak_stress_MPa must be two stresses > 0, the smaller first, got {between.tolist()}")
     count = len(PAPER_DIAMETERS_UM)
-    population = paper_population()
-    if shared_material:
-        plastic = jax.tree.map(lambda x: jnp.broadcast_to(x, (count,)), population.mean_law)
-    else:
-        plastic = population.sample(jax.random.key(seed), count)
+    plastic = draw_plastic(count, seed, shared=shared_material)
     laws = law_for_each(plastic, PAPER_SHAPE_PARAMETER, PAPER_EFFECTIVE_MODULUS_MPA, unloading, strain_scaling)
     programme = programme or Programme.cycles(rate=PAPER_LOAD_RATE_MN_PER_S)
-    rng = np.random.default_rng(np.random.SeedSequence(seed).generate_state(4))
-    stress = rng.uniform(between[0], between[1], count)
-    particles = particle_batch(PAPER_DIAMETERS_UM)
-    peaks = np.asarray(eqx.filter_vmap(Particle.force)(particles, jnp.asarray(stress)))
-    if programme.control == "displacement":
-        strain = eqx.filter_vmap(lambda law, particle, s: law.plastic.strain(s) / law.shape_factor(particle))(
-            laws, particles, jnp.asarray(stress)
-        )
-        peaks = np.asarray(eqx.filter_vmap(Particle.displacement)(particles, strain))
+    peaks = peaks_at_stress(
+        laws, particle_batch(PAPER_DIAMETERS_UM), draw_evenly(between, count, seed), programme.control
+    )
     return simulate_campaign(
         laws,
         PAPER_DIAMETERS_UM,

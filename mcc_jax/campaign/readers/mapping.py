@@ -345,8 +345,8 @@ def _in_header(table: Any) -> InHeader:
     """The rows above the samples that hold the diameters."""
     names = table.get("header") if isinstance(table, dict) else None
     names = [names] if isinstance(names, str) else names
-    listed = isinstance(names, list) and all(isinstance(name, str) and name.strip() for name in names)
-    if not listed or len(names) not in (1, 3):
+    names = names if isinstance(names, list) else []
+    if len(names) not in (1, 3) or not all(isinstance(name, str) and name.strip() for name in names):
         remedy = 'Write header = "Gage length", or header = ["D1", "D2", "D3"]; diameters of your own belong in '
         raise _wrong("must name one row, or three", "diameters.header", remedy + "[diameters_um]")
     _only(table, ["header", "unit"], "diameters.")
