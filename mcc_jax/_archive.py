@@ -22,7 +22,7 @@ import msgspec
 import numpy as np
 
 from ._errors import InputError
-from ._version import own_version
+from ._extras import own_version
 from .files import LIMITS, read_regular
 
 FORMAT, VERSION = "mcc_jax result", 1

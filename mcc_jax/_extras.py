@@ -1,12 +1,22 @@
-"""Packages that only some parts need, by the name of the extra that brings them: one helper, one message."""
+"""What is installed: this package's version, and packages that only some parts need, by the extra that brings them."""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from ._errors import InputError
+
+
+def own_version() -> str:
+    """The version of this package, or "(not installed)" where it runs from a folder only."""
+    try:
+        return version("mcc-jax")
+    except PackageNotFoundError:
+        return "(not installed)"
+
 
 EXTRAS = {
     "command": ("the command mcc-jax needs", ("click", "rich", "platformdirs")),

@@ -1,4 +1,4 @@
-"""Opening files that come from outside: regular files only, bounded in size before a byte is read.
+"""Files and texts from outside: regular files only, bounded in size before a byte is read.
 
 A path that a user gives, or that a folder of tests holds, may be a pipe that never answers, a device that never ends,
 or a file that fills the memory. Every reader of this package opens its files here, and refuses such a one in one line.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import json
 import os
 import re
 import stat
@@ -15,7 +16,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BufferedReader
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ._errors import InputError
 
@@ -160,12 +161,9 @@ class _Lines:
         lengths = np.diff(at, prepend=-1 - before, append=length) - 1
         if lengths.max() > most:
             where = int(np.searchsorted(ends, np.append(at, length)[int(np.argmax(lengths > most))]))
-            raise InputError(
-                f"a {what} here has more than {most:,} bytes",
-                file=self.file,
-                row=self.row + where,
-                remedy="The file is damaged, or is no table of measurements; export it again",
-            )
+            remedy = "The file is damaged, or is no table of measurements; export it again"
+            problem = f"a {what} here has more than {most:,} bytes"
+            raise InputError(problem, file=self.file, row=self.row + where, remedy=remedy)
         return int(lengths[-1])
 
 
@@ -197,12 +195,8 @@ def check_toml(text: str, file: str | Path, limits: FileLimits = LIMITS) -> None
         else:
             dots = 0
         if depth > most or dots >= most:
-            raise InputError(
-                f"keys or lists are nested more than {most} deep",
-                file=file,
-                row=text.count("\n", 0, at) + 1,
-                remedy="Write flat keys; no setting needs more than three levels",
-            )
+            remedy, row = "Write flat keys; no setting needs more than three levels", text.count("\n", 0, at) + 1
+            raise InputError(f"keys or lists are nested more than {most} deep", file=file, row=row, remedy=remedy)
 
 
 _TOKEN = re.compile(r'"""|\'\'\'|["\'#.\[\]{}=,\n]')
@@ -224,11 +218,8 @@ def _refuse_other_kinds(found: os.stat_result, file: Path) -> None:
 
 def _refuse_size(size: int, most: int, file: Path, remedy: str) -> None:
     if size > most:
-        raise InputError(
-            f"the file is too large: {_in_words(size)}, where at most {_in_words(most)} are read",
-            file=file,
-            remedy=remedy,
-        )
+        problem = f"the file is too large: {_in_words(size)}, where at most {_in_words(most)} are read"
+        raise InputError(problem, file=file, remedy=remedy)
 
 
 def _in_words(size: int) -> str:
@@ -248,3 +239,16 @@ def _cannot(error: OSError | ValueError, file: Path) -> InputError:
         return InputError("this is a link that leads back to itself", file=file, remedy="Give the file itself")
     why = (isinstance(error, OSError) and error.strerror) or str(error)
     return InputError(f"cannot be read: {why}", file=file, remedy="Check the permissions and the path")
+
+
+def check_text(content: Any, file: Path, remedy: str) -> None:
+    """Refuse a JSON value that holds lone surrogates, which JSON can write and no file can hold.
+
+    Raises `InputError` naming the file.
+    """
+    try:
+        json.dumps(content, ensure_ascii=False).encode("utf-8")
+    except UnicodeEncodeError as error:
+        half = error.object[error.start]
+        problem = f"holds text that is not Unicode: half of a pair, {half!a}"
+        raise InputError(problem, file=file, remedy=remedy) from None

@@ -27,7 +27,7 @@ _BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 
 def load_toml(text: str, file: Path) -> dict[str, Any]:
-    """Parse TOML. Raises `InputError` naming the line with the mistake."""
+    """Parse TOML; the line with a mistake is named."""
     check_toml(text, file)
     try:
         entries = tomllib.loads(text)
@@ -76,23 +76,13 @@ def load_toml_file(path: str | Path, what: str) -> dict[str, Any]:
 
 
 def read_settings(file: Path, limits: FileLimits = LIMITS) -> str:
-    """The text of a TOML file, which may be empty.
-
-    Raises `InputError` if it cannot be read, is too large, or is no UTF-8 text.
-    """
+    """The text of a TOML file, which may be empty."""
     data = read_regular(file, limits.settings_bytes, "Keep settings alone in it; readings belong in a table")
     return decode(data, file, "plain text in UTF-8")
 
 
 def parse_metadata(text: str, file: Path) -> Metadata:
-    """The metadata that a `campaign.toml` holds; keys it does not know go to `other`.
-
-    Raises `InputError` if it is not TOML, or a known key has a wrong type, value or unit.
-
-    Args:
-        text: the file's text.
-        file: for messages.
-    """
+    """The metadata that the text of a `campaign.toml` holds; keys it does not know go to `other`."""
     entries = load_toml(text, file)
     for key in entries:
         if key.lower() != key and key.lower() in (*_WORDS, *_QUANTITIES):
@@ -136,10 +126,6 @@ def format_metadata(metadata: Metadata, file: Path) -> str:
     """The text of a `campaign.toml` that reads back as the same metadata.
 
     Raises `InputError` if `other` holds what TOML cannot, or a key that has a meaning of its own.
-
-    Args:
-        metadata: what to write.
-        file: for messages.
     """
     known = {
         "control": metadata.control,

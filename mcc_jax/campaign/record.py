@@ -138,12 +138,9 @@ def humidity_column(
         except ValueError:
             values[i] = np.nan
         if not 0 <= values[i] <= 100:
-            raise InputError(
-                f"the relative humidity of particle {particles[i]!r} is {text!r}",
-                file=source or None,
-                column=HUMIDITY_COLUMN,
-                remedy="Write a number from 0 to 100, in percent",
-            )
+            problem = f"the relative humidity of particle {particles[i]!r} is {text!r}"
+            remedy = "Write a number from 0 to 100, in percent"
+            raise InputError(problem, file=source or None, column=HUMIDITY_COLUMN, remedy=remedy)
     return values
 
 

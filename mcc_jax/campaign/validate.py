@@ -13,7 +13,7 @@ import numpy as np
 from .. import arguments
 from .._errors import InputError
 from .columns import LARGEST_MAGNITUDE
-from .schema import Campaign, Metadata
+from .schema import Campaign, Curve, Metadata
 
 SMALLEST_DIAMETER_UM = 1e-6
 _TAKEN = ("particle", "D1_um", "D2_um", "D3_um")
@@ -22,16 +22,9 @@ _TAKEN = ("particle", "D1_um", "D2_um", "D3_um")
 def check_magnitudes(
     values: np.ndarray, file: str | Path, rows: Sequence[int], column: str, *, diameter: bool = False
 ) -> None:
-    """Refuse values that are too large to be measured, and diameters that are not positive.
+    """Refuse values that are too large to be measured, and diameters that are not positive, at the first of them.
 
-    Raises `InputError` at the first such value.
-
-    Args:
-        values: in canonical units, shape (n,).
-        file: for messages.
-        rows: the row each value stands in.
-        column: for messages.
-        diameter: whether the values are diameters.
+    `values` are in canonical units, shape (n,); `rows` says in which row of the file each stands.
     """
     bad = ~(np.abs(values) <= LARGEST_MAGNITUDE)
     if diameter:
@@ -39,12 +32,10 @@ def check_magnitudes(
     if not bad.any():
         return
     i = int(np.argmax(bad))
-    value = float(values[i])
+    value, remedy = float(values[i]), "Check the number and the column's unit"
+    problem = f"{value:.4g} (in mN, um or s) is too {'small' if abs(value) < 1 else 'large'} to be real"
     if diameter and value <= 0:
         problem, remedy = f"the diameter {value:.10g} um is not positive", "Enter the measured diameter"
-    else:
-        problem = f"{value:.4g} (in mN, um or s) is " + ("too small" if abs(value) < 1 else "too large") + " to be real"
-        remedy = "Check the number and the column's unit"
     raise InputError(problem, file=file, row=rows[i], column=column, remedy=remedy)
 
 
@@ -60,10 +51,8 @@ def check_campaign(campaign: Any, name: str = "campaign", *, file: str | Path = 
         InputError: if names, shapes or values are unfit; for a path, how to read it.
     """
     if isinstance(campaign, str | PurePath):
-        raise InputError(
-            f"{name} must be a Campaign, got the path {str(campaign)!r}",
-            remedy=f"Read it first: mcc_jax.read_campaign({str(campaign)!r}).",
-        )
+        remedy = f"Read it first: mcc_jax.read_campaign({str(campaign)!r})."
+        raise InputError(f"{name} must be a Campaign, got the path {str(campaign)!r}", remedy=remedy)
     arguments.instance(campaign, Campaign, name, "Read one with mcc_jax.read_campaign(folder), or make one in memory.")
     place = file or campaign.source or f"the {name}"
 
@@ -82,7 +71,7 @@ def check_campaign(campaign: Any, name: str = "campaign", *, file: str | Path = 
         if not ((triple >= SMALLEST_DIAMETER_UM) & (triple <= LARGEST_MAGNITUDE)).all():
             raise fail(f"the diameters {triple.tolist()} um of particle {name!r} are not all positive and finite")
     for name, curve in zip(campaign.particles, campaign.curves, strict=True):
-        _check_curve(name, curve.time_s, curve.force_mN, curve.displacement_um, fail)
+        _check_curve(name, curve, fail)
     for column, cells in campaign.columns.items():
         if not column or column != column.strip() or "\ufeff" in column or column in _TAKEN or column[:3] in _DIAMETER:
             raise fail(f"{column!r} cannot be the name of a further column")
@@ -111,15 +100,13 @@ def check_finite(values: np.ndarray, what: str, fail: Callable[..., InputError])
         raise fail(f"{what} is {values[bad[0]]} at sample {bad[0] + 1}", remedy)
 
 
-def _check_curve(
-    name: str, time: np.ndarray, force: np.ndarray, displacement: np.ndarray, fail: Callable[..., InputError]
-) -> None:
-    parts = {"time": time, "force": force, "displacement": displacement}
+def _check_curve(name: str, curve: Curve, fail: Callable[..., InputError]) -> None:
+    parts = {"time": curve.time_s, "force": curve.force_mN, "displacement": curve.displacement_um}
     for what, values in parts.items():
         check_finite(values, f"the {what} of particle {name!r}", fail)
         if what != "time" and not values.any():
             raise fail(f"every {what} of particle {name!r} is zero, so the test holds no data")
-    if len(time) < 2:
+    if len(curve) < 2:
         raise fail(f"the particle {name!r} has one row only; a curve needs at least two")
     back = np.flatnonzero(np.diff(parts["time"]) < 0)
     if len(back):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import re
 import zipfile
@@ -75,25 +76,22 @@ def read_sheet(
         raise InputError(f"{where} is empty", file=file, remedy="Save the workbook again with the table in it")
     if len(held) > 1:
         listed = ", ".join(map(repr, held))
-        raise InputError(
-            f"{len(held)} sheets hold something: {listed}",
-            file=file,
-            remedy=how or f"Call the sheet with the table {preferred!r}, or save it alone",
-        )
+        remedy = how or f"Call the sheet with the table {preferred!r}, or save it alone"
+        raise InputError(f"{len(held)} sheets hold something: {listed}", file=file, remedy=remedy)
     (frame,) = held.values()
     cells = ([_text(value, decimal_mark) for value in row] for row in frame.itertuples(index=False, name=None))
     return [(number, row) for number, row in enumerate(cells, start=1)]
 
 
 def _choose(names: list[str], sheet: str | int | None, preferred: str | None, file: Path) -> str | None:
-    if isinstance(sheet, int) and sheet <= len(names):
-        return names[sheet - 1]
     if sheet is None:
         return preferred if preferred in names else None
-    if sheet not in names:
-        what = f"sheet {sheet}" if isinstance(sheet, int) else f"sheet called {sheet!r}"
-        raise InputError(f"there is no {what}", file=file, remedy=f"The sheets are: {', '.join(map(repr, names))}")
-    return str(sheet)
+    if isinstance(sheet, int) and sheet <= len(names):
+        return names[sheet - 1]
+    if sheet in names:
+        return str(sheet)
+    what = f"sheet {sheet}" if isinstance(sheet, int) else f"sheet called {sheet!r}"
+    raise InputError(f"there is no {what}", file=file, remedy=f"The sheets are: {', '.join(map(repr, names))}")
 
 
 def _text(value: Any, decimal_mark: str) -> str:
@@ -119,19 +117,14 @@ def _check_size(data: bytes, file: Path) -> None:
                     raise zipfile.BadZipFile  # noqa: TRY301
                 if not entry.filename.startswith("xl/worksheets/"):
                     continue
-                last = [0, 0]
-                for cell in _LAST.finditer(content):
-                    letters, digits = cell.groups()
-                    column = 0
-                    for letter in letters:
-                        column = 26 * column + letter - 64
-                    last = [max(last[0], int(digits)), max(last[1], column)]
-                if last[0] * last[1] > MAX_CELLS:
-                    raise InputError(
-                        f"a sheet reaches to row {last[0]} and column {last[1]}, which is too large",
-                        file=file,
-                        remedy="Delete the rows and columns without content behind the table, or save it as CSV",
-                    )
+                rows, columns = 0, 0
+                for letters, digits in _LAST.findall(content):
+                    column = functools.reduce(lambda number, letter: 26 * number + letter - 64, letters, 0)
+                    rows, columns = max(rows, int(digits)), max(columns, column)
+                if rows * columns > MAX_CELLS:
+                    problem = f"a sheet reaches to row {rows} and column {columns}, which is too large"
+                    remedy = "Delete the rows and columns without content behind the table, or save it as CSV"
+                    raise InputError(problem, file=file, remedy=remedy)
     except (zipfile.BadZipFile, zlib.error, ValueError, OSError, NotImplementedError, EOFError, RuntimeError) as error:
         if isinstance(error, InputError):
             raise

@@ -8,7 +8,7 @@ import click
 
 from .._store import results
 from . import options as common
-from .session import say, session
+from .session import say, say_files, sentence, session
 
 FORMATS = ("json", "csv", "jax", "c", "lammps", "yade")
 
@@ -77,7 +77,5 @@ def export(
     sizes = " x ".join(f"{float(d):.4g}" for d in (shown.D1, shown.D2, shown.D3))
     say(f"Golden table of a particle of {sizes} um ({origin.geometry}).")
     for warning in origin.warnings:
-        say(f"Warning: {warning[:1].upper()}{warning[1:].rstrip('.')}.", fg="yellow")
-    say(f"Written into {out}:")
-    for name in files:
-        say(f"  {name}")
+        say(f"Warning: {sentence(warning)}", fg="yellow")
+    say_files(out, files)

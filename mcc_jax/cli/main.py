@@ -70,12 +70,7 @@ def one_line(text: str) -> str:
 
 
 def explain(error: BaseException, debug: bool) -> Stop:
-    """What a run that ended with this error tells its user.
-
-    Args:
-        error: what was raised.
-        debug: print the traceback of what is nobody's input error.
-    """
+    """What a run that ended with this error tells its user; `debug` prints the traceback of a defect."""
     match error:
         case Stop():
             return error
@@ -154,7 +149,7 @@ def _silence_stdout() -> None:
 
 def _version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
     if wanted and not ctx.resilient_parsing:
-        from .._version import own_version
+        from .._extras import own_version
 
         click.echo(f"{PROGRAM} {own_version()}")
         ctx.exit()

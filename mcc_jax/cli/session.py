@@ -37,11 +37,7 @@ PACKAGES = ("jax", "jaxlib", "equinox", "optimistix", "numpyro", "arviz", "numpy
 def session(steps: int) -> Iterator[Tell]:
     """Double precision, and progress on standard error if that is a terminal.
 
-    Args:
-        steps: how many times the command will call the function it gets.
-
-    Yields:
-        A function that is called with the name of each step as it begins.
+    Yields a function to be called with the name of each step as it begins, `steps` times in all.
     """
     with _progress(steps) as tell:
         tell("loading the library")
@@ -64,10 +60,9 @@ def require_device() -> None:
     except (RuntimeError, AssertionError) as error:  # of a platform that is not installed it says either
         asked = os.environ.get("JAX_PLATFORMS") or jax.config.read("jax_platforms") or "the default"
         why = " ".join(str(error).split()).split(" (set JAX_PLATFORMS")[0][:160]  # its hint is in the remedy
-        raise InputError(
-            f"JAX finds no device for JAX_PLATFORMS={asked}" + (f" ({why})" if why else ""),
-            remedy="Unset JAX_PLATFORMS to compute on the processor, or install JAX for your accelerator",
-        ) from None
+        problem = f"JAX finds no device for JAX_PLATFORMS={asked}" + (f" ({why})" if why else "")
+        remedy = "Unset JAX_PLATFORMS to compute on the processor, or install JAX for your accelerator"
+        raise InputError(problem, remedy=remedy) from None
 
 
 CACHE_BYTES = 300 * 2**20
@@ -222,7 +217,7 @@ def provenance(command: str, campaign: Path, settings: Mapping[str, Any], *, tol
     import platform
     from importlib.metadata import version
 
-    from .._version import own_version
+    from .._extras import own_version
     from ..campaign import file_checksums
 
     def plain(value: Any) -> Any:

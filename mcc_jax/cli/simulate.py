@@ -149,11 +149,7 @@ def simulate(out: Path, **options: Any) -> None:
 
 
 def _refuse_contradictions(options: dict[str, Any]) -> None:
-    """No option is accepted and then ignored.
-
-    Raises:
-        UsageError: naming the two that do not go together.
-    """
+    """No option is accepted and then ignored."""
 
     def given(name: str) -> bool:
         return options[name] is not None
@@ -202,10 +198,7 @@ def _sizes(file: Path | None) -> Sizes:
 
 
 def _laws(options: Mapping[str, Any], sizes: Sizes) -> MccLaw:
-    """One law per particle, of fixed or drawn coefficients.
-
-    Raises `InputError` if `a` leaves a particle without stress.
-    """
+    """One law per particle, of fixed or drawn coefficients."""
     import equinox as eqx
     import jax.numpy as jnp
 
@@ -223,11 +216,9 @@ def _laws(options: Mapping[str, Any], sizes: Sizes) -> MccLaw:
     eta = of_each_particle(sizes.diameters_um, lambda p: plastic_shape_factor(p, a))
     if not (eta > 0).all():
         worst = int(eta.argmin())
-        raise InputError(
-            f"the shape factor of particle {sizes.names[worst]!r} is {eta[worst]:.4g} with a = {a:g}",
-            file=sizes.file,
-            remedy="Give an --a nearer to zero: shape factors must be positive",
-        )
+        problem = f"the shape factor of particle {sizes.names[worst]!r} is {eta[worst]:.4g} with a = {a:g}"
+        remedy = "Give an --a nearer to zero: shape factors must be positive"
+        raise InputError(problem, file=sizes.file, remedy=remedy)
     form, scaling = Unloading(options["unloading"]), StrainScaling(options["strain_scaling"])
     return law_for_each(plastic, a, options["effective_modulus"], form, scaling)
 
@@ -261,11 +252,8 @@ def _peaks(options: Mapping[str, Any], programme: Programme, laws: MccLaw, sizes
 
     strained = options["peak_strain"] is not None
     if strained and programme.control != "displacement":
-        raise InputError(
-            "the programme runs under load control, where --peak-strain has no meaning",
-            file=options["programme"],
-            remedy="Give --peak-stress",
-        )
+        problem = "the programme runs under load control, where --peak-strain has no meaning"
+        raise InputError(problem, file=options["programme"], remedy="Give --peak-stress")
     between = options["peak_strain"] or options["peak_stress"] or PAPER_PEAK_STRESS_MPA
     drawn = draw_evenly(between, len(sizes.names), options["seed"])
     particles = particle_batch(sizes.diameters_um)
@@ -292,11 +280,8 @@ def _check_size(programme: Programme, peaks: np.ndarray, file: Path | None) -> N
         samples = programme.points or math.ceil(duration / (programme.interval_s or 1.0))
         rows += samples + len(programme.steps)
         if rows > MAX_ROWS or samples * len(programme.steps) > 10 * MAX_ROWS:
-            raise InputError(
-                f"the campaign would have more than {MAX_ROWS} rows, or too many steps for its points",
-                file=file,
-                remedy="Take fewer points, a longer interval or a higher rate",
-            )
+            problem = f"the campaign would have more than {MAX_ROWS} rows, or too many steps for its points"
+            raise InputError(problem, file=file, remedy="Take fewer points, a longer interval or a higher rate")
 
 
 def _hidden_effects(texts: Sequence[str], sizes: Sizes) -> tuple[HiddenEffect, ...]:
@@ -315,11 +300,8 @@ def _hidden_effects(texts: Sequence[str], sizes: Sizes) -> tuple[HiddenEffect, .
             raise InputError(f"--effect {text}: {error}") from error
     wet = [effect for effect in hidden if Need.HUMIDITY_COLUMN in effect.variant.needs]
     if wet and HUMIDITY_COLUMN not in sizes.columns:
-        raise InputError(
-            f"--effect {wet[0].variant.mechanism}: needs a column {HUMIDITY_COLUMN} in the table of particles",
-            file=sizes.file,
-            remedy="Give --particles FILE with that column",
-        )
+        problem = f"--effect {wet[0].variant.mechanism}: needs a column {HUMIDITY_COLUMN} in the table of particles"
+        raise InputError(problem, file=sizes.file, remedy="Give --particles FILE with that column")
     return tuple(hidden)
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from .._extras import extra
-from .._version import own_version
+from .._extras import extra, own_version
 from ..geometry import Particle
 from ..law import TESTED_STRAIN, MccLaw, StrainScaling, Unloading
 from .effects import factor_in_c, in_words, parameters_in_c

@@ -6,7 +6,7 @@ import hashlib
 import json
 from typing import Any
 
-from .._version import own_version
+from .._extras import own_version
 from ..geometry import Particle
 from ..law import TESTED_STRAIN, MccLaw
 from .effects import described

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .._version import own_version
+from .._extras import own_version
 from ..geometry import Particle
 from ..law import MccLaw
 from .c_header import origin_lines, render

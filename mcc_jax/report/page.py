@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from .. import arguments
-from .._extras import extra
+from .._extras import extra, own_version
 from .._format import interval, number, percent, probability, with_sd
-from .._version import own_version
 from ..calibrate.curves import KINDS, FittedCurve
 from ..campaign.findings import worst
 from .read import Results

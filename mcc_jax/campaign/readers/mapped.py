@@ -16,9 +16,8 @@ from ..schema import Curve
 from ..table import APOSTROPHES, Grouping, filled, number_of_cells, parse_number, same_text, thousands_mark
 from ..validate import check_magnitudes
 from .diameters import check_triple
-from .mapped_rows import Rows, Sheet, read_rows
 from .mapping import DIMENSIONS, InHeader, MappingFile
-from .text import Tests, checked_curve
+from .text import Rows, Sheet, Tests, checked_curve, read_rows
 
 _FURTHEST = 200
 """Rows above a header found by `begin`, within which it is looked for again; a tester's preamble has a few dozen."""

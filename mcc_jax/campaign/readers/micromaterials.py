@@ -15,6 +15,7 @@ from pathlib import Path, PurePosixPath
 
 from ..._errors import InputError
 from ..schema import Curve
+from ..table import filled
 from .text import Tests, checked_curve, decode_lines, number_block
 
 _ROW = re.compile(r"-?\d+\.\d{6}\t-?\d+\.\d{6}\t-?\d+\.\d{6}\s*")
@@ -48,11 +49,9 @@ def read_zip(data: bytes, file: Path) -> Tests:
         name = PurePosixPath(path).stem
         lines = decode_lines(content)
         if not matches(lines):
-            raise InputError(
-                "is no Micro Materials text (three columns t, h, F with six decimals)",
-                file=inside,
-                remedy="Remove it from the archive, or unpack it and write a mapping file",
-            )
+            problem = "is no Micro Materials text (three columns t, h, F with six decimals)"
+            remedy = "Remove it from the archive, or unpack it and write a mapping file"
+            raise InputError(problem, file=inside, remedy=remedy)
         if name in curves:
             raise InputError(f"two tests are called {name!r}", file=inside, remedy="Rename one of them")
         curves[name] = _curve(lines, inside, name)
@@ -62,7 +61,7 @@ def read_zip(data: bytes, file: Path) -> Tests:
 
 
 def _curve(lines: list[str], file: Path, name: str) -> Curve:
-    end = next((i for i in range(len(lines), 0, -1) if lines[i - 1].strip()), 0)
+    end = filled(lines)
     numbers = number_block(lines, 0, end, _NAMES, file)
     return checked_curve(numbers[:, 0], numbers[:, 2], numbers[:, 1] / 1e3, file, 1, name)
 
@@ -83,9 +82,8 @@ def _entries(data: bytes, file: Path) -> Iterator[tuple[str, bytes]]:
             if entry.flag_bits & 0x1:
                 raise InputError(f"the entry {entry.filename!r} is encrypted", file=file, remedy="Unpack it first")
             if entry.compress_type not in _METHODS:  # others may ask for gigabytes before the first byte
-                raise InputError(
-                    f"the entry {entry.filename!r} is compressed in an unusual way", file=file, remedy="Unpack it first"
-                )
+                problem = f"the entry {entry.filename!r} is compressed in an unusual way"
+                raise InputError(problem, file=file, remedy="Unpack it first")
             try:
                 # The size in the directory may lie; no more than it says is unpacked.
                 with archive.open(entry) as stream:
@@ -96,7 +94,6 @@ def _entries(data: bytes, file: Path) -> Iterator[tuple[str, bytes]]:
             if len(content) > entry.file_size or total > LARGEST_TOTAL:
                 raise broken
             if content.startswith((b"PK\x03\x04", b"\x1f\x8b")):
-                raise InputError(
-                    f"the entry {entry.filename!r} is itself an archive", file=file, remedy="Unpack it first"
-                )
+                problem = f"the entry {entry.filename!r} is itself an archive"
+                raise InputError(problem, file=file, remedy="Unpack it first")
             yield entry.filename, content
