@@ -75,6 +75,8 @@ def convert(
     if diameters is not None and not diameters.strip():
         raise click.BadParameter("it is empty.", param_hint="--diameters")
     with session(3) as tell:
+        import numpy as np
+
         from ..campaign import (
             campaign_findings,
             check_plausibility,
@@ -100,23 +102,17 @@ def convert(
     points = sum(len(curve) for curve in campaign.curves)
     source = (campaign.metadata.provenance or "").partition(";")[0]
     say(f"{len(campaign)} test{'s' if len(campaign) > 1 else ''}, {points} points ({source}).")
+    peaks = [(curve.force_mN.max(), curve.displacement_um.max()) for curve in campaign.curves]
     rows = [
-        (
-            name,
-            str(len(curve)),
-            f"{curve.force_mN.max():.4g}",
-            f"{curve.displacement_um.max():.4g}",
-            *(str(found[kind]) for kind in KINDS),
-        )
-        for name, curve, found in zip(campaign.particles, campaign.curves, segments, strict=True)
+        (name, str(len(curve)), *(f"{peak:.4g}" for peak in of), *(str(found[kind]) for kind in KINDS))
+        for name, curve, of, found in zip(campaign.particles, campaign.curves, peaks, segments, strict=True)
     ]
     say_table(("test", "points", "max force mN", "max displ um", *KINDS), rows[:SHOWN])
     if len(rows) > SHOWN:
-        force = [curve.force_mN.max() for curve in campaign.curves]
-        displacement = [curve.displacement_um.max() for curve in campaign.curves]
+        (force, displacement), (most_force, farthest) = np.min(peaks, axis=0), np.max(peaks, axis=0)
         say(
-            f"  ... and {len(rows) - SHOWN} more; in all, max force {min(force):.4g} to {max(force):.4g} mN, "
-            f"max displ {min(displacement):.4g} to {max(displacement):.4g} um"
+            f"  ... and {len(rows) - SHOWN} more; in all, max force {force:.4g} to {most_force:.4g} mN, "
+            f"max displ {displacement:.4g} to {farthest:.4g} um"
         )
     total = sum(segments, Counter())
     say("Segments in all: " + ", ".join(f"{total[kind]} {kind}" for kind in KINDS) + ".")

@@ -52,12 +52,7 @@ Shell completion (bash; likewise zsh_source, fish_source):
 
 
 class Stop(Exception):
-    """The end of a run before its time.
-
-    Attributes:
-        status: the exit status.
-        line: what to say on standard error; nothing if empty.
-    """
+    """The end of a run before its time: the exit status, and what to say on standard error, nothing if empty."""
 
     def __init__(self, status: int, line: str) -> None:
         super().__init__(line)
