@@ -113,24 +113,18 @@ class Table:
         return ","
 
     def refuse_groups(self, columns: Sequence[int]) -> None:
-        """Refuse numbers that look as if the decimal mark parted thousands; see `Grouping`.
-
-        Raises `InputError` naming the cell.
-
-        Args:
-            columns: those whose numbers have one decimal mark; those with one unit are judged together.
-        """
+        """Refuse numbers whose decimal mark looks like one between thousands; columns of a unit are judged together."""
         mark = self.decimal_mark(columns)
-        by_unit: dict[str, Grouping] = {}
+        units: dict[str, list[int]] = {}
         for column in columns:
-            grouping = by_unit.setdefault(self.header[column].rpartition("_")[2], Grouping(mark))
-            for row, record in zip(self.rows, self.records, strict=True):
-                grouping.see(record[column], (row, column))
-        for grouping in by_unit.values():
-            if (found := grouping.found()) is not None:
-                (row, column), problem = found
+            units.setdefault(self.header[column].rpartition("_")[2], []).append(column)
+        for alike in units.values():
+            cells = ((k, record[column]) for column in alike for k, record in enumerate(self.records))
+            if (found := thousands_for_decimals(cells, mark)) is not None:
+                k, problem = found
+                column = next(c for c in alike if mark in self.records[k][c])
                 remedy = "Write numbers without marks between the thousands, or all with as many decimals"
-                raise InputError(problem, file=self.file, row=row, column=self.header[column], remedy=remedy)
+                raise InputError(problem, file=self.file, row=self.rows[k], column=self.header[column], remedy=remedy)
 
     def numbers(self, columns: Sequence[int]) -> list[np.ndarray]:
         """The cells of some columns as finite numbers, all with one decimal mark; the first that is none is named."""
@@ -188,37 +182,34 @@ def parse_number(cell: str, decimal_mark: str = ".", thousands: str = "") -> flo
     return number
 
 
-class Grouping:
-    """Whether a decimal mark may be one between thousands, so that readings would be a thousandth of what they are.
+def thousands_for_decimals(cells: Iterable[tuple[int, str]], mark: str) -> tuple[int, str] | None:
+    """Where a decimal mark may be one between thousands, so that readings would be a thousandth of what they are.
 
     So it looks where some cells of a quantity hold whole numbers of three digits and more without the mark (500), and
     every other one has one to three digits, the mark, and three digits (1.500). Programs write neither: with a fixed
     number of decimals 500 would be 500.000, and without a fixed one 1.500 would be 1.5.
+
+    Args:
+        cells: row and text of each.
+        mark: the decimal mark.
+
+    Returns:
+        The row of the first such cell and what is wrong with it; None if nothing is.
     """
-
-    def __init__(self, decimal_mark: str) -> None:
-        self.mark = decimal_mark
-        self.cleared = False
-        self.grouped: tuple[tuple[int, int], str] | None = None
-        self.whole: str | None = None
-
-    def see(self, cell: str, place: tuple[int, int]) -> None:
-        """Take a cell in a place, its row and column, into account."""
-        if self.cleared:
-            return
-        cell = cell.strip()
-        if self.mark in cell:
-            self.cleared = _one_group(self.mark).fullmatch(cell) is None
-            self.grouped = self.grouped or (place, cell)
-        elif self.whole is None and _WHOLE.fullmatch(cell):
-            self.whole = cell
-
-    def found(self) -> tuple[tuple[int, int], str] | None:
-        """The place of the first such cell and what is wrong with it; None if nothing is."""
-        if self.cleared or self.grouped is None or self.whole is None:
-            return None
-        place, cell = self.grouped
-        return place, f"{cell!r} beside {self.whole!r} looks like a mark between thousands, not a decimal mark"
+    grouped: tuple[int, str] | None = None
+    whole: str | None = None
+    for row, text in cells:
+        cell = text.strip()
+        if mark in cell:
+            if not _one_group(mark).fullmatch(cell):
+                return None
+            grouped = grouped or (row, cell)
+        elif whole is None and _WHOLE.fullmatch(cell):
+            whole = cell
+    if grouped is None or whole is None:
+        return None
+    row, cell = grouped
+    return row, f"{cell!r} beside {whole!r} looks like a mark between thousands, not a decimal mark"
 
 
 _WHOLE = re.compile(r"[-+]?[1-9][0-9]{2,}")
@@ -243,11 +234,6 @@ def thousands_mark(cell: str, decimal_mark: str = ".") -> str | None:
     return None
 
 
-def delimiter_of(header: str) -> str:
-    """What parts the columns of a table, told by its header: the commonest of comma, semicolon and tab."""
-    return max(",;\t", key=re.sub('"[^"]*"', "", header).count)
-
-
 def parse_header(cells: list[str], file: Path) -> tuple[str, ...]:
     """Names of the columns, without blanks around them.
 
@@ -269,17 +255,6 @@ def parse_header(cells: list[str], file: Path) -> tuple[str, ...]:
 def number_of_cells(count: int) -> str:
     """The number of cells of a row, in words."""
     return "1 cell" if count == 1 else f"{count} cells"
-
-
-def ragged(count: int, header: tuple[str, ...], file: Path, row: int, delimiter: str = ",") -> InputError:
-    """The error for a row with too many or too few cells."""
-    few = count < len(header)
-    where = header[count] if few else None
-    extra = "Use decimal points and quote" if delimiter == "," else "Quote"
-    what = {",": "commas", ";": "semicolons", "\t": "tabs"}[delimiter]
-    hint = "Fill the cell" if few else f"{extra} text that holds {what}"
-    problem = f"{number_of_cells(count)} where the header has {len(header)}"
-    return InputError(problem, file=file, row=row, column=where, remedy=hint)
 
 
 def make_table(found: Iterable[tuple[int, list[str]]], file: Path, delimiter: str = ",") -> Table:
@@ -306,7 +281,12 @@ def make_table(found: Iterable[tuple[int, list[str]]], file: Path, delimiter: st
         raise InputError("there is a header but no row of data", file=file, row=1, remedy="Export it again")
     for row, cells in full[1:]:
         if len(cells) < width or filled(cells) > width:
-            raise ragged(len(cells) if len(cells) < width else filled(cells), header, file, row, delimiter)
+            few = len(cells) < width
+            count = len(cells) if few else filled(cells)
+            what = {",": "commas", ";": "semicolons", "\t": "tabs"}[delimiter]
+            extra = f"{'Use decimal points and quote' if delimiter == ',' else 'Quote'} text that holds {what}"
+            problem, where = f"{number_of_cells(count)} where the header has {width}", header[count] if few else None
+            raise InputError(problem, file=file, row=row, column=where, remedy="Fill the cell" if few else extra)
     return Table(file, header, [cells[:width] for _, cells in full[1:]], [row for row, _ in full[1:]], delimiter)
 
 
@@ -326,7 +306,9 @@ def parse_table(text: str, file: Path) -> Table:
     row, told = 1, _SEPARATOR.match(text)
     if told is not None:  # a line by which a spreadsheet is told what parts the columns
         text, row = text[told.end() :], 2
-    delimiter = told[1] if told is not None else delimiter_of(text.lstrip().partition("\n")[0].partition("\r")[0])
+    # Else the commonest of those that part columns, outside of quotes, in the header.
+    header = re.sub('"[^"]*"', "", text.lstrip().partition("\n")[0].partition("\r")[0])
+    delimiter = told[1] if told is not None else max(",;\t", key=header.count)
     reader = csv.reader(io.StringIO(text, newline=""), strict=True, delimiter=delimiter)
     found: list[tuple[int, list[str]]] = []
     above = row

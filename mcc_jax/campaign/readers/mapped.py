@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections import Counter
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,15 @@ import numpy as np
 from ..._errors import InputError
 from ..columns import LARGEST_MAGNITUDE, LENGTH, convert, unit_factor
 from ..schema import Curve
-from ..table import APOSTROPHES, Grouping, filled, number_of_cells, parse_number, same_text, thousands_mark
+from ..table import (
+    APOSTROPHES,
+    filled,
+    number_of_cells,
+    parse_number,
+    same_text,
+    thousands_for_decimals,
+    thousands_mark,
+)
 from ..validate import check_magnitudes
 from .diameters import check_triple
 from .mapping import DIMENSIONS, InHeader, MappingFile
@@ -28,11 +38,6 @@ def read_mapped(data: bytes, file: Path, mapping: MappingFile) -> Tests:
     """The tests of a file that a mapping describes.
 
     Raises `InputError` if the file does not hold what the mapping says, or a cell is damaged.
-
-    Args:
-        data: the file's bytes.
-        file: its path, for names and messages.
-        mapping: what `read_mapping` gave.
     """
     reader = _Reader(read_rows(data, file, mapping), file, mapping)
     reader.run()
@@ -77,12 +82,11 @@ class _Reader:
         """Read all rows. Raises `InputError` at the first row that is neither sample, header nor footer."""
         rows, mapping = self.rows, self.mapping
         head = self._head()
-        self.header = self._header(head)
+        self.header = rows.cells(head) if mapping.header_rows and head < len(rows) else None
         self.stop = self._stop(head + mapping.header_rows)
         self.where = {name: self._place(column.column, head) for name, column in mapping.columns.items()}
         self.wanted = [quantity for quantity in DIMENSIONS if quantity in self.where]
         self.width, self.raw_width = self._widths(head)
-        self.groupings = {quantity: Grouping(mapping.decimal_mark) for quantity in self.wanted}
         sizes = self._diameters(0, head)
         block, ended = 1, False
         i = head + mapping.header_rows
@@ -91,54 +95,54 @@ class _Reader:
                 self.parted = self.parted or mapping.tests == "blank line"
                 ended = ended and mapping.tests != "blank line"
                 i += 1
-                continue
-            if mapping.comment_prefix is not None and rows.begins(i, mapping.comment_prefix):
+            elif mapping.comment_prefix is not None and rows.begins(i, mapping.comment_prefix):
                 i += 1
-                continue
-            below = self._rows_above_again(i)
-            if below is not None:
-                sizes = self._diameters(i, below) if mapping.diameters is not None else sizes
+            elif (below := self._rows_above_again(i)) is not None:
+                sizes = self._diameters(i, below)
                 i = below
-                continue
-            again = self._header_again(i)
-            if again is not None:
+            elif (again := self._header_again(i)) is not None:
                 if mapping.tests == "file" and mapping.pace is not None:
                     remedy = f'Write tests = "header" in {mapping.file.name}'
                     raise self.wrong("the header comes again, so this is more than one test", remedy, again)
-                if mapping.diameters is not None and again > i:
-                    sizes = self._diameters(i, again)
+                sizes = self._diameters(i, again) if again > i else sizes
                 self.parted, ended = self.parted or mapping.tests == "header", False
                 self.header_came_again = True
                 i = again + mapping.header_rows
-                continue
-            ended = ended or (mapping.end is not None and rows.begins(i, mapping.end))
-            if not ended:
-                cells = self._fit(i)
-                numbers = self._numbers(cells, i)
-                if mapping.tests in ("blank line", "header"):
-                    block += self.parted and bool(self.samples or self.missing)
-                name = self._name(cells, block, i)
-                self.parted = False
-                if numbers is None:
-                    self.missing[name] += 1
-                else:
-                    self.samples.setdefault(name, []).append(
-                        (i + 1, len(self.samples.get(name, ())) + self.missing[name], numbers)
-                    )
-                if sizes is not None:
-                    self.diameters_um.setdefault(name, sizes)
-            i += 1
+            else:
+                ended = ended or (mapping.end is not None and rows.begins(i, mapping.end))
+                if not ended:
+                    if mapping.tests in ("blank line", "header"):
+                        block += self.parted and bool(self.samples or self.missing)
+                    self._take(i, block, sizes)
+                i += 1
         self._refuse_groups()
+
+    def _take(self, i: int, block: int, sizes: list[float] | InputError | None) -> None:
+        """Keep a row of data, of the test of this number where the file does not name it, with its diameters."""
+        cells = self._fit(i)
+        numbers = self._numbers(cells, i)
+        name = self._name(cells, block, i)
+        self.parted = False
+        if numbers is None:
+            self.missing[name] += 1
+        else:
+            rows = self.samples.setdefault(name, [])
+            rows.append((i + 1, len(rows) + self.missing[name], numbers))
+        if sizes is not None:
+            self.diameters_um.setdefault(name, sizes)
 
     def _refuse_groups(self) -> None:
         """Refuse a column of text whose decimal mark looks like one between thousands, unless the mapping says none."""
         if self.mapping.thousands is not None or isinstance(self.rows, Sheet):
             return
-        for quantity, grouping in self.groupings.items():
-            if (found := grouping.found()) is not None:
-                (row, _), problem = found
-                word = {".": "point", ",": "comma"}[self.mapping.decimal_mark]
-                other = {".": ",", ",": "."}[self.mapping.decimal_mark]
+        mark = self.mapping.decimal_mark
+        for quantity in self.wanted:
+            place = self.where[quantity]
+            taken = (row for samples in self.samples.values() for row, _, _ in samples)
+            found = thousands_for_decimals(((row, self.rows.cells(row - 1)[place]) for row in taken), mark)
+            if found is not None:
+                row, problem = found
+                word, other = ("point", ",") if mark == "." else ("comma", ".")
                 remedy = (
                     f'Write thousands = "{word}" and decimal_mark = "{other}" in {self.mapping.file.name}, or '
                     'thousands = "none" if it is a decimal mark'
@@ -154,11 +158,6 @@ class _Reader:
         if found is None:
             raise self.wrong(f"no row begins with {begin!r}", f"Correct begin in {self.mapping.file.name}")
         return found
-
-    def _header(self, head: int) -> list[str] | None:
-        if not self.mapping.header_rows or head >= len(self.rows):
-            return None
-        return self.rows.cells(head)
 
     def _place(self, column: str | int, head: int) -> int:
         """The index of a column, told by its name in the header or its number."""
@@ -279,7 +278,6 @@ class _Reader:
             cell = cells[self.where[quantity]]
             try:
                 found.append(self._number(cell))
-                self.groupings[quantity].see(cell, (i + 1, self.where[quantity]))
             except ValueError as error:
                 remedy = self._number_remedy(cell.strip(), i)
                 raise self.wrong(str(error), remedy, i, mapping.columns[quantity].column) from None
@@ -287,16 +285,21 @@ class _Reader:
 
     def _is_missing(self, cell: str) -> bool:
         cell = cell.strip()
+        texts, numbers = self.missing_marks
+        try:
+            return cell.lower() in texts or (bool(numbers) and self._number(cell) in numbers)
+        except ValueError:
+            return False
+
+    @cached_property
+    def missing_marks(self) -> tuple[set[str], set[float]]:
+        """Texts, and numbers, that mean that there is no reading."""
+        texts = {mark.lower() for mark in self.mapping.missing if isinstance(mark, str)}
+        numbers: set[float] = set()
         for mark in self.mapping.missing:
-            if isinstance(mark, str) and cell.lower() == mark.lower():
-                return True
-            try:
-                number = parse_number(str(mark)) if isinstance(mark, str) else mark
-                if self._number(cell) == number:
-                    return True
-            except ValueError:
-                continue
-        return False
+            with contextlib.suppress(ValueError):
+                numbers.add(parse_number(mark) if isinstance(mark, str) else mark)
+        return texts, numbers
 
     def _number_remedy(self, cell: str, i: int) -> str:
         """What to do about a cell that is no number, by what it looks like."""
