@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from ._errors import InputError
@@ -12,6 +11,8 @@ from ._errors import InputError
 
 def own_version() -> str:
     """The version of this package, or "(not installed)" where it runs from a folder only."""
+    from importlib.metadata import PackageNotFoundError, version  # slow, and few ask
+
     try:
         return version("mcc-jax")
     except PackageNotFoundError:

@@ -53,6 +53,12 @@ class FileLimits:
         settings_depth: of keys with dots, and of lists and tables within each other, in a TOML file. The deepest file
             of ours needs 3.
         result_bytes: of `calibration.json` and `discovery.json` [bytes]. 1000 particles take half a MiB.
+        unpacked_bytes: that a zip archive of tests or a workbook may unpack to [bytes].
+        archive_files: in a zip archive of tests.
+        swelling: how many times its size an archive of tests may unpack to: measured numbers as text deflate to a fifth
+            or so; what shrinks to a hundredth is no measurement.
+        sheet_cells: of a sheet's rectangle, empty ones included, since the engine makes room for all (32 bytes each): a
+            full sheet of 1,048,576 rows has 38 columns then; a cell alone in the last row and column asks for 17e9.
         posterior_bytes: of `posterior.nc` or a saved state of many particles [bytes]. 4000 draws of 1000 particles
             with 100 compared points each are 3 GiB.
     """
@@ -63,6 +69,10 @@ class FileLimits:
     settings_bytes: int = 2**20
     settings_depth: int = 32
     result_bytes: int = 16 * 2**20
+    unpacked_bytes: int = 512 * 2**20
+    archive_files: int = 10_000
+    swelling: int = 100
+    sheet_cells: int = 40_000_000
     posterior_bytes: int = 4 * 2**30
 
 

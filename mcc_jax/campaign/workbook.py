@@ -12,13 +12,9 @@ from typing import Any
 
 from .._errors import InputError
 from .._extras import extra
+from ..files import LIMITS
 
 _BOOK = "xl/workbook.xml"
-LARGEST_UNPACKED = 512 * 2**20
-"""Bytes that a workbook may unpack to: what a zip archive of tests may, see `readers._micromaterials`."""
-MAX_CELLS = 40_000_000
-"""Cells of a sheet's rectangle, empty ones included, since the engine makes room for all (32 bytes each): a full
-sheet of 1,048,576 rows has 38 columns then; a cell alone in the last row and column would ask for 17e9."""
 _LAST = re.compile(rb'<c\b[^>]*?\br="([A-Z]{1,3})([0-9]{1,7})"')
 _REMEDY = "Open it in a spreadsheet program and save it again, or save the sheet as CSV"
 
@@ -105,7 +101,7 @@ def _check_size(data: bytes, file: Path) -> None:
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             entries = archive.infolist()
-            if sum(entry.file_size for entry in entries) > LARGEST_UNPACKED:
+            if sum(entry.file_size for entry in entries) > LIMITS.unpacked_bytes:
                 raise InputError("the workbook is too large", file=file, remedy="Save the sheet alone, or as CSV")
             for entry in entries:
                 if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
@@ -121,7 +117,7 @@ def _check_size(data: bytes, file: Path) -> None:
                 for letters, digits in _LAST.findall(content):
                     column = functools.reduce(lambda number, letter: 26 * number + letter - 64, letters, 0)
                     rows, columns = max(rows, int(digits)), max(columns, column)
-                if rows * columns > MAX_CELLS:
+                if rows * columns > LIMITS.sheet_cells:
                     problem = f"a sheet reaches to row {rows} and column {columns}, which is too large"
                     remedy = "Delete the rows and columns without content behind the table, or save it as CSV"
                     raise InputError(problem, file=file, remedy=remedy)

@@ -178,11 +178,6 @@ def _terminate(number: int, _: Any) -> None:
     raise _Terminated(128 + number)
 
 
-INSIST_S = 5.0
-
-SOON_S = 0.05
-
-
 def _send(number: int, after_s: float) -> None:
     """Send the signal once more, unless the process is gone by then."""
     again = threading.Timer(after_s, _thread.interrupt_main, (number,))
@@ -192,7 +187,7 @@ def _send(number: int, after_s: float) -> None:
 
 def _interrupt(*_: Any) -> None:
     """Interrupt, and again unless the process is gone: raised in a library's callback from C, it would be swallowed."""
-    _send(signal.SIGINT, INSIST_S)
+    _send(signal.SIGINT, after_s=5.0)
     raise KeyboardInterrupt
 
 
@@ -200,9 +195,9 @@ def _unraisable(found: Any) -> None:
     """What a signal's handler raised within a destructor would be lost there: send the signal again, outside of it."""
     match found.exc_value:
         case KeyboardInterrupt():
-            _send(signal.SIGINT, SOON_S)
+            _send(signal.SIGINT, after_s=0.05)
         case _Terminated(code=int(status)):
-            _send(status - 128, SOON_S)
+            _send(status - 128, after_s=0.05)
         case _:
             sys.__unraisablehook__(found)
 

@@ -14,17 +14,14 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 from ..._errors import InputError
+from ...files import LIMITS
 from ..schema import Curve
 from ..table import filled
 from .text import Tests, checked_curve, decode_lines, number_block
 
 _ROW = re.compile(r"-?\d+\.\d{6}\t-?\d+\.\d{6}\t-?\d+\.\d{6}\s*")
 _NAMES = ("t", "h", "F")
-LARGEST_TOTAL = 512 * 1024**2
-# Measured numbers as text deflate to a fifth or so; what shrinks to a hundredth is no measurement.
-LARGEST_SWELLING = 100
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-MAX_ENTRIES = 10_000
 
 
 def matches(lines: list[str]) -> bool:
@@ -75,7 +72,8 @@ def _entries(data: bytes, file: Path) -> Iterator[tuple[str, bytes]]:
         raise broken from None
     with archive:
         whole = sum(entry.file_size for entry in entries)
-        if len(entries) > MAX_ENTRIES or whole > LARGEST_TOTAL or whole > LARGEST_SWELLING * max(len(data), 10_000):
+        most = min(LIMITS.unpacked_bytes, LIMITS.swelling * max(len(data), 10_000))
+        if len(entries) > LIMITS.archive_files or whole > most:
             raise InputError("the archive is too large for a tester's export", file=file, remedy="Split it")
         total = 0
         for entry in entries:
@@ -91,7 +89,7 @@ def _entries(data: bytes, file: Path) -> Iterator[tuple[str, bytes]]:
             except (zipfile.BadZipFile, zlib.error, ValueError, OSError, EOFError, RuntimeError):
                 raise broken from None
             total += len(content)
-            if len(content) > entry.file_size or total > LARGEST_TOTAL:
+            if len(content) > entry.file_size or total > LIMITS.unpacked_bytes:
                 raise broken
             if content.startswith((b"PK\x03\x04", b"\x1f\x8b")):
                 problem = f"the entry {entry.filename!r} is itself an archive"
