@@ -59,7 +59,10 @@ def record_columns(
         kind = KINDS.index(segment.kind)
         part = slice(segment.start, segment.stop)
         if kind not in (HOLD, APPROACH):
-            begins = _first_value(time[part], force[part])
+            first = slice(part.start, min(part.start + 9, part.stop))
+            begins = float(force[part.start])
+            if len(force[first]) >= 3 and np.ptp(time[first]) > 0:
+                begins = straight_line(time[first] - time[part.start], force[first])[1]
             if kind == UNLOAD and branch != UNLOAD:
                 unload_from = begins
             if kind != UNLOAD and branch == UNLOAD:
@@ -142,13 +145,6 @@ def humidity_column(
             remedy = "Write a number from 0 to 100, in percent"
             raise InputError(problem, file=source or None, column=HUMIDITY_COLUMN, remedy=remedy)
     return values
-
-
-def _first_value(time: np.ndarray, force: np.ndarray) -> float:
-    n = min(len(force), 9)
-    if n < 3 or np.ptp(time[:n]) <= 0:
-        return float(force[0])
-    return straight_line(time[:n] - time[0], force[:n])[1]
 
 
 def _slope(time: np.ndarray, force: np.ndarray, before: float) -> float:

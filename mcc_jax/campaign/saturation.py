@@ -132,29 +132,27 @@ def censor_force(curve: Curve, options: SaturationOptions | None = None) -> Cens
     for start, stop in found:
         hidden[start:stop] = True
     fitted = _loading(force, path, hidden, found[0][0], end, options.fitted_from)
-    keep, turning = ~hidden, {}
+    before = slice(max(found[0][0] - 12, 0), found[0][0])
+    way = float(np.ptp(path[before]))
+    pace = float(np.ptp(force[before])) / way if way > 0 else 0.0  # [mN/um]
+    new_force, new_path, sd = force.copy(), path.copy(), np.zeros(len(force))
+    turning = np.zeros(len(force), bool)
     reached = -np.inf
     for start, stop in found:
         reached = max(reached, float(np.max(path[:start])))
-        farthest = start + int(np.argmax(path[start:stop]))
-        top = _turning(path[start:stop], farthest - start, noise)
+        row = start + int(np.argmax(path[start:stop]))
+        top = _turning(path[start:stop], row - start, noise)
         if top <= reached:
             continue  # reloading that stays below what was reached before: elastic, the history does not change
-        keep[farthest] = True
-        turning[farthest] = top
-        reached = top
-    new_force, new_path = force.copy(), path.copy()
-    sd = np.zeros(len(force))
-    for row, top in turning.items():
         value, error = (np.nan, np.nan) if fitted is None else fitted.at(top, noise)
-        if not np.isfinite(value) or value < end:
-            value, error = end, max(noise * _pace(force, path, found[0][0]), 0.0)
-        new_force[row], new_path[row], sd[row] = value, top, error
-    compared = np.ones(len(force), bool)
-    compared[list(turning)] = False
-    note = _note(end, int(hidden.sum()), new_force[~compared], sd[~compared], options.trusted)
+        if not end <= value < np.inf:
+            value, error = end, noise * pace
+        new_force[row], new_path[row], sd[row], turning[row] = value, top, error, True
+        reached = top
+    note = _note(end, int(hidden.sum()), new_force[turning], sd[turning], options.trusted)
+    keep = ~hidden | turning
     checked = Curve(curve.time_s[keep], new_force[keep], new_path[keep])
-    return CensoredForce(checked, np.flatnonzero(keep), compared[keep], sd[keep], note)
+    return CensoredForce(checked, np.flatnonzero(keep), ~turning[keep], sd[keep], note)
 
 
 def censor_displacement(curve: Curve, options: SaturationOptions | None = None) -> tuple[np.ndarray, Note] | None:
@@ -194,13 +192,6 @@ def _note(end: float, count: int, largest: np.ndarray, sds: np.ndarray, trusted:
     if far:
         sentence += ", too far beyond the range to be relied on"
     return Note("saturation", "bad" if far else "look", sentence, (end, count, top, sd), remedy)
-
-
-def _pace(force: np.ndarray, path: np.ndarray, start: int) -> float:
-    """Slope of force over displacement before a reading [mN/um]."""
-    before = slice(max(start - 12, 0), start)
-    reach = float(np.ptp(path[before]))
-    return float(np.ptp(force[before])) / reach if reach > 0 else 0.0
 
 
 def _turning(part: np.ndarray, top: int, noise: float) -> float:

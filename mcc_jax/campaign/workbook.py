@@ -75,8 +75,12 @@ def read_sheet(
         remedy = how or f"Call the sheet with the table {preferred!r}, or save it alone"
         raise InputError(f"{len(held)} sheets hold something: {listed}", file=file, remedy=remedy)
     (frame,) = held.values()
-    cells = ([_text(value, decimal_mark) for value in row] for row in frame.itertuples(index=False, name=None))
-    return [(number, row) for number, row in enumerate(cells, start=1)]
+
+    def text(value: Any) -> str:
+        return repr(value).replace(".", decimal_mark) if isinstance(value, float) else str(value)
+
+    rows = frame.itertuples(index=False, name=None)
+    return [(number, [text(value) for value in row]) for number, row in enumerate(rows, start=1)]
 
 
 def _choose(names: list[str], sheet: str | int | None, preferred: str | None, file: Path) -> str | None:
@@ -88,12 +92,6 @@ def _choose(names: list[str], sheet: str | int | None, preferred: str | None, fi
         return str(sheet)
     what = f"sheet {sheet}" if isinstance(sheet, int) else f"sheet called {sheet!r}"
     raise InputError(f"there is no {what}", file=file, remedy=f"The sheets are: {', '.join(map(repr, names))}")
-
-
-def _text(value: Any, decimal_mark: str) -> str:
-    if isinstance(value, float):
-        return repr(value).replace(".", decimal_mark)
-    return str(value)
 
 
 def _check_size(data: bytes, file: Path) -> None:

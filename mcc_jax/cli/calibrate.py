@@ -52,11 +52,6 @@ BELONGS = {
 NO_SETTINGS = ("campaign", "out", "no_figures", "as_json")
 
 
-def _applies(name: str, method: str) -> bool:
-    """Whether an option says how a result of this method comes about."""
-    return name not in NO_SETTINGS and method in BELONGS.get(name, METHODS)
-
-
 @click.command(short_help="Fit the law to a campaign.")
 @common.campaign()
 @common.out(required=True)
@@ -137,7 +132,9 @@ def calibrate(
         data = read_without(campaign, options["leave_out"], tell)
         if options["reference"] is not None:
             require_particle(options["reference"], data, "--reference")
-        origin = provenance("calibrate", campaign, {n: v for n, v in context.params.items() if _applies(n, method)})
+        # What says how a result of this method comes about.
+        told = {n: v for n, v in context.params.items() if n not in NO_SETTINGS and method in BELONGS.get(n, METHODS)}
+        origin = provenance("calibrate", campaign, told)
         writers = functools.partial(import_writers, figures=not no_figures, posterior=method == "bayes")
         with results(out) as stage, beside(writers):
             calibration = _calibrated(data, method, options, tell)

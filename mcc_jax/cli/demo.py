@@ -115,7 +115,13 @@ def _job(
     campaign, seed = _campaign(settings["seed"], effect), settings["seed"]
     write_campaign(campaign, stage.folder / "campaign")
     origin = provenance("demo", stage.folder / "campaign", settings, told="campaign")
-    with beside(_import_the_rest):  # compilers leave a core to Python
+
+    def rest() -> None:
+        from .. import discover, report  # noqa: F401
+
+        import_writers(figures=True, posterior=True)
+
+    with beside(rest):  # seconds to import, for which compilers leave a core to Python
         calibration = sample(campaign, seed=seed, progress=tell)
     from ..discover import discover
     from ..report import read_results, report_page
@@ -140,13 +146,6 @@ def _campaign(seed: int, effect: HiddenEffect | None) -> Campaign:
     made = paper_campaign(seed, programme=programme, effects=() if effect is None else (effect,))
     some = made.select(np.arange(len(made)) < PARTICLES)
     return dataclasses.replace(some, columns={}, metadata=dataclasses.replace(some.metadata, other={}))
-
-
-def _import_the_rest() -> None:
-    """What the demo needs after calibrating, seconds to import: discovery, drawing, the page, the posterior's file."""
-    from .. import discover, report  # noqa: F401
-
-    import_writers(figures=True, posterior=True)
 
 
 def _say_found(calibration: dict[str, Any], found: dict[str, Any]) -> None:

@@ -76,11 +76,12 @@ def read_folder(
     same: dict[str, list[Path]] = {}
     for file in files:
         try:
-            if not _is_text(file.name):
-                raise InputError("the file's name is no Unicode text", file=file, remedy="Rename it")  # noqa: TRY301
+            file.name.encode("utf-8")  # a name in another encoding than the system's cannot be written into a file
             data = read_bytes(file, limits)
             found[file] = read(file, data)
             same.setdefault(hashlib.sha256(data).hexdigest(), []).append(file)
+        except UnicodeEncodeError:
+            failed[file] = InputError("the file's name is no Unicode text", file=file, remedy="Rename it")
         except InputError as error:
             failed[file] = error
     if failed:
@@ -148,14 +149,6 @@ def _files(folder: Path, skip: Sequence[str]) -> tuple[list[Path], list[Finding]
 def _fits(entry: Path, pattern: str) -> bool:
     name, stem, wanted = same_text(entry.name), same_text(entry.stem), same_text(pattern)
     return wanted in (name, stem) or fnmatchcase(name, wanted)
-
-
-def _is_text(name: str) -> bool:
-    """Whether a name can be written into a file; one in another encoding than the system's cannot."""
-    try:
-        return bool(name.encode("utf-8"))
-    except UnicodeEncodeError:
-        return False
 
 
 def _count(files: Sequence[Path]) -> str:

@@ -186,29 +186,25 @@ def _is_encoding(name: str) -> bool:
         return False
 
 
-def _is_delimiter(text: str) -> bool:
-    return text in _DELIMITERS or (len(text) == 1 and text not in '"\r\n\0')
-
-
 def _are_marks(marks: list[Any]) -> bool:
     return bool(marks) and all(isinstance(mark, str | int | float) and not isinstance(mark, bool) for mark in marks)
 
 
-def _is_sheet(sheet: str | int) -> bool:
-    return sheet >= 1 if isinstance(sheet, int) else bool(sheet.strip())
-
-
-def _is_count(number: int) -> bool:
-    return number >= 0
-
-
 _MARKS = '"point", "comma", "apostrophe", "space", "none"'
 _TEXT = str, lambda text: bool(text.strip())
-_COUNT = int, _is_count, "a whole number, 0 or more"
+_COUNT = int, lambda number: number >= 0, "a whole number, 0 or more"
 _PLAIN: dict[str, tuple[type | tuple[type, ...], Callable[[Any], bool], str]] = {
     "encoding": (str, _is_encoding, 'a name such as "latin-1"'),
-    "delimiter": (str, _is_delimiter, '"comma", "semicolon", "tab", "space" or one character'),
-    "sheet": ((str, int), _is_sheet, "the sheet's name, or its number from 1 on"),
+    "delimiter": (
+        str,
+        lambda text: text in _DELIMITERS or (len(text) == 1 and text not in '"\r\n\0'),
+        '"comma", "semicolon", "tab", "space" or one character',
+    ),
+    "sheet": (
+        (str, int),
+        lambda sheet: bool(sheet.strip()) if isinstance(sheet, str) else sheet >= 1,
+        "the sheet's name, or its number from 1 on",
+    ),
     "decimal_mark": (str, (".", ",").__contains__, '"." or ","'),
     "thousands": (str, _THOUSANDS.__contains__, f"{_MARKS} or one of these characters"),
     "missing": (list, _are_marks, 'a list of texts and numbers such as ["NaN", "", -999]'),
@@ -309,7 +305,12 @@ def _columns(entries: dict[str, Any], values: dict[str, Any]) -> tuple[dict[str,
         if (isinstance(column, int) and column < 1) or (isinstance(column, str) and values.get("header_rows", 1) == 0):
             remedy = "Count columns from 1; names need header_rows of at least 1"
             raise _wrong(f"{column!r} cannot be found", f"{place}.column", remedy)
-        found[name] = Column(column, *_meaning(table, name)) if name in DIMENSIONS else Column(column)
+        found[name] = Column(column)
+        if name in DIMENSIONS:
+            factor, sign = _factor(table.get("unit"), DIMENSIONS[name], place), table.get("sign", 1)
+            if isinstance(sign, bool) or sign not in (1, -1):
+                raise _wrong(f"{sign!r} is not a sign", f"{place}.sign", "Write 1 or -1")
+            found[name] = Column(column, factor, int(sign))
     return found, pace
 
 
@@ -352,14 +353,6 @@ def _in_header(table: Any) -> InHeader:
     _only(table, ["header", "unit"], "diameters.")
     factor = _factor(table["unit"], LENGTH, "diameters") if "unit" in table else None
     return InHeader(tuple(same_text(name).strip() for name in names), factor)
-
-
-def _meaning(table: dict[str, Any], name: str) -> tuple[Fraction, int]:
-    place, sign = f"columns.{name}", table.get("sign", 1)
-    factor = _factor(table.get("unit"), DIMENSIONS[name], place)
-    if isinstance(sign, bool) or sign not in (1, -1):
-        raise _wrong(f"{sign!r} is not a sign", f"{place}.sign", "Write 1 or -1")
-    return factor, int(sign)
 
 
 def _diameters(table: Any, file: Path) -> Diameters:
