@@ -174,7 +174,7 @@ def _check_match(table: Table, names: tuple[str, ...], curves: CurveRows) -> Non
     for name, records in curves.groups.items():
         if name not in known:
             remedy = _similar(name, names) or f"Add its diameters to {PARTICLES} or remove its rows here"
-            raise curves.wrong(f"the particle {name!r} is not in {PARTICLES}", int(records[0]), remedy)
+            raise curves.wrong(f"the particle {name!r} is not in {PARTICLES}", records[0], remedy)
 
 
 def _similar(name: str, others: Iterable[str]) -> str | None:

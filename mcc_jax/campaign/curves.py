@@ -50,14 +50,14 @@ class CurveRows:
         time, force, displacement = (np.ascontiguousarray(column[self.groups[name]]) for column in self.values)
         return Curve(time, force, displacement)
 
-    def wrong(self, problem: str, record: int, remedy: str, column: str = "particle") -> InputError:
+    def wrong(self, problem: str, record: int | np.integer, remedy: str, column: str = "particle") -> InputError:
         """The error for a record, which names the line of the file that it stands in."""
         row = parse_table(self.text, self.file).rows[record]
         return InputError(problem, file=self.file, row=row, column=column, remedy=remedy)
 
     def check(self, name: str, curve: Curve) -> None:
         """Refuse a test that cannot be one, naming file, row and column."""
-        records = self.groups[name].tolist()
+        records = self.groups[name]
         if len(curve) < 2:
             remedy = "A curve needs at least two rows; add them or remove the particle"
             raise self.wrong(f"the particle {name!r} has one row only", records[0], remedy)
@@ -103,7 +103,7 @@ def read_curves(file: Path, limits: FileLimits = LIMITS) -> CurveRows:
             check_magnitudes(column, file, rows, layout.header[of])
     for name, records in groups.items():
         if not name.strip():
-            raise curves.wrong("the name is empty", int(records[0]), "Name the particle")
+            raise curves.wrong("the name is empty", records[0], "Name the particle")
     return curves
 
 

@@ -100,16 +100,14 @@ def find_segments(
     arguments.instance(curve, Curve, "curve", A_CURVE)
     if control is not None:
         arguments.choice(control, get_args(Control), "control")
-    thresholds = {"smallest_turn": smallest_turn, "noise_multiple": noise_multiple, "band": band, "contact": contact}
-    for name, value in (thresholds | {"hold_slowness": hold_slowness}).items():
+    thresholds = {"smallest_turn": smallest_turn, "noise_multiple": noise_multiple, "band": band}
+    for name, value in (thresholds | {"contact": contact, "hold_slowness": hold_slowness}).items():
         arguments.number(value, name, least=0)
     arguments.whole(hold_samples, "hold_samples", least=1)
     if not len(curve):
         raise InputError("the curve has no point", remedy="Give a test with two points or more.")
     for name in ("time_s", "force_mN", "displacement_um"):
-        check_finite(
-            getattr(curve, name), f"the {name} of a curve", lambda text, remedy: InputError(text, remedy=remedy)
-        )
+        check_finite(getattr(curve, name), f"the {name} of a curve", InputError)
     options = DriveOptions(smallest_turn, noise_multiple, band, hold_slowness, hold_samples)
     return remembered(curve, (control, options, contact), lambda: _found(curve, control, options, contact))
 

@@ -97,7 +97,7 @@ def check_finite(values: np.ndarray, what: str, fail: Callable[..., InputError])
     bad = np.flatnonzero(~(np.abs(values) <= LARGEST_MAGNITUDE))
     if bad.size:
         remedy = "Leave that sample out, or check the unit if all are so large"
-        raise fail(f"{what} is {values[bad[0]]} at sample {bad[0] + 1}", remedy)
+        raise fail(f"{what} is {values[bad[0]]} at sample {bad[0] + 1}", remedy=remedy)
 
 
 def _check_curve(name: str, curve: Curve, fail: Callable[..., InputError]) -> None:

@@ -74,25 +74,25 @@ def explain(error: BaseException, debug: bool) -> Stop:
         case BrokenPipeError():
             return Stop(DONE, "")  # whoever reads our output has seen enough
         case InputError():
-            return Stop(BAD_INPUT, f"error: {error}")
+            problem = str(error)
         case click.MissingParameter(param=click.Option(name="out"), ctx=click.Context(command_path=command)):
-            return Stop(
-                BAD_INPUT,
-                f"error: no folder is given for the results. Add --out DIR, a new folder or one of earlier results; "
-                f"see '{command} --help'.",
-            )
+            remedy = f"Add --out DIR, a new folder or one of earlier results; see '{command} --help'."
+            problem = f"no folder is given for the results. {remedy}"
         case click.UsageError():
-            command = error.ctx.command_path if error.ctx else PROGRAM
-            problem = one_line(error.format_message())
-            return Stop(
-                BAD_INPUT, f"error: {problem}{'' if problem.endswith(('.', '?', ')')) else '.'} See '{command} --help'."
-            )
+            command, problem = error.ctx.command_path if error.ctx else PROGRAM, one_line(error.format_message())
+            problem += f"{'' if problem.endswith(('.', '?', ')')) else '.'} See '{command} --help'."
         case click.ClickException():
-            return Stop(BAD_INPUT, f"error: {error.format_message()}")
+            problem = error.format_message()
         case MemoryError():
-            return Stop(BAD_INPUT, "error: there is not enough memory. Use fewer points or fewer particles.")
+            problem = "there is not enough memory. Use fewer points or fewer particles."
         case OSError(errno=errno.ENOSPC | errno.EFBIG | errno.EDQUOT | errno.EIO):
-            return Stop(BAD_INPUT, f"error: output cannot be written: {error.strerror}. Make room and run again.")
+            problem = f"output cannot be written: {error.strerror}. Make room and run again."
+        case _:
+            return _defect(error, debug)
+    return Stop(BAD_INPUT, f"error: {problem}")
+
+
+def _defect(error: BaseException, debug: bool) -> Stop:
     if debug:
         click.echo("".join(traceback.format_exception(error)), err=True, nl=False)
         hint = ""
