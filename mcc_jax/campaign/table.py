@@ -234,11 +234,8 @@ def thousands_mark(cell: str, decimal_mark: str = ".") -> str | None:
     return None
 
 
-def parse_header(cells: list[str], file: Path) -> tuple[str, ...]:
-    """Names of the columns, without blanks around them.
-
-    Raises `InputError` if the delimiter is none of those known, a name is empty or stands there twice.
-    """
+def _header(cells: list[str], file: Path) -> tuple[str, ...]:
+    """Names of the columns, without blanks around them; none may be empty or stand there twice."""
     if len(cells) == 1 and "|" in cells[0]:
         problem = "the columns are separated by '|'"
         raise InputError(problem, file=file, row=1, remedy="Use commas, semicolons or tabs instead")
@@ -276,7 +273,7 @@ def make_table(found: Iterable[tuple[int, list[str]]], file: Path, delimiter: st
     # A column without a name that holds something is a mistake, which the header's check names.
     if any(len(names) >= len(cells) > width and filled(cells) > width for _, cells in full[1:]):
         width = len(names)
-    header = parse_header(names[:width], file)
+    header = _header(names[:width], file)
     if len(full) == 1:
         raise InputError("there is a header but no row of data", file=file, row=1, remedy="Export it again")
     for row, cells in full[1:]:

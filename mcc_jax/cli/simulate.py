@@ -150,31 +150,25 @@ def simulate(out: Path, **options: Any) -> None:
 
 def _refuse_contradictions(options: dict[str, Any]) -> None:
     """No option is accepted and then ignored."""
-
-    def given(name: str) -> bool:
-        return options[name] is not None
-
-    def refuse(one: str, other: str, why: str) -> None:
-        raise click.UsageError(f"--{one} does not go with --{other}: {why}.")
-
-    if given("programme"):
-        for name in ("control", "rate", "levels", "unload_to", "hold_s", "points", "interval_s"):
-            if given(name):
-                refuse(name.replace("_", "-"), "programme", "the programme file says that already")
-    if given("points") and given("interval_s"):
-        refuse("interval-s", "points", "each says how densely the test is sampled")
-    if given("peak_stress") and given("peak_strain"):
-        refuse("peak-strain", "peak-stress", "each says where the peak is")
-    if given("peak_strain") and not given("programme") and options["control"] != "displacement":
+    replaced = ("control", "rate", "levels", "unload_to", "hold_s", "points", "interval_s")
+    for one, other, why in (
+        *((name, "programme", "the programme file says that already") for name in replaced),
+        ("interval_s", "points", "each says how densely the test is sampled"),
+        ("peak_strain", "peak_stress", "each says where the peak is"),
+    ):
+        if options[one] is not None and options[other] is not None:
+            names = (name.replace("_", "-") for name in (one, other))
+            raise click.UsageError(f"--{' does not go with --'.join(names)}: {why}.")
+    if options["peak_strain"] and not options["programme"] and options["control"] != "displacement":
         raise click.UsageError("--peak-strain needs --control displacement.")
-    levels = options["levels"] or (1.0,)
-    if given("unload_to"):
-        if len(levels) < 2:
-            raise click.UsageError("--unload-to needs two --levels or more: the last unloading is always complete.")
-        if options["unload_to"] >= min(levels[:-1]):
-            raise click.UsageError("--unload-to lies not below the --levels it unloads from.")
-    if options["shared_material"] and all(given(name) for name in ("C1", "C3", "C5")):
-        refuse("shared-material", "C1, --C3 and --C5", "they fix the material already")
+    levels, unload_to = options["levels"] or (1.0,), options["unload_to"]
+    if unload_to is not None and len(levels) < 2:
+        raise click.UsageError("--unload-to needs two --levels or more: the last unloading is always complete.")
+    if unload_to is not None and unload_to >= min(levels[:-1]):
+        raise click.UsageError("--unload-to lies not below the --levels it unloads from.")
+    if options["shared_material"] and all(options[name] is not None for name in ("C1", "C3", "C5")):
+        both = "--shared-material does not go with --C1, --C3 and --C5"
+        raise click.UsageError(f"{both}: they fix the material already.")
 
 
 class Sizes(NamedTuple):
