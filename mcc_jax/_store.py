@@ -78,12 +78,7 @@ def results(directory: Path) -> Iterator[Stage]:
 
 
 def write_file(file: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Write one file, which takes the place of an older one when it is complete and on the disk.
-
-    Args:
-        file: its folder exists.
-        write: writes the contents into the stream it gets.
-    """
+    """Write one file, in a folder that exists; it replaces an older one when it is complete and on the disk."""
     handle, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.", suffix=".part")
     try:
         with os.fdopen(handle, "wb") as stream:

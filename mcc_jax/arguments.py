@@ -144,8 +144,6 @@ def floats(value: Any, name: str, *, shape: str = "an array of numbers") -> np.n
 
     Args:
         value: what was given; not traced.
-        name: for messages.
-        shape: what it should be, in words.
     """
     if isinstance(value, Iterable) and not isinstance(value, str | bytes) and not hasattr(value, "__array__"):
         value = list(value)

@@ -33,14 +33,9 @@ def _registry() -> Any:
 
 @cache
 def unit_factor(unit: str, dimension: str) -> Fraction:
-    """How many canonical units (mN, um, s) one `unit` is.
+    """How many canonical units (mN, um, s) one `unit`, letters only, is.
 
-    Args:
-        unit: a unit's symbol or name, letters only.
-        dimension: "force", "length" or "time".
-
-    Raises:
-        ValueError: if the unit is unknown or measures something else; the text says which.
+    Raises `ValueError` if the unit is unknown or measures something else; the text says which.
     """
     canonical = CANONICAL[dimension]
     if unit == canonical:
@@ -79,7 +74,6 @@ def find_column(
         header: the names, already stripped of blanks.
         quantity: the name without its unit, e.g. "force".
         dimension: "force", "length" or "time".
-        file: for messages.
         what: what the names are called in messages.
     """
     expected = f"{quantity}_{CANONICAL[dimension]}"

@@ -143,7 +143,6 @@ def refusal(campaign: Campaign, problem: str, why_not: Sequence[str | None]) -> 
     """The error that says why a campaign's particles cannot be used, with every reason once, and what to do.
 
     Args:
-        campaign: the tests.
         problem: what fails for want of particles.
         why_not: a reason for each particle, None for those that can be used.
     """

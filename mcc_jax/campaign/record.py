@@ -159,11 +159,7 @@ def available_data(campaign: Campaign, segments: tuple[tuple[Segment, ...], ...]
     """What a campaign holds of what effects need.
 
     A kind of segment counts as present when at least one test in five has it; sizes and shapes when they differ by a
-    tenth; peaks and rates when the largest is 1.3 times the smallest.
-
-    Args:
-        campaign: the tests.
-        segments: the segments of each; found anew if None.
+    tenth; peaks and rates when the largest is 1.3 times the smallest. Segments are found anew if None.
     """
     check_campaign(campaign)
     found = campaign_segments(campaign) if segments is None else segments

@@ -137,11 +137,7 @@ def _found(curve: Curve, control: Control | None, options: DriveOptions, contact
 
 
 def summarise_segments(curve: Curve, segments: tuple[Segment, ...]) -> list[dict[str, Any]]:
-    """One row per segment for printing.
-
-    Args:
-        curve: the test.
-        segments: what `find_segments` gave.
+    """One row per segment, as `find_segments` gave them, for printing.
 
     Returns:
         Rows with `kind`, `samples`, `start_s`, `stop_s`, `force_from_mN`, `force_to_mN`, `displacement_from_um` and

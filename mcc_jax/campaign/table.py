@@ -150,8 +150,7 @@ def parse_number(cell: str, decimal_mark: str = ".", thousands: str = "") -> flo
         decimal_mark: "." or ",".
         thousands: characters each of which may stand between groups of three digits; none if empty.
 
-    Raises:
-        ValueError: if the cell is empty, text, not finite, or too large; the text says which.
+    Raises `ValueError` if the cell is empty, text, not finite, or too large; the text says which.
     """
     stripped = cell.strip()
     if not stripped:
@@ -262,7 +261,6 @@ def make_table(found: Iterable[tuple[int, list[str]]], file: Path, delimiter: st
 
     Args:
         found: number of the row and its cells, the header first.
-        file: for messages.
         delimiter: what parts the columns.
     """
     full = [(row, cells) for row, cells in found if any(cell.strip() for cell in cells)]

@@ -73,13 +73,7 @@ class TurningForces(NamedTuple):
 
 
 def turning_forces(curve: Curve, segments: tuple[Segment, ...], options: TurningOptions | None = None) -> TurningForces:
-    """Estimate the force at which every branch begins.
-
-    Args:
-        curve: the test.
-        segments: of the curve, from `find_segments`.
-        options: see `TurningOptions`.
-    """
+    """Estimate the force at which every branch of a test, cut by `find_segments`, begins."""
     check_segmented(curve, segments)
     options = TurningOptions() if options is None else options
     arguments.instance(options, TurningOptions, "options", "Make one with mcc_jax.campaign.TurningOptions().")

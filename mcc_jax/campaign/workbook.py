@@ -44,8 +44,6 @@ def read_sheet(
     Raises `InputError` if it is damaged or too large, the sheet is not there or not told, or calamine is not installed.
 
     Args:
-        data: the workbook's bytes.
-        file: for messages.
         sheet: the sheet's name, or its number, 1 for the first; None for the only one that holds anything.
         preferred: the name of the sheet to take, if there is one, where `sheet` is None.
         decimal_mark: how numbers are written; "." or ",".

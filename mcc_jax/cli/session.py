@@ -122,14 +122,11 @@ def import_writers(*, figures: bool, posterior: bool) -> None:
 
 @contextlib.contextmanager
 def beside[R](work: Callable[[], R]) -> Iterator[Callable[[], R]]:
-    """Let work go on in a thread of its own while the block runs.
+    """Let work go on in a thread of its own while the block runs; yields a function that waits for its result.
 
     The block ends when the work has ended, too: an interpreter that ends under a compiler or an import may crash. Only
-    an interrupt does not wait, since nothing of the work is kept and the process ends at once.
-
-    Yields:
-        A function that waits for the work and returns its result, or raises what it raised. Work of which nobody
-        asks for the result may fail unnoticed.
+    an interrupt does not wait, since nothing of the work is kept and the process ends at once. What the work raised is
+    raised where its result is asked for; work of which nobody asks may fail unnoticed.
     """
     future: Future[R] = Future()
 

@@ -76,15 +76,9 @@ class HiddenEffect:
         return self.variant.typical if self.amplitude is None else self.amplitude
 
     def draw(self, seed: int, place: int, count: int) -> tuple[AbstractEffect, dict[str, np.ndarray]]:
-        """The effect of every test.
+        """The effect of every test: one whose every field has a leading axis N, and its parameters by name, shape (N,).
 
-        Args:
-            seed: seed of the campaign.
-            place: position among the campaign's effects; each has a stream of its own.
-            count: number of tests N.
-
-        Returns:
-            An effect whose every field has a leading axis N, and the parameters by name, shape (N,).
+        Each effect of a campaign has a stream of draws of its own, by the campaign's seed and its place among them.
         """
         values = {self.variant.parameter: np.full(count, self.strength)}
         for nuisance in self.variant.nuisances:

@@ -76,7 +76,6 @@ def diameters_for(
             counts.
         diameters: one triple for all tests, or a table by name, which counts before what the file tells.
         told: what the tests' files tell, or why they do not.
-        file: for messages.
 
     Returns:
         Diameters [um], shape (N, 3), and the number of entries left over.

@@ -62,10 +62,8 @@ def read_folder(
     Raises `InputError` if there is no file, a file cannot be read, two tests have one name, or `skip` fits no file.
 
     Args:
-        folder: the folder.
         read: reads the bytes of one file.
         skip: names of files, with or without ending, or patterns with "*" and "?", that are left out.
-        limits: how large a file may be.
 
     Returns:
         The tests; by the name of each the names under which a table may hold its diameters; and what was left out.
