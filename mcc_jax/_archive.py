@@ -22,7 +22,7 @@ import msgspec
 import numpy as np
 
 from ._errors import InputError
-from ._version import own_version
+from ._extras import own_version
 from .files import LIMITS, read_regular
 
 FORMAT, VERSION = "mcc_jax result", 1
@@ -44,8 +44,7 @@ class _Archive(msgspec.Struct):
 def encode(value: Any) -> bytes:
     """The bytes of a file that holds a value.
 
-    Raises:
-        InputError: naming a part that cannot be written, such as an effect of a class of one's own.
+    Raises `InputError` naming a part that cannot be written, such as an effect of a class of one's own.
     """
     content = msgspec.msgpack.encode(_plain(value, "result"))
     digest = hashlib.sha256(content).hexdigest()
@@ -55,8 +54,7 @@ def encode(value: Any) -> bytes:
 def read_archive(file: Path) -> Any:
     """The value that a file holds.
 
-    Raises:
-        InputError: if it is missing, cut off, changed, of a newer version, or something else.
+    Raises `InputError` if it is missing, cut off, changed, of a newer version, or something else.
     """
     raw = read_regular(file, LIMITS.posterior_bytes, AGAIN)
     try:

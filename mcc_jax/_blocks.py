@@ -31,7 +31,8 @@ def in_blocks[**P, R](
     ``devices=tuple(jax.devices())``. On a GPU, `jax.vmap` alone is faster unless memory is short.
 
     Differentiate inside, ``in_blocks(jax.grad(energy))``, where each contact has its own parameters: outside it works
-    as well, in both modes, and computes each block twice in reverse mode.
+    as well, in both modes, and computes each block twice in reverse mode. Raises `InputError` if the arrays differ in
+    length, have no axis to divide, or cannot be shared out equally.
 
     Args:
         function: of one contact; its positional arguments are trees of arrays without a batch axis.
@@ -41,9 +42,6 @@ def in_blocks[**P, R](
 
     Returns:
         A function of the same arguments with one more axis in front, of the same length in every array.
-
-    Raises:
-        InputError: if the arrays differ in length, have no axis to divide, or cannot be shared out equally.
     """
     if not callable(function):
         raise InputError(f"function must be a function, got {arguments.kind_of(function)}")

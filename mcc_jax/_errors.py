@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 
 class InputError(ValueError):
@@ -39,3 +40,8 @@ class InputError(ValueError):
             message = f"{message.rstrip('.')}. {remedy}"
         # A cell's text may hold line breaks or control characters; the promise is one line.
         super().__init__("".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in message))
+
+    def changed(self, **parts: Any) -> InputError:
+        """The same error with some of its parts, named as above, in place of its own."""
+        own = {name: getattr(self, name) for name in ("problem", "file", "row", "column", "remedy")}
+        return InputError(**own | parts)

@@ -1,4 +1,4 @@
-"""Packages that only some parts need, by the name of the extra that brings them: one helper, one message."""
+"""What is installed: this package's version, and packages that only some parts need, by the extra that brings them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,17 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from ._errors import InputError
+
+
+def own_version() -> str:
+    """The version of this package, or "(not installed)" where it runs from a folder only."""
+    from importlib.metadata import PackageNotFoundError, version  # slow, and few ask
+
+    try:
+        return version("mcc-jax")
+    except PackageNotFoundError:
+        return "(not installed)"
+
 
 EXTRAS = {
     "command": ("the command mcc-jax needs", ("click", "rich", "platformdirs")),
@@ -20,13 +31,7 @@ EXTRAS = {
 
 
 class MissingExtraError(InputError, ModuleNotFoundError):
-    """Something is called for that the base installation does not bring; the message says how to get it.
-
-    Args:
-        extra: a name of `EXTRAS`.
-        module: what could not be imported.
-        file: the file that needs it, if one does.
-    """
+    """Something is called for that the base installation does not bring; the message says how to get it."""
 
     def __init__(self, extra: str, module: str, file: str | Path | None = None) -> None:
         super().__init__(
@@ -39,14 +44,9 @@ class MissingExtraError(InputError, ModuleNotFoundError):
 
 @contextlib.contextmanager
 def extra(name: str, file: str | Path | None = None) -> Iterator[None]:
-    """Imports of what an extra brings: `with extra("plots"): from matplotlib import colormaps`.
+    """Imports of what an extra brings, for a file if one needs it: `with extra("plots"): from matplotlib import ...`.
 
-    Args:
-        name: a name of `EXTRAS`.
-        file: the file that needs it, for the message.
-
-    Raises:
-        MissingExtraError: where a package of the extra is not installed.
+    Raises `MissingExtraError` where a package of the extra is not installed.
     """
     try:
         yield

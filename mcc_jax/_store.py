@@ -48,13 +48,11 @@ def results(directory: Path) -> Iterator[Stage]:
 
     If it does not, or they cannot be moved, the folder is as it was, and folders made for it are gone. Only files that
     the run wrote, or named as stale, are touched. The folder is locked meanwhile. A process killed before the results
-    are complete leaves the folder as it was; one killed while they are moved leaves the rest to the next run.
+    are complete leaves the folder as it was; one killed while they are moved leaves the rest to the next run. Raises
+    `InputError` if the folder cannot be written, or another run is writing there.
 
     Args:
         directory: the folder, made with its parents if need be.
-
-    Raises:
-        InputError: if the folder cannot be written, or another run is writing there.
     """
     made: list[Path] = []
     try:
@@ -80,12 +78,7 @@ def results(directory: Path) -> Iterator[Stage]:
 
 
 def write_file(file: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Write one file, which takes the place of an older one when it is complete and on the disk.
-
-    Args:
-        file: its folder exists.
-        write: writes the contents into the stream it gets.
-    """
+    """Write one file, in a folder that exists; it replaces an older one when it is complete and on the disk."""
     handle, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.", suffix=".part")
     try:
         with os.fdopen(handle, "wb") as stream:

@@ -22,8 +22,7 @@ Values: TypeAlias = Float[Array, "..."]
 def scalar(value: ScalarLike) -> Scalar:
     """Convert a field's value to a floating-point scalar array, keeping the precision of arrays.
 
-    Raises:
-        InputError: if it is no number, or has a batch axis; modules describe one contact and are batched by `vmap`.
+    Raises `InputError` if it is no number, or has a batch axis; modules describe one contact and are batched by `vmap`.
     """
     plain = isinstance(value, int | float) or is_traced(value)
     array = jnp.asarray(value) if plain else values_of(value, "a parameter", shape="a number")

@@ -1,7 +1,7 @@
 """Arguments of public functions: what is obviously meant is converted, the rest refused in one line that names it.
 
-Only what can be looked at is checked. A tracer (inside `jax.jit`, `vmap` or `grad`) passes, so nothing here is part of
-what is compiled; in plain Python a check takes microseconds.
+What is refused raises `InputError`. Only what can be looked at is checked: a tracer (inside `jax.jit`, `vmap` or
+`grad`) passes, so nothing here is part of what is compiled; in plain Python a check takes microseconds.
 """
 
 from __future__ import annotations
@@ -45,22 +45,14 @@ def kind_of(value: Any) -> str:
 
 
 def choice[T](value: Any, choices: Collection[T], name: str) -> T:
-    """The value, if it is one of the choices.
-
-    Raises:
-        InputError: naming the option and its choices.
-    """
+    """The value, if it is one of the choices."""
     if isinstance(value, str | int | float) and value in choices:
         return cast(T, value)
     raise InputError(f"there is no {name} {shown(value)}", remedy=f"Choices: {', '.join(map(str, choices))}.")
 
 
 def member[E: enum.Enum](value: E | str, choices: type[E], name: str) -> E:
-    """The member of an enumeration, given itself or as its text.
-
-    Raises:
-        InputError: naming the option and its choices.
-    """
+    """The member of an enumeration, given itself or as its text."""
     if isinstance(value, choices):
         return value
     texts = {one.value: one for one in choices}
@@ -68,11 +60,7 @@ def member[E: enum.Enum](value: E | str, choices: type[E], name: str) -> E:
 
 
 def instance[T](value: Any, kind: type[T] | tuple[type[T], ...], name: str, remedy: str) -> T:
-    """The value, if it is of a kind.
-
-    Raises:
-        InputError: saying what was given and how to make what is wanted.
-    """
+    """The value, if it is of a kind; `remedy` says how to make what is wanted."""
     if isinstance(value, kind):
         return value
     kinds = kind if isinstance(kind, tuple) else (kind,)
@@ -98,44 +86,27 @@ def number(
     below: float | int = math.inf,
     infinite: bool = False,
 ) -> float:
-    """A number, finite and within bounds, as a Python float.
+    """A number, finite and within bounds, as a Python float: `least` and `most` are allowed, `above` and `below` not.
 
     Args:
         value: anything that is one number: also of numpy, JAX or pandas.
         name: for messages, with its unit.
-        least: it must not be smaller.
-        above: it must be larger.
-        most: it must not be larger.
-        below: it must be smaller.
         infinite: whether infinity is allowed.
-
-    Raises:
-        InputError: naming it and what it must be.
     """
-    bounds = [
-        *([f">= {least:g}"] if least > -math.inf else []),
-        *([f"> {above:g}"] if above > -math.inf else []),
-        *([f"<= {most:g}"] if most < math.inf else []),
-        *([f"< {below:g}"] if below < math.inf else []),
-    ]
-    must = f"{name} must be a {'' if infinite else 'finite '}number{' ' if bounds else ''}{' and '.join(bounds)}"
+    bounds = {">=": least, ">": above, "<=": most, "<": below}
+    told = " and ".join(f"{sign} {bound:g}" for sign, bound in bounds.items() if math.isfinite(bound))
+    must = f"{name} must be a {'' if infinite else 'finite '}number {told}".rstrip()
     if not is_number(value):
         raise InputError(f"{must}, got {shown(value)}")
     found = float(value)
     inside = least <= found <= most and (found > above or above == -math.inf) and (found < below or below == math.inf)
-    if not inside:
-        raise InputError(f"{must}, got {found:g}")
-    if math.isinf(found) and not infinite:
+    if not inside or (math.isinf(found) and not infinite):
         raise InputError(f"{must}, got {found:g}")
     return found
 
 
 def whole(value: Any, name: str, *, least: int = 0, most: int | None = None) -> int:
-    """A whole number within bounds, as a Python integer: a count, a seed.
-
-    Raises:
-        InputError: naming it and what it must be.
-    """
+    """A whole number within bounds, as a Python integer: a count, a seed."""
     upper = "" if most is None else f" and <= {most}"
     plain = isinstance(value, numbers.Integral | float) and not isinstance(value, bool)
     if not plain and isinstance(value, jax.Array | np.ndarray) and not is_traced(value):
@@ -147,20 +118,12 @@ def whole(value: Any, name: str, *, least: int = 0, most: int | None = None) -> 
 
 
 def seed(value: Any, name: str = "seed") -> int:
-    """A seed of random numbers: a whole number from 0 to 2^63 - 1.
-
-    Raises:
-        InputError: if it is anything else.
-    """
+    """A seed of random numbers: a whole number from 0 to 2^63 - 1."""
     return whole(value, name, most=2**63 - 1)
 
 
 def flag(value: Any, name: str) -> bool:
-    """True or False, and nothing that only counts as such: the text "no" would count as true.
-
-    Raises:
-        InputError: if it is anything else.
-    """
+    """True or False, and nothing that only counts as such: the text "no" would count as true."""
     if not isinstance(value, bool | np.bool_):
         raise InputError(f"{name} must be True or False, got {shown(value)}")
     return bool(value)
@@ -181,11 +144,6 @@ def floats(value: Any, name: str, *, shape: str = "an array of numbers") -> np.n
 
     Args:
         value: what was given; not traced.
-        name: for messages.
-        shape: what it should be, in words.
-
-    Raises:
-        InputError: if it is not numbers, or lists of unequal length.
     """
     if isinstance(value, Iterable) and not isinstance(value, str | bytes) and not hasattr(value, "__array__"):
         value = list(value)
@@ -202,11 +160,7 @@ def floats(value: Any, name: str, *, shape: str = "an array of numbers") -> np.n
 
 
 def values(value: Any, name: str, *, shape: str = "a number or an array of numbers") -> jax.Array:
-    """Numbers of any shape as a JAX array of floating-point numbers; tracers pass.
-
-    Raises:
-        InputError: if it is not numbers.
-    """
+    """Numbers of any shape as a JAX array of floating-point numbers; tracers pass."""
     if is_traced(value) or isinstance(value, jax.Array) or type(value) in (int, float):
         array = jnp.asarray(value)
         if jnp.issubdtype(array.dtype, jnp.floating):
@@ -226,9 +180,6 @@ def path(value: Any, name: str, *, many: str = "") -> jax.Array:
         value: what was given; it may be traced.
         name: for messages.
         many: what to do with several paths at once, in words.
-
-    Raises:
-        InputError: if it is none.
     """
     array = values(value, name, shape="a 1-D array of at least one point")
     if array.ndim == 1 and array.shape[0] > 0:
@@ -239,11 +190,7 @@ def path(value: Any, name: str, *, many: str = "") -> jax.Array:
 
 
 def same_length(**arrays: Any) -> int:
-    """The length that all arrays share.
-
-    Raises:
-        InputError: naming two that differ, with both lengths, or one that is a single number.
-    """
+    """The length that all arrays share; two that differ are named, and one that is a single number."""
     for name, array in arrays.items():
         if not isinstance(array, Sized) or (isinstance(array, np.ndarray | jax.Array) and array.ndim == 0):
             raise InputError(f"{name} must be a list of numbers, got {shown(array)}")
@@ -257,11 +204,7 @@ def same_length(**arrays: Any) -> int:
 
 
 def diameters(value: Any, name: str = "diameters_um") -> np.ndarray:
-    """D1, D2, D3 [um] of N particles as an array of shape (N, 3), all positive and finite.
-
-    Raises:
-        InputError: naming the first particle whose are not.
-    """
+    """D1, D2, D3 [um] of N particles as an array of shape (N, 3), all positive and finite."""
     array = floats(value, name, shape="D1, D2, D3 [um] of every particle, shape (N, 3)")
     if array.ndim != 2 or array.shape[1] != 3:
         remedy = "For one particle write [[D1, D2, D3]]." if array.shape == (3,) else None
@@ -274,11 +217,7 @@ def diameters(value: Any, name: str = "diameters_um") -> np.ndarray:
 
 
 def one_particle(value: Any, name: str = "diameters_um") -> np.ndarray:
-    """D1, D2, D3 [um] of one particle as an array of shape (3,), all positive and finite.
-
-    Raises:
-        InputError: if they are not.
-    """
+    """D1, D2, D3 [um] of one particle as an array of shape (3,), all positive and finite."""
     array = floats(value, name, shape="D1, D2, D3 [um] of one particle")
     if array.shape != (3,) or not (np.isfinite(array) & (array > 0)).all():
         raise InputError(
@@ -295,9 +234,6 @@ def positive(value: Any, name: str, *, zero: bool = False, plain: bool = False) 
         name: for messages, with its unit.
         zero: whether 0 is allowed.
         plain: look at numbers of Python and numpy only, not at results of a computation.
-
-    Raises:
-        InputError: naming it.
     """
     checked = not is_traced(value) and not (plain and isinstance(value, jax.Array))
     array = np.asarray(value) if checked else None
@@ -309,32 +245,20 @@ def positive(value: Any, name: str, *, zero: bool = False, plain: bool = False) 
 
 
 def finite(value: Any, name: str) -> None:
-    """Refuse a plain number that is NaN or infinite; what is computed or traced passes.
-
-    Raises:
-        InputError: naming it.
-    """
+    """Refuse a plain number that is NaN or infinite; what is computed or traced passes."""
     if isinstance(value, int | float | np.number | np.ndarray) and not np.isfinite(value).all():
         raise InputError(f"{name} must be a finite number, got {shown(value)}")
 
 
 def file_path(value: Any, name: str) -> Path:
-    """The path of a file or folder.
-
-    Raises:
-        InputError: if it is neither text nor a path, or empty.
-    """
+    """The path of a file or folder."""
     if not isinstance(value, str | os.PathLike) or not str(value):
         raise InputError(f"{name} must be the path of a file or folder, got {kind_of(value)}")
     return Path(value)
 
 
 def teller(progress: Any, name: str = "progress") -> Callable[[str], None]:
-    """The function that is told the name of each step; one that does nothing for None.
-
-    Raises:
-        InputError: if it is no function.
-    """
+    """The function that is told the name of each step; one that does nothing for None."""
     if progress is not None and not callable(progress):
         raise InputError(f"{name} must be a function of the name of a step, got {kind_of(progress)}")
     return (lambda _: None) if progress is None else cast(Callable[[str], None], progress)

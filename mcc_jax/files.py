@@ -1,4 +1,4 @@
-"""Opening files that come from outside: regular files only, bounded in size before a byte is read.
+"""Files and texts from outside: regular files only, bounded in size before a byte is read.
 
 A path that a user gives, or that a folder of tests holds, may be a pipe that never answers, a device that never ends,
 or a file that fills the memory. Every reader of this package opens its files here, and refuses such a one in one line.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import json
 import os
 import re
 import stat
@@ -15,7 +16,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BufferedReader
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ._errors import InputError
 
@@ -52,6 +53,12 @@ class FileLimits:
         settings_depth: of keys with dots, and of lists and tables within each other, in a TOML file. The deepest file
             of ours needs 3.
         result_bytes: of `calibration.json` and `discovery.json` [bytes]. 1000 particles take half a MiB.
+        unpacked_bytes: that a zip archive of tests or a workbook may unpack to [bytes].
+        archive_files: in a zip archive of tests.
+        swelling: how many times its size an archive of tests may unpack to: measured numbers as text deflate to a fifth
+            or so; what shrinks to a hundredth is no measurement.
+        sheet_cells: of a sheet's rectangle, empty ones included, since the engine makes room for all (32 bytes each): a
+            full sheet of 1,048,576 rows has 38 columns then; a cell alone in the last row and column asks for 17e9.
         posterior_bytes: of `posterior.nc` or a saved state of many particles [bytes]. 4000 draws of 1000 particles
             with 100 compared points each are 3 GiB.
     """
@@ -62,6 +69,10 @@ class FileLimits:
     settings_bytes: int = 2**20
     settings_depth: int = 32
     result_bytes: int = 16 * 2**20
+    unpacked_bytes: int = 512 * 2**20
+    archive_files: int = 10_000
+    swelling: int = 100
+    sheet_cells: int = 40_000_000
     posterior_bytes: int = 4 * 2**30
 
 
@@ -73,6 +84,8 @@ LIMITS = FileLimits()
 def open_regular(path: str | os.PathLike[str], most_bytes: int, remedy: str) -> Iterator[BufferedReader]:
     """Open a regular file for reading bytes; anything else is refused by name without being opened.
 
+    Raises `InputError` if there is none, it is no regular file, it is too large, or it cannot be opened.
+
     Args:
         path: the file; links are followed.
         most_bytes: the largest size allowed [bytes].
@@ -80,9 +93,6 @@ def open_regular(path: str | os.PathLike[str], most_bytes: int, remedy: str) -> 
 
     Yields:
         The open file.
-
-    Raises:
-        InputError: if there is none, it is no regular file, it is too large, or it cannot be opened.
     """
     file = Path(path)
     handle = -1
@@ -115,10 +125,8 @@ def read_regular(path: str | os.PathLike[str], most_bytes: int, remedy: str) -> 
 def read_table_bytes(path: str | os.PathLike[str], limits: FileLimits = LIMITS) -> bytes:
     """The bytes of a text table or a tester's export, refused at the first row or cell that is too long.
 
-    What begins as no text does (a zip archive, for instance) is bounded in its size alone.
-
-    Raises:
-        InputError: if it cannot be read, or is too large as a whole or in one row or cell.
+    What begins as no text does (a zip archive, for instance) is bounded in its size alone. Raises `InputError` if it
+    cannot be read, or is too large as a whole or in one row or cell.
     """
     file = Path(path)
     parts: list[bytes] = []
@@ -163,12 +171,9 @@ class _Lines:
         lengths = np.diff(at, prepend=-1 - before, append=length) - 1
         if lengths.max() > most:
             where = int(np.searchsorted(ends, np.append(at, length)[int(np.argmax(lengths > most))]))
-            raise InputError(
-                f"a {what} here has more than {most:,} bytes",
-                file=self.file,
-                row=self.row + where,
-                remedy="The file is damaged, or is no table of measurements; export it again",
-            )
+            remedy = "The file is damaged, or is no table of measurements; export it again"
+            problem = f"a {what} here has more than {most:,} bytes"
+            raise InputError(problem, file=self.file, row=self.row + where, remedy=remedy)
         return int(lengths[-1])
 
 
@@ -180,10 +185,7 @@ def check_toml(text: str, file: str | Path, limits: FileLimits = LIMITS) -> None
     """Refuse TOML whose keys or lists are nested so deep that parsing them takes gigabytes.
 
     The work of Python's parser goes with the square of the number of parts of a key. Text and comments are passed over;
-    what is no TOML otherwise is left for the parser to refuse.
-
-    Raises:
-        InputError: naming the line.
+    what is no TOML otherwise is left for the parser to refuse. Raises `InputError` naming the line.
     """
     most = limits.settings_depth
     depth = dots = at = 0
@@ -203,12 +205,8 @@ def check_toml(text: str, file: str | Path, limits: FileLimits = LIMITS) -> None
         else:
             dots = 0
         if depth > most or dots >= most:
-            raise InputError(
-                f"keys or lists are nested more than {most} deep",
-                file=file,
-                row=text.count("\n", 0, at) + 1,
-                remedy="Write flat keys; no setting needs more than three levels",
-            )
+            remedy, row = "Write flat keys; no setting needs more than three levels", text.count("\n", 0, at) + 1
+            raise InputError(f"keys or lists are nested more than {most} deep", file=file, row=row, remedy=remedy)
 
 
 _TOKEN = re.compile(r'"""|\'\'\'|["\'#.\[\]{}=,\n]')
@@ -230,11 +228,8 @@ def _refuse_other_kinds(found: os.stat_result, file: Path) -> None:
 
 def _refuse_size(size: int, most: int, file: Path, remedy: str) -> None:
     if size > most:
-        raise InputError(
-            f"the file is too large: {_in_words(size)}, where at most {_in_words(most)} are read",
-            file=file,
-            remedy=remedy,
-        )
+        problem = f"the file is too large: {_in_words(size)}, where at most {_in_words(most)} are read"
+        raise InputError(problem, file=file, remedy=remedy)
 
 
 def _in_words(size: int) -> str:
@@ -254,3 +249,16 @@ def _cannot(error: OSError | ValueError, file: Path) -> InputError:
         return InputError("this is a link that leads back to itself", file=file, remedy="Give the file itself")
     why = (isinstance(error, OSError) and error.strerror) or str(error)
     return InputError(f"cannot be read: {why}", file=file, remedy="Check the permissions and the path")
+
+
+def check_text(content: Any, file: Path, remedy: str) -> None:
+    """Refuse a JSON value that holds lone surrogates, which JSON can write and no file can hold.
+
+    Raises `InputError` naming the file.
+    """
+    try:
+        json.dumps(content, ensure_ascii=False).encode("utf-8")
+    except UnicodeEncodeError as error:
+        half = error.object[error.start]
+        problem = f"holds text that is not Unicode: half of a pair, {half!a}"
+        raise InputError(problem, file=file, remedy=remedy) from None

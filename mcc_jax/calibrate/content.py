@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from .._errors import InputError
-from .._text import check_text
-from ..files import LIMITS, read_regular
+from ..files import LIMITS, check_text, read_regular
 
 SCHEMA = 1
 LONGEST = 160

@@ -1,5 +1,7 @@
 """Measured (or simulated) tests on single particles: reading, checking, converting and segmenting them."""
 
+from ..geometry import of_each_particle as of_each_particle
+from ..geometry import particle_batch as particle_batch
 from .adjustment import THRESHOLD_MPA as THRESHOLD_MPA
 from .adjustment import Adjustment as Adjustment
 from .adjustment import LoadingCurve as LoadingCurve
@@ -8,14 +10,12 @@ from .adjustment import campaign_segments as campaign_segments
 from .adjustment import effective_diameter_um as effective_diameter_um
 from .adjustment import loading_curve as loading_curve
 from .adjustment import stress_and_strain as stress_and_strain
-from .batch import of_each_particle as of_each_particle
-from .batch import particle_batch as particle_batch
-from .checksums import file_checksums as file_checksums
 from .csv import check_folder as check_folder
+from .csv import file_checksums as file_checksums
 from .csv import read_campaign as read_campaign
 from .csv import read_particles as read_particles
+from .csv import write_campaign as write_campaign
 from .findings import Finding as Finding
-from .join import join_campaigns as join_campaigns
 from .metadata import load_toml_file as load_toml_file
 from .paper import PAPER_DIAMETERS_UM as PAPER_DIAMETERS_UM
 from .paper import PAPER_EFFECTIVE_MODULUS_MPA as PAPER_EFFECTIVE_MODULUS_MPA
@@ -47,4 +47,4 @@ from .turning import TurningForces as TurningForces
 from .turning import TurningOptions as TurningOptions
 from .turning import turning_forces as turning_forces
 from .validate import check_campaign as check_campaign
-from .write import write_campaign as write_campaign
+from .validate import join_campaigns as join_campaigns

@@ -197,32 +197,27 @@ def adjust(campaign: Campaign, threshold_MPa: float = THRESHOLD_MPA) -> Adjustme
     stress = [None if c is None else c.stress_max_MPa for c in used]
     strain = [None if c is None else float(np.ptp(c.strain[1:])) for c in used]
     why_not = [reason or apart for reason, apart in zip(why_not, far_apart(stress, strain), strict=True)]
-    if threshold_MPa == 0:
-        kept = tuple(c if r is None else None for c, r in zip(raw, why_not, strict=True))
-        return Adjustment(kept, np.zeros(len(raw)), 0.0, 0.0, tuple(why_not), segments)
-    at_threshold = np.array(
-        [
-            float(c.at(threshold_MPa)) if c is not None and r is None else np.nan
-            for c, r in zip(raw, why_not, strict=True)
-        ]
+    kept = tuple(c if r is None else None for c, r in zip(raw, why_not, strict=True))
+    at_threshold = [None if c is None else float(c.at(threshold_MPa)) for c in kept]
+    known = [value for value in at_threshold if value is not None]
+    if threshold_MPa == 0 or not known:
+        return Adjustment(kept, np.zeros(len(raw)), threshold_MPa, 0.0, tuple(why_not), segments)
+    mean = float(np.mean(known))
+    shift = np.array([0.0 if value is None else mean - value for value in at_threshold])
+    adjusted = tuple(
+        None if curve is None else _through(curve, offset, threshold_MPa, mean)
+        for curve, offset in zip(kept, shift, strict=True)
     )
-    if np.isnan(at_threshold).all():
-        return Adjustment((None,) * len(raw), np.zeros(len(raw)), threshold_MPa, 0.0, tuple(why_not), segments)
-    mean = float(np.nanmean(at_threshold))
-    shift = np.where(np.isnan(at_threshold), 0.0, mean - at_threshold)
-    adjusted: list[LoadingCurve | None] = []
-    for curve, reason, offset in zip(raw, why_not, shift, strict=True):
-        if curve is None or reason is not None:
-            adjusted.append(None)
-            continue
-        above = curve.stress_MPa > threshold_MPa
-        adjusted.append(
-            LoadingCurve(
-                np.concatenate([[0.0, threshold_MPa], curve.stress_MPa[above]]),
-                np.concatenate([[0.0, mean], curve.strain[above] + offset]),
-            )
-        )
-    return Adjustment(tuple(adjusted), shift, threshold_MPa, mean, tuple(why_not), segments)
+    return Adjustment(adjusted, shift, threshold_MPa, mean, tuple(why_not), segments)
+
+
+def _through(curve: LoadingCurve, offset: float, threshold_MPa: float, strain: float) -> LoadingCurve:
+    """The curve moved by a strain, and straight from the origin to a strain at the threshold."""
+    above = curve.stress_MPa > threshold_MPa
+    return LoadingCurve(
+        np.concatenate([[0.0, threshold_MPa], curve.stress_MPa[above]]),
+        np.concatenate([[0.0, strain], curve.strain[above] + offset]),
+    )
 
 
 def _why_not(

@@ -33,14 +33,9 @@ def _registry() -> Any:
 
 @cache
 def unit_factor(unit: str, dimension: str) -> Fraction:
-    """How many canonical units (mN, um, s) one `unit` is.
+    """How many canonical units (mN, um, s) one `unit`, letters only, is.
 
-    Args:
-        unit: a unit's symbol or name, letters only.
-        dimension: "force", "length" or "time".
-
-    Raises:
-        ValueError: if the unit is unknown or measures something else; the text says which.
+    Raises `ValueError` if the unit is unknown or measures something else; the text says which.
     """
     canonical = CANONICAL[dimension]
     if unit == canonical:
@@ -73,54 +68,40 @@ def find_column(
 ) -> tuple[int, Fraction]:
     """Where `quantity` stands in a header, and the factor that turns its unit into the canonical one.
 
+    Raises `InputError` if the quantity is missing, stands there twice, or has no unit or a wrong one.
+
     Args:
         header: the names, already stripped of blanks.
         quantity: the name without its unit, e.g. "force".
         dimension: "force", "length" or "time".
-        file: for messages.
         what: what the names are called in messages.
-
-    Raises:
-        InputError: if the quantity is missing, stands there twice, or has no unit or a wrong one.
     """
     expected = f"{quantity}_{CANONICAL[dimension]}"
     allowed = f"accepted units, as a suffix: {EXAMPLES[dimension]} (for example {expected})"
     found = [i for i, name in enumerate(header) if name.rpartition("_")[0] == quantity]
-    if len(found) > 1:
-        both = " and ".join(header[i] for i in found)
-        raise InputError(
-            f"{quantity} is given {len(found)} times", file=file, row=_row(what), column=both, remedy="Keep one of them"
-        )
-    if found:
-        name = header[found[0]]
+    if len(found) == 1:
+        named = header[found[0]]
         try:
-            return found[0], unit_factor(name.rpartition("_")[2], dimension)
+            return found[0], unit_factor(named.rpartition("_")[2], dimension)
         except ValueError as error:
-            raise InputError(
-                str(error), file=file, row=_row(what), column=name, remedy=allowed[0].upper() + allowed[1:]
-            ) from None
-    if quantity in header:
-        raise InputError(
-            "the unit is missing", file=file, row=_row(what), column=quantity, remedy=f"Name it {expected}; {allowed}"
-        )
-    raise missing_column(header, expected, file, what=what, hint=allowed)
+            problem, remedy = str(error), allowed[0].upper() + allowed[1:]
+    elif found:
+        problem, named = f"{quantity} is given {len(found)} times", " and ".join(header[i] for i in found)
+        remedy = "Keep one of them"
+    elif quantity in header:
+        problem, named, remedy = "the unit is missing", quantity, f"Name it {expected}; {allowed}"
+    else:
+        raise missing_column(header, expected, file, what=what, hint=f"; {allowed}")
+    raise InputError(problem, file=file, row=1 if what == "column" else None, column=named, remedy=remedy)
 
 
 def missing_column(
-    header: Sequence[str], expected: str, file: str | Path, *, what: str = "column", hint: str | None = None
+    header: Sequence[str], expected: str, file: str | Path, *, what: str = "column", hint: str = ""
 ) -> InputError:
     """The error for a column that is not there, with the nearest name that is."""
     lower = {name.lower(): name for name in reversed(header)}
     close = get_close_matches(expected.lower(), list(lower), n=1, cutoff=0.6)
     there = ", ".join(header[:12]) + (", ..." if len(header) > 12 else "")
     remedy = f"Did you mean {expected!r} by {lower[close[0]]!r}? Rename it" if close else f"Add it; there are: {there}"
-    return InputError(
-        f"the {what} {expected!r} is missing",
-        file=file,
-        row=_row(what),
-        remedy=remedy + (f"; {hint}" if hint else ""),
-    )
-
-
-def _row(what: str) -> int | None:
-    return 1 if what == "column" else None
+    row = 1 if what == "column" else None
+    return InputError(f"the {what} {expected!r} is missing", file=file, row=row, remedy=remedy + hint)

@@ -1,10 +1,11 @@
-"""Reading a campaign: a folder with `particles.csv`, `curves.csv` and, optionally, `campaign.toml`."""
+"""A campaign on the disk: a folder with `particles.csv`, `curves.csv` and, optionally, `campaign.toml`."""
 
 from __future__ import annotations
 
+import hashlib
 import os
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -12,13 +13,14 @@ import numpy as np
 
 from .. import arguments
 from .._errors import InputError
-from ..files import LIMITS, FileLimits
+from .._store import results
+from ..files import LIMITS, FileLimits, open_regular
 from .columns import LENGTH, convert, find_column
 from .curves import PARTICLES, CurveRows, name_column, read_curves
-from .metadata import parse_metadata, read_settings
+from .metadata import format_metadata, parse_metadata, read_settings
 from .schema import Campaign
 from .table import Table, decode, make_table, parse_table, read_bytes, read_table
-from .validate import check_magnitudes
+from .validate import check_campaign, check_magnitudes
 from .workbook import is_workbook, read_sheet
 
 CURVES, METADATA = "curves.csv", "campaign.toml"
@@ -45,7 +47,7 @@ def read_campaign(folder: str | os.PathLike[str], *, limits: FileLimits = LIMITS
     table = read_table(path / PARTICLES, limits)
     names, diameters, columns = parse_particles(table)
     curves = read_curves(path / CURVES, limits).named_as(names)
-    _check_match(table, names, curves, path)
+    _check_match(table, names, curves)
     metadata_file = path / METADATA
     campaign = Campaign(
         particles=names,
@@ -78,9 +80,8 @@ def check_folder(path: str | Path) -> None:
             raise InputError("is a file, not a campaign folder", file=path, remedy=remedy)
         there = sorted(entry.name for entry in path.iterdir())
     except OSError as error:
-        raise InputError(
-            f"cannot be read: {error.strerror or error}", file=path, remedy="Check the permissions"
-        ) from None
+        problem = f"cannot be read: {error.strerror or error}"
+        raise InputError(problem, file=path, remedy="Check the permissions") from None
     for name in (PARTICLES, CURVES):
         if name not in there:
             lower = {entry.lower(): entry for entry in there}
@@ -95,19 +96,16 @@ def check_folder(path: str | Path) -> None:
 
 
 def _metadata_text(file: Path, limits: FileLimits) -> str:
-    """The text of `campaign.toml`; empty if there is none. What stands there under that name is never passed over.
-
-    Raises:
-        InputError: if it cannot be read, or the name is written in another way, so that nobody would look for it.
+    """The text of `campaign.toml`; empty if there is none. What has nearly that name, which nobody would look for, is
+    refused.
     """
     if os.path.lexists(file):
         return read_settings(file, limits)
     for entry in file.parent.iterdir():
         plain = unicodedata.normalize("NFKC", entry.name).strip().casefold()
         if plain in (METADATA, f"{METADATA}.txt"):
-            raise InputError(
-                f"would be ignored under this name: it is not {METADATA!r}", file=entry, remedy="Rename it"
-            )
+            problem = f"would be ignored under this name: it is not {METADATA!r}"
+            raise InputError(problem, file=entry, remedy="Rename it")
     return ""
 
 
@@ -136,15 +134,7 @@ def read_particles(
 def parse_particles(
     table: Table, named: Sequence[str] = ("particle",)
 ) -> tuple[tuple[str, ...], np.ndarray, dict[str, tuple[str, ...]]]:
-    """Names, diameters [um] and further columns of a table of particles.
-
-    Args:
-        table: the table.
-        named: what the column of names may be called.
-
-    Raises:
-        InputError: naming file, row and column.
-    """
+    """Names, diameters [um] and further columns of a table of particles; see `read_particles`."""
     where = name_column(table.header, table.file, named)
     names = _checked_names(table.text(where), table)
     found = [find_column(table.header, quantity, LENGTH, table.file) for quantity in ("D1", "D2", "D3")]
@@ -161,48 +151,96 @@ def parse_particles(
 
 def _checked_names(names: list[str], table: Table) -> tuple[str, ...]:
     seen: dict[str, int] = {}
-    for i, name in enumerate(names):
-        row = table.rows[i]
+    for name, row in zip(names, table.rows, strict=True):
         if not name.strip():
-            raise InputError(
-                "the name is empty", file=table.file, row=row, column="particle", remedy="Name the particle"
-            )
+            raise _wrong(table, row, "the name is empty", "Name the particle")
         if name in seen:
-            raise InputError(
-                f"the particle {name!r} is already in row {seen[name]}",
-                file=table.file,
-                row=row,
-                column="particle",
-                remedy="Give every particle one row",
-            )
+            problem = f"the particle {name!r} is already in row {seen[name]}"
+            raise _wrong(table, row, problem, "Give every particle one row")
         seen[name] = row
     return tuple(names)
 
 
-def _check_match(table: Table, names: tuple[str, ...], curves: CurveRows, path: Path) -> None:
-    for i, name in enumerate(names):
+def _wrong(table: Table, row: int, problem: str, remedy: str) -> InputError:
+    return InputError(problem, file=table.file, row=row, column="particle", remedy=remedy)
+
+
+def _check_match(table: Table, names: tuple[str, ...], curves: CurveRows) -> None:
+    for name, row in zip(names, table.rows, strict=True):
         if name not in curves.groups:
-            raise InputError(
-                f"the particle {name!r} has no curve in {CURVES}",
-                file=table.file,
-                row=table.rows[i],
-                column="particle",
-                remedy=_similar(name, curves.groups) or f"Add its rows to {CURVES} or remove it here",
-            )
+            remedy = _similar(name, curves.groups) or f"Add its rows to {CURVES} or remove it here"
+            raise _wrong(table, row, f"the particle {name!r} has no curve in {CURVES}", remedy)
     known = set(names)
     for name, records in curves.groups.items():
         if name not in known:
-            raise InputError(
-                f"the particle {name!r} is not in {PARTICLES}",
-                file=path / CURVES,
-                row=curves.row(int(records[0])),
-                column="particle",
-                remedy=_similar(name, names) or f"Add its diameters to {PARTICLES} or remove its rows here",
-            )
+            remedy = _similar(name, names) or f"Add its diameters to {PARTICLES} or remove its rows here"
+            raise curves.wrong(f"the particle {name!r} is not in {PARTICLES}", records[0], remedy)
 
 
-def _similar(name: str, others: Sequence[str] | dict[str, np.ndarray]) -> str | None:
-    for other in others:
-        if other.strip() == name.strip():
-            return f"The other file has {other!r}; mind the blanks"
-    return None
+def _similar(name: str, others: Iterable[str]) -> str | None:
+    found = (f"The other file has {other!r}; mind the blanks" for other in others if other.strip() == name.strip())
+    return next(found, None)
+
+
+def file_checksums(folder: str | Path) -> dict[str, str]:
+    """SHA-256 of `particles.csv`, `curves.csv` and `campaign.toml`, by name; of those that are there.
+
+    Raises:
+        InputError: if a file cannot be read.
+    """
+    path = arguments.file_path(folder, "folder")
+    found = {}
+    for name in (PARTICLES, CURVES, METADATA):
+        file = path / name
+        if not os.path.lexists(file):
+            continue
+        with open_regular(file, LIMITS.table_bytes, "Split the campaign into several folders") as stream:
+            found[name] = hashlib.file_digest(stream, "sha256").hexdigest()
+    return found
+
+
+def write_campaign(campaign: Campaign, folder: str | os.PathLike[str]) -> None:
+    """Write a campaign so that `read_campaign` gives back exactly the same numbers and texts.
+
+    The three files appear in `folder` together or not at all; other files there are left alone.
+
+    Args:
+        campaign: what to write; it is checked first.
+        folder: the folder to make or to replace the campaign in.
+
+    Raises:
+        InputError: if the campaign could not be read back, or the folder cannot be written.
+    """
+    path = arguments.file_path(folder, "folder")
+    check_campaign(campaign, file=path)
+    texts = {
+        PARTICLES: _format_particles(campaign),
+        CURVES: _format_curves(campaign),
+        METADATA: format_metadata(campaign.metadata, path / METADATA),
+    }
+    with results(path) as stage:
+        for name, text in texts.items():
+            (stage.folder / name).write_bytes(text.encode("utf-8"))
+
+
+def _cell(text: str) -> str:
+    if any(mark in text for mark in ',"\r\n'):
+        return '"' + text.replace('"', '""') + '"'
+    return text
+
+
+def _format_particles(campaign: Campaign) -> str:
+    lines = [",".join(["particle", "D1_um", "D2_um", "D3_um", *map(_cell, campaign.columns)])]
+    further = list(campaign.columns.values())
+    for i, (name, diameters) in enumerate(zip(campaign.particles, campaign.diameters_um.tolist(), strict=True)):
+        lines.append(",".join([_cell(name), *map(repr, diameters), *(_cell(values[i]) for values in further)]))
+    return "\n".join(lines) + "\n"
+
+
+def _format_curves(campaign: Campaign) -> str:
+    lines = ["particle,time_s,force_mN,displacement_um"]
+    for name, curve in zip(campaign.particles, campaign.curves, strict=True):
+        cell = _cell(name)
+        columns = (np.asarray(c, float).tolist() for c in (curve.time_s, curve.force_mN, curve.displacement_um))
+        lines.extend(f"{cell},{t!r},{f!r},{d!r}" for t, f, d in zip(*columns, strict=True))
+    return "\n".join(lines) + "\n"

@@ -74,18 +74,13 @@ def curve_features(
     segments: Sequence[Segment] = (),
     options: FeatureOptions | None = None,
 ) -> CurveFeatures | None:
-    """The features of one test.
+    """The features of one test; None for a record that shows no loading or holds values that are not finite.
 
     Args:
-        time_s: time [s], shape (n,).
-        force_mN: force [mN], shape (n,).
-        displacement_um: displacement [um], shape (n,).
+        time_s, force_mN, displacement_um: the test, each of shape (n,).
         segments: what `find_segments` gave, if it is known; the end of an approach is then taken from there, unless
             forces turn out negative.
         options: where features are read.
-
-    Returns:
-        The features, or None for a record that shows no loading or holds values that are not finite.
     """
     options = options or FeatureOptions()
     step = -(-len(time_s) // options.most_samples)
@@ -109,39 +104,27 @@ def curve_features(
             return None
         displacement_sign = 1 if together > 0 else -1
         depth = displacement_sign * displacement
-        return _measure(time, load, depth, contact, peak, begins_at_peak, (force_sign, displacement_sign), options)
-
-
-def _measure(
-    time: np.ndarray,
-    load: np.ndarray,
-    depth: np.ndarray,
-    contact: int,
-    peak: int,
-    begins_at_peak: bool,
-    signs: tuple[int, int],
-    options: FeatureOptions,
-) -> CurveFeatures:
-    height = float(load[peak])
-    way = float(abs(depth[peak]) if begins_at_peak else depth[peak] - depth[contact])
-    fullness = loading_s = loss = np.nan
-    rows = contact + np.flatnonzero(load[contact : peak + 1] >= np.maximum.accumulate(load[contact : peak + 1]))
-    if not begins_at_peak and way > 0:
-        fullness = float(np.trapezoid(load[rows], depth[rows])) / (height * way)
-        first, last = (rows[np.argmax(load[rows] >= share * height)] for share in (0.1, 0.9))
-        loading_s = float(time[last] - time[first])
-        if depth[peak] - depth[peak:].min() > options.least_retreat * way and fullness > 0:
-            loss = 1 + float(np.trapezoid(load[peak:], depth[peak:])) / (fullness * height * way)
-    return CurveFeatures(
-        *signs,
-        force_mN=height,
-        displacement_um=way if way > 0 else np.nan,
-        slope_mN_per_um=_unloading_slope(load[peak:], depth[peak:], options),
-        fullness=fullness,
-        loss=loss,
-        loading_s=loading_s,
-        interval_s=median(differences(time)),
-    )
+        height = float(load[peak])
+        way = float(abs(depth[peak]) if begins_at_peak else depth[peak] - depth[contact])
+        fullness = loading_s = loss = np.nan
+        rows = contact + np.flatnonzero(load[contact : peak + 1] >= np.maximum.accumulate(load[contact : peak + 1]))
+        if not begins_at_peak and way > 0:
+            fullness = float(np.trapezoid(load[rows], depth[rows])) / (height * way)
+            first, last = (rows[np.argmax(load[rows] >= share * height)] for share in (0.1, 0.9))
+            loading_s = float(time[last] - time[first])
+            if depth[peak] - depth[peak:].min() > options.least_retreat * way and fullness > 0:
+                loss = 1 + float(np.trapezoid(load[peak:], depth[peak:])) / (fullness * height * way)
+        return CurveFeatures(
+            force_sign,
+            displacement_sign,
+            force_mN=height,
+            displacement_um=way if way > 0 else np.nan,
+            slope_mN_per_um=_unloading_slope(load[peak:], depth[peak:], options),
+            fullness=fullness,
+            loss=loss,
+            loading_s=loading_s,
+            interval_s=median(differences(time)),
+        )
 
 
 def _without_spikes(values: np.ndarray) -> np.ndarray:

@@ -50,43 +50,31 @@ class CurveRows:
         time, force, displacement = (np.ascontiguousarray(column[self.groups[name]]) for column in self.values)
         return Curve(time, force, displacement)
 
-    def row(self, record: int) -> int:
-        """The line of the file that a record stands in, the first being 1."""
-        return parse_table(self.text, self.file).rows[record]
+    def wrong(self, problem: str, record: int | np.integer, remedy: str, column: str = "particle") -> InputError:
+        """The error for a record, which names the line of the file that it stands in."""
+        row = parse_table(self.text, self.file).rows[record]
+        return InputError(problem, file=self.file, row=row, column=column, remedy=remedy)
 
     def check(self, name: str, curve: Curve) -> None:
         """Refuse a test that cannot be one, naming file, row and column."""
         records = self.groups[name]
         if len(curve) < 2:
-            raise InputError(
-                f"the particle {name!r} has one row only",
-                file=self.file,
-                row=self.row(int(records[0])),
-                column="particle",
-                remedy="A curve needs at least two rows; add them or remove the particle",
-            )
+            remedy = "A curve needs at least two rows; add them or remove the particle"
+            raise self.wrong(f"the particle {name!r} has one row only", records[0], remedy)
+        time, force, displacement = (self.header[column] for column in self.columns)
         back = np.flatnonzero(np.diff(curve.time_s) < 0)
         if len(back):
             i = int(back[0])
-            raise InputError(
-                f"the time of {name!r} goes back, from {curve.time_s[i]:.10g} s to {curve.time_s[i + 1]:.10g} s",
-                file=self.file,
-                row=self.row(int(records[i + 1])),
-                column=self.header[self.columns[0]],
-                remedy="Keep each particle's rows in the order of time; two tests need two names",
-            )
+            problem = f"the time of {name!r} goes back, from {curve.time_s[i]:.10g} s to {curve.time_s[i + 1]:.10g} s"
+            remedy = "Keep each particle's rows in the order of time; two tests need two names"
+            raise self.wrong(problem, records[i + 1], remedy, time)
         for quantity, column, values in (
-            ("force", self.columns[1], curve.force_mN),
-            ("displacement", self.columns[2], curve.displacement_um),
+            ("force", force, curve.force_mN),
+            ("displacement", displacement, curve.displacement_um),
         ):
             if not values.any():
-                raise InputError(
-                    f"every {quantity} of particle {name!r} is zero, so the test holds no data",
-                    file=self.file,
-                    row=self.row(int(records[0])),
-                    column=self.header[column],
-                    remedy="Export the test again or remove the particle",
-                )
+                problem = f"every {quantity} of particle {name!r} is zero, so the test holds no data"
+                raise self.wrong(problem, records[0], "Export the test again or remove the particle", column)
 
 
 def read_curves(file: Path, limits: FileLimits = LIMITS) -> CurveRows:
@@ -104,7 +92,7 @@ def read_curves(file: Path, limits: FileLimits = LIMITS) -> CurveRows:
         raw = table.numbers(layout.columns)
         if table.delimiter != ",":
             table.refuse_groups(layout.columns)
-        groups = _group(names)
+        groups = _group(np.array(names, object))
     else:
         raw, groups = fast
     values = np.stack([convert(column, factor) for column, factor in zip(raw, layout.factors, strict=True)])
@@ -115,13 +103,7 @@ def read_curves(file: Path, limits: FileLimits = LIMITS) -> CurveRows:
             check_magnitudes(column, file, rows, layout.header[of])
     for name, records in groups.items():
         if not name.strip():
-            raise InputError(
-                "the name is empty",
-                file=file,
-                row=curves.row(int(records[0])),
-                column="particle",
-                remedy="Name the particle",
-            )
+            raise curves.wrong("the name is empty", records[0], "Name the particle")
     return curves
 
 
@@ -139,13 +121,8 @@ def _curve_layout(header: tuple[str, ...], file: Path) -> _Layout:
     columns = tuple(column for column, _ in found)
     for i, other in enumerate(header):
         if i != name and i not in columns:
-            raise InputError(
-                "is no column of curves",
-                file=file,
-                row=1,
-                column=other,
-                remedy=f"Keep particle, time, force and displacement; facts about a particle belong in {PARTICLES}",
-            )
+            remedy = f"Keep particle, time, force and displacement; facts about a particle belong in {PARTICLES}"
+            raise InputError("is no column of curves", file=file, row=1, column=other, remedy=remedy)
     return _Layout(header, name, columns, tuple(factor for _, factor in found))
 
 
@@ -180,11 +157,7 @@ def _split_fast(text: str, layout: _Layout) -> tuple[list[np.ndarray], dict[str,
     raw = [frame[names[column]].to_numpy() for column in layout.columns]
     if len(frame) != count or not all(np.isfinite(column).all() for column in raw):
         return None
-    codes, particles = pd.factorize(frame[names[layout.name]])
-    order = np.argsort(codes, kind="stable")
-    parts = np.split(order, np.flatnonzero(np.diff(codes[order])) + 1)
-    parts.sort(key=lambda part: int(part[0]))  # particles in the order in which they appear
-    return raw, {str(particles[codes[part[0]]]): part for part in parts}
+    return raw, _group(frame[names[layout.name]])
 
 
 def _count_records(text: str, data: bytes, width: int) -> int | None:
@@ -203,11 +176,13 @@ def _count_records(text: str, data: bytes, width: int) -> int | None:
     return len(ends) - 1 if len(ends) > 1 and (commas == width - 1).all() else None
 
 
-def _group(names: list[str]) -> dict[str, np.ndarray]:
-    members: dict[str, list[int]] = {}
-    for i, name in enumerate(names):
-        members.setdefault(name, []).append(i)
-    return {name: np.array(indices) for name, indices in members.items()}
+def _group(names: Any) -> dict[str, np.ndarray]:
+    """Where each name stands, names in the order in which they appear."""
+    import pandas as pd
+
+    codes, different = pd.factorize(names)
+    parts = np.split(np.argsort(codes, kind="stable"), np.cumsum(np.bincount(codes))[:-1])
+    return {str(name): part for name, part in zip(different, parts, strict=True)}
 
 
 def name_column(header: Sequence[str], file: Path, allowed: Sequence[str] = ("particle",)) -> int:

@@ -44,30 +44,32 @@ def zero_of_force(curve: Curve, control: Control | None, options: QualityOptions
     air, when = curve.force_mN[:stop], curve.time_s[:stop]
     mean, sd = float(np.mean(air)), float(np.std(air, ddof=1))
     largest = max(float(np.max(curve.force_mN) - mean), 1e-300)
-    flat = np.full(len(curve), mean)
     centred = when - when.mean()
     spread = float(np.sum(centred**2))
-    if not (sd > 0 and spread > 0):
-        return ZeroOfForce(flat, mean, 0.0, _offset_notes(mean, 0.0, largest, options))
-    slope = float(np.sum(centred * air) / spread)
-    left = air - mean - slope * centred
-    slope_sd = float(np.std(left, ddof=2) / np.sqrt(spread)) * _inflation(left)
-    change = slope * float(when[-1] - when[0])
-    if abs(slope) > options.drift_said * slope_sd and abs(change) > options.air_share * largest:
-        at = np.minimum(curve.time_s, curve.time_s[contact - 1]) - when.mean()
-        path = mean + slope * at
-        error = float(np.hypot(np.std(left, ddof=2) / np.sqrt(len(air)), abs(change) / np.sqrt(12)))
-        note = Note(
-            "zero of force",
-            "look",
-            "force drifts by {} mN in the air before contact; the zero at contact ({} mN) was taken off, with this "
-            "drift as its error",
-            (abs(change), float(path[-1])),
-            "Let the load cell settle before a test",
-        )
-        return ZeroOfForce(path, float(path[-1]), error, (note,))
-    error = sd / np.sqrt(len(air)) * _inflation(air - mean)
-    return ZeroOfForce(flat, mean, float(error), _offset_notes(mean, error, largest, options))
+    error = 0.0
+    if sd > 0 and spread > 0:
+        slope = float(np.sum(centred * air) / spread)
+        left = air - mean - slope * centred
+        slope_sd = float(np.std(left, ddof=2) / np.sqrt(spread)) * _inflation(left)
+        change = slope * float(when[-1] - when[0])
+        if abs(slope) > options.drift_said * slope_sd and abs(change) > options.air_share * largest:
+            path = mean + slope * (np.minimum(curve.time_s, curve.time_s[contact - 1]) - when.mean())
+            error = float(np.hypot(np.std(left, ddof=2) / np.sqrt(len(air)), abs(change) / np.sqrt(12)))
+            note = Note(
+                "zero of force",
+                "look",
+                "force drifts by {} mN in the air before contact; the zero at contact ({} mN) was taken off, with this "
+                "drift as its error",
+                (abs(change), float(path[-1])),
+                "Let the load cell settle before a test",
+            )
+            return ZeroOfForce(path, float(path[-1]), error, (note,))
+        error = float(sd / np.sqrt(len(air)) * _inflation(air - mean))
+    notes: tuple[Note, ...] = ()
+    if abs(mean) > options.air_said * error and abs(mean) > options.air_share * largest:
+        sentence = "force reads {} mN in the air before contact; this was taken off"
+        notes = (Note("zero of force", "told", sentence, (mean,)),)
+    return ZeroOfForce(np.full(len(curve), mean), mean, error, notes)
 
 
 def _perhaps_drift(curve: Curve, ahead: SlowStart | None, options: QualityOptions) -> ZeroOfForce | None:
@@ -90,12 +92,6 @@ def _inflation(scatter: np.ndarray) -> float:
     lag = float(np.sum(scatter[1:] * scatter[:-1]) / max(np.sum(scatter**2), 1e-300))
     lag = min(max(lag, 0.0), 0.9)
     return float(np.sqrt((1 + lag) / (1 - lag)))
-
-
-def _offset_notes(zero: float, error: float, largest: float, options: QualityOptions) -> tuple[Note, ...]:
-    if abs(zero) <= options.air_said * error or abs(zero) <= options.air_share * largest:
-        return ()
-    return (Note("zero of force", "told", "force reads {} mN in the air before contact; this was taken off", (zero,)),)
 
 
 def air_until(curve: Curve, control: Control | None, options: QualityOptions) -> tuple[int | None, SlowStart | None]:

@@ -9,13 +9,7 @@ from .schema import Curve
 
 
 def remembered[T](curve: Curve, question: Hashable, find: Callable[[], T]) -> T:
-    """What was found of a curve, or is found now; found anew once a reading has changed.
-
-    Args:
-        curve: the test.
-        question: what was looked for, with all settings.
-        find: looks for it.
-    """
+    """What `find` found of a curve by a question with all its settings; found anew once a reading has changed."""
     mark = hash((curve.time_s.tobytes(), curve.force_mN.tobytes(), curve.displacement_um.tobytes()))
     known: dict[Hashable, tuple[int, Any]] = vars(curve).setdefault("_found", {})
     if (kept := known.get(question)) is None or kept[0] != mark:

@@ -7,9 +7,9 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NoReturn, get_args
+from typing import Any, get_args
 
 import numpy as np
 
@@ -27,44 +27,34 @@ _BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 
 def load_toml(text: str, file: Path) -> dict[str, Any]:
-    """Parse TOML.
-
-    Raises:
-        InputError: naming the line with the mistake.
-    """
+    """Parse TOML; the line with a mistake is named."""
     check_toml(text, file)
     try:
         entries = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         place = re.search(r" \(at line (\d+), column \d+\)", str(error))
         problem = str(error)[: place.start()] if place else str(error).removesuffix(" (at end of document)")
-        raise InputError(
-            f"this is not TOML: {problem}",
-            file=file,
-            row=int(place[1]) if place else text.rstrip().count("\n") + 1,
-            remedy='Write key = value lines, text in double quotes, for example control = "load"',
-        ) from None
+        row = int(place[1]) if place else text.rstrip().count("\n") + 1
+        remedy = 'Write key = value lines, text in double quotes, for example control = "load"'
+        raise InputError(f"this is not TOML: {problem}", file=file, row=row, remedy=remedy) from None
     _check_sizes(entries, file)
     return entries
 
 
-def _check_sizes(entries: dict[str, Any], file: Path) -> None:
+def _check_sizes(value: Any, file: Path, key: str = "", depth: int = 0) -> None:
     """Refuse what Python reads and then fails on: integers that no float holds, tables too deep to walk through."""
-    level: list[tuple[str, Any]] = list(entries.items())
-    for _ in range(_DEEPEST):
-        for key, value in level:
-            # TOML promises 64 bits only.
-            if isinstance(value, int) and not -(2**63) <= value < 2**63:
-                problem = "holds an integer of more than 64 bits"
-                raise InputError(problem, file=file, column=key, remedy="Write it with a decimal point")
-        level = [(key, item) for key, value in level for item in _items(value)]
-        if not level:
-            return
-    raise InputError(f"is nested more than {_DEEPEST} deep", file=file, column=level[0][0], remedy="Flatten it")
-
-
-def _items(value: Any) -> Iterable[Any]:
-    return value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    if depth > _DEEPEST:
+        raise InputError(f"is nested more than {_DEEPEST} deep", file=file, column=key, remedy="Flatten it")
+    # TOML promises 64 bits only.
+    if isinstance(value, int) and not -(2**63) <= value < 2**63:
+        problem = "holds an integer of more than 64 bits"
+        raise InputError(problem, file=file, column=key, remedy="Write it with a decimal point")
+    if isinstance(value, dict):
+        for name, item in value.items():
+            _check_sizes(item, file, name, depth + 1)
+    elif isinstance(value, list):
+        for item in value:
+            _check_sizes(item, file, key, depth + 1)
 
 
 def load_toml_file(path: str | Path, what: str) -> dict[str, Any]:
@@ -81,58 +71,40 @@ def load_toml_file(path: str | Path, what: str) -> dict[str, Any]:
     try:
         text = read_settings(file)
     except InputError as error:
-        raise InputError(
-            error.problem, file=file, row=error.row, column=error.column, remedy=f"{error.remedy}: {what}"
-        ) from None
+        raise error.changed(remedy=f"{error.remedy}: {what}") from None
     return load_toml(text, file)
 
 
 def read_settings(file: Path, limits: FileLimits = LIMITS) -> str:
-    """The text of a TOML file, which may be empty.
-
-    Raises:
-        InputError: if it cannot be read, is too large, or is no UTF-8 text.
-    """
+    """The text of a TOML file, which may be empty."""
     data = read_regular(file, limits.settings_bytes, "Keep settings alone in it; readings belong in a table")
     return decode(data, file, "plain text in UTF-8")
 
 
 def parse_metadata(text: str, file: Path) -> Metadata:
-    """The metadata that a `campaign.toml` holds; keys it does not know go to `other`.
-
-    Args:
-        text: the file's text.
-        file: for messages.
-
-    Raises:
-        InputError: if it is not TOML, or a known key has a wrong type, value or unit.
-    """
+    """The metadata that the text of a `campaign.toml` holds; keys it does not know go to `other`."""
     entries = load_toml(text, file)
     for key in entries:
-        for known in (*_WORDS, *_QUANTITIES):
-            if key != known and key.lower() == known:
-                raise InputError("is misspelt", file=file, column=key, remedy=f"Did you mean {known!r}?")
+        if key.lower() != key and key.lower() in (*_WORDS, *_QUANTITIES):
+            raise InputError("is misspelt", file=file, column=key, remedy=f"Did you mean {key.lower()!r}?")
     control, provenance, corrections = (entries.pop(key, None) for key in _WORDS)
-
-    def refuse(key: str, problem: str, remedy: str) -> NoReturn:
-        raise InputError(problem, file=file, column=key, remedy=remedy)
-
     if control is not None and control not in get_args(Control):
-        refuse("control", f"{control!r} is no way of control", 'Write "load" or "displacement"')
-    if provenance is not None and not isinstance(provenance, str):
-        refuse("provenance", "must be text", 'Write it in quotes, provenance = "..."')
-    corrections = [] if corrections is None else corrections
-    if not isinstance(corrections, list) or not all(isinstance(name, str) for name in corrections):
-        refuse("corrections", "must be a list of names", 'Write corrections = ["frame_compliance"]')
-    return Metadata(
-        control=control,
-        force_resolution_mN=_positive(entries, "force_resolution", file),
-        displacement_resolution_um=_positive(entries, "displacement_resolution", file),
-        punch_diameter_um=_positive(entries, "punch_diameter", file),
-        provenance=provenance,
-        corrections=tuple(corrections),
-        other=entries,
-    )
+        problem, key, remedy = f"{control!r} is no way of control", "control", 'Write "load" or "displacement"'
+    elif provenance is not None and not isinstance(provenance, str):
+        problem, key, remedy = "must be text", "provenance", 'Write it in quotes, provenance = "..."'
+    elif not isinstance(corrections, list | None) or not all(isinstance(name, str) for name in corrections or ()):
+        problem, key, remedy = "must be a list of names", "corrections", 'Write corrections = ["frame_compliance"]'
+    else:
+        return Metadata(
+            control=control,
+            force_resolution_mN=_positive(entries, "force_resolution", file),
+            displacement_resolution_um=_positive(entries, "displacement_resolution", file),
+            punch_diameter_um=_positive(entries, "punch_diameter", file),
+            provenance=provenance,
+            corrections=tuple(corrections or ()),
+            other=entries,
+        )
+    raise InputError(problem, file=file, column=key, remedy=remedy)
 
 
 def _positive(entries: dict[str, Any], quantity: str, file: Path) -> float | None:
@@ -153,12 +125,7 @@ def _positive(entries: dict[str, Any], quantity: str, file: Path) -> float | Non
 def format_metadata(metadata: Metadata, file: Path) -> str:
     """The text of a `campaign.toml` that reads back as the same metadata.
 
-    Args:
-        metadata: what to write.
-        file: for messages.
-
-    Raises:
-        InputError: if `other` holds what TOML cannot, or a key that has a meaning of its own.
+    Raises `InputError` if `other` holds what TOML cannot, or a key that has a meaning of its own.
     """
     known = {
         "control": metadata.control,
@@ -168,25 +135,31 @@ def format_metadata(metadata: Metadata, file: Path) -> str:
         "provenance": metadata.provenance,
         "corrections": list(metadata.corrections) or None,
     }
-    plain = {key: value for key, value in known.items() if value is not None}
-    tables: dict[str, Any] = {}
-    for key, value in metadata.other.items():
+    for key in metadata.other:
         if not isinstance(key, str) or key in known:
             raise InputError(f"{key!r} cannot be a key of its own", file=file, remedy="Rename it in Metadata.other")
-        (tables if isinstance(value, Mapping) else plain)[key] = value
+    told = {key: value for key, value in known.items() if value is not None}
     try:
-        lines = [f"{_key(key)} = {_value(value)}" for key, value in plain.items()]
-        for key, table in tables.items():
-            lines += ["", f"[{_key(key)}]", *(f"{_key(k)} = {_value(v)}" for k, v in table.items())]
-        text = "".join(line + "\n" for line in lines)
+        text = _table({**told, **metadata.other})
         text.encode("utf-8")
     except (TypeError, ValueError) as error:
-        raise InputError(
-            f"cannot be written as TOML: {error}", file=file, remedy="Keep text, numbers, dates, lists and tables"
-        ) from None
-    if parse_metadata(text, file).other != _plain(metadata.other) and not _has_nan(metadata.other):
+        problem = f"cannot be written as TOML: {error}"
+        raise InputError(problem, file=file, remedy="Keep text, numbers, dates, lists and tables") from None
+    # Texts are compared, since a number may be none (NaN), which equals nothing.
+    if _table(parse_metadata(text, file).other) != _table(metadata.other):
         raise InputError("would not read back the same", file=file, remedy="Rename the keys of Metadata.other")
     return text
+
+
+def _table(entries: Mapping[str, Any]) -> str:
+    """Entries as TOML: tables behind all others."""
+    plain = [f"{_key(key)} = {_value(value)}\n" for key, value in entries.items() if not isinstance(value, Mapping)]
+    tables = [
+        "".join([f"\n[{_key(key)}]\n", *(f"{_key(k)} = {_value(v)}\n" for k, v in table.items())])
+        for key, table in entries.items()
+        if isinstance(table, Mapping)
+    ]
+    return "".join(plain + tables)
 
 
 def _key(key: Any) -> str:
@@ -217,17 +190,3 @@ def _value(value: Any) -> str:
         case list() | tuple():
             return "[" + ", ".join(_value(v) for v in value) + "]"
     raise TypeError(f"{type(value).__name__} {value!r} has no form in TOML")
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
-    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
-
-
-def _has_nan(value: Any) -> bool:
-    if isinstance(value, Mapping):
-        return any(_has_nan(item) for item in value.values())
-    if isinstance(value, list | tuple):
-        return any(_has_nan(item) for item in value)
-    return isinstance(value, float) and math.isnan(value)

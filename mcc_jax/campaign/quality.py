@@ -58,28 +58,34 @@ def check_test(curve: Curve, control: Control | None, options: QualityOptions) -
     """One test, checked; see the top of the file for the steps."""
     notes: list[Note] = []
     rows = np.arange(len(curve))
-    for channel, name in ((curve.force_mN, "force"), (curve.displacement_um, "displacement")):
-        far = spikes(channel[rows], options)
-        if far.any():
-            notes.append(_spike_note(name, int(far.sum())))
-            rows = rows[~far]
-    for channel, name in ((curve.force_mN, "force"), (curve.displacement_um, "displacement")):
-        repeated = stuck(channel[rows], options)
-        if repeated.any():
-            notes.append(_stuck_note(name, int(repeated.sum())))
-            rows = rows[~repeated]
+    for wrong, check, sentence, remedy in _SINGLE_READINGS:
+        for channel, name in ((curve.force_mN, "force"), (curve.displacement_um, "displacement")):
+            found = wrong(channel[rows], options)
+            if found.any():
+                notes.append(Note(check, "told", sentence.replace("CHANNEL", name), (int(found.sum()),), remedy))
+                rows = rows[~found]
     clean = _taken(curve, rows)
     if begins_at_peak(clean, options):
-        notes.append(_begins_note(float(clean.force_mN[0])))
+        sentence = "the record begins at its largest force ({} mN), so its loading is missing"
+        remedy = "Join the loading part of the test to it: some testers store the two apart"
+        notes.append(Note("loading", "look", sentence, (float(clean.force_mN[0]),), remedy))
     broke = breakage(clean, options)
     if broke is not None:
         last, lost = broke
-        notes.append(_breakage_note(float(curve.force_mN[rows[last]]), lost))
+        sentence = "the particle broke at {} mN (the force falls by {} % at once); its record counts up to there"
+        remedy = "Load particles of this batch less, or leave this one out"
+        notes.append(Note("breakage", "look", sentence, (float(curve.force_mN[rows[last]]), 100 * lost), remedy))
         rows = rows[: last + 1]
         clean = _taken(curve, rows)
     slipping = gives_way(clean, control, options)
     if slipping.any():
-        notes.append(_slip_note(float(clean.force_mN[np.argmax(slipping) - 1]), int(slipping.sum())))
+        sentence = (
+            "force falls from {} mN on while the platens go on closing (the particle gives way or slips): {} readings "
+            "are left out"
+        )
+        remedy = "Look whether the particle still is one, and load it less if it is not"
+        numbers = float(clean.force_mN[np.argmax(slipping) - 1]), int(slipping.sum())
+        notes.append(Note("breakage", "told", sentence, numbers, remedy))
         rows = rows[~slipping]
         clean = _taken(curve, rows)
     zero = zero_of_force(clean, control, options)
@@ -94,8 +100,8 @@ def check_test(curve: Curve, control: Control | None, options: QualityOptions) -
         notes.append(seen.note)
     hidden = censor_displacement(clean, options.saturation)
     if hidden is not None:
-        compared &= ~hidden.rows
-        notes.append(hidden.note)
+        compared &= ~hidden[0]
+        notes.append(hidden[1])
     if not notes and zero is None:
         return curve
     taken_off, error = (0.0, 0.0) if zero is None else (zero.value, zero.sd)
@@ -164,11 +170,8 @@ def stuck(values: np.ndarray, options: QualityOptions) -> np.ndarray:
         near = np.concatenate([before, after])
         if not len(near):
             continue
-        pace = median(near)
-        jump = steps[stop - 1]
-        if jump > options.stuck_catch_up * (stop - start) * pace and jump > options.stuck_jump * max(
-            typical, float(np.max(near))
-        ):
+        caught_up = options.stuck_catch_up * (stop - start) * median(near)
+        if steps[stop - 1] > max(caught_up, options.stuck_jump * max(typical, float(np.max(near)))):
             found[start + 1 : stop] = True
     return found
 
@@ -220,9 +223,7 @@ def breakage(curve: Curve, options: QualityOptions) -> tuple[int, float] | None:
             if goes_on or ends:
                 first = int(i), float(share[i])
                 break
-    if first is None or first[0] < 8:
-        return None
-    return first
+    return first if first is not None and first[0] >= 8 else None
 
 
 def gives_way(curve: Curve, control: Control | None, options: QualityOptions) -> np.ndarray:
@@ -251,49 +252,15 @@ def gives_way(curve: Curve, control: Control | None, options: QualityOptions) ->
     return found
 
 
-# ---- words -----------------------------------------------------------------------------------------------------------
-
-
-def _spike_note(name: str, count: int) -> Note:
-    return Note(
-        "spikes", "told", f"single readings of {name} ({{}}) lie far from their neighbours and are left out", (count,)
-    )
-
-
-def _stuck_note(name: str, count: int) -> Note:
-    sentence = f"{{}} readings of {name} repeat the one before while the test goes on, and are left out"
-    return Note("stuck readings", "told", sentence, (count,), "Look for a loose cable or a full buffer of the logger")
-
-
-def _begins_note(force_mN: float) -> Note:
-    return Note(
-        "loading",
-        "look",
-        "the record begins at its largest force ({} mN), so its loading is missing",
-        (force_mN,),
-        "Join the loading part of the test to it: some testers store the two apart",
-    )
-
-
-def _breakage_note(force_mN: float, share: float) -> Note:
-    return Note(
-        "breakage",
-        "look",
-        "the particle broke at {} mN (the force falls by {} % at once); its record counts up to there",
-        (force_mN, 100 * share),
-        "Load particles of this batch less, or leave this one out",
-    )
-
-
-def _slip_note(force_mN: float, count: int) -> Note:
-    return Note(
-        "breakage",
-        "told",
-        "force falls from {} mN on while the platens go on closing (the particle gives way or slips): {} readings are "
-        "left out",
-        (force_mN, count),
-        "Look whether the particle still is one, and load it less if it is not",
-    )
+_SINGLE_READINGS = (
+    (spikes, "spikes", "single readings of CHANNEL ({}) lie far from their neighbours and are left out", ""),
+    (
+        *(stuck, "stuck readings"),
+        "{} readings of CHANNEL repeat the one before while the test goes on, and are left out",
+        "Look for a loose cable or a full buffer of the logger",
+    ),
+)
+"""What single readings may be: how they are found, the check's name, sentence and remedy."""
 
 
 def campaign_findings(campaign: Campaign) -> tuple[Finding, ...]:
@@ -303,17 +270,15 @@ def campaign_findings(campaign: Campaign) -> tuple[Finding, ...]:
         campaign: what `check_tests` made.
     """
     check_campaign(campaign)
-    groups: dict[tuple[str, str, str, str], list[tuple[str, tuple[float | int, ...]]]] = {}
+    groups: dict[Note, dict[str, tuple[float | int, ...]]] = {}
     for name, curve in zip(campaign.particles, campaign.curves, strict=True):
         for note in curve.checked.notes if curve.checked is not None else ():
-            key = note.check, note.level, note.sentence, note.remedy
-            groups.setdefault(key, []).append((name, note.numbers))
+            groups.setdefault(replace(note, numbers=()), {})[name] = note.numbers
     found = []
-    for (check, level, sentence, remedy), members in groups.items():
-        names = tuple(name for name, _ in members)
-        texts = [_range(column) for column in zip(*(numbers for _, numbers in members), strict=True)]
-        text = f"{named(names, len(campaign))}: {sentence.format(*texts)}"
-        found.append(Finding(check, level, text, remedy, names))  # pyright: ignore[reportArgumentType]
+    for note, numbers in groups.items():
+        texts = [_range(column) for column in zip(*numbers.values(), strict=True)]
+        text = f"{named(tuple(numbers), len(campaign))}: {note.sentence.format(*texts)}"
+        found.append(Finding(note.check, note.level, text, note.remedy, tuple(numbers)))
     return tuple(found)
 
 

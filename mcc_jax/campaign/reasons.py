@@ -11,6 +11,7 @@ from .._errors import InputError
 from .plausibility import check_plausibility
 from .schema import Campaign, Curve
 from .segments import Segment
+from .signal import median
 
 
 @dataclass(frozen=True)
@@ -38,14 +39,7 @@ SHOWN = 3
 
 
 def no_loading(curve: Curve, segments: tuple[Segment, ...], stress_MPa: np.ndarray, threshold_MPa: float) -> str:
-    """Why a test has no virgin loading.
-
-    Args:
-        curve: the test.
-        segments: its segments.
-        stress_MPa: its stresses, shape (n,).
-        threshold_MPa: stress below which nothing counts.
-    """
+    """Why a test with these stresses [MPa], shape (n,), has no virgin loading; below the threshold nothing counts."""
     force = np.asarray(curve.force_mN, float)
     low, high = float(force.min()), float(force.max())
     if not high > low:
@@ -121,44 +115,34 @@ def far_apart(stress_MPa: Sequence[float | None], strain: Sequence[float | None]
     """
     found: list[str | None] = []
     stresses, strains = (np.sort([v for v in values if v is not None]) for values in (stress_MPa, strain))
-    for i in range(len(stress_MPa)):
-        stress, usual = _apart(stress_MPa[i], stresses)
-        if stress is not None:
-            found.append(
+    for stress, share in zip(stress_MPa, strain, strict=True):
+        reason = None
+        if (usual := _others_median(stress, stresses)) is not None:
+            reason = (
                 f"reaches {stress:.3g} MPa where the others reach {usual:.3g} MPa; "
                 "check its unit of force and its diameters (they turn force into stress), or leave the particle out"
             )
-            continue
-        share, usual = _apart(strain[i], strains)
-        found.append(
-            None
-            if share is None
-            else f"is compressed by {share:.3g} of its size where the others are by {usual:.3g}; "
-            "check its unit of displacement and its diameters, or leave the particle out"
-        )
+        elif (usual := _others_median(share, strains)) is not None:
+            reason = (
+                f"is compressed by {share:.3g} of its size where the others are by {usual:.3g}; "
+                "check its unit of displacement and its diameters, or leave the particle out"
+            )
+        found.append(reason)
     return found
 
 
-def _apart(own: float | None, ordered: np.ndarray) -> tuple[float | None, float]:
-    """A particle's value if it is far from the median of the others', else None; and that median.
-
-    Args:
-        own: its value.
-        ordered: the values of all particles, its own among them, in order.
-    """
+def _others_median(own: float | None, ordered: np.ndarray) -> float | None:
+    """The median of the others, of all particles' values in order, if a particle's own is far from it; else None."""
     if own is None or len(ordered) < 2:
-        return None, 0.0
-    at, rest = int(np.searchsorted(ordered, own)), len(ordered) - 1
-    low, high = (float(ordered[k + (k >= at)]) for k in ((rest - 1) // 2, rest // 2))
-    usual = (low + high) / 2
-    return None if usual / USABLE.far_apart <= own <= usual * USABLE.far_apart else own, usual
+        return None
+    usual = median(np.delete(ordered, np.searchsorted(ordered, own)))
+    return None if usual / USABLE.far_apart <= own <= usual * USABLE.far_apart else usual
 
 
 def refusal(campaign: Campaign, problem: str, why_not: Sequence[str | None]) -> InputError:
     """The error that says why a campaign's particles cannot be used, with every reason once, and what to do.
 
     Args:
-        campaign: the tests.
         problem: what fails for want of particles.
         why_not: a reason for each particle, None for those that can be used.
     """

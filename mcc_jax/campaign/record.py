@@ -59,7 +59,10 @@ def record_columns(
         kind = KINDS.index(segment.kind)
         part = slice(segment.start, segment.stop)
         if kind not in (HOLD, APPROACH):
-            begins = _first_value(time[part], force[part])
+            first = slice(part.start, min(part.start + 9, part.stop))
+            begins = float(force[part.start])
+            if len(force[first]) >= 3 and np.ptp(time[first]) > 0:
+                begins = straight_line(time[first] - time[part.start], force[first])[1]
             if kind == UNLOAD and branch != UNLOAD:
                 unload_from = begins
             if kind != UNLOAD and branch == UNLOAD:
@@ -92,7 +95,7 @@ def record_batch(
     Args:
         campaign: the tests.
         segments: the segments of each; found anew if None.
-        multiple: round the length up to a multiple of this, as in `mcc_jax.campaign.batch`.
+        multiple: round the length up to a multiple of this.
 
     Raises:
         InputError: if the campaign cannot be used, or the column of humidities holds what is no number.
@@ -138,20 +141,10 @@ def humidity_column(
         except ValueError:
             values[i] = np.nan
         if not 0 <= values[i] <= 100:
-            raise InputError(
-                f"the relative humidity of particle {particles[i]!r} is {text!r}",
-                file=source or None,
-                column=HUMIDITY_COLUMN,
-                remedy="Write a number from 0 to 100, in percent",
-            )
+            problem = f"the relative humidity of particle {particles[i]!r} is {text!r}"
+            remedy = "Write a number from 0 to 100, in percent"
+            raise InputError(problem, file=source or None, column=HUMIDITY_COLUMN, remedy=remedy)
     return values
-
-
-def _first_value(time: np.ndarray, force: np.ndarray) -> float:
-    n = min(len(force), 9)
-    if n < 3 or np.ptp(time[:n]) <= 0:
-        return float(force[0])
-    return straight_line(time[:n] - time[0], force[:n])[1]
 
 
 def _slope(time: np.ndarray, force: np.ndarray, before: float) -> float:
@@ -166,11 +159,7 @@ def available_data(campaign: Campaign, segments: tuple[tuple[Segment, ...], ...]
     """What a campaign holds of what effects need.
 
     A kind of segment counts as present when at least one test in five has it; sizes and shapes when they differ by a
-    tenth; peaks and rates when the largest is 1.3 times the smallest.
-
-    Args:
-        campaign: the tests.
-        segments: the segments of each; found anew if None.
+    tenth; peaks and rates when the largest is 1.3 times the smallest. Segments are found anew if None.
     """
     check_campaign(campaign)
     found = campaign_segments(campaign) if segments is None else segments

@@ -14,6 +14,7 @@ the fit and the noise of the turning point give the force's standard deviation.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -54,8 +55,7 @@ class SaturationOptions:
     trusted: float = 0.25
 
 
-@dataclass(frozen=True)
-class CensoredForce:
+class CensoredForce(NamedTuple):
     """A test whose force channel saturated.
 
     Attributes:
@@ -74,26 +74,10 @@ class CensoredForce:
     note: Note
 
 
-@dataclass(frozen=True)
-class CensoredDisplacement:
-    """Which readings of displacement stand at the end of the range, and a note."""
-
-    rows: np.ndarray
-    note: Note
-
-
 def plateaus(
     values: np.ndarray, other: np.ndarray, time: np.ndarray, noise: float, options: SaturationOptions
 ) -> list[tuple[int, int]]:
-    """Stretches [start, stop) at the largest value of a channel during which the other channel goes on.
-
-    Args:
-        values: the channel, shape (n,).
-        other: the other channel.
-        time: when [s].
-        noise: standard deviation of the other channel's readings.
-        options: what counts.
-    """
+    """Stretches [start, stop) at the largest value of a channel during which the other, of this noise, goes on."""
     count = len(values)
     if count < 12:
         return []
@@ -134,11 +118,8 @@ def plateaus(
 
 
 def censor_force(curve: Curve, options: SaturationOptions | None = None) -> CensoredForce | None:
-    """The test with the turning points that its force channel did not see; None if the channel did not saturate.
-
-    Args:
-        curve: the test, its zero of force taken off.
-        options: what counts.
+    """The test, its zero of force taken off, with the turning points that its force channel did not see; None if there
+    are none.
     """
     options = options or SaturationOptions()
     force, path = curve.force_mN, curve.displacement_um
@@ -151,36 +132,31 @@ def censor_force(curve: Curve, options: SaturationOptions | None = None) -> Cens
     for start, stop in found:
         hidden[start:stop] = True
     fitted = _loading(force, path, hidden, found[0][0], end, options.fitted_from)
-    keep, turning = ~hidden, {}
+    before = slice(max(found[0][0] - 12, 0), found[0][0])
+    way = float(np.ptp(path[before]))
+    pace = float(np.ptp(force[before])) / way if way > 0 else 0.0  # [mN/um]
+    new_force, new_path, sd = force.copy(), path.copy(), np.zeros(len(force))
+    turning = np.zeros(len(force), bool)
     reached = -np.inf
     for start, stop in found:
         reached = max(reached, float(np.max(path[:start])))
-        farthest = start + int(np.argmax(path[start:stop]))
-        top = _turning(path[start:stop], farthest - start, noise)
+        row = start + int(np.argmax(path[start:stop]))
+        top = _turning(path[start:stop], row - start, noise)
         if top <= reached:
             continue  # reloading that stays below what was reached before: elastic, the history does not change
-        keep[farthest] = True
-        turning[farthest] = top
-        reached = top
-    largest, sds = [], []
-    new_force, new_path = force.copy(), path.copy()
-    sd = np.zeros(len(force))
-    for row, top in turning.items():
         value, error = (np.nan, np.nan) if fitted is None else fitted.at(top, noise)
-        if not np.isfinite(value) or value < end:
-            value, error = end, max(noise * _pace(force, path, found[0][0]), 0.0)
-        new_force[row], new_path[row], sd[row] = value, top, error
-        largest.append(value)
-        sds.append(error)
-    note = _note(end, int(hidden.sum()), largest, sds, options.trusted)
-    compared = np.ones(len(force), bool)
-    compared[list(turning)] = False
+        if not end <= value < np.inf:
+            value, error = end, noise * pace
+        new_force[row], new_path[row], sd[row], turning[row] = value, top, error, True
+        reached = top
+    note = _note(end, int(hidden.sum()), new_force[turning], sd[turning], options.trusted)
+    keep = ~hidden | turning
     checked = Curve(curve.time_s[keep], new_force[keep], new_path[keep])
-    return CensoredForce(checked, np.flatnonzero(keep), compared[keep], sd[keep], note)
+    return CensoredForce(checked, np.flatnonzero(keep), ~turning[keep], sd[keep], note)
 
 
-def censor_displacement(curve: Curve, options: SaturationOptions | None = None) -> CensoredDisplacement | None:
-    """Readings of displacement at the end of its range; None if there are none."""
+def censor_displacement(curve: Curve, options: SaturationOptions | None = None) -> tuple[np.ndarray, Note] | None:
+    """Which readings of displacement stand at the end of its range, and a note; None if there are none."""
     options = options or SaturationOptions()
     found = plateaus(curve.displacement_um, curve.force_mN, curve.time_s, point_noise(curve.force_mN), options)
     if not found:
@@ -199,15 +175,15 @@ def censor_displacement(curve: Curve, options: SaturationOptions | None = None) 
         (float(path.max()), int(rows.sum())),
         "Measure with a larger range of displacement",
     )
-    return CensoredDisplacement(rows, note)
+    return rows, note
 
 
-def _note(end: float, count: int, largest: list[float], sds: list[float], trusted: float) -> Note:
+def _note(end: float, count: int, largest: np.ndarray, sds: np.ndarray, trusted: float) -> Note:
     remedy = "Measure with a load cell of a larger range"
-    if not largest:
+    if not len(largest):
         sentence = "force stands at {} mN, the end of its range, for {} readings, which are left out"
         return Note("saturation", "look", sentence, (end, count), remedy)
-    top, sd = max(largest), max(sds)
+    top, sd = float(largest.max()), float(sds.max())
     sentence = (
         "force stands at {} mN, the end of its range, for {} readings while the platens go on; they are left out and "
         "the turning point is taken from the displacement ({} +- {} mN)"
@@ -216,13 +192,6 @@ def _note(end: float, count: int, largest: list[float], sds: list[float], truste
     if far:
         sentence += ", too far beyond the range to be relied on"
     return Note("saturation", "bad" if far else "look", sentence, (end, count, top, sd), remedy)
-
-
-def _pace(force: np.ndarray, path: np.ndarray, start: int) -> float:
-    """Slope of force over displacement before a reading [mN/um]."""
-    before = slice(max(start - 12, 0), start)
-    reach = float(np.ptp(path[before]))
-    return float(np.ptp(force[before])) / reach if reach > 0 else 0.0
 
 
 def _turning(part: np.ndarray, top: int, noise: float) -> float:
@@ -238,29 +207,27 @@ def _turning(part: np.ndarray, top: int, noise: float) -> float:
 
 @dataclass(frozen=True)
 class _Loading:
-    """Loading in the law's form, fitted below the end of the range."""
+    """Loading in the law's form, F = k1 x - k3 x^3 + k5 x^5, x = d / scale - zero, fitted below the range's end."""
 
-    parameters: np.ndarray  # zero, and the three factors per mN
+    parameters: np.ndarray  # zero, k1, k3, k5
     covariance: np.ndarray
     scale_um: float
 
-    def force(self, parameters: np.ndarray, path: np.ndarray | float) -> np.ndarray:
-        x = (np.asarray(path, float) - parameters[0] * self.scale_um) / self.scale_um
-        return np.asarray(parameters[1] * x - parameters[2] * x**3 + parameters[3] * x**5)
-
     def at(self, path: float, noise: float) -> tuple[float, float]:
         """Force at a displacement, and its standard deviation [mN]."""
-        value = float(self.force(self.parameters, path))
-        steps = 1e-6 * np.maximum(np.abs(self.parameters), 1e-6)
-        slope = np.array(
-            [
-                (float(self.force(self.parameters + h * e, path)) - value) / h
-                for h, e in zip(steps, np.eye(4), strict=True)
-            ]
-        )
-        h = 1e-5 * self.scale_um
-        along = (float(self.force(self.parameters, path + h)) - value) / h
-        return value, float(np.sqrt(max(slope @ self.covariance @ slope, 0.0) + (along * noise) ** 2))
+        x = path / self.scale_um - self.parameters[0]
+        powers, slope = _powers(x), _slopes(x) @ self.parameters[1:]
+        gradient = np.array([-slope, *powers])
+        variance = max(gradient @ self.covariance @ gradient, 0.0) + (slope / self.scale_um * noise) ** 2
+        return float(powers @ self.parameters[1:]), float(np.sqrt(variance))
+
+
+def _powers(x: np.ndarray | float) -> np.ndarray:
+    return np.stack([x, -np.power(x, 3), np.power(x, 5)], -1)
+
+
+def _slopes(x: np.ndarray | float) -> np.ndarray:
+    return np.stack([np.ones_like(x), -3 * np.square(x), 5 * np.power(x, 4)], -1)
 
 
 def _loading(
@@ -269,31 +236,23 @@ def _loading(
     """The loading curve before the force channel saturates for the first time."""
     from scipy.optimize import least_squares
 
-    rows = np.arange(start)
-    virgin = rows[
-        (path[rows] >= np.maximum.accumulate(path[rows])) & (force[rows] >= fitted_from * end) & ~hidden[rows]
-    ]
-    if len(virgin) < 8:
+    before = slice(start)
+    virgin = (path[before] >= np.maximum.accumulate(path[before])) & (force[before] >= fitted_from * end)
+    rows = np.flatnonzero(virgin & ~hidden[before])
+    if len(rows) < 8:
         return None
-    f, d = force[virgin], path[virgin]
+    f, d = force[rows], path[rows]
     scale = float(d[-1] - d[0]) / (1 - fitted_from)
     if not scale > 0:
         return None
-    unit = _Loading(np.zeros(4), np.zeros((4, 4)), scale)
 
-    def slope(parameters: np.ndarray) -> np.ndarray:
+    def misfit(parameters: np.ndarray) -> np.ndarray:  # in displacement, where the noise is
         x = d / scale - parameters[0]
-        k1, k3, k5 = parameters[1:]
-        return np.maximum((k1 - 3 * k3 * x**2 + 5 * k5 * x**4) / scale, 1e-3 * end / scale)
+        slope = np.maximum(_slopes(x) @ parameters[1:] / scale, 1e-3 * end / scale)
+        return (_powers(x) @ parameters[1:] - f) / slope
 
     first = d[0] / scale - fitted_from
-    x = d / scale - first
-    design = np.stack([x, -(x**3), x**5], 1)
-    start_at = np.concatenate([[first], np.linalg.lstsq(design, f, rcond=None)[0]])
-    solution = least_squares(
-        lambda p: (unit.force(p, d) - f) / slope(p), start_at, x_scale=np.maximum(np.abs(start_at), 1e-3), max_nfev=100
-    )
-    misfit = float(np.sum(solution.fun**2) / max(len(d) - 4, 1))
-    curvature = solution.jac.T @ solution.jac
-    covariance = misfit * np.linalg.pinv(curvature)
-    return _Loading(solution.x, covariance, scale)
+    begin = np.concatenate([[first], np.linalg.lstsq(_powers(d / scale - first), f, rcond=None)[0]])
+    found = least_squares(misfit, begin, x_scale=np.maximum(np.abs(begin), 1e-3), max_nfev=100)
+    variance = float(np.sum(found.fun**2) / max(len(d) - 4, 1))
+    return _Loading(found.x, variance * np.linalg.pinv(found.jac.T @ found.jac), scale)

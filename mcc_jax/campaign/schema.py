@@ -220,13 +220,10 @@ class Campaign:
         Raises:
             InputError: if there is no such particle.
         """
-        try:
+        if particle in self.particles:
             return self.particles.index(particle)
-        except ValueError:
-            known = ", ".join(self.particles)
-            raise InputError(
-                f"there is no particle {arguments.shown(particle)}", remedy=f"There are: {known}."
-            ) from None
+        known = ", ".join(self.particles)
+        raise InputError(f"there is no particle {arguments.shown(particle)}", remedy=f"There are: {known}.")
 
     def select(self, keep: np.ndarray) -> Campaign:
         """The campaign of those particles where `keep`, booleans of shape (N,), is true.
@@ -257,9 +254,8 @@ class Campaign:
         """
         gone = {self.index(name) for name in particles}
         if len(gone) == len(self):
-            raise InputError(
-                "no particle would be left", file=self.source or None, remedy="Leave at least one particle in"
-            )
+            remedy = "Leave at least one particle in"
+            raise InputError("no particle would be left", file=self.source or None, remedy=remedy)
         return self.select(np.array([i not in gone for i in range(len(self))]))
 
 

@@ -27,9 +27,6 @@ from .validate import check_finite
 SegmentKind = Literal["approach", "load", "hold", "unload", "reload"]
 
 
-SEGMENTS = "Take those of mcc_jax.find_segments(curve)."
-
-
 @dataclass(frozen=True)
 class Segment:
     """A stretch of a curve, samples `start` to `stop - 1`.
@@ -103,16 +100,14 @@ def find_segments(
     arguments.instance(curve, Curve, "curve", A_CURVE)
     if control is not None:
         arguments.choice(control, get_args(Control), "control")
-    thresholds = {"smallest_turn": smallest_turn, "noise_multiple": noise_multiple, "band": band, "contact": contact}
-    for name, value in (thresholds | {"hold_slowness": hold_slowness}).items():
+    thresholds = {"smallest_turn": smallest_turn, "noise_multiple": noise_multiple, "band": band}
+    for name, value in (thresholds | {"contact": contact, "hold_slowness": hold_slowness}).items():
         arguments.number(value, name, least=0)
     arguments.whole(hold_samples, "hold_samples", least=1)
     if not len(curve):
         raise InputError("the curve has no point", remedy="Give a test with two points or more.")
     for name in ("time_s", "force_mN", "displacement_um"):
-        check_finite(
-            getattr(curve, name), f"the {name} of a curve", lambda text, remedy: InputError(text, remedy=remedy)
-        )
+        check_finite(getattr(curve, name), f"the {name} of a curve", InputError)
     options = DriveOptions(smallest_turn, noise_multiple, band, hold_slowness, hold_samples)
     return remembered(curve, (control, options, contact), lambda: _found(curve, control, options, contact))
 
@@ -142,32 +137,26 @@ def _found(curve: Curve, control: Control | None, options: DriveOptions, contact
 
 
 def summarise_segments(curve: Curve, segments: tuple[Segment, ...]) -> list[dict[str, Any]]:
-    """One row per segment for printing.
-
-    Args:
-        curve: the test.
-        segments: what `find_segments` gave.
+    """One row per segment, as `find_segments` gave them, for printing.
 
     Returns:
         Rows with `kind`, `samples`, `start_s`, `stop_s`, `force_from_mN`, `force_to_mN`, `displacement_from_um` and
         `displacement_to_um`; times, forces and displacements are those of the first and the last sample.
     """
     check_segmented(curve, segments)
+    columns = {
+        ("start_s", "stop_s"): curve.time_s,
+        ("force_from_mN", "force_to_mN"): curve.force_mN,
+        ("displacement_from_um", "displacement_to_um"): curve.displacement_um,
+    }
     rows: list[dict[str, Any]] = []
-    for segment in segments:
-        first, last = segment.start, segment.stop - 1
-        rows.append(
-            {
-                "kind": segment.kind,
-                "samples": len(segment),
-                "start_s": float(curve.time_s[first]),
-                "stop_s": float(curve.time_s[last]),
-                "force_from_mN": float(curve.force_mN[first]),
-                "force_to_mN": float(curve.force_mN[last]),
-                "displacement_from_um": float(curve.displacement_um[first]),
-                "displacement_to_um": float(curve.displacement_um[last]),
-            }
-        )
+    for part in segments:
+        ends = {
+            name: float(values[at])
+            for names, values in columns.items()
+            for name, at in zip(names, (part.start, part.stop - 1), strict=True)
+        }
+        rows.append({"kind": part.kind, "samples": len(part)} | ends)
     return rows
 
 
@@ -264,10 +253,9 @@ def _bend(values: np.ndarray, rise: float, abscissae: tuple[np.ndarray, ...]) ->
     for whole in abscissae:
         along = whole[: len(values)]
         low, high = along.min(), along[-1]
-        if high > low:
-            depth = float(((along - low) / (high - low) - height).max())
-            if depth > best:
-                best, bent = depth, whole
+        depth = float(((along - low) / (high - low) - height).max()) if high > low else 0.0
+        if depth > best:
+            best, bent = depth, whole
     return bent
 
 
@@ -314,5 +302,6 @@ def _assemble(drive: Drive, holds: list[Hold], force: Drive, onset: int) -> tupl
 def check_segmented(curve: Any, segments: Any) -> None:
     """Refuse what is no curve, or no segments of one."""
     arguments.instance(curve, Curve, "curve", A_CURVE)
-    for one in arguments.instance(segments, Sequence, "segments", SEGMENTS):
-        arguments.instance(one, Segment, "every one of segments", SEGMENTS)
+    remedy = "Take those of mcc_jax.find_segments(curve)."
+    for one in arguments.instance(segments, Sequence, "segments", remedy):
+        arguments.instance(one, Segment, "every one of segments", remedy)

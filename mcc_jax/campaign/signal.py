@@ -47,14 +47,11 @@ SIGNAL = SignalOptions()
 
 
 def noise_level(values: np.ndarray, span: float) -> float:
-    """Standard deviation of the noise, from differences that a smooth course does not show, plus rounding.
+    """Standard deviation of the noise of a signal of shape (n,) and this range: differences that no smooth course has,
+    plus rounding.
 
     A signal that turns every few samples, of hundreds of quick cycles, is not smooth: there the noise is no more than
     what the differences between two turning points show, nor than what cycles that repeat do from one to the next.
-
-    Args:
-        values: the signal, shape (n,).
-        span: its range.
     """
     scatter = 0.0
     if len(values) >= SIGNAL.least_samples:
@@ -159,13 +156,9 @@ def _resolution(values: np.ndarray, span: float) -> float:
 
 
 def steady_clock(time: np.ndarray) -> np.ndarray:
-    """Time with gaps shortened and repeats spread, so that dwelling is judged by samples that are there.
+    """A strictly increasing clock in units of the typical interval of times that never decrease, both of shape (n,).
 
-    Args:
-        time: never decreasing, shape (n,).
-
-    Returns:
-        A strictly increasing clock in units of the typical interval.
+    Gaps are shortened and repeats spread, so that dwelling is judged by samples that are there.
     """
     steps = differences(time)
     positive = steps[steps > 0]
@@ -222,12 +215,7 @@ def branch_envelope(values: np.ndarray) -> np.ndarray:
 
 
 def two_lines(x: np.ndarray, y: np.ndarray) -> int:
-    """The index at which a second straight line best takes over from a first, by least squares.
-
-    Args:
-        x: abscissa, shape (n,), n >= 8.
-        y: ordinate, shape (n,).
-    """
+    """The index at which a second straight line best takes over from a first, by least squares; shapes (n,), n >= 8."""
     x, y = x - x.mean(), y - y.mean()
     count = np.arange(1, len(x) + 1)
     sums = np.cumsum(np.stack([x, y, x * x, x * y, y * y]), axis=1)

@@ -55,8 +55,7 @@ def binary_kind(data: bytes) -> str | None:
 def read_bytes(file: Path, limits: FileLimits = LIMITS) -> bytes:
     """The bytes of a table or a tester's export.
 
-    Raises:
-        InputError: if it cannot be read, is empty or too large; see `mcc_jax.files`.
+    Raises `InputError` if it cannot be read, is empty or too large; see `mcc_jax.files`.
     """
     data = read_table_bytes(file, limits)
     if not data.strip(b" \t\r\n\xef\xbb\xbf"):
@@ -65,11 +64,7 @@ def read_bytes(file: Path, limits: FileLimits = LIMITS) -> bytes:
 
 
 def decode(data: bytes, file: Path, wanted: str = "plain CSV text in UTF-8") -> str:
-    """UTF-8 text, without a byte order mark.
-
-    Raises:
-        InputError: if it is compressed, binary or in another encoding.
-    """
+    """UTF-8 text, without a byte order mark. Raises `InputError` if it is compressed, binary or in another encoding."""
     kind = binary_kind(data)
     if kind is not None:
         raise InputError(f"the file is {kind}, not text", file=file, remedy=f"Save it as {wanted}")
@@ -79,9 +74,8 @@ def decode(data: bytes, file: Path, wanted: str = "plain CSV text in UTF-8") -> 
         # The decoder may count from behind the byte order mark; the bytes it saw are in the exception.
         before = bytes(error.object[: error.start])
         row = 1 + before.count(b"\n") + before.replace(b"\r\n", b"").count(b"\r")
-        raise InputError(
-            f"the byte 0x{error.object[error.start]:02x} is not UTF-8", file=file, row=row, remedy="Save it as UTF-8"
-        ) from None
+        problem = f"the byte 0x{error.object[error.start]:02x} is not UTF-8"
+        raise InputError(problem, file=file, row=row, remedy="Save it as UTF-8") from None
 
 
 def same_text(text: str) -> str:
@@ -119,57 +113,33 @@ class Table:
         return ","
 
     def refuse_groups(self, columns: Sequence[int]) -> None:
-        """Refuse numbers that look as if the decimal mark parted thousands; see `Grouping`.
-
-        Args:
-            columns: those whose numbers have one decimal mark; those with one unit are judged together.
-
-        Raises:
-            InputError: naming the cell.
-        """
+        """Refuse numbers whose decimal mark looks like one between thousands; columns of a unit are judged together."""
         mark = self.decimal_mark(columns)
-        by_unit: dict[str, Grouping] = {}
+        units: dict[str, list[int]] = {}
         for column in columns:
-            grouping = by_unit.setdefault(self.header[column].rpartition("_")[2], Grouping(mark))
-            for row, record in zip(self.rows, self.records, strict=True):
-                grouping.see(record[column], (row, column))
-        for grouping in by_unit.values():
-            if (found := grouping.found()) is not None:
-                (row, column), problem = found
-                raise InputError(
-                    problem,
-                    file=self.file,
-                    row=row,
-                    column=self.header[column],
-                    remedy="Write numbers without marks between the thousands, or all with as many decimals",
-                )
+            units.setdefault(self.header[column].rpartition("_")[2], []).append(column)
+        for alike in units.values():
+            cells = ((k, record[column]) for column in alike for k, record in enumerate(self.records))
+            if (found := thousands_for_decimals(cells, mark)) is not None:
+                k, problem = found
+                column = next(c for c in alike if mark in self.records[k][c])
+                remedy = "Write numbers without marks between the thousands, or all with as many decimals"
+                raise InputError(problem, file=self.file, row=self.rows[k], column=self.header[column], remedy=remedy)
 
     def numbers(self, columns: Sequence[int]) -> list[np.ndarray]:
-        """The cells of some columns as finite numbers, all with the same decimal mark.
+        """The cells of some columns as finite numbers, all with one decimal mark; the first that is none is named."""
+        mark, cells = self.decimal_mark(columns), list(zip(self.rows, self.records, strict=True))
+        return [np.array([self._number(record[i], mark, row, i) for row, record in cells]) for i in columns]
 
-        Raises:
-            InputError: at the first cell of a column that is none.
-        """
-        mark = self.decimal_mark(columns)
-        return [self._numbers(column, mark) for column in columns]
-
-    def _numbers(self, column: int, mark: str) -> np.ndarray:
-        values = np.empty(len(self.records))
-        for i, record in enumerate(self.records):
-            try:
-                values[i] = parse_number(record[column], mark)
-            except ValueError as error:
-                point = "a decimal point" if mark == "." else "a decimal comma, as in the other rows,"
-                if thousands_mark(record[column], mark):
-                    point += " and no mark between the thousands"
-                raise InputError(
-                    str(error),
-                    file=self.file,
-                    row=self.rows[i],
-                    column=self.header[column],
-                    remedy=f"Write a number with {point}, or remove the row",
-                ) from None
-        return values
+    def _number(self, cell: str, mark: str, row: int, column: int) -> float:
+        try:
+            return parse_number(cell, mark)
+        except ValueError as error:
+            point = "a decimal point" if mark == "." else "a decimal comma, as in the other rows,"
+            if thousands_mark(cell, mark):
+                point += " and no mark between the thousands"
+            remedy = f"Write a number with {point}, or remove the row"
+            raise InputError(str(error), file=self.file, row=row, column=self.header[column], remedy=remedy) from None
 
 
 def parse_number(cell: str, decimal_mark: str = ".", thousands: str = "") -> float:
@@ -180,8 +150,7 @@ def parse_number(cell: str, decimal_mark: str = ".", thousands: str = "") -> flo
         decimal_mark: "." or ",".
         thousands: characters each of which may stand between groups of three digits; none if empty.
 
-    Raises:
-        ValueError: if the cell is empty, text, not finite, or too large; the text says which.
+    Raises `ValueError` if the cell is empty, text, not finite, or too large; the text says which.
     """
     stripped = cell.strip()
     if not stripped:
@@ -212,37 +181,34 @@ def parse_number(cell: str, decimal_mark: str = ".", thousands: str = "") -> flo
     return number
 
 
-class Grouping:
-    """Whether a decimal mark may be one between thousands, so that readings would be a thousandth of what they are.
+def thousands_for_decimals(cells: Iterable[tuple[int, str]], mark: str) -> tuple[int, str] | None:
+    """Where a decimal mark may be one between thousands, so that readings would be a thousandth of what they are.
 
     So it looks where some cells of a quantity hold whole numbers of three digits and more without the mark (500), and
     every other one has one to three digits, the mark, and three digits (1.500). Programs write neither: with a fixed
     number of decimals 500 would be 500.000, and without a fixed one 1.500 would be 1.5.
+
+    Args:
+        cells: row and text of each.
+        mark: the decimal mark.
+
+    Returns:
+        The row of the first such cell and what is wrong with it; None if nothing is.
     """
-
-    def __init__(self, decimal_mark: str) -> None:
-        self.mark = decimal_mark
-        self.cleared = False
-        self.grouped: tuple[tuple[int, int], str] | None = None
-        self.whole: str | None = None
-
-    def see(self, cell: str, place: tuple[int, int]) -> None:
-        """Take a cell in a place, its row and column, into account."""
-        if self.cleared:
-            return
-        cell = cell.strip()
-        if self.mark in cell:
-            self.cleared = _one_group(self.mark).fullmatch(cell) is None
-            self.grouped = self.grouped or (place, cell)
-        elif self.whole is None and _WHOLE.fullmatch(cell):
-            self.whole = cell
-
-    def found(self) -> tuple[tuple[int, int], str] | None:
-        """The place of the first such cell and what is wrong with it; None if nothing is."""
-        if self.cleared or self.grouped is None or self.whole is None:
-            return None
-        place, cell = self.grouped
-        return place, f"{cell!r} beside {self.whole!r} looks like a mark between thousands, not a decimal mark"
+    grouped: tuple[int, str] | None = None
+    whole: str | None = None
+    for row, text in cells:
+        cell = text.strip()
+        if mark in cell:
+            if not _one_group(mark).fullmatch(cell):
+                return None
+            grouped = grouped or (row, cell)
+        elif whole is None and _WHOLE.fullmatch(cell):
+            whole = cell
+    if grouped is None or whole is None:
+        return None
+    row, cell = grouped
+    return row, f"{cell!r} beside {whole!r} looks like a mark between thousands, not a decimal mark"
 
 
 _WHOLE = re.compile(r"[-+]?[1-9][0-9]{2,}")
@@ -267,21 +233,11 @@ def thousands_mark(cell: str, decimal_mark: str = ".") -> str | None:
     return None
 
 
-def delimiter_of(header: str) -> str:
-    """What parts the columns of a table, told by its header: the commonest of comma, semicolon and tab."""
-    return max(",;\t", key=re.sub('"[^"]*"', "", header).count)
-
-
-def parse_header(cells: list[str], file: Path) -> tuple[str, ...]:
-    """Names of the columns, without blanks around them.
-
-    Raises:
-        InputError: if the delimiter is none of those known, a name is empty or stands there twice.
-    """
+def _header(cells: list[str], file: Path) -> tuple[str, ...]:
+    """Names of the columns, without blanks around them; none may be empty or stand there twice."""
     if len(cells) == 1 and "|" in cells[0]:
-        raise InputError(
-            "the columns are separated by '|'", file=file, row=1, remedy="Use commas, semicolons or tabs instead"
-        )
+        problem = "the columns are separated by '|'"
+        raise InputError(problem, file=file, row=1, remedy="Use commas, semicolons or tabs instead")
     header = tuple(cell.strip().strip("\ufeff").strip() for cell in cells)
     for i, name in enumerate(header):
         if not name:
@@ -297,51 +253,42 @@ def number_of_cells(count: int) -> str:
     return "1 cell" if count == 1 else f"{count} cells"
 
 
-def ragged(count: int, header: tuple[str, ...], file: Path, row: int, delimiter: str = ",") -> InputError:
-    """The error for a row with too many or too few cells."""
-    few = count < len(header)
-    where = header[count] if few else None
-    extra = "Use decimal points and quote" if delimiter == "," else "Quote"
-    what = {",": "commas", ";": "semicolons", "\t": "tabs"}[delimiter]
-    hint = "Fill the cell" if few else f"{extra} text that holds {what}"
-    problem = f"{number_of_cells(count)} where the header has {len(header)}"
-    return InputError(problem, file=file, row=row, column=where, remedy=hint)
-
-
 def make_table(found: Iterable[tuple[int, list[str]]], file: Path, delimiter: str = ",") -> Table:
     """A table from rows that are already split; rows whose cells are all empty are passed over.
 
-    Empty cells behind the last column that has a name hold nothing and are passed over, too.
+    Empty cells behind the last column that has a name hold nothing and are passed over, too. Raises `InputError` if a
+    row has another number of cells than the header, or there are no rows.
 
     Args:
         found: number of the row and its cells, the header first.
-        file: for messages.
         delimiter: what parts the columns.
-
-    Raises:
-        InputError: if a row has another number of cells than the header, or there are no rows.
     """
     full = [(row, cells) for row, cells in found if any(cell.strip() for cell in cells)]
     if not full:
         raise InputError("the file is empty", file=file, remedy="Export it again")
     names = full[0][1]
-    width = _filled(names)
+    width = filled(names)
     # A column without a name that holds something is a mistake, which the header's check names.
-    if any(len(names) >= len(cells) > width and _filled(cells) > width for _, cells in full[1:]):
+    if any(len(names) >= len(cells) > width and filled(cells) > width for _, cells in full[1:]):
         width = len(names)
-    header = parse_header(names[:width], file)
+    header = _header(names[:width], file)
     if len(full) == 1:
         raise InputError("there is a header but no row of data", file=file, row=1, remedy="Export it again")
     for row, cells in full[1:]:
-        if len(cells) < width or _filled(cells) > width:
-            raise ragged(len(cells) if len(cells) < width else _filled(cells), header, file, row, delimiter)
+        if len(cells) < width or filled(cells) > width:
+            few = len(cells) < width
+            count = len(cells) if few else filled(cells)
+            what = {",": "commas", ";": "semicolons", "\t": "tabs"}[delimiter]
+            extra = f"{'Use decimal points and quote' if delimiter == ',' else 'Quote'} text that holds {what}"
+            problem, where = f"{number_of_cells(count)} where the header has {width}", header[count] if few else None
+            raise InputError(problem, file=file, row=row, column=where, remedy="Fill the cell" if few else extra)
     return Table(file, header, [cells[:width] for _, cells in full[1:]], [row for row, _ in full[1:]], delimiter)
 
 
 _SEPARATOR = re.compile(r'"?sep=([,;\t])"?[,;\t]*(?:\r\n|\r|\n)', re.IGNORECASE)
 
 
-def _filled(cells: list[str]) -> int:
+def filled(cells: list[str]) -> int:
     """The number of cells up to the last one that holds something."""
     return next((i for i in range(len(cells), 0, -1) if cells[i - 1].strip()), 0)
 
@@ -349,13 +296,14 @@ def _filled(cells: list[str]) -> int:
 def parse_table(text: str, file: Path) -> Table:
     """The whole of a table; rows that are wholly empty are passed over.
 
-    Raises:
-        InputError: if quotes do not close, a row has another number of cells than the header, or there are no rows.
+    Raises `InputError` if quotes do not close, a row has another number of cells than the header, or there are no rows.
     """
     row, told = 1, _SEPARATOR.match(text)
     if told is not None:  # a line by which a spreadsheet is told what parts the columns
         text, row = text[told.end() :], 2
-    delimiter = told[1] if told is not None else delimiter_of(text.lstrip().partition("\n")[0].partition("\r")[0])
+    # Else the commonest of those that part columns, outside of quotes, in the header.
+    header = re.sub('"[^"]*"', "", text.lstrip().partition("\n")[0].partition("\r")[0])
+    delimiter = told[1] if told is not None else max(",;\t", key=header.count)
     reader = csv.reader(io.StringIO(text, newline=""), strict=True, delimiter=delimiter)
     found: list[tuple[int, list[str]]] = []
     above = row
@@ -364,9 +312,8 @@ def parse_table(text: str, file: Path) -> Table:
             found.append((row, record))
             row = reader.line_num + above
     except csv.Error as error:
-        raise InputError(
-            f"quotes or cells are damaged ({error})", file=file, row=row, remedy="Close every double quote"
-        ) from None
+        problem = f"quotes or cells are damaged ({error})"
+        raise InputError(problem, file=file, row=row, remedy="Close every double quote") from None
     return make_table(found, file, delimiter)
 
 

@@ -73,25 +73,16 @@ class TurningForces(NamedTuple):
 
 
 def turning_forces(curve: Curve, segments: tuple[Segment, ...], options: TurningOptions | None = None) -> TurningForces:
-    """Estimate the force at which every branch begins.
-
-    Args:
-        curve: the test.
-        segments: of the curve, from `find_segments`.
-        options: see `TurningOptions`.
-    """
+    """Estimate the force at which every branch of a test, cut by `find_segments`, begins."""
     check_segmented(curve, segments)
-    if options is not None:
-        arguments.instance(options, TurningOptions, "options", "Make one with mcc_jax.campaign.TurningOptions().")
-    options = options or TurningOptions()
+    options = TurningOptions() if options is None else options
+    arguments.instance(options, TurningOptions, "options", "Make one with mcc_jax.campaign.TurningOptions().")
     time, raw = np.asarray(curve.time_s, float), np.asarray(curve.force_mN, float)
     force, peak = raw.copy(), raw.copy()
     error, reading = np.zeros(len(raw)), np.ones(len(raw), bool)
     level, level_error = None, 0.0
     noise = noise_level(raw, float(np.ptp(raw)))
-    # Readings that saturate are replaced by what the ramps say, with an error of its own.
-    worked_out = curve.checked is not None and bool(np.any(curve.checked.force_sd_mN))
-    if worked_out:
+    if np.any(curve.worked_out):  # readings that saturate are replaced by what the ramps say, with an error of its own
         options = replace(options, share=0.0)
     for k, part in enumerate(segments):
         rows = slice(part.start, part.stop)

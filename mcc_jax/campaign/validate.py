@@ -1,9 +1,10 @@
-"""What every campaign must satisfy, whether read from files or made in memory."""
+"""What every campaign must satisfy, read from files, made in memory or joined from several."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 from .. import arguments
 from .._errors import InputError
 from .columns import LARGEST_MAGNITUDE
-from .schema import Campaign
+from .schema import Campaign, Curve, Metadata
 
 SMALLEST_DIAMETER_UM = 1e-6
 _TAKEN = ("particle", "D1_um", "D2_um", "D3_um")
@@ -21,17 +22,9 @@ _TAKEN = ("particle", "D1_um", "D2_um", "D3_um")
 def check_magnitudes(
     values: np.ndarray, file: str | Path, rows: Sequence[int], column: str, *, diameter: bool = False
 ) -> None:
-    """Refuse values that are too large to be measured, and diameters that are not positive.
+    """Refuse values that are too large to be measured, and diameters that are not positive, at the first of them.
 
-    Args:
-        values: in canonical units, shape (n,).
-        file: for messages.
-        rows: the row each value stands in.
-        column: for messages.
-        diameter: whether the values are diameters.
-
-    Raises:
-        InputError: at the first such value.
+    `values` are in canonical units, shape (n,); `rows` says in which row of the file each stands.
     """
     bad = ~(np.abs(values) <= LARGEST_MAGNITUDE)
     if diameter:
@@ -39,12 +32,10 @@ def check_magnitudes(
     if not bad.any():
         return
     i = int(np.argmax(bad))
-    value = float(values[i])
+    value, remedy = float(values[i]), "Check the number and the column's unit"
+    problem = f"{value:.4g} (in mN, um or s) is too {'small' if abs(value) < 1 else 'large'} to be real"
     if diameter and value <= 0:
         problem, remedy = f"the diameter {value:.10g} um is not positive", "Enter the measured diameter"
-    else:
-        problem = f"{value:.4g} (in mN, um or s) is " + ("too small" if abs(value) < 1 else "too large") + " to be real"
-        remedy = "Check the number and the column's unit"
     raise InputError(problem, file=file, row=rows[i], column=column, remedy=remedy)
 
 
@@ -60,10 +51,8 @@ def check_campaign(campaign: Any, name: str = "campaign", *, file: str | Path = 
         InputError: if names, shapes or values are unfit; for a path, how to read it.
     """
     if isinstance(campaign, str | PurePath):
-        raise InputError(
-            f"{name} must be a Campaign, got the path {str(campaign)!r}",
-            remedy=f"Read it first: mcc_jax.read_campaign({str(campaign)!r}).",
-        )
+        remedy = f"Read it first: mcc_jax.read_campaign({str(campaign)!r})."
+        raise InputError(f"{name} must be a Campaign, got the path {str(campaign)!r}", remedy=remedy)
     arguments.instance(campaign, Campaign, name, "Read one with mcc_jax.read_campaign(folder), or make one in memory.")
     place = file or campaign.source or f"the {name}"
 
@@ -82,7 +71,7 @@ def check_campaign(campaign: Any, name: str = "campaign", *, file: str | Path = 
         if not ((triple >= SMALLEST_DIAMETER_UM) & (triple <= LARGEST_MAGNITUDE)).all():
             raise fail(f"the diameters {triple.tolist()} um of particle {name!r} are not all positive and finite")
     for name, curve in zip(campaign.particles, campaign.curves, strict=True):
-        _check_curve(name, curve.time_s, curve.force_mN, curve.displacement_um, fail)
+        _check_curve(name, curve, fail)
     for column, cells in campaign.columns.items():
         if not column or column != column.strip() or "\ufeff" in column or column in _TAKEN or column[:3] in _DIAMETER:
             raise fail(f"{column!r} cannot be the name of a further column")
@@ -108,19 +97,85 @@ def check_finite(values: np.ndarray, what: str, fail: Callable[..., InputError])
     bad = np.flatnonzero(~(np.abs(values) <= LARGEST_MAGNITUDE))
     if bad.size:
         remedy = "Leave that sample out, or check the unit if all are so large"
-        raise fail(f"{what} is {values[bad[0]]} at sample {bad[0] + 1}", remedy)
+        raise fail(f"{what} is {values[bad[0]]} at sample {bad[0] + 1}", remedy=remedy)
 
 
-def _check_curve(
-    name: str, time: np.ndarray, force: np.ndarray, displacement: np.ndarray, fail: Callable[..., InputError]
-) -> None:
-    parts = {"time": time, "force": force, "displacement": displacement}
+def _check_curve(name: str, curve: Curve, fail: Callable[..., InputError]) -> None:
+    parts = {"time": curve.time_s, "force": curve.force_mN, "displacement": curve.displacement_um}
     for what, values in parts.items():
         check_finite(values, f"the {what} of particle {name!r}", fail)
         if what != "time" and not values.any():
             raise fail(f"every {what} of particle {name!r} is zero, so the test holds no data")
-    if len(time) < 2:
+    if len(curve) < 2:
         raise fail(f"the particle {name!r} has one row only; a curve needs at least two")
     back = np.flatnonzero(np.diff(parts["time"]) < 0)
     if len(back):
         raise fail(f"the time of particle {name!r} goes back at sample {int(back[0]) + 2}")
+
+
+_ALIKE = ("control", "punch_diameter_um", "corrections")
+_COARSEST = ("force_resolution_mN", "displacement_resolution_um")
+
+
+def join_campaigns(first: Campaign, *further: Campaign) -> Campaign:
+    """The tests of several campaigns as one, for instance those that a discovery proposed beside those it had.
+
+    Programmes of load may differ. What is read from `campaign.toml` must agree where the law or the search depend on
+    it; of resolutions the coarsest counts, provenances stand one after the other, and of further entries with one name
+    the first campaign's stays.
+
+    Args:
+        first: a campaign; its particles come first.
+        further: other ones, of the same material.
+
+    Raises:
+        InputError: if two particles have the same name, a column is not in all campaigns, or control, punch or
+            corrections differ.
+    """
+    campaigns = tuple(check_campaign(one, f"campaign {i}") for i, one in enumerate((first, *further), start=1))
+    for other in further:
+        _check_alike(first, other)
+    names = [name for campaign in campaigns for name in campaign.particles]
+    twice = [name for name, count in Counter(names).items() if count > 1]
+    if twice:
+        at = next(c for c in reversed(campaigns) if twice[0] in c.particles)
+        problem, remedy = (
+            f"the particle {twice[0]!r} is in another of the campaigns, too",
+            "Give every particle a name of its own",
+        )
+        raise InputError(problem, file=at.source or None, column="particle", remedy=remedy)
+    joined = {name: tuple(v for c in campaigns for v in c.columns[name]) for name in first.columns}
+    return Campaign(
+        tuple(names),
+        np.concatenate([campaign.diameters_um for campaign in campaigns]),
+        tuple(curve for campaign in campaigns for curve in campaign.curves),
+        joined,
+        _metadata([campaign.metadata for campaign in campaigns]),
+        ", ".join(dict.fromkeys(campaign.source for campaign in campaigns if campaign.source)),
+    )
+
+
+def _check_alike(first: Campaign, other: Campaign) -> None:
+    for name in sorted(first.columns.keys() ^ other.columns.keys()):
+        lacking = other if name in first.columns else first
+        problem, remedy = (
+            "the column is in another of the campaigns only",
+            "Enter it for all particles, or leave it out everywhere",
+        )
+        raise InputError(problem, file=lacking.source or None, column=name, remedy=remedy)
+    for name in _ALIKE:
+        one, another = getattr(first.metadata, name), getattr(other.metadata, name)
+        if one != another:
+            problem = f"{name} is {another!r} here and {one!r} in the first campaign"
+            remedy = "Such tests are not of one kind; judge them apart, or correct the entry"
+            raise InputError(problem, file=other.source or None, remedy=remedy)
+
+
+def _metadata(each: list[Metadata]) -> Metadata:
+    coarsest = {}
+    for name in _COARSEST:
+        known = [value for m in each if (value := getattr(m, name)) is not None]
+        coarsest[name] = max(known, default=None)
+    told = dict.fromkeys(m.provenance for m in each if m.provenance)
+    other = {name: value for m in reversed(each) for name, value in m.other.items()}
+    return replace(each[0], **coarsest, provenance="; ".join(told) or None, other=other)

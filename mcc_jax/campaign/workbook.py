@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import re
 import zipfile
@@ -11,13 +12,9 @@ from typing import Any
 
 from .._errors import InputError
 from .._extras import extra
+from ..files import LIMITS
 
 _BOOK = "xl/workbook.xml"
-LARGEST_UNPACKED = 512 * 2**20
-"""Bytes that a workbook may unpack to: what a zip archive of tests may, see `readers._micromaterials`."""
-MAX_CELLS = 40_000_000
-"""Cells of a sheet's rectangle, empty ones included, since the engine makes room for all (32 bytes each): a full
-sheet of 1,048,576 rows has 38 columns then; a cell alone in the last row and column would ask for 17e9."""
 _LAST = re.compile(rb'<c\b[^>]*?\br="([A-Z]{1,3})([0-9]{1,7})"')
 _REMEDY = "Open it in a spreadsheet program and save it again, or save the sheet as CSV"
 
@@ -44,16 +41,13 @@ def read_sheet(
 ) -> list[tuple[int, list[str]]]:
     """The rows of a sheet: the number of each and its cells as text, numbers with all their digits.
 
+    Raises `InputError` if it is damaged or too large, the sheet is not there or not told, or calamine is not installed.
+
     Args:
-        data: the workbook's bytes.
-        file: for messages.
         sheet: the sheet's name, or its number, 1 for the first; None for the only one that holds anything.
         preferred: the name of the sheet to take, if there is one, where `sheet` is None.
         decimal_mark: how numbers are written; "." or ",".
         how: how a sheet is chosen, for the message where there are several; one sentence.
-
-    Raises:
-        InputError: if it is damaged or too large, the sheet is not there or not told, or calamine is not installed.
     """
     import pandas as pd
 
@@ -76,31 +70,26 @@ def read_sheet(
         raise InputError(f"{where} is empty", file=file, remedy="Save the workbook again with the table in it")
     if len(held) > 1:
         listed = ", ".join(map(repr, held))
-        raise InputError(
-            f"{len(held)} sheets hold something: {listed}",
-            file=file,
-            remedy=how or f"Call the sheet with the table {preferred!r}, or save it alone",
-        )
+        remedy = how or f"Call the sheet with the table {preferred!r}, or save it alone"
+        raise InputError(f"{len(held)} sheets hold something: {listed}", file=file, remedy=remedy)
     (frame,) = held.values()
-    cells = ([_text(value, decimal_mark) for value in row] for row in frame.itertuples(index=False, name=None))
-    return [(number, row) for number, row in enumerate(cells, start=1)]
+
+    def text(value: Any) -> str:
+        return repr(value).replace(".", decimal_mark) if isinstance(value, float) else str(value)
+
+    rows = frame.itertuples(index=False, name=None)
+    return [(number, [text(value) for value in row]) for number, row in enumerate(rows, start=1)]
 
 
 def _choose(names: list[str], sheet: str | int | None, preferred: str | None, file: Path) -> str | None:
-    if isinstance(sheet, int) and sheet <= len(names):
-        return names[sheet - 1]
     if sheet is None:
         return preferred if preferred in names else None
-    if sheet not in names:
-        what = f"sheet {sheet}" if isinstance(sheet, int) else f"sheet called {sheet!r}"
-        raise InputError(f"there is no {what}", file=file, remedy=f"The sheets are: {', '.join(map(repr, names))}")
-    return str(sheet)
-
-
-def _text(value: Any, decimal_mark: str) -> str:
-    if isinstance(value, float):
-        return repr(value).replace(".", decimal_mark)
-    return str(value)
+    if isinstance(sheet, int) and sheet <= len(names):
+        return names[sheet - 1]
+    if sheet in names:
+        return str(sheet)
+    what = f"sheet {sheet}" if isinstance(sheet, int) else f"sheet called {sheet!r}"
+    raise InputError(f"there is no {what}", file=file, remedy=f"The sheets are: {', '.join(map(repr, names))}")
 
 
 def _check_size(data: bytes, file: Path) -> None:
@@ -108,7 +97,7 @@ def _check_size(data: bytes, file: Path) -> None:
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             entries = archive.infolist()
-            if sum(entry.file_size for entry in entries) > LARGEST_UNPACKED:
+            if sum(entry.file_size for entry in entries) > LIMITS.unpacked_bytes:
                 raise InputError("the workbook is too large", file=file, remedy="Save the sheet alone, or as CSV")
             for entry in entries:
                 if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
@@ -120,19 +109,14 @@ def _check_size(data: bytes, file: Path) -> None:
                     raise zipfile.BadZipFile  # noqa: TRY301
                 if not entry.filename.startswith("xl/worksheets/"):
                     continue
-                last = [0, 0]
-                for cell in _LAST.finditer(content):
-                    letters, digits = cell.groups()
-                    column = 0
-                    for letter in letters:
-                        column = 26 * column + letter - 64
-                    last = [max(last[0], int(digits)), max(last[1], column)]
-                if last[0] * last[1] > MAX_CELLS:
-                    raise InputError(
-                        f"a sheet reaches to row {last[0]} and column {last[1]}, which is too large",
-                        file=file,
-                        remedy="Delete the rows and columns without content behind the table, or save it as CSV",
-                    )
+                rows, columns = 0, 0
+                for letters, digits in _LAST.findall(content):
+                    column = functools.reduce(lambda number, letter: 26 * number + letter - 64, letters, 0)
+                    rows, columns = max(rows, int(digits)), max(columns, column)
+                if rows * columns > LIMITS.sheet_cells:
+                    problem = f"a sheet reaches to row {rows} and column {columns}, which is too large"
+                    remedy = "Delete the rows and columns without content behind the table, or save it as CSV"
+                    raise InputError(problem, file=file, remedy=remedy)
     except (zipfile.BadZipFile, zlib.error, ValueError, OSError, NotImplementedError, EOFError, RuntimeError) as error:
         if isinstance(error, InputError):
             raise

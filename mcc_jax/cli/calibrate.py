@@ -13,27 +13,23 @@ import click
 from click.core import ParameterSource
 
 from .._store import Stage, results
-from .options import (
-    CampaignFolder,
-    json_option,
-    law_options,
-    leave_out_option,
-    no_figures_option,
-    out_option,
-    priors_option,
-    seed_option,
-    threshold_option,
-)
-from .session import NOT_CONVERGED, Tell, beside, import_writers, say, say_table, session
-from .shared import (
+from . import options as common
+from .session import (
+    NOT_CONVERGED,
+    Tell,
+    beside,
+    import_writers,
     joint_model,
     listed,
     provenance,
     read_without,
     require_particle,
+    say,
     say_files,
     say_json,
+    say_table,
     sentence,
+    session,
     write_figures,
 )
 
@@ -45,36 +41,24 @@ if TYPE_CHECKING:
 
 RESULT, POSTERIOR, ARCHIVE = "calibration.json", "posterior.nc", "calibration.msgpack"
 METHODS = ("paper", "least-squares", "bayes")
-# Which methods an option belongs to; given with another one it would be ignored, so it is refused.
+JOINT = ("least-squares", "bayes")
 BELONGS = {
-    "objective": ("paper",),
-    "reference": ("paper",),
+    **dict.fromkeys(("objective", "reference"), ("paper",)),
     "loss": ("least-squares",),
-    "mode": ("bayes",),
-    "chains": ("bayes",),
-    "draws": ("bayes",),
-    "priors": ("least-squares", "bayes"),
-    "modulus_scatter": ("least-squares", "bayes"),
-    "shape_scatter": ("least-squares", "bayes"),
-    "robust": ("least-squares", "bayes"),
-    "effects": ("least-squares", "bayes"),
-    "varying": ("least-squares", "bayes"),
+    **dict.fromkeys(("mode", "chains", "draws"), ("bayes",)),
+    **dict.fromkeys(("priors", "modulus_scatter", "shape_scatter", "robust", "effects", "varying"), JOINT),
 }
+"""Which methods an option belongs to; given with another one it would be ignored, so it is refused."""
 NO_SETTINGS = ("campaign", "out", "no_figures", "as_json")
 
 
-def _applies(name: str, method: str) -> bool:
-    """Whether an option says how a result of this method comes about."""
-    return name not in NO_SETTINGS and method in BELONGS.get(name, METHODS)
-
-
 @click.command(short_help="Fit the law to a campaign.")
-@click.argument("campaign", type=CampaignFolder(), metavar="CAMPAIGN")
-@out_option(required=True)
+@common.campaign()
+@common.out(required=True)
 @click.option("--method", type=click.Choice(METHODS), default="bayes", show_default=True, help="How to calibrate.")
-@leave_out_option
-@threshold_option(". paper: of the offset step, which 0 leaves out; otherwise: points below it do not count.")
-@priors_option("  [least-squares, bayes]")
+@common.leave_out
+@common.threshold(". paper: of the offset step, which 0 leaves out; otherwise: points below it do not count.")
+@common.priors("  [least-squares, bayes]")
 @click.option(
     "--modulus-scatter", is_flag=True, help="Let every particle have its own modulus.  [least-squares, bayes]"
 )
@@ -93,38 +77,28 @@ def _applies(name: str, method: str) -> bool:
 )
 @click.option("--shape-scatter", is_flag=True, help="Let a differ from particle to particle.  [least-squares, bayes]")
 @click.option("--robust", is_flag=True, help="Noise with heavy tails: spikes count for little.  [least-squares, bayes]")
-@click.option(
-    "--mode",
-    type=click.Choice(["fast", "joint"]),
-    default="fast",
-    show_default=True,
-    help="Integrate the particles out, or sample everything at once (minutes).  [bayes]",
+@common.one_of(
+    "--mode", ("fast", "joint"), "Integrate the particles out, or sample everything at once (minutes).  [bayes]"
 )
 @click.option("--chains", type=click.IntRange(1, 64), default=4, show_default=True, help="Chains.  [bayes]")
 @click.option(
     "--draws", type=click.IntRange(20, 100_000), default=1000, show_default=True, help="Draws per chain.  [bayes]"
 )
-@click.option(
+@common.one_of(
     "--loss",
-    type=click.Choice(["linear", "soft_l1", "cauchy"]),
-    default="linear",
-    show_default=True,
-    help="Loss of the residuals; all but linear bear outliers.  [least-squares]",
+    ("linear", "soft_l1", "cauchy"),
+    "Loss of the residuals; all but linear bear outliers.  [least-squares]",
 )
-@click.option(
-    "--objective",
-    type=click.Choice(["full", "reference"]),
-    default="full",
-    show_default=True,
-    help="Which objective's a the rest is built on; both are reported.  [paper]",
+@common.one_of(
+    "--objective", ("full", "reference"), "Which objective's a the rest is built on; both are reported.  [paper]"
 )
 @click.option(
     "--reference", metavar="NAME", help="Reference particle of that objective; by the paper's rule if absent.  [paper]"
 )
-@law_options
-@no_figures_option
-@seed_option()
-@json_option(RESULT)
+@common.law
+@common.no_figures
+@common.seed()
+@common.json(RESULT)
 @click.pass_context
 def calibrate(
     context: click.Context, campaign: Path, out: Path, method: str, no_figures: bool, as_json: bool, **options: Any
@@ -158,7 +132,9 @@ def calibrate(
         data = read_without(campaign, options["leave_out"], tell)
         if options["reference"] is not None:
             require_particle(options["reference"], data, "--reference")
-        origin = provenance("calibrate", campaign, {n: v for n, v in context.params.items() if _applies(n, method)})
+        # What says how a result of this method comes about.
+        told = {n: v for n, v in context.params.items() if n not in NO_SETTINGS and method in BELONGS.get(n, METHODS)}
+        origin = provenance("calibrate", campaign, told)
         writers = functools.partial(import_writers, figures=not no_figures, posterior=method == "bayes")
         with results(out) as stage, beside(writers):
             calibration = _calibrated(data, method, options, tell)
@@ -200,17 +176,7 @@ def write_calibration(
     """Write the calibration, the figures and, if there is one, the posterior into the stage.
 
     Files that an earlier calibration lists as its own, and this one does not write, become stale: they would contradict
-    what lies beside them now.
-
-    Args:
-        calibration: what was found.
-        stage: where to write.
-        origin: data, settings and versions, as `provenance` gives them.
-        figures: whether to draw.
-        tell: progress.
-
-    Returns:
-        The contents of `calibration.json`.
+    what lies beside them now. `origin` is what `provenance` gives. Returns the contents of `calibration.json`.
     """
     from ..calibrate import Posterior, write_posterior
 
@@ -228,12 +194,9 @@ def write_calibration(
 def _draw(calibration: Calibration) -> Mapping[str, Any]:
     from ..plots import least_squares_figures, paper_figures, posterior_figures
 
-    figures: dict[str, Callable[[Any], Mapping[str, Any]]] = {
-        "paper": paper_figures,
-        "least-squares": least_squares_figures,
-        "bayes": posterior_figures,
-    }
-    return figures[calibration.to_json()["method"]](calibration)
+    draw: dict[str, Callable[[Any], Mapping[str, Any]]]
+    draw = {"paper": paper_figures, "least-squares": least_squares_figures, "bayes": posterior_figures}
+    return draw[calibration.to_json()["method"]](calibration)
 
 
 def main_numbers(content: dict[str, Any]) -> list[tuple[str, str]]:
@@ -258,47 +221,40 @@ def main_numbers(content: dict[str, Any]) -> list[tuple[str, str]]:
 
 def median_text(log: dict[str, Any]) -> str:
     """The exponential of an estimate of a logarithm, with its standard deviation."""
-    median = _exp(log["value"])
+    value = log["value"]
+    median = None if value is None or value > 700 else math.exp(value)
     return estimate_text({"value": median, "sd": None if log["sd"] is None or median is None else median * log["sd"]})
 
 
 def estimate_text(estimate: dict[str, Any], factor: float = 1.0) -> str:
     """A value with its standard deviation, which decides the digits of both."""
+    from .._format import decimals
+
     value, sd = estimate["value"], estimate["sd"]
-    if value is None or sd is None or not sd > 0:
-        return _number(None if value is None else value * factor)
-    value, sd = value * factor, sd * factor
-    digits = max(0, 1 - math.floor(math.log10(sd)))
-    if digits > 6 or abs(value) >= 1e6:
-        return f"{value:.4g} +- {sd:.2g}"
-    return f"{value:.{digits}f} +- {sd:.{digits}f}"
-
-
-def _exp(value: float | None) -> float | None:
-    return None if value is None or value > 700 else math.exp(value)
-
-
-def _number(value: float | None) -> str:
-    return "unknown" if value is None else f"{value:.4g}"
+    if value is None:
+        return "unknown"
+    value *= factor
+    if sd is None or not sd > 0:
+        return f"{value:.4g}"
+    places = decimals(value, sd * factor)
+    if places is None:
+        return f"{value:.4g} +- {sd * factor:.2g}"
+    return f"{value:.{places}f} +- {sd * factor:.{places}f}"
 
 
 def say_state(content: dict[str, Any]) -> None:
     """Print how many particles took part, whether the fit converged, and whether its numbers can be true."""
-    used = sum(entry["kept"] for entry in content["particles"])
-    law = content["law"]
-    say(
-        f"Method {content['method']}: {used} of {len(content['particles'])} particles, "
-        + (f"a by the {content['a_objective']} objective, " if "a_objective" in content else "")
-        + f"unloading {law['unloading']}, strain scaling {law['strain_scaling']}; "
-        + _state(content)
-    )
-
-
-def _state(content: dict[str, Any]) -> str:
+    used, law = sum(entry["kept"] for entry in content["particles"]), content["law"]
+    objective = f"a by the {content['a_objective']} objective, " if "a_objective" in content else ""
+    state = "converged."
     if not content["converged"]:
-        return "NOT converged."
-    bad = any(one["level"] == "bad" for one in content["findings"])
-    return "the optimisers converged, but NOT TO BE TRUSTED: see below." if bad else "converged."
+        state = "NOT converged."
+    elif any(one["level"] == "bad" for one in content["findings"]):
+        state = "the optimisers converged, but NOT TO BE TRUSTED: see below."
+    say(
+        f"Method {content['method']}: {used} of {len(content['particles'])} particles, {objective}"
+        f"unloading {law['unloading']}, strain scaling {law['strain_scaling']}; {state}"
+    )
 
 
 def say_warnings(content: dict[str, Any]) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 
 from .._store import results
-from .options import Location, out_option, seed_option
+from . import options as common
 from .session import say, say_table, session
 
 SHOWN = 12
@@ -19,8 +19,8 @@ KINDS = ("approach", "load", "hold", "unload", "reload")
 
 
 @click.command(short_help="Turn a tester's file, or a folder of them, into a campaign.")
-@click.argument("file", type=Location(), metavar="FILE|FOLDER")
-@out_option(required=True)
+@click.argument("file", type=common.Location(), metavar="FILE|FOLDER")
+@common.out(required=True)
 @click.option(
     "--diameters",
     metavar="D1,D2,D3|FILE",
@@ -29,7 +29,7 @@ KINDS = ("approach", "load", "hold", "unload", "reload")
 )
 @click.option(
     "--mapping",
-    type=Location(),
+    type=common.Location(),
     multiple=True,
     metavar="FILE",
     help="TOML file that says what stands where, for any other text table or Excel workbook; repeatable, for a FOLDER "
@@ -41,7 +41,7 @@ KINDS = ("approach", "load", "hold", "unload", "reload")
     metavar="NAME",
     help='A file of FOLDER to leave out; may hold "*" and "?"; repeatable.',
 )
-@seed_option("Recorded in campaign.toml; converting itself draws no random number.")
+@common.seed("Recorded in campaign.toml; converting itself draws no random number.")
 def convert(
     file: Path, out: Path, diameters: str | None, mapping: tuple[Path, ...], skip: tuple[str, ...], seed: int
 ) -> None:
@@ -75,6 +75,8 @@ def convert(
     if diameters is not None and not diameters.strip():
         raise click.BadParameter("it is empty.", param_hint="--diameters")
     with session(3) as tell:
+        import numpy as np
+
         from ..campaign import (
             campaign_findings,
             check_plausibility,
@@ -100,23 +102,17 @@ def convert(
     points = sum(len(curve) for curve in campaign.curves)
     source = (campaign.metadata.provenance or "").partition(";")[0]
     say(f"{len(campaign)} test{'s' if len(campaign) > 1 else ''}, {points} points ({source}).")
+    peaks = [(curve.force_mN.max(), curve.displacement_um.max()) for curve in campaign.curves]
     rows = [
-        (
-            name,
-            str(len(curve)),
-            f"{curve.force_mN.max():.4g}",
-            f"{curve.displacement_um.max():.4g}",
-            *(str(found[kind]) for kind in KINDS),
-        )
-        for name, curve, found in zip(campaign.particles, campaign.curves, segments, strict=True)
+        (name, str(len(curve)), *(f"{peak:.4g}" for peak in of), *(str(found[kind]) for kind in KINDS))
+        for name, curve, of, found in zip(campaign.particles, campaign.curves, peaks, segments, strict=True)
     ]
     say_table(("test", "points", "max force mN", "max displ um", *KINDS), rows[:SHOWN])
     if len(rows) > SHOWN:
-        force = [curve.force_mN.max() for curve in campaign.curves]
-        displacement = [curve.displacement_um.max() for curve in campaign.curves]
+        (force, displacement), (most_force, farthest) = np.min(peaks, axis=0), np.max(peaks, axis=0)
         say(
-            f"  ... and {len(rows) - SHOWN} more; in all, max force {min(force):.4g} to {max(force):.4g} mN, "
-            f"max displ {min(displacement):.4g} to {max(displacement):.4g} um"
+            f"  ... and {len(rows) - SHOWN} more; in all, max force {force:.4g} to {most_force:.4g} mN, "
+            f"max displ {displacement:.4g} to {farthest:.4g} um"
         )
     total = sum(segments, Counter())
     say("Segments in all: " + ", ".join(f"{total[kind]} {kind}" for kind in KINDS) + ".")

@@ -3,35 +3,47 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import math
 import shlex
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from .._store import Stage, results
+from . import options as common
 from .calibrate import estimate_text, median_text, say_state, say_warnings, write_calibration
 from .discover import DISCOVERY, main_finding, write_discovery
-from .options import out_option, seed_option
 from .report import REPORT
-from .sealed import SEALED, compared, sealed_answer
-from .session import Tell, beside, import_writers, say, say_table, session
-from .shared import provenance, say_files
+from .session import Tell, beside, import_writers, provenance, say, say_files, say_table, session
 
 if TYPE_CHECKING:
     from ..campaign import Campaign
     from ..simulate import HiddenEffect
 
+SEALED = "sealed.json"
+
+STRENGTHS = {
+    "reload_hysteresis": (0.15, 0.3),
+    "frame_compliance": (2e-3, 4e-3),
+    "creep": (3e-4, 6e-4),
+    "unloading_shape": (0.08, 0.15),
+}
+"""What may be hidden, and between which amplitudes: effects that eight particles show beyond doubt.
+
+`benchmarks/results/` says how often weaker and other ones are found.
+"""
 CAMPAIGN_FILES = ("particles.csv", "curves.csv", "campaign.toml")
 NOTHING = "nothing-hidden"
 PARTICLES = 8
 
 
 @click.command(short_help="Hide an effect, find it, and once more with nothing hidden.")
-@out_option(default="mcc-jax-demo", show_default=True)
-@seed_option("Draws what is hidden, the particles and the noise.")
+@common.out(default="mcc-jax-demo", show_default=True)
+@common.seed("Draws what is hidden, the particles and the noise.")
 def demo(out: Path, seed: int) -> None:
     """Hide in simulated tests an effect that the law does not contain, find it, add it to the law, and break the seal.
 
@@ -103,7 +115,13 @@ def _job(
     campaign, seed = _campaign(settings["seed"], effect), settings["seed"]
     write_campaign(campaign, stage.folder / "campaign")
     origin = provenance("demo", stage.folder / "campaign", settings, told="campaign")
-    with beside(_import_the_rest):  # compilers leave a core to Python
+
+    def rest() -> None:
+        from .. import discover, report  # noqa: F401
+
+        import_writers(figures=True, posterior=True)
+
+    with beside(rest):  # seconds to import, for which compilers leave a core to Python
         calibration = sample(campaign, seed=seed, progress=tell)
     from ..discover import discover
     from ..report import read_results, report_page
@@ -128,13 +146,6 @@ def _campaign(seed: int, effect: HiddenEffect | None) -> Campaign:
     made = paper_campaign(seed, programme=programme, effects=() if effect is None else (effect,))
     some = made.select(np.arange(len(made)) < PARTICLES)
     return dataclasses.replace(some, columns={}, metadata=dataclasses.replace(some.metadata, other={}))
-
-
-def _import_the_rest() -> None:
-    """What the demo needs after calibrating, seconds to import: discovery, drawing, the page, the posterior's file."""
-    from .. import discover, report  # noqa: F401
-
-    import_writers(figures=True, posterior=True)
 
 
 def _say_found(calibration: dict[str, Any], found: dict[str, Any]) -> None:
@@ -173,3 +184,71 @@ def _numbers(sides: list[dict[str, Any]]) -> list[tuple[str, ...]]:
             for name, (mean, _) in PAPER_LOG_C.items()
         ),
     ]
+
+
+@dataclass(frozen=True)
+class Sealed:
+    """An answer that nobody can change unnoticed.
+
+    Attributes:
+        effect: what is hidden.
+        text: the answer with a number used once, without which the few possible answers could be tried.
+    """
+
+    effect: HiddenEffect
+    text: str
+
+    @property
+    def sha256(self) -> str:
+        """The seal: `sha256sum sealed.json` gives it, too."""
+        return hashlib.sha256(self.text.encode()).hexdigest()
+
+
+def sealed_answer(seed: int) -> Sealed:
+    """Draw what is hidden, how strong it is, and the number used once."""
+    import numpy as np
+
+    from ..effects import find_variant
+    from ..simulate import HiddenEffect
+
+    rng = np.random.default_rng([seed, 0x5EA1])
+    name = list(STRENGTHS)[int(rng.integers(len(STRENGTHS)))]
+    low, high = STRENGTHS[name]
+    amplitude = float(f"{low * (high / low) ** rng.random():.3g}")
+    effect = HiddenEffect(find_variant(name), amplitude)
+    variant = effect.variant
+    answer = {
+        "mechanism": name,
+        "variant": variant.name,
+        "parameters": {variant.parameter: amplitude} | {n.name: n.middle for n in variant.nuisances},
+        "nonce": rng.bytes(16).hex(),
+    }
+    return Sealed(effect, json.dumps(answer) + "\n")
+
+
+def compared(answer: dict[str, Any], found: dict[str, Any]) -> tuple[bool, str]:
+    """Whether a discovery (discovery.json) named what was hidden (sealed.json), and in a sentence how both agree."""
+    hidden = answer["mechanism"]
+    named = [effect["mechanism"] for effect in found["effects"]]
+    if named != [hidden]:
+        told = " and ".join(map(_plain, named)) or f"no name (verdict {found['verdict']})"
+        return False, f"The discovery is WRONG: hidden was {_plain(hidden)}, found was {told}."
+    effect = found["effects"][0]
+    rivals = [_plain(name) for name in found["candidate_set"][0] if name != hidden]
+    doubt = f", though these tests cannot tell it from {' or '.join(rivals)}" if rivals else ""
+    if effect["variant"] != answer["variant"]:
+        formulas = f"{_plain(effect['variant'])}, hidden was {_plain(answer['variant'])}"
+        return True, f"The name agrees{doubt}; the formula is another ({formulas}), so amplitudes do not compare."
+    name, true = next(iter(answer["parameters"].items()))
+    value, sd, ends = (effect["parameters"][name][key] for key in ("value", "sd", "interval_95"))
+    where = "unknown" if ends is None else "inside" if ends[0] <= true <= ends[1] else "OUTSIDE"
+    off = f"{100 * (value / true - 1):+.1f} %"
+    spread = "" if not sd else f", {abs(value - true) / sd:.1f} standard deviations"
+    return True, (
+        f"The name agrees{doubt}. The amplitude found is off by {off}{spread}; "
+        f"the true one lies {where} its 95 % interval."
+    )
+
+
+def _plain(name: str) -> str:
+    return name.replace("_", " ")

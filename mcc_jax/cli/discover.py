@@ -1,4 +1,4 @@
-"""`mcc-jax discover`."""
+"""`mcc-jax discover`, and `mcc-jax power`, which asks the same of a campaign before it is measured."""
 
 from __future__ import annotations
 
@@ -11,37 +11,40 @@ import click
 
 from .._errors import InputError
 from .._store import Stage, results
-from .options import (
-    CampaignFolder,
-    exclude_option,
-    json_option,
-    law_options,
-    leave_out_option,
-    no_figures_option,
-    out_option,
-    priors_option,
-    seed_option,
-    threshold_option,
+from . import options as common
+from .session import (
+    Tell,
+    beside,
+    import_writers,
+    joint_model,
+    provenance,
+    read_without,
+    say,
+    say_files,
+    say_json,
+    say_table,
+    sentence,
+    session,
+    write_figures,
+    write_result,
 )
-from .session import Tell, beside, import_writers, say, say_table, session
-from .shared import joint_model, provenance, read_without, say_files, say_json, sentence, write_figures
 
 if TYPE_CHECKING:
     from ..discover import Discovery
 
-DISCOVERY = "discovery.json"
+DISCOVERY, POWER = "discovery.json", "power.json"
 ROWS = 6
 """So many mechanisms stand in the table; the file has all."""
 
 
 @click.command(short_help="Find, name and add what the law misses.")
-@click.argument("campaign", type=CampaignFolder(), metavar="CAMPAIGN")
-@out_option(required=True)
-@exclude_option
-@leave_out_option
-@threshold_option(default=0.0)
-@priors_option()
-@law_options
+@common.campaign()
+@common.out(required=True)
+@common.exclude
+@common.leave_out
+@common.threshold(default=0.0)
+@common.priors()
+@common.law
 @click.option(
     "--no-held-out", is_flag=True, help="Do not repeat the search without each particle: no gap on unseen particles."
 )
@@ -49,9 +52,9 @@ ROWS = 6
 @click.option(
     "--no-posterior", is_flag=True, help="Do not sample the law with effects: standard errors of its fit instead."
 )
-@no_figures_option
-@seed_option("Seed of the bootstrap.")
-@json_option(DISCOVERY)
+@common.no_figures
+@common.seed("Seed of the bootstrap.")
+@common.json(DISCOVERY)
 def discover(
     campaign: Path,
     out: Path,
@@ -104,8 +107,7 @@ def discover(
 def require_mechanisms(names: tuple[str, ...]) -> None:
     """Refuse to exclude what does not exist, before anything is computed.
 
-    Raises:
-        InputError: naming the mechanisms there are.
+    Raises `InputError` naming the mechanisms there are.
     """
     from ..effects import LIBRARY
 
@@ -143,17 +145,11 @@ def say_discovery(content: dict[str, Any]) -> None:
         return
     say()
     rows = []
+    forms = {"statistic": ".1f", "estimate": ".3g", "detection_limit": ".2g", "probability": ".3f"}
     for entry in content["ranking"][:ROWS]:
-        unit = "" if entry["unit"] == "-" else f" {entry['unit']}"
-        rows.append(
-            (
-                entry["mechanism"],
-                _number(entry["statistic"], ".1f"),
-                f"{_number(entry['estimate'], '.3g')}{unit}",
-                f"{_number(entry['detection_limit'], '.2g')}{unit}",
-                _number(entry["probability"], ".3f"),
-            )
-        )
+        units = {"estimate": entry["unit"], "detection_limit": entry["unit"]}
+        numbers = (_number(entry[name], form, units.get(name, "-")) for name, form in forms.items())
+        rows.append((entry["mechanism"], *numbers))
     say_table(("mechanism", "statistic", "estimate", "detection limit", "probability"), rows)
     further = len(content["ranking"]) - len(rows)
     say(
@@ -162,8 +158,8 @@ def say_discovery(content: dict[str, Any]) -> None:
     )
 
 
-def _number(value: float | None, form: str) -> str:
-    return "unknown" if value is None else format(value, form)
+def _number(value: float | None, form: str, unit: str = "-") -> str:
+    return ("unknown" if value is None else format(value, form)) + ("" if unit == "-" else f" {unit}")
 
 
 def main_finding(content: dict[str, Any]) -> str:
@@ -180,3 +176,56 @@ def main_finding(content: dict[str, Any]) -> str:
     closed = content["gap"]["closed_fraction"]
     gap = "" if closed is None else f"; it closes {100 * closed:.0f} % of the gap on held-out particles"
     return f"missing is {names}{sure}{gap}"
+
+
+@click.command(short_help="Say what a planned campaign could show.")
+@common.campaign()
+@common.out(required=True)
+@common.exclude
+@common.threshold(default=0.0)
+@common.priors()
+@common.law
+@common.seed("For the record: nothing here is random.")
+@common.json(POWER, "a table")
+def power(campaign: Path, out: Path, seed: int, as_json: bool, **options: Any) -> None:
+    """Say how large each mechanism must be for the tests in the folder CAMPAIGN to show it, and which they cannot tell
+    apart. CAMPAIGN is what `mcc-jax simulate` makes of your plan with your tester's noise, or a measured campaign.
+
+    Writes power.json into DIR.
+
+    \b
+    Example: would twelve particles with a hold and a reload do?
+      mcc-jax simulate --particles twelve.csv --out planned --levels 0.5,1,1 --hold-s 20 --noise-um 0.05 --noise-mN 0.05
+      mcc-jax power planned --out planned
+    """
+    with session(20) as tell:
+        from ..discover import power_of_campaign
+        from ..effects import LIBRARY
+
+        require_mechanisms(options["exclude"])
+        data = read_without(campaign, (), tell)
+        with results(out) as stage:
+            found = power_of_campaign(
+                data,
+                library={name: m for name, m in LIBRARY.items() if name not in options["exclude"]},
+                model=joint_model(options),
+                threshold_MPa=options["threshold_MPa"],
+                progress=tell,
+            )
+            content: dict[str, Any] = found.to_json() | {"seed": seed}
+            write_result(stage, POWER, content)
+    if as_json:
+        say_json(content)
+        return
+    rows = []
+    for entry in content["mechanisms"]:
+        limits = (_number(value, ".2g", entry["unit"]) for value in (entry["detection_limit"], entry["plausible"][1]))
+        rows.append((entry["mechanism"], *limits, "yes" if entry["visible"] else "no"))
+    say_table(("mechanism", "found from", "largest plausible", "can be seen"), rows)
+    for entry in content["untestable"]:
+        say(f"{entry['mechanism']} needs {entry['needs']}.")
+    for entry in content["inseparable"]:
+        one, other = entry["pair"]
+        say(f"{one} and {other} look alike ({100 * entry['similarity']:.0f} %).")
+    say()
+    say_files(out, [POWER])

@@ -7,16 +7,16 @@ from pathlib import Path
 import click
 
 from .._store import results
-from .options import Location, out_option, seed_option
-from .session import say, session
+from . import options as common
+from .session import say, say_files, sentence, session
 
 FORMATS = ("json", "csv", "jax", "c", "lammps", "yade")
 
 
 @click.command(short_help="Hand the calibrated law to other engines.")
-@click.argument("directory", type=Location(), metavar="DIR")
+@click.argument("directory", type=common.Location(), metavar="DIR")
 @click.option("--format", "form", type=click.Choice(FORMATS), required=True, help="What to write; see below.")
-@out_option(required=True)
+@common.out(required=True)
 @click.option("--particle", metavar="NAME", help="Take this particle's coefficients instead of the population's.")
 @click.option(
     "--diameters",
@@ -27,7 +27,7 @@ FORMATS = ("json", "csv", "jax", "c", "lammps", "yade")
 @click.option(
     "--allow-not-monotone", is_flag=True, help="Export a law whose stress falls on loading, instead of refusing it."
 )
-@seed_option("Seed of the random paths in the golden table.")
+@common.seed("Seed of the random paths in the golden table.")
 def export(
     directory: Path,
     form: str,
@@ -77,7 +77,5 @@ def export(
     sizes = " x ".join(f"{float(d):.4g}" for d in (shown.D1, shown.D2, shown.D3))
     say(f"Golden table of a particle of {sizes} um ({origin.geometry}).")
     for warning in origin.warnings:
-        say(f"Warning: {warning[:1].upper()}{warning[1:].rstrip('.')}.", fg="yellow")
-    say(f"Written into {out}:")
-    for name in files:
-        say(f"  {name}")
+        say(f"Warning: {sentence(warning)}", fg="yellow")
+    say_files(out, files)

@@ -20,9 +20,8 @@ from .._errors import InputError
 from .calibrate import calibrate
 from .convert import convert
 from .demo import demo
-from .discover import discover
+from .discover import discover, power
 from .export import export
-from .power import power
 from .report import report
 from .session import BAD_INPUT, DEFECT, DONE, INTERRUPTED, PROGRAM
 from .simulate import simulate
@@ -53,12 +52,7 @@ Shell completion (bash; likewise zsh_source, fish_source):
 
 
 class Stop(Exception):
-    """The end of a run before its time.
-
-    Attributes:
-        status: the exit status.
-        line: what to say on standard error; nothing if empty.
-    """
+    """The end of a run before its time: the exit status, and what to say on standard error, nothing if empty."""
 
     def __init__(self, status: int, line: str) -> None:
         super().__init__(line)
@@ -71,12 +65,7 @@ def one_line(text: str) -> str:
 
 
 def explain(error: BaseException, debug: bool) -> Stop:
-    """What a run that ended with this error tells its user.
-
-    Args:
-        error: what was raised.
-        debug: print the traceback of what is nobody's input error.
-    """
+    """What a run that ended with this error tells its user; `debug` prints the traceback of a defect."""
     match error:
         case Stop():
             return error
@@ -85,25 +74,25 @@ def explain(error: BaseException, debug: bool) -> Stop:
         case BrokenPipeError():
             return Stop(DONE, "")  # whoever reads our output has seen enough
         case InputError():
-            return Stop(BAD_INPUT, f"error: {error}")
+            problem = str(error)
         case click.MissingParameter(param=click.Option(name="out"), ctx=click.Context(command_path=command)):
-            return Stop(
-                BAD_INPUT,
-                f"error: no folder is given for the results. Add --out DIR, a new folder or one of earlier results; "
-                f"see '{command} --help'.",
-            )
+            remedy = f"Add --out DIR, a new folder or one of earlier results; see '{command} --help'."
+            problem = f"no folder is given for the results. {remedy}"
         case click.UsageError():
-            command = error.ctx.command_path if error.ctx else PROGRAM
-            problem = one_line(error.format_message())
-            return Stop(
-                BAD_INPUT, f"error: {problem}{'' if problem.endswith(('.', '?', ')')) else '.'} See '{command} --help'."
-            )
+            command, problem = error.ctx.command_path if error.ctx else PROGRAM, one_line(error.format_message())
+            problem += f"{'' if problem.endswith(('.', '?', ')')) else '.'} See '{command} --help'."
         case click.ClickException():
-            return Stop(BAD_INPUT, f"error: {error.format_message()}")
+            problem = error.format_message()
         case MemoryError():
-            return Stop(BAD_INPUT, "error: there is not enough memory. Use fewer points or fewer particles.")
+            problem = "there is not enough memory. Use fewer points or fewer particles."
         case OSError(errno=errno.ENOSPC | errno.EFBIG | errno.EDQUOT | errno.EIO):
-            return Stop(BAD_INPUT, f"error: output cannot be written: {error.strerror}. Make room and run again.")
+            problem = f"output cannot be written: {error.strerror}. Make room and run again."
+        case _:
+            return _defect(error, debug)
+    return Stop(BAD_INPUT, f"error: {problem}")
+
+
+def _defect(error: BaseException, debug: bool) -> Stop:
     if debug:
         click.echo("".join(traceback.format_exception(error)), err=True, nl=False)
         hint = ""
@@ -155,7 +144,7 @@ def _silence_stdout() -> None:
 
 def _version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
     if wanted and not ctx.resilient_parsing:
-        from .._version import own_version
+        from .._extras import own_version
 
         click.echo(f"{PROGRAM} {own_version()}")
         ctx.exit()
@@ -189,11 +178,6 @@ def _terminate(number: int, _: Any) -> None:
     raise _Terminated(128 + number)
 
 
-INSIST_S = 5.0
-
-SOON_S = 0.05
-
-
 def _send(number: int, after_s: float) -> None:
     """Send the signal once more, unless the process is gone by then."""
     again = threading.Timer(after_s, _thread.interrupt_main, (number,))
@@ -203,7 +187,7 @@ def _send(number: int, after_s: float) -> None:
 
 def _interrupt(*_: Any) -> None:
     """Interrupt, and again unless the process is gone: raised in a library's callback from C, it would be swallowed."""
-    _send(signal.SIGINT, INSIST_S)
+    _send(signal.SIGINT, after_s=5.0)
     raise KeyboardInterrupt
 
 
@@ -211,9 +195,9 @@ def _unraisable(found: Any) -> None:
     """What a signal's handler raised within a destructor would be lost there: send the signal again, outside of it."""
     match found.exc_value:
         case KeyboardInterrupt():
-            _send(signal.SIGINT, SOON_S)
+            _send(signal.SIGINT, after_s=0.05)
         case _Terminated(code=int(status)):
-            _send(status - 128, SOON_S)
+            _send(status - 128, after_s=0.05)
         case _:
             sys.__unraisablehook__(found)
 

@@ -1,8 +1,9 @@
-"""Types of options: numbers that are finite, lists, ranges, paths that are not empty."""
+"""Options that commands share, and their types: numbers that are finite, lists, ranges, paths that are not empty."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,88 +14,47 @@ UNLOADING = ("printed", "punch", "punch_exact")
 STRAIN_SCALING = ("raw", "contact", "master")
 
 
-class Number(click.ParamType):
-    """A finite number, from a smallest one on.
+def number(least: float | int | None = None, *, above: bool = False) -> Callable[[Any], float]:
+    """A type of option: a finite number, from `least` on; `above` refuses the smallest number itself."""
 
-    Args:
-        least: the smallest number allowed; none if None.
-        above: refuse the smallest number itself.
-        metavar: what it is, for the help text: the unit.
-    """
-
-    name = "number"
-
-    def __init__(self, least: float | int | None = None, *, above: bool = False, metavar: str = "NUMBER") -> None:
-        self.least, self.above, self.metavar = least, above, metavar
-
-    def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str | None:
-        """The unit."""
-        return self.metavar
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """The number of a text."""
+    def convert(value: Any) -> float:
         try:
-            number = float(value)
+            found = float(value)
         except ValueError:
-            self.fail(f"{value!r} is not a number.", param, ctx)
-        if not math.isfinite(number) or abs(number) > LARGEST:
-            self.fail(f"{value!r} is not a finite number of sensible size.", param, ctx)
-        if self.least is not None and (number <= self.least if self.above else number < self.least):
-            self.fail(f"{value} is not {'above' if self.above else 'at least'} {self.least:g}.", param, ctx)
-        return number
+            raise click.BadParameter(f"{value!r} is not a number.") from None
+        if not math.isfinite(found) or abs(found) > LARGEST:
+            raise click.BadParameter(f"{value!r} is not a finite number of sensible size.")
+        if least is not None and (found <= least if above else found < least):
+            raise click.BadParameter(f"{value} is not {'above' if above else 'at least'} {least:g}.")
+        return found
+
+    return convert
 
 
-class Seed(click.ParamType):
-    """A whole number that every generator takes."""
-
-    name = "seed"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """The number of a text."""
-        return int(click.IntRange(0, 2**63 - 1).convert(value, param, ctx))
+_positive = number(0, above=True)
 
 
-class Levels(click.ParamType):
+def whole_number(value: Any) -> int:
+    """A seed that every generator takes."""
+    return int(click.IntRange(0, 2**63 - 1).convert(value, None, None))
+
+
+def levels(value: Any) -> tuple[float, ...]:
     """Positive numbers with commas between them."""
-
-    name = "levels"
-
-    def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str | None:
-        """An example of the form."""
-        return "L1,L2,..."
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
-        """The numbers of a text."""
-        if isinstance(value, tuple):
-            return value
-        number = Number(0, above=True)
-        return tuple(number.convert(part, param, ctx) for part in str(value).split(","))
+    return value if isinstance(value, tuple) else tuple(_positive(part) for part in str(value).split(","))
 
 
-class Interval(click.ParamType):
+def interval(value: Any) -> tuple[float, float]:
     """A positive number, or two with a colon between them."""
-
-    name = "interval"
-
-    def __init__(self, metavar: str) -> None:
-        self.metavar = metavar
-
-    def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str | None:
-        """The form, with the unit."""
-        return self.metavar
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
-        """The two ends."""
-        if isinstance(value, tuple):
-            return value
-        parts = str(value).split(":")
-        if len(parts) > 2:
-            self.fail(f"{value!r} is neither a number nor LOW:HIGH.", param, ctx)
-        number = Number(0, above=True)
-        low, high = (number.convert(part, param, ctx) for part in (parts[0], parts[-1]))
-        if low > high:
-            self.fail(f"{value!r} begins with the larger number; write LOW:HIGH.", param, ctx)
-        return low, high
+    if isinstance(value, tuple):
+        return value
+    parts = str(value).split(":")
+    if len(parts) > 2:
+        raise click.BadParameter(f"{value!r} is neither a number nor LOW:HIGH.")
+    low, high = _positive(parts[0]), _positive(parts[-1])
+    if low > high:
+        raise click.BadParameter(f"{value!r} begins with the larger number; write LOW:HIGH.")
+    return low, high
 
 
 class Location(click.Path):
@@ -114,11 +74,7 @@ class CampaignFolder(Location):
     """A campaign; a path that cannot be one is refused before anything else is asked for."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The path of a text.
-
-        Raises:
-            InputError: saying what was expected and what is there.
-        """
+        """The path of a text. Raises `InputError` saying what was expected and what is there."""
         path = super().convert(value, param, ctx)
         if not all((path / name).exists() for name in ("particles.csv", "curves.csv")):
             from ..campaign import check_folder
@@ -127,71 +83,59 @@ class CampaignFolder(Location):
         return path
 
 
-def out_option(**settings: Any) -> Any:
+def campaign() -> Any:
+    """The argument CAMPAIGN."""
+    return click.argument("campaign", type=CampaignFolder(), metavar="CAMPAIGN")
+
+
+def out(**settings: Any) -> Any:
     """`--out DIR`."""
     return click.option("--out", metavar="DIR", type=Location(), help="Folder for the results.", **settings)
 
 
-def seed_option(help: str = "Seed of all draws.") -> Any:
+def seed(help: str = "Seed of all draws.") -> Any:
     """`--seed`."""
-    return click.option(
-        "--seed",
-        type=Seed(),
-        default=0,
-        show_default=True,
-        metavar="N",
-        help=help,
-    )
+    return click.option("--seed", type=whole_number, default=0, show_default=True, metavar="N", help=help)
 
 
-def threshold_option(use: str = ": points below it do not count.", default: float = 0.2) -> Any:
+def threshold(use: str = ": points below it do not count.", default: float = 0.2) -> Any:
     """`--threshold-MPa`; `use` says what it does."""
-    return click.option(
-        "--threshold-MPa",
-        "threshold_MPa",
-        type=Number(0, metavar="MPa"),
-        default=default,
-        show_default=True,
-        help=f"Stress below which only surface asperities deform{use}",
-    )
+    text = f"Stress below which only surface asperities deform{use}"
+    settings = {"type": number(0), "metavar": "MPa", "default": default, "show_default": True}
+    return click.option("--threshold-MPa", "threshold_MPa", help=text, **settings)
 
 
-def priors_option(where: str = "") -> Any:
+def priors(where: str = "") -> Any:
     """`--priors FILE`; `where` says with which methods."""
     return click.option("--priors", type=Location(), metavar="FILE", help=f"TOML file of priors.{where}")
 
 
-exclude_option = click.option(
-    "--exclude", multiple=True, metavar="NAME", help="A mechanism that cannot be there, on your authority; repeatable."
-)
+def one_of(name: str, choices: tuple[str, ...], help: str) -> Any:
+    """An option that takes one of several words, the first if it is not given."""
+    return click.option(name, type=click.Choice(choices), default=choices[0], show_default=True, help=help)
 
 
-def law_options(command: Any) -> Any:
+def law(command: Any) -> Any:
     """`--unloading` and `--strain-scaling`."""
-    scaling = click.option(
-        "--strain-scaling",
-        type=click.Choice(STRAIN_SCALING),
-        default=STRAIN_SCALING[0],
-        show_default=True,
-        help="How the shape factor enters unloading.",
-    )
-    unloading = click.option(
+    scaling = one_of("--strain-scaling", STRAIN_SCALING, "How the shape factor enters unloading.")
+    unloading = one_of(
         "--unloading",
-        type=click.Choice(UNLOADING),
-        default=UNLOADING[0],
-        show_default=True,
-        help="Form of the unloading law; the paper's 16 GPa belongs to 'printed' only. At peak strains where a form "
-        "would return more energy than it took ('printed': below about 0.01) the recovered strain is limited.",
+        UNLOADING,
+        "Form of the unloading law; the paper's 16 GPa belongs to 'printed' only. At peak strains where a form would "
+        "return more energy than it took ('printed': below about 0.01) the recovered strain is limited.",
     )
     return unloading(scaling(command))
 
 
-leave_out_option = click.option(
+exclude = click.option(
+    "--exclude", multiple=True, metavar="NAME", help="A mechanism that cannot be there, on your authority; repeatable."
+)
+leave_out = click.option(
     "--leave-out", multiple=True, metavar="NAME", help="Leave this particle out; may be given several times."
 )
-no_figures_option = click.option("--no-figures", is_flag=True, help="Draw no figures.")
+no_figures = click.option("--no-figures", is_flag=True, help="Draw no figures.")
 
 
-def json_option(file: str, instead: str = "a summary") -> Any:
+def json(file: str, instead: str = "a summary") -> Any:
     """`--json`: print the result's file."""
     return click.option("--json", "as_json", is_flag=True, help=f"Print {file} instead of {instead}.")

@@ -7,19 +7,19 @@ from pathlib import Path
 import click
 
 from .._store import results
-from .options import Location, out_option, seed_option
+from . import options as common
 from .session import say, session
 
 REPORT = "report.html"
 
 
 @click.command(short_help="One page that shows all results.")
-@click.argument("folder", type=Location(), metavar="DIR")
-@out_option()
+@click.argument("folder", type=common.Location(), metavar="DIR")
+@common.out()
 @click.option(
-    "--campaign", type=Location(), metavar="CAMPAIGN", help="Folder of the tests, if the results do not know it."
+    "--campaign", type=common.Location(), metavar="CAMPAIGN", help="Folder of the tests, if the results do not know it."
 )
-@seed_option("For the record: nothing here is random.")
+@common.seed("For the record: nothing here is random.")
 def report(folder: Path, out: Path | None, campaign: Path | None, seed: int) -> None:
     """Write one self-contained HTML page from what is in the folder DIR: a campaign, calibration.json with
     posterior.nc, discovery.json, or any of them.

@@ -1,37 +1,43 @@
-"""What a command does around its work: precision, progress, printing."""
+"""What commands do around their work: precision, progress, the campaign, the model, figures, files, printing."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import logging
 import os
+import re
 import shutil
 import stat
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, wait
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from .._errors import InputError
+from .._store import Stage, json_text
+from ..files import LIMITS, read_regular
+
+if TYPE_CHECKING:
+    from ..calibrate import Model
+    from ..campaign import Campaign
 
 Tell = Callable[[str], None]
 PROGRAM = "mcc-jax"
 DONE, DEFECT, BAD_INPUT, NOT_CONVERGED, INTERRUPTED = 0, 1, 2, 3, 130
+FIGURES = "figures"
+PACKAGES = ("jax", "jaxlib", "equinox", "optimistix", "numpyro", "arviz", "numpy", "scipy")
 
 
 @contextlib.contextmanager
 def session(steps: int) -> Iterator[Tell]:
     """Double precision, and progress on standard error if that is a terminal.
 
-    Args:
-        steps: how many times the command will call the function it gets.
-
-    Yields:
-        A function that is called with the name of each step as it begins.
+    Yields a function to be called with the name of each step as it begins, `steps` times in all.
     """
     with _progress(steps) as tell:
         tell("loading the library")
@@ -46,11 +52,7 @@ def session(steps: int) -> Iterator[Tell]:
 
 
 def require_device() -> None:
-    """Start JAX on the device that it was told to use.
-
-    Raises:
-        InputError: if there is none of that kind.
-    """
+    """Start JAX on the device that it was told to use. Raises `InputError` if there is none of that kind."""
     import jax
 
     try:
@@ -58,10 +60,9 @@ def require_device() -> None:
     except (RuntimeError, AssertionError) as error:  # of a platform that is not installed it says either
         asked = os.environ.get("JAX_PLATFORMS") or jax.config.read("jax_platforms") or "the default"
         why = " ".join(str(error).split()).split(" (set JAX_PLATFORMS")[0][:160]  # its hint is in the remedy
-        raise InputError(
-            f"JAX finds no device for JAX_PLATFORMS={asked}" + (f" ({why})" if why else ""),
-            remedy="Unset JAX_PLATFORMS to compute on the processor, or install JAX for your accelerator",
-        ) from None
+        problem = f"JAX finds no device for JAX_PLATFORMS={asked}" + (f" ({why})" if why else "")
+        remedy = "Unset JAX_PLATFORMS to compute on the processor, or install JAX for your accelerator"
+        raise InputError(problem, remedy=remedy) from None
 
 
 CACHE_BYTES = 300 * 2**20
@@ -121,14 +122,11 @@ def import_writers(*, figures: bool, posterior: bool) -> None:
 
 @contextlib.contextmanager
 def beside[R](work: Callable[[], R]) -> Iterator[Callable[[], R]]:
-    """Let work go on in a thread of its own while the block runs.
+    """Let work go on in a thread of its own while the block runs; yields a function that waits for its result.
 
     The block ends when the work has ended, too: an interpreter that ends under a compiler or an import may crash. Only
-    an interrupt does not wait, since nothing of the work is kept and the process ends at once.
-
-    Yields:
-        A function that waits for the work and returns its result, or raises what it raised. Work of which nobody
-        asks for the result may fail unnoticed.
+    an interrupt does not wait, since nothing of the work is kept and the process ends at once. What the work raised is
+    raised where its result is asked for; work of which nobody asks may fail unnoticed.
     """
     future: Future[R] = Future()
 
@@ -166,16 +164,115 @@ def say(text: str = "", **style: Any) -> None:
     click.secho(text, **style)
 
 
-def say_table(header: tuple[str, ...], rows: list[tuple[str, ...]], *, text_columns: int = 1) -> None:
-    """Print a small table, the first `text_columns` columns to the left and the others to the right."""
+def say_table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
+    """Print a small table, the first column to the left and the others to the right."""
     widths = [max(len(row[i]) for row in (header, *rows)) for i in range(len(header))]
 
     def line(row: tuple[str, ...]) -> str:
-        cells = (
-            c.ljust(w) if i < text_columns else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))
-        )
-        return ("  " + "  ".join(cells)).rstrip()
+        first, *others = zip(row, widths, strict=True)
+        return "  ".join(["", first[0].ljust(first[1]), *(cell.rjust(width) for cell, width in others)]).rstrip()
 
     say(line(header), bold=True)
     for row in rows:
         say(line(row))
+
+
+def read_without(folder: Path, left_out: tuple[str, ...], tell: Tell) -> Campaign:
+    """The campaign in a folder without the particles of `--leave-out`."""
+    from ..campaign import read_campaign
+
+    tell("reading the campaign")
+    campaign = read_campaign(folder)
+    for name in left_out:
+        require_particle(name, campaign, "--leave-out")
+    return campaign.without(*left_out) if left_out else campaign
+
+
+def require_particle(name: str, campaign: Campaign, option: str) -> None:
+    """Refuse a particle that is not there, before anything is computed. Raises `InputError` naming those that are."""
+    names = campaign.particles
+    if name not in names:
+        remedy = f"{option} takes one of: {', '.join(names[:12])}{', ...' if len(names) > 12 else ''}"
+        raise InputError(f"there is no particle {name!r}", file=campaign.source or None, remedy=remedy)
+
+
+def joint_model(options: Mapping[str, Any], *, modulus_scatter: bool = True, shape_scatter: bool = False) -> Model:
+    """The model that `--unloading`, `--strain-scaling` and `--priors` describe."""
+    from ..calibrate import Model, read_priors
+    from ..law import StrainScaling, Unloading
+
+    form = Unloading(options["unloading"])
+    priors = None if options["priors"] is None else read_priors(options["priors"], form)
+    return Model(form, StrainScaling(options["strain_scaling"]), modulus_scatter, shape_scatter, priors)
+
+
+def provenance(command: str, campaign: Path, settings: Mapping[str, Any], *, told: str | None = None) -> dict[str, Any]:
+    """Folder and checksums of the campaign, settings of the command in force, versions of what computed.
+
+    The result names the folder by its absolute path, or as `told`.
+    """
+    import platform
+    from importlib.metadata import version
+
+    from .._extras import own_version
+    from ..campaign import file_checksums
+
+    def plain(value: Any) -> Any:
+        return value.name if isinstance(value, Path) else list(value) if isinstance(value, tuple) else value
+
+    versions = {"mcc_jax": own_version(), "python": platform.python_version(), **{n: version(n) for n in PACKAGES}}
+    return {
+        "campaign": {"folder": told or str(campaign.resolve()), "sha256": file_checksums(campaign)},
+        "settings": {"command": command} | {name: plain(value) for name, value in settings.items()},
+        "versions": versions,
+    }
+
+
+def listed(result: Path, key: str, pattern: str) -> list[str]:
+    """Files that an earlier result names as its own; what is no such result names none."""
+    names: Any = None
+    with contextlib.suppress(ValueError, KeyError, TypeError, RecursionError):
+        names = json.loads(read_regular(result, LIMITS.result_bytes, ""))[key]
+    return [n for n in names if isinstance(n, str) and re.fullmatch(pattern, n)] if isinstance(names, list) else []
+
+
+def write_figures(stage: Stage, result: str, draw: Callable[[], Mapping[str, Any]] | None, tell: Tell) -> list[str]:
+    """Draw into the stage, and give the figures' names; `draw` is None for no figures.
+
+    Figures that an earlier file `result` lists as its own, and this run does not draw, become stale.
+    """
+    names: list[str] = []
+    tell("writing" if draw is None else "drawing the figures")
+    if draw is not None:
+        from ..plots import save_figures
+
+        (stage.folder / FIGURES).mkdir(exist_ok=True)
+        names = sorted(f"{FIGURES}/{path.name}" for path in save_figures(draw(), stage.folder / FIGURES))
+    earlier = listed(stage.directory / result, "figures", rf"{FIGURES}/[A-Za-z0-9_-]+\.png")
+    stage.stale += [name for name in earlier if name not in names]
+    return names
+
+
+def write_result(stage: Stage, result: str, content: dict[str, Any]) -> None:
+    """Write a result file into the stage."""
+    (stage.folder / result).write_text(json_text(content), encoding="utf-8")
+
+
+def say_json(content: dict[str, Any]) -> None:
+    """Print a result as it stands in its file: JSON is UTF-8, whatever the terminal speaks."""
+    click.echo(json_text(content).encode(), nl=False)
+
+
+def say_files(directory: Path, names: list[str]) -> None:
+    """Print what was written where; figures are counted, not listed."""
+    figures = [name for name in names if name.startswith(f"{FIGURES}/")]
+    say(f"Written into {directory}:")
+    for name in (name for name in names if name not in figures):
+        say(f"  {name}")
+    if figures:
+        say(f"  {FIGURES}/ ({len(figures)} png)")
+
+
+def sentence(text: str) -> str:
+    """A text as a sentence: a capital at its beginning, one full stop at its end."""
+    return f"{text[:1].upper()}{text[1:].rstrip('.')}."

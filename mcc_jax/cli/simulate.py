@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -13,7 +13,7 @@ import click
 
 from .._errors import InputError
 from .._store import results
-from .options import Interval, Levels, Location, Number, law_options, out_option, seed_option
+from . import options as common
 from .session import say, session
 
 if TYPE_CHECKING:
@@ -25,54 +25,54 @@ if TYPE_CHECKING:
 
 MAX_ROWS = 10_000_000
 LONGEST_S = 1e12
-POSITIVE, NOT_NEGATIVE = {"least": 0, "above": True}, {"least": 0}
+POSITIVE, NOT_NEGATIVE = common.number(0, above=True), common.number(0)
 
 
-def _number(name: str, unit: str, limits: dict[str, Any], text: str, **settings: Any) -> Any:
-    return click.option(
-        name, name.lstrip("-").replace("-", "_"), type=Number(**limits, metavar=unit), help=text, **settings
-    )
+def _option(name: str, unit: str, kind: Callable[[Any], Any] | click.ParamType, text: str, **settings: Any) -> Any:
+    return click.option(name, name[2:].replace("-", "_"), type=kind, metavar=unit, help=text, **settings)
 
 
 def _zero(name: str, unit: str, text: str) -> Any:
-    return _number(name, unit, NOT_NEGATIVE, text, default=0.0, show_default=True)
+    return _option(name, unit, NOT_NEGATIVE, text, default=0.0, show_default=True)
 
 
 @click.command(short_help="Test particles in the computer.")
-@out_option(required=True)
-@click.option(
+@common.out(required=True)
+@_option(
     "--particles",
-    type=Location(),
-    metavar="FILE",
-    help="CSV table with particle,D1_um,D2_um,D3_um; further columns are kept.  [default: the paper's Table 1]",
+    "FILE",
+    common.Location(),
+    "CSV table with particle,D1_um,D2_um,D3_um; further columns are kept.  [default: the paper's Table 1]",
 )
-@click.option("--programme", type=Location(), metavar="FILE", help="TOML file with the steps of the test; see above.")
+@_option("--programme", "FILE", common.Location(), "TOML file with the steps of the test; see above.")
 @click.option("--control", type=click.Choice(["load", "displacement"]), help="Controlled quantity.  [default: load]")
-@_number("--rate", "mN/s|um/s", POSITIVE, "Rate in mN/s or, under displacement control, um/s.  [default: 2]")
-@click.option("--levels", type=Levels(), help="Peak of each cycle as a share of the particle's peak.  [default: 1]")
-@_number("--unload-to", "SHARE", NOT_NEGATIVE, "Share at which reloading starts.  [default: 0]")
-@_number("--hold-s", "s", POSITIVE, "Hold at every level.  [default: none]")
-@click.option("--points", type=click.IntRange(2, 1_000_000), metavar="N", help="Samples of a test.  [default: 300]")
-@_number("--interval-s", "s", POSITIVE, "Time between samples, instead of --points.")
-@click.option(
+@_option("--rate", "mN/s|um/s", POSITIVE, "Rate in mN/s or, under displacement control, um/s.  [default: 2]")
+@_option("--levels", "L1,L2,...", common.levels, "Peak of each cycle as a share of the particle's peak.  [default: 1]")
+@_option("--unload-to", "SHARE", NOT_NEGATIVE, "Share at which reloading starts.  [default: 0]")
+@_option("--hold-s", "s", POSITIVE, "Hold at every level.  [default: none]")
+@_option("--points", "N", click.IntRange(2, 1_000_000), "Samples of a test.  [default: 300]")
+@_option("--interval-s", "s", POSITIVE, "Time between samples, instead of --points.")
+@_option(
     "--peak-stress",
-    type=Interval("MPa|LOW:HIGH"),
-    help="Stress at each particle's peak, or a range to draw from.  [default: 7:16]",
+    "MPa|LOW:HIGH",
+    common.interval,
+    "Stress at each particle's peak, or a range to draw from.  [default: 7:16]",
 )
-@click.option(
+@_option(
     "--peak-strain",
-    type=Interval("STRAIN|LOW:HIGH"),
-    help="Strain displacement/D_e at the peak instead; displacement control only.",
+    "STRAIN|LOW:HIGH",
+    common.interval,
+    "Strain displacement/D_e at the peak instead; displacement control only.",
 )
 @click.option(
     "--shared-material", is_flag=True, help="Give all particles the mean law of Table 2 instead of draws from it."
 )
-@_number("--C1", "C1", POSITIVE, "Fix C1 for all particles.  [default: drawn from Table 2]")
-@_number("--C3", "C3", NOT_NEGATIVE, "Fix C3 likewise.")
-@_number("--C5", "C5", POSITIVE, "Fix C5 likewise.")
-@_number("--a", "A", {}, "Shape parameter.", default=1.43, show_default=True)
-@_number("--effective-modulus", "MPa", POSITIVE, "Effective modulus.", default=16000.0, show_default=True)
-@law_options
+@_option("--C1", "C1", POSITIVE, "Fix C1 for all particles.  [default: drawn from Table 2]")
+@_option("--C3", "C3", NOT_NEGATIVE, "Fix C3 likewise.")
+@_option("--C5", "C5", POSITIVE, "Fix C5 likewise.")
+@_option("--a", "A", common.number(), "Shape parameter.", default=1.43, show_default=True)
+@_option("--effective-modulus", "MPa", POSITIVE, "Effective modulus.", default=16000.0, show_default=True)
+@common.law
 @click.option(
     "--effect",
     "effects",
@@ -85,7 +85,7 @@ def _zero(name: str, unit: str, text: str) -> Any:
 @_zero("--resolution-um", "um", "Smallest step of displacement.")
 @_zero("--resolution-mN", "mN", "Smallest step of force.")
 @_zero("--zero-um", "um", "Standard deviation of each test's zero of displacement.")
-@seed_option()
+@common.seed()
 def simulate(out: Path, **options: Any) -> None:
     """Put particles through a test programme in the computer and write the campaign into DIR.
 
@@ -149,36 +149,26 @@ def simulate(out: Path, **options: Any) -> None:
 
 
 def _refuse_contradictions(options: dict[str, Any]) -> None:
-    """No option is accepted and then ignored.
-
-    Raises:
-        UsageError: naming the two that do not go together.
-    """
-
-    def given(name: str) -> bool:
-        return options[name] is not None
-
-    def refuse(one: str, other: str, why: str) -> None:
-        raise click.UsageError(f"--{one} does not go with --{other}: {why}.")
-
-    if given("programme"):
-        for name in ("control", "rate", "levels", "unload_to", "hold_s", "points", "interval_s"):
-            if given(name):
-                refuse(name.replace("_", "-"), "programme", "the programme file says that already")
-    if given("points") and given("interval_s"):
-        refuse("interval-s", "points", "each says how densely the test is sampled")
-    if given("peak_stress") and given("peak_strain"):
-        refuse("peak-strain", "peak-stress", "each says where the peak is")
-    if given("peak_strain") and not given("programme") and options["control"] != "displacement":
+    """No option is accepted and then ignored."""
+    replaced = ("control", "rate", "levels", "unload_to", "hold_s", "points", "interval_s")
+    for one, other, why in (
+        *((name, "programme", "the programme file says that already") for name in replaced),
+        ("interval_s", "points", "each says how densely the test is sampled"),
+        ("peak_strain", "peak_stress", "each says where the peak is"),
+    ):
+        if options[one] is not None and options[other] is not None:
+            names = (name.replace("_", "-") for name in (one, other))
+            raise click.UsageError(f"--{' does not go with --'.join(names)}: {why}.")
+    if options["peak_strain"] and not options["programme"] and options["control"] != "displacement":
         raise click.UsageError("--peak-strain needs --control displacement.")
-    levels = options["levels"] or (1.0,)
-    if given("unload_to"):
-        if len(levels) < 2:
-            raise click.UsageError("--unload-to needs two --levels or more: the last unloading is always complete.")
-        if options["unload_to"] >= min(levels[:-1]):
-            raise click.UsageError("--unload-to lies not below the --levels it unloads from.")
-    if options["shared_material"] and all(given(name) for name in ("C1", "C3", "C5")):
-        refuse("shared-material", "C1, --C3 and --C5", "they fix the material already")
+    levels, unload_to = options["levels"] or (1.0,), options["unload_to"]
+    if unload_to is not None and len(levels) < 2:
+        raise click.UsageError("--unload-to needs two --levels or more: the last unloading is always complete.")
+    if unload_to is not None and unload_to >= min(levels[:-1]):
+        raise click.UsageError("--unload-to lies not below the --levels it unloads from.")
+    if options["shared_material"] and all(options[name] is not None for name in ("C1", "C3", "C5")):
+        both = "--shared-material does not go with --C1, --C3 and --C5"
+        raise click.UsageError(f"{both}: they fix the material already.")
 
 
 class Sizes(NamedTuple):
@@ -202,36 +192,27 @@ def _sizes(file: Path | None) -> Sizes:
 
 
 def _laws(options: Mapping[str, Any], sizes: Sizes) -> MccLaw:
-    """One law per particle, of fixed or drawn coefficients.
-
-    Raises:
-        InputError: if `a` leaves a particle without stress.
-    """
+    """One law per particle, of fixed or drawn coefficients."""
     import equinox as eqx
-    import jax
     import jax.numpy as jnp
 
     from ..campaign import of_each_particle
     from ..geometry import plastic_shape_factor
     from ..law import StrainScaling, Unloading
-    from ..simulate import law_for_each, paper_population
+    from ..simulate import law_for_each
+    from ..simulate.campaign import draw_plastic
 
-    count, population, a = len(sizes.names), paper_population(), options["a"]
-    if options["shared_material"]:
-        plastic = jax.tree.map(lambda x: jnp.broadcast_to(x, (count,)), population.mean_law)
-    else:
-        plastic = population.sample(jax.random.key(options["seed"]), count)
+    count, a = len(sizes.names), options["a"]
+    plastic = draw_plastic(count, options["seed"], shared=options["shared_material"])
     for name in ("C1", "C3", "C5"):
         if options[name] is not None:
             plastic = eqx.tree_at(lambda p, n=name: getattr(p, n), plastic, jnp.full(count, options[name]))
     eta = of_each_particle(sizes.diameters_um, lambda p: plastic_shape_factor(p, a))
     if not (eta > 0).all():
         worst = int(eta.argmin())
-        raise InputError(
-            f"the shape factor of particle {sizes.names[worst]!r} is {eta[worst]:.4g} with a = {a:g}",
-            file=sizes.file,
-            remedy="Give an --a nearer to zero: shape factors must be positive",
-        )
+        problem = f"the shape factor of particle {sizes.names[worst]!r} is {eta[worst]:.4g} with a = {a:g}"
+        remedy = "Give an --a nearer to zero: shape factors must be positive"
+        raise InputError(problem, file=sizes.file, remedy=remedy)
     form, scaling = Unloading(options["unloading"]), StrainScaling(options["strain_scaling"])
     return law_for_each(plastic, a, options["effective_modulus"], form, scaling)
 
@@ -254,44 +235,29 @@ def _programme(options: Mapping[str, Any]) -> Programme:
 
 
 def _peaks(options: Mapping[str, Any], programme: Programme, laws: MccLaw, sizes: Sizes) -> np.ndarray:
-    """Each particle's peak [mN or um], shape (N,).
-
-    Raises:
-        InputError: if the programme is unfit for what was given.
-    """
+    """Each particle's peak [mN or um], shape (N,). Raises `InputError` if the programme is unfit for what was given."""
     import equinox as eqx
-    import jax.numpy as jnp
     import numpy as np
 
     from ..campaign import particle_batch
     from ..geometry import Particle
     from ..simulate import PAPER_PEAK_STRESS_MPA
+    from ..simulate.campaign import draw_evenly, peaks_at_stress
 
     strained = options["peak_strain"] is not None
     if strained and programme.control != "displacement":
-        raise InputError(
-            "the programme runs under load control, where --peak-strain has no meaning",
-            file=options["programme"],
-            remedy="Give --peak-stress",
-        )
-    # The same draws as `paper_campaign` makes.
-    rng = np.random.default_rng(np.random.SeedSequence(options["seed"]).generate_state(4))
-    low, high = options["peak_strain"] or options["peak_stress"] or PAPER_PEAK_STRESS_MPA
-    drawn = jnp.asarray(rng.uniform(low, high, len(sizes.names)))
+        problem = "the programme runs under load control, where --peak-strain has no meaning"
+        raise InputError(problem, file=options["programme"], remedy="Give --peak-stress")
+    between = options["peak_strain"] or options["peak_stress"] or PAPER_PEAK_STRESS_MPA
+    drawn = draw_evenly(between, len(sizes.names), options["seed"])
     particles = particle_batch(sizes.diameters_um)
-    if programme.control == "displacement" and not strained:
-        strain = eqx.filter_vmap(lambda law, particle, s: law.plastic.strain(s) / law.shape_factor(particle))
-        drawn = strain(laws, particles, drawn)
-    quantity = Particle.force if programme.control == "load" else Particle.displacement
-    return np.asarray(eqx.filter_vmap(quantity)(particles, drawn))
+    if strained:
+        return np.asarray(eqx.filter_vmap(Particle.displacement)(particles, drawn))
+    return peaks_at_stress(laws, particles, drawn, programme.control)
 
 
 def _check_size(programme: Programme, peaks: np.ndarray, file: Path | None) -> None:
-    """Refuse what would fill memory or disk.
-
-    Raises:
-        InputError: if so.
-    """
+    """Refuse what would fill memory or disk."""
     from ..simulate import Ramp
 
     rows = 0.0
@@ -308,18 +274,14 @@ def _check_size(programme: Programme, peaks: np.ndarray, file: Path | None) -> N
         samples = programme.points or math.ceil(duration / (programme.interval_s or 1.0))
         rows += samples + len(programme.steps)
         if rows > MAX_ROWS or samples * len(programme.steps) > 10 * MAX_ROWS:
-            raise InputError(
-                f"the campaign would have more than {MAX_ROWS} rows, or too many steps for its points",
-                file=file,
-                remedy="Take fewer points, a longer interval or a higher rate",
-            )
+            problem = f"the campaign would have more than {MAX_ROWS} rows, or too many steps for its points"
+            raise InputError(problem, file=file, remedy="Take fewer points, a longer interval or a higher rate")
 
 
 def _hidden_effects(texts: Sequence[str], sizes: Sizes) -> tuple[HiddenEffect, ...]:
     """The effects of the option --effect.
 
-    Raises:
-        InputError: naming the valid choices, or what an effect needs of the table of particles.
+    Raises `InputError` naming the valid choices, or what an effect needs of the table of particles.
     """
     from ..effects import HUMIDITY_COLUMN, Need
     from ..simulate import read_effect
@@ -332,11 +294,8 @@ def _hidden_effects(texts: Sequence[str], sizes: Sizes) -> tuple[HiddenEffect, .
             raise InputError(f"--effect {text}: {error}") from error
     wet = [effect for effect in hidden if Need.HUMIDITY_COLUMN in effect.variant.needs]
     if wet and HUMIDITY_COLUMN not in sizes.columns:
-        raise InputError(
-            f"--effect {wet[0].variant.mechanism}: needs a column {HUMIDITY_COLUMN} in the table of particles",
-            file=sizes.file,
-            remedy="Give --particles FILE with that column",
-        )
+        problem = f"--effect {wet[0].variant.mechanism}: needs a column {HUMIDITY_COLUMN} in the table of particles"
+        raise InputError(problem, file=sizes.file, remedy="Give --particles FILE with that column")
     return tuple(hidden)
 
 
@@ -350,8 +309,7 @@ def _campaign(
 ) -> Campaign:
     """The campaign, with the further columns of the particles' table.
 
-    Raises:
-        InputError: if the law or the programme give no usable curves.
+    Raises `InputError` if the law or the programme give no usable curves.
     """
     from ..campaign import check_campaign
     from ..campaign.record import humidity_column

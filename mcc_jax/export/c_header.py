@@ -12,9 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._errors import InputError
-from .._extras import extra
+from .._extras import extra, own_version
 from .._types import Scalar
-from .._version import own_version
 from ..dem import half_contact
 from ..formulas import Formulas, Plastic
 from ..geometry import Particle

@@ -10,7 +10,7 @@ from typing import Any
 
 import equinox as eqx
 
-from .._version import own_version
+from .._extras import own_version
 from ..effects import LIBRARY
 from ..geometry import Particle
 from ..law import TESTED_STRAIN, MccLaw

@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from .. import arguments
-from .._extras import extra
+from .._extras import extra, own_version
 from .._format import interval, number, percent, probability, with_sd
-from .._version import own_version
 from ..calibrate.curves import KINDS, FittedCurve
 from ..campaign import PAPER_EFFECTIVE_MODULUS_MPA, PAPER_LOG_C, PAPER_SHAPE_PARAMETER
 from ..campaign.findings import worst

@@ -11,8 +11,8 @@ from .drive import drive as drive
 from .drive import simulate_batch as simulate_batch
 from .effects import HiddenEffect as HiddenEffect
 from .effects import read_effect as read_effect
-from .instrument import Instrument as Instrument
 from .programme import Hold as Hold
+from .programme import Instrument as Instrument
 from .programme import Programme as Programme
 from .programme import Ramp as Ramp
 from .programme import read_programme as read_programme

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from .. import arguments
 from .._errors import InputError
@@ -21,6 +22,7 @@ from ..campaign import (
     PAPER_LOG_C,
     PAPER_SHAPE_PARAMETER,
     Campaign,
+    Control,
     Curve,
     Metadata,
     particle_batch,
@@ -29,9 +31,8 @@ from ..effects import HUMIDITY_COLUMN, REFERENCE_HUMIDITY_PERCENT, Need
 from ..geometry import Particle
 from ..law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainScaling, Unloading
 from .drive import A_LAW, gains_energy, simulate_batch
-from .effects import HiddenEffect, batched_humidity, hidden_effects, humidities_of
-from .instrument import Instrument
-from .programme import Programme
+from .effects import HiddenEffect, hidden_effects, humidities_of
+from .programme import Instrument, Programme
 
 PAPER_PEAK_STRESS_MPA = (7.0, 16.0)
 """Range of the maximum stress of the paper's tests [MPa]; the value of each particle is not published."""
@@ -49,6 +50,29 @@ def paper_law(
     return MccLaw(
         paper_population().mean_law, PAPER_SHAPE_PARAMETER, PAPER_EFFECTIVE_MODULUS_MPA, unloading, strain_scaling
     )
+
+
+def draw_plastic(count: int, seed: int, *, shared: bool) -> Plastic:
+    """Coefficients of so many particles, drawn from Table 2; `shared`: the mean law's for all."""
+    population = paper_population()
+    if shared:
+        return jax.tree.map(lambda x: jnp.broadcast_to(x, (count,)), population.mean_law)
+    return population.sample(jax.random.key(seed), count)
+
+
+def draw_evenly(between: Sequence[float] | np.ndarray, count: int, seed: int) -> Array:
+    """So many numbers from a range; a stream apart from those of coefficients and noise."""
+    rng = np.random.default_rng(np.random.SeedSequence(seed).generate_state(4))
+    low, high = between
+    return jnp.asarray(rng.uniform(low, high, count))
+
+
+def peaks_at_stress(laws: MccLaw, particles: Particle, stress_MPa: Array, control: Control) -> np.ndarray:
+    """Force [mN] or displacement [um], as is controlled, at which each particle reaches its stress, shape (N,)."""
+    if control == "load":
+        return np.asarray(eqx.filter_vmap(Particle.force)(particles, stress_MPa))
+    strain = eqx.filter_vmap(lambda law, particle, s: law.plastic.strain(s) / law.shape_factor(particle))
+    return np.asarray(eqx.filter_vmap(Particle.displacement)(particles, strain(laws, particles, stress_MPa)))
 
 
 def law_for_each(
@@ -110,8 +134,8 @@ def simulate_campaign(
     if jnp.ndim(laws.plastic.C1) != 1:
         raise InputError("laws has no leading axis", remedy="Make one law for each with mcc_jax.law_for_each.")
     arguments.instance(programme, Programme, "programme", "Take mcc_jax.Programme.cycles().")
-    if instrument is not None:
-        arguments.instance(instrument, Instrument, "instrument", "Make one with mcc_jax.Instrument().")
+    instrument = Instrument() if instrument is None else instrument
+    arguments.instance(instrument, Instrument, "instrument", "Make one with mcc_jax.Instrument().")
     seed = arguments.seed(seed)
     effects = hidden_effects(effects)
     diameters_um = arguments.diameters(diameters_um)
@@ -130,26 +154,26 @@ def simulate_campaign(
             f"{count} particles need as many names ({len(names)}), peaks ({len(peaks)}) "
             f"and laws ({laws.plastic.C1.shape[0]})"
         )
-    instrument = instrument or Instrument()
     samples = [programme.sample(float(peak)) for peak in peaks]
     longest = max(len(time) for time, _ in samples)
     # Padding repeats the last value: a valid path whose further points change nothing.
-    paths = np.stack([np.pad(target, (0, longest - len(target)), mode="edge") for _, target in samples])
+    times, paths = (
+        jnp.asarray(np.stack([np.pad(row, (0, longest - len(row)), mode="edge") for row in rows]))
+        for rows in zip(*samples, strict=True)
+    )
     drawn = [effect.draw(seed, i, count) for i, effect in enumerate(effects)]
     wet = [e.variant.mechanism for e in effects if Need.HUMIDITY_COLUMN in e.variant.needs]
     if wet and relative_humidity_percent is None:
         raise InputError(f"the effect {wet[0]} needs the relative humidity of every test ({HUMIDITY_COLUMN})")
-    times = humidity = None
     acting = laws.with_effects(*(effect for effect, _ in drawn))
-    if acting.effects:
-        times = jnp.asarray([np.pad(time, (0, longest - len(time)), mode="edge") for time, _ in samples])
-        humidity = batched_humidity(relative_humidity_percent, count, REFERENCE_HUMIDITY_PERCENT)
+    humidity = relative_humidity_percent
+    humidity = np.full(count, REFERENCE_HUMIDITY_PERCENT) if humidity is None else humidity
     response = simulate_batch(
         acting,
         particle_batch(diameters_um),
-        jnp.asarray(paths),
-        times=times,
-        relative_humidity=humidity,
+        paths,
+        times=times if acting.effects else None,
+        relative_humidity=jnp.asarray(humidity, dtype=float) if acting.effects else None,
         control=programme.control,
     )
     force, displacement = np.asarray(response.force, float), np.asarray(response.displacement, float)
@@ -160,18 +184,19 @@ def simulate_campaign(
             raise gains_energy(law, particle, one.state, f"particle {names[bad[0]]!r}")
         raise InputError(f"particle {names[bad[0]]!r}: {RESULTS[one.result]}")
     streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(count)]
-    curves = []
-    for i, (time, _) in enumerate(samples):
-        read = instrument.read(streams[i], force[i, : len(time)], displacement[i, : len(time)])
-        curves.append(Curve(time, *read))
-    truth = {name: np.asarray(getattr(laws.plastic, name), float) for name in ("C1", "C3", "C5")}
-    columns = {f"true_{name}": tuple(repr(float(v)) for v in values) for name, values in truth.items()}
+    curves = [
+        Curve(time, *instrument.read(rng, force[i, : len(time)], displacement[i, : len(time)]))
+        for i, ((time, _), rng) in enumerate(zip(samples, streams, strict=True))
+    ]
+    truth = {name: getattr(laws.plastic, name) for name in ("C1", "C3", "C5")}
+    mechanisms = [effect.variant.mechanism for effect in effects]
     for i, (effect, (_, values)) in enumerate(zip(effects, drawn, strict=True)):
-        mark = "" if [e.variant.mechanism for e in effects].count(effect.variant.mechanism) == 1 else f"_{i + 1}"
-        for name in effect.random:
-            columns[f"true_{effect.variant.mechanism}{mark}_{name}"] = tuple(repr(float(v)) for v in values[name])
+        mark = "" if mechanisms.count(mechanisms[i]) == 1 else f"_{i + 1}"
+        truth |= {f"{mechanisms[i]}{mark}_{name}": values[name] for name in effect.random}
+    numbers = {f"true_{name}": values for name, values in truth.items()}
     if relative_humidity_percent is not None:
-        columns[HUMIDITY_COLUMN] = tuple(repr(float(v)) for v in relative_humidity_percent)
+        numbers[HUMIDITY_COLUMN] = relative_humidity_percent
+    columns = {name: tuple(repr(float(v)) for v in np.asarray(values, float)) for name, values in numbers.items()}
     columns["true_monotone"] = tuple("yes" if m else "no" for m in np.asarray(response.monotone))
     metadata = Metadata(
         control=programme.control,
@@ -229,39 +254,26 @@ def paper_campaign(
     """
     seed = arguments.seed(seed)
     shared_material = arguments.flag(shared_material, "shared_material")
-    if programme is not None:
-        arguments.instance(programme, Programme, "programme", "Take mcc_jax.Programme.cycles().")
-    if instrument is not None:
-        arguments.instance(instrument, Instrument, "instrument", "Make one with mcc_jax.Instrument().")
-    effects = hidden_effects(effects)
+    programme = Programme.cycles(rate=PAPER_LOAD_RATE_MN_PER_S) if programme is None else programme
+    arguments.instance(programme, Programme, "programme", "Take mcc_jax.Programme.cycles().")
+    instrument = Instrument(displacement_noise_um=0.02, force_noise_mN=0.05) if instrument is None else instrument
     unloading = arguments.member(unloading, Unloading, "unloading")
     strain_scaling = arguments.member(strain_scaling, StrainScaling, "strain_scaling")
     between = arguments.floats(peak_stress_MPa, "peak_stress_MPa", shape="two stresses [MPa], the smaller first")
     if between.shape != (2,) or not (0 < between[0] <= between[1] < np.inf):
         raise InputError(f"peak_stress_MPa must be two stresses > 0, the smaller first, got {between.tolist()}")
     count = len(PAPER_DIAMETERS_UM)
-    population = paper_population()
-    if shared_material:
-        plastic = jax.tree.map(lambda x: jnp.broadcast_to(x, (count,)), population.mean_law)
-    else:
-        plastic = population.sample(jax.random.key(seed), count)
+    plastic = draw_plastic(count, seed, shared=shared_material)
     laws = law_for_each(plastic, PAPER_SHAPE_PARAMETER, PAPER_EFFECTIVE_MODULUS_MPA, unloading, strain_scaling)
-    programme = programme or Programme.cycles(rate=PAPER_LOAD_RATE_MN_PER_S)
-    rng = np.random.default_rng(np.random.SeedSequence(seed).generate_state(4))
-    stress = rng.uniform(between[0], between[1], count)
-    particles = particle_batch(PAPER_DIAMETERS_UM)
-    peaks = np.asarray(eqx.filter_vmap(Particle.force)(particles, jnp.asarray(stress)))
-    if programme.control == "displacement":
-        strain = eqx.filter_vmap(lambda law, particle, s: law.plastic.strain(s) / law.shape_factor(particle))(
-            laws, particles, jnp.asarray(stress)
-        )
-        peaks = np.asarray(eqx.filter_vmap(Particle.displacement)(particles, strain))
+    peaks = peaks_at_stress(
+        laws, particle_batch(PAPER_DIAMETERS_UM), draw_evenly(between, count, seed), programme.control
+    )
     return simulate_campaign(
         laws,
         PAPER_DIAMETERS_UM,
         peaks,
         programme,
-        instrument=instrument or Instrument(displacement_noise_um=0.02, force_noise_mN=0.05),
+        instrument=instrument,
         effects=effects,
         relative_humidity_percent=relative_humidity_percent,
         seed=seed,

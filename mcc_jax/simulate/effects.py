@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -44,23 +43,26 @@ class HiddenEffect:
         arguments.instance(self.variant, Variant, "variant", 'Take mcc_jax.effects.find_variant("creep").')
         arguments.instance(self.nuisance, Mapping, "nuisance", "Give a dictionary of numbers by name.")
         variant, name = self.variant, f"{self.variant.mechanism}:{self.variant.name}"
+
+        def wrong(what: str, must: str, value: Any) -> InputError:
+            return InputError(f"{name}: {what} must be {must}, got {value}")
+
         if self.amplitude is not None and not arguments.is_number(self.amplitude):
-            raise InputError(f"{name}: {variant.parameter} must be a number, got {arguments.shown(self.amplitude)}")
+            raise wrong(variant.parameter, "a number", arguments.shown(self.amplitude))
         if not math.isfinite(self.strength) or abs(self.strength) > 1e9:
-            raise InputError(f"{name}: {variant.parameter} must be a number of sensible size, got {self.strength:g}")
+            raise wrong(variant.parameter, "a number of sensible size", f"{self.strength:g}")
         if self.strength * variant.sign < 0:
-            sign = "zero or positive" if variant.sign > 0 else "zero or negative"
-            raise InputError(f"{name}: {variant.parameter} must be {sign} to be physical, got {self.strength:g}")
-        known = {n.name: n for n in variant.nuisances}
+            sign = "positive" if variant.sign > 0 else "negative"
+            raise wrong(variant.parameter, f"zero or {sign} to be physical", f"{self.strength:g}")
+        known = {n.name: n.plausible[0] for n in variant.nuisances}
         for key, value in self.nuisance.items():
             if key not in known:
                 names = ", ".join([variant.parameter, *known])
                 raise InputError(f"{name} has no parameter {key!r}; it has: {names}")
             if not arguments.is_number(value):
-                raise InputError(f"{name}: {key} must be a number, got {arguments.shown(value)}")
-            least = known[key].plausible[0]
-            if not math.isfinite(value) or abs(value) > 1e9 or (least > 0 and value <= 0):
-                raise InputError(f"{name}: {key} must be {'above 0' if least > 0 else 'finite'}, got {value:g}")
+                raise wrong(key, "a number", arguments.shown(value))
+            if not math.isfinite(value) or abs(value) > 1e9 or (known[key] > 0 and value <= 0):
+                raise wrong(key, "above 0" if known[key] > 0 else "finite", f"{value:g}")
 
     def __repr__(self) -> str:
         numbers = {self.variant.parameter: self.strength} | {n.name: n.middle for n in self.variant.nuisances}
@@ -74,15 +76,9 @@ class HiddenEffect:
         return self.variant.typical if self.amplitude is None else self.amplitude
 
     def draw(self, seed: int, place: int, count: int) -> tuple[AbstractEffect, dict[str, np.ndarray]]:
-        """The effect of every test.
+        """The effect of every test: one whose every field has a leading axis N, and its parameters by name, shape (N,).
 
-        Args:
-            seed: seed of the campaign.
-            place: position among the campaign's effects; each has a stream of its own.
-            count: number of tests N.
-
-        Returns:
-            An effect whose every field has a leading axis N, and the parameters by name, shape (N,).
+        Each effect of a campaign has a stream of draws of its own, by the campaign's seed and its place among them.
         """
         values = {self.variant.parameter: np.full(count, self.strength)}
         for nuisance in self.variant.nuisances:
@@ -93,8 +89,11 @@ class HiddenEffect:
             streams = [np.random.default_rng(source) for source in sources]
             if name == self.variant.parameter:
                 values[name] = self.strength * np.array([rng.standard_normal() for rng in streams])
-            else:
-                low, high = self._range(name)
+            else:  # between the ends of the grid where it is positive, as far as is plausible otherwise
+                nuisance = next(n for n in self.variant.nuisances if n.name == name)
+                low, high = nuisance.plausible
+                if low > 0:
+                    low, high = min(nuisance.grid), max(nuisance.grid)
                 share = np.array([rng.random() for rng in streams])
                 values[name] = low * (high / low) ** share if low > 0 else low + (high - low) * share
         amplitude, *others = (jnp.asarray(v, dtype=float) for v in values.values())
@@ -108,11 +107,6 @@ class HiddenEffect:
         names = [self.variant.parameter] if self.variant.random_per_test else []
         names += [n.name for n in self.variant.nuisances if n.random_per_test and n.name not in self.nuisance]
         return tuple(names)
-
-    def _range(self, name: str) -> tuple[float, float]:
-        """Between the ends of the grid where it is positive, as far as is plausible otherwise."""
-        nuisance = next(n for n in self.variant.nuisances if n.name == name)
-        return (min(nuisance.grid), max(nuisance.grid)) if nuisance.plausible[0] > 0 else nuisance.plausible
 
     def describe(self) -> dict[str, Any]:
         """For the campaign's metadata."""
@@ -160,17 +154,8 @@ def _number(name: str, text: str) -> float:
         raise InputError(f"{name} must be a number, got {text!r}") from None
 
 
-def batched_humidity(values: np.ndarray | None, count: int, reference: float) -> jax.Array:
-    """Relative humidity of every test [%], the reference where none is known."""
-    return jnp.full(count, reference) if values is None else jnp.asarray(values, dtype=float)
-
-
 def hidden_effects(effects: Any) -> tuple[HiddenEffect, ...]:
-    """Several hidden effects; one alone is a tuple of one.
-
-    Raises:
-        InputError: if one of them is none.
-    """
+    """Several hidden effects; one alone is a tuple of one. Raises `InputError` if one of them is none."""
     if isinstance(effects, HiddenEffect):
         return (effects,)
     remedy = 'Make each with mcc_jax.simulate.read_effect("creep").'
@@ -180,11 +165,7 @@ def hidden_effects(effects: Any) -> tuple[HiddenEffect, ...]:
 
 
 def humidities_of(values: Any, count: int) -> np.ndarray:
-    """Relative humidity of every test [%], shape (N,).
-
-    Raises:
-        InputError: if there are not as many as tests, or one is not between 0 and 100.
-    """
+    """Relative humidity of every test [%], shape (N,), all from 0 to 100."""
     found = arguments.floats(values, "relative_humidity_percent", shape="one number from 0 to 100 for every test")
     if found.shape != (count,) or not ((found >= 0) & (found <= 100)).all():
         raise InputError(

@@ -200,6 +200,40 @@ def test_quick_unloading_is_no_breakage():
     assert not [one for one in campaign_findings(checked) if one.check == "breakage"]
 
 
+@quickly
+@given(SEEDS, st.floats(0.3, 0.8), st.integers(8, 40), st.floats(0.03, 0.2), st.booleans())
+def test_force_that_falls_while_the_platens_close_on_is_no_unloading(seed, at, readings, lost, for_good):
+    """A slip of a test under displacement: its readings are left out until the force is back, or to the end."""
+
+    def slipping(time, force, path):
+        first = int(np.argmax(force >= at * force.max()))
+        before = force[first]
+        falls = before * (1 - lost * np.arange(1, readings + 1) / readings)
+        rises = np.empty(0) if for_good else np.linspace(falls[-1], before, readings + 1)[1:-1]
+        more = np.concatenate([falls, rises])
+        speed, step = (path[first] - path[first // 2]) / (first - first // 2), time[1] - time[0]
+        there = np.arange(1, len(more) + 1)
+        stop = first + 1 if for_good else len(force)
+        rest = slice(first + 1, stop)
+        return (
+            np.concatenate([time[: first + 1], time[first] + step * there, time[rest] + step * len(more)]),
+            np.concatenate([force[: first + 1], more, force[rest]]),
+            np.concatenate([path[: first + 1], path[first] + speed * there, path[rest] + speed * len(more)]),
+        )
+
+    slipped = faulty.changed(exact(), slipping, only=("2",))
+    checked, found = only(noisy(slipped, seed), "breakage")
+    assert (found.level, found.particles) == ("told", ("2",))
+    assert "gives way or slips" in found.sentence
+    raw = slipped.curves[1]
+    first = int(np.argmax(raw.force_mN >= at * exact().curves[1].force_mN.max()))
+    gone = readings if for_good else 2 * readings - 1
+    left_out = np.setdiff1d(np.arange(len(raw)), checked.curves[1].checked.rows)
+    assert abs(len(left_out) - gone) <= 4
+    assert abs(left_out[0] - first - 1) <= 3
+    assert np.all(np.diff(left_out) == 1)
+
+
 # ---- records that lack their loading ---------------------------------------------------------------------------------
 
 

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from mcc_jax._errors import InputError
 from mcc_jax.campaign import read_campaign, read_diameters, read_tester_file, write_campaign
 from mcc_jax.campaign.readers import micromaterials
+from mcc_jax.files import FileLimits
 
 FILES = ("FS1.txt", "Exp-50mN_0000.hld", "RobinSteel0000LC.txt", "multipleIndentations.zip")
 SIZES = [200.0, 190.0, 180.0]
@@ -268,7 +269,7 @@ def test_bad_archives(tmp_path, data, piece):
 
 def test_too_large_archive(tmp_path, monkeypatch):
     (tmp_path / "a.zip").write_bytes(zipped(**{"a.txt": ROWS}))
-    monkeypatch.setattr(micromaterials, "LARGEST_TOTAL", 50)
+    monkeypatch.setattr(micromaterials, "LIMITS", FileLimits(unpacked_bytes=50))
     assert "too large" in message(tmp_path / "a.zip")
 
 

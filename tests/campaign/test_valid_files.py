@@ -458,13 +458,12 @@ def test_time_from_a_speed(tmp_path):
 @given(seed=st.integers(0, 2**32 - 1), cycles=st.integers(1, 4), noise=st.floats(0, 2e-3))
 def test_noise_of_the_displacement_adds_no_time(seed, cycles, noise):
     from mcc_jax.campaign.readers.mapping import Pace
-    from mcc_jax.campaign.readers.pace import paced
 
     rng = np.random.default_rng(seed)
     corners = np.ravel([[rng.uniform(0, 0.3), rng.uniform(0.7, 1)] for _ in range(cycles)])
     true = np.concatenate([np.linspace(a, b, 200) for a, b in pairwise(corners)])
     measured = true + rng.uniform(-noise, noise, len(true))
-    times = paced(measured, np.arange(len(true)), Pace(speed_um_per_s=0.5))
+    times = Pace(speed_um_per_s=0.5).times(measured, np.arange(len(true)))
     path = np.concatenate([[0], np.cumsum(np.abs(np.diff(true)))]) / 0.5
     assert (np.diff(times) >= 0).all()
     assert np.abs(times - path).max() <= 4 * noise * len(corners) / 0.5 + 1e-12

@@ -10,10 +10,9 @@ from asserting import snapshot
 from helpers import TESTERS
 
 from mcc_jax.campaign import PAPER_DIAMETERS_UM, find_segments, read_campaign
-from mcc_jax.cli.demo import NOTHING
+from mcc_jax.cli.demo import NOTHING, SEALED, STRENGTHS, compared, sealed_answer
 from mcc_jax.cli.main import cli
 from mcc_jax.cli.options import STRAIN_SCALING, UNLOADING
-from mcc_jax.cli.sealed import SEALED, STRENGTHS, compared, sealed_answer
 from mcc_jax.law import StrainScaling, Unloading
 from mcc_jax.simulate import Instrument, paper_campaign
 

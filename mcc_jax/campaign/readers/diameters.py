@@ -38,7 +38,7 @@ def read_diameters(text: str | os.PathLike[str]) -> Diameters:
     if not isinstance(text, str):
         text = arguments.file_path(text, "diameters")
     parts = str(text).split(",")
-    if len(parts) == 3 and not _is_file(Path(text)):
+    if len(parts) == 3 and not os.path.isfile(text):  # noqa: PTH113  # Path's raises where a name is too long
         try:
             values = [parse_number(part) for part in parts]
         except ValueError as error:
@@ -49,30 +49,16 @@ def read_diameters(text: str | os.PathLike[str]) -> Diameters:
     return dict(zip(names, diameters.tolist(), strict=True))
 
 
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except (OSError, ValueError):  # three long numbers are no name of a file
-        return False
-
-
 def check_triple(triple: Triple, what: str, file: str | Path) -> None:
-    """Refuse anything but three positive, finite lengths [um].
-
-    Raises:
-        InputError: saying which.
-    """
+    """Refuse anything but three positive, finite lengths [um]."""
     try:
         values = np.asarray(triple, float)
     except (OverflowError, TypeError, ValueError):
         values = np.empty(0)
     if values.shape != (3,) or not ((values >= SMALLEST_DIAMETER_UM) & (values < 1e15)).all():
         shown = list(triple) if isinstance(triple, Sequence | np.ndarray) else triple
-        raise InputError(
-            f"the diameters of {what} are {shown}, where three positive lengths in um are expected",
-            file=file,
-            remedy="Give D1, D2 and D3",
-        )
+        problem = f"the diameters of {what} are {shown}, where three positive lengths in um are expected"
+        raise InputError(problem, file=file, remedy="Give D1, D2 and D3")
 
 
 def diameters_for(
@@ -83,26 +69,22 @@ def diameters_for(
 ) -> tuple[np.ndarray, int]:
     """Diameters in the order of the tests, and how many entries of a table no test needed.
 
+    Raises `InputError` if a test has none.
+
     Args:
         keys: by the name of each test the names under which a table may hold its diameters; the first that fits
             counts.
         diameters: one triple for all tests, or a table by name, which counts before what the file tells.
         told: what the tests' files tell, or why they do not.
-        file: for messages.
 
     Returns:
         Diameters [um], shape (N, 3), and the number of entries left over.
-
-    Raises:
-        InputError: if a test has none.
     """
     if diameters is not None and not isinstance(diameters, Mapping):
         check_triple(diameters, "all particles", file)
         return np.tile(np.asarray(diameters, float), (len(keys), 1)), 0
     table = dict(diameters or {})
-    form: dict[str, str] = {}
-    for name in table:
-        form.setdefault(same_text(name), name)
+    form = {same_text(name): name for name in reversed(table)}
     found: list[list[float]] = []
     used: set[str] = set()
     lacking: dict[str, InputError | None] = {}
@@ -131,22 +113,16 @@ def _no_diameters(
     if why is not None:
         others = list(lacking)[1:]
         more = f" (so it is with {_shown(others)}, too)" if others else ""
-        return InputError(why.problem + more, file=why.file, row=why.row, column=why.column, remedy=why.remedy)
+        return why.changed(problem=why.problem + more)
     if not table:
         return InputError("a tester's file knows no particle diameters", file=file, remedy=_HOW)
     if len(lacking) == len(names):
         there, tests = _shown(list(table)), _shown(names)
-        return InputError(
-            f"none of the diameters is for a test: they are for {there}, the tests are {tests}",
-            file=file,
-            remedy="Name the particles in the table like the tests or their files",
-        )
+        problem = f"none of the diameters is for a test: they are for {there}, the tests are {tests}"
+        return InputError(problem, file=file, remedy="Name the particles in the table like the tests or their files")
     more = f" (nor have {len(lacking) - 1} more)" if len(lacking) > 1 else ""
-    return InputError(
-        f"the test {name!r} has no diameters{more}",
-        file=file,
-        remedy=f"Add a row for it; the table has rows for: {_shown(list(table))}",
-    )
+    remedy = f"Add a row for it; the table has rows for: {_shown(list(table))}"
+    return InputError(f"the test {name!r} has no diameters{more}", file=file, remedy=remedy)
 
 
 def _shown(names: list[str]) -> str:

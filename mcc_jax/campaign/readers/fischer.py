@@ -27,8 +27,7 @@ def matches(lines: list[str]) -> bool:
 def read(lines: list[str], file: Path) -> Tests:
     """All tests of an export, named by their value number (`block-value` if there are several blocks).
 
-    Raises:
-        InputError: if a test is cut off or damaged, or tests are missing.
+    Raises `InputError` if a test is cut off or damaged, or tests are missing.
     """
     starts = [i for i, line in enumerate(lines) if _TEST.match(line)]
     labels = [match.groups() for i in starts if (match := _TEST.match(lines[i]))]

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import re
 import shlex
+from collections import Counter
 from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -58,17 +59,14 @@ def read_folder(
 ) -> tuple[Tests, dict[str, tuple[str, ...]], list[Finding]]:
     """The tests of all files of a folder.
 
+    Raises `InputError` if there is no file, a file cannot be read, two tests have one name, or `skip` fits no file.
+
     Args:
-        folder: the folder.
         read: reads the bytes of one file.
         skip: names of files, with or without ending, or patterns with "*" and "?", that are left out.
-        limits: how large a file may be.
 
     Returns:
         The tests; by the name of each the names under which a table may hold its diameters; and what was left out.
-
-    Raises:
-        InputError: if there is no file, a file cannot be read, two tests have one name, or `skip` fits no file.
     """
     files, findings = _files(folder, skip)
     found: dict[Path, Tests] = {}
@@ -76,20 +74,18 @@ def read_folder(
     same: dict[str, list[Path]] = {}
     for file in files:
         try:
-            if not _is_text(file.name):
-                raise InputError("the file's name is no Unicode text", file=file, remedy="Rename it")  # noqa: TRY301
+            file.name.encode("utf-8")  # a name in another encoding than the system's cannot be written into a file
             data = read_bytes(file, limits)
             found[file] = read(file, data)
             same.setdefault(hashlib.sha256(data).hexdigest(), []).append(file)
+        except UnicodeEncodeError:
+            failed[file] = InputError("the file's name is no Unicode text", file=file, remedy="Rename it")
         except InputError as error:
             failed[file] = error
     if failed:
         raise _unreadable(failed, len(files))
     findings += [_twice(each) for each in same.values() if len(each) > 1]
-    own: dict[str, int] = {}
-    for tests in found.values():
-        for name in tests.curves:
-            own[name] = own.get(name, 0) + 1
+    own = Counter(name for tests in found.values() for name in tests.curves)
     curves: dict[str, Curve] = {}
     keys: dict[str, tuple[str, ...]] = {}
     told: dict[str, list[float] | InputError] = {}
@@ -100,11 +96,9 @@ def read_folder(
         for name, curve in tests.curves.items():
             full = stem if len(tests.curves) == 1 else f"{stem}-{name}"
             if full in curves:
-                raise InputError(
-                    f"this file and {origin[full].name} both give a test the name {full!r}",
-                    file=file,
-                    remedy=f"Rename one of them, or leave one out with --skip {shlex.quote(file.name)}",
-                )
+                problem = f"this file and {origin[full].name} both give a test the name {full!r}"
+                remedy = f"Rename one of them, or leave one out with --skip {shlex.quote(file.name)}"
+                raise InputError(problem, file=file, remedy=remedy)
             curves[full], origin[full] = curve, file
             keys[full] = (full, *names_of(file), *([name] if own[name] == 1 else []))
             if (size := tests.diameters_um.get(name)) is not None:
@@ -121,24 +115,18 @@ def _files(folder: Path, skip: Sequence[str]) -> tuple[list[Path], list[Finding]
         entries = sorted(folder.iterdir(), key=lambda entry: natural(entry.name))
         inside = [entry for entry in entries if entry.is_dir()]
     except OSError as error:
-        raise InputError(
-            f"cannot be read: {error.strerror or error}", file=folder, remedy="Check the permissions"
-        ) from None
-    names = {entry.name for entry in entries}
-    if {"particles.csv", "curves.csv"} <= names:
+        problem = f"cannot be read: {error.strerror or error}"
+        raise InputError(problem, file=folder, remedy="Check the permissions") from None
+    if {"particles.csv", "curves.csv"} <= {entry.name for entry in entries}:
         raise InputError("is a campaign already", file=folder, remedy="Give the folder with the tester's files")
-    rest = [entry for entry in entries if entry not in inside]
-    quiet = [entry for entry in rest if passed_over(entry.name)]
-    rest = [entry for entry in rest if entry not in quiet]
+    quiet = [entry for entry in entries if entry not in inside and passed_over(entry.name)]
+    rest = [entry for entry in entries if entry not in inside and entry not in quiet]
     skipped: list[Path] = []
     for pattern in skip:
         fitting = [entry for entry in rest if _fits(entry, pattern)]
         if not fitting and not any(_fits(entry, pattern) for entry in quiet):
-            raise InputError(
-                f"--skip {shlex.quote(pattern)} fits no file",
-                file=folder,
-                remedy="Give a name as in the folder, or a pattern",
-            )
+            problem = f"--skip {shlex.quote(pattern)} fits no file"
+            raise InputError(problem, file=folder, remedy="Give a name as in the folder, or a pattern")
         skipped += [entry for entry in fitting if entry not in skipped]
     files = [entry for entry in rest if entry not in skipped]
     if not files:
@@ -161,14 +149,6 @@ def _fits(entry: Path, pattern: str) -> bool:
     return wanted in (name, stem) or fnmatchcase(name, wanted)
 
 
-def _is_text(name: str) -> bool:
-    """Whether a name can be written into a file; one in another encoding than the system's cannot."""
-    try:
-        return bool(name.encode("utf-8"))
-    except UnicodeEncodeError:
-        return False
-
-
 def _count(files: Sequence[Path]) -> str:
     return "1 file" if len(files) == 1 else f"{len(files)} files"
 
@@ -184,7 +164,7 @@ def _unreadable(failed: dict[Path, InputError], files: int) -> InputError:
     if len(failed) == files:
         more = f". So it is with all {files} files" if files > 1 else ""
         remedy = (error.remedy or "").rstrip(".") + more
-        return InputError(error.problem, file=error.file, row=error.row, column=error.column, remedy=remedy)
+        return error.changed(remedy=remedy)
     shown = " ".join(f"--skip {shlex.quote(name)}" for name in names[:_SHOWN])
     others = f" ({len(names)} of {files} files cannot be read)" if len(names) > 1 else ""
     rest = " ..." if len(names) > _SHOWN else ""
@@ -194,7 +174,7 @@ def _unreadable(failed: dict[Path, InputError], files: int) -> InputError:
 def _or_skip(error: InputError, how: str, others: str = "") -> InputError:
     """The same error, with the way to leave the file out."""
     remedy = ", ".join([*([error.remedy.rstrip(".")] if error.remedy else []), f"or leave it out{others} with {how}"])
-    return InputError(error.problem, file=error.file, row=error.row, column=error.column, remedy=remedy)
+    return error.changed(remedy=remedy)
 
 
 def _twice(files: Sequence[Path]) -> Finding:
@@ -214,11 +194,8 @@ def _control(found: dict[Path, Tests]) -> Control | None:
     for file, tests in found.items():
         by.setdefault(tests.control, file)
     if "load" in by and "displacement" in by:
-        raise InputError(
-            f"the test is controlled by displacement, that of {by['load'].name} by load",
-            file=by["displacement"],
-            remedy="Convert tests of two kinds apart, with --skip",
-        )
+        problem = f"the test is controlled by displacement, that of {by['load'].name} by load"
+        raise InputError(problem, file=by["displacement"], remedy="Convert tests of two kinds apart, with --skip")
     return next(iter(by)) if len(by) == 1 else None
 
 
@@ -233,11 +210,7 @@ def _other(found: dict[Path, Tests]) -> dict[str, Any]:
 
 
 def _short(value: Any) -> Any:
-    if isinstance(value, dict):
-        kept = {key: _short(item) for key, item in value.items()}
-        return {key: item for key, item in kept.items() if item != {} and not _is_long(item)}
-    return value
-
-
-def _is_long(value: Any) -> bool:
-    return isinstance(value, list) and len(value) > LONGEST_LIST
+    if not isinstance(value, dict):
+        return value
+    kept = {key: _short(item) for key, item in value.items()}
+    return {k: v for k, v in kept.items() if v != {} and not (isinstance(v, list) and len(v) > LONGEST_LIST)}

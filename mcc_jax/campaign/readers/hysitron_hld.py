@@ -26,11 +26,7 @@ def matches(lines: list[str]) -> bool:
 
 
 def read(lines: list[str], file: Path) -> Tests:
-    """The one test of the file, named by the file.
-
-    Raises:
-        InputError: if a block is missing, cut off or damaged.
-    """
+    """The one test of the file, named by the file. Raises `InputError` if a block is missing, cut off or damaged."""
     blocks: dict[str, dict[str, np.ndarray]] = {}
     first_row = 0
     header: list[tuple[str, str]] = []

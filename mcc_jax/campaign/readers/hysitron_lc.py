@@ -17,10 +17,6 @@ _COUNT = re.compile(r"Number of Points *= *(\d{1,9})\s*")
 _TIME, _DEPTH, _LOAD = "Time (s)", "Depth (nm)", "Load (µN)"
 
 
-def _normal(name: str) -> str:
-    return name.replace("μ", "µ").replace("uN", "µN").strip()
-
-
 def matches(lines: list[str]) -> bool:
     """Whether this is such an export."""
     return any(_COUNT.fullmatch(line) for line in lines[:20]) and any(
@@ -29,39 +25,24 @@ def matches(lines: list[str]) -> bool:
 
 
 def read(lines: list[str], file: Path) -> Tests:
-    """The one test of the file, named by the file.
-
-    Raises:
-        InputError: if samples or columns are missing or damaged.
-    """
+    """The one test of the file, named by the file. Raises `InputError` if samples or columns are missing or damaged."""
     head = next(i for i, line in enumerate(lines) if line.startswith("Depth (nm)"))
     count_row, announced = next((i + 1, int(m[1])) for i, line in enumerate(lines) if (m := _COUNT.fullmatch(line)))
-    names = [_normal(name) for name in lines[head].split("\t")]
+    names = [name.replace("μ", "µ").replace("uN", "µN").strip() for name in lines[head].split("\t")]
     for name in (_TIME, _DEPTH, _LOAD):
         if name not in names:
             raise cut_off(f"the column {name!r} is missing", file, head + 1)
     refuse_twice(names, file, head + 1)
-    rows = [i for i in range(head + 1, len(lines)) if lines[i].strip()]
+    rows = np.array([i for i in range(head + 1, len(lines)) if lines[i].strip()], int)
     if len(rows) != announced:
         raise cut_off(f"{announced} points are announced, the file holds {len(rows)}", file, count_row)
-    columns: dict[str, list[float]] = {name: [] for name in names}
-    lengths: list[int] = []
-    i = head + 1
-    while i < len(lines):
-        stop = next((j for j in range(i, len(lines)) if not lines[j].strip()), len(lines))
-        if stop > i:
-            block = number_block(lines, i, stop, names, file)
-            lengths.append(len(block))
-            for name, values in zip(names, block.T, strict=True):
-                columns[name].extend(values.tolist())
-        i = stop + 1
-    return _tests(columns, lengths, rows, lines[0].strip(), file)
-
-
-def _tests(columns: dict[str, list[float]], lengths: list[int], rows: list[int], date: str, file: Path) -> Tests:
-    time, depth, load = (np.array(columns.pop(name)) for name in (_TIME, _DEPTH, _LOAD))
+    parts = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
+    blocks = [number_block(lines, int(part[0]), int(part[-1]) + 1, names, file) for part in parts if len(part)]
+    columns = dict(zip(names, np.concatenate([np.empty((0, len(names))), *blocks]).T, strict=True))
+    time, depth, load = (columns.pop(name) for name in (_TIME, _DEPTH, _LOAD))
     back = np.flatnonzero(np.diff(time) < 0)
-    first_row = rows[int(back[0]) + 1] - int(back[0]) if len(back) else rows[0] + 1 if rows else 1
-    curve = checked_curve(time, load / 1e3, depth / 1e3, file, first_row, file.stem)
-    other = {"date": date, "block_lengths": lengths, "further_columns": columns}
+    first_row = rows[back[0] + 1] - back[0] if len(back) else rows[0] + 1 if len(rows) else 1
+    curve = checked_curve(time, load / 1e3, depth / 1e3, file, int(first_row), file.stem)
+    further = {name: values.tolist() for name, values in columns.items()}
+    other = {"date": lines[0].strip(), "block_lengths": [len(block) for block in blocks], "further_columns": further}
     return Tests({file.stem: curve}, "Hysitron load-control text", "load", other)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections import Counter
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -15,18 +17,17 @@ from ..columns import LARGEST_MAGNITUDE, LENGTH, convert, unit_factor
 from ..schema import Curve
 from ..table import (
     APOSTROPHES,
-    Grouping,
+    filled,
     number_of_cells,
     parse_number,
     same_text,
+    thousands_for_decimals,
     thousands_mark,
 )
 from ..validate import check_magnitudes
 from .diameters import check_triple
-from .mapped_rows import Rows, Sheet, read_rows
 from .mapping import DIMENSIONS, InHeader, MappingFile
-from .pace import paced
-from .text import Tests, checked_curve
+from .text import Rows, Sheet, Tests, checked_curve, read_rows
 
 _FURTHEST = 200
 """Rows above a header found by `begin`, within which it is looked for again; a tester's preamble has a few dozen."""
@@ -36,28 +37,19 @@ _OWN_DIAMETER = "Add it to the file, or give this test's diameters in a table by
 def read_mapped(data: bytes, file: Path, mapping: MappingFile) -> Tests:
     """The tests of a file that a mapping describes.
 
-    Args:
-        data: the file's bytes.
-        file: its path, for names and messages.
-        mapping: what `read_mapping` gave.
-
-    Raises:
-        InputError: if the file does not hold what the mapping says, or a cell is damaged.
+    Raises `InputError` if the file does not hold what the mapping says, or a cell is damaged.
     """
     reader = _Reader(read_rows(data, file, mapping), file, mapping)
     reader.run()
     if not reader.samples:
-        remedy = f"Check skip_rows, header_rows and {'end' if mapping.end else 'skip_footer'} in {mapping.file.name}"
         if reader.missing:
-            raise InputError(
-                "every row has a missing reading", file=file, remedy=f"Check missing in {mapping.file.name}"
-            )
-        raise InputError("there are no rows of data", file=file, remedy=remedy)
+            raise reader.wrong("every row has a missing reading", f"Check missing in {mapping.file.name}")
+        end = "end" if mapping.end else "skip_footer"
+        remedy = f"Check skip_rows, header_rows and {end} in {mapping.file.name}"
+        raise reader.wrong("there are no rows of data", remedy)
     for name in reader.missing:
         if name not in reader.samples:
-            raise InputError(
-                f"every row of the test {name!r} has a missing reading", file=file, remedy="Remove the test's rows"
-            )
+            raise reader.wrong(f"every row of the test {name!r} has a missing reading", "Remove the test's rows")
     again = reader.header_came_again
     curves = {name: _curve(name, rows, mapping, file, again) for name, rows in reader.samples.items()}
     other = {"mapping_provenance": mapping.provenance} if mapping.provenance else {}
@@ -81,20 +73,20 @@ class _Reader:
     parted: bool = False  # whether the next sample begins a test
     header_came_again: bool = False
 
-    def run(self) -> None:
-        """Read all rows.
+    def wrong(self, problem: str, remedy: str, i: int | None = None, column: str | int | None = None) -> InputError:
+        """The error for the file, or for its row of index `i`."""
+        row, named = None if i is None else i + 1, None if column is None else str(column)
+        return InputError(problem, file=self.file, row=row, column=named, remedy=remedy)
 
-        Raises:
-            InputError: at the first row that is neither sample, header nor footer.
-        """
+    def run(self) -> None:
+        """Read all rows. Raises `InputError` at the first row that is neither sample, header nor footer."""
         rows, mapping = self.rows, self.mapping
         head = self._head()
-        self.header = self._header(head)
+        self.header = rows.cells(head) if mapping.header_rows and head < len(rows) else None
         self.stop = self._stop(head + mapping.header_rows)
-        self.where = {n: _index(c.column, self.header, self.file, head + 1, self) for n, c in mapping.columns.items()}
+        self.where = {name: self._place(column.column, head) for name, column in mapping.columns.items()}
         self.wanted = [quantity for quantity in DIMENSIONS if quantity in self.where]
         self.width, self.raw_width = self._widths(head)
-        self.groupings = {quantity: Grouping(mapping.decimal_mark) for quantity in self.wanted}
         sizes = self._diameters(0, head)
         block, ended = 1, False
         i = head + mapping.header_rows
@@ -103,66 +95,59 @@ class _Reader:
                 self.parted = self.parted or mapping.tests == "blank line"
                 ended = ended and mapping.tests != "blank line"
                 i += 1
-                continue
-            if mapping.comment_prefix is not None and rows.begins(i, mapping.comment_prefix):
+            elif mapping.comment_prefix is not None and rows.begins(i, mapping.comment_prefix):
                 i += 1
-                continue
-            below = self._rows_above_again(i)
-            if below is not None:
-                sizes = self._diameters(i, below) if mapping.diameters is not None else sizes
+            elif (below := self._rows_above_again(i)) is not None:
+                sizes = self._diameters(i, below)
                 i = below
-                continue
-            again = self._header_again(i)
-            if again is not None:
+            elif (again := self._header_again(i)) is not None:
                 if mapping.tests == "file" and mapping.pace is not None:
-                    raise InputError(
-                        "the header comes again, so this is more than one test",
-                        file=self.file,
-                        row=again + 1,
-                        remedy=f'Write tests = "header" in {mapping.file.name}',
-                    )
-                if mapping.diameters is not None and again > i:
-                    sizes = self._diameters(i, again)
+                    remedy = f'Write tests = "header" in {mapping.file.name}'
+                    raise self.wrong("the header comes again, so this is more than one test", remedy, again)
+                sizes = self._diameters(i, again) if again > i else sizes
                 self.parted, ended = self.parted or mapping.tests == "header", False
                 self.header_came_again = True
                 i = again + mapping.header_rows
-                continue
-            ended = ended or (mapping.end is not None and rows.begins(i, mapping.end))
-            if not ended:
-                cells = self._fit(i)
-                numbers = self._numbers(cells, i)
-                if mapping.tests in ("blank line", "header"):
-                    block += self.parted and bool(self.samples or self.missing)
-                name = self._name(cells, block, i)
-                self.parted = False
-                if numbers is None:
-                    self.missing[name] += 1
-                else:
-                    self.samples.setdefault(name, []).append(
-                        (i + 1, len(self.samples.get(name, ())) + self.missing[name], numbers)
-                    )
-                if sizes is not None:
-                    self.diameters_um.setdefault(name, sizes)
-            i += 1
+            else:
+                ended = ended or (mapping.end is not None and rows.begins(i, mapping.end))
+                if not ended:
+                    if mapping.tests in ("blank line", "header"):
+                        block += self.parted and bool(self.samples or self.missing)
+                    self._take(i, block, sizes)
+                i += 1
         self._refuse_groups()
+
+    def _take(self, i: int, block: int, sizes: list[float] | InputError | None) -> None:
+        """Keep a row of data, of the test of this number where the file does not name it, with its diameters."""
+        cells = self._fit(i)
+        numbers = self._numbers(cells, i)
+        name = self._name(cells, block, i)
+        self.parted = False
+        if numbers is None:
+            self.missing[name] += 1
+        else:
+            rows = self.samples.setdefault(name, [])
+            rows.append((i + 1, len(rows) + self.missing[name], numbers))
+        if sizes is not None:
+            self.diameters_um.setdefault(name, sizes)
 
     def _refuse_groups(self) -> None:
         """Refuse a column of text whose decimal mark looks like one between thousands, unless the mapping says none."""
         if self.mapping.thousands is not None or isinstance(self.rows, Sheet):
             return
-        for quantity, grouping in self.groupings.items():
-            if (found := grouping.found()) is not None:
-                (row, _), problem = found
-                word = {".": "point", ",": "comma"}[self.mapping.decimal_mark]
-                other = {".": ",", ",": "."}[self.mapping.decimal_mark]
-                raise InputError(
-                    problem,
-                    file=self.file,
-                    row=row,
-                    column=str(self.mapping.columns[quantity].column),
-                    remedy=f'Write thousands = "{word}" and decimal_mark = "{other}" in {self.mapping.file.name}, or '
-                    'thousands = "none" if it is a decimal mark',
+        mark = self.mapping.decimal_mark
+        for quantity in self.wanted:
+            place = self.where[quantity]
+            taken = (row for samples in self.samples.values() for row, _, _ in samples)
+            found = thousands_for_decimals(((row, self.rows.cells(row - 1)[place]) for row in taken), mark)
+            if found is not None:
+                row, problem = found
+                word, other = ("point", ",") if mark == "." else ("comma", ".")
+                remedy = (
+                    f'Write thousands = "{word}" and decimal_mark = "{other}" in {self.mapping.file.name}, or '
+                    'thousands = "none" if it is a decimal mark'
                 )
+                raise self.wrong(problem, remedy, row - 1, self.mapping.columns[quantity].column)
 
     def _head(self) -> int:
         """The index of the header, or of the first row of data where there is none."""
@@ -171,15 +156,30 @@ class _Reader:
             return self.mapping.skip_rows
         found = next((i for i in range(len(self.rows)) if self.rows.begins(i, begin)), None)
         if found is None:
-            raise InputError(
-                f"no row begins with {begin!r}", file=self.file, remedy=f"Correct begin in {self.mapping.file.name}"
-            )
+            raise self.wrong(f"no row begins with {begin!r}", f"Correct begin in {self.mapping.file.name}")
         return found
 
-    def _header(self, head: int) -> list[str] | None:
-        if not self.mapping.header_rows or head >= len(self.rows):
-            return None
-        return self.rows.cells(head)
+    def _place(self, column: str | int, head: int) -> int:
+        """The index of a column, told by its name in the header or its number."""
+        if isinstance(column, int):
+            if self.header is not None and column > len(self.header):
+                raise self.wrong(f"there is no column {column}, only {len(self.header)}", "Count again", head)
+            return column - 1
+        names = [same_text(name).strip() for name in self.header or []]
+        found = [i for i, name in enumerate(names) if name == same_text(column)]
+        if len(found) == 1:
+            return found[0]
+        if found:
+            raise self.wrong(f"there are {len(found)} columns called {column!r}", "Give its number", head)
+        file, close = self.mapping.file.name, get_close_matches(column, names, n=1)
+        other = [word for word, mark in (("semicolon", ";"), ("tab", "\t"), ("comma", ",")) if mark in "".join(names)]
+        if len(names) == 1 and other:
+            remedy = f'If its columns are parted by a {other[0]}, write delimiter = "{other[0]}" in {file}'
+        elif close:
+            remedy = f"Did you mean {close[0]!r}?"
+        else:
+            remedy = f"There are: {', '.join(names)}; if this is not the header, correct skip_rows in {file}"
+        raise self.wrong(f"there is no column {column!r}", remedy, head)
 
     def _stop(self, body: int) -> int:
         """The index behind the last row, without the footer."""
@@ -193,7 +193,7 @@ class _Reader:
         if first is None:
             first = next((self.rows.cells(i) for i in range(head, self.stop) if not self.rows.blank(i)), [])
         needed = max(self.where.values()) + 1
-        return max(needed, _filled(first)), max(needed, len(first))
+        return max(needed, filled(first)), max(needed, len(first))
 
     def _header_again(self, i: int) -> int | None:
         """The index of the header if it comes again at this row, or below rows that are no samples; else None."""
@@ -228,28 +228,25 @@ class _Reader:
         for place in self.where.values():
             first = same_text((self.header or [])[place]).strip()
             if place >= len(names) or names[place] != first:
-                raise InputError(
-                    f"the header comes again without {first!r} as its column {place + 1}",
-                    file=self.file,
-                    row=i + 1,
-                    remedy="Put tests with other columns into a file of their own",
-                )
+                problem = f"the header comes again without {first!r} as its column {place + 1}"
+                raise self.wrong(problem, "Put tests with other columns into a file of their own", i)
         return i
 
     def _is_sample(self, i: int) -> bool:
         """Whether every reading of a row is a number, or marked as missing."""
         if self.rows.blank(i):
             return False
-        cells = self.rows.cells(i)
-        return all(
-            self.where[q] < len(cells)
-            and (self._is_number(cells[self.where[q]]) or self._is_missing(cells[self.where[q]]))
-            for q in self.wanted
+        cells, places = self.rows.cells(i), [self.where[quantity] for quantity in self.wanted]
+        return max(places) < len(cells) and all(
+            self._is_number(cells[place]) or self._is_missing(cells[place]) for place in places
         )
+
+    def _number(self, cell: str) -> float:
+        return parse_number(cell, self.mapping.decimal_mark, self.mapping.thousands or "")
 
     def _is_number(self, cell: str) -> bool:
         try:
-            parse_number(cell, self.mapping.decimal_mark, self.mapping.thousands or "")
+            self._number(cell)
         except ValueError:
             return False
         return True
@@ -257,9 +254,9 @@ class _Reader:
     def _fit(self, i: int) -> list[str]:
         """The cells of a row of data, of which those behind the last column are empty."""
         cells = self.rows.cells(i)
-        if len(cells) == self.raw_width or (len(cells) >= self.width and _filled(cells) <= self.width):
+        if len(cells) == self.raw_width or (len(cells) >= self.width and filled(cells) <= self.width):
             return cells
-        count = len(cells) if len(cells) < self.width else _filled(cells)
+        count = len(cells) if len(cells) < self.width else filled(cells)
         name = self.mapping.file.name
         if self._is_footer(i):
             remedy = self._footer_remedy(i)
@@ -269,9 +266,7 @@ class _Reader:
             remedy = f"Check delimiter and decimal_mark in {name}, and quote text that holds the delimiter"
         else:
             remedy = "Fill the row or delete it; if the file was cut off here, export it again"
-        raise InputError(
-            f"{number_of_cells(count)} where {self.width} are expected", file=self.file, row=i + 1, remedy=remedy
-        )
+        raise self.wrong(f"{number_of_cells(count)} where {self.width} are expected", remedy, i)
 
     def _numbers(self, cells: list[str], i: int) -> list[float] | None:
         """The readings of a row, None where one of them is missing."""
@@ -282,30 +277,29 @@ class _Reader:
         for quantity in self.wanted:
             cell = cells[self.where[quantity]]
             try:
-                found.append(parse_number(cell, mapping.decimal_mark, mapping.thousands or ""))
-                self.groupings[quantity].see(cell, (i + 1, self.where[quantity]))
+                found.append(self._number(cell))
             except ValueError as error:
-                raise InputError(
-                    str(error),
-                    file=self.file,
-                    row=i + 1,
-                    column=str(mapping.columns[quantity].column),
-                    remedy=self._number_remedy(cell.strip(), i),
-                ) from None
+                remedy = self._number_remedy(cell.strip(), i)
+                raise self.wrong(str(error), remedy, i, mapping.columns[quantity].column) from None
         return found
 
     def _is_missing(self, cell: str) -> bool:
         cell = cell.strip()
+        texts, numbers = self.missing_marks
+        try:
+            return cell.lower() in texts or (bool(numbers) and self._number(cell) in numbers)
+        except ValueError:
+            return False
+
+    @cached_property
+    def missing_marks(self) -> tuple[set[str], set[float]]:
+        """Texts, and numbers, that mean that there is no reading."""
+        texts = {mark.lower() for mark in self.mapping.missing if isinstance(mark, str)}
+        numbers: set[float] = set()
         for mark in self.mapping.missing:
-            if isinstance(mark, str) and cell.lower() == mark.lower():
-                return True
-            try:
-                number = parse_number(str(mark)) if isinstance(mark, str) else mark
-                if parse_number(cell, self.mapping.decimal_mark, self.mapping.thousands or "") == number:
-                    return True
-            except ValueError:
-                continue
-        return False
+            with contextlib.suppress(ValueError):
+                numbers.add(parse_number(mark) if isinstance(mark, str) else mark)
+        return texts, numbers
 
     def _number_remedy(self, cell: str, i: int) -> str:
         """What to do about a cell that is no number, by what it looks like."""
@@ -356,13 +350,8 @@ class _Reader:
             case "column":
                 name = same_text(cells[self.where["test"]].strip())
                 if not name:
-                    raise InputError(
-                        "the test's name is empty",
-                        file=self.file,
-                        row=i + 1,
-                        column=str(self.mapping.columns["test"].column),
-                        remedy="Fill the cell, or remove the row",
-                    )
+                    column = self.mapping.columns["test"].column
+                    raise self.wrong("the test's name is empty", "Fill the cell, or remove the row", i, column)
                 return name
             case "file":
                 return same_text(self.mapping.test_name or self.file.stem)
@@ -393,31 +382,22 @@ class _Reader:
             numbers = [w for w in words if self._is_number(w)]
             if len(numbers) != 1:
                 problem = f"{name!r} holds {len(numbers) or 'no'} number{'s' if numbers else ''}"
-                raise InputError(problem, file=self.file, row=i + 1, remedy=_OWN_DIAMETER)
-            value = parse_number(numbers[0], self.mapping.decimal_mark, self.mapping.thousands or "")
+                raise self.wrong(problem, _OWN_DIAMETER, i)
+            value = self._number(numbers[0])
             try:
                 if asked.factor is None and not units:
                     raise ValueError("the unit is missing")  # noqa: TRY301
                 factor = unit_factor(units[0], LENGTH) if asked.factor is None else asked.factor
             except ValueError as error:
                 remedy = f'Write unit = "mm" below header in {self.mapping.file.name}'
-                raise InputError(str(error), file=self.file, row=i + 1, column=name, remedy=remedy) from None
+                raise self.wrong(str(error), remedy, i, name) from None
             if not value > 0:
-                problem = f"the diameter {value:g} is not positive"
-                raise InputError(problem, file=self.file, row=i + 1, column=name, remedy=_OWN_DIAMETER)
+                raise self.wrong(f"the diameter {value:g} is not positive", _OWN_DIAMETER, i, name)
             return float(convert(np.array([value]), factor)[0])
-        raise InputError(
-            f"no row above the samples begins with {name!r}, which is to tell a diameter",
-            file=self.file,
-            remedy=_OWN_DIAMETER,
-        )
+        raise self.wrong(f"no row above the samples begins with {name!r}, which is to tell a diameter", _OWN_DIAMETER)
 
 
 _CLOCK = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}.*|(?:[0-9]+ days?,? )?[0-9]{1,2}:[0-9]{2}(?::[0-9.]+)?.*")
-
-
-def _filled(cells: list[str]) -> int:
-    return next((i for i in range(len(cells), 0, -1) if cells[i - 1].strip()), 0)
 
 
 def _first(cells: list[str]) -> str:
@@ -438,35 +418,6 @@ def _is_no_reading(cell: str) -> bool:
         return False
 
 
-def _index(column: str | int | None, header: list[str] | None, file: Path, row: int, reader: _Reader) -> int:
-    if isinstance(column, int):
-        if header is not None and column > len(header):
-            raise InputError(
-                f"there is no column {column}, only {len(header)}", file=file, row=row, remedy="Count again"
-            )
-        return column - 1
-    names = [same_text(name).strip() for name in header or []]
-    found = [i for i, name in enumerate(names) if name == same_text(str(column))]
-    if len(found) == 1:
-        return found[0]
-    problem = f"there are {len(found)} columns called {column!r}" if found else f"there is no column {column!r}"
-    close = get_close_matches(str(column), names, n=1)
-    other = [word for word, mark in (("semicolon", ";"), ("tab", "\t"), ("comma", ",")) if mark in "".join(names)]
-    if found:
-        remedy = "Give its number"
-    elif len(names) == 1 and other:
-        remedy = (
-            f'If its columns are parted by a {other[0]}, write delimiter = "{other[0]}" in {reader.mapping.file.name}'
-        )
-    elif close:
-        remedy = f"Did you mean {close[0]!r}?"
-    else:
-        remedy = (
-            f"There are: {', '.join(names)}; if this is not the header, correct skip_rows in {reader.mapping.file.name}"
-        )
-    raise InputError(problem, file=file, row=row, remedy=remedy)
-
-
 def _curve(name: str, rows: list[_Sample], mapping: MappingFile, file: Path, again: bool) -> Curve:
     wanted = [quantity for quantity in DIMENSIONS if quantity in mapping.columns]
     raw = np.array([numbers for _, _, numbers in rows]).T
@@ -477,19 +428,15 @@ def _curve(name: str, rows: list[_Sample], mapping: MappingFile, file: Path, aga
         columns[quantity] = column.sign * convert(np.ascontiguousarray(values), column.factor)
         check_magnitudes(columns[quantity], file, at, str(column.column))
     if mapping.pace is not None:
-        columns["time"] = paced(columns["displacement"], np.array([order for _, order, _ in rows]), mapping.pace)
+        columns["time"] = mapping.pace.times(columns["displacement"], np.array([order for _, order, _ in rows]))
         check_magnitudes(columns["time"], file, at, "time")
     time = columns["time"]
     back = np.flatnonzero(np.diff(time) < 0)
     if len(back) and mapping.tests == "file":
         before, here = at[int(back[0])], at[int(back[0]) + 1]
         way = "header" if again else "blank line" if here > before + 1 else "column"
-        raise InputError(
-            f"the time of test {name!r} goes back",
-            file=file,
-            row=here,
-            remedy=f'If another test begins here, write tests = "{way}" in {mapping.file.name} or part the file',
-        )
+        remedy = f'If another test begins here, write tests = "{way}" in {mapping.file.name} or part the file'
+        raise InputError(f"the time of test {name!r} goes back", file=file, row=here, remedy=remedy)
     # Rows of one test need not follow each other, so the row of the first sample is no guide.
     first = at[int(back[0]) + 1] - int(back[0]) - 1 if len(back) else at[0]
     return checked_curve(time, columns["force"], columns["displacement"], file, first, name)

@@ -51,25 +51,31 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Callable
 from collections.abc import Mapping as MappingABC
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from difflib import get_close_matches
 from fractions import Fraction
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal, get_args
+
+import numpy as np
 
 from ..._errors import InputError
 from ..columns import EXAMPLES, FORCE, LENGTH, TIME, unit_factor
 from ..metadata import load_toml_file
 from ..schema import Control
+from ..signal import turning_points
 from ..table import APOSTROPHES, SPACES, same_text
 from .diameters import Diameters, check_triple
 
 _DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
 DIMENSIONS = {"time": TIME, "force": FORCE, "displacement": LENGTH}
 Split = Literal["file", "blank line", "header", "column"]
-_THOUSANDS = {"none": "", "point": ".", "comma": ",", "apostrophe": APOSTROPHES, "space": SPACES}
-_SAME = {**dict.fromkeys(SPACES, SPACES), **dict.fromkeys(APOSTROPHES, APOSTROPHES), ".": ".", ",": ","}
+_THOUSANDS = {"none": "", "point": ".", "comma": ",", "apostrophe": APOSTROPHES, "space": SPACES} | {
+    mark: marks for marks in (".", ",", APOSTROPHES, SPACES) for mark in marks
+}
 
 
 @dataclass(frozen=True)
@@ -87,6 +93,31 @@ class Pace:
     interval_s: float | None = None
     speed_um_per_s: float | None = None
     reversal_share: float = 0.02
+
+    def times(self, displacement_um: np.ndarray, order: np.ndarray) -> np.ndarray:
+        """Times [s] of the samples, shape (n,), never decreasing; the first row of the test is at 0.
+
+        With a speed v the time is the length of the path gone so far over v. The path runs from one turning point to
+        the next; between two of them no time passes until the displacement exceeds what it had reached, so that noise
+        adds nothing. A displacement that stands still (a hold at constant displacement) takes no time, which no file
+        without times can tell otherwise.
+
+        Args:
+            displacement_um: displacement [um], shape (n,).
+            order: number of each sample's row in its test, from 0; rows with missing readings count, shape (n,).
+        """
+        if self.interval_s is not None:
+            return self.interval_s * order
+        assert self.speed_um_per_s is not None
+        path = np.zeros(len(displacement_um))
+        gone = 0.0
+        for start, stop in pairwise(turning_points(displacement_um, self.reversal_share * np.ptp(displacement_um))):
+            leg = displacement_um[start : stop + 1]
+            sign = 1.0 if leg[-1] >= leg[0] else -1.0
+            path[start : stop + 1] = gone + np.maximum.accumulate(sign * (leg - leg[0]))
+            gone = float(path[stop])
+        with np.errstate(over="ignore"):  # the caller checks the size
+            return path / self.speed_um_per_s
 
 
 @dataclass(frozen=True)
@@ -134,46 +165,61 @@ class MappingFile:
     test_name: str | None = None
     control: Control | None = None
     provenance: str | None = None
-    diameters_um: Diameters | None = field(default=None)
+    diameters_um: Diameters | None = None
     diameters: InHeader | None = None
 
 
 def read_mapping(path: str | os.PathLike[str]) -> MappingFile:
-    """Read and check a mapping file.
-
-    Args:
-        path: the TOML file.
-
-    Raises:
-        InputError: naming the key that is missing, unknown or wrong.
-    """
+    """Read and check a mapping file. Raises `InputError` naming the key that is missing, unknown or wrong."""
     file = Path(path)
     entries = load_toml_file(file, "a TOML mapping file")
     try:
         return MappingFile(file=file, **_values(entries, file))
     except InputError as error:
-        raise InputError(error.problem, file=file, column=error.column, remedy=error.remedy) from None
+        raise error.changed(file=file) from None
 
 
-_WANTED = {
-    "encoding": (str, 'a name such as "latin-1"'),
-    "delimiter": (str, '"comma", "semicolon", "tab", "space" or one character'),
-    "sheet": ((str, int), "the sheet's name, or its number from 1 on"),
-    "decimal_mark": (str, '"." or ","'),
-    "thousands": (str, '"point", "comma", "apostrophe", "space", "none" or one of these characters'),
-    "missing": (list, 'a list of texts and numbers such as ["NaN", "", -999]'),
-    "comment_prefix": (str, 'text such as "#"'),
-    "skip_rows": (int, "a whole number, 0 or more"),
-    "begin": (str, "the text that the header begins with"),
-    "header_rows": (int, "a whole number, 0 or more"),
-    "skip_footer": (int, "a whole number, 0 or more"),
-    "end": (str, "the text that the first row below the samples begins with"),
-    "tests": (str, '"file", "blank line", "header" or "column"'),
-    "test_name": (str, "text"),
-    "control": (str, '"load" or "displacement"'),
-    "provenance": (str, "text"),
+def _is_encoding(name: str) -> bool:
+    try:
+        return "".encode(name) is not None
+    except (LookupError, ValueError):
+        return False
+
+
+def _are_marks(marks: list[Any]) -> bool:
+    return bool(marks) and all(isinstance(mark, str | int | float) and not isinstance(mark, bool) for mark in marks)
+
+
+_MARKS = '"point", "comma", "apostrophe", "space", "none"'
+_TEXT = str, lambda text: bool(text.strip())
+_COUNT = int, lambda number: number >= 0, "a whole number, 0 or more"
+_PLAIN: dict[str, tuple[type | tuple[type, ...], Callable[[Any], bool], str]] = {
+    "encoding": (str, _is_encoding, 'a name such as "latin-1"'),
+    "delimiter": (
+        str,
+        lambda text: text in _DELIMITERS or (len(text) == 1 and text not in '"\r\n\0'),
+        '"comma", "semicolon", "tab", "space" or one character',
+    ),
+    "sheet": (
+        (str, int),
+        lambda sheet: bool(sheet.strip()) if isinstance(sheet, str) else sheet >= 1,
+        "the sheet's name, or its number from 1 on",
+    ),
+    "decimal_mark": (str, (".", ",").__contains__, '"." or ","'),
+    "thousands": (str, _THOUSANDS.__contains__, f"{_MARKS} or one of these characters"),
+    "missing": (list, _are_marks, 'a list of texts and numbers such as ["NaN", "", -999]'),
+    "comment_prefix": (*_TEXT, 'text such as "#"'),
+    "skip_rows": _COUNT,
+    "begin": (*_TEXT, "the text that the header begins with"),
+    "header_rows": _COUNT,
+    "skip_footer": _COUNT,
+    "end": (*_TEXT, "the text that the first row below the samples begins with"),
+    "tests": (str, get_args(Split).__contains__, '"file", "blank line", "header" or "column"'),
+    "test_name": (*_TEXT, "text"),
+    "control": (str, get_args(Control).__contains__, '"load" or "displacement"'),
+    "provenance": (*_TEXT, "text"),
 }
-"""Kinds of the plain entries, and what to write."""
+"""Kinds of the plain entries, what else must hold of them, and what to write."""
 
 
 def _wrong(problem: str, key: str, remedy: str) -> InputError:
@@ -181,26 +227,22 @@ def _wrong(problem: str, key: str, remedy: str) -> InputError:
 
 
 def _values(entries: dict[str, Any], file: Path) -> dict[str, Any]:
-    _only(entries, [*_WANTED, "columns", "diameters_um", "diameters"])
-    values: dict[str, Any] = {}
-    for key, (kind, wanted) in _WANTED.items():
-        if key in entries:
-            value = entries[key]
-            if not isinstance(value, kind) or isinstance(value, bool) or not _allowed(key, value):
-                raise _wrong(f"{value!r} is not allowed", key, f"Write {wanted}")
-            values[key] = value
+    _only(entries, [*_PLAIN, "columns", "diameters_um", "diameters"])
+    values = {key: entries[key] for key in _PLAIN if key in entries}
+    for key, value in values.items():
+        kind, allowed, wanted = _PLAIN[key]
+        if not isinstance(value, kind) or isinstance(value, bool) or not allowed(value):
+            raise _wrong(f"{value!r} is not allowed", key, f"Write {wanted}")
     if "delimiter" in values:
         values["delimiter"] = _DELIMITERS.get(values["delimiter"], values["delimiter"])
     if "thousands" in values:
-        values["thousands"] = (_THOUSANDS | _SAME)[values["thousands"]]
+        values["thousands"] = _THOUSANDS[values["thousands"]]
     # TOML has a number nan, which equals nothing, itself included.
     values["missing"] = tuple(
         float(mark) if not isinstance(mark, str) and math.isfinite(mark) else str(mark).strip()
         for mark in values.get("missing", ())
     )
-    _check_marks(values)
-    if "test_name" in values and values.get("tests", "file") != "file":
-        raise _wrong('is for tests = "file" only', "test_name", "Remove it")
+    _refuse_contradictions(values)
     values["columns"], values["pace"] = _columns(entries, values)
     if "diameters" in entries:
         if "diameters_um" in entries:
@@ -211,8 +253,7 @@ def _values(entries: dict[str, Any], file: Path) -> dict[str, Any]:
     return values
 
 
-def _check_marks(values: dict[str, Any]) -> None:
-    """Refuse keys that contradict each other."""
+def _refuse_contradictions(values: dict[str, Any]) -> None:
     thousands = values.get("thousands", "")
     decimals = values.get("decimal_mark", ".") in thousands
     if decimals or (values.get("delimiter") == " " and " " in thousands):
@@ -223,34 +264,8 @@ def _check_marks(values: dict[str, Any]) -> None:
     needing = "begin" if "begin" in values else "tests" if values.get("tests") == "header" else None
     if needing is not None and values.get("header_rows", 1) == 0:
         raise _wrong("needs a header", needing, "Write header_rows of at least 1")
-
-
-def _allowed(key: str, value: Any) -> bool:
-    match key:
-        case "thousands":
-            return value in _THOUSANDS or value in _SAME
-        case "missing":
-            numbers = all(isinstance(mark, str | int | float) and not isinstance(mark, bool) for mark in value)
-            return bool(value) and numbers
-        case "sheet" if isinstance(value, int):
-            return value >= 1
-        case "encoding":
-            try:
-                return "".encode(value) is not None
-            except (LookupError, ValueError):
-                return False
-        case "delimiter":
-            return value in _DELIMITERS or (len(value) == 1 and value not in '"\r\n\0')
-        case "decimal_mark":
-            return value in (".", ",")
-        case "skip_rows" | "header_rows" | "skip_footer":
-            return value >= 0
-        case "tests":
-            return value in get_args(Split)
-        case "control":
-            return value in get_args(Control)
-        case _:
-            return bool(value.strip())
+    if "test_name" in values and values.get("tests", "file") != "file":
+        raise _wrong('is for tests = "file" only', "test_name", "Remove it")
 
 
 def _only(entries: MappingABC[str, Any], known: list[str], inside: str = "") -> None:
@@ -275,15 +290,14 @@ def _columns(entries: dict[str, Any], values: dict[str, Any]) -> tuple[dict[str,
     found: dict[str, Column] = {}
     pace: Pace | None = None
     for name in needed:
-        place = f"columns.{name}"
-        table = tables.get(name)
+        place, table = f"columns.{name}", tables.get(name)
         if not isinstance(table, dict):
             raise InputError(f"the table {place!r} is missing", remedy=f"Add [{place}]")
         if name == "time" and ("speed" in table or "interval" in table):
             pace = _pace(table)
             continue
-        further = ["speed", "interval"] if name == "time" else []
-        _only(table, ["column", "unit", "sign", *further] if name in DIMENSIONS else ["column"], place + ".")
+        further = {"time": ["unit", "sign", "speed", "interval"], "test": []}.get(name, ["unit", "sign"])
+        _only(table, ["column", *further], place + ".")
         column = table.get("column")
         if isinstance(column, bool) or not isinstance(column, str | int) or column in ("", 0):
             remedy = 'Write column = "Load" or column = 2'
@@ -291,18 +305,22 @@ def _columns(entries: dict[str, Any], values: dict[str, Any]) -> tuple[dict[str,
         if (isinstance(column, int) and column < 1) or (isinstance(column, str) and values.get("header_rows", 1) == 0):
             remedy = "Count columns from 1; names need header_rows of at least 1"
             raise _wrong(f"{column!r} cannot be found", f"{place}.column", remedy)
-        found[name] = Column(column, *_meaning(table, name)) if name in DIMENSIONS else Column(column)
+        found[name] = Column(column)
+        if name in DIMENSIONS:
+            factor, sign = _factor(table.get("unit"), DIMENSIONS[name], place), table.get("sign", 1)
+            if isinstance(sign, bool) or sign not in (1, -1):
+                raise _wrong(f"{sign!r} is not a sign", f"{place}.sign", "Write 1 or -1")
+            found[name] = Column(column, factor, int(sign))
     return found, pace
 
 
 def _factor(unit: Any, dimension: str, place: str) -> Fraction:
-    if not isinstance(unit, str):
-        problem = "the unit is missing" if unit is None else f"{unit!r} is not a unit"
-    else:
-        try:
+    try:
+        if isinstance(unit, str):
             return unit_factor(unit, dimension)
-        except ValueError as error:
-            problem = str(error)
+        problem = "the unit is missing" if unit is None else f"{unit!r} is not a unit"
+    except ValueError as error:
+        problem = str(error)
     raise _wrong(problem, f"{place}.unit", f"Write one of {EXAMPLES[dimension]}")
 
 
@@ -328,24 +346,13 @@ def _in_header(table: Any) -> InHeader:
     """The rows above the samples that hold the diameters."""
     names = table.get("header") if isinstance(table, dict) else None
     names = [names] if isinstance(names, str) else names
-    if (
-        not isinstance(names, list)
-        or len(names) not in (1, 3)
-        or not all(isinstance(n, str) and n.strip() for n in names)
-    ):
+    names = names if isinstance(names, list) else []
+    if len(names) not in (1, 3) or not all(isinstance(name, str) and name.strip() for name in names):
         remedy = 'Write header = "Gage length", or header = ["D1", "D2", "D3"]; diameters of your own belong in '
         raise _wrong("must name one row, or three", "diameters.header", remedy + "[diameters_um]")
     _only(table, ["header", "unit"], "diameters.")
     factor = _factor(table["unit"], LENGTH, "diameters") if "unit" in table else None
     return InHeader(tuple(same_text(name).strip() for name in names), factor)
-
-
-def _meaning(table: dict[str, Any], name: str) -> tuple[Fraction, int]:
-    place, sign = f"columns.{name}", table.get("sign", 1)
-    factor = _factor(table.get("unit"), DIMENSIONS[name], place)
-    if isinstance(sign, bool) or sign not in (1, -1):
-        raise _wrong(f"{sign!r} is not a sign", f"{place}.sign", "Write 1 or -1")
-    return factor, int(sign)
 
 
 def _diameters(table: Any, file: Path) -> Diameters:

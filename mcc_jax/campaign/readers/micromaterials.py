@@ -14,16 +14,14 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 from ..._errors import InputError
+from ...files import LIMITS
 from ..schema import Curve
+from ..table import filled
 from .text import Tests, checked_curve, decode_lines, number_block
 
 _ROW = re.compile(r"-?\d+\.\d{6}\t-?\d+\.\d{6}\t-?\d+\.\d{6}\s*")
 _NAMES = ("t", "h", "F")
-LARGEST_TOTAL = 512 * 1024**2
-# Measured numbers as text deflate to a fifth or so; what shrinks to a hundredth is no measurement.
-LARGEST_SWELLING = 100
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-MAX_ENTRIES = 10_000
 
 
 def matches(lines: list[str]) -> bool:
@@ -33,19 +31,14 @@ def matches(lines: list[str]) -> bool:
 
 
 def read(lines: list[str], file: Path) -> Tests:
-    """One text file.
-
-    Raises:
-        InputError: if a row is damaged.
-    """
+    """One text file. Raises `InputError` if a row is damaged."""
     return Tests({file.stem: _curve(lines, file, file.stem)}, "Micro Materials text")
 
 
 def read_zip(data: bytes, file: Path) -> Tests:
     """An archive of text files, one test each.
 
-    Raises:
-        InputError: if the archive or a file in it is damaged, encrypted, nested, too large or no such test.
+    Raises `InputError` if the archive or a file in it is damaged, encrypted, nested, too large or no such test.
     """
     curves: dict[str, Curve] = {}
     for path, content in _entries(data, file):
@@ -53,11 +46,9 @@ def read_zip(data: bytes, file: Path) -> Tests:
         name = PurePosixPath(path).stem
         lines = decode_lines(content)
         if not matches(lines):
-            raise InputError(
-                "is no Micro Materials text (three columns t, h, F with six decimals)",
-                file=inside,
-                remedy="Remove it from the archive, or unpack it and write a mapping file",
-            )
+            problem = "is no Micro Materials text (three columns t, h, F with six decimals)"
+            remedy = "Remove it from the archive, or unpack it and write a mapping file"
+            raise InputError(problem, file=inside, remedy=remedy)
         if name in curves:
             raise InputError(f"two tests are called {name!r}", file=inside, remedy="Rename one of them")
         curves[name] = _curve(lines, inside, name)
@@ -67,7 +58,7 @@ def read_zip(data: bytes, file: Path) -> Tests:
 
 
 def _curve(lines: list[str], file: Path, name: str) -> Curve:
-    end = next((i for i in range(len(lines), 0, -1) if lines[i - 1].strip()), 0)
+    end = filled(lines)
     numbers = number_block(lines, 0, end, _NAMES, file)
     return checked_curve(numbers[:, 0], numbers[:, 2], numbers[:, 1] / 1e3, file, 1, name)
 
@@ -81,16 +72,16 @@ def _entries(data: bytes, file: Path) -> Iterator[tuple[str, bytes]]:
         raise broken from None
     with archive:
         whole = sum(entry.file_size for entry in entries)
-        if len(entries) > MAX_ENTRIES or whole > LARGEST_TOTAL or whole > LARGEST_SWELLING * max(len(data), 10_000):
+        most = min(LIMITS.unpacked_bytes, LIMITS.swelling * max(len(data), 10_000))
+        if len(entries) > LIMITS.archive_files or whole > most:
             raise InputError("the archive is too large for a tester's export", file=file, remedy="Split it")
         total = 0
         for entry in entries:
             if entry.flag_bits & 0x1:
                 raise InputError(f"the entry {entry.filename!r} is encrypted", file=file, remedy="Unpack it first")
             if entry.compress_type not in _METHODS:  # others may ask for gigabytes before the first byte
-                raise InputError(
-                    f"the entry {entry.filename!r} is compressed in an unusual way", file=file, remedy="Unpack it first"
-                )
+                problem = f"the entry {entry.filename!r} is compressed in an unusual way"
+                raise InputError(problem, file=file, remedy="Unpack it first")
             try:
                 # The size in the directory may lie; no more than it says is unpacked.
                 with archive.open(entry) as stream:
@@ -98,10 +89,9 @@ def _entries(data: bytes, file: Path) -> Iterator[tuple[str, bytes]]:
             except (zipfile.BadZipFile, zlib.error, ValueError, OSError, EOFError, RuntimeError):
                 raise broken from None
             total += len(content)
-            if len(content) > entry.file_size or total > LARGEST_TOTAL:
+            if len(content) > entry.file_size or total > LIMITS.unpacked_bytes:
                 raise broken
             if content.startswith((b"PK\x03\x04", b"\x1f\x8b")):
-                raise InputError(
-                    f"the entry {entry.filename!r} is itself an archive", file=file, remedy="Unpack it first"
-                )
+                problem = f"the entry {entry.filename!r} is itself an archive"
+                raise InputError(problem, file=file, remedy="Unpack it first")
             yield entry.filename, content

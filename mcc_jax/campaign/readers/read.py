@@ -12,14 +12,27 @@ from ..._errors import InputError
 from ...files import LIMITS, FileLimits
 from ..findings import Finding
 from ..schema import Campaign, Metadata
-from ..table import read_bytes
+from ..table import binary_kind, read_bytes
 from ..validate import check_campaign
-from .detect import read_known
+from ..workbook import is_workbook
+from . import fischer, hysitron_hld, hysitron_lc, micromaterials
 from .diameters import Diameters, diameters_for
 from .folder import names_of, read_folder
 from .mapped import read_mapped
 from .mapping import MappingFile, read_mapping
-from .text import Tests
+from .text import Tests, decode_lines
+
+FORMATS = {
+    "Fischer HM export": fischer,
+    "Hysitron hld": hysitron_hld,
+    "Hysitron load-control text": hysitron_lc,
+    "Micro Materials text (also many in one zip)": micromaterials,
+}
+_EXAMPLE = (
+    "Write a TOML mapping file and give it with --mapping; for example "
+    'decimal_mark = "."; [columns] time = { column = "Time", unit = "s" }, '
+    'force = { column = "Load", unit = "mN" }, displacement = { column = "Depth", unit = "um" }'
+)
 
 
 def read_tester_file(
@@ -57,15 +70,14 @@ def read_tester_file(
     described = [read_mapping(one) for one in given]
 
     def read(file: Path, data: bytes) -> Tests:
-        return _read_by_one(data, file, described) if described else read_known(data, file)
+        return _read_by_one(data, file, described) if described else _read_known(data, file)
 
     findings: list[Finding] = []
     if place.is_dir():
         for one in described:
             if one.test_name is not None:
-                raise InputError(
-                    "is for one file, not for a folder", file=one.file, column="test_name", remedy="Remove it"
-                )
+                problem = "is for one file, not for a folder"
+                raise InputError(problem, file=one.file, column="test_name", remedy="Remove it")
         tests, keys, findings = read_folder(place, read, skip, limits)
         origin = f"folder {place.resolve().name}, {tests.format}"
     else:
@@ -77,12 +89,18 @@ def read_tester_file(
         origin = f"{place.name}, {tests.format}"
     for one in described:
         if len(described) > 1 and one.diameters_um is not None:
-            raise InputError(
-                "cannot be told apart by mapping file", file=one.file, column="diameters_um", remedy="Give --diameters"
-            )
+            problem = "cannot be told apart by mapping file"
+            raise InputError(problem, file=one.file, column="diameters_um", remedy="Give --diameters")
         diameters_um = one.diameters_um if diameters_um is None else diameters_um
     sizes, unused = diameters_for(keys, diameters_um, tests.diameters_um, place)
-    findings += [*_missing(tests.missing), *_unused(unused)]
+    if dropped := sum(tests.missing.values()):
+        rows = "1 row with a missing reading was" if dropped == 1 else f"{dropped} rows with a missing reading were"
+        where = "1 test" if len(tests.missing) == 1 else f"{len(tests.missing)} tests"
+        sentence = f"{rows} dropped, in {where}"
+        findings.append(Finding("missing readings", "told", sentence, "", tuple(tests.missing)))
+    if unused:
+        rows = "1 row of the diameters is" if unused == 1 else f"{unused} rows of the diameters are"
+        findings.append(Finding("diameters", "told", f"{rows} for no test here and not used"))
     other = dict(tests.other)
     if findings:
         other["conversion"] = {"findings": [finding.to_json() for finding in findings]}
@@ -98,11 +116,27 @@ def read_tester_file(
     return campaign
 
 
+def _read_known(data: bytes, file: Path) -> Tests:
+    """Read a file of a known format, told by what is in it."""
+    if is_workbook(data):
+        raise InputError("an Excel workbook has no format of its own", file=file, remedy=_EXAMPLE)
+    if data.startswith((b"PK\x03\x04", b"PK\x05\x06")):
+        return micromaterials.read_zip(data, file)
+    kind = binary_kind(data)
+    if kind is not None:
+        problem = f"the file is {kind}; no reader knows it"
+        raise InputError(problem, file=file, remedy="Export it from the tester as text")
+    lines = decode_lines(data)
+    for reader in FORMATS.values():
+        if reader.matches(lines):
+            return reader.read(lines, file)
+    raise InputError(f"the format is not known (known: {', '.join(FORMATS)})", file=file, remedy=_EXAMPLE)
+
+
 def _read_by_one(data: bytes, file: Path, mappings: Sequence[MappingFile]) -> Tests:
     """The tests of a file by the one mapping that fits it.
 
-    Raises:
-        InputError: if none fits, or two fit and read it differently: which is right is not for a program to guess.
+    Raises `InputError` if none fits, or two fit and read it differently: which is right is not for a program to guess.
     """
     fitting: list[tuple[MappingFile, Tests]] = []
     failed: list[InputError] = []
@@ -112,44 +146,23 @@ def _read_by_one(data: bytes, file: Path, mappings: Sequence[MappingFile]) -> Te
         except InputError as error:
             failed.append(error)
     if not fitting:
-        first = failed[0]
         more = "" if len(failed) == 1 else f" by {mappings[0].file.name}, and no other mapping file fits"
-        raise InputError(first.problem + more, file=first.file, row=first.row, column=first.column, remedy=first.remedy)
+        raise failed[0].changed(problem=failed[0].problem + more)
     (chosen, tests), *others = fitting
     for other, again in others:
         if not _same(tests, again):
-            raise InputError(
-                f"{chosen.file.name} and {other.file.name} both fit this file and read it differently",
-                file=file,
-                remedy="Give files of the two kinds in commands of their own",
-            )
+            problem = f"{chosen.file.name} and {other.file.name} both fit this file and read it differently"
+            raise InputError(problem, file=file, remedy="Give files of the two kinds in commands of their own")
     return tests
 
 
 def _same(one: Tests, other: Tests) -> bool:
-    def readings(tests: Tests) -> list[tuple[Any, ...]]:
-        return [
+    def told(tests: Tests) -> tuple[Any, ...]:
+        readings = [
             (name, *(values.tobytes() for values in (curve.time_s, curve.force_mN, curve.displacement_um)))
             for name, curve in tests.curves.items()
         ]
+        sizes = {name: size if isinstance(size, list) else None for name, size in tests.diameters_um.items()}
+        return readings, sizes, tests.control
 
-    def sizes(tests: Tests) -> dict[str, list[float] | None]:
-        return {name: size if isinstance(size, list) else None for name, size in tests.diameters_um.items()}
-
-    return (readings(one), sizes(one), one.control) == (readings(other), sizes(other), other.control)
-
-
-def _missing(missing: dict[str, int]) -> list[Finding]:
-    if not missing:
-        return []
-    total = sum(missing.values())
-    rows = "1 row with a missing reading was" if total == 1 else f"{total} rows with a missing reading were"
-    where = "1 test" if len(missing) == 1 else f"{len(missing)} tests"
-    return [Finding("missing readings", "told", f"{rows} dropped, in {where}", "", tuple(missing))]
-
-
-def _unused(unused: int) -> list[Finding]:
-    if not unused:
-        return []
-    rows = "1 row of the diameters is" if unused == 1 else f"{unused} rows of the diameters are"
-    return [Finding("diameters", "told", f"{rows} for no test here and not used")]
+    return told(one) == told(other)

@@ -1,7 +1,8 @@
-"""What the readers of testers' text files share: decoding, and blocks of numbers checked cell by cell."""
+"""What readers share: decoding, rows of texts and workbooks, and blocks of numbers checked cell by cell."""
 
 from __future__ import annotations
 
+import csv
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -13,7 +14,9 @@ import numpy as np
 
 from ..._errors import InputError
 from ..schema import Control, Curve
-from ..table import number_of_cells, parse_number
+from ..table import binary_kind, number_of_cells, parse_number, same_text
+from ..workbook import is_workbook, read_sheet
+from .mapping import MappingFile
 
 _NUMBER = re.compile(r"[-+]?[0-9]+(?:\.[0-9]*)?(?:[eE][-+]?[0-9]+)?")
 
@@ -42,8 +45,7 @@ class Tests:
 def decode_lines(data: bytes, encoding: str | None = None, file: Path | None = None) -> list[str]:
     """The lines of a tester's file; by default UTF-8 or, as most testers write, Latin-1.
 
-    Raises:
-        InputError: if the file is not in the encoding given.
+    Raises `InputError` if the file is not in the encoding given.
     """
     if encoding is None:
         try:
@@ -54,68 +56,44 @@ def decode_lines(data: bytes, encoding: str | None = None, file: Path | None = N
         try:
             text = data.decode(encoding)
         except (UnicodeDecodeError, LookupError, ValueError) as error:
-            raise InputError(
-                f"cannot be decoded as {encoding!r}: {error}", file=file, remedy="Name the file's encoding"
-            ) from None
+            problem = f"cannot be decoded as {encoding!r}: {error}"
+            raise InputError(problem, file=file, remedy="Name the file's encoding") from None
     return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
 
 
 def number_block(
     lines: Sequence[str], first: int, stop: int, names: Sequence[str], file: Path, decimal_mark: str = "."
 ) -> np.ndarray:
-    """Tab-separated numbers, shape (rows, columns).
+    """Tab-separated numbers of the lines from `first` to before `stop`, shape (rows, columns).
 
-    Args:
-        lines: all lines of the file.
-        first: index of the first line of the block.
-        stop: index behind the last one.
-        names: the columns' names.
-        file: for messages.
-        decimal_mark: "." or ",".
-
-    Raises:
-        InputError: at the first row or cell that is damaged.
+    Raises `InputError` at the first row or cell that is damaged.
     """
     block = np.empty((stop - first, len(names)))
     for i in range(first, stop):
         cells = lines[i].rstrip("\t ").split("\t")
         if len(cells) != len(names):
-            raise InputError(
-                f"{number_of_cells(len(cells))} where {len(names)} are expected ({', '.join(names)})",
-                file=file,
-                row=i + 1,
-                remedy="The file is damaged or cut off; export it again",
-            )
+            problem = f"{number_of_cells(len(cells))} where {len(names)} are expected ({', '.join(names)})"
+            raise InputError(problem, file=file, row=i + 1, remedy="The file is damaged or cut off; export it again")
         for j, cell in enumerate(cells):
             try:
                 block[i - first, j] = parse_number(cell, decimal_mark)
             except ValueError as error:
-                raise InputError(
-                    str(error), file=file, row=i + 1, column=names[j], remedy="Export the file again"
-                ) from None
+                remedy = "Export the file again"
+                raise InputError(str(error), file=file, row=i + 1, column=names[j], remedy=remedy) from None
     return block
 
 
 def checked_curve(
     time: np.ndarray, force: np.ndarray, displacement: np.ndarray, file: Path, row: int, name: str
 ) -> Curve:
-    """A curve whose time never goes back and that has at least two samples.
-
-    Raises:
-        InputError: naming the row; `row` is that of the first sample.
-    """
+    """A curve whose time never goes back and that has at least two samples, the first in row `row` of the file."""
     if len(time) < 2:
-        raise InputError(
-            f"the test {name!r} has fewer than two samples", file=file, row=row, remedy="Export the file again"
-        )
+        problem = f"the test {name!r} has fewer than two samples"
+        raise InputError(problem, file=file, row=row, remedy="Export the file again")
     back = np.flatnonzero(np.diff(time) < 0)
     if len(back):
-        raise InputError(
-            f"the time of test {name!r} goes back",
-            file=file,
-            row=row + int(back[0]) + 1,
-            remedy="Each test needs a file or a name of its own",
-        )
+        problem, at = f"the time of test {name!r} goes back", row + int(back[0]) + 1
+        raise InputError(problem, file=file, row=at, remedy="Each test needs a file or a name of its own")
     return Curve(time, force, displacement)
 
 
@@ -125,11 +103,7 @@ def cut_off(problem: str, file: Path, row: int | None = None) -> InputError:
 
 
 def refuse_twice(names: Sequence[str], file: Path, row: int) -> None:
-    """Refuse a header that names two columns alike: one of them would be lost.
-
-    Raises:
-        InputError: naming the column.
-    """
+    """Refuse a header that names two columns alike: one of them would be lost."""
     name, count = Counter(names).most_common(1)[0]
     if count > 1:
         raise InputError(f"stands there {count} times", file=file, row=row, column=name, remedy="Export the file again")
@@ -139,3 +113,78 @@ def leading_number(text: str) -> float | None:
     """The number a text such as `0.0066 nm/uN` begins with."""
     match = _NUMBER.match(text.strip())
     return float(match[0]) if match else None
+
+
+class Rows:
+    """Lines of text, split when they are asked for."""
+
+    def __init__(self, lines: list[str], file: Path, mapping: MappingFile) -> None:
+        self.lines, self.file, self.delimiter, self.mapping = lines, file, mapping.delimiter, mapping.file.name
+        self.nothing = '" \t' if mapping.delimiter == " " else mapping.delimiter + '" \t'
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    def blank(self, i: int) -> bool:
+        """Whether a row holds nothing but delimiters."""
+        return not self.lines[i].strip(self.nothing)
+
+    def begins(self, i: int, text: str) -> bool:
+        """Whether a row, or the first thing that it holds, begins with a text."""
+        line, text = same_text(self.lines[i].lstrip()), same_text(text)
+        return line.startswith(text) or line.lstrip(self.nothing).startswith(text)
+
+    def cells(self, i: int) -> list[str]:
+        """The cells of a row."""
+        line = self.lines[i]
+        if self.delimiter == " ":
+            return line.split()
+        if '"' not in line:
+            return line.split(self.delimiter)
+        try:
+            return next(csv.reader([line], delimiter=self.delimiter, strict=True))
+        except (csv.Error, StopIteration) as error:
+            problem = f"quotes are damaged ({error})"
+            remedy = f"Close every double quote, or correct delimiter in {self.mapping}"
+            raise InputError(problem, file=self.file, row=i + 1, remedy=remedy) from None
+
+
+class Sheet(Rows):
+    """Rows of a workbook's sheet, as they are."""
+
+    def __init__(self, rows: list[list[str]], file: Path, mapping: MappingFile) -> None:
+        super().__init__([], file, mapping)
+        self.rows = rows
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def blank(self, i: int) -> bool:
+        """Whether a row holds nothing."""
+        return not any(cell.strip() for cell in self.rows[i])
+
+    def begins(self, i: int, text: str) -> bool:
+        """Whether the first thing that a row holds begins with a text."""
+        first = next((cell for cell in self.rows[i] if cell.strip()), "")
+        return same_text(first.lstrip()).startswith(same_text(text))
+
+    def cells(self, i: int) -> list[str]:
+        """The cells of a row."""
+        return self.rows[i]
+
+
+def read_rows(data: bytes, file: Path, mapping: MappingFile) -> Rows:
+    """The rows of a file, a table of text or a sheet of a workbook. Raises `InputError` if it is neither."""
+    if is_workbook(data):
+        how = f'Write sheet = "..." in {mapping.file.name}'
+        rows = read_sheet(data, file, mapping.sheet, decimal_mark=mapping.decimal_mark, how=how)
+        return Sheet([cells for _, cells in rows], file, mapping)
+    if mapping.sheet is not None:
+        problem = f"is no Excel workbook (xlsx), though {mapping.file.name} names a sheet"
+        raise InputError(problem, file=file, remedy="Remove the key sheet, or save the file as xlsx")
+    kind = binary_kind(data)
+    if kind is not None and not mapping.encoding.lower().replace("_", "-").startswith(("utf-16", "utf-32")):
+        remedy = "Unpack it, save it as xlsx or text, or name its encoding"
+        raise InputError(f"the file is {kind}", file=file, remedy=remedy)
+    first, *others = decode_lines(data, mapping.encoding, file)
+    return Rows([first.removeprefix("\ufeff"), *others], file, mapping)
