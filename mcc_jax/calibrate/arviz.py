@@ -15,7 +15,7 @@ from .._extras import extra
 from ..law import MccLaw
 from .compiling import compiled
 from .data import Tests
-from .effects import effect_numbers
+from .draws import named_population
 from .mode import log_priors, prior_populations
 from .model import Model
 from .noise import Whitening, standard_promotion
@@ -59,13 +59,10 @@ def prior_draws(calibration: Posterior, count: int, seed: int) -> dict[str, np.n
 
 def _variables(p: Population, model: Model) -> dict[str, np.ndarray]:
     """The population by the names of the model's sites; of ArviZ's `mu` and `tau` all three in one."""
-    mu, tau = np.asarray(p.mu), np.asarray(p.tau)
-    named = {"a": np.asarray(p.a), "effective_modulus_MPa": np.exp(np.asarray(p.log_modulus)), "mu": mu, "tau": tau}
-    for j, name in enumerate(COEFFICIENTS):
-        named |= {f"{name}_median": np.exp(mu[..., j]), f"tau_{name}": tau[..., j]}
-    for name, there in (("modulus_scatter", model.modulus_scatter), ("shape_scatter", model.shape_scatter)):
-        named |= {name: np.asarray(getattr(p, name))} if there else {}
-    return named | effect_numbers(p, model) | {"noise_factor": np.exp(np.asarray(p.log_noise))}
+    mu = np.asarray(p.mu)
+    named = {name: values for name, values in named_population(p, model).items() if not name.startswith("mu_")}
+    medians = {f"{name}_median": np.exp(mu[..., j]) for j, name in enumerate(COEFFICIENTS)}
+    return {"mu": mu, "tau": np.asarray(p.tau)} | medians | named
 
 
 def to_arviz(calibration: Posterior, *, prior_count: int = 500, points: bool = False, seed: int = 0) -> DataTree:

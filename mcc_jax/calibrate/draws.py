@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -12,10 +11,11 @@ import numpy as np
 from jaxtyping import Array
 
 from .compiling import compiled
-from .effects import effect_numbers
+from .estimates import effect_numbers
 from .fit_result import Fit
 from .importance import diagnostics, sample_weighted
 from .mode import LogPosterior, density_of, populations
+from .model import Model
 from .noise import standard_promotion
 from .particles import Drawer, ExactLikelihood, Length, chunk_of, corrected, every, stride_of, weighted
 from .population import COEFFICIENTS, Population
@@ -80,12 +80,6 @@ def draw_fast(key: Array, fit: Fit, length: Length, block: int, *, patient: bool
     Without patience, and where the fit did not converge, the sampler never runs, which takes minutes there: the draws
     are then those of the proposal.
 
-    Args:
-        key: random key.
-        fit: the fit to draw around.
-        length: how many draws.
-        block: particles of a block, as they were fitted; 0 for a single one.
-        patient: see above.
     """
     count, exact = count_of(fit.tests), exact_likelihood(fit)
     population_key, particle_key, check_key, pick_key = jax.random.split(key, 4)
@@ -262,9 +256,9 @@ def _collected(
     )
 
 
-def named_numbers(population: Population, fit: Fit) -> Mapping[str, np.ndarray]:
-    """Draws of everything that all particles share, by the names of coordinates that a diagnostic is worked out of."""
-    p, model = population, fit.model
+def coordinates_of(population: Population, model: Model) -> dict[str, np.ndarray]:
+    """Draws of everything that all particles share, in the coordinates that diagnostics are worked out of."""
+    p = population
     columns = {"a": p.a, "log_modulus": p.log_modulus}
     columns |= {f"mu_{n}": p.mu[..., j] for j, n in enumerate(COEFFICIENTS)}
     columns |= {f"tau_{n}": p.tau[..., j] for j, n in enumerate(COEFFICIENTS)}
@@ -277,6 +271,13 @@ def named_numbers(population: Population, fit: Fit) -> Mapping[str, np.ndarray]:
     return {name: np.asarray(v) for name, v in columns.items()}
 
 
+def named_population(population: Population, model: Model) -> dict[str, np.ndarray]:
+    """The same by the names used in files: modulus and factor on the noise in place of their logarithms."""
+    named = coordinates_of(population, model)
+    powers = {"log_modulus": "effective_modulus_MPa", "noise_factor": "noise_factor"}
+    return {powers.get(name, name): np.exp(v) if name in powers else v for name, v in named.items()}
+
+
 def _stack(population: Population, fit: Fit, length: Length) -> tuple[list[str], np.ndarray]:
-    columns = named_numbers(population, fit)
+    columns = coordinates_of(population, fit.model)
     return list(columns), np.stack([v.reshape(length.chains, length.draws) for v in columns.values()], -1)

@@ -16,22 +16,19 @@ from .._errors import InputError
 from .._memory import make_room
 from ..campaign import THRESHOLD_MPA, Campaign, other_material
 from .compiling import compiled
-from .data import Selection, Tests, select
+from .data import Selection, Tests, point_noise_um, select
 from .distributions import SpreadCoordinate
-from .expectation import careful_enough, expect
 from .fit_result import Fit, population_of
 from .forward import Point
-from .linearisation import Linearisation, linear_data
+from .linearisation import Linearisation, linear_data, start_of_effects
 from .marginal import Marginal, summarise
-from .mode import LogPosterior, gradients, most_probable
+from .mode import LogPosterior, careful_enough, expect, gradients, most_probable
 from .model import Model, check_prior_of_a
 from .noise import Noise, NoiseFit, estimate_noise, particle_scales, squared_innovations, student_weights
-from .paper.prediction import point_noise_um
 from .particle_fit import ParticleFits, fit_particles, linear_starts
 from .priors import Priors
 from .settings import FIT
 from .sharding import Blocks, Parts, block_size, count_of, filled_up, require_same
-from .starts import start_of_effects
 
 
 def prepare(
@@ -47,12 +44,9 @@ def prepare(
     """What every calibration begins with: points and particles selected, filled up to blocks, and fitted.
 
     Args:
-        campaign: the tests.
-        model: what is assumed, its priors as `in_own_units` has them.
-        threshold_MPa: points below this stress on loading do not count [MPa].
+        model: with priors as `in_own_units` has them.
         fill_up: let copies that count for nothing make up whole blocks; if False, all particles are one block.
         block: particles of a block; by default `block_size` of their number.
-        tell: called with the name of each step.
         settings: of `fit_tests`.
 
     Returns:
@@ -60,10 +54,7 @@ def prepare(
 
     Raises:
         InputError: if no particle can be used, numbers overflow, or processes were given different tests.
-        ValueError: for blocks of no particles.
     """
-    if block is not None and block < 1:
-        raise ValueError(f"a block must have at least one particle, got {block}")
     make_room()
     tell("selecting points")
     selection = select(campaign, threshold_MPa=threshold_MPa)
@@ -104,15 +95,12 @@ OWN_UNITS = (
 def beyond_numbers(campaign: Campaign, selection: Selection) -> InputError:
     """The error of tests whose fit ends in no numbers, with the ranges that it was asked to describe."""
     tests = selection.tests
-    mask = np.asarray(tests.mask)
-    stress = 1e3 * np.asarray(tests.force) / (np.pi * np.asarray(tests.effective_diameter)[:, None] ** 2 / 4)
-    strain = np.asarray(tests.displacement) - np.asarray(tests.contact)[:, None]
-    strain = np.abs(strain) / np.asarray(tests.effective_diameter)[:, None]
-    top = np.where(mask, stress, 0.0).max(1)
-    deepest = np.where(mask, strain, 0.0).max(1)
+    size = np.asarray(tests.effective_diameter)[:, None]
+    stress = 1e3 * np.asarray(tests.force) / (np.pi * size**2 / 4)
+    strain = np.abs(np.asarray(tests.displacement) - np.asarray(tests.contact)[:, None]) / size
+    top, deepest = (np.where(np.asarray(tests.mask), x, 0.0).max(1) for x in (stress, strain))
+    most, deep = int(np.argmax(top)), int(np.argmax(deepest))
     names = [repr(campaign.particles[i]) for i in selection.kept]
-    most = int(np.argmax(top))
-    deep = int(np.argmax(deepest))
     return InputError(
         "the law cannot be fitted to these tests: their numbers overflow; the largest stress is "
         f"{top[most]:.3g} MPa (particle {names[most]}), the largest displacement {deepest[deep]:.3g} times the size "
@@ -244,10 +232,7 @@ class _Fitter:
         """Particles and population after a step of Gauss-Newton, halved while the density, with the tests linearised
         where it ends, is lower than where it begins.
 
-        Args:
-            white, before, target: as in `together`.
-            noise: the noise.
-            ends: where the step begins and ends, in unbounded coordinates.
+        `ends` are where the step begins and ends, in unbounded coordinates.
         """
         least, share = _density(ends[0], target) - FIT.still, 1.0
         while True:
@@ -278,14 +263,11 @@ def fit_tests(
     halved until the tests are more probable where it ends (`_Fitter.step`).
 
     Args:
-        tests: the measurements.
-        model: what is assumed.
         read_out_um: noise of displacement from point to point, a first guess [um].
         correlated: estimate the whole noise; if False, white noise of the residuals' median modulus, which outliers do
             not move.
         rounds: how often noise, population and particles take turns, at least.
         block: particles of a block (`Blocks`), of which there is a whole number; 0 for all in one.
-        tell: called with the name of each step.
     """
     N, effects = len(tests), bool(model.effects)
     fitter = _Fitter(tests, model, Blocks(N, block), tell)
@@ -295,13 +277,12 @@ def fit_tests(
     individual = fitter.alone(np.full(N, read_out))
     point = individual.point
     four = [read_out, *np.asarray(priors.noise.median)[1:]]
-    unknown = jnp.asarray(np.full((4, 4), np.nan)), jnp.asarray(np.nan)
-    noise = NoiseFit(Noise.of(four, jnp.asarray(np.ones(N))), *unknown, True)
+    noise = NoiseFit.unsure(Noise.of(four, jnp.asarray(np.ones(N))), converged=True)
     start = _start(np.asarray(point.latent)[:count], np.asarray(fitter.flatness)[:count], model)
     if effects:
-        found = start_of_effects(point, tests, fitter.linear.at(point), noise.noise, model, blocks)
-        start |= found.sites
-        point = replace(point, theta=jnp.asarray(np.broadcast_to(found.theta, point.theta.shape)))
+        sites, theta = start_of_effects(point, tests, fitter.linear.at(point), noise.noise, model, blocks)
+        start |= sites
+        point = replace(point, theta=jnp.asarray(np.broadcast_to(theta, point.theta.shape)))
     free = None
     turn, uncertainty = 0, True
     linear = fitter.linear.at(point)
@@ -310,8 +291,7 @@ def fit_tests(
         if not correlated:
             residual = np.asarray(blocks.whole(Parts(tuple(wave.residual for wave in linear.waves))))[:count]
             width = 1.4826 * np.median(np.abs(residual[np.asarray(tests.mask)[:count]]))
-            none = jnp.asarray(0.0)
-            white_noise = Noise(jnp.asarray(max(width, 1e-9)), none, none, jnp.asarray(1.0), jnp.asarray(np.ones(N)))
+            white_noise = Noise.of([max(width, 1e-9), 0.0, 0.0, 1.0], jnp.asarray(np.ones(N)))
             noise = replace(noise, noise=white_noise)
         elif (turn or not effects) and not last:
             # With effects no round knows that it is the last.
@@ -427,11 +407,7 @@ def _start(latent: np.ndarray, flatness: np.ndarray, model: Model) -> dict[str, 
 def checked_settings(
     progress: Callable[[str], None] | None, model: Model | None, threshold_MPa: Any, block: int | None
 ) -> tuple[Callable[[str], None], Model, float]:
-    """What all calibrations share, with the defaults filled in.
-
-    Raises:
-        InputError: for one of the wrong kind or out of its range.
-    """
+    """What all calibrations share, with defaults filled in; refuses what is of the wrong kind or out of its range."""
     tell = arguments.teller(progress)
     if model is not None:
         arguments.instance(model, Model, "model", "Make one with mcc_jax.Model().")

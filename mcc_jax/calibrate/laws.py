@@ -12,9 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._errors import InputError
-from ..effects import AbstractEffect, Variant
+from ..effects import AbstractEffect, Variant, find_variant
 from ..law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainScaling, Unloading
-from .effects import built
 from .population import COEFFICIENTS
 
 RIGID_MPA = 1e9
@@ -145,3 +144,22 @@ def _typical(content: Mapping[str, Any]) -> np.ndarray:
     population = PlasticPopulation(*parts)
     law = population.mean_law if content["method"] == "paper" else population.median_law
     return np.array([float(law.C1), float(law.C3), float(law.C5)])
+
+
+def built(
+    entry: Mapping[str, Any],
+    variants: Mapping[str, Variant] | None = None,
+    amplitude: Mapping[str, Any] | None = None,
+) -> AbstractEffect:
+    """The effect that an entry of a result describes.
+
+    Args:
+        variants: formulas that are not in the library, by "mechanism:variant".
+        amplitude: of one particle, where it differs.
+    """
+    name = f"{entry['mechanism']}:{entry['variant']}"
+    variant = (variants or {}).get(name) or find_variant(name)
+    values = {key: one["value"] for key, one in entry["parameters"].items()}
+    strength = values.pop(variant.parameter) if amplitude is None else amplitude["value"]
+    values.pop(variant.parameter, None)
+    return variant.build(strength, **values)

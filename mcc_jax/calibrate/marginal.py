@@ -159,13 +159,7 @@ class Marginal(eqx.Module):
         return Laplace(xi, hessian, stretch, value, placed)
 
     def draw(self, population: Population, normal: Array, normal_zero: Array) -> ParticleDraw:
-        """Every particle's own numbers given the population, from standard normal numbers.
-
-        Args:
-            population: what all particles share.
-            normal: shape (N, k).
-            normal_zero: shape (N,).
-        """
+        """Every particle's own numbers given the population, from standard normal numbers."""
         at = self.laplace(population)
         inner = Cholesky(at.hessian)
         nu = inner.backward(normal)
@@ -291,15 +285,8 @@ def summarise(
 ) -> Summaries:
     """Summarise all tests around a point by Gauss-Newton curvature.
 
-    Args:
-        point: around what.
-        straight: coordinates of the effects' numbers.
-        tests: the measurements.
-        linear: the tests linearised there, in these coordinates.
-        noise: the noise.
-        zero_prior: mean and standard deviation of the zeros, from the recorded contact [um].
-        scatter: what differs from particle to particle.
-        correlation, along: of the correlated residuals.
+    `linear` has the derivatives in the coordinates `straight`; `zero_prior` is the zeros' distance from the recorded
+    contact, mean and standard deviation [um].
     """
 
     def of_one(scale: Scalar, tests: Tests, linear: Linear) -> Whitening:

@@ -40,14 +40,9 @@ from .sharding import Blocks, count_of
 
 
 class ParticleDraws(NamedTuple):
-    """Draws of the particles' parameters, one for each draw of the population.
+    """Draws of the particles' parameters, one for each draw of the population; see `ParticleDraw`.
 
-    Attributes:
-        latent: b1, b3, b5, e.
-        theta: numbers of the effects.
-        zero: zero of displacement [um].
-        log_likelihood: of every test given the population, the particle integrated out.
-        log_ratio: log of exact over quadratic likelihood; 0 where the exact one was not looked at.
+    `log_ratio` is the log of exact over quadratic likelihood; 0 where the exact one was not looked at.
     """
 
     latent: Float[Array, "draws particles 4"]
@@ -277,10 +272,8 @@ class Drawer:
         """Draw restless particles anew from many candidates, in place, and their Pareto k, until none is left.
 
         Args:
-            key: random key.
-            drawn: of all particles under `population`.
-            population: draws.
-            k: of every particle.
+            drawn: all particles under `population`; theirs are replaced.
+            k: Pareto k of every particle.
             restless: positions of the restless ones.
             candidates: how many per draw: first, and for the few that scatter most even then.
         """
@@ -417,10 +410,8 @@ class Correction(NamedTuple):
 def correction(total: Callable[[int, np.ndarray], np.ndarray], draws: np.ndarray) -> Correction:
     """Regression of the sum of log ratios on the population's parameters, and its prediction for every draw.
 
-    Args:
-        total: the sums at the given rows of `draws`, all with the same random numbers, which depend on the first
-            argument: 0 or 1.
-        draws: of the parameters, shape (draws, parameters).
+    `total` gives the sums at rows of `draws`, with random numbers that depend on its first argument, 0 or 1; `draws`
+    are those of the parameters, shape (draws, parameters).
     """
     rows = evenly(len(draws), SAMPLING.probes)
     unit, values, _ = np.linalg.svd(draws - draws.mean(0), full_matrices=False)

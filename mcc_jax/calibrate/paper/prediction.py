@@ -13,13 +13,11 @@ from ..._format import described
 from ...campaign import (
     Adjustment,
     Campaign,
-    Curve,
     check_campaign,
     effective_diameter_um,
     particle_batch,
     stress_and_strain,
 )
-from ...campaign.signal import point_noise
 from ...law import MccLaw, Plastic
 from ...simulate import simulate_batch
 from .loading import fit_polynomial
@@ -51,12 +49,6 @@ class ParticleFit:
     own_rms_um: float
 
     __repr__ = described()
-
-
-def point_noise_um(curve: Curve) -> float:
-    """Standard deviation of displacement from point to point [um]: second differences cancel any smooth course."""
-    arguments.instance(curve, Curve, "curve", "Make one with mcc_jax.Curve(time_s, force_mN, displacement_um).")
-    return point_noise(curve.displacement_um)
 
 
 def predict_particles(

@@ -17,7 +17,7 @@ from ..._errors import InputError
 from ..._format import described
 from ..._types import Scalar
 from ..settings import PAPER
-from .master_curve import StrainTable, enough
+from .loading import StrainTable, enough
 
 Objective = Literal["full", "reference"]
 
