@@ -67,9 +67,7 @@ class Normal(eqx.Module):
         shared = -Cholesky(complement).solve(right)
         return Parameters(-forward - jnp.einsum("npq,q->np", inner, shared), shared)
 
-    def covariance(
-        self,
-    ) -> tuple[Float[Array, "particles P P"], Float[Array, "particles P Q"], Float[Array, "Q Q"]]:
+    def covariance(self) -> tuple[Float[Array, "particles P P"], Float[Array, "particles P Q"], Float[Array, "Q Q"]]:
         """Blocks of the inverse: each particle's own, between it and the shared parameters, and of the shared ones."""
         factor, inner, complement = self.schur()
         shared = Cholesky(_damped(complement, 0.0)).inverse()
@@ -109,27 +107,23 @@ def _flat(tree: Any, count: int) -> Float[Array, "particles residuals"]:
     return jnp.concatenate([leaf.reshape(count, -1) for leaf in jax.tree.leaves(tree)], axis=1)
 
 
-class _State(eqx.Module):
-    normal: Normal
-
-
-class ArrowDescent(optx.AbstractDescent[Parameters, optx.FunctionInfo.ResidualJac, _State]):
+class ArrowDescent(optx.AbstractDescent[Parameters, optx.FunctionInfo.ResidualJac, Normal]):
     """The damped Gauss-Newton step of an arrow problem, each parameter damped on its own scale."""
 
-    def init(self, y: Parameters, f_info_struct: Any) -> _State:
+    def init(self, y: Parameters, f_info_struct: Any) -> Normal:
         """Normal equations of the right shapes, all zero."""
         count, P = y.local.shape
         Q = y.shared.shape[0]
         zeros = (jnp.zeros(s) for s in ((count, P, P), (count, P, Q), (Q, Q), (count, P), (Q,)))
-        return _State(Normal(*zeros))
+        return Normal(*zeros)
 
-    def query(self, y: Parameters, f_info: Any, state: _State) -> _State:
+    def query(self, y: Parameters, f_info: Any, state: Normal) -> Normal:
         """The normal equations at `y`."""
-        return _State(normal_equations(f_info.jac.mv, f_info.residual, y))
+        return normal_equations(f_info.jac.mv, f_info.residual, y)
 
-    def step(self, step_size: Float[Array, ""], state: _State) -> tuple[Parameters, optx.RESULTS]:
+    def step(self, step_size: Float[Array, ""], state: Normal) -> tuple[Parameters, optx.RESULTS]:
         """The step whose damping is one over the step size."""
-        return state.normal.solve(1 / step_size), optx.RESULTS.successful
+        return state.solve(1 / step_size), optx.RESULTS.successful
 
 
 class ArrowLevenbergMarquardt(optx.AbstractGaussNewton[Parameters, Any, Any]):
@@ -187,7 +181,7 @@ def minimise(
     solver = ArrowLevenbergMarquardt(rtol=tolerance, atol=tolerance)
     found = optx.least_squares(lambda y, _: residual(y), solver, start, max_steps=max_steps, throw=False)
     # What the solver linearised last, at the value it returns: no second linearisation to compile and to compute.
-    at, normal = found.state.f_info.residual, found.state.descent_state.normal
+    at, normal = found.state.f_info.residual, found.state.descent_state
     loss = 0.5 * sum((jnp.sum(leaf**2) for leaf in jax.tree.leaves(at)), jnp.zeros(()))
     converged = found.result == optx.RESULTS.successful
     return Solution(found.value, at, normal, loss, converged, found.stats["num_steps"])
@@ -294,8 +288,6 @@ def pooled_residual(settings: Pooled, tests: Tests) -> Callable[[Parameters], tu
 
 
 @compiled
-def fit_pooled(
-    tests: Tests, settings: Pooled, start: Parameters, *, max_steps: int = 300, tolerance: float = 1e-7
-) -> Solution:
+def fit_pooled(tests: Tests, settings: Pooled, start: Parameters) -> Solution:
     """Minimise the pooled residuals."""
-    return minimise(pooled_residual(settings, tests), start, max_steps=max_steps, tolerance=tolerance)
+    return minimise(pooled_residual(settings, tests), start, max_steps=300, tolerance=1e-7)

@@ -140,7 +140,7 @@ def judged(
     unknown = unknown_modulus(campaign, modulus, options)
     value = modulus["value"] if unknown is None else None  # what is not known cannot be implausible
     found += [] if unknown is None else [unknown]
-    found += check_plausibility(campaign.raw or campaign, modulus_MPa=value)
+    found += check_plausibility(campaign, modulus_MPa=value)
     if again is None:
         return tuple(found)
     answers: dict[tuple[str, ...], str] = {}

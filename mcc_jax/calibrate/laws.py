@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -53,34 +52,22 @@ def laws_of(
     entries = [entry_of(content, name) for name in names]
     a = content["a"]["value"] or 0.0
     modulus = content["effective_modulus_MPa"]["value"] or RIGID_MPA
-    own = np.array([[entry[name]["value"] for name in COEFFICIENTS] for entry in entries], float)
-    shapes = [_own_shape(content, entry, size, a) for entry, size in zip(entries, diameters_um, strict=True)]
-    moduli = [_own_modulus(entry, modulus) for entry in entries]
-    form, scaling = _forms(content)
 
-    def law(C: Any, a: Any, modulus: Any, effects: Any) -> MccLaw:
-        return MccLaw(Plastic(C[0], C[1], C[2]), a, modulus, form, scaling, effects=effects)
+    def law(C: Any, a: float, modulus: float, entry: Mapping[str, Any] | None) -> MccLaw:
+        return MccLaw(Plastic(*C), a, modulus, *_forms(content), effects=_effects(content, entry, variants))
 
-    def together(several: list[tuple[AbstractEffect, ...]]) -> Any:
-        return jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v, float) for v in x]), *several)
-
-    count = len(names)
-    typical = np.broadcast_to(_typical(content), own.shape)
-    make = eqx.filter_vmap(law)
-    return (
-        make(
-            jnp.asarray(own),
-            jnp.asarray(shapes),
-            jnp.asarray(moduli),
-            together([_effects(content, entry, variants) for entry in entries]),
-        ),
-        make(
-            jnp.asarray(typical),
-            jnp.full(count, a),
-            jnp.full(count, modulus),
-            together([_effects(content, None, variants)] * count),
-        ),
-    )
+    own = [
+        law(
+            [entry[name]["value"] for name in COEFFICIENTS],
+            _own_shape(content, entry, size, a),
+            _own_modulus(entry, modulus),
+            entry,
+        )
+        for entry, size in zip(entries, diameters_um, strict=True)
+    ]
+    typical = [law(_typical(content), a, modulus, None)] * len(names)
+    several = (jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v, float) for v in x]), *laws) for laws in (own, typical))
+    return next(several), next(several)
 
 
 def entry_of(content: Mapping[str, Any], particle: str) -> Mapping[str, Any]:
@@ -147,9 +134,7 @@ def _typical(content: Mapping[str, Any]) -> np.ndarray:
 
 
 def built(
-    entry: Mapping[str, Any],
-    variants: Mapping[str, Variant] | None = None,
-    amplitude: Mapping[str, Any] | None = None,
+    entry: Mapping[str, Any], variants: Mapping[str, Variant] | None = None, amplitude: Mapping[str, Any] | None = None
 ) -> AbstractEffect:
     """The effect that an entry of a result describes.
 

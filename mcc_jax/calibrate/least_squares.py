@@ -19,7 +19,7 @@ from .data import Selection, Tests, ranges_um
 from .distributions import SpreadCoordinate, nuisance_moments
 from .estimates import NO_SAMPLER, effect_entries, estimate, finite, log_estimate, normal_estimate, power_of_e
 from .fit_result import Fit
-from .fitting import beyond_numbers, checked_settings, in_own_units, prepare
+from .fitting import beyond_numbers, checked_settings, prepare
 from .forward import residuals
 from .hierarchical import SHARED, Parameters, Pooled, Solution, fit_pooled, unpack
 from .judgement import judged, numbers_in_reach, unlike_others
@@ -318,9 +318,8 @@ def least_squares(
     if model.robust and loss != "linear":
         raise InputError("robust noise and a robust loss exclude each other", remedy="Take one of them.")
     with numbers_in_reach(campaign):
-        chosen, own_units = in_own_units(campaign, model)
         selection, fit, _ = prepare(
-            campaign, chosen, threshold_MPa, block=block, tell=tell, correlated=loss == "linear", rounds=1
+            campaign, model, threshold_MPa, block=block, tell=tell, correlated=loss == "linear", rounds=1
         )
         tests, population = fit.tests, fit.population
         further = [nuisance_moments(n) for v in model.effects for n in v.nuisances]
@@ -360,8 +359,7 @@ def least_squares(
         return least_squares(some, model, without_flagged=False, **settings).answer()
 
     findings = judged(campaign, calibration.answer(), outlying, again if without_flagged else None)
-    notes = () if own_units is None else (own_units,)
-    return replace(calibration, findings=findings, notes=notes, runtime_s=time.perf_counter() - started)
+    return replace(calibration, findings=findings, runtime_s=time.perf_counter() - started)
 
 
 def solve(fit: Fit, settings: Pooled, tests: Tests, a: float, mu: np.ndarray, log_modulus: float) -> Solution:

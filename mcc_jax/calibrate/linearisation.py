@@ -18,7 +18,7 @@ from .forward import Forms, Linear, Point, linearise
 from .model import Model
 from .noise import Along, Correlation, Noise, whitening
 from .settings import FIT
-from .sharding import Blocks, Parts, count_of
+from .sharding import Blocks, Parts
 from .small_matrices import eliminate
 from .straightening import Straight, box_cox, moved, products
 
@@ -43,11 +43,11 @@ class Linearisation:
         straight: coordinates of the effects' numbers.
     """
 
-    def __init__(self, tests: Tests, model: Model, blocks: Blocks) -> None:
-        self._tests, self._model, self._blocks = tests, model, blocks
-        self._count, self._own = count_of(tests), blocks.cut(tests)
+    def __init__(self, own: Parts, count: int, model: Model, blocks: Blocks) -> None:
+        """Keep this process's own tests, and of how many particles all tests are, without copies that only fill up."""
+        self._own, self._count, self._model, self._blocks = own, count, model, blocks
         still = np.zeros(len(model.forms.names))
-        self.straight = Straight.of(len(tests), still, still)
+        self.straight = Straight.of(blocks.count, still, still)
 
     def at(self, point: Point, sd: np.ndarray | None = None) -> Parts:
         """All tests linearised around a point; with effects and how they bend over a standard deviation of each number.
@@ -62,54 +62,50 @@ class Linearisation:
             return self._blocks.each(linear_data, self._blocks.cut(point), self._own, self._model.forms)
         found = self._moved(point, np.zeros(numbers))
         bends = [self._bend(point, k, 0.0 if sd is None else float(sd[k])) for k in range(numbers)]
-        waves = (replace(w, bends=jnp.concatenate(each, -1)) for w, *each in zip(found.waves, *bends, strict=True))
-        return Parts(tuple(waves), found.axis)
+        return found.map(lambda linear, *each: replace(linear, bends=jnp.concatenate(each, -1)), *bends)
 
     def _straightened(self, point: Point, sd: np.ndarray) -> Straight:
         """Coordinates in which the prediction bends least (`straightening`), over these standard deviations."""
         still = np.zeros(point.theta.shape[1])
         shear, power = still.copy(), still.copy()
-        start, weight = np.asarray(point.theta), np.ones(len(self._tests))
+        start, weight = np.asarray(point.theta), np.ones(self._blocks.count)
         weight[self._count :] = 0.0
-        self.straight = Straight.of(len(self._tests), still, still)
+        self.straight = Straight.of(self._blocks.count, still, still)
 
         def gram(away: np.ndarray) -> np.ndarray:
-            linear = self._moved(point, away)
-            return np.asarray(
-                self._blocks.whole(self._blocks.each(products, Parts(tuple(w.columns for w in linear.waves))))
-            )
+            columns = self._moved(point, away).map(lambda linear: linear.columns)
+            return np.asarray(self._blocks.all(products, columns))
 
         here = gram(still)
         for k, owner in self._model.scatter.positive:
             size = weight @ (start[:, owner] ** 2 * here[:, owner, owner])
             shear[k] = start[0, k] * (weight @ (start[:, owner] * here[:, owner, k])) / size if size > 0 else 0.0
         shear = np.clip(shear, -FIT.steepest, FIT.steepest)
-        self.straight = Straight.of(len(self._tests), shear, power)
+        self.straight = Straight.of(self._blocks.count, shear, power)
         for k, _ in self._model.scatter.positive:
             step = np.where(np.arange(len(still)) == k, start[0, k] * sd[k], 0.0)
             up, down = (weight @ gram(by)[:, k, k] for by in (step, -step))
             power[k] = np.log(up / down) / (4 * sd[k]) if min(up, down) > 0 else 0.0
-        return Straight.of(len(self._tests), shear, np.clip(power, -FIT.steepest, FIT.steepest))
+        return Straight.of(self._blocks.count, shear, np.clip(power, -FIT.steepest, FIT.steepest))
 
     def _moved(self, point: Point, away: np.ndarray) -> Parts:
         """All tests linearised where the effects' numbers have these coordinates, by these coordinates."""
         theta, slope = moved(jnp.asarray(away), point.theta, self.straight, self._model.scatter.positive)
-        there = self._blocks.cut((replace(point, theta=theta), slope))
-        found = self._blocks.each(linear_data, Parts(tuple(p for p, _ in there.waves)), self._own, self._model.forms)
-        waves = (_sheared(linear, by) for linear, (_, by) in zip(found.waves, there.waves, strict=True))
-        return Parts(tuple(waves), found.axis)
+        cut = self._blocks.cut
+        found = self._blocks.each(linear_data, cut(replace(point, theta=theta)), self._own, self._model.forms)
+        return found.map(_sheared, cut(slope))
 
-    def _bend(self, point: Point, number: int, step: float) -> list[Array]:
+    def _bend(self, point: Point, number: int, step: float) -> Parts:
         """Derivative of all columns by one of the effects' numbers, as in `Marginal`, by differences over a step; 0 for
         a step of 0."""
         size = point.theta.shape[1]
         if not step:
-            return [jnp.zeros((*wave.mask.shape, 4 + size)) for wave in self._own.waves]
+            return self._own.map(lambda own: jnp.zeros((*own.mask.shape, 4 + size)))
         ends = np.array([step, -step])
         if number in dict(self._model.scatter.positive):
             ends = np.asarray(point.theta[0, number] * box_cox(jnp.asarray(ends), self.straight.power[0, number]))
-        up, down = (self._moved(point, np.where(np.arange(size) == number, end, 0.0)).waves for end in ends)
-        return [(a.columns - b.columns) / (ends[0] - ends[1]) for a, b in zip(up, down, strict=True)]
+        up, down = (self._moved(point, np.where(np.arange(size) == number, end, 0.0)) for end in ends)
+        return up.map(lambda a, b: (a.columns - b.columns) / (ends[0] - ends[1]), down)
 
 
 # ---- where effects are looked for ------------------------------------------------------------------------------------
@@ -143,7 +139,7 @@ def score_of_effects(
 
 
 def start_of_effects(
-    point: Point, tests: Tests, linear: Parts, noise: Noise, model: Model, blocks: Blocks
+    point: Point, own: Parts, count: int, linear: Parts, noise: Noise, model: Model, blocks: Blocks
 ) -> tuple[dict[str, float], np.ndarray]:
     """Values of the effects' sites to start from, and numbers to linearise around first: there, amplitudes are 0.
 
@@ -156,8 +152,8 @@ def start_of_effects(
     effects = tuple(v.build(0.0, **further) for v, further in candidates)
     kinds = effects, model.forms, model.zero_prior[1], model.correlation, model.along
     cut = blocks.cut
-    found = blocks.whole(blocks.each(score_of_effects, cut(point), cut(tests), linear, cut(noise), *kinds))
-    score, information = np.asarray(found)[: count_of(tests)].sum(0).T
+    found = blocks.all(score_of_effects, cut(point), own, linear, cut(noise), *kinds)
+    score, information = np.asarray(found)[:count].sum(0).T
     start: dict[str, float] = {}
     values: dict[str, float] = {}
     best: dict[str, float] = {}

@@ -366,7 +366,7 @@ def estimate_noise(
 
     def value_and_gradient(logs: np.ndarray) -> tuple[float, np.ndarray]:
         at = jnp.asarray(logs + DIFFERENCES)
-        each = blocks.whole(blocks.each(likelihoods, at, scale, tests, linear, zero_sd, correlation, along, axis=1))
+        each = blocks.all(likelihoods, at, scale, tests, linear, zero_sd, correlation, along, axis=1)
         # Summed here, in one order, however the particles are spread.
         values = -(np.sum(np.asarray(each), axis=1) + prior.log_density(np.asarray(at)))
         return float(values[0]), (values[1:5] - values[5:]) / (2 * STEP)

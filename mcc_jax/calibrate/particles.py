@@ -213,17 +213,13 @@ class Drawer:
 
         def draw(key: Array, population: Population) -> list[np.ndarray]:
             keys, same = blocks.keys(key), jnp.asarray(np.asarray(common))
-            found = blocks.whole(blocks.each(draw_particles, keys, population, self._own, candidates, same, axis=1))
+            found = blocks.all(draw_particles, keys, population, self._own, candidates, same, axis=1)
             return [np.asarray(v)[:, : self.count] for v in found]
 
         return self._chunked(draw, key, population, common)
 
     def _chunked(
-        self,
-        draw: Callable[[Array, Population], list[np.ndarray]],
-        key: Array,
-        population: Population,
-        common: bool,
+        self, draw: Callable[[Array, Population], list[np.ndarray]], key: Array, population: Population, common: bool
     ) -> ParticleDraws:
         """Draws under all populations, the last one repeated to fill up chunks."""
         draws = len(np.asarray(population.a))

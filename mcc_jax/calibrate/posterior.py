@@ -14,12 +14,13 @@ from .. import arguments
 from .._errors import InputError
 from .._format import with_sd
 from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_plausibility, check_tests
+from ..campaign.findings import worst
 from .compiling import imported_meanwhile
 from .data import Selection, ranges_um
 from .draws import Draws, draw_fast, draw_joint, named_population
 from .estimates import effect_entries, finite, summary
 from .fit_result import Fit
-from .fitting import checked_settings, in_own_units, prepare
+from .fitting import checked_settings, prepare
 from .judgement import at_noise_level, judged, numbers_in_reach, unlike_others
 from .least_squares import least_squares
 from .model import Model
@@ -256,11 +257,10 @@ def sample(
     length = Length(chains, arguments.whole(warmup, "warmup", least=1), draws)
     fast = mode == "fast"
     with numbers_in_reach(campaign):
-        chosen, own_units = in_own_units(campaign, model)
-        selection, fit, size = prepare(campaign, chosen, threshold_MPa, fill_up=fast, block=block, tell=tell)
+        selection, fit, size = prepare(campaign, model, threshold_MPa, fill_up=fast, block=block, tell=tell)
         tell("sampling the population" if fast else "sampling everything")
         key = jax.random.key(seed)
-        likely = not any(one.level == "bad" for one in check_plausibility(campaign.raw or campaign))
+        likely = worst(check_plausibility(campaign)) != "bad"
         drawn = draw_fast(key, fit, length, size, patient=likely) if fast else draw_joint(key, fit, length)
     tell("diagnosing")
     calibration = Posterior(
@@ -282,21 +282,22 @@ def sample(
         return sample(some, model, without_flagged=False, **settings, **few).answer()
 
     findings = judged(campaign, calibration.answer(), outlying, again if without_flagged else None)
-    told = [own_units]
+    notes = calibration.notes
     if model.effects and without_flagged:
         tell("calibrating without the effects")
-        told.append(_moved_by_effects(campaign, model, calibration, threshold_MPa))
-    notes = (*calibration.notes, *(one for one in told if one is not None))
+        notes += _moved_by_effects(campaign, model, calibration, threshold_MPa)
     return replace(calibration, findings=findings, notes=notes, runtime_s=time.perf_counter() - started)
 
 
-def _moved_by_effects(campaign: Campaign, model: Model, calibration: Posterior, threshold_MPa: float) -> str | None:
+def _moved_by_effects(
+    campaign: Campaign, model: Model, calibration: Posterior, threshold_MPa: float
+) -> tuple[str, ...]:
     """A sentence if a or the modulus move by more than their stated error when the effects come into the law."""
     plain = replace(model, effects=(), varying=())
     try:
         base = least_squares(campaign, plain, threshold_MPa=threshold_MPa, without_flagged=False)
     except InputError:
-        return None  # without the effects there is no answer to compare with
+        return ()  # without the effects there is no answer to compare with
     before, after = base.answer(), calibration.answer()
     moved = []
     for name, unit, factor in (("effective_modulus_MPa", " GPa", 1e-3), ("a", "", 1.0)):
@@ -306,9 +307,9 @@ def _moved_by_effects(campaign: Campaign, model: Model, calibration: Posterior, 
         label = "the effective modulus" if unit else "a"
         moved.append(f"{label} from {with_sd(old, factor)}{unit} to {with_sd(new, factor)}{unit}")
     if not moved:
-        return None
+        return ()
     names = ", ".join(model.variants)
     return (
         f"With {names} in the law {' and '.join(moved)}, by more than the error it had: without the effect the base "
-        "law's own numbers had taken up what it explains"
+        "law's own numbers had taken up what it explains",
     )

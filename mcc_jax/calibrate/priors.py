@@ -214,11 +214,7 @@ class Priors:
         return [(f.name, getattr(self, f.name)) for f in dataclasses.fields(self) if f.name != "changed"]
 
 
-_NAMES = {
-    NormalPrior: "normal",
-    LogNormalPrior: "log-normal",
-    NakagamiPrior: "nakagami",
-}
+_NAMES = {NormalPrior: "normal", LogNormalPrior: "log-normal", NakagamiPrior: "nakagami"}
 
 
 def read_priors(file: str | Path, unloading: Unloading | str = Unloading.PRINTED) -> Priors:

@@ -68,6 +68,11 @@ class Parts:
     waves: tuple[Any, ...]
     axis: int = 0
 
+    def map(self, function: Callable[..., Any], *others: Parts) -> Parts:
+        """A function of every wave, and of the same waves of others."""
+        several = zip(self.waves, *(one.waves for one in others), strict=True)
+        return Parts(tuple(function(*waves) for waves in several), self.axis)
+
 
 class Blocks:
     """How the particles are cut into blocks, and which of them are this process's own.
@@ -142,6 +147,10 @@ class Blocks:
             return _on_all_devices(chosen, axes, axis, function.__wrapped__, self.mesh)  # pyright: ignore[reportFunctionMemberAccess]
 
         return Parts(tuple(wave(w) for w in range(len(self._own))), axis)
+
+    def all(self, function: Callable[..., Any], *arguments: Any, axis: int = 0) -> Any:
+        """The same, of all particles."""
+        return self.whole(self.each(function, *arguments, axis=axis))
 
     def whole(self, parts: Parts) -> Any:
         """Arrays of all particles, the same bits on every process, from each process's own."""

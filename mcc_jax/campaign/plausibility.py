@@ -58,7 +58,7 @@ def check_plausibility(
     """What a slip of unit, sign or column would explain in a campaign, in sentences.
 
     Judges raw tests, before any fit: each test's peak, the stiffness of loading and unloading, the work given back, its
-    sizes and its times. Nothing is changed, and nothing is an error.
+    sizes and its times. Of a checked campaign those that it was made from. Nothing is changed, and nothing is an error.
 
     Args:
         campaign: the tests.
@@ -75,7 +75,7 @@ def check_plausibility(
     if not isinstance(campaign, Campaign):
         check_campaign(campaign)  # what is no campaign; one with wrong values is still looked at, to name their cause
     options = options or PlausibilityOptions()
-    looks = _looks(campaign, segments, options)
+    looks = _looks(campaign.raw or campaign, segments, options)
     if looks.typical is None or worst(looks.findings) == "bad":
         return looks.findings
     return (*looks.findings, *_fitted_modulus(looks.typical, modulus_MPa, options), *looks.told)
@@ -172,8 +172,8 @@ class _Tests:
         if not rows:
             return None
         sizes = diameters[rows]
-        numbers, swapped = log_numbers(given, sizes), log_numbers(others, sizes)
-        return cls(tuple(campaign.particles[i] for i in rows), sizes, tuple(given), numbers, swapped)
+        numbers, exchanged = log_numbers(given, sizes), log_numbers(others, sizes)
+        return cls(tuple(campaign.particles[i] for i in rows), sizes, tuple(given), numbers, exchanged)
 
     def some(self, chosen: np.ndarray) -> tuple[str, ...]:
         """Names of the chosen tests, none where all are."""

@@ -183,6 +183,6 @@ def refusal(campaign: Campaign, problem: str, why_not: Sequence[str | None]) -> 
 
 def or_slip(campaign: Campaign, problem: str, remedy: str) -> tuple[str, str]:
     """A problem and its remedy; with the likely slip of unit, sign or column that explains it, where there is one."""
-    slips = [one for one in check_plausibility(campaign.raw or campaign) if one.level == "bad"]
+    slips = [one for one in check_plausibility(campaign) if one.level == "bad"]
     # What a slip explains needs no other remedy.
     return (f"{problem}; {slips[0].sentence}", slips[0].remedy) if slips else (problem, remedy)

@@ -149,7 +149,7 @@ class PaperCalibration(Calibration):
 
     def _misfit(self, name: str) -> float:
         fits = [p for p in self.particles if p is not None and p.used.any()]
-        return float(np.median([getattr(p, name) / max(np.ptp(p.measured_um[p.used]), 1e-300) for p in fits]))
+        return float(np.median([getattr(p, name) / max(p.range_um, 1e-300) for p in fits]))
 
     def answer(self) -> dict[str, Any]:
         """Whether it converged, a and the modulus, as in `calibration.json`."""
@@ -307,8 +307,8 @@ def calibrate_paper(
         time.perf_counter() - started,
     )
     fits = [(n, p) for n, p in zip(campaign.particles, particles, strict=True) if p is not None and p.used.any()]
-    misfit = np.array([(p.own_rms_um, np.ptp(p.measured_um[p.used])) for _, p in fits]).reshape(-1, 2)
-    outlying = unlike_others([name for name, _ in fits], *misfit.T)
+    misfit, ranges = (np.array(v) for v in ([p.own_rms_um for _, p in fits], [p.range_um for _, p in fits]))
+    outlying = unlike_others([name for name, _ in fits], misfit, ranges)
 
     def again(some: Campaign) -> dict[str, Any]:
         settings: dict[str, Any] = {"threshold_MPa": threshold_MPa, "objective": objective, "seed": seed}

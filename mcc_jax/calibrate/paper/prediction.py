@@ -10,14 +10,7 @@ import numpy as np
 
 from ... import arguments
 from ..._format import described
-from ...campaign import (
-    Adjustment,
-    Campaign,
-    check_campaign,
-    effective_diameter_um,
-    particle_batch,
-    stress_and_strain,
-)
+from ...campaign import Adjustment, Campaign, check_campaign, effective_diameter_um, particle_batch, stress_and_strain
 from ...law import MccLaw, Plastic
 from ...simulate import simulate_batch
 from .loading import fit_polynomial
@@ -49,6 +42,11 @@ class ParticleFit:
     own_rms_um: float
 
     __repr__ = described()
+
+    @property
+    def range_um(self) -> float:
+        """Range of the measured displacement where it is compared [um]."""
+        return float(np.ptp(self.measured_um[self.used]))
 
 
 def predict_particles(
