@@ -39,7 +39,12 @@ def law_of(
     modulus = _number(content["effective_modulus_MPa"], "effective_modulus_MPa")
     if entry is not None:
         a, modulus = _own_shape(content, entry, diameters_um, a), _own_modulus(entry, modulus)
-    return MccLaw(Plastic(*C), a, modulus, *_forms(content), effects=_effects(content, entry, variants))
+    return _law(content, C, a, modulus, entry, variants)
+
+
+def _law(content: Mapping[str, Any], C: Any, a: float, modulus: float, entry: Any, variants: Variants | None) -> MccLaw:
+    form = Unloading(content["law"]["unloading"]), StrainScaling(content["law"]["strain_scaling"])
+    return MccLaw(Plastic(*C), a, modulus, *form, effects=_effects(content, entry, variants))
 
 
 def laws_of(
@@ -49,25 +54,21 @@ def laws_of(
 
     The typical law has the medians of the coefficients; of the paper's method it is the law of the expected stress.
     """
-    entries = [entry_of(content, name) for name in names]
     a = content["a"]["value"] or 0.0
     modulus = content["effective_modulus_MPa"]["value"] or RIGID_MPA
+    own = []
+    for name, size in zip(names, diameters_um, strict=True):
+        entry = entry_of(content, name)
+        C = [entry[coefficient]["value"] for coefficient in COEFFICIENTS]
+        shape = _own_shape(content, entry, size, a)
+        own.append(_law(content, C, shape, _own_modulus(entry, modulus), entry, variants))
+    typical = [_law(content, _typical(content), a, modulus, None, variants)] * len(names)
+    return _together(own), _together(typical)
 
-    def law(C: Any, a: float, modulus: float, entry: Mapping[str, Any] | None) -> MccLaw:
-        return MccLaw(Plastic(*C), a, modulus, *_forms(content), effects=_effects(content, entry, variants))
 
-    own = [
-        law(
-            [entry[name]["value"] for name in COEFFICIENTS],
-            _own_shape(content, entry, size, a),
-            _own_modulus(entry, modulus),
-            entry,
-        )
-        for entry, size in zip(entries, diameters_um, strict=True)
-    ]
-    typical = [law(_typical(content), a, modulus, None)] * len(names)
-    several = (jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v, float) for v in x]), *laws) for laws in (own, typical))
-    return next(several), next(several)
+def _together(laws: list[MccLaw]) -> MccLaw:
+    """Laws of one form as one, every array field with a leading axis."""
+    return jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v, float) for v in x]), *laws)
 
 
 def entry_of(content: Mapping[str, Any], particle: str) -> Mapping[str, Any]:
@@ -86,10 +87,6 @@ def entry_of(content: Mapping[str, Any], particle: str) -> Mapping[str, Any]:
             remedy="Take another particle or, without one, the population.",
         )
     return entries[particle]
-
-
-def _forms(content: Mapping[str, Any]) -> tuple[Unloading, StrainScaling]:
-    return Unloading(content["law"]["unloading"]), StrainScaling(content["law"]["strain_scaling"])
 
 
 def _number(estimate: Mapping[str, Any], name: str) -> float:

@@ -124,15 +124,12 @@ class Model:
             filters: of a fit: the noise as it was estimated, but for a common factor; sampled if None.
             around: of a fit: every particle's own numbers are sampled in the coordinates of its Laplace approximation.
         """
-        shapes = tests if marginal is None else marginal
-        assert shapes is not None
         if marginal is not None:
-            population = self.population(shapes)
-            numpyro.factor("tests", jnp.sum(marginal.log_likelihood(population)))
+            numpyro.factor("tests", jnp.sum(marginal.log_likelihood(self.population(marginal))))
             return
         assert tests is not None
         p, count, size = self.chosen_priors, len(tests), self.scatter.size
-        population = self.population(shapes, noise_factor=filters is not None)
+        population = self.population(tests, noise_factor=filters is not None)
         noise = None if filters is not None else self._noise(count)
         with numpyro.plate("particle", count):
             if around is None:

@@ -44,7 +44,6 @@ class NormalPrior:
     sd: float
 
     def __post_init__(self) -> None:
-        """Refuse what is no normal distribution."""
         object.__setattr__(self, "mean", arguments.number(self.mean, "the mean of a prior"))
         object.__setattr__(self, "sd", arguments.number(self.sd, "the sd of a prior", above=0))
 
@@ -61,7 +60,6 @@ class LogNormalPrior:
     log_sd: float
 
     def __post_init__(self) -> None:
-        """Refuse what is no log-normal distribution."""
         object.__setattr__(self, "median", arguments.number(self.median, "the median of a prior", above=0))
         object.__setattr__(self, "log_sd", arguments.number(self.log_sd, "the log_sd of a prior", above=0))
 
@@ -87,7 +85,6 @@ class NakagamiPrior:
     shape: float = 0.5
 
     def __post_init__(self) -> None:
-        """Refuse what is no distribution of a spread."""
         object.__setattr__(self, "sd", arguments.number(self.sd, "the scale sd of a spread", above=0))
         shape = arguments.number(self.shape, "the shape of a spread's prior", above=0, most=MAX_SHAPE)
         object.__setattr__(self, "shape", shape)
