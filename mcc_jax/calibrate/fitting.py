@@ -23,10 +23,10 @@ from .forward import Point
 from .linearisation import Linearisation, linear_data, start_of_effects
 from .marginal import Marginal, summarise
 from .mode import LogPosterior, careful_enough, expect, gradients, most_probable
-from .model import Model, check_prior_of_a
+from .model import Model
 from .noise import Noise, NoiseFit, estimate_noise, particle_scales, squared_innovations, student_weights
 from .particle_fit import ParticleFits, fit_particles, linear_starts
-from .priors import Priors
+from .priors import Priors, check_prior_of_a
 from .settings import FIT
 from .sharding import Blocks, Parts, block_size, count_of, filled_up, require_same
 

@@ -16,8 +16,8 @@ import numpy as np
 
 from .._errors import InputError
 from ..campaign import Campaign, Finding, campaign_findings, check_plausibility
+from ..campaign.plausibility import or_slip
 from ..campaign.quality import named
-from ..campaign.reasons import or_slip
 from .fit_result import Fit
 from .settings import JUDGEMENT, JudgementSettings
 

@@ -26,12 +26,10 @@ from .forward import Forms, Linear, Point, linearise
 from .marginal import Marginal
 from .noise import FREEDOM, Along, Correlation, Noise, Whitening, whitening
 from .population import COEFFICIENTS, Population, Scatter, particles_at
-from .priors import NakagamiPrior, Priors
+from .priors import ALMOST, NakagamiPrior, Priors
 
 sample: Any = numpyro.sample
 deterministic: Any = numpyro.deterministic
-ALMOST = 0.98
-"""Share of the way to the value of a at which a particle's shape factor would vanish."""
 
 
 @dataclass(frozen=True)
@@ -321,19 +319,3 @@ def _variant(effect: Any) -> Variant:
                 remedy="A model has one value for all tests; take another formula of the mechanism.",
             )
     return found
-
-
-def check_prior_of_a(priors: Priors, flatness: np.ndarray) -> None:
-    """Make sure that the prior of `a` leaves values under which every particle's shape factor is positive.
-
-    Raises:
-        InputError: if it does not.
-    """
-    most, least = max(flatness.max(), 1e-3), min(flatness.min(), -1e-3)
-    low, high = -ALMOST / most, -ALMOST / least
-    if not (low < priors.a.mean + 6 * priors.a.sd and high > priors.a.mean - 6 * priors.a.sd):
-        raise InputError(
-            f"the prior of a ({priors.a.mean:g} +- {priors.a.sd:g}) leaves no value under which every particle's shape "
-            f"factor is positive ({low:.3g} < a < {high:.3g})",
-            remedy="Widen the prior, or check the diameters.",
-        )

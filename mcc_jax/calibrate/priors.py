@@ -91,6 +91,8 @@ class NakagamiPrior:
 
 
 MAX_SHAPE = 0.5
+ALMOST = 0.98
+"""Share of the way to the value of a at which a particle's shape factor would vanish."""
 CELLULOSE = 11.0, 0.6
 """Peak stress [MPa] and scaled strain there of the paper's tests, about: what the default priors belong to."""
 
@@ -209,6 +211,22 @@ class Priors:
 
     def _entries(self) -> list[tuple[str, Any]]:
         return [(f.name, getattr(self, f.name)) for f in dataclasses.fields(self) if f.name != "changed"]
+
+
+def check_prior_of_a(priors: Priors, flatness: np.ndarray) -> None:
+    """Make sure that the prior of `a` leaves values under which every particle's shape factor is positive.
+
+    Raises:
+        InputError: if it does not.
+    """
+    most, least = max(flatness.max(), 1e-3), min(flatness.min(), -1e-3)
+    low, high = -ALMOST / most, -ALMOST / least
+    if not (low < priors.a.mean + 6 * priors.a.sd and high > priors.a.mean - 6 * priors.a.sd):
+        raise InputError(
+            f"the prior of a ({priors.a.mean:g} +- {priors.a.sd:g}) leaves no value under which every particle's shape "
+            f"factor is positive ({low:.3g} < a < {high:.3g})",
+            remedy="Widen the prior, or check the diameters.",
+        )
 
 
 _NAMES = {NormalPrior: "normal", LogNormalPrior: "log-normal", NakagamiPrior: "nakagami"}

@@ -121,6 +121,13 @@ def _looks(campaign: Campaign, segments: Sequence[Sequence[Segment]] | None, opt
     return remembered(campaign, ("looks", parts, options), find)
 
 
+def or_slip(campaign: Campaign, problem: str, remedy: str) -> tuple[str, str]:
+    """A problem and its remedy; with the likely slip of unit, sign or column that explains it, where there is one."""
+    slips = [one for one in check_plausibility(campaign) if one.level == "bad"]
+    # What a slip explains needs no other remedy.
+    return (f"{problem}; {slips[0].sentence}", slips[0].remedy) if slips else (problem, remedy)
+
+
 def wrong_signs(campaign: Campaign) -> bool:
     """Whether force, displacement or both are counted the other way round in most tests of a campaign."""
     with np.errstate(all="ignore"):
