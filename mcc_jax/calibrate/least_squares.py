@@ -122,7 +122,7 @@ class LeastSquares(JointCalibration):
         agree, count = self.agreeing_starts
         if agree < count:
             notes.append(f"{count - agree} of {count} starts ended at a worse optimum")
-        notes += self.notes_of_the_fit()
+        notes += self._notes_of_the_fit()
         if self._alone:
             notes.append("one particle says nothing of the scatter between particles: no spread is given")
         elif np.any(np.asarray(self.settings.population.tau) < 1e-3):
@@ -189,9 +189,9 @@ class LeastSquares(JointCalibration):
             },
             # The scatter of C1 is part of its mean.
             "yield_stress_MPa": estimate(None if self._alone else power_of_e(values[2] + tau[0] ** 2 / 2) / 17.16),
-            "noise": self.noise_numbers(),
+            "noise": self._noise_numbers(),
             "priors": self.model.chosen_priors.to_json(),
-            "particles": self.entries(numbers),
+            "particles": self._entries(numbers),
             "warnings": self.warnings(),
             "findings": [one.to_json() for one in self.findings],
             "diagnostics": {

@@ -70,7 +70,7 @@ class Posterior(PosteriorDraws, Draws):
         reasons = ("noise", "population")
         unfitted = [r for r, fine in zip(reasons, np.asarray(self.fit.converged)[1:], strict=True) if not fine]
         if unfitted and self.mode == "fast":  # of what was drawn around a fit that is none, no diagnostic says anything
-            by, what = self.missed, " and ".join(unfitted)
+            by, what = self._missed, " and ".join(unfitted)
             if at_noise_level(self.fit, self.rms_um()):
                 return [
                     f"the search for the {what} did not come to rest, although the law misses these tests by no more "
@@ -114,7 +114,7 @@ class Posterior(PosteriorDraws, Draws):
 
     def warnings(self) -> list[str]:
         """What a reader of the numbers must know, one sentence each."""
-        notes = [*self.failures(), *map(str, self.findings), *self.notes_of_the_fit()]
+        notes = [*self.failures(), *map(str, self.findings), *self._notes_of_the_fit()]
         if len(self.particles) < 3:
             notes.append(
                 f"{len(self.particles)} particles say little about a population: its spread is mostly the prior"
@@ -181,9 +181,9 @@ class Posterior(PosteriorDraws, Draws):
             "shape_scatter": summary(named["shape_scatter"]) if self.model.shape_scatter else None,
             "yield_stress_MPa": summary(self.yield_stress_MPa()),
             "probability_not_monotone": summary(self.probability_not_monotone()),
-            "noise": self.noise_numbers() | {"factor": summary(named["noise_factor"])},
+            "noise": self._noise_numbers() | {"factor": summary(named["noise_factor"])},
             "priors": self.model.chosen_priors.to_json(),
-            "particles": self.entries(numbers, pareto_k=self.pareto_k),
+            "particles": self._entries(numbers, pareto_k=self.pareto_k),
             "warnings": self.warnings(),
             "findings": [one.to_json() for one in self.findings],
             "diagnostics": {

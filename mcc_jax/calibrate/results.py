@@ -174,7 +174,7 @@ class JointCalibration(Calibration):
         return float(np.median(self.rms_um() / np.maximum(ranges_um(self.selection.tests), 1e-300)))
 
     @property
-    def missed(self) -> str:
+    def _missed(self) -> str:
         """How far the law is from the tests, in words."""
         return f"{np.median(self.rms_um()):.2g} um, {100 * self.own_misfit:.2g} % of their range (medians)"
 
@@ -183,21 +183,21 @@ class JointCalibration(Calibration):
         """Share of what the law misses that correlated noise has taken up; see `noise_share`."""
         return noise_share(self.fit)
 
-    def notes_of_the_fit(self) -> list[str]:
+    def _notes_of_the_fit(self) -> list[str]:
         """Warnings that stand in the tests, in how they were calibrated, and in what the law misses."""
         notes = [*self.selection.notes, *self.notes]
-        notes += filter(None, (misfit_note(self.own_misfit), noise_note(self.noise_share, self.missed)))
+        notes += filter(None, (misfit_note(self.own_misfit), noise_note(self.noise_share, self._missed)))
         dropped = sum(reason is not None for reason in self.selection.why_not)
         return notes + [f"{dropped} of {len(self.campaign)} particles could not be used"] * (dropped > 0)
 
-    def noise_numbers(self) -> dict[str, Any]:
+    def _noise_numbers(self) -> dict[str, Any]:
         """Estimates of the noise by their names in files."""
         noise = self.fit.noise
         names = ("displacement_um", "force_mN", "correlated_um", "correlation_length")
         numbers = zip(names, np.asarray(noise.noise.logs), noise.log_sd, strict=True)
         return {name: log_estimate(m, s) if np.isfinite(m) else estimate(0.0) for name, m, s in numbers}
 
-    def entries(self, numbers: Callable[[int], dict[str, Any]], **more: np.ndarray) -> list[dict[str, Any]]:
+    def _entries(self, numbers: Callable[[int], dict[str, Any]], **more: np.ndarray) -> list[dict[str, Any]]:
         """What stands in files of every particle of the campaign.
 
         Args:
