@@ -116,7 +116,8 @@ def picture(mechanism):
     with rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
         figures = [Figure(figsize=(3.8, 2.7), layout="constrained") for _ in range(2)]
         left, right = (figure.subplots() for figure in figures)
-        left.plot(law.displacement_um, law.force_mN, "--", color=VERMILION, lw=1.3, label="law alone")
+        # Broad and pale below narrow and dark: dashes of a path that goes back on itself would fill each other's gaps.
+        left.plot(law.displacement_um, law.force_mN, color=VERMILION, alpha=0.6, lw=2.8, label="law alone")
         left.plot(curve.displacement_um, curve.force_mN, color=BLUE, lw=1.3, label="with the effect")
         left.set(xlabel="displacement / µm", ylabel="force / mN")
         left.legend(frameon=False, fontsize=8, loc="upper left")
@@ -133,7 +134,7 @@ def picture(mechanism):
         force.set_yticks([])
         force.spines["right"].set_visible(False)
         look = {"ha": "right", "va": "top", "fontsize": 8, "color": "0.3"}
-        force.text(0.99, 0.99, "grey: force, from 0 at the bottom", transform=force.transAxes, **look)
+        force.text(0.99, 0.99, "grey: force, on a scale of its own", transform=force.transAxes, **look)
         right.set_zorder(force.get_zorder() + 1)
         right.patch.set_visible(False)
         streams = [io.BytesIO() for _ in figures]

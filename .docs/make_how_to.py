@@ -285,7 +285,7 @@ def report(file):
         tab.screenshot(path=file)
         browser.close()
     with Image.open(file) as whole:
-        whole.convert("RGB").quantize(48, dither=Image.Dither.NONE).save(file, optimize=True)
+        whole.convert("RGB").quantize(96, dither=Image.Dither.NONE).save(file, optimize=True)
 
 
 if __name__ == "__main__":

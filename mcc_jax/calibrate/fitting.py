@@ -27,7 +27,7 @@ from .model import Model
 from .noise import Noise, NoiseFit, estimate_noise, particle_scales, squared_innovations, student_weights
 from .particle_fit import ParticleFits, fit_particles, linear_starts
 from .priors import Priors, check_prior_of_a
-from .settings import FIT
+from .settings import FIT, SELECTION
 from .sharding import Blocks, Parts, block_size, count_of, filled_up, require_same
 
 
@@ -38,6 +38,7 @@ def prepare(
     *,
     fill_up: bool = True,
     block: int | None = None,
+    most_points: int = SELECTION.most_points,
     tell: Callable[[str], None] = lambda _: None,
     **settings: Any,
 ) -> tuple[Selection, Fit, int]:
@@ -47,6 +48,7 @@ def prepare(
         model: what is assumed; its priors become the campaign's own where they have to (`in_own_units`).
         fill_up: let copies that count for nothing make up whole blocks; if False, all particles are one block.
         block: particles of a block; by default `block_size` of their number.
+        most_points: records longer than this are thinned.
         settings: of `fit_tests`.
 
     Returns:
@@ -58,7 +60,7 @@ def prepare(
     make_room()
     model, told = in_own_units(campaign, model)
     tell("selecting points")
-    selection = select(campaign, threshold_MPa=threshold_MPa)
+    selection = select(campaign, threshold_MPa=threshold_MPa, most_points=most_points)
     selection = replace(selection, notes=(*selection.notes, *told))
     require_same(selection.tests)
     size = (block or block_size(len(selection.tests))) if fill_up else len(selection.tests)

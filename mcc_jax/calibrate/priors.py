@@ -188,6 +188,7 @@ class Priors:
             tau_C1=wider(base.tau_C1),
             tau_C3=wider(base.tau_C3),
             tau_C5=wider(base.tau_C5),
+            noise_length=LogNormalPrior(base.noise_length.median, 0.25),
         )
 
     @property

@@ -4,7 +4,8 @@
 
 1. single readings far from all their neighbours (spikes) are left out;
 2. readings that repeat while the test goes on, and then catch up in one jump (a stuck channel), are left out;
-3. a sudden loss of force (the particle broke) ends the record;
+3. a sudden loss of force (the particle broke) ends the record; where force falls while the platens go on closing as
+   fast as before (it gives way or slips), readings are left out until the force is back, or to the end;
 4. the mean force in the air before contact is the zero of force: it is taken off, its error is kept;
 5. readings at the end of a channel's range are not compared with the law (`saturation`).
 
@@ -23,6 +24,7 @@ from .plausibility import wrong_signs
 from .quality_options import QualityOptions
 from .saturation import censor_displacement, censor_force
 from .schema import Campaign, Checked, Control, Curve, Note
+from .segments import find_segments
 from .signal import differences, median, point_noise, quantile, runs
 from .validate import check_campaign
 
@@ -74,7 +76,12 @@ def check_test(curve: Curve, control: Control | None, options: QualityOptions) -
         last, lost = broke
         notes.append(_breakage_note(float(curve.force_mN[rows[last]]), lost))
         rows = rows[: last + 1]
-    clean = _taken(curve, rows)
+        clean = _taken(curve, rows)
+    slipping = gives_way(clean, control, options)
+    if slipping.any():
+        notes.append(_slip_note(float(clean.force_mN[np.argmax(slipping) - 1]), int(slipping.sum())))
+        rows = rows[~slipping]
+        clean = _taken(curve, rows)
     zero = zero_of_force(clean, control, options)
     if zero is not None:
         notes += zero.notes
@@ -218,6 +225,32 @@ def breakage(curve: Curve, options: QualityOptions) -> tuple[int, float] | None:
     return first
 
 
+def gives_way(curve: Curve, control: Control | None, options: QualityOptions) -> np.ndarray:
+    """Which readings come after the particle gave way or slipped, until its force is back; booleans.
+
+    Force falls while the platens go on closing at about the speed they had: no unloading, in which they part or, of a
+    stiff particle that creeps, stand still. The law knows force on virgin loading, unloading and reloading alone.
+    """
+    force, path, time = curve.force_mN, curve.displacement_um, curve.time_s
+    found = np.zeros(len(curve), bool)
+    if len(curve) < 12:
+        return found
+    back = max(4 * point_noise(path), 1e-3 * float(np.ptp(path)))
+    for segment in find_segments(curve, control=control):
+        start, last = segment.start, segment.stop - 1
+        if segment.kind != "unload" or start == 0 or found[start] or last == start:
+            continue
+        risen = np.flatnonzero(force[: start + 1] <= 0.5 * force[start])
+        before = int(risen[-1]) if len(risen) else 0
+        way, gone = path[last] - path[start], path[start] - path[before]
+        # Both speeds times both durations: a clock that stood still divides nothing.
+        as_fast = way * (time[start] - time[before]) > options.goes_on * gone * (time[last] - time[start])
+        if gone > 0 and way > back and as_fast and float(np.min(path[start : last + 1])) > path[start] - back:
+            again = np.flatnonzero(force[last:] >= force[start])
+            found[start + 1 : last + int(again[0]) if len(again) else len(curve)] = True
+    return found
+
+
 # ---- words -----------------------------------------------------------------------------------------------------------
 
 
@@ -249,6 +282,17 @@ def _breakage_note(force_mN: float, share: float) -> Note:
         "the particle broke at {} mN (the force falls by {} % at once); its record counts up to there",
         (force_mN, 100 * share),
         "Load particles of this batch less, or leave this one out",
+    )
+
+
+def _slip_note(force_mN: float, count: int) -> Note:
+    return Note(
+        "breakage",
+        "told",
+        "force falls from {} mN on while the platens go on closing (the particle gives way or slips): {} readings are "
+        "left out",
+        (force_mN, count),
+        "Look whether the particle still is one, and load it less if it is not",
     )
 
 

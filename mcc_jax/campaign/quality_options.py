@@ -31,6 +31,8 @@ class QualityOptions:
         loss_pace: and so many times faster than the force changes elsewhere, at least.
         loss_from: and from this share of the largest force on: below it, the platens bounce on asperities.
         loss_noise: and so many standard deviations of the noise, at least.
+        goes_on: force that falls is no unloading if the platens go on closing at this share of their speed, at least:
+            in an unloading they part, and creep in its first readings is slower than the loading before it.
         air_readings: readings in the air, at least: fewer do not give the zero's error.
         air_said: an offset is told from so many standard deviations on,
         air_share: and from this share of the largest force on: below it no answer moves by a tenth of its error.
@@ -57,6 +59,7 @@ class QualityOptions:
     loss_pace: float = 5.0
     loss_from: float = 0.05
     loss_noise: float = 10.0
+    goes_on: float = 0.5
     air_readings: int = 5
     air_said: float = 3.0
     air_share: float = 1e-3

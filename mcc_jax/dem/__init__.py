@@ -8,12 +8,14 @@ from .band import population_packing as population_packing
 from .dynamics import Motion as Motion
 from .dynamics import Segment as Segment
 from .dynamics import advance as advance
+from .dynamics import in_single as in_single
 from .dynamics import replay as replay
 from .dynamics import run as run
 from .dynamics import stable_time_step as stable_time_step
 from .dynamics import step as step
 from .edges import Edges as Edges
 from .edges import carry_history as carry_history
+from .edges import close_pairs as close_pairs
 from .edges import list_edges as list_edges
 from .edges import relabel as relabel
 from .forces import Forces as Forces
@@ -28,7 +30,6 @@ from .load_steps import Replayed as Replayed
 from .load_steps import Solver as Solver
 from .load_steps import replay_compaction as replay_compaction
 from .measured import Trajectory as Trajectory
-from .neighbours import close_pairs as close_pairs
 from .packings import MCC_DENSITY as MCC_DENSITY
 from .packings import relative_density as relative_density
 from .packings import scattered as scattered
@@ -42,12 +43,9 @@ from .pair import pair_split as pair_split
 from .pair import wall_energy as wall_energy
 from .pair import wall_force as wall_force
 from .pair import wall_recovery as wall_recovery
-from .precision import in_single as in_single
 from .quasistatic import Compaction as Compaction
 from .quasistatic import compact as compact
 from .quasistatic import relaxed as relaxed
-from .restart import load_state as load_state
-from .restart import save_state as save_state
 from .sensitivity import STRESSES as STRESSES
 from .sensitivity import Sensitivity as Sensitivity
 from .sensitivity import punch_sensitivity as punch_sensitivity
@@ -58,7 +56,9 @@ from .side import sides_of as sides_of
 from .state import State as State
 from .state import check_state as check_state
 from .state import listed as listed
+from .state import load_state as load_state
 from .state import not_monotone as not_monotone
+from .state import save_state as save_state
 from .state import start as start
 from .walls import Cylinder as Cylinder
 from .walls import Plane as Plane

@@ -74,11 +74,7 @@ class Band(NamedTuple):
 
 
 def population_packing(
-    calibration: Posterior,
-    diameter: Any,
-    *,
-    seed: int = 0,
-    density: float = MCC_DENSITY,
+    calibration: Posterior, diameter: Any, *, seed: int = 0, density: float = MCC_DENSITY
 ) -> PopulationPacking:
     r"""Spheres whose laws follow the population, :math:`\ln C_i = \mu + \tau z_i`, and alike for the modulus.
 

@@ -1,7 +1,8 @@
-"""Contacts between particles as a list of fixed length, and what each remembers across lists."""
+"""Contacts between particles: which are close, their list of fixed length, and what each remembers across lists."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -73,6 +74,55 @@ class Edges(eqx.Module):
             )
 
 
+def close_pairs(position: Any, radius: Any, skin: float) -> Int[np.ndarray, "pairs 2"]:
+    r"""All pairs whose surfaces are closer than the skin, :math:`|x_i - x_j| < R_i + R_j + s`.
+
+    By `vesin` if it is installed (``pip install mcc-jax[neighbours]``), else by SciPy's k-d tree; the same pairs.
+
+    Args:
+        position: centres [m].
+        radius: radii [m].
+        skin: extra distance [m]. No pair can touch unseen until a particle has moved by half of it.
+
+    Raises:
+        InputError: if a position is not finite; it names the particle.
+    """
+    position = arguments.floats(position, "position", shape="centres [m], shape (N, 3)")
+    radius = arguments.floats(radius, "radius", shape="radii [m], shape (N,)")
+    if position.ndim != 2 or position.shape[1] != 3 or radius.ndim != 1:
+        shapes = f"{position.shape} and {radius.shape}"
+        raise InputError(f"position and radius have the shapes {shapes} where (N, 3) and (N,) are expected")
+    arguments.same_length(position=position, radius=radius)
+    arguments.positive(radius, "radius [m]")
+    skin = arguments.number(skin, "skin [m]", least=0)
+    lost = np.flatnonzero(~np.isfinite(position).all(axis=1))
+    if lost.size:
+        raise InputError(
+            f"the position of particle {lost[0]} is not finite",
+            remedy="A smaller time step, or look at how the packing was made.",
+        )
+    if len(position) < 2:
+        return np.zeros((0, 2), np.int64)
+    cutoff = 2 * float(radius.max()) + skin
+    pairs = _pairs_within(position, cutoff)
+    gap = np.linalg.norm(position[pairs[:, 0]] - position[pairs[:, 1]], axis=1) - radius[pairs].sum(axis=1)
+    return pairs[gap < skin]
+
+
+def _pairs_within(position: np.ndarray, cutoff: float) -> np.ndarray:
+    try:
+        from vesin import NeighborList  # pyright: ignore[reportMissingImports]  # optional
+    except ImportError:
+        from scipy.spatial import KDTree
+
+        return KDTree(position).query_pairs(cutoff, output_type="ndarray").astype(np.int64)
+    # vesin's cell grid is made for lengths of the order of one: in units of the cut-off they are.
+    found = NeighborList(cutoff=1.0, full_list=False).compute(
+        points=position / cutoff, box=np.zeros((3, 3)), periodic=False, quantities="ij"
+    )
+    return np.stack(found, axis=1).astype(np.int64)
+
+
 def list_edges(pairs: Any, particles: int, capacity: int, dtype: np.dtype | type = np.float64) -> Edges:
     """Edges of virgin contacts from pairs in any order.
 
@@ -124,28 +174,37 @@ def carry_history(old: Edges, new: Edges) -> Edges:
     """
     place = jnp.searchsorted(old.key, new.key).clip(0, old.capacity - 1)
     known = (old.key[place] == new.key) & new.active
-    return eqx.tree_at(
-        lambda e: (e.overlap_max, e.slip),
-        new,
-        (
-            jnp.where(known, old.overlap_max[place], 0.0),
-            jax.vmap(lambda known, slip: jnp.where(known, slip, 0.0))(known, old.slip[place]),
-        ),
-    )
+    history = jnp.where(known, old.overlap_max[place], 0.0), jnp.where(known[:, None], old.slip[place], 0.0)
+    return eqx.tree_at(lambda e: (e.overlap_max, e.slip), new, history)
+
+
+def relisted(old: Edges, key: Array, i: Array, j: Array) -> Edges:
+    """The contacts on another list of the same particles, with the history of the pairs that were in the old one."""
+    overlap_max, slip = jnp.zeros(key.shape[0], old.slip.dtype), jnp.zeros((key.shape[0], 3), old.slip.dtype)
+    return carry_history(old, Edges(key, i, j, overlap_max, slip, old.wanted, old.particles))
+
+
+def stacked_lists[Recorded: Any](tape: Sequence[Recorded]) -> Recorded:
+    """Named tuples with a list of edges each (`key`, `i`, `j`) as one with a leading axis, lists filled up alike."""
+    room = max(step.key.shape[0] for step in tape)
+
+    def padded(step: Recorded) -> Recorded:
+        spare = (0, room - step.key.shape[0])
+        key = np.pad(step.key, spare, constant_values=PADDING)
+        return step._replace(key=key, i=np.pad(step.i, spare), j=np.pad(step.j, spare))
+
+    return type(tape[0])(*(jnp.asarray(np.stack(column)) for column in zip(*map(padded, tape), strict=True)))
+
+
+def lengthened[Rows: eqx.Module](tree: Rows, rows: int) -> Rows:
+    """The same with as many rows in every array that has some, the new ones 0."""
+    return jax.tree.map(lambda x: jnp.pad(x, [(0, rows - len(x))] + [(0, 0)] * (x.ndim - 1)) if x.ndim else x, tree)
 
 
 def widened(edges: Edges, capacity: int) -> Edges:
     """The same list with room for more."""
-    spare = capacity - edges.capacity
-    return Edges(
-        jnp.pad(edges.key, (0, spare), constant_values=PADDING),
-        jnp.pad(edges.i, (0, spare)),
-        jnp.pad(edges.j, (0, spare)),
-        jnp.pad(edges.overlap_max, (0, spare)),
-        jnp.pad(edges.slip, ((0, spare), (0, 0))),
-        edges.wanted,
-        edges.particles,
-    )
+    key = jnp.pad(edges.key, (0, capacity - edges.capacity), constant_values=PADDING)
+    return eqx.tree_at(lambda e: e.key, lengthened(edges, capacity), key)
 
 
 @jax.jit

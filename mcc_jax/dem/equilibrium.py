@@ -53,14 +53,12 @@ class ContactNewton(optx.AbstractMinimiser[Vectors, Balance, _State]):
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
         """Nothing is known yet: the first step evaluates where it stands."""
-        del fn, args, options, tags
         zero, no = jnp.zeros((), f_struct.dtype), jnp.array(False)
         at = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), aux_struct)
         return _State(y, jnp.zeros_like(y), zero + 1, zero, zero, jnp.array(True), no, no, at)
 
     def step(self, fn, y, args, options, state: _State, tags) -> tuple[Vectors, _State, Balance]:
         """Evaluate the trial; take it and find a new direction, or shorten the step."""
-        del options, tags
         energy, at = fn(state.trial, args)
         largest = jnp.max(jnp.abs(at.net))
         slope_there = -jnp.sum(at.net * state.direction)
@@ -90,13 +88,11 @@ class ContactNewton(optx.AbstractMinimiser[Vectors, Balance, _State]):
 
     def terminate(self, fn, y, args, options, state: _State, tags) -> tuple[Flag, optx.RESULTS]:
         """Whether the net force is small enough, or no step helps any more."""
-        del fn, y, args, options, tags
         result = optx.RESULTS.where(state.stuck, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful)
         return state.settled | state.stuck, result
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result) -> tuple[Vectors, Balance, dict[str, Any]]:
         """The balance is that of the centres returned, also where the last trial was not taken."""
-        del fn, aux, args, options, tags, result
         return y, state.at, {}
 
 
@@ -158,7 +154,6 @@ def settle(held: Held, guess: Vectors, rtol: Scalar | float, max_steps: int) -> 
 @eqx.filter_custom_jvp
 def _implicit(position: Vectors, stiffness: Stiffness, net: Vectors) -> Vectors:
     """The position itself; it moves as the equilibrium does when the net force changes."""
-    del stiffness, net
     return position
 
 

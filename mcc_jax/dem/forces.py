@@ -232,13 +232,7 @@ def _load(force: Vector, radius: Scalar, couple: Vector) -> Float[Array, " 6"]:
 
 
 def _between(
-    interaction: Interaction,
-    i: _Body,
-    j: _Body,
-    listed: Flag,
-    overlap_max: Scalar,
-    slip: Vector,
-    time_step: Scalar,
+    interaction: Interaction, i: _Body, j: _Body, listed: Flag, overlap_max: Scalar, slip: Vector, time_step: Scalar
 ) -> _Contact:
     overlap, normal = overlap_and_normal(i.position, j.position, i.radius + j.radius, listed)
     relative = j.velocity - i.velocity
@@ -306,10 +300,7 @@ def _contact(
     tangential = jax.lax.optimization_barrier(tangential)
     held = jnp.where(slips, tangential * shared(1 / jnp.where(stiffness > 0, stiffness, 1.0)), slip)
     return _Contact(
-        tangential - push * normal,
-        jnp.cross(normal, tangential),
-        overlap_max,
-        jnp.where(touching, held, 0.0),
+        tangential - push * normal, jnp.cross(normal, tangential), overlap_max, jnp.where(touching, held, 0.0)
     )
 
 

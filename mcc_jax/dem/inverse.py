@@ -103,13 +103,7 @@ def fit_compaction(
 
 @eqx.filter_jit
 def _least_squares(
-    packing_of: PackingOf,
-    start: Array,
-    state: State,
-    steps: LoadStep,
-    target: Array,
-    solver: Solver,
-    tolerance: float,
+    packing_of: PackingOf, start: Array, state: State, steps: LoadStep, target: Array, solver: Solver, tolerance: float
 ) -> Array:
     ends = jnp.nonzero(steps.last, size=len(target))[0]
 

@@ -8,14 +8,13 @@ from typing import NamedTuple, cast
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .. import arguments
 from .._errors import InputError
 from .._format import described
 from .._types import Scalar
-from .edges import PADDING, Edges, carry_history
+from .edges import Edges, relisted, stacked_lists
 from .equilibrium import settle
 from .forces import A_PACKING, Packing, Vectors, WallHistory
 from .state import A_STATE, State
@@ -134,7 +133,7 @@ def replay_compaction(
     """
     arguments.instance(packing, Packing, "packing", A_PACKING)
     arguments.instance(state, State, "state", A_STATE)
-    return _replay(packing, state, stacked(tape), checked_solver(solver))
+    return eqx.filter_jit(replay_stacked)(packing, state, stacked(tape), checked_solver(solver))
 
 
 def stacked(tape: Sequence[LoadStep]) -> LoadStep:
@@ -145,32 +144,16 @@ def stacked(tape: Sequence[LoadStep]) -> LoadStep:
     """
     if not tape:
         raise InputError("a compaction without load steps", remedy="Give `compact` a list as its `tape`.")
-    room = max(step.key.shape[0] for step in tape)
-
-    def padded(step: LoadStep) -> LoadStep:
-        spare = (0, room - step.key.shape[0])
-        key = np.pad(step.key, spare, constant_values=PADDING)
-        return step._replace(key=key, i=np.pad(step.i, spare), j=np.pad(step.j, spare))
-
-    return LoadStep(*(jnp.asarray(np.stack(column)) for column in zip(*map(padded, tape), strict=True)))
-
-
-@eqx.filter_jit
-def _replay(packing: Packing, state: State, steps: LoadStep, solver: Solver) -> Replayed:
-    return replay_stacked(packing, state, steps, solver)
+    return stacked_lists(tape)
 
 
 def replay_stacked(packing: Packing, state: State, steps: LoadStep, solver: Solver) -> Replayed:
     """`replay_compaction` of load steps that are `stacked`, to be traced."""
-    room = steps.key.shape[1]
-    empty = jnp.zeros(room, state.edges.overlap_max.dtype)
-    slip = jnp.zeros((room, 3), empty.dtype)
 
     def one(carry, step):
         previous, recorded, edges, wall_history = carry
-        fresh = Edges(step.key, step.i, step.j, empty, slip, edges.wanted, edges.particles)
-        walls = lowered(state.walls, step.height)
-        held = Held(packing, walls, carry_history(edges, fresh), wall_history, previous, step.spring)
+        edges = relisted(edges, step.key, step.i, step.j)
+        held = Held(packing, lowered(state.walls, step.height), edges, wall_history, previous, step.spring)
         settled = settle(held, previous + (step.position - recorded), solver.rtol, solver.max_steps)
         edges, wall_history = remembered(held, settled.position)
         springs = step.spring * jnp.sum(jnp.abs(settled.position[:, 2] - previous[:, 2]))
@@ -178,9 +161,7 @@ def replay_stacked(packing: Packing, state: State, steps: LoadStep, solver: Solv
         row = (force_on_walls(held, settled.position), settled.position, net / settled.balance.scale, springs)
         return (settled.position, step.position, edges, wall_history), (*row, settled.converged)
 
-    before = carry_history(
-        state.edges, Edges(steps.key[0], steps.i[0], steps.j[0], empty, slip, state.edges.wanted, state.edges.particles)
-    )
+    before = relisted(state.edges, steps.key[0], steps.i[0], steps.j[0])
     carry = (state.position, state.position, before, state.wall_history)
     (_, _, edges, wall_history), (on_wall, position, residual, proximal, converged) = jax.lax.scan(one, carry, steps)
     return Replayed(on_wall, position, edges, wall_history, residual, proximal, converged)

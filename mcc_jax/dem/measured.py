@@ -71,11 +71,4 @@ def measured(packing: Packing, state: State, on_wall: Float[Array, "walls 3"]) -
     kinetic = 0.5 * jnp.sum(packing.mass * jnp.sum(state.velocity**2, axis=1)) + 0.2 * jnp.sum(
         packing.mass * packing.radius**2 * jnp.sum(state.spin**2, axis=1)
     )
-    return Sample(
-        state.time,
-        state.walls,
-        on_wall,
-        touching,
-        jnp.sum(beyond) + jnp.sum(beyond_at_walls),
-        kinetic,
-    )
+    return Sample(state.time, state.walls, on_wall, touching, jnp.sum(beyond) + jnp.sum(beyond_at_walls), kinetic)

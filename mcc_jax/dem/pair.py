@@ -198,8 +198,6 @@ def _series_force(power: int, i: Numbers, j: Numbers, peak: Scalar, drop: Scalar
 
 @_series_force.defjvp
 def _series_force_jvp(power, primals, tangents):
-    # With the tangents t of the sides and their explicit changes dF_s at fixed compression,
-    #   dF_P = (t_i t_j dpeak + t_j dF_i + t_i dF_j) / (t_i + t_j),   d(d_s) = (dF_P - dF_s) / t_s,
     #   dF = f dF_P + F_P f' d(drop) / W + (h / W) sum_s 2 F_P d(span_s),  h = -q f' / 2.
     i, j, peak, drop = primals
     di, dj, dpeak, ddrop = tangents
@@ -211,13 +209,7 @@ def _series_force_jvp(power, primals, tangents):
     q = jnp.where(inside, q, 0.0)
     fall = jnp.where(inside, 4 / jnp.pi * shared(jnp.sqrt((1 - q) * (1 + q))), 0.0)  # -f'
     h = 0.5 * q * fall
-    t_i, t_j = _tangent(i, series.d_i), _tangent(j, series.d_j)
-    change_i, change_j = _explicit(di, series.d_i), _explicit(dj, series.d_j)
-    flexibility = shared(1 / (t_i + t_j))
-    dforce = flexibility * (t_i * t_j * dpeak + t_j * change_i + t_i * change_j)
-    # d(d_i) + d(d_j) = d(peak); written without a division by a tangent that may be small.
-    dd_i = flexibility * (t_j * dpeak + change_j - change_i)
-    dd_j = flexibility * (t_i * dpeak + change_i - change_j)
+    dd_i, dd_j, dforce = _series_change(i, j, series, di, dj, dpeak)
     force = series.force
     widths = _widening(power, i, di, force, dforce, series.d_i, dd_i, span_i)
     widths = widths + _widening(power, j, dj, force, dforce, series.d_j, dd_j, span_j)
@@ -286,12 +278,21 @@ def _series_jvp(primals, tangents):
     i, j, overlap = primals
     di, dj, doverlap = tangents
     series = _series(i, j, overlap)  # not its steps: a second derivative takes this rule again
+    return series, _series_change(i, j, series, di, dj, doverlap)
+
+
+def _series_change(i: Numbers, j: Numbers, series: _Series, di: Numbers, dj: Numbers, doverlap: Scalar) -> _Series:
+    # With the tangents t of the sides and their explicit changes dF_s at fixed compression,
+    #   dF_P = (t_i t_j doverlap + t_j dF_i + t_i dF_j) / (t_i + t_j),   d(d_s) = (dF_P - dF_s) / t_s,
+    # and d(d_i) + d(d_j) = doverlap; written without a division by a tangent that may be small.
     t_i, t_j = _tangent(i, series.d_i), _tangent(j, series.d_j)
     change_i, change_j = _explicit(di, series.d_i), _explicit(dj, series.d_j)
     flexibility = shared(1 / (t_i + t_j))
-    dd_i = flexibility * (t_j * doverlap + change_j - change_i)
-    dd_j = flexibility * (t_i * doverlap + change_i - change_j)
-    return series, _Series(dd_i, dd_j, flexibility * (t_i * t_j * doverlap + t_j * change_i + t_i * change_j))
+    return _Series(
+        flexibility * (t_j * doverlap + change_j - change_i),
+        flexibility * (t_i * doverlap + change_i - change_j),
+        flexibility * (t_i * t_j * doverlap + t_j * change_i + t_i * change_j),
+    )
 
 
 def _solve(i: Numbers, j: Numbers, overlap: Scalar) -> _Series:

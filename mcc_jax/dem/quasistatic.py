@@ -15,7 +15,7 @@ from .._format import described
 from .._types import Scalar
 from .edges import Edges
 from .equilibrium import Settled, settle
-from .forces import Packing, Vectors, WallHistory
+from .forces import Packing
 from .load_steps import BOTTOM, TOP, LoadStep, Solver, checked_solver, die_walls, lowered
 from .measured import measured
 from .state import A_STATE, State, check_packing, check_state, listed, start
@@ -107,11 +107,7 @@ def relaxed(packing: Packing, walls: Walls, position: Any, solver: Solver | None
 
 
 def compact(
-    packing: Packing,
-    state: State,
-    heights: Any,
-    solver: Solver | None = None,
-    tape: list[LoadStep] | None = None,
+    packing: Packing, state: State, heights: Any, solver: Solver | None = None, tape: list[LoadStep] | None = None
 ) -> tuple[State, Compaction]:
     r"""Move the top punch from height to height, down or up, without friction and without inertia.
 
@@ -202,9 +198,7 @@ def _attempt(packing: Packing, state: State, height: float, solver: Solver) -> _
     held, settled = best
     edges, wall_history = _remembered(held, settled.position)
     end = eqx.tree_at(
-        lambda s: (s.position, s.edges, s.wall_history, s.walls),
-        state,
-        (settled.position, edges, wall_history, walls),
+        lambda s: (s.position, s.edges, s.wall_history, s.walls), state, (settled.position, edges, wall_history, walls)
     )
     moved = np.asarray(settled.position - state.position)
     springs, top = float(held.proximal) * np.abs(moved[:, 2]).sum(), float(settled.balance.on_wall[TOP])
@@ -216,14 +210,8 @@ def _attempt(packing: Packing, state: State, height: float, solver: Solver) -> _
     return _Attempt(end, settled, bool(settled.converged), complete, spring, held.proximal, evaluations, share, move)
 
 
-@eqx.filter_jit
-def _settle(held: Held, guess: Vectors, rtol: Scalar, max_steps: int) -> Settled:
-    return settle(held, guess, rtol, max_steps)
-
-
-@eqx.filter_jit
-def _remembered(held: Held, position: Vectors) -> tuple[Edges, WallHistory]:
-    return remembered(held, position)
+_settle = eqx.filter_jit(settle)
+_remembered = eqx.filter_jit(remembered)
 
 
 def _unlisted(packing: Packing, old: Edges, fresh: State) -> bool:

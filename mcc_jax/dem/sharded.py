@@ -14,7 +14,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from .._types import Scalar
-from .edges import Edges, widened
+from .edges import Edges, lengthened, widened
 from .forces import (
     Forces,
     Interaction,
@@ -108,8 +108,8 @@ def _padded(state: Any, parts: int) -> Any:
     """The state with as many edges, and rows of contacts with walls, as divide among the parts."""
     edges, history = state.edges, state.wall_history
     room, rows = (parts * math.ceil(n / parts) for n in (edges.capacity, history.slip.shape[0]))
-    spare = jax.tree.map(lambda x: jnp.pad(x, [(0, rows - len(x))] + [(0, 0)] * (x.ndim - 1)), history)
-    return eqx.tree_at(lambda s: (s.edges, s.wall_history), state, (widened(edges, room), spare))
+    longer = widened(edges, room), lengthened(history, rows)
+    return eqx.tree_at(lambda s: (s.edges, s.wall_history), state, longer)
 
 
 def _share_of_contacts(

@@ -1,8 +1,9 @@
-"""What a packing is at one moment: places, velocities, contacts with their history, walls; how it starts."""
+"""What a packing is at one moment: places, velocities, contacts with their history, walls; its start, and on disk."""
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -12,12 +13,13 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from .. import arguments
+from .._archive import encode, read_archive
 from .._errors import InputError
 from .._format import described
+from .._store import write_file
 from .._types import Scalar
-from .edges import Edges, carry_history, list_edges
+from .edges import Edges, carry_history, close_pairs, list_edges
 from .forces import A_PACKING, Packing, Vectors, WallHistory
-from .neighbours import close_pairs
 from .walls import Cylinder, Plane, Walls
 
 A_STATE = "Make one with mcc_jax.dem.start(packing, walls, position, skin)."
@@ -180,3 +182,36 @@ def _astray(state: State) -> tuple[Bool[Array, " particles"], Bool[Array, "walls
     behind = [jax.vmap(wall.distance)(state.position) < 0 for wall in state.walls]
     lost = ~jnp.all(jnp.isfinite(state.position), axis=1)
     return lost, jnp.stack(behind) if behind else jnp.zeros((0, len(lost)), bool)
+
+
+# ---- a state on disk -------------------------------------------------------------------------------------------------
+
+
+def save_state(path: str | Path, packing: Packing, state: State) -> None:
+    """Write packing and state into one file, replacing an older one only when it is complete.
+
+    Args:
+        path: the file.
+        packing: the spheres.
+        state: all that moves or remembers.
+    """
+    path = arguments.file_path(path, "path")
+    arguments.instance(packing, Packing, "packing", A_PACKING)
+    arguments.instance(state, State, "state", A_STATE)
+    if not path.parent.is_dir():
+        raise InputError("no such folder", file=path.parent, remedy="Make it first.")
+    content = encode((packing, state))
+    write_file(path, lambda stream: stream.write(content))
+
+
+def load_state(path: str | Path) -> tuple[Packing, State]:
+    """What `save_state` wrote.
+
+    Raises:
+        InputError: if the file is missing, damaged, of another version, or of something else.
+    """
+    path = arguments.file_path(path, "path")
+    match read_archive(path):
+        case (Packing() as packing, State() as state):
+            return packing, state
+    raise InputError("is not a saved state", file=path, remedy="Name one that `save_state` wrote.")

@@ -65,15 +65,10 @@ class Stiffness(eqx.Module):
 
     def dense(self) -> Float[Array, "unknowns unknowns"]:
         """The whole matrix."""
-        n = self.alone.shape[0]
+        n, i, j = self.alone.shape[0], self.i, self.j
         each = jnp.arange(n)
         blocks = jnp.zeros((n, n, 3, 3), self.alone.dtype).at[each, each].add(self.alone)
-        for a, b, sign in (
-            (self.i, self.i, 1.0),
-            (self.j, self.j, 1.0),
-            (self.i, self.j, -1.0),
-            (self.j, self.i, -1.0),
-        ):
+        for a, b, sign in ((i, i, 1.0), (j, j, 1.0), (i, j, -1.0), (j, i, -1.0)):
             blocks = blocks.at[a, b].add(sign * self.pairs)
         return blocks.transpose(0, 2, 1, 3).reshape(3 * n, 3 * n)
 

@@ -46,7 +46,6 @@ class Plane(eqx.Module):
 
     def normal_at(self, position: Vector) -> Vector:
         """Direction in which the wall pushes a particle there."""
-        del position
         return self.normal
 
     def moved(self, time: Scalar) -> Plane:

@@ -20,8 +20,8 @@ from ..calibrate.forward import Forms, Point, snap
 from ..calibrate.judgement import numbers_in_reach
 from ..calibrate.model import Model
 from ..calibrate.sharding import Blocks, Parts
-from ..campaign import Campaign
-from .settings import NUMERICS
+from ..campaign import Campaign, find_segments
+from .settings import DECISIONS, NUMERICS
 
 
 class State(eqx.Module):
@@ -55,6 +55,7 @@ class Base:
         hyperparameters: logarithms of the noise's four numbers, coordinates of the spreads of b1, b3, b5 and e.
         converged: whether noise and population did.
         threshold_MPa: stress below which points do not count [MPa].
+        coarse: whether few readings of each branch are compared, see `base_fit`.
         rms_um, range_um: of every test, residuals of the particle's own fit and range of displacement [um].
     """
 
@@ -67,6 +68,7 @@ class Base:
     hyperparameters: np.ndarray
     converged: bool
     threshold_MPa: float
+    coarse: bool
     rms_um: np.ndarray
     range_um: np.ndarray
 
@@ -113,11 +115,15 @@ class Base:
         return self.campaign.particles[self.selection.kept[row]]
 
     @property
-    def snapping(self) -> tuple[str, ...]:
-        """Particles whose law snaps through below their largest force: there no displacement belongs to a force."""
+    def snaps(self) -> np.ndarray:
+        """Where the law snaps through below a test's largest force: there no displacement belongs to a force."""
         log_force = np.asarray(jax.vmap(snap)(self.state.point.latent, self.tests.particle))
-        most = np.log(np.max(np.where(self.tests.mask, self.tests.force, 1e-300), axis=1))
-        return tuple(name for name, low in zip(self.names, log_force < most, strict=True) if low)
+        return log_force < np.log(np.max(np.where(self.tests.mask, self.tests.force, 1e-300), axis=1))
+
+    @property
+    def snapping(self) -> tuple[str, ...]:
+        """The particles of those tests."""
+        return tuple(name for name, low in zip(self.names, self.snaps, strict=True) if low)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -128,12 +134,23 @@ class Base:
 def base_fit(campaign: Campaign, model: Model, *, threshold_MPa: float, tell: Callable[[str], None]) -> Base:
     """Fit the base law to a campaign.
 
+    Of a material that the law was not made for, and does not fit, only some readings of each branch are compared: what
+    is left is every particle's own over a good part of its branch, so that neighbouring readings say the same, and
+    hundreds of them would decide by how smooth they are. That is a coarsened posterior (Miller and Dunson 2019, J. Am.
+    Stat. Assoc. 114, 1113).
+
     Raises:
         InputError: if no particle can be used, or the numbers are beyond arithmetic.
     """
     with numbers_in_reach(campaign):
-        model, _ = in_own_units(campaign, model)
+        model, foreign = in_own_units(campaign, model)
         selection, fit, _ = prepare(campaign, model, threshold_MPa, fill_up=False, tell=tell)
+        share = np.median(root_mean_squares(fit.tests, fit.residual) / ranges_um(fit.tests))
+        coarse = foreign is not None and bool(share > DECISIONS.foreign_misfit)
+        if coarse:
+            branches = int(np.median([len(find_segments(curve)) for curve in campaign.curves]))
+            most = DECISIONS.readings * branches
+            selection, fit, _ = prepare(campaign, model, threshold_MPa, fill_up=False, most_points=most, tell=tell)
     p = fit.population
     shift = float(jnp.mean(jnp.log1p(p.a * fit.tests.flatness)))
     population = jnp.concatenate([jnp.stack([p.a, p.log_modulus]), p.mu + shift])
@@ -149,6 +166,7 @@ def base_fit(campaign: Campaign, model: Model, *, threshold_MPa: float, tell: Ca
         np.zeros(0),
         bool(np.all(np.asarray(fit.converged)[1:])),
         threshold_MPa,
+        coarse,
         root_mean_squares(fit.tests, fit.residual),
         ranges_um(fit.tests),
     )

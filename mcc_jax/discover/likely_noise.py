@@ -6,8 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..calibrate.data import ranges_um
 from ..calibrate.model import Model
 from ..calibrate.noise import Along, Correlation
+from ..calibrate.settings import JUDGEMENT
 from .base import Base
 from .columns import Design, with_noise
 from .design import design_of
@@ -16,10 +18,16 @@ from .settings import NUMERICS
 
 
 def with_other_noise(design: Design, free: np.ndarray, model: Model) -> Optimum:
-    """The mode of the hyperparameters under the noise of a model, from the mode under another."""
+    """The mode of the hyperparameters under the noise of a model, from the mode under another.
+
+    Its log density is -inf where the correlated noise is more than a misfit may be: a smooth curve of every test's own
+    describes any test, and leaves nothing for a law to explain.
+    """
     other, start = with_noise(design, model), free.copy()
     start[3] = other.noise[0, 3]  # the length's unit may be another
-    return optimise(other, start, curvature=False)
+    found = optimise(other, start, curvature=False)
+    share = np.median(np.exp(found.free[2]) * design.scale / ranges_um(design.tests))
+    return found if share < JUDGEMENT.misfit else replace(found, log_evidence=-np.inf, log_joint=-np.inf)
 
 
 def with_likely_noise(base: Base) -> tuple[Base, Optimum]:

@@ -149,8 +149,9 @@ def general(at: dict[str, np.ndarray], tests: Tests, linear: Linear) -> tuple[np
     all particles and in proportion to their size, but for what a tester does, which depends on micrometres and
     millinewtons alone. In stress they are fine: a particle's layers and flaws yield within a narrow range of it. What a
     drive loses at a reversal, it loses at once: there the time since the reversal is a coordinate, and reloading has
-    parts of its own. A stress that the loading curve lacks, and a force that the cell gets wrong, move every particle
-    as far as it is soft.
+    parts of its own. Of loading alone, time is no coordinate: a drive that closes at one speed makes it the
+    displacement itself. A stress that the loading curve lacks, and a force that the cell gets wrong, move every
+    particle as far as it is soft.
 
     Args:
         at: coordinates of all points, between 0 and 1.
@@ -164,13 +165,13 @@ def general(at: dict[str, np.ndarray], tests: Tests, linear: Linear) -> tuple[np
         np.concatenate([at[way][..., None], since * at[way][..., None]], -1) for way in ("unloading", "reloading")
     ]
     products = splines(at["peak"], 3)[..., :, None] * splines(at["load"], 3)[..., None, :]
+    timed = ("clock",) if np.median(np.max(np.where(mask, at["unloading"], 0.0), 1)) > 0 else ()
     reduced = [
         splines(at["peak"], NUMERICS.fine_splines),
-        *(splines(at[name], NUMERICS.splines) for name in ("strain", "travel", "load", "clock")),
+        *(splines(at[name], NUMERICS.splines) for name in ("strain", "travel", "load", *timed)),
         splines(at["load"], NUMERICS.splines) * at["reloading"][..., None],
         products.reshape(*products.shape[:-2], -1),
-        waves(at["travel"]),
-        waves(at["clock"]),
+        *(waves(at[name]) for name in ("travel", *timed)),
     ]
     by_force, by_peak = (np.where(mask, x, 0.0)[..., None] for x in (linear.by_force, linear.by_peak))
     yielding = np.where(np.asarray(tests.loading)[..., None], by_force, by_peak)

@@ -18,7 +18,7 @@ from ..effects import Mechanism, Variant
 from .base import Base, State
 from .candidates import Candidate, candidates_of, located
 from .columns import Design, with_amplitudes, without_further
-from .design import NOTHING_MORE, More, design_of
+from .design import NOTHING_MORE, More, design_of, without_snaps
 from .evidence import left_by_particle, log_joint, optimise, solve, visible, with_little_noise, without_first
 from .hypothesis import UNLISTED, Hypothesis, Names, Smooth
 from .likely_noise import noise_models, with_likely_noise, with_other_noise
@@ -57,7 +57,9 @@ class Search:
         self.library, self.tell = library, tell
         base, start = with_likely_noise(base)
         self.base = base
-        self.null = refined(base, base.state, (), np.zeros(0), start.free)
+        places = [base.state, without_snaps(base)] if base.snaps.any() else [base.state]
+        nulls = [refined(base, place, (), np.zeros(0), start.free) for place in places]
+        self.null = max(nulls, key=lambda r: r.log_evidence)
         self.natural = {k: np.asarray(x) for k, x in base.each(coordinates, self.state.point, base.forms).items()}
         self.at = scaled(self.natural, np.asarray(base.tests.mask))
         self.shared = {

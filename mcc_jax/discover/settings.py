@@ -29,7 +29,10 @@ class Decisions:
         jump: share of the tests in which a sudden step is expected, a priori: where it is looked for once more.
         contradicted: standard errors by which held-out particles must be predicted worse with what was found before it
             is taken back: beyond two a difference is hardly chance.
-        least: particles that must be left before those that snap through are left out.
+        readings: of a branch that are compared, about, of a material that the law was not made for: what the law
+            misses there is each particle's own over a fifth of a branch, and a few readings in each such piece show it.
+        foreign_misfit: share of the range of displacement that the law must miss for that; with its own data and a
+            tester's noise it misses less.
     """
 
     level: float = 0.05
@@ -45,7 +48,8 @@ class Decisions:
     general_log_sd: float = 1.5
     jump: float = 0.25
     contradicted: float = 2.0
-    least: int = 3
+    readings: int = 24
+    foreign_misfit: float = 0.01
 
     __repr__ = described()
 

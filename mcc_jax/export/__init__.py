@@ -1,15 +1,15 @@
 """The calibrated law for other engines: parameter card, tables, JAX artefacts, C header, recipes, golden tables."""
 
 from .c_header import c_header as c_header
-from .calibrated import read_calibration as read_calibration
+from .c_header import lammps_recipe as lammps_recipe
+from .c_header import yade_recipe as yade_recipe
 from .card import card as card
 from .golden import golden_pair_table as golden_pair_table
 from .golden import golden_table as golden_table
 from .jax_artefact import Artefact as Artefact
 from .jax_artefact import jax_artefact as jax_artefact
 from .origin import Origin as Origin
-from .recipes import lammps_recipe as lammps_recipe
-from .recipes import yade_recipe as yade_recipe
+from .origin import read_calibration as read_calibration
 from .tables import CurveTables as CurveTables
 from .tables import curve_tables as curve_tables
 from .write import FORMATS as FORMATS

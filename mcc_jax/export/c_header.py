@@ -1,16 +1,27 @@
-"""The law as a C99 header, and text from the templates beside it."""
+"""The law as a C99 header, and how to put it into LAMMPS and Yade: text from the templates beside it."""
 
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._errors import InputError
 from .._extras import extra
+from .._types import Scalar
 from .._version import own_version
+from ..dem import half_contact
+from ..formulas import Formulas, Plastic
 from ..geometry import Particle
 from ..law import TESTED_STRAIN, MccLaw, StrainScaling, Unloading
-from .effects import factor_in_c, in_words, parameters_in_c
-from .origin import Origin, checked, numbers
+from ..law.response import factor_at_peak, folded
+from .card import in_words
+from .origin import SPHERE_UM, Origin, checked, numbers
 
 
 def c_header(law: MccLaw, particle: Particle | None = None, *, origin: Origin | None = None) -> str:
@@ -31,53 +42,83 @@ def c_header(law: MccLaw, particle: Particle | None = None, *, origin: Origin | 
             passed on; `read_calibration` refuses it, and so should you unless you know what a pair of them means.
     """
     origin = checked(law, particle, origin, needed=False)
-    values = numbers(law)
-    return render(
+    return _render(
         "mcc_law.h.j2",
         parameters=parameters_in_c(law),
         factor=factor_in_c(law, particle),
-        effects=quoted(", ".join(effect.name for effect in law.effects))[1:-1],
+        effects=_quoted(", ".join(effect.name for effect in law.effects))[1:-1],
         version=own_version(),
-        origin=origin_lines(law, particle, origin),
+        origin=_origin_lines(law, particle, origin),
         strain_max=TESTED_STRAIN,
-        forms=[
-            {
-                "name": form.name,
-                "constant": repr(form.constant),
-                "power": form.stress_power,
-            }
-            for form in Unloading
-        ],
+        forms=[{"name": one.name, "constant": repr(one.constant), "power": one.stress_power} for one in Unloading],
         scalings=[{"name": scaling.name, "power": scaling.power} for scaling in StrainScaling],
         form=law.unloading.name,
         scaling=law.strain_scaling.name,
-        modulus=repr(values["effective_modulus_MPa"] * 1e6),
-        **{name: repr(values[name]) for name in ("C1", "C3", "C5", "a")},
+        **_values(law),
     )
 
 
-def origin_lines(law: MccLaw, particle: Particle | None, origin: Origin) -> list[str]:
+def lammps_recipe(law: MccLaw, particle: Particle, *, origin: Origin | None = None) -> str:
+    """Markdown: a normal model for LAMMPS' `pair_style granular` around the header of `c_header`, with the values.
+
+    Args:
+        law: the law.
+        particle: the particle of the golden table beside it.
+        origin: where the law comes from.
+
+    Raises:
+        InputError: if the law or the particle is not usable, or the law has an effect that `c_header` refuses.
+    """
+    return _recipe("lammps.md.j2", law, particle, origin)
+
+
+def yade_recipe(law: MccLaw, particle: Particle, *, origin: Origin | None = None) -> str:
+    """Markdown: material, `Ip2` and `Law2` functors for Yade around the header of `c_header`, with the values.
+
+    Arguments and errors as of `lammps_recipe`.
+    """
+    return _recipe("yade.md.j2", law, particle, origin)
+
+
+def _recipe(name: str, law: MccLaw, particle: Particle, origin: Origin | None) -> str:
+    origin = checked(law, particle, origin)
+    return _render(
+        name,
+        version=own_version(),
+        factor=factor_in_c(law, particle),
+        origin=[f"- {line}" for line in _origin_lines(law, particle, origin)],
+        **_values(law),
+    )
+
+
+def _values(law: MccLaw) -> dict[str, str]:
+    """The five numbers of a law as C writes them, SI."""
+    values = numbers(law)
+    return {"modulus": repr(values.pop("effective_modulus_MPa") * 1e6), **{k: repr(v) for k, v in values.items()}}
+
+
+def _origin_lines(law: MccLaw, particle: Particle | None, origin: Origin) -> list[str]:
     """Where the values come from, a fact a line."""
     lines = [f"Unloading {law.unloading.value}, strain scaling {law.strain_scaling.value}."]
-    lines += [quoted(line)[1:-1] for line in in_words(law)]
+    lines += [_quoted(line)[1:-1] for line in in_words(law)]
     if origin.calibration is not None:
         c = origin.calibration
         lines.append(
-            f"From {quoted(str(c['file']))}, method {quoted(str(c['method']))}, sha256 {str(c['sha256'])[:16]}..."
+            f"From {_quoted(str(c['file']))}, method {_quoted(str(c['method']))}, sha256 {str(c['sha256'])[:16]}..."
         )
         if not c["converged"]:
             lines.append("WARNING: that calibration did not converge.")
-    whose = "the population (medians)" if origin.particle is None else f"particle {quoted(origin.particle)}"
+    whose = "the population (medians)" if origin.particle is None else f"particle {_quoted(origin.particle)}"
     lines.append(f"Coefficients of {whose}.")
     if particle is not None:
         sizes = ", ".join(f"{float(d):.6g}" for d in (particle.D1, particle.D2, particle.D3))
-        lines.append(f"Particle of the golden table: D1, D2, D3 = {sizes} um ({quoted(origin.geometry)}).")
+        lines.append(f"Particle of the golden table: D1, D2, D3 = {sizes} um ({_quoted(origin.geometry)}).")
     if not bool(law.is_monotone):
         lines.append("WARNING: the loading curve is not monotone; a pair of such contacts has several solutions.")
     return lines
 
 
-def render(name: str, **values: Any) -> str:
+def _render(name: str, **values: Any) -> str:
     """The template of that name with the values put in; a value it wants and does not get is an error."""
     with extra("export"):
         from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -93,6 +134,110 @@ def render(name: str, **values: Any) -> str:
     return environment.get_template(name).render(**values)
 
 
-def quoted(text: str) -> str:
+def _quoted(text: str) -> str:
     """Any text in one line of ASCII that ends no comment, string or code block, wherever it is put."""
     return json.dumps(text, ensure_ascii=True).replace("*", "\\u002a").replace("`", "\\u0060").replace("?", "\\u003f")
+
+
+# ---- effects: as C where they are closed formulas of particle and peak ---------------------------------------------
+
+
+def parameters_in_c(law: MccLaw) -> str | None:
+    """C statements that put what effects make of `law` for a particle into `own`; None if no effect changes parameters.
+
+    They read C1, C3, C5, a and effective_modulus of `*law`, and D1, D2, D3, all SI.
+    """
+    if not any(effect.overrides("modify") for effect in law.effects):
+        return None
+
+    def own(C1: Scalar, C3: Scalar, C5: Scalar, a: Scalar, E: Scalar, *diameters: Scalar) -> tuple[Scalar, ...]:
+        plain = Formulas(Plastic(C1, C3, C5), a, 1e-6 * E, law.unloading, law.strain_scaling)
+        made, _ = folded(plain, law.effects, Particle(*(1e6 * D for D in diameters)), "C")
+        return made.plastic.C1, made.plastic.C3, made.plastic.C5, made.a, 1e6 * made.effective_modulus
+
+    names = ("C1", "C3", "C5", "a", "effective_modulus")
+    lines, results = in_c(own, [f"law->{name}" for name in names] + ["D1", "D2", "D3"])
+    return "\n".join([*lines, *(f"own.{name} = {value};" for name, value in zip(names, results, strict=True))])
+
+
+def factor_in_c(law: MccLaw, particle: Particle | None) -> str | None:
+    """C statements that return the factor on the modulus at `strain` and `stress` [MPa]; None if there is none.
+
+    Raises:
+        InputError: naming an effect that no particle code can take.
+    """
+    sphere = Particle(SPHERE_UM, SPHERE_UM, SPHERE_UM)
+    at_peak = half_contact(law, sphere if particle is None else particle).effects
+    if not at_peak:
+        return None
+    lines, results = in_c(lambda strain, stress: (factor_at_peak(at_peak, strain, stress),), ["strain", "stress"])
+    unused = [f"(void){name};" for name in ("strain", "stress") if not any(re.search(rf"\b{name}\b", x) for x in lines)]
+    return "\n".join([*lines, *unused, f"return {results[0]};"])
+
+
+_OPERATIONS = {
+    "add": "{} + {}", "sub": "{} - {}", "mul": "{} * {}", "div": "{} / {}", "neg": "-{}", "square": "{0} * {0}",
+    "gt": "{} > {}", "lt": "{} < {}", "ge": "{} >= {}", "le": "{} <= {}", "eq": "{} == {}", "ne": "{} != {}",
+    "and": "{} && {}", "or": "{} || {}", "not": "!{}", "select_n": "{0} ? {2} : {1}", "abs": "fabs({})",
+    "max": "{0} > {1} ? {0} : {1}", "min": "{0} < {1} ? {0} : {1}", "pow": "pow({}, {})", "rsqrt": "1.0 / sqrt({})",
+    **{name: f"{name}({{}})" for name in ("exp", "log", "log1p", "expm1", "sqrt", "cbrt", "sin", "cos", "tan", "tanh")},
+}  # fmt: skip
+"""What JAX calls an operation on numbers, and how C writes it."""
+_THE_SAME = ("broadcast_in_dim", "convert_element_type", "copy", "reduce_precision", "optimization_barrier")
+_CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call")
+
+
+def in_c(function: Callable[..., tuple[Scalar, ...]], names: Sequence[str]) -> tuple[list[str], list[str]]:
+    """A function of as many scalars as names as C: the statements, and what to write for each result.
+
+    JAX traces it; so C computes what the library computes, of an effect of the user's own, too.
+
+    Raises:
+        InputError: for an operation that has no counterpart in C.
+    """
+    traced = jax.make_jaxpr(function)(*(jnp.ones(()) for _ in names))
+    statements: list[tuple[str, str, str]] = []
+
+    def written(value: Any) -> str:
+        number = np.asarray(value)
+        text = repr(number.item() if number.dtype.kind == "f" else int(number))
+        return f"({text})" if text.startswith("-") else text
+
+    def follow(jaxpr: Any, constants: Sequence[Any], given: Sequence[str]) -> list[str]:
+        known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*map(written, constants), *given], strict=True))
+
+        def read(atom: Any) -> str:
+            return written(atom.val) if hasattr(atom, "val") else known[atom]
+
+        for equation in jaxpr.eqns:
+            results = list(map(read, equation.invars))
+            if equation.primitive.name in _CALLS:
+                inner = next(p for p in equation.params.values() if hasattr(p, "jaxpr"))
+                results = follow(inner.jaxpr, inner.consts, results)
+            elif equation.primitive.name not in _THE_SAME or equation.outvars[0].aval.ndim:
+                kind = "int" if equation.outvars[0].aval.dtype.kind == "b" else "double"
+                statements.append((kind, f"t{len(statements)}", _operation(equation, results)))
+                results = [statements[-1][1]]
+            known.update(zip(equation.outvars, results, strict=True))
+        return list(map(read, jaxpr.outvars))
+
+    results = follow(traced.jaxpr, traced.consts, names)
+    needed, lines = set(results), []
+    for kind, name, expression in reversed(statements):  # a compiler would warn of what is not used
+        if name in needed:
+            needed.update(re.findall(r"\bt\d+\b", expression))
+            lines.insert(0, f"const {kind} {name} = {expression};")
+    return lines, results
+
+
+def _operation(equation: Any, inputs: Sequence[str]) -> str:
+    name = equation.primitive.name
+    if name == "integer_pow":
+        product = " * ".join([inputs[0]] * abs(equation.params["y"]))
+        return product if equation.params["y"] > 0 else f"1.0 / ({product})"
+    if name not in _OPERATIONS or equation.outvars[0].aval.ndim:
+        raise InputError(
+            f"an effect of this law takes the operation {name}, which has no counterpart in C",
+            remedy="Export the law as a JAX artefact (--format jax), or leave that effect out.",
+        )
+    return _OPERATIONS[name].format(*inputs)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
+import inspect
 import json
 from typing import Any
 
+import equinox as eqx
+
 from .._version import own_version
+from ..effects import LIBRARY
 from ..geometry import Particle
 from ..law import TESTED_STRAIN, MccLaw
-from .effects import described
 from .origin import Origin, checked, numbers
 
 UNITS = {"C1": "1", "C3": "1", "C5": "1", "a": "1", "effective_modulus_MPa": "MPa"}
@@ -95,6 +99,32 @@ def card(law: MccLaw, particle: Particle | None = None, *, origin: Origin | None
         "warnings": list(origin.warnings),
         "sha256": checksum({"law": form, "values": values, **effects}),
     }
+
+
+def described(law: MccLaw) -> list[dict[str, Any]]:
+    """The effects of a law: name, equation, the amplitude's unit where it is known, and numbers by name."""
+    told = []
+    for effect in law.effects:
+        mechanism, _, name = effect.name.partition(":")
+        known = next((v for v in LIBRARY.get(mechanism, ()) if v.name == name), None)
+        numbers = {field.name: getattr(effect, field.name) for field in dataclasses.fields(effect)}
+        numbers = {name: float(value) for name, value in numbers.items() if eqx.is_inexact_array(value)}
+        if known is None:
+            more = {"equation": (inspect.getdoc(effect) or "").partition("\n")[0]}
+        else:
+            more = {"equation": known.equation, "unit": known.unit}
+            numbers = {known.parameter if name == "amplitude" else name: value for name, value in numbers.items()}
+        told.append({"name": effect.name, **more, "numbers": numbers})
+    return told
+
+
+def in_words(law: MccLaw) -> list[str]:
+    """A line for each effect of a law."""
+    lines = []
+    for effect in described(law):
+        numbers = ", ".join(f"{name} = {value:.6g}" for name, value in effect["numbers"].items())
+        lines.append(f"Effect {effect['name']}: {effect['equation']}; {numbers}.")
+    return lines
 
 
 def checksum(content: Any) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -17,13 +17,7 @@ from ..dem import HalfContact, half_contact, pair_force, pair_recovery, wall_for
 from ..geometry import Particle
 from ..law import TESTED_STRAIN, MccLaw
 from .origin import checked
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    Table = pd.DataFrame
-else:
-    Table = object
+from .tables import Table
 
 RANDOM_PATHS = 8
 STEPS = 40
@@ -86,6 +80,8 @@ def golden_pair_table(
 
 def _contact_rows(side: HalfContact, other: HalfContact | None, seed: int) -> Table:
     """Paths of the overlap of a pair, or with a rigid wall [um, mN]."""
+    import pandas as pd
+
     scale = float(side.tested) if other is None else 2 * min(float(side.tested), float(other.tested))
 
     def recovered(peak: np.ndarray) -> np.ndarray:
@@ -95,7 +91,8 @@ def _contact_rows(side: HalfContact, other: HalfContact | None, seed: int) -> Ta
     number = np.repeat(np.arange(len(paths)), [len(path) for path in paths])
     x, past = np.concatenate(paths), np.concatenate([np.maximum.accumulate(np.maximum(path, 0.0)) for path in paths])
     force, tangent = (np.asarray(v) for v in _contact(side, other, jnp.asarray(past), jnp.asarray(x)))
-    return _rows(number, 1e6 * x, 1e6 * past, 1e3 * force, 1e-3 * tangent)
+    columns = {"path": number, "displacement": 1e6 * x, "displacement_max": 1e6 * past}
+    return pd.DataFrame(columns | {"force": 1e3 * force, "tangent": 1e-3 * tangent})
 
 
 def _driven(law: MccLaw, particle: Particle, seed: int) -> Table:
@@ -154,24 +151,10 @@ def _paths(scale: float, recovered: Callable[[np.ndarray], np.ndarray], seed: in
     return [first, *walks, turns.ravel()]
 
 
-def _rows(
-    number: int | np.ndarray, path: np.ndarray, peak: np.ndarray, force: np.ndarray, tangent: np.ndarray
-) -> Table:
-    import pandas as pd
-
-    return pd.DataFrame(
-        {"path": number, "displacement": path, "displacement_max": peak, "force": force, "tangent": tangent}
-    )
-
-
 def _in_units(table: Table, units: str) -> Table:
-    columns = {}
-    for name in table.columns:
-        if name.removesuffix("_max") not in _SI:
-            continue
+    columns = {name: name for name in ("partner", "path", "time_s") if name in table}
+    for name in table.columns.difference(list(columns), sort=False):
         ours, si, factor = _SI[name.removesuffix("_max")]
         columns[name] = f"{name}_{si if units == 'SI' else ours}"
-        if units == "SI":
-            table[name] *= factor
-    front = [name for name in ("partner", "path", "time_s") if name in table]
-    return table.rename(columns=columns).reindex(columns=front + list(columns.values()))
+        table[name] *= factor if units == "SI" else 1.0
+    return table.reindex(columns=list(columns)).rename(columns=columns)

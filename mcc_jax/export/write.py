@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,26 +11,26 @@ from .. import arguments
 from .._errors import InputError
 from ..geometry import Particle
 from ..law import MccLaw
-from .c_header import c_header
+from .c_header import c_header, lammps_recipe, yade_recipe
 from .card import card
 from .golden import golden_pair_table, golden_table
 from .jax_artefact import jax_artefact, signatures
 from .origin import Origin, checked
-from .recipes import lammps_recipe, yade_recipe
 from .tables import curve_tables
 
-Write = Callable[[MccLaw, Particle, Origin, Path, int], list[str]]
+Files = Iterator[tuple[str, Any]]
+"""Names of files, and what each of them holds: text, bytes, a table, or what JSON can."""
 
 
-def _json(law: MccLaw, particle: Particle, origin: Origin, folder: Path, seed: int) -> list[str]:
-    _dump(folder / "parameters.json", card(law, particle, origin=origin))
-    return ["parameters.json", *_golden(law, particle, folder, seed, "parameters")]
+def _json(law: MccLaw, particle: Particle, origin: Origin, seed: int) -> Files:
+    yield "parameters.json", card(law, particle, origin=origin)
+    yield "parameters_golden.csv", golden_table(law, particle, seed=seed)
 
 
-def _csv(law: MccLaw, particle: Particle, origin: Origin, folder: Path, seed: int) -> list[str]:
+def _csv(law: MccLaw, particle: Particle, origin: Origin, seed: int) -> Files:
     tables = curve_tables(law, particle)
-    _table(folder / "master_curve.csv", tables.loading)
-    _table(folder / "unloading_curve.csv", tables.unloading)
+    yield "master_curve.csv", tables.loading
+    yield "unloading_curve.csv", tables.unloading
     p = law.strain_scaling.power
     use = {
         "loading": "stress from scaled strain eta_p eps, linearly between rows",
@@ -42,52 +42,44 @@ def _csv(law: MccLaw, particle: Particle, origin: Origin, folder: Path, seed: in
         "largest_error": tables.error,
         "error_of": "linear interpolation, as a share of each column's largest value",
     }
-    _dump(folder / "master_curve.json", {**card(law, particle, origin=origin), "tables": use})
-    names = ["master_curve.csv", "unloading_curve.csv", "master_curve.json"]
-    return [*names, *_golden(law, particle, folder, seed, "master_curve")]
+    yield "master_curve.json", {**card(law, particle, origin=origin), "tables": use}
+    yield "master_curve_golden.csv", golden_table(law, particle, seed=seed)
 
 
-def _jax(law: MccLaw, particle: Particle, origin: Origin, folder: Path, seed: int) -> list[str]:
-    names, told = [], {}
+def _jax(law: MccLaw, particle: Particle, origin: Origin, seed: int) -> Files:
+    told = {}
     for dtype in ("float64", "float32"):
         for which in signatures(law):
             artefact = jax_artefact(law, particle, which, dtype=dtype)
             name = f"mcc_{artefact.name}.jax_export"
-            (folder / name).write_bytes(artefact.content)
             told[name] = artefact.signature
-            names.append(name)
+            yield name, artefact.content
     use = "jax.export.deserialize(bytearray(Path(file).read_bytes())).call(...), with the packages jax and flatbuffers"
-    _dump(
-        folder / "mcc_jax_export.json",
-        {**card(law, particle, origin=origin), "artefacts": {"use": use, "files": told}},
-    )
-    return [*names, "mcc_jax_export.json", *_golden(law, particle, folder, seed, "mcc_jax_export")]
+    artefacts = {"use": use, "files": told}
+    yield "mcc_jax_export.json", {**card(law, particle, origin=origin), "artefacts": artefacts}
+    yield "mcc_jax_export_golden.csv", golden_table(law, particle, seed=seed)
 
 
-def _c(law: MccLaw, particle: Particle, origin: Origin, folder: Path, seed: int) -> list[str]:
-    (folder / "mcc_law.h").write_text(c_header(law, particle, origin=origin), encoding="utf-8")
-    _table(folder / "mcc_law_golden.csv", golden_table(law, particle, seed=seed, units="SI"))
-    _table(folder / "mcc_law_pair_golden.csv", golden_pair_table(law, particle, seed=seed, units="SI"))
-    return ["mcc_law.h", "mcc_law_golden.csv", "mcc_law_pair_golden.csv"]
+def _c(law: MccLaw, particle: Particle, origin: Origin, seed: int) -> Files:
+    yield "mcc_law.h", c_header(law, particle, origin=origin)
+    yield "mcc_law_golden.csv", golden_table(law, particle, seed=seed, units="SI")
+    yield "mcc_law_pair_golden.csv", golden_pair_table(law, particle, seed=seed, units="SI")
 
 
-def _recipe(recipe: Callable[..., str], name: str) -> Write:
-    def write(law: MccLaw, particle: Particle, origin: Origin, folder: Path, seed: int) -> list[str]:
-        (folder / name).write_text(recipe(law, particle, origin=origin), encoding="utf-8")
-        return [name, *_c(law, particle, origin, folder, seed)]
-
-    return write
+def _lammps(law: MccLaw, particle: Particle, origin: Origin, seed: int) -> Files:
+    yield "lammps.md", lammps_recipe(law, particle, origin=origin)
+    yield from _c(law, particle, origin, seed)
 
 
-_WRITERS: dict[str, Write] = {
-    "json": _json,
-    "csv": _csv,
-    "jax": _jax,
-    "c": _c,
-    "lammps": _recipe(lammps_recipe, "lammps.md"),
-    "yade": _recipe(yade_recipe, "yade.md"),
-}
-FORMATS = tuple(_WRITERS)
+def _yade(law: MccLaw, particle: Particle, origin: Origin, seed: int) -> Files:
+    yield "yade.md", yade_recipe(law, particle, origin=origin)
+    yield from _c(law, particle, origin, seed)
+
+
+_FILES: dict[str, Callable[[MccLaw, Particle, Origin, int], Files]] = {
+    "json": _json, "csv": _csv, "jax": _jax, "c": _c, "lammps": _lammps, "yade": _yade,
+}  # fmt: skip
+FORMATS = tuple(_FILES)
 """What `write_export` writes: parameter card, tables, JAX artefacts, C header, recipes for LAMMPS and Yade."""
 
 
@@ -116,17 +108,18 @@ def write_export(
     place = arguments.file_path(folder, "folder")
     if not place.is_dir():
         raise InputError("no such folder", file=place, remedy="Make it first.")
-    return _WRITERS[format](law, particle, origin, place, arguments.seed(seed))
+    names = []
+    for name, content in _FILES[format](law, particle, origin, arguments.seed(seed)):
+        names.append(name)
+        if isinstance(content, bytes):
+            (place / name).write_bytes(content)
+        elif name.endswith(".csv"):
+            content.to_csv(place / name, index=False, float_format="%.17g", lineterminator="\n")
+        else:
+            text = content if isinstance(content, str) else _as_json(content)
+            (place / name).write_text(text, encoding="utf-8")
+    return names
 
 
-def _golden(law: MccLaw, particle: Particle, folder: Path, seed: int, stem: str) -> list[str]:
-    _table(folder / f"{stem}_golden.csv", golden_table(law, particle, seed=seed))
-    return [f"{stem}_golden.csv"]
-
-
-def _table(file: Path, table: Any) -> None:
-    table.to_csv(file, index=False, float_format="%.17g", lineterminator="\n")
-
-
-def _dump(file: Path, content: Any) -> None:
-    file.write_text(json.dumps(content, allow_nan=False, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+def _as_json(content: Any) -> str:
+    return json.dumps(content, allow_nan=False, indent=2, ensure_ascii=False) + "\n"

@@ -115,8 +115,7 @@ def _beside(calibration: Posterior | LeastSquares, what: str, line: str, extra: 
         handles.append(Line2D([], [], color=style.PALE, label="not used", **_DOT))
     handles += [Line2D([], [], color=style.BLACK, linewidth=0.8, label=line), *extra]
     title = what if len(chosen) == len(kept) else f"{what}, {len(chosen)} of {len(kept)} particles"
-    lines = style.cautions(figure, calibration)
-    return style.finish(figure, calibration.campaign.metadata, title=title, lines=lines, handles=handles)
+    return style.finish_joint(figure, calibration, title, handles)
 
 
 def _told(curve: FittedCurve) -> str:
@@ -195,7 +194,7 @@ def plot_whitened(calibration: LeastSquares) -> Figure:
     loss = "" if calibration.loss == "linear" else f", {calibration.loss} loss"
     count = f"{len(residual)} particles" if len(residual) > 1 else "one particle"
     title = f"Residuals of {count}{loss}: rms {np.sqrt(np.mean(values**2)):.2f}"
-    return style.finish(figure, calibration.campaign.metadata, title=title, lines=style.cautions(figure, calibration))
+    return style.finish_joint(figure, calibration, title)
 
 
 def _histogram(ax: Axes, values: np.ndarray, reach: float) -> None:
@@ -263,8 +262,7 @@ def plot_new_particle(calibration: Posterior, diameters_um: Any = None) -> Figur
         Patch(color=style.GREY, alpha=0.25, linewidth=0, label="95 %"),
         Line2D([], [], color=style.GREY, linewidth=0.6, label="single draws"),
     ]
-    lines = style.cautions(figure, calibration)
-    return style.finish(figure, calibration.campaign.metadata, title=title, lines=lines, handles=handles)
+    return style.finish_joint(figure, calibration, title, handles)
 
 
 # ---- the paper's calibration -----------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse, Patch
 from matplotlib.ticker import MaxNLocator
 
+from .._format import with_sd
 from ..calibrate import LeastSquares, Posterior, compare_with_paper
 from ..calibrate.arviz import prior_draws
 from ..calibrate.population import COEFFICIENTS
@@ -64,14 +65,8 @@ def posterior_figures(calibration: Posterior) -> dict[str, Figure]:
     Returns:
         `pairs`, `prior_posterior`, `forest`, `shrinkage`, `bands`, `new_particle`.
     """
-    return {
-        "pairs": plot_pairs(calibration),
-        "prior_posterior": plot_prior_posterior(calibration),
-        "forest": plot_forest(calibration),
-        "shrinkage": plot_shrinkage(calibration),
-        "bands": plot_bands(calibration),
-        "new_particle": plot_new_particle(calibration),
-    }
+    plots = (plot_pairs, plot_prior_posterior, plot_forest, plot_shrinkage, plot_bands, plot_new_particle)
+    return {plot.__name__.removeprefix("plot_"): plot(calibration) for plot in plots}
 
 
 @style.of_its_kind
@@ -81,11 +76,8 @@ def least_squares_figures(calibration: LeastSquares) -> dict[str, Figure]:
     Returns:
         `whitened`, `fits`, `estimates`.
     """
-    return {
-        "whitened": plot_whitened(calibration),
-        "fits": plot_fits(calibration),
-        "estimates": plot_estimates(calibration),
-    }
+    plots = (plot_whitened, plot_fits, plot_estimates)
+    return {plot.__name__.removeprefix("plot_"): plot(calibration) for plot in plots}
 
 
 # ---- the population --------------------------------------------------------------------------------------------------
@@ -135,14 +127,9 @@ def _area(ax: Axes, x: np.ndarray, y: np.ndarray, fill: str, edge: str) -> None:
     ax.plot(x, y, color=edge, linewidth=1.0)
 
 
-def with_sd(value: float, sd: float) -> str:
-    """A number and its standard deviation, to two digits of the latter."""
-    if not (np.isfinite(sd) and sd > 0):
-        return f"{value:.4g}"
-    digits = 1 - int(np.floor(np.log10(sd)))
-    if digits > 6:
-        return f"{value:.2g} ± {sd:.1g}"
-    return f"{value:.{max(digits, 0)}f} ± {sd:.{max(digits, 0)}f}"
+def _told(draws: np.ndarray) -> str:
+    """Mean and standard deviation of draws."""
+    return with_sd({"value": float(draws.mean()), "sd": float(draws.std())})
 
 
 @style.styled
@@ -173,7 +160,7 @@ def plot_pairs(calibration: Posterior) -> Figure:
                 ax.set_ylim(0, 1.08)
                 ax.set_yticks([])
                 ax.spines["left"].set_visible(False)
-                ax.set_title(with_sd(float(values.mean()), float(values.std())), fontsize=7, loc="center")
+                ax.set_title(_told(values), fontsize=7, loc="center")
             else:
                 ax.plot(draws[names[j]].ravel()[shown], values[shown], ".", **dots)
                 ax.yaxis.set_major_locator(MaxNLocator(3))
@@ -189,8 +176,7 @@ def plot_pairs(calibration: Posterior) -> Figure:
         place: style.Look = {"transform": corner.transAxes, "ha": "right", "va": "top", "fontsize": 8.5}
         corner.text(1, 1 - 0.25 * rank, meaning, **place).set_in_layout(False)
     chains, each = draws["a"].shape
-    title, lines = f"Population, {chains} × {each} draws", style.cautions(figure, calibration)
-    return style.finish(figure, calibration.campaign.metadata, title=title, lines=lines)
+    return style.finish_joint(figure, calibration, f"Population, {chains} × {each} draws")
 
 
 def prior_of(calibration: Posterior) -> dict[str, np.ndarray]:
@@ -226,8 +212,7 @@ def plot_prior_posterior(calibration: Posterior) -> Figure:
         Patch(color=style.SKY, alpha=0.7, linewidth=0, label="posterior"),
         Line2D([], [], label="paper", **_PAPER),
     ]
-    title, lines = "What the data added: over the prior's range, and enlarged", style.cautions(figure, calibration)
-    return style.finish(figure, calibration.campaign.metadata, title=title, lines=lines, handles=handles)
+    return style.finish_joint(figure, calibration, "What the data added: over the prior's range, and enlarged", handles)
 
 
 def _prior_posterior(
@@ -256,7 +241,7 @@ def _prior_posterior(
         if paper is not None and x[0] <= paper <= x[-1]:
             ax.axvline(paper, linewidth=1.3, **_PAPER)
     near.set_yticks([])
-    near.set_title(with_sd(float(posterior.mean()), float(posterior.std())), fontsize=8, color=style.BLACK)
+    near.set_title(_told(posterior), fontsize=8, color=style.BLACK)
     if paper is not None and not inside:
         style.note(near, f"paper {paper:.4g}", place="upper left" if paper < close[0] else "upper right")
 
@@ -375,8 +360,7 @@ def _forest(calibration: Posterior | LeastSquares, table: CoefficientTable) -> F
     if count > style.SETTINGS.labelled:
         shown = f"{style.SETTINGS.rows} of {count}" if count > style.SETTINGS.rows else f"{count}"
         title += f", {shown} particles, each panel in its own order"
-    lines = style.cautions(figure, calibration)
-    return style.finish(figure, calibration.campaign.metadata, title=title, lines=lines, handles=handles)
+    return style.finish_joint(figure, calibration, title, handles)
 
 
 @style.styled
@@ -446,5 +430,4 @@ def plot_shrinkage(calibration: Posterior) -> Figure:
         Line2D([], [], markersize=9, label="population mean", **cross),
         Patch(label="95 % of the population", **shade),
     ]
-    title, lines = "Each particle alone, and among the others", style.cautions(figure, calibration)
-    return style.finish(figure, calibration.campaign.metadata, title=title, lines=lines, handles=handles)
+    return style.finish_joint(figure, calibration, "Each particle alone, and among the others", handles)

@@ -292,6 +292,14 @@ def finish(
     return figure
 
 
+def finish_joint(
+    figure: Figure, calibration: Posterior | LeastSquares, title: str, handles: Sequence[Artist] = ()
+) -> Figure:
+    """`finish` for a joint calibration, with what keeps its numbers from being relied on below the title."""
+    lines = cautions(figure, calibration)
+    return finish(figure, calibration.campaign.metadata, title=title, lines=lines, handles=handles)
+
+
 def note(ax: Axes, text: str, *, place: str = "upper left") -> None:
     """A few small words in a corner of a panel."""
     vertical, horizontal = place.split()

@@ -1,16 +1,19 @@
-"""The interactive chart: Bokeh's figures without data, which the page's own script fills particle by particle."""
+"""The interactive chart: which particles it shows, and Bokeh's figures, which the page's own script fills with them."""
 
 from __future__ import annotations
 
 import json
 import re
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from importlib.resources import files
 from typing import Any
 
 import numpy as np
 
-from ..calibrate.curves import KINDS, FittedCurve
+from ..calibrate.curves import KINDS, FittedCurve, measured_curves
 from ..plots.style import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION
+from .read import Results
 
 ROOTS = ("chart-curve", "chart-residual")
 LOOKS = {
@@ -26,6 +29,46 @@ COLUMNS = ("displacement", "force", "residual", "marker", "colour", "alpha", "pa
 
 LOADED_FROM = re.compile(r"https://(?:cdn\.jsdelivr\.net|maps\.googleapis\.com)/[^\"'`\\\s]*")
 """What Bokeh's script would load from elsewhere: MathJax, icons and maps, none of which the page uses."""
+
+
+@dataclass(frozen=True)
+class PageOptions:
+    """How much of the curves stands in the page.
+
+    Attributes:
+        points: about so many in all, shared among the particles: 40,000 make a page of 3 MB that still scrolls.
+        fewest: of one particle, at least; of more particles than that allows, those that the law misses by most.
+    """
+
+    points: int = 40_000
+    fewest: int = 40
+
+
+def compare(results: Results, options: PageOptions | None = None) -> list[FittedCurve]:
+    """Every particle, or those that the law misses by most if there are too many; empty without tests."""
+    options = options or PageOptions()
+    if results.saved is not None:
+        curves: Sequence[FittedCurve] = results.saved.curves
+    else:
+        curves = () if results.campaign is None else measured_curves(results.campaign)
+    if not curves:
+        return []
+    rms = np.array([one.rms_um or 0.0 for one in curves])
+    chosen = np.sort(np.argsort(-rms, kind="stable")[: options.points // options.fewest])
+    most = max(options.points // len(chosen), options.fewest)
+    return [_thinned(curves[i], most) for i in chosen]
+
+
+def _thinned(one: FittedCurve, most: int) -> FittedCurve:
+    """At most about so many points; the ends of segments always."""
+    n = len(one.kind)
+    stride = -(-n // most)
+    if stride <= 1:
+        return one
+    turns = np.flatnonzero(np.diff(one.kind)) + 1
+    rows = np.unique(np.concatenate([np.arange(0, n, stride), turns, turns - 1, [n - 1]]))
+    columns = [f.name for f in fields(one) if f.name not in ("name", "why_not")]
+    return replace(one, **{name: getattr(one, name)[rows] for name in columns})
 
 
 def chart_scripts() -> str:
@@ -53,9 +96,9 @@ def chart_items() -> dict[str, Any]:
     residual.add_layout(Span(location=0, dimension="width", line_color=BLACK, line_width=1.3))
     curve.line("typical", "force", source=lines, color=BLACK, line_dash=[6, 4], line_width=1.3)
     curve.line("own", "force", source=lines, color=BLACK, line_width=1.3)
-    tips = [(word, f"@{column}") for word, column in (("particle", "particle"), ("segment", "segment"))]
-    tips += [("force", "@force{0.000} mN"), ("displacement", "@displacement{0.000} µm")]
-    tips += [("measured − predicted", "@residual{0.0000} µm"), ("time", "@time{0.0} s"), ("compared", "@compared")]
+    tips = [("particle", "@particle"), ("segment", "@segment"), ("force", "@force{0.000} mN")]
+    tips += [("displacement", "@displacement{0.000} µm"), ("measured − predicted", "@residual{0.0000} µm")]
+    tips += [("time", "@time{0.0} s"), ("compared", "@compared")]
     for figure, x, y in ((curve, "displacement", "force"), (residual, "time", "residual")):
         marks = figure.scatter(
             x, y, source=points, marker="marker", color="colour", fill_alpha="alpha", line_alpha="alpha", size=6
@@ -64,9 +107,14 @@ def chart_items() -> dict[str, Any]:
     document = Document()
     for root in (curve, residual):
         document.add_root(root)
-    roots = dict(zip((curve.id, residual.id), ROOTS, strict=True))
+    # Bokeh numbers models by what the process drew before; in their own order the same page gets the same names.
+    text = serialize_json(document.to_json())
+    names = {name: f"model-{i}" for i, name in enumerate(dict.fromkeys(re.findall(r'"id": ?"([^"]+)"', text)))}
+    for name, other in names.items():
+        text = text.replace(f'"{name}"', f'"{other}"')
+    roots = {names[curve.id]: ROOTS[0], names[residual.id]: ROOTS[1]}
     items = [{"docid": "chart", "roots": roots, "root_ids": list(roots)}]
-    return _same_names({"docs": {"chart": json.loads(serialize_json(document.to_json()))}, "items": items})
+    return {"docs": {"chart": json.loads(text)}, "items": items}
 
 
 def _figure(name: str, across: str, up: str) -> Any:
@@ -97,28 +145,6 @@ def _figure(name: str, across: str, up: str) -> Any:
         axis.minor_tick_line_color = None
         axis.axis_label_text_color = axis.major_label_text_color = "#222222"
     return plot
-
-
-def _same_names(item: dict[str, Any]) -> dict[str, Any]:
-    """The item with models named in their order: Bokeh numbers them by what the process drew before."""
-    text = json.dumps(item)
-    names: dict[str, str] = {}
-    for name in _ids(item):
-        names.setdefault(name, f"model-{len(names)}")
-    for name, other in names.items():
-        text = text.replace(f'"{name}"', f'"{other}"')
-    return json.loads(text)
-
-
-def _ids(value: Any):
-    if isinstance(value, dict):
-        if isinstance(value.get("id"), str):
-            yield value["id"]
-        for item in value.values():
-            yield from _ids(item)
-    elif isinstance(value, list):
-        for item in value:
-            yield from _ids(item)
 
 
 def chart_data(shown: list[FittedCurve], labels: list[str], facts: list[str]) -> dict[str, Any]:

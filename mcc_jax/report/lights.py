@@ -13,7 +13,7 @@ from ..calibrate.curves import FittedCurve
 from ..calibrate.settings import JUDGEMENT, SAMPLING
 from ..campaign import Finding, campaign_findings, check_plausibility, check_tests
 from ..campaign.findings import worst
-from .read import Results, checksums_told
+from .read import DATA, Results, checksums_told
 
 Level = Literal["good", "look", "bad", "unknown"]
 RHAT_BAD, ESS_BAD, PARETO_K_BAD = 1.05, 100.0, 1.0
@@ -23,14 +23,6 @@ GOOD_MISFIT = 0.01
 GOOD_NOISE_SHARE = 0.2
 INSIDE = (0.90, 0.99)
 NOT_MONOTONE = 0.05
-ANSWERS = {
-    "NO_GAP": "Nothing missing",
-    "NAMED": "Missing and named",
-    "SET": "Missing, several candidates",
-    "UNLISTED": "Missing, unlisted",
-    "FIT_NOT_CONVERGED": "Cannot ask",
-}
-"""What a verdict says, in words."""
 FEW_PARTICLES = 6
 """Fewer say little of the scatter between particles."""
 
@@ -54,6 +46,74 @@ class Light:
     meaning: str
 
 
+CHECKS = {
+    "Calibration converged": (
+        "yes",
+        "Every part of the calibration must meet its own tolerances. If not: the numbers are not to be trusted before "
+        "the checks below are mended.",
+    ),
+    "Particles used": (
+        f"all, and at least {FEW_PARTICLES}",
+        "Few particles say little of how particles differ. Why some are left out stands with what was measured.",
+    ),
+    "Chains agree (R-hat)": (
+        f"at most {SAMPLING.rhat}",
+        "Chains that started apart must end with one answer. If not: more draws (--draws).",
+    ),
+    "Independent draws (bulk ESS)": (
+        f"at least {SAMPLING.ess:.0f}",
+        "So many independent draws the chains are worth. If too few: more draws (--draws).",
+    ),
+    "Diverging trajectories": (
+        "0",
+        "The sampler could not follow the posterior everywhere. If not 0: more draws, or narrower priors.",
+    ),
+    "Fast mode is accurate (Pareto k)": (
+        f"at most {SAMPLING.pareto_k}",
+        "How well the quadratic summaries of the fast mode stand for the tests themselves. If not: --mode joint.",
+    ),
+    "The law's form fits": (
+        f"at most {percent(GOOD_MISFIT)}",
+        "Median misfit with each particle's own coefficients, as a share of its range of displacement. If large: these "
+        "may be no compressions of single particles, or the diameters are wrong.",
+    ),
+    "What is left is noise": (
+        f"at most {percent(GOOD_NOISE_SHARE)}",
+        "Share of what is left that is correlated along a test. A large one is not noise of the instrument but "
+        "something that the law misses, and the stated errors are those of a law that misses it.",
+    ),
+    "New particles behave": (
+        f"at most {percent(NOT_MONOTONE)}",
+        "Share of particles drawn from this population whose loading curve would fall somewhere.",
+    ),
+    "Prediction bands hold": (
+        f"about 95 %, {percent(INSIDE[0])} to {percent(INSIDE[1])}",
+        "Measured points inside the band that should hold 95 % of them. Fewer: the law misses something, or the noise "
+        "is larger than estimated. More: the noise is smaller.",
+    ),
+    "Same data": ("checksums agree", "The data shown here are those that were calibrated. If not: calibrate again."),
+}
+"""What every check should be, and what it means."""
+
+COMPLETE = "Law is complete"
+VERDICTS: dict[str, tuple[Level, str, str]] = {
+    "NO_GAP": ("good", "Nothing missing", "Nothing is missing in the law that these tests could show."),
+    "NAMED": (
+        "look",
+        "Missing and named",
+        "The law alone is incomplete: use its parameters together with the effect that was added.",
+    ),
+    "SET": (
+        "look",
+        "Missing, several candidates",
+        "The law alone is incomplete, and these tests cannot tell several causes apart.",
+    ),
+    "UNLISTED": ("look", "Missing, unlisted", "The law alone is incomplete, and no listed mechanism explains it."),
+    "FIT_NOT_CONVERGED": ("bad", "Cannot ask", "The law could not be fitted well enough to ask what it lacks."),
+}
+"""Level of a verdict, what it says in words, and what that means."""
+
+
 def lights(results: Results, shown: Sequence[FittedCurve] = ()) -> list[Light]:
     """All checks that these results allow, the convergence of the calibration first.
 
@@ -61,20 +121,21 @@ def lights(results: Results, shown: Sequence[FittedCurve] = ()) -> list[Light]:
         results: what a folder holds.
         shown: its particles with their predictions, for what the calibration itself does not tell.
     """
-    findings = tested(results)
+    findings, content, inside = tested(results), results.calibration, share_inside(shown)
     found = [_finding(one) for one in findings]
-    if results.calibration is not None:
-        found += _calibration(results.calibration)
-        if results.calibration["method"] == "bayes":
-            found += _sampler(results.calibration["diagnostics"])
-        found += _fit(results.calibration, shown)
-    inside = share_inside(shown)
+    if content is not None:
+        found += _calibration(content)
+        if content["method"] == "bayes":
+            found += _sampler(content["diagnostics"])
+        found += _fit(content, shown)
     if inside is not None:
-        found.append(_coverage(inside))
-    if results.calibration is not None:
-        found.append(_data(results))
+        level = "good" if INSIDE[0] <= inside <= INSIDE[1] else "look"
+        found.append(_light("Prediction bands hold", level, f"{percent(inside, 3)} of points inside"))
+    if content is not None:
+        found.append(_data(results, content))
     if results.discovery is not None:
-        found.append(_discovery(results.discovery))
+        level, answer, meaning = VERDICTS[results.discovery["verdict"]]
+        found.append(Light(level, COMPLETE, answer, VERDICTS["NO_GAP"][1].lower(), meaning))
     if worst(findings) == "bad":
         # Beside numbers that cannot be true nothing is fine: what would be is not judged.
         found = [replace(light, level="unknown") if light.level == "good" else light for light in found]
@@ -83,7 +144,7 @@ def lights(results: Results, shown: Sequence[FittedCurve] = ()) -> list[Light]:
 
 def tested(results: Results) -> tuple[Finding, ...]:
     """What the checks of the tests found: as the results tell it, or by the campaign itself where there are none."""
-    told = [one for _, content in results.results for one in content.get("findings", [])]
+    told = [one for content in results.results.values() for one in content.get("findings", [])]
     if told:
         unique = {(one["check"], tuple(one["particles"]), one["sentence"]): one for one in told}
         return tuple(Finding.from_json(one) for one in unique.values())
@@ -95,68 +156,39 @@ def tested(results: Results) -> tuple[Finding, ...]:
     )
 
 
+def _light(check: str, level: Level, value: str) -> Light:
+    return Light(level, check, value, *CHECKS[check])
+
+
 def _finding(one: Finding) -> Light:
-    level: dict[str, Level] = {"told": "good", "look": "look", "bad": "bad"}
-    value = {"told": "settled", "look": "look at it", "bad": "cannot be true as it stands"}[one.level]
-    return Light(level[one.level], f"Tests: {one.check}", value, "nothing found", str(one))
+    told: dict[str, tuple[Level, str]] = {
+        "told": ("good", "settled"),
+        "look": ("look", "look at it"),
+        "bad": ("bad", "cannot be true as it stands"),
+    }
+    level, value = told[one.level]
+    return Light(level, f"Tests: {one.check}", value, "nothing found", str(one))
 
 
 def _calibration(content: dict[str, Any]) -> list[Light]:
     count, used = len(content["particles"]), sum(entry["kept"] for entry in content["particles"])
-    share = used / count
+    enough = "good" if used == count >= FEW_PARTICLES else "look" if used >= max(2, count / 2) else "bad"
+    done = content["converged"]
     return [
-        Light(
-            "good" if content["converged"] else "bad",
-            "Calibration converged",
-            "yes" if content["converged"] else "no",
-            "yes",
-            "Every part of the calibration met its own tolerances."
-            if content["converged"]
-            else "The numbers are not to be trusted before the checks below are mended.",
-        ),
-        Light(
-            "good" if share == 1 and used >= FEW_PARTICLES else "look" if share >= 0.5 and used > 1 else "bad",
-            "Particles used",
-            f"{used} of {count}",
-            f"all, and at least {FEW_PARTICLES}",
-            "Few particles say little of how particles differ. Why some are left out stands with what was measured.",
-        ),
+        _light("Calibration converged", "good" if done else "bad", "yes" if done else "no"),
+        _light("Particles used", enough, f"{used} of {count}"),
     ]
 
 
 def _sampler(d: dict[str, Any]) -> list[Light]:
     rhat, ess, divergences, k = (d.get(n) for n in ("rhat_max", "ess_bulk_min", "divergences", "pareto_k_max"))
-    joint = d.get("pareto_k_joint")
-    worst = None if k is None else max(k, joint or k)
+    k = None if k is None else max(k, d.get("pareto_k_joint") or k)
+    few = _below(None if ess is None else -ess, -SAMPLING.ess, -ESS_BAD)
     return [
-        Light(
-            _below(rhat, SAMPLING.rhat, RHAT_BAD),
-            "Chains agree (R-hat)",
-            number(rhat),
-            f"at most {SAMPLING.rhat}",
-            "Chains that started apart must end with one answer. If not: more draws (--draws).",
-        ),
-        Light(
-            _below(None if ess is None else -ess, -SAMPLING.ess, -ESS_BAD),
-            "Independent draws (bulk ESS)",
-            number(ess),
-            f"at least {SAMPLING.ess:.0f}",
-            "So many independent draws the chains are worth. If too few: more draws (--draws).",
-        ),
-        Light(
-            "unknown" if divergences is None else "good" if divergences == 0 else "bad",
-            "Diverging trajectories",
-            number(divergences),
-            "0",
-            "The sampler could not follow the posterior everywhere. If not 0: more draws, or narrower priors.",
-        ),
-        Light(
-            _below(worst, SAMPLING.pareto_k, PARETO_K_BAD),
-            "Fast mode is accurate (Pareto k)",
-            number(worst, 2),
-            f"at most {SAMPLING.pareto_k}",
-            "How well the quadratic summaries of the fast mode stand for the tests themselves. If not: --mode joint.",
-        ),
+        _light("Chains agree (R-hat)", _below(rhat, SAMPLING.rhat, RHAT_BAD), number(rhat)),
+        _light("Independent draws (bulk ESS)", few, number(ess)),
+        _light("Diverging trajectories", _below(divergences, 0.0, 0.0), number(divergences)),
+        _light("Fast mode is accurate (Pareto k)", _below(k, SAMPLING.pareto_k, PARETO_K_BAD), number(k, 2)),
     ]
 
 
@@ -168,43 +200,20 @@ def _own_misfit(shown: Sequence[FittedCurve]) -> float:
 
 def _fit(content: dict[str, Any], shown: Sequence[FittedCurve]) -> list[Light]:
     d = content["diagnostics"]
-    misfit, share = d.get("own_misfit"), (content.get("probability_not_monotone") or {}).get("value")
+    misfit, noise = d.get("own_misfit"), d.get("noise_share")
+    falling = (content.get("probability_not_monotone") or {}).get("value")
     if misfit is None and shown:
         misfit = _own_misfit(shown)
     found = []
     if misfit is not None and np.isfinite(misfit):
-        found.append(
-            Light(
-                _below(misfit, GOOD_MISFIT, JUDGEMENT.misfit),
-                "The law's form fits",
-                f"off by {percent(misfit)}",
-                f"at most {percent(GOOD_MISFIT)}",
-                "Median misfit with each particle's own coefficients, as a share of its range of displacement. If "
-                "large: these may be no compressions of single particles, or the diameters are wrong.",
-            )
-        )
-    noise = d.get("noise_share")
+        level = _below(misfit, GOOD_MISFIT, JUDGEMENT.misfit)
+        found.append(_light("The law's form fits", level, f"off by {percent(misfit)}"))
     if noise is not None:
-        found.append(
-            Light(
-                _below(noise, GOOD_NOISE_SHARE, JUDGEMENT.noise_share),
-                "What is left is noise",
-                f"{percent(noise)} hangs together",
-                f"at most {percent(GOOD_NOISE_SHARE)}",
-                "Share of what is left that is correlated along a test. A large one is not noise of the instrument but "
-                "something that the law misses, and the stated errors are those of a law that misses it.",
-            )
-        )
-    if share is not None:
-        found.append(
-            Light(
-                "good" if share <= NOT_MONOTONE else "look",
-                "New particles behave",
-                f"{percent(share)} snap through",
-                f"at most {percent(NOT_MONOTONE)}",
-                "Share of particles drawn from this population whose loading curve would fall somewhere.",
-            )
-        )
+        level = _below(noise, GOOD_NOISE_SHARE, JUDGEMENT.noise_share)
+        found.append(_light("What is left is noise", level, f"{percent(noise)} hangs together"))
+    if falling is not None:
+        level = "good" if falling <= NOT_MONOTONE else "look"
+        found.append(_light("New particles behave", level, f"{percent(falling)} snap through"))
     gaps = d.get("open_combinations", [])
     name = "Data determine the parameters"
     return found + [Light("bad", name, "not all", "all", f"The data leave open: {text}.") for text in gaps]
@@ -217,48 +226,14 @@ def share_inside(shown: Sequence[FittedCurve]) -> float | None:
     return float(np.mean(np.concatenate(inside))) if sum(map(len, inside)) else None
 
 
-def _coverage(inside: float) -> Light:
-    low, high = INSIDE
-    return Light(
-        "good" if low <= inside <= high else "look",
-        "Prediction bands hold",
-        f"{percent(inside, 3)} of points inside",
-        f"about 95 %, {percent(low)} to {percent(high)}",
-        "Measured points inside the band that should hold 95 % of them. Fewer: the law misses something, or the "
-        "noise is larger than estimated. More: the noise is smaller.",
-    )
-
-
-def _data(results: Results) -> Light:
-    assert results.calibration is not None
-    told = checksums_told(results.calibration)
+def _data(results: Results, content: dict[str, Any]) -> Light:
+    told = checksums_told(content)
     if not told or not results.checksums:
-        return Light(
-            "unknown", "Same data", "cannot tell", "checksums agree", "Checksums or the campaign's files are missing."
-        )
-    same = all(results.checksums.get(name) == told.get(name) for name in ("particles.csv", "curves.csv"))
-    return Light(
-        "good" if same and not results.cautions else "bad",
-        "Same data",
-        "checksums agree" if same else "checksums differ",
-        "checksums agree",
-        "The data shown here are those that were calibrated. If not: calibrate again.",
-    )
-
-
-def _discovery(content: dict[str, Any]) -> Light:
-    level: dict[str, Level] = {"NO_GAP": "good", "FIT_NOT_CONVERGED": "bad"}
-    meaning = {
-        "NO_GAP": "Nothing is missing in the law that these tests could show.",
-        "NAMED": "The law alone is incomplete: use its parameters together with the effect that was added.",
-        "SET": "The law alone is incomplete, and these tests cannot tell several causes apart.",
-        "UNLISTED": "The law alone is incomplete, and no listed mechanism explains it.",
-        "FIT_NOT_CONVERGED": "The law could not be fitted well enough to ask what it lacks.",
-    }
-    verdict = content["verdict"]
-    return Light(
-        level.get(verdict, "look"), "Law is complete", ANSWERS[verdict], ANSWERS["NO_GAP"].lower(), meaning[verdict]
-    )
+        why = "Checksums or the campaign's files are missing."
+        return Light("unknown", "Same data", "cannot tell", "checksums agree", why)
+    same = all(results.checksums.get(name) == told.get(name) for name in DATA)
+    level = "good" if same and not results.cautions else "bad"
+    return _light("Same data", level, "checksums agree" if same else "checksums differ")
 
 
 def _below(value: float | int | None, good: float, bad: float) -> Level:

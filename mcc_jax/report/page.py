@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shlex
 from collections.abc import Callable
@@ -14,26 +15,18 @@ from .._extras import extra
 from .._format import interval, number, percent, probability, with_sd
 from .._version import own_version
 from ..calibrate.curves import KINDS, FittedCurve
+from ..campaign import PAPER_EFFECTIVE_MODULUS_MPA, PAPER_LOG_C, PAPER_SHAPE_PARAMETER
 from ..campaign.findings import worst
 from .read import Results
 
 with extra("report"):
     from ..plots.style import particle_labels
     from . import pictures as pictures
-    from .chart import LOOKS, chart_data, chart_items, chart_scripts
-    from .compare import compare
-    from .lights import ANSWERS, lights, share_inside, tested
-    from .sentences import (
-        METHODS,
-        calibration_sentences,
-        listed,
-        next_steps,
-        plain,
-        quantity,
-        simulated,
-    )
+    from .chart import LOOKS, chart_data, chart_items, chart_scripts, compare
+    from .lights import COMPLETE, lights, share_inside, tested
+    from .sentences import METHODS, calibration_sentences, listed, next_steps, plain, quantity, simulated
     from .story import story
-    from .tables import measured, parameters, particle_facts, particle_rows
+    from .tables import changes, exponential, measured, particle_facts, particle_rows, spread
 
 CAPTIONS = {
     "bands": ("compare", "Measured curves and the central 95 % of what the posterior expects"),
@@ -61,6 +54,8 @@ CAPTIONS = {
     "discovery_shifts": ("discovery", "What the missing effect had done to the parameters"),
 }
 """Section and caption of every figure, by its stem."""
+WITHIN_A_NUMBER = re.compile(r"(?<=[\d)]) (?=[±×%]|(?:µm|[GM]Pa|mN|s)\b)|(?<=[±×]) (?=[\d(])")
+"""Blanks at which a line must not break: before a unit, and around the sign of a standard deviation or a power."""
 
 
 def report_page(results: Results, *, seed: int = 0, progress: Callable[[str], None] | None = None) -> str:
@@ -105,12 +100,13 @@ def _environment() -> Any:
         loader=PackageLoader("mcc_jax.report"),
         autoescape=True,
         undefined=StrictUndefined,
+        finalize=_unbroken,
         trim_blocks=True,
         lstrip_blocks=True,
     )
     # Bokeh wants a model before what refers to it.
     found.policies["json.dumps_kwargs"] = {"sort_keys": False, "allow_nan": False, "separators": (",", ":")}
-    found.globals["plain_name"] = quantity
+    found.globals |= {"plain_name": quantity, "exp": math.exp}
     found.filters |= {
         "number": number,
         "percent": percent,
@@ -119,13 +115,20 @@ def _environment() -> Any:
         "interval": interval,
         "plain": plain,
         "listed": listed,
+        "exponential": exponential,
+        "spread": spread,
     }
     return found
 
 
+def _unbroken(value: Any) -> Any:
+    """What a template prints, with every number in one piece; our own scripts and styles as they are."""
+    return WITHIN_A_NUMBER.sub("\N{NO-BREAK SPACE}", value) if type(value) is str else value
+
+
 def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
     """What the templates show."""
-    from markupsafe import Markup
+    from markupsafe import Markup, escape
 
     labels = particle_labels([one.name for one in shown], 40)
     folder = shlex.quote(results.name)
@@ -138,33 +141,32 @@ def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
         "story": story(results, shown),
         "cards": _cards(results, checks),
         "summary": _summary(results),
-        "next_steps": next_steps(results, folder),
+        # A command is copied: its blanks stay as they are.
+        "next_steps": [(text, escape(command)) for text, command in next_steps(results, folder)],
         "facts": [] if results.campaign is None else measured(results.campaign),
         "rows": particle_rows(results),
-        "parameters": [] if results.calibration is None else parameters(results.calibration),
+        "paper": {"a": PAPER_SHAPE_PARAMETER, "modulus_MPa": PAPER_EFFECTIVE_MODULUS_MPA, "log_C": PAPER_LOG_C},
         "methods": METHODS,
         "shown": shown,
         "bands": share_inside(shown) is not None,
         "labels": labels,
         "looks": {word: (marker, colour) for marker, colour, word in (LOOKS[kind] for kind in KINDS)},
         "seen": sorted({LOOKS[KINDS[k]][2] for one in shown for k in set(one.kind.tolist())}),
-        "chart": _chart(results, shown, labels) if shown else None,
+        "chart": {"bokeh": chart_items(), "data": chart_data(shown, labels, particle_facts(results, shown))}
+        if shown
+        else None,
         "bokeh": Markup(_closed(chart_scripts())) if shown else "",
         "grid": pictures.grid(shown),
         "marginals": [] if results.posterior is None else pictures.marginals(results.posterior),
         "lights": checks,
-        "answers": ANSWERS,
-        "verdict_level": next((one.level for one in checks if one.check == "Law is complete"), "unknown"),
-        "steps": [] if results.discovery is None else _steps(results.discovery["gap"]),
-        "shift_pictures": []
-        if results.discovery is None
-        else pictures.shifts(results.discovery["parameters_before"], results.discovery["parameters_after"]),
+        "verdict": next((one for one in checks if one.check == COMPLETE), None),
+        "changes": [] if results.discovery is None else changes(results.discovery),
         "before_after": CAPTIONS["discovery_before_after"][1],
         "figures_of": _figures(results),
         "folder": folder,
         "style": Markup(_source("style.css")),
         "script": Markup(_closed(_source("page.js"))),
-        "versions": next((v for _, c in results.results if (v := c["provenance"]["versions"])), {}),
+        "versions": next((v for _, c in results.results.items() if (v := c["provenance"]["versions"])), {}),
     }
 
 
@@ -175,11 +177,6 @@ def _source(name: str) -> str:
 def _closed(script: str) -> str:
     """A script that cannot end its element early."""
     return re.sub(r"</(script)", r"<\\/\1", script, flags=re.IGNORECASE)
-
-
-def _chart(results: Results, shown: list[FittedCurve], labels: list[str]) -> dict[str, Any]:
-    facts = particle_facts(results, [s.name for s in shown], [s.rms_um for s in shown], [s.why_not for s in shown])
-    return {"bokeh": chart_items(), "data": chart_data(shown, labels, facts)}
 
 
 def _cards(results: Results, checks: list[Any]) -> list[dict[str, str]]:
@@ -237,22 +234,6 @@ def _sections(results: Results, shown: list[FittedCurve], checks: list[Any]) -> 
         ("cite", "How to cite", True),
     )
     return [(name, title) for name, title, here in there if here]
-
-
-def _steps(gap: dict[str, Any]) -> list[dict[str, Any]]:
-    """The systematic gap on held-out particles at every step, with the length of its bar in per cent."""
-    known = [step for step in gap["steps"] if step["systematic_um"] is not None]
-    if len(known) < 2:
-        return []
-    most = max(step["systematic_um"] for step in known) or 1.0
-    return [
-        {
-            "name": "law alone" if step["added"] is None else f"with {plain(step['added'])}",
-            "value": number(step["systematic_um"], 2),
-            "length": round(100 * step["systematic_um"] / most, 1),
-        }
-        for step in known
-    ]
 
 
 def _figures(results: Results) -> dict[str, list[tuple[str, str]]]:

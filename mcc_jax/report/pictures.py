@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
@@ -16,7 +16,7 @@ from matplotlib.transforms import ScaledTranslation
 
 from ..calibrate.curves import FittedCurve
 from ..calibrate.results import PosteriorDraws
-from ..plots.style import BLACK, BLUE, GREY, ORANGE, PALE, RC, SKY, VERMILION, new_figure, particle_labels
+from ..plots.style import BLACK, BLUE, GREY, ORANGE, PALE, RC, SKY, VERMILION, Look, new_figure, particle_labels
 
 GRID = 30
 """At most so many particles stand in the grid; of more, those with the largest misfit."""
@@ -66,15 +66,15 @@ class Telling:
         return "simulated test" if self.simulated else "measured"
 
     @property
-    def laws(self) -> list[tuple[np.ndarray, str, Literal["-", "--"], str]]:
-        """Measured less predicted, colour, line and label of every law that is drawn."""
-        alone = "law alone" if self.added else "law"
-        found: list[tuple[np.ndarray, str, Literal["-", "--"], str]] = [
-            (self.before_um, VERMILION, "--" if self.added else "-", alone)
-        ]
-        if self.after_um is not None:
-            found.append((self.after_um, BLUE, "-", self.added))
-        return found
+    def laws(self) -> list[tuple[np.ndarray, Look]]:
+        """Measured less predicted, and how it is drawn and called, of every law: broad and pale below narrow and dark.
+
+        Dashes would not do: where a test goes back on its own path they fill each other's gaps.
+        """
+        if self.after_um is None:
+            return [(self.before_um, {"color": VERMILION, "linewidth": 1.4, "label": "law"})]
+        alone: Look = {"color": VERMILION, "alpha": 0.6, "linewidth": 2.8, "label": "law alone"}
+        return [(self.before_um, alone), (self.after_um, {"color": BLUE, "linewidth": 1.4, "label": self.added})]
 
     @property
     def near(self) -> np.ndarray:
@@ -110,14 +110,14 @@ def telling_pictures(told: Telling) -> list[tuple[str, str]]:
 def draw_enlarged(ax: Axes, told: Telling) -> list[Any]:
     """Force over displacement where law and test differ most, in a corner the whole test; what stands in a legend."""
     near = told.near
-    _force_over_displacement(ax, told, size=4.5)
+    _force_over_displacement(ax, told)
     across, up = told.displacement_um[near], told.force_mN[near]
     ax.set_xlim(across.min() - 0.05 * np.ptp(across), across.max() + 0.05 * np.ptp(across))
     ax.set_ylim(up.min() - 0.05 * np.ptp(up), up.max() + 0.05 * np.ptp(up))
     ax.set_xlabel("displacement [µm]")
     ax.set_ylabel("force [mN]")
     inset = ax.inset_axes(_emptiest(across, up))
-    _force_over_displacement(inset, told, size=1.2)
+    _force_over_displacement(inset, told, 0.3)
     inset.set(xticks=[], yticks=[])
     inset.spines[["top", "right"]].set_visible(True)
     inset.set_title("the whole test", fontsize=8.5, color=BLACK, pad=2, loc="center")
@@ -125,27 +125,18 @@ def draw_enlarged(ax: Axes, told: Telling) -> list[Any]:
     inset.add_patch(Rectangle(corner, np.ptp(across), np.ptp(up), fill=False, edgecolor=BLACK, linewidth=1.1, zorder=9))
     _arrows(ax, told)
     dots = Line2D([], [], marker="o", linestyle="", markersize=4.5, color=PALE, markeredgecolor=GREY, label=told.test)
-    return [dots, *(Line2D([], [], color=colour, linestyle=line, label=label) for _, colour, line, label in told.laws)]
+    return [dots, *(Line2D([], [], **look) for _, look in told.laws)]
 
 
 def draw_left_over(ax: Axes, told: Telling) -> list[Any]:
     """What each law leaves over time, beside the noise; what stands in a legend."""
     handles: list[Any] = []
     if told.noise_um is not None:
-        handles.append(
-            ax.fill_between(
-                told.time_s,
-                -told.noise_um,
-                told.noise_um,
-                color=ORANGE,
-                alpha=0.45,
-                linewidth=0,
-                label="noise (± 1 sd)",
-            )
-        )
+        look: Look = {"color": ORANGE, "alpha": 0.45, "linewidth": 0, "label": "noise (± 1 sd)"}
+        handles.append(ax.fill_between(told.time_s, -told.noise_um, told.noise_um, **look))
     ax.axhline(0.0, color=GREY, linewidth=0.7)
-    for away, colour, line, label in told.laws:
-        handles += ax.plot(told.time_s, away, color=colour, linestyle=line, linewidth=1.3, label=label)
+    for away, look in told.laws:
+        handles += ax.plot(told.time_s, away, **look)
     ax.set_xlabel("time [s]")
     ax.set_ylabel("test − law [µm]")
     ax.margins(x=0.01)
@@ -178,14 +169,11 @@ def _emptiest(across: np.ndarray, up: np.ndarray) -> tuple[float, float, float, 
     return 0.03 + 0.94 * left, 0.03 + 0.9 * low, 0.94 * wide, 0.9 * high
 
 
-def _force_over_displacement(ax: Axes, told: Telling, size: float) -> None:
-    ax.plot(
-        told.displacement_um, told.force_mN, "o", markersize=size, color=PALE, markeredgecolor=GREY, markeredgewidth=0.4
-    )
-    for away, colour, line, _ in told.laws:
-        ax.plot(
-            told.displacement_um - away, told.force_mN, color=colour, linestyle=line, linewidth=1.4 if size > 2 else 0.7
-        )
+def _force_over_displacement(ax: Axes, told: Telling, scale: float = 1.0) -> None:
+    dots: Look = {"markersize": 4.5 * scale, "color": PALE, "markeredgecolor": GREY, "markeredgewidth": 0.4}
+    ax.plot(told.displacement_um, told.force_mN, "o", **dots)
+    for away, look in told.laws:
+        ax.plot(told.displacement_um - away, told.force_mN, **look | {"linewidth": scale * look["linewidth"]})
 
 
 def data_uri(picture: bytes, kind: str = "png") -> str:
@@ -194,8 +182,6 @@ def data_uri(picture: bytes, kind: str = "png") -> str:
 
 
 def _svg(figure: Any) -> str:
-    from matplotlib import rc_context
-
     stream = io.BytesIO()
     # The same ids and no date: one input, one page. Text stays text, and small.
     with rc_context({"svg.hashsalt": "mcc_jax", "svg.fonttype": "none"}):
@@ -265,43 +251,3 @@ def grid(shown: list[FittedCurve]) -> tuple[str, int] | None:
     figure.supylabel("force [mN]", fontsize=8)
     figure.set_layout_engine("constrained")
     return _svg(figure), len(chosen)
-
-
-@rc_context(RC)
-def shifts(before: dict[str, Any], after: dict[str, Any]) -> list[tuple[str, str]]:
-    """Each parameter before and after what was added, with 95 % intervals; and the same in words."""
-    names = [
-        ("a", "shape parameter a [-]", 1.0),
-        ("effective_modulus_MPa", "effective modulus [GPa]", 1e-3),
-        *((f"log_C{k}", f"mean log C{'₀₁₂₃₄₅'[k]} [-]", 1.0) for k in (1, 3, 5)),
-    ]
-    found = []
-    for name, label, factor in names:
-        pair = [_estimate(parameters, name) for parameters in (before, after)]
-        if any(e is None or e["value"] is None for e in pair):
-            continue
-        figure = new_figure(3.2, 1.25)
-        ax = figure.subplots()
-        told = []
-        for y, (estimate, colour, marker, word) in enumerate(
-            zip(pair, (VERMILION, BLUE), ("o", "s"), ("before", "after"), strict=True)
-        ):
-            assert estimate is not None
-            value = estimate["value"] * factor
-            ax.plot(value, y, marker, color=colour, markersize=5)
-            if estimate["interval_95"] is not None:
-                ax.hlines(y, *(end * factor for end in estimate["interval_95"]), color=colour, linewidth=2)
-            told.append(f"{word} {value:.4g}")
-        ax.set_yticks([0, 1], ["before", "after"])
-        ax.set_ylim(1.5, -0.5)
-        ax.set_xlabel(label)
-        ax.locator_params(axis="x", nbins=4)
-        ax.margins(x=0.1)
-        ax.grid(axis="x", color=ORANGE, alpha=0.25, linewidth=0.6)
-        found.append((_svg(figure), f"{label}: {', '.join(told)}"))
-    return found
-
-
-def _estimate(parameters: dict[str, Any], name: str) -> dict[str, Any] | None:
-    entry = parameters.get(name)
-    return entry.get("mean") if entry is not None and "mean" in entry else entry

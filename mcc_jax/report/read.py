@@ -19,6 +19,7 @@ from ..discover import Discovery
 from ..files import read_regular
 
 CALIBRATION, DISCOVERY, CAMPAIGN = "calibration.json", "discovery.json", "campaign"
+MADE_BY = {CALIBRATION: "mcc-jax calibrate", DISCOVERY: "mcc-jax discover"}
 DATA = ("particles.csv", "curves.csv")
 FIGURE = re.compile(r"figures/([A-Za-z0-9_-]+)\.png")
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -75,10 +76,10 @@ class Results:
         return tuple(text for part, text in parts if part is None)
 
     @property
-    def results(self) -> list[tuple[str, dict[str, Any]]]:
+    def results(self) -> dict[str, dict[str, Any]]:
         """The two results by the names of their files, those that are there."""
         both = ((CALIBRATION, self.calibration), (DISCOVERY, self.discovery))
-        return [(name, content) for name, content in both if content is not None]
+        return {name: content for name, content in both if content is not None}
 
 
 def read_results(folder: str | Path, campaign: str | Path | None = None, *, name: str | None = None) -> Results:
@@ -99,10 +100,9 @@ def read_results(folder: str | Path, campaign: str | Path | None = None, *, name
     if campaign is not None:
         campaign = arguments.file_path(campaign, "campaign")
     there = _listed(path)
-    calibration = read_result(path / CALIBRATION, "mcc-jax calibrate") if CALIBRATION in there else None
-    discovery = read_result(path / DISCOVERY, "mcc-jax discover") if DISCOVERY in there else None
-    results = [(n, c) for n, c in ((CALIBRATION, calibration), (DISCOVERY, discovery)) if c is not None]
-    where, why = _find(path, there, campaign, [content for _, content in results])
+    results = {name: read_result(path / name, again) for name, again in MADE_BY.items() if name in there}
+    calibration, discovery = results.get(CALIBRATION), results.get(DISCOVERY)
+    where, why = _find(path, there, campaign, list(results.values()))
     data = None if where is None else check_tests(read_campaign(where))
     checksums = {} if where is None else file_checksums(where)
     if data is None and not results:
@@ -112,7 +112,7 @@ def read_results(folder: str | Path, campaign: str | Path | None = None, *, name
             file=path,
             remedy=f"Give a folder that mcc-jax demo, calibrate or discover wrote into; found there: {found}",
         )
-    cautions = list(_cautions(data, checksums, calibration, discovery))
+    cautions = list(_cautions(data, checksums, results))
     saved = None if calibration is None else OldCalibration(calibration, data)
     if calibration is not None and ARCHIVE in there:
         kept = read_archive(path / ARCHIVE)
@@ -133,8 +133,8 @@ def read_results(folder: str | Path, campaign: str | Path | None = None, *, name
         calibration,
         discovery,
         saved,
-        _figures(path, [content for _, content in results]),
-        _newest([path / n for n, _ in results]),
+        _figures(path, [name for content in results.values() for name in content["figures"]]),
+        max((datetime.date.fromtimestamp((path / name).stat().st_mtime) for name in results), default=None),
         tuple(cautions),
         why,
         found,
@@ -143,19 +143,14 @@ def read_results(folder: str | Path, campaign: str | Path | None = None, *, name
 
 def _listed(path: Path) -> set[str]:
     try:
-        if not path.exists():
-            raise InputError(
-                "there is no such folder", file=path, remedy="Give a folder of results; mcc-jax demo makes one"
-            )
-        if not path.is_dir():
-            raise InputError(
-                "is a file, not a folder of results", file=path, remedy="Give the folder that calibrate wrote into"
-            )
         return {entry.name for entry in path.iterdir() if not entry.name.startswith(".")}
+    except FileNotFoundError:
+        problem, remedy = "there is no such folder", "Give a folder of results; mcc-jax demo makes one"
+    except NotADirectoryError:
+        problem, remedy = "is a file, not a folder of results", "Give the folder that calibrate wrote into"
     except OSError as error:
-        raise InputError(
-            f"cannot be read: {error.strerror or error}", file=path, remedy="Check the permissions"
-        ) from None
+        problem, remedy = f"cannot be read: {error.strerror or error}", "Check the permissions"
+    raise InputError(problem, file=path, remedy=remedy)
 
 
 def _find(
@@ -180,18 +175,17 @@ def _find(
     return None, "The results do not say where their campaign is."
 
 
-def _cautions(data: Campaign | None, checksums: Mapping[str, str], *results: dict[str, Any] | None):
-    both = zip((CALIBRATION, DISCOVERY), results, strict=True)
-    told = {n: checksums_told(c) for n, c in both if c is not None}
+def _cautions(data: Campaign | None, checksums: Mapping[str, str], results: Mapping[str, dict[str, Any]]):
+    told = {name: checksums_told(content) for name, content in results.items()}
     for name, sums in told.items():
         changed = [f for f in DATA if f in sums and f in checksums and sums[f] != checksums[f]]
         if changed:
             yield f"{name} was made from other data: {' and '.join(changed)} of the campaign differ in their checksums"
     if len(told) == 2 and all(told.values()) and any(told[CALIBRATION].get(f) != told[DISCOVERY].get(f) for f in DATA):
         yield f"{CALIBRATION} and {DISCOVERY} were made from different data"
-    calibration = results[0]
-    if data is not None and calibration is not None:
-        missing = [e["particle"] for e in calibration["particles"] if e["particle"] not in data.particles]
+    if data is not None and CALIBRATION in results:
+        names = [entry["particle"] for entry in results[CALIBRATION]["particles"]]
+        missing = [name for name in names if name not in data.particles]
         if missing:
             yield f"{len(missing)} particles of {CALIBRATION} are not in the campaign, {missing[0]!r} first"
 
@@ -206,23 +200,16 @@ def _belongs(saved: Calibration, content: dict[str, Any]) -> bool:
     return all(told[name] == content[name] for name in ("method", "a", "effective_modulus_MPa", "log_C1"))
 
 
-def _figures(path: Path, results: list[dict[str, Any]]) -> dict[str, bytes]:
+def _figures(path: Path, names: list[str]) -> dict[str, bytes]:
     found = {}
-    for content in results:
-        for name in content["figures"]:
-            match = FIGURE.fullmatch(name)
-            file = path / name
-            try:
-                if match is None or not file.exists():
-                    continue
-                picture = read_regular(file, LARGEST_FIGURE, "")
-            except (OSError, InputError):  # the page does without it
+    for name in names:
+        match = FIGURE.fullmatch(name)
+        try:
+            if match is None or not (path / name).exists():
                 continue
-            if picture.startswith(PNG):
-                found[match[1]] = picture
+            picture = read_regular(path / name, LARGEST_FIGURE, "")
+        except (OSError, InputError):  # the page does without it
+            continue
+        if picture.startswith(PNG):
+            found[match[1]] = picture
     return found
-
-
-def _newest(files: list[Path]) -> datetime.date | None:
-    times = [file.stat().st_mtime for file in files]
-    return datetime.date.fromtimestamp(max(times)) if times else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from typing import Any
 
 from .._format import interval, number, percent, probability
@@ -14,10 +15,7 @@ METHODS = {
     "least-squares": "joint least squares of all tests at once (Optimistix)",
     "paper": "the paper's own steps, one after the other",
 }
-SURE = {
-    "bayes": "with 95 % probability",
-    "least-squares": "as the 95 % confidence interval",
-}
+SURE = {"bayes": "with 95 % probability", "least-squares": "as the 95 % confidence interval"}
 
 
 def plain(name: str) -> str:
@@ -62,7 +60,7 @@ def calibration_sentences(content: dict[str, Any], law: str = "the law") -> list
         known = [
             f"{name} lies between {interval(content[key], factor)}{unit}".replace(" to ", " and ")
             for name, key, factor, unit in (
-                ("the shape parameter a", "a", 1.0, ""),
+                ("the shape parameter a, how much more flat particles are strained than spheres,", "a", 1.0, ""),
                 ("the effective modulus", "effective_modulus_MPa", 1e-3, " GPa"),
             )
             if content[key]["interval_95"] is not None
@@ -74,8 +72,8 @@ def calibration_sentences(content: dict[str, Any], law: str = "the law") -> list
     misfit = content["diagnostics"].get("own_misfit")
     if misfit is not None:
         found.append(
-            f"With its own C₁, C₃, C₅ {law} follows a particle's displacement to {percent(misfit)} of its range "
-            "(median over the particles)."
+            f"With its own curve of loading (coefficients C₁, C₃, C₅) {law} follows a particle's displacement to "
+            f"{percent(misfit)} of its range (median over the particles)."
         )
     return found
 
@@ -137,8 +135,8 @@ def next_steps(results: Results, folder: str) -> list[tuple[str, str]]:
 def _mend(found: dict[str, Any] | None) -> str:
     if found is not None and found["effects"]:
         return (
-            "The law alone does not fit these tests, which may be why its calibration did not converge: use the "
-            "parameters “after” under Discovery, and see what failed under Checks."
+            "The law alone does not fit these tests, which may be why its calibration did not converge; what failed "
+            "stands under Checks."
         )
     return "Mend the checks that failed under Checks before anything else."
 
@@ -157,7 +155,17 @@ def _after(found: dict[str, Any]) -> list[tuple[str, str]]:
         first = found["checks"][0]
         return [(f"Check directly. For {plain(first['mechanism'])}: {first['check']}. For the others, see below.", "")]
     if verdict in ("NAMED", "SET", "UNLISTED"):
-        return [("Use the law together with what was added (parameters “after” below), not alone.", "")]
+        use = "Use the law together with what was added (parameters “after” below), not alone"
+        named = [":".join(filter(None, (effect["mechanism"], effect["variant"]))) for effect in found["effects"]]
+        if not named or found["closure"]:
+            return [(f"{use}.", "")]
+        options = " ".join(f"--effect {shlex.quote(name)}" for name in named)
+        return [
+            (
+                f"{use}. All about it, from every particle's curve to the checks:",
+                f"mcc-jax calibrate CAMPAIGN {options} --out with-effect",
+            )
+        ]
     if verdict == "NO_GAP" and found["untestable"]:
         needs = sorted({entry["needs"] for entry in found["untestable"]})
         return [(f"To learn about more mechanisms, the tests need {listed(needs)}.", "")]

@@ -64,7 +64,7 @@ def telling_test(found: Discovery) -> Telling | None:
     before, after, source = left.before, left.after, "its own numbers fitted to it"
     if added and found.held_out is not None and found.held_out.residual_um is not None:
         before, after = found.held_out.residual_um[0], found.held_out.residual_um[-1]
-        source = "predicted from the other particles, only its own C₁, C₃, C₅, modulus and zero fitted"
+        source = "predicted from the other particles, with only its own curve of loading, modulus and zero fitted"
     count = np.maximum(left.used.sum(1), 1)
     rms = [np.sqrt(np.sum(np.where(left.used, one, 0.0) ** 2, axis=1) / count) for one in (before, after)]
     j = int(np.argmax(rms[0] - rms[1] if added else rms[0]))
@@ -94,7 +94,7 @@ def _of_fit(shown: Sequence[FittedCurve]) -> Telling | None:
     one = max(known, key=lambda one: one.rms_um or 0.0)
     use = one.used
     caption = (
-        f"Particle {one.name} with its own C₁, C₃, C₅: of all particles the one that the law misses most, by "
+        f"Particle {one.name} with its own curve of loading: of all particles the one that the law misses most, by "
         f"{number(one.rms_um, 2)} µm on average."
     )
     away = one.displacement_um - one.own_um
@@ -110,8 +110,8 @@ def _gap_tiles(found: dict[str, Any]) -> list[tuple[str, str, str]]:
     if gap["closed_fraction"] is not None:
         before, after = (number(gap["steps"][i]["chi2_per_dof"], 3) for i in (0, -1))
         meaning = (
-            f"of what the law alone missed on held-out particles, of which only own C₁, C₃, C₅, modulus and zero "
-            f"are fitted. χ² per point (misfit in units of the noise) falls from {before} to {after}; 1 is noise alone."
+            f"of what the law alone missed on held-out particles: χ² per point (misfit in units of the noise) falls "
+            f"from {before} to {after}; 1 is noise alone."
         )
         tiles.append(("Gap closed", percent(gap["closed_fraction"], 3), meaning))
     pair = [side.get("effective_modulus_MPa") for side in (found["parameters_before"], found["parameters_after"])]

@@ -1,24 +1,19 @@
-"""The tables of the page: facts of the campaign, parameters, particles."""
+"""What the tables of the page show: facts of the campaign, parameters, particles."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from .._format import interval, number, span, with_sd
-from ..campaign import (
-    PAPER_EFFECTIVE_MODULUS_MPA,
-    PAPER_LOG_C,
-    PAPER_SHAPE_PARAMETER,
-    Campaign,
-    campaign_segments,
-    effective_diameter_um,
-)
+from ..calibrate.curves import FittedCurve
+from ..campaign import Campaign, campaign_segments, effective_diameter_um
 from .read import Results
-from .sentences import plain, quantity
+from .sentences import plain
 
 KINDS = {"approach": "approach", "load": "loading", "hold": "hold", "unload": "unloading", "reload": "reloading"}
 
@@ -33,7 +28,12 @@ def measured(campaign: Campaign) -> list[tuple[str, str]]:
     counts = Counter(part.kind for parts in campaign_segments(campaign) for part in parts)
     segments = ", ".join(f"{counts[kind]} × {word}" for kind, word in KINDS.items() if counts[kind])
     meta = campaign.metadata
-    facts = [
+    resolution = [
+        f"{number(value)} {unit}"
+        for value, unit in ((meta.force_resolution_mN, "mN"), (meta.displacement_resolution_um, "µm"))
+        if value is not None
+    ]
+    return [
         ("Tests", f"{len(campaign)} particles, {sum(len(c) for c in campaign.curves)} points"),
         ("Diameters", span(sizes.ravel(), "µm")),
         ("Flatness 1 − D₃²/(D₁D₂)", span(flatness, "", 2)),
@@ -42,107 +42,31 @@ def measured(campaign: Campaign) -> list[tuple[str, str]]:
         ("Segments", segments),
         ("Duration", span([float(c.time_s[-1] - c.time_s[0]) for c in campaign.curves], "s")),
         ("Control", {"load": "force", "displacement": "displacement", None: "not recorded"}[meta.control]),
-        ("Resolution", _resolution(campaign)),
+        ("Resolution", ", ".join(resolution) or "not recorded"),
+        *([("Punch", f"{number(punch)} µm diameter")] if (punch := meta.punch_diameter_um) is not None else []),
+        ("Corrections before", ", ".join(map(plain, meta.corrections)) or "none recorded"),
+        ("Provenance", meta.provenance or "not recorded"),
     ]
-    if meta.punch_diameter_um is not None:
-        facts.append(("Punch", f"{number(meta.punch_diameter_um)} µm diameter"))
-    facts.append(("Corrections before", ", ".join(map(plain, meta.corrections)) or "none recorded"))
-    facts.append(("Provenance", meta.provenance or "not recorded"))
-    return facts
 
 
-def _resolution(campaign: Campaign) -> str:
-    meta = campaign.metadata
-    parts = [
-        f"{number(value)} {unit}"
-        for value, unit in ((meta.force_resolution_mN, "mN"), (meta.displacement_resolution_um, "µm"))
-        if value is not None
-    ]
-    return ", ".join(parts) or "not recorded"
-
-
-def parameters(content: dict[str, Any]) -> list[dict[str, str]]:
-    """Rows of the table of parameters: symbol, name, meaning, value, interval, and the paper's value."""
-    form = content["law"]["unloading"]
-    rows = [
-        {
-            "symbol": "a",
-            "sub": "",
-            "name": "Shape parameter",
-            "meaning": "How much more a flat particle is strained than a sphere under the same displacement; "
-            "0 would mean that shape does not matter.",
-            **_told(content["a"]),
-            "paper": number(PAPER_SHAPE_PARAMETER),
-        },
-        {
-            "symbol": "Ē",
-            "sub": "",
-            "name": "Effective modulus [GPa]",
-            "meaning": f"How stiffly a particle springs back on unloading. It belongs to the form “{form}” of the law "
-            "only. Where that form would return more energy than it took (printed: peak strains below about 0.01), the "
-            "recovered strain is limited.",
-            **_told(content["effective_modulus_MPa"], 1e-3),
-            "paper": f"{PAPER_EFFECTIVE_MODULUS_MPA / 1e3:g}" if form == "printed" else "other form",
-        },
-    ]
-    meanings = {
-        "C1": "Initial slope of stress over scaled strain [MPa]: how hard the first squeeze is.",
-        "C3": "Softening in the middle of the curve, entering as a cube.",
-        "C5": "Stiffening at large strain, entering as a fifth power.",
-    }
-    for name, meaning in meanings.items():
-        mean, sd = content[f"log_{name}"]["mean"], content[f"log_{name}"]["sd"]
-        rows.append(
-            {
-                "symbol": "C",
-                "sub": name[1],
-                "name": "Median particle",
-                "meaning": meaning,
-                **_told(_exponential(mean)),
-                "paper": number(math.exp(PAPER_LOG_C[name][0])),
-            }
-        )
-        rows.append(
-            {
-                "symbol": "τ",
-                "sub": name[1],
-                "name": f"Spread of log C{name[1]}",
-                "meaning": _spread(mean["value"], sd["value"]),
-                **_told(sd),
-                "paper": number(PAPER_LOG_C[name][1]),
-            }
-        )
-    for effect in content.get("effects", ()):
-        for name, value in effect["parameters"].items():
-            rows.append(
-                {
-                    "symbol": "",
-                    "sub": "",
-                    "name": f"{plain(effect['mechanism']).capitalize()}: {quantity(name)}",
-                    "meaning": f"An effect in the law beside the formulas above: {effect['equation']}",
-                    **_told(value),
-                    "paper": "not in it",
-                }
-            )
-    if "yield_stress_MPa" in content:
-        rows.append(
-            {
-                "symbol": "σ",
-                "sub": "y",
-                "name": "Yield stress [MPa]",
-                "meaning": "Mean of C₁ over 17.16: where a sphere of this material begins to yield.",
-                **_told(content["yield_stress_MPa"]),
-                "paper": "0.4085",
-            }
-        )
+def changes(found: dict[str, Any]) -> list[tuple[str, list[tuple[str, str | None]]]]:
+    """What a discovery did to the parameters: name, and before and after the value with its error, and its interval."""
+    sides = found["parameters_before"], found["parameters_after"]
+    rows = []
+    for name, label, factor in (
+        ("a", "a", 1.0),
+        ("effective_modulus_MPa", "Ē [GPa]", 1e-3),
+        *((f"log_C{k}", f"C{'₀₁₂₃₄₅'[k]}", 1.0) for k in (1, 3, 5)),
+    ):
+        pair = [one.get("mean", one) for side in sides if (one := side.get(name)) is not None]
+        if name.startswith("log_"):
+            pair = [exponential(one) for one in pair]
+        if len(pair) == 2 and all(one["value"] is not None for one in pair):
+            rows.append((label, [(with_sd(one, factor), interval(one, factor)) for one in pair]))
     return rows
 
 
-def _told(estimate: dict[str, Any], factor: float = 1.0) -> dict[str, str]:
-    return {"value": with_sd(estimate, factor), "interval": interval(estimate, factor) or "none given"}
-
-
-def _exponential(estimate: dict[str, Any]) -> dict[str, Any]:
+def exponential(estimate: dict[str, Any]) -> dict[str, Any]:
     """The estimate of exp of what is estimated."""
 
     def exp(value: float | int) -> float:
@@ -157,7 +81,9 @@ def _exponential(estimate: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _spread(mean: float | int | None, sd: float | int | None) -> str:
+def spread(log: dict[str, Any]) -> str:
+    """How much particles differ in a coefficient, in words: of mean and standard deviation of its logarithm."""
+    mean, sd = log["mean"]["value"], log["sd"]["value"]
     if mean is None or sd is None or not abs(mean) + abs(sd) < 300:
         return "How much particles differ; these data do not tell."
     if sd < 1e-3:
@@ -166,22 +92,22 @@ def _spread(mean: float | int | None, sd: float | int | None) -> str:
     return f"How much particles differ: two of three lie between {low} and {high}."
 
 
-def particle_facts(results: Results, names: list[str], rms: list[float | None], whys: list[str | None]) -> list[str]:
+def particle_facts(results: Results, shown: Sequence[FittedCurve]) -> list[str]:
     """One line about each particle, for the line below the chart."""
     campaign = results.campaign
     assert campaign is not None
     entries = {e["particle"]: e for e in results.calibration["particles"]} if results.calibration else {}
     facts = []
-    for name, misfit, why in zip(names, rms, whys, strict=True):
-        sizes = " × ".join(number(d) for d in campaign.diameters_um[campaign.index(name)])
+    for one in shown:
+        sizes = " × ".join(number(d) for d in campaign.diameters_um[campaign.index(one.name)])
         parts = [f"D₁ × D₂ × D₃ = {sizes}\N{NO-BREAK SPACE}µm"]
-        eta = entries.get(name, {}).get("eta_p", {}).get("value")
+        eta = entries.get(one.name, {}).get("eta_p", {}).get("value")
         if eta is not None:
             parts.append(f"shape factor {number(eta, 3)}")
-        if why is not None:
-            parts.append(f"not used: {why}")
-        elif misfit is not None:
-            parts.append(f"root mean square of measured − predicted {number(misfit, 2)}\N{NO-BREAK SPACE}µm")
+        if one.why_not is not None:
+            parts.append(f"not used: {one.why_not}")
+        elif one.rms_um is not None:
+            parts.append(f"root mean square of measured − predicted {number(one.rms_um, 2)}\N{NO-BREAK SPACE}µm")
         facts.append("; ".join(parts) + ".")
     return facts
 

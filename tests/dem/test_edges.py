@@ -1,5 +1,7 @@
 """Lists of contacts: history follows the pair through new lists, other orders, more room, other names, the disk."""
 
+import os
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,6 +12,7 @@ from hypothesis import strategies as st
 from packed import PRESSING, SKIN, dense, forces_of, loose, motion, packing
 
 from mcc_jax import InputError
+from mcc_jax._archive import encode
 from mcc_jax.dem import (
     Edges,
     WallHistory,
@@ -165,19 +168,19 @@ def test_a_pair_that_left_the_list_is_virgin():
 def test_resumed_run_is_bitwise_the_same(tmp_path):
     state = dense()
     half, _ = advance(packing(), motion(), state, PRESSING, 2, 40, SKIN)
-    save_state(tmp_path / "half.npz", packing(), half)
+    save_state(tmp_path / "half.mcc", packing(), half)
     whole, rows = advance(packing(), motion(), half, PRESSING, 2, 40, SKIN)
-    again_packing, again = load_state(tmp_path / "half.npz")
+    again_packing, again = load_state(tmp_path / "half.mcc")
     assert eqx.tree_equal((again_packing, again), (packing(), half))
     resumed, rows_again = advance(again_packing, motion(), again, PRESSING, 2, 40, SKIN)
     assert eqx.tree_equal(resumed, whole)
     assert np.array_equal(rows.on_wall, rows_again.on_wall)
-    assert list(tmp_path.iterdir()) == [tmp_path / "half.npz"]
+    assert list(tmp_path.iterdir()) == [tmp_path / "half.mcc"]
 
 
-@pytest.mark.parametrize("damage", ["missing", "empty", "cut", "text", "other"])
+@pytest.mark.parametrize("damage", ["missing", "empty", "cut", "text", "other", "another result"])
 def test_damaged_states_are_refused(tmp_path, damage):
-    file = tmp_path / "state.npz"
+    file = tmp_path / "state.mcc"
     save_state(file, packing(), loose())
     if damage == "missing":
         file.unlink()
@@ -187,21 +190,23 @@ def test_damaged_states_are_refused(tmp_path, damage):
         file.write_bytes(file.read_bytes()[:-900])
     elif damage == "text":
         file.write_text("not a state")
-    else:
+    elif damage == "other":
         np.savez(file, x=np.zeros(3))
-    with pytest.raises(InputError, match=r"state\.npz"):
+    else:
+        file.write_bytes(encode(packing()))
+    with pytest.raises(InputError, match=r"state\.mcc"):
         load_state(file)
 
 
 def test_interrupted_save_leaves_the_old_file(tmp_path, monkeypatch):
-    file = tmp_path / "state.npz"
+    file = tmp_path / "state.mcc"
     save_state(file, packing(), loose())
     before = file.read_bytes()
 
     def fails(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(np, "savez", fails)
+    monkeypatch.setattr(os, "fsync", fails)
     with pytest.raises(OSError, match="No space"):
         save_state(file, packing(), dense())
     assert file.read_bytes() == before

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import json
 import shutil
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,23 +73,6 @@ def values_of(*names: str) -> Damage:
 
 def archive(rng: Random, _: Case) -> Case:
     return {"tests.zip": hostile_archive(rng, sample("micromaterials.txt"), sample("hysitron_lc.txt"))}
-
-
-def state(rng: Random, whole: Case) -> Case:
-    """A saved state with damage outside or, with checksums that fit, inside."""
-    if rng.random() < 0.3:
-        return bytes_of("state.npz")(rng, whole)
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(whole["state.npz"])) as old, zipfile.ZipFile(buffer, "w") as new:
-        names = old.namelist()
-        chosen = rng.sample(names, rng.choice((1, 1, 2)))
-        for name in names:
-            content = old.read(name)
-            if name not in chosen:
-                new.writestr(zipfile.ZipInfo(name), content)
-            elif rng.random() < 0.95:
-                new.writestr(zipfile.ZipInfo(name), mutate(rng, content, old.read(rng.choice(names))))
-    return {"state.npz": buffer.getvalue()}
 
 
 def diameters(rng: Random, whole: Case) -> Case:
@@ -173,7 +154,7 @@ def export(folder: Path) -> None:
 def read_state(folder: Path) -> None:
     from mcc_jax.dem import load_state
 
-    load_state(folder / "state.npz")
+    load_state(folder / "state.msgpack")
 
 
 FOLDER, MAPPED, HEADED = samples("campaign"), samples("mapped"), samples("headed")
@@ -214,7 +195,7 @@ READERS = (
     Reader("programme", 2, {"programme.toml": sample("programme.toml")}, bytes_of("programme.toml"), read_programme),
     *(Reader(name, 2, CAMPAIGN | {name: RESULTS[name]}, values_of(name), read_results) for name in BOTH),
     Reader("saved calibration", 2, {SAVED: saved_calibration()}, bytes_of(SAVED), load_result),
-    Reader("saved state", 1, {"state.npz": sample("state.npz")}, state, read_state),
+    Reader("saved state", 1, {"state.msgpack": sample("state.msgpack")}, bytes_of("state.msgpack"), read_state),
     Reader("export", 0.2, CAMPAIGN | RESULTS, values_of("calibration.json"), export),
     Reader("report page", 0.05, CAMPAIGN | RESULTS, values_of(*BOTH), report),
 )

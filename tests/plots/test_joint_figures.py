@@ -33,7 +33,6 @@ from mcc_jax.plots.posterior import (
     enlarged_prior,
     posterior_table,
     shrinkage,
-    with_sd,
 )
 from mcc_jax.plots.style import spread_over
 from mcc_jax.simulate import paper_campaign
@@ -311,23 +310,3 @@ def test_a_prior_that_piles_up_at_zero_is_no_level_line_where_it_is_enlarged():
     fine = enlarged_prior(prior, far, everywhere, close, tau)
     assert fine.max() == fine[0] == 1.0
     assert fine[-1] < 0.2
-
-
-@pytest.mark.parametrize(
-    ("value", "sd", "text"),
-    [
-        (1.42934, 0.0017, "1.4293 ± 0.0017"),
-        (16011.5, 10.3, "16012 ± 10"),
-        (2.5e-9, 3e-9, "2.5e-09 ± 3e-09"),
-        (1.25, 0.0, "1.25"),
-    ],
-)
-def test_numbers_have_two_digits_of_their_uncertainty(value, sd, text):
-    assert with_sd(value, sd) == text
-
-
-def test_positions_are_spread_from_first_to_last():
-    assert spread_over(3, 12).tolist() == [0, 1, 2]
-    assert spread_over(1, 12).tolist() == [0]
-    many = spread_over(1000, 12)
-    assert (len(many), many[0], many[-1]) == (12, 0, 999)

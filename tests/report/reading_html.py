@@ -43,6 +43,7 @@ class Page(HTMLParser):
             if self.open[-1] == ("script", "chart-data"):
                 self.script += data
             return
+        data = data.replace("\N{NO-BREAK SPACE}", " ")  # where a line must not break is another question
         self.text += data
         for tag, name in self.open:
             if tag == "section":

@@ -12,7 +12,7 @@ from results_folder import calibration, discovery
 from mcc_jax import InputError
 from mcc_jax.campaign import file_checksums
 from mcc_jax.report import read_results
-from mcc_jax.report.compare import compare
+from mcc_jax.report.chart import compare
 from mcc_jax.report.lights import lights
 from mcc_jax.report.page import _environment, context
 

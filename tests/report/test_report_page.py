@@ -17,8 +17,7 @@ from results_folder import C as COEFFICIENTS
 from mcc_jax._format import interval, number, with_sd
 from mcc_jax.calibrate.curves import KINDS
 from mcc_jax.report import read_results, report_page
-from mcc_jax.report.chart import chart_data, chart_items
-from mcc_jax.report.compare import PageOptions, compare
+from mcc_jax.report.chart import PageOptions, chart_data, chart_items, compare
 from mcc_jax.report.lights import lights, share_inside
 from mcc_jax.report.pictures import Telling, telling_pictures
 from mcc_jax.report.sentences import calibration_sentences, discovery_sentence, next_steps
@@ -296,13 +295,27 @@ def telling(gap_at, points=60):
     return Telling(rows, rows**2, rows, before, np.zeros(points), None, "law with creep", "Particle 1.")
 
 
+def test_parameters_before_and_after_stand_there_as_numbers(page):
+    told = "".join(Page(page).sections["discovery"].split())
+    assert "Ē[GPa]9.000±0.0508.902to9.09816.000000±0.000010" in told
+
+
+def test_no_line_breaks_within_a_number_and_commands_can_be_copied(folder):
+    results = dataclasses.replace(read_results(folder), name="tests of 5 mN")
+    page = report_page(results).replace("\N{NO-BREAK SPACE}", "~")
+    assert "16.000000~±~0.000010~GPa" in page
+    assert "mcc-jax calibrate CAMPAIGN --out &#39;tests of 5 mN&#39;" in report_page(
+        dataclasses.replace(results, calibration=None, saved=None)
+    )
+
+
 @pytest.mark.parametrize("gap_at", [5, 30, 55])
 def test_the_enlarged_part_holds_the_largest_gap(gap_at):
     told = telling(gap_at)
     assert told.near[gap_at]
     assert told.near.sum() < 20
     assert telling(2, points=4).near.sum() > 1  # of a record with few readings more is shown, never one
-    assert [label for *_, label in told.laws] == ["law alone", "law with creep"]
+    assert [look["label"] for _, look in told.laws] == ["law alone", "law with creep"]
     assert all(
         source.startswith("data:image/svg+xml") and "Particle 1" in words for source, words in telling_pictures(told)
     )

@@ -1,4 +1,4 @@
-"""The pair law as a force model of JaxDEM."""
+"""The contact inside other particle codes in JAX: JaxDEM and JAX-MD. Importing this needs neither."""
 
 from __future__ import annotations
 
@@ -7,12 +7,44 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
-from ..._errors import InputError
-from ..._numerics import shared
-from ..pair import largest_overlap, pair_energy, pair_force
-from ..side import HalfContact, sides_of
+from .._errors import InputError
+from .._numerics import shared
+from .edges import Edges, list_edges
+from .pair import largest_overlap, pair_energy, pair_force
+from .side import HalfContact, sides_of
+
+
+def edges_from_jaxmd(neighbours: Any, capacity: int | None = None, dtype: np.dtype | type = np.float64) -> Edges:
+    """Edges of virgin contacts from a `jax_md.partition.NeighborList`; give them history with `carry_history`.
+
+    jax-md looks for pairs on the accelerator and makes its lists for one cut-off: with spheres of several sizes take
+    the largest sum of two radii. The list comes to the host here, as does that of `close_pairs`.
+
+    Args:
+        neighbours: a list of format OrderedSparse or Sparse (``pip install mcc-jax[jaxmd]``).
+        capacity: length of the list of edges; that of jax-md's if None.
+        dtype: precision of the history.
+
+    Raises:
+        InputError: if the list is dense, or if it overflowed and so pairs are missing.
+    """
+    index = np.asarray(neighbours.idx)
+    count = len(neighbours.reference_position)
+    if index.ndim != 2 or len(index) != 2 or "Sparse" not in str(neighbours.format):
+        raise InputError(
+            f"a neighbour list of format {neighbours.format}",
+            remedy="Make it with `format=jax_md.partition.NeighborListFormat.OrderedSparse`.",
+        )
+    if bool(neighbours.did_buffer_overflow):
+        raise InputError(
+            "jax-md's neighbour list overflowed: pairs are missing",
+            remedy="Allocate it again: `neighbours = neighbour_fn.allocate(position)`.",
+        )
+    pairs = index.T[(index < count).all(axis=0)]  # places not used name particle N
+    return list_edges(pairs, count, index.shape[1] if capacity is None else capacity, dtype)
 
 
 def jaxdem_force_model(sides: HalfContact) -> Any:
