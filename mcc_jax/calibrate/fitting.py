@@ -61,7 +61,7 @@ def prepare(
     model, told = in_own_units(campaign, model)
     tell("selecting points")
     selection = select(campaign, threshold_MPa=threshold_MPa, most_points=most_points)
-    selection = replace(selection, notes=(*selection.notes, *told))
+    selection = selection if told is None else replace(selection, notes=(*selection.notes, told))
     require_same(selection.tests)
     size = (block or block_size(len(selection.tests))) if fill_up else len(selection.tests)
     tests = filled_up(selection.tests, size) if fill_up else selection.tests
@@ -73,14 +73,14 @@ def prepare(
     return selection, found, size
 
 
-def in_own_units(campaign: Campaign, model: Model) -> tuple[Model, tuple[str, ...]]:
+def in_own_units(campaign: Campaign, model: Model) -> tuple[Model, str | None]:
     """The model with priors in the campaign's own stress and strain, if its material is not like cellulose, and what a
-    reader must know of it. Priors that were given stay."""
+    reader must know of it; None where nothing was changed. Priors that were given stay."""
     material = other_material(campaign) if model.priors is None else None
     if material is None:
-        return model, ()
+        return model, None
     priors = Priors.of_scale(material.stress_MPa, material.strain, model.unloading)
-    return replace(model, priors=priors), (OWN_UNITS.format(material.stress_MPa, material.strain),)
+    return replace(model, priors=priors), OWN_UNITS.format(material.stress_MPa, material.strain)
 
 
 OWN_UNITS = (
