@@ -24,9 +24,8 @@ import numpy as np
 
 import mcc_jax as mcc
 from mcc_jax.calibrate.forward import Forms, Point
-from mcc_jax.calibrate.linearisation import linear_data
+from mcc_jax.calibrate.linearisation import linear_data, score_of_effects
 from mcc_jax.calibrate.noise import Noise
-from mcc_jax.calibrate.starts import score_of_effects
 from mcc_jax.effects import find_variant
 
 RESULTS = Path(__file__).parent / "results"

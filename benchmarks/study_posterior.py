@@ -27,7 +27,7 @@ import numpy as np
 
 from mcc_jax import HiddenEffect
 from mcc_jax.calibrate import LogNormalPrior, Model, NakagamiPrior, NormalPrior, Priors, sample
-from mcc_jax.calibrate.effects import effect_numbers
+from mcc_jax.calibrate.estimates import effect_numbers
 from mcc_jax.calibrate.mode import prior_populations
 from mcc_jax.campaign import PAPER_DIAMETERS_UM, particle_batch
 from mcc_jax.geometry import Particle

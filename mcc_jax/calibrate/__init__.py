@@ -3,6 +3,7 @@
 from .arviz import to_arviz as to_arviz
 from .arviz import write_posterior as write_posterior
 from .curves import FittedCurve as FittedCurve
+from .data import point_noise_um as point_noise_um
 from .data import select_tests as select_tests
 from .evidence import Evidence as Evidence
 from .evidence import compare as compare
@@ -16,13 +17,13 @@ from .many_campaigns import calibrate_many as calibrate_many
 from .model import Model as Model
 from .paper.calibrate import PaperCalibration as PaperCalibration
 from .paper.calibrate import calibrate_paper as calibrate_paper
+from .paper.loading import MasterCurve as MasterCurve
 from .paper.loading import PlasticFit as PlasticFit
+from .paper.loading import StrainTable as StrainTable
 from .paper.loading import fit_polynomial as fit_polynomial
 from .paper.loading import fit_population as fit_population
-from .paper.master_curve import MasterCurve as MasterCurve
-from .paper.master_curve import StrainTable as StrainTable
-from .paper.master_curve import master_curve as master_curve
-from .paper.master_curve import strain_table as strain_table
+from .paper.loading import master_curve as master_curve
+from .paper.loading import strain_table as strain_table
 from .paper.modulus import MIN_RATIO as MIN_RATIO
 from .paper.modulus import ElasticBranch as ElasticBranch
 from .paper.modulus import ElasticFit as ElasticFit
@@ -30,7 +31,6 @@ from .paper.modulus import campaign_branches as campaign_branches
 from .paper.modulus import elastic_branches as elastic_branches
 from .paper.modulus import fit_effective_modulus as fit_effective_modulus
 from .paper.prediction import ParticleFit as ParticleFit
-from .paper.prediction import point_noise_um as point_noise_um
 from .paper.prediction import predict_particles as predict_particles
 from .paper.shape import Objective as Objective
 from .paper.shape import ShapeFit as ShapeFit

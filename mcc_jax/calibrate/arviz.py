@@ -15,7 +15,7 @@ from .._extras import extra
 from ..law import MccLaw
 from .compiling import compiled
 from .data import Tests
-from .effects import effect_numbers
+from .draws import named_population
 from .mode import log_priors, prior_populations
 from .model import Model
 from .noise import Whitening, standard_promotion
@@ -27,27 +27,29 @@ from .settings import SAMPLING
 if TYPE_CHECKING:
     from xarray import DataTree
 
-UNITS = {
-    "a": "1",
-    "effective_modulus_MPa": "MPa",
-    "mu": "1",
-    "tau": "1",
-    "modulus_scatter": "1",
-    "shape_scatter": "1",
-    "noise_factor": "1",
-    "yield_stress_MPa": "MPa",
-    "C": "1 (MPa^(1/k))",
-    "particle_modulus_MPa": "MPa",
-    "zero_um": "um",
-    "eta_p": "1",
-    "displacement_um": "um",
-    "force_mN": "mN",
-    "diameters_um": "um",
-    "test": "nat",
-    "mask": "1",
-    "pareto_k": "1",
-    "lp_test": "nat",
+VARIABLES: dict[str, tuple[str, list[str]]] = {
+    "a": ("1", []),
+    "effective_modulus_MPa": ("MPa", []),
+    "mu": ("1", ["coefficient"]),
+    "tau": ("1", ["coefficient"]),
+    "modulus_scatter": ("1", []),
+    "shape_scatter": ("1", []),
+    "noise_factor": ("1", []),
+    "yield_stress_MPa": ("MPa", []),
+    "C": ("1 (MPa^(1/k))", ["particle", "coefficient"]),
+    "particle_modulus_MPa": ("MPa", ["particle"]),
+    "zero_um": ("um", ["particle"]),
+    "eta_p": ("1", ["particle"]),
+    "displacement_um": ("um", ["particle", "point"]),
+    "force_mN": ("mN", ["particle", "point"]),
+    "diameters_um": ("um", ["particle", "axis"]),
+    "test": ("nat", ["particle"]),
+    "mask": ("1", ["particle", "point"]),
+    "points": ("1", ["particle"]),
+    "pareto_k": ("1", ["particle"]),
+    "lp_test": ("nat", []),
 }
+"""Unit and dimensions of what stands in the groups."""
 
 
 def prior_draws(calibration: Posterior, count: int, seed: int) -> dict[str, np.ndarray]:
@@ -59,13 +61,10 @@ def prior_draws(calibration: Posterior, count: int, seed: int) -> dict[str, np.n
 
 def _variables(p: Population, model: Model) -> dict[str, np.ndarray]:
     """The population by the names of the model's sites; of ArviZ's `mu` and `tau` all three in one."""
-    mu, tau = np.asarray(p.mu), np.asarray(p.tau)
-    named = {"a": np.asarray(p.a), "effective_modulus_MPa": np.exp(np.asarray(p.log_modulus)), "mu": mu, "tau": tau}
-    for j, name in enumerate(COEFFICIENTS):
-        named |= {f"{name}_median": np.exp(mu[..., j]), f"tau_{name}": tau[..., j]}
-    for name, there in (("modulus_scatter", model.modulus_scatter), ("shape_scatter", model.shape_scatter)):
-        named |= {name: np.asarray(getattr(p, name))} if there else {}
-    return named | effect_numbers(p, model) | {"noise_factor": np.exp(np.asarray(p.log_noise))}
+    mu = np.asarray(p.mu)
+    named = {name: values for name, values in named_population(p, model).items() if not name.startswith("mu_")}
+    medians = {f"{name}_median": np.exp(mu[..., j]) for j, name in enumerate(COEFFICIENTS)}
+    return {"mu": mu, "tau": np.asarray(p.tau)} | medians | named
 
 
 def to_arviz(calibration: Posterior, *, prior_count: int = 500, points: bool = False, seed: int = 0) -> DataTree:
@@ -116,29 +115,20 @@ def to_arviz(calibration: Posterior, *, prior_count: int = 500, points: bool = F
     shown, predicted, before = _predictive(c, prior, seed, thin if points else None)
     observed = np.where(mask, np.asarray(tests.displacement), np.nan)
     likelihood: dict[str, Any] = {"test": c.log_likelihood[:, thin]}
-    along = ["particle", "point"]
-    if points:
-        likelihood = {"displacement_um": _point_likelihoods(c, thin)[..., mask]}
-        observed, along = observed[mask], ["observation"]
-        predicted, before = (x[..., mask[:shown]] for x in (predicted, before))
-    one_each = ("zero_um", "eta_p", "particle_modulus_MPa", "test", "pareto_k", "points")
-    one_each += tuple(f"particle_{name}" for name in c.model.varying_places)
-    dims = {
-        **{name: ["coefficient"] for name in ("mu", "tau")},
-        "C": ["particle", "coefficient"],
-        **{name: ["particle"] for name in one_each},
-        "diameters_um": ["particle", "axis"],
-        **{name: ["particle", "point"] for name in ("force_mN", "mask")},
-        "displacement_um": along,
-    }
+    dims = {name: dimensions for name, (_, dimensions) in VARIABLES.items() if dimensions}
+    dims |= {f"particle_{name}": ["particle"] for name in c.model.varying_places}
     coords: dict[str, Any] = {
         "particle": particles,
         "coefficient": list(COEFFICIENTS),
         "point": np.arange(mask.shape[1]),
         "axis": ["D1", "D2", "D3"],
     }
+    some = coords | {"particle": particles[:shown]}
     if points:
-        coords["observation"] = np.arange(mask.sum())
+        likelihood = {"displacement_um": _point_likelihoods(c, thin)[..., mask]}
+        observed, dims["displacement_um"] = observed[mask], ["observation"]
+        coords["observation"], some["observation"] = np.arange(mask.sum()), np.arange(mask[:shown].sum())
+        predicted, before = (x[..., mask[:shown]] for x in (predicted, before))
     constant = {
         "force_mN": np.asarray(tests.force),
         "diameters_um": c.campaign.diameters_um[list(c.selection.kept)],
@@ -156,17 +146,14 @@ def to_arviz(calibration: Posterior, *, prior_count: int = 500, points: bool = F
         "constant_data": constant,
     }
     tree = from_dict(groups, coords=coords, dims=dims)
-    some = coords | {"particle": particles[:shown]}
-    if points:
-        some["observation"] = np.arange(mask[:shown].sum())
     curves = from_dict(
         {"posterior_predictive": {"displacement_um": predicted}, "prior_predictive": {"displacement_um": before}},
-        coords={name: some[name] for name in along},
-        dims={"displacement_um": along},
+        coords={name: some[name] for name in dims["displacement_um"]},
+        dims={"displacement_um": dims["displacement_um"]},
     )
     for group in ("posterior_predictive", "prior_predictive"):
         tree[group] = curves[group]
-    units = UNITS | {v.mechanism: v.unit for v in c.model.effects}
+    units = {name: unit for name, (unit, _) in VARIABLES.items()} | {v.mechanism: v.unit for v in c.model.effects}
     units |= {f"{v.mechanism}.{n.name}": n.name.rpartition("_")[2] for v in c.model.effects for n in v.nuisances}
     for group in tree.children.values():
         for name, variable in group.data_vars.items():

@@ -75,12 +75,7 @@ def fitted_curves(
 ) -> tuple[FittedCurve, ...]:
     """The tests of a campaign beside its calibrated law. Needs double precision, as calibration does.
 
-    Args:
-        content: the contents of its `calibration.json`.
-        campaign: the tests.
-        compared: see `Calibration.compared`.
-        predictions: see `Calibration.predictions`.
-        variants: formulas of effects that are not in the library.
+    For `compared` and `predictions` see `Calibration`; `variants` are formulas that are not in the library.
     """
     segments = campaign_segments(campaign)
     shown = [_measured(campaign, i, parts, compared.get(i)) for i, parts in enumerate(segments)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -27,10 +27,9 @@ from ..campaign import (
 )
 from ..campaign.reasons import SHOWN, below_threshold, far_apart, no_climb, no_loading, refusal, too_few
 from ..campaign.record import humidities, record_columns
+from ..campaign.signal import point_noise
 from ..effects import Record
 from ..geometry import Particle
-from .paper.modulus import MIN_RATIO
-from .paper.prediction import point_noise_um
 from .settings import PAPER, SELECTION
 
 
@@ -96,15 +95,6 @@ class Tests(eqx.Module):
     def effective_diameter(self) -> Float[Array, " particles"]:
         """D1 D2/D3 of every particle [um]."""
         return eqx.filter_vmap(lambda particle: particle.effective_diameter)(self.particle)
-
-
-def enlarged(tests: Tests, particles: int) -> Tests:
-    """The same tests among as many: copies of the last particle are added that count for nothing.
-
-    Every particle gets a weight, whether copies are needed or not: one kind of arrays, one compilation.
-    """
-    weight = np.ones(len(tests)) if tests.weight is None else np.asarray(tests.weight)
-    return replace(longer(tests, particles), weight=jnp.asarray(np.pad(weight, (0, particles - len(tests)))))
 
 
 def longer(tree: Any, particles: int) -> Any:
@@ -189,9 +179,8 @@ def select(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_poi
     used = [one for one in prepared if not isinstance(one, str)]
     longest = padded_length(max(len(one.rows) for one in used))
 
-    def padded(values: list[np.ndarray], fill: str) -> np.ndarray:
-        options = {"mode": "edge"} if fill == "edge" else {"mode": "constant", "constant_values": False}
-        return np.stack([np.pad(v, (0, longest - len(v)), **options) for v in values])  # pyright: ignore[reportCallIssue, reportArgumentType]
+    def padded(values: list[np.ndarray], mode: Literal["edge", "constant"] = "constant") -> np.ndarray:
+        return np.stack([np.pad(v, (0, longest - len(v)), mode=mode) for v in values])
 
     curves = [campaign.curves[i] for i in kept]
     records = records_of(campaign, kept, segments, [one.rows for one in used], longest)
@@ -202,8 +191,8 @@ def select(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_poi
         particle_batch(campaign.diameters_um[list(kept)]),
         records.record,
         jnp.asarray(padded([c.displacement_um[one.rows] for c, one in zip(curves, used, strict=True)], "edge"), float),
-        jnp.asarray(padded([one.mask for one in used], "false")),
-        jnp.asarray(padded([one.loading for one in used], "false")),
+        jnp.asarray(padded([one.mask for one in used])),
+        jnp.asarray(padded([one.loading for one in used])),
         jnp.asarray([one.contact for one in used]),
         jnp.asarray(np.cumsum(changes, axis=1) / force.max(axis=1, keepdims=True)),
         jnp.asarray(branch),
@@ -269,10 +258,9 @@ def records_of(
     """Records of some tests at some of their rows, padded with the last one.
 
     Args:
-        campaign: the tests.
-        places: which of them.
+        places: which tests.
         segments: of all tests.
-        rows: of those.
+        rows: of the chosen ones.
         longest: length to pad to.
     """
     humidity = humidities(campaign)
@@ -352,7 +340,7 @@ def _prepare(
     rows = rows_from_contact(curve, segments, most_points)
     peak = np.maximum.accumulate(stress[rows])
     loading = (kind[rows] == "load") & (stress[rows] >= threshold) & (stress[rows] > 0)
-    elastic = np.isin(kind[rows], ("hold", "unload", "reload")) & (stress[rows] >= MIN_RATIO * peak)
+    elastic = np.isin(kind[rows], ("hold", "unload", "reload")) & (stress[rows] >= PAPER.unloaded_from * peak)
     mask = loading | (elastic & (stress[rows] >= threshold) & (peak > 0))
     hidden = bool((mask & ~loading).any())
     mask, loading = mask & curve.compared[rows], loading & curve.compared[rows]
@@ -371,6 +359,12 @@ def _prepare(
     return _Prepared(rows, mask, loading, contact, largest, reach, hidden)
 
 
+def point_noise_um(curve: Curve) -> float:
+    """Standard deviation of displacement from point to point [um]: second differences cancel any smooth course."""
+    arguments.instance(curve, Curve, "curve", "Make one with mcc_jax.Curve(time_s, force_mN, displacement_um).")
+    return point_noise(curve.displacement_um)
+
+
 def ranges_um(tests: Tests) -> np.ndarray:
     """Range of the displacements that are compared, of every test [um], shape (N,)."""
     mask, measured = np.asarray(tests.mask), np.asarray(tests.displacement)
@@ -381,11 +375,6 @@ def root_mean_squares(tests: Tests, residual: Array | np.ndarray) -> np.ndarray:
     """Root mean square of every test's residuals [um], shape (N,); residuals are 0 where masked."""
     count = np.maximum(np.asarray(tests.mask).sum(1), 1)
     return np.sqrt((np.asarray(residual) ** 2).sum(1) / count)
-
-
-def own_misfit(tests: Tests, residual: Float[Array, "particles points"]) -> float:
-    """Median over the particles of the root mean square residual, in shares of the range of displacement [-]."""
-    return float(np.median(root_mean_squares(tests, residual) / np.maximum(ranges_um(tests), 1e-300)))
 
 
 def _notes(campaign: Campaign, kept: tuple[int, ...], used: Sequence[_Prepared], most_points: int):

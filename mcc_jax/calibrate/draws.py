@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -12,10 +11,11 @@ import numpy as np
 from jaxtyping import Array
 
 from .compiling import compiled
-from .effects import effect_numbers
+from .estimates import effect_numbers
 from .fit_result import Fit
 from .importance import diagnostics, sample_weighted
 from .mode import LogPosterior, density_of, populations
+from .model import Model
 from .noise import standard_promotion
 from .particles import Drawer, ExactLikelihood, Length, chunk_of, corrected, every, stride_of, weighted
 from .population import COEFFICIENTS, Population
@@ -79,30 +79,21 @@ def draw_fast(key: Array, fit: Fit, length: Length, block: int, *, patient: bool
 
     Without patience, and where the fit did not converge, the sampler never runs, which takes minutes there: the draws
     are then those of the proposal.
-
-    Args:
-        key: random key.
-        fit: the fit to draw around.
-        length: how many draws.
-        block: particles of a block, as they were fitted; 0 for a single one.
-        patient: see above.
     """
     count, exact = count_of(fit.tests), exact_likelihood(fit)
     population_key, particle_key, check_key, pick_key = jax.random.split(key, 4)
     few = stride_of(count, length.total) == 1
     patient = patient and bool(np.all(np.asarray(fit.converged)[1:]))
     run, good, (integral, error) = _sampled(population_key, fit, length, not few, patient)
-    population = run.population
-    names, stacked = _stack(population, fit, length)
-    flat = stacked.reshape(length.total, -1)
     if few:
-        found = weighted(Drawer(exact, block, chunk_of(length.total)), population, length, check_key, pick_key)
+        drawer = Drawer(exact, block, chunk_of(length.total))
+        found = weighted(drawer, run.population, length, check_key, pick_key)
     else:
-        keys = check_key, pick_key, particle_key
-        found = corrected(Drawer(exact, block, SAMPLING.probes), population, flat, length, *keys)
-    stacked, population = flat[found.chosen].reshape(stacked.shape), every(population, found.chosen)
-    run = run._replace(population=population)
-    drawn = _collected(run, names, stacked, found.particles[:4], fit, length, found.keep)
+        drawer = Drawer(exact, block, SAMPLING.probes)
+        parameters = _stack(run.population, fit, length)[1].reshape(length.total, -1)
+        found = corrected(drawer, run.population, parameters, length, check_key, pick_key, particle_key)
+    run = run._replace(population=every(run.population, found.chosen))
+    drawn = _collected(run, found.particles[:4], fit, length, found.keep)
     k_joint = found.k_joint if good else np.inf
     value = integral + found.log_ratio[0] + float(fit.noise.log_evidence)
     evidence = value, float(np.hypot(error, found.log_ratio[1]))
@@ -164,10 +155,7 @@ def _sample_density(
         value = -target.log_density(mode + factor @ z)
         return jnp.where(jnp.isnan(value), jnp.inf, value)
 
-    options: dict[str, Any] = {
-        "target_accept_prob": SAMPLING.fallback_accept,
-        "max_tree_depth": SAMPLING.tree_depth,
-    }
+    options: dict[str, Any] = {"target_accept_prob": SAMPLING.fallback_accept, "max_tree_depth": SAMPLING.tree_depth}
 
     def chain(key: Array) -> tuple[Array, Array, Array]:
         kernel = NUTS(potential_fn=potential, **options)
@@ -204,8 +192,7 @@ def draw_joint(key: Array, fit: Fit, length: Length) -> Draws:
     sites = {name: jnp.asarray(samples[name]) for name in (*fit.names, "own")}
     population, particles = jax.tree.map(np.asarray, _explicit(sites, fit.target))
     run = Run(population, int(np.sum(extra["diverging"])), float(np.mean(extra["num_steps"])))
-    names, stacked = _stack(population, fit, length)
-    return _collected(run, names, stacked, particles, fit, length)
+    return _collected(run, particles, fit, length)
 
 
 @compiled
@@ -220,22 +207,14 @@ def _explicit(sites: dict[str, Array], target: LogPosterior) -> tuple[Population
     return jax.lax.map(one, sites)
 
 
-def _collected(
-    run: Run,
-    names: list[str],
-    stacked: np.ndarray,
-    particles: Any,
-    fit: Fit,
-    length: Length,
-    keep: int = 1,
-) -> Draws:
+def _collected(run: Run, particles: Any, fit: Fit, length: Length, keep: int = 1) -> Draws:
     """What the results of both modes have in common; of the population every `keep`-th draw of each chain."""
 
     def shaped(x: Any) -> np.ndarray:
         return np.asarray(x).reshape(length.chains, length.draws, *x.shape[1:])[:, ::keep]
 
     population = jax.tree.map(shaped, run.population)
-    rhat, bulk, tail = diagnostics(names, stacked)
+    rhat, bulk, tail = diagnostics(*_stack(run.population, fit, length))
     count = count_of(fit.tests)
     latent, theta, zero, likelihood = (np.asarray(v) for v in particles)
     flatness = np.asarray(fit.marginal.flatness)[:count]
@@ -262,9 +241,9 @@ def _collected(
     )
 
 
-def named_numbers(population: Population, fit: Fit) -> Mapping[str, np.ndarray]:
-    """Draws of everything that all particles share, by the names of coordinates that a diagnostic is worked out of."""
-    p, model = population, fit.model
+def coordinates_of(population: Population, model: Model) -> dict[str, np.ndarray]:
+    """Draws of everything that all particles share, in the coordinates that diagnostics are worked out of."""
+    p = population
     columns = {"a": p.a, "log_modulus": p.log_modulus}
     columns |= {f"mu_{n}": p.mu[..., j] for j, n in enumerate(COEFFICIENTS)}
     columns |= {f"tau_{n}": p.tau[..., j] for j, n in enumerate(COEFFICIENTS)}
@@ -277,6 +256,13 @@ def named_numbers(population: Population, fit: Fit) -> Mapping[str, np.ndarray]:
     return {name: np.asarray(v) for name, v in columns.items()}
 
 
+def named_population(population: Population, model: Model) -> dict[str, np.ndarray]:
+    """The same by the names used in files: modulus and factor on the noise in place of their logarithms."""
+    named = coordinates_of(population, model)
+    powers = {"log_modulus": "effective_modulus_MPa", "noise_factor": "noise_factor"}
+    return {powers.get(name, name): np.exp(v) if name in powers else v for name, v in named.items()}
+
+
 def _stack(population: Population, fit: Fit, length: Length) -> tuple[list[str], np.ndarray]:
-    columns = named_numbers(population, fit)
+    columns = coordinates_of(population, fit.model)
     return list(columns), np.stack([v.reshape(length.chains, length.draws) for v in columns.values()], -1)

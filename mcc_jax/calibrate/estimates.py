@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from ..campaign import Curve
+from .model import Model
+from .population import Population
 from .settings import JUDGEMENT
 
 NO_SAMPLER: dict[str, None] = dict.fromkeys(("rhat_max", "ess_bulk_min", "divergences", "pareto_k_max"))
@@ -25,13 +28,8 @@ def misfit_note(own_misfit: float) -> str | None:
     )
 
 
-def missed(rms_um: np.ndarray, share: float) -> str:
-    """How far the law is from the tests, in words, from every particle's root mean square and `own_misfit`."""
-    return f"{np.median(rms_um):.2g} um, {100 * share:.2g} % of their range (medians)"
-
-
 def noise_note(share: float, by: str) -> str | None:
-    """A sentence if correlated noise has taken up what the law misses, `by` so much (`missed`), else None."""
+    """A sentence if correlated noise has taken up what the law misses, `by` so much, else None."""
     if not share > JUDGEMENT.noise_share:
         return None
     return (
@@ -62,8 +60,12 @@ def force_zero(curve: Curve) -> dict[str, Any]:
     checked = curve.checked
     if checked is None or not (checked.force_zero_mN or checked.force_zero_sd_mN):
         return estimate(None)
-    value, sd = checked.force_zero_mN, checked.force_zero_sd_mN
-    return estimate(value, sd, (value - 1.96 * sd, value + 1.96 * sd))
+    return normal_estimate(checked.force_zero_mN, checked.force_zero_sd_mN)
+
+
+def normal_estimate(value: float, sd: float, least: float = -math.inf) -> dict[str, Any]:
+    """An estimate with a normal error, cut off below `least`; without error where it is not finite."""
+    return estimate(value, sd, (max(value - 1.96 * sd, least), value + 1.96 * sd))
 
 
 def summary(draws: np.ndarray) -> dict[str, Any]:
@@ -87,3 +89,36 @@ def power_of_e(log: float) -> float:
         return math.exp(log)
     except OverflowError:
         return math.inf
+
+
+def effect_numbers(population: Population, model: Model) -> dict[str, np.ndarray]:
+    """Numbers of the effects by the names of their sites, with the leading axes of the population."""
+    theta, spread = np.asarray(population.theta), np.asarray(population.theta_scatter)
+    named = {name: theta[..., k] for k, name in enumerate(model.forms.names)}
+    return named | {f"tau_{name}": spread[..., j] for j, name in enumerate(model.varying_places)}
+
+
+def effect_entries(model: Model, draws: Mapping[str, Any], estimates: bool = False) -> list[dict[str, Any]]:
+    """Entries of `calibration.json`, one for each effect.
+
+    `draws` are those of every number by the name of its site, or estimates already.
+    """
+
+    def told(name: str) -> dict[str, Any]:
+        value = draws[name]
+        return value if estimates else (summary(value) if np.ndim(value) else estimate(float(value)))
+
+    entries = []
+    for v in model.effects:
+        parameters = {v.parameter: told(v.mechanism)}
+        parameters |= {n.name: told(f"{v.mechanism}.{n.name}") for n in v.nuisances}
+        entry: dict[str, Any] = {
+            "mechanism": v.mechanism,
+            "variant": v.name,
+            "equation": v.equation,
+            "parameters": parameters,
+        }
+        if v.mechanism in model.varying:
+            entry["differs_between_particles"] = told(f"tau_{v.mechanism}")
+        entries.append(entry)
+    return entries

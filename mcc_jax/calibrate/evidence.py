@@ -13,7 +13,7 @@ from .._errors import InputError
 from .._format import described
 from ..campaign import THRESHOLD_MPA, Campaign, check_tests
 from .fit_result import Fit
-from .fitting import checked_settings, in_own_units, prepare
+from .fitting import checked_settings, prepare
 from .importance import smoothed
 from .judgement import numbers_in_reach
 from .model import Model
@@ -44,7 +44,6 @@ def fit(
     campaign = check_tests(campaign)
     tell, model, threshold_MPa = checked_settings(progress, model, threshold_MPa, None)
     with numbers_in_reach(campaign):
-        model, _ = in_own_units(campaign, model)
         _, found, _ = prepare(campaign, model, threshold_MPa, fill_up=False, tell=tell)
     return found
 

@@ -16,22 +16,19 @@ from .._errors import InputError
 from .._memory import make_room
 from ..campaign import THRESHOLD_MPA, Campaign, other_material
 from .compiling import compiled
-from .data import Selection, Tests, select
+from .data import Selection, Tests, point_noise_um, select
 from .distributions import SpreadCoordinate
-from .expectation import careful_enough, expect
 from .fit_result import Fit, population_of
 from .forward import Point
-from .linearisation import Linearisation, linear_data
+from .linearisation import Linearisation, linear_data, start_of_effects
 from .marginal import Marginal, summarise
-from .mode import LogPosterior, gradients, most_probable
-from .model import Model, check_prior_of_a
+from .mode import LogPosterior, careful_enough, expect, gradients, most_probable
+from .model import Model
 from .noise import Noise, NoiseFit, estimate_noise, particle_scales, squared_innovations, student_weights
-from .paper.prediction import point_noise_um
 from .particle_fit import ParticleFits, fit_particles, linear_starts
-from .priors import Priors
+from .priors import Priors, check_prior_of_a
 from .settings import FIT, SELECTION
 from .sharding import Blocks, Parts, block_size, count_of, filled_up, require_same
-from .starts import start_of_effects
 
 
 def prepare(
@@ -48,13 +45,10 @@ def prepare(
     """What every calibration begins with: points and particles selected, filled up to blocks, and fitted.
 
     Args:
-        campaign: the tests.
-        model: what is assumed, its priors as `in_own_units` has them.
-        threshold_MPa: points below this stress on loading do not count [MPa].
+        model: what is assumed; its priors become the campaign's own where they have to (`in_own_units`).
         fill_up: let copies that count for nothing make up whole blocks; if False, all particles are one block.
         block: particles of a block; by default `block_size` of their number.
         most_points: records longer than this are thinned.
-        tell: called with the name of each step.
         settings: of `fit_tests`.
 
     Returns:
@@ -62,13 +56,12 @@ def prepare(
 
     Raises:
         InputError: if no particle can be used, numbers overflow, or processes were given different tests.
-        ValueError: for blocks of no particles.
     """
-    if block is not None and block < 1:
-        raise ValueError(f"a block must have at least one particle, got {block}")
     make_room()
+    model, told = in_own_units(campaign, model)
     tell("selecting points")
     selection = select(campaign, threshold_MPa=threshold_MPa, most_points=most_points)
+    selection = selection if told is None else replace(selection, notes=(*selection.notes, told))
     require_same(selection.tests)
     size = (block or block_size(len(selection.tests))) if fill_up else len(selection.tests)
     tests = filled_up(selection.tests, size) if fill_up else selection.tests
@@ -81,16 +74,9 @@ def prepare(
 
 
 def in_own_units(campaign: Campaign, model: Model) -> tuple[Model, str | None]:
-    """The model with priors in the campaign's own stress and strain, if its material is not like cellulose.
-
-    Priors that were given stay.
-
-    Returns:
-        The model, and what a reader must know; None where nothing was changed.
-    """
-    if model.priors is not None:
-        return model, None
-    material = other_material(campaign)
+    """The model with priors in the campaign's own stress and strain, if its material is not like cellulose, and what a
+    reader must know of it; None where nothing was changed. Priors that were given stay."""
+    material = other_material(campaign) if model.priors is None else None
     if material is None:
         return model, None
     priors = Priors.of_scale(material.stress_MPa, material.strain, model.unloading)
@@ -106,15 +92,12 @@ OWN_UNITS = (
 def beyond_numbers(campaign: Campaign, selection: Selection) -> InputError:
     """The error of tests whose fit ends in no numbers, with the ranges that it was asked to describe."""
     tests = selection.tests
-    mask = np.asarray(tests.mask)
-    stress = 1e3 * np.asarray(tests.force) / (np.pi * np.asarray(tests.effective_diameter)[:, None] ** 2 / 4)
-    strain = np.asarray(tests.displacement) - np.asarray(tests.contact)[:, None]
-    strain = np.abs(strain) / np.asarray(tests.effective_diameter)[:, None]
-    top = np.where(mask, stress, 0.0).max(1)
-    deepest = np.where(mask, strain, 0.0).max(1)
+    size = np.asarray(tests.effective_diameter)[:, None]
+    stress = 1e3 * np.asarray(tests.force) / (np.pi * size**2 / 4)
+    strain = np.abs(np.asarray(tests.displacement) - np.asarray(tests.contact)[:, None]) / size
+    top, deepest = (np.where(np.asarray(tests.mask), x, 0.0).max(1) for x in (stress, strain))
+    most, deep = int(np.argmax(top)), int(np.argmax(deepest))
     names = [repr(campaign.particles[i]) for i in selection.kept]
-    most = int(np.argmax(top))
-    deep = int(np.argmax(deepest))
     return InputError(
         "the law cannot be fitted to these tests: their numbers overflow; the largest stress is "
         f"{top[most]:.3g} MPa (particle {names[most]}), the largest displacement {deepest[deep]:.3g} times the size "
@@ -125,55 +108,115 @@ def beyond_numbers(campaign: Campaign, selection: Selection) -> InputError:
 
 
 class _Fitter:
-    """The turns of a fit: what stays the same in all of them."""
+    """A fit under way.
+
+    Attributes:
+        tests, own: all tests with the weights of their readings, and this process's own.
+        weighted: the same as inference takes them.
+        individual: every particle on its own.
+        point, linear: the particles, and the tests linearised there.
+        noise: the noise.
+        marginal, filters, white: summaries under it, this process's own filters, and white noise of equal weight.
+    """
 
     def __init__(self, tests: Tests, model: Model, blocks: Blocks, tell: Callable[[str], None]) -> None:
-        self.tests, self.model, self.blocks, self.tell = tests, model, blocks, tell
+        self.model, self.blocks, self.tell = model, blocks, tell
+        self.tests, self.count = tests, count_of(tests)
         if model.robust:
             self.tests = replace(tests, reading_weight=jnp.asarray(np.ones(tests.mask.shape)))
-        self.count, self.own = count_of(tests), blocks.cut(self.tests)
-        self.linear = Linearisation(self.tests, model, blocks)
+        self.own = blocks.cut(self.tests)
         self.weighted = self.tests, self.own
-        self.flatness = tests.flatness
+        self.linearisation = Linearisation(self.own, self.count, model, blocks)
         self.varying = tuple(k for k, _ in model.scatter.varying)
 
-    def summaries(self, point: Point, linear: Parts, noise: Noise) -> tuple[Marginal, Parts, Array]:
-        """All particles' summaries, this process's own filters, and the white noise of equal weight."""
+    def begin(self, read_out_um: float) -> dict[str, float]:
+        """Every particle on its own, and from which values of the model's sites to look for the population."""
+        model, N = self.model, len(self.tests)
+        self.individual = self.alone(np.full(N, read_out_um))
+        self.point = self.individual.point
+        noise = Noise.of([read_out_um, *np.asarray(model.chosen_priors.noise.median)[1:]], jnp.asarray(np.ones(N)))
+        self.noise = NoiseFit.unsure(noise, converged=True)
+        latent, flatness = (np.asarray(v)[: self.count] for v in (self.point.latent, self.tests.flatness))
+        start = _start(latent, flatness, model)
+        self.linear = self.linearisation.at(self.point)
+        if model.effects:
+            sites, theta = start_of_effects(self.point, self.own, self.count, self.linear, noise, model, self.blocks)
+            start |= sites
+            self.point = replace(self.point, theta=jnp.asarray(np.broadcast_to(theta, self.point.theta.shape)))
+            self.linear = self.linearisation.at(self.point)
+        return start
+
+    @property
+    def residual(self) -> Array:
+        """Measured less predicted displacement at the point [um]."""
+        return self.blocks.whole(self.linear.map(lambda wave: wave.residual))
+
+    # ---- noise -------------------------------------------------------------------------------------------------------
+
+    def summaries(self, point: Point, linear: Parts) -> tuple[Marginal, Parts, Array]:
+        """`marginal`, `filters` and `white` of any point."""
         m, cut = self.model, self.blocks.cut
         kinds = m.zero_prior, m.scatter, m.correlation, m.along
-        places = cut(point), cut(self.linear.straight)
-        found = self.blocks.each(summarise, *places, self.weighted[1], linear, cut(noise), *kinds)
-        marginal, filters, white = (Parts(tuple(wave[k] for wave in found.waves)) for k in range(3))
+        places = cut(point), cut(self.linearisation.straight)
+        found = self.blocks.each(summarise, *places, self.weighted[1], linear, cut(self.noise.noise), *kinds)
+        marginal, filters, white = (found.map(lambda wave, k=k: wave[k]) for k in range(3))
         return self.blocks.whole(marginal), filters, self.blocks.whole(white)
 
-    def weigh(self, filters: Parts, linear: Parts, noise: Noise) -> None:
-        """Weights of the readings under Student noise, anew; `weighted` are the tests as inference takes them."""
-        blocks = self.blocks
-        squares = np.asarray(
-            blocks.whole(blocks.each(squared_innovations, self.weighted[1], filters, linear, blocks.cut(noise)))
+    def summarise(self) -> None:
+        """Summarise the tests at the point, under the noise."""
+        self.marginal, self.filters, self.white = self.summaries(self.point, self.linear)
+
+    def take_noise(self, *, uncertainty: bool) -> None:
+        """The noise of what the particles leave, with weights of readings and the particles' own scales; summaries
+        under it."""
+        self.estimate_noise(uncertainty)
+        self.summarise()
+        for _ in range(FIT.student_steps if self.model.robust else 0):
+            self.weigh()
+            self.estimate_noise(uncertainty)
+            self.summarise()
+        old, count = np.asarray(self.noise.noise.scale), self.count
+        squares, points = np.asarray(self.marginal.gram)[:, -1, -1], np.asarray(self.marginal.count)
+        scale = particle_scales(old[:count], squares[:count], points[:count] - 4)
+        scale = np.pad(scale, (0, len(old) - count), mode="edge")
+        if np.any(scale != old):
+            self.noise = replace(self.noise, noise=replace(self.noise.noise, scale=jnp.asarray(scale)))
+            self.summarise()
+
+    def take_white_noise(self) -> None:
+        """White noise of the residuals' median modulus, which outliers do not move; summaries under it."""
+        residual, mask = np.asarray(self.residual)[: self.count], np.asarray(self.tests.mask)[: self.count]
+        width = max(1.4826 * np.median(np.abs(residual[mask])), 1e-9)
+        noise = Noise.of([width, 0.0, 0.0, 1.0], jnp.asarray(np.ones(len(self.tests))))
+        self.noise = replace(self.noise, noise=noise)
+        self.summarise()
+
+    def estimate_noise(self, uncertainty: bool) -> None:
+        """The four numbers of the noise, of very many particles from some of them."""
+        self.tell("estimating the noise")
+        m, blocks, own, linear, start = self.model, self.blocks, self.own, self.linear, self.noise.noise
+        if blocks.number > FIT.noise_blocks:
+            rows = np.linspace(0, self.count - 1, FIT.noise_blocks * blocks.size).astype(int)
+            blocks = Blocks(len(rows), blocks.size)
+            own = blocks.cut(_rows(self.tests, rows))
+            linear = blocks.each(linear_data, blocks.cut(_rows(self.point, rows)), own, m.forms)
+            start = replace(start, scale=start.scale[rows])
+        prior = m.chosen_priors.noise
+        found = estimate_noise(
+            own, linear, m.zero_prior[1], prior, start, m.correlation, m.along, uncertainty=uncertainty, blocks=blocks
         )
+        self.noise = replace(found, noise=replace(found.noise, scale=self.noise.noise.scale))
+
+    def weigh(self) -> None:
+        """Weights of the readings under Student noise, anew."""
+        blocks, noise = self.blocks, self.blocks.cut(self.noise.noise)
+        squares = np.asarray(blocks.all(squared_innovations, self.weighted[1], self.filters, self.linear, noise))
         weight, overstated = student_weights(squares, np.asarray(self.tests.mask))
         self.tests = replace(self.tests, reading_weight=jnp.asarray(weight))
         weighted = replace(self.tests, reading_weight=jnp.asarray(weight / overstated))
         self.own, self.weighted = blocks.cut(self.tests), (weighted, blocks.cut(weighted))
 
-    def estimated(self, point: Point, linear: Parts, start: Noise, *, uncertainty: bool) -> NoiseFit:
-        """The noise, of very many particles from some of them."""
-        self.tell("estimating the noise")
-        m, blocks, own = self.model, self.blocks, self.own
-        if blocks.number > FIT.noise_blocks:
-            rows = np.linspace(0, self.count - 1, FIT.noise_blocks * blocks.size).astype(int)
-            blocks = Blocks(len(rows), blocks.size)
-            own = blocks.cut(_rows(self.tests, rows))
-            linear = blocks.each(linear_data, blocks.cut(_rows(point, rows)), own, m.forms)
-            some = replace(start, scale=start.scale[rows])
-        else:
-            some = start
-        prior = m.chosen_priors.noise
-        found = estimate_noise(
-            own, linear, m.zero_prior[1], prior, some, m.correlation, m.along, uncertainty=uncertainty, blocks=blocks
-        )
-        return replace(found, noise=replace(found.noise, scale=start.scale))
+    # ---- particles ---------------------------------------------------------------------------------------------------
 
     def particles(
         self, white: Array | np.ndarray, centre: np.ndarray, width: np.ndarray, theta: Any, starts: Parts
@@ -188,7 +231,7 @@ class _Fitter:
         def fit(blocks: Blocks, own: Parts, arrays: Any, starts: Parts, most_steps: int) -> ParticleFits:
             cut = [blocks.cut(v) for v in arrays]
             steps = jnp.asarray(np.asarray(most_steps))
-            return blocks.whole(blocks.each(fit_particles, own, *cut, starts, self.model.forms, self.varying, steps))
+            return blocks.all(fit_particles, own, *cut, starts, self.model.forms, self.varying, steps)
 
         if self.blocks.whole_here:
             return fit(self.blocks, self.own, arrays, starts, FIT.steps)
@@ -207,59 +250,49 @@ class _Fitter:
         priors, N = self.model.chosen_priors, len(self.tests)
         middle = np.append(_centre(priors), 0.0)
         centre = np.broadcast_to(middle, (N, 5)).copy()
-        centre[:, 4] = np.asarray(self.tests.contact) + priors.zero_um.mean
+        centre[:, 4] = self.zero_mean
         width = np.broadcast_to(np.array([FIT.alone] * 4 + [priors.zero_um.sd]), (N, 5))
         starts = self.blocks.each(linear_starts, self.own, jnp.asarray(middle[3]), axis=1)
         if self.varying:
             centre, width = (np.pad(x, ((0, 0), (0, len(self.varying)))) for x in (centre, width))
             width[:, 5:] = 1e-12
             padded = ((0, 0), (0, 0), (0, len(self.varying)))
-            starts = Parts(tuple(jnp.pad(wave, padded) for wave in starts.waves), 1)
+            starts = starts.map(lambda wave: jnp.pad(wave, padded))
         theta = np.broadcast_to(self.model.forms.without_effects, (N, len(self.model.forms.names)))
         return self.particles(white, centre, width, theta, starts)
 
-    def together(self, white: Array, before: Point, target: LogPosterior, free: Float[Array, " d"]) -> Point:
+    def together(self, target: LogPosterior, free: Float[Array, " d"]) -> Point:
         """Every particle under the population, from where it was and where the summaries expect it."""
-        expected = expect(free, target)
+        before, expected, varying = self.point, expect(free, target), list(self.varying)
         width = np.maximum(np.asarray(expected.sd), FIT.narrowest)
-        varying = list(self.varying)
-        own = np.asarray(expected.theta)[:, varying]
-        zero_mean = np.asarray(self.tests.contact) + self.model.chosen_priors.zero_um.mean
         zero_sd = np.full(len(self.tests), self.model.chosen_priors.zero_um.sd)
         spread = np.maximum(np.asarray(expected.theta_sd), 1e-12)
-        centre = np.column_stack([expected.mean, zero_mean, np.asarray(expected.theta_mean)])
+        centre = np.column_stack([expected.mean, self.zero_mean, np.asarray(expected.theta_mean)])
         widths = np.column_stack([width, zero_sd, spread])
-        several = [
-            np.column_stack([latent, zero, own])
-            for latent, zero in (
-                (before.latent, before.zero),
-                (expected.latent, expected.zero),
-                (expected.mean, before.zero),
-            )
-        ]
-        starts = self.blocks.cut(jnp.asarray(np.stack(several)), axis=1)
-        return self.particles(white, centre, widths, expected.theta, starts).point
+        own = np.asarray(expected.theta)[:, varying]
+        places = (before.latent, before.zero), (expected.latent, expected.zero), (expected.mean, before.zero)
+        several = np.stack([np.column_stack([latent, zero, own]) for latent, zero in places])
+        starts = self.blocks.cut(jnp.asarray(several), axis=1)
+        return self.particles(self.white, centre, widths, expected.theta, starts).point
 
-    def step(
-        self, white: Array, noise: Noise, before: Point, target: LogPosterior, ends: tuple[Array, Array]
-    ) -> tuple[Point, Parts, Array]:
-        """Particles and population after a step of Gauss-Newton, halved while the density, with the tests linearised
-        where it ends, is lower than where it begins.
+    @property
+    def zero_mean(self) -> np.ndarray:
+        """Where the zeros of displacement are expected [um]."""
+        return np.asarray(self.tests.contact) + self.model.chosen_priors.zero_um.mean
 
-        Args:
-            white, before, target: as in `together`.
-            noise: the noise.
-            ends: where the step begins and ends, in unbounded coordinates.
-        """
-        least, share = _density(ends[0], target) - FIT.still, 1.0
+    def step(self, target: LogPosterior, before: Array, after: Array) -> Array:
+        """A step of Gauss-Newton of population and particles, halved while the density, with the tests linearised where
+        it ends, is lower than where it begins; where the population then is."""
+        least, share = _density(before, target) - FIT.still, 1.0
         while True:
-            free = ends[0] + share * (ends[1] - ends[0])
-            point = self.together(white, before, target, free)
-            linear = self.linear.at(point)
-            marginal = replace(self.summaries(point, linear, noise)[0], scatter=target.marginal.scatter)
+            free = before + share * (after - before)
+            point = self.together(target, free)
+            linear = self.linearisation.at(point)
+            marginal = replace(self.summaries(point, linear)[0], scatter=target.marginal.scatter)
             share /= 2
             if _density(free, replace(target, marginal=marginal)) > least or share < 0.5**FIT.halvings:
-                return point, linear, free
+                self.point, self.linear = point, linear
+                return free
 
 
 def fit_tests(
@@ -280,65 +313,30 @@ def fit_tests(
     halved until the tests are more probable where it ends (`_Fitter.step`).
 
     Args:
-        tests: the measurements.
-        model: what is assumed.
         read_out_um: noise of displacement from point to point, a first guess [um].
         correlated: estimate the whole noise; if False, white noise of the residuals' median modulus, which outliers do
             not move.
         rounds: how often noise, population and particles take turns, at least.
         block: particles of a block (`Blocks`), of which there is a whole number; 0 for all in one.
-        tell: called with the name of each step.
     """
-    N, effects = len(tests), bool(model.effects)
+    check_prior_of_a(model.chosen_priors, np.asarray(tests.flatness))
+    N, effects, count = len(tests), bool(model.effects), count_of(tests)
     fitter = _Fitter(tests, model, Blocks(N, block), tell)
-    count, blocks, priors = fitter.count, fitter.blocks, model.chosen_priors
-    check_prior_of_a(priors, np.asarray(fitter.flatness))
-    read_out = max(read_out_um, 1e-4)
-    individual = fitter.alone(np.full(N, read_out))
-    point = individual.point
-    four = [read_out, *np.asarray(priors.noise.median)[1:]]
-    unknown = jnp.asarray(np.full((4, 4), np.nan)), jnp.asarray(np.nan)
-    noise = NoiseFit(Noise.of(four, jnp.asarray(np.ones(N))), *unknown, True)
-    start = _start(np.asarray(point.latent)[:count], np.asarray(fitter.flatness)[:count], model)
-    if effects:
-        found = start_of_effects(point, tests, fitter.linear.at(point), noise.noise, model, blocks)
-        start |= found.sites
-        point = replace(point, theta=jnp.asarray(np.broadcast_to(found.theta, point.theta.shape)))
-    free = None
-    turn, uncertainty = 0, True
-    linear = fitter.linear.at(point)
+    start = fitter.begin(max(read_out_um, 1e-4))
+    free, turn = None, 0
     while True:
         last = turn >= (max(rounds, FIT.most_rounds) if effects else rounds)
         if not correlated:
-            residual = np.asarray(blocks.whole(Parts(tuple(wave.residual for wave in linear.waves))))[:count]
-            width = 1.4826 * np.median(np.abs(residual[np.asarray(tests.mask)[:count]]))
-            none = jnp.asarray(0.0)
-            white_noise = Noise(jnp.asarray(max(width, 1e-9)), none, none, jnp.asarray(1.0), jnp.asarray(np.ones(N)))
-            noise = replace(noise, noise=white_noise)
-        elif (turn or not effects) and not last:
-            # With effects no round knows that it is the last.
-            uncertainty = effects or turn == rounds - 1
-            noise = fitter.estimated(point, linear, noise.noise, uncertainty=uncertainty)
-        marginal, filtered, white = fitter.summaries(point, linear, noise.noise)
-        for _ in range(FIT.student_steps if model.robust and not last and (turn or not effects) else 0):
-            fitter.weigh(filtered, linear, noise.noise)
-            noise = fitter.estimated(point, linear, noise.noise, uncertainty=uncertainty)
-            marginal, filtered, white = fitter.summaries(point, linear, noise.noise)
-        if correlated and not last and (turn or not effects):
-            old = np.asarray(noise.noise.scale)
-            squares = np.asarray(marginal.gram)[:, -1, -1]
-            scale = particle_scales(old[:count], squares[:count], np.asarray(marginal.count)[:count] - 4)
-            scale = np.pad(scale, (0, N - count), mode="edge")
-            if np.any(scale != old):
-                noise = replace(noise, noise=replace(noise.noise, scale=jnp.asarray(scale)))
-                marginal, filtered, white = fitter.summaries(point, linear, noise.noise)
+            fitter.take_white_noise()
+        elif last or (effects and not turn):
+            fitter.summarise()
+        else:  # with effects no round knows that it is the last
+            fitter.take_noise(uncertainty=effects or turn == rounds - 1)
         tell("fitting the population")
-        target = LogPosterior(model, marginal)
-        if free is None:
-            free = target.unconstrain(start)
-        before = free
-        target = careful_enough(free, target, count)
-        free, covariance, mode_converged = most_probable(free, target)
+        target = LogPosterior(model, fitter.marginal)
+        before = target.unconstrain(start) if free is None else free
+        target = careful_enough(before, target, count)
+        free, covariance, mode_converged = most_probable(before, target)
         if effects and not turn:  # amplitudes of zero tell nothing of further numbers
             free = jnp.where(jnp.asarray(["." in name for name in target.names]), before, free)
         gain = _density(free, target) - _density(before, target) if effects else 0.0
@@ -347,24 +345,29 @@ def fit_tests(
             break
         turn += 1
         if effects and turn > 1:
-            point, linear, free = fitter.step(white, noise.noise, point, target, (before, free))
+            free = fitter.step(target, before, free)
         else:
-            point = fitter.together(white, point, target, free)
-            linear = fitter.linear.at(point)
+            fitter.point = fitter.together(target, free)
+            fitter.linear = fitter.linearisation.at(fitter.point)
     if effects:
         # Once more, with how the law bends over what is still open of the effects' numbers.
-        linear = fitter.linear.at(point, _widths(free, covariance, target))
-        marginal, filtered, white = fitter.summaries(point, linear, noise.noise)
-        target = careful_enough(free, LogPosterior(model, marginal), count)
+        fitter.linear = fitter.linearisation.at(fitter.point, _widths(free, covariance, target))
+        fitter.summarise()
+        target = careful_enough(free, LogPosterior(model, fitter.marginal), count)
         free, covariance, mode_converged = most_probable(free, target)
-    converged = np.asarray(
-        [bool(np.all(np.asarray(individual.converged)[:count])), noise.converged, mode_converged and at_rest]
-    )
-    filters = blocks.whole(filtered)
-    residual = blocks.whole(Parts(tuple(wave.residual for wave in linear.waves)))
-    marginal = target.marginal
+    alone = bool(np.all(np.asarray(fitter.individual.converged)[:count]))
     return Fit(
-        model, fitter.weighted[0], individual, noise, filters, point, residual, marginal, free, covariance, converged
+        model,
+        fitter.weighted[0],
+        fitter.individual,
+        fitter.noise,
+        fitter.blocks.whole(fitter.filters),
+        fitter.point,
+        fitter.residual,
+        target.marginal,
+        free,
+        covariance,
+        np.asarray([alone, fitter.noise.converged, mode_converged and at_rest]),
     )
 
 
@@ -429,11 +432,7 @@ def _start(latent: np.ndarray, flatness: np.ndarray, model: Model) -> dict[str, 
 def checked_settings(
     progress: Callable[[str], None] | None, model: Model | None, threshold_MPa: Any, block: int | None
 ) -> tuple[Callable[[str], None], Model, float]:
-    """What all calibrations share, with the defaults filled in.
-
-    Raises:
-        InputError: for one of the wrong kind or out of its range.
-    """
+    """What all calibrations share, with defaults filled in; refuses what is of the wrong kind or out of its range."""
     tell = arguments.teller(progress)
     if model is not None:
         arguments.instance(model, Model, "model", "Make one with mcc_jax.Model().")

@@ -125,9 +125,6 @@ def linearise(
     """Linearise all tests, by forward derivatives in as many directions as one particle has numbers.
 
     Args:
-        point: around what.
-        tests: the measurements.
-        forms: the law.
         with_numbers: whether derivatives by the particle's numbers are wanted; none if not.
         with_force: whether derivatives by force are wanted; 0 if not.
     """

@@ -1,17 +1,28 @@
-"""Least squares over all particles at once, by Optimistix with the block structure of the problem."""
+r"""Least squares over all particles at once, by Optimistix: every particle has parameters of its own, all share a few.
+
+The Jacobian of such a problem is block diagonal but for the columns of the shared parameters. All particles' first
+parameters can therefore be perturbed at once, and the whole Jacobian of N particles costs as many directional
+derivatives as one particle's. Its normal equations
+
+.. math:: \begin{pmatrix} D & B \\ B^T & S \end{pmatrix}
+    \begin{pmatrix} \delta_{local} \\ \delta_{shared} \end{pmatrix} = -\begin{pmatrix} g_l \\ g_s \end{pmatrix}
+
+are solved through the Schur complement :math:`S - B^T D^{-1} B`, in a time linear in N.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import optimistix as optx
+from jaxtyping import Array, Bool, Float
 
 from .._types import Values
-from .block_arrow import Parameters, Solution, minimise
 from .compiling import compiled
 from .data import Tests
 from .forward import Forms, Point, residuals
@@ -19,6 +30,164 @@ from .noise import Whitening
 from .population import Population, Scatter, moments
 from .settings import FIT
 from .small_matrices import Cholesky
+
+
+class Parameters(NamedTuple):
+    """Parameters of an arrow problem: one row per particle, and those that all share."""
+
+    local: Float[Array, "particles P"]
+    shared: Float[Array, " Q"]
+
+
+class Normal(eqx.Module):
+    """Normal equations of an arrow problem."""
+
+    local: Float[Array, "particles P P"]
+    border: Float[Array, "particles P Q"]
+    shared: Float[Array, "Q Q"]
+    gradient_local: Float[Array, "particles P"]
+    gradient_shared: Float[Array, " Q"]
+
+    def schur(self, damping: Any = 0.0) -> tuple[Cholesky, Float[Array, "particles P Q"], Float[Array, "Q Q"]]:
+        """Factor of D, D^-1 B and the Schur complement, each diagonal enlarged by 1 + damping."""
+        D = _damped(self.local, damping)
+        factor = Cholesky(D)
+        columns = [factor.solve(self.border[..., q]) for q in range(self.border.shape[-1])]
+        inner = jnp.stack(columns, -1) if columns else jnp.zeros_like(self.border)
+        complement = _damped(self.shared, damping) - jnp.einsum("npq,npr->qr", self.border, inner)
+        return factor, inner, complement
+
+    def solve(self, damping: Any) -> Parameters:
+        """The damped Gauss-Newton step."""
+        factor, inner, complement = self.schur(damping)
+        forward = factor.solve(self.gradient_local)
+        if self.shared.shape[0] == 0:
+            return Parameters(-forward, self.gradient_shared)
+        right = self.gradient_shared - jnp.einsum("npq,np->q", self.border, forward)
+        shared = -Cholesky(complement).solve(right)
+        return Parameters(-forward - jnp.einsum("npq,q->np", inner, shared), shared)
+
+    def covariance(self) -> tuple[Float[Array, "particles P P"], Float[Array, "particles P Q"], Float[Array, "Q Q"]]:
+        """Blocks of the inverse: each particle's own, between it and the shared parameters, and of the shared ones."""
+        factor, inner, complement = self.schur()
+        shared = Cholesky(_damped(complement, 0.0)).inverse()
+        between = -jnp.einsum("npq,qr->npr", inner, shared)
+        return factor.inverse() - jnp.einsum("npq,noq->npo", between, inner), between, shared
+
+
+def _damped(A: Float[Array, "*batch p p"], damping: Any) -> Float[Array, "*batch p p"]:
+    diagonal = jnp.diagonal(A, axis1=-2, axis2=-1)
+    # A direction that the data do not know at all gets a curvature of its own, so that it stays where it is.
+    floor = jnp.where(diagonal > 1e-12, diagonal * (damping + 1e-14), 1.0)
+    eye = jnp.broadcast_to(jnp.eye(A.shape[-1]), A.shape)
+    return A + eye * floor[..., None, :]
+
+
+def normal_equations(push: Callable[[Parameters], Any], residual: Any, y: Parameters) -> Normal:
+    """Assemble the normal equations from a linearised residual.
+
+    `push` is the directional derivative of the residual; every leaf of it has the particles as its first axis.
+    """
+    count, P = y.local.shape
+    Q = y.shared.shape[0]
+    eye = jnp.eye(P + Q)
+
+    def column(direction: Float[Array, " PQ"]) -> Float[Array, "particles residuals"]:
+        out = push(Parameters(jnp.broadcast_to(direction[:P], (count, P)), direction[P:]))
+        return _flat(out, count)
+
+    J = jax.vmap(column, out_axes=-1)(eye)
+    r = _flat(residual, count)
+    whole = jnp.einsum("nkp,nkq->npq", J, J)
+    gradient = jnp.einsum("nkp,nk->np", J, r)
+    return Normal(whole[:, :P, :P], whole[:, :P, P:], whole[:, P:, P:].sum(0), gradient[:, :P], gradient[:, P:].sum(0))
+
+
+def _flat(tree: Any, count: int) -> Float[Array, "particles residuals"]:
+    return jnp.concatenate([leaf.reshape(count, -1) for leaf in jax.tree.leaves(tree)], axis=1)
+
+
+class ArrowDescent(optx.AbstractDescent[Parameters, optx.FunctionInfo.ResidualJac, Normal]):
+    """The damped Gauss-Newton step of an arrow problem, each parameter damped on its own scale."""
+
+    def init(self, y: Parameters, f_info_struct: Any) -> Normal:
+        """Normal equations of the right shapes, all zero."""
+        count, P = y.local.shape
+        Q = y.shared.shape[0]
+        zeros = (jnp.zeros(s) for s in ((count, P, P), (count, P, Q), (Q, Q), (count, P), (Q,)))
+        return Normal(*zeros)
+
+    def query(self, y: Parameters, f_info: Any, state: Normal) -> Normal:
+        """The normal equations at `y`."""
+        return normal_equations(f_info.jac.mv, f_info.residual, y)
+
+    def step(self, step_size: Float[Array, ""], state: Normal) -> tuple[Parameters, optx.RESULTS]:
+        """The step whose damping is one over the step size."""
+        return state.solve(1 / step_size), optx.RESULTS.successful
+
+
+class ArrowLevenbergMarquardt(optx.AbstractGaussNewton[Parameters, Any, Any]):
+    """Levenberg-Marquardt for arrow problems, in the trust-region form of Optimistix."""
+
+    rtol: float = 1e-9
+    atol: float = 1e-9
+    norm: Callable[[Any], Float[Array, ""]] = optx.max_norm
+    descent: ArrowDescent = ArrowDescent()  # pyright: ignore[reportIncompatibleVariableOverride]
+    search: optx.ClassicalTrustRegion[Parameters] = optx.ClassicalTrustRegion(high_constant=10.0)  # pyright: ignore[reportIncompatibleVariableOverride]
+    verbose: Callable[..., None] = eqx.field(static=True, default=lambda **_: None)
+
+
+class Solution(eqx.Module):
+    """Where the optimiser ended.
+
+    Attributes:
+        value: the parameters.
+        residual: residuals there.
+        normal: normal equations there.
+        loss: half the sum of squares.
+        converged: whether the tolerances were met.
+        steps: how many steps it took.
+    """
+
+    value: Parameters
+    residual: Any
+    normal: Normal
+    loss: Float[Array, ""]
+    converged: Bool[Array, ""]
+    steps: Any
+
+    def first(self, count: int) -> Solution:
+        """The same of the first `count` particles."""
+        value, normal = self.value, self.normal
+        first = replace(
+            normal,
+            local=normal.local[:count],
+            border=normal.border[:count],
+            gradient_local=normal.gradient_local[:count],
+        )
+        residual = jax.tree.map(lambda x: x[:count], self.residual)
+        return replace(self, value=value._replace(local=value.local[:count]), residual=residual, normal=first)
+
+
+def minimise(
+    residual: Callable[[Parameters], Any], start: Parameters, *, max_steps: int = 100, tolerance: float = 1e-9
+) -> Solution:
+    """Minimise the sum of squares of an arrow problem's residuals.
+
+    Args:
+        residual: a pytree whose every leaf has the particles as its first axis.
+        tolerance: relative and absolute tolerance on parameters and residuals.
+    """
+    solver = ArrowLevenbergMarquardt(rtol=tolerance, atol=tolerance)
+    found = optx.least_squares(lambda y, _: residual(y), solver, start, max_steps=max_steps, throw=False)
+    # What the solver linearised last, at the value it returns: no second linearisation to compile and to compute.
+    at, normal = found.state.f_info.residual, found.state.descent_state
+    loss = 0.5 * sum((jnp.sum(leaf**2) for leaf in jax.tree.leaves(at)), jnp.zeros(()))
+    converged = found.result == optx.RESULTS.successful
+    return Solution(found.value, at, normal, loss, converged, found.stats["num_steps"])
+
+
+# ---- the campaign as such a problem ----------------------------------------------------------------------------------
 
 
 def robust(loss: str, r: Values) -> Values:
@@ -119,8 +288,6 @@ def pooled_residual(settings: Pooled, tests: Tests) -> Callable[[Parameters], tu
 
 
 @compiled
-def fit_pooled(
-    tests: Tests, settings: Pooled, start: Parameters, *, max_steps: int = 300, tolerance: float = 1e-7
-) -> Solution:
+def fit_pooled(tests: Tests, settings: Pooled, start: Parameters) -> Solution:
     """Minimise the pooled residuals."""
-    return minimise(pooled_residual(settings, tests), start, max_steps=max_steps, tolerance=tolerance)
+    return minimise(pooled_residual(settings, tests), start, max_steps=300, tolerance=1e-7)

@@ -71,9 +71,7 @@ def sample_weighted(
     A spread's coordinate may have either sign for the same spread: proposals and draws are folded to positive ones.
 
     Args:
-        key: random key.
         mode, covariance: of the population in unbounded coordinates.
-        target: its density.
         chains, draws: shape of what is returned; each chain is resampled from proposals of its own.
         many: propose no more than is kept: a density is dear.
         however_bad: give the draws of the first round whatever their weights.

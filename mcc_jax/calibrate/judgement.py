@@ -9,46 +9,17 @@ from __future__ import annotations
 import contextlib
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from .._errors import InputError
 from ..campaign import Campaign, Finding, campaign_findings, check_plausibility
+from ..campaign.plausibility import or_slip
 from ..campaign.quality import named
-from ..campaign.reasons import or_slip
 from .fit_result import Fit
-from .settings import JUDGEMENT
-
-
-@dataclass(frozen=True)
-class JudgementOptions:
-    """When a particle is unlike all others, and how much is done about flagged ones.
-
-    Attributes:
-        outlying: a particle is unlike the others if the logarithm of its residual lies so many robust standard
-            deviations (1.4826 times the median absolute deviation) above their median: of 1000 normal ones none does.
-        times: and if its residual is so many times their median, at least: smaller differences do no harm.
-        share: of the particles, at most, can be unlike all others; more are a mixture.
-        least: particles, at least, to know what is usual.
-        answers: so many sets of flagged particles are left out in turn to tell the answer without them, at most.
-        few: flagged particles are left out for such an answer if they are at least this share of all: fewer than one
-            in a hundred hardly move what all share, and the answer would cost a whole calibration of many particles.
-        left: particles, at least, that an answer without the flagged ones rests on.
-        unknown: the modulus counts as unknown if its standard deviation is at least this share of it: the 95 % interval
-            then spans a factor of seven, nearly that of the prior (50), in which most solids lie.
-    """
-
-    outlying: float = 5.0
-    times: float = 3.0
-    share: float = 0.2
-    least: int = 5
-    answers: int = 4
-    few: float = 0.01
-    left: int = 3
-    unknown: float = 0.5
-
+from .settings import JUDGEMENT, JudgementSettings
 
 MODULUS_OPEN = "unknown modulus"
 """The `check` of the finding that the tests leave the modulus open."""
@@ -81,17 +52,12 @@ def _variances(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
 
 
 def unlike_others(
-    names: Sequence[str], rms_um: np.ndarray, range_um: np.ndarray, options: JudgementOptions | None = None
+    names: Sequence[str], rms_um: np.ndarray, range_um: np.ndarray, options: JudgementSettings = JUDGEMENT
 ) -> Finding | None:
     """The particles whose residual is unlike all others', both in micrometres and as a share of their range.
 
-    Args:
-        names: of N particles.
-        rms_um: root mean square residuals [um], shape (N,).
-        range_um: ranges of their displacements [um], shape (N,).
-        options: see `JudgementOptions`.
+    `rms_um` are root mean square residuals and `range_um` the ranges of displacement of all particles [um].
     """
-    options = options or JudgementOptions()
     rms, reach = np.asarray(rms_um, float), np.asarray(range_um, float)
     known = np.isfinite(rms) & (rms > 0) & (reach > 0)
     if known.sum() < options.least:
@@ -110,16 +76,12 @@ def unlike_others(
 
 
 def unknown_modulus(
-    campaign: Campaign, modulus: Mapping[str, Any], options: JudgementOptions | None = None
+    campaign: Campaign, modulus: Mapping[str, Any], options: JudgementSettings = JUDGEMENT
 ) -> Finding | None:
     """That the tests leave the modulus open, and why; None if they tell it, or the method gives no error.
 
-    Args:
-        campaign: the checked campaign.
-        modulus: value, sd and interval_95 [MPa].
-        options: see `JudgementOptions`.
+    `modulus` has value, sd and interval_95 [MPa].
     """
-    options = options or JudgementOptions()
     if not told_by_no_test(modulus, options):
         return None
     interval = modulus.get("interval_95")
@@ -137,10 +99,10 @@ def unknown_modulus(
     return Finding(MODULUS_OPEN, "look", f"The tests do not tell the modulus{between}{why}", remedy)
 
 
-def told_by_no_test(modulus: Mapping[str, Any], options: JudgementOptions | None = None) -> bool:
+def told_by_no_test(modulus: Mapping[str, Any], options: JudgementSettings = JUDGEMENT) -> bool:
     """Whether an estimate of the modulus is so wide that it tells nothing; not where the method gives no error."""
     value, sd = modulus["value"], modulus["sd"]
-    return value is not None and sd is not None and sd >= (options or JudgementOptions()).unknown * abs(value)
+    return value is not None and sd is not None and sd >= options.unknown * abs(value)
 
 
 def modulus_is_open(content: Mapping[str, Any]) -> bool:
@@ -151,7 +113,7 @@ def modulus_is_open(content: Mapping[str, Any]) -> bool:
 UNLOAD = "Unload the particles before the test ends, and record the unloading with as many readings as the loading"
 
 
-def _far(logs: np.ndarray, options: JudgementOptions) -> np.ndarray:
+def _far(logs: np.ndarray, options: JudgementSettings) -> np.ndarray:
     away = logs - np.median(logs)
     spread = 1.4826 * float(np.median(np.abs(away)))
     return away > max(options.outlying * spread, np.log(options.times))
@@ -162,18 +124,15 @@ def judged(
     answer: Mapping[str, Any],
     outlying: Finding | None,
     again: Callable[[Campaign], Mapping[str, Any]] | None,
-    options: JudgementOptions | None = None,
+    options: JudgementSettings = JUDGEMENT,
 ) -> tuple[Finding, ...]:
     """All findings of a calibrated campaign, each with what the answer is without the particles that it names.
 
     Args:
-        campaign: the checked campaign.
         answer: a, modulus and their errors as in `calibration.json`, and whether it converged.
         outlying: what `unlike_others` found.
         again: calibrates a campaign and gives the same numbers; None to leave the answers without them out.
-        options: see `JudgementOptions`.
     """
-    options = options or JudgementOptions()
     found = [*campaign_findings(campaign), *([] if outlying is None else [outlying])]
     modulus = answer["effective_modulus_MPa"]
     if not answer.get("converged", True):
@@ -181,7 +140,7 @@ def judged(
     unknown = unknown_modulus(campaign, modulus, options)
     value = modulus["value"] if unknown is None else None  # what is not known cannot be implausible
     found += [] if unknown is None else [unknown]
-    found += check_plausibility(campaign.raw or campaign, modulus_MPa=value)
+    found += check_plausibility(campaign, modulus_MPa=value)
     if again is None:
         return tuple(found)
     answers: dict[tuple[str, ...], str] = {}

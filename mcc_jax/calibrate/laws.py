@@ -6,15 +6,13 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from .._errors import InputError
-from ..effects import AbstractEffect, Variant
+from ..effects import AbstractEffect, Variant, find_variant
 from ..law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainScaling, Unloading
-from .effects import built
 from .population import COEFFICIENTS
 
 RIGID_MPA = 1e9
@@ -41,7 +39,12 @@ def law_of(
     modulus = _number(content["effective_modulus_MPa"], "effective_modulus_MPa")
     if entry is not None:
         a, modulus = _own_shape(content, entry, diameters_um, a), _own_modulus(entry, modulus)
-    return MccLaw(Plastic(*C), a, modulus, *_forms(content), effects=_effects(content, entry, variants))
+    return _law(content, C, a, modulus, entry, variants)
+
+
+def _law(content: Mapping[str, Any], C: Any, a: float, modulus: float, entry: Any, variants: Variants | None) -> MccLaw:
+    form = Unloading(content["law"]["unloading"]), StrainScaling(content["law"]["strain_scaling"])
+    return MccLaw(Plastic(*C), a, modulus, *form, effects=_effects(content, entry, variants))
 
 
 def laws_of(
@@ -51,37 +54,21 @@ def laws_of(
 
     The typical law has the medians of the coefficients; of the paper's method it is the law of the expected stress.
     """
-    entries = [entry_of(content, name) for name in names]
     a = content["a"]["value"] or 0.0
     modulus = content["effective_modulus_MPa"]["value"] or RIGID_MPA
-    own = np.array([[entry[name]["value"] for name in COEFFICIENTS] for entry in entries], float)
-    shapes = [_own_shape(content, entry, size, a) for entry, size in zip(entries, diameters_um, strict=True)]
-    moduli = [_own_modulus(entry, modulus) for entry in entries]
-    form, scaling = _forms(content)
+    own = []
+    for name, size in zip(names, diameters_um, strict=True):
+        entry = entry_of(content, name)
+        C = [entry[coefficient]["value"] for coefficient in COEFFICIENTS]
+        shape = _own_shape(content, entry, size, a)
+        own.append(_law(content, C, shape, _own_modulus(entry, modulus), entry, variants))
+    typical = [_law(content, _typical(content), a, modulus, None, variants)] * len(names)
+    return _together(own), _together(typical)
 
-    def law(C: Any, a: Any, modulus: Any, effects: Any) -> MccLaw:
-        return MccLaw(Plastic(C[0], C[1], C[2]), a, modulus, form, scaling, effects=effects)
 
-    def together(several: list[tuple[AbstractEffect, ...]]) -> Any:
-        return jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v, float) for v in x]), *several)
-
-    count = len(names)
-    typical = np.broadcast_to(_typical(content), own.shape)
-    make = eqx.filter_vmap(law)
-    return (
-        make(
-            jnp.asarray(own),
-            jnp.asarray(shapes),
-            jnp.asarray(moduli),
-            together([_effects(content, entry, variants) for entry in entries]),
-        ),
-        make(
-            jnp.asarray(typical),
-            jnp.full(count, a),
-            jnp.full(count, modulus),
-            together([_effects(content, None, variants)] * count),
-        ),
-    )
+def _together(laws: list[MccLaw]) -> MccLaw:
+    """Laws of one form as one, every array field with a leading axis."""
+    return jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v, float) for v in x]), *laws)
 
 
 def entry_of(content: Mapping[str, Any], particle: str) -> Mapping[str, Any]:
@@ -100,10 +87,6 @@ def entry_of(content: Mapping[str, Any], particle: str) -> Mapping[str, Any]:
             remedy="Take another particle or, without one, the population.",
         )
     return entries[particle]
-
-
-def _forms(content: Mapping[str, Any]) -> tuple[Unloading, StrainScaling]:
-    return Unloading(content["law"]["unloading"]), StrainScaling(content["law"]["strain_scaling"])
 
 
 def _number(estimate: Mapping[str, Any], name: str) -> float:
@@ -145,3 +128,20 @@ def _typical(content: Mapping[str, Any]) -> np.ndarray:
     population = PlasticPopulation(*parts)
     law = population.mean_law if content["method"] == "paper" else population.median_law
     return np.array([float(law.C1), float(law.C3), float(law.C5)])
+
+
+def built(
+    entry: Mapping[str, Any], variants: Mapping[str, Variant] | None = None, amplitude: Mapping[str, Any] | None = None
+) -> AbstractEffect:
+    """The effect that an entry of a result describes.
+
+    Args:
+        variants: formulas that are not in the library, by "mechanism:variant".
+        amplitude: of one particle, where it differs.
+    """
+    name = f"{entry['mechanism']}:{entry['variant']}"
+    variant = (variants or {}).get(name) or find_variant(name)
+    values = {key: one["value"] for key, one in entry["parameters"].items()}
+    strength = values.pop(variant.parameter) if amplitude is None else amplitude["value"]
+    values.pop(variant.parameter, None)
+    return variant.build(strength, **values)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
@@ -15,30 +15,17 @@ from .. import arguments
 from .._errors import InputError
 from .._format import described
 from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_tests
-from ..effects import Variant
-from .block_arrow import Parameters, Solution
-from .data import Selection, Tests, compared_rows, own_misfit, ranges_um, root_mean_squares
+from .data import Selection, Tests, ranges_um
 from .distributions import SpreadCoordinate, nuisance_moments
-from .effects import effect_entries
-from .estimates import (
-    NO_SAMPLER,
-    estimate,
-    finite,
-    force_zero,
-    log_estimate,
-    misfit_note,
-    missed,
-    noise_note,
-    power_of_e,
-)
+from .estimates import NO_SAMPLER, effect_entries, estimate, finite, log_estimate, normal_estimate, power_of_e
 from .fit_result import Fit
-from .fitting import beyond_numbers, checked_settings, in_own_units, prepare
+from .fitting import beyond_numbers, checked_settings, prepare
 from .forward import residuals
-from .hierarchical import SHARED, Pooled, fit_pooled, unpack
-from .judgement import judged, noise_share, numbers_in_reach, unlike_others
+from .hierarchical import SHARED, Parameters, Pooled, Solution, fit_pooled, unpack
+from .judgement import judged, numbers_in_reach, unlike_others
 from .model import Model
 from .population import COEFFICIENTS
-from .results import Calibration
+from .results import JointCalibration
 from .settings import FIT
 
 Loss = Literal["linear", "soft_l1", "cauchy"]
@@ -73,7 +60,7 @@ class Identifiability:
 
 
 @dataclass(frozen=True, repr=False)
-class LeastSquares(Calibration):
+class LeastSquares(JointCalibration):
     """The joint least-squares fit of a campaign.
 
     Attributes:
@@ -106,20 +93,6 @@ class LeastSquares(Calibration):
     notes: tuple[str, ...] = ()
 
     @property
-    def variants(self) -> dict[str, Variant]:
-        """The formulas of the law's effects by name."""
-        return self.model.variants
-
-    def compared(self) -> Mapping[int, tuple[np.ndarray, np.ndarray]]:
-        """Rows of every particle's curve that stand in the tests, and which of them are compared."""
-        return compared_rows(self.selection)
-
-    @property
-    def particles(self) -> tuple[str, ...]:
-        """Names of the particles that took part."""
-        return tuple(self.campaign.particles[i] for i in self.selection.kept)
-
-    @property
     def reason(self) -> str:
         """Why the fit must not be called converged; empty if it is."""
         if not bool(self.solution.converged):
@@ -149,13 +122,7 @@ class LeastSquares(Calibration):
         agree, count = self.agreeing_starts
         if agree < count:
             notes.append(f"{count - agree} of {count} starts ended at a worse optimum")
-        notes += [*self.selection.notes, *self.notes]
-        share = own_misfit(self.selection.tests, jnp.asarray(self.residual()))
-        told = misfit_note(share), noise_note(noise_share(self.fit), missed(self.rms_um(), share))
-        notes += [note for note in told if note is not None]
-        dropped = sum(reason is not None for reason in self.selection.why_not)
-        if dropped:
-            notes.append(f"{dropped} of {len(self.campaign)} particles could not be used")
+        notes += self._notes_of_the_fit()
         if self._alone:
             notes.append("one particle says nothing of the scatter between particles: no spread is given")
         elif np.any(np.asarray(self.settings.population.tau) < 1e-3):
@@ -165,11 +132,11 @@ class LeastSquares(Calibration):
 
     def answer(self) -> dict[str, Any]:
         """Whether it converged, a and the modulus, as in `calibration.json`."""
-        values, sds, known = np.asarray(self.solution.value.shared), self._shared_sd, self._known
+        values, sds = np.asarray(self.solution.value.shared), self._told_sd
         return {
             "converged": self.converged,
-            "a": _normal(float(values[0]), float(sds[0])) if known[0] else estimate(float(values[0])),
-            "effective_modulus_MPa": log_estimate(float(values[1]), float(sds[1]) if known[1] else np.nan),
+            "a": normal_estimate(values[0], sds[0]),
+            "effective_modulus_MPa": log_estimate(values[1], sds[1]),
         }
 
     def to_json(self) -> dict[str, Any]:
@@ -179,46 +146,29 @@ class LeastSquares(Calibration):
         latent, zero, theta = np.asarray(point.latent), np.asarray(point.zero), np.asarray(point.theta)
         own, between, shared = (np.asarray(v) for v in self.solution.normal.covariance())
         values = np.asarray(self.solution.value.shared)
-        sds, known = self._shared_sd, self._known
+        sds = self._told_sd
         flat, eta = np.asarray(tests.flatness), self._shape_factor
         slope = flat / eta
         # Where it is not positive, which the reason says, there is no logarithm, and no coefficient without it.
         log_eta = np.log(np.where(eta > 0, eta, np.nan))
-        rms = self.rms_um()
-        position = {i: row for row, i in enumerate(self.selection.kept)}
-        entries = []
-        for i, name in enumerate(self.campaign.particles):
-            row = position.get(i)
-            found: dict[str, Any] = dict.fromkeys(("eta_p", *COEFFICIENTS, "zero_um"), estimate(None))
-            if row is not None:
-                spread = abs(flat[row]) * sds[0]
-                found["eta_p"] = _normal(float(eta[row]), float(spread)) if known[0] else estimate(float(eta[row]))
-                for j, coefficient in enumerate(COEFFICIENTS):
-                    variance = own[row, j, j] - 2 * slope[row] * between[row, j, 0] + slope[row] ** 2 * shared[0, 0]
-                    log = float(latent[row, j] - log_eta[row])
-                    found[coefficient] = log_estimate(log, float(np.sqrt(max(variance, 0.0))) if known[0] else np.nan)
-                found["zero_um"] = _normal(float(zero[row]), float(np.sqrt(own[row, 3, 3])))
-                if self.model.modulus_scatter:
-                    log_modulus = float(latent[row, 3] - self.model.shape_power * log_eta[row])
-                    found["effective_modulus_MPa"] = estimate(power_of_e(log_modulus))
-                if self.model.varying:
-                    places = self.model.varying_places
-                    found["amplitudes"] = {m: estimate(float(theta[row, k])) for m, k in places.items()}
-            entries.append(
-                {
-                    "particle": name,
-                    **found,
-                    "rms_um": finite(float(rms[row])) if row is not None else None,
-                    "noise_scale": finite(float(self.fit.noise.noise.scale[row])) if row is not None else None,
-                    "kept": row is not None,
-                    "why_not": self.selection.why_not[i],
-                    "force_zero_mN": force_zero(self.campaign.curves[i]),
-                }
-            )
+
+        def numbers(row: int) -> dict[str, Any]:
+            found: dict[str, Any] = {"eta_p": normal_estimate(eta[row], abs(flat[row]) * sds[0])}
+            for j, coefficient in enumerate(COEFFICIENTS):
+                variance = own[row, j, j] - 2 * slope[row] * between[row, j, 0] + slope[row] ** 2 * shared[0, 0]
+                sd = np.nan if np.isnan(sds[0]) else np.sqrt(max(variance, 0.0))
+                found[coefficient] = log_estimate(latent[row, j] - log_eta[row], sd)
+            found["zero_um"] = normal_estimate(zero[row], np.sqrt(own[row, 3, 3]))
+            if self.model.modulus_scatter:
+                log_modulus = float(latent[row, 3] - self.model.shape_power * log_eta[row])
+                found["effective_modulus_MPa"] = estimate(power_of_e(log_modulus))
+            if self.model.varying:
+                places = self.model.varying_places
+                found["amplitudes"] = {m: estimate(float(theta[row, k])) for m, k in places.items()}
+            return found
+
         tau = np.asarray(self.settings.population.tau)
         spread_sd = self._spread_sd()
-        logs, log_sds = np.asarray(self.fit.noise.noise.logs), self.fit.noise.log_sd
-        numbers = ("displacement_um", "force_mN", "correlated_um", "correlation_length")
         steps = int(self.solution.steps)
         return {
             "schema": 1,
@@ -232,21 +182,16 @@ class LeastSquares(Calibration):
             "loss": self.loss,
             **{
                 f"log_{name}": {
-                    "mean": _normal(float(values[2 + j]), float(sds[2 + j]))
-                    if known[2 + j]
-                    else estimate(values[2 + j]),
-                    "sd": estimate(None) if self._alone else _spread(float(tau[j]), float(spread_sd[j])),
+                    "mean": normal_estimate(values[2 + j], sds[2 + j]),
+                    "sd": estimate(None) if self._alone else normal_estimate(tau[j], spread_sd[j], least=0.0),
                 }
                 for j, name in enumerate(COEFFICIENTS)
             },
             # The scatter of C1 is part of its mean.
             "yield_stress_MPa": estimate(None if self._alone else power_of_e(values[2] + tau[0] ** 2 / 2) / 17.16),
-            "noise": {
-                name: log_estimate(m, s) if np.isfinite(m) else estimate(0.0)
-                for name, m, s in zip(numbers, logs, log_sds, strict=True)
-            },
+            "noise": self._noise_numbers(),
             "priors": self.model.chosen_priors.to_json(),
-            "particles": entries,
+            "particles": self._entries(numbers),
             "warnings": self.warnings(),
             "findings": [one.to_json() for one in self.findings],
             "diagnostics": {
@@ -254,7 +199,7 @@ class LeastSquares(Calibration):
                 "steps": steps,
                 "loss": finite(float(self.solution.loss)),
                 "chi2_per_dof": finite(self._chi2()),
-                "noise_share": finite(noise_share(self.fit)),
+                "noise_share": finite(self.noise_share),
                 "singular_values": [float(v) for v in self.identifiability.singular_values],
                 "open_combinations": self.identifiability.open,
                 "agreeing_starts": list(self.agreeing_starts),
@@ -267,10 +212,6 @@ class LeastSquares(Calibration):
         point = unpack(self.solution.value, self.settings, tests)
         return np.asarray(jax.jit(residuals)(point, tests, self.model.forms))
 
-    def rms_um(self) -> np.ndarray:
-        """Root mean square residual of every particle [um], shape (N,)."""
-        return root_mean_squares(self.selection.tests, self.residual())
-
     @property
     def _shape_factor(self) -> np.ndarray:
         """eta_p of the particles that took part, shape (N,)."""
@@ -282,10 +223,12 @@ class LeastSquares(Calibration):
         return np.sqrt(np.diagonal(np.asarray(self.solution.normal.covariance()[2])))
 
     @property
-    def _known(self) -> list[bool]:
-        """Which of the shared parameters the data do not leave open."""
-        free = bool(self.identifiability.open)
-        return [not (free and self._open_share(q) > 0.1) for q in range(len(self.solution.value.shared))]
+    def _told_sd(self) -> np.ndarray:
+        """The same; NaN where the data leave a parameter open."""
+        found = self.identifiability
+        rows = found.directions[found.singular_values < FIT.open]
+        is_open = (np.sum(rows**2, 0) > 0.1) & bool(found.open)
+        return np.where(is_open, np.nan, self._shared_sd)
 
     @property
     def _alone(self) -> bool:
@@ -308,7 +251,7 @@ class LeastSquares(Calibration):
         size, found = len(self.model.effects), {}
         for k, name in enumerate(self.model.forms.names):
             log = k >= size and self.model.forms.positive[k - size]
-            found[name] = log_estimate(values[k], sds[k]) if log else _normal(float(values[k]), float(sds[k]))
+            found[name] = (log_estimate if log else normal_estimate)(values[k], sds[k])
         for j, name in enumerate(self.model.varying_places):
             found[f"tau_{name}"] = estimate(float(self.settings.population.theta_scatter[j]))
         return found
@@ -317,18 +260,6 @@ class LeastSquares(Calibration):
         used = int(np.asarray(self.selection.tests.mask).sum())
         freedom = max(used - 4 * len(self.selection.kept) - 5, 1)
         return float(np.sum(np.asarray(self.solution.residual[0]) ** 2) / freedom)
-
-    def _open_share(self, parameter: int) -> float:
-        rows = self.identifiability.directions[self.identifiability.singular_values < FIT.open]
-        return float(np.sum(rows[:, parameter] ** 2)) if len(rows) else 0.0
-
-
-def _normal(value: float, sd: float) -> dict[str, Any]:
-    return estimate(value, sd, (value - 1.96 * sd, value + 1.96 * sd))
-
-
-def _spread(value: float, sd: float) -> dict[str, Any]:
-    return estimate(value, sd, (max(value - 1.96 * sd, 0.0), value + 1.96 * sd))
 
 
 def identifiability(solution: Solution, names: tuple[str, ...] = SHARED) -> Identifiability:
@@ -387,12 +318,13 @@ def least_squares(
     if model.robust and loss != "linear":
         raise InputError("robust noise and a robust loss exclude each other", remedy="Take one of them.")
     with numbers_in_reach(campaign):
-        chosen, own_units = in_own_units(campaign, model)
         selection, fit, _ = prepare(
-            campaign, chosen, threshold_MPa, block=block, tell=tell, correlated=loss == "linear", rounds=1
+            campaign, model, threshold_MPa, block=block, tell=tell, correlated=loss == "linear", rounds=1
         )
         tests, population = fit.tests, fit.population
-        settings = Pooled(fit.filters, population, model.zero_prior, _further(model), model.forms, model.scatter, loss)
+        further = [nuisance_moments(n) for v in model.effects for n in v.nuisances]
+        priors = model.zero_prior, jnp.asarray(np.array(further).reshape(-1, 2))
+        settings = Pooled(fit.filters, population, *priors, model.forms, model.scatter, loss)
         tell("fitting all particles together")
         flatness = np.asarray(tests.flatness)
         low, high = -0.9 / max(flatness.max(), 1e-3), -0.9 / min(flatness.min(), -1e-3)
@@ -427,14 +359,7 @@ def least_squares(
         return least_squares(some, model, without_flagged=False, **settings).answer()
 
     findings = judged(campaign, calibration.answer(), outlying, again if without_flagged else None)
-    notes = () if own_units is None else (own_units,)
-    return replace(calibration, findings=findings, notes=notes, runtime_s=time.perf_counter() - started)
-
-
-def _further(model: Model) -> Any:
-    """Mean and standard deviation of every further number, of its logarithm if it is positive."""
-    moments = [nuisance_moments(n) for v in model.effects for n in v.nuisances]
-    return jnp.asarray(np.array(moments).reshape(-1, 2))
+    return replace(calibration, findings=findings, runtime_s=time.perf_counter() - started)
 
 
 def solve(fit: Fit, settings: Pooled, tests: Tests, a: float, mu: np.ndarray, log_modulus: float) -> Solution:

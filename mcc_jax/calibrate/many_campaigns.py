@@ -55,20 +55,16 @@ def calibrate_many(
         InputError: if the method is unknown, there is no worker, or one of the campaigns is none.
         TypeError: for settings that the method does not have.
     """
-    methods: dict[str, Callable[..., Calibration]] = {
-        "bayes": sample,
-        "least-squares": least_squares,
-    }
-    arguments.choice(method, methods, "method")
+    methods: dict[str, Callable[..., Calibration]] = {"bayes": sample, "least-squares": least_squares}
+    calibrate = methods[arguments.choice(method, methods, "method")]
     workers = arguments.whole(workers, "workers", least=1)
     threshold_MPa = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
     if isinstance(campaigns, str | Path | Campaign) or not isinstance(campaigns, Iterable):
         raise InputError(f"campaigns must be a list of campaigns, got {arguments.kind_of(campaigns)}")
-    names = set(inspect.signature(methods[method]).parameters) - {"campaign", "progress", "threshold_MPa"}
+    names = set(inspect.signature(calibrate).parameters) - {"campaign", "progress", "threshold_MPa"}
     unknown = sorted(set(settings) - names)
     if unknown:
         raise TypeError(f"{method} has no setting {', '.join(unknown)}; it has: {', '.join(sorted(names))}")
-    calibrate = methods[method]
     queue = list(campaigns)
     for i, item in enumerate(queue, start=1):
         if not isinstance(item, Campaign):  # one that is damaged stands in its place with its error

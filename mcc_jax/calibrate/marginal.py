@@ -153,19 +153,15 @@ class Marginal(eqx.Module):
         bend = jnp.maximum(1 - stretch[None] * xi, 0.25)
         hessian = curvature + eye * bend[..., None, :]
         inner = Cholesky(hessian)
-        tilt = 0.5 * jnp.sum(inner.forward(jnp.broadcast_to(stretch, xi.shape)) ** 2, -1)
+        # Small next to the curvature; where tests are silent and spreads wide, stretch^2 keeps it below 1/2 each.
+        slope = jnp.broadcast_to(stretch, xi.shape)
+        tilt = 0.5 * jnp.sum(Cholesky(hessian + eye * stretch**2).forward(slope) ** 2, -1)
         value = -0.5 * share * squares - 0.5 * jnp.sum(xi**2, -1) - 0.5 * inner.log_det() + tilt
         value += self.log_scale - self.count * population.log_noise
         return Laplace(xi, hessian, stretch, value, placed)
 
     def draw(self, population: Population, normal: Array, normal_zero: Array) -> ParticleDraw:
-        """Every particle's own numbers given the population, from standard normal numbers.
-
-        Args:
-            population: what all particles share.
-            normal: shape (N, k).
-            normal_zero: shape (N,).
-        """
+        """Every particle's own numbers given the population, from standard normal numbers."""
         at = self.laplace(population)
         inner = Cholesky(at.hessian)
         nu = inner.backward(normal)
@@ -291,15 +287,8 @@ def summarise(
 ) -> Summaries:
     """Summarise all tests around a point by Gauss-Newton curvature.
 
-    Args:
-        point: around what.
-        straight: coordinates of the effects' numbers.
-        tests: the measurements.
-        linear: the tests linearised there, in these coordinates.
-        noise: the noise.
-        zero_prior: mean and standard deviation of the zeros, from the recorded contact [um].
-        scatter: what differs from particle to particle.
-        correlation, along: of the correlated residuals.
+    `linear` has the derivatives in the coordinates `straight`; `zero_prior` is the zeros' distance from the recorded
+    contact, mean and standard deviation [um].
     """
 
     def of_one(scale: Scalar, tests: Tests, linear: Linear) -> Whitening:

@@ -1,8 +1,10 @@
-"""The mode of the population in coordinates without bounds, given the tests with every particle integrated out."""
+"""The population in coordinates without bounds, given the tests with every particle integrated out: its density, its
+mode, the particles that it expects."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -18,13 +20,18 @@ from numpyro.infer.util import constrain_fn, potential_energy, unconstrain_fn
 from .._types import Scalar
 from .compiling import compiled
 from .distributions import SpreadCoordinate
-from .marginal import Marginal
+from .marginal import Marginal, straighten
 from .model import Model
 from .noise import standard_promotion
 from .population import COEFFICIENTS, Population
 from .settings import FIT
 
 handlers: Any = numpyro.handlers
+
+
+def seeded(model: Any) -> Any:
+    """A NumPyro model that may ask for random numbers, all of which are given."""
+    return handlers.seed(model, jax.random.key(0))
 
 
 class Shapes(eqx.Module):
@@ -45,7 +52,7 @@ def coordinate_names(model: Model) -> tuple[str, ...]:
     names: list[str] = []
 
     def collect(shapes: Shapes) -> None:
-        trace = handlers.trace(handlers.seed(model.population, jax.random.key(0))).get_trace(shapes)
+        trace = handlers.trace(seeded(model.population)).get_trace(shapes)
         names.extend(name for name, site in trace.items() if site["type"] == "sample")
 
     with standard_promotion():
@@ -82,14 +89,14 @@ class LogPosterior(eqx.Module):
     def population(self, free: Float[Array, " d"]) -> Population:
         """The population at unbounded coordinates."""
         with standard_promotion():
-            prior = handlers.seed(self.model.population, jax.random.key(0))
+            prior = seeded(self.model.population)
             return self.at_values(constrain_fn(prior, (self.marginal,), {}, self.sites(free)))
 
     def at_values(self, values: dict[str, Array]) -> Population:
         """The population at values of its sites."""
         prior = handlers.substitute(self.model.population, data=values)
         with standard_promotion():
-            return handlers.seed(prior, jax.random.key(0))(self.marginal)
+            return seeded(prior)(self.marginal)
 
     def sites(self, free: Array) -> dict[str, Array]:
         """Unbounded coordinates by the names of their sites."""
@@ -103,7 +110,7 @@ class LogPosterior(eqx.Module):
 @compiled
 def _unconstrained(values: Float[Array, " d"], target: LogPosterior) -> Float[Array, " d"]:
     with standard_promotion():
-        prior = handlers.seed(target.model.population, jax.random.key(0))
+        prior = seeded(target.model.population)
         free = unconstrain_fn(prior, (target.marginal,), {}, target.sites(values))
     return jnp.stack([jnp.asarray(free[name]) for name in target.names])
 
@@ -135,7 +142,7 @@ def log_priors(population: Population, model: Model, flatness: Array) -> dict[st
     def one(at: Population) -> dict[str, Array]:
         values = values_of(at, model, flatness)
         with standard_promotion():
-            prior = handlers.substitute(handlers.seed(model.population, jax.random.key(0)), data=values)
+            prior = handlers.substitute(seeded(model.population), data=values)
             trace = handlers.trace(prior).get_trace(Shapes(flatness))
             return {name: trace[name]["fn"].log_prob(values[name]) for name in values}
 
@@ -157,6 +164,73 @@ def prior_populations(keys: Array, model: Model, flatness: Array) -> Population:
 def density_of(free: Float[Array, " d"], target: LogPosterior) -> Scalar:
     """Log density at unbounded coordinates."""
     return target.log_density(free)
+
+
+class Expected(eqx.Module):
+    """What a population says of its particles, and what the tests add.
+
+    Attributes:
+        mean, sd: of b1, b3, b5, e under the population, shape (N, 4).
+        latent: most probable ones given the tests, too, shape (N, 4).
+        theta: most probable numbers of the effects.
+        theta_mean, theta_sd: of the amplitudes that vary, under the population.
+        zero: most probable zeros [um], shape (N,).
+        hessian, stretch: of `Laplace`.
+    """
+
+    mean: Float[Array, "particles 4"]
+    sd: Float[Array, "particles 4"]
+    latent: Float[Array, "particles 4"]
+    theta: Float[Array, "particles numbers"]
+    theta_mean: Float[Array, "particles varying"]
+    theta_sd: Float[Array, "particles varying"]
+    zero: Float[Array, " particles"]
+    hessian: Float[Array, "particles k k"]
+    stretch: Float[Array, " k"]
+
+
+@compiled
+def expect(free: Float[Array, " d"], target: LogPosterior) -> Expected:
+    """The particles under the population at unbounded coordinates."""
+    marginal, population = target.marginal, target.population(free)
+    at = marginal.laplace(population)
+    none = marginal.place(population, jnp.zeros_like(at.deviations))
+    varying = jnp.asarray([k for k, _ in marginal.scatter.varying], int)
+    width = jnp.sqrt(jnp.sum(at.placed.jacobian**2, -1))
+    mean, factor = none.latent, none.jacobian[:, :4]
+    # Without the bend of the straightened coordinates, which is that of the point.
+    _, slope = straighten(mean - marginal.point.latent)
+    sd = jnp.sqrt(jnp.sum((factor / slope[..., None]) ** 2, -1))
+    zero = marginal.zero + jnp.einsum("np,np->n", marginal.zero_slope, at.placed.u)
+    theta = at.placed.theta
+    return Expected(
+        mean,
+        sd,
+        at.placed.latent,
+        theta,
+        none.theta[:, varying],
+        width[:, 4:][:, varying],
+        zero,
+        at.hessian,
+        at.stretch,
+    )
+
+
+def careful_enough(free: Float[Array, " d"], target: LogPosterior, count: int) -> LogPosterior:
+    """The target with as many Newton steps as the integration over the particles needs: none if every coefficient is
+    known sharply.
+
+    Args:
+        free: population in unbounded coordinates.
+        target: of the tests.
+        count: number of particles, without copies that only fill up.
+    """
+    scatter = replace(target.marginal.scatter, newton=0)
+    sharp = replace(target, marginal=replace(target.marginal, scatter=scatter))
+    at = expect(free, sharp)
+    variance = np.diagonal(np.linalg.inv(np.asarray(at.hessian)[:count]), axis1=1, axis2=2)
+    widest = float(np.max(np.sqrt(variance) * np.asarray(at.stretch)))
+    return sharp if widest < FIT.sharp else target
 
 
 @compiled
@@ -192,6 +266,7 @@ def gradients(free: np.ndarray, target: LogPosterior) -> tuple[np.ndarray, np.nd
     return np.asarray(value)[: len(free)], np.asarray(slope)[: len(free)]
 
 
+@np.errstate(over="ignore", invalid="ignore")  # steps may lead to where numbers overflow; they are refused
 def most_probable(
     start: Float[Array, " d"], target: LogPosterior
 ) -> tuple[Float[Array, " d"], Float[Array, "d d"], bool]:
@@ -201,12 +276,7 @@ def most_probable(
     from differences of exact gradients, which are quicker than second derivatives are to compile. Where the density has
     no curvature that is a number, even at the start, the covariance is not one either.
     """
-    # Steps may lead to where numbers overflow; they are refused.
-    with np.errstate(over="ignore", invalid="ignore"):
-        return _most_probable(np.asarray(start), target)
-
-
-def _most_probable(origin: np.ndarray, target: LogPosterior) -> tuple[Float[Array, " d"], Float[Array, "d d"], bool]:
+    origin = np.asarray(start)
     d = len(origin)
     width = np.full(d, 1e-5)
 

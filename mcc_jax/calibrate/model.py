@@ -26,12 +26,10 @@ from .forward import Forms, Linear, Point, linearise
 from .marginal import Marginal
 from .noise import FREEDOM, Along, Correlation, Noise, Whitening, whitening
 from .population import COEFFICIENTS, Population, Scatter, particles_at
-from .priors import NakagamiPrior, Priors
+from .priors import ALMOST, NakagamiPrior, Priors
 
 sample: Any = numpyro.sample
 deterministic: Any = numpyro.deterministic
-ALMOST = 0.98
-"""Share of the way to the value of a at which a particle's shape factor would vanish."""
 
 
 @dataclass(frozen=True)
@@ -124,15 +122,12 @@ class Model:
             filters: of a fit: the noise as it was estimated, but for a common factor; sampled if None.
             around: of a fit: every particle's own numbers are sampled in the coordinates of its Laplace approximation.
         """
-        shapes = tests if marginal is None else marginal
-        assert shapes is not None
         if marginal is not None:
-            population = self.population(shapes)
-            numpyro.factor("tests", jnp.sum(marginal.log_likelihood(population)))
+            numpyro.factor("tests", jnp.sum(marginal.log_likelihood(self.population(marginal))))
             return
         assert tests is not None
         p, count, size = self.chosen_priors, len(tests), self.scatter.size
-        population = self.population(shapes, noise_factor=filters is not None)
+        population = self.population(tests, noise_factor=filters is not None)
         noise = None if filters is not None else self._noise(count)
         with numpyro.plate("particle", count):
             if around is None:
@@ -324,19 +319,3 @@ def _variant(effect: Any) -> Variant:
                 remedy="A model has one value for all tests; take another formula of the mechanism.",
             )
     return found
-
-
-def check_prior_of_a(priors: Priors, flatness: np.ndarray) -> None:
-    """Make sure that the prior of `a` leaves values under which every particle's shape factor is positive.
-
-    Raises:
-        InputError: if it does not.
-    """
-    most, least = max(flatness.max(), 1e-3), min(flatness.min(), -1e-3)
-    low, high = -ALMOST / most, -ALMOST / least
-    if not (low < priors.a.mean + 6 * priors.a.sd and high > priors.a.mean - 6 * priors.a.sd):
-        raise InputError(
-            f"the prior of a ({priors.a.mean:g} +- {priors.a.sd:g}) leaves no value under which every particle's shape "
-            f"factor is positive ({low:.3g} < a < {high:.3g})",
-            remedy="Widen the prior, or check the diameters.",
-        )

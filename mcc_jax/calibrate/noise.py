@@ -205,12 +205,7 @@ def whitening(
 ) -> Whitening:
     """The factored covariance of one test.
 
-    Args:
-        noise: the campaign's noise; `noise.scale` is not used.
-        scale: this particle's scale.
-        tests: the test, without the axis of the particles.
-        linear: how its prediction moves with force, without that axis.
-        correlation, along: of the correlated residuals.
+    The scale is this particle's, and `noise.scale` is not used; tests and linear are without an axis of particles.
     """
     variance = jnp.where(tests.mask, scale**2 * _read_out(noise, tests, linear), MASKED_UM2)
     place = tests.path if along is Along.LOAD else tests.record.time
@@ -331,6 +326,11 @@ class NoiseFit(eqx.Module):
     log_evidence: Float[Array, ""]
     converged: bool = eqx.field(static=True)
 
+    @classmethod
+    def unsure(cls, noise: Noise, *, converged: bool) -> NoiseFit:
+        """A noise of which no error is known."""
+        return cls(noise, jnp.asarray(np.full((4, 4), np.nan)), jnp.asarray(np.nan), converged)
+
     @property
     def log_sd(self) -> np.ndarray:
         """Standard deviations of the logarithms of the four numbers."""
@@ -355,13 +355,10 @@ def estimate_noise(
     differences, all of them in one batch, than to compile.
 
     Args:
-        tests, linear: measurements and linear residuals, of this process's own particles.
+        tests, linear: of this process's own particles.
         zero_sd: standard deviation of the zeros [um].
-        prior: prior of the four numbers.
         start: where to begin, and the particles' scales.
-        correlation, along: of the correlated residuals.
         uncertainty: whether to work out the covariance.
-        blocks: how the particles are cut.
     """
     from scipy.optimize import minimize
 
@@ -369,7 +366,7 @@ def estimate_noise(
 
     def value_and_gradient(logs: np.ndarray) -> tuple[float, np.ndarray]:
         at = jnp.asarray(logs + DIFFERENCES)
-        each = blocks.whole(blocks.each(likelihoods, at, scale, tests, linear, zero_sd, correlation, along, axis=1))
+        each = blocks.all(likelihoods, at, scale, tests, linear, zero_sd, correlation, along, axis=1)
         # Summed here, in one order, however the particles are spread.
         values = -(np.sum(np.asarray(each), axis=1) + prior.log_density(np.asarray(at)))
         return float(values[0]), (values[1:5] - values[5:]) / (2 * STEP)
@@ -379,16 +376,15 @@ def estimate_noise(
     inside = np.clip(np.asarray(start.logs), *np.transpose(bounds))
     found = minimize(value_and_gradient, inside, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-9})
     noise = Noise.of(np.exp(found.x), start.scale)
-    unknown, nothing = jnp.asarray(np.full((4, 4), np.nan)), jnp.asarray(np.nan)
     if not uncertainty:
-        return NoiseFit(noise, unknown, nothing, bool(found.success))
+        return NoiseFit.unsure(noise, converged=bool(found.success))
     width = 0.02
     columns = [
         (value_and_gradient(found.x + width * e)[1] - value_and_gradient(found.x - width * e)[1]) / (2 * width)
         for e in np.eye(4)
     ]
     if not np.isfinite(columns).all():
-        return NoiseFit(noise, unknown, nothing, False)
+        return NoiseFit.unsure(noise, converged=False)
     values, vectors = np.linalg.eigh((np.array(columns) + np.array(columns).T) / 2)
     values = np.maximum(values, 1e-6)
     volume = float(prior.log_density(found.x)) + 2 * np.log(2 * np.pi) - 0.5 * np.sum(np.log(values))

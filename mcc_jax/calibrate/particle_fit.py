@@ -107,13 +107,9 @@ def fit_particles(
     waits for the others, so there is one loop whatever their number.
 
     Args:
-        tests: the measurements.
         noise: scale of each particle's residuals [um].
         centre, width: normal prior of each particle's b1, b3, b5, e, zero [um], and the amplitudes that vary.
-        theta: numbers of the effects; those that vary are fitted.
-        starts: where to start from.
-        forms: the law.
-        varying: places of the amplitudes that vary.
+        theta: numbers of the effects; those whose places are in `varying` are fitted.
         most_steps: give up after as many.
     """
     count, size = len(starts), starts.shape[-1]

@@ -40,14 +40,9 @@ from .sharding import Blocks, count_of
 
 
 class ParticleDraws(NamedTuple):
-    """Draws of the particles' parameters, one for each draw of the population.
+    """Draws of the particles' parameters, one for each draw of the population; see `ParticleDraw`.
 
-    Attributes:
-        latent: b1, b3, b5, e.
-        theta: numbers of the effects.
-        zero: zero of displacement [um].
-        log_likelihood: of every test given the population, the particle integrated out.
-        log_ratio: log of exact over quadratic likelihood; 0 where the exact one was not looked at.
+    `log_ratio` is the log of exact over quadratic likelihood; 0 where the exact one was not looked at.
     """
 
     latent: Float[Array, "draws particles 4"]
@@ -214,33 +209,18 @@ class Drawer:
 
     def all(self, key: Array, population: Population, candidates: int = 1, *, common: bool = False) -> ParticleDraws:
         """All particles, with `candidates` and `common` of `draw_particles`."""
-        blocks = self._blocks
-
-        def draw(key: Array, population: Population) -> list[np.ndarray]:
-            keys, same = blocks.keys(key), jnp.asarray(np.asarray(common))
-            found = blocks.whole(blocks.each(draw_particles, keys, population, self._own, candidates, same, axis=1))
-            return [np.asarray(v)[:, : self.count] for v in found]
-
-        return self._chunked(draw, key, population, common)
-
-    def _chunked(
-        self,
-        draw: Callable[[Array, Population], list[np.ndarray]],
-        key: Array,
-        population: Population,
-        common: bool,
-    ) -> ParticleDraws:
-        """Draws under all populations, the last one repeated to fill up chunks."""
-        draws = len(np.asarray(population.a))
-        chunk = self._chunk or draws
+        blocks, draws = self._blocks, len(np.asarray(population.a))
+        chunk, same = self._chunk or draws, jnp.asarray(np.asarray(common))
 
         def one(first: int) -> list[np.ndarray]:
-            rows = np.minimum(np.arange(first, first + chunk), draws - 1)
-            own = key if common or not first else jax.random.fold_in(key, first)
-            return draw(own, jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[rows]), population))
+            rows = np.minimum(np.arange(first, first + chunk), draws - 1)  # the last one fills up the last chunk
+            keys = blocks.keys(key if common or not first else jax.random.fold_in(key, first))
+            some = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[rows]), population)
+            found = blocks.all(draw_particles, keys, some, self._own, candidates, same, axis=1)
+            return [np.asarray(v)[:, : self.count] for v in found]
 
         # Several processes exchange the numbers of their blocks, in one order.
-        found = (side_by_side if self._blocks.whole_here else map)(one, range(0, draws, chunk))
+        found = (side_by_side if blocks.whole_here else map)(one, range(0, draws, chunk))
         return ParticleDraws(*(cast(Any, np.concatenate(several)[:draws]) for several in zip(*found, strict=True)))
 
     def some(
@@ -253,16 +233,9 @@ class Drawer:
             # Always of one of a few sizes, the first one repeated: every size would be compiled anew.
             size = min(self.count, NUMERICS.group, 4 ** int(np.ceil(np.log(max(len(group), 2)) / np.log(4))))
             padded = jnp.asarray(np.pad(group, (0, size - len(group)), constant_values=group[0]))
-            exact, count = self._exact.some(padded), len(group)
-
-            def draw(
-                key: Array, population: Population, exact: ExactLikelihood = exact, count: int = count
-            ) -> list[np.ndarray]:
-                same = jnp.asarray(np.asarray(common))
-                drawn = draw_particles(key[None], population, exact, candidates, same)
-                return [np.asarray(v)[:, :count] for v in drawn]
-
-            found.append(self._chunked(draw, jax.random.fold_in(key, 1000 * i + candidates), population, common))
+            own = jax.random.fold_in(key, 1000 * i + candidates)
+            drawn = Drawer(self._exact.some(padded), 0, self._chunk).all(own, population, candidates, common=common)
+            found.append([np.asarray(v)[:, : len(group)] for v in drawn])
         return ParticleDraws(*(cast(Any, np.concatenate(several, 1)) for several in zip(*found, strict=True)))
 
     def settle(
@@ -277,10 +250,8 @@ class Drawer:
         """Draw restless particles anew from many candidates, in place, and their Pareto k, until none is left.
 
         Args:
-            key: random key.
-            drawn: of all particles under `population`.
-            population: draws.
-            k: of every particle.
+            drawn: all particles under `population`; theirs are replaced.
+            k: Pareto k of every particle.
             restless: positions of the restless ones.
             candidates: how many per draw: first, and for the few that scatter most even then.
         """
@@ -417,10 +388,8 @@ class Correction(NamedTuple):
 def correction(total: Callable[[int, np.ndarray], np.ndarray], draws: np.ndarray) -> Correction:
     """Regression of the sum of log ratios on the population's parameters, and its prediction for every draw.
 
-    Args:
-        total: the sums at the given rows of `draws`, all with the same random numbers, which depend on the first
-            argument: 0 or 1.
-        draws: of the parameters, shape (draws, parameters).
+    `total` gives the sums at rows of `draws`, with random numbers that depend on its first argument, 0 or 1; `draws`
+    are those of the parameters, shape (draws, parameters).
     """
     rows = evenly(len(draws), SAMPLING.probes)
     unit, values, _ = np.linalg.svd(draws - draws.mean(0), full_matrices=False)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 import jax
 import numpy as np
@@ -14,31 +14,23 @@ from .. import arguments
 from .._errors import InputError
 from .._format import with_sd
 from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_plausibility, check_tests
-from ..effects import Variant
+from ..campaign.findings import worst
 from .compiling import imported_meanwhile
-from .data import Selection, compared_rows, own_misfit, ranges_um, root_mean_squares
-from .draws import Draws, draw_fast, draw_joint
-from .effects import effect_entries, effect_numbers
-from .estimates import estimate, finite, force_zero, log_estimate, misfit_note, missed, noise_note, summary
+from .data import Selection, ranges_um
+from .draws import Draws, draw_fast, draw_joint, named_population
+from .estimates import effect_entries, finite, summary
 from .fit_result import Fit
-from .fitting import checked_settings, in_own_units, prepare
-from .judgement import at_noise_level, judged, noise_share, numbers_in_reach, unlike_others
+from .fitting import checked_settings, prepare
+from .judgement import at_noise_level, judged, numbers_in_reach, unlike_others
 from .least_squares import least_squares
 from .model import Model
 from .particles import Length
-from .population import COEFFICIENTS, Population
+from .population import COEFFICIENTS
 from .predict import predict_measured
 from .results import PosteriorDraws
 from .settings import SAMPLING
 
 Mode = Literal["fast", "joint"]
-
-
-class Worst(NamedTuple):
-    """The parameter that a diagnostic is worst for, and its value."""
-
-    name: str
-    value: float
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -69,30 +61,16 @@ class Posterior(PosteriorDraws, Draws):
     runtime_s: float
     findings: tuple[Finding, ...] = field(default=())
 
-    def compared(self) -> Mapping[int, tuple[np.ndarray, np.ndarray]]:
-        """Rows of every particle's curve that stand in the tests, and which of them are compared."""
-        return compared_rows(self.selection)
-
-    @property
-    def variants(self) -> dict[str, Variant]:
-        """The formulas of the law's effects by name."""
-        return self.model.variants
-
     def predictions(self, particle: str) -> np.ndarray | None:
         """Draws of what may be measured of a particle at its rows [um], shape (draws, rows)."""
         return predict_measured(self, particle, seed=self.seed).observed_um
-
-    @property
-    def particles(self) -> tuple[str, ...]:
-        """Names of the particles that took part."""
-        return tuple(self.campaign.particles[i] for i in self.selection.kept)
 
     def failures(self) -> list[str]:
         """Why the result must not be called converged, and what to do; empty if all gates are passed."""
         reasons = ("noise", "population")
         unfitted = [r for r, fine in zip(reasons, np.asarray(self.fit.converged)[1:], strict=True) if not fine]
         if unfitted and self.mode == "fast":  # of what was drawn around a fit that is none, no diagnostic says anything
-            by, what = missed(self.rms_um(), self._own_misfit), " and ".join(unfitted)
+            by, what = self._missed, " and ".join(unfitted)
             if at_noise_level(self.fit, self.rms_um()):
                 return [
                     f"the search for the {what} did not come to rest, although the law misses these tests by no more "
@@ -103,11 +81,12 @@ class Posterior(PosteriorDraws, Draws):
                 "out the particles that are unlike the others, or look for what is missing (discover)"
             ]
         found = []
-        rhat, ess = unmixed(self.rhat, self.ess_bulk)
-        if rhat is not None:
-            found.append(f"R-hat of {rhat.name} is {rhat.value:.3f}, above {SAMPLING.rhat}: draw longer (--draws)")
-        if ess is not None:
-            found.append(f"bulk ESS of {ess.name} is {ess.value:.0f}, below {SAMPLING.ess:.0f}: draw longer (--draws)")
+        slowest = max(self.rhat, key=lambda name: self.rhat[name])
+        if not (rhat := self.rhat[slowest]) <= SAMPLING.rhat:
+            found.append(f"R-hat of {slowest} is {rhat:.3f}, above {SAMPLING.rhat}: draw longer (--draws)")
+        fewest = min(self.ess_bulk, key=lambda name: self.ess_bulk[name])
+        if not (ess := self.ess_bulk[fewest]) >= SAMPLING.ess:
+            found.append(f"bulk ESS of {fewest} is {ess:.0f}, below {SAMPLING.ess:.0f}: draw longer (--draws)")
         if self.divergences:
             found.append(f"{self.divergences} trajectories diverged: draw longer, or narrow the priors")
         bad = np.flatnonzero(~(self.pareto_k <= SAMPLING.pareto_k))
@@ -125,39 +104,17 @@ class Posterior(PosteriorDraws, Draws):
         return found
 
     @property
-    def _own_misfit(self) -> float:
-        return own_misfit(self.selection.tests, self.fit.residual)
-
-    @property
     def converged(self) -> bool:
         """Whether every gate is passed."""
         return not self.failures()
 
     def named_population(self) -> dict[str, np.ndarray]:
         """Draws of the population by the names used in files, shape (chains, draws)."""
-        p = self.population
-        named = {"a": p.a, "effective_modulus_MPa": np.exp(np.asarray(p.log_modulus))}
-        for j, name in enumerate(COEFFICIENTS):
-            named[f"mu_{name}"] = p.mu[..., j]
-        for j, name in enumerate(COEFFICIENTS):
-            named[f"tau_{name}"] = p.tau[..., j]
-        if self.model.modulus_scatter:
-            named["modulus_scatter"] = p.modulus_scatter
-        if self.model.shape_scatter:
-            named["shape_scatter"] = p.shape_scatter
-        named |= effect_numbers(p, self.model)
-        named["noise_factor"] = np.exp(np.asarray(p.log_noise))
-        return {name: np.asarray(values) for name, values in named.items()}
+        return named_population(self.population, self.model)
 
     def warnings(self) -> list[str]:
         """What a reader of the numbers must know, one sentence each."""
-        notes = [*self.failures(), *map(str, self.findings), *self.selection.notes, *self.notes]
-        by = missed(self.rms_um(), self._own_misfit)
-        told = misfit_note(self._own_misfit), noise_note(self.noise_share, by)
-        notes += [note for note in told if note is not None]
-        dropped = sum(reason is not None for reason in self.selection.why_not)
-        if dropped:
-            notes.append(f"{dropped} of {len(self.campaign)} particles could not be used")
+        notes = [*self.failures(), *map(str, self.findings), *self._notes_of_the_fit()]
         if len(self.particles) < 3:
             notes.append(
                 f"{len(self.particles)} particles say little about a population: its spread is mostly the prior"
@@ -183,53 +140,34 @@ class Posterior(PosteriorDraws, Draws):
         r""":math:`\sigma_y = E[C_1]/17.16` [MPa] (eq. 22), one number per draw of the population."""
         return np.exp(np.asarray(self.population.mu)[..., 0] + np.asarray(self.population.tau)[..., 0] ** 2 / 2) / 17.16
 
-    @property
-    def noise_share(self) -> float:
-        """Share of what the law misses that correlated noise has taken up; see `noise_share`."""
-        return noise_share(self.fit)
-
-    def rms_um(self) -> np.ndarray:
-        """Root mean square residual of every particle at the most probable parameters [um]."""
-        return root_mean_squares(self.selection.tests, self.fit.residual)
-
     def answer(self) -> dict[str, Any]:
         """Whether it converged, a, the modulus and the population, as in `calibration.json`."""
-        return {"converged": self.converged, **population_json(self.population)}
+        mu, tau = np.asarray(self.population.mu), np.asarray(self.population.tau)
+        return {
+            "converged": self.converged,
+            "a": summary(np.asarray(self.population.a)),
+            "effective_modulus_MPa": summary(np.exp(np.asarray(self.population.log_modulus))),
+            **{
+                f"log_{name}": {"mean": summary(mu[..., j]), "sd": summary(tau[..., j])}
+                for j, name in enumerate(COEFFICIENTS)
+            },
+        }
 
     def to_json(self) -> dict[str, Any]:
         """The contents of `calibration.json`."""
         named = self.named_population()
-        noise = self.fit.noise.noise
-        numbers = ("displacement_um", "force_mN", "correlated_um", "correlation_length")
-        logs, sds = np.asarray(noise.logs), self.fit.noise.log_sd
-        entries = []
-        rms = self.rms_um()
-        position = {i: row for row, i in enumerate(self.selection.kept)}
-        for i, name in enumerate(self.campaign.particles):
-            row = position.get(i)
-            draws: dict[str, Any] = dict.fromkeys(("eta_p", *COEFFICIENTS, "zero_um"), estimate(None))
-            if row is not None:
-                draws["eta_p"] = summary(self.shape_factor[..., row])
-                for j, coefficient in enumerate(COEFFICIENTS):
-                    draws[coefficient] = summary(self.C[..., row, j])
-                draws["zero_um"] = summary(self.zero_um[..., row])
-                if self.model.modulus_scatter:
-                    draws["effective_modulus_MPa"] = summary(self.modulus_MPa[..., row])
-                if self.model.varying:
-                    places = self.model.varying_places
-                    draws["amplitudes"] = {m: summary(self.theta[..., row, k]) for m, k in places.items()}
-            entries.append(
-                {
-                    "particle": name,
-                    **draws,
-                    "rms_um": finite(rms[row]) if row is not None else None,
-                    "noise_scale": finite(float(noise.scale[row])) if row is not None else None,
-                    "pareto_k": finite(float(self.pareto_k[row])) if row is not None else None,
-                    "kept": row is not None,
-                    "why_not": self.selection.why_not[i],
-                    "force_zero_mN": force_zero(self.campaign.curves[i]),
-                }
-            )
+
+        def numbers(row: int) -> dict[str, Any]:
+            found = {"eta_p": summary(self.shape_factor[..., row])}
+            found |= {name: summary(self.C[..., row, j]) for j, name in enumerate(COEFFICIENTS)}
+            found["zero_um"] = summary(self.zero_um[..., row])
+            if self.model.modulus_scatter:
+                found["effective_modulus_MPa"] = summary(self.modulus_MPa[..., row])
+            if self.model.varying:
+                places = self.model.varying_places
+                found["amplitudes"] = {m: summary(self.theta[..., row, k]) for m, k in places.items()}
+            return found
+
         return {
             "schema": 1,
             "method": "bayes",
@@ -243,12 +181,9 @@ class Posterior(PosteriorDraws, Draws):
             "shape_scatter": summary(named["shape_scatter"]) if self.model.shape_scatter else None,
             "yield_stress_MPa": summary(self.yield_stress_MPa()),
             "probability_not_monotone": summary(self.probability_not_monotone()),
-            "noise": {
-                **{name: log_estimate(m, s) for name, m, s in zip(numbers, logs, sds, strict=True)},
-                "factor": summary(named["noise_factor"]),
-            },
+            "noise": self._noise_numbers() | {"factor": summary(named["noise_factor"])},
             "priors": self.model.chosen_priors.to_json(),
-            "particles": entries,
+            "particles": self._entries(numbers, pareto_k=self.pareto_k),
             "warnings": self.warnings(),
             "findings": [one.to_json() for one in self.findings],
             "diagnostics": {
@@ -263,33 +198,10 @@ class Posterior(PosteriorDraws, Draws):
                 "log_evidence": finite(self.log_evidence[0]),
                 "log_evidence_error": finite(self.log_evidence[1]),
                 "noise_share": finite(self.noise_share),
-                "own_misfit": finite(self._own_misfit),
+                "own_misfit": finite(self.own_misfit),
                 "failures": self.failures(),
             },
         }
-
-
-def population_json(draws: Population) -> dict[str, Any]:
-    """a, modulus, means and spreads of log C1, log C3, log C5, as they stand in result files."""
-    mu, tau = np.asarray(draws.mu), np.asarray(draws.tau)
-    return {
-        "a": summary(np.asarray(draws.a)),
-        "effective_modulus_MPa": summary(np.exp(np.asarray(draws.log_modulus))),
-        **{
-            f"log_{name}": {"mean": summary(mu[..., j]), "sd": summary(tau[..., j])}
-            for j, name in enumerate(COEFFICIENTS)
-        },
-    }
-
-
-def unmixed(rhat: Mapping[str, float], ess_bulk: Mapping[str, float]) -> tuple[Worst | None, Worst | None]:
-    """The largest R-hat and the smallest bulk ESS; None for what passes the gate."""
-    slowest = max(rhat, key=lambda name: rhat[name])
-    fewest = min(ess_bulk, key=lambda name: ess_bulk[name])
-    return (
-        None if rhat[slowest] <= SAMPLING.rhat else Worst(slowest, rhat[slowest]),
-        None if ess_bulk[fewest] >= SAMPLING.ess else Worst(fewest, ess_bulk[fewest]),
-    )
 
 
 def sample(
@@ -345,11 +257,10 @@ def sample(
     length = Length(chains, arguments.whole(warmup, "warmup", least=1), draws)
     fast = mode == "fast"
     with numbers_in_reach(campaign):
-        chosen, own_units = in_own_units(campaign, model)
-        selection, fit, size = prepare(campaign, chosen, threshold_MPa, fill_up=fast, block=block, tell=tell)
+        selection, fit, size = prepare(campaign, model, threshold_MPa, fill_up=fast, block=block, tell=tell)
         tell("sampling the population" if fast else "sampling everything")
         key = jax.random.key(seed)
-        likely = not any(one.level == "bad" for one in check_plausibility(campaign.raw or campaign))
+        likely = worst(check_plausibility(campaign)) != "bad"
         drawn = draw_fast(key, fit, length, size, patient=likely) if fast else draw_joint(key, fit, length)
     tell("diagnosing")
     calibration = Posterior(
@@ -371,21 +282,22 @@ def sample(
         return sample(some, model, without_flagged=False, **settings, **few).answer()
 
     findings = judged(campaign, calibration.answer(), outlying, again if without_flagged else None)
-    told = [own_units]
+    notes = calibration.notes
     if model.effects and without_flagged:
         tell("calibrating without the effects")
-        told.append(_moved_by_effects(campaign, model, calibration, threshold_MPa))
-    notes = (*calibration.notes, *(one for one in told if one is not None))
+        notes += _moved_by_effects(campaign, model, calibration, threshold_MPa)
     return replace(calibration, findings=findings, notes=notes, runtime_s=time.perf_counter() - started)
 
 
-def _moved_by_effects(campaign: Campaign, model: Model, calibration: Posterior, threshold_MPa: float) -> str | None:
+def _moved_by_effects(
+    campaign: Campaign, model: Model, calibration: Posterior, threshold_MPa: float
+) -> tuple[str, ...]:
     """A sentence if a or the modulus move by more than their stated error when the effects come into the law."""
     plain = replace(model, effects=(), varying=())
     try:
         base = least_squares(campaign, plain, threshold_MPa=threshold_MPa, without_flagged=False)
     except InputError:
-        return None  # without the effects there is no answer to compare with
+        return ()  # without the effects there is no answer to compare with
     before, after = base.answer(), calibration.answer()
     moved = []
     for name, unit, factor in (("effective_modulus_MPa", " GPa", 1e-3), ("a", "", 1.0)):
@@ -395,9 +307,9 @@ def _moved_by_effects(campaign: Campaign, model: Model, calibration: Posterior, 
         label = "the effective modulus" if unit else "a"
         moved.append(f"{label} from {with_sd(old, factor)}{unit} to {with_sd(new, factor)}{unit}")
     if not moved:
-        return None
+        return ()
     names = ", ".join(model.variants)
     return (
         f"With {names} in the law {' and '.join(moved)}, by more than the error it had: without the effect the base "
-        "law's own numbers had taken up what it explains"
+        "law's own numbers had taken up what it explains",
     )

@@ -44,7 +44,6 @@ class NormalPrior:
     sd: float
 
     def __post_init__(self) -> None:
-        """Refuse what is no normal distribution."""
         object.__setattr__(self, "mean", arguments.number(self.mean, "the mean of a prior"))
         object.__setattr__(self, "sd", arguments.number(self.sd, "the sd of a prior", above=0))
 
@@ -61,7 +60,6 @@ class LogNormalPrior:
     log_sd: float
 
     def __post_init__(self) -> None:
-        """Refuse what is no log-normal distribution."""
         object.__setattr__(self, "median", arguments.number(self.median, "the median of a prior", above=0))
         object.__setattr__(self, "log_sd", arguments.number(self.log_sd, "the log_sd of a prior", above=0))
 
@@ -87,13 +85,14 @@ class NakagamiPrior:
     shape: float = 0.5
 
     def __post_init__(self) -> None:
-        """Refuse what is no distribution of a spread."""
         object.__setattr__(self, "sd", arguments.number(self.sd, "the scale sd of a spread", above=0))
         shape = arguments.number(self.shape, "the shape of a spread's prior", above=0, most=MAX_SHAPE)
         object.__setattr__(self, "shape", shape)
 
 
 MAX_SHAPE = 0.5
+ALMOST = 0.98
+"""Share of the way to the value of a at which a particle's shape factor would vanish."""
 CELLULOSE = 11.0, 0.6
 """Peak stress [MPa] and scaled strain there of the paper's tests, about: what the default priors belong to."""
 
@@ -215,11 +214,23 @@ class Priors:
         return [(f.name, getattr(self, f.name)) for f in dataclasses.fields(self) if f.name != "changed"]
 
 
-_NAMES = {
-    NormalPrior: "normal",
-    LogNormalPrior: "log-normal",
-    NakagamiPrior: "nakagami",
-}
+def check_prior_of_a(priors: Priors, flatness: np.ndarray) -> None:
+    """Make sure that the prior of `a` leaves values under which every particle's shape factor is positive.
+
+    Raises:
+        InputError: if it does not.
+    """
+    most, least = max(flatness.max(), 1e-3), min(flatness.min(), -1e-3)
+    low, high = -ALMOST / most, -ALMOST / least
+    if not (low < priors.a.mean + 6 * priors.a.sd and high > priors.a.mean - 6 * priors.a.sd):
+        raise InputError(
+            f"the prior of a ({priors.a.mean:g} +- {priors.a.sd:g}) leaves no value under which every particle's shape "
+            f"factor is positive ({low:.3g} < a < {high:.3g})",
+            remedy="Widen the prior, or check the diameters.",
+        )
+
+
+_NAMES = {NormalPrior: "normal", LogNormalPrior: "log-normal", NakagamiPrior: "nakagami"}
 
 
 def read_priors(file: str | Path, unloading: Unloading | str = Unloading.PRINTED) -> Priors:

@@ -1,13 +1,19 @@
-"""What every calibration can do once it is made: give its law, its curves, be saved and be read again."""
+"""What every calibration can do once it is made: give its law, its curves, be saved and be read again.
+
+What is read is strict JSON of a known schema, or one line on what is wrong.
+"""
 
 from __future__ import annotations
 
 import abc
-from collections.abc import Mapping
+import json
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
+from importlib.resources import files
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 
@@ -16,14 +22,16 @@ from .._archive import encode, read_archive
 from .._errors import InputError
 from .._format import table, with_sd
 from .._store import json_text, results
+from .._text import check_text
 from ..campaign import Campaign, read_campaign
 from ..effects import Variant
+from ..files import LIMITS, read_regular
 from ..law import MccLaw
-from .content import read_result
 from .curves import FittedCurve, fitted_curves
-from .data import Selection
+from .data import Selection, compared_rows, ranges_um, root_mean_squares
+from .estimates import estimate, finite, force_zero, log_estimate, misfit_note, noise_note
 from .fit_result import Fit
-from .judgement import modulus_is_open
+from .judgement import modulus_is_open, noise_share
 from .laws import law_of
 from .model import Model
 from .population import COEFFICIENTS, Population
@@ -128,24 +136,99 @@ class Calibration(Saved):
         return None
 
 
-class PosteriorDraws(Calibration):
-    """A calibration by draws of a posterior, as predictions need it; see `Posterior` for its attributes."""
+class JointCalibration(Calibration):
+    """A calibration of all particles at once, which began with a fit; see `LeastSquares` and `Posterior`."""
 
     campaign: Campaign
     selection: Selection
     model: Model
     fit: Fit
+    notes: tuple[str, ...]
+
+    @property
+    def variants(self) -> dict[str, Variant]:
+        """The formulas of the law's effects by name."""
+        return self.model.variants
+
+    @property
+    def particles(self) -> tuple[str, ...]:
+        """Names of the particles that took part."""
+        return tuple(self.campaign.particles[i] for i in self.selection.kept)
+
+    def compared(self) -> Mapping[int, tuple[np.ndarray, np.ndarray]]:
+        """Rows of every particle's curve that stand in the tests, and which of them are compared."""
+        return compared_rows(self.selection)
+
+    def residual(self) -> np.ndarray:
+        """Measured less predicted displacement [um] at the most probable parameters, shape (N, points), 0 where
+        masked."""
+        return np.asarray(self.fit.residual)
+
+    def rms_um(self) -> np.ndarray:
+        """Root mean square residual of every particle [um], shape (N,)."""
+        return root_mean_squares(self.selection.tests, self.residual())
+
+    @property
+    def own_misfit(self) -> float:
+        """Median over the particles of `rms_um`, in shares of the range of displacement [-]."""
+        return float(np.median(self.rms_um() / np.maximum(ranges_um(self.selection.tests), 1e-300)))
+
+    @property
+    def _missed(self) -> str:
+        """How far the law is from the tests, in words."""
+        return f"{np.median(self.rms_um()):.2g} um, {100 * self.own_misfit:.2g} % of their range (medians)"
+
+    @property
+    def noise_share(self) -> float:
+        """Share of what the law misses that correlated noise has taken up; see `noise_share`."""
+        return noise_share(self.fit)
+
+    def _notes_of_the_fit(self) -> list[str]:
+        """Warnings that stand in the tests, in how they were calibrated, and in what the law misses."""
+        notes = [*self.selection.notes, *self.notes]
+        notes += filter(None, (misfit_note(self.own_misfit), noise_note(self.noise_share, self._missed)))
+        dropped = sum(reason is not None for reason in self.selection.why_not)
+        return notes + [f"{dropped} of {len(self.campaign)} particles could not be used"] * (dropped > 0)
+
+    def _noise_numbers(self) -> dict[str, Any]:
+        """Estimates of the noise by their names in files."""
+        noise = self.fit.noise
+        names = ("displacement_um", "force_mN", "correlated_um", "correlation_length")
+        numbers = zip(names, np.asarray(noise.noise.logs), noise.log_sd, strict=True)
+        return {name: log_estimate(m, s) if np.isfinite(m) else estimate(0.0) for name, m, s in numbers}
+
+    def _entries(self, numbers: Callable[[int], dict[str, Any]], **more: np.ndarray) -> list[dict[str, Any]]:
+        """What stands in files of every particle of the campaign.
+
+        Args:
+            numbers: estimates of a row of the tests.
+            more: further numbers of all rows.
+        """
+        row_of = {i: row for row, i in enumerate(self.selection.kept)}
+        told = {"rms_um": self.rms_um(), "noise_scale": np.asarray(self.fit.noise.noise.scale)} | more
+        nothing: dict[str, Any] = dict.fromkeys(("eta_p", *COEFFICIENTS, "zero_um"), estimate(None))
+        return [
+            {
+                "particle": name,
+                **(nothing if (row := row_of.get(i)) is None else numbers(row)),
+                **{key: None if row is None else finite(float(values[row])) for key, values in told.items()},
+                "kept": row is not None,
+                "why_not": self.selection.why_not[i],
+                "force_zero_mN": force_zero(self.campaign.curves[i]),
+            }
+            for i, name in enumerate(self.campaign.particles)
+        ]
+
+
+class PosteriorDraws(JointCalibration):
+    """A calibration by draws of a posterior, as predictions need it; see `Posterior` for its attributes."""
+
     population: Population
     C: np.ndarray
     modulus_MPa: np.ndarray
     zero_um: np.ndarray
     theta: np.ndarray
     seed: int
-
-    @property
-    @abc.abstractmethod
-    def particles(self) -> tuple[str, ...]:
-        """Names of the particles that took part."""
 
     @abc.abstractmethod
     def named_population(self) -> dict[str, np.ndarray]:
@@ -209,3 +292,84 @@ def _read(archive: Path) -> Any:
     if not isinstance(found, Saved) or found.archive_file != archive.name:
         raise InputError(f"holds a {type(found).__name__}", file=archive, remedy=A_FOLDER)
     return found
+
+
+SCHEMA = 1
+LONGEST = 160
+"""So much of a validator's message is shown; it may quote the whole file."""
+
+
+@cache
+def _validator(stem: str) -> Any:
+    from jsonschema import Draft202012Validator
+
+    text = files("mcc_jax.calibrate").joinpath("schemas", f"{stem}.json").read_text(encoding="utf-8")
+    return Draft202012Validator(json.loads(text))
+
+
+def _no_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is no number of JSON")
+
+
+def _finite(text: str) -> float:
+    """A number that JSON can hold again: Python also reads 1e400, and would not write it."""
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"{text[:40]} is no number of JSON")
+    return number
+
+
+def read_result(file: Path, again: str) -> dict[str, Any]:
+    """The contents of a result.
+
+    `again` is the command that writes it, for the remedy.
+
+    Raises:
+        InputError: if it cannot be read, is no JSON, of another schema, or lacks something.
+    """
+    remedy = f"Write it again: {again}"
+    try:
+        data = read_regular(file, LIMITS.result_bytes, remedy)
+        content = json.loads(data.decode("utf-8"), parse_constant=_no_constant, parse_float=_finite)
+    except InputError:
+        raise
+    except json.JSONDecodeError as error:
+        raise InputError(f"is no JSON: {error.msg}", file=file, row=error.lineno, remedy=remedy) from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"is no JSON: {str(error)[:LONGEST]}", file=file, remedy=remedy) from None
+    check_text(content, file, remedy)
+    number = content.get("schema") if isinstance(content, dict) else None
+    if isinstance(number, int) and number != SCHEMA:
+        raise InputError(
+            f"is of schema {number}, this mcc-jax knows {SCHEMA}", file=file, remedy=f"Update mcc-jax, or {again}"
+        )
+    _check(content, file, remedy)
+    schema = _validator(file.stem).schema
+    return _filled(content, schema, schema["$defs"])
+
+
+def _check(content: Any, file: Path, remedy: str) -> None:
+    from jsonschema.exceptions import best_match
+
+    error = best_match(_validator(file.stem).iter_errors(content))
+    if error is None:
+        return
+    place = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in error.absolute_path).lstrip(".")
+    message = error.message if len(error.message) <= LONGEST else f"{error.message[:LONGEST]}..."
+    raise InputError(f"does not hold what it should: {message}", file=file, column=place or None, remedy=remedy)
+
+
+def _filled(content: Any, schema: dict[str, Any], definitions: dict[str, Any]) -> Any:
+    """The content with the schema's defaults where it leaves something out."""
+    if "$ref" in schema:
+        schema = definitions[schema["$ref"].rpartition("/")[2]]
+    if isinstance(content, dict):
+        for branch in schema.get("anyOf", []):
+            content = _filled(content, branch, definitions)
+        parts = schema.get("properties", {})
+        left = schema.get("additionalProperties", {})
+        own = {name: _filled(value, parts.get(name, left), definitions) for name, value in content.items()}
+        return {name: part["default"] for name, part in parts.items() if "default" in part} | own
+    if isinstance(content, list):
+        return [_filled(item, schema.get("items", {}), definitions) for item in content]
+    return content

@@ -195,17 +195,36 @@ class SamplingSettings:
 
 @dataclass(frozen=True)
 class JudgementSettings:
-    """When an answer must not be called fine.
+    """When an answer must not be called fine, a particle is unlike all others, and how much is done about it.
 
     Attributes:
         misfit: share of the range of displacement that the law misses with every particle's own coefficients; with the
             law's own data and a tester's noise it stays below 0.01.
         noise_share: share of the residual's variance that correlated noise holds: at half it is as large as read-out
             noise.
+        outlying: a particle is unlike the others if the logarithm of its residual lies so many robust standard
+            deviations (1.4826 times the median absolute deviation) above their median: of 1000 normal ones none does.
+        times: and if its residual is so many times their median, at least: smaller differences do no harm.
+        share: of the particles, at most, can be unlike all others; more are a mixture.
+        least: particles, at least, to know what is usual.
+        answers: so many sets of flagged particles are left out in turn to tell the answer without them, at most.
+        few: flagged particles are left out for such an answer if they are at least this share of all: fewer than one
+            in a hundred hardly move what all share, and the answer would cost a whole calibration of many particles.
+        left: particles, at least, that an answer without the flagged ones rests on.
+        unknown: the modulus counts as unknown if its standard deviation is at least this share of it: the 95 % interval
+            then spans a factor of seven, nearly that of the prior (50), in which most solids lie.
     """
 
     misfit: float = 0.05
     noise_share: float = 0.5
+    outlying: float = 5.0
+    times: float = 3.0
+    share: float = 0.2
+    least: int = 5
+    answers: int = 4
+    few: float = 0.01
+    left: int = 3
+    unknown: float = 0.5
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import equinox as eqx
@@ -25,7 +25,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from .._errors import InputError
 from .compiling import compiled
-from .data import Tests, enlarged
+from .data import Tests, longer
 from .settings import NUMERICS
 
 AXIS = "particles"
@@ -42,8 +42,13 @@ def block_size(count: int) -> int:
 
 
 def filled_up(tests: Tests, block: int) -> Tests:
-    """The same tests among as many more as whole blocks take: copies of the last particle that count for nothing."""
-    return enlarged(tests, len(tests) + -len(tests) % block)
+    """The same tests among as many more as whole blocks take: copies of the last particle that count for nothing.
+
+    Every particle gets a weight, whether copies are needed or not: one kind of arrays, one compilation.
+    """
+    more = -len(tests) % block
+    weight = np.ones(len(tests)) if tests.weight is None else np.asarray(tests.weight)
+    return replace(longer(tests, len(tests) + more), weight=jnp.asarray(np.pad(weight, (0, more))))
 
 
 def count_of(tests: Tests) -> int:
@@ -62,6 +67,11 @@ class Parts:
 
     waves: tuple[Any, ...]
     axis: int = 0
+
+    def map(self, function: Callable[..., Any], *others: Parts) -> Parts:
+        """A function of every wave, and of the same waves of others."""
+        several = zip(self.waves, *(one.waves for one in others), strict=True)
+        return Parts(tuple(function(*waves) for waves in several), self.axis)
 
 
 class Blocks:
@@ -137,6 +147,10 @@ class Blocks:
             return _on_all_devices(chosen, axes, axis, function.__wrapped__, self.mesh)  # pyright: ignore[reportFunctionMemberAccess]
 
         return Parts(tuple(wave(w) for w in range(len(self._own))), axis)
+
+    def all(self, function: Callable[..., Any], *arguments: Any, axis: int = 0) -> Any:
+        """The same, of all particles."""
+        return self.whole(self.each(function, *arguments, axis=axis))
 
     def whole(self, parts: Parts) -> Any:
         """Arrays of all particles, the same bits on every process, from each process's own."""

@@ -61,10 +61,7 @@ class Cholesky:
 
 
 def eliminate(
-    gram: Matrix,
-    own: Sequence[int],
-    precision: Float[Array, "*batch o"],
-    mean: Float[Array, "*batch o"] | float = 0.0,
+    gram: Matrix, own: Sequence[int], precision: Float[Array, "*batch o"], mean: Float[Array, "*batch o"] | float = 0.0
 ) -> tuple[Float[Array, "*batch r r"], Float[Array, "*batch"]]:
     r"""Integrate numbers with a normal prior out of a Gaussian likelihood: a Schur complement.
 

@@ -55,11 +55,7 @@ def coordinates(
 ) -> tuple[Float[Array, " numbers"], Float[Array, " numbers"]]:
     """Coordinates of one particle's numbers, and the factor that each amplitude has in its own.
 
-    Args:
-        theta: the numbers.
-        at: those where its test is linearised.
-        straight: shear and power, without an axis of particles.
-        places: of the positive ones.
+    All without an axis of particles; `at` are the numbers where the test is linearised.
     """
     away, factor = theta - at, jnp.ones_like(theta)
     for k, amplitude in places:

@@ -58,7 +58,7 @@ def check_plausibility(
     """What a slip of unit, sign or column would explain in a campaign, in sentences.
 
     Judges raw tests, before any fit: each test's peak, the stiffness of loading and unloading, the work given back, its
-    sizes and its times. Nothing is changed, and nothing is an error.
+    sizes and its times. Of a checked campaign those that it was made from. Nothing is changed, and nothing is an error.
 
     Args:
         campaign: the tests.
@@ -75,21 +75,57 @@ def check_plausibility(
     if not isinstance(campaign, Campaign):
         check_campaign(campaign)  # what is no campaign; one with wrong values is still looked at, to name their cause
     options = options or PlausibilityOptions()
-    with np.errstate(all="ignore"):
-        tests = _Tests.of(campaign, segments, options)
-        if tests is None:
-            return ()
-        found = list(_signs(tests))
-        scales = _scales(tests, options)
-        found += scales or _outside(tests, options)
-        found += _clock(tests, options)
-        if not scales:  # one diameter in another unit is out of order, too
-            found += _order_of_diameters(tests, options)
-        material = [] if found else _another_material(tests, options)
-        if worst(found) != "bad":
-            found += _fitted_modulus(tests, modulus_MPa, options)
-        found += material
-    return tuple(found)
+    looks = _looks(campaign.raw or campaign, segments, options)
+    if looks.typical is None or worst(looks.findings) == "bad":
+        return looks.findings
+    return (*looks.findings, *_fitted_modulus(looks.typical, modulus_MPa, options), *looks.told)
+
+
+@dataclass(frozen=True)
+class _Looks:
+    """What a campaign looks like before any fit.
+
+    Attributes:
+        findings: slips, and numbers that no solid has.
+        typical: median numbers of its tests, as `log_numbers` gives them; None where no test shows any.
+        material: how it differs from micro-crystalline cellulose; None where it does not.
+        told: a finding of it, where nothing else was found.
+    """
+
+    findings: tuple[Finding, ...] = ()
+    typical: np.ndarray | None = None
+    material: Material | None = None
+    told: tuple[Finding, ...] = ()
+
+
+def _looks(campaign: Campaign, segments: Sequence[Sequence[Segment]] | None, options: PlausibilityOptions) -> _Looks:
+    """The same for every question about a campaign, so worked out once."""
+
+    def find() -> _Looks:
+        with np.errstate(all="ignore"):
+            tests = _Tests.of(campaign, segments, options)
+            if tests is None:
+                return _Looks()
+            found = list(_signs(tests))
+            scales = _scales(tests, options)
+            found += scales or _outside(tests, options)
+            found += _clock(tests, options)
+            if not scales:  # one diameter in another unit is out of order, too
+                found += _order_of_diameters(tests, options)
+            it = Apparent.of(tests.numbers)
+            material = _material(tests, it, options)
+            told = () if found or material is None else (_another_material(material, it),)
+            return _Looks(tuple(found), _typical(tests.numbers), material, told)
+
+    parts = None if segments is None else tuple(map(tuple, segments))
+    return remembered(campaign, ("looks", parts, options), find)
+
+
+def or_slip(campaign: Campaign, problem: str, remedy: str) -> tuple[str, str]:
+    """A problem and its remedy; with the likely slip of unit, sign or column that explains it, where there is one."""
+    slips = [one for one in check_plausibility(campaign) if one.level == "bad"]
+    # What a slip explains needs no other remedy.
+    return (f"{problem}; {slips[0].sentence}", slips[0].remedy) if slips else (problem, remedy)
 
 
 def wrong_signs(campaign: Campaign) -> bool:
@@ -104,13 +140,19 @@ def wrong_signs(campaign: Campaign) -> bool:
 
 @dataclass(frozen=True)
 class _Tests:
-    """The tests that show anything: their features as given and with force and displacement swapped."""
+    """The tests that show anything.
+
+    Attributes:
+        names, diameters_um: of their particles.
+        given: features of their curves.
+        numbers, swapped: what `log_numbers` makes of them, as given and with force and displacement swapped.
+    """
 
     names: tuple[str, ...]
-    count: int
     diameters_um: np.ndarray
     given: tuple[CurveFeatures, ...]
-    swapped: tuple[CurveFeatures | None, ...]
+    numbers: np.ndarray
+    swapped: np.ndarray
 
     @classmethod
     def of(
@@ -136,8 +178,9 @@ class _Tests:
             others.append(_features(curve, None, options) if swapped else None)
         if not rows:
             return None
-        names = tuple(campaign.particles[i] for i in rows)
-        return cls(names, len(campaign), diameters[rows], tuple(given), tuple(others))
+        sizes = diameters[rows]
+        numbers, exchanged = log_numbers(given, sizes), log_numbers(others, sizes)
+        return cls(tuple(campaign.particles[i] for i in rows), sizes, tuple(given), numbers, exchanged)
 
     def some(self, chosen: np.ndarray) -> tuple[str, ...]:
         """Names of the chosen tests, none where all are."""
@@ -166,8 +209,8 @@ def _scales(tests: _Tests, options: PlausibilityOptions) -> list[Finding]:
     """Slips of unit and swapped columns, of the whole campaign and of single particles."""
     slips = hypotheses(options)
     prior = np.array([slip.prior for slip in slips])
-    given = log_numbers(tests.given, tests.diameters_um)
-    undone = undo(given, log_numbers(tests.swapped, tests.diameters_um), slips)
+    given = tests.numbers
+    undone = undo(given, tests.swapped, slips)
     each = log_density(undone, options)
     whole = np.median(each, axis=0) + prior
     found: list[Finding] = []
@@ -216,7 +259,7 @@ def _single_slips(
     values = np.column_stack([numbers[:, 2:5], it.strain, it.loading_modulus])
     centre = _typical(values)
     width = np.maximum(options.spread, 1.4826 * _typical(np.abs(values - centre)))
-    undone = undo(numbers, log_numbers(tests.swapped, tests.diameters_um), slips)
+    undone = undo(numbers, tests.swapped, slips)
     there = Apparent.of(undone)
     moved = np.concatenate([undone[..., 2:5], there.strain[..., None], there.loading_modulus[..., None]], axis=-1)
     # Student's t with four degrees of freedom: real particles have outliers, too.
@@ -376,8 +419,7 @@ def _order_of_diameters(tests: _Tests, options: PlausibilityOptions) -> list[Fin
 def _outside(tests: _Tests, options: PlausibilityOptions) -> list[Finding]:
     """Numbers beyond every range though no slip explains them."""
     found: list[Finding] = []
-    it = Apparent.of(log_numbers(tests.given, tests.diameters_um))
-    apart = it.closure > 0
+    apart = Apparent.of(tests.numbers).closure > 0
     if apart.any():
         names = tests.some(apart)
         who = "all tests" if not names else f"particle{'s' if len(names) > 1 else ''} {_listed(names)}"
@@ -390,7 +432,7 @@ def _outside(tests: _Tests, options: PlausibilityOptions) -> list[Finding]:
                 names,
             )
         )
-    numbers = _typical(log_numbers(tests.given, tests.diameters_um))
+    numbers = _typical(tests.numbers)
     whole = Apparent.of(numbers)
     solids = options.solids
     hulls = (
@@ -414,12 +456,12 @@ def _outside(tests: _Tests, options: PlausibilityOptions) -> list[Finding]:
     return found
 
 
-def _fitted_modulus(tests: _Tests, modulus_MPa: float | None, options: PlausibilityOptions) -> list[Finding]:
+def _fitted_modulus(typical: np.ndarray, modulus_MPa: float | None, options: PlausibilityOptions) -> list[Finding]:
     """A fitted modulus that no solid has, of tests that look ordinary."""
     low, high = _hull([s.modulus_MPa for s in options.solids])
     if modulus_MPa is None or low / options.beyond <= modulus_MPa <= options.beyond * high:
         return []
-    it = Apparent.of(_typical(log_numbers(tests.given, tests.diameters_um)))
+    it = Apparent.of(typical)
     own = (
         f"with about {_modulus(it.modulus)} told by the slope of unloading"
         if np.isfinite(it.modulus)
@@ -459,18 +501,11 @@ def other_material(campaign: Campaign, options: PlausibilityOptions | None = Non
     """How much stiffer or softer than micro-crystalline cellulose the tests are; None if they are like it, or if a slip
     of unit or sign is more likely."""
     check_campaign(campaign)
-    options = options or PlausibilityOptions()
-    given = campaign.raw or campaign
-    if worst(check_plausibility(given, options=options)) == "bad":
-        return None
-    with np.errstate(all="ignore"):
-        tests = _Tests.of(given, None, options, swapped=False)
-        return None if tests is None else _material(tests, options)
+    looks = _looks(campaign.raw or campaign, None, options or PlausibilityOptions())
+    return None if worst(looks.findings) == "bad" else looks.material
 
 
-def _material(tests: _Tests, options: PlausibilityOptions) -> Material | None:
-    numbers = log_numbers(tests.given, tests.diameters_um)
-    it = Apparent.of(numbers)
+def _material(tests: _Tests, it: Apparent, options: PlausibilityOptions) -> Material | None:
     D1, D2, D3 = tests.diameters_um.T
     x = (1 + PAPER_SHAPE_PARAMETER * (1 - D3**2 / (D1 * D2))) * 10**it.strain
     C1, C3, C5 = (np.exp(PAPER_LOG_C[name][0]) for name in ("C1", "C3", "C5"))
@@ -481,19 +516,13 @@ def _material(tests: _Tests, options: PlausibilityOptions) -> Material | None:
     return Material(ratio, float(10 ** _median(it.stress)), float(np.nanmedian(x)))
 
 
-def _another_material(tests: _Tests, options: PlausibilityOptions) -> list[Finding]:
+def _another_material(found: Material, it: Apparent) -> Finding:
     """Tests that are much stiffer or softer than micro-crystalline cellulose, which accuses nobody."""
-    found = _material(tests, options)
-    if found is None:
-        return []
-    it = Apparent.of(log_numbers(tests.given, tests.diameters_um))
     word = "stiffer" if found.decades > 0 else "softer"
-    return [
-        Finding(
-            CHECK,
-            "told",
-            f"The material is {_number(abs(found.decades))} times {word} in loading than micro-crystalline cellulose"
-            f" (Avicel PH-200): {_number(_median(it.stress))} MPa at a strain of"
-            f" {_number(_median(it.strain))}; a typical solid otherwise",
-        )
-    ]
+    return Finding(
+        CHECK,
+        "told",
+        f"The material is {_number(abs(found.decades))} times {word} in loading than micro-crystalline cellulose"
+        f" (Avicel PH-200): {_number(_median(it.stress))} MPa at a strain of"
+        f" {_number(_median(it.strain))}; a typical solid otherwise",
+    )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .._errors import InputError
-from .plausibility import check_plausibility
+from .plausibility import or_slip
 from .schema import Campaign, Curve
 from .segments import Segment
 from .signal import median
@@ -163,10 +163,3 @@ def refusal(campaign: Campaign, problem: str, why_not: Sequence[str | None]) -> 
     said = ". ".join(remedy[:1].upper() + remedy[1:] for remedy in remedies if remedy)
     problem, said = or_slip(campaign, f"{problem}: {'; '.join(parts)}", said)
     return InputError(problem, file=campaign.source or None, remedy=f"{said}.")
-
-
-def or_slip(campaign: Campaign, problem: str, remedy: str) -> tuple[str, str]:
-    """A problem and its remedy; with the likely slip of unit, sign or column that explains it, where there is one."""
-    slips = [one for one in check_plausibility(campaign.raw or campaign) if one.level == "bad"]
-    # What a slip explains needs no other remedy.
-    return (f"{problem}; {slips[0].sentence}", slips[0].remedy) if slips else (problem, remedy)

@@ -12,7 +12,8 @@ from .._errors import InputError
 from ..calibrate import Model, Posterior, sample
 from ..calibrate.data import root_mean_squares
 from ..calibrate.fitting import checked_settings
-from ..calibrate.judgement import JudgementOptions, numbers_in_reach, unlike_others
+from ..calibrate.judgement import numbers_in_reach, unlike_others
+from ..calibrate.settings import JUDGEMENT
 from ..campaign import Campaign, Finding, available_data, campaign_findings, check_plausibility, check_tests
 from ..campaign.quality import named
 from ..effects import LIBRARY, Mechanism
@@ -198,7 +199,7 @@ def _settled_fit(
         told.append(replace(outlying, sentence=f"{outlying.sentence}; it takes no part in the search"))
         without = outlying.particles
     left = len(base.tests) - len({*snapping, *without})
-    if snapping and not base.coarse and left >= JudgementOptions().left:
+    if snapping and not base.coarse and left >= JUDGEMENT.left:
         text = f"{named(snapping, len(campaign))}: the law snaps through in its loading; it takes no part in the search"
         told.append(Finding("snap-through", "told", text, "", snapping))
         without = (*without, *(name for name in snapping if name not in without))

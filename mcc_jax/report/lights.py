@@ -151,7 +151,7 @@ def tested(results: Results) -> tuple[Finding, ...]:
     if results.results or results.campaign is None:
         return ()
     return (
-        *check_plausibility(results.campaign.raw or results.campaign),
+        *check_plausibility(results.campaign),
         *campaign_findings(check_tests(results.campaign)),
     )
 

@@ -13,8 +13,7 @@ from .. import arguments
 from .._archive import read_archive
 from .._errors import InputError
 from .._format import described
-from ..calibrate.content import read_result
-from ..calibrate.results import ARCHIVE, DISCOVERY_ARCHIVE, Calibration, OldCalibration, PosteriorDraws
+from ..calibrate.results import ARCHIVE, DISCOVERY_ARCHIVE, Calibration, OldCalibration, PosteriorDraws, read_result
 from ..campaign import Campaign, check_tests, file_checksums, read_campaign
 from ..discover import Discovery
 from ..files import read_regular

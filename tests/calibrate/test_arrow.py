@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from mcc_jax.calibrate.block_arrow import Normal, Parameters, minimise, normal_equations
+from mcc_jax.calibrate.hierarchical import Normal, Parameters, minimise, normal_equations
 
 N, P, Q, K = 4, 3, 2, 7
 

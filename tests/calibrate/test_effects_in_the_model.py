@@ -67,7 +67,8 @@ def test_what_did_not_come_to_rest_is_told_from_what_does_not_fit(posterior):
 def second_order_misses(posterior, sd, away):
     """What of a change of all numbers the columns leave, and what columns and bends leave, over the change."""
     fit, model = posterior.fit, posterior.model
-    linearisation = Linearisation(fit.tests, model, Blocks(len(fit.tests)))
+    blocks = Blocks(len(fit.tests))
+    linearisation = Linearisation(blocks.cut(fit.tests), len(fit.tests), model, blocks)
     (linear,) = linearisation.at(fit.point, sd).waves
     latent, theta = fit.point.latent + away[None, :4], fit.point.theta * jnp.exp(away[4:])[None]
     moved = residuals(Point(latent, fit.point.zero, theta), fit.tests, model.forms)

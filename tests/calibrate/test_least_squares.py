@@ -11,8 +11,7 @@ from joint_cases import NOISE, flatness, simulated, true_coefficients
 from scipy.optimize import least_squares as scipy_least_squares
 
 from mcc_jax import Curve, Instrument, Programme, least_squares, paper_campaign
-from mcc_jax.calibrate.block_arrow import Parameters
-from mcc_jax.calibrate.hierarchical import pooled_residual, robust
+from mcc_jax.calibrate.hierarchical import Parameters, pooled_residual, robust
 
 # Eight particles in every test: one compilation.
 KEEP = np.arange(20) < 8

@@ -24,8 +24,8 @@ from mcc_jax.calibrate.distributions import Amplitude, SpreadCoordinate, nuisanc
 from mcc_jax.calibrate.fit_result import population_of
 from mcc_jax.calibrate.forward import Point
 from mcc_jax.calibrate.mode import LogPosterior, Shapes, log_priors, most_probable, populations, values_of
-from mcc_jax.calibrate.model import check_prior_of_a
 from mcc_jax.calibrate.noise import standard_promotion
+from mcc_jax.calibrate.priors import check_prior_of_a
 from mcc_jax.effects import LIBRARY, find_variant
 
 pytestmark = pytest.mark.long  # minutes of compiling; the quick run has the model end to end

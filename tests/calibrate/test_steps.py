@@ -20,7 +20,7 @@ from mcc_jax.calibrate import (
     master_curve,
     strain_table,
 )
-from mcc_jax.calibrate.paper.master_curve import MasterCurve, StrainTable
+from mcc_jax.calibrate.paper.loading import MasterCurve, StrainTable
 from mcc_jax.calibrate.paper.shape import _weights, full_residuals, reference_residuals
 from mcc_jax.campaign import adjust, find_segments, loading_curve
 

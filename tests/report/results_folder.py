@@ -170,6 +170,10 @@ class Draws(PosteriorDraws):
         return self.content
 
     @property
+    def variants(self):
+        return {}
+
+    @property
     def particles(self):
         return tuple(self.campaign.particles[:-1])
 

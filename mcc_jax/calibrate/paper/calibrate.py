@@ -25,15 +25,14 @@ from ...campaign import (
 from ...campaign.reasons import refusal
 from ...geometry import plastic_shape_factor
 from ...law import MccLaw, StrainScaling, Unloading
-from ..data import rows_from_contact
+from ..data import point_noise_um, rows_from_contact
 from ..estimates import NO_SAMPLER, estimate, finite, force_zero, misfit_note
 from ..judgement import judged, numbers_in_reach, unlike_others
 from ..results import Calibration
 from ..settings import PAPER, SELECTION
-from .loading import PlasticFit, fit_population
-from .master_curve import MasterCurve, StrainTable, master_curve, strain_table
+from .loading import MasterCurve, PlasticFit, StrainTable, fit_population, master_curve, strain_table
 from .modulus import ElasticFit, campaign_branches, fit_effective_modulus
-from .prediction import ParticleFit, point_noise_um, predict_particles
+from .prediction import ParticleFit, predict_particles
 from .shape import Objective, ShapeFit, fit_shape_parameter
 
 
@@ -150,7 +149,7 @@ class PaperCalibration(Calibration):
 
     def _misfit(self, name: str) -> float:
         fits = [p for p in self.particles if p is not None and p.used.any()]
-        return float(np.median([getattr(p, name) / max(np.ptp(p.measured_um[p.used]), 1e-300) for p in fits]))
+        return float(np.median([getattr(p, name) / max(p.range_um, 1e-300) for p in fits]))
 
     def answer(self) -> dict[str, Any]:
         """Whether it converged, a and the modulus, as in `calibration.json`."""
@@ -307,10 +306,9 @@ def calibrate_paper(
         seed,
         time.perf_counter() - started,
     )
-    fits = [p for p in particles if p is not None and p.used.any()]
-    names = [n for n, p in zip(campaign.particles, particles, strict=True) if p is not None and p.used.any()]
-    ranges = np.array([np.ptp(p.measured_um[p.used]) for p in fits])
-    outlying = unlike_others(names, np.array([p.own_rms_um for p in fits]), ranges)
+    fits = [(n, p) for n, p in zip(campaign.particles, particles, strict=True) if p is not None and p.used.any()]
+    misfit, ranges = (np.array(v) for v in ([p.own_rms_um for _, p in fits], [p.range_um for _, p in fits]))
+    outlying = unlike_others([name for name, _ in fits], misfit, ranges)
 
     def again(some: Campaign) -> dict[str, Any]:
         settings: dict[str, Any] = {"threshold_MPa": threshold_MPa, "objective": objective, "seed": seed}

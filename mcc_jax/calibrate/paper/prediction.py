@@ -10,16 +10,7 @@ import numpy as np
 
 from ... import arguments
 from ..._format import described
-from ...campaign import (
-    Adjustment,
-    Campaign,
-    Curve,
-    check_campaign,
-    effective_diameter_um,
-    particle_batch,
-    stress_and_strain,
-)
-from ...campaign.signal import point_noise
+from ...campaign import Adjustment, Campaign, check_campaign, effective_diameter_um, particle_batch, stress_and_strain
 from ...law import MccLaw, Plastic
 from ...simulate import simulate_batch
 from .loading import fit_polynomial
@@ -52,11 +43,10 @@ class ParticleFit:
 
     __repr__ = described()
 
-
-def point_noise_um(curve: Curve) -> float:
-    """Standard deviation of displacement from point to point [um]: second differences cancel any smooth course."""
-    arguments.instance(curve, Curve, "curve", "Make one with mcc_jax.Curve(time_s, force_mN, displacement_um).")
-    return point_noise(curve.displacement_um)
+    @property
+    def range_um(self) -> float:
+        """Range of the measured displacement where it is compared [um]."""
+        return float(np.ptp(self.measured_um[self.used]))
 
 
 def predict_particles(

@@ -17,7 +17,7 @@ from ..._errors import InputError
 from ..._format import described
 from ..._types import Scalar
 from ..settings import PAPER
-from .master_curve import StrainTable, enough
+from .loading import StrainTable, enough
 
 Objective = Literal["full", "reference"]
 
@@ -171,13 +171,7 @@ def fit_shape_parameter(table: StrainTable, objective: Objective = "full", refer
             raise InputError("the reference particle was not kept")
         others = np.arange(len(table.index)) != row
         reached = reached[others] & reached[row]
-        data = (
-            strain[others],
-            _weights(stress, reached),
-            strain[row],
-            table.flatness[others],
-            table.flatness[row],
-        )
+        data = (strain[others], _weights(stress, reached), strain[row], table.flatness[others], table.flatness[row])
         solved, at_zero = _solve(reference_residuals, starts, tuple(jnp.asarray(d, dtype=float) for d in data))
     values, costs, converged = (np.asarray(x) for x in solved)
     # A shape factor that is not positive turns the particle inside out; such a minimum is none.
