@@ -22,10 +22,9 @@ from .._archive import encode, read_archive
 from .._errors import InputError
 from .._format import table, with_sd
 from .._store import json_text, results
-from .._text import check_text
 from ..campaign import Campaign, read_campaign
 from ..effects import Variant
-from ..files import LIMITS, read_regular
+from ..files import LIMITS, check_text, read_regular
 from ..law import MccLaw
 from .curves import FittedCurve, fitted_curves
 from .data import Selection, compared_rows, ranges_um, root_mean_squares
