@@ -125,7 +125,7 @@ def closure(search: Search, seed: int) -> Closure:
     assert smooth is not None
     tests = search.base.tests
     mask, size = np.asarray(tests.mask), np.asarray(tests.effective_diameter)
-    natural = {name: np.asarray(search.natural[name]) for name in LETTERS}
+    natural = {name: np.asarray(search.natural[name]) for name in LETTERS if name in search.natural}
     span = {name: (float(x[mask].min()), float(x[mask].max())) for name, x in natural.items()}
     terms = [t for name, (low, high) in span.items() if high > low for t in terms_of(name, low, high)]
     values = np.stack([t.function(natural[t.coordinate]) * size[:, None] for t in terms], -1)

@@ -181,18 +181,18 @@ def means_and_slope(beta: Float[Array, " 5"], flatness: Array, power: float) -> 
     return particle_means(beta, flatness, power), jax.jacfwd(lambda b: particle_means(b, flatness, power))(beta)
 
 
-def without_snaps(base: Base) -> State:
-    """Where the base law fits, with the priors' middle for particles whose law snaps through.
+def at_priors(base: Base, rows: np.ndarray) -> State:
+    """Where the base law fits, but for some tests at the priors' middle; the population, too, if they are most.
 
-    It is monotone there, as their tests are, and what the law lacks can be found from there.
+    The law is monotone there, as tests are, and what it lacks can be found from there.
     """
-    mean, snaps = np.asarray(base.population_prior[0]), base.snaps
-    point, population = base.state.point, np.asarray(base.state.population)
-    if 2 * snaps.sum() > len(snaps):
+    mean, point = np.asarray(base.population_prior[0]), base.state.point
+    population = np.asarray(base.state.population)
+    if 2 * rows.sum() > len(rows):
         population = np.concatenate([population[:2], mean[2:]])
     middle = particle_means(jnp.asarray(mean), base.tests.flatness, base.model.shape_power)
-    latent = jnp.where(snaps[:, None], middle, point.latent)
-    zero = jnp.where(snaps, base.tests.contact, point.zero)
+    latent = jnp.where(rows[:, None], middle, point.latent)
+    zero = jnp.where(rows, base.tests.contact, point.zero)
     return State(replace(point, latent=latent, zero=zero), jnp.asarray(population))
 
 

@@ -79,6 +79,15 @@ def coordinates(point: Point, tests: Tests, forms: Forms) -> dict[str, Array]:
     return jax.vmap(one)(point.latent, tests)
 
 
+def telling(at: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]:
+    """Coordinates that say something: time does where most tests unload.
+
+    Of loading alone it is what is measured: a drive that closes at one speed makes it the displacement itself.
+    """
+    unloads = np.max(np.where(mask, at["unloading"], 0.0), 1)
+    return at if np.median(unloads) > 0 else {name: x for name, x in at.items() if name != "clock"}
+
+
 def scaled(at: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]:
     """Coordinates between 0 and 1 over the campaign."""
 
@@ -149,8 +158,7 @@ def general(at: dict[str, np.ndarray], tests: Tests, linear: Linear) -> tuple[np
     all particles and in proportion to their size, but for what a tester does, which depends on micrometres and
     millinewtons alone. In stress they are fine: a particle's layers and flaws yield within a narrow range of it. What a
     drive loses at a reversal, it loses at once: there the time since the reversal is a coordinate, and reloading has
-    parts of its own. Of loading alone, time is no coordinate: a drive that closes at one speed makes it the
-    displacement itself. A stress that the loading curve lacks, and a force that the cell gets wrong, move every
+    parts of its own. A stress that the loading curve lacks, and a force that the cell gets wrong, move every
     particle as far as it is soft.
 
     Args:
@@ -165,7 +173,7 @@ def general(at: dict[str, np.ndarray], tests: Tests, linear: Linear) -> tuple[np
         np.concatenate([at[way][..., None], since * at[way][..., None]], -1) for way in ("unloading", "reloading")
     ]
     products = splines(at["peak"], 3)[..., :, None] * splines(at["load"], 3)[..., None, :]
-    timed = ("clock",) if np.median(np.max(np.where(mask, at["unloading"], 0.0), 1)) > 0 else ()
+    timed = tuple(name for name in ("clock",) if name in at)
     reduced = [
         splines(at["peak"], NUMERICS.fine_splines),
         *(splines(at[name], NUMERICS.splines) for name in ("strain", "travel", "load", *timed)),

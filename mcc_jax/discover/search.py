@@ -18,13 +18,13 @@ from ..effects import Mechanism, Variant
 from .base import Base, State
 from .candidates import Candidate, candidates_of, located
 from .columns import Design, with_amplitudes, without_further
-from .design import NOTHING_MORE, More, design_of, without_snaps
+from .design import NOTHING_MORE, More, at_priors, design_of
 from .evidence import left_by_particle, log_joint, optimise, solve, visible, with_little_noise, without_first
 from .hypothesis import UNLISTED, Hypothesis, Names, Smooth
 from .likely_noise import noise_models, with_likely_noise, with_other_noise
-from .misfit import ANY, COORDINATES, coordinates, functions, general, scaled
+from .misfit import ANY, COORDINATES, coordinates, functions, general, scaled, telling
 from .own_numbers import OwnNumbers, differing, sudden_steps
-from .refine import Refined, refined
+from .refine import Refined, evidence_of, refined
 from .screen import Screen, Setting, pair_integrals, screen, signature_columns, single_integrals
 from .settings import DECISIONS, HYPERPARAMETERS, NUMERICS
 
@@ -45,6 +45,8 @@ class Search:
         base: the tests.
         library: mechanisms that are searched for.
         null: the base law at its optimum.
+        starts: states from which hypotheses look for their optimum: the null's, and of a material that the law was not
+            made for the priors' middle, too, since such tests have several optima.
         natural, at: coordinates of all points, in natural units and between 0 and 1.
         candidates, columns: all formulas and their signatures, in units of their smallest plausible amplitudes.
         screen: those that all tests share, to first order.
@@ -57,10 +59,13 @@ class Search:
         self.library, self.tell = library, tell
         base, start = with_likely_noise(base)
         self.base = base
-        places = [base.state, without_snaps(base)] if base.snaps.any() else [base.state]
-        nulls = [refined(base, place, (), np.zeros(0), start.free) for place in places]
-        self.null = max(nulls, key=lambda r: r.log_evidence)
-        self.natural = {k: np.asarray(x) for k, x in base.each(coordinates, self.state.point, base.forms).items()}
+        places = [base.state]
+        if base.coarse:
+            places += [at_priors(base, rows) for rows in (base.snaps, np.ones(len(base.tests), bool)) if rows.any()]
+        self.null = max((refined(base, at, (), np.zeros(0), start.free) for at in places), key=evidence_of)
+        self.starts = [self.null.state, *places[1:][-1:]]
+        natural = {k: np.asarray(x) for k, x in base.each(coordinates, self.state.point, base.forms).items()}
+        self.natural = telling(natural, np.asarray(base.tests.mask))
         self.at = scaled(self.natural, np.asarray(base.tests.mask))
         self.shared = {
             name: m for name, m in library.items() if name != SUDDEN and not any(v.random_per_test for v in m.variants)
@@ -140,7 +145,8 @@ class Search:
     def fit(self, ks: tuple[int, ...]) -> Refined:
         """Some candidates together at their own optimum, by their formulas."""
         if ks not in self.fits:
-            self.fits[ks] = refined(self.base, self.state, *self.start_of(ks), self.small)
+            fits = (refined(self.base, at, *self.start_of(ks), self.small) for at in self.starts)
+            self.fits[ks] = max(fits, key=evidence_of)
         return self.fits[ks]
 
     def fitted_as(self, r: Refined) -> tuple[int, ...]:
