@@ -138,7 +138,7 @@ class Numerics:
     seconds: int = 3
     strong: float = 8.0
     very_strong: float = 50.0
-    steps: int = 6
+    steps: int = 25
     still: float = 0.05
     flat: float = 0.2
     evaluations: int = 40
