@@ -16,18 +16,13 @@ import _report
 TARGETS = {"seconds": 150.0, "GiB": 4.0}
 
 
-def one_size(count: int, points: int) -> dict:
-    """Calibrate a simulated campaign of this many particles, in this process."""
-    import resource
-
+def campaign_of(count: int, points: int):
+    """A simulated campaign of this many particles, and which of their laws are monotone."""
     import equinox as eqx
     import jax
-
-    jax.config.update("jax_enable_x64", True)
     import jax.numpy as jnp
     import numpy as np
 
-    from mcc_jax.calibrate import sample
     from mcc_jax.campaign import PAPER_DIAMETERS_UM, particle_batch
     from mcc_jax.geometry import Particle
     from mcc_jax.simulate import Instrument, Programme, law_for_each, paper_population, simulate_campaign
@@ -39,7 +34,21 @@ def one_size(count: int, points: int) -> dict:
     stress = jnp.asarray(rng.uniform(7, 16, count))
     peaks = np.asarray(eqx.filter_vmap(Particle.force)(particle_batch(diameters), stress))
     instrument = Instrument(displacement_noise_um=0.02, force_noise_mN=0.05)
-    campaign = simulate_campaign(laws, diameters, peaks, Programme.cycles(points=points), instrument=instrument)
+    monotone = np.asarray(plastic.is_monotone if count == 1 else jax.vmap(lambda p: p.is_monotone)(plastic))
+    programme = Programme.cycles(points=points)
+    return simulate_campaign(laws, diameters, peaks, programme, instrument=instrument), monotone
+
+
+def one_size(count: int, points: int) -> dict:
+    """Calibrate a simulated campaign of this many particles, in this process."""
+    import resource
+
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    from mcc_jax.calibrate import sample
+
+    campaign, monotone = campaign_of(count, points)
     seconds = []
     for _ in range(2):
         start = time.perf_counter()
@@ -49,9 +58,7 @@ def one_size(count: int, points: int) -> dict:
     return {
         "particles": count,
         "kept": len(result.particles),
-        "not monotone": int(
-            (~np.asarray(plastic.is_monotone if count == 1 else jax.vmap(lambda p: p.is_monotone)(plastic))).sum()
-        ),
+        "not monotone": int((~monotone).sum()),
         "first run [s]": seconds[0],
         "second run [s]": seconds[1],
         "peak memory [GiB]": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
