@@ -155,7 +155,7 @@ class Marginal(eqx.Module):
         inner = Cholesky(hessian)
         # Small next to the curvature; where tests are silent and spreads wide, stretch^2 keeps it below 1/2 each.
         slope = jnp.broadcast_to(stretch, xi.shape)
-        tilt = 0.5 * jnp.sum(Cholesky(hessian + eye * stretch**2).forward(slope) ** 2, -1)
+        tilt = 0.5 * jnp.sum(Cholesky(hessian + eye * (stretch**2)[None, None]).forward(slope) ** 2, -1)
         value = -0.5 * share * squares - 0.5 * jnp.sum(xi**2, -1) - 0.5 * inner.log_det() + tilt
         value += self.log_scale - self.count * population.log_noise
         return Laplace(xi, hessian, stretch, value, placed)
