@@ -145,7 +145,10 @@ class Search:
     def fit(self, ks: tuple[int, ...]) -> Refined:
         """Some candidates together at their own optimum, by their formulas."""
         if ks not in self.fits:
-            fits = (refined(self.base, at, *self.start_of(ks), self.small) for at in self.starts)
+            starts = self.starts
+            if self.base.coarse and len(ks) > 1:  # from where the names alone have been found
+                starts = [self.fits[(k,)].state for k in ks if (k,) in self.fits][:1] or starts[:1]
+            fits = (refined(self.base, at, *self.start_of(ks), self.small) for at in starts)
             self.fits[ks] = max(fits, key=evidence_of)
         return self.fits[ks]
 
