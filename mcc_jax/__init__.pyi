@@ -1,3 +1,4 @@
+from . import discover as discover
 from ._blocks import in_blocks as in_blocks
 from ._errors import InputError as InputError
 from ._results import RESULTS as RESULTS

@@ -305,7 +305,7 @@ def _moved_by_effects(
         if old["value"] is None or abs(new["value"] - old["value"]) <= 2 * max(old["sd"] or 0.0, new["sd"]):
             continue
         label = "the effective modulus" if unit else "a"
-        moved.append(f"{label} from {with_sd(old, factor)}{unit} to {with_sd(new, factor)}{unit}")
+        moved.append(f"{label} moves from {with_sd(old, factor)}{unit} to {with_sd(new, factor)}{unit}")
     if not moved:
         return ()
     names = ", ".join(model.variants)

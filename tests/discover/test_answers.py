@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 
+from mcc_jax import InputError
 from mcc_jax.discover.answer import _averaged
 from mcc_jax.discover.closure import LETTERS, terms_of
 from mcc_jax.discover.discover import _taken_back
@@ -130,3 +131,12 @@ def test_few_numbers_decide():
     text = Decisions.__doc__ or ""
     assert all(field.name in text for field in dataclasses.fields(Decisions))
     assert Decisions() == DECISIONS
+
+
+def test_the_package_may_be_called_as_its_function():
+    import mcc_jax as mcc
+    from mcc_jax.discover import discover
+
+    assert mcc.discover.__call__ is discover
+    with pytest.raises(InputError, match="campaign"):
+        mcc.discover(None)

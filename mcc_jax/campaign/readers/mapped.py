@@ -178,7 +178,8 @@ class _Reader:
         elif close:
             remedy = f"Did you mean {close[0]!r}?"
         else:
-            remedy = f"There are: {', '.join(names)}; if this is not the header, correct skip_rows in {file}"
+            known = ", ".join(filter(None, names)) or "none"
+            remedy = f"There are: {known}; if this is not the header, correct skip_rows or begin in {file}"
         raise self.wrong(f"there is no column {column!r}", remedy, head)
 
     def _stop(self, body: int) -> int:

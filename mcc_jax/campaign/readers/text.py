@@ -57,7 +57,8 @@ def decode_lines(data: bytes, encoding: str | None = None, file: Path | None = N
             text = data.decode(encoding)
         except (UnicodeDecodeError, LookupError, ValueError) as error:
             problem = f"cannot be decoded as {encoding!r}: {error}"
-            raise InputError(problem, file=file, remedy="Name the file's encoding") from None
+            remedy = 'Name the file\'s encoding in the mapping file: encoding = "cp1252" for Windows in western Europe'
+            raise InputError(problem, file=file, remedy=remedy) from None
     return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
 
 
