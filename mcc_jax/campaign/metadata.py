@@ -51,7 +51,7 @@ def _check_sizes(value: Any, file: Path, key: str = "", depth: int = 0) -> None:
         raise InputError(problem, file=file, column=key, remedy="Write it with a decimal point")
     if isinstance(value, dict):
         for name, item in value.items():
-            _check_sizes(item, file, name, depth + 1)
+            _check_sizes(item, file, key or name, depth + 1)
     elif isinstance(value, list):
         for item in value:
             _check_sizes(item, file, key, depth + 1)
