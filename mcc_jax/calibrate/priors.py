@@ -162,7 +162,9 @@ class Priors:
         Under a change of units of stress and strain the coefficients go as :math:`C_1 \sim \sigma/\epsilon`,
         :math:`C_5 \sim \sigma^{1/5}/\epsilon` and the modulus as :math:`\sigma/\epsilon^3` (printed form) or
         :math:`\sigma/\epsilon^{3/2}` (punch forms), so medians move with the median peak; widths are twice those for
-        cellulose, since a shape of curve that is known for one material is a guess for another.
+        cellulose, since a shape of curve that is known for one material is a guess for another. The length of
+        correlated noise is held near its median: noise that hangs together over several branches is a curve of every
+        test's own, which would describe any test.
 
         Args:
             stress_MPa: at the median test's peak.

@@ -197,9 +197,7 @@ def breakage(curve: Curve, options: QualityOptions) -> tuple[int, float] | None:
         return None
     base = float(np.min(force))
     reached = np.maximum.accumulate(force - base)
-    noise = point_noise(path)
-    travel = max(float(np.ptp(path)), 1e-300)
-    back = max(4 * noise, 1e-3 * travel)
+    back = _way_back(path)
     steps = np.abs(differences(force))
     interval = differences(time)
     moving = steps > 0.05 * max(median(steps), 1e-300)
@@ -236,7 +234,7 @@ def gives_way(curve: Curve, control: Control | None, options: QualityOptions) ->
     found = np.zeros(len(curve), bool)
     if len(curve) < 12:
         return found
-    back = max(4 * point_noise(path), 1e-3 * float(np.ptp(path)))
+    back = _way_back(path)
     for segment in find_segments(curve, control=control):
         start, last = segment.start, segment.stop - 1
         if segment.kind != "unload" or start == 0 or found[start] or last == start:
@@ -250,6 +248,12 @@ def gives_way(curve: Curve, control: Control | None, options: QualityOptions) ->
             again = np.flatnonzero(force[last:] >= force[start])
             found[start + 1 : last + int(again[0]) if len(again) else len(curve)] = True
     return found
+
+
+def _way_back(path: np.ndarray) -> float:
+    """How far displacement must move to have moved at all [um]: four times its noise, or a thousandth of its range."""
+    # Never nil: displacement that stands still has not gone back.
+    return max(4 * point_noise(path), 1e-3 * float(np.ptp(path)), 1e-303)
 
 
 _SINGLE_READINGS = (

@@ -47,11 +47,6 @@ class Refined:
         return self.design.amplitude[..., : len(units)] * (self.theta[: len(units)] / units)
 
 
-def evidence_of(one: Refined) -> float:
-    """Its log marginal likelihood, to choose the best by."""
-    return one.log_evidence
-
-
 def refined(
     base: Base,
     state: State,

@@ -24,7 +24,7 @@ from .hypothesis import UNLISTED, Hypothesis, Names, Smooth
 from .likely_noise import noise_models, with_likely_noise, with_other_noise
 from .misfit import ANY, COORDINATES, coordinates, functions, general, scaled, telling
 from .own_numbers import OwnNumbers, differing, sudden_steps
-from .refine import Refined, evidence_of, refined
+from .refine import Refined, refined
 from .screen import Screen, Setting, pair_integrals, screen, signature_columns, single_integrals
 from .settings import DECISIONS, HYPERPARAMETERS, NUMERICS
 
@@ -62,7 +62,7 @@ class Search:
         places = [base.state]
         if base.coarse:
             places += [at_priors(base, rows) for rows in (base.snaps, np.ones(len(base.tests), bool)) if rows.any()]
-        self.null = max((refined(base, at, (), np.zeros(0), start.free) for at in places), key=evidence_of)
+        self.null = max((refined(base, at, (), np.zeros(0), start.free) for at in places), key=lambda r: r.log_evidence)
         self.starts = [self.null.state, *places[1:][-1:]]
         natural = {k: np.asarray(x) for k, x in base.each(coordinates, self.state.point, base.forms).items()}
         self.natural = telling(natural, np.asarray(base.tests.mask))
@@ -149,7 +149,7 @@ class Search:
             if self.base.coarse and len(ks) > 1:  # from where the names alone have been found
                 starts = [self.fits[(k,)].state for k in ks if (k,) in self.fits][:1] or starts[:1]
             fits = (refined(self.base, at, *self.start_of(ks), self.small) for at in starts)
-            self.fits[ks] = max(fits, key=evidence_of)
+            self.fits[ks] = max(fits, key=lambda r: r.log_evidence)
         return self.fits[ks]
 
     def fitted_as(self, r: Refined) -> tuple[int, ...]:
