@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import shlex
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +28,7 @@ from .session import (
     say,
     say_files,
     say_json,
+    say_next,
     say_table,
     sentence,
     session,
@@ -151,6 +153,11 @@ def calibrate(
             )
         say_warnings(content)
         say_files(out, [*content["figures"], *content["files"], RESULT])
+        here = shlex.quote(str(out))
+        say_next(
+            (f"mcc-jax discover {shlex.quote(str(campaign))} --out {here}", "what the law misses"),
+            (f"mcc-jax report {here}", "all of it on one page"),
+        )
     return None if content["converged"] else NOT_CONVERGED
 
 

@@ -11,7 +11,7 @@ import click
 
 from .._store import results
 from . import options as common
-from .session import say, say_table, session
+from .session import say, say_next, say_table, session
 
 SHOWN = 12
 """Rows of the table of tests; a folder may hold hundreds."""
@@ -121,7 +121,7 @@ def convert(
     for one in (*check_plausibility(campaign), *campaign_findings(check_tests(campaign))):
         say(f"{'Warning' if one.level != 'told' else 'Note'}: {one}", fg="red" if one.level == "bad" else "yellow")
     say(f"Written into {out}: particles.csv, curves.csv, campaign.toml")
-    say(f"Next: mcc-jax calibrate {shlex.quote(str(out))} --out fit")
+    say_next((f"mcc-jax calibrate {shlex.quote(str(out))} --out fit", "the law and its uncertainty"))
 
 
 def _lies_in(path: Path, folder: Path) -> bool:

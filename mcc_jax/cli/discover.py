@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +23,7 @@ from .session import (
     say,
     say_files,
     say_json,
+    say_next,
     say_table,
     sentence,
     session,
@@ -99,9 +101,16 @@ def discover(
     if as_json:
         say_json(content)
         return
+    from ..report.sentences import calibration_with_found
+
     say_discovery(content)
     say()
     say_files(out, [*content["figures"], DISCOVERY])
+    with_found = calibration_with_found(content, shlex.quote(str(campaign)))
+    say_next(
+        (with_found, "the law with what was found"),
+        (f"mcc-jax report {shlex.quote(str(out))}", "all of it on one page"),
+    )
 
 
 def require_mechanisms(names: tuple[str, ...]) -> None:

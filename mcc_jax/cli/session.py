@@ -273,6 +273,13 @@ def say_files(directory: Path, names: list[str]) -> None:
         say(f"  {FIGURES}/ ({len(figures)} png)")
 
 
+def say_next(*steps: tuple[str, str]) -> None:
+    """Print what to run next: a command and what it is for each; a step without a command is left out."""
+    for place, (command, purpose) in enumerate(step for step in steps if step[0]):
+        say(f"{'Next:' if place == 0 else '     '} {command}", nl=False)
+        say(f"   # {purpose}", dim=True)
+
+
 def sentence(text: str) -> str:
     """A text as a sentence: a capital at its beginning, one full stop at its end."""
     return f"{text[:1].upper()}{text[1:].rstrip('.')}."

@@ -14,7 +14,7 @@ import click
 from .._errors import InputError
 from .._store import results
 from . import options as common
-from .session import say, session
+from .session import say, say_next, session
 
 if TYPE_CHECKING:
     import numpy as np
@@ -145,7 +145,7 @@ def simulate(out: Path, **options: Any) -> None:
         what = "snaps through" if programme.control == "load" else "softens"
         say(f"Warning: the loading curve falls somewhere, and the particle {what}: {', '.join(falling)}.", fg="yellow")
     say(f"Written into {out}: particles.csv, curves.csv, campaign.toml")
-    say(f"Next: mcc-jax calibrate {shlex.quote(str(out))} --out fit")
+    say_next((f"mcc-jax calibrate {shlex.quote(str(out))} --out fit", "the law and its uncertainty"))
 
 
 def _refuse_contradictions(options: dict[str, Any]) -> None:

@@ -118,7 +118,7 @@ _MADE_BY = {
     "PaperCalibration": "mcc_jax.calibrate_paper(campaign)",
     "LeastSquares": "mcc_jax.least_squares(campaign)",
     "Posterior": "mcc_jax.sample(campaign)",
-    "Discovery": "mcc_jax.discover.discover(campaign)",
+    "Discovery": "mcc_jax.discover(campaign)",
 }
 
 

@@ -132,6 +132,20 @@ def next_steps(results: Results, folder: str) -> list[tuple[str, str]]:
     return steps
 
 
+def calibration_with_found(found: dict[str, Any], campaign: str) -> str:
+    """The command that calibrates the law with the effects found; empty where no options can say what was added.
+
+    Args:
+        found: contents of `discovery.json`.
+        campaign: folder of the tests, as a shell reads it.
+    """
+    named = [":".join(filter(None, (effect["mechanism"], effect["variant"]))) for effect in found["effects"]]
+    if not named or found["closure"]:
+        return ""
+    options = " ".join(f"--effect {shlex.quote(name)}" for name in named)
+    return f"mcc-jax calibrate {campaign} {options} --out with-effect"
+
+
 def _mend(found: dict[str, Any] | None) -> str:
     if found is not None and found["effects"]:
         return (
@@ -156,16 +170,8 @@ def _after(found: dict[str, Any]) -> list[tuple[str, str]]:
         return [(f"Check directly. For {plain(first['mechanism'])}: {first['check']}. For the others, see below.", "")]
     if verdict in ("NAMED", "SET", "UNLISTED"):
         use = "Use the law together with what was added (parameters “after” below), not alone"
-        named = [":".join(filter(None, (effect["mechanism"], effect["variant"]))) for effect in found["effects"]]
-        if not named or found["closure"]:
-            return [(f"{use}.", "")]
-        options = " ".join(f"--effect {shlex.quote(name)}" for name in named)
-        return [
-            (
-                f"{use}. All about it, from every particle's curve to the checks:",
-                f"mcc-jax calibrate CAMPAIGN {options} --out with-effect",
-            )
-        ]
+        command = calibration_with_found(found, "CAMPAIGN")
+        return [(f"{use}. All about it, from every particle's curve to the checks:" if command else f"{use}.", command)]
     if verdict == "NO_GAP" and found["untestable"]:
         needs = sorted({entry["needs"] for entry in found["untestable"]})
         return [(f"To learn about more mechanisms, the tests need {listed(needs)}.", "")]
