@@ -55,7 +55,8 @@ def solve(part: int, parts: int, strength: float) -> None:
     file = RESULTS / "left_out" / f"{strength:g}_{part}_of_{parts}.jsonl"
     file.parent.mkdir(exist_ok=True)
     done = {json.loads(line)["formula"] for line in file.read_text().splitlines()} if file.exists() else set()
-    for k in range(part - 1, len(variants), parts):
+    # Shuffled, so that what a stopped run has done is a fair sample of the library.
+    for k in np.random.default_rng(0).permutation(len(variants))[part - 1 :: parts]:
         v = variants[k]
         unit = min(strength / sd[k], v.plausible[1] / v.plausible[0])
         name = f"{v.mechanism}:{v.name}"
