@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 
 import jax.numpy as jnp
@@ -18,12 +19,18 @@ from .segments import Segment
 from .signal import straight_line
 from .validate import check_campaign
 
+LEAST_JUMP = 1.3
+"""Rates count as different where the larger is so many times the smaller: less is what testers' control leaves."""
+SMALLEST_RAMP, MOST_KINKS = 6, 6
+"""Readings of a ramp from which on changes of its speed are looked for (two lines that meet have four numbers), and how
+many at most: a change between two readings makes two."""
+
 
 def record_of(curve: Curve, segments: tuple[Segment, ...], *, relative_humidity_percent: float | None = None) -> Record:
     """The record of a measured test.
 
-    Rates are the slopes of straight lines through whole segments. The forces where branches begin come from straight
-    lines through their first points.
+    Rates are the slopes of straight lines through segments, or through their parts where the programme changes its
+    speed (`ramp_rates`). The forces where branches begin come from straight lines through their first points.
 
     Args:
         curve: the test, raw.
@@ -73,10 +80,17 @@ def record_columns(
                     progress += min(max(done, 0.0), 1.0)
                 reloads, reload_from = reloads + 1, max(begins, 0.0)
             branch = LOAD if branch == LOAD and kind != UNLOAD else kind
-            rate = _slope(time[part], force[part], rate)
-            loading_rate = loading_rate if branch == UNLOAD else rate
-        values = (kind, branch, reloads, progress, unload_from, reload_from, rate, loading_rate)
-        for column, value in zip(columns.values(), values, strict=True):
+            columns["rate"][part] = ramp_rates(time[part], force[part], rate)
+            if len(force[part]):
+                rate = float(columns["rate"][part.stop - 1])
+            if branch != UNLOAD:
+                columns["loading_rate"][part], loading_rate = columns["rate"][part], rate
+            else:
+                columns["loading_rate"][part] = loading_rate
+        else:
+            columns["rate"][part], columns["loading_rate"][part] = rate, loading_rate
+        values = (kind, branch, reloads, progress, unload_from, reload_from)
+        for column, value in zip(columns.values(), values, strict=False):
             column[part] = value
     # What comes before the first ramp goes at its rate.
     known = np.flatnonzero(columns["loading_rate"] > 0)
@@ -147,12 +161,90 @@ def humidity_column(
     return values
 
 
-def _slope(time: np.ndarray, force: np.ndarray, before: float) -> float:
-    """Magnitude of the slope of a straight line; what it was before, if the segment has no duration."""
+def ramp_rates(time: Float[np.ndarray, " n"], force: Float[np.ndarray, " n"], before: float) -> Float[np.ndarray, " n"]:
+    """Force rate at every reading of a ramp: of one straight line, or of several where the programme changes its speed.
+
+    A change of speed is a kink. Kinks are believed where straight lines that meet describe the force better than one
+    line and than any polynomial of as many numbers, by the Bayesian information criterion (Schwarz 1978; a kink counts
+    as three numbers, Zhang and Siegmund 2007): a force that bends smoothly, as under a steady platen, keeps one mean
+    rate. The rate changes behind the reading at a kink.
+
+    Args:
+        time: of the readings [s].
+        force: the same [mN].
+        before: what the rate is where the ramp has no duration [mN/s].
+    """
     if len(time) < 2 or np.ptp(time) <= 0:
-        return before
-    centred = time - time.mean()
-    return float(abs(centred @ force) / (centred @ centred))
+        return np.full(len(time), before)
+    ends = [0, *_kinks(time, force), len(time) - 1]
+    rates = np.empty(len(time))
+    for first, last in itertools.pairwise(ends):
+        x = time[first : last + 1] - time[first : last + 1].mean()
+        rates[first + (first > 0) : last + 1] = abs(x @ force[first : last + 1]) / max(float(x @ x), 1e-300)
+    return rates
+
+
+def _kinks(time: np.ndarray, force: np.ndarray) -> list[int]:
+    """The readings at which a ramp changes its speed, in order; see `ramp_rates`."""
+    n = len(time)
+    if n < SMALLEST_RAMP:
+        return []
+    x, y = (2 * (v - v.mean()) / max(float(np.ptp(v)), 1e-300) for v in (time, force))
+
+    def criterion(design: np.ndarray, numbers: int) -> float:
+        rest = y - design @ np.linalg.lstsq(design, y)[0]
+        # Not below rounding: a course without noise is described to the last digit.
+        return n * np.log(max(float(rest @ rest), n * np.finfo(float).eps)) + numbers * np.log(n)
+
+    def lines(kinks: list[int]) -> np.ndarray:
+        return np.stack([np.ones(n), x, *(np.maximum(x - x[k], 0.0) for k in kinks)], 1)
+
+    def of_lines(kinks: list[int]) -> float:
+        return criterion(lines(kinks), 2 + 3 * len(kinks))
+
+    kinks: list[int] = []
+    best, found = of_lines([]), []
+    for _ in range(min(MOST_KINKS, (n - 4) // 2)):
+        ends = [0, *kinks, n - 1]
+        gains = [_best_kink(x[i : j + 1], y[i : j + 1]) for i, j in itertools.pairwise(ends)]
+        piece = int(np.argmax([gain for gain, _ in gains]))
+        kinks = sorted([*kinks, ends[piece] + gains[piece][1]])
+        value = of_lines(kinks)
+        if value < best:
+            best, found = value, kinks
+        elif len(kinks) == 1:
+            return []  # by far the most ramps
+    # The first kinks were placed before the others were known: some are needed no more.
+    while found:
+        value, fewer = min((of_lines(fewer), fewer) for fewer in ([k for k in found if k != one] for one in found))
+        if value > best:
+            break
+        best, found = value, fewer
+    curves = np.polynomial.chebyshev.chebvander(x, min(1 + 2 * MOST_KINKS, n - 3))
+    if not found or best >= min(criterion(curves[:, :k], k) for k in range(3, curves.shape[1] + 1)):
+        return []
+    slopes = np.cumsum(np.linalg.lstsq(lines(found), y)[0][1:])
+    return found if _apart(np.abs(slopes).tolist(), LEAST_JUMP) else []
+
+
+def _best_kink(x: np.ndarray, y: np.ndarray) -> tuple[float, int]:
+    """What a kink of the straight line through a piece gains of its residual square at most, and at which reading."""
+    n = len(x)
+    if n < 3 or not np.ptp(x) > 0:
+        return 0.0, 0
+    x, y = x - x.mean(), y - y.mean()
+    rest = y - (x @ y) / (x @ x) * x
+
+    def behind(values: np.ndarray) -> np.ndarray:
+        return np.cumsum(values[::-1])[::-1][1:-1]
+
+    # The hinge max(x - at, 0), for each reading `at`, less its part along the line: its square, its product with rest.
+    at, count = x[1:-1], np.arange(n - 1, 1, -1)
+    x1, x2 = behind(x), behind(x * x)
+    square = (x2 - 2 * at * x1 + count * at**2) - (x1 - count * at) ** 2 / n - (x2 - at * x1) ** 2 / (x @ x)
+    gain = (behind(rest * x) - at * behind(rest)) ** 2 / np.maximum(square, 1e-9 * (x @ x))
+    kink = int(np.argmax(gain))
+    return float(gain[kink]), kink + 1
 
 
 def available_data(campaign: Campaign, segments: tuple[tuple[Segment, ...], ...] | None = None) -> frozenset[Need]:
@@ -190,7 +282,7 @@ def available_data(campaign: Campaign, segments: tuple[tuple[Segment, ...], ...]
         Need.RELOAD: often("reload"),
         Need.SECOND_RELOAD: often("reload", 2),
         Need.LONG_TIME: float(np.median(durations)) > 200,
-        Need.TWO_RATES: _apart(rates, 1.3),
+        Need.TWO_RATES: _apart(rates, LEAST_JUMP),
         Need.SEVERAL_SIZES: _apart((D1 * D2 / D3).tolist(), 1.1),
         Need.SEVERAL_SHAPES: bool(np.ptp(1 - D3**2 / (D1 * D2)) > 0.1),
         Need.SEVERAL_PEAKS: _apart(peaks, 1.3),

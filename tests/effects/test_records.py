@@ -5,10 +5,13 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from tested import FORCE, LAW, PARTICLE, RECORD, TIME, VARIANTS, signature_rows
 
 from mcc_jax import Hold, InputError, Instrument, Programme, Ramp, find_segments, paper_campaign
 from mcc_jax.campaign import available_data, humidities, record_batch, record_of
+from mcc_jax.campaign.record import ramp_rates
 from mcc_jax.effects import Need, clean_record
 
 STEPS = (Ramp(0.6, 2.0), Ramp(0.2, 4.0), Ramp(1.0, 1.0), Hold(40.0), Ramp(0.3, 2.0), Ramp(0.9, 2.0), Ramp(0.0, 2.0))
@@ -49,6 +52,45 @@ def test_segments_and_clean_path_tell_the_same():
         for name, scale in (("unload_from", top), ("reload_from", top), ("loading_rate", 2.0), ("rate", 2.0)):
             difference = np.abs(np.asarray(getattr(measured, name)) - np.asarray(getattr(clean, name)))[same]
             assert np.quantile(difference, 0.97) < 0.02 * scale, name
+
+
+def test_a_change_of_speed_on_the_way_up_is_seen():
+    """A rate jump has no turn in it: one mean rate for the whole ramp would hide what the jump does."""
+    steps = (Ramp(0.4, 1.0), Ramp(0.7, 8.0), Ramp(1.0, 0.5), Ramp(0.0, 2.0))
+    for curve in campaign(0.02, steps).curves[:3]:
+        clean = clean_record(jnp.asarray(curve.force_mN), jnp.asarray(curve.time_s))
+        measured = record_of(curve, find_segments(curve, control="load"))
+        share = curve.force_mN / curve.force_mN.max()
+        for low, high, rate in ((0.02, 0.37, 1.0), (0.45, 0.65, 8.0), (0.73, 0.97, 0.5)):
+            inside = (share > low) & (share < high) & (np.asarray(clean.branch) == 1)
+            np.testing.assert_allclose(np.asarray(measured.loading_rate)[inside], rate, rtol=0.02)
+
+
+@given(
+    jump=st.sampled_from((0.1, 0.4, 2.5, 10.0)),
+    place=st.floats(0.25, 0.75),
+    noise=st.floats(0.0, 3e-4),
+    readings=st.integers(25, 300),
+    seed=st.integers(0, 99),
+)
+def test_a_kink_has_two_rates_and_a_bend_has_one(jump, place, noise, readings, seed):
+    time = np.linspace(0.0, 10.0, readings)
+    scatter = noise * np.random.default_rng(seed).normal(size=readings)
+    kinked = np.interp(time, [0.0, 10 * place, 10.0], np.cumsum([0.0, place, jump * (1 - place)]))
+    kinked, slope = kinked / kinked[-1], 0.1 / kinked[-1]
+    rates = ramp_rates(time, kinked + scatter, 0.0)
+    found = [np.median(rates[part]) for part in (time < 10 * place, time > 10 * place)]
+    np.testing.assert_allclose(found, [slope, jump * slope], rtol=0.1)
+    for smooth in (time, time**1.5, time**2, np.expm1(time / 5), 1 - np.exp(-time / 4)):
+        assert len(set(ramp_rates(time, smooth / smooth[-1] + scatter, 0.0))) == 1
+
+
+def test_rates_of_very_short_ramps():
+    assert ramp_rates(np.array([3.0]), np.array([1.0]), 7.0).tolist() == [7.0]
+    assert ramp_rates(np.array([3.0, 3.0]), np.array([1.0, 2.0]), 7.0).tolist() == [7.0, 7.0]
+    np.testing.assert_allclose(ramp_rates(np.array([1.0, 2.0]), np.array([4.0, 1.0]), 7.0), 3.0)
+    # Readings that share one time, as testers with coarse clocks write them.
+    assert np.all(np.isfinite(ramp_rates(np.repeat([0.0, 1.0, 2.0, 3.0], 4), np.linspace(0, 1, 16) ** 2, 7.0)))
 
 
 @pytest.mark.long
