@@ -59,6 +59,14 @@ class LogarithmicToe(AbstractToe):
         return jnp.log1p(stress_share) / jnp.log(10.0)
 
 
+class PowerToe(AbstractToe):
+    """A soft layer: a small power of stress, no end."""
+
+    def flattened(self, stress_share: Values) -> Values:
+        """((1 + x)^(1/4) - 1) / (10^(1/4) - 1), 1 at x = 9 as the logarithmic form."""
+        return jnp.expm1(0.25 * jnp.log1p(stress_share)) / (10**0.25 - 1)
+
+
 _FLATTENING = (0.05, 0.1, 0.18, 0.3, 0.55, 1.0, 3.0)
 """Stresses [MPa]: rough cellulose up to 1, ceramic pebbles 3 and more, a twelfth of what crushes them."""
 
@@ -88,11 +96,16 @@ TOE = Mechanism(
              "Asperities of exponentially distributed height; once flat they stay flat."),
         _toe("hyperbolic", HyperbolicToe, "d = D_e d_t x / (1 + x), x = sigma_P / s", "The toe ends slowly."),
         _toe("logarithmic", LogarithmicToe, "d = D_e d_t lg(1 + sigma_P / s)", "Asperities of all heights."),
+        _toe("power", PowerToe, "d = D_e d_t ((1 + sigma_P / s)^(1/4) - 1) / (10^(1/4) - 1)",
+             "A soft layer that gives way further and further, as a small power of stress.",
+             "Archard (1957), Proc. R. Soc. A 243, 190"),
         _toe("elastic", ExponentialToe, "d = D_e d_t (1 - exp(-sigma / s))",
              "The asperities spring back on unloading.", springs=True),
         _toe("elastic_hyperbolic", HyperbolicToe, "d = D_e d_t x / (1 + x), x = sigma / s",
              "A rough joint that closes and opens again, as the joints of rock do.",
              "Bandis, Lumsden and Barton (1983), Int. J. Rock Mech. Min. Sci. 20, 249", springs=True),
+        _toe("elastic_logarithmic", LogarithmicToe, "d = D_e d_t lg(1 + sigma / s)",
+             "Asperities of all heights that spring back.", "Persson (2007), Phys. Rev. Lett. 99, 125502", springs=True),
     ),
     ("zero of displacement, where the toe lies below all data",),
     check="measure how rough particles and platens are; on a reload asperities stay flat",

@@ -145,9 +145,10 @@ class ViscousFlow(AbstractIntegral):
 
 
 class ViscoplasticCreep(AbstractIntegral):
-    """Permanent creep, only near the largest load: logarithmic in the time spent there."""
+    """Permanent creep, only near the largest load: logarithmic in the time spent there, or its cube root."""
 
     tau_s: Scalar = eqx.field(converter=scalar)
+    root: bool = eqx.field(static=True, default=False, kw_only=True)
 
     def driver(self, context: Context) -> Values:
         """u^8: unloading by a tenth more than halves it."""
@@ -155,9 +156,10 @@ class ViscoplasticCreep(AbstractIntegral):
         return square * square * square * square
 
     def inside(self, context: Context) -> Values:
-        """D_e c sigma_P ln(1 + t_load / tau)."""
-        strain = context.peak_stress * jnp.log1p(context.memory / self.tau_s)
-        return self.amplitude * context.particle.displacement(strain)
+        """D_e c sigma_P ln(1 + t_load / tau), or sigma_P [(1 + t_load / tau)^(1/3) - 1]."""
+        time = jnp.log1p(context.memory / self.tau_s)
+        grown = jnp.expm1(time / 3) if self.root else time
+        return self.amplitude * context.particle.displacement(context.peak_stress * grown)
 
 
 class AbstractHoldCreep(AbstractEffect):
@@ -241,6 +243,10 @@ CREEP = Mechanism(
         _creep("viscoplastic", ViscoplasticCreep, "d = D_e c sigma_P ln(1 + t_load / tau), t_load = integral of u^8 dt",
                "Permanent creep while the load is near its maximum, logarithmic in the time spent there.",
                "Oyen and Cook (2003); logarithmic indentation creep", nuisances=_tau(1.0, 10.0, 100.0)),
+        _creep("viscoplastic_root", ViscoplasticCreep,
+               "d = D_e c sigma_P [(1 + t_load / tau)^(1/3) - 1], t_load = integral of u^8 dt",
+               "Permanent creep while the load is near its maximum, as the cube root of the time spent there.",
+               "Andrade (1910), Proc. R. Soc. A 84, 1", nuisances=_tau(1.0, 10.0, 100.0), fixed={"root": True}),
         _creep("hold_logarithmic", LogarithmicHold, "d = D_e c [sum over holds of sigma ln(1 + t_hold / tau)]",
                "Creep under constant load only, logarithmic in the time of each hold; it stays.",
                "Chudoba and Richter (2001), Surf. Coat. Technol. 148, 191", needs=(Need.HOLD,),

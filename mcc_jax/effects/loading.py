@@ -304,6 +304,18 @@ class LockingFactor(AbstractLoadingFactor):
         return 1 + self.amplitude * jnp.where(some, power, 0.0)
 
 
+class ExponentialLocking(AbstractLoadingFactor):
+    """The same with an exponential: it sets in earlier and grows longer."""
+
+    exponent: Scalar = eqx.field(converter=scalar)
+
+    def factor(self, particle: Particle, strain: Values) -> Values:
+        """1 + b (e^(k eps) - 1 - k eps) / (the same at 0.5)."""
+        at = self.exponent * strain
+        most = self.exponent * LOCKING_STRAIN
+        return 1 + self.amplitude * (jnp.expm1(at) - at) / (jnp.expm1(most) - most)
+
+
 # ---- hardening exponent ----------------------------------------------------------------------------------------------
 
 
@@ -321,17 +333,21 @@ class FiniteHardening(AbstractEffect):
         return first, third, fifth
 
 
+def _power_of_load(half_inverse: Scalar, context: Context) -> Values:
+    """Delta [s(u) - s(u^(1 / (1 + 1/2m)))], the same exponent on the elastic branch; `half_inverse` is 1/2m."""
+    share = context.load_share
+    some = share > 0
+    log = jnp.log(jnp.where(some, share, 1.0))
+    moved = jnp.where(some, share * jnp.exp(-half_inverse / (1 + half_inverse) * log), share)
+    return context.recoverable * (recovery(share) - recovery(jnp.where(moved < 1, moved, 1.0)))
+
+
 class FiniteHardeningBoth(FiniteHardening):
     """The same exponent on the elastic branch."""
 
     def inside(self, context: Context) -> Values:
         """Delta [s(u) - s(u^(1 / (1 + 1/2m)))]."""
-        share = context.load_share
-        some = share > 0
-        log = jnp.log(jnp.where(some, share, 1.0))
-        q = 0.5 * self.amplitude
-        moved = jnp.where(some, share * jnp.exp(-q / (1 + q) * log), share)
-        return context.recoverable * (recovery(share) - recovery(jnp.where(moved < 1, moved, 1.0)))
+        return _power_of_load(0.5 * self.amplitude, context)
 
 
 class FiniteHardeningContact(FiniteHardening):
@@ -365,6 +381,14 @@ class StrainPower(AbstractEffect):
         safe = jnp.where(strain > 1e-9, strain, 1e-9)
         first = jnp.exp(0.5 * self.amplitude * jnp.log(safe / REFERENCE_STRAIN))
         return first, first**3, first**5
+
+
+class StrainPowerBoth(StrainPower):
+    """The same exponent on the elastic branch."""
+
+    def inside(self, context: Context) -> Values:
+        """Delta [s(u) - s(u^(1 / (1 + 1/2m)))]."""
+        return _power_of_load(0.5 * self.amplitude, context)
 
 
 def _hardening(
@@ -407,6 +431,10 @@ HARDENING = Mechanism(
         _hardening("every_term", StrainPower, "sigma(0.2 (eps / 0.2)^(1 + 1/2m))",
                    "A power of strain in place of strain in every term; 1/m = 1 is an elastic contact after Hertz, "
                    "ceramic pebbles show 1.2 to 1.6.", _STORAKERS, plausible=(0.02, 2.0)),
+        _hardening("every_term_and_unloading", StrainPowerBoth,
+                   "sigma(0.2 (eps / 0.2)^(1 + 1/2m)); on unloading u^(1/(1 + 1/2m)) for u",
+                   "The same, and on the pressure that unloading releases.", "Olsson and Larsson (2013)",
+                   plausible=(0.02, 2.0)),
     ),
     check="repeat between polished platens, or indent a compact of the same powder",
 )  # fmt: skip

@@ -12,7 +12,7 @@ from ..formulas import Formulas, Plastic
 from ..geometry import Particle
 from .context import Context, positive
 from .effect import AbstractEffect, AbstractModulusAtPeak, at_least
-from .loading import LockingFactor
+from .loading import ExponentialLocking, LockingFactor
 from .record import REFERENCE_HUMIDITY_PERCENT, Record
 from .variant import Mechanism, Need, Nuisance, Variant
 
@@ -400,6 +400,10 @@ DENSIFICATION = Mechanism(
                "Rusch (1969), J. Appl. Polym. Sci. 13, 2297; Gibson and Ashby (1997), Cellular Solids, ch. 5",
                needs=(), helps=(Need.SEVERAL_PEAKS,),
                nuisances=(Nuisance("exponent", (4.0, 8.0), (2.0, 16.0), "power of strain"),)),
+        _dense("locking_exponential", ExponentialLocking, "sigma(eps) [1 + b (e^(k eps) - 1 - k eps) / (at eps = 0.5)]",
+               "The same, exponential in strain.", "Gibson and Ashby (1997), Cellular Solids, ch. 5", needs=(),
+               helps=(Need.SEVERAL_PEAKS,),
+               nuisances=(Nuisance("exponent", (6.0, 15.0), (1.0, 40.0), "growth per strain"),)),
     ),
     ("damage with a negative amplitude",),
     check="cycle one particle to rising peaks, its porosity measured by tomography before and after",

@@ -326,9 +326,11 @@ class ExponentialReversal(AbstractReversal):
 class StayingReversal(AbstractReversal):
     """Reverse yield that a reload takes back only in proportion to force."""
 
+    power: int = eqx.field(static=True, default=4, kw_only=True)
+
     def tail(self, share: Values) -> Values:
-        """(1 - u)^4."""
-        return (1 - share) ** 4
+        """(1 - u)^4, or ^2."""
+        return (1 - share) ** self.power
 
     def inside(self, context: Context) -> Values:
         """On a reload g(u_r) (1 - u) / (1 - u_r)."""
@@ -380,6 +382,9 @@ REVERSAL = Mechanism(
                   nuisances=(Nuisance("decay_share", (0.05, 0.1, 0.2, 0.4), (0.01, 1.0), "share of the peak load"),)),
         _reversal("staying", StayingReversal, "d = -gamma_P c (1 - u)^4; on a reload (1 - u_r)^4 (1 - u) / (1 - u_r)",
                   "As the quartic form, but a reload does not retrace it."),
+        _reversal("staying_quadratic", StayingReversal,
+                  "d = -gamma_P c (1 - u)^2; on a reload (1 - u_r)^2 (1 - u) / (1 - u_r)",
+                  "As the quadratic form, but a reload does not retrace it.", fixed={"power": 2}),
     ),
     check="unload, hold close to zero load, reload and unload once more",
 )  # fmt: skip

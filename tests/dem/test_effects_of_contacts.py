@@ -27,7 +27,7 @@ from mcc_jax.dem import (
 from mcc_jax.effects import LIBRARY, AbstractEffect, AbstractModulusAtPeak, find_variant
 
 CLOSED = [v for m in ("damage", "densification_stiffening", "size_effect", "shape_second_order") for v in LIBRARY[m]]
-CLOSED = [v for v in CLOSED if v.name not in ("cyclic", "locking")]
+CLOSED = [v for v in CLOSED if v.name not in ("cyclic", "locking", "locking_exponential")]
 AT_PEAK = [v for v in CLOSED if v.mechanism in ("damage", "densification_stiffening")]
 OTHERS = [v for m in LIBRARY.values() for v in m if v not in CLOSED]
 

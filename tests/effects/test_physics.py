@@ -101,6 +101,7 @@ def test_creep_functions_are_those_of_their_names():
         np.testing.assert_allclose(creep("power_law", exponent=n)[late], (time[late] / 100) ** n, rtol=0.01)
     np.testing.assert_allclose(creep("viscous_flow"), time / 100, atol=1e-5)
     np.testing.assert_allclose(creep("viscoplastic", tau_s=10.0), np.log1p(time / 10), atol=1e-3)
+    np.testing.assert_allclose(creep("viscoplastic_root", tau_s=10.0), np.cbrt(1 + time / 10) - 1, atol=1e-3)
     np.testing.assert_allclose(creep("hold_logarithmic", tau_s=10.0), np.log1p((time - 1e-3) / 10), atol=1e-9)
     np.testing.assert_allclose(creep("hold_kelvin", tau_s=20.0), -np.expm1(-(time - 1e-3) / 20), atol=1e-9)
     spread = creep("distributed", tau_s=20.0)
@@ -201,7 +202,7 @@ def test_damage_softens_and_densification_stiffens_unloading(name):
     force = np.asarray(FORCE)
     virgin = force >= np.maximum.accumulate(force)
     for variant in LIBRARY[name]:
-        if variant.name == "locking":  # loading itself stiffens: below
+        if variant.name.startswith("locking"):  # loading itself stiffens: below
             continue
         values, _ = lanes(variant)
         np.testing.assert_allclose(values[4][virgin], values[0][virgin], rtol=1e-12)
@@ -309,16 +310,22 @@ def test_friction_and_hardening_meet_the_stress_they_say():
     for mechanism, name, factor in (
         ("platen_friction", "strain", lambda e, a: 1 + a * e),
         ("densification_stiffening", "locking", lambda e, a: 1 + a * (e / 0.5) ** 8),
+        (
+            "densification_stiffening",
+            "locking_exponential",
+            lambda e, a: 1 + a * (np.expm1(15 * e) - 15 * e) / (np.expm1(7.5) - 7.5),
+        ),
         ("finite_hardening_exponent", "all_terms", lambda e, a: (e / 0.2) ** (a / 2)),
     ):
         variant = LIBRARY[mechanism][name]
         strain = PARTICLE.strain(respond(variant, variant.typical, record=record))[1:]
         stress = LAW.loading_stress(PARTICLE, strain) * factor(strain, variant.typical)
         np.testing.assert_allclose(stress, PARTICLE.stress(force)[1:], rtol=1e-9)
-    variant = LIBRARY["finite_hardening_exponent"]["every_term"]
-    strain = PARTICLE.strain(respond(variant, variant.typical, record=record))[1:]
-    stress = LAW.loading_stress(PARTICLE, 0.2 * (strain / 0.2) ** (1 + variant.typical / 2))
-    np.testing.assert_allclose(stress, PARTICLE.stress(force)[1:], rtol=1e-9)
+    for name in ("every_term", "every_term_and_unloading"):
+        variant = LIBRARY["finite_hardening_exponent"][name]
+        strain = PARTICLE.strain(respond(variant, variant.typical, record=record))[1:]
+        stress = LAW.loading_stress(PARTICLE, 0.2 * (strain / 0.2) ** (1 + variant.typical / 2))
+        np.testing.assert_allclose(stress, PARTICLE.stress(force)[1:], rtol=1e-9)
 
 
 def test_dry_air_hardens_and_an_unknown_humidity_does_nothing():
