@@ -152,7 +152,11 @@ def design_of(
 
 
 def moved(base: Base, state: State, variants: tuple[Variant, ...], solution: Solution) -> State:
-    """The state at a solution; a positive number moves by a factor of e at most, others within what is plausible."""
+    """The state at a solution, or on the way there: no positive number moves by more than a factor of e.
+
+    All numbers go the same share of the way, since an amplitude that is right at the solution is wrong beside further
+    numbers that stayed behind. Further numbers of an effect whose amplitude is zero stay: nothing tells of them there.
+    """
     tests, model = base.tests, base.model
     mean, factor = map(np.asarray, base.population_prior)
     beta = mean + factor @ solution.common[:POPULATION]
@@ -160,19 +164,29 @@ def moved(base: Base, state: State, variants: tuple[Variant, ...], solution: Sol
     latent = at + slope @ (beta - np.asarray(state.population)) + solution.own[:, :4]
     zero_mean, zero_sd = np.asarray(model.zero_prior)
     zero = np.asarray(tests.contact) + zero_mean + zero_sd * solution.own[:, 4]
-    numbers: list[Any] = [v.plausible[0] * float(solution.amplitude[k]) for k, v in enumerate(variants)]
-    old, place = np.asarray(state.point.theta[0]), POPULATION
-    for v in variants:
+    old, place, share = np.asarray(state.point.theta[0]), POPULATION, 1.0
+    steps = [v.plausible[0] * float(solution.amplitude[k]) - float(old[k]) for k, v in enumerate(variants)]
+    logs = [False] * len(steps)
+    for k, v in enumerate(variants):
         for n in v.nuisances:
             middle, sd = nuisance_moments(n)
-            x, now = middle + sd * float(solution.common[place]), float(old[len(numbers)])
-            if n.plausible[0] > 0:
-                numbers.append(now * np.exp(np.clip(x - np.log(now), -1.0, 1.0)))
-            else:
-                numbers.append(float(np.clip(x, *n.plausible)))
+            x, now = middle + sd * float(solution.common[place]), float(old[len(steps)])
+            log = n.plausible[0] > 0
+            step = x - np.log(now) if log else float(np.clip(x, *n.plausible)) - now
+            step = step if old[k] else 0.0
+            if log:
+                share = min(share, 1 / max(abs(step), 1.0))
+            steps.append(step)
+            logs.append(log)
             place += 1
-    point = Point(jnp.asarray(latent), jnp.asarray(zero), state.point.theta)
-    return State(point, jnp.asarray(beta)).with_numbers(np.array(numbers))
+    ways = share * np.array(steps)
+    numbers = np.where(logs, old[: len(steps)] * np.exp(np.where(logs, ways, 0.0)), old[: len(steps)] + ways)
+
+    def on_the_way(now: Any, there: np.ndarray) -> Any:
+        return jnp.asarray(there if share == 1 else np.asarray(now) + share * (there - np.asarray(now)))
+
+    point = Point(on_the_way(state.point.latent, latent), on_the_way(state.point.zero, zero), state.point.theta)
+    return State(point, on_the_way(state.population, beta)).with_numbers(numbers)
 
 
 @compiled

@@ -76,10 +76,13 @@ def refined(
                 raise
             optimum = None  # a step beyond arithmetic is as bad as can be
         last = k == NUMERICS.steps - 1
-        if not last and (optimum is None or optimum.log_joint < value - NUMERICS.worse):
+        # First order from an amplitude of zero promises too much: the first steps may take some of it back. Later a
+        # step that makes things worse goes to and fro around the optimum.
+        worse = value - (NUMERICS.worse if k < NUMERICS.early else NUMERICS.still)
+        if not last and (optimum is None or optimum.log_joint < worse):
             state, value = between(before, state), -np.inf  # what was linear there is not here
         else:
-            if optimum is None or (last and optimum.log_joint < value - NUMERICS.worse):
+            if optimum is None or (last and optimum.log_joint < worse):
                 state = before
                 design = design_of(base, state, variants, more)
                 break

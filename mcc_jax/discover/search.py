@@ -94,7 +94,11 @@ class Search:
     # ---- posterior ---------------------------------------------------------------------------------------------------
 
     def log_posteriors(self) -> dict[Names, float]:
-        """Log evidence and log prior of every hypothesis, best first; pairs must lead by the margin to count."""
+        """Log evidence and log prior of every hypothesis, best first.
+
+        Pairs must lead by the margin to count, and with a second name of credible size: what takes an amplitude beyond
+        its largest plausible one imitates what the first name's formula misses.
+        """
         count = len(self.library)
         logs = {}
         for names, one in self.found.items():
@@ -113,8 +117,21 @@ class Search:
                 larger = names if logs[names] >= logs[UNLISTED] else UNLISTED
                 logs[larger] = float(np.logaddexp(logs[larger], both))
         fewer = max(v for names, v in logs.items() if len(names) < 2)
-        kept = {names: v for names, v in logs.items() if len(names) < 2 or v > fewer + DECISIONS.margin}
+        kept = {
+            names: v
+            for names, v in logs.items()
+            if len(names) < 2 or (v > fewer + DECISIONS.margin and self._credible(names))
+        }
         return dict(sorted(kept.items(), key=lambda item: -item[1]))
+
+    def _credible(self, names: Names) -> bool:
+        """Whether the name of a pair that explains less by itself has an amplitude that one would believe."""
+        r = self.found[names].formulas
+        if r is None:
+            return True
+        second = min(names, key=lambda n: self.found[(n,)].log_evidence)
+        sizes = zip(r.variants, r.theta, strict=False)
+        return all(abs(size) <= v.plausible[1] for v, size in sizes if v.mechanism == second)
 
     def posterior(self) -> dict[Names, float]:
         """Probability of every hypothesis, most probable first."""

@@ -111,7 +111,8 @@ class Numerics:
         aside: how far from there, in the same unit, slopes are compared for its curvature.
         drifts: drifts of every test's own that are fitted at their own optimum.
         little: factor on correlated noise that has swallowed a gap, where what explains it begins to be fitted.
-        worse: nats by which a step may make things worse before half of it is taken back.
+        worse, early: nats by which each of so many first steps may make things worse before half of it is taken back;
+            later ones by `still`.
         hats, degree: hat functions of each coordinate of a misfit, and total degree of smooth products.
         splines, fine_splines: cosines of each coordinate of a discrepancy that no mechanism explains, and of stress.
         columns, entries: columns that are freed of the noise at once, at least and at most, and about how many numbers
@@ -144,6 +145,7 @@ class Numerics:
     evaluations: int = 40
     aside: float = 0.1
     worse: float = 5.0
+    early: int = 4
     drifts: int = 6
     little: float = 0.1
     locations: int = 32

@@ -122,7 +122,7 @@ def test_products_and_their_derivatives():
 
 
 def test_what_moved_is_told(posterior):
-    told = [note for note in posterior.warnings() if "effective modulus from" in note]
+    told = [note for note in posterior.warnings() if "effective modulus moves from" in note]
     assert len(told) == 1
     assert CREEP in told[0]
 

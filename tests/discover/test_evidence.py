@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from scipy.stats import multivariate_normal, norm
 
 from mcc_jax import Model, log_evidence
-from mcc_jax.calibrate.distributions import SCALES
+from mcc_jax.calibrate.distributions import SCALES, nuisance_moments
 from mcc_jax.discover.design import More, between, design_of, moved
 from mcc_jax.discover.evidence import (
     amplitudes,
@@ -24,6 +24,7 @@ from mcc_jax.discover.evidence import (
     whitened,
 )
 from mcc_jax.discover.refine import refined
+from mcc_jax.discover.settings import POPULATION
 from mcc_jax.effects import find_variant
 
 COMPLIANCE = 0.004
@@ -129,6 +130,24 @@ def test_a_formula_is_fitted_at_its_own_optimum(base):
     found = refined(base, nothing.state, (variant,), np.zeros(1), nothing.optimum.free)
     assert found.log_evidence > nothing.log_evidence + 50
     assert found.theta[0] == pytest.approx(COMPLIANCE, rel=0.1)
+
+
+def test_a_step_that_is_cut_short_is_cut_for_all_numbers(base):
+    """An amplitude that is right at the solution is wrong beside a time on the way there: steps that cut the time alone
+    went to and fro, and could end with an amplitude of zero."""
+    variant = find_variant("creep:kelvin_voigt")
+    (time,), unit = variant.nuisances, variant.plausible[0]
+    state = base.state.with_numbers(np.array([unit, 100.0]))
+    found = solve(base.hyperparameters, design_of(base, state, (variant,)))
+    mean, sd = nuisance_moments(time)
+    common = found.common.copy()
+    common[POPULATION] = (np.log(100.0) + 3.0 - mean) / sd  # three powers of e away
+    there = moved(base, state, (variant,), found._replace(common=common, amplitude=np.array([4.0])))
+    np.testing.assert_allclose(there.point.theta[0], [2.0 * unit, 100.0 * np.e], rtol=1e-6)
+    # Where the amplitude is zero nothing tells of the time: it stays, and the others go all the way.
+    nothing = base.state.with_numbers(np.array([0.0, 100.0]))
+    there = moved(base, nothing, (variant,), found._replace(common=common, amplitude=np.array([4.0])))
+    np.testing.assert_allclose(there.point.theta[0], [4.0 * unit, 100.0], rtol=1e-6)
 
 
 @pytest.mark.long

@@ -104,6 +104,21 @@ def test_two_names_must_lead_by_the_margin(named):
     named.found = kept
 
 
+def test_a_second_name_has_an_amplitude_that_one_would_believe(named):
+    best = max(h.log_evidence for h in named.found.values())
+    pair, kept = ("damage", "frame_compliance"), dict(named.found)
+    one = kept[("frame_compliance",)].best
+    first = max(pair, key=lambda n: kept[(n,)].log_evidence)
+    variants = tuple(LIBRARY[n].variants[0] for n in pair)
+    for beyond in pair:
+        theta = np.array([(1.5 if n == beyond else 0.5) * v.plausible[1] for n, v in zip(pair, variants, strict=True)])
+        formulas = replace(one, variants=variants, state=one.state.with_numbers(theta))
+        two = Hypothesis(pair, alone=best + 100, with_misfit=best + 100, best=formulas)
+        named.found = {**kept, pair: two}
+        assert (pair in named.posterior()) is (beyond == first)
+    named.found = kept
+
+
 def test_what_no_mechanism_explains_has_prior_odds_of_its_own(named):
     kept = dict(named.found)
     named.found = {n: replace(h, beside=-np.inf) for n, h in kept.items()}
