@@ -45,7 +45,7 @@ def modulus(kind):
 # ---- answers ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", first_in_time(["offset and force", "path", "spiked", "broken"], 2))
+@pytest.mark.parametrize("kind", first_in_time(["offset and force", "path", "spiked", "broken"]))
 def test_the_modulus_holds_the_truth_and_is_as_sharp_as_the_clean_tests_allow(kind):
     low, high = modulus(kind)["interval_95"]
     clean_low, clean_high = modulus("clean")["interval_95"]

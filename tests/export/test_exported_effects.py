@@ -186,14 +186,12 @@ assert not [name for name in sys.modules if name.startswith(("mcc_jax", "equinox
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "names",
     [
         ("creep:logarithmic", "frame_compliance"),
-        pytest.param(
-            ("creep:logarithmic", "frame_compliance", "thermal_drift", "damage:cyclic", "size_effect"),
-            marks=pytest.mark.long,
-        ),
+        ("creep:logarithmic", "frame_compliance", "thermal_drift", "damage:cyclic", "size_effect"),
     ],
     ids=["two", "five"],
 )

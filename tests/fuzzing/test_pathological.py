@@ -35,7 +35,7 @@ FILES = ("a force that is text", "cut off in the middle of a row", "a diameter o
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.long if i > 1 else ()) for i, name in enumerate(FITTED)]
+    "name", [pytest.param(name, marks=pytest.mark.long if i else ()) for i, name in enumerate(FITTED)]
 )
 def test_ends_in_a_result(name):
     found = run_one(BY_NAME[name], 1, "least-squares")
