@@ -127,7 +127,7 @@ def picture(mechanism):
         low, high = min(added.min(), 0.0), max(added.max(), 0.0)
         room = 0.12 * (high - low)
         right.set_ylim(low - room, high + room)
-        right.set(xlabel="time / s", ylabel="what the effect adds / µm")
+        right.set(xlabel="time / s", ylabel="added displacement / µm")
         force = right.twinx()
         force.fill_between(law.time_s, law.force_mN, color="0.9", lw=0)
         force.set_ylim(0, 1.15 * law.force_mN.max())

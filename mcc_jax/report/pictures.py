@@ -94,13 +94,15 @@ class Telling:
 def telling_pictures(told: Telling) -> list[tuple[str, str]]:
     """Force over displacement, a part of it enlarged; and what each law leaves over time. With each, what it shows."""
     found = []
-    for draw, words in (
-        (draw_enlarged, "Force over displacement, enlarged where law and test differ most"),
-        (draw_left_over, "Measured less predicted displacement over time"),
+    for draw, title, words in (
+        (draw_enlarged, "where law and test differ most", "Force over displacement, enlarged where they differ most"),
+        (draw_left_over, "what each law leaves, over time", "Measured less predicted displacement over time"),
     ):
         # No wider than a phone: its type is read there at the size in which it is set.
         figure = new_figure(4.6, 3.6)
-        handles = draw(figure.subplots(), told)
+        ax = figure.subplots()
+        handles = draw(ax, told)
+        ax.set_title(title, fontsize=9.5, color=BLACK, pad=4)
         figure.legend(handles=handles, loc="outside upper center", ncols=3, columnspacing=1.2, handlelength=1.6)
         figure.set_layout_engine("constrained")
         found.append((_svg(figure), f"{words}: {told.caption}"))
