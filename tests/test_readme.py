@@ -105,7 +105,7 @@ def drifted(readme: str) -> list[str]:
 
 def test_the_scoreboard_says_what_the_tables_say():
     assert drifted(README) == []
-    ours = ("97.5 % of", "100.0 % of", "3.3 % of", "80.0 % of", "1.77 s", "0.00874", "4.96")
+    ours = ("97.5 % of", "87.5 % of", "3.3 % of", "90.0 % of", "1.77 s", "0.00874", "4.96")
     for number in (*ours, "oracle 75.0", "1.65e+06"):
         assert README.count(number) == 1
         assert len(drifted(README.replace(number, "7777"))) == 1, number
