@@ -182,11 +182,8 @@ def moved(base: Base, state: State, variants: tuple[Variant, ...], solution: Sol
     ways = share * np.array(steps)
     numbers = np.where(logs, old[: len(steps)] * np.exp(np.where(logs, ways, 0.0)), old[: len(steps)] + ways)
 
-    def on_the_way(now: Any, there: np.ndarray) -> Any:
-        return jnp.asarray(there if share == 1 else np.asarray(now) + share * (there - np.asarray(now)))
-
-    point = Point(on_the_way(state.point.latent, latent), on_the_way(state.point.zero, zero), state.point.theta)
-    return State(point, on_the_way(state.population, beta)).with_numbers(numbers)
+    there = State(Point(jnp.asarray(latent), jnp.asarray(zero), state.point.theta), jnp.asarray(beta))
+    return between(state, there, share).with_numbers(numbers)
 
 
 @compiled
@@ -210,6 +207,6 @@ def at_priors(base: Base, rows: np.ndarray) -> State:
     return State(replace(point, latent=latent, zero=zero), jnp.asarray(population))
 
 
-def between(one: State, other: State) -> State:
-    """Half the way from one state to another."""
-    return jax.tree.map(lambda x, y: 0.5 * (x + y), one, other)
+def between(one: State, other: State, share: float = 0.5) -> State:
+    """A share of the way from one state to another, half of it by default."""
+    return jax.tree.map(lambda x, y: (1 - share) * x + share * y, one, other)
