@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,11 +20,23 @@ from .segments import Segment
 from .signal import straight_line
 from .validate import check_campaign
 
-LEAST_JUMP = 1.3
-"""Rates count as different where the larger is so many times the smaller: less is what testers' control leaves."""
-SMALLEST_RAMP, MOST_KINKS = 6, 6
-"""Readings of a ramp from which on changes of its speed are looked for (two lines that meet have four numbers), and how
-many at most: a change between two readings makes two."""
+
+@dataclass(frozen=True)
+class RampOptions:
+    """When rates of force count as different.
+
+    Attributes:
+        jump: where the larger is so many times the smaller: less is what testers' control leaves.
+        readings: of a ramp from which on changes of its speed are looked for: two lines that meet have four numbers.
+        kinks: of a ramp at most: a change between two readings makes two.
+    """
+
+    jump: float = 1.3
+    readings: int = 6
+    kinks: int = 6
+
+
+RAMPS = RampOptions()
 
 
 def record_of(curve: Curve, segments: tuple[Segment, ...], *, relative_humidity_percent: float | None = None) -> Record:
@@ -187,7 +200,7 @@ def ramp_rates(time: Float[np.ndarray, " n"], force: Float[np.ndarray, " n"], be
 def _kinks(time: np.ndarray, force: np.ndarray) -> list[int]:
     """The readings at which a ramp changes its speed, in order; see `ramp_rates`."""
     n = len(time)
-    if n < SMALLEST_RAMP:
+    if n < RAMPS.readings:
         return []
     x, y = (2 * (v - v.mean()) / max(float(np.ptp(v)), 1e-300) for v in (time, force))
 
@@ -204,7 +217,7 @@ def _kinks(time: np.ndarray, force: np.ndarray) -> list[int]:
 
     kinks: list[int] = []
     best, found = of_lines([]), []
-    for _ in range(min(MOST_KINKS, (n - 4) // 2)):
+    for _ in range(min(RAMPS.kinks, (n - 4) // 2)):
         ends = [0, *kinks, n - 1]
         gains = [_best_kink(x[i : j + 1], y[i : j + 1]) for i, j in itertools.pairwise(ends)]
         piece = int(np.argmax([gain for gain, _ in gains]))
@@ -220,11 +233,11 @@ def _kinks(time: np.ndarray, force: np.ndarray) -> list[int]:
         if value > best:
             break
         best, found = value, fewer
-    curves = np.polynomial.chebyshev.chebvander(x, min(1 + 2 * MOST_KINKS, n - 3))
+    curves = np.polynomial.chebyshev.chebvander(x, min(1 + 2 * RAMPS.kinks, n - 3))
     if not found or best >= min(criterion(curves[:, :k], k) for k in range(3, curves.shape[1] + 1)):
         return []
     slopes = np.cumsum(np.linalg.lstsq(lines(found), y)[0][1:])
-    return found if _apart(np.abs(slopes).tolist(), LEAST_JUMP) else []
+    return found if _apart(np.abs(slopes).tolist(), RAMPS.jump) else []
 
 
 def _best_kink(x: np.ndarray, y: np.ndarray) -> tuple[float, int]:
@@ -282,7 +295,7 @@ def available_data(campaign: Campaign, segments: tuple[tuple[Segment, ...], ...]
         Need.RELOAD: often("reload"),
         Need.SECOND_RELOAD: often("reload", 2),
         Need.LONG_TIME: float(np.median(durations)) > 200,
-        Need.TWO_RATES: _apart(rates, LEAST_JUMP),
+        Need.TWO_RATES: _apart(rates, RAMPS.jump),
         Need.SEVERAL_SIZES: _apart((D1 * D2 / D3).tolist(), 1.1),
         Need.SEVERAL_SHAPES: bool(np.ptp(1 - D3**2 / (D1 * D2)) > 0.1),
         Need.SEVERAL_PEAKS: _apart(peaks, 1.3),
