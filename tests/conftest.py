@@ -37,6 +37,7 @@ def pytest_configure(config):
     for name, value in settings.items():
         jax.config.update(name, value)
         os.environ[name.upper()] = str(value)  # for workers and for processes that tests start
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the workers are as many as the cores
 
 
 def _keep_everything():

@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, cast
 
 import equinox as eqx
+from threadpoolctl import threadpool_limits
 
 
 def compiled[**P, R](function: Callable[P, R], level: int = 1) -> Callable[P, R]:
@@ -40,6 +41,15 @@ def imported_meanwhile(*names: str) -> None:
     """Import what is needed later beside what is compiled first: together they would take seconds longer."""
     for name in names:
         threading.Thread(target=importlib.import_module, args=(name,), daemon=True).start()
+
+
+def one_blas_thread[**P, R](function: Callable[P, R]) -> Callable[P, R]:
+    """A function that calls NumPy and JAX in turn, with one thread of NumPy's BLAS.
+
+    Its matrices are small here, and threads that wait for the next one take the cores from JAX: on two cores all would
+    take a third longer.
+    """
+    return cast(Any, threadpool_limits.wrap(limits=1, user_api="blas"))(function)
 
 
 def side_by_side[A, B](function: Callable[[A], B], arguments: Iterable[A]) -> list[B]:

@@ -12,6 +12,7 @@ from .. import arguments
 from .._errors import InputError
 from .._format import described
 from ..campaign import THRESHOLD_MPA, Campaign, check_tests
+from .compiling import one_blas_thread
 from .fit_result import Fit
 from .fitting import checked_settings, prepare
 from .importance import smoothed
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
+@one_blas_thread
 def fit(
     campaign: Campaign,
     model: Model | None = None,

@@ -197,8 +197,9 @@ class _Mixture:
         self._log_density = np.concatenate([self._log_density, log_density[:count]])
         old = [self._proposal(new[:count], *part[:2]) for part in self._parts]
         known = np.concatenate([self._log_proposals, np.stack(old, 1) if old else np.empty((count, 0))])
-        self._parts.append((centre, factor, count))
-        self._log_proposals = np.column_stack([known, self._proposal(self.free, centre, factor)])
+        inverse = np.tril(np.linalg.inv(factor))
+        self._parts.append((centre, inverse, count))
+        self._log_proposals = np.column_stack([known, self._proposal(self.free, centre, inverse)])
 
     @property
     def log_weight(self) -> np.ndarray:
@@ -210,19 +211,26 @@ class _Mixture:
         mixture = np.asarray(logsumexp(self._log_proposals + share, axis=1))
         return self._log_density + twice - mixture
 
-    def _proposal(self, free: np.ndarray, centre: np.ndarray, factor: np.ndarray) -> np.ndarray:
-        from scipy.linalg import solve_triangular
-
-        inverse = solve_triangular(factor, np.eye(len(factor)), lower=True)
-        spreads = self._spreads
-        # In units of the distribution, what has a sign apart from what has none: all signs in one product of matrices.
-        signed = free[:, spreads].T[:, :, None] * inverse[:, spreads].T[:, None, :]
-        alike = (np.where(np.isin(np.arange(len(factor)), spreads), 0.0, free) - centre) @ inverse.T
-        all_signs = np.tensordot(self._signs, signed, 1) + alike
-        away = 1 + np.einsum("snd,snd->sn", all_signs, all_signs) / (SAMPLING.freedom - 2)
-        least, power = away.min(0), 0.5 * (SAMPLING.freedom + len(factor))
+    def _proposal(self, free: np.ndarray, centre: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+        """Log density of a distribution, given the inverse of its covariance's factor."""
+        away = 1 + self._squares(free, centre, inverse) / (SAMPLING.freedom - 2)
+        least, power = away.min(0), 0.5 * (SAMPLING.freedom + len(inverse))
         density = np.log(((least / away) ** power).sum(0)) - power * np.log(least)
-        return self._constant + density - np.sum(np.log(np.diagonal(factor)))
+        return self._constant + density + np.sum(np.log(np.diagonal(inverse)))
+
+    def _squares(self, free: np.ndarray, centre: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+        """Squared distances from the centre in units of the distribution, one row for each choice of signs.
+
+        Changing the sign of x_i adds -2 x_i k_i to the whitened z, k_i the i-th column of the inverse factor: the
+        square changes by -4 x_i (z . k_i) each and 4 x_i x_j (k_i . k_j) for each pair.
+        """
+        columns, own = inverse[:, self._spreads], free[:, self._spreads]
+        white = (free - centre) @ inverse.T
+        products = (own[:, :, None] * own[:, None, :] * (columns.T @ columns)).reshape(len(free), -1)
+        flipped = (1 - self._signs) / 2
+        pairs = (flipped[:, :, None] * flipped[:, None, :]).reshape(len(flipped), -1)
+        alike = np.einsum("nd,nd->n", white, white)
+        return np.maximum(alike + 4 * (pairs @ products.T - flipped @ (own * (white @ columns)).T), 0.0)
 
     def _densities(self, part: np.ndarray) -> np.ndarray:
         # Of few particles a gradient takes no time to speak of, and what the mode was found by is compiled already.

@@ -15,6 +15,7 @@ from .. import arguments
 from .._errors import InputError
 from .._format import described
 from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_tests
+from .compiling import one_blas_thread
 from .data import Selection, Tests, ranges_um
 from .distributions import SpreadCoordinate, nuisance_moments
 from .estimates import NO_SAMPLER, effect_entries, estimate, finite, log_estimate, normal_estimate, power_of_e
@@ -275,6 +276,7 @@ def identifiability(solution: Solution, names: tuple[str, ...] = SHARED) -> Iden
     return Identifiability(np.maximum(values[order], 0.0), vectors.T[order], names)
 
 
+@one_blas_thread
 def least_squares(
     campaign: Campaign,
     model: Model | None = None,

@@ -13,6 +13,7 @@ import jax
 from .. import arguments
 from .._errors import InputError
 from ..campaign import THRESHOLD_MPA, Campaign, check_campaign
+from .compiling import one_blas_thread
 from .data import select
 from .least_squares import LeastSquares, least_squares
 from .posterior import Posterior, sample
@@ -21,6 +22,7 @@ from .sharding import block_size
 Calibration = Posterior | LeastSquares
 
 
+@one_blas_thread
 def calibrate_many(
     campaigns: Iterable[Campaign],
     *,

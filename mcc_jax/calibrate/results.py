@@ -20,6 +20,7 @@ import numpy as np
 from .. import arguments
 from .._archive import encode, read_archive
 from .._errors import InputError
+from .._extras import extra
 from .._format import table, with_sd
 from .._store import json_text, results
 from ..campaign import Campaign, read_campaign
@@ -300,7 +301,8 @@ LONGEST = 160
 
 @cache
 def _validator(stem: str) -> Any:
-    from jsonschema import Draft202012Validator
+    with extra("report"):
+        from jsonschema import Draft202012Validator
 
     text = files("mcc_jax.calibrate").joinpath("schemas", f"{stem}.json").read_text(encoding="utf-8")
     return Draft202012Validator(json.loads(text))

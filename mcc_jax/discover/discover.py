@@ -12,6 +12,7 @@ from typing import Any
 from .. import arguments
 from .._errors import InputError
 from ..calibrate import Model, Posterior, sample
+from ..calibrate.compiling import one_blas_thread
 from ..calibrate.data import root_mean_squares
 from ..calibrate.fitting import checked_settings
 from ..calibrate.judgement import numbers_in_reach, unlike_others
@@ -53,6 +54,7 @@ from .settings import DECISIONS
 Tell = Callable[[str], None]
 
 
+@one_blas_thread
 def discover(
     campaign: Campaign,
     model: Model | None = None,
