@@ -13,7 +13,7 @@ processor's devices share its threads, and sums are divided otherwise. Their dra
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -65,13 +65,32 @@ class Parts:
         axis: that of the particles.
     """
 
-    waves: tuple[Any, ...]
+    waves: Sequence[Any]
     axis: int = 0
 
     def map(self, function: Callable[..., Any], *others: Parts) -> Parts:
         """A function of every wave, and of the same waves of others."""
         several = zip(self.waves, *(one.waves for one in others), strict=True)
         return Parts(tuple(function(*waves) for waves in several), self.axis)
+
+
+@dataclass(frozen=True)
+class _Cut(Sequence[Any]):
+    """Waves that are cut out each time they are asked for: of very many particles a second copy of all would be large.
+
+    Attributes:
+        part: what a row of blocks holds.
+        own: the rows.
+    """
+
+    part: Callable[[np.ndarray], Any]
+    own: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.own)
+
+    def __getitem__(self, wave: Any) -> Any:
+        return self.part(self.own[wave])
 
 
 class Blocks:
@@ -121,7 +140,7 @@ class Blocks:
                 lambda x: x if jnp.ndim(x) == 0 else self._placed(np.take(np.asarray(x), rows, axis), axis), tree
             )
 
-        return Parts(tuple(part(blocks) for blocks in self._own), axis)
+        return Parts(_Cut(part, self._own), axis)
 
     def keys(self, key: Any) -> Parts:
         """A random key for every block."""
