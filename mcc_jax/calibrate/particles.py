@@ -205,7 +205,7 @@ class Drawer:
         """
         self.count = count_of(exact.tests)
         self._exact, self._blocks, self._chunk = exact, Blocks(len(exact.tests), block), chunk
-        self._own = self._blocks.cut(exact)
+        self._own = self._blocks.cut(exact, kept=False)
 
     def all(self, key: Array, population: Population, candidates: int = 1, *, common: bool = False) -> ParticleDraws:
         """All particles, with `candidates` and `common` of `draw_particles`."""

@@ -76,7 +76,7 @@ class Parts:
 
 @dataclass(frozen=True)
 class _Cut(Sequence[Any]):
-    """Waves that are cut out each time they are asked for: of very many particles a second copy of all would be large.
+    """Waves that are cut out each time they are asked for.
 
     Attributes:
         part: what a row of blocks holds.
@@ -129,8 +129,12 @@ class Blocks:
         """Whether one device of every process has all particles at once."""
         return self.number == 1
 
-    def cut(self, tree: Any, axis: int = 0) -> Parts:
-        """This process's own particles of arrays of all; numbers without axes stay as they are."""
+    def cut(self, tree: Any, axis: int = 0, *, kept: bool = True) -> Parts:
+        """This process's own particles of arrays of all; numbers without axes stay as they are.
+
+        Parts that are not kept are cut out each time they are asked for: of very many particles a second copy of all
+        would be large.
+        """
         if self.whole_here:
             return Parts((tree,), axis)
 
@@ -140,7 +144,7 @@ class Blocks:
                 lambda x: x if jnp.ndim(x) == 0 else self._placed(np.take(np.asarray(x), rows, axis), axis), tree
             )
 
-        return Parts(_Cut(part, self._own), axis)
+        return Parts(tuple(map(part, self._own)) if kept else _Cut(part, self._own), axis)
 
     def keys(self, key: Any) -> Parts:
         """A random key for every block."""

@@ -91,10 +91,10 @@ def _population(base: Base, design: Design, free: np.ndarray) -> tuple[np.ndarra
     is integrated out, too, and widens the errors (Brynjarsdottir and O'Hagan 2014).
     """
     solution = solve(free, design)
-    mean, factor = map(np.asarray, base.population_prior)
+    mean, factor = base.population_prior
     beta = mean + factor @ np.asarray(solution.common[:POPULATION])
     sd = np.sqrt(np.diagonal(factor @ _covariance(design, free)[:POPULATION, :POPULATION] @ factor.T))
-    beta[2:] -= np.mean(np.log1p(np.maximum(beta[0] * np.asarray(design.tests.flatness), -0.99)))
+    beta[2:] -= np.mean(np.log1p(np.maximum(beta[0] * base.flatness, -0.99)))
     return beta, sd, np.asarray(scales_of(free, design)[0])[:3]
 
 

@@ -83,8 +83,18 @@ class Base:
         p = self.model.chosen_priors
         return p.tau_C1, p.tau_C3, p.tau_C5, p.modulus_scatter
 
-    @property
-    def population_prior(self) -> tuple[Array, Array]:
+    @cached_property
+    def flatness(self) -> np.ndarray:
+        """1 - D3^2/(D1 D2) of every particle [-]."""
+        return np.asarray(self.tests.flatness)
+
+    @cached_property
+    def zero_prior(self) -> np.ndarray:
+        """Mean and standard deviation of the zeros, from the recorded contact [um]."""
+        return np.asarray(self.model.zero_prior)
+
+    @cached_property
+    def population_prior(self) -> tuple[np.ndarray, np.ndarray]:
         """Prior of `State.population`: mean, and factor of the covariance."""
         p = self.model.chosen_priors
         mean, factor = np.zeros(5), np.zeros((5, 5))
@@ -95,7 +105,7 @@ class Base:
         # The softening 9 C3^6 / (20 C1 C5^5) has a prior of its own.
         mean[3] = (np.log(20 / 9) + mean[2] + 5 * mean[4] + np.log(p.softening.median)) / 6
         factor[3, 2], factor[3, 4], factor[3, 3] = factor[2, 2] / 6, 5 * factor[4, 4] / 6, p.softening.log_sd / 6
-        return jnp.asarray(mean), jnp.asarray(factor)
+        return mean, factor
 
     @cached_property
     def blocks(self) -> tuple[Blocks, Parts]:

@@ -101,20 +101,20 @@ def design_of(
     linear: Linear | None = None,
 ) -> Design:
     """The design of a hypothesis around a state, from the tests linearised there if they are already."""
-    tests, model = base.tests, base.model
+    tests, model, (middle, factor) = base.tests, base.model, base.population_prior
     linear = linear_at(base, state, variants) if linear is None else linear
     point, columns = state.point, np.asarray(linear.columns)
     of_particle, effect = columns[..., :4], columns[..., 4:]
     population, data = base_columns(
         point.latent,
         state.population,
-        tests.flatness,
+        jnp.asarray(base.flatness),
         linear.columns[..., :4],
         linear.residual,
-        base.population_prior,
+        (jnp.asarray(middle), jnp.asarray(factor)),
         model.shape_power,
     )
-    zero_mean, zero_sd = np.asarray(model.zero_prior)
+    zero_mean, zero_sd = base.zero_prior
     ones = np.where(tests.mask, 1.0, 0.0)
     data = np.asarray(data) - (np.asarray(tests.contact) + zero_mean - np.asarray(point.zero))[:, None] * ones
     own = [of_particle, (zero_sd * ones)[..., None], *([] if more.own is None else [more.own])]
@@ -158,11 +158,11 @@ def moved(base: Base, state: State, variants: tuple[Variant, ...], solution: Sol
     numbers that stayed behind. Further numbers of an effect whose amplitude is zero stay: nothing tells of them there.
     """
     tests, model = base.tests, base.model
-    mean, factor = map(np.asarray, base.population_prior)
+    mean, factor = base.population_prior
     beta = mean + factor @ solution.common[:POPULATION]
-    at, slope = map(np.asarray, means_and_slope(state.population, tests.flatness, model.shape_power))
+    at, slope = map(np.asarray, means_and_slope(state.population, jnp.asarray(base.flatness), model.shape_power))
     latent = at + slope @ (beta - np.asarray(state.population)) + solution.own[:, :4]
-    zero_mean, zero_sd = np.asarray(model.zero_prior)
+    zero_mean, zero_sd = base.zero_prior
     zero = np.asarray(tests.contact) + zero_mean + zero_sd * solution.own[:, 4]
     old, place, share = np.asarray(state.point.theta[0]), POPULATION, 1.0
     steps = [v.plausible[0] * float(solution.amplitude[k]) - float(old[k]) for k, v in enumerate(variants)]
@@ -197,11 +197,11 @@ def at_priors(base: Base, rows: np.ndarray) -> State:
 
     The law is monotone there, as tests are, and what it lacks can be found from there.
     """
-    mean, point = np.asarray(base.population_prior[0]), base.state.point
+    mean, point = base.population_prior[0], base.state.point
     population = np.asarray(base.state.population)
     if 2 * rows.sum() > len(rows):
         population = np.concatenate([population[:2], mean[2:]])
-    middle = particle_means(jnp.asarray(mean), base.tests.flatness, base.model.shape_power)
+    middle = particle_means(jnp.asarray(mean), jnp.asarray(base.flatness), base.model.shape_power)
     latent = jnp.where(rows[:, None], middle, point.latent)
     zero = jnp.where(rows, base.tests.contact, point.zero)
     return State(replace(point, latent=latent, zero=zero), jnp.asarray(population))

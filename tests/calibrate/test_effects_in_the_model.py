@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import first_in_time
 from scipy.special import logsumexp
 
 import mcc_jax as mcc
@@ -49,7 +48,8 @@ def test_amplitude_time_and_modulus_are_recovered(posterior):
     assert named["creep"].std() < 0.1 * AMPLITUDE
 
 
-@pytest.mark.parametrize("tau_s", first_in_time([0.1, 0.3]))
+@pytest.mark.long
+@pytest.mark.parametrize("tau_s", [0.1, 0.3])
 def test_strong_creep_with_a_time_far_from_the_priors_is_found(tau_s):
     """Undamped steps leave for times of 1e-5 s and 1e5 s in turn, and end in numbers that overflow."""
     fit = mcc.fit(creeping(tau_s), mcc.Model().with_effects(CREEP))

@@ -37,10 +37,15 @@ def hard_spheres(count, toe, seed=0, rows=300):
     return Campaign(tuple(f"S{k + 1}" for k in range(count)), diameters, tuple(curves))
 
 
-def test_a_record_ends_where_a_sphere_gives_way_and_few_readings_are_compared():
+def test_a_record_ends_where_a_sphere_gives_way():
     campaign = hard_spheres(8, toe=4e-3)
     (gives_way,) = [one for one in campaign_findings(check_tests(campaign)) if one.check == "breakage"]
     assert len(gives_way.particles) == 4
+
+
+@pytest.mark.long
+def test_few_readings_are_compared():
+    campaign = hard_spheres(8, toe=4e-3)
     base = base_fit(check_tests(campaign), Model(), threshold_MPa=0.0, tell=lambda _: None)
     assert base.coarse
     assert np.all(np.asarray(base.tests.mask).sum(1) <= 2 * DECISIONS.readings)

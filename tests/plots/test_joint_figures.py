@@ -4,7 +4,6 @@ import dataclasses
 import itertools
 import re
 
-import jax
 import matplotlib as mpl
 import numpy as np
 import pytest
@@ -40,17 +39,6 @@ from mcc_jax.simulate import paper_campaign
 KINDS = ("paper", *(pytest.param(kind, marks=pytest.mark.long) for kind in ("one", "odd")))
 STEMS = ["pairs", "prior_posterior", "forest", "shrinkage", "bands", "new_particle", "whitened", "fits", "estimates"]
 UNIT = re.compile(r"\[(GPa|mN|µm|-)\]$")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _as_users_have_it():
-    """NumPyro promotes types and ranks; by `config`, since the sampler is compiled in a thread of its own."""
-    before = {name: jax.config.values[name] for name in ("jax_numpy_rank_promotion", "jax_numpy_dtype_promotion")}
-    jax.config.update("jax_numpy_rank_promotion", "allow")
-    jax.config.update("jax_numpy_dtype_promotion", "standard")
-    yield
-    for name, value in before.items():
-        jax.config.update(name, value)
 
 
 class Calibrations(dict):
