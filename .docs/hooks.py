@@ -16,11 +16,12 @@ _ELSEWHERE = re.compile(
     r'<(?:script|img|iframe|source)\b[^>]*\bsrc="(?:https?:)?//|<link\b[^>]*\bhref="(?:https?:)?//', re.I
 )
 _LEFT_OVER = re.compile(
-    r'class="arithmatex"|:math:|\.\. math::|^!(?:api|names|file|gallery|which-test|look-alikes)\b', re.M
+    r'class="arithmatex"|:math:|\.\. math::|^!(?:api|names|file|table|gallery|which-test|look-alikes)\b', re.M
 )
 _API = re.compile(r"^!api (\S+)$", re.M)
 _NAMES = re.compile(r"^!names (\S+)$", re.M)
 _FILE = re.compile(r"^!file (\S+)$", re.M)
+_TABLE = re.compile(r"^!table (\S+) (.+)$", re.M)
 _FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.S)
 
 
@@ -44,7 +45,7 @@ def on_page_markdown(markdown, **_):
     """`!api mcc_jax.law` stands for an entry for each name of the module, `!names mcc_jax` for links to them.
 
     `!gallery`, `!which-test` and `!look-alikes` stand for what `gallery.py` writes of the effects, `!file NAME` for
-    a file at the top of the repository.
+    a file at the top of the repository, `!table FILE HEADING` for the table under that heading of a benchmark's results.
     """
 
     def entries(match):
@@ -56,6 +57,11 @@ def on_page_markdown(markdown, **_):
         }
         return "\n".join(f"- [`{name}`][{home}.{name}]" for name, home in sorted(homes.items(), key=lambda i: i[1]))
 
+    def table(match):
+        text = (PACKAGE.parent / "benchmarks" / "results" / match[1]).read_text(encoding="utf-8")
+        return text.partition(f"## {match[2]}\n")[2].partition("\n## ")[0].strip()
+
+    markdown = _TABLE.sub(table, markdown)
     markdown = _FILE.sub(lambda match: (PACKAGE.parent / match[1]).read_text(encoding="utf-8"), markdown)
     return gallery.filled(_NAMES.sub(links, _API.sub(entries, markdown)))
 
