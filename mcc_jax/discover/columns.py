@@ -172,8 +172,9 @@ class Columns:
     def white(self, free: np.ndarray) -> White:
         """Whitened at the hyperparameters; those of the last call are kept, since most are asked for more than once."""
         noise = tuple(map(float, free[:4]))
-        if self._last is not None and self._last[0] == noise:
-            return self._last[1]
+        last = self._last  # another thread may put its own in place meanwhile
+        if last is not None and last[0] == noise:
+            return last[1]
         found = [white_of(*self._given(free, piece)) for piece in self.pieces]  # all are begun before one is awaited
         found = [jax.tree.map(np.asarray, one) for one in found]
         columns = np.zeros(self.shape)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
-from typing import NamedTuple
+from functools import cached_property, partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import logsumexp
@@ -315,12 +315,17 @@ class Search:
         for names, ks in tried.items():
             alone = self.fit(ks).log_evidence - self.log_combinations(names)
             self.found[names] = Hypothesis(names, alone, best=self.fit(ks))
-            self.with_misfit_if_better(self.found[names], leader)
-        for m, mechanism in self.library.items():
-            if m not in self.shared:
-                names = pair_of(m, leader.names[0])
-                self.keep(names, self.of_their_own(m, mechanism, r))
-                self.with_misfit_if_better(self.found[names], leader)
+        further = [pair_of(m, leader.names[0]) for m in self.not_shared]
+        ones = side_by_side(lambda m: self.of_their_own(m, r), self.not_shared)
+        for names, one in zip(further, ones, strict=True):
+            self.keep(names, one)
+        pairs = [self.found[names] for names in (*tried, *further)]
+        side_by_side(lambda pair: self.with_misfit_if_better(pair, leader), pairs)
+
+    def pairs_of_each(self, leaders: Sequence[Hypothesis]) -> None:
+        """The best second names beside each of some leaders."""
+        for leader in leaders:
+            self.pairs_of(leader)
 
     def other_formulas(self, pair: Hypothesis) -> None:
         """A pair by the other formulas of either name, each beside the best of the other, at their own optimum."""
@@ -402,22 +407,23 @@ class Search:
         side_by_side(self.with_misfit, [self.found[(m,)] for m in serious])
         for m in names[NUMERICS.contenders :]:
             self.found[(m,)] = Hypothesis((m,), rank[m])
-        self.tell("what differs from test to test")
-        for m, mechanism in self.library.items():
-            if m not in self.shared:
-                self.keep((m,), self.of_their_own(m, mechanism, self.null))
-                if (own := self.found[m,].own) is not None and not own.jumps:
-                    self.with_misfit(self.found[m,])
-        self.tell("a discrepancy on no list")
-        smooth = self.smooth(self.null)
+        self.tell("what differs from test to test, and a discrepancy on no list")
+        tasks: list[Callable[[], Any]] = [partial(self.smooth, self.null)]
+        tasks += [partial(self.of_their_own, m, self.null) for m in self.not_shared]
+        smooth, *ones = side_by_side(lambda task: task(), tasks)
+        for m, one in zip(self.not_shared, ones, strict=True):
+            self.keep((m,), one)
+        alone = [self.found[m,] for m in self.not_shared]
+        side_by_side(self.with_misfit, [x for x in alone if x.own is not None and not x.own.jumps])
         self.found[UNLISTED] = Hypothesis(UNLISTED, smooth.optimum.log_evidence, smooth=smooth)
         leaders = sorted((x for x in self.found.values() if x.names and x.best is not None), key=lambda x: -x.alone)
         if leaders and max(x.log_evidence for x in self.found.values()) - nothing > NUMERICS.strong:
             self.tell("two names")
-            for leader in leaders[:2]:
-                assert leader.best is not None
-                leader.beside = self.smooth(leader.best).optimum.log_evidence
-                self.pairs_of(leader)
+            leading = [(x, x.best) for x in leaders[:2] if x.best is not None]
+            tasks = [partial(self.pairs_of_each, leaders[:2]), *(partial(self.smooth, best) for _, best in leading)]
+            _, *smooths = side_by_side(lambda task: task(), tasks)
+            for (leader, _), smooth in zip(leading, smooths, strict=True):
+                leader.beside = smooth.optimum.log_evidence
             first = max((x for x in self.found.values() if len(x.names) == 1), key=lambda x: x.log_evidence)
             if first.own is not None and self.screen is not None:
                 self.pairs_of_their_own(first)
@@ -430,10 +436,15 @@ class Search:
         self.other_noise()
         return self
 
-    def of_their_own(self, name: str, mechanism: Mechanism, start: Refined) -> OwnNumbers | None:
+    @property
+    def not_shared(self) -> list[str]:
+        """The mechanisms whose numbers differ from test to test."""
+        return [m for m in self.library if m not in self.shared]
+
+    def of_their_own(self, name: str, start: Refined) -> OwnNumbers | None:
         """A mechanism whose numbers differ from test to test, beside what is there at the start."""
         if name == SUDDEN:
-            return sudden_steps(self.base, start, mechanism.variants[0])
+            return sudden_steps(self.base, start, self.library[name].variants[0])
         candidates, columns = self.formulas_of({name})
         return differing(self.base, start, columns, candidates)
 
