@@ -45,7 +45,7 @@ def on_page_markdown(markdown, **_):
     """`!api mcc_jax.law` stands for an entry for each name of the module, `!names mcc_jax` for links to them.
 
     `!gallery`, `!which-test` and `!look-alikes` stand for what `gallery.py` writes of the effects, `!file NAME` for
-    a file at the top of the repository, `!table FILE HEADING` for the table under that heading of a benchmark's results.
+    a file at the top of the repository, `!table FILE HEADING` for a table of `benchmarks/results/`.
     """
 
     def entries(match):
