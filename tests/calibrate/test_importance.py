@@ -8,9 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from mcc_jax import Model, paper_campaign, sample
 from mcc_jax.calibrate import draws as drawing
+from mcc_jax.calibrate.compiling import one_blas_thread
 from mcc_jax.calibrate.importance import sample_weighted
 from mcc_jax.calibrate.mode import LogPosterior, prior_populations
 
@@ -91,3 +93,14 @@ def test_threads_may_trace_the_model_side_by_side():
             assert set(pool.map(trace, range(2, 42))) == {(2,)}
     finally:
         sys.setswitchinterval(interval)
+
+
+def test_numpy_has_one_thread_meanwhile_and_its_own_afterwards():
+    def threads():
+        return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+    with threadpool_limits(2, "blas"):
+        before = threads()
+        assert before != {1}
+        assert one_blas_thread(threads)() == {1}
+        assert threads() == before
