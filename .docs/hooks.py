@@ -8,6 +8,7 @@ from pathlib import Path
 
 import gallery
 from latex2mathml.converter import convert
+from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File
 
 PACKAGE = Path(__file__).parents[1] / "mcc_jax"
@@ -59,7 +60,10 @@ def on_page_markdown(markdown, **_):
 
     def table(match):
         text = (PACKAGE.parent / "benchmarks" / "results" / match[1]).read_text(encoding="utf-8")
-        return text.partition(f"## {match[2]}\n")[2].partition("\n## ")[0].strip()
+        _, heading, rest = text.partition(f"## {match[2]}\n")
+        if not heading:
+            raise PluginError(f"{match[1]} has no table {match[2]}")
+        return rest.partition("\n## ")[0].strip()
 
     markdown = _TABLE.sub(table, markdown)
     markdown = _FILE.sub(lambda match: (PACKAGE.parent / match[1]).read_text(encoding="utf-8"), markdown)

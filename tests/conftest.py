@@ -87,8 +87,8 @@ def pytest_xdist_make_scheduler(config, log):
     return ByGroup(config, log) if config.getoption("dist") == "loadfile" else None
 
 
-CASES = 2
-"""Of a test with more cases the first and the last run; `--every-case` and `-k` run all."""
+CASES = 3
+"""Of a test with more cases as many run, spread evenly; `--every-case` and `-k` run all."""
 
 
 def pytest_addoption(parser):

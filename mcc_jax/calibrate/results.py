@@ -350,9 +350,10 @@ def read_result(file: Path, again: str) -> dict[str, Any]:
 
 
 def _check(content: Any, file: Path, remedy: str) -> None:
+    validator = _validator(file.stem)  # says which extra it needs
     from jsonschema.exceptions import best_match
 
-    error = best_match(_validator(file.stem).iter_errors(content))
+    error = best_match(validator.iter_errors(content))
     if error is None:
         return
     place = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in error.absolute_path).lstrip(".")

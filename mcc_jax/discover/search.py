@@ -267,6 +267,11 @@ class Search:
         solution = solve(optimum.free, design)
         return Smooth(design, optimum, solution, basis)
 
+    def with_discrepancy(self, leader: Hypothesis) -> None:
+        """Log evidence of a name with a smooth discrepancy beside it."""
+        assert leader.best is not None
+        leader.beside = self.smooth(leader.best).optimum.log_evidence
+
     # ---- two names ---------------------------------------------------------------------------------------------------
 
     def seconds(self, at: Refined, first: Variant, column: np.ndarray) -> list[tuple[float, int]]:
@@ -419,11 +424,9 @@ class Search:
         leaders = sorted((x for x in self.found.values() if x.names and x.best is not None), key=lambda x: -x.alone)
         if leaders and max(x.log_evidence for x in self.found.values()) - nothing > NUMERICS.strong:
             self.tell("two names")
-            leading = [(x, x.best) for x in leaders[:2] if x.best is not None]
-            tasks = [partial(self.pairs_of_each, leaders[:2]), *(partial(self.smooth, best) for _, best in leading)]
-            _, *smooths = side_by_side(lambda task: task(), tasks)
-            for (leader, _), smooth in zip(leading, smooths, strict=True):
-                leader.beside = smooth.optimum.log_evidence
+            leading = leaders[:2]
+            tasks = [partial(self.pairs_of_each, leading), *(partial(self.with_discrepancy, x) for x in leading)]
+            side_by_side(lambda task: task(), tasks)
             first = max((x for x in self.found.values() if len(x.names) == 1), key=lambda x: x.log_evidence)
             if first.own is not None and self.screen is not None:
                 self.pairs_of_their_own(first)
