@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .quality_options import QualityOptions
-from .schema import Control, Curve, Note
+from .schema import Campaign, Control, Curve, Note
 from .segments import find_segments
-from .signal import point_noise, two_lines
+from .signal import differences, median, point_noise, two_lines
 
 
 @dataclass(frozen=True)
@@ -30,15 +30,16 @@ class ZeroOfForce:
 
 
 def zero_of_force(curve: Curve, control: Control | None, options: QualityOptions) -> ZeroOfForce | None:
-    """The force that is read in the air before contact; None if there are no such readings.
+    """The force that is read in the air before contact; None if nothing tells of another zero than the file's own.
 
     Without a drift it is the readings' mean, with the error of a mean of readings that hang together (as of an
     autoregressive process of order 1). With a drift it is their straight line over time up to contact, and the line's
     value there from then on; what the drift did during the test nobody knows, so its change in the air is the error.
+    Without readings in the air a record that begins far from zero leaves its zero open by as much.
     """
     contact, ahead = air_until(curve, control, options)
     if contact is None:
-        return _perhaps_drift(curve, ahead, options)
+        return _perhaps_drift(curve, ahead, options) or _begins_elsewhere(curve, options)
     # The last readings before the platens touch may already feel the first asperities.
     stop = max(options.air_readings, int(0.9 * contact))
     air, when = curve.force_mN[:stop], curve.time_s[:stop]
@@ -84,6 +85,37 @@ def _perhaps_drift(curve: Curve, ahead: SlowStart | None, options: QualityOption
         (ahead.change,),
         "Cut these readings off if the platens did not touch yet, and let the load cell settle before a test",
     )
+    return ZeroOfForce(np.zeros(len(curve)), 0.0, 0.0, (note,))
+
+
+_OPEN = "force begins at {} mN without a reading in the air: a preload, or a load cell that was not tared"
+
+
+def zero_is_open(campaign: Campaign) -> bool:
+    """Whether some checked test begins at a force that may be a preload as well as an error of the zero."""
+    notes = (note for curve in campaign.curves if curve.checked is not None for note in curve.checked.notes)
+    return any(note.sentence == _OPEN for note in notes)
+
+
+def _begins_elsewhere(curve: Curve, options: QualityOptions) -> ZeroOfForce | None:
+    """A record in contact whose first reading is below zero, or more than a step of the ramp above it.
+
+    One that begins above `start_share` of its largest force has lost its loading, and tells no zero at all. Below zero
+    the load cell was not tared: the reading is taken off, and its error is as large as itself. Above it, that and a
+    preload look alike: the file's zero stays, unless `begins_at_zero`.
+    """
+    first = float(curve.force_mN[0])
+    step = median(np.abs(differences(curve.force_mN[: options.air_readings + 1])))
+    least = max(options.air_share * float(np.ptp(curve.force_mN)), options.air_said * point_noise(curve.force_mN))
+    tared, largest = options.begins_at_zero, float(curve.force_mN.max())
+    within, most = (least, options.begins_at) if tared else (step + least, options.start_share)
+    if -least <= first <= within or abs(first) > most * largest:
+        return None
+    if first < 0 or tared:
+        sentence = "force begins at {} mN without a reading in the air; this was taken off, with itself as its error"
+        note = Note("zero of force", "look", sentence, (first,), "Tare the load cell, and begin in the air")
+        return ZeroOfForce(np.full(len(curve), first), first, abs(first), (note,))
+    note = Note("zero of force", "told", _OPEN, (first,), "Tell the two apart by readings in the air before contact")
     return ZeroOfForce(np.zeros(len(curve)), 0.0, 0.0, (note,))
 
 

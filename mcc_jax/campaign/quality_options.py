@@ -43,6 +43,8 @@ class QualityOptions:
         other_stiffness: if force over displacement is not another one there, by this factor, only the tester's speed
             was.
         start_share: of the largest force, in front of which such a rise is looked for: farther on loading itself bends.
+            A preload is no larger.
+        begins_at_zero: a record that begins in contact began without load, whatever its file says.
         saturation: when a channel counts as saturated.
     """
 
@@ -68,6 +70,7 @@ class QualityOptions:
     drift_like: float = 0.7
     other_stiffness: float = 1.5
     start_share: float = 0.1
+    begins_at_zero: bool = False
     saturation: SaturationOptions = field(default_factory=SaturationOptions)
 
     __repr__ = described()

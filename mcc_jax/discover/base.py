@@ -78,6 +78,11 @@ class Base:
         return Forms(self.model.unloading)
 
     @property
+    def readings(self) -> int:
+        """How many readings are compared."""
+        return int(np.sum(np.asarray(self.tests.mask)))
+
+    @property
     def spreads(self) -> tuple[Any, ...]:
         """Priors of the spreads of b1, b3, b5 and e."""
         p = self.model.chosen_priors

@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from types import ModuleType
 from typing import Any
 
@@ -18,7 +19,9 @@ from ..calibrate.fitting import checked_settings
 from ..calibrate.judgement import numbers_in_reach, unlike_others
 from ..calibrate.settings import JUDGEMENT
 from ..campaign import Campaign, Finding, available_data, campaign_findings, check_plausibility, check_tests
+from ..campaign.force_zero import zero_is_open
 from ..campaign.quality import named
+from ..campaign.quality_options import QualityOptions
 from ..effects import LIBRARY, Mechanism
 from ..effects.library import checked_library
 from .answer import (
@@ -109,18 +112,21 @@ def discover(
         )
         found = Discovery("FIT_NOT_CONVERGED", summary, None, None, seed, 0.0)
         return _finished(found, (*wrong, *findings), started)
-    base, left_out = _settled_fit(campaign, findings, without_effects(assumed), threshold_MPa, tell)
-    findings = (*findings, *left_out)
-    testable, missing = untestable(without_punch(known, base), available_data(campaign))
-    if not testable:
-        raise InputError("no mechanism is left to look for", remedy="Exclude fewer, or measure what the others need.")
-    tell("signatures of all effects")
-    with numbers_in_reach(base.campaign):
-        search = Search(base, testable, tell).run()
-        tell("is anything missing")
-        p_any = p_anything(search, seed)
-    probabilities = search.posterior()
-    nothing = p_any >= DECISIONS.level or probabilities[()] >= 0.5
+    begun = partial(_begun, model=without_effects(assumed), known=known, threshold_MPa=threshold_MPa, tell=tell)
+    search, missing, left_out = begun(campaign, findings)
+    p_any = _run(search, seed, tell)
+    if _is_gap(search, p_any) and (tared := _tared(campaign)) is not None:
+        tell("the same, had the load cell not been tared")
+        told = campaign_findings(tared)
+        other, still_missing, also_left_out = begun(tared, told)
+        best = max(one.log_evidence for one in search.found.values())
+        # Readings that begin at no force are not compared, so evidence counts by the reading.
+        if other.null.log_evidence / other.base.readings > best / search.base.readings:
+            p_other = _run(other, seed, tell)
+            if not _is_gap(other, p_other):
+                search, p_any, missing, left_out = other, p_other, still_missing, also_left_out
+                findings = (*told, _NOT_TARED)
+    base, findings = search.base, (*findings, *left_out)
     ranking = ranking_of(search)
     found = Discovery(
         "NO_GAP",
@@ -136,7 +142,7 @@ def discover(
         notes=_notes(base),
         likeness=likeness_of(search, (), ranking),
     )
-    if nothing:
+    if not _is_gap(search, p_any):
         return _finished(_of_law_alone(found, search), findings, started)
     winner = leader_of(search).names
     if confirm and len(base.tests) > 2:
@@ -180,6 +186,57 @@ def _searched(library: Mapping[str, Mechanism] | None, exclude: Sequence[str]) -
             raise InputError(f"there is no mechanism {name!r}", remedy=f"Known: {', '.join(known)}.")
         known.pop(name)
     return known
+
+
+def _begun(
+    campaign: Campaign,
+    findings: Sequence[Finding],
+    *,
+    model: Model,
+    known: Mapping[str, Mechanism],
+    threshold_MPa: float,
+    tell: Tell,
+) -> tuple[Search, list[dict[str, str]], list[Finding]]:
+    """The search with the law alone in it, what these tests cannot say, and what was left out.
+
+    Raises:
+        InputError: if no particle can be used, or no mechanism is left to look for.
+    """
+    base, left_out = _settled_fit(campaign, findings, model, threshold_MPa, tell)
+    testable, missing = untestable(without_punch(known, base), available_data(campaign))
+    if not testable:
+        raise InputError("no mechanism is left to look for", remedy="Exclude fewer, or measure what the others need.")
+    tell("signatures of all effects")
+    with numbers_in_reach(base.campaign):
+        return Search(base, testable, tell), missing, left_out
+
+
+def _run(search: Search, seed: int, tell: Tell) -> float:
+    """Work all hypotheses out; how likely so much evidence of anything is by chance."""
+    with numbers_in_reach(search.base.campaign):
+        search.run()
+        tell("is anything missing")
+        return p_anything(search, seed)
+
+
+def _is_gap(search: Search, p_any: float) -> bool:
+    """Whether anything is missing."""
+    return p_any < DECISIONS.level and search.posterior()[()] < 0.5
+
+
+def _tared(campaign: Campaign) -> Campaign | None:
+    """The tests as they are if no particle was loaded when its record began; None where nothing speaks for that."""
+    assert campaign.raw is not None
+    return check_tests(campaign.raw, QualityOptions(begins_at_zero=True)) if zero_is_open(campaign) else None
+
+
+_NOT_TARED = Finding(
+    "zero of force",
+    "look",
+    "With the zero of the file, law and tests disagree; with the first readings taken off they do not. So a load cell "
+    "that was not tared is explanation enough, and nothing is named",
+    "Take a record that begins in the air; if the particles were preloaded, something is missing after all",
+)
 
 
 def _settled_fit(

@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 
 from mcc_jax.campaign import Curve, Finding, campaign_findings, check_tests
 from mcc_jax.campaign.findings import worst
+from mcc_jax.campaign.force_zero import zero_is_open
+from mcc_jax.campaign.quality_options import QualityOptions
 
 SEEDS = st.integers(0, 2**31 - 1)
 quickly = settings(max_examples=15)
@@ -110,6 +112,43 @@ def test_an_offset_that_no_answer_can_feel_is_taken_off_without_a_word():
     checked = check_tests(faulty.in_air(noisy(exact(), 0), offset_mN=0.1))
     assert campaign_findings(checked) == ()
     assert all(abs(curve.checked.force_zero_mN - 0.1) < 0.05 for curve in checked.curves)
+
+
+def shifted(campaign, offset_mN):
+    """The tests as a load cell reads them whose zero is off."""
+    return replace(campaign, curves=tuple(replace(c, force_mN=c.force_mN + offset_mN) for c in campaign.curves))
+
+
+def test_a_record_that_begins_below_zero_without_air_was_not_tared():
+    checked, found = only(shifted(noisy(exact(), 0), -10.0), "zero of force")
+    assert found.level == "look"
+    assert found.particles == exact().particles
+    assert "Tare the load cell" in found.remedy
+    for curve in checked.curves:
+        # The first reading may lie a step of the ramp behind contact; its error has room for that.
+        assert abs(curve.checked.force_zero_mN + 10.0) < curve.checked.force_zero_sd_mN
+
+
+def test_a_record_that_begins_above_zero_without_air_leaves_its_zero_open():
+    checked, found = only(shifted(noisy(exact(), 0), 20.0), "zero of force")
+    assert found.level == "told"
+    assert "preload" in found.sentence
+    assert zero_is_open(checked)
+    assert all(c.checked is None or c.checked.force_zero_mN == 0.0 for c in checked.curves)
+    # Had the load cell not been tared: every test of it is off, seen by itself or not.
+    tared = check_tests(checked.raw, QualityOptions(begins_at_zero=True))
+    assert not zero_is_open(tared)
+    for curve in tared.curves:
+        assert abs(curve.checked.force_zero_mN - 20.0) < curve.checked.force_zero_sd_mN
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
+def test_a_record_that_begins_within_a_step_of_its_ramp_is_not_remarked(share):
+    campaign = noisy(exact(), 0)
+    later = [replace(c, force_mN=c.force_mN + share * (c.force_mN[1] - c.force_mN[0])) for c in campaign.curves]
+    checked = check_tests(replace(campaign, curves=tuple(later)))
+    assert campaign_findings(checked) == ()
+    assert not zero_is_open(checked)
 
 
 @pytest.mark.parametrize("drift_mN", [-20.0, -5.0, 3.0, 8.0])

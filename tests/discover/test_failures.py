@@ -66,6 +66,33 @@ def test_two_effects_that_cancel():
     assert told["verdict"] != "NAMED" or named & {"frame_compliance", "platen_sink_in", "reverse_plasticity"}
 
 
+def off_zero(whole, offset_mN):
+    """The tests of a load cell that was not tared."""
+    return with_curves(whole, lambda c: (c.time_s, c.force_mN + offset_mN, c.displacement_um))
+
+
+@pytest.mark.parametrize("offset_mN", [-8.0, 8.0])
+def test_a_load_cell_that_was_not_tared_is_no_physics(offset_mN):
+    whole = cached(programme=SINGLE)
+    told = answer(off_zero(whole, offset_mN), library=FEW)
+    assert told["verdict"] == "NO_GAP"
+    assert {one["check"] for one in told["findings"]} == {"zero of force"}
+    assert any(one["level"] == "look" for one in told["findings"])
+
+
+def test_an_effect_is_named_of_preloaded_particles_too():
+    """Records cut in front of 8 mN begin at a force that was there: what they miss is no zero."""
+    whole = cached("frame_compliance=0.004", programme=SINGLE)
+
+    def begun(c):
+        rows = slice(int(np.argmax(c.force_mN >= 8.0)), None)
+        return c.time_s[rows], c.force_mN[rows], c.displacement_um[rows]
+
+    told = answer(with_curves(whole, begun), library=FEW)
+    assert told["effects"][0]["mechanism"] == "frame_compliance"
+    assert {one["level"] for one in told["findings"] if one["check"] == "zero of force"} <= {"told"}
+
+
 def test_particles_that_snap_through_take_no_part():
     from snapping_campaign import snapping
 
