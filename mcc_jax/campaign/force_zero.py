@@ -91,10 +91,22 @@ def _perhaps_drift(curve: Curve, ahead: SlowStart | None, options: QualityOption
 _OPEN = "force begins at {} mN without a reading in the air: a preload, or a load cell that was not tared"
 
 
-def zero_is_open(campaign: Campaign) -> bool:
-    """Whether some checked test begins at a force that may be a preload as well as an error of the zero."""
+def open_zero(campaign: Campaign, options: QualityOptions) -> tuple[float, float] | None:
+    """The zero of force [mN] and its error, if checked tests were not tared of which some may have been preloaded.
+
+    One load cell has one zero, and nothing pulled: it is the smallest force at which a test begins, which may be any
+    part of a step of its ramp beyond contact. None where that is no force, or where no test leaves its zero open.
+    """
     notes = (note for curve in campaign.curves if curve.checked is not None for note in curve.checked.notes)
-    return any(note.sentence == _OPEN for note in notes)
+    lowest = min(campaign.curves, key=lambda curve: curve.force_mN[0])
+    zero = float(lowest.force_mN[0])
+    opens = zero > 0 and any(note.sentence == _OPEN for note in notes)
+    return (zero, _first_steps(lowest, options) / np.sqrt(12)) if opens else None
+
+
+def _first_steps(curve: Curve, options: QualityOptions) -> float:
+    """By how much force grows from one reading to the next where a record begins [mN]."""
+    return median(np.abs(differences(curve.force_mN[: options.air_readings + 1])))
 
 
 def _begins_elsewhere(curve: Curve, options: QualityOptions) -> ZeroOfForce | None:
@@ -102,19 +114,20 @@ def _begins_elsewhere(curve: Curve, options: QualityOptions) -> ZeroOfForce | No
 
     One that begins above `start_share` of its largest force has lost its loading, and tells no zero at all. Below zero
     the load cell was not tared: the reading is taken off, and its error is as large as itself. Above it, that and a
-    preload look alike: the file's zero stays, unless `begins_at_zero`.
+    preload look alike, and the file's zero stays.
     """
+    if options.zero_mN is not None:
+        zero, error = options.zero_mN
+        return ZeroOfForce(np.full(len(curve), zero), zero, error)
     first = float(curve.force_mN[0])
-    step = median(np.abs(differences(curve.force_mN[: options.air_readings + 1])))
+    step = _first_steps(curve, options)
     least = max(options.air_share * float(np.ptp(curve.force_mN)), options.air_said * point_noise(curve.force_mN))
-    tared, largest = options.begins_at_zero, float(curve.force_mN.max())
-    within, most = (least, options.begins_at) if tared else (step + least, options.start_share)
-    if -least <= first <= within or abs(first) > most * largest:
+    if -least <= first <= step + least or abs(first) > options.start_share * float(curve.force_mN.max()):
         return None
-    if first < 0 or tared:
+    if first < 0:
         sentence = "force begins at {} mN without a reading in the air; this was taken off, with itself as its error"
         note = Note("zero of force", "look", sentence, (first,), "Tare the load cell, and begin in the air")
-        return ZeroOfForce(np.full(len(curve), first), first, abs(first), (note,))
+        return ZeroOfForce(np.full(len(curve), first), first, -first, (note,))
     note = Note("zero of force", "told", _OPEN, (first,), "Tell the two apart by readings in the air before contact")
     return ZeroOfForce(np.zeros(len(curve)), 0.0, 0.0, (note,))
 

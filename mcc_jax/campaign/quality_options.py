@@ -44,7 +44,7 @@ class QualityOptions:
             was.
         start_share: of the largest force, in front of which such a rise is looked for: farther on loading itself bends.
             A preload is no larger.
-        begins_at_zero: a record that begins in contact began without load, whatever its file says.
+        zero_mN: zero of force of records that begin in contact, and its error [mN]; their file's own if None.
         saturation: when a channel counts as saturated.
     """
 
@@ -70,7 +70,7 @@ class QualityOptions:
     drift_like: float = 0.7
     other_stiffness: float = 1.5
     start_share: float = 0.1
-    begins_at_zero: bool = False
+    zero_mN: tuple[float, float] | None = None
     saturation: SaturationOptions = field(default_factory=SaturationOptions)
 
     __repr__ = described()

@@ -19,7 +19,7 @@ from ..calibrate.fitting import checked_settings
 from ..calibrate.judgement import numbers_in_reach, unlike_others
 from ..calibrate.settings import JUDGEMENT
 from ..campaign import Campaign, Finding, available_data, campaign_findings, check_plausibility, check_tests
-from ..campaign.force_zero import zero_is_open
+from ..campaign.force_zero import open_zero
 from ..campaign.quality import named
 from ..campaign.quality_options import QualityOptions
 from ..effects import LIBRARY, Mechanism
@@ -117,15 +117,14 @@ def discover(
     p_any = _run(search, seed, tell)
     if _is_gap(search, p_any) and (tared := _tared(campaign)) is not None:
         tell("the same, had the load cell not been tared")
-        told = campaign_findings(tared)
-        other, still_missing, also_left_out = begun(tared, told)
+        other, still_missing, also_left_out = begun(tared[0], campaign_findings(tared[0]))
         best = max(one.log_evidence for one in search.found.values())
-        # Readings that begin at no force are not compared, so evidence counts by the reading.
+        # Readings without force are not compared, so evidence counts by the reading.
         if other.null.log_evidence / other.base.readings > best / search.base.readings:
             p_other = _run(other, seed, tell)
             if not _is_gap(other, p_other):
                 search, p_any, missing, left_out = other, p_other, still_missing, also_left_out
-                findings = (*told, _NOT_TARED)
+                findings = (*findings, tared[1])
     base, findings = search.base, (*findings, *left_out)
     ranking = ranking_of(search)
     found = Discovery(
@@ -224,19 +223,18 @@ def _is_gap(search: Search, p_any: float) -> bool:
     return p_any < DECISIONS.level and search.posterior()[()] < 0.5
 
 
-def _tared(campaign: Campaign) -> Campaign | None:
-    """The tests as they are if no particle was loaded when its record began; None where nothing speaks for that."""
+def _tared(campaign: Campaign) -> tuple[Campaign, Finding] | None:
+    """The tests with what they begin at taken off, and what is said then; None if no test leaves its zero open."""
+    zero = open_zero(campaign, QualityOptions())
+    if zero is None:
+        return None
     assert campaign.raw is not None
-    return check_tests(campaign.raw, QualityOptions(begins_at_zero=True)) if zero_is_open(campaign) else None
-
-
-_NOT_TARED = Finding(
-    "zero of force",
-    "look",
-    "With the zero of the file, law and tests disagree; with the first readings taken off they do not. So a load cell "
-    "that was not tared is explanation enough, and nothing is named",
-    "Take a record that begins in the air; if the particles were preloaded, something is missing after all",
-)
+    text = (
+        f"With the zero of the file, law and tests disagree; with {zero[0]:.3g} mN taken off every force they do not: "
+        "a load cell that was not tared is explanation enough, and nothing is named"
+    )
+    remedy = "Take a record that begins in the air; if the particles were preloaded, something is missing after all"
+    return check_tests(campaign.raw, QualityOptions(zero_mN=zero)), Finding("zero of force", "look", text, remedy)
 
 
 def _settled_fit(

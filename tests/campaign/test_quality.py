@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from mcc_jax.campaign import Curve, Finding, campaign_findings, check_tests
 from mcc_jax.campaign.findings import worst
-from mcc_jax.campaign.force_zero import zero_is_open
+from mcc_jax.campaign.force_zero import open_zero
 from mcc_jax.campaign.quality_options import QualityOptions
 
 SEEDS = st.integers(0, 2**31 - 1)
@@ -133,13 +133,14 @@ def test_a_record_that_begins_above_zero_without_air_leaves_its_zero_open():
     checked, found = only(shifted(noisy(exact(), 0), 20.0), "zero of force")
     assert found.level == "told"
     assert "preload" in found.sentence
-    assert zero_is_open(checked)
     assert all(c.checked is None or c.checked.force_zero_mN == 0.0 for c in checked.curves)
+    zero, error = open_zero(checked, QualityOptions())
+    assert zero == pytest.approx(20.0, abs=0.5)
+    assert 0.1 < error < 3.0
     # Had the load cell not been tared: every test of it is off, seen by itself or not.
-    tared = check_tests(checked.raw, QualityOptions(begins_at_zero=True))
-    assert not zero_is_open(tared)
-    for curve in tared.curves:
-        assert abs(curve.checked.force_zero_mN - 20.0) < curve.checked.force_zero_sd_mN
+    tared = check_tests(checked.raw, QualityOptions(zero_mN=(20.0, error)))
+    assert open_zero(tared, QualityOptions()) is None
+    assert all(c.checked.force_zero_mN == 20.0 for c in tared.curves)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
@@ -148,7 +149,7 @@ def test_a_record_that_begins_within_a_step_of_its_ramp_is_not_remarked(share):
     later = [replace(c, force_mN=c.force_mN + share * (c.force_mN[1] - c.force_mN[0])) for c in campaign.curves]
     checked = check_tests(replace(campaign, curves=tuple(later)))
     assert campaign_findings(checked) == ()
-    assert not zero_is_open(checked)
+    assert open_zero(checked, QualityOptions()) is None
 
 
 @pytest.mark.parametrize("drift_mN", [-20.0, -5.0, 3.0, 8.0])
