@@ -345,6 +345,8 @@ def _notes(base: Base) -> tuple[str, ...]:
     for name, reason in zip(base.campaign.particles, base.selection.why_not, strict=True):
         if reason is not None:
             notes.append(f"particle {name!r} {reason}")
+    if len(base.tests) < 3:
+        notes.append("of fewer than three particles none can be held out: what is found rests on the noise model alone")
     return tuple(notes)
 
 
