@@ -35,7 +35,7 @@ def zero_of_force(curve: Curve, control: Control | None, options: QualityOptions
     Without a drift it is the readings' mean, with the error of a mean of readings that hang together (as of an
     autoregressive process of order 1). With a drift it is their straight line over time up to contact, and the line's
     value there from then on; what the drift did during the test nobody knows, so its change in the air is the error.
-    Without readings in the air a record that begins far from zero leaves its zero open by as much.
+    Without readings in the air a record is looked at that begins far from zero.
     """
     contact, ahead = air_until(curve, control, options)
     if contact is None:
@@ -91,7 +91,7 @@ def _perhaps_drift(curve: Curve, ahead: SlowStart | None, options: QualityOption
 _OPEN = "force begins at {} mN without a reading in the air: a preload, or a load cell that was not tared"
 
 
-def open_zero(campaign: Campaign, options: QualityOptions) -> tuple[float, float] | None:
+def open_zero(campaign: Campaign, options: QualityOptions | None = None) -> tuple[float, float] | None:
     """The zero of force [mN] and its error, if checked tests were not tared of which some may have been preloaded.
 
     One load cell has one zero, and nothing pulled: it is the smallest force at which a test begins, which may be any
@@ -101,7 +101,7 @@ def open_zero(campaign: Campaign, options: QualityOptions) -> tuple[float, float
     lowest = min(campaign.curves, key=lambda curve: curve.force_mN[0])
     zero = float(lowest.force_mN[0])
     opens = zero > 0 and any(note.sentence == _OPEN for note in notes)
-    return (zero, _first_steps(lowest, options) / np.sqrt(12)) if opens else None
+    return (zero, _first_steps(lowest, options or QualityOptions()) / np.sqrt(12)) if opens else None
 
 
 def _first_steps(curve: Curve, options: QualityOptions) -> float:

@@ -78,6 +78,11 @@ class Base:
         return Forms(self.model.unloading)
 
     @property
+    def holds_out(self) -> bool:
+        """Whether there are particles enough to hold one out."""
+        return len(self.tests) > 2
+
+    @property
     def readings(self) -> int:
         """How many readings are compared."""
         return int(np.sum(np.asarray(self.tests.mask)))

@@ -55,6 +55,7 @@ from .sentences import summary_of
 from .settings import DECISIONS
 
 Tell = Callable[[str], None]
+_Begun = tuple[Search, list[dict[str, str]], list[Finding]]
 
 
 @one_blas_thread
@@ -115,16 +116,9 @@ def discover(
     begun = partial(_begun, model=without_effects(assumed), known=known, threshold_MPa=threshold_MPa, tell=tell)
     search, missing, left_out = begun(campaign, findings)
     p_any = _run(search, seed, tell)
-    if _is_gap(search, p_any) and (tared := _tared(campaign)) is not None:
-        tell("the same, had the load cell not been tared")
-        other, still_missing, also_left_out = begun(tared[0], campaign_findings(tared[0]))
-        best = max(one.log_evidence for one in search.found.values())
-        # Readings without force are not compared, so evidence counts by the reading.
-        if other.null.log_evidence / other.base.readings > best / search.base.readings:
-            p_other = _run(other, seed, tell)
-            if not _is_gap(other, p_other):
-                search, p_any, missing, left_out = other, p_other, still_missing, also_left_out
-                findings = (*findings, tared[1])
+    if _is_gap(search, p_any):
+        explained = _not_tared(campaign, search, begun, seed, tell)
+        search, p_any, missing, left_out = explained or (search, p_any, missing, left_out)
     base, findings = search.base, (*findings, *left_out)
     ranking = ranking_of(search)
     found = Discovery(
@@ -144,7 +138,7 @@ def discover(
     if not _is_gap(search, p_any):
         return _finished(_of_law_alone(found, search), findings, started)
     winner = leader_of(search).names
-    if confirm and len(base.tests) > 2:
+    if confirm and base.holds_out:
         tell("held-out particles")
         held = held_out(search, winner)
         found = replace(found, held_out=held)
@@ -195,7 +189,7 @@ def _begun(
     known: Mapping[str, Mechanism],
     threshold_MPa: float,
     tell: Tell,
-) -> tuple[Search, list[dict[str, str]], list[Finding]]:
+) -> _Begun:
     """The search with the law alone in it, what these tests cannot say, and what was left out.
 
     Raises:
@@ -223,18 +217,33 @@ def _is_gap(search: Search, p_any: float) -> bool:
     return p_any < DECISIONS.level and search.posterior()[()] < 0.5
 
 
-def _tared(campaign: Campaign) -> tuple[Campaign, Finding] | None:
-    """The tests with what they begin at taken off, and what is said then; None if no test leaves its zero open."""
-    zero = open_zero(campaign, QualityOptions())
+def _not_tared(
+    campaign: Campaign, search: Search, begun: Callable[..., _Begun], seed: int, tell: Tell
+) -> tuple[Search, float, list[dict[str, str]], list[Finding]] | None:
+    """The search with what the tests begin at taken off their force, where the law alone then does; None elsewhere.
+
+    Its evidence must be larger than that of anything named with the zero of the file, and nothing may be missing there.
+    """
+    zero = open_zero(campaign)
     if zero is None:
         return None
+    tell("the same, had the load cell not been tared")
     assert campaign.raw is not None
+    tared = check_tests(campaign.raw, QualityOptions(zero_mN=zero))
+    other, missing, left_out = begun(tared, campaign_findings(tared))
+    best = max(one.log_evidence for one in search.found.values())
+    # Readings without force are not compared, so evidence counts by the reading.
+    if other.null.log_evidence / other.base.readings <= best / search.base.readings:
+        return None
+    p_any = _run(other, seed, tell)
+    if _is_gap(other, p_any):
+        return None
     text = (
         f"With the zero of the file, law and tests disagree; with {zero[0]:.3g} mN taken off every force they do not: "
         "a load cell that was not tared is explanation enough, and nothing is named"
     )
     remedy = "Take a record that begins in the air; if the particles were preloaded, something is missing after all"
-    return check_tests(campaign.raw, QualityOptions(zero_mN=zero)), Finding("zero of force", "look", text, remedy)
+    return other, p_any, missing, [Finding("zero of force", "look", text, remedy), *left_out]
 
 
 def _settled_fit(
@@ -345,7 +354,7 @@ def _notes(base: Base) -> tuple[str, ...]:
     for name, reason in zip(base.campaign.particles, base.selection.why_not, strict=True):
         if reason is not None:
             notes.append(f"particle {name!r} {reason}")
-    if len(base.tests) < 3:
+    if not base.holds_out:
         notes.append("of fewer than three particles none can be held out: what is found rests on the noise model alone")
     return tuple(notes)
 

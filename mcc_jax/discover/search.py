@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
+from operator import call
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -415,7 +416,7 @@ class Search:
         self.tell("what differs from test to test, and a discrepancy on no list")
         tasks: list[Callable[[], Any]] = [partial(self.smooth, self.null)]
         tasks += [partial(self.of_their_own, m, self.null) for m in self.not_shared]
-        smooth, *ones = side_by_side(lambda task: task(), tasks)
+        smooth, *ones = side_by_side(call, tasks)
         for m, one in zip(self.not_shared, ones, strict=True):
             self.keep((m,), one)
         alone = [self.found[m,] for m in self.not_shared]
@@ -426,7 +427,7 @@ class Search:
             self.tell("two names")
             leading = leaders[:2]
             tasks = [partial(self.pairs_of_each, leading), *(partial(self.with_discrepancy, x) for x in leading)]
-            side_by_side(lambda task: task(), tasks)
+            side_by_side(call, tasks)
             first = max((x for x in self.found.values() if len(x.names) == 1), key=lambda x: x.log_evidence)
             if first.own is not None and self.screen is not None:
                 self.pairs_of_their_own(first)

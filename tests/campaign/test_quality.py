@@ -134,12 +134,12 @@ def test_a_record_that_begins_above_zero_without_air_leaves_its_zero_open():
     assert found.level == "told"
     assert "preload" in found.sentence
     assert all(c.checked is None or c.checked.force_zero_mN == 0.0 for c in checked.curves)
-    zero, error = open_zero(checked, QualityOptions())
+    zero, error = open_zero(checked)
     assert zero == pytest.approx(20.0, abs=0.5)
     assert 0.1 < error < 3.0
     # Had the load cell not been tared: every test of it is off, seen by itself or not.
     tared = check_tests(checked.raw, QualityOptions(zero_mN=(20.0, error)))
-    assert open_zero(tared, QualityOptions()) is None
+    assert open_zero(tared) is None
     assert all(c.checked.force_zero_mN == 20.0 for c in tared.curves)
 
 
@@ -149,7 +149,7 @@ def test_a_record_that_begins_within_a_step_of_its_ramp_is_not_remarked(share):
     later = [replace(c, force_mN=c.force_mN + share * (c.force_mN[1] - c.force_mN[0])) for c in campaign.curves]
     checked = check_tests(replace(campaign, curves=tuple(later)))
     assert campaign_findings(checked) == ()
-    assert open_zero(checked, QualityOptions()) is None
+    assert open_zero(checked) is None
 
 
 @pytest.mark.parametrize("drift_mN", [-20.0, -5.0, 3.0, 8.0])
