@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -91,17 +92,46 @@ def _perhaps_drift(curve: Curve, ahead: SlowStart | None, options: QualityOption
 _OPEN = "force begins at {} mN without a reading in the air: a preload, or a load cell that was not tared"
 
 
-def open_zero(campaign: Campaign, options: QualityOptions | None = None) -> tuple[float, float] | None:
-    """The zero of force [mN] and its error, if checked tests were not tared of which some may have been preloaded.
+_TARE = "Tare the load cell, and begin in the air"
+_BELOW = "force begins at {} mN without a reading in the air; {} mN was taken off"
 
-    One load cell has one zero, and nothing pulled: it is the smallest force at which a test begins, which may be any
-    part of a step of its ramp beyond contact. None where that is no force, or where no test leaves its zero open.
+
+def open_zero(campaign: Campaign) -> tuple[float, float] | None:
+    """The zero of force [mN] and its error, if checked tests were not tared of which some may have been preloaded."""
+    zero = _one_zero(campaign.curves, _OPEN)
+    return zero if zero is not None and zero[0] > 0 else None
+
+
+def untared_zero(curves: Sequence[Curve]) -> tuple[float, float] | None:
+    """The zero of force [mN] and its error, if checked tests begin below zero which one load cell explains."""
+    return _one_zero(curves, _BELOW)
+
+
+def _one_zero(curves: Sequence[Curve], sentence: str) -> tuple[float, float] | None:
+    """The zero that all tests share, and its error [mN]; None if they share none, or no test tells this of its zero.
+
+    One load cell has one zero, and nothing pulled: every test begins within a step of its ramp above it. The line of
+    first readings over first steps, weighted by the step, meets the zero where the step is nil; of fewer than three
+    tests the lowest reading is taken, which may be any part of its step beyond contact.
     """
-    notes = (note for curve in campaign.curves if curve.checked is not None for note in curve.checked.notes)
-    lowest = min(campaign.curves, key=lambda curve: curve.force_mN[0])
-    zero = float(lowest.force_mN[0])
-    opens = zero > 0 and any(note.sentence == _OPEN for note in notes)
-    return (zero, _first_steps(lowest, options or QualityOptions()) / np.sqrt(12)) if opens else None
+    notes = (note for curve in curves if curve.checked is not None for note in curve.checked.notes)
+    if not any(note.sentence == sentence for note in notes):
+        return None
+    taken_off = (0.0 if curve.checked is None else curve.checked.force_zero_mN for curve in curves)
+    begins = np.array([curve.force_mN[0] + off for curve, off in zip(curves, taken_off, strict=True)])
+    steps = np.array([_first_steps(curve, QualityOptions()) for curve in curves])
+    noise = max(point_noise(curve.force_mN) for curve in curves)
+    lowest = int(np.argmin(begins))
+    zero, error = float(begins[lowest]), float(steps[lowest] / np.sqrt(12))
+    if len(curves) > 2 and np.all(steps > noise):
+        design = np.stack([1 / steps, np.ones(len(steps))], 1)
+        (crossing, part), *_ = np.linalg.lstsq(design, begins / steps, rcond=None)
+        left = np.sum((begins / steps - design @ (crossing, part)) ** 2) / (len(steps) - 2)
+        spread = float(np.sqrt(left / np.sum((1 / steps - np.mean(1 / steps)) ** 2)))
+        if spread < error and crossing <= zero:
+            zero, error = float(crossing), max(spread, noise / np.sqrt(len(steps)))
+    together = np.all(begins - zero <= steps + QualityOptions().air_said * noise)
+    return (zero, error) if together else None
 
 
 def _first_steps(curve: Curve, options: QualityOptions) -> float:
@@ -113,20 +143,20 @@ def _begins_elsewhere(curve: Curve, options: QualityOptions) -> ZeroOfForce | No
     """A record in contact whose first reading is below zero, or more than a step of the ramp above it.
 
     One that begins above `start_share` of its largest force has lost its loading, and tells no zero at all. Below zero
-    the load cell was not tared: the reading is taken off, and its error is as large as itself. Above it, that and a
-    preload look alike, and the file's zero stays.
+    the load cell was not tared: the reading is taken off, and its error is as large as itself, unless all tests share a
+    zero, which is known better. Above it, that and a preload look alike, and the file's zero stays.
     """
+    first = float(curve.force_mN[0])
     if options.zero_mN is not None:
         zero, error = options.zero_mN
-        return ZeroOfForce(np.full(len(curve), zero), zero, error)
-    first = float(curve.force_mN[0])
+        notes = (Note("zero of force", "look", _BELOW, (first, zero), _TARE),) if zero < 0 else ()
+        return ZeroOfForce(np.full(len(curve), zero), zero, error, notes)
     step = _first_steps(curve, options)
     least = max(options.air_share * float(np.ptp(curve.force_mN)), options.air_said * point_noise(curve.force_mN))
     if -least <= first <= step + least or abs(first) > options.start_share * float(curve.force_mN.max()):
         return None
     if first < 0:
-        sentence = "force begins at {} mN without a reading in the air; this was taken off, with itself as its error"
-        note = Note("zero of force", "look", sentence, (first,), "Tare the load cell, and begin in the air")
+        note = Note("zero of force", "look", _BELOW, (first, first), _TARE)
         return ZeroOfForce(np.full(len(curve), first), first, -first, (note,))
     note = Note("zero of force", "told", _OPEN, (first,), "Tell the two apart by readings in the air before contact")
     return ZeroOfForce(np.zeros(len(curve)), 0.0, 0.0, (note,))

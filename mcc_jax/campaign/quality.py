@@ -19,7 +19,7 @@ from dataclasses import replace
 import numpy as np
 
 from .findings import Finding
-from .force_zero import zero_of_force
+from .force_zero import untared_zero, zero_of_force
 from .plausibility import wrong_signs
 from .quality_options import QualityOptions
 from .saturation import censor_displacement, censor_force
@@ -51,6 +51,9 @@ def check_tests(campaign: Campaign, options: QualityOptions | None = None) -> Ca
         return replace(campaign, raw=campaign)  # what looks like air or breakage is the test read backwards
     control = campaign.metadata.control
     curves = tuple(check_test(curve, control, options) for curve in campaign.curves)
+    zero = untared_zero(curves)
+    if zero is not None and options.zero_mN is None:
+        return check_tests(campaign, replace(options, zero_mN=zero))
     return replace(campaign, curves=curves, raw=campaign)
 
 

@@ -143,6 +143,31 @@ def test_a_record_that_begins_above_zero_without_air_leaves_its_zero_open():
     assert all(c.checked.force_zero_mN == 20.0 for c in tared.curves)
 
 
+@pytest.mark.parametrize("offset_mN", [-10.0, 20.0])
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_tests_of_one_load_cell_tell_its_zero_together(offset_mN, share):
+    """Every record begins at the same part of the first step of its ramp: the line over steps meets the zero."""
+    campaign = noisy(exact(), 0)
+    later = [
+        replace(c, force_mN=c.force_mN + offset_mN + share * (c.force_mN[1] - c.force_mN[0])) for c in campaign.curves
+    ]
+    checked = check_tests(replace(campaign, curves=tuple(later)))
+    zero = open_zero(checked)[0] if offset_mN > 0 else checked.curves[0].checked.force_zero_mN
+    assert abs(zero - offset_mN) < 0.3
+    assert len({c.checked and c.checked.force_zero_mN for c in checked.curves} - {None}) == 1
+
+
+def test_tests_that_share_no_zero_are_taken_one_by_one():
+    campaign = noisy(exact(), 0)
+    offsets = np.linspace(-30.0, -5.0, len(campaign.curves))
+    later = [replace(c, force_mN=c.force_mN + o) for c, o in zip(campaign.curves, offsets, strict=True)]
+    checked = check_tests(replace(campaign, curves=tuple(later)))
+    for curve, offset in zip(checked.curves, offsets, strict=True):
+        if curve.checked is not None:  # a small particle's record may begin beyond what is a zero
+            assert abs(curve.checked.force_zero_mN - offset) < 0.5
+            assert curve.checked.force_zero_sd_mN == -curve.checked.force_zero_mN
+
+
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
 def test_a_record_that_begins_within_a_step_of_its_ramp_is_not_remarked(share):
     campaign = noisy(exact(), 0)
