@@ -176,8 +176,17 @@ def name_probabilities(search: Search) -> dict[str, float]:
     return {m: sum(p for names, p in found.items() if m in names) / gap for m in search.library}
 
 
-def sets_of(search: Search, leader: Names, effects: Sequence[Effect]) -> tuple[tuple[str, ...], ...]:
-    """For each effect the mechanisms that may be in its place, most probable first, itself among them."""
+def sets_of(
+    search: Search, leader: Names, effects: Sequence[Effect], pairs: Sequence[Names]
+) -> tuple[tuple[str, ...], ...]:
+    """For each effect the mechanisms that may be in its place, most probable first, itself among them.
+
+    Args:
+        search: the hypotheses.
+        leader: names that were added.
+        effects: theirs.
+        pairs: two names each that may be in place of a single one, which come last.
+    """
     logs = {names: one.log_evidence for names, one in search.found.items()}
     found = []
     for effect in effects:
@@ -196,9 +205,16 @@ def sets_of(search: Search, leader: Names, effects: Sequence[Effect]) -> tuple[t
             held += weight[name] / total
             if held >= DECISIONS.set_mass:
                 break
-        ordered = [effect.mechanism, *(m for m in members if m != effect.mechanism)]
-        found.append(tuple(ordered))
+        found.append(tuple(dict.fromkeys([effect.mechanism, *members, *(n for pair in pairs for n in pair)])))
     return tuple(found)
+
+
+def instead_of(search: Search, leader: Names) -> tuple[Names, ...]:
+    """Two names that together may be in place of the one that is named, most probable first."""
+    if len(leader) != 1:
+        return ()
+    left_out = 1.0 - DECISIONS.set_mass
+    return tuple(n for n, p in search.posterior().items() if len(n) == 2 and leader[0] not in n and p > left_out)
 
 
 def ranking_of(search: Search) -> tuple[dict[str, Any], ...]:

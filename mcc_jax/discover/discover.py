@@ -27,6 +27,7 @@ from ..effects.library import checked_library
 from .answer import (
     checks_of,
     effects_of,
+    instead_of,
     leader_of,
     leads_of,
     likely,
@@ -158,7 +159,8 @@ def discover(
         found = _sampled(found, base, threshold_MPa, seed, tell)
     if experiments and found.candidate_set and len(found.candidate_set) == 1:
         tell("next experiments")
-        found = replace(found, next_experiments=tuple(next_experiments(search, found.candidate_set[0])))
+        alone = tuple(n for n in found.candidate_set[0] if n not in found.paired)
+        found = replace(found, next_experiments=tuple(next_experiments(search, alone)))
     return _finished(found, findings, started)
 
 
@@ -294,7 +296,8 @@ def _named(found: Discovery, search: Search, known: Mapping[str, Mechanism], tel
         tell("a formula of its own")
         return replace(found, verdict="UNLISTED", closure=closure(search, found.seed))
     effects = effects_of(search, winner, name_probabilities(search), found.p_any)
-    sets = sets_of(search, winner, effects)
+    pairs = instead_of(search, winner)
+    sets = sets_of(search, winner, effects, pairs)
     model = found.model
     assert model is not None
     model = model.with_effects(*(e.variant for e in effects if not differs_from_test_to_test(e.variant)))
@@ -304,6 +307,7 @@ def _named(found: Discovery, search: Search, known: Mapping[str, Mechanism], tel
         model=model,
         effects=effects,
         candidate_set=sets,
+        pairs=pairs,
         checks=checks_of(known, sets),
         likeness=likeness_of(search, sets, found.ranking),
     )

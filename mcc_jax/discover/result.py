@@ -134,6 +134,7 @@ class Discovery(Saved):
             sudden steps of its own.
         effects: what was added, in order.
         candidate_set: for each effect, the mechanisms that may be in its place, most probable first.
+        pairs: two names each that together may be in place of the one that was added.
         ranking: all mechanisms against the base law, as in `discovery.json`.
         untestable: mechanisms these data cannot show, and what they need.
         where: places of disagreement.
@@ -166,6 +167,7 @@ class Discovery(Saved):
     runtime_s: float
     effects: tuple[Effect, ...] = ()
     candidate_set: tuple[tuple[str, ...], ...] = ()
+    pairs: tuple[tuple[str, ...], ...] = ()
     ranking: tuple[dict[str, Any], ...] = ()
     untestable: tuple[dict[str, str], ...] = ()
     where: tuple[dict[str, Any], ...] = ()
@@ -209,6 +211,11 @@ class Discovery(Saved):
         numbers = {"method": "bayes", "law": {"unloading": model.unloading, "strain_scaling": model.strain_scaling}}
         law = law_of(numbers | (self.parameters_after or self.parameters_before), particle)
         return law.with_effects(*(effect.build() for effect in self.effects))
+
+    @property
+    def paired(self) -> set[str]:
+        """The mechanisms that only two together may be in place of the one that was added."""
+        return {name for pair in self.pairs for name in pair}
 
     def gap(self) -> dict[str, Any]:
         """The gap at every step, on held-out particles."""
@@ -264,6 +271,7 @@ class Discovery(Saved):
             "summary": self.summary,
             "effects": [effect.to_json() | self._jumps(effect) for effect in self.effects],
             "candidate_set": [list(names) for names in self.candidate_set],
+            "candidate_pairs": [list(names) for names in self.pairs],
             "ranking": list(self.ranking),
             "untestable": list(self.untestable),
             "where": list(self.where),

@@ -94,11 +94,11 @@ class Search:
 
     # ---- posterior ---------------------------------------------------------------------------------------------------
 
-    def log_posteriors(self) -> dict[Names, float]:
-        """Log evidence and log prior of every hypothesis, best first.
+    def _log_joints(self) -> dict[Names, float]:
+        """Log evidence and log prior of every hypothesis.
 
-        Pairs must lead by the margin to count, and with a second name of credible size: what takes an amplitude beyond
-        its largest plausible one imitates what the first name's formula misses.
+        Pairs count with a second name of credible size: what takes an amplitude beyond its largest plausible one
+        imitates what the first name's formula misses.
         """
         count = len(self.library)
         logs = {}
@@ -117,12 +117,13 @@ class Search:
                 both = one.beside + min(one.other_noise, 0.0) - np.log(2 * count) - DECISIONS.pair - DECISIONS.unlisted
                 larger = names if logs[names] >= logs[UNLISTED] else UNLISTED
                 logs[larger] = float(np.logaddexp(logs[larger], both))
+        return {names: v for names, v in logs.items() if len(names) < 2 or self._credible(names)}
+
+    def log_posteriors(self) -> dict[Names, float]:
+        """Log evidence and log prior of every hypothesis that may be named, best first: pairs lead by the margin."""
+        logs = self._log_joints()
         fewer = max(v for names, v in logs.items() if len(names) < 2)
-        kept = {
-            names: v
-            for names, v in logs.items()
-            if len(names) < 2 or (v > fewer + DECISIONS.margin and self._credible(names))
-        }
+        kept = {names: v for names, v in logs.items() if len(names) < 2 or v > fewer + DECISIONS.margin}
         return dict(sorted(kept.items(), key=lambda item: -item[1]))
 
     def _credible(self, names: Names) -> bool:
@@ -135,8 +136,16 @@ class Search:
         return all(abs(size) <= v.plausible[1] for v, size in sizes if v.mechanism == second)
 
     def posterior(self) -> dict[Names, float]:
-        """Probability of every hypothesis, most probable first."""
+        """Probability of every hypothesis, most probable first.
+
+        The margin is for second names, which what a first one misses invites. Two names in place of the one that would
+        be named are no such invitation: they count by their prior odds, and make the answer a set.
+        """
         logs = self.log_posteriors()
+        leader = next(iter(logs))
+        if len(leader) == 1 and leader != UNLISTED:
+            others = {n: v for n, v in self._log_joints().items() if len(n) == 2 and leader[0] not in n}
+            logs = dict(sorted((logs | others).items(), key=lambda item: -item[1]))
         total = float(np.logaddexp.reduce(list(logs.values())))
         return {names: float(np.exp(v - total)) for names, v in logs.items()}
 

@@ -36,7 +36,8 @@ def summary_of(found: Discovery) -> str:
                 f"That is more than is plausible (at most {most}): something else may be in it, and the parameters "
                 "beside it are as doubtful."
             )
-        rivals = [_plain(n) for n in names if n != effect.mechanism]
+        rivals = [_plain(n) for n in names if n != effect.mechanism and n not in found.paired]
+        rivals += [" together with ".join(map(_plain, pair)) for pair in found.pairs]
         if rivals:
             sentences.append(f"These tests cannot tell it from {_listed(rivals)}.")
         if effect.misfit > 2 * DECISIONS.misfit:

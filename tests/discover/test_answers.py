@@ -114,6 +114,11 @@ def test_a_summary_is_plain_english(verdict):
     assert ("frame compliance" in told) is (verdict == "SET")
 
 
+def test_two_names_in_place_of_one_are_told_together():
+    told = answer("SET", pairs=(("creep", "reverse_plasticity"),)).summary
+    assert "cannot tell it from frame compliance or creep together with reverse plasticity" in told
+
+
 def test_an_amplitude_beyond_reason_is_said():
     most = find_variant("platen_sink_in").plausible[1]
     assert "more than is plausible" in answer("NAMED", 1.1 * most).summary

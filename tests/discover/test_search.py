@@ -7,6 +7,7 @@ import pytest
 from campaigns import base_of, cached
 
 from mcc_jax.campaign import available_data
+from mcc_jax.discover.answer import effects_of, instead_of, name_probabilities, sets_of
 from mcc_jax.discover.bootstrap import p_anything
 from mcc_jax.discover.candidates import untestable
 from mcc_jax.discover.heldout import held_out
@@ -101,6 +102,28 @@ def test_two_names_must_lead_by_the_margin(named):
     for lead, there in ((0.5 * DECISIONS.margin, False), (3 * DECISIONS.margin, True)):
         named.found = {**kept, pair: Hypothesis(pair, alone=best + lead, with_misfit=best + lead)}
         assert (pair in named.posterior()) is there
+    named.found = kept
+
+
+@pytest.mark.parametrize(("lead", "told"), [(0.0, False), (0.5, True), (3.0, False)])
+def test_two_names_short_of_the_margin_in_place_of_one_make_a_set(named, lead, told):
+    """Below their prior odds they are not told; beyond the margin they are the answer themselves."""
+    kept = dict(named.found)
+    pair, leader = ("creep", "damage"), ("frame_compliance",)
+    best = max(named.log_posteriors().values())
+    level = best + DECISIONS.pair + lead * DECISIONS.margin  # one pair of two mechanisms has no further odds
+    if lead == 0:
+        level -= 2 * DECISIONS.pair
+    named.found = {**kept, pair: Hypothesis(pair, alone=level, with_misfit=level)}
+    winner = next(iter(named.log_posteriors()))
+    assert winner == (pair if lead > 1 else leader)
+    assert instead_of(named, winner) == ((pair,) if told else ())
+    if winner == leader:
+        pairs = instead_of(named, leader)
+        (effect,) = effects = effects_of(named, leader, name_probabilities(named), 0.0)
+        (names,) = sets_of(named, leader, effects, pairs)
+        assert names == ((*leader, *pair) if told else leader)
+        assert (effect.probability > 0.9) is not told
     named.found = kept
 
 
