@@ -105,47 +105,56 @@ def _law_alone():
 
 
 def picture(mechanism):
-    """Strength, and two pictures of a mechanism's first formula in a test with holds and a reload.
+    """Strength, and three pictures of a mechanism's first formula in a test with holds and a reload.
 
-    The whole curve, and what is added to it: two, so that a phone shows one below the other.
+    The whole curve, and what is added to it: two, so that a phone shows one below the other; the latter small, too.
     """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     law, (strength, curve) = _law_alone(), _shown(mechanism.variants[0])
     with rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
-        figures = [Figure(figsize=(3.8, 2.7), layout="constrained") for _ in range(2)]
-        left, right = (figure.subplots() for figure in figures)
+        figures = [Figure(figsize=size, layout="constrained") for size in ((3.8, 2.7), (3.8, 2.7), (1.6, 1.1))]
+        left, right, small = (figure.subplots() for figure in figures)
         # Broad and pale below narrow and dark: dashes of a path that goes back on itself would fill each other's gaps.
         left.plot(law.displacement_um, law.force_mN, color=VERMILION, alpha=0.6, lw=2.8, label="law alone")
         left.plot(curve.displacement_um, curve.force_mN, color=BLUE, lw=1.3, label="with the effect")
         left.set(xlabel="displacement / µm", ylabel="force / mN")
         left.legend(frameon=False, fontsize=8, loc="upper left")
         added = curve.displacement_um - law.displacement_um
-        right.plot(curve.time_s, added, color=BLUE, lw=1.3)
-        right.axhline(0, color=GREY, lw=0.6)
-        low, high = min(added.min(), 0.0), max(added.max(), 0.0)
-        room = 0.12 * (high - low)
-        right.set_ylim(low - room, high + room)
+        for ax in (right, small):
+            _draw_added(ax, law, added)
         right.set(xlabel="time / s", ylabel="added displacement / µm")
-        force = right.twinx()
-        force.fill_between(law.time_s, law.force_mN, color="0.9", lw=0)
-        force.set_ylim(0, 1.15 * law.force_mN.max())
-        force.set_yticks([])
-        force.spines["right"].set_visible(False)
         look = {"ha": "right", "va": "top", "fontsize": 8, "color": "0.3"}
-        force.text(0.99, 0.99, "grey: force, on a scale of its own", transform=force.transAxes, **look)
-        right.set_zorder(force.get_zorder() + 1)
-        right.patch.set_visible(False)
+        right.text(0.99, 0.99, "grey: force, on a scale of its own", transform=right.transAxes, **look)
+        small.set_xticks([])
+        small.set_yticks([])
+        small.spines[:].set_visible(False)
         streams = [io.BytesIO() for _ in figures]
         for figure, stream in zip(figures, streams, strict=True):
             figure.savefig(stream, format="png", dpi=140, metadata={"Software": None})
     return strength, *(stream.getvalue() for stream in streams)
 
 
+def _draw_added(ax, law, added):
+    """What an effect adds to the displacement, over time; in grey behind it the force."""
+    ax.plot(law.time_s, added, color=BLUE, lw=1.3)
+    ax.axhline(0, color=GREY, lw=0.6)
+    low, high = min(added.min(), 0.0), max(added.max(), 0.0)
+    room = 0.12 * (high - low)
+    ax.set_ylim(low - room, high + room)
+    force = ax.twinx()
+    force.fill_between(law.time_s, law.force_mN, color="0.9", lw=0)
+    force.set_ylim(0, 1.15 * law.force_mN.max())
+    force.set_yticks([])
+    force.spines[:].set_visible(False)
+    ax.set_zorder(force.get_zorder() + 1)
+    ax.patch.set_visible(False)
+
+
 @cache
 def pictures():
-    """Of every mechanism: the strength that is drawn, and its two pictures."""
+    """Of every mechanism: the strength that is drawn, and its pictures."""
     from mcc_jax.effects import LIBRARY
 
     return {name: picture(mechanism) for name, mechanism in LIBRARY.items()}
@@ -158,8 +167,18 @@ def gallery():
     """The page's entries, one for each mechanism, in the library's order."""
     from mcc_jax.effects import LIBRARY
 
-    index = " · ".join(f"[{plain(name)}](#{name})" for name in LIBRARY)
-    return f"{index}\n\n" + "\n\n".join(entry(mechanism) for mechanism in LIBRARY.values())
+    return "\n\n".join(entry(mechanism) for mechanism in LIBRARY.values())
+
+
+def sheet():
+    """All mechanisms side by side, each a small picture of what it adds that leads to its entry."""
+    from mcc_jax.effects import LIBRARY
+
+    cells = [
+        f"[![What {plain(name)} adds over time](../{FOLDER}/{name}-small.png) {plain(name)}](#{name})"
+        for name in LIBRARY
+    ]
+    return "\n".join(['<div class="sheet" markdown>', *cells, "</div>"])
 
 
 def entry(mechanism):
@@ -389,15 +408,19 @@ def _broken(title):
 def files():
     """Every picture by its path in the pages."""
     found = {}
-    for name, (_, curve, added) in pictures().items():
-        found |= {f"{FOLDER}/{name}.png": curve, f"{FOLDER}/{name}-added.png": added}
+    for name, (_, curve, added, small) in pictures().items():
+        found |= {
+            f"{FOLDER}/{name}.png": curve,
+            f"{FOLDER}/{name}-added.png": added,
+            f"{FOLDER}/{name}-small.png": small,
+        }
     return found | {"images/which-test.png": which_test_picture()}
 
 
-BLOCKS = {"gallery": gallery, "which-test": which_test, "look-alikes": look_alikes}
-_MARK = re.compile(r"^!(gallery|which-test|look-alikes)$", re.M)
+BLOCKS = {"gallery": gallery, "sheet": sheet, "which-test": which_test, "look-alikes": look_alikes}
+_MARK = re.compile(rf"^!({'|'.join(BLOCKS)})$", re.M)
 
 
 def filled(markdown):
-    """The page with `!gallery` and the two tables in place of their marks."""
+    """The page with `!gallery`, `!sheet` and the two tables in place of their marks."""
     return _MARK.sub(lambda match: BLOCKS[match[1]](), markdown)

@@ -17,7 +17,7 @@ _ELSEWHERE = re.compile(
     r'<(?:script|img|iframe|source)\b[^>]*\bsrc="(?:https?:)?//|<link\b[^>]*\bhref="(?:https?:)?//', re.I
 )
 _LEFT_OVER = re.compile(
-    r'class="arithmatex"|:math:|\.\. math::|^!(?:api|names|file|table|gallery|which-test|look-alikes)\b', re.M
+    r'class="arithmatex"|:math:|\.\. math::|^!(?:api|names|file|table|gallery|sheet|which-test|look-alikes)\b', re.M
 )
 _API = re.compile(r"^!api (\S+)$", re.M)
 _NAMES = re.compile(r"^!names (\S+)$", re.M)
@@ -45,8 +45,8 @@ def on_files(files, config, **_):
 def on_page_markdown(markdown, **_):
     """`!api mcc_jax.law` stands for an entry for each name of the module, `!names mcc_jax` for links to them.
 
-    `!gallery`, `!which-test` and `!look-alikes` stand for what `gallery.py` writes of the effects, `!file NAME` for
-    a file at the top of the repository, `!table FILE HEADING` for a table of `benchmarks/results/`.
+    `!gallery`, `!sheet`, `!which-test` and `!look-alikes` stand for what `gallery.py` writes of the effects,
+    `!file NAME` for a file at the top of the repository, `!table FILE HEADING` for a table of `benchmarks/results/`.
     """
 
     def entries(match):
