@@ -194,7 +194,7 @@ def entry(mechanism):
         facts.append(f"| Easier to tell with | {_listed(need.value for need in first.helps)} |")
     facts.append(f"| Mistaken for | {mistaken_for(name)} |")
     if mechanism.equivalences:
-        facts.append(f"| No test of this kind tells it from | {_listed(mechanism.equivalences)} |")
+        facts.append(f"| Never to be told from, by such tests | {_listed(mechanism.equivalences)} |")
     facts.append(f"| What shows it by itself | {mechanism.check} |")
     sources = list(dict.fromkeys(variant.source for variant in mechanism))
     rows = [
@@ -247,7 +247,7 @@ def _alike(plan, name):
 
 
 def _pairs(found):
-    return ", ".join(f"[{plain(other)}](#{other}) ({_percent(value)})" for other, value in found.items())
+    return ", ".join(f"[{plain(other)}](#{other}) ({_percent(value)} alike)" for other, value in found.items())
 
 
 def _percent(value):
@@ -266,7 +266,7 @@ def _range(variant):
 
 def _sign(variant):
     return {1: "only above zero", -1: "only below zero", 0: "either"}[variant.sign] + (
-        ", another in every test" if variant.random_per_test else ""
+        "; it differs from test to test" if variant.random_per_test else ""
     )
 
 

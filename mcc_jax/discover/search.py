@@ -28,6 +28,7 @@ from .own_numbers import OwnNumbers, differing, sudden_steps
 from .refine import Refined, refined
 from .screen import Screen, Setting, pair_integrals, screen, signature_columns, single_integrals
 from .settings import DECISIONS, HYPERPARAMETERS, NUMERICS
+from .weighing import log_posteriors, posterior
 
 OPPOSITE = {frozenset(("damage", "densification_stiffening"))}
 """One quantity with two signs is no pair."""
@@ -94,60 +95,13 @@ class Search:
 
     # ---- posterior ---------------------------------------------------------------------------------------------------
 
-    def _log_joints(self) -> dict[Names, float]:
-        """Log evidence and log prior of every hypothesis.
-
-        Pairs count with a second name of credible size: what takes an amplitude beyond its largest plausible one
-        imitates what the first name's formula misses.
-        """
-        count = len(self.library)
-        logs = {}
-        for names, one in self.found.items():
-            prior = 0.0
-            if names == UNLISTED:
-                prior = -DECISIONS.unlisted
-            elif len(names) == 1:
-                prior = -np.log(count)
-            elif len(names) == 2:
-                prior = -DECISIONS.pair - np.log(count * (count - 1) / 2)
-            logs[names] = one.log_evidence + prior
-        for names, one in self.found.items():
-            if len(names) == 1 and np.isfinite(one.beside):
-                # Two causes, of which one is on no list: they count for the one that explains more by itself.
-                both = one.beside + min(one.other_noise, 0.0) - np.log(2 * count) - DECISIONS.pair - DECISIONS.unlisted
-                larger = names if logs[names] >= logs[UNLISTED] else UNLISTED
-                logs[larger] = float(np.logaddexp(logs[larger], both))
-        return {names: v for names, v in logs.items() if len(names) < 2 or self._credible(names)}
-
     def log_posteriors(self) -> dict[Names, float]:
-        """Log evidence and log prior of every hypothesis that may be named, best first: pairs lead by the margin."""
-        logs = self._log_joints()
-        fewer = max(v for names, v in logs.items() if len(names) < 2)
-        kept = {names: v for names, v in logs.items() if len(names) < 2 or v > fewer + DECISIONS.margin}
-        return dict(sorted(kept.items(), key=lambda item: -item[1]))
-
-    def _credible(self, names: Names) -> bool:
-        """Whether the name of a pair that explains less by itself has an amplitude that one would believe."""
-        r = self.found[names].formulas
-        if r is None:
-            return True
-        second = min(names, key=lambda n: self.found[(n,)].log_evidence)
-        sizes = zip(r.variants, r.theta, strict=False)
-        return all(abs(size) <= v.plausible[1] for v, size in sizes if v.mechanism == second)
+        """Log evidence and log prior of every hypothesis that may be named, best first."""
+        return log_posteriors(self.found, len(self.library))
 
     def posterior(self) -> dict[Names, float]:
-        """Probability of every hypothesis, most probable first.
-
-        The margin is for second names, which what a first one misses invites. Two names in place of the one that would
-        be named are no such invitation: they count by their prior odds, and make the answer a set.
-        """
-        logs = self.log_posteriors()
-        leader = next(iter(logs))
-        if len(leader) == 1 and leader != UNLISTED:
-            others = {n: v for n, v in self._log_joints().items() if len(n) == 2 and leader[0] not in n}
-            logs = dict(sorted((logs | others).items(), key=lambda item: -item[1]))
-        total = float(np.logaddexp.reduce(list(logs.values())))
-        return {names: float(np.exp(v - total)) for names, v in logs.items()}
+        """Probability of every hypothesis, most probable first."""
+        return posterior(self.found, len(self.library))
 
     # ---- one name ----------------------------------------------------------------------------------------------------
 

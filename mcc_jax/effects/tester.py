@@ -174,7 +174,7 @@ FRAME = Mechanism(
         _frame(
             "softening", FrameCompliance, "d = C F (F / 100 mN)^(1/2)",
             "A frame that yields the more the harder it is pressed, d ~ F^(3/2): a loose guide that begins to slip.",
-            "limit opposite to a seat", fixed={"power": 1.5},
+            "our own: the limit opposite to a rounded seat", fixed={"power": 1.5},
         ),
     ),
     ("thermal_drift linear, while force grows at one rate",),

@@ -199,18 +199,23 @@ def _cards(results: Results, checks: list[Any]) -> list[dict[str, str]]:
             {
                 "level": "bad" if bad else "look" if look else "good",
                 "title": f"Checks{alone}",
-                "answer": f"{len(good)} of {len(checks)} fine" if trusted else "Numbers cannot be true",
+                "answer": _count(len(checks) - len(good), len(checks)) if trusted else "Numbers cannot be true",
                 "line": _not_fine([*bad, *look], alone),
             }
         )
     return found
 
 
+def _count(failed: int, checks: int) -> str:
+    """How many checks are not fine."""
+    return f"{failed} of {checks} fail" if failed else f"all {checks} hold"
+
+
 def _not_fine(names: list[str], alone: str) -> str:
     """Which checks failed; that some must fail where the law alone lacks what was found."""
     if not names:
         return "nothing stands out"
-    return f"Not fine: {listed(names)}" + ("; it lacks what was found" if alone else "")
+    return listed(names) + (": to be expected, since it lacks what was found" if alone else "")
 
 
 def _summary(results: Results) -> list[str]:

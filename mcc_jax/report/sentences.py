@@ -46,7 +46,8 @@ def calibration_sentences(content: dict[str, Any], law: str = "the law") -> list
 
     Args:
         content: contents of `calibration.json`.
-        law: what to call it: beside effects that were found it is "the law alone".
+        law: what to call it: beside effects that were found it is "the law alone", and its numbers are those of a law
+            that is known to be wrong: not to be told in front of the right ones.
     """
     count, used = len(content["particles"]), sum(entry["kept"] for entry in content["particles"])
     found = [
@@ -54,6 +55,8 @@ def calibration_sentences(content: dict[str, Any], law: str = "the law") -> list
         + ("." if content["converged"] else "; it did NOT converge, so its numbers may not be relied on.")
     ]
     sure = SURE.get(content["method"])
+    if law != "the law":
+        return found
     if sure is None:
         found.append("This method gives values without uncertainty; the posterior (mcc-jax calibrate) gives both.")
     else:
@@ -66,13 +69,11 @@ def calibration_sentences(content: dict[str, Any], law: str = "the law") -> list
             if content[key]["interval_95"] is not None
         ]
         if known:
-            same = "" if content.get("modulus_scatter") else " and all particles had one modulus"
-            given = f"If {law} were complete{same}" if law != "the law" else "Given the law and these tests"
-            found.append(f"{given}, {listed(known)}, each {sure}.")
+            found.append(f"Given the law and these tests, {listed(known)}, each {sure}.")
     misfit = content["diagnostics"].get("own_misfit")
     if misfit is not None:
         found.append(
-            f"With its own curve of loading (coefficients C₁, C₃, C₅) {law} follows a particle's displacement to "
+            "With its own curve of loading (coefficients C₁, C₃, C₅) the law follows a particle's displacement to "
             f"{percent(misfit)} of its range (median over the particles)."
         )
     return found
