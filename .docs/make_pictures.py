@@ -103,9 +103,12 @@ def found():
     told = telling_test(answer)
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.2, 3.9), layout="constrained")
     handles = draw_enlarged(left, told)
-    left.set_title("One particle crushed and released: the law alone misses the loop", fontsize=9, loc="left")
+    text = "A particle of cellulose, pressed and released three times:\nthe contact law alone misses the loop"
+    left.set_title(text, fontsize=9, loc="left")
     noise = draw_left_over(right, told)[0]
-    right.set_title(f"Creep closes the gap: χ² per point {before:.0f} → {after:.1f} (noise: 1)", fontsize=9, loc="left")
+    gap = f"(χ² per point {before:.0f} → {after:.1f}; 1 is noise)"
+    text = f"The whole test over time: with creep added only noise is left\n{gap}"
+    right.set_title(text, fontsize=9, loc="left")
     for ax in (left, right):
         ax.spines[["top", "right"]].set_visible(False)
     figure.legend(handles=[*handles, noise], loc="outside lower center", ncols=4, frameon=False)
