@@ -115,41 +115,35 @@ def picture(mechanism):
     law, (strength, curve) = _law_alone(), _shown(mechanism.variants[0])
     with rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
         figures = [Figure(figsize=size, layout="constrained") for size in ((3.8, 2.7), (3.8, 2.7), (1.6, 1.1))]
-        left, right, small = (figure.subplots() for figure in figures)
+        left = figures[0].subplots()
+        right, small = (figure.subplots(2, 1, sharex=True, height_ratios=(4, 1)) for figure in figures[1:])
         # Broad and pale below narrow and dark: dashes of a path that goes back on itself would fill each other's gaps.
         left.plot(law.displacement_um, law.force_mN, color=VERMILION, alpha=0.6, lw=2.8, label="law alone")
         left.plot(curve.displacement_um, curve.force_mN, color=BLUE, lw=1.3, label="with the effect")
         left.set(xlabel="displacement / µm", ylabel="force / mN")
         left.legend(frameon=False, fontsize=8, loc="upper left")
         added = curve.displacement_um - law.displacement_um
-        for ax in (right, small):
-            _draw_added(ax, law, added)
-        right.set(xlabel="time / s", ylabel="added displacement / µm")
-        look = {"ha": "right", "va": "top", "fontsize": 8, "color": "0.3"}
-        right.text(0.99, 0.99, "grey: force, on a scale of its own", transform=right.transAxes, **look)
-        small.set_xticks([])
-        small.set_yticks([])
-        small.spines[:].set_visible(False)
+        for axes in (right, small):
+            _draw_added(*axes, law, added)
+        right[0].set(ylabel="added\ndisplacement / µm")
+        right[1].set(xlabel="time / s", ylabel="force")
+        for ax in small:
+            ax.set(xticks=[], yticks=[])
+            ax.spines[:].set_visible(False)
         streams = [io.BytesIO() for _ in figures]
         for figure, stream in zip(figures, streams, strict=True):
             figure.savefig(stream, format="png", dpi=140, metadata={"Software": None})
     return strength, *(stream.getvalue() for stream in streams)
 
 
-def _draw_added(ax, law, added):
-    """What an effect adds to the displacement, over time; in grey behind it the force."""
-    ax.plot(law.time_s, added, color=BLUE, lw=1.3)
-    ax.axhline(0, color=GREY, lw=0.6)
-    low, high = min(added.min(), 0.0), max(added.max(), 0.0)
-    room = 0.12 * (high - low)
-    ax.set_ylim(low - room, high + room)
-    force = ax.twinx()
-    force.fill_between(law.time_s, law.force_mN, color="0.9", lw=0)
-    force.set_ylim(0, 1.15 * law.force_mN.max())
-    force.set_yticks([])
-    force.spines[:].set_visible(False)
-    ax.set_zorder(force.get_zorder() + 1)
-    ax.patch.set_visible(False)
+def _draw_added(above, below, law, added):
+    """What an effect adds to the displacement, over time; below it the force in grey."""
+    above.plot(law.time_s, added, color=BLUE, lw=1.3)
+    above.axhline(0, color=GREY, lw=0.6)
+    above.margins(y=0.08)
+    below.fill_between(law.time_s, law.force_mN, color="0.75", lw=0)
+    below.set_ylim(0, 1.05 * law.force_mN.max())
+    below.set_yticks([])
 
 
 @cache
@@ -194,7 +188,7 @@ def entry(mechanism):
         facts.append(f"| Easier to tell with | {_listed(need.value for need in first.helps)} |")
     facts.append(f"| Mistaken for | {mistaken_for(name)} |")
     if mechanism.equivalences:
-        facts.append(f"| Never to be told from, by such tests | {_listed(mechanism.equivalences)} |")
+        facts.append(f"| Cannot be told from, by tests of force and displacement | {_listed(mechanism.equivalences)} |")
     facts.append(f"| What shows it by itself | {mechanism.check} |")
     sources = list(dict.fromkeys(variant.source for variant in mechanism))
     rows = [

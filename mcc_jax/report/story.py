@@ -64,7 +64,9 @@ def telling_test(found: Discovery) -> Telling | None:
     before, after, source = left.before, left.after, "its own numbers fitted to it"
     if added and found.held_out is not None and found.held_out.residual_um is not None:
         before, after = found.held_out.residual_um[0], found.held_out.residual_um[-1]
-        source = "what all share from the other particles, its own curve of loading, modulus and zero fitted"
+        source = (
+            "its own curve of loading, modulus and zero fitted to it, everything else taken from the other particles"
+        )
     count = np.maximum(left.used.sum(1), 1)
     rms = [np.sqrt(np.sum(np.where(left.used, one, 0.0) ** 2, axis=1) / count) for one in (before, after)]
     j = int(np.argmax(rms[0] - rms[1] if added else rms[0]))
