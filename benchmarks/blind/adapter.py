@@ -31,6 +31,11 @@ def quick(folder: Path, *, seed: int = 0) -> dict[str, Any]:
     return in_process(folder, seed=seed, confirm=False, posterior=False)
 
 
+def confirmed(folder: Path, *, seed: int = 0) -> dict[str, Any]:
+    """`in_process` without a posterior: the gap on held-out particles, and whether they contradict what was found."""
+    return in_process(folder, seed=seed, posterior=False)
+
+
 def in_process(folder: Path, *, seed: int = 0, **options: Any) -> dict[str, Any]:
     """`mcc_jax.discover.discover` in this process: campaigns share what is compiled."""
     import jax

@@ -19,6 +19,7 @@ from typing import Any
 
 from . import seal as sealing
 from . import workers
+from .outcome import NAMING
 from .settings import SETTINGS, Running
 
 RESULTS = Path(__file__).parents[1] / "results" / "blind"
@@ -43,6 +44,7 @@ def solve(
     solver: str = "inprocess",
     seed: int = 0,
     subset: int | None = None,
+    named: str = "",
     work: Path = sealing.WORK,
     results: Path = RESULTS,
     running: Running = SETTINGS.running,
@@ -52,6 +54,9 @@ def solve(
     wanted = [key for key in sorted(tasks) if subset is None or tasks[key]["subset"]]
     if subset not in (None, len(wanted)):
         raise SystemExit(f"the subset of {name} has {len(wanted)} campaigns, not {subset}")
+    if named:
+        told = read_outcomes(results / named)
+        wanted = [key for key in wanted if (told.get(key, {}).get("discovery") or {}).get("verdict") in NAMING]
     number, parts = part
     folder = results / (f"{name}-{label}" if label else name)
     folder.mkdir(parents=True, exist_ok=True)
@@ -88,6 +93,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--solver", default="inprocess", help="inprocess, module:function or checkout:FOLDER")
     parser.add_argument("--label", default="", help="of another solver's outcomes: they stand in NAME-LABEL")
     parser.add_argument("--subset", type=int, help="only the fixed subset, given by its size (100)")
+    parser.add_argument("--named", default="", help="only campaigns in which this run named something")
     parser.add_argument("--seed", type=int, default=0, help="of the solver (0)")
     parser.add_argument("--timeout", type=float, default=SETTINGS.running.timeout_s, help="seconds a campaign")
     given = parser.parse_args(arguments)
@@ -97,7 +103,7 @@ def main(arguments: list[str] | None = None) -> None:
     running = replace(SETTINGS.running, timeout_s=given.timeout)
     solve(
         given.name, given.part, label=given.label, solver=given.solver, seed=given.seed, subset=given.subset,
-        running=running,
+        named=given.named, running=running,
     )  # fmt: skip
 
 

@@ -25,6 +25,11 @@ def silent(folder, *, seed=0):
     return discovery("NO_GAP", summary=str(os.getpid()))
 
 
+def naming(folder, *, seed=0):
+    """Names something in every campaign of an odd number."""
+    return discovery("NAMED", [("creep", 1.0)], [["creep"]]) if int(folder.name[1:]) % 2 else discovery("NO_GAP")
+
+
 def moody(folder, *, seed=0):
     """Crashes, hangs, dies or talks nonsense, by the name of the campaign."""
     mood = folder.name

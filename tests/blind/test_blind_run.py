@@ -70,6 +70,15 @@ def test_parts_resume_and_processes_are_renewed(sealed, tmp_path):
         run.solve("day-3", subset=100, **given)
 
 
+def test_a_gap_is_asked_for_where_something_was_named(sealed, tmp_path):
+    place, *_ = sealed
+    given = {"work": place / "work", "results": tmp_path, "running": FAST}
+    run.solve("day-3", solver="fake_solvers:naming", **given)
+    odd = sum(int(key[1:]) % 2 for key in run.read_outcomes(tmp_path / "day-3"))
+    assert 0 < odd < 6
+    assert run.solve("day-3", solver="fake_solvers:silent", label="gap", named="day-3", **given) == odd
+
+
 def test_a_crash_a_hang_and_a_dead_process_cost_one_campaign_each():
     names = ("crash", "fine", "hang", "nonsense", "die", "fine")
     running = replace(FAST, renew_after=10)
