@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import mcc_jax as mcc
+from mcc_jax import InputError
 from mcc_jax._archive import encode
 from mcc_jax.calibrate import OldCalibration
 from mcc_jax.discover import Discovery
@@ -47,6 +48,9 @@ def test_a_discovery_beside_it_has_it_as_its_before(calibration, tmp_path):
     again = mcc.load(tmp_path)
     assert again.verdict == "NO_GAP"
     assert encode(again.before) == encode(calibration)
+    assert encode(mcc.load(tmp_path / "calibration.msgpack")) == encode(calibration)
+    with pytest.raises(InputError, match="is a file"):
+        mcc.load(tmp_path / "discovery.json")
 
 
 def test_its_law_drives_and_is_exported(calibration, tmp_path):

@@ -260,7 +260,7 @@ def load(folder: str | Path) -> Any:
     A calibration of an older version, of which only `calibration.json` is there, gives its numbers and its law.
 
     Args:
-        folder: where `save`, `mcc-jax calibrate` or `mcc-jax discover` wrote.
+        folder: where `save`, `mcc-jax calibrate` or `mcc-jax discover` wrote; or one of the `.msgpack` files in it.
 
     Returns:
         A `Discovery`, a `PaperCalibration`, `LeastSquares`, `Posterior` or `OldCalibration`, or a
@@ -270,6 +270,10 @@ def load(folder: str | Path) -> Any:
         InputError: if the folder holds none, or a file is damaged, foreign or of a newer version.
     """
     path = arguments.file_path(folder, "folder")
+    if path.name in (DISCOVERY_ARCHIVE, ARCHIVE) and path.is_file():
+        return _read(path)
+    if path.is_file():
+        raise InputError("is a file, and not one that a result is read from", file=path, remedy=A_FOLDER)
     if not path.is_dir():
         raise InputError("there is no such folder", file=path, remedy=A_FOLDER)
     there = {entry.name for entry in path.iterdir()}

@@ -155,7 +155,10 @@ def calibrate(
         say_files(out, [*content["figures"], *content["files"], RESULT])
         here = shlex.quote(str(out))
         say_next(
-            (f"mcc-jax discover {shlex.quote(str(campaign))} --out {here}", "what the law misses"),
+            (
+                "" if options["effects"] else f"mcc-jax discover {shlex.quote(str(campaign))} --out {here}",
+                "what the law misses",
+            ),
             (f"mcc-jax report {here}", "all of it on one page"),
         )
     return None if content["converged"] else NOT_CONVERGED

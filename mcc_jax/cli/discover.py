@@ -101,11 +101,12 @@ def discover(
     if as_json:
         say_json(content)
         return
+    from ..calibrate.results import DISCOVERY_ARCHIVE
     from ..report.sentences import calibration_with_found
 
     say_discovery(content)
     say()
-    say_files(out, [*content["figures"], DISCOVERY])
+    say_files(out, [*content["figures"], DISCOVERY_ARCHIVE, DISCOVERY])
     with_found = calibration_with_found(content, shlex.quote(str(campaign)))
     say_next(
         (with_found, "the law with what was found"),

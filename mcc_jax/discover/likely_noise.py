@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
 from ..calibrate.data import ranges_um
 from ..calibrate.model import Model
-from ..calibrate.noise import Along, Correlation
+from ..calibrate.noise import Along, Correlation, particle_scales
 from ..calibrate.settings import JUDGEMENT
 from .base import Base
 from .columns import Design, with_noise
 from .design import design_of
-from .evidence import Optimum, optimise
+from .evidence import Optimum, optimise, residual_of, solve, whitened
 from .settings import NUMERICS
 
 
@@ -37,15 +38,31 @@ def with_likely_noise(base: Base) -> tuple[Base, Optimum]:
     """
     design = design_of(base, base.state)
     own = optimise(design, base.hyperparameters, curvature=False)
-    others = [(with_other_noise(design, own.free, model), model) for model in noise_models(base)]
-    best, model = max(others, key=lambda one: one[0].log_joint)
+    others = [(*with_own_scales(design, own.free, model), model) for model in noise_models(base)]
+    best, scale, model = max(others, key=lambda one: one[0].log_joint)
     if best.log_joint > own.log_joint + NUMERICS.strong:
-        return replace(base, model=model), best
+        return replace(base, model=model, scale=scale), best
     return base, own
 
 
+def with_own_scales(design: Design, free: np.ndarray, model: Model) -> tuple[Optimum, np.ndarray]:
+    """As `with_other_noise`, with the particles' own factors that belong to this kind of noise, and these factors.
+
+    Under noise of another kind what wanders for long makes some particles look noisier than others.
+    """
+    alike = replace(design, scale=np.ones(len(design.scale)))
+    found = with_other_noise(alike, free, model)
+    same = with_noise(alike, model)
+    white, _ = whitened(found.free, same, residual_of(solve(found.free, same), same))
+    mask = np.asarray(design.tests.mask)
+    scale = particle_scales(alike.scale, np.sum(np.where(mask, white, 0.0) ** 2, 1), mask.sum(1) - 4)
+    if np.any(scale != 1.0):
+        found = with_other_noise(replace(design, scale=scale), found.free, model)
+    return found, scale
+
+
 def noise_models(base: Base) -> tuple[Model, ...]:
-    """The model with other kinds of noise: rough or smooth along the load, or smooth in time.
+    """The model with other kinds of noise: rough or smooth, along the load or in time.
 
     The prior of its length keeps its share of a test.
     """
@@ -58,7 +75,7 @@ def noise_models(base: Base) -> tuple[Model, ...]:
 
     models = []
     rough, smooth = Correlation.EXPONENTIAL, Correlation.MATERN_32
-    for correlation, along in ((rough, Along.LOAD), (smooth, Along.LOAD), (smooth, Along.TIME)):
+    for correlation, along in product((rough, smooth), (Along.LOAD, Along.TIME)):
         if (correlation, along) != (model.correlation, model.along):
             median = prior.noise_length.median * length(along) / length(model.along)
             priors = replace(prior, noise_length=replace(prior.noise_length, median=median))

@@ -197,19 +197,25 @@ class Discovery(Saved):
         return self.verdict
 
     def law(self, particle: str | None = None) -> MccLaw:
-        """The calibrated law with the effects that were added.
+        """The calibrated law with the effects that were added: of the median particle, or of one of the tests.
 
         Raises:
-            InputError: if there was no fit, or the gap is closed by a formula that no listed mechanism has.
+            InputError: if there was no fit, the gap is closed by a formula that no listed mechanism has, or the law of
+                one test is asked for where the law with effects has no posterior.
         """
         if self.closure is not None:
             remedy = "Draw or tabulate it: its terms stand in discovery.json."
             raise InputError("the formula of this discovery is no effect of the library", remedy=remedy)
         if self.base is None:
             raise InputError("this discovery has no law: its fit did not converge", remedy="Calibrate first.")
+        if particle is not None:
+            if self.posterior is None:
+                remedy = "Sample it: mcc.sample(campaign, found.model).law(particle)."
+                raise InputError("the law of one particle with effects takes its posterior", remedy=remedy)
+            return self.posterior.law(particle)
         model = self.base.model
         numbers = {"method": "bayes", "law": {"unloading": model.unloading, "strain_scaling": model.strain_scaling}}
-        law = law_of(numbers | (self.parameters_after or self.parameters_before), particle)
+        law = law_of(numbers | (self.parameters_after or self.parameters_before))
         return law.with_effects(*(effect.build() for effect in self.effects))
 
     @property

@@ -47,8 +47,9 @@ def summary_of(found: Discovery) -> str:
         sentences.append(f"A formula describes it{near}: {found.closure.formula}.")
     sentences += _gap(found)
     if found.leads:
-        names = ", ".join(_plain(one["mechanism"]) for one in found.leads)
-        sentences.append(f"Beside it, what is left may be {names}; that is not added to the law.")
+        each = [f"{_plain(one['mechanism'])} ({max(100 * one['share'], 0.1):.2g} %)" for one in found.leads]
+        text = f"Beside it, a share of the evidence may be due to {_listed(each)}; that is not added to the law."
+        sentences.append(text)
     if found.parameters_after and found.verdict in ("NAMED", "SET", "UNLISTED"):
         sentences.append(
             _modulus(*(p["effective_modulus_MPa"] for p in (found.parameters_before, found.parameters_after)))

@@ -1,5 +1,6 @@
 """From curves to an answer: a hidden effect is named, nothing hidden is nothing found, the rest is declared."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -99,6 +100,14 @@ def test_what_was_added_is_an_ordinary_part_of_the_law(named):
     assert float(built.amplitude) == pytest.approx(effect.amplitude)
     assert [v.mechanism for v in named.model.effects] == [effect.mechanism]
     assert named.outcome == named.verdict
+    name = named.base.campaign.particles[2]
+    own, typical = named.law(name), named.law()
+    assert [type(e) for e in own.effects] == [type(e) for e in typical.effects] == [type(built)]
+    assert float(own.plastic.C1) == float(named.posterior.law(name).plastic.C1) != float(typical.plastic.C1)
+    with pytest.raises(InputError, match="no particle 'none'"):
+        named.law("none")
+    with pytest.raises(InputError, match="takes its posterior"):
+        dataclasses.replace(named, posterior=None).law(name)
 
 
 @pytest.mark.long

@@ -20,6 +20,7 @@ from .diameters import Diameters, diameters_for
 from .folder import names_of, read_folder
 from .mapped import read_mapped
 from .mapping import MappingFile, read_mapping
+from .suggestion import suggested_mapping
 from .text import Tests, decode_lines
 
 FORMATS = {
@@ -28,11 +29,6 @@ FORMATS = {
     "Hysitron load-control text": hysitron_lc,
     "Micro Materials text (also many in one zip)": micromaterials,
 }
-_EXAMPLE = (
-    "Write a TOML mapping file and give it with --mapping; for example "
-    'decimal_mark = "."; [columns] time = { column = "Time", unit = "s" }, '
-    'force = { column = "Load", unit = "mN" }, displacement = { column = "Depth", unit = "um" }'
-)
 
 
 def read_tester_file(
@@ -119,7 +115,7 @@ def read_tester_file(
 def _read_known(data: bytes, file: Path) -> Tests:
     """Read a file of a known format, told by what is in it."""
     if is_workbook(data):
-        raise InputError("an Excel workbook has no format of its own", file=file, remedy=_EXAMPLE)
+        raise InputError("an Excel workbook has no format of its own", file=file, remedy=suggested_mapping(b""))
     if data.startswith((b"PK\x03\x04", b"PK\x05\x06")):
         return micromaterials.read_zip(data, file)
     kind = binary_kind(data)
@@ -130,7 +126,8 @@ def _read_known(data: bytes, file: Path) -> Tests:
     for reader in FORMATS.values():
         if reader.matches(lines):
             return reader.read(lines, file)
-    raise InputError(f"the format is not known (known: {', '.join(FORMATS)})", file=file, remedy=_EXAMPLE)
+    problem = f"the format is not known (known: {', '.join(FORMATS)})"
+    raise InputError(problem, file=file, remedy=suggested_mapping(data))
 
 
 def _read_by_one(data: bytes, file: Path, mappings: Sequence[MappingFile]) -> Tests:
