@@ -17,7 +17,7 @@ _ELSEWHERE = re.compile(
     r'<(?:script|img|iframe|source)\b[^>]*\bsrc="(?:https?:)?//|<link\b[^>]*\bhref="(?:https?:)?//', re.I
 )
 _LEFT_OVER = re.compile(
-    r'class="arithmatex"|:math:|\.\. math::|^!(?:api|names|file|table|gallery|sheet|which-test|look-alikes)\b', re.M
+    rf'class="arithmatex"|:math:|\.\. math::|^!(?:api|names|file|table|{"|".join(gallery.BLOCKS)})\b', re.M
 )
 _API = re.compile(r"^!api (\S+)$", re.M)
 _NAMES = re.compile(r"^!names (\S+)$", re.M)

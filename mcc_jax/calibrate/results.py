@@ -270,9 +270,9 @@ def load(folder: str | Path) -> Any:
         InputError: if the folder holds none, or a file is damaged, foreign or of a newer version.
     """
     path = arguments.file_path(folder, "folder")
-    if path.name in (DISCOVERY_ARCHIVE, ARCHIVE) and path.is_file():
-        return _read(path)
     if path.is_file():
+        if path.name in (DISCOVERY_ARCHIVE, ARCHIVE):
+            return _read(path)
         raise InputError("is a file, and not one that a result is read from", file=path, remedy=A_FOLDER)
     if not path.is_dir():
         raise InputError("there is no such folder", file=path, remedy=A_FOLDER)

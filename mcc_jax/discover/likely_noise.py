@@ -50,10 +50,9 @@ def with_own_scales(design: Design, free: np.ndarray, model: Model) -> tuple[Opt
 
     Under noise of another kind what wanders for long makes some particles look noisier than others.
     """
-    alike = replace(design, scale=np.ones(len(design.scale)))
+    alike = with_noise(replace(design, scale=np.ones(len(design.scale))), model)
     found = with_other_noise(alike, free, model)
-    same = with_noise(alike, model)
-    white, _ = whitened(found.free, same, residual_of(solve(found.free, same), same))
+    white, _ = whitened(found.free, alike, residual_of(solve(found.free, alike), alike))
     mask = np.asarray(design.tests.mask)
     scale = particle_scales(alike.scale, np.sum(np.where(mask, white, 0.0) ** 2, 1), mask.sum(1) - 4)
     if np.any(scale != 1.0):

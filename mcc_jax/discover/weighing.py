@@ -17,9 +17,7 @@ def log_posteriors(found: Mapping[Names, Hypothesis], count: int) -> dict[Names,
         found: hypotheses by their names.
         count: mechanisms that are searched for.
     """
-    logs = _log_joints(found, count)
-    fewer = max(v for names, v in logs.items() if len(names) < 2)
-    return _best_first({n: v for n, v in logs.items() if len(n) < 2 or v > fewer + DECISIONS.margin})
+    return _that_may_be_named(_log_joints(found, count))
 
 
 def posterior(found: Mapping[Names, Hypothesis], count: int) -> dict[Names, float]:
@@ -32,10 +30,11 @@ def posterior(found: Mapping[Names, Hypothesis], count: int) -> dict[Names, floa
         found: hypotheses by their names.
         count: mechanisms that are searched for.
     """
-    logs = log_posteriors(found, count)
+    joints = _log_joints(found, count)
+    logs = _that_may_be_named(joints)
     leader = next(iter(logs))
     if len(leader) == 1 and leader != UNLISTED:
-        logs |= {n: v for n, v in _log_joints(found, count).items() if len(n) == 2 and leader[0] not in n}
+        logs |= {n: v for n, v in joints.items() if len(n) == 2 and leader[0] not in n}
     total = float(np.logaddexp.reduce(list(logs.values())))
     return {names: float(np.exp(v - total)) for names, v in _best_first(logs).items()}
 
@@ -59,6 +58,11 @@ def _log_joints(found: Mapping[Names, Hypothesis], count: int) -> dict[Names, fl
             larger = names if logs[names] >= logs[UNLISTED] else UNLISTED
             logs[larger] = float(np.logaddexp(logs[larger], both))
     return {names: v for names, v in logs.items() if len(names) < 2 or _credible(found, names)}
+
+
+def _that_may_be_named(logs: Mapping[Names, float]) -> dict[Names, float]:
+    fewer = max(v for names, v in logs.items() if len(names) < 2)
+    return _best_first({n: v for n, v in logs.items() if len(n) < 2 or v > fewer + DECISIONS.margin})
 
 
 def _credible(found: Mapping[Names, Hypothesis], names: Names) -> bool:

@@ -163,6 +163,7 @@ def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
         "before_after": CAPTIONS["discovery_before_after"][1],
         "figures_of": _figures(results),
         "folder": folder,
+        "law_alone": _law_alone(results),
         "style": Markup(_source("style.css")),
         "script": Markup(_closed(_source("page.js"))),
         "versions": next((v for _, c in results.results.items() if (v := c["provenance"]["versions"])), {}),
@@ -222,7 +223,7 @@ def _summary(results: Results) -> list[str]:
     """What stands below the first screen, in sentences."""
     if results.calibration is None:
         return []
-    return calibration_sentences(results.calibration, "the law alone" if _law_alone(results) else "the law")
+    return calibration_sentences(results.calibration, alone=_law_alone(results))
 
 
 def _law_alone(results: Results) -> bool:

@@ -41,22 +41,23 @@ def simulated(results: Results) -> bool:
     return results.campaign is not None and is_simulated(results.campaign.metadata)
 
 
-def calibration_sentences(content: dict[str, Any], law: str = "the law") -> list[str]:
+def calibration_sentences(content: dict[str, Any], *, alone: bool = False) -> list[str]:
     """The calibration in a few sentences.
 
     Args:
         content: contents of `calibration.json`.
-        law: what to call it: beside effects that were found it is "the law alone", and its numbers are those of a law
-            that is known to be wrong: not to be told in front of the right ones.
+        alone: whether it is of the law without effects that were found to be missing. Its numbers are those of a law
+            that is known to be wrong, not to be told in front of the right ones.
     """
     count, used = len(content["particles"]), sum(entry["kept"] for entry in content["particles"])
+    law = "The law alone" if alone else "The law"
     found = [
-        f"{law.capitalize()} was calibrated on {used} of {count} particles by {METHODS[content['method']]}"
+        f"{law} was calibrated on {used} of {count} particles by {METHODS[content['method']]}"
         + ("." if content["converged"] else "; it did NOT converge, so its numbers may not be relied on.")
     ]
-    sure = SURE.get(content["method"])
-    if law != "the law":
+    if alone:
         return found
+    sure = SURE.get(content["method"])
     if sure is None:
         found.append("This method gives values without uncertainty; the posterior (mcc-jax calibrate) gives both.")
     else:

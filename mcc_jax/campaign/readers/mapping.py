@@ -70,7 +70,7 @@ from ..signal import turning_points
 from ..table import APOSTROPHES, SPACES, same_text
 from .diameters import Diameters, check_triple
 
-_DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
+DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
 DIMENSIONS = {"time": TIME, "force": FORCE, "displacement": LENGTH}
 Split = Literal["file", "blank line", "header", "column"]
 _THOUSANDS = {"none": "", "point": ".", "comma": ",", "apostrophe": APOSTROPHES, "space": SPACES} | {
@@ -197,7 +197,7 @@ _PLAIN: dict[str, tuple[type | tuple[type, ...], Callable[[Any], bool], str]] = 
     "encoding": (str, _is_encoding, 'a name such as "latin-1"'),
     "delimiter": (
         str,
-        lambda text: text in _DELIMITERS or (len(text) == 1 and text not in '"\r\n\0'),
+        lambda text: text in DELIMITERS or (len(text) == 1 and text not in '"\r\n\0'),
         '"comma", "semicolon", "tab", "space" or one character',
     ),
     "sheet": (
@@ -234,7 +234,7 @@ def _values(entries: dict[str, Any], file: Path) -> dict[str, Any]:
         if not isinstance(value, kind) or isinstance(value, bool) or not allowed(value):
             raise _wrong(f"{value!r} is not allowed", key, f"Write {wanted}")
     if "delimiter" in values:
-        values["delimiter"] = _DELIMITERS.get(values["delimiter"], values["delimiter"])
+        values["delimiter"] = DELIMITERS.get(values["delimiter"], values["delimiter"])
     if "thousands" in values:
         values["thousands"] = _THOUSANDS[values["thousands"]]
     # TOML has a number nan, which equals nothing, itself included.

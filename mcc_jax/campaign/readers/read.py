@@ -20,7 +20,7 @@ from .diameters import Diameters, diameters_for
 from .folder import names_of, read_folder
 from .mapped import read_mapped
 from .mapping import MappingFile, read_mapping
-from .suggestion import suggested_mapping
+from .suggestion import EXAMPLE, suggested_mapping
 from .text import Tests, decode_lines
 
 FORMATS = {
@@ -115,7 +115,7 @@ def read_tester_file(
 def _read_known(data: bytes, file: Path) -> Tests:
     """Read a file of a known format, told by what is in it."""
     if is_workbook(data):
-        raise InputError("an Excel workbook has no format of its own", file=file, remedy=suggested_mapping(b""))
+        raise InputError("an Excel workbook has no format of its own", file=file, remedy=EXAMPLE)
     if data.startswith((b"PK\x03\x04", b"PK\x05\x06")):
         return micromaterials.read_zip(data, file)
     kind = binary_kind(data)

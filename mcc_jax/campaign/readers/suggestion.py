@@ -5,16 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
+from .mapping import DELIMITERS
 from .text import decode_lines
-
-DELIMITERS = {"semicolon": ";", "tab": "\t", "comma": ",", "space": None}
-"""By their names in a mapping file; blanks last, which tabs are, too."""
 
 LINES = 500
 """So many lines of a file are looked at."""
-
-EXAMPLE = ('"Time"', '"Load"', '"Depth"')
-"""Columns where a file shows none."""
 
 _NUMBER = re.compile(r"[-+]?[0-9]+(?:[.,][0-9]*)?(?:[eE][-+]?[0-9]+)?")
 _COLUMNS = (
@@ -22,6 +17,8 @@ _COLUMNS = (
     'displacement = {{ column = {}, unit = "um" }}'
 )
 _HOW = "Write a TOML mapping file and give it with --mapping; for example"
+EXAMPLE = f'{_HOW} decimal_mark = "."; [columns] ' + _COLUMNS.format('"Time"', '"Load"', '"Depth"')
+"""What to do about a file that shows nothing of itself."""
 
 
 def suggested_mapping(data: bytes) -> str:
@@ -36,7 +33,7 @@ def suggested_mapping(data: bytes) -> str:
     }
     name = max(rows, key=lambda name: len(rows[name]))
     if not rows[name]:
-        return f'{_HOW} decimal_mark = "."; [columns] {_COLUMNS.format(*EXAMPLE)}'
+        return EXAMPLE
     first, mark = rows[name][0], DELIMITERS[name]
     samples = [_cells(lines[i], mark) for i in rows[name]]
     keys = [f'delimiter = "{name}"']
@@ -59,9 +56,9 @@ def suggested_mapping(data: bytes) -> str:
     return f"{_HOW} {'; '.join(keys)}; [columns] {_COLUMNS.format(*['"..."'] * 3)}; its columns are {told}"
 
 
-def _cells(line: str, mark: str | None) -> list[str]:
+def _cells(line: str, mark: str) -> list[str]:
     """The cells of a line, without quotes and blanks around them; empty ones behind the last are none."""
-    cells = [cell.strip().strip('"').strip() for cell in line.split(mark)]
+    cells = [cell.strip().strip('"').strip() for cell in line.split(None if mark == " " else mark)]
     while cells and not cells[-1]:
         cells.pop()
     return cells
@@ -71,7 +68,7 @@ def _all_numbers(cells: Sequence[str]) -> bool:
     return len(cells) > 1 and all(_NUMBER.fullmatch(cell) for cell in cells)
 
 
-def _header(above: Sequence[str], mark: str | None, count: int) -> list[int]:
+def _header(above: Sequence[str], mark: str, count: int) -> list[int]:
     """The rows of names, and of units below them, in front of the samples; none if there are none."""
     found: list[int] = []
     for i in range(len(above) - 1, max(len(above) - 3, -1), -1):
