@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from mcc_jax.calibrate import Model
-from mcc_jax.campaign import PAPER_DIAMETERS_UM, Campaign
+from mcc_jax.campaign import PAPER_DIAMETERS_UM, Campaign, Curve
 from mcc_jax.discover.base import base_fit
 from mcc_jax.simulate import (
     Instrument,
@@ -65,6 +65,12 @@ def subset(whole, chosen):
         {name: tuple(values[i] for i in chosen) for name, values in whole.columns.items()},
         whole.metadata,
     )
+
+
+def with_curves(whole, change):
+    """The same campaign with each curve's time, force and displacement changed."""
+    curves = tuple(Curve(*change(c)) for c in whole.curves)
+    return Campaign(whole.particles, whole.diameters_um, curves, whole.columns, whole.metadata)
 
 
 def mixed(one, other, from_other):

@@ -4,11 +4,11 @@ import json
 
 import numpy as np
 import pytest
-from campaigns import SINGLE, cached, campaign, mixed, subset
+from campaigns import SINGLE, cached, campaign, mixed, subset, with_curves
 from helpers import TESTERS
 
 from mcc_jax import InputError
-from mcc_jax.campaign import Campaign, Curve, read_tester_file
+from mcc_jax.campaign import read_tester_file
 from mcc_jax.discover import discover
 from mcc_jax.effects import LIBRARY
 
@@ -33,11 +33,6 @@ def answer(campaign, **options):
     if told["verdict"] in ("NO_GAP", "FIT_NOT_CONVERGED"):
         assert told["effects"] == []
     return told
-
-
-def with_curves(whole, change):
-    curves = tuple(Curve(*change(c)) for c in whole.curves)
-    return Campaign(whole.particles, whole.diameters_um, curves, whole.columns, whole.metadata)
 
 
 @pytest.mark.long

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from campaigns import base_of, cached
+from campaigns import base_of, cached, with_curves
 
 from mcc_jax.calibrate.noise import Along, Correlation
-from mcc_jax.campaign import Campaign, Curve
 from mcc_jax.discover.likely_noise import with_likely_noise
 
 WANDER_UM, LENGTH_S = 0.3, 25.0
@@ -20,8 +19,7 @@ def wandering(whole, smooth, seed=3):
         kernel = (1 + np.sqrt(3) * x) * np.exp(-np.sqrt(3) * x) if smooth else np.exp(-x)
         return WANDER_UM * np.linalg.cholesky(kernel + 1e-9 * np.eye(len(x))) @ rng.standard_normal(len(x))
 
-    curves = tuple(Curve(c.time_s, c.force_mN, c.displacement_um + noise(c.time_s)) for c in whole.curves)
-    return Campaign(whole.particles, whole.diameters_um, curves, whole.columns, whole.metadata)
+    return with_curves(whole, lambda c: (c.time_s, c.force_mN, c.displacement_um + noise(c.time_s)))
 
 
 @pytest.mark.parametrize(("smooth", "correlation"), [(True, Correlation.MATERN_32), (False, Correlation.EXPONENTIAL)])
