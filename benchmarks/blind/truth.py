@@ -53,6 +53,12 @@ class Truths:
         error = projection.unexplained(found) - left
         return float(np.sqrt(np.mean(error**2)) / np.ptp(left))
 
+    def modulus_at_peaks(self, outcome: Outcome) -> float:
+        """The modulus that acts at the particles' largest forces, in MPa."""
+        world = _world(outcome.answer)[0]
+        sizes = [effect["amplitude"] for effect in outcome.answer["effects"]]
+        return world.modulus_at_peaks(list(zip(world.hidden, sizes, strict=True)))
+
 
 def _world(answer: dict[str, Any]) -> tuple[World, Projection]:
     case = from_record(answer["case"])

@@ -55,9 +55,9 @@ class World:
 
     columns: of `particles.csv`. diameter: effective, um. spread: standard deviations of ln C1, ln C3, ln C5 between
     particles. deviation: of ln C1, ln C3, ln C5 and ln modulus from the population, (4, n). truth: parameters of the
-    population. hidden: what the case asks for. curves: displacement in um at every
-    reading for effects and a shift of the base law. listed: formulas of all listed mechanisms that this campaign can
-    show, for comparison; pop-ins are left out, whose signature is whatever jumps there are.
+    population. hidden: what the case asks for. curves: displacement in um at every reading for effects and a shift of
+    the base law. moduli: in MPa at every reading, with effects. listed: formulas of all listed mechanisms that this
+    campaign can show, for comparison; pop-ins are left out, whose signature is whatever jumps there are.
     """
 
     columns: dict[str, np.ndarray]
@@ -70,7 +70,14 @@ class World:
     truth: dict[str, float]
     hidden: tuple[Hidden, ...]
     curves: Callable[[Sized, Shift | None], np.ndarray]
+    moduli: Callable[[Sized], np.ndarray]
     listed: Callable[[], Iterable[Hidden]]
+
+    def modulus_at_peaks(self, sized: Sized) -> float:
+        """The population's modulus with what effects make of it at the particles' largest forces, in MPa."""
+        tops = [s.start + int(np.argmax(self.force[s])) for s in self.slices]
+        change = np.log(self.moduli(sized)[tops] / self.moduli(())[tops])
+        return float(self.truth["effective_modulus_MPa"] * np.exp(change.mean()))
 
     @property
     def count(self) -> int:

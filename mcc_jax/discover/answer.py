@@ -11,22 +11,23 @@ import numpy as np
 from ..calibrate import Posterior
 from ..calibrate.estimates import estimate, finite, summary
 from ..effects import Mechanism
+from .at_peaks import of_modulus_at_peaks
 from .base import Base
 from .columns import Design
 from .design import design_of
 from .evidence import left_by_particle, residual_of, scales_of, solve, whitened
 from .hypothesis import UNLISTED, Hypothesis, Names
 from .own_numbers import OwnNumbers
+from .refine import Refined
 from .result import Effect, Likeness, Residuals
 from .search import Search
-from .settings import DECISIONS, POPULATION, TELLING
+from .settings import AT_PEAKS, DECISIONS, POPULATION, TELLING
 
 
 def parameters_alone(base: Base) -> dict[str, Any]:
     """The population's parameters by the law alone, under the model's own noise: those of a calibration."""
-    return _averaged(
-        [_population(base, design_of(base, base.state), base.hyperparameters)], np.ones(1), len(base.tests)
-    )
+    alone = _population(base, None, design_of(base, base.state), base.hyperparameters)
+    return _averaged([alone], np.ones(1), len(base.tests))
 
 
 def parameters_with(search: Search, probabilities: Mapping[Names, float]) -> dict[str, Any]:
@@ -36,7 +37,8 @@ def parameters_with(search: Search, probabilities: Mapping[Names, float]) -> dic
         search: the hypotheses.
         probabilities: of those that are averaged over; their sum need not be 1.
     """
-    each = [_population(search.base, *search.found[names].likely_form()) for names in probabilities]
+    found = [search.found[names] for names in probabilities]
+    each = [_population(search.base, one.formulas, *one.likely_form()) for one in found]
     weights = np.array(list(probabilities.values())) / sum(probabilities.values())
     return _averaged(each, weights, len(search.base.tests))
 
@@ -52,22 +54,25 @@ def _averaged(
     from scipy.stats import t as student
 
     mean, sd, tau = (np.array(parts) for parts in zip(*each, strict=True))
-    freedom = np.array([np.inf, np.inf, *3 * [max(particles - 1.0, 1.0)]])
+    freedom = np.array([np.inf, np.inf, *3 * [max(particles - 1.0, 1.0)], np.inf])
     # Of three degrees of freedom and more Student's t has a standard deviation.
     wider = np.where(freedom > 2, student.std(freedom), 1.0)
     middle = weights @ mean
     wide = np.sqrt(weights @ ((sd * wider) ** 2 + (mean - middle) ** 2))
     low, high = (_quantiles(q, weights, mean, sd, freedom) for q in (0.025, 0.975))
-    spread, modulus = weights @ tau, float(np.exp(middle[1]))
+    spread = weights @ tau
 
     def entry(j: int) -> dict[str, Any]:
         return estimate(float(middle[j]), float(wide[j]), (low[j], high[j]))
 
+    def modulus(j: int) -> dict[str, Any]:
+        value = float(np.exp(middle[j]))
+        return estimate(value, value * float(wide[j]), (float(np.exp(low[j])), float(np.exp(high[j]))))
+
     return {
         "a": entry(0),
-        "effective_modulus_MPa": estimate(
-            modulus, modulus * float(wide[1]), (float(np.exp(low[1])), float(np.exp(high[1])))
-        ),
+        "effective_modulus_MPa": modulus(1),
+        AT_PEAKS: modulus(5),
         **{
             f"log_{name}": {"mean": entry(2 + j), "sd": estimate(float(spread[j]))}
             for j, name in enumerate(("C1", "C3", "C5"))
@@ -84,8 +89,11 @@ def likely(search: Search) -> dict[Names, float]:
     return found
 
 
-def _population(base: Base, design: Design, free: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Means of a, log modulus and of log C1, C3, C5 under a hypothesis, their errors, and the spreads of the latter.
+def _population(
+    base: Base, formulas: Refined | None, design: Design, free: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Means of a, log modulus, log C1, C3, C5 and log modulus at the peaks under a hypothesis, their errors, and the
+    spreads of the coefficients.
 
     Errors are those of the linear model. Where the formulas are off, so is the law that would answer for it: the misfit
     is integrated out, too, and widens the errors (Brynjarsdottir and O'Hagan 2014).
@@ -93,9 +101,18 @@ def _population(base: Base, design: Design, free: np.ndarray) -> tuple[np.ndarra
     solution = solve(free, design)
     mean, factor = base.population_prior
     beta = mean + factor @ np.asarray(solution.common[:POPULATION])
-    sd = np.sqrt(np.diagonal(factor @ _covariance(design, free)[:POPULATION, :POPULATION] @ factor.T))
+    covariance, width = _covariance(design, free), design.common.shape[-1]
+    rows = np.zeros((POPULATION + 1, len(covariance)))
+    rows[:POPULATION, :POPULATION] = factor
+    change, slope = (0.0, np.zeros(0)) if formulas is None else of_modulus_at_peaks(base, formulas, solution)
+    names = 0 if formulas is None else len(formulas.variants)
+    rows[-1] = rows[1]
+    rows[-1, width : width + names] += slope[:names]
+    rows[-1, POPULATION : POPULATION + len(slope) - names] += slope[names:]
+    sd = np.sqrt(np.diagonal(rows @ covariance @ rows.T))
+    at_peaks = beta[1] + change
     beta[2:] -= np.mean(np.log1p(np.maximum(beta[0] * base.flatness, -0.99)))
-    return beta, sd, np.asarray(scales_of(free, design)[0])[:3]
+    return np.append(beta, at_peaks), sd, np.asarray(scales_of(free, design)[0])[:3]
 
 
 def _quantiles(q: float, weights: np.ndarray, mean: np.ndarray, sd: np.ndarray, freedom: np.ndarray) -> list[float]:

@@ -11,13 +11,14 @@ import numpy as np
 
 from .._format import described
 from .columns import Design, with_amplitudes
+from .design import design_of
 from .evidence import left_by_particle, scales_of, without_first
 from .hypothesis import UNLISTED
 from .search import Search
 from .settings import HYPERPARAMETERS, NUMERICS, TELLING
 
 LETTERS = {
-    "strain": ("e", "peak strain"),
+    "strain": ("e", "reduced peak strain (1 + a H) epsilon_P"),
     "peak": ("s", "square root of the peak stress [MPa]"),
     "travel": ("g", "displacement / D_e"),
     "load": ("u", "F / F_peak"),
@@ -131,18 +132,17 @@ def closure(search: Search, seed: int) -> Closure:
     values = np.stack([t.function(natural[t.coordinate]) * size[:, None] for t in terms], -1)
     values = np.where(mask[..., None], values, 0.0)
     scale = np.maximum(np.sqrt((values**2).mean((0, 1))), 1e-300)
-    null = search.null.design
-    free = smooth.optimum.free[:HYPERPARAMETERS]
+    law, free = without_discrepancy(search), smooth.at.optimum.free[:HYPERPARAMETERS]
     curve = smooth.curve_um[..., None]
     known = np.zeros((*curve.shape[:2], 0)) if search.screen is None else search.screen.columns
     every = np.concatenate([values / scale, curve, known], -1)
-    left = left_by_particle(free, with_amplitudes(null, every)).gram
+    left = left_by_particle(free, with_amplitudes(law, every)).gram
     T = len(terms)
     everyone = np.arange(len(left))
-    chosen, weights = _best_terms(left, null.common.shape[-1], T, everyone)
+    chosen, weights = _best_terms(left, law.common.shape[-1], T, everyone)
     rng = np.random.default_rng([seed, 47])
     again = [
-        terms[_best_terms(left, null.common.shape[-1], T, rng.choice(everyone, len(everyone)), one=True)[0][0]]
+        terms[_best_terms(left, law.common.shape[-1], T, rng.choice(everyone, len(everyone)), one=True)[0][0]]
         for _ in range(20)
     ]
     name = terms[chosen[0]].coordinate
@@ -158,11 +158,18 @@ def closure(search: Search, seed: int) -> Closure:
         added,
         sd,
         float(np.mean([t.coordinate == name for t in again])),
-        _resembling(search, left, null.common.shape[-1], T),
+        _resembling(search, left, law.common.shape[-1], T),
         span,
         curve[..., 0],
-        _held_out(smooth.design, smooth.optimum.free, smooth.basis),
+        _held_out(smooth.at.design, smooth.at.optimum.free, smooth.basis),
     )
+
+
+def without_discrepancy(search: Search) -> Design:
+    """The law alone, linear where it is beside the discrepancy."""
+    smooth = search.found[UNLISTED].smooth
+    assert smooth is not None
+    return design_of(search.base, smooth.at.state)
 
 
 def _shared(left: np.ndarray, common: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -223,9 +230,9 @@ def _along(search: Search, name: str, x: np.ndarray, span: tuple[float, float]) 
 
     basis = functions(at) * size[:, None, None] / np.sqrt(N)
     basis = np.where(np.asarray(tests.mask)[..., None], basis, 0.0)
-    free = smooth.optimum.free[:HYPERPARAMETERS]
-    left = left_by_particle(free, with_amplitudes(search.null.design, basis))
-    total, _ = without_first(left.gram.sum(0), search.null.design.common.shape[-1])
+    law, free = without_discrepancy(search), smooth.at.optimum.free[:HYPERPARAMETERS]
+    left = left_by_particle(free, with_amplitudes(law, basis))
+    total, _ = without_first(left.gram.sum(0), law.common.shape[-1])
     G, s = total[:-1, :-1], total[:-1, -1]
     # Weights have the size that the smooth discrepancy was found to have, in units of strain.
     unit = float(np.sqrt(np.mean((smooth.curve_um / size[:, None])[np.asarray(tests.mask)] ** 2)))

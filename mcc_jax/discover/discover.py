@@ -53,7 +53,7 @@ from .plan import without_effects
 from .result import Discovery, Effect
 from .search import Search, differs_from_test_to_test
 from .sentences import summary_of
-from .settings import DECISIONS
+from .settings import AT_PEAKS, DECISIONS
 
 Tell = Callable[[str], None]
 _Begun = tuple[Search, list[dict[str, str]], list[Finding]]
@@ -342,6 +342,7 @@ def _sampled(found: Discovery, base: Base, threshold_MPa: float, seed: int, tell
         )
         return replace(found, posterior=drawn, notes=(*found.notes, note))
     answer: dict[str, Any] = {k: v for k, v in drawn.answer().items() if k != "converged"}
+    answer[AT_PEAKS] = found.parameters_after[AT_PEAKS]
     effects: tuple[Effect, ...] = tuple(with_draws(effect, drawn) for effect in found.effects)
     if found.verdict == "SET" or any(effect.misfit for effect in effects):
         # The draws take the leading formula for true: their errors would be too small.

@@ -11,6 +11,7 @@ from .columns import Design, with_noise
 from .evidence import Optimum, Solution
 from .own_numbers import OwnNumbers
 from .refine import Refined
+from .settings import DECISIONS
 
 Names = tuple[str, ...]
 UNLISTED: Names = ("UNLISTED",)
@@ -54,7 +55,7 @@ class Hypothesis:
     @property
     def fitted(self) -> tuple[Design, Optimum, Solution] | None:
         """Design, hyperparameters and numbers of the form in which it is added to the law."""
-        one = self.smooth or self.formulas
+        one = self.formulas if self.smooth is None else self.smooth.at
         return None if one is None else (one.design, one.optimum, one.solution)
 
     @property
@@ -69,7 +70,9 @@ class Hypothesis:
             return ()
         one = self.formulas
         assert one is not None
-        return tuple(float(x) for x in np.exp(self.misfit_form[1][len(one.optimum.free) + len(one.variants) :]))
+        design, free = self.misfit_form
+        logs = free[len(one.optimum.free) + len(one.variants) :] - design.misfits[:, 0]
+        return tuple(float(x) for x in DECISIONS.misfit * np.exp(logs))
 
     @property
     def formulas(self) -> Refined | None:
@@ -97,16 +100,14 @@ class Smooth:
     """A smooth discrepancy common to all particles.
 
     Attributes:
-        design, optimum, solution: with it.
+        at: the law with it at its optimum.
         basis: its functions [um].
     """
 
-    design: Design
-    optimum: Optimum
-    solution: Solution
+    at: Refined
     basis: np.ndarray
 
     @property
     def curve_um(self) -> np.ndarray:
         """What it adds to the law's displacement at every point [um]."""
-        return self.basis @ self.solution.common[self.design.of_misfits]
+        return self.basis @ self.at.solution.common[self.at.design.of_misfits]

@@ -44,8 +44,11 @@ ANY = ("peak", "load", "since")
 
 
 @compiled_quickly
-def coordinates(point: Point, tests: Tests, forms: Forms) -> dict[str, Array]:
-    """Coordinates of every point: strain and travel in diameters, force, loads, times, sizes."""
+def coordinates(point: Point, tests: Tests, forms: Forms, a: Array) -> dict[str, Array]:
+    """Coordinates of every point: reduced strain (1 + a H) epsilon_P, travel in diameters, force, loads, times, sizes.
+
+    Reduced strain is what the law's loading curve is a function of: what it lacks may well be one of that, too.
+    """
 
     def one(latent: Array, tests: Tests) -> dict[str, Array]:
         law = forms.law(latent, jnp.zeros(0))
@@ -56,7 +59,7 @@ def coordinates(point: Point, tests: Tests, forms: Forms) -> dict[str, Array]:
         ones = jnp.ones_like(time)
         return {
             "peak": jnp.sqrt(jnp.maximum(c.peak_stress, 0.0)),
-            "strain": c.peak_strain,
+            "strain": c.peak_strain * jnp.maximum(1 + a * tests.particle.flatness, 0.01),
             "load": c.load_share,
             "force": c.force,
             "peak_force": c.peak_force,

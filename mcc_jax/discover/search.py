@@ -19,8 +19,8 @@ from ..effects import Mechanism, Variant
 from .base import Base, State
 from .candidates import Candidate, candidates_of, located
 from .columns import Design, with_amplitudes, without_further
-from .design import NOTHING_MORE, More, at_priors, design_of
-from .evidence import left_by_particle, log_joint, optimise, solve, visible, with_little_noise, without_first
+from .design import NOTHING_MORE, More, at_priors, design_of, moved
+from .evidence import Optimum, left_by_particle, log_joint, optimise, solve, visible, with_little_noise, without_first
 from .hypothesis import UNLISTED, Hypothesis, Names, Smooth
 from .likely_noise import noise_models, with_likely_noise, with_other_noise
 from .misfit import ANY, COORDINATES, coordinates, functions, general, scaled, telling
@@ -66,7 +66,8 @@ class Search:
             places += [at_priors(base, rows) for rows in (base.snaps, np.ones(len(base.tests), bool)) if rows.any()]
         self.null = max((refined(base, at, (), np.zeros(0), start.free) for at in places), key=lambda r: r.log_evidence)
         self.starts = [self.null.state, *places[1:][-1:]]
-        natural = {k: np.asarray(x) for k, x in base.each(coordinates, self.state.point, base.forms).items()}
+        each = base.each(coordinates, self.state.point, base.forms, self.state.population[0])
+        natural = {k: np.asarray(x) for k, x in each.items()}
         self.natural = telling(natural, np.asarray(base.tests.mask))
         self.at = scaled(self.natural, np.asarray(base.tests.mask))
         self.shared = {
@@ -206,14 +207,36 @@ class Search:
         return design_of(self.base, r.state, r.variants, more)
 
     def with_misfit(self, one: Hypothesis) -> None:
-        """Log evidence where every name's formula may be wrong."""
+        """Log evidence where every name's formula may be wrong by a share of the effect.
+
+        Columns of a misfit are made at the amplitude of the formula alone. Where the amplitude is another beside them,
+        so is the effect of which they may be a share: their prior follows it until both agree. Else a formula that
+        explains nothing by itself would lend its name to what its misfit explains.
+        """
         r, design = one.formulas, self.misfit_design(one)
         assert r is not None
         some = float(SpreadCoordinate(SCATTER).coordinate(SCATTER.sd))
-        start = [r.optimum.free, [some] * len(r.variants), design.misfits[:, 0]]
-        optimum = optimise(design, np.concatenate(start), without=r.optimum)
+        start = np.concatenate([r.optimum.free, [some] * len(r.variants), design.misfits[:, 0]])
+        optimum = optimise(design, start, without=r.optimum)
+        sizes, shift = design.misfits, np.zeros(len(design.misfits))
+        for _ in range(NUMERICS.followed):
+            away = self.amplitudes_by_now(r, design, optimum) - shift
+            if optimum.log_evidence < r.log_evidence or np.all(np.abs(away) < NUMERICS.agree):
+                break
+            shift = shift + away / 2  # all of the way would overshoot
+            design = replace(design, misfits=sizes + shift[:, None] * [1.0, 0.0, 1.0])
+            at = np.concatenate([optimum.free[: -len(sizes)], design.misfits[:, 0]])
+            optimum = optimise(design, at, without=r.optimum)
         one.with_misfit = optimum.log_evidence + (0.0 if one.own is None else one.own.of_choices)
         one.misfit_form = replace(design), optimum.free  # a copy, without its whitened columns
+
+    def amplitudes_by_now(self, r: Refined, design: Design, optimum: Optimum) -> np.ndarray:
+        """Logarithms of the amplitudes beside misfits, over those of the formulas alone; 0 of a test's own numbers."""
+        names = len(r.variants)
+        now = solve(optimum.free, design).amplitude[:names] * np.array([v.plausible[0] for v in r.variants])
+        alone = np.maximum(np.abs(r.theta[:names]), 1e-300)
+        logs = np.log(np.maximum(np.abs(now), 1e-300) / alone)
+        return np.append(logs, np.zeros(len(design.misfits) - names))
 
     @cached_property
     def discrepancy(self) -> tuple[np.ndarray, list[int]]:
@@ -228,13 +251,23 @@ class Search:
         more = More(basis=basis, group=group, sizes=[(unit, DECISIONS.general_log_sd, np.inf)] * parts)
         design = design_of(self.base, r.state, r.variants, more)
         optimum = optimise(design, np.append(r.optimum.free, [unit - 1.0] * parts), without=r.optimum)
-        solution = solve(optimum.free, design)
-        return Smooth(design, optimum, solution, basis)
+        at = Refined(r.variants, r.state, design, optimum, solve(optimum.free, design))
+        if optimum.log_joint > r.optimum.log_joint + NUMERICS.very_strong:
+            # What it takes away from the law's numbers moves these as far as a name does.
+            there = at
+            for _ in range(NUMERICS.early):
+                state = moved(self.base, there.state, r.variants, there.solution)
+                design = design_of(self.base, state, r.variants, more)
+                there = replace(there, state=state, design=design, solution=solve(optimum.free, design))
+            optimum = optimise(design, optimum.free, without=r.optimum)
+            if optimum.log_joint > at.optimum.log_joint:
+                at = replace(there, optimum=optimum, solution=solve(optimum.free, design))
+        return Smooth(at, basis)
 
     def with_discrepancy(self, leader: Hypothesis) -> None:
         """Log evidence of a name with a smooth discrepancy beside it."""
         assert leader.best is not None
-        leader.beside = self.smooth(leader.best).optimum.log_evidence
+        leader.beside = self.smooth(leader.best).at.log_evidence
 
     # ---- two names ---------------------------------------------------------------------------------------------------
 
@@ -384,7 +417,7 @@ class Search:
             self.keep((m,), one)
         alone = [self.found[m,] for m in self.not_shared]
         side_by_side(self.with_misfit, [x for x in alone if x.own is not None and not x.own.jumps])
-        self.found[UNLISTED] = Hypothesis(UNLISTED, smooth.optimum.log_evidence, smooth=smooth)
+        self.found[UNLISTED] = Hypothesis(UNLISTED, smooth.at.log_evidence, smooth=smooth)
         leaders = sorted((x for x in self.found.values() if x.names and x.best is not None), key=lambda x: -x.alone)
         if leaders and max(x.log_evidence for x in self.found.values()) - nothing > NUMERICS.strong:
             self.tell("two names")

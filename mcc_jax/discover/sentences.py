@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from .._format import interval, with_sd
 from ..calibrate.judgement import told_by_no_test
-from .settings import DECISIONS, TELLING
+from .settings import AT_PEAKS, DECISIONS, TELLING
 
 if TYPE_CHECKING:
     from .result import Discovery, Effect
@@ -51,9 +51,7 @@ def summary_of(found: Discovery) -> str:
         text = f"Beside it, a share of the evidence may be due to {_listed(each)}; that is not added to the law."
         sentences.append(text)
     if found.parameters_after and found.verdict in ("NAMED", "SET", "UNLISTED"):
-        sentences.append(
-            _modulus(*(p["effective_modulus_MPa"] for p in (found.parameters_before, found.parameters_after)))
-        )
+        sentences.append(_modulus(found.parameters_before, found.parameters_after))
     sentences += _next(found)
     if found.untestable:
         needs = "; ".join(f"{_plain(u['mechanism'])} (needs {u['needs']})" for u in found.untestable)
@@ -62,11 +60,12 @@ def summary_of(found: Discovery) -> str:
 
 
 def _modulus(before: dict[str, Any], after: dict[str, Any]) -> str:
-    """What the addition did to the modulus."""
-    if told_by_no_test(after):
-        return f"With it these tests do not tell the effective modulus (95 % interval {interval(after, 1e-3)} GPa)."
-    now, was = with_sd(after, 1e-3), with_sd(before, 1e-3)
-    return f"With it the effective modulus is {now} GPa instead of {was} GPa."
+    """What the addition did to the modulus: to that at the peaks, where formulas of the modulus take it elsewhere."""
+    own, now, was = after["effective_modulus_MPa"], after[AT_PEAKS], before[AT_PEAKS]
+    if told_by_no_test(now):
+        return f"With it these tests do not tell the effective modulus (95 % interval {interval(now, 1e-3)} GPa)."
+    where = "" if own["value"] == now["value"] else " at the peaks of these tests"
+    return f"With it the effective modulus{where} is {with_sd(now, 1e-3)} GPa instead of {with_sd(was, 1e-3)} GPa."
 
 
 def _verdict(found: Discovery, count: int) -> str:

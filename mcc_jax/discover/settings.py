@@ -83,6 +83,9 @@ class Telling:
     within: float = 0.05
 
 
+AT_PEAKS = "modulus_at_peaks_MPa"
+"""In `discovery.json`, the modulus that acts at the peaks of the tests."""
+
 POPULATION = 5
 """Numbers of the population, which come first among what all particles share: a, log modulus, means of b1, b3, b5."""
 
@@ -113,6 +116,8 @@ class Numerics:
         little: factor on correlated noise that has swallowed a gap, where what explains it begins to be fitted.
         worse, early: nats by which each of so many first steps may make things worse before half of it is taken back;
             later ones by `still`.
+        followed, agree: how often at most the prior of a misfit follows the amplitude of its formula, and the
+            difference of their logarithms at which it need not.
         hats, degree: hat functions of each coordinate of a misfit, and total degree of smooth products.
         splines, fine_splines: cosines of each coordinate of a discrepancy that no mechanism explains, and of stress.
         columns, entries: columns that are freed of the noise at once, at least and at most, and about how many numbers
@@ -150,6 +155,8 @@ class Numerics:
     little: float = 0.1
     locations: int = 32
     phases: int = 14
+    followed: int = 4
+    agree: float = 0.1
     hats: int = 8
     splines: int = 12
     fine_splines: int = 24

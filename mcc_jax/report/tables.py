@@ -56,6 +56,7 @@ def changes(found: dict[str, Any]) -> list[tuple[str, list[tuple[str, str | None
     for name, label, factor in (
         ("a", "a", 1.0),
         ("effective_modulus_MPa", "Ē [GPa]", 1e-3),
+        ("modulus_at_peaks_MPa", "Ē at the peaks [GPa]", 1e-3),
         *((f"log_C{k}", f"C{'₀₁₂₃₄₅'[k]}", 1.0) for k in (1, 3, 5)),
     ):
         pair = [one.get("mean", one) for side in sides if (one := side.get(name)) is not None]

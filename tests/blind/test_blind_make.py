@@ -44,6 +44,42 @@ def test_generators_share_no_code_with_each_other_or_the_library(name):
                 assert module in allowed
 
 
+@pytest.mark.parametrize(
+    ("generator", "mechanism", "formula", "way"),
+    [
+        ("first", "damage", "exact", -1),
+        ("first", "densification_stiffening", "linear", 1),
+        ("first", "creep", "power", 0),
+        ("second", "densification_stiffening", "DensificationSpriggs", 1),
+        ("second", "humidity", "HumidityThreshold", -1),
+        ("second", "creep", "CreepLogarithmic", 0),
+    ],
+)
+def test_the_modulus_at_peaks_is_that_of_unloading_from_there(generator, mechanism, formula, way):
+    """What a particle gives back on unloading from its peak goes with one over the root of the modulus there."""
+    _, drawn, _ = make.drawn(single(generator, mechanism, formula, 20.0, particles=5), 5, 0)
+    alone = drawn.truth["effective_modulus_MPa"]
+    (hidden,) = drawn.hidden
+    sized = [(hidden, 0.2 * hidden.start)]
+    assert drawn.modulus_at_peaks([(hidden, 0.0)]) == pytest.approx(alone, rel=1e-12)
+    found = drawn.modulus_at_peaks(sized) / alone
+    if not way:
+        assert found == 1.0
+        return
+    given_back = []
+    for curve in (drawn.curves((), None), drawn.curves(sized, None)):
+        ends = []
+        for s in drawn.slices:
+            top = int(np.argmax(drawn.force[s]))
+            low = top + int(np.argmin(drawn.force[s][top:]))
+            ends.append(np.log(curve[s][top] - curve[s][low]))
+        given_back.append(np.mean(ends))
+    if mechanism == "humidity":  # it moves the peak, too
+        assert np.sign(np.log(found)) == way
+    else:
+        assert np.log(found) == pytest.approx(2 * (given_back[0] - given_back[1]), rel=1e-6)
+
+
 QUICK = (("first", "P1"), ("second", "P2"))
 
 

@@ -1,6 +1,7 @@
 """The scorer on made-up outcomes, against figures worked out by hand."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -146,16 +147,22 @@ def test_unlisted_places_and_probabilities():
 def test_closing_and_running():
     def one(chi2, low, high, verdict="NAMED"):
         estimate = {"interval_95": [low, high]}
-        after = {"effective_modulus_MPa": estimate, "log_C1": {"mean": {"interval_95": [1.8, 2.0]}}}
+        peaks = {"interval_95": [high - 1000, high]}
+        after = {
+            "effective_modulus_MPa": estimate,
+            "modulus_at_peaks_MPa": peaks,
+            "log_C1": {"mean": {"interval_95": [1.8, 2.0]}},
+        }
         gap = {"steps": [{"chi2_per_dof": 9.0}, {"chi2_per_dof": chi2}]}
         effects = [("creep", 1)] if verdict == "NAMED" else ()
         return outcome("single", verdict, effects, [("creep", 30.0)], key=str(chi2), gap=gap, parameters_after=after)
 
     some = [one(1.05, 15000, 17000), one(1.07, 15000, 15500), one(0.99, 15000, 17000, "NO_GAP")]
-    found = by_name(rows.closing(some))
+    found = by_name(rows.closing(some, SimpleNamespace(modulus_at_peaks=lambda outcome: 16500.0)))
     # Half width with 5000 readings: 1.96 * 0.02 + 0.02 = 0.0592.
     assert found["chi2 per point of the extended law within its interval, lambda >= 20"].text == "66.7 %"
     assert found["effective_modulus_MPa within its 95 % interval"].text == "66.7 %"
+    assert found["modulus_at_peaks_MPa within its 95 % interval"].text == "66.7 %"
     assert found["log_C1 within its 95 % interval"].text == "100.0 %"
     found = by_name(rows.running(some, {}))
     assert found["search failures among all campaigns"].text.startswith("not measured: 0 of 1")

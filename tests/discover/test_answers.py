@@ -17,6 +17,7 @@ from mcc_jax.discover.settings import DECISIONS, Decisions
 from mcc_jax.effects import find_variant
 
 EST = {"value": 16_000.0, "sd": 100.0, "interval_95": [15_800.0, 16_200.0]}
+MODULI = {"effective_modulus_MPa": EST, "modulus_at_peaks_MPa": EST}
 
 
 @pytest.mark.parametrize("name", LETTERS)
@@ -46,7 +47,7 @@ def test_a_share_stands_beside_chi2_and_is_of_what_could_be_closed():
 
 
 def test_the_mean_of_few_particles_follows_student_t():
-    one = np.arange(1.0, 6.0), np.full(5, 0.1), np.full(3, 0.3)
+    one = np.arange(1.0, 7.0), np.full(6, 0.1), np.full(3, 0.3)
     found = _averaged([one], np.ones(1), 5)
     assert found["a"]["interval_95"] == pytest.approx([1 - 0.196, 1 + 0.196], abs=1e-4)
     assert found["log_C1"]["mean"]["interval_95"] == pytest.approx([3 - 0.27764, 3 + 0.27764], abs=1e-4)
@@ -83,8 +84,8 @@ def answer(verdict, amplitude=1e-4, **more):
     found = Discovery(
         verdict, "", None, None, 0, 0.0,
         effects=(effect,) if named else (), candidate_set=sets, p_any=0.002 if verdict != "NO_GAP" else 0.4,
-        parameters_before={"effective_modulus_MPa": EST},
-        parameters_after={"effective_modulus_MPa": EST} if named else {},
+        parameters_before=MODULI,
+        parameters_after=MODULI if named else {},
         untestable=({"mechanism": "reload_hysteresis", "needs": "a reload segment"},), **more,
     )  # fmt: skip
     return dataclasses.replace(found, summary=summary_of(found))

@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from campaigns import base_of, cached
+from campaigns import base_of, cached, with_curves
 
 from mcc_jax.campaign import available_data
-from mcc_jax.discover.answer import effects_of, instead_of, name_probabilities, sets_of
+from mcc_jax.discover.answer import _population, effects_of, instead_of, name_probabilities, sets_of
 from mcc_jax.discover.bootstrap import p_anything
 from mcc_jax.discover.candidates import untestable
+from mcc_jax.discover.evidence import solve
 from mcc_jax.discover.heldout import held_out
 from mcc_jax.discover.hypothesis import UNLISTED, Hypothesis
 from mcc_jax.discover.locate import difference, places, where
@@ -163,3 +164,43 @@ def test_a_name_beside_a_discrepancy_counts_for_what_explains_more(named):
         assert logs[1][larger] > logs[0][larger] + 50
         assert [n for n in logs[0] if logs[0][n] != logs[1][n]] == [larger]
     named.found = kept
+
+
+def kinked(whole, um):
+    """The same tests with an unloading that bends at 60 % of the load: no mechanism of the library does."""
+
+    def bent(c):
+        share = c.force_mN / np.maximum(np.maximum.accumulate(c.force_mN), 1e-9)
+        return c.time_s, c.force_mN, c.displacement_um - um * np.maximum(0.6 - share, 0.0) * (c.force_mN > 0.05)
+
+    return with_curves(whole, bent)
+
+
+def test_the_misfit_of_a_formula_is_a_share_of_the_effect_that_is_left():
+    """Its prior follows the amplitude: a formula that explains little lends its name to little."""
+    search = Search(base_of(kinked(cached(seed=1), 1.0)), {"toe_asperity": LIBRARY["toe_asperity"]})
+    search.single("toe_asperity", 1)
+    one = search.found[("toe_asperity",)]
+    search.with_misfit(one)
+    design, free = one.misfit_form
+    alone = one.best.theta[0] / one.best.variants[0].plausible[0]
+    share = solve(free, design).amplitude[0] / alone
+    assert 0.4 < share < 0.8  # 0.37 with a misfit of the whole amplitude
+    assert np.exp(design.misfits[0, [0, 2]]) == pytest.approx(share * np.array([0.1, 0.3]), rel=0.15)
+    assert one.sizes[0] <= DECISIONS.misfit_most + 1e-6
+
+
+def test_formulas_of_the_modulus_agree_at_the_peaks():
+    """The modulus of each is that of the law at a strain of its own; at the peaks all describe the same tests."""
+    whole = cached("densification_stiffening:exponential=1.0", seed=1)
+    library = {"densification_stiffening": LIBRARY["densification_stiffening"]}
+    search = Search(base_of(whole), library)
+    search.single("densification_stiffening", 4)
+    each = [_population(search.base, r, r.design, r.optimum.free) for r in search.fits.values() if r.theta[0]]
+    extrapolated, at_peaks = (np.array([mean[j] for mean, _, _ in each]) for j in (1, 5))
+    assert np.ptp(extrapolated) > 0.1
+    assert np.ptp(at_peaks) < 0.03
+    strain = [float(np.max(c.displacement_um)) for c in whole.curves] / np.asarray(search.base.tests.effective_diameter)
+    errors = np.array([sd[5] for _, sd, _ in each])
+    assert np.all(np.abs(at_peaks - np.log(16e3) - np.mean(strain)) < 3 * errors)
+    assert np.all(errors < [sd[1] for _, sd, _ in each])

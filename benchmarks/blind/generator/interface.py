@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from ..settings import SETTINGS
 from ..world import Hidden, Shift, Sized, World
 from . import designs
 from .effects import BY_NAME, HUMIDITY, LISTED, RELOAD, UNLISTED, Effect
-from .law import EFFECTIVE_MODULUS_MPA, LOG_C, SHAPE_PARAMETER, Particles, monotone_means, simulate
+from .law import EFFECTIVE_MODULUS_MPA, LOG_C, SHAPE_PARAMETER, Particles, monotone_means, response, simulate
 
 if TYPE_CHECKING:
     from ..plan import Case
@@ -77,18 +77,22 @@ def draw(rng: np.random.Generator, case: Case) -> World:
         truth,
         tuple(map(_hidden, asked)),
         lambda sized, shift: _curves(particles, path, sized, shift),
+        lambda sized: response(particles, path, _active(sized), SHAPE_PARAMETER).modulus.ravel(),
         lambda: _listed(case, humid),
     )
 
 
+def _active(sized: Sized) -> list[Any]:
+    return [pair for hidden, amplitude in sized for pair in hidden.effect(amplitude)]
+
+
 def _curves(particles: Particles, path: designs.Path, sized: Sized, shift: Shift | None) -> np.ndarray:
-    active = [pair for hidden, amplitude in sized for pair in hidden.effect(amplitude)]
     a = SHAPE_PARAMETER
     if shift is not None:
         logs = {name: getattr(particles, name) * np.exp(shift.log_C[k]) for k, name in enumerate(LOG_C)}
         particles = particles.with_(**logs, modulus=particles.modulus * np.exp(shift.log_modulus))
         a = a + shift.a
-    return simulate(particles, path, active, a).ravel()
+    return simulate(particles, path, _active(sized), a).ravel()
 
 
 def _listed(case: Case, humid: bool) -> Iterator[Hidden]:

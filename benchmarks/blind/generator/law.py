@@ -140,6 +140,13 @@ def simulate(
     `effects` are pairs (hooks, amplitude); hooks is a dictionary of functions, each called as f(amplitude, value,
     state), and "flow" as f(amplitude, stress, x, state).
     """
+    return response(particles, path, effects, a).displacement
+
+
+def response(
+    particles: Particles, path: Path, effects: Sequence[tuple[dict[str, Callable], float]], a: float
+) -> SimpleNamespace:
+    """What acts along `path`: `displacement` in um, `modulus` in MPa, and what they are made of; see `simulate`."""
     p, state = _state(particles, path, a)
 
     def apply(name: str, value: np.ndarray) -> np.ndarray:
@@ -176,7 +183,8 @@ def simulate(
     state.eps = state.eps_P - state.recovery
     state.eps = apply("strain", state.eps)
     state.gamma = p.De * state.eps
-    return apply("observable", state.gamma)
+    state.displacement = apply("observable", state.gamma)
+    return state
 
 
 def _state(particles: Particles, path: Path, a: float) -> tuple[SimpleNamespace, SimpleNamespace]:

@@ -15,7 +15,7 @@ from . import effects, particles
 from .campaign import Campaign
 from .effects import Effect, Formula
 from .law import Shift as LawShift
-from .law import simulate
+from .law import response, simulate
 
 if TYPE_CHECKING:
     from ..plan import Case
@@ -90,6 +90,7 @@ def draw(rng: np.random.Generator, case: Case) -> World:
         truth,
         tuple(map(_hidden, asked)),
         lambda sized, shift: _curves(campaign, sized, shift),
+        lambda sized: response(campaign, [(hidden.effect, theta) for hidden, theta in sized]).modulus,
         lambda: _listed(campaign),
     )
 

@@ -115,6 +115,11 @@ def loading(campaign: Campaign, effects: Sized, values: SimpleNamespace, owner: 
 
 def simulate(campaign: Campaign, effects: Sized = (), shift: Shift = NO_SHIFT) -> np.ndarray:
     """Displacement in um at every sample, without noise. effects: pairs (effect, amplitude)."""
+    return response(campaign, effects, shift).displacement
+
+
+def response(campaign: Campaign, effects: Sized = (), shift: Shift = NO_SHIFT) -> SimpleNamespace:
+    """What acts at every sample: `displacement` in um, `modulus` in MPa, and what they are made of."""
     p, path, owner = campaign.particles, campaign.path, campaign.owner
     values = coefficients(campaign, effects, shift)
     eta, modulus, De = values.eta[owner], values.modulus[owner], p.De[owner]
@@ -138,7 +143,8 @@ def simulate(campaign: Campaign, effects: Sized = (), shift: Shift = NO_SHIFT) -
     gamma = s.gamma.copy()
     for effect, theta in effects:
         gamma = gamma + effect.displacement(theta, campaign, s)
-    return gamma
+    s.displacement, s.modulus = gamma, modulus
+    return s
 
 
 def _recovered(campaign: Campaign, effects: Sized, s: SimpleNamespace) -> np.ndarray:
