@@ -342,7 +342,9 @@ def _sampled(found: Discovery, base: Base, threshold_MPa: float, seed: int, tell
         )
         return replace(found, posterior=drawn, notes=(*found.notes, note))
     answer: dict[str, Any] = {k: v for k, v in drawn.answer().items() if k != "converged"}
-    answer[AT_PEAKS] = found.parameters_after[AT_PEAKS]
+    linear = found.parameters_after
+    same = linear[AT_PEAKS]["value"] == linear["effective_modulus_MPa"]["value"]
+    answer[AT_PEAKS] = answer["effective_modulus_MPa"] if same else linear[AT_PEAKS]
     effects: tuple[Effect, ...] = tuple(with_draws(effect, drawn) for effect in found.effects)
     if found.verdict == "SET" or any(effect.misfit for effect in effects):
         # The draws take the leading formula for true: their errors would be too small.
