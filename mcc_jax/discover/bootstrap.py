@@ -33,7 +33,7 @@ class _Statistic:
 
     def __init__(self, search: Search) -> None:
         design, screen = search.null.design, search.screen
-        basis, parts = search.discrepancy
+        basis, parts = search.discrepancy.basis, search.discrepancy.group
         self.parts = np.array(parts)
         own, self.own_names, self.own_ratio = [], [], []
         for name in search.library:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
@@ -107,7 +108,7 @@ def scaled(at: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]
 
 
 def functions(
-    names: tuple[str, ...], at: dict[str, np.ndarray], *, degree: int = NUMERICS.degree, hats: int = NUMERICS.hats
+    names: tuple[str, ...], at: Mapping[str, np.ndarray], *, degree: int = NUMERICS.degree, hats: int = NUMERICS.hats
 ) -> np.ndarray:
     """Smooth products of cosines and hat functions over some coordinates, shape (N, points, functions).
 

@@ -12,22 +12,21 @@ import numpy as np
 from scipy.special import logsumexp
 
 from ..calibrate.compiling import side_by_side
-from ..calibrate.distributions import SpreadCoordinate
 from ..calibrate.model import Model
-from ..calibrate.priors import NakagamiPrior
 from ..effects import Mechanism, Variant
 from .base import Base, State
 from .candidates import Candidate, candidates_of, located
-from .columns import Design, with_amplitudes, without_further
-from .design import NOTHING_MORE, More, at_priors, design_of, moved
-from .evidence import Optimum, left_by_particle, log_joint, optimise, solve, visible, with_little_noise, without_first
-from .hypothesis import UNLISTED, Hypothesis, Names, Smooth
+from .columns import with_amplitudes
+from .design import at_priors
+from .evidence import left_by_particle, log_joint, with_little_noise, without_first
+from .hypothesis import UNLISTED, Hypothesis, Names
 from .likely_noise import noise_models, with_likely_noise, with_other_noise
-from .misfit import ANY, COORDINATES, coordinates, functions, general, scaled, telling
+from .misfit import coordinates, general, scaled, telling
+from .misfit_form import Discrepancy, fit_with_misfit
 from .own_numbers import OwnNumbers, differing, sudden_steps
 from .refine import Refined, refined
 from .screen import Screen, Setting, pair_integrals, screen, signature_columns, single_integrals
-from .settings import DECISIONS, HYPERPARAMETERS, NUMERICS
+from .settings import NUMERICS
 from .weighing import log_posteriors, posterior
 
 OPPOSITE = {frozenset(("damage", "densification_stiffening"))}
@@ -35,9 +34,6 @@ OPPOSITE = {frozenset(("damage", "densification_stiffening"))}
 
 SUDDEN = "pop_in"
 """The mechanism whose sudden steps are looked for at every point of a test."""
-
-SCATTER = NakagamiPrior(DECISIONS.scatter)
-"""Prior of the spread of an amplitude over the particles, as a share of it."""
 
 
 class Search:
@@ -169,105 +165,25 @@ class Search:
         total = float(logsumexp(list(values.values())) - np.log(len(values)))
         self.found[(mechanism,)] = Hypothesis((mechanism,), total, best=best)
 
-    def misfit_columns(self, r: Refined, which: int) -> np.ndarray:
-        """Columns by which one of the formulas may be wrong: at its amplitude, and towards each of its siblings."""
-        assert self.screen is not None
-        variant = r.variants[which]
-        own = r.curves_um[..., which]
-        smooth = own[..., None] * functions(COORDINATES.get(variant.mechanism, ANY), self.at)
-        size = float(np.sqrt(np.sum(own**2)))
-        others = []
-        for f, (_, k) in self.first_order.get(variant.mechanism, {}).items():
-            column = self.screen.columns[..., k]
-            length = float(np.sqrt(np.sum(column**2)))
-            if f != variant.name and length > 0:
-                likeness = float(np.sum(column * own))
-                others.append(column * np.copysign(size / length, likeness) - own)
-        siblings = np.stack(others, -1) if others else smooth[..., :0]
-        return np.concatenate([siblings, smooth], -1)
-
-    def misfit_design(self, one: Hypothesis) -> Design:
-        """A hypothesis where every name's formula may be wrong, and its amplitude differ from particle to particle."""
-        r = one.formulas
-        assert r is not None
-        basis, more = [self.misfit_columns(r, i) for i in range(len(r.variants))], NOTHING_MORE
-        # A formula is wrong by a share of what can be seen of it: most of some is like a particle's own numbers.
-        seen = list(visible(r.optimum.free, r.design, r.curves_um))
-        if one.own is not None:
-            more = one.own.more
-            if not one.own.jumps:
-                curve = one.own.curve_um[..., None]
-                basis.append(curve * functions(COORDINATES.get(one.own.variant.mechanism, ANY), self.at))
-                seen.extend(visible(r.optimum.free[:HYPERPARAMETERS], without_further(r.design), curve))
-        basis = [share * columns for share, columns in zip(seen, basis, strict=True)]
-        sizes = [(np.log(DECISIONS.misfit), DECISIONS.misfit_log_sd, float(np.log(DECISIONS.misfit_most)))] * len(basis)
-        group = [i for i, columns in enumerate(basis, 1) for _ in range(columns.shape[-1])]
-        more = more.with_own(r.curves_um, [SCATTER] * len(r.variants))
-        more = replace(more, basis=np.concatenate(basis, -1), group=group, sizes=sizes)
-        return design_of(self.base, r.state, r.variants, more)
+    def signatures_of(self, mechanism: str) -> dict[str, np.ndarray]:
+        """The best signature of every formula of a mechanism that all tests share."""
+        columns = np.zeros(0) if self.screen is None else self.screen.columns
+        return {f: columns[..., k] for f, (_, k) in self.first_order.get(mechanism, {}).items()}
 
     def with_misfit(self, one: Hypothesis) -> None:
-        """Log evidence where every name's formula may be wrong by a share of the effect.
-
-        Columns of a misfit are made at the amplitude of the formula alone. Where the amplitude is another beside them,
-        so is the effect of which they may be a share: their prior follows it until both agree. Else a formula that
-        explains nothing by itself would lend its name to what its misfit explains.
-        """
-        r, design = one.formulas, self.misfit_design(one)
-        assert r is not None
-        some = float(SpreadCoordinate(SCATTER).coordinate(SCATTER.sd))
-        start = np.concatenate([r.optimum.free, [some] * len(r.variants), design.misfits[:, 0]])
-        optimum = optimise(design, start, without=r.optimum)
-        sizes, shift = design.misfits, np.zeros(len(design.misfits))
-        for _ in range(NUMERICS.followed):
-            away = self.amplitudes_by_now(r, design, optimum) - shift
-            if optimum.log_evidence < r.log_evidence or np.all(np.abs(away) < NUMERICS.agree):
-                break
-            shift = shift + away / 2  # all of the way would overshoot
-            design = replace(design, misfits=sizes + shift[:, None] * [1.0, 0.0, 1.0])
-            at = np.concatenate([optimum.free[: -len(sizes)], design.misfits[:, 0]])
-            optimum = optimise(design, at, without=r.optimum)
-        one.with_misfit = optimum.log_evidence + (0.0 if one.own is None else one.own.of_choices)
-        one.misfit_form = replace(design), optimum.free  # a copy, without its whitened columns
-
-    def amplitudes_by_now(self, r: Refined, design: Design, optimum: Optimum) -> np.ndarray:
-        """Logarithms of the amplitudes beside misfits, over those of the formulas alone; 0 of a test's own numbers."""
-        names = len(r.variants)
-        now = solve(optimum.free, design).amplitude[:names] * np.array([v.plausible[0] for v in r.variants])
-        alone = np.maximum(np.abs(r.theta[:names]), 1e-300)
-        logs = np.log(np.maximum(np.abs(now), 1e-300) / alone)
-        return np.append(logs, np.zeros(len(design.misfits) - names))
+        """Log evidence where every name's formula may be wrong."""
+        one.misfit_form, one.with_misfit = fit_with_misfit(self.base, one, self.at, self.signatures_of)
 
     @cached_property
-    def discrepancy(self) -> tuple[np.ndarray, list[int]]:
-        """Functions of what no mechanism explains, and of which part each is."""
-        return general(self.at, self.base.tests, self.null.design.linear)
-
-    def smooth(self, r: Refined) -> Smooth:
-        """A hypothesis with a smooth discrepancy beside it."""
-        basis, group = self.discrepancy
-        unit = float(np.log(DECISIONS.general) + self.null.optimum.free[0])
-        parts = max(group)
-        more = More(basis=basis, group=group, sizes=[(unit, DECISIONS.general_log_sd, np.inf)] * parts)
-        design = design_of(self.base, r.state, r.variants, more)
-        optimum = optimise(design, np.append(r.optimum.free, [unit - 1.0] * parts), without=r.optimum)
-        at = Refined(r.variants, r.state, design, optimum, solve(optimum.free, design))
-        if optimum.log_joint > r.optimum.log_joint + NUMERICS.very_strong:
-            # What it takes away from the law's numbers moves these as far as a name does.
-            there = at
-            for _ in range(NUMERICS.early):
-                state = moved(self.base, there.state, r.variants, there.solution)
-                design = design_of(self.base, state, r.variants, more)
-                there = replace(there, state=state, design=design, solution=solve(optimum.free, design))
-            optimum = optimise(design, optimum.free, without=r.optimum)
-            if optimum.log_joint > at.optimum.log_joint:
-                at = replace(there, optimum=optimum, solution=solve(optimum.free, design))
-        return Smooth(at, basis)
+    def discrepancy(self) -> Discrepancy:
+        """Functions of what no mechanism explains."""
+        functions, group = general(self.at, self.base.tests, self.null.design.linear)
+        return Discrepancy(functions, group, float(self.null.optimum.free[0]))
 
     def with_discrepancy(self, leader: Hypothesis) -> None:
         """Log evidence of a name with a smooth discrepancy beside it."""
         assert leader.best is not None
-        leader.beside = self.smooth(leader.best).at.log_evidence
+        leader.beside = self.discrepancy.beside(self.base, leader.best).at.log_evidence
 
     # ---- two names ---------------------------------------------------------------------------------------------------
 
@@ -410,7 +326,7 @@ class Search:
         for m in names[NUMERICS.contenders :]:
             self.found[(m,)] = Hypothesis((m,), rank[m])
         self.tell("what differs from test to test, and a discrepancy on no list")
-        tasks: list[Callable[[], Any]] = [partial(self.smooth, self.null)]
+        tasks: list[Callable[[], Any]] = [partial(self.discrepancy.beside, self.base, self.null)]
         tasks += [partial(self.of_their_own, m, self.null) for m in self.not_shared]
         smooth, *ones = side_by_side(call, tasks)
         for m, one in zip(self.not_shared, ones, strict=True):

@@ -1,0 +1,141 @@
+"""Hypotheses whose formulas may be wrong, and those of a smooth discrepancy that no mechanism explains."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..calibrate.distributions import SpreadCoordinate
+from ..calibrate.priors import NakagamiPrior
+from .base import Base
+from .columns import Design, without_further
+from .design import NOTHING_MORE, More, design_of, moved
+from .evidence import Optimum, optimise, solve, visible
+from .hypothesis import Hypothesis, Smooth
+from .misfit import ANY, COORDINATES, functions
+from .refine import Refined
+from .settings import DECISIONS, HYPERPARAMETERS, NUMERICS
+
+SCATTER = NakagamiPrior(DECISIONS.scatter)
+"""Prior of the spread of an amplitude over the particles, as a share of it."""
+
+Coordinates = Mapping[str, np.ndarray]
+Signatures = Callable[[str], Mapping[str, np.ndarray]]
+"""Signatures of all formulas of a mechanism."""
+
+
+def fit_with_misfit(
+    base: Base, one: Hypothesis, at: Coordinates, signatures: Signatures
+) -> tuple[tuple[Design, np.ndarray], float]:
+    """A hypothesis where every name's formula may be wrong by a share of the effect.
+
+    Columns of a misfit are made at the amplitude of the formula alone. Where the amplitude is another beside them, so
+    is the effect of which they may be a share: their prior follows it until both agree. Else a formula that explains
+    nothing by itself would lend its name to what its misfit explains.
+
+    Args:
+        base: the tests.
+        one: the hypothesis by its formulas alone.
+        at: coordinates of all points, between 0 and 1.
+        signatures: of the formulas of each mechanism.
+
+    Returns:
+        Its design and hyperparameters at the mode, and its log evidence.
+    """
+    r, design = one.formulas, _design(base, one, at, signatures)
+    assert r is not None
+    some = float(SpreadCoordinate(SCATTER).coordinate(SCATTER.sd))
+    start = np.concatenate([r.optimum.free, [some] * len(r.variants), design.misfits[:, 0]])
+    optimum = optimise(design, start, without=r.optimum)
+    sizes, shift = design.misfits, np.zeros(len(design.misfits))
+    for _ in range(NUMERICS.followed):
+        away = _amplitudes(r, design, optimum) - shift
+        if optimum.log_evidence < r.log_evidence or np.all(np.abs(away) < NUMERICS.agree):
+            break
+        shift = shift + away / 2  # all of the way would overshoot
+        design = replace(design, misfits=sizes + shift[:, None] * [1.0, 0.0, 1.0])
+        start = np.concatenate([optimum.free[: -len(sizes)], design.misfits[:, 0]])
+        optimum = optimise(design, start, without=r.optimum)
+    value = optimum.log_evidence + (0.0 if one.own is None else one.own.of_choices)
+    return (replace(design), optimum.free), value  # a copy, without its whitened columns
+
+
+def _amplitudes(r: Refined, design: Design, optimum: Optimum) -> np.ndarray:
+    """Logarithms of the amplitudes beside misfits, over those of the formulas alone; 0 of a test's own numbers."""
+    names = len(r.variants)
+    now = solve(optimum.free, design).amplitude[:names] * np.array([v.plausible[0] for v in r.variants])
+    alone = np.maximum(np.abs(r.theta[:names]), 1e-300)
+    return np.append(np.log(np.maximum(np.abs(now), 1e-300) / alone), np.zeros(len(design.misfits) - names))
+
+
+def _design(base: Base, one: Hypothesis, at: Coordinates, signatures: Signatures) -> Design:
+    """Every formula with its misfit, and an amplitude that differs from particle to particle."""
+    r = one.formulas
+    assert r is not None
+    basis, more = [_columns(r, i, at, signatures) for i in range(len(r.variants))], NOTHING_MORE
+    # A formula is wrong by a share of what can be seen of it: most of some is like a particle's own numbers.
+    seen = list(visible(r.optimum.free, r.design, r.curves_um))
+    if one.own is not None:
+        more = one.own.more
+        if not one.own.jumps:
+            curve = one.own.curve_um[..., None]
+            basis.append(curve * functions(COORDINATES.get(one.own.variant.mechanism, ANY), at))
+            seen.extend(visible(r.optimum.free[:HYPERPARAMETERS], without_further(r.design), curve))
+    basis = [share * columns for share, columns in zip(seen, basis, strict=True)]
+    sizes = [(np.log(DECISIONS.misfit), DECISIONS.misfit_log_sd, float(np.log(DECISIONS.misfit_most)))] * len(basis)
+    group = [i for i, columns in enumerate(basis, 1) for _ in range(columns.shape[-1])]
+    more = more.with_own(r.curves_um, [SCATTER] * len(r.variants))
+    more = replace(more, basis=np.concatenate(basis, -1), group=group, sizes=sizes)
+    return design_of(base, r.state, r.variants, more)
+
+
+def _columns(r: Refined, which: int, at: Coordinates, signatures: Signatures) -> np.ndarray:
+    """Columns by which one of the formulas may be wrong: at its amplitude, and towards each of its siblings."""
+    variant, own = r.variants[which], r.curves_um[..., which]
+    smooth = own[..., None] * functions(COORDINATES.get(variant.mechanism, ANY), at)
+    size = float(np.sqrt(np.sum(own**2)))
+    others = []
+    for formula, column in signatures(variant.mechanism).items():
+        length = float(np.sqrt(np.sum(column**2)))
+        if formula != variant.name and length > 0:
+            likeness = float(np.sum(column * own))
+            others.append(column * np.copysign(size / length, likeness) - own)
+    siblings = np.stack(others, -1) if others else smooth[..., :0]
+    return np.concatenate([siblings, smooth], -1)
+
+
+@dataclass(frozen=True)
+class Discrepancy:
+    """Functions of what no mechanism explains.
+
+    Attributes:
+        basis: the functions [um].
+        group: of which part each is.
+        log_white: logarithm of the standard deviation of white noise, by which they are measured.
+    """
+
+    basis: np.ndarray
+    group: Sequence[int]
+    log_white: float
+
+    def beside(self, base: Base, r: Refined) -> Smooth:
+        """The discrepancy beside the law, or beside what is named, at its optimum."""
+        unit, parts = float(np.log(DECISIONS.general)) + self.log_white, max(self.group)
+        sizes = [(unit, DECISIONS.general_log_sd, np.inf)] * parts
+        more = More(basis=self.basis, group=self.group, sizes=sizes)
+        design = design_of(base, r.state, r.variants, more)
+        optimum = optimise(design, np.append(r.optimum.free, [unit - 1.0] * parts), without=r.optimum)
+        at = Refined(r.variants, r.state, design, optimum, solve(optimum.free, design))
+        if optimum.log_joint > r.optimum.log_joint + NUMERICS.very_strong:
+            # What it takes away from the law's numbers moves these as far as a name does.
+            there = at
+            for _ in range(NUMERICS.early):
+                state = moved(base, there.state, r.variants, there.solution)
+                design = design_of(base, state, r.variants, more)
+                there = replace(there, state=state, design=design, solution=solve(optimum.free, design))
+            optimum = optimise(design, optimum.free, without=r.optimum)
+            if optimum.log_joint > at.optimum.log_joint:
+                at = replace(there, optimum=optimum, solution=solve(optimum.free, design))
+        return Smooth(at, self.basis)
