@@ -93,6 +93,16 @@ class Screen:
             best, amplitude = np.where(better, s.log_null + value, best), np.where(better, mean, amplitude)
         return best, amplitude * np.array([c.variant.plausible[0] for c in self.candidates])
 
+    def pairs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Candidates of every two mechanisms, first and second, and log marginal likelihood of both, each at its best
+        setting."""
+        a, b = np.triu_indices(len(self.candidates), 1)
+        names = np.array([c.mechanism for c in self.candidates])
+        two = names[a] != names[b]
+        a, b = a[two], b[two]
+        each = [s.log_null + pair_integrals(s, a, b, self.signs, self.largest) for s in self.settings]
+        return a, b, np.max(each, 0)
+
     @property
     def information(self) -> np.ndarray:
         """Information on each candidate's amplitude at the first setting, in units of the smallest plausible one."""

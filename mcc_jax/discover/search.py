@@ -229,10 +229,7 @@ class Search:
         (first,) = self.fitted_as(r)
         seconds = self.seconds(r, r.variants[0], r.design.amplitude[..., :1])
         tried = {n: (first, k) for n, k in self.best_seconds(seconds, leader.names[0]).items() if n not in self.found}
-        side_by_side(self.fit, list(tried.values()))
-        for names, ks in tried.items():
-            alone = self.fit(ks).log_evidence - self.log_combinations(names)
-            self.found[names] = Hypothesis(names, alone, best=self.fit(ks))
+        self.fit_pairs(tried)
         further = [pair_of(m, leader.names[0]) for m in self.not_shared]
         ones = side_by_side(lambda m: self.of_their_own(m, r), self.not_shared)
         for names, one in zip(further, ones, strict=True):
@@ -241,9 +238,35 @@ class Search:
         side_by_side(lambda pair: self.with_misfit_if_better(pair, leader), pairs)
 
     def pairs_of_each(self, leaders: Sequence[Hypothesis]) -> None:
-        """The best second names beside each of some leaders."""
+        """The best second names beside each of some leaders, and what leads of all pairs to first order."""
         for leader in leaders:
             self.pairs_of(leader)
+        tried = {names: ks for names, ks in self.first_order_pairs().items() if names not in self.found}
+        self.fit_pairs(tried)
+        side_by_side(lambda names: self.with_misfit_if_better(self.found[names], leaders[0]), list(tried))
+
+    def first_order_pairs(self) -> dict[Names, tuple[int, int]]:
+        """The leading pairs of names to first order around the base law, each by its best candidates.
+
+        Of two strong effects neither need lead by itself: what imitates part of both may.
+        """
+        assert self.screen is not None
+        a, b, value = self.screen.pairs()
+        found: dict[Names, tuple[int, int]] = {}
+        for k in np.argsort(-value):
+            names = pair_of(*(self.screen.candidates[j[k]].mechanism for j in (a, b)))
+            if frozenset(names) not in OPPOSITE:
+                found.setdefault(names, (int(a[k]), int(b[k])))
+            if len(found) >= NUMERICS.seconds:
+                break
+        return found
+
+    def fit_pairs(self, tried: Mapping[Names, tuple[int, int]]) -> None:
+        """Pairs of candidates at their own optimum, as hypotheses."""
+        side_by_side(self.fit, list(tried.values()))
+        for names, ks in tried.items():
+            alone = self.fit(ks).log_evidence - self.log_combinations(names)
+            self.found[names] = Hypothesis(names, alone, best=self.fit(ks))
 
     def other_formulas(self, pair: Hypothesis) -> None:
         """A pair by the other formulas of either name, each beside the best of the other, at their own optimum."""

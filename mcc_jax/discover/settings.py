@@ -103,7 +103,7 @@ class Numerics:
         block: particles that are linearised at once.
         contenders: mechanisms that are fitted at their own optimum.
         formulas: formulas of each of them where `very_strong`, else one; of the two leading ones up to `all_formulas`.
-        seconds: second names that are tried beside each of the two leading names.
+        seconds: second names that are tried beside each of the two leading names, and pairs that lead to first order.
         strong: nats by which a name must beat nothing before several of its formulas and second names are tried.
         very_strong: the same, from which on first order cannot be relied on to choose the formula.
         locations, phases: values tried of a number that differs from test to test: of a place somewhere between two

@@ -204,3 +204,18 @@ def test_formulas_of_the_modulus_agree_at_the_peaks():
     errors = np.array([sd[5] for _, sd, _ in each])
     assert np.all(np.abs(at_peaks - np.log(16e3) - np.mean(strain)) < 3 * errors)
     assert np.all(errors < [sd[1] for _, sd, _ in each])
+
+
+def test_pairs_to_first_order_are_of_two_mechanisms(named):
+    a, b, value = named.screen.pairs()
+    mechanism = np.array([c.mechanism for c in named.screen.candidates])
+    few = np.unique(mechanism, return_counts=True)[1]
+    assert np.all(mechanism[a] != mechanism[b])
+    assert len(value) == np.prod(few)
+    # A second amplitude that explains nothing costs a little of the evidence that the first has alone.
+    alone, _ = named.screen.singles()
+    best = int(np.argmax(value))
+    assert alone.max() - 8 < value[best] < alone.max() + 8
+    ((names, ks),) = named.first_order_pairs().items()
+    assert names == ("damage", "frame_compliance")
+    assert ks == (a[best], b[best])
