@@ -44,11 +44,18 @@ class PageOptions:
     fewest: int = 40
 
 
-def compare(results: Results, options: PageOptions | None = None) -> list[FittedCurve]:
-    """Every particle, or those that the law misses by most if there are too many; empty without tests."""
+def compare(results: Results, options: PageOptions | None = None, *, found: bool = False) -> list[FittedCurve]:
+    """Every particle, or those that the law misses by most if there are too many; empty without tests.
+
+    Args:
+        results: of one campaign.
+        options: how much stands in the page.
+        found: whether the law has what discovery added, where that has a posterior to be believed.
+    """
     options = options or PageOptions()
-    if results.saved is not None:
-        curves: Sequence[FittedCurve] = results.saved.curves
+    law = results.with_found if found and results.with_found is not None else results.saved
+    if law is not None:
+        curves: Sequence[FittedCurve] = law.curves
     else:
         curves = () if results.campaign is None else measured_curves(results.campaign)
     if not curves:

@@ -76,9 +76,10 @@ def report_page(results: Results, *, seed: int = 0, progress: Callable[[str], No
         import jinja2  # noqa: F401
     tell = progress or (lambda _: None)
     tell("predicting every particle")
-    shown = compare(results)
+    fitted = compare(results)
+    shown = fitted if results.with_found is None else compare(results, found=True)
     tell("drawing the page")
-    return _environment().get_template("page.html").render(context(results, shown), seed=seed)
+    return _environment().get_template("page.html").render(context(results, fitted, shown), seed=seed)
 
 
 def _require_double() -> None:
@@ -125,19 +126,26 @@ def _unbroken(value: Any) -> Any:
     return WITHIN_A_NUMBER.sub("\N{NO-BREAK SPACE}", value) if type(value) is str else value
 
 
-def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
-    """What the templates show."""
+def context(results: Results, fitted: list[FittedCurve], shown: list[FittedCurve] | None = None) -> dict[str, Any]:
+    """What the templates show.
+
+    Args:
+        results: of one campaign.
+        fitted: tests and calibrated law, of which checks are made.
+        shown: tests and law in the chart, if it is another: with what discovery added.
+    """
+    shown = fitted if shown is None else shown
     from markupsafe import Markup, escape
 
     labels = particle_labels([one.name for one in shown], 40)
     folder = shlex.quote(results.name)
-    checks = lights(results, shown)
+    checks = lights(results, fitted)
     return {
         "results": results,
         "version": own_version(),
         "simulated": simulated(results),
         "sections": _sections(results, shown, checks),
-        "story": story(results, shown),
+        "story": story(results, fitted),
         "cards": _cards(results, checks),
         "summary": _summary(results),
         # A command is copied: its blanks stay as they are.
@@ -164,6 +172,7 @@ def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
         "figures_of": _figures(results),
         "folder": folder,
         "law_alone": _law_alone(results),
+        "with_found": results.with_found is not None,
         "style": Markup(_source("style.css")),
         "script": Markup(_closed(_source("page.js"))),
         "versions": next((v for _, c in results.results.items() if (v := c["provenance"]["versions"])), {}),

@@ -65,6 +65,19 @@ class Results:
         return self.saved if isinstance(self.saved, PosteriorDraws) else None
 
     @property
+    def with_found(self) -> PosteriorDraws | None:
+        """The posterior of the law with what discovery added, if it may be believed and is of all these particles.
+
+        None, too, where the calibration is of a law with effects itself, or there is none that it would be beside.
+        """
+        found, campaign = self.found, self.campaign
+        if self.calibration is None or self.calibration.get("effects"):
+            return None
+        if found is None or campaign is None or found.posterior is None or found.posterior.failures():
+            return None
+        return found.posterior if found.posterior.campaign.particles == campaign.particles else None
+
+    @property
     def missing(self) -> tuple[str, ...]:
         """What is not there, and how to get it."""
         parts = (

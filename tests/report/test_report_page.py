@@ -5,17 +5,19 @@ import json
 import math
 import re
 from importlib.resources import files
+from typing import ClassVar
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from reading_html import Page
-from results_folder import ARCHIVE, MODULUS, NAMES, NOISE, calibration, discovery
+from results_folder import ARCHIVE, MODULUS, NAMES, NOISE, Draws, calibration, discovery
 from results_folder import C as COEFFICIENTS
 
 from mcc_jax._format import interval, number, with_sd
 from mcc_jax.calibrate.curves import KINDS
+from mcc_jax.discover import Discovery
 from mcc_jax.report import read_results, report_page
 from mcc_jax.report.chart import PageOptions, chart_data, chart_items, compare
 from mcc_jax.report.lights import lights, share_inside
@@ -108,6 +110,45 @@ def test_own_modulus_and_own_shape_are_used_where_they_scatter(without_posterior
     found = changed(without_posterior, shape_scatter=scatter, a={"value": 0.5, "sd": None, "interval_95": None})
     for one in compare(found)[:-1]:
         np.testing.assert_allclose(one.own_um, one.displacement_um, atol=1e-7)
+
+
+class WithWhatWasFound(Draws):
+    """The posterior of the law with what was found: half a micrometre off that of the law alone."""
+
+    problems: ClassVar[tuple[str, ...]] = ()
+
+    def failures(self):
+        return self.problems
+
+    def predictions(self, particle):
+        return super().predictions(particle) + 0.5
+
+
+class NotConverged(WithWhatWasFound):
+    problems = ("R-hat 1.2",)
+
+
+def with_posterior_of_the_found(results, kind):
+    saved = results.saved
+    posterior = kind(saved.campaign, saved.content, saved.of_a)
+    found = Discovery("NAMED", results.discovery["summary"], None, None, 0, 0.0)
+    object.__setattr__(found, "posterior", posterior)  # a stand-in: that of a discovery would take a minute
+    return dataclasses.replace(results, found=found)
+
+
+def test_the_chart_has_what_discovery_added_where_that_may_be_believed(results):
+    found = with_posterior_of_the_found(results, WithWhatWasFound)
+    alone, added = compare(found), compare(found, found=True)
+    for one, other in zip(alone[:-1], added[:-1], strict=True):
+        np.testing.assert_allclose((other.own_um - one.own_um)[one.used], 0.5, atol=1e-6)
+    assert "The law in these lines has what discovery added" in report_page(found)
+    assert lights(found, alone) == lights(results, compare(results))
+    for other in (results, with_posterior_of_the_found(results, NotConverged)):
+        assert other.with_found is None
+        assert "Effects that discovery added are not in these lines" in report_page(other)
+    content = found.calibration | {"effects": [{"mechanism": "creep"}]}
+    other = dataclasses.replace(results, calibration=content)
+    assert with_posterior_of_the_found(other, WithWhatWasFound).with_found is None
 
 
 def test_the_typical_particle_is_the_median_or_for_the_papers_method_the_mean(folder):
