@@ -26,7 +26,7 @@ from .misfit_form import Discrepancy, fit_with_misfit
 from .own_numbers import OwnNumbers, differing, sudden_steps
 from .refine import Refined, refined
 from .screen import Screen, Setting, pair_integrals, screen, signature_columns, single_integrals
-from .settings import NUMERICS
+from .settings import DECISIONS, NUMERICS
 from .weighing import log_posteriors, posterior
 
 OPPOSITE = {frozenset(("damage", "densification_stiffening"))}
@@ -248,12 +248,16 @@ class Search:
     def first_order_pairs(self) -> dict[Names, tuple[int, int]]:
         """The leading pairs of names to first order around the base law, each by its best candidates.
 
-        Of two strong effects neither need lead by itself: what imitates part of both may.
+        Of two strong effects neither need lead by itself: what imitates part of both may. A pair that does not lead
+        every single name by the margin there is left out.
         """
         assert self.screen is not None
         a, b, value = self.screen.pairs()
+        least = self.screen.singles()[0].max() + DECISIONS.margin
         found: dict[Names, tuple[int, int]] = {}
         for k in np.argsort(-value):
+            if value[k] < least:
+                break
             names = pair_of(*(self.screen.candidates[j[k]].mechanism for j in (a, b)))
             if frozenset(names) not in OPPOSITE:
                 found.setdefault(names, (int(a[k]), int(b[k])))
