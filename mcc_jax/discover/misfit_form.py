@@ -128,8 +128,8 @@ class Discrepancy:
         design = design_of(base, r.state, r.variants, more)
         optimum = optimise(design, np.append(r.optimum.free, [unit - 1.0] * parts), without=r.optimum)
         at = Refined(r.variants, r.state, design, optimum, solve(optimum.free, design))
-        if optimum.log_joint > r.optimum.log_joint + NUMERICS.very_strong:
-            # What it takes away from the law's numbers moves these as far as a name does.
+        if not r.variants and optimum.log_joint > r.optimum.log_joint + NUMERICS.very_strong:
+            # What it takes away from the law's numbers moves these as far as a name does; beside one that is done.
             there = at
             for _ in range(NUMERICS.early):
                 state = moved(base, there.state, r.variants, there.solution)
