@@ -13,15 +13,13 @@ from jaxtyping import Array
 
 from ..calibrate.distributions import nuisance_moments
 from ..calibrate.forward import Forms
-from ..effects import Variant
 from ..effects.record import Record
 from ..geometry import Particle
 from ..law.response import modulus_factor
-from .base import Base, State
+from .base import Base
 from .design import moved
 from .evidence import Solution
 from .refine import Refined
-from .settings import NUMERICS
 
 
 def of_modulus_at_peaks(base: Base, formulas: Refined, solution: Solution) -> tuple[float, np.ndarray]:
@@ -35,35 +33,23 @@ def of_modulus_at_peaks(base: Base, formulas: Refined, solution: Solution) -> tu
     Returns:
         The mean, and its derivatives by the amplitudes and then by the further numbers, each in units of its column.
     """
-    variants = formulas.variants
-    at = np.asarray(moved(base, formulas.state, variants, solution).point.theta[0])
-    steps = [v.plausible[0] for v in variants]
-    for v in variants:
-        for n in v.nuisances:
-            _, sd = nuisance_moments(n)
-            steps.append(sd * float(at[len(steps)]) if n.plausible[0] > 0 else sd)
-    effects = Forms(base.model.unloading, variants).build(jnp.asarray(at))
-    if not any(effect.overrides("modify", "stiffness") for effect in effects):
-        return 0.0, np.zeros(len(steps))
+    variants, names = formulas.variants, len(formulas.variants)
+    forms, state = Forms(base.model.unloading, variants), formulas.state
+    at = jnp.asarray(moved(base, state, variants, solution).point.theta[0])
+    if not any(effect.overrides("modify", "stiffness") for effect in forms.build(at)):
+        return 0.0, np.zeros(len(at))
 
-    def mean(numbers: np.ndarray) -> float:
-        return _mean(base, formulas.state, variants, numbers)
+    def mean(numbers: Array) -> tuple[Array, Array]:
+        def one(latent: Array, particle: Particle, record: Record) -> Array:
+            law = forms.law(latent, numbers)
+            context = law.context(particle, record)
+            factor = modulus_factor(law.effects, context)[record.force.argmax()]
+            return jnp.log(factor * context.law.effective_modulus / law.formulas.effective_modulus)
 
-    small = NUMERICS.aside
-    return mean(at), np.array([(mean(at + way) - mean(at - way)) / (2 * small) for way in np.diag(steps) * small])
+        found = jax.vmap(one)(state.point.latent, base.tests.particle, base.tests.record).mean()
+        return found, found  # the value, too
 
-
-def _mean(base: Base, state: State, variants: tuple[Variant, ...], numbers: np.ndarray) -> float:
-    """Mean logarithm of the factor on the modulus at numbers of the effects."""
-    forms = Forms(base.model.unloading, variants)
-
-    def one(latent: Array, particle: Particle, record: Record) -> Array:
-        law = forms.law(latent, jnp.asarray(numbers))
-        context = law.context(particle, record)
-        top = record.force.argmax()
-        return jnp.log(
-            context.law.effective_modulus * modulus_factor(law.effects, context)[top] / law.formulas.effective_modulus
-        )
-
-    tests = base.tests
-    return float(jax.vmap(one)(state.point.latent, tests.particle, tests.record).mean())
+    further = np.array([nuisance_moments(n)[1] for v in variants for n in v.nuisances])
+    units = [*(v.plausible[0] for v in variants), *further * np.where(forms.positive, at[names:], 1.0)]
+    slope, value = jax.jacfwd(mean, has_aux=True)(at)
+    return float(value), np.asarray(slope) * np.array(units)

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from .._format import described
-from .columns import Design, with_amplitudes
-from .design import design_of
+from .columns import Design, with_amplitudes, without_misfits
 from .evidence import left_by_particle, scales_of, without_first
 from .hypothesis import UNLISTED
 from .search import Search
@@ -132,7 +131,7 @@ def closure(search: Search, seed: int) -> Closure:
     values = np.stack([t.function(natural[t.coordinate]) * size[:, None] for t in terms], -1)
     values = np.where(mask[..., None], values, 0.0)
     scale = np.maximum(np.sqrt((values**2).mean((0, 1))), 1e-300)
-    law, free = without_discrepancy(search), smooth.at.optimum.free[:HYPERPARAMETERS]
+    law, free = without_misfits(smooth.at.design), smooth.at.optimum.free[:HYPERPARAMETERS]
     curve = smooth.curve_um[..., None]
     known = np.zeros((*curve.shape[:2], 0)) if search.screen is None else search.screen.columns
     every = np.concatenate([values / scale, curve, known], -1)
@@ -163,13 +162,6 @@ def closure(search: Search, seed: int) -> Closure:
         curve[..., 0],
         _held_out(smooth.at.design, smooth.at.optimum.free, smooth.basis),
     )
-
-
-def without_discrepancy(search: Search) -> Design:
-    """The law alone, linear where it is beside the discrepancy."""
-    smooth = search.found[UNLISTED].smooth
-    assert smooth is not None
-    return design_of(search.base, smooth.at.state)
 
 
 def _shared(left: np.ndarray, common: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -230,7 +222,7 @@ def _along(search: Search, name: str, x: np.ndarray, span: tuple[float, float]) 
 
     basis = functions(at) * size[:, None, None] / np.sqrt(N)
     basis = np.where(np.asarray(tests.mask)[..., None], basis, 0.0)
-    law, free = without_discrepancy(search), smooth.at.optimum.free[:HYPERPARAMETERS]
+    law, free = without_misfits(smooth.at.design), smooth.at.optimum.free[:HYPERPARAMETERS]
     left = left_by_particle(free, with_amplitudes(law, basis))
     total, _ = without_first(left.gram.sum(0), law.common.shape[-1])
     G, s = total[:-1, :-1], total[:-1, -1]

@@ -105,6 +105,12 @@ def without_further(design: Design) -> Design:
     return replace(design, own=design.own[..., :5], kinds=replace(design.kinds, spreads=design.kinds.spreads[:4]))
 
 
+def without_misfits(design: Design) -> Design:
+    """The design without its misfits, linear where it is."""
+    fixed = design.group == 0
+    return replace(design, common=design.common[..., fixed], group=design.group[fixed], misfits=design.misfits[:0])
+
+
 class White(NamedTuple):
     """Columns freed of the noise.
 

@@ -167,8 +167,9 @@ class Search:
 
     def signatures_of(self, mechanism: str) -> dict[str, np.ndarray]:
         """The best signature of every formula of a mechanism that all tests share."""
-        columns = np.zeros(0) if self.screen is None else self.screen.columns
-        return {f: columns[..., k] for f, (_, k) in self.first_order.get(mechanism, {}).items()}
+        if self.screen is None:
+            return {}
+        return {f: self.screen.columns[..., k] for f, (_, k) in self.first_order.get(mechanism, {}).items()}
 
     def with_misfit(self, one: Hypothesis) -> None:
         """Log evidence where every name's formula may be wrong."""

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..calibrate.curves import KINDS, FittedCurve, measured_curves
+from ..calibrate.results import Calibration
 from ..plots.style import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION
 from .read import Results
 
@@ -44,16 +45,18 @@ class PageOptions:
     fewest: int = 40
 
 
-def compare(results: Results, options: PageOptions | None = None, *, found: bool = False) -> list[FittedCurve]:
+def compare(
+    results: Results, options: PageOptions | None = None, *, law: Calibration | None = None
+) -> list[FittedCurve]:
     """Every particle, or those that the law misses by most if there are too many; empty without tests.
 
     Args:
         results: of one campaign.
         options: how much stands in the page.
-        found: whether the law has what discovery added, where that has a posterior to be believed.
+        law: what predicts, if it is not the calibration.
     """
     options = options or PageOptions()
-    law = results.with_found if found and results.with_found is not None else results.saved
+    law = results.saved if law is None else law
     if law is not None:
         curves: Sequence[FittedCurve] = law.curves
     else:

@@ -76,8 +76,8 @@ def report_page(results: Results, *, seed: int = 0, progress: Callable[[str], No
         import jinja2  # noqa: F401
     tell = progress or (lambda _: None)
     tell("predicting every particle")
-    fitted = compare(results)
-    shown = fitted if results.with_found is None else compare(results, found=True)
+    fitted, added = compare(results), results.with_found
+    shown = fitted if added is None else compare(results, law=added)
     tell("drawing the page")
     return _environment().get_template("page.html").render(context(results, fitted, shown), seed=seed)
 
@@ -134,9 +134,9 @@ def context(results: Results, fitted: list[FittedCurve], shown: list[FittedCurve
         fitted: tests and calibrated law, of which checks are made.
         shown: tests and law in the chart, if it is another: with what discovery added.
     """
-    shown = fitted if shown is None else shown
     from markupsafe import Markup, escape
 
+    shown = fitted if shown is None else shown
     labels = particle_labels([one.name for one in shown], 40)
     folder = shlex.quote(results.name)
     checks = lights(results, fitted)
@@ -172,7 +172,7 @@ def context(results: Results, fitted: list[FittedCurve], shown: list[FittedCurve
         "figures_of": _figures(results),
         "folder": folder,
         "law_alone": _law_alone(results),
-        "with_found": results.with_found is not None,
+        "with_found": shown is not fitted,
         "style": Markup(_source("style.css")),
         "script": Markup(_closed(_source("page.js"))),
         "versions": next((v for _, c in results.results.items() if (v := c["provenance"]["versions"])), {}),

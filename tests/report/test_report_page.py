@@ -138,7 +138,7 @@ def with_posterior_of_the_found(results, kind):
 
 def test_the_chart_has_what_discovery_added_where_that_may_be_believed(results):
     found = with_posterior_of_the_found(results, WithWhatWasFound)
-    alone, added = compare(found), compare(found, found=True)
+    alone, added = compare(found), compare(found, law=found.with_found)
     for one, other in zip(alone[:-1], added[:-1], strict=True):
         np.testing.assert_allclose((other.own_um - one.own_um)[one.used], 0.5, atol=1e-6)
     assert "The law in these lines has what discovery added" in report_page(found)

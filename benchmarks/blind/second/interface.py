@@ -90,9 +90,13 @@ def draw(rng: np.random.Generator, case: Case) -> World:
         truth,
         tuple(map(_hidden, asked)),
         lambda sized, shift: _curves(campaign, sized, shift),
-        lambda sized: response(campaign, [(hidden.effect, theta) for hidden, theta in sized]).modulus,
+        lambda sized: response(campaign, _active(sized)).modulus,
         lambda: _listed(campaign),
     )
+
+
+def _active(sized: Sized) -> list[tuple[Effect, float]]:
+    return [(hidden.effect, theta) for hidden, theta in sized]
 
 
 def _curves(campaign: Campaign, sized: Sized, shift: Shift | None) -> np.ndarray:
@@ -101,7 +105,7 @@ def _curves(campaign: Campaign, sized: Sized, shift: Shift | None) -> np.ndarray
         tested = campaign.particles
         tested = replace(tested, modulus=tested.modulus * np.exp(shift.log_modulus))
         campaign = Campaign(tested, campaign.path, campaign.memory)
-    return simulate(campaign, [(hidden.effect, theta) for hidden, theta in sized], moved)
+    return simulate(campaign, _active(sized), moved)
 
 
 def _listed(campaign: Campaign) -> Iterator[Hidden]:
