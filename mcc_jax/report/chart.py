@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..calibrate.curves import KINDS, FittedCurve, measured_curves
-from ..calibrate.results import Calibration
-from ..plots.style import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION
+from ..plots.style import BLACK, BLUE, GREEN, GREY, ORANGE, SKY, VERMILION
 from .read import Results
 
 ROOTS = ("chart-curve", "chart-residual")
@@ -45,20 +44,16 @@ class PageOptions:
     fewest: int = 40
 
 
-def compare(
-    results: Results, options: PageOptions | None = None, *, law: Calibration | None = None
-) -> list[FittedCurve]:
+def compare(results: Results, options: PageOptions | None = None) -> list[FittedCurve]:
     """Every particle, or those that the law misses by most if there are too many; empty without tests.
 
     Args:
         results: of one campaign.
         options: how much stands in the page.
-        law: what predicts, if it is not the calibration.
     """
     options = options or PageOptions()
-    law = results.saved if law is None else law
-    if law is not None:
-        curves: Sequence[FittedCurve] = law.curves
+    if results.saved is not None:
+        curves: Sequence[FittedCurve] = results.saved.curves
     else:
         curves = () if results.campaign is None else measured_curves(results.campaign)
     if not curves:
@@ -104,7 +99,8 @@ def chart_items() -> dict[str, Any]:
     curve.patches("displacement", "force", source=bands, color=SKY, alpha=0.45, line_width=0)
     residual.patches("time", "away", source=bands, color=SKY, alpha=0.45, line_width=0)
     residual.add_layout(Span(location=0, dimension="width", line_color=BLACK, line_width=1.3))
-    curve.line("typical", "force", source=lines, color=BLACK, line_dash=[6, 4], line_width=1.3)
+    # Pale and broad, not dashed: where a test goes back on its own path dashes fill each other's gaps.
+    curve.line("typical", "force", source=lines, color=GREY, line_alpha=0.55, line_width=2.6)
     curve.line("own", "force", source=lines, color=BLACK, line_width=1.3)
     tips = [("particle", "@particle"), ("segment", "@segment"), ("force", "@force{0.000} mN")]
     tips += [("displacement", "@displacement{0.000} µm"), ("measured − predicted", "@residual{0.0000} µm")]

@@ -14,6 +14,7 @@ from ..calibrate.settings import JUDGEMENT, SAMPLING
 from ..campaign import Finding, campaign_findings, check_plausibility, check_tests
 from ..campaign.findings import worst
 from .read import DATA, Results, checksums_told
+from .sentences import law_called, within_noise
 
 Level = Literal["good", "look", "bad", "unknown"]
 RHAT_BAD, ESS_BAD, PARETO_K_BAD = 1.05, 100.0, 1.0
@@ -134,12 +135,27 @@ def lights(results: Results, shown: Sequence[FittedCurve] = ()) -> list[Light]:
     if content is not None:
         found.append(_data(results, content))
     if results.discovery is not None:
-        level, answer, meaning = VERDICTS[results.discovery["verdict"]]
+        level, answer, meaning = (
+            _with_found(results, results.discovery["gap"])
+            if results.has_found
+            else VERDICTS[results.discovery["verdict"]]
+        )
         found.append(Light(level, COMPLETE, answer, VERDICTS["NO_GAP"][1].lower(), meaning))
     if worst(findings) == "bad":
         # Beside numbers that cannot be true nothing is fine: what would be is not judged.
         found = [replace(light, level="unknown") if light.level == "good" else light for light in found]
     return found
+
+
+def _with_found(results: Results, gap: dict[str, Any]) -> tuple[Level, str, str]:
+    """Level, answer and meaning for the law with what was added: whether held-out tests still differ from it."""
+    closed, law = within_noise(gap), law_called(results)
+    law = law[0].upper() + law[1:]
+    if closed is None:
+        return "unknown", "not known", f"{law} was not tried on held-out particles."
+    if closed:
+        return "good", "Nothing missing", f"{law} agrees with held-out particles within the noise."
+    return "look", "Part is missing", f"{law} closes a part of the gap; held-out particles still differ from it."
 
 
 def tested(results: Results) -> tuple[Finding, ...]:

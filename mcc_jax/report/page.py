@@ -23,9 +23,19 @@ with extra("report"):
     from . import pictures as pictures
     from .chart import LOOKS, chart_data, chart_items, chart_scripts, compare
     from .lights import COMPLETE, lights, share_inside, tested
-    from .sentences import METHODS, calibration_sentences, listed, next_steps, plain, quantity, simulated
+    from .sentences import (
+        METHODS,
+        calibration_sentences,
+        is_law_alone,
+        law_called,
+        listed,
+        next_steps,
+        plain,
+        quantity,
+        simulated,
+    )
     from .story import story
-    from .tables import changes, exponential, measured, particle_facts, particle_rows, spread
+    from .tables import changes, equation, exponential, measured, particle_facts, particle_rows, spread
 
 CAPTIONS = {
     "bands": ("compare", "Measured curves and the central 95 % of what the posterior expects"),
@@ -76,10 +86,10 @@ def report_page(results: Results, *, seed: int = 0, progress: Callable[[str], No
         import jinja2  # noqa: F401
     tell = progress or (lambda _: None)
     tell("predicting every particle")
-    fitted, added = compare(results), results.with_found
-    shown = fitted if added is None else compare(results, law=added)
+    told = results.told
+    shown = compare(told)
     tell("drawing the page")
-    return _environment().get_template("page.html").render(context(results, fitted, shown), seed=seed)
+    return _environment().get_template("page.html").render(context(told, shown), seed=seed)
 
 
 def _require_double() -> None:
@@ -117,6 +127,7 @@ def _environment() -> Any:
         "listed": listed,
         "exponential": exponential,
         "spread": spread,
+        "equation": equation,
     }
     return found
 
@@ -126,26 +137,24 @@ def _unbroken(value: Any) -> Any:
     return WITHIN_A_NUMBER.sub("\N{NO-BREAK SPACE}", value) if type(value) is str else value
 
 
-def context(results: Results, fitted: list[FittedCurve], shown: list[FittedCurve] | None = None) -> dict[str, Any]:
+def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
     """What the templates show.
 
     Args:
         results: of one campaign.
-        fitted: tests and calibrated law, of which checks are made.
-        shown: tests and law in the chart, if it is another: with what discovery added.
+        shown: its tests and the law in them.
     """
     from markupsafe import Markup, escape
 
-    shown = fitted if shown is None else shown
     labels = particle_labels([one.name for one in shown], 40)
     folder = shlex.quote(results.name)
-    checks = lights(results, fitted)
+    checks = lights(results, shown)
     return {
         "results": results,
         "version": own_version(),
         "simulated": simulated(results),
         "sections": _sections(results, shown, checks),
-        "story": story(results, fitted),
+        "story": story(results, shown),
         "cards": _cards(results, checks),
         "summary": _summary(results),
         # A command is copied: its blanks stay as they are.
@@ -171,8 +180,8 @@ def context(results: Results, fitted: list[FittedCurve], shown: list[FittedCurve
         "before_after": CAPTIONS["discovery_before_after"][1],
         "figures_of": _figures(results),
         "folder": folder,
-        "law_alone": _law_alone(results),
-        "with_found": shown is not fitted,
+        "law": law_called(results),
+        "law_alone": is_law_alone(results),
         "style": Markup(_source("style.css")),
         "script": Markup(_closed(_source("page.js"))),
         "versions": next((v for _, c in results.results.items() if (v := c["provenance"]["versions"])), {}),
@@ -192,14 +201,14 @@ def _cards(results: Results, checks: list[Any]) -> list[dict[str, str]]:
     """The answers at the top, each with a level, a heading and a line."""
     found = []
     if results.calibration is not None:
-        content = results.calibration
+        content, alone = results.calibration, is_law_alone(results)
         used = sum(entry["kept"] for entry in content["particles"])
-        alone = " of the law alone" if _law_alone(results) else ""
+        law = "" if (law := law_called(results)) == "the law" else f" of {law}"
         done, trusted = content["converged"], worst(tested(results)) != "bad"
         found.append(
             {
                 "level": "good" if done and trusted else "bad",
-                "title": f"Calibration{alone}",
+                "title": f"Calibration{law}",
                 "answer": "Not converged" if not done else "Converged" if trusted else "Not to be trusted",
                 "line": f"{used} of {len(content['particles'])} particles, by {METHODS[content['method']]}",
             }
@@ -208,7 +217,7 @@ def _cards(results: Results, checks: list[Any]) -> list[dict[str, str]]:
         found.append(
             {
                 "level": "bad" if bad else "look" if look else "good",
-                "title": f"Checks{alone}",
+                "title": f"Checks{law}",
                 "answer": _count(len(checks) - len(good), len(checks)) if trusted else "Numbers cannot be true",
                 "line": _not_fine([*bad, *look], alone),
             }
@@ -221,7 +230,7 @@ def _count(failed: int, checks: int) -> str:
     return f"{failed} of {checks} fail" if failed else f"all {checks} hold"
 
 
-def _not_fine(names: list[str], alone: str) -> str:
+def _not_fine(names: list[str], alone: bool) -> str:
     """Which checks failed; that some must fail where the law alone lacks what was found."""
     if not names:
         return "nothing stands out"
@@ -232,13 +241,7 @@ def _summary(results: Results) -> list[str]:
     """What stands below the first screen, in sentences."""
     if results.calibration is None:
         return []
-    return calibration_sentences(results.calibration, alone=_law_alone(results))
-
-
-def _law_alone(results: Results) -> bool:
-    """Whether the calibration is of the law without the effects that were found to be missing in it."""
-    found, calibration = results.discovery, results.calibration
-    return bool(found and found["effects"] and calibration and not calibration.get("effects"))
+    return calibration_sentences(results.calibration, law_called(results), alone=is_law_alone(results))
 
 
 def _sections(results: Results, shown: list[FittedCurve], checks: list[Any]) -> list[tuple[str, str]]:
@@ -258,14 +261,15 @@ def _sections(results: Results, shown: list[FittedCurve], checks: list[Any]) -> 
 
 
 def _figures(results: Results) -> dict[str, list[tuple[str, str]]]:
-    """Pictures and captions by section."""
+    """Pictures and captions by section; where the page is of the law with what was found, those without it apart."""
     found: dict[str, list[tuple[str, str]]] = {
-        name: [] for name in ("measured", "law", "compare", "posterior", "discovery")
+        name: [] for name in ("measured", "law", "compare", "posterior", "discovery", "alone")
     }
     order = list(CAPTIONS)
     for stem in sorted(results.figures, key=lambda s: (order.index(_kind(s)) if _kind(s) in order else 99, s)):
         section, caption = CAPTIONS.get(_kind(stem), ("posterior", stem.replace("_", " ")))
-        found[section].append((pictures.data_uri(results.figures[stem]), caption))
+        alone = results.has_found and section in ("law", "compare", "posterior")
+        found["alone" if alone else section].append((pictures.data_uri(results.figures[stem]), caption))
     return found
 
 

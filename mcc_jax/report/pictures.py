@@ -80,7 +80,7 @@ class Telling:
     def near(self) -> np.ndarray:
         """Which readings stand in the enlarged part: a strip of displacement, where law and test differ most in all."""
         gap = np.abs(self.before_um - (0.0 if self.after_um is None else self.after_um))
-        width = max(10 * float(np.quantile(gap, 0.9)), 0.06 * float(np.ptp(self.displacement_um)))
+        width = max(10 * float(np.quantile(gap, 0.9)), 0.03 * float(np.ptp(self.displacement_um)))
         left = self.displacement_um[:, None]
         while True:
             inside = (self.displacement_um >= left) & (self.displacement_um <= left + width)

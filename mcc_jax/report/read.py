@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +76,20 @@ class Results:
         if found is None or campaign is None or found.posterior is None or found.posterior.failures():
             return None
         return found.posterior if found.posterior.campaign.particles == campaign.particles else None
+
+    @property
+    def told(self) -> Results:
+        """What a page shows: of the law with what discovery added where that may be believed, else as it is."""
+        posterior, found = self.with_found, self.discovery
+        if posterior is None or found is None:
+            return self
+        content = posterior.to_json() | {"figures": [], "provenance": found["provenance"]}
+        return replace(self, calibration=content, saved=posterior)
+
+    @property
+    def has_found(self) -> bool:
+        """Whether the calibration is the discovery's own, of the law with what it added."""
+        return self.found is not None and self.saved is not None and self.saved is self.found.posterior
 
     @property
     def missing(self) -> tuple[str, ...]:

@@ -15,6 +15,8 @@ METHODS = {
     "least-squares": "joint least squares of all tests at once (Optimistix)",
     "paper": "the paper's own steps, one after the other",
 }
+GAP = {True: "law and tests agree within the noise", False: "part of the gap closes, and part stays"}
+"""What is said of held-out particles."""
 SURE = {"bayes": "with 95 % probability", "least-squares": "as the 95 % confidence interval"}
 
 
@@ -41,18 +43,32 @@ def simulated(results: Results) -> bool:
     return results.campaign is not None and is_simulated(results.campaign.metadata)
 
 
-def calibration_sentences(content: dict[str, Any], *, alone: bool = False) -> list[str]:
+def is_law_alone(results: Results) -> bool:
+    """Whether the calibration is of the law without the effects that were found to be missing in it."""
+    found, calibration = results.discovery, results.calibration
+    return bool(found and found["effects"] and calibration and not calibration.get("effects"))
+
+
+def law_called(results: Results) -> str:
+    """The law of which the calibration is, in words: alone, or with its effects."""
+    if is_law_alone(results):
+        return "the law alone"
+    effects = (results.calibration or {}).get("effects")
+    return f"the law with {listed([plain(effect['mechanism']) for effect in effects])}" if effects else "the law"
+
+
+def calibration_sentences(content: dict[str, Any], law: str = "the law", *, alone: bool = False) -> list[str]:
     """The calibration in a few sentences.
 
     Args:
         content: contents of `calibration.json`.
+        law: what the law is called, see `law_called`.
         alone: whether it is of the law without effects that were found to be missing. Its numbers are those of a law
             that is known to be wrong, not to be told in front of the right ones.
     """
     count, used = len(content["particles"]), sum(entry["kept"] for entry in content["particles"])
-    law = "The law alone" if alone else "The law"
     found = [
-        f"{law} was calibrated on {used} of {count} particles by {METHODS[content['method']]}"
+        f"{law[0].upper()}{law[1:]} was calibrated on {used} of {count} particles by {METHODS[content['method']]}"
         + ("." if content["converged"] else "; it did NOT converge, so its numbers may not be relied on.")
     ]
     if alone:
@@ -70,11 +86,11 @@ def calibration_sentences(content: dict[str, Any], *, alone: bool = False) -> li
             if content[key]["interval_95"] is not None
         ]
         if known:
-            found.append(f"Given the law and these tests, {listed(known)}, each {sure}.")
+            found.append(f"Given {law} and these tests, {listed(known)}, each {sure}.")
     misfit = content["diagnostics"].get("own_misfit")
     if misfit is not None:
         found.append(
-            "With its own curve of loading (coefficients C₁, C₃, C₅) the law follows a particle's displacement to "
+            f"With its own curve of loading (coefficients C₁, C₃, C₅) {law} follows a particle's displacement to "
             f"{percent(misfit)} of its range (median over the particles)."
         )
     return found
@@ -87,7 +103,8 @@ def discovery_sentence(content: dict[str, Any]) -> str:
         return "Nothing is missing in the law that these tests could show."
     if verdict == "FIT_NOT_CONVERGED":
         return "The law could not be fitted well enough to ask what it lacks."
-    gap = _gap(content["gap"])
+    closed = within_noise(content["gap"])
+    gap = "" if closed is None else "; with it added, " + GAP[closed]
     if verdict == "UNLISTED" or not content["effects"]:
         return f"Something is missing that no listed mechanism explains{gap}."
     names = listed([plain(effect["mechanism"]) for effect in content["effects"]])
@@ -95,19 +112,17 @@ def discovery_sentence(content: dict[str, Any]) -> str:
     return f"The law misses {names}{sure}{gap}."
 
 
-def _gap(gap: dict[str, Any]) -> str:
-    """How law and held-out particles agree with what was added; empty where nobody knows."""
+def within_noise(gap: dict[str, Any]) -> bool | None:
+    """Whether held-out particles agree with what was added within the noise; None where nobody knows."""
     if gap["closed_fraction"] is None or not gap["steps"]:
-        return ""
+        return None
     last = gap["steps"][-1]
     match last.get("chi2_interval_95"):
         case [float() | int() as low, _]:
             pass
         case _:
             low = last["chi2_per_dof"]
-    if low is not None and low <= 1 + TELLING.within:
-        return "; with it added, law and tests agree within the noise"
-    return "; with it added, part of the gap closes, and part stays"
+    return low is not None and low <= 1 + TELLING.within
 
 
 def next_steps(results: Results, folder: str) -> list[tuple[str, str]]:
@@ -128,7 +143,7 @@ def next_steps(results: Results, folder: str) -> list[tuple[str, str]]:
     if found is None:
         steps.append(("Ask what the law misses:", f"mcc-jax discover CAMPAIGN --out {folder}"))
     else:
-        steps += _after(found)
+        steps += _after(found, told=results.has_found)
     if content is not None and content["converged"] and (found is None or found["verdict"] == "NO_GAP"):
         steps.append(("Predict tests that you plan:", "mcc-jax simulate --out planned"))
     return steps
@@ -157,7 +172,8 @@ def _mend(found: dict[str, Any] | None) -> str:
     return "Mend the checks that failed under Checks before anything else."
 
 
-def _after(found: dict[str, Any]) -> list[tuple[str, str]]:
+def _after(found: dict[str, Any], *, told: bool) -> list[tuple[str, str]]:
+    """What to do after a discovery; `told` if the page is of the law with what was added already."""
     verdict = found["verdict"]
     if found["next_experiments"]:
         best = found["next_experiments"][0]
@@ -171,6 +187,8 @@ def _after(found: dict[str, Any]) -> list[tuple[str, str]]:
         first = found["checks"][0]
         return [(f"Check directly. For {plain(first['mechanism'])}: {first['check']}. For the others, see below.", "")]
     if verdict in ("NAMED", "SET", "UNLISTED"):
+        if told:
+            return [("Use the law together with what was added: the parameters below are of both.", "")]
         use = "Use the law together with what was added (parameters “after” below), not alone"
         command = calibration_with_found(found, "CAMPAIGN")
         return [(f"{use}. All about it, from every particle's curve to the checks:" if command else f"{use}.", command)]

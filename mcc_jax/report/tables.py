@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any
@@ -15,6 +16,19 @@ from ..campaign import Campaign, campaign_segments, effective_diameter_um
 from .read import Results
 from .sentences import plain
 
+GREEK = {
+    "sigma": "σ",
+    "eps": "ε",
+    "tau": "τ",
+    "eta": "η",
+    "kappa": "κ",
+    "gamma": "γ",
+    "mu": "μ",
+    "alpha": "α",
+    "phi": "φ",
+    "pi": "π",
+    "Delta": "Δ",
+}
 KINDS = {"approach": "approach", "load": "loading", "hold": "hold", "unload": "unloading", "reload": "reloading"}
 
 
@@ -80,6 +94,25 @@ def exponential(estimate: dict[str, Any]) -> dict[str, Any]:
         "sd": None if middle is None or sd is None else middle * sd,
         "interval_95": None if ends is None else [exp(end) for end in ends],
     }
+
+
+def equation(text: str) -> Any:
+    """An equation as the library writes it, for a page: Greek letters, indices and powers."""
+    from markupsafe import Markup, escape
+
+    def name(match: re.Match[str]) -> str:
+        letter, number, below = match["letter"], match["number"] or "", (match["below"] or "_")[1:]
+        return f"<i>{GREEK.get(letter, letter)}</i>" + (f"<sub>{number}{below}</sub>" if number or below else "")
+
+    # An `s` after a number is a second, and the `a` of "on a reload" no length.
+    second = r"(?!(?<=[\da][ /])s\b|(?<=N/)s\b)"
+    letters = rf"(?P<letter>{'|'.join(GREEK)}|[A-Za-z])(?P<number>\d)?(?P<below>_\w+)?\b"
+    written = re.sub(rf"(?<!on )\b{second}{letters}", name, str(escape(text)).replace("&#39;", "′"))
+    raised = r"\^(?:\((?P<bracketed>[^()]*)\)|(?P<plain>-?(?:<i>\w+</i>|[\d.]*\d)))"
+    written = re.sub(raised, lambda match: f"<sup>{match['bracketed'] or match['plain']}</sup>", written)
+    for pattern, sign in ((r"(?<=[\s(>])-", "−"), (r"\bum\b", "µm")):
+        written = re.sub(pattern, sign, written)
+    return Markup(written)
 
 
 def spread(log: dict[str, Any]) -> str:

@@ -117,6 +117,9 @@ class WithWhatWasFound(Draws):
 
     problems: ClassVar[tuple[str, ...]] = ()
 
+    def to_json(self):
+        return super().to_json() | {"effects": discovery()["effects"]}
+
     def failures(self):
         return self.problems
 
@@ -130,21 +133,34 @@ class NotConverged(WithWhatWasFound):
 
 def with_posterior_of_the_found(results, kind):
     saved = results.saved
-    posterior = kind(saved.campaign, saved.content, saved.of_a)
+    posterior = kind(saved.campaign, results.calibration, saved.of_a)
     found = Discovery("NAMED", results.discovery["summary"], None, None, 0, 0.0)
     object.__setattr__(found, "posterior", posterior)  # a stand-in: that of a discovery would take a minute
     return dataclasses.replace(results, found=found)
 
 
-def test_the_chart_has_what_discovery_added_where_that_may_be_believed(results):
+def test_the_page_is_of_the_law_with_what_was_found_where_that_may_be_believed(results):
     found = with_posterior_of_the_found(results, WithWhatWasFound)
-    alone, added = compare(found), compare(found, law=found.with_found)
+    alone, added = compare(found), compare(found.told)
     for one, other in zip(alone[:-1], added[:-1], strict=True):
         np.testing.assert_allclose((other.own_um - one.own_um)[one.used], 0.5, atol=1e-6)
-    assert "The law in these lines has what discovery added" in report_page(found)
-    assert lights(found, alone) == lights(results, compare(results))
+    page = report_page(found)
+    for words in (
+        "Calibration of the law with frame compliance",
+        "Parameters of the law with frame compliance",
+        "Figures of the law alone",
+    ):
+        assert words in page
+        assert words not in report_page(results)
+    assert "<strong>frame compliance</strong> (in the form “linear”): <i>d</i> = <i>C</i> <i>F</i>" in page
+    assert "law alone, which lacks" not in page
+    step = found.discovery["gap"]["steps"][-1]
+    for chi2, answer in ((1.0, "Nothing missing"), (2.0, "Part is missing")):
+        step["chi2_per_dof"] = chi2
+        checks = {one.check: one for one in lights(found.told, added)}
+        assert (checks["Law is complete"].value, len(checks)) == (answer, len(lights(found, alone)))
     for other in (results, with_posterior_of_the_found(results, NotConverged)):
-        assert other.with_found is None
+        assert other.told is other
         assert "Effects that discovery added are not in these lines" in report_page(other)
     content = found.calibration | {"effects": [{"mechanism": "creep"}]}
     other = dataclasses.replace(results, calibration=content)
@@ -333,7 +349,7 @@ def telling(gap_at, points=60):
     """A test of rising load whose law is wrong in one place."""
     rows = np.arange(points, dtype=float)
     before = np.where(np.abs(rows - gap_at) < 4, 0.5, 0.0)
-    return Telling(rows, rows**2, rows, before, np.zeros(points), None, "law with creep", "Particle 1.")
+    return Telling(rows, rows**2, rows, before, np.zeros(points), None, "law with frame compliance", "Particle 1.")
 
 
 def test_parameters_before_and_after_stand_there_as_numbers(page):
@@ -356,7 +372,7 @@ def test_the_enlarged_part_holds_the_largest_gap(gap_at):
     assert told.near[gap_at]
     assert told.near.sum() < 20
     assert telling(2, points=4).near.sum() > 1  # of a record with few readings more is shown, never one
-    assert [look["label"] for _, look in told.laws] == ["law alone", "law with creep"]
+    assert [look["label"] for _, look in told.laws] == ["law alone", "law with frame compliance"]
     assert all(
         source.startswith("data:image/svg+xml") and "Particle 1" in words for source, words in telling_pictures(told)
     )
