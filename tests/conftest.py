@@ -101,7 +101,9 @@ def some_of_many(config, items):
         return items, []
     several = {}
     for item in items:
-        several.setdefault(item.nodeid.split("[")[0], []).append(item)
+        # Every notebook is read by itself: none of them stands for another.
+        name = item.nodeid if item.get_closest_marker("notebook") else item.nodeid.split("[")[0]
+        several.setdefault(name, []).append(item)
     kept = []
     for cases in several.values():
         step = max(1, (len(cases) - 1) / (CASES - 1))
