@@ -105,10 +105,11 @@ def _law_alone():
 
 
 def picture(mechanism):
-    """Strength, and three pictures of a mechanism's first formula in a test with holds and a reload.
+    """Strength, most it adds [um], and three pictures of a mechanism's first formula with holds and a reload.
 
     The whole curve, and what is added to it: two, so that a phone shows one below the other; the latter small, too.
     """
+    import numpy as np
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -133,7 +134,7 @@ def picture(mechanism):
         streams = [io.BytesIO() for _ in figures]
         for figure, stream in zip(figures, streams, strict=True):
             figure.savefig(stream, format="png", dpi=140, metadata={"Software": None})
-    return strength, *(stream.getvalue() for stream in streams)
+    return strength, float(np.max(np.abs(added))), *(stream.getvalue() for stream in streams)
 
 
 def _draw_added(above, below, law, added):
@@ -154,6 +155,17 @@ def pictures():
     return {name: picture(mechanism) for name, mechanism in LIBRARY.items()}
 
 
+CAUSES = {
+    "tester": "Of the tester",
+    "contact": "Where particle and platen meet",
+    "loading": "Of loading",
+    "unloading": "Of unloading",
+    "cycles": "Of time and cycles",
+    "creep": "Of time and cycles",
+    "material": "Of the particle and its material",
+}
+"""What mechanisms have in common, by the module that holds them."""
+
 # ---- the gallery -----------------------------------------------------------------------------------------------------
 
 
@@ -165,14 +177,18 @@ def gallery():
 
 
 def sheet():
-    """All mechanisms side by side, each a small picture of what it adds that leads to its entry."""
+    """All mechanisms by cause, each a small picture of what it adds that leads to its entry."""
     from mcc_jax.effects import LIBRARY
 
-    cells = [
-        f"[![What {plain(name)} adds over time](../{FOLDER}/{name}-small.png) {plain(name)}](#{name})"
-        for name in LIBRARY
-    ]
-    return "\n".join(['<div class="sheet" markdown>', *cells, "</div>"])
+    cells = {cause: [] for cause in CAUSES.values()}
+    for name, mechanism in LIBRARY.items():
+        label = f"{plain(name)}<br>{pictures()[name][1]:.2g} µm"
+        cells[CAUSES[mechanism.variants[0].make.__module__.rpartition(".")[2]]].append(
+            f"[![What {plain(name)} adds over time](../{FOLDER}/{name}-small.png) {label}](#{name})"
+        )
+    return "\n\n".join(
+        f'**{cause}**\n\n<div class="sheet" markdown>\n' + "\n".join(some) + "\n</div>" for cause, some in cells.items()
+    )
 
 
 def entry(mechanism):
@@ -402,7 +418,7 @@ def _broken(title):
 def files():
     """Every picture by its path in the pages."""
     found = {}
-    for name, (_, curve, added, small) in pictures().items():
+    for name, (_, _, curve, added, small) in pictures().items():
         found |= {
             f"{FOLDER}/{name}.png": curve,
             f"{FOLDER}/{name}-added.png": added,

@@ -103,7 +103,7 @@ def found():
     told = telling_test(answer)
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.2, 3.9), layout="constrained")
     handles = draw_enlarged(left, told)
-    text = "A particle of cellulose, pressed and released three times:\nthe contact law alone misses the loop"
+    text = "A simulated particle with creep put in, pressed three times:\nthe contact law alone misses the loop"
     left.set_title(text, fontsize=9, loc="left")
     noise = draw_left_over(right, told)[0]
     gap = f"(χ² per point {before:.0f} → {after:.1f}; 1 is noise)"

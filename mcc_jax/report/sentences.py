@@ -26,9 +26,13 @@ def plain(name: str) -> str:
 
 
 def quantity(name: str) -> str:
-    """A key with its unit, `compliance_um_per_mN`, for a person."""
+    """A key with its unit for a person: `compliance_um_per_mN` is "compliance [µm/mN]"."""
+    units = {"um": "µm", "percent": "%"} | {one: one for one in ("mN", "MPa", "s")}
     words = name.split("_")
-    return " ".join({"um": "µm"}.get(word, word) for word in words)
+    start = next((k for k in range(1, len(words)) if all(w in units or w == "per" for w in words[k:])), len(words))
+    unit = "".join("/" if word == "per" else units[word] for word in words[start:])
+    label = " ".join(words[:start])
+    return f"{label} [{'1' * unit.startswith('/')}{unit}]" if unit else label
 
 
 def listed(names: list[str], word: str = "and") -> str:
@@ -96,8 +100,8 @@ def calibration_sentences(content: dict[str, Any], law: str = "the law", *, alon
     return found
 
 
-def discovery_sentence(content: dict[str, Any]) -> str:
-    """The discovery in one sentence."""
+def discovery_sentence(content: dict[str, Any], *, simulated: bool = False) -> str:
+    """The discovery in one sentence; that of simulated tests says so."""
     verdict = content["verdict"]
     if verdict == "NO_GAP":
         return "Nothing is missing in the law that these tests could show."
@@ -105,6 +109,7 @@ def discovery_sentence(content: dict[str, Any]) -> str:
         return "The law could not be fitted well enough to ask what it lacks."
     closed = within_noise(content["gap"])
     gap = "" if closed is None else "; with it added, " + GAP[closed]
+    gap = gap.replace("law and tests", "law and simulated tests") if simulated else gap
     if verdict == "UNLISTED" or not content["effects"]:
         return f"Something is missing that no listed mechanism explains{gap}."
     names = listed([plain(effect["mechanism"]) for effect in content["effects"]])

@@ -14,7 +14,7 @@ from ..discover import Discovery
 from ..plots.style import is_simulated
 from .pictures import Telling, telling_pictures
 from .read import Results
-from .sentences import discovery_sentence, listed, plain, quantity
+from .sentences import discovery_sentence, listed, plain, quantity, simulated
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ def story(results: Results, shown: Sequence[FittedCurve]) -> Story:
     if found is not None:
         told = telling_test(results.found) if results.found is not None else None
         told = told or _of_fit(shown)
-        return Story(discovery_sentence(found), *_drawn(told), _gap_tiles(found))
+        return Story(discovery_sentence(found, simulated=simulated(results)), *_drawn(told), _gap_tiles(found))
     if results.calibration is not None:
         content = results.calibration
         used = sum(entry["kept"] for entry in content["particles"])
@@ -61,12 +61,10 @@ def telling_test(found: Discovery) -> Telling | None:
     if left is None or base is None:
         return None
     added = bool(found.effects) or found.closure is not None
-    before, after, source = left.before, left.after, "its own numbers fitted to it"
+    before, after, source = left.before, left.after, "its own numbers"
     if added and found.held_out is not None and found.held_out.residual_um is not None:
         before, after = found.held_out.residual_um[0], found.held_out.residual_um[-1]
-        source = (
-            "its own curve of loading, modulus and zero fitted to it, everything else taken from the other particles"
-        )
+        source = "its own curve of loading, modulus and zero, and everything else is taken from the other particles"
     count = np.maximum(left.used.sum(1), 1)
     rms = [np.sqrt(np.sum(np.where(left.used, one, 0.0) ** 2, axis=1) / count) for one in (before, after)]
     j = int(np.argmax(rms[0] - rms[1] if added else rms[0]))
@@ -74,12 +72,14 @@ def telling_test(found: Discovery) -> Telling | None:
     curve, used = base.campaign.curves[i], left.used[j, : len(rows)]
     rows = np.asarray(rows)[used]
     name = listed([plain(effect.mechanism) for effect in found.effects]) if found.effects else "the formula found"
-    off, which = f"{number(float(rms[0][j]), 2)} µm", "of all particles this one fits worst"
+    off, which = f"{number(float(rms[0][j]), 2)} µm", "fits worst"
     if added:
         middle = [f"{number(float(np.median(one)), 2)} µm" for one in rms]
         off += f" before and {number(float(rms[1][j]), 2)} µm after {name} was added"
-        which = f"of all particles this one gains most (median of all: {middle[0]} before, {middle[1]} after)"
-    caption = f"Particle {base.campaign.particles[i]}, {source}. On average the law is off by {off}; {which}."
+        off += f" (median of all: {middle[0]} and {middle[1]})"
+        which = "gains most"
+    shown = f"particle {base.campaign.particles[i]}, which of {len(before)} particles {which}"
+    caption = f"Shown: {shown}. On average the law is off by {off}; in it the particle has {source}."
     columns = (column[j, : len(used)][used] for column in (before, after, left.noise))
     one, two, noise = columns
     return Telling(
@@ -123,17 +123,18 @@ def _gap_tiles(found: dict[str, Any]) -> list[tuple[str, str, str]]:
         change = 100 * (after["value"] / before["value"] - 1)
         way = "higher" if change > 0 else "lower"
         meaning = (
-            f"at the peaks of these tests, instead of {with_sd(before, 1e-3)} GPa by the law alone, where it may "
-            f"differ between particles: {number(abs(change), 2)} % {way}."
+            f"at the peaks of these tests; {number(abs(change), 2)} % {way} than by the law alone, which gives "
+            f"{with_sd(before, 1e-3)} GPa."
         )
         tiles.append(("Effective modulus", f"{with_sd(after, 1e-3)} GPa", meaning))
     for effect in found["effects"]:
-        for name, value in list(effect["parameters"].items())[:1]:
-            meaning = (
-                f"{quantity(name)}, ± one standard deviation. That it is this one, of {len(found['ranking'])} effects "
-                f"that these tests could show, has probability {probability(effect['probability'])}."
-            )
-            tiles.append((plain(effect["mechanism"]).capitalize(), with_sd(value), meaning))
+        (name, first), *others = effect["parameters"].items()
+        beside = "".join(f"; {quantity(other)} {with_sd(value)}" for other, value in others)
+        meaning = (
+            f"{quantity(name)}, ± one standard deviation{beside}. That it is this one, of {len(found['ranking'])} "
+            f"effects that these tests could show, has probability {probability(effect['probability'])}."
+        )
+        tiles.append((plain(effect["mechanism"]).capitalize(), with_sd(first), meaning))
     if found["verdict"] == "NO_GAP":
         chance = found.get("p_anything_missing")
         meaning = "that tests of a law that lacks nothing disagree with it at least so much."
