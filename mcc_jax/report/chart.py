@@ -95,7 +95,7 @@ def chart_items() -> dict[str, Any]:
     lines = ColumnDataSource({name: [] for name in ("force", "own", "typical")}, name="lines")
     bands = ColumnDataSource({name: [] for name in ("displacement", "force", "time", "away")}, name="bands")
     curve = _figure("curve", "displacement [µm]", "force [mN]")
-    residual = _figure("residual", "time [s]", "measured − predicted [µm]")
+    residual = _figure("residual", "time [s]", "test − law [µm]")
     curve.patches("displacement", "force", source=bands, color=SKY, alpha=0.45, line_width=0)
     residual.patches("time", "away", source=bands, color=SKY, alpha=0.45, line_width=0)
     residual.add_layout(Span(location=0, dimension="width", line_color=BLACK, line_width=1.3))
@@ -103,7 +103,7 @@ def chart_items() -> dict[str, Any]:
     curve.line("typical", "force", source=lines, color=GREY, line_alpha=0.55, line_width=2.6)
     curve.line("own", "force", source=lines, color=BLACK, line_width=1.3)
     tips = [("particle", "@particle"), ("segment", "@segment"), ("force", "@force{0.000} mN")]
-    tips += [("displacement", "@displacement{0.000} µm"), ("measured − predicted", "@residual{0.0000} µm")]
+    tips += [("displacement", "@displacement{0.000} µm"), ("test − law", "@residual{0.0000} µm")]
     tips += [("time", "@time{0.0} s"), ("compared", "@compared")]
     for figure, x, y in ((curve, "displacement", "force"), (residual, "time", "residual")):
         marks = figure.scatter(

@@ -95,8 +95,12 @@ def telling_pictures(told: Telling) -> list[tuple[str, str]]:
     """Force over displacement, a part of it enlarged; and what each law leaves over time. With each, what it shows."""
     found = []
     for draw, title, words in (
-        (draw_enlarged, "where law and test differ most", "Force over displacement, enlarged where they differ most"),
-        (draw_left_over, "what each law leaves, over time", "Measured less predicted displacement over time"),
+        (
+            draw_enlarged,
+            "where law and test differ, enlarged",
+            "Force over displacement, enlarged where they differ most",
+        ),
+        (draw_left_over, "test minus law, over time", "Measured less predicted displacement over time"),
     ):
         # No wider than a phone: its type is read there at the size in which it is set.
         figure = new_figure(4.6, 3.6)

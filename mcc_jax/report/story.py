@@ -61,10 +61,10 @@ def telling_test(found: Discovery) -> Telling | None:
     if left is None or base is None:
         return None
     added = bool(found.effects) or found.closure is not None
-    before, after, source = left.before, left.after, "its own numbers"
+    before, after, source = left.before, left.after, ""
     if added and found.held_out is not None and found.held_out.residual_um is not None:
         before, after = found.held_out.residual_um[0], found.held_out.residual_um[-1]
-        source = "its own curve of loading, modulus and zero, and everything else is taken from the other particles"
+        source = " It was left out for this: all but its own curve of loading, modulus and zero is by the others."
     count = np.maximum(left.used.sum(1), 1)
     rms = [np.sqrt(np.sum(np.where(left.used, one, 0.0) ** 2, axis=1) / count) for one in (before, after)]
     j = int(np.argmax(rms[0] - rms[1] if added else rms[0]))
@@ -79,7 +79,7 @@ def telling_test(found: Discovery) -> Telling | None:
         off += f" (median of all: {middle[0]} and {middle[1]})"
         which = "gains most"
     shown = f"particle {base.campaign.particles[i]}, which of {len(before)} particles {which}"
-    caption = f"Shown: {shown}. On average the law is off by {off}; in it the particle has {source}."
+    caption = f"Shown: {shown}. On average the law is off by {off}.{source}"
     columns = (column[j, : len(used)][used] for column in (before, after, left.noise))
     one, two, noise = columns
     return Telling(

@@ -141,7 +141,7 @@ def particle_facts(results: Results, shown: Sequence[FittedCurve]) -> list[str]:
         if one.why_not is not None:
             parts.append(f"not used: {one.why_not}")
         elif one.rms_um is not None:
-            parts.append(f"root mean square of measured − predicted {number(one.rms_um, 2)}\N{NO-BREAK SPACE}µm")
+            parts.append(f"root mean square of test − law {number(one.rms_um, 2)}\N{NO-BREAK SPACE}µm")
         facts.append("; ".join(parts) + ".")
     return facts
 
