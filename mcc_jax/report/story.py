@@ -128,7 +128,10 @@ def _gap_tiles(found: dict[str, Any]) -> list[tuple[str, str, str]]:
         )
         tiles.append(("Effective modulus", f"{with_sd(after, 1e-3)} GPa", meaning))
     for effect in found["effects"]:
-        (name, first), *others = effect["parameters"].items()
+        parameters = list(effect["parameters"].items())
+        if not parameters:
+            continue
+        (name, first), *others = parameters
         beside = "".join(f"; {quantity(other)} {with_sd(value)}" for other, value in others)
         meaning = (
             f"{quantity(name)}, ± one standard deviation{beside}. That it is this one, of {len(found['ranking'])} "

@@ -65,8 +65,9 @@ def test_every_mechanism_stands_in_the_tables(docs):
 def test_an_entry_says_everything_and_shows_a_picture(docs, monkeypatch):
     gallery = docs("gallery")
     creep = LIBRARY["creep"]
-    strength, *pictures = gallery.picture(creep)
-    monkeypatch.setattr(gallery, "pictures", lambda: {"creep": (strength, *pictures)})
+    strength, most, *pictures = gallery.picture(creep)
+    assert 1.0 < most < 20.0
+    monkeypatch.setattr(gallery, "pictures", lambda: {"creep": (strength, most, *pictures)})
     entry = gallery.entry(creep)
     for picture in pictures:
         assert picture.startswith(b"\x89PNG")
@@ -91,3 +92,13 @@ def test_a_plan_worked_out_again_gives_the_kept_numbers(docs):
     kept, again = docs("gallery").POWER["plans"]["unload"], docs("make_power").worked_out("unload")
     assert again["needs"] == kept["needs"]
     assert again["limits"] == pytest.approx(kept["limits"], rel=0.05)
+
+
+def test_every_mechanism_stands_once_among_those_of_its_cause(docs, monkeypatch):
+    gallery = docs("gallery")
+    monkeypatch.setattr(gallery, "pictures", lambda: dict.fromkeys(LIBRARY, (1.0, 2.5)))
+    sheet = gallery.sheet()
+    assert sorted(re.findall(r"\(#(\w+)\)", sheet)) == sorted(LIBRARY)
+    of_tester = sheet.split("**")[2]
+    assert re.findall(r"\(#(\w+)\)", of_tester) == ["frame_compliance", "thermal_drift", "platen_sink_in"]
+    assert "2.5 µm" in of_tester
