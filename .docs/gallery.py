@@ -155,6 +155,8 @@ def pictures():
     return {name: picture(mechanism) for name, mechanism in LIBRARY.items()}
 
 
+# ---- the gallery -----------------------------------------------------------------------------------------------------
+
 CAUSES = {
     "tester": "Of the tester",
     "contact": "Where particle and platen meet",
@@ -165,8 +167,6 @@ CAUSES = {
     "material": "Of the particle and its material",
 }
 """What mechanisms have in common, by the module that holds them."""
-
-# ---- the gallery -----------------------------------------------------------------------------------------------------
 
 
 def gallery():

@@ -14,7 +14,7 @@ from ..calibrate.settings import JUDGEMENT, SAMPLING
 from ..campaign import Finding, campaign_findings, check_plausibility, check_tests
 from ..campaign.findings import worst
 from .read import DATA, Results, checksums_told
-from .sentences import law_called, within_noise
+from .sentences import beside_the_law, within_noise
 
 Level = Literal["good", "look", "bad", "unknown"]
 RHAT_BAD, ESS_BAD, PARETO_K_BAD = 1.05, 100.0, 1.0
@@ -149,8 +149,7 @@ def lights(results: Results, shown: Sequence[FittedCurve] = ()) -> list[Light]:
 
 def _with_found(results: Results, gap: dict[str, Any]) -> tuple[Level, str, str]:
     """Level, answer and meaning for the law with what was added: whether held-out tests still differ from it."""
-    closed, law = within_noise(gap), law_called(results)
-    law = law[0].upper() + law[1:]
+    closed, law = within_noise(gap), f"The law{beside_the_law(results)}"
     if closed is None:
         return "unknown", "not known", f"{law} was not tried on held-out particles."
     if closed:

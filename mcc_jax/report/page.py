@@ -25,9 +25,9 @@ with extra("report"):
     from .lights import COMPLETE, lights, share_inside, tested
     from .sentences import (
         METHODS,
+        beside_the_law,
         calibration_sentences,
         is_law_alone,
-        law_called,
         listed,
         next_steps,
         plain,
@@ -180,7 +180,7 @@ def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
         "before_after": CAPTIONS["discovery_before_after"][1],
         "figures_of": _figures(results),
         "folder": folder,
-        "law": law_called(results),
+        "law": f"the law{beside_the_law(results)}",
         "law_alone": is_law_alone(results),
         "style": Markup(_source("style.css")),
         "script": Markup(_closed(_source("page.js"))),
@@ -203,7 +203,7 @@ def _cards(results: Results, checks: list[Any]) -> list[dict[str, str]]:
     if results.calibration is not None:
         content, alone = results.calibration, is_law_alone(results)
         used = sum(entry["kept"] for entry in content["particles"])
-        law = "" if (law := law_called(results)) == "the law" else f" of {law}"
+        law = f" of the law{beside}" if (beside := beside_the_law(results)) else ""
         done, trusted = content["converged"], worst(tested(results)) != "bad"
         found.append(
             {
@@ -241,7 +241,7 @@ def _summary(results: Results) -> list[str]:
     """What stands below the first screen, in sentences."""
     if results.calibration is None:
         return []
-    return calibration_sentences(results.calibration, law_called(results), alone=is_law_alone(results))
+    return calibration_sentences(results.calibration, beside_the_law(results), alone=is_law_alone(results))
 
 
 def _sections(results: Results, shown: list[FittedCurve], checks: list[Any]) -> list[tuple[str, str]]:

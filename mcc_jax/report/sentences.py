@@ -15,8 +15,6 @@ METHODS = {
     "least-squares": "joint least squares of all tests at once (Optimistix)",
     "paper": "the paper's own steps, one after the other",
 }
-GAP = {True: "law and tests agree within the noise", False: "part of the gap closes, and part stays"}
-"""What is said of held-out particles."""
 SURE = {"bayes": "with 95 % probability", "least-squares": "as the 95 % confidence interval"}
 
 
@@ -53,26 +51,26 @@ def is_law_alone(results: Results) -> bool:
     return bool(found and found["effects"] and calibration and not calibration.get("effects"))
 
 
-def law_called(results: Results) -> str:
-    """The law of which the calibration is, in words: alone, or with its effects."""
+def beside_the_law(results: Results) -> str:
+    """What follows "the law" where the calibration's is meant: " alone", " with" its effects, or nothing."""
     if is_law_alone(results):
-        return "the law alone"
+        return " alone"
     effects = (results.calibration or {}).get("effects")
-    return f"the law with {listed([plain(effect['mechanism']) for effect in effects])}" if effects else "the law"
+    return f" with {listed([plain(effect['mechanism']) for effect in effects])}" if effects else ""
 
 
-def calibration_sentences(content: dict[str, Any], law: str = "the law", *, alone: bool = False) -> list[str]:
+def calibration_sentences(content: dict[str, Any], beside: str = "", *, alone: bool = False) -> list[str]:
     """The calibration in a few sentences.
 
     Args:
         content: contents of `calibration.json`.
-        law: what the law is called, see `law_called`.
+        beside: what follows "the law", see `beside_the_law`.
         alone: whether it is of the law without effects that were found to be missing. Its numbers are those of a law
             that is known to be wrong, not to be told in front of the right ones.
     """
     count, used = len(content["particles"]), sum(entry["kept"] for entry in content["particles"])
     found = [
-        f"{law[0].upper()}{law[1:]} was calibrated on {used} of {count} particles by {METHODS[content['method']]}"
+        f"The law{beside} was calibrated on {used} of {count} particles by {METHODS[content['method']]}"
         + ("." if content["converged"] else "; it did NOT converge, so its numbers may not be relied on.")
     ]
     if alone:
@@ -90,26 +88,31 @@ def calibration_sentences(content: dict[str, Any], law: str = "the law", *, alon
             if content[key]["interval_95"] is not None
         ]
         if known:
-            found.append(f"Given {law} and these tests, {listed(known)}, each {sure}.")
+            found.append(f"Given the law{beside} and these tests, {listed(known)}, each {sure}.")
     misfit = content["diagnostics"].get("own_misfit")
     if misfit is not None:
         found.append(
-            f"With its own curve of loading (coefficients C₁, C₃, C₅) {law} follows a particle's displacement to "
-            f"{percent(misfit)} of its range (median over the particles)."
+            f"With its own curve of loading (coefficients C₁, C₃, C₅) the law{beside} follows a particle's "
+            f"displacement to {percent(misfit)} of its range (median over the particles)."
         )
     return found
 
 
-def discovery_sentence(content: dict[str, Any], *, simulated: bool = False) -> str:
-    """The discovery in one sentence; that of simulated tests says so."""
+def discovery_sentence(content: dict[str, Any], tests: str = "tests") -> str:
+    """The discovery in one sentence.
+
+    Args:
+        content: contents of `discovery.json`.
+        tests: what the tests are called.
+    """
     verdict = content["verdict"]
     if verdict == "NO_GAP":
         return "Nothing is missing in the law that these tests could show."
     if verdict == "FIT_NOT_CONVERGED":
         return "The law could not be fitted well enough to ask what it lacks."
     closed = within_noise(content["gap"])
-    gap = "" if closed is None else "; with it added, " + GAP[closed]
-    gap = gap.replace("law and tests", "law and simulated tests") if simulated else gap
+    told = f"law and {tests} agree within the noise" if closed else "part of the gap closes, and part stays"
+    gap = "" if closed is None else f"; with it added, {told}"
     if verdict == "UNLISTED" or not content["effects"]:
         return f"Something is missing that no listed mechanism explains{gap}."
     names = listed([plain(effect["mechanism"]) for effect in content["effects"]])

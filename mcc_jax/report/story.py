@@ -40,7 +40,8 @@ def story(results: Results, shown: Sequence[FittedCurve]) -> Story:
     if found is not None:
         told = telling_test(results.found) if results.found is not None else None
         told = told or _of_fit(shown)
-        return Story(discovery_sentence(found, simulated=simulated(results)), *_drawn(told), _gap_tiles(found))
+        tests = "simulated tests" if simulated(results) else "tests"
+        return Story(discovery_sentence(found, tests), *_drawn(told), _gap_tiles(found))
     if results.calibration is not None:
         content = results.calibration
         used = sum(entry["kept"] for entry in content["particles"])

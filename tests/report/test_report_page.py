@@ -144,14 +144,14 @@ def test_the_page_is_of_the_law_with_what_was_found_where_that_may_be_believed(r
     alone, added = compare(found), compare(found.told)
     for one, other in zip(alone[:-1], added[:-1], strict=True):
         np.testing.assert_allclose((other.own_um - one.own_um)[one.used], 0.5, atol=1e-6)
-    page = report_page(found)
+    page, before = report_page(found), report_page(results)
     for words in (
         "Calibration of the law with frame compliance",
         "Parameters of the law with frame compliance",
         "Figures of the law alone",
     ):
         assert words in page
-        assert words not in report_page(results)
+        assert words not in before
     assert "<strong>frame compliance</strong> (in the form “linear”): <i>d</i> = <i>C</i> <i>F</i>" in page
     assert "law alone, which lacks" not in page
     step = found.discovery["gap"]["steps"][-1]
@@ -160,6 +160,7 @@ def test_the_page_is_of_the_law_with_what_was_found_where_that_may_be_believed(r
         checks = {one.check: one for one in lights(found.told, added)}
         assert (checks["Law is complete"].value, len(checks)) == (answer, len(lights(found, alone)))
     for other in (results, with_posterior_of_the_found(results, NotConverged)):
+        assert other.with_found is None
         assert other.told is other
         assert "Effects that discovery added are not in these lines" in report_page(other)
     content = found.calibration | {"effects": [{"mechanism": "creep"}]}
@@ -349,7 +350,7 @@ def telling(gap_at, points=60):
     """A test of rising load whose law is wrong in one place."""
     rows = np.arange(points, dtype=float)
     before = np.where(np.abs(rows - gap_at) < 4, 0.5, 0.0)
-    return Telling(rows, rows**2, rows, before, np.zeros(points), None, "law with frame compliance", "Particle 1.")
+    return Telling(rows, rows**2, rows, before, np.zeros(points), None, "law with creep", "Particle 1.")
 
 
 def test_parameters_before_and_after_stand_there_as_numbers(page):
@@ -372,7 +373,7 @@ def test_the_enlarged_part_holds_the_largest_gap(gap_at):
     assert told.near[gap_at]
     assert told.near.sum() < 20
     assert telling(2, points=4).near.sum() > 1  # of a record with few readings more is shown, never one
-    assert [look["label"] for _, look in told.laws] == ["law alone", "law with frame compliance"]
+    assert [look["label"] for _, look in told.laws] == ["law alone", "law with creep"]
     assert all(
         source.startswith("data:image/svg+xml") and "Particle 1" in words for source, words in telling_pictures(told)
     )
