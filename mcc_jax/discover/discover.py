@@ -198,12 +198,13 @@ def _begun(
         InputError: if no particle can be used, or no mechanism is left to look for.
     """
     base, left_out = _settled_fit(campaign, findings, model, threshold_MPa, tell)
-    testable, missing = untestable(without_punch(known, base), available_data(campaign))
+    known = without_punch(known, base)
+    testable, missing = untestable(known, available_data(campaign))
     if not testable:
         raise InputError("no mechanism is left to look for", remedy="Exclude fewer, or measure what the others need.")
     tell("signatures of all effects")
     with numbers_in_reach(base.campaign):
-        return Search(base, testable, tell), missing, left_out
+        return Search(base, testable, tell, whole=known), missing, left_out
 
 
 def _run(search: Search, seed: int, tell: Tell) -> float:

@@ -317,7 +317,15 @@ def _upside_down(
     return -value, -slope * scale
 
 
-def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, without: Optimum | None = None) -> Optimum:
+def optimise(
+    design: Design,
+    start: np.ndarray,
+    *,
+    curvature: bool = True,
+    without: Optimum | None = None,
+    several: bool = False,
+    at_least: float = -np.inf,
+) -> Optimum:
     """The mode of the hyperparameters by L-BFGS, in coordinates scaled by their expected curvature.
 
     Args:
@@ -325,6 +333,10 @@ def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, witho
         start: hyperparameters to begin with.
         curvature: whether they are integrated out; if not, `log_evidence` is the log posterior at the mode.
         without: the optimum without misfits, whose curvature is taken for that of the hyperparameters it has.
+        several: begin at the best of several settings of correlated noise, if it is clearly better: what was fitted
+            without misfits may have swallowed what they explain.
+        at_least: a log evidence to compare with. What begins `Numerics.very_strong` below is left there, its own
+            log evidence -inf.
 
     Raises:
         FloatingPointError: if it has no evidence where it begins.
@@ -349,18 +361,31 @@ def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, witho
         some = OfMisfits(x * scale, design)
         return lambda y: _upside_down(some, y * scale[first:], scale[first:])
 
+    def followed(x: np.ndarray) -> Any:
+        """The mode of the scales of misfits alone."""
+        some: Any = {"jac": True, "method": "L-BFGS-B", "bounds": bounds[first:], "options": options}
+        return minimize(of_misfits(x), x[first:], **some)
+
     def down(x: np.ndarray) -> tuple[float, np.ndarray]:
         # Scales of misfits cost nothing while noise and spreads stay: they follow, and at their mode have no slope.
         best[:first] = x
         if len(design.misfits):
-            best[first:] = minimize(
-                of_misfits(best), best[first:], jac=True, method="L-BFGS-B", bounds=bounds[first:],
-                options=options,
-            ).x  # fmt: skip
+            best[first:] = followed(best).x
         value, slope = _upside_down(value_and_gradient, best * scale, scale, design)
         if value < least[0]:
             least[:] = value, best.copy(), slope
         return value, slope[:first]
+
+    if several:
+        shorter = NUMERICS.length_factors[-1]
+        factors = np.log([(1.0, 1.0), *((factor, shorter) for factor in NUMERICS.noise_factors[1:])])
+        begun = [np.concatenate([best[:2], best[2:4] + at / scale[2:4], best[4:]]) for at in factors]
+        modes = [followed(x) for x in begun]
+        k = int(np.argmin([mode.fun for mode in modes]))
+        k = k if modes[k].fun < modes[0].fun - NUMERICS.strong else 0
+        best = np.append(begun[k][:first], modes[k].x)
+        if -modes[k].fun < at_least - NUMERICS.very_strong:
+            return Optimum(best * scale, -np.inf, -float(modes[k].fun), 0)
 
     least: list[Any] = [1e30, best, np.zeros(len(start))]
     found = minimize(down, best[:first].copy(), jac=True, method="L-BFGS-B", options=options)

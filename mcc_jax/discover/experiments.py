@@ -71,7 +71,7 @@ def next_experiments(search: Search, names: tuple[str, ...]) -> list[dict[str, A
 
 def _screened(base: Base, plan: Plan, library: Mapping[str, Mechanism]) -> tuple[Screen, int]:
     planned = planned_base(base, plan)
-    return first_order(planned, library, base.hyperparameters), len(planned.tests)
+    return first_order(planned, library), len(planned.tests)
 
 
 def _power(search: Search, members: list[str], other: Screen, copies: float) -> float:

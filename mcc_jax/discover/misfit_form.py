@@ -120,13 +120,14 @@ class Discrepancy:
     group: Sequence[int]
     log_white: float
 
-    def beside(self, base: Base, r: Refined) -> Smooth:
-        """The discrepancy beside the law, or beside what is named, at its optimum."""
+    def beside(self, base: Base, r: Refined, at_least: float = -np.inf) -> Smooth:
+        """The discrepancy beside the law, or beside what is named, at its optimum; `at_least` as of `optimise`."""
         unit, parts = float(np.log(DECISIONS.general)) + self.log_white, max(self.group)
         sizes = [(unit, DECISIONS.general_log_sd, np.inf)] * parts
         more = More(basis=self.basis, group=self.group, sizes=sizes)
         design = design_of(base, r.state, r.variants, more)
-        optimum = optimise(design, np.append(r.optimum.free, [unit - 1.0] * parts), without=r.optimum)
+        start = np.append(r.optimum.free, [unit - 1.0] * parts)
+        optimum = optimise(design, start, without=r.optimum, several=True, at_least=at_least)
         at = Refined(r.variants, r.state, design, optimum, solve(optimum.free, design))
         if not r.variants and optimum.log_joint > r.optimum.log_joint + NUMERICS.very_strong:
             # What it takes away from the law's numbers moves these as far as a name does; beside one that is done.

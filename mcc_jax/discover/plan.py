@@ -236,4 +236,4 @@ def without_effects(model: Model) -> Model:
 def screened(base: Base, library: Mapping[str, Mechanism]) -> tuple[Screen, Sequence[dict[str, str]]]:
     """All formulas that the campaign can be searched for, to first order, and what the others need."""
     testable, missing = untestable(library, available_data(base.campaign))
-    return first_order(base, testable), missing
+    return first_order(base, library, testable), missing

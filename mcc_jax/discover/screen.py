@@ -144,6 +144,18 @@ def pair_integrals(s: Setting, a: np.ndarray, b: np.ndarray, signs: np.ndarray, 
     return np.asarray(logsumexp(np.stack(found), axis=0)) - 2 * np.log(SCALES)
 
 
+def testable_columns(
+    base: Base, state: State, whole: Mapping[str, Mechanism], testable: Mapping[str, Mechanism]
+) -> tuple[tuple[Candidate, ...], np.ndarray]:
+    """The formulas of a library that tests can tell, and their signatures.
+
+    Those of the whole library are worked out: campaigns that can tell different ones share what is compiled.
+    """
+    every = candidates_of(whole)
+    rows = [k for k, c in enumerate(every) if c.mechanism in testable and c.variant in testable[c.mechanism].variants]
+    return tuple(every[k] for k in rows), signature_columns(base, state, every)[..., np.array(rows, int)]
+
+
 def signature_columns(base: Base, state: State, candidates: Sequence[Candidate]) -> np.ndarray:
     """Signatures of candidates at the base law, in units of their smallest plausible amplitudes."""
     effects = tuple(c.effect for c in candidates)
@@ -184,9 +196,7 @@ def screen(
     return Screen(tuple(candidates), tuple(settings), columns)
 
 
-def first_order(base: Base, library: Mapping[str, Mechanism], free: np.ndarray | None = None) -> Screen:
-    """Scores of a library around the base law at its own hyperparameters, or at others."""
-    candidates = candidates_of(library)
-    columns = signature_columns(base, base.state, candidates)
-    at = base.hyperparameters if free is None else free
-    return screen(base, base.state, at, candidates, columns, several=False)
+def first_order(base: Base, whole: Mapping[str, Mechanism], testable: Mapping[str, Mechanism] | None = None) -> Screen:
+    """Scores of a library around the base law at its own hyperparameters, or of what of it the tests can tell."""
+    candidates, columns = testable_columns(base, base.state, whole, whole if testable is None else testable)
+    return screen(base, base.state, base.hyperparameters, candidates, columns, several=False)

@@ -15,7 +15,7 @@ from ..calibrate.compiling import side_by_side
 from ..calibrate.model import Model
 from ..effects import Mechanism, Variant
 from .base import Base, State
-from .candidates import Candidate, candidates_of, located
+from .candidates import Candidate, located
 from .columns import with_amplitudes
 from .design import at_priors
 from .evidence import left_by_particle, log_joint, with_little_noise, without_first
@@ -25,7 +25,7 @@ from .misfit import coordinates, general, scaled, telling
 from .misfit_form import Discrepancy, fit_with_misfit
 from .own_numbers import OwnNumbers, differing, sudden_steps
 from .refine import Refined, refined
-from .screen import Screen, Setting, pair_integrals, screen, signature_columns, single_integrals
+from .screen import Screen, Setting, pair_integrals, screen, single_integrals, testable_columns
 from .settings import DECISIONS, NUMERICS
 from .weighing import log_posteriors, posterior
 
@@ -41,7 +41,7 @@ class Search:
 
     Attributes:
         base: the tests.
-        library: mechanisms that are searched for.
+        library: mechanisms that are searched for, with the formulas that the tests can tell.
         null: the base law at its optimum.
         starts: states from which hypotheses look for their optimum: the null's, and of a material that the law was not
             made for the priors' middle, too, since such tests have several optima.
@@ -52,8 +52,14 @@ class Search:
     """
 
     def __init__(
-        self, base: Base, library: Mapping[str, Mechanism], tell: Callable[[str], None] = lambda _: None
+        self,
+        base: Base,
+        library: Mapping[str, Mechanism],
+        tell: Callable[[str], None] = lambda _: None,
+        *,
+        whole: Mapping[str, Mechanism] | None = None,
     ) -> None:
+        """Fit the law alone; `whole` has the formulas, too, that the tests cannot tell."""
         self.library, self.tell = library, tell
         base, start = with_likely_noise(base)
         self.base = base
@@ -69,8 +75,7 @@ class Search:
         self.shared = {
             name: m for name, m in library.items() if name != SUDDEN and not any(v.random_per_test for v in m.variants)
         }
-        self.candidates = candidates_of(library)
-        self.columns = signature_columns(base, self.state, self.candidates)
+        self.candidates, self.columns = testable_columns(base, self.state, whole or library, library)
         self.screen = self.screened(self.shared) if self.shared else None
         self.small = with_little_noise(self.null.optimum.free)
         self.fits: dict[tuple[int, ...], Refined] = {}
@@ -181,10 +186,10 @@ class Search:
         functions, group = general(self.at, self.base.tests, self.null.design.linear)
         return Discrepancy(functions, group, float(self.null.optimum.free[0]))
 
-    def with_discrepancy(self, leader: Hypothesis) -> None:
-        """Log evidence of a name with a smooth discrepancy beside it."""
+    def with_discrepancy(self, leader: Hypothesis, at_least: float) -> None:
+        """Log evidence of a name with a smooth discrepancy beside it, where it comes near that of another."""
         assert leader.best is not None
-        leader.beside = self.discrepancy.beside(self.base, leader.best).at.log_evidence
+        leader.beside = self.discrepancy.beside(self.base, leader.best, at_least).at.log_evidence
 
     # ---- two names ---------------------------------------------------------------------------------------------------
 
@@ -363,10 +368,11 @@ class Search:
         side_by_side(self.with_misfit, [x for x in alone if x.own is not None and not x.own.jumps])
         self.found[UNLISTED] = Hypothesis(UNLISTED, smooth.at.log_evidence, smooth=smooth)
         leaders = sorted((x for x in self.found.values() if x.names and x.best is not None), key=lambda x: -x.alone)
-        if leaders and max(x.log_evidence for x in self.found.values()) - nothing > NUMERICS.strong:
+        most = max(x.log_evidence for x in self.found.values())
+        if leaders and most - nothing > NUMERICS.strong:
             self.tell("two names")
             leading = leaders[:2]
-            tasks = [partial(self.pairs_of_each, leading), *(partial(self.with_discrepancy, x) for x in leading)]
+            tasks = [partial(self.pairs_of_each, leading), *(partial(self.with_discrepancy, x, most) for x in leading)]
             side_by_side(call, tasks)
             first = max((x for x in self.found.values() if len(x.names) == 1), key=lambda x: x.log_evidence)
             if first.own is not None and self.screen is not None:
