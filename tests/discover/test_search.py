@@ -7,15 +7,16 @@ import pytest
 from campaigns import base_of, cached, with_curves
 
 from mcc_jax.campaign import available_data
+from mcc_jax.discover import screen
 from mcc_jax.discover.answer import _population, effects_of, instead_of, name_probabilities, sets_of
 from mcc_jax.discover.bootstrap import p_anything
 from mcc_jax.discover.candidates import untestable
-from mcc_jax.discover.evidence import solve
+from mcc_jax.discover.evidence import optimise, solve
 from mcc_jax.discover.heldout import held_out
 from mcc_jax.discover.hypothesis import UNLISTED, Hypothesis
 from mcc_jax.discover.locate import difference, places, where
 from mcc_jax.discover.search import Search
-from mcc_jax.discover.settings import DECISIONS
+from mcc_jax.discover.settings import DECISIONS, NUMERICS
 from mcc_jax.effects import LIBRARY
 
 FEW = {name: LIBRARY[name] for name in ("frame_compliance", "damage")}
@@ -219,3 +220,33 @@ def test_pairs_to_first_order_are_of_two_mechanisms(named, monkeypatch):
     assert named.first_order_pairs() == {}
     monkeypatch.setattr("mcc_jax.discover.search.DECISIONS", replace(DECISIONS, margin=-100.0))
     assert named.first_order_pairs() == {("damage", "frame_compliance"): (a[best], b[best])}
+
+
+def test_what_tests_cannot_tell_is_compiled_but_not_searched(named, monkeypatch):
+    """Campaigns that can tell other formulas of one library trace its signatures once."""
+    traced = []
+    signatures = screen.signatures
+    monkeypatch.setattr(screen, "signatures", lambda *given: traced.append(1) or signatures(*given))
+    compliance = FEW["frame_compliance"]
+    fewer = {"frame_compliance": replace(compliance, variants=compliance.variants[1:])}
+    every, columns = screen.testable_columns(named.base, named.state, FEW, FEW)
+    some, fewer_columns = screen.testable_columns(named.base, named.state, FEW, fewer)
+    assert len(traced) <= 1
+    assert 0 < len(some) < len(every)
+    assert {c.variant.name for c in some} == {v.name for v in compliance.variants[1:]}
+    np.testing.assert_array_equal(fewer_columns, columns[..., [every.index(c) for c in some]])
+
+
+def test_a_discrepancy_begins_where_noise_leaves_it_most(named):
+    """Fitted without it, correlated noise has swallowed a gap; what cannot come near another name is left."""
+    r, of = named.null, named.discrepancy
+    start = np.append(r.optimum.free, [np.log(DECISIONS.general) + of.log_white - 1.0] * max(of.group))
+    design = of.beside(named.base, r).at.design
+    swallowed = np.where(np.arange(len(start)) == 2, start + 2.0, start)
+    one, best = (optimise(design, swallowed, without=r.optimum, several=several) for several in (False, True))
+    assert best.log_joint > one.log_joint - 0.02 * len(start)  # as near as a mode is met (`Numerics.flat`)
+    assert best.evaluations <= one.evaluations
+    far = best.log_joint + NUMERICS.very_strong + 10.0
+    left = optimise(design, start, without=r.optimum, several=True, at_least=far)
+    assert left.evaluations == 0
+    assert left.log_evidence == -np.inf
