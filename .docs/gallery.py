@@ -10,6 +10,8 @@ from pathlib import Path
 
 from equations import in_tex
 
+from mcc_jax._format import number, plain
+
 POWER = json.loads((Path(__file__).parent / "power.json").read_text(encoding="utf-8"))
 FEW, MANY = "unload", "rates"
 """The two plans by which the gallery says what an effect is mistaken for."""
@@ -23,11 +25,6 @@ LARGEST_SHARE = 0.12
 """Of the largest displacement: an effect that adds more is drawn weaker than its largest plausible strength."""
 
 
-def plain(name):
-    """`platen_sink_in` as a person writes it."""
-    return name.replace("_", " ")
-
-
 def unit_of(unit):
     """A unit for people; nothing where there is none."""
     if unit.startswith("1/"):
@@ -37,8 +34,6 @@ def unit_of(unit):
 
 def written(value):
     """A number as a person writes it: 0.0002, 30, 1.43."""
-    from mcc_jax._format import number
-
     return number(value, 3)
 
 
@@ -310,7 +305,6 @@ def visible_share(mechanism, limit):
 
 def which_test():
     """A table: mechanisms down, plans across, from which size on each is found."""
-    from mcc_jax._format import number
     from mcc_jax.effects import LIBRARY
 
     plans = POWER["plans"].values()

@@ -25,6 +25,7 @@ from PIL import Image
 
 import mcc_jax as mcc
 from mcc_jax import dem
+from mcc_jax._format import plain
 from mcc_jax.effects import AbstractEffect
 
 HERE = Path(__file__).parent
@@ -135,7 +136,7 @@ def plan():
         low, high = mcc.LIBRARY[name].variants[0].plausible
         ax.plot([1.0, high / low], [row, row], color=BLUE, lw=6, alpha=0.35, solid_capstyle="butt")
         ax.plot(limits[name] / low, row, "|", ms=12, mew=2.5, color=VERMILION)
-    ax.set_yticks(range(len(names)), [name.replace("_", " ") for name in reversed(names)])
+    ax.set_yticks(range(len(names)), [plain(name) for name in reversed(names)])
     ax.set_xscale("log")
     ax.set_xlabel("size over the smallest plausible one\nblue: plausible; red: seen from here on")
     ax.spines[["top", "right"]].set_visible(False)

@@ -18,6 +18,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mcc_jax as mcc
+from mcc_jax._format import plain
 from mcc_jax.discover import discover
 from mcc_jax.effects import find_variant
 from mcc_jax.report.pictures import draw_enlarged, draw_left_over
@@ -74,7 +75,7 @@ def discovery():
     gain = np.sum(left.white_before**2 - left.white_after**2, axis=1)
     i = int(np.argsort(gain)[len(gain) // 2])  # the particle in the middle, not the best one
     used, time = left.used[i], left.time_s[i]
-    name = " or ".join(n.replace("_", " ") for n in found.candidate_set[0])
+    name = " or ".join(plain(n) for n in found.candidate_set[0])
     figure, ax = panel(f"A discovery: {name}", "time / s", "measured less predicted / µm")
     show = {key: np.where(used, getattr(left, key)[i], np.nan) for key in ("before", "after", "noise")}
     ax.fill_between(time, -show["noise"], show["noise"], color=ORANGE, alpha=0.5, lw=0, label="noise")

@@ -1,11 +1,11 @@
-"""Numbers as a person writes them, for command, pages, figures and `repr`."""
+"""Numbers and names as a person writes them, for command, pages, figures and `repr`."""
 
 from __future__ import annotations
 
 import dataclasses
 import enum
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,18 @@ def number(value: float | int | None, digits: int = 4) -> str:
     if "e" in text:
         text = f"{value:.0f}"
     return text.replace("-", "−")
+
+
+def plain(name: str) -> str:
+    """A mechanism's name, or a formula's, for a sentence: `platen_sink_in` is "platen sink in"."""
+    return name.replace("_", " ")
+
+
+def listed(names: Sequence[str], word: str = "and") -> str:
+    """Names in a row, the last after a word."""
+    if len(names) < 2:
+        return names[0] if names else "nothing"
+    return f"{', '.join(names[:-1])} {word} {names[-1]}"
 
 
 def _raised(exponent: int) -> str:

@@ -228,16 +228,18 @@ def sealed_answer(seed: int) -> Sealed:
 
 def compared(answer: dict[str, Any], found: dict[str, Any]) -> tuple[bool, str]:
     """Whether a discovery (discovery.json) named what was hidden (sealed.json), and in a sentence how both agree."""
+    from .._format import plain
+
     hidden = answer["mechanism"]
     named = [effect["mechanism"] for effect in found["effects"]]
     if named != [hidden]:
-        told = " and ".join(map(_plain, named)) or f"no name (verdict {found['verdict']})"
-        return False, f"The discovery is WRONG: hidden was {_plain(hidden)}, found was {told}."
+        told = " and ".join(map(plain, named)) or f"no name (verdict {found['verdict']})"
+        return False, f"The discovery is WRONG: hidden was {plain(hidden)}, found was {told}."
     effect = found["effects"][0]
-    rivals = [_plain(name) for name in found["candidate_set"][0] if name != hidden]
+    rivals = [plain(name) for name in found["candidate_set"][0] if name != hidden]
     doubt = f", though these tests cannot tell it from {' or '.join(rivals)}" if rivals else ""
     if effect["variant"] != answer["variant"]:
-        formulas = f"{_plain(effect['variant'])}, hidden was {_plain(answer['variant'])}"
+        formulas = f"{plain(effect['variant'])}, hidden was {plain(answer['variant'])}"
         return True, f"The name agrees{doubt}; the formula is another ({formulas}), so amplitudes do not compare."
     name, true = next(iter(answer["parameters"].items()))
     value, sd, ends = (effect["parameters"][name][key] for key in ("value", "sd", "interval_95"))
@@ -248,7 +250,3 @@ def compared(answer: dict[str, Any], found: dict[str, Any]) -> tuple[bool, str]:
         f"The name agrees{doubt}. The amplitude found is off by {off}{spread}; "
         f"the true one lies {where} its 95 % interval."
     )
-
-
-def _plain(name: str) -> str:
-    return name.replace("_", " ")

@@ -181,7 +181,9 @@ def main_finding(content: dict[str, Any]) -> str:
         return "the law cannot be fitted well enough to ask what it lacks"
     if verdict == "UNLISTED":
         return "something is missing that no listed mechanism explains; a formula for it is in discovery.json"
-    names = " and ".join(effect["mechanism"].replace("_", " ") for effect in content["effects"])
+    from .._format import listed, plain
+
+    names = listed([plain(effect["mechanism"]) for effect in content["effects"]])
     sure = "" if verdict == "NAMED" else ", or what these tests cannot tell from it"
     closed = content["gap"]["closed_fraction"]
     gap = "" if closed is None else f"; it closes {100 * closed:.0f} % of the gap on held-out particles"

@@ -12,6 +12,7 @@ from typing import Any
 
 from .. import arguments
 from .._errors import InputError
+from .._format import listed, plain
 from ..calibrate import Model, Posterior, sample
 from ..calibrate.compiling import one_blas_thread
 from ..calibrate.data import root_mean_squares
@@ -322,7 +323,7 @@ def _of_law_alone(found: Discovery, search: Search) -> Discovery:
 
 def _taken_back(found: Discovery, winner: Names, objection: str) -> Discovery:
     """No answer: the law misses these tests, and what would explain it does not hold on held-out particles."""
-    names = "a formula of its own" if winner == UNLISTED else " and ".join(winner).replace("_", " ")
+    names = "a formula of its own" if winner == UNLISTED else listed(list(map(plain, winner)))
     summary = (
         f"The law does not describe these tests, and nothing was found that does. What explains most is {names}, but "
         f"of particles that took no part {objection}. Look at the tests one by one: records that run on through slips "

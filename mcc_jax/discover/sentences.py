@@ -4,20 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from .._format import interval, with_sd
+from .._format import interval, listed, plain, with_sd
 from ..calibrate.judgement import told_by_no_test
 from .settings import AT_PEAKS, DECISIONS, TELLING
 
 if TYPE_CHECKING:
     from .result import Discovery, Effect
-
-
-def _listed(names: list[str]) -> str:
-    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " or " + names[-1]
-
-
-def _plain(name: str) -> str:
-    return name.replace("_", " ")
 
 
 def summary_of(found: Discovery) -> str:
@@ -27,7 +19,7 @@ def summary_of(found: Discovery) -> str:
     for effect, names in zip(found.effects, found.candidate_set, strict=True):
         unit = "" if effect.variant.unit == "-" else f" {effect.variant.unit}"
         value = f"{effect.variant.name.replace('_', ' ')}, {effect.amplitude:.3g} +- {effect.sd:.2g}{unit}"
-        sentences.append(f"It is {_plain(effect.mechanism)} with probability {effect.probability:.2f} ({value}).")
+        sentences.append(f"It is {plain(effect.mechanism)} with probability {effect.probability:.2f} ({value}).")
         if effect.jumps:
             sentences.append(_jumps(found, effect))
         elif abs(effect.amplitude) > effect.variant.plausible[1]:
@@ -36,25 +28,25 @@ def summary_of(found: Discovery) -> str:
                 f"That is more than is plausible (at most {most}): something else may be in it, and the parameters "
                 "beside it are as doubtful."
             )
-        rivals = [_plain(n) for n in names if n != effect.mechanism and n not in found.paired]
-        rivals += [" together with ".join(map(_plain, pair)) for pair in found.pairs]
+        rivals = [plain(n) for n in names if n != effect.mechanism and n not in found.paired]
+        rivals += [" together with ".join(map(plain, pair)) for pair in found.pairs]
         if rivals:
-            sentences.append(f"These tests cannot tell it from {_listed(rivals)}.")
+            sentences.append(f"These tests cannot tell it from {listed(rivals, 'or')}.")
         if effect.misfit > 2 * DECISIONS.misfit:
             sentences.append(f"Its formula is off by about {100 * effect.misfit:.0f} % of the effect.")
     if found.closure is not None:
-        near = f", most like {_plain(found.closure.resembles[0][0])}" if found.closure.resembles else ""
+        near = f", most like {plain(found.closure.resembles[0][0])}" if found.closure.resembles else ""
         sentences.append(f"A formula describes it{near}: {found.closure.formula}.")
     sentences += _gap(found)
     if found.leads:
-        each = [f"{_plain(one['mechanism'])} ({max(100 * one['share'], 0.1):.2g} %)" for one in found.leads]
-        text = f"Beside it, a share of the evidence may be due to {_listed(each)}; that is not added to the law."
+        each = [f"{plain(one['mechanism'])} ({max(100 * one['share'], 0.1):.2g} %)" for one in found.leads]
+        text = f"Beside it, a share of the evidence may be due to {listed(each, 'or')}; that is not added to the law."
         sentences.append(text)
     if found.parameters_after and found.verdict in ("NAMED", "SET", "UNLISTED"):
         sentences.append(_modulus(found.parameters_before, found.parameters_after))
     sentences += _next(found)
     if found.untestable:
-        needs = "; ".join(f"{_plain(u['mechanism'])} (needs {u['needs']})" for u in found.untestable)
+        needs = "; ".join(f"{plain(u['mechanism'])} (needs {u['needs']})" for u in found.untestable)
         sentences.append(f"These tests say nothing about {needs}.")
     return " ".join(sentences)
 
@@ -75,7 +67,7 @@ def _verdict(found: Discovery, count: int) -> str:
         return (
             f"The law and the {count} tests agree within the noise; nothing is missing that they could show ({chance})."
         )
-    names = " and ".join(_plain(e.mechanism) for e in found.effects)
+    names = " and ".join(plain(e.mechanism) for e in found.effects)
     lead = f"The law misses {names}" if names else "The law misses something that no listed mechanism explains"
     if found.verdict == "SET":
         lead += ", or what looks like it"
@@ -102,14 +94,14 @@ def _next(found: Discovery) -> list[str]:
     best = found.next_experiments[0] if found.next_experiments else None
     sure = best is not None and best["power"] >= TELLING.enough
     if best is not None:
-        names = _listed([_plain(n) for n in best["separates"]])
+        names = listed([plain(n) for n in best["separates"]], "or")
         doubt = "" if sure else f"No further test of those tried on paper would surely separate {names}. "
         told.append(
             f"{doubt}{'Next' if sure else 'The best'}: {best['experiment']}, {best['particles']} further particles; "
             f"with these it would separate {names} with probability {best['power']:.2f}."
         )
     if found.checks and not sure:
-        each = "; ".join(f"{_plain(one['mechanism'])}: {one['check']}" for one in found.checks[: TELLING.checks])
+        each = "; ".join(f"{plain(one['mechanism'])}: {one['check']}" for one in found.checks[: TELLING.checks])
         told.append(f"Each would show by itself ({each}).")
     return told
 

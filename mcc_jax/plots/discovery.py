@@ -14,6 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from .._errors import InputError
+from .._format import plain
 from ..discover import Discovery
 from ..discover.locate import Place
 from ..discover.settings import TELLING
@@ -50,11 +51,6 @@ def _finished(figure: Figure, found: Discovery, **more: Any) -> Figure:
     if found.base is None:
         raise InputError("the base law was not fitted; there is nothing to draw")
     return style.finish(figure, found.base.campaign.metadata, **more)
-
-
-def plain_name(name: str) -> str:
-    """A mechanism's name in words."""
-    return name.replace("_", " ")
 
 
 @style.styled
@@ -142,7 +138,7 @@ def plot_ranking(found: Discovery) -> Figure:
         needs = f"needs {missing['needs']}"
         ax.text(0.012 * scale, row, needs, va="center", fontsize=style.SMALL, color=style.GREY, zorder=5, bbox=patch)
     ax.axvline(TELLING.detectable, **_FLOOR)
-    ax.set_yticks(range(count), [plain_name(e["mechanism"]) for e in (*entries, *found.untestable)])
+    ax.set_yticks(range(count), [plain(e["mechanism"]) for e in (*entries, *found.untestable)])
     for tick in ax.get_yticklabels()[len(entries) :]:
         tick.set_color(style.GREY)
     ax.set_ylim(count - 0.4, -0.6)
@@ -183,7 +179,7 @@ def plot_similarity(found: Discovery) -> Figure:
     for (i, j), value in np.ndenumerate(both):
         ink, words = "white" if abs(value) > 0.65 else style.BLACK, f"{value:.2f}".replace("-0.00", "0.00")
         ax.text(j, i, words, ha="center", va="center", fontsize=7, color=ink)
-    words = [plain_name(name) for name in names]
+    words = [plain(name) for name in names]
     ax.set_xticks(range(count), words, rotation=45, ha="right", rotation_mode="anchor")
     ax.set_yticks(range(count), words)
     for axis in (ax.get_xticklabels(), ax.get_yticklabels()):
@@ -209,7 +205,7 @@ def plot_gap(found: Discovery) -> Figure:
         for ax in (left, right):
             style.empty(ax, reason)
         return _finished(figure, found, title="The gap on held-out particles")
-    labels = ["law alone", *(f"+ {plain_name(s['added'])}" for s in steps[1:])]
+    labels = ["law alone", *(f"+ {plain(s['added'])}" for s in steps[1:])]
     colours = [style.VERMILION, *([style.BLUE] * (len(steps) - 1))]
     for ax, key, label, form, floor in (
         (left, "chi2_per_dof", "χ² per point [-]", ".2f", 1.0),

@@ -12,7 +12,7 @@ from typing import Any
 
 from .. import arguments
 from .._extras import extra, own_version
-from .._format import interval, number, percent, probability, with_sd
+from .._format import interval, listed, number, percent, plain, probability, with_sd
 from ..calibrate.curves import KINDS, FittedCurve
 from ..campaign import PAPER_EFFECTIVE_MODULUS_MPA, PAPER_LOG_C, PAPER_SHAPE_PARAMETER
 from ..campaign.findings import worst
@@ -28,9 +28,7 @@ with extra("report"):
         beside_the_law,
         calibration_sentences,
         is_law_alone,
-        listed,
         next_steps,
-        plain,
         quantity,
         simulated,
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from typing import Any
 
-from .._format import interval, number, percent, probability
+from .._format import interval, listed, number, percent, plain, probability
 from ..discover.settings import TELLING
 from ..plots.style import is_simulated
 from .read import Results
@@ -18,11 +18,6 @@ METHODS = {
 SURE = {"bayes": "with 95 % probability", "least-squares": "as the 95 % confidence interval"}
 
 
-def plain(name: str) -> str:
-    """A mechanism's name for a sentence."""
-    return name.replace("_", " ")
-
-
 def quantity(name: str) -> str:
     """A key with its unit for a person: `compliance_um_per_mN` is "compliance [µm/mN]"."""
     units = {"um": "µm", "percent": "%"} | {one: one for one in ("mN", "MPa", "s")}
@@ -31,13 +26,6 @@ def quantity(name: str) -> str:
     unit = "".join("/" if word == "per" else units[word] for word in words[start:])
     label = " ".join(words[:start])
     return f"{label} [{'1' * unit.startswith('/')}{unit}]" if unit else label
-
-
-def listed(names: list[str], word: str = "and") -> str:
-    """Names in a row, the last after a word."""
-    if len(names) < 2:
-        return names[0] if names else "nothing"
-    return f"{', '.join(names[:-1])} {word} {names[-1]}"
 
 
 def simulated(results: Results) -> bool:

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from .._format import number, percent, probability, with_sd
+from .._format import listed, number, percent, plain, probability, with_sd
 from ..calibrate.curves import FittedCurve
 from ..discover import Discovery
 from ..plots.style import is_simulated
 from .pictures import Telling, telling_pictures
 from .read import Results
-from .sentences import discovery_sentence, listed, plain, quantity, simulated
+from .sentences import discovery_sentence, quantity, simulated
 
 
 @dataclass(frozen=True)

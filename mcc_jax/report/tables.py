@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from .._format import interval, number, span, with_sd
+from .._format import interval, number, plain, span, with_sd
 from ..calibrate.curves import FittedCurve
 from ..campaign import Campaign, campaign_segments, effective_diameter_um
 from .read import Results
-from .sentences import plain
 
 GREEK = {
     "sigma": "σ",
