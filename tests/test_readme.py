@@ -58,6 +58,7 @@ def cell(file: str, keys: tuple[str, ...], column: str) -> str:
 
 SET = "2026-11-27-84117"
 BLIND = f"blind/{SET}/score.md"
+HARDER = "2026-11-28-29852-final"
 BASELINES = {"oracle": "oracle", "aic": "AIC", "discrepancy": "discrepancy"}
 """Labels of runs beside ours, and what README calls them."""
 SEALED = {
@@ -110,6 +111,12 @@ def test_the_scoreboard_says_what_the_tables_say():
     for number in (*ours, "oracle 75.0", "1.65e+06"):
         assert README.count(number) == 1
         assert len(drifted(README.replace(number, "7777"))) == 1, number
+
+
+def test_a_harder_set_is_told_beside_the_scoreboard():
+    told = [cell(f"blind/{HARDER}/score.md", (row,), "found").split("%")[0].strip() for row in SEALED.values()]
+    assert f"in this order, {' %, '.join(told[:-1])} % and {told[-1]} %" in " ".join(README.split())
+    assert "114 of 460 campaigns answered" in (RESULTS / f"blind/{HARDER}/score.md").read_text(encoding="utf-8")
 
 
 def test_the_list_of_benchmarks_is_gathered_from_their_tables(monkeypatch):
