@@ -307,14 +307,116 @@ class Optimum:
     evaluations: int
 
 
-def _upside_down(
-    function: Callable[..., tuple[float, np.ndarray]], at: np.ndarray, scale: np.ndarray, *given: Any
-) -> tuple[float, np.ndarray]:
-    """A function to be minimised in scaled coordinates; a step into numbers beyond arithmetic is taken back."""
-    value, slope = function(at, *given)
-    if not (np.isfinite(value) and np.isfinite(slope).all()):
-        return 1e30, np.zeros(len(at))
-    return -value, -slope * scale
+class _Surface:
+    """The log posterior of a design's hyperparameters upside down, in coordinates scaled by their expected curvature.
+
+    Attributes:
+        design: of a hypothesis.
+        first: number of hyperparameters that are no scales of misfits.
+        scale: unit of each coordinate.
+        most: the largest value of each.
+        options: of L-BFGS.
+    """
+
+    def __init__(self, design: Design) -> None:
+        count, spreads = float(np.asarray(design.tests.mask).sum()), len(design.kinds.spreads)
+        self.design, self.first = design, 4 + spreads
+        noise = count * np.array([1.5, 0.2, 0.1, 0.02])
+        expected = [noise, np.full(spreads, 2.0 * len(design.tests)), np.full(len(design.misfits), 2.0)]
+        self.scale = 1 / np.sqrt(np.concatenate(expected))
+        self.most = np.concatenate([np.full(self.first, np.inf), design.misfits[:, 2]]) / self.scale
+        self.options: Any = {"ftol": 1e-7, "gtol": NUMERICS.flat, "maxiter": NUMERICS.evaluations}
+
+    def _minimise(self, function: Callable[[np.ndarray], tuple[float, np.ndarray]], start: np.ndarray, **more: Any):
+        from scipy.optimize import minimize
+
+        return minimize(function, start, jac=True, method="L-BFGS-B", options=self.options, **more)
+
+    def _upside_down(self, value: float, slope: np.ndarray) -> tuple[float, np.ndarray]:
+        """A step into numbers beyond arithmetic is taken back."""
+        if not (np.isfinite(value) and np.isfinite(slope).all()):
+            return 1e30, np.zeros(len(slope))
+        return -value, -slope * self.scale[len(self.scale) - len(slope) :]
+
+    def at(self, x: np.ndarray) -> tuple[float, np.ndarray]:
+        """Value and slope."""
+        return self._upside_down(*value_and_gradient(x * self.scale, self.design))
+
+    def of_misfits(self, x: np.ndarray) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:
+        """Value and slope as a function of the scales of misfits alone."""
+        some = OfMisfits(x * self.scale, self.design)
+        return lambda y: self._upside_down(*some(y * self.scale[self.first :]))
+
+    def followed(self, x: np.ndarray) -> tuple[float, np.ndarray]:
+        """Where the scales of misfits are at their mode, all else as it is: the value there, and all coordinates."""
+        bounds = [(None, None if np.isinf(one) else one) for one in self.most[self.first :]]
+        found = self._minimise(self.of_misfits(x), x[self.first :], bounds=bounds)
+        return float(found.fun), np.append(x[: self.first], found.x)
+
+    def likely(self, x: np.ndarray) -> tuple[float, np.ndarray]:
+        """The best of several settings of correlated noise, if it is clearly better than the one given.
+
+        What was fitted without misfits may have swallowed what they explain.
+        """
+        shorter = NUMERICS.length_factors[-1]
+        factors = np.log([(1.0, 1.0), *((factor, shorter) for factor in NUMERICS.noise_factors[1:])])
+        some = [self.followed(np.concatenate([x[:2], x[2:4] + by / self.scale[2:4], x[4:]])) for by in factors]
+        best = min(some, key=lambda one: one[0])
+        return best if best[0] < some[0][0] - NUMERICS.strong else some[0]
+
+    def mode(self, start: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, int]:
+        """The lowest point met by L-BFGS: value, coordinates, slope, and evaluations."""
+        x = start.copy()
+        least: list[Any] = [1e30, x.copy(), np.zeros(len(x))]
+
+        def down(y: np.ndarray) -> tuple[float, np.ndarray]:
+            # Scales of misfits cost nothing while noise and spreads stay: they follow, and at their mode have no slope.
+            x[: self.first] = y
+            if len(self.design.misfits):
+                x[:] = self.followed(x)[1]
+            value, slope = self.at(x)
+            if value < least[0]:
+                least[:] = value, x.copy(), slope
+            return value, slope[: self.first]
+
+        found = self._minimise(down, x[: self.first].copy())
+        return *least, int(found.nfev)
+
+    def log_volume(self, x: np.ndarray, jac: np.ndarray, known: int) -> float:
+        """What Laplace's method adds for the hyperparameters at their mode, but for the first `known` ones.
+
+        Args:
+            x: the mode.
+            jac: the slope there.
+            known: how many are integrated elsewhere; if any, the curvature is that of the scales of misfits alone.
+        """
+        scale, first = self.scale, self.first
+        bound = x * scale >= self.most * scale - 1e-6
+        volume = -float(np.sum(np.log(np.maximum(-jac[bound] / scale[bound], 1.0))))  # an exponential, cut off
+        wanted = np.flatnonzero(~bound)
+        wanted = wanted[wanted >= known]
+        some = self.of_misfits(x) if known else None
+
+        def slope(x: np.ndarray, j: int) -> np.ndarray:
+            if some is None or j < first:
+                return self.at(x)[1]
+            return np.append(jac[:first], some(x[first:])[1])
+
+        columns = np.zeros((len(wanted), len(wanted)))
+        for row, j in enumerate(wanted.tolist()):
+            e = np.where(np.arange(len(x)) == j, NUMERICS.aside, 0.0)
+            columns[row] = (slope(x + e, j) - jac)[wanted] / NUMERICS.aside
+        if some is not None:  # the rows of misfits know nothing of the others
+            rest = int(np.sum(wanted < first))
+            columns[rest:, :rest] = columns[:rest, rest:].T
+        values, vectors = np.linalg.eigh((columns + columns.T) / 2)
+        values = np.maximum(values, 1e-3)
+        # A spread's coordinate stands for either sign: close to none, both are the same.
+        of_spreads = (wanted >= 4) & (wanted < first)
+        sd = np.sqrt(np.sum(vectors**2 / values, 1))
+        volume += float(np.sum(log_ndtr(np.abs(x[wanted]) / sd)[of_spreads]))
+        normal = 0.5 * len(wanted) * np.log(2 * np.pi) - 0.5 * np.sum(np.log(values)) + np.sum(np.log(scale[wanted]))
+        return volume + float(normal)
 
 
 def optimise(
@@ -333,95 +435,28 @@ def optimise(
         start: hyperparameters to begin with.
         curvature: whether they are integrated out; if not, `log_evidence` is the log posterior at the mode.
         without: the optimum without misfits, whose curvature is taken for that of the hyperparameters it has.
-        several: begin at the best of several settings of correlated noise, if it is clearly better: what was fitted
-            without misfits may have swallowed what they explain.
+        several: begin at the best of several settings of correlated noise, if it is clearly better.
         at_least: a log evidence to compare with. What begins `Numerics.very_strong` below is left there, its own
-            log evidence -inf.
+            log evidence -inf; only with `several`.
 
     Raises:
         FloatingPointError: if it has no evidence where it begins.
     """
-    from scipy.optimize import minimize
-
-    count = float(np.asarray(design.tests.mask).sum())
-    spreads = len(design.kinds.spreads)
-    expected = np.full(len(start), 2.0)
-    expected[:4] = count * np.array([1.5, 0.2, 0.1, 0.02])
-    expected[4 : 4 + spreads] = 2.0 * len(design.tests)
-    scale = 1 / np.sqrt(expected)
-
-    first = 4 + spreads
-    options: Any = {"ftol": 1e-7, "gtol": NUMERICS.flat, "maxiter": NUMERICS.evaluations}
-    most = np.concatenate([np.full(first, np.inf), design.misfits[:, 2]])
-    bounds = [(None, None if np.isinf(x) else x) for x in most / scale]
-    best = np.minimum(start, most) / scale
-
-    def of_misfits(x: np.ndarray) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:
-        """Of the scales of misfits alone, upside down."""
-        some = OfMisfits(x * scale, design)
-        return lambda y: _upside_down(some, y * scale[first:], scale[first:])
-
-    def followed(x: np.ndarray) -> Any:
-        """The mode of the scales of misfits alone."""
-        some: Any = {"jac": True, "method": "L-BFGS-B", "bounds": bounds[first:], "options": options}
-        return minimize(of_misfits(x), x[first:], **some)
-
-    def down(x: np.ndarray) -> tuple[float, np.ndarray]:
-        # Scales of misfits cost nothing while noise and spreads stay: they follow, and at their mode have no slope.
-        best[:first] = x
-        if len(design.misfits):
-            best[first:] = followed(best).x
-        value, slope = _upside_down(value_and_gradient, best * scale, scale, design)
-        if value < least[0]:
-            least[:] = value, best.copy(), slope
-        return value, slope[:first]
-
+    surface = _Surface(design)
+    x = np.minimum(start / surface.scale, surface.most)
     if several:
-        shorter = NUMERICS.length_factors[-1]
-        factors = np.log([(1.0, 1.0), *((factor, shorter) for factor in NUMERICS.noise_factors[1:])])
-        begun = [np.concatenate([best[:2], best[2:4] + at / scale[2:4], best[4:]]) for at in factors]
-        modes = [followed(x) for x in begun]
-        k = int(np.argmin([mode.fun for mode in modes]))
-        k = k if modes[k].fun < modes[0].fun - NUMERICS.strong else 0
-        best = np.append(begun[k][:first], modes[k].x)
-        if -modes[k].fun < at_least - NUMERICS.very_strong:
-            return Optimum(best * scale, -np.inf, -float(modes[k].fun), 0)
-
-    least: list[Any] = [1e30, best, np.zeros(len(start))]
-    found = minimize(down, best[:first].copy(), jac=True, method="L-BFGS-B", options=options)
-    value, x, jac = least
-    joint = -float(value)
+        value, x = surface.likely(x)
+        if -value < at_least - NUMERICS.very_strong:
+            return Optimum(x * surface.scale, -np.inf, -value, 0)
+    value, x, jac, evaluations = surface.mode(x)
+    evidence = joint = -float(value)
     if joint < -1e29:
         raise FloatingPointError("the evidence of a hypothesis is no number")
-    evidence, free = joint, x * scale
     if curvature:
-        bound = free >= most - 1e-6
-        evidence -= float(np.sum(np.log(np.maximum(-jac[bound] / scale[bound], 1.0))))  # an exponential, cut off
-        wanted, some = np.flatnonzero(~bound), None
-        if without is not None:
-            wanted, some = wanted[wanted >= len(without.free)], of_misfits(x)
-            evidence += without.log_evidence - without.log_joint
-
-        def slope(x: np.ndarray, j: int) -> np.ndarray:
-            if some is None or j < first:
-                return _upside_down(value_and_gradient, x * scale, scale, design)[1]
-            return np.append(jac[:first], some(x[first:])[1])
-
-        columns = np.zeros((len(wanted), len(wanted)))
-        for row, j in enumerate(wanted.tolist()):
-            e = np.where(np.arange(len(start)) == j, NUMERICS.aside, 0.0)
-            columns[row] = (slope(x + e, j) - jac)[wanted] / NUMERICS.aside
-        if some is not None:  # the rows of misfits know nothing of the others
-            rest = int(np.sum(wanted < first))
-            columns[rest:, :rest] = columns[:rest, rest:].T
-        values, vectors = np.linalg.eigh((columns + columns.T) / 2)
-        values = np.maximum(values, 1e-3)
-        # A spread's coordinate stands for either sign: close to none, both are the same.
-        of_spreads = (wanted >= 4) & (wanted < first)
-        sd = np.sqrt(np.sum(vectors**2 / values, 1))
-        evidence += float(np.sum(log_ndtr(np.abs(x[wanted]) / sd)[of_spreads]))
-        evidence += 0.5 * len(wanted) * np.log(2 * np.pi) - 0.5 * np.sum(np.log(values)) + np.sum(np.log(scale[wanted]))
-    return Optimum(free, float(evidence), joint, int(found.nfev))
+        known = 0 if without is None else len(without.free)
+        evidence += surface.log_volume(x, jac, known)
+        evidence += 0.0 if without is None else without.log_evidence - without.log_joint
+    return Optimum(x * surface.scale, float(evidence), joint, evaluations)
 
 
 def visible(free: np.ndarray, design: Design, curves: np.ndarray) -> np.ndarray:
