@@ -419,15 +419,15 @@ class _Surface:
         return volume + float(normal)
 
 
-def optimise(
-    design: Design,
-    start: np.ndarray,
-    *,
-    curvature: bool = True,
-    without: Optimum | None = None,
-    several: bool = False,
-    at_least: float = -np.inf,
-) -> Optimum:
+def likely_start(design: Design, start: np.ndarray) -> tuple[np.ndarray, float]:
+    """Where to look for the mode of a hypothesis with misfits: as given, or with correlated noise that is clearly
+    likelier beside them; and the log posterior there."""
+    surface = _Surface(design)
+    value, x = surface.likely(np.minimum(start / surface.scale, surface.most))
+    return x * surface.scale, -value
+
+
+def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, without: Optimum | None = None) -> Optimum:
     """The mode of the hyperparameters by L-BFGS, in coordinates scaled by their expected curvature.
 
     Args:
@@ -435,20 +435,12 @@ def optimise(
         start: hyperparameters to begin with.
         curvature: whether they are integrated out; if not, `log_evidence` is the log posterior at the mode.
         without: the optimum without misfits, whose curvature is taken for that of the hyperparameters it has.
-        several: begin at the best of several settings of correlated noise, if it is clearly better.
-        at_least: a log evidence to compare with. What begins `Numerics.very_strong` below is left there, its own
-            log evidence -inf; only with `several`.
 
     Raises:
         FloatingPointError: if it has no evidence where it begins.
     """
     surface = _Surface(design)
-    x = np.minimum(start / surface.scale, surface.most)
-    if several:
-        value, x = surface.likely(x)
-        if -value < at_least - NUMERICS.very_strong:
-            return Optimum(x * surface.scale, -np.inf, -value, 0)
-    value, x, jac, evaluations = surface.mode(x)
+    value, x, jac, evaluations = surface.mode(np.minimum(start / surface.scale, surface.most))
     evidence = joint = -float(value)
     if joint < -1e29:
         raise FloatingPointError("the evidence of a hypothesis is no number")

@@ -12,7 +12,7 @@ from ..calibrate.priors import NakagamiPrior
 from .base import Base
 from .columns import Design, without_further
 from .design import NOTHING_MORE, More, design_of, moved
-from .evidence import Optimum, optimise, solve, visible
+from .evidence import Optimum, likely_start, optimise, solve, visible
 from .hypothesis import Hypothesis, Smooth
 from .misfit import ANY, COORDINATES, functions
 from .refine import Refined
@@ -120,14 +120,19 @@ class Discrepancy:
     group: Sequence[int]
     log_white: float
 
-    def beside(self, base: Base, r: Refined, at_least: float = -np.inf) -> Smooth:
-        """The discrepancy beside the law, or beside what is named, at its optimum; `at_least` as of `optimise`."""
+    def beside(self, base: Base, r: Refined, at_least: float = -np.inf) -> Smooth | None:
+        """The discrepancy beside the law, or beside what is named, at its optimum.
+
+        None where it begins `Numerics.very_strong` below a log evidence to compare with: it would not come near.
+        """
         unit, parts = float(np.log(DECISIONS.general)) + self.log_white, max(self.group)
         sizes = [(unit, DECISIONS.general_log_sd, np.inf)] * parts
         more = More(basis=self.basis, group=self.group, sizes=sizes)
         design = design_of(base, r.state, r.variants, more)
-        start = np.append(r.optimum.free, [unit - 1.0] * parts)
-        optimum = optimise(design, start, without=r.optimum, several=True, at_least=at_least)
+        start, value = likely_start(design, np.append(r.optimum.free, [unit - 1.0] * parts))
+        if value < at_least - NUMERICS.very_strong:
+            return None
+        optimum = optimise(design, start, without=r.optimum)
         at = Refined(r.variants, r.state, design, optimum, solve(optimum.free, design))
         if not r.variants and optimum.log_joint > r.optimum.log_joint + NUMERICS.very_strong:
             # What it takes away from the law's numbers moves these as far as a name does; beside one that is done.

@@ -189,7 +189,9 @@ class Search:
     def with_discrepancy(self, leader: Hypothesis, at_least: float) -> None:
         """Log evidence of a name with a smooth discrepancy beside it, where it comes near that of another."""
         assert leader.best is not None
-        leader.beside = self.discrepancy.beside(self.base, leader.best, at_least).at.log_evidence
+        found = self.discrepancy.beside(self.base, leader.best, at_least)
+        if found is not None:
+            leader.beside = found.at.log_evidence
 
     # ---- two names ---------------------------------------------------------------------------------------------------
 

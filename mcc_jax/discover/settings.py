@@ -99,13 +99,16 @@ class Numerics:
 
     Attributes:
         noise_factors, length_factors, spread_factors: settings of correlated noise and of spreads, over those of the
-            base fit, at which all formulas are screened. Noise that swallowed a gap hides what explains it.
+            base fit, at which all formulas are screened and a discrepancy on no list begins. Noise that swallowed a gap
+            hides what explains it.
         block: particles that are linearised at once.
         contenders: mechanisms that are fitted at their own optimum.
         formulas: formulas of each of them where `very_strong`, else one; of the two leading ones up to `all_formulas`.
         seconds: second names that are tried beside each of the two leading names, and pairs that lead to first order.
-        strong: nats by which a name must beat nothing before several of its formulas and second names are tried.
-        very_strong: the same, from which on first order cannot be relied on to choose the formula.
+        strong: nats by which a name must beat nothing before several of its formulas and second names are tried, and
+            another kind or setting of noise the one at hand.
+        very_strong: the same, from which on first order cannot be relied on to choose the formula; so far below another
+            hypothesis a discrepancy that begins is not worked out.
         locations, phases: values tried of a number that differs from test to test: of a place somewhere between two
             that lie far apart, which must be met closely, and of a phase.
         steps, still: Gauss-Newton steps at most, and the change of the log posterior at which they end.

@@ -11,7 +11,7 @@ from mcc_jax.discover import screen
 from mcc_jax.discover.answer import _population, effects_of, instead_of, name_probabilities, sets_of
 from mcc_jax.discover.bootstrap import p_anything
 from mcc_jax.discover.candidates import untestable
-from mcc_jax.discover.evidence import optimise, solve
+from mcc_jax.discover.evidence import likely_start, optimise, solve
 from mcc_jax.discover.heldout import held_out
 from mcc_jax.discover.hypothesis import UNLISTED, Hypothesis
 from mcc_jax.discover.locate import difference, places, where
@@ -243,10 +243,14 @@ def test_a_discrepancy_begins_where_noise_leaves_it_most(named):
     start = np.append(r.optimum.free, [np.log(DECISIONS.general) + of.log_white - 1.0] * max(of.group))
     design = of.beside(named.base, r).at.design
     swallowed = np.where(np.arange(len(start)) == 2, start + 2.0, start)
-    one, best = (optimise(design, swallowed, without=r.optimum, several=several) for several in (False, True))
+    likely, _ = likely_start(design, swallowed)
+    one, best = (optimise(design, begun, without=r.optimum) for begun in (swallowed, likely))
     assert best.log_joint > one.log_joint - 0.02 * len(start)  # as near as a mode is met (`Numerics.flat`)
     assert best.evaluations <= one.evaluations
     far = best.log_joint + NUMERICS.very_strong + 10.0
-    left = optimise(design, start, without=r.optimum, several=True, at_least=far)
-    assert left.evaluations == 0
-    assert left.log_evidence == -np.inf
+    assert of.beside(named.base, r, far) is None
+    leader = replace(named.found[("frame_compliance",)], beside=-np.inf)
+    named.with_discrepancy(leader, leader.alone + 2 * NUMERICS.very_strong)
+    assert leader.beside == -np.inf
+    named.with_discrepancy(leader, -np.inf)
+    assert np.isfinite(leader.beside)
