@@ -148,7 +148,8 @@ def particle_batch(diameters_um: Any) -> Particle:
         InputError: for another shape, or a diameter that is not positive and finite; traced ones pass.
     """
     sizes = diameters_um if is_traced(diameters_um) else diameters(diameters_um)
-    D1, D2, D3 = jnp.asarray(sizes, dtype=float).T
+    # Not cut by JAX unless it must: every operation on another number of particles would be compiled.
+    D1, D2, D3 = jnp.asarray(sizes, dtype=float).T if is_traced(sizes) else (jnp.asarray(x, float) for x in sizes.T)
     return eqx.filter_vmap(Particle)(D1, D2, D3)
 
 

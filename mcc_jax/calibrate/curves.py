@@ -16,7 +16,7 @@ from ..effects import Record
 from ..geometry import Particle
 from ..law import MccLaw
 from .compiling import compiled
-from .data import records_of, rows_from_contact
+from .data import padded_length, records_of, rows_from_contact
 from .laws import Variants, laws_of
 from .population import COEFFICIENTS
 from .settings import SELECTION
@@ -133,8 +133,7 @@ def _displacements(
     rows = [compared[i][0] if i in compared else _rows(campaign, i, segments[i]) for i in places]
     sizes = campaign.diameters_um[places]
     # Campaigns of similar length share one compilation.
-    longest = max(len(one) for one in rows)
-    records = records_of(campaign, places, segments, rows, longest + -longest % 64).record
+    records = records_of(campaign, places, segments, rows, padded_length(max(map(len, rows)))).record
     particles = particle_batch(sizes)
     own, typical = (
         np.asarray(_respond(laws, particles, records))

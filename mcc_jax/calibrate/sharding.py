@@ -41,6 +41,11 @@ def block_size(count: int) -> int:
     return size + -size % 4
 
 
+def filled_rows(count: int) -> np.ndarray:
+    """Rows 0 to `count` - 1, and the last one again until blocks are full: few numbers of rows, few compilations."""
+    return np.minimum(np.arange(count + -count % block_size(count)), count - 1)
+
+
 def filled_up(tests: Tests, block: int) -> Tests:
     """The same tests among as many more as whole blocks take: copies of the last particle that count for nothing.
 

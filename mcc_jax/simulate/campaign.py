@@ -156,6 +156,7 @@ def simulate_campaign(
         )
     samples = [programme.sample(float(peak)) for peak in peaks]
     longest = max(len(time) for time, _ in samples)
+    longest += -longest % 64  # programmes of similar length share one compilation
     # Padding repeats the last value: a valid path whose further points change nothing.
     times, paths = (
         jnp.asarray(np.stack([np.pad(row, (0, longest - len(row)), mode="edge") for row in rows]))

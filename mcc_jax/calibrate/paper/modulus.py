@@ -19,6 +19,7 @@ from ...campaign import Adjustment, Campaign, Curve, Segment, check_campaign, st
 from ...formulas import recovery
 from ...law import StrainScaling, Unloading
 from ..settings import PAPER
+from ..sharding import filled_rows
 
 MIN_RATIO = PAPER.unloaded_from
 
@@ -146,7 +147,7 @@ def recoverable_strain(
     return stress_max / (modulus * jnp.sqrt(unloading.constant * shape_power * strain_max))
 
 
-@partial(jax.jit, static_argnames=("unloading", "count"))
+@partial(jax.jit, static_argnames="unloading")
 def _fit(
     start: Scalar,
     stress_max: Float[Array, " branches"],
@@ -155,21 +156,25 @@ def _fit(
     strain: Float[Array, " points"],
     ratio: Float[Array, " points"],
     branch: Int[Array, " points"],
+    counted: Float[Array, " points"],
     *,
     unloading: Unloading,
-    count: int,
 ):
-    released = recovery(ratio)
-    points = jnp.maximum(jax.ops.segment_sum(jnp.ones_like(strain), branch, count), 1.0)
+    released, count = recovery(ratio), len(stress_max)
+    points = jnp.maximum(jax.ops.segment_sum(counted, branch, count), 1.0)
+
+    def about_mean_of_branch(values):
+        """Each value less the mean of its branch; nothing where it only fills up."""
+        mean = jax.ops.segment_sum(counted * values, branch, count) / points
+        return counted * (values - mean[branch])
 
     def residuals(log_modulus, _):
         delta = recoverable_strain(log_modulus, stress_max, strain_max, shape_power, unloading)
-        deviation = strain - (strain_max[branch] - delta[branch] * released)
         # The zero of every branch is free; least squares over it is the branch's mean.
-        return deviation - (jax.ops.segment_sum(deviation, branch, count) / points)[branch]
+        return about_mean_of_branch(strain - (strain_max[branch] - delta[branch] * released))
 
     # Each branch alone, from the slope of strain over the recovery curve: linear, so in closed form.
-    centred = released - (jax.ops.segment_sum(released, branch, count) / points)[branch]
+    centred = about_mean_of_branch(released)
     slope = -jax.ops.segment_sum(strain * centred, branch, count) / jax.ops.segment_sum(centred**2, branch, count)
     unit = recoverable_strain(jnp.zeros_like(start), stress_max, strain_max, shape_power, unloading)
     exponent = 2 if unloading is Unloading.PRINTED else 1
@@ -178,7 +183,8 @@ def _fit(
     first = jnp.where(jnp.isfinite(jnp.nanmedian(alone)), jnp.log(jnp.nanmedian(alone)), start)
     solution = optx.least_squares(residuals, solver, first, max_steps=200, throw=False)
     final = residuals(solution.value, None)
-    return solution.value, jnp.sqrt(jnp.mean(final**2)), alone, solution.result == optx.RESULTS.successful
+    rms = jnp.sqrt(jnp.sum(final**2) / jnp.sum(counted))
+    return solution.value, rms, alone, solution.result == optx.RESULTS.successful
 
 
 def fit_effective_modulus(
@@ -214,22 +220,24 @@ def fit_effective_modulus(
     top = np.array([b.stress_max_MPa for b in branches])
     stress = np.concatenate([b.stress_MPa for b in branches])
     eta = np.asarray(shape_factor)[[b.particle for b in branches]]
+    of_branches = (top, np.array([b.strain_max for b in branches]), eta**strain_scaling.power)
+    of_points = (np.concatenate([b.strain for b in branches]), stress / top[index], index)
+    # Copies of the last branch and point, of which none counts, so that campaigns share one compilation.
+    rows, points = filled_rows(len(top)), 1 << (len(index) - 1).bit_length()
+    at = np.minimum(np.arange(points), len(index) - 1)
     value, rms, alone, converged = _fit(
         jnp.log(jnp.asarray(1e4)),
-        jnp.asarray(top),
-        jnp.asarray([b.strain_max for b in branches]),
-        jnp.asarray(eta**strain_scaling.power),
-        jnp.asarray(np.concatenate([b.strain for b in branches])),
-        jnp.asarray(stress / top[index]),
-        jnp.asarray(index),
+        *(jnp.asarray(x[rows], float) for x in of_branches),
+        *(jnp.asarray(x[at]) for x in of_points),
+        jnp.asarray(np.arange(points) < len(index), float),
         unloading=unloading,
-        count=len(branches),
     )
+    alone = np.asarray(alone)[: len(branches)]
     modulus = float(jnp.exp(value))
     if not (np.isfinite(modulus) and modulus > 0):
-        return ElasticFit(None, np.nan, np.asarray(alone), branches, False, "strain does not fall on unloading")
+        return ElasticFit(None, np.nan, alone, branches, False, "strain does not fall on unloading")
     reason = "" if converged else "the optimiser did not meet its tolerances within 200 steps"
-    return ElasticFit(modulus, float(rms), np.asarray(alone), branches, bool(converged), reason)
+    return ElasticFit(modulus, float(rms), alone, branches, bool(converged), reason)
 
 
 def collapsed_branches(

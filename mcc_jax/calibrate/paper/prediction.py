@@ -13,6 +13,8 @@ from ..._format import described
 from ...campaign import Adjustment, Campaign, check_campaign, effective_diameter_um, particle_batch, stress_and_strain
 from ...law import MccLaw, Plastic
 from ...simulate import simulate_batch
+from ..data import padded_length
+from ..sharding import filled_rows
 from .loading import fit_polynomial
 
 
@@ -74,14 +76,13 @@ def predict_particles(
         # Residuals are relative: below a fiftieth of the peak they would be those of the force read-out.
         use = curve.stress_MPa >= max(adjustment.threshold_MPa, 0.02 * curve.stress_max_MPa)
         own.append(fit_polynomial(eta[i] * curve.strain[use], curve.stress_MPa[use]))
-    plastic = eqx.filter_vmap(Plastic.from_polynomial)(*jnp.asarray(own).T)
-    longest = max(len(campaign.curves[i]) for i in kept)
-    # Lengths in steps of 64: campaigns of similar length then share one compilation.
-    longest += -longest % 64
-    forces = jnp.asarray(
-        [np.pad(campaign.curves[i].force_mN, (0, longest - len(campaign.curves[i])), mode="edge") for i in kept]
-    )
-    sizes = particle_batch(campaign.diameters_um[kept])
+    # Campaigns of similar size and length share one compilation.
+    rows = filled_rows(len(kept))
+    plastic = eqx.filter_vmap(Plastic.from_polynomial)(*jnp.asarray(np.array(own)[rows].T))
+    curves = [campaign.curves[i] for i in kept[rows]]
+    longest = padded_length(max(map(len, curves)))
+    forces = jnp.asarray([np.pad(curve.force_mN, (0, longest - len(curve)), mode="edge") for curve in curves])
+    sizes = particle_batch(campaign.diameters_um[kept[rows]])
     same = eqx.filter_vmap(lambda one: eqx.tree_at(lambda each: each.plastic, law, one))(plastic)
     mean = eqx.filter_vmap(lambda _: law)(plastic.C1)
     by_mean = np.asarray(simulate_batch(mean, sizes, forces, control="load").displacement)

@@ -17,6 +17,7 @@ from ..._errors import InputError
 from ..._format import described
 from ..._types import Scalar
 from ..settings import PAPER
+from ..sharding import filled_rows
 from .loading import StrainTable, enough
 
 Objective = Literal["full", "reference"]
@@ -155,12 +156,17 @@ def fit_shape_parameter(table: StrainTable, objective: Objective = "full", refer
     arguments.choice(objective, get_args(Objective), "objective")
     if len(table.index) < 2:
         raise InputError("the shape parameter needs at least two particles")
-    use = enough(table)
-    stress, strain, reached = table.stress_MPa[use], table.strain[:, use], table.reached[:, use]
+    stress, strain, flatness = table.stress_MPa, table.strain, table.flatness
+    reached = table.reached & enough(table)
+    # Particles are filled up to few numbers, and the grid keeps its length, so that campaigns share one compilation: it
+    # takes seconds, the fit none.
+    fill = filled_rows(len(strain))
+    extra = np.arange(len(fill)) >= len(strain)
     starts = jnp.asarray(PAPER.shape_starts, dtype=float)
     if objective == "full":
         row = None
-        data = (strain, _weights(stress, reached), reached, table.flatness)
+        # Copies reach no stress, so that none counts.
+        data = (strain[fill], _weights(stress, reached)[fill], reached[fill] & ~extra[:, None], flatness[fill])
         solved, at_zero = _solve(full_residuals, starts, tuple(jnp.asarray(d) for d in data))
     else:
         if reference is None:
@@ -169,9 +175,10 @@ def fit_shape_parameter(table: StrainTable, objective: Objective = "full", refer
             row = int(np.flatnonzero(table.index == reference)[0])
         else:
             raise InputError("the reference particle was not kept")
-        others = np.arange(len(table.index)) != row
-        reached = reached[others] & reached[row]
-        data = (strain[others], _weights(stress, reached), strain[row], table.flatness[others], table.flatness[row])
+        # The reference particle itself, and copies of it, deviate from it by nothing, whatever `a`.
+        fill = np.where(extra, row, fill)
+        weights = _weights(stress, reached[fill] & reached[row])
+        data = (strain[fill], weights, strain[row], flatness[fill], flatness[row])
         solved, at_zero = _solve(reference_residuals, starts, tuple(jnp.asarray(d, dtype=float) for d in data))
     values, costs, converged = (np.asarray(x) for x in solved)
     # A shape factor that is not positive turns the particle inside out; such a minimum is none.
