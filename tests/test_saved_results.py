@@ -23,7 +23,7 @@ SIZES = mcc.Particle(200.0, 190.0, 160.0)
 
 @pytest.fixture(scope="module")
 def campaign():
-    whole = mcc.paper_campaign(0, programme=mcc.Programme.cycles(points=60))
+    whole = mcc.paper_campaign(0)
     return whole.select(np.arange(len(whole)) < 6)
 
 

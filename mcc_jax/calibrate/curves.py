@@ -136,14 +136,15 @@ def _displacements(
     records = records_of(campaign, places, segments, rows, padded_length(max(map(len, rows)))).record
     particles = particle_batch(sizes)
     own, typical = (
-        np.asarray(_respond(laws, particles, records))
+        np.asarray(responses(laws, particles, records))
         for laws in laws_of(content, [one.name for one in shown], sizes, variants)
     )
     return [(o[: len(one.kind)], t[: len(one.kind)]) for one, o, t in zip(shown, own, typical, strict=True)]
 
 
 @compiled
-def _respond(laws: MccLaw, particles: Particle, records: Record) -> Array:
+def responses(laws: MccLaw, particles: Particle, records: Record) -> Array:
+    """Displacement [um] of particles by a law each, along a record each, shape (N, points)."""
     return jax.vmap(lambda law, *one: law.respond(*one))(laws, particles, records)
 
 

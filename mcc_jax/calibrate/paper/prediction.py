@@ -12,8 +12,8 @@ from ... import arguments
 from ..._format import described
 from ...campaign import Adjustment, Campaign, check_campaign, effective_diameter_um, particle_batch, stress_and_strain
 from ...law import MccLaw, Plastic
-from ...simulate import simulate_batch
-from ..data import padded_length
+from ..curves import responses
+from ..data import padded_length, records_of
 from ..sharding import filled_rows
 from .loading import fit_polynomial
 
@@ -78,15 +78,15 @@ def predict_particles(
         own.append(fit_polynomial(eta[i] * curve.strain[use], curve.stress_MPa[use]))
     # Campaigns of similar size and length share one compilation.
     rows = filled_rows(len(kept))
+    places = kept[rows].tolist()
+    points = [np.arange(len(campaign.curves[i])) for i in places]
+    longest = padded_length(max(map(len, points)))
+    records = records_of(campaign, places, adjustment.segments, points, longest).record
+    sizes = particle_batch(campaign.diameters_um[places])
     plastic = eqx.filter_vmap(Plastic.from_polynomial)(*jnp.asarray(np.array(own)[rows].T))
-    curves = [campaign.curves[i] for i in kept[rows]]
-    longest = padded_length(max(map(len, curves)))
-    forces = jnp.asarray([np.pad(curve.force_mN, (0, longest - len(curve)), mode="edge") for curve in curves])
-    sizes = particle_batch(campaign.diameters_um[kept[rows]])
     same = eqx.filter_vmap(lambda one: eqx.tree_at(lambda each: each.plastic, law, one))(plastic)
     mean = eqx.filter_vmap(lambda _: law)(plastic.C1)
-    by_mean = np.asarray(simulate_batch(mean, sizes, forces, control="load").displacement)
-    by_own = np.asarray(simulate_batch(same, sizes, forces, control="load").displacement)
+    by_mean, by_own = (np.asarray(responses(laws, sizes, records)) for laws in (mean, same))
     fits: list[ParticleFit | None] = [None] * len(campaign)
     for row, i in enumerate(kept):
         curve = campaign.curves[i]
