@@ -251,7 +251,7 @@ def _sections(results: Results, shown: list[FittedCurve], checks: list[Any]) -> 
         ("posterior", "Posterior", calibrated),
         ("diagnostics", "Checks", bool(checks)),
         ("discovery", "Discovery in detail", results.discovery is not None),
-        ("measured", "What was measured", results.campaign is not None or calibrated),
+        ("measured", "The tests", results.campaign is not None or calibrated),
         ("settings", "Settings and data", True),
         ("cite", "How to cite", True),
     )

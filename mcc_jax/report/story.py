@@ -63,16 +63,17 @@ def telling_test(found: Discovery) -> Telling | None:
         return None
     added = bool(found.effects) or found.closure is not None
     before, after, source = left.before, left.after, ""
+    name = listed([plain(effect.mechanism) for effect in found.effects]) if found.effects else "the formula found"
     if added and found.held_out is not None and found.held_out.residual_um is not None:
         before, after = found.held_out.residual_um[0], found.held_out.residual_um[-1]
-        source = " It was left out for this: all but its own curve of loading, modulus and zero is by the others."
+        source = f" Here {name} is as the other particles tell it; only what each particle has of its own (curve of "
+        source += "loading, modulus, zero) is fitted to its test."
     count = np.maximum(left.used.sum(1), 1)
     rms = [np.sqrt(np.sum(np.where(left.used, one, 0.0) ** 2, axis=1) / count) for one in (before, after)]
     j = int(np.argmax(rms[0] - rms[1] if added else rms[0]))
     i, rows = base.selection.kept[j], base.selection.rows[j]
     curve, used = base.campaign.curves[i], left.used[j, : len(rows)]
     rows = np.asarray(rows)[used]
-    name = listed([plain(effect.mechanism) for effect in found.effects]) if found.effects else "the formula found"
     off, which = f"{number(float(rms[0][j]), 2)} µm", "fits worst"
     if added:
         middle = [f"{number(float(np.median(one)), 2)} µm" for one in rms]
