@@ -6,6 +6,7 @@ import math
 import re
 from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 from equations import in_tex
@@ -148,6 +149,49 @@ def pictures():
     from mcc_jax.effects import LIBRARY
 
     return {name: picture(mechanism) for name, mechanism in LIBRARY.items()}
+
+
+EXAMPLE = "creep"
+
+
+def how_to_read():
+    """The picture of one effect with words in it, for those who see such pictures for the first time."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    from mcc_jax.effects import LIBRARY
+
+    law, (_, curve) = _law_alone(), _shown(LIBRARY[EXAMPLE].variants[0])
+    added = curve.displacement_um - law.displacement_um
+    turns = [0, *_turns(law.force_mN), len(added) - 1]
+    with rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
+        figure = Figure(figsize=(6.4, 3.4), layout="constrained")
+        above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+        _draw_added(above, below, law, added)
+        above.set(title=f"how to read the small pictures: {plain(EXAMPLE)}", ylabel="added\ndisplacement / µm")
+        below.set(xlabel="time / s", ylabel="force")
+        top = int(added.argmax())
+        above.annotate(
+            f"at most {added[top]:.2g} µm more than\nby the law alone: the number\nbelow a small picture",
+            (law.time_s[top], added[top]), (0.02, 0.97), textcoords="axes fraction", va="top",
+            arrowprops={"arrowstyle": "->", "color": GREY},
+        )  # fmt: skip
+        above.text(law.time_s[-1], 0.0, "the law alone (below this line: less displacement)", ha="right", va="bottom")
+        words = ("loaded", "held", "unloaded", "reloaded", "held", "unloaded")
+        for word, (first, last) in zip(words, pairwise(turns), strict=True):
+            middle = (law.time_s[first] + law.time_s[last]) / 2
+            below.text(middle, 0.06 * law.force_mN.max(), word, ha="center", va="bottom", fontsize=8)
+        stream = io.BytesIO()
+        figure.savefig(stream, format="png", dpi=140, metadata={"Software": None})
+    return stream.getvalue()
+
+
+def _turns(force):
+    """Where the force of the pictures' test begins to be held, to fall or to rise."""
+    import numpy as np
+
+    way = np.sign(np.round(np.diff(force), 6))
+    return (1 + np.flatnonzero(np.diff(way))).tolist()
 
 
 # ---- the gallery -----------------------------------------------------------------------------------------------------
@@ -418,7 +462,7 @@ def files():
             f"{FOLDER}/{name}-added.png": added,
             f"{FOLDER}/{name}-small.png": small,
         }
-    return found | {"images/which-test.png": which_test_picture()}
+    return found | {f"{FOLDER}/how-to-read.png": how_to_read(), "images/which-test.png": which_test_picture()}
 
 
 BLOCKS = {"gallery": gallery, "sheet": sheet, "which-test": which_test, "look-alikes": look_alikes}
