@@ -101,9 +101,10 @@ def _law_alone():
 
 
 def picture(mechanism):
-    """Strength, most it adds [um], and three pictures of a mechanism's first formula with holds and a reload.
+    """Strength, most it adds or takes away [um], and three pictures of a mechanism's first formula.
 
-    The whole curve, and what is added to it: two, so that a phone shows one below the other; the latter small, too.
+    One test with holds and a reload: the whole curve, and what is added to it, two, so that a phone shows one below the
+    other; the latter small, too.
     """
     import numpy as np
     from matplotlib import rc_context
@@ -130,7 +131,7 @@ def picture(mechanism):
         streams = [io.BytesIO() for _ in figures]
         for figure, stream in zip(figures, streams, strict=True):
             figure.savefig(stream, format="png", dpi=140, metadata={"Software": None})
-    return strength, float(np.max(np.abs(added))), *(stream.getvalue() for stream in streams)
+    return strength, float(added[np.abs(added).argmax()]), *(stream.getvalue() for stream in streams)
 
 
 def _draw_added(above, below, law, added):
@@ -171,8 +172,9 @@ def how_to_read():
         above.set(title=f"how to read the small pictures: {plain(EXAMPLE)}", ylabel="added\ndisplacement / µm")
         below.set(xlabel="time / s", ylabel="force")
         top = int(added.argmax())
+        most = _signed(added[top])
         above.annotate(
-            f"at most {added[top]:.2g} µm more than\nby the law alone: the number\nbelow a small picture",
+            f"at most {most[1:]} µm more than\nby the law alone: {most} µm\nstands below a small picture",
             (law.time_s[top], added[top]), (0.02, 0.97), textcoords="axes fraction", va="top",
             arrowprops={"arrowstyle": "->", "color": GREY},
         )  # fmt: skip
@@ -184,6 +186,10 @@ def how_to_read():
         stream = io.BytesIO()
         figure.savefig(stream, format="png", dpi=140, metadata={"Software": None})
     return stream.getvalue()
+
+
+def _signed(value):
+    return f"{value:+.2g}".replace("-", "\N{MINUS SIGN}")
 
 
 def _turns(force):
@@ -221,7 +227,7 @@ def sheet():
 
     cells = {cause: [] for cause in CAUSES.values()}
     for name, mechanism in LIBRARY.items():
-        label = f"{plain(name)}<br>{pictures()[name][1]:.2g} µm"
+        label = f"{plain(name)}<br>{_signed(pictures()[name][1])} µm"
         cells[CAUSES[mechanism.variants[0].make.__module__.rpartition(".")[2]]].append(
             f"[![What {plain(name)} adds over time](../{FOLDER}/{name}-small.png) {label}](#{name})"
         )

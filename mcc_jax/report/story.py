@@ -114,8 +114,8 @@ def _gap_tiles(found: dict[str, Any]) -> list[tuple[str, str, str]]:
     if gap["closed_fraction"] is not None:
         before, after = (number(gap["steps"][i]["chi2_per_dof"], 3) for i in (0, -1))
         meaning = (
-            f"of what the law alone missed on held-out particles: χ² per point (misfit in units of the noise) falls "
-            f"from {before} to {after}; 1 is noise alone."
+            "of what the law alone missed on particles that were held out, each predicted from others: χ² "
+            f"per point (misfit in units of the noise) falls from {before} to {after}; 1 is noise alone."
         )
         tiles.append(("Gap closed", percent(gap["closed_fraction"], 3), meaning))
     sides = found["parameters_before"], found["parameters_after"]
