@@ -6,7 +6,6 @@ import math
 import re
 from dataclasses import replace
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 
 from equations import in_tex
@@ -22,6 +21,7 @@ BLUE, VERMILION, GREY = "#0072B2", "#D55E00", "0.45"
 DIAMETERS_UM, HUMIDITY_PERCENT, PEAK_STRESS_MPA = (213.5, 196.1, 150.0), 75.0, 8.0
 """The particle of all pictures: flat, not of 200 um, in humid air, so that no effect of size, shape or water hides."""
 
+STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
 LARGEST_SHARE = 0.12
 """Of the largest displacement: an effect that adds more is drawn weaker than its largest plausible strength."""
 
@@ -111,7 +111,7 @@ def picture(mechanism):
     from matplotlib.figure import Figure
 
     law, (strength, curve) = _law_alone(), _shown(mechanism.variants[0])
-    with rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
+    with rc_context(STYLE):
         figures = [Figure(figsize=size, layout="constrained") for size in ((3.8, 2.7), (3.8, 2.7), (1.6, 1.1))]
         left = figures[0].subplots()
         right, small = (figure.subplots(2, 1, sharex=True, height_ratios=(4, 1)) for figure in figures[1:])
@@ -128,10 +128,14 @@ def picture(mechanism):
         for ax in small:
             ax.set(xticks=[], yticks=[])
             ax.spines[:].set_visible(False)
-        streams = [io.BytesIO() for _ in figures]
-        for figure, stream in zip(figures, streams, strict=True):
-            figure.savefig(stream, format="png", dpi=140, metadata={"Software": None})
-    return strength, float(added[np.abs(added).argmax()]), *(stream.getvalue() for stream in streams)
+        drawn = [_png(figure) for figure in figures]
+    return strength, float(added[np.abs(added).argmax()]), *drawn
+
+
+def _png(figure, dpi=140):
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=dpi, metadata={"Software": None})
+    return stream.getvalue()
 
 
 def _draw_added(above, below, law, added):
@@ -160,12 +164,12 @@ def how_to_read():
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
+    from mcc_jax.campaign import find_segments
     from mcc_jax.effects import LIBRARY
 
     law, (_, curve) = _law_alone(), _shown(LIBRARY[EXAMPLE].variants[0])
     added = curve.displacement_um - law.displacement_um
-    turns = [0, *_turns(law.force_mN), len(added) - 1]
-    with rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
+    with rc_context(STYLE):
         figure = Figure(figsize=(6.4, 3.4), layout="constrained")
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
         _draw_added(above, below, law, added)
@@ -179,25 +183,15 @@ def how_to_read():
             arrowprops={"arrowstyle": "->", "color": GREY},
         )  # fmt: skip
         above.text(law.time_s[-1], 0.0, "the law alone (below this line: less displacement)", ha="right", va="bottom")
-        words = ("loaded", "held", "unloaded", "reloaded", "held", "unloaded")
-        for word, (first, last) in zip(words, pairwise(turns), strict=True):
-            middle = (law.time_s[first] + law.time_s[last]) / 2
-            below.text(middle, 0.06 * law.force_mN.max(), word, ha="center", va="bottom", fontsize=8)
-        stream = io.BytesIO()
-        figure.savefig(stream, format="png", dpi=140, metadata={"Software": None})
-    return stream.getvalue()
+        words = {"load": "loaded", "hold": "held", "unload": "unloaded", "reload": "reloaded"}
+        for part in find_segments(law, control="load"):
+            middle = (law.time_s[part.start] + law.time_s[part.stop - 1]) / 2
+            below.text(middle, 0.06 * law.force_mN.max(), words[part.kind], ha="center", va="bottom", fontsize=8)
+        return _png(figure)
 
 
 def _signed(value):
     return f"{value:+.2g}".replace("-", "\N{MINUS SIGN}")
-
-
-def _turns(force):
-    """Where the force of the pictures' test begins to be held, to fall or to rise."""
-    import numpy as np
-
-    way = np.sign(np.round(np.diff(force), 6))
-    return (1 + np.flatnonzero(np.diff(way))).tolist()
 
 
 # ---- the gallery -----------------------------------------------------------------------------------------------------
@@ -434,9 +428,7 @@ def which_test_picture():
         ax.xaxis.tick_top()
         ax.tick_params(length=0)
         ax.spines[:].set_visible(False)
-        stream = io.BytesIO()
-        figure.savefig(stream, format="png", dpi=120, metadata={"Software": None})
-    return stream.getvalue()
+        return _png(figure, 120)
 
 
 def _cell(column, row, share):

@@ -18,7 +18,7 @@ def summary_of(found: Discovery) -> str:
     sentences = [_verdict(found, count)]
     for effect, names in zip(found.effects, found.candidate_set, strict=True):
         unit = "" if effect.variant.unit == "-" else f" {effect.variant.unit}"
-        value = f"{effect.variant.name.replace('_', ' ')}, {effect.amplitude:.3g} +- {effect.sd:.2g}{unit}"
+        value = f"{plain(effect.variant.name)}, {effect.amplitude:.3g} +- {effect.sd:.2g}{unit}"
         sentences.append(f"It is {plain(effect.mechanism)} with probability {effect.probability:.2f} ({value}).")
         if effect.jumps:
             sentences.append(_jumps(found, effect))

@@ -66,8 +66,10 @@ def telling_test(found: Discovery) -> Telling | None:
     name = listed([plain(effect.mechanism) for effect in found.effects]) if found.effects else "the formula found"
     if added and found.held_out is not None and found.held_out.residual_um is not None:
         before, after = found.held_out.residual_um[0], found.held_out.residual_um[-1]
-        source = f" Here {name} is as the other particles tell it; only what each particle has of its own (curve of "
-        source += "loading, modulus, zero) is fitted to its test."
+        source = (
+            f" Here {name} is as the other particles tell it; only what each particle has of its own (curve of "
+            "loading, modulus, zero) is fitted to its test."
+        )
     count = np.maximum(left.used.sum(1), 1)
     rms = [np.sqrt(np.sum(np.where(left.used, one, 0.0) ** 2, axis=1) / count) for one in (before, after)]
     j = int(np.argmax(rms[0] - rms[1] if added else rms[0]))

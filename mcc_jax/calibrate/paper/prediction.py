@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -78,11 +79,11 @@ def predict_particles(
         own.append(fit_polynomial(eta[i] * curve.strain[use], curve.stress_MPa[use]))
     # Campaigns of similar size and length share one compilation.
     rows = filled_rows(len(kept))
-    places = kept[rows].tolist()
-    points = [np.arange(len(campaign.curves[i])) for i in places]
+    points = [np.arange(len(campaign.curves[i])) for i in kept]
     longest = padded_length(max(map(len, points)))
-    records = records_of(campaign, places, adjustment.segments, points, longest).record
-    sizes = particle_batch(campaign.diameters_um[places])
+    record = records_of(campaign, kept.tolist(), adjustment.segments, points, longest).record
+    records = jax.tree.map(lambda x: np.asarray(x)[rows], record)
+    sizes = particle_batch(campaign.diameters_um[kept[rows]])
     plastic = eqx.filter_vmap(Plastic.from_polynomial)(*jnp.asarray(np.array(own)[rows].T))
     same = eqx.filter_vmap(lambda one: eqx.tree_at(lambda each: each.plastic, law, one))(plastic)
     mean = eqx.filter_vmap(lambda _: law)(plastic.C1)
