@@ -6,6 +6,7 @@ import functools
 from collections.abc import Callable
 from typing import Any, cast
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
@@ -96,6 +97,22 @@ def compiled_whole[**P, R](function: Callable[P, R]) -> Callable[P, R]:
     tenth of a second, and as little again for other numbers.
     """
     return cast(Any, jax.jit)(function, inline=True)
+
+
+def compiled[**P, R](function: Callable[P, R], level: int = 1) -> Callable[P, R]:
+    """`equinox.filter_jit` with less optimisation: a fifth less time to compile, the same speed.
+
+    A new campaign in a new process waits for compilation longer than for anything else. Within other compiled code it
+    dissolves.
+    """
+    whole = cast(Any, eqx.filter_jit)(function, compiler_options={"xla_backend_optimization_level": level})
+
+    @functools.wraps(function)
+    def run(*given: P.args, **named: P.kwargs) -> R:
+        traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((given, named)))
+        return (function if traced else whole)(*given, **named)
+
+    return run
 
 
 def shared(x: Values) -> Values:

@@ -9,17 +9,9 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, cast
 
-import equinox as eqx
 from threadpoolctl import threadpool_limits
 
-
-def compiled[**P, R](function: Callable[P, R], level: int = 1) -> Callable[P, R]:
-    """`equinox.filter_jit` with less optimisation: a fifth less time to compile, the same speed.
-
-    These functions are long chains of small operations, and a new campaign in a new process waits for their compilation
-    longer than for anything else.
-    """
-    return cast(Any, eqx.filter_jit)(function, compiler_options={"xla_backend_optimization_level": level})
+from .._numerics import compiled as compiled
 
 
 def compiled_quickly[**P, R](function: Callable[P, R]) -> Callable[P, R]:

@@ -20,7 +20,8 @@ from .data import Selection, Tests, point_noise_um, select
 from .distributions import SpreadCoordinate
 from .fit_result import Fit, population_of
 from .forward import Point
-from .linearisation import Linearisation, linear_data, start_of_effects
+from .forward import linearise
+from .linearisation import Linearisation, start_of_effects
 from .marginal import Marginal, summarise
 from .mode import LogPosterior, careful_enough, expect, gradients, most_probable
 from .model import Model
@@ -199,7 +200,7 @@ class _Fitter:
             rows = np.linspace(0, self.count - 1, FIT.noise_blocks * blocks.size).astype(int)
             blocks = Blocks(len(rows), blocks.size)
             own = blocks.cut(_rows(self.tests, rows))
-            linear = blocks.each(linear_data, blocks.cut(_rows(self.point, rows)), own, m.forms)
+            linear = blocks.each(linearise, blocks.cut(_rows(self.point, rows)), own, m.forms)
             start = replace(start, scale=start.scale[rows])
         prior = m.chosen_priors.noise
         found = estimate_noise(

@@ -13,6 +13,9 @@ particle never contain the shape parameter `a`: it enters through what particles
 
 from __future__ import annotations
 
+import functools
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -22,11 +25,17 @@ from jaxtyping import Array, Float
 from .._types import Path, Scalar
 from ..effects import AbstractEffect, Record, Variant
 from ..geometry import Particle
-from ..law import MccLaw, Plastic, Unloading
+from ..law import MccLaw, Plastic, StrainScaling, Unloading
+from ..law.derivatives import Formula, Numbers, along
 from .data import Tests
 
 Latent = Float[Array, " 4"]
 """b1, b3, b5 and e of one particle."""
+
+
+@functools.cache
+def _formula(variant: Variant) -> Formula:
+    return Formula(variant.build(1.0), ("amplitude", *(n.name for n in variant.nuisances)))
 
 
 class Forms(eqx.Module):
@@ -55,6 +64,17 @@ class Forms(eqx.Module):
     def positive(self) -> np.ndarray:
         """Which of the further numbers must be positive, and are fitted by their logarithm."""
         return np.array([n.plausible[0] > 0 for v in self.effects for n in v.nuisances], bool)
+
+    @property
+    def formulas(self) -> tuple[Formula, ...]:
+        """The effects without their numbers."""
+        return tuple(map(_formula, self.effects))
+
+    @property
+    def places(self) -> tuple[tuple[int, ...], ...]:
+        """Where the numbers of each effect are among all: its amplitude, then its further numbers."""
+        ends = np.cumsum([len(self.effects), *(len(v.nuisances) for v in self.effects)]).tolist()
+        return tuple((k, *range(ends[k], ends[k + 1])) for k in range(len(self.effects)))
 
     def build(self, theta: Float[Array, " numbers"]) -> tuple[AbstractEffect, ...]:
         """The effects with these numbers, in the order of `names`."""
@@ -104,12 +124,12 @@ class Linear(eqx.Module):
             None for a law without effects.
     """
 
-    residual: Float[Array, "particles points"]
-    columns: Float[Array, "particles points numbers"]
-    by_force: Float[Array, "particles points"]
-    by_peak: Float[Array, "particles points"]
-    by_offset: Float[Array, "particles points"]
-    bends: Float[Array, "particles points bends"] | None = None
+    residual: Float[Array | np.ndarray, "particles points"]
+    columns: Float[Array | np.ndarray, "particles points numbers"]
+    by_force: Float[Array | np.ndarray, "particles points"]
+    by_peak: Float[Array | np.ndarray, "particles points"]
+    by_offset: Float[Array | np.ndarray, "particles points"]
+    bends: Float[Array | np.ndarray, "particles points bends"] | None = None
 
 
 def residuals(point: Point, tests: Tests, forms: Forms) -> Float[Array, "particles points"]:
@@ -124,36 +144,46 @@ def linearise(
 ) -> Linear:
     """Linearise all tests, by forward derivatives in as many directions as one particle has numbers.
 
+    Nothing that is compiled on the way holds both the law and the formula of an effect (`mcc_jax.law.derivatives`), so
+    this is not to be compiled itself.
+
     Args:
         with_numbers: whether derivatives by the particle's numbers are wanted; none if not.
         with_force: whether derivatives by force are wanted; 0 if not.
     """
-    record, still = tests.record, jnp.zeros_like(tests.force)
-    count, size = len(tests), 4 + point.theta.shape[1]
-
-    def predicted(numbers: Array, force: Array, peak: Array) -> Array:
-        moved = eqx.tree_at(lambda r: (r.force, r.peak), record, (force, peak))
-        return jax.vmap(lambda x, *one: forms.displacement(x[:4], x[4:], *one))(numbers, tests.particle, moved)
-
-    numbers = jnp.concatenate([point.latent, point.theta], 1)
-    value, push = jax.linearize(predicted, numbers, tests.force, record.peak)
-    directions = [jnp.broadcast_to(jnp.eye(size)[:, None], (size, count, size))] if with_numbers else []
-    wanted = size if with_numbers else 0
-    forces = peaks = [still] * wanted
+    record, theta = tests.record, point.theta
+    assert record.peak is not None
+    xp: Any = jnp if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((point, tests))) else np
+    count, points, asked = len(tests), tests.force.shape[1], 2 * with_force
+    size = (4 + theta.shape[1]) * with_numbers
+    law = xp.insert(xp.exp(xp.asarray(point.latent)), 3, 0.0, axis=1)  # a = 0: the shape is taken in
+    # Every number of a particle has a direction of its own; those of the law are logarithms.
+    unit = np.zeros((size + asked, 4 + theta.shape[1]))
+    unit[range(size), range(size)] = 1.0
+    d_law = unit[:, None, [0, 1, 2, 0, 3]] * law[None]
+    d_theta = np.broadcast_to(unit[:, None, 4:], (len(unit), count, theta.shape[1]))
+    d_force = d_peak = xp.zeros((len(unit), count, points))
     if with_force:
-        directions.append(jnp.zeros((2, count, size)))
-        own = jnp.where(tests.reading, 1.0, 0.0)
-        elastic = jnp.where(tests.peak_error > 0, 1.0, 0.0)
+        own = xp.where(xp.asarray(tests.reading), 1.0, 0.0)
+        elastic = xp.where(xp.asarray(tests.peak_error) > 0, 1.0, 0.0)
         # A reading on virgin loading is its own peak; where the estimate stands in for readings, both move together.
-        forces = [*forces, own, 1 - own]
-        peaks = [*peaks, 1 - elastic, elastic]
-    columns = jax.vmap(push)(jnp.concatenate(directions), jnp.stack(forces), jnp.stack(peaks))
-    columns = jnp.where(tests.mask[None], columns, 0.0)
-    residual = still
+        d_force = xp.concatenate([d_force[:size], xp.stack([own, 1 - own])])
+        d_peak = xp.concatenate([d_peak[:size], xp.stack([1 - elastic, elastic])])
+
+    def of_effects(numbers: Any) -> tuple[Any, ...]:
+        return tuple(numbers[..., list(each)] for each in forms.places)
+
+    numbers = Numbers(law, tests.force, record.peak, of_effects(xp.asarray(theta)))
+    directions = Numbers(d_law, d_force, d_peak, of_effects(d_theta))
+    kinds = forms.unloading, StrainScaling.RAW
+    value, slopes = map(xp.asarray, along(kinds, forms.formulas, tests.particle, record, numbers, directions))
+    columns = xp.where(xp.asarray(tests.mask)[None], slopes, 0.0)
+    residual = still = xp.zeros((count, points))
     if tests.displacement is not None:
-        residual = jnp.where(tests.mask, tests.displacement - value - point.zero[:, None], 0.0)
-    by_force, by_peak = columns[wanted:] if with_force else (still, still)
-    return Linear(residual, jnp.moveaxis(columns[:wanted], 0, -1), by_force, by_peak, by_force + by_peak)
+        away = xp.asarray(tests.displacement) - value - xp.asarray(point.zero)[:, None]
+        residual = xp.where(xp.asarray(tests.mask), away, 0.0)
+    by_force, by_peak = columns[size:] if with_force else (still, still)
+    return Linear(residual, xp.moveaxis(columns[:size], 0, -1), by_force, by_peak, by_force + by_peak)
 
 
 def snap(latent: Latent, particle: Particle) -> Scalar:

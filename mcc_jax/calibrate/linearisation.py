@@ -24,12 +24,6 @@ from .straightening import Straight, box_cox, moved, products
 
 
 @compiled
-def linear_data(point: Point, tests: Tests, forms: Forms) -> Linear:
-    """All tests linearised, how noise of force moves them included."""
-    return linearise(point, tests, forms)
-
-
-@compiled
 def _sheared(linear: Linear, slope: Float[Array, "particles numbers numbers"]) -> Linear:
     """The same by coordinates of the effects' numbers, from the derivatives of these by them."""
     own = jnp.einsum("npk,nkl->npl", linear.columns[..., 4:], slope)
@@ -59,7 +53,7 @@ class Linearisation:
             self.straight = self._straightened(point, sd)
         numbers = point.theta.shape[1]
         if not numbers:
-            return self._blocks.each(linear_data, self._blocks.cut(point), self._own, self._model.forms)
+            return self._blocks.each(linearise, self._blocks.cut(point), self._own, self._model.forms)
         found = self._moved(point, np.zeros(numbers))
         bends = [self._bend(point, k, 0.0 if sd is None else float(sd[k])) for k in range(numbers)]
         return found.map(lambda linear, *each: replace(linear, bends=jnp.concatenate(each, -1)), *bends)
@@ -92,7 +86,7 @@ class Linearisation:
         """All tests linearised where the effects' numbers have these coordinates, by these coordinates."""
         theta, slope = moved(jnp.asarray(away), point.theta, self.straight, self._model.scatter.positive)
         cut = self._blocks.cut
-        found = self._blocks.each(linear_data, cut(replace(point, theta=theta)), self._own, self._model.forms)
+        found = self._blocks.each(linearise, cut(replace(point, theta=theta)), self._own, self._model.forms)
         return found.map(_sheared, cut(slope))
 
     def _bend(self, point: Point, number: int, step: float) -> Parts:

@@ -172,7 +172,7 @@ class Blocks:
             if self.mesh is None:
                 return function(*chosen)
             axes = tuple(a.axis if isinstance(a, Parts) else -1 for a in arguments)
-            return _on_all_devices(chosen, axes, axis, function.__wrapped__, self.mesh)  # pyright: ignore[reportFunctionMemberAccess]
+            return _on_all_devices(chosen, axes, axis, function, self.mesh)
 
         return Parts(tuple(wave(w) for w in range(len(self._own))), axis)
 

@@ -6,6 +6,8 @@ it may be twice what acts in the tests. At their peaks all formulas that describ
 
 from __future__ import annotations
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +17,6 @@ from ..calibrate.distributions import nuisance_moments
 from ..calibrate.forward import Forms
 from ..effects.record import Record
 from ..geometry import Particle
-from ..law.response import modulus_factor
 from .base import Base
 from .design import moved
 from .evidence import Solution
@@ -43,7 +44,7 @@ def of_modulus_at_peaks(base: Base, formulas: Refined, solution: Solution) -> tu
         def one(latent: Array, particle: Particle, record: Record) -> Array:
             law = forms.law(latent, numbers)
             context = law.context(particle, record)
-            factor = modulus_factor(law.effects, context)[record.force.argmax()]
+            factor = math.prod(effect.stiffness(context) for effect in law.effects)[record.force.argmax()]
             return jnp.log(factor * context.law.effective_modulus / law.formulas.effective_modulus)
 
         found = jax.vmap(one)(state.point.latent, base.tests.particle, base.tests.record).mean()

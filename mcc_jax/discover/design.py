@@ -11,15 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..calibrate.compiling import compiled, compiled_quickly
+from ..calibrate.compiling import compiled
 from ..calibrate.distributions import nuisance_moments
-from ..calibrate.fitting import linear_data
 from ..calibrate.forward import Forms, Linear, Point, linearise
 from ..effects import Variant
 from .base import Base, State
 from .columns import Design, Kinds, prior_of_noise
 from .evidence import Solution
-from .settings import NUMERICS, POPULATION
+from .settings import POPULATION
 
 
 def particle_means(beta: Float[Array, " 5"], flatness: Array, power: float) -> Float[Array, "particles 4"]:
@@ -51,9 +50,6 @@ def base_columns(
     columns = jnp.einsum("npk,nkb,bc->npc", own, slope, factor)
     away = at + jnp.einsum("nkb,b->nk", slope, mean - population) - latent
     return columns, residual - jnp.einsum("npk,nk->np", own, away)
-
-
-linearised_by_few = compiled_quickly(linearise)
 
 
 @dataclass(frozen=True)
@@ -89,8 +85,7 @@ NOTHING_MORE = More()
 
 def linear_at(base: Base, state: State, variants: tuple[Variant, ...]) -> Linear:
     """The tests linearised at a state."""
-    function = linearised_by_few if base.blocks[0].number <= NUMERICS.few_blocks else linear_data
-    return base.each(function, state.point, Forms(base.model.unloading, variants))
+    return base.each(linearise, state.point, Forms(base.model.unloading, variants))
 
 
 def design_of(

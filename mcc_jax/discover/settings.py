@@ -125,7 +125,6 @@ class Numerics:
         splines, fine_splines: cosines of each coordinate of a discrepancy that no mechanism explains, and of stress.
         columns, entries: columns that are freed of the noise at once, at least and at most, and about how many numbers
             they hold together, so that they stay in a processor's own memory.
-        few_blocks: of particles; up to so many, formulas are compiled with less optimisation and run for longer.
         waves, drive_waves: periods that a periodic discrepancy may have over the range of travel and of time, and over
             that of micrometres, which is the widest among particles of several sizes.
         bootstrap: campaigns drawn for the p value.
@@ -140,7 +139,7 @@ class Numerics:
     noise_factors: tuple[float, ...] = (1.0, 0.4, 0.15, 0.05)
     length_factors: tuple[float, ...] = (1.0, 0.3)
     spread_factors: tuple[float, ...] = (1.0, 0.5)
-    block: int = 4
+    block: int = 8
     contenders: int = 5
     formulas: int = 2
     all_formulas: int = 8
@@ -166,7 +165,6 @@ class Numerics:
     degree: int = 2
     columns: tuple[int, int] = (6, 18)
     entries: int = 270_000
-    few_blocks: int = 8
     waves: int = 12
     drive_waves: int = 26
     bootstrap: int = 400

@@ -1,23 +1,259 @@
-"""What one unit of each effect would add to a measured curve, to first order."""
+r"""Derivatives of displacement by everything it depends on: of the law with effects, and of every effect at its null.
+
+A program that holds the law and a formula would be compiled for every formula, and for every pair of them. So the law is
+taken in stages,
+
+    parameters -> strain of loading -> peak and recovery -> modulus -> additions,
+
+each a program of its own, and so is each hook of an effect. A stage is given values and their derivatives along some
+directions, and passes both on by the chain rule.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .. import arguments
+from .._numerics import compiled
 from .._types import Path, Scalar
 from ..effects import AbstractEffect, Context, Record
-from ..formulas import Formulas, recovery, tangent_modulus
+from ..formulas import Formulas, Plastic, StrainScaling, Unloading, recovery, tangent_modulus
 from ..geometry import Particle
+from .loading import NEWTON_STEPS, base_strain, newton_step, slope_at, stress_at
 from .mcc import MccLaw
-from .response import additions, no_memory, since_peak
+from .response import additions, no_memory, peak_displacement, peak_forces, released, since_peak
+
+DIRECTIONS = 12
+"""As many as two effects with two further numbers each need; with fewer the rest is padding, so that all formulas share
+programs. More are a program more."""
+SETTLED = 1e-9  # relative step of the strain from which on the last step of Newton's method is exact to rounding
+
+# ---- the law along measured tests ------------------------------------------------------------------------------------
+
+
+class Numbers(eqx.Module):
+    """What displacement depends on, of every test.
+
+    Attributes:
+        law: C1, C3, C5, a and the effective modulus.
+        force, peak: force of every point, and that from which its branch starts [mN].
+        effects: amplitude and further numbers of each effect.
+    """
+
+    law: Float[Array | np.ndarray, "*tests 5"]
+    force: Float[Array | np.ndarray, "*tests points"]
+    peak: Float[Array | np.ndarray, "*tests points"]
+    effects: tuple[Float[Array | np.ndarray, "*tests _"], ...]
+
+
+@dataclass(frozen=True)
+class Formula:
+    """An effect without its numbers.
+
+    Attributes:
+        effect: the effect, whatever its numbers.
+        names: the fields that are its numbers, the amplitude first.
+    """
+
+    effect: AbstractEffect
+    names: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "effect", replace(self.effect, label=""))  # which would keep equal programs apart
+
+
+Forms = tuple[Unloading, StrainScaling]
+"""Of unloading, and of how the shape factor enters it."""
+
+
+def along(
+    forms: Forms,
+    formulas: Sequence[Formula],
+    particle: Particle,
+    record: Record,
+    numbers: Numbers,
+    directions: Numbers,
+) -> tuple[Float[Array, "tests points"], Float[Array, "along tests points"]]:
+    """Displacement [um] of virgin particles along their tests, and its derivatives along directions of all numbers.
+
+    Each of the effects acts through its own programs: two together compile nothing that each alone did not.
+
+    Args:
+        forms: of the law.
+        formulas: what acts besides.
+        particle, record: one of every test; `record.peak` is given.
+        numbers: where.
+        directions: with a leading axis.
+    """
+    count, asked = len(numbers.force), len(directions.law)
+    if formulas:
+        more = -asked % DIRECTIONS + 1
+        directions = jax.tree.map(lambda x: jnp.pad(x, ((0, more), *[(0, 0)] * (x.ndim - 1))), directions)
+    tests, law, d_law = (particle, record), numbers.law, directions.law
+    loads, d_loads = (numbers.force, numbers.peak), (directions.force, directions.peak)
+
+    def hook(which: str, k: int, context: Any = (), d_context: Any = ()) -> tuple[Any, Any]:
+        given, along = (numbers.effects[k], law, loads, context), (directions.effects[k], d_law, d_loads, d_context)
+        return _staged(_hook, given, along, tests, (forms, which, formulas[k].names), formulas[k].effect)
+
+    def with_hook(*names: str) -> list[int]:
+        return [k for k, formula in enumerate(formulas) if formula.effect.overrides(*names)]
+
+    for k in with_hook("modify"):
+        law, d_law = hook("modify", k)
+    if loading := with_hook("loading"):
+        strain, step = _start(forms, law, loads, particle, []), jnp.inf
+        by_strain = jnp.zeros((len(d_law), *strain.shape)).at[-1].set(1.0)  # the padding has room for one
+
+        def factors(strain: Any) -> tuple[Any, Any, Any]:
+            found = [hook("loading", k, strain, by_strain) for k in loading]
+            values, slopes = [one for one, _ in found], [one for _, one in found]
+            return values, jax.tree.map(lambda x: x[-1], slopes), slopes
+
+        strain = _start(forms, law, loads, particle, factors(strain)[0])
+        for _ in range(NEWTON_STEPS):
+            strain, step = _newton(forms, law, loads, particle, strain, *factors(strain)[:2])
+            if not isinstance(step, jax.core.Tracer) and step < SETTLED:
+                break
+        values, slopes, d_values = factors(strain)
+        reached, d_reached = _reached(forms, law, loads, *tests, strain, values, slopes, (d_law, d_loads, d_values))
+        context, d_context = _staged(
+            _released, (law, loads, reached, []), (d_law, d_loads, d_reached, []), tests, forms
+        )
+    else:
+        context, d_context = _staged(_base, (law, loads), (d_law, d_loads), tests, forms)
+    if stiffening := with_hook("stiffness"):
+        values, slopes = zip(*(hook("stiffness", k, context, d_context) for k in stiffening), strict=True)
+        given, directed = (law, loads, context[0], values), (d_law, d_loads, d_context[0], slopes)
+        context, d_context = _staged(_released, given, directed, tests, forms)
+    total, slopes = context[2], d_context[2]
+    for k in with_hook("inside", "observe"):
+        added, d_added = hook("added", k, context, d_context)
+        total, slopes = total + added, slopes + d_added
+    return total, slopes[:asked]
+
+
+@compiled
+def _staged(
+    stage: Callable[..., Any], given: Any, directions: Any, tests: tuple[Particle, Any], static: Any, *shared: Any
+) -> tuple[Any, Any]:
+    """A stage of every test and its derivatives along directions of what it is given."""
+
+    def every(given: Any) -> Any:
+        return jax.vmap(lambda one, test: stage(one, *test, static, *shared))(given, tests)
+
+    value, push = jax.linearize(every, given)
+    return value, jax.vmap(push)(directions)
+
+
+def _law(numbers: Array, forms: Forms) -> Formulas:
+    return Formulas(Plastic(*numbers[:3]), *numbers[3:], *forms)
+
+
+def _loaded(
+    law: Array, loads: Any, particle: Particle, record: Record, forms: Forms
+) -> tuple[Particle, Formulas, Record, Path]:
+    """What a context begins with: particle, law, record, and the force from which every branch starts."""
+    record = eqx.tree_at(lambda r: (r.force, r.peak), record, loads)
+    return particle, _law(law, forms), record, peak_forces(record, jnp.zeros_like(particle.D3))
+
+
+def _base(given: Any, particle: Particle, record: Record, forms: Forms) -> tuple[Path, Path, Path]:
+    _, law, record, highest = _loaded(*given, particle, record, forms)
+    reached, moved = law.peak_and_displacement(particle, jnp.zeros_like(particle.D3), record.force, highest)
+    return reached, law.recoverable_displacement(particle, reached, highest, jnp.ones_like(reached)), moved
+
+
+def _released(given: Any, particle: Particle, record: Record, forms: Forms) -> tuple[Path, Path, Path]:
+    law, loads, reached, factors = given
+    context = released(Context(*_loaded(law, loads, particle, record, forms), reached, reached, reached), factors)
+    return reached, context.recoverable, context.displacement
+
+
+def _hook(given: Any, particle: Particle, record: Record, static: Any, effect: AbstractEffect) -> Any:
+    """One hook of an effect with its numbers."""
+    numbers, law, loads, moved = given
+    forms, which, names = static
+    effect = replace(effect, **dict(zip(names, numbers, strict=True)))
+    loaded = _loaded(law, loads, particle, record, forms)
+    if which == "modify":
+        changed = effect.modify(loaded[1], particle, record)
+        plastic = changed.plastic
+        return jnp.stack([plastic.C1, plastic.C3, plastic.C5, changed.a, changed.effective_modulus])
+    if which == "loading":
+        return effect.loading(loaded[1], particle, loaded[2], moved)
+    context = Context(*loaded, *moved)
+    if which == "stiffness":
+        return effect.stiffness(context)
+    before = no_memory((effect,), jnp.zeros_like(particle.D3))
+    return additions((effect,), eqx.tree_at(lambda m: m.point.time, before, record.time[0]), context)[1]
+
+
+def _stress(particle: Particle, loads: Any) -> Path:
+    stress = particle.stress(loads[0])
+    return jnp.where(stress >= 0, stress, 0.0)
+
+
+@compiled
+def _start(forms: Forms, law: Array, loads: Any, particle: Particle, factors: list[Any]) -> Array:
+    """Strain of loading at every force, the factors taken as independent of strain."""
+    return jax.vmap(
+        lambda law, loads, particle, f: base_strain(_law(law, forms), particle, _stress(particle, loads), f)
+    )(law, loads, particle, factors)
+
+
+@compiled
+def _newton(
+    forms: Forms, law: Array, loads: Any, particle: Particle, strain: Array, factors: list[Any], slopes: list[Any]
+) -> tuple[Array, Array]:
+    """A step of Newton's method, and how long it was at most, relative to the strain."""
+
+    def one(law: Array, loads: Any, particle: Particle, *at: Any) -> Array:
+        return newton_step(_law(law, forms), particle, _stress(particle, loads), *at)
+
+    new = jax.vmap(one)(law, loads, particle, strain, factors, slopes)
+    return new, jnp.max(jnp.abs(new - strain) / jnp.where(strain > 0, strain, 1.0))
+
+
+@compiled
+def _reached(
+    forms: Forms,
+    law: Array,
+    loads: Any,
+    particle: Particle,
+    record: Record,
+    strain: Array,
+    factors: list[Any],
+    slopes: list[Any],
+    directions: Any,
+) -> tuple[Array, Array]:
+    """Largest displacement so far, and its derivatives by the implicit-function rule at the strain of loading."""
+
+    def residual(given: Any, particle: Particle, strain: Array, _: Any) -> Array:
+        law, loads, factors = given
+        return stress_at(_law(law, forms), particle, strain, factors) - _stress(particle, loads)
+
+    def peak(given: Any, particle: Particle, record: Record, _: Any) -> Array:
+        strain, *loads = given
+        _, _, record, highest = _loaded(law[0], loads, particle, record, forms)
+        return peak_displacement(particle, record, highest, strain, jnp.zeros_like(particle.D3), since_peak(record))
+
+    off, change = _staged(residual, (law, loads, factors), directions, (particle, strain), None)
+    slope = jax.vmap(lambda law, *at: slope_at(_law(law, forms), *at))(law, particle, strain, factors, slopes)
+    given, along = (strain - off / slope, *loads), (-change / slope[None], *directions[1])
+    return _staged(peak, given, along, (particle, record), None)
+
+
+# ---- every effect at its null ----------------------------------------------------------------------------------------
 
 
 def signatures(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -32,60 +32,68 @@ def strain_under(effects: Effects, law: Formulas, particle: Particle, record: Re
         stress: stress [MPa]; 0 is returned at and below zero.
     """
     target = jnp.where(stress >= 0, stress, 0.0)
-    still, fixed, body, points = jax.tree.map(jax.lax.stop_gradient, (effects, law, particle, record))
-    root = _root(still, fixed, body, points, jax.lax.stop_gradient(target))
+    fixed = jax.tree.map(jax.lax.stop_gradient, (effects, law, particle, record))
+    law_there, particle_there, target_there = *fixed[1:3], jax.lax.stop_gradient(target)
 
-    def residual(strain: Values) -> Values:
-        return _stress(effects, law, particle, record, strain) - target
+    def factors(strain: Values) -> list[Factors]:
+        return [effect.loading(*fixed[1:], strain) for effect in fixed[0]]
 
-    slope = _slope(lambda strain: _stress(still, fixed, body, points, strain), root, fixed, body)
-    return root - residual(root) / slope
-
-
-def loading_factors(effects: Effects, law: Formulas, particle: Particle, record: Record, strain: Values) -> Factors:
-    """Product of the factors of all effects on the three terms of loading."""
-    one = jnp.ones_like(strain)
-    product = (one, one, one)
-    for effect in effects:
-        f1, f3, f5 = effect.loading(law, particle, record, strain)
-        product = (product[0] * f1, product[1] * f3, product[2] * f5)
-    return product
-
-
-def _root(effects: Effects, law: Formulas, particle: Particle, record: Record, target: Values) -> Values:
-    eta = law.shape_factor(particle)
-    K1, K3, K5 = (jnp.broadcast_to(k, target.shape) for k in law.plastic.polynomial)
-    strain = _inverse(K1, K3, K5, target) / eta
-    f1, f3, f5 = loading_factors(effects, law, particle, record, strain)
-    strain = _inverse(K1 * f1, K3 * f3, K5 * f5, target) / eta
-
-    def stress(strain: Values) -> Values:
-        return _stress(effects, law, particle, record, strain)
+    def with_slopes(strain: Values) -> tuple[list[Factors], list[Factors]]:
+        return jax.jvp(factors, (strain,), (jnp.ones_like(strain),))
 
     def newton(_: Any, strain: Values) -> Values:
-        change = (target - stress(strain)) / _slope(stress, strain, law, particle)
-        limit = 0.3 * strain
-        return strain + jnp.where(change > limit, limit, jnp.where(change < -limit, -limit, change))
+        return newton_step(law_there, particle_there, target_there, strain, *with_slopes(strain))
 
+    start = base_strain(law_there, particle_there, target_there)
+    start = base_strain(law_there, particle_there, target_there, factors(start))
     # Written out, the steps would multiply what is to be compiled.
-    return jax.lax.fori_loop(0, NEWTON_STEPS, newton, strain)
+    root = jax.lax.fori_loop(0, NEWTON_STEPS, newton, start)
+    residual = stress_at(law, particle, root, [e.loading(law, particle, record, root) for e in effects]) - target
+    return root - residual / slope_at(law_there, particle_there, root, *with_slopes(root))
 
 
-def _inverse(K1: Values, K3: Values, K5: Values, stress: Values) -> Values:
-    zero = jnp.zeros_like(K1)
-    return (jax.vmap(loading_strain) if stress.ndim else loading_strain)(K1, K3, K5, stress, zero)
+def stress_at(law: Formulas, particle: Particle, strain: Values, factors: Sequence[Factors] = ()) -> Values:
+    """Stress [MPa] of virgin loading at a strain, with the factors of effects on its three terms."""
+    K1, K3, K5 = _with_factors(law, strain, factors)
+    x = law.shape_factor(particle) * strain
+    square = x * x
+    return x * (K1 - square * (K3 - square * K5))
 
 
-def _slope(stress: Callable[[Values], Values], strain: Values, law: Formulas, particle: Particle) -> Values:
-    """Slope of stress over strain, kept above a thousandth of the initial one, where a curve stops being monotone."""
-    slope = jax.jvp(stress, (strain,), (jnp.ones_like(strain),))[1]
+def slope_at(
+    law: Formulas, particle: Particle, strain: Values, factors: Sequence[Factors], slopes: Sequence[Factors]
+) -> Values:
+    """Slope of `stress_at` over strain, of the factors' own slopes too; kept above a thousandth of the initial one,
+    where a curve stops being monotone."""
+    one = jnp.ones_like(strain)
+    slope = jax.jvp(lambda *at: stress_at(law, particle, *at), (strain, factors), (one, slopes))[1]
     least = 1e-3 * law.plastic.C1 * law.shape_factor(particle)
     return jnp.where(slope > least, slope, least)
 
 
-def _stress(effects: Effects, law: Formulas, particle: Particle, record: Record, strain: Values) -> Values:
-    K1, K3, K5 = law.plastic.polynomial
-    f1, f3, f5 = loading_factors(effects, law, particle, record, strain)
-    x = law.shape_factor(particle) * strain
-    square = x * x
-    return x * (K1 * f1 - square * (K3 * f3 - square * (K5 * f5)))
+def base_strain(law: Formulas, particle: Particle, stress: Values, factors: Sequence[Factors] = ()) -> Values:
+    """Strain of virgin loading at a stress, with factors that do not depend on strain."""
+    K1, K3, K5 = _with_factors(law, stress, factors)
+    inverse = jax.vmap(loading_strain) if stress.ndim else loading_strain
+    return inverse(K1, K3, K5, stress, jnp.zeros_like(K1)) / law.shape_factor(particle)
+
+
+def newton_step(
+    law: Formulas,
+    particle: Particle,
+    stress: Values,
+    strain: Values,
+    factors: Sequence[Factors],
+    slopes: Sequence[Factors],
+) -> Values:
+    """A step of Newton's method for the strain at a stress, of at most 30 % of the strain."""
+    change = (stress - stress_at(law, particle, strain, factors)) / slope_at(law, particle, strain, factors, slopes)
+    limit = 0.3 * strain
+    return strain + jnp.where(change > limit, limit, jnp.where(change < -limit, -limit, change))
+
+
+def _with_factors(law: Formulas, like: Values, factors: Sequence[Factors]) -> tuple[Values, Values, Values]:
+    K1, K3, K5 = (jnp.broadcast_to(K, like.shape) for K in law.plastic.polynomial)
+    for f1, f3, f5 in factors:
+        K1, K3, K5 = K1 * f1, K3 * f3, K5 * f5
+    return K1, K3, K5

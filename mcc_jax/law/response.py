@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -83,7 +85,7 @@ def one_point(
         return *effect.evolve(own, driven, driver, time - before.time), driver
 
     after, values = _remember(effects, memory, record, highest, remember)
-    return context.peak_displacement, after, _with_additions(effects, context, values)
+    return context.peak_displacement, after, context.displacement + _added(effects, context, values)
 
 
 def whole_path(
@@ -92,8 +94,8 @@ def whole_path(
     """The same after all points of a record, closed form but for the memories."""
     highest = peak_forces(record, memory.peak_force)
     context = modified(law, effects, particle, displacement_max, record, highest, since_peak(record))
-    after, displacement = additions(effects, memory, context)
-    return context.peak_displacement[-1], after, displacement
+    after, added = additions(effects, memory, context)
+    return context.peak_displacement[-1], after, context.displacement + added
 
 
 def modified(
@@ -116,38 +118,46 @@ def modified(
         highest: the largest force so far [mN].
         along: the running maximum, or nothing for a single point.
     """
-    force = record.force
     for effect in effects:
         law = effect.modify(law, particle, record)
     loading = tuple(e for e in effects if e.overrides("loading"))
     stiffening = tuple(e for e in effects if e.overrides("stiffness"))
     if loading:
-        strain = strain_under(loading, law, particle, record, particle.stress(force))
-        new = along(jnp.where(force >= highest, particle.displacement(strain), 0.0))
-        reached = moved = jnp.where(new > displacement_max, new, displacement_max)
+        strain = strain_under(loading, law, particle, record, particle.stress(record.force))
+        reached = moved = peak_displacement(particle, record, highest, strain, displacement_max, along)
     else:
-        reached, moved = law.peak_and_displacement(particle, displacement_max, force, highest)
+        reached, moved = law.peak_and_displacement(particle, displacement_max, record.force, highest)
     recoverable = law.recoverable_displacement(particle, reached, highest, jnp.ones_like(reached))
     context = Context(particle, law, record, highest, reached, recoverable, moved)
-    if stiffening:
-        recoverable = law.recoverable_displacement(particle, reached, highest, modulus_factor(stiffening, context))
-        context = eqx.tree_at(lambda c: c.recoverable, context, recoverable)
     if loading or stiffening:
-        released = jnp.where(force < highest, recoverable * recovery(context.load_share), 0.0)
-        context = eqx.tree_at(lambda c: c.displacement, context, reached - released)
+        context = released(context, [effect.stiffness(context) for effect in stiffening])
     return context
 
 
-def modulus_factor(effects: Effects, context: Context) -> Values:
-    """Product of the factors of all effects on the effective modulus."""
-    factor = jnp.ones_like(context.peak_displacement)
-    for effect in effects:
-        factor = factor * effect.stiffness(context)
-    return factor
+def peak_displacement(
+    particle: Particle,
+    record: Record,
+    highest: Values,
+    strain: Values,
+    displacement_max: Scalar,
+    along: Callable[[Values], Values],
+) -> Values:
+    """Largest displacement so far [um], from the strain of virgin loading at every point's force."""
+    new = along(jnp.where(record.force >= highest, particle.displacement(strain), 0.0))
+    return jnp.where(new > displacement_max, new, displacement_max)
+
+
+def released(context: Context, factors: Sequence[Values]) -> Context:
+    """The context with these factors on the effective modulus of its branches."""
+    law, particle, reached = context.law, context.particle, context.peak_displacement
+    factor = math.prod(factors, start=jnp.ones_like(reached))
+    recoverable = law.recoverable_displacement(particle, reached, context.peak_force, factor)
+    share = jnp.where(context.record.force < context.peak_force, recovery(context.load_share), 0.0)
+    return replace(context, recoverable=recoverable, displacement=reached - recoverable * share)
 
 
 def additions(effects: Effects, memory: Memory, context: Context) -> tuple[Memory, Path]:
-    """The second half of a path under load control: memories, additions inside the law, additions by the tester.
+    """Memories after a path under load control, and what is added along it inside the law and by the tester [um].
 
     Args:
         effects: what acts.
@@ -165,7 +175,7 @@ def additions(effects: Effects, memory: Memory, context: Context) -> tuple[Memor
 
     point, highest = jax.tree.map(lambda x: x[-1], (record.at_points, context.peak_force))
     after, values = _remember(effects, memory, point, highest, remember)
-    return after, _with_additions(effects, context, values)
+    return after, _added(effects, context, values)
 
 
 def force_at(
@@ -260,8 +270,8 @@ def _remember(
     return Memory(point, highest, tuple(own), tuple(drivers)), values
 
 
-def _with_additions(effects: Effects, context: Context, values: list[Any]) -> Values:
-    total = context.displacement
+def _added(effects: Effects, context: Context, values: list[Any]) -> Values:
+    total = jnp.zeros_like(context.displacement)
     for effect, value in zip(effects, values, strict=True):
         if effect.overrides("inside", "observe"):
             own = eqx.tree_at(lambda c: c.memory, context, value, is_leaf=lambda x: x is None)

@@ -21,7 +21,6 @@ CREEP = Model().with_effects("creep:logarithmic").forms
 PLAIN = Model().forms
 
 residual_of = eqx.filter_jit(residuals)
-linearised = eqx.filter_jit(linearise)
 starts = jax.jit(jax.vmap(linear_start))
 
 
@@ -70,7 +69,7 @@ def test_derivatives_are_finite_differences(law, theta):
     point = point_at(
         true_latent(unloading=law.unloading) + 0.02 * rng.standard_normal((4, 4)), rng.standard_normal(4), theta
     )
-    linear = linearised(point, tests, law)
+    linear = linearise(point, tests, law)
     columns, mask = np.asarray(linear.columns), np.asarray(tests.mask)
     np.testing.assert_allclose(linear.residual, residual_of(point, tests, law), rtol=1e-12, atol=1e-12)
     assert columns.shape == (*mask.shape, 4 + len(theta))
@@ -90,8 +89,34 @@ def test_derivatives_are_finite_differences(law, theta):
     assert np.all(columns[..., 3][loading] == 0)
     assert np.all(columns[..., 3][mask & (np.asarray(tests.force) < 0.95 * np.asarray(tests.record.peak))])
     # What is not asked for is not there.
-    assert linearised(point, tests, law, with_numbers=False).columns.shape == (*mask.shape, 0)
-    assert not np.any(linearised(point, tests, law, with_force=False).by_force)
+    assert linearise(point, tests, law, with_numbers=False).columns.shape == (*mask.shape, 0)
+    assert not np.any(linearise(point, tests, law, with_force=False).by_force)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [("rate_dependence", "damage"), ("size_effect", "creep:logarithmic"), ("platen_friction", "rate_dependence")],
+    ids="+".join,
+)
+def test_stages_joined_by_the_chain_rule_are_the_derivatives_of_the_whole_law(names):
+    tests, law = measured_with(), Model().with_effects(*names).forms
+    numbers = [0.5 * v.typical for v in law.effects] + [n.middle for v in law.effects for n in v.nuisances]
+    point = point_at(true_latent() + 0.02, 0.0, numbers)
+
+    @eqx.filter_jit
+    def whole(point):
+        def one(x, *test):
+            return law.displacement(x[:4], x[4:], *test)
+
+        x = jnp.concatenate([point.latent, point.theta], 1)
+        return jax.vmap(jax.jacfwd(one))(x, tests.particle, tests.record)
+
+    linear, slopes = linearise(point, tests, law), np.asarray(whole(point))
+    expected = np.where(np.asarray(tests.mask)[..., None], slopes, 0.0)
+    scale = np.abs(expected).max((0, 1))
+    assert np.all(scale > 0)
+    np.testing.assert_allclose(np.asarray(linear.columns) / scale, expected / scale, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(linear.residual, residual_of(point, tests, law), atol=1e-10)
 
 
 @pytest.mark.parametrize(("law", "theta"), [(PLAIN, ()), (CREEP, (3e-4, 10.0))], ids=["plain", "creep"])
@@ -100,7 +125,7 @@ def test_how_errors_of_force_move_a_prediction(law, theta, hum):
     """By a point's own reading, by the peak of its branch, by an error that all forces share: each by differences."""
     tests = measured_with(instrument=Instrument(force_noise_mN=hum), peak_MPa=5.0)
     point = point_at(true_latent(), 0.0, theta)
-    linear = linearised(point, tests, law)
+    linear = linearise(point, tests, law)
     own, elastic, mask = (np.asarray(x) for x in (tests.reading, tests.peak_error > 0, tests.mask))
 
     @eqx.filter_jit
