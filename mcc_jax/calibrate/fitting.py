@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,20 +16,34 @@ from .._errors import InputError
 from .._memory import make_room
 from ..campaign import THRESHOLD_MPA, Campaign, other_material
 from .compiling import compiled
-from .data import Selection, Tests, point_noise_um, select
+from .data import Selection, Tests, longer, point_noise_um, select
 from .distributions import SpreadCoordinate
 from .fit_result import Fit, population_of
-from .forward import Point
-from .forward import linearise
+from .forward import Point, linearise
 from .linearisation import Linearisation, start_of_effects
 from .marginal import Marginal, summarise
-from .mode import LogPosterior, careful_enough, expect, gradients, most_probable
+from .mode import LogPosterior, careful_enough, expect, gradients, most_probable, values_of
 from .model import Model
 from .noise import Noise, NoiseFit, estimate_noise, particle_scales, squared_innovations, student_weights
 from .particle_fit import ParticleFits, fit_particles, linear_starts
+from .population import Population
 from .priors import Priors, check_prior_of_a
 from .settings import FIT, SELECTION
 from .sharding import Blocks, Parts, block_size, count_of, filled_up, require_same
+
+
+class Start(NamedTuple):
+    """Where a fit may begin instead of from nothing: what another fit of the same tests found.
+
+    Attributes:
+        point: the particles.
+        population: what they share.
+        noise: the noise.
+    """
+
+    point: Point
+    population: Population
+    noise: Noise
 
 
 def prepare(
@@ -40,6 +54,7 @@ def prepare(
     fill_up: bool = True,
     block: int | None = None,
     most_points: int = SELECTION.most_points,
+    start: Start | None = None,
     tell: Callable[[str], None] = lambda _: None,
     **settings: Any,
 ) -> tuple[Selection, Fit, int]:
@@ -50,6 +65,7 @@ def prepare(
         fill_up: let copies that count for nothing make up whole blocks; if False, all particles are one block.
         block: particles of a block; by default `block_size` of their number.
         most_points: records longer than this are thinned.
+        start: where the fit begins.
         settings: of `fit_tests`.
 
     Returns:
@@ -66,8 +82,12 @@ def prepare(
     require_same(selection.tests)
     size = (block or block_size(len(selection.tests))) if fill_up else len(selection.tests)
     tests = filled_up(selection.tests, size) if fill_up else selection.tests
+    if start is not None and start.point.theta.shape != (len(selection.kept), len(model.forms.names)):
+        raise InputError(
+            "start is of other particles or effects", remedy="Give the fit of the same campaign and the same model."
+        )
     read_out = float(np.median([point_noise_um(campaign.curves[i]) for i in selection.kept]))
-    found = fit_tests(tests, model, read_out, block=size, tell=tell, **settings)
+    found = fit_tests(tests, model, read_out, block=size, start=start, tell=tell, **settings)
     parts = (found.point.latent, found.point.zero, found.mode, found.covariance)
     if not all(np.isfinite(np.asarray(part)).all() for part in parts):
         raise beyond_numbers(campaign, selection)
@@ -130,10 +150,21 @@ class _Fitter:
         self.linearisation = Linearisation(self.own, self.count, model, blocks)
         self.varying = tuple(k for k, _ in model.scatter.varying)
 
+    def begin_at(self, start: Start) -> dict[str, Any]:
+        """Particles and noise of another fit, and its values of the model's sites."""
+        N = len(self.tests)
+        point, scale = longer((start.point, start.noise.scale), N)
+        self.point, self.noise = point, NoiseFit.unsure(replace(start.noise, scale=scale), converged=True)
+        own = np.column_stack([point.latent, point.zero, np.asarray(point.theta)[:, list(self.varying)]])
+        self.individual = self.alone(np.exp(np.asarray(start.noise.logs)[0]) * scale, point.theta, own[None])
+        self.linear = self.linearisation.at(point)
+        return values_of(start.population, self.model, self.tests.flatness)
+
     def begin(self, read_out_um: float) -> dict[str, float]:
         """Every particle on its own, and from which values of the model's sites to look for the population."""
         model, N = self.model, len(self.tests)
-        self.individual = self.alone(np.full(N, read_out_um))
+        theta = np.broadcast_to(model.forms.without_effects, (N, len(model.forms.names)))
+        self.individual = self.alone(np.full(N, read_out_um), theta)
         self.point = self.individual.point
         noise = Noise.of([read_out_um, *np.asarray(model.chosen_priors.noise.median)[1:]], jnp.asarray(np.ones(N)))
         self.noise = NoiseFit.unsure(noise, converged=True)
@@ -231,8 +262,7 @@ class _Fitter:
 
         def fit(blocks: Blocks, own: Parts, arrays: Any, starts: Parts, most_steps: int) -> ParticleFits:
             cut = [blocks.cut(v) for v in arrays]
-            steps = jnp.asarray(np.asarray(most_steps))
-            return blocks.all(fit_particles, own, *cut, starts, self.model.forms, self.varying, steps)
+            return blocks.all(fit_particles, own, *cut, starts, self.model.forms, self.varying, most_steps)
 
         if self.blocks.whole_here:
             return fit(self.blocks, self.own, arrays, starts, FIT.steps)
@@ -246,21 +276,20 @@ class _Fitter:
         again = fit(few, few.cut(_rows(self.tests, rows)), _rows(arrays, rows), ends, FIT.steps)
         return jax.tree.map(lambda x, y: x.at[late].set(y[: len(late)]), found, again)
 
-    def alone(self, white: np.ndarray) -> ParticleFits:
-        """Every particle on its own, without effects."""
-        priors, N = self.model.chosen_priors, len(self.tests)
+    def alone(self, white: np.ndarray, theta: Any, starts: np.ndarray | None = None) -> ParticleFits:
+        """Every particle on its own, the effects' numbers held."""
+        priors, N, varying = self.model.chosen_priors, len(self.tests), len(self.varying)
         middle = np.append(_centre(priors), 0.0)
         centre = np.broadcast_to(middle, (N, 5)).copy()
         centre[:, 4] = self.zero_mean
         width = np.broadcast_to(np.array([FIT.alone] * 4 + [priors.zero_um.sd]), (N, 5))
-        starts = self.blocks.each(linear_starts, self.own, jnp.asarray(middle[3]), axis=1)
-        if self.varying:
-            centre, width = (np.pad(x, ((0, 0), (0, len(self.varying)))) for x in (centre, width))
-            width[:, 5:] = 1e-12
-            padded = ((0, 0), (0, 0), (0, len(self.varying)))
-            starts = starts.map(lambda wave: jnp.pad(wave, padded))
-        theta = np.broadcast_to(self.model.forms.without_effects, (N, len(self.model.forms.names)))
-        return self.particles(white, centre, width, theta, starts)
+        width = np.pad(width, ((0, 0), (0, varying)), constant_values=1e-12)
+        centre = np.concatenate([centre, np.asarray(theta)[:, list(self.varying)]], 1)
+        if starts is not None:
+            return self.particles(white, centre, width, theta, self.blocks.cut(jnp.asarray(starts), axis=1))
+        first = self.blocks.each(linear_starts, self.own, jnp.asarray(middle[3]), axis=1)
+        padded = ((0, 0), (0, 0), (0, varying))
+        return self.particles(white, centre, width, theta, first.map(lambda wave: np.pad(wave, padded)))
 
     def together(self, target: LogPosterior, free: Float[Array, " d"]) -> Point:
         """Every particle under the population, from where it was and where the summaries expect it."""
@@ -304,6 +333,7 @@ def fit_tests(
     correlated: bool = True,
     rounds: int = FIT.rounds,
     block: int = 0,
+    start: Start | None = None,
     tell: Callable[[str], None] = lambda _: None,
 ) -> Fit:
     """Fit particles, noise and population.
@@ -319,23 +349,25 @@ def fit_tests(
             not move.
         rounds: how often noise, population and particles take turns, at least.
         block: particles of a block (`Blocks`), of which there is a whole number; 0 for all in one.
+        start: where to begin; the last turn is then the only one, unless the tests want more.
     """
     check_prior_of_a(model.chosen_priors, np.asarray(tests.flatness))
     N, effects, count = len(tests), bool(model.effects), count_of(tests)
     fitter = _Fitter(tests, model, Blocks(N, block), tell)
-    start = fitter.begin(max(read_out_um, 1e-4))
-    free, turn = None, 0
+    first = fitter.begin(max(read_out_um, 1e-4)) if start is None else fitter.begin_at(start)
+    begun = 0 if start is None else rounds
+    free, turn = None, begun
     while True:
         last = turn >= (max(rounds, FIT.most_rounds) if effects else rounds)
         if not correlated:
             fitter.take_white_noise()
-        elif last or (effects and not turn):
+        elif (last and turn > begun) or (effects and not turn):
             fitter.summarise()
         else:  # with effects no round knows that it is the last
-            fitter.take_noise(uncertainty=effects or turn == rounds - 1)
+            fitter.take_noise(uncertainty=effects or turn >= rounds - 1)
         tell("fitting the population")
         target = LogPosterior(model, fitter.marginal)
-        before = target.unconstrain(start) if free is None else free
+        before = target.unconstrain(first) if free is None else free
         target = careful_enough(before, target, count)
         free, covariance, mode_converged = most_probable(before, target)
         if effects and not turn:  # amplitudes of zero tell nothing of further numbers

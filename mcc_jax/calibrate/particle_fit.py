@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from .._types import Path, Scalar
 from ..geometry import Particle
@@ -89,97 +92,92 @@ def linear_starts(tests: Tests, log_modulus: Scalar) -> Float[Array, "starts par
     return first[None] + jnp.pad(jnp.asarray(FIT.variations), ((0, 0), (0, 2)))[:, None]
 
 
-@compiled
 def fit_particles(
-    tests: Tests,
-    noise: Float[Array, " particles"],
-    centre: Float[Array, "particles p"],
-    width: Float[Array, "particles p"],
-    theta: Float[Array, "particles numbers"],
-    starts: Float[Array, "starts particles p"],
-    forms: Forms,
-    varying: tuple[int, ...] = (),
-    most_steps: int | Int[Array, ""] = FIT.steps,
-) -> ParticleFits:
-    """Fit every particle by itself, its modulus included, from several starts.
+    tests: Tests, noise: Any, centre: Any, width: Any, theta: Any, starts: Any, forms: Forms,
+    varying: tuple[int, ...] = (), most_steps: int = FIT.steps,
+) -> ParticleFits:  # fmt: skip
+    """Fit every particle by itself, its modulus included, from several starts, by Levenberg's and Marquardt's method.
 
-    Levenberg-Marquardt for all particles and starts in step, each with a damping of its own: one that has converged
-    waits for the others, so there is one loop whatever their number.
+    The law is linearised by the programs that every other fit uses, as many particles at a time as there are; a start
+    that has converged takes no further part.
 
     Args:
         noise: scale of each particle's residuals [um].
-        centre, width: normal prior of each particle's b1, b3, b5, e, zero [um], and the amplitudes that vary.
-        theta: numbers of the effects; those whose places are in `varying` are fitted.
+        centre, width: normal prior of each particle's b1, b3, b5, e, zero [um], and the amplitudes that vary, shape
+            (particles, p).
+        theta: numbers of the effects, shape (particles, numbers); those whose places are in `varying` are fitted.
+        starts: shape (starts, particles, p).
         most_steps: give up after as many.
     """
-    count, size = len(starts), starts.shape[-1]
+    noise, centre, width, theta, starts = (np.asarray(x) for x in (noise, centre, width, theta, starts))
+    (count, N, size), places = starts.shape, list(varying)
+    tests = jax.tree.map(np.asarray, tests)
+    points = np.maximum(tests.mask.sum(1), 1)
 
-    def tile(x: Array) -> Array:
-        return jnp.tile(x, (count, *[1] * (x.ndim - 1)))
+    def at(y: np.ndarray, rows: np.ndarray) -> Point:
+        own = theta[rows].copy()
+        own[:, places] = y[:, 5:]
+        return Point(jnp.asarray(y[:, :4]), jnp.asarray(y[:, 4]), jnp.asarray(own))
 
-    many: Tests = jax.tree.map(tile, tests)
-    scale = tile(noise)[:, None]
-    points = jnp.maximum(jnp.sum(many.mask, 1), 1).astype(noise.dtype)
-    middle, width, shared = tile(centre), tile(width), tile(theta)
+    def normal_equations(y: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Loss, gradient and curvature of some particles, as many as there are at most."""
+        filled = np.resize(np.arange(len(rows)), N)  # of one shape, for one compilation
+        some = tests if np.array_equal(rows, np.arange(N)) else jax.tree.map(lambda x: x[rows[filled]], tests)
+        linear = linearise(at(y[filled], rows[filled]), some, forms)
+        ones = np.where(some.mask, 1.0, 0.0)[..., None]
+        J = np.concatenate([linear.columns[..., :4], ones, linear.columns[..., [4 + k for k in places]]], -1)
+        scale = noise[rows[filled]][:, None]
+        if some.reading_weight is not None:
+            scale = scale / np.sqrt(some.reading_weight)
+        r, J = (np.asarray(linear.residual) / scale)[: len(rows)], (-J / scale[..., None])[: len(rows)]
+        away = (y - centre[rows]) / width[rows]
+        H = J.mT @ J + np.eye(size) / width[rows][..., None] ** 2
+        g = np.einsum("nkp,nk->np", J, r) + away / width[rows]
+        loss = 0.5 * ((r**2).sum(1) + (away**2).sum(1))
+        fine = np.isfinite(loss) & np.isfinite(g).all(1) & np.isfinite(H).all((1, 2))
+        H = np.where(fine[:, None, None], H, np.eye(size))
+        return np.where(fine, loss, np.inf), np.where(fine[:, None], g, 0.0), H
 
-    def at(y: Array) -> Point:
-        own = shared.at[:, jnp.asarray(varying, int)].set(y[:, 5:]) if varying else shared
-        return Point(y[:, :4], y[:, 4], own)
+    def every(y: np.ndarray, rows: np.ndarray) -> list[np.ndarray]:
+        cut = range(0, len(rows), N)
+        found = [normal_equations(y[k : k + N], rows[k : k + N]) for k in cut]
+        return [np.concatenate(several) for several in zip(*found, strict=True)]
 
-    def normal_equations(y):
-        linear = linearise(at(y), many, forms, with_force=False)
-        columns = [linear.columns[..., :4], jnp.where(many.mask, 1.0, 0.0)[..., None]]
-        columns += [linear.columns[..., 4 + k : 5 + k] for k in varying]
-        r, J, away = linear.residual / scale, -jnp.concatenate(columns, -1) / scale[..., None], (y - middle) / width
-        if many.reading_weight is not None:
-            root = jnp.sqrt(many.reading_weight)
-            r, J = root * r, root[..., None] * J
-        H = jnp.einsum("nkp,nkq->npq", J, J) + jnp.eye(size)[None] / width[..., None] ** 2
-        g = jnp.einsum("nkp,nk->np", J, r) + away / width
-        loss = 0.5 * (jnp.sum(r**2, 1) + jnp.sum(away**2, 1))
-        return jnp.where(jnp.isfinite(loss), loss, jnp.inf), g, H
-
-    def step(carry):
-        y, loss, g, H, damping, count, _ = carry
-        diagonal = jnp.diagonal(H, axis1=1, axis2=2)
-        move = -Cholesky(H + jnp.eye(size)[None] * (damping[:, None] * diagonal)[:, None, :]).solve(g)
+    y, particle = starts.reshape(-1, size).astype(float), np.tile(np.arange(N), count)
+    loss, g, H = every(y, particle)
+    damping, done = np.full(len(y), 1e-3), np.zeros(len(y), bool)
+    for _ in range(int(most_steps)):
+        now = np.flatnonzero(~done)
+        if not len(now):
+            break
+        rows = particle[now]
+        damped = H[now] + damping[now, None, None] * np.eye(size) * H[now]
+        move = -np.linalg.solve(damped, g[now][..., None])[..., 0]
         # No logarithm moves by more than a factor of e, nothing else by more than its prior's width, at a time.
-        most = jnp.max(jnp.abs(move) / jnp.concatenate([jnp.ones_like(move[:, :4]), width[:, 4:]], 1), 1)
-        tried = y + move / jnp.maximum(most, 1.0)[:, None]
-        new_loss, new_g, new_H = normal_equations(tried)
-        better = new_loss < loss
+        most = np.abs(move / np.concatenate([np.ones((len(now), 4)), width[rows, 4:]], 1)).max(1)
+        tried = y[now] + move / np.maximum(most, 1.0)[:, None]
+        new_loss, new_g, new_H = every(tried, rows)
+        better = new_loss < loss[now]
         # What a step would still gain, in units of the scatter that there is: where the law does not describe the
         # curve, that is many times the noise.
-        scatter = 1 + 2 * jnp.where(jnp.isfinite(loss), loss, 0.0) / points
-        done = (jnp.abs(jnp.einsum("np,np->n", move, g)) < FIT.gain * scatter) | (damping > 1e8)
-
-        def choose(new, old):
-            return jnp.where(better.reshape(-1, *[1] * (old.ndim - 1)), new, old)
-
-        damping = jnp.where(done, damping, jnp.where(better, jnp.maximum(damping / 8, 1e-9), damping * 4))
-        return (*map(choose, (tried, new_loss, new_g, new_H), (y, loss, g, H)), damping, count + 1, done)
-
-    y = starts.reshape(-1, size)
-    unfinished = jnp.zeros(len(y), bool)
-    # The first pass evaluates the start: an infinite loss accepts whatever comes, and no force moves it.
-    carry = (y, jnp.full(len(y), jnp.inf), jnp.zeros_like(y), jnp.broadcast_to(jnp.eye(size), (len(y), size, size)))
-    carry = (*carry, jnp.full(len(y), 1e-3), 0, unfinished)
-    going = lambda c: (c[5] < 2) | ((c[5] < most_steps) & ~jnp.all(c[6]))  # noqa: E731  # a condition, no function
-    y, loss, _, _, _, _, done = jax.lax.while_loop(going, step, carry)
-    y, loss, done = (v.reshape(count, len(tests), *v.shape[1:]) for v in (y, loss, done))
+        scatter = 1 + 2 * np.where(np.isfinite(loss[now]), loss[now], 0.0) / points[rows]
+        gain = np.abs(np.einsum("np,np->n", move, g[now]))
+        done[now] = (gain < FIT.gain * scatter) | (damping[now] > 1e8)
+        damping[now] = np.where(better, np.maximum(damping[now] / 8, 1e-9), damping[now] * 4)
+        for old, new in ((y, tried), (loss, new_loss), (g, new_g), (H, new_H)):
+            old[now[better]] = new[better]
+    y, loss, done = (v.reshape(count, N, *v.shape[1:]) for v in (y, loss, done))
     # A snap-through below the first load that counts is no part of the test: nothing shows it. A sharp rise from
     # nothing is fitted so if it may be, and the fit then presses the snap-through against that first load for good.
-    first = jnp.min(jnp.where(many.mask & many.loading, many.force, jnp.inf), 1)
-    unseen = jax.vmap(snap)(y.reshape(-1, size)[:, :4], many.particle) < jnp.log(first)
-    seen = jnp.where(unseen.reshape(loss.shape), jnp.inf, loss)
+    first = np.where(tests.mask & tests.loading, tests.force, np.inf).min(1)
+    unseen = np.stack([np.asarray(snaps(jnp.asarray(one[:, :4]), tests.particle)) for one in y]) < np.log(first)
+    seen = np.where(unseen, np.inf, loss)
     # Unless nothing else comes near the data: then the particle has snapped through before anybody looked.
-    near = jnp.min(seen, axis=0) < FIT.unseen * jnp.min(loss, axis=0) + FIT.unseen
-    best = jnp.argmin(jnp.where(near[None], seen, loss), axis=0)
+    near = seen.min(0) < FIT.unseen * loss.min(0) + FIT.unseen
+    best = np.where(near, seen, loss).argmin(0), np.arange(N)
+    rms = noise * np.sqrt(2 * loss[best] / points)
+    found = at(y[best], np.arange(N)), rms, done[best], np.moveaxis(y, 0, 1), done.all(0)
+    return ParticleFits(*jax.tree.map(jnp.asarray, found))
 
-    def take(values):
-        return jnp.take_along_axis(values, best.reshape(1, -1, *[1] * (values.ndim - 2)), axis=0)[0]
 
-    found = take(y)
-    point = Point(found[:, :4], found[:, 4], at(jnp.tile(found, (count, 1))).theta[: len(tests)])
-    rms = noise * jnp.sqrt(2 * take(loss) / points[: len(tests)])
-    return ParticleFits(point, rms, take(done), jnp.moveaxis(y, 0, 1), jnp.all(done, 0))
+snaps = compiled(jax.vmap(snap))

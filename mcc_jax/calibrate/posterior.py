@@ -20,7 +20,7 @@ from .data import Selection, ranges_um
 from .draws import Draws, draw_fast, draw_joint, named_population
 from .estimates import effect_entries, finite, log_estimate, normal_estimate, summary
 from .fit_result import Fit, population_of
-from .fitting import checked_settings, prepare
+from .fitting import Start, checked_settings, prepare
 from .judgement import at_noise_level, judged, numbers_in_reach, unlike_others
 from .model import Model
 from .particles import Length
@@ -216,6 +216,7 @@ def sample(
     seed: int = 0,
     block: int | None = None,
     without_flagged: bool = True,
+    start: Start | Fit | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Posterior:
     """The joint posterior of everything: a, modulus, population, noise, and every particle's C1, C3, C5 and zero.
@@ -241,6 +242,7 @@ def sample(
         seed: random seed.
         block: particles of a block; by default all in one up to 64, and about 64 of larger campaigns. Other blocks make
             other draws of the same posterior. The mode "joint" has a single one.
+        start: where the fit begins, for one: what `fit` gave of the same campaign and model.
         progress: called with the name of each step.
 
     Raises:
@@ -257,7 +259,10 @@ def sample(
     length = Length(chains, arguments.whole(warmup, "warmup", least=1), draws)
     fast = mode == "fast"
     with numbers_in_reach(campaign):
-        selection, fit, size = prepare(campaign, model, threshold_MPa, fill_up=fast, block=block, tell=tell)
+        begin = Start(start.point, start.population, start.noise.noise) if isinstance(start, Fit) else start
+        selection, fit, size = prepare(
+            campaign, model, threshold_MPa, fill_up=fast, block=block, start=begin, tell=tell
+        )
         tell("sampling the population" if fast else "sampling everything")
         key = jax.random.key(seed)
         likely = worst(check_plausibility(campaign)) != "bad"

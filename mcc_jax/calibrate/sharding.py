@@ -162,14 +162,14 @@ class Blocks:
         """A function of one block, applied to all of this process's own.
 
         Args:
-            function: from `compiled`.
+            function: from `compiled`, for all devices at once; any other calls compiled functions one after the other.
             arguments: `Parts`, or what all blocks share.
             axis: of the particles in every array of the result.
         """
 
         def wave(w: int) -> Any:
             chosen = tuple(a.waves[w] if isinstance(a, Parts) else a for a in arguments)
-            if self.mesh is None:
+            if self.mesh is None or not hasattr(function, "__wrapped__"):
                 return function(*chosen)
             axes = tuple(a.axis if isinstance(a, Parts) else -1 for a in arguments)
             return _on_all_devices(chosen, axes, axis, function, self.mesh)

@@ -157,7 +157,7 @@ def discover(
         )
         found = replace(found, notes=(*found.notes, note))
     elif posterior and found.effects:
-        found = _sampled(found, base, threshold_MPa, seed, tell)
+        found = _sampled(found, search, threshold_MPa, seed, tell)
     if experiments and found.candidate_set and len(found.candidate_set) == 1:
         tell("next experiments")
         alone = tuple(n for n in found.candidate_set[0] if n not in found.paired)
@@ -333,10 +333,20 @@ def _taken_back(found: Discovery, winner: Names, objection: str) -> Discovery:
     return replace(found, verdict="FIT_NOT_CONVERGED", summary=summary)
 
 
-def _sampled(found: Discovery, base: Base, threshold_MPa: float, seed: int, tell: Tell) -> Discovery:
+def _sampled(found: Discovery, search: Search, threshold_MPa: float, seed: int, tell: Tell) -> Discovery:
     """The answer with the posterior of the law with effects, if it may be believed."""
     tell("posterior of the law with effects")
-    drawn: Posterior = sample(base.campaign, found.model, threshold_MPa=threshold_MPa, seed=seed, without_flagged=False)
+    base, fitted = search.base, leader_of(search).best
+    same = fitted is not None and found.model is not None and fitted.variants == found.model.effects
+    drawn: Posterior = sample(
+        base.campaign,
+        found.model,
+        threshold_MPa=threshold_MPa,
+        seed=seed,
+        without_flagged=False,
+        start=fitted.start(base) if fitted is not None and same else None,
+        progress=tell,
+    )
     if drawn.failures():
         note = (
             f"the posterior of the law with effects has not converged ({'; '.join(drawn.failures())}); amplitudes and "

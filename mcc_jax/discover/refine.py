@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import jax.numpy as jnp
 import numpy as np
 
+from ..calibrate.fitting import Start
+from ..calibrate.noise import Noise
+from ..calibrate.population import Population
 from ..effects import Variant
 from .base import Base, State
 from .columns import Design
 from .design import NOTHING_MORE, More, between, design_of, moved
-from .evidence import Optimum, Solution, optimise, solve
+from .evidence import Optimum, Solution, optimise, solve, spreads_of
 from .settings import NUMERICS
 
 
@@ -39,6 +43,20 @@ class Refined:
     def theta(self) -> np.ndarray:
         """Numbers of the effects."""
         return np.asarray(self.state.point.theta[0])
+
+    def start(self, base: Base) -> Start:
+        """Where a posterior of the law with these formulas begins: the numbers of this optimum."""
+        free, population = self.optimum.free, np.asarray(self.state.population)
+        shift = np.mean(np.log1p(population[0] * base.flatness))
+        spreads = spreads_of(free[4:8], base.spreads).value
+        return Start(
+            self.state.point,
+            Population(
+                *map(jnp.asarray, (population[0], population[1], population[2:] - shift, spreads[:3], spreads[3])),
+                *map(jnp.asarray, (0.0, 0.0, self.theta, np.zeros(0))),
+            ),
+            Noise.from_logs(jnp.asarray(free[:4]), jnp.asarray(base.scale)),
+        )
 
     @property
     def curves_um(self) -> np.ndarray:

@@ -1,6 +1,6 @@
 r"""Derivatives of displacement by everything it depends on: of the law with effects, and of every effect at its null.
 
-A program that holds the law and a formula would be compiled for every formula, and for every pair of them. So the law is
+A program that holds law and formula would be compiled for every formula, and for every pair of them. So the law is
 taken in stages,
 
     parameters -> strain of loading -> peak and recovery -> modulus -> additions,
@@ -11,7 +11,6 @@ directions, and passes both on by the chain rule.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -94,7 +93,7 @@ def along(
         numbers: where.
         directions: with a leading axis.
     """
-    count, asked = len(numbers.force), len(directions.law)
+    asked = len(directions.law)
     if formulas:
         more = -asked % DIRECTIONS + 1
         directions = jax.tree.map(lambda x: jnp.pad(x, ((0, more), *[(0, 0)] * (x.ndim - 1))), directions)
