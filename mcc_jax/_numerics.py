@@ -109,7 +109,7 @@ def compiled[**P, R](function: Callable[P, R], level: int = 1) -> Callable[P, R]
 
     @functools.wraps(function)
     def run(*given: P.args, **named: P.kwargs) -> R:
-        traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((given, named)))
+        traced = any(is_traced(x) for x in jax.tree.leaves((given, named)))
         return (function if traced else whole)(*given, **named)
 
     return run

@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._types import Path, Scalar
+from ..arguments import is_traced
 from ..effects import AbstractEffect, Record, Variant
 from ..geometry import Particle
 from ..law import MccLaw, Plastic, StrainScaling, Unloading
@@ -124,12 +125,12 @@ class Linear(eqx.Module):
             None for a law without effects.
     """
 
-    residual: Float[Array | np.ndarray, "particles points"]
-    columns: Float[Array | np.ndarray, "particles points numbers"]
-    by_force: Float[Array | np.ndarray, "particles points"]
-    by_peak: Float[Array | np.ndarray, "particles points"]
-    by_offset: Float[Array | np.ndarray, "particles points"]
-    bends: Float[Array | np.ndarray, "particles points bends"] | None = None
+    residual: Float[Array, "particles points"]
+    columns: Float[Array, "particles points numbers"]
+    by_force: Float[Array, "particles points"]
+    by_peak: Float[Array, "particles points"]
+    by_offset: Float[Array, "particles points"]
+    bends: Float[Array, "particles points bends"] | None = None
 
 
 def residuals(point: Point, tests: Tests, forms: Forms) -> Float[Array, "particles points"]:
@@ -153,7 +154,7 @@ def linearise(
     """
     record, theta = tests.record, point.theta
     assert record.peak is not None
-    xp: Any = jnp if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((point, tests))) else np
+    xp: Any = jnp if any(is_traced(x) for x in jax.tree.leaves((point, tests))) else np
     count, points, asked = len(tests), tests.force.shape[1], 2 * with_force
     size = (4 + theta.shape[1]) * with_numbers
     law = xp.insert(xp.exp(xp.asarray(point.latent)), 3, 0.0, axis=1)  # a = 0: the shape is taken in
@@ -173,17 +174,19 @@ def linearise(
     def of_effects(numbers: Any) -> tuple[Any, ...]:
         return tuple(numbers[..., list(each)] for each in forms.places)
 
-    numbers = Numbers(law, tests.force, record.peak, of_effects(xp.asarray(theta)))
-    directions = Numbers(d_law, d_force, d_peak, of_effects(d_theta))
+    numbers = law, tests.force, record.peak, of_effects(xp.asarray(theta))
+    directions = d_law, d_force, d_peak, of_effects(d_theta)
+    there, directed = (Numbers(*jax.tree.map(jnp.asarray, each)) for each in (numbers, directions))
     kinds = forms.unloading, StrainScaling.RAW
-    value, slopes = map(xp.asarray, along(kinds, forms.formulas, tests.particle, record, numbers, directions))
+    value, slopes = map(xp.asarray, along(kinds, forms.formulas, tests.particle, record, there, directed))
     columns = xp.where(xp.asarray(tests.mask)[None], slopes, 0.0)
     residual = still = xp.zeros((count, points))
     if tests.displacement is not None:
         away = xp.asarray(tests.displacement) - value - xp.asarray(point.zero)[:, None]
         residual = xp.where(xp.asarray(tests.mask), away, 0.0)
     by_force, by_peak = columns[size:] if with_force else (still, still)
-    return Linear(residual, xp.moveaxis(columns[:size], 0, -1), by_force, by_peak, by_force + by_peak)
+    found = residual, xp.moveaxis(columns[:size], 0, -1), by_force, by_peak, by_force + by_peak
+    return Linear(*map(jnp.asarray, found))
 
 
 def snap(latent: Latent, particle: Particle) -> Scalar:

@@ -44,7 +44,8 @@ def of_modulus_at_peaks(base: Base, formulas: Refined, solution: Solution) -> tu
         def one(latent: Array, particle: Particle, record: Record) -> Array:
             law = forms.law(latent, numbers)
             context = law.context(particle, record)
-            factor = math.prod(effect.stiffness(context) for effect in law.effects)[record.force.argmax()]
+            factors = (effect.stiffness(context)[record.force.argmax()] for effect in law.effects)
+            factor = math.prod(factors, start=jnp.ones(()))
             return jnp.log(factor * context.law.effective_modulus / law.formulas.effective_modulus)
 
         found = jax.vmap(one)(state.point.latent, base.tests.particle, base.tests.record).mean()

@@ -18,7 +18,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from .. import arguments
@@ -48,10 +47,10 @@ class Numbers(eqx.Module):
         effects: amplitude and further numbers of each effect.
     """
 
-    law: Float[Array | np.ndarray, "*tests 5"]
-    force: Float[Array | np.ndarray, "*tests points"]
-    peak: Float[Array | np.ndarray, "*tests points"]
-    effects: tuple[Float[Array | np.ndarray, "*tests _"], ...]
+    law: Float[Array, "*tests 5"]
+    force: Float[Array, "*tests points"]
+    peak: Float[Array, "*tests points"]
+    effects: tuple[Float[Array, "*tests _"], ...]
 
 
 @dataclass(frozen=True)
@@ -121,7 +120,7 @@ def along(
         strain = _start(forms, law, loads, particle, factors(strain)[0])
         for _ in range(NEWTON_STEPS):
             strain, step = _newton(forms, law, loads, particle, strain, *factors(strain)[:2])
-            if not isinstance(step, jax.core.Tracer) and step < SETTLED:
+            if not arguments.is_traced(step) and step < SETTLED:
                 break
         values, slopes, d_values = factors(strain)
         reached, d_reached = _reached(forms, law, loads, *tests, strain, values, slopes, (d_law, d_loads, d_values))
@@ -174,7 +173,7 @@ def _base(given: Any, particle: Particle, record: Record, forms: Forms) -> tuple
 
 def _released(given: Any, particle: Particle, record: Record, forms: Forms) -> tuple[Path, Path, Path]:
     law, loads, reached, factors = given
-    context = released(Context(*_loaded(law, loads, particle, record, forms), reached, reached, reached), factors)
+    context = released(Context(*_loaded(law, loads, particle, record, forms), *(reached,) * 3), factors)
     return reached, context.recoverable, context.displacement
 
 
