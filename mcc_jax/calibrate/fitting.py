@@ -252,14 +252,12 @@ class _Fitter:
         centre = np.broadcast_to(middle, (N, 5)).copy()
         centre[:, 4] = self.zero_mean
         width = np.broadcast_to(np.array([FIT.alone] * 4 + [priors.zero_um.sd]), (N, 5))
-        starts = self.blocks.each(linear_starts, self.own, jnp.asarray(middle[3]), axis=1)
+        starts, more = linear_starts(self.tests, middle[3]), (0, len(self.varying))
         if self.varying:
-            centre, width = (np.pad(x, ((0, 0), (0, len(self.varying)))) for x in (centre, width))
+            centre, width, starts = (np.pad(x, (*[(0, 0)] * (x.ndim - 1), more)) for x in (centre, width, starts))
             width[:, 5:] = 1e-12
-            padded = ((0, 0), (0, 0), (0, len(self.varying)))
-            starts = starts.map(lambda wave: jnp.pad(wave, padded))
         theta = np.broadcast_to(self.model.forms.without_effects, (N, len(self.model.forms.names)))
-        return self.particles(white, centre, width, theta, starts)
+        return self.particles(white, centre, width, theta, self.blocks.cut(jnp.asarray(starts), axis=1))
 
     def together(self, target: LogPosterior, free: Float[Array, " d"]) -> Point:
         """Every particle under the population, from where it was and where the summaries expect it."""
