@@ -16,12 +16,12 @@ from ..law import MccLaw
 from .compiling import compiled
 from .data import Tests
 from .draws import named_population
-from .mode import log_priors, prior_populations
 from .model import Model
 from .noise import Whitening, standard_promotion
 from .population import COEFFICIENTS, Population, flattened
 from .posterior import Posterior
 from .predict import A_CALIBRATION, laws_with, predicted_at, predicted_by
+from .prior_draws import log_priors, prior_populations
 from .settings import SAMPLING
 
 if TYPE_CHECKING:
@@ -54,8 +54,8 @@ VARIABLES: dict[str, tuple[str, list[str]]] = {
 
 def prior_draws(calibration: Posterior, count: int, seed: int) -> dict[str, np.ndarray]:
     """Draws of the population from its prior, by the names of the posterior, shape (1, count, ...)."""
-    keys = jax.random.split(jax.random.key(seed), count)
-    drawn = prior_populations(keys, calibration.model, calibration.fit.tests.flatness)
+    flatness = np.asarray(calibration.fit.tests.flatness)
+    drawn = prior_populations(np.random.default_rng(seed), count, calibration.model, flatness)
     return _variables(jax.tree.map(lambda x: np.asarray(x)[None], drawn), calibration.model)
 
 
@@ -106,11 +106,8 @@ def to_arviz(calibration: Posterior, *, prior_count: int = 500, points: bool = F
         posterior["particle_modulus_MPa"] = c.modulus_MPa[:, thin]
     for name, place in c.model.varying_places.items():
         posterior[f"particle_{name}"] = c.theta[:, thin, :, place]
-    flat = jax.tree.map(jnp.asarray, flattened(population))
-    prior_density = {
-        name: np.asarray(values).reshape(chains, -1)
-        for name, values in log_priors(flat, c.model, c.fit.tests.flatness).items()
-    }
+    densities = log_priors(flattened(population), c.model, np.asarray(c.fit.tests.flatness))
+    prior_density = {name: values.reshape(chains, -1) for name, values in densities.items()}
     prior = prior_draws(c, prior_count, seed)
     shown, predicted, before = _predictive(c, prior, seed, thin if points else None)
     observed = np.where(mask, np.asarray(tests.displacement), np.nan)

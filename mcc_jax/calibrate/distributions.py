@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import reduce
 from typing import Any
 
 import equinox as eqx
@@ -10,13 +11,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
-from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float
 from numpyro.distributions import constraints
 
 from ..effects import Nuisance, Variant
 from .noise import Whitening
 from .priors import NakagamiPrior
+
+
+def numpy_of(x: Any) -> Any:
+    """NumPy of NumPy's arrays and plain numbers, which then compile nothing; JAX's of its own."""
+    return jnp if isinstance(x, jax.Array) else np
+
 
 KNEE = 0.1
 """Share of its prior's scale above which a spread's coordinate is logarithmic."""
@@ -47,24 +53,25 @@ class SpreadCoordinate(dist.Distribution):
         m, s = self.prior.shape, self.prior.sd
         return -math.lgamma(m) - m * math.log(2 * s**2) + 2 * m * math.log(self.unit) + math.log(self.power)
 
-    def spread(self, coordinate: Array) -> Array:
+    def spread(self, coordinate: Any) -> Any:
         """The spread at a coordinate."""
-        return self.unit * jnp.sinh(jnp.abs(coordinate)) ** self.power
+        xp = numpy_of(coordinate)
+        return self.unit * xp.sinh(xp.abs(coordinate)) ** self.power
 
-    def coordinate(self, spread: Array | float) -> Array:
+    def coordinate(self, spread: Any) -> Any:
         """The coordinate, >= 0, of a spread."""
-        return jnp.arcsinh((spread / self.unit) ** (1 / self.power))
+        return numpy_of(spread).arcsinh((spread / self.unit) ** (1 / self.power))
 
-    def log_prob(self, value: Any, intermediates: Any = None) -> Array:
+    def log_prob(self, value: Any, intermediates: Any = None) -> Any:
         """Log density of the coordinate."""
-        spread = self.spread(value) / self.prior.sd
-        return self.constant - 0.5 * spread**2 + jnp.log(jnp.cosh(value))
+        xp, spread = numpy_of(value), self.spread(value) / self.prior.sd
+        return self.constant - 0.5 * spread**2 + xp.log(xp.cosh(value))
 
     def sample(self, key: Any, sample_shape: tuple[int, ...] = ()) -> Array:
         """Draws of the coordinate."""
         size, sign = jax.random.split(key)
         tau = self.prior.sd * jnp.sqrt(2 * jax.random.gamma(size, self.prior.shape, sample_shape))
-        x = jnp.arcsinh((tau / self.unit) ** (1 / self.power))
+        x = self.coordinate(tau)
         return jnp.where(jax.random.bernoulli(sign, 0.5, sample_shape), x, -x)
 
 
@@ -92,10 +99,10 @@ class Amplitude(dist.Distribution):
         """Softplus keeps the coordinate linear where the amplitude is more than barely plausible."""
         return constraints.real if self.both else constraints.softplus_positive
 
-    def log_prob(self, value: Any, intermediates: Any = None) -> Array:
+    def log_prob(self, value: Any, intermediates: Any = None) -> Any:
         """Log density."""
         each = [-0.5 * (value / s) ** 2 - math.log(s * math.sqrt(2 * math.pi)) for s in self.scales.tolist()]
-        total = logsumexp(jnp.stack(each), axis=0) - math.log(SCALES)
+        total = reduce(numpy_of(value).logaddexp, each) - math.log(SCALES)
         return total if self.both else total + math.log(2)
 
     def sample(self, key: Any, sample_shape: tuple[int, ...] = ()) -> Array:
@@ -138,7 +145,7 @@ class RecordNoise(dist.Distribution):
         self.loc, self.filters, self.factor = loc, filters, factor
         super().__init__(batch_shape=loc.shape[:1], event_shape=loc.shape[1:])
 
-    def log_prob(self, value: Any, intermediates: Any = None) -> Array:
+    def log_prob(self, value: Any, intermediates: Any = None) -> Any:
         """Log density of every test; points that do not count carry nothing."""
         away = jnp.where(self.filters.mask, value - self.loc, 0.0)
         return jax.vmap(lambda f, one: f.log_density(one, jnp.log(self.factor)))(self.filters, away)

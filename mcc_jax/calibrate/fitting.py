@@ -285,11 +285,9 @@ class _Fitter:
         width = np.broadcast_to(np.array([FIT.alone] * 4 + [priors.zero_um.sd]), (N, 5))
         width = np.pad(width, ((0, 0), (0, varying)), constant_values=1e-12)
         centre = np.concatenate([centre, np.asarray(theta)[:, list(self.varying)]], 1)
-        if starts is not None:
-            return self.particles(white, centre, width, theta, self.blocks.cut(jnp.asarray(starts), axis=1))
-        first = self.blocks.each(linear_starts, self.own, jnp.asarray(middle[3]), axis=1)
-        padded = ((0, 0), (0, 0), (0, varying))
-        return self.particles(white, centre, width, theta, first.map(lambda wave: np.pad(wave, padded)))
+        if starts is None:
+            starts = np.pad(linear_starts(self.tests, middle[3]), ((0, 0), (0, 0), (0, varying)))
+        return self.particles(white, centre, width, theta, self.blocks.cut(jnp.asarray(starts), axis=1))
 
     def together(self, target: LogPosterior, free: Float[Array, " d"]) -> Point:
         """Every particle under the population, from where it was and where the summaries expect it."""

@@ -19,11 +19,10 @@ from numpyro.infer.util import constrain_fn, potential_energy, unconstrain_fn
 
 from .._types import Scalar
 from .compiling import compiled
-from .distributions import SpreadCoordinate
 from .marginal import Marginal, straighten
 from .model import Model
 from .noise import standard_promotion
-from .population import COEFFICIENTS, Population
+from .population import Population
 from .settings import FIT
 
 handlers: Any = numpyro.handlers
@@ -113,51 +112,6 @@ def _unconstrained(values: Float[Array, " d"], target: LogPosterior) -> Float[Ar
         prior = seeded(target.model.population)
         free = unconstrain_fn(prior, (target.marginal,), {}, target.sites(values))
     return jnp.stack([jnp.asarray(free[name]) for name in target.names])
-
-
-def values_of(population: Population, model: Model, flatness: Array) -> dict[str, Array]:
-    """Values of the sampled sites at a population; of a spread's coordinate the positive one."""
-    p, priors = population, model.chosen_priors
-    shift = jnp.mean(jnp.log1p(p.a * flatness))
-    values = {"a": p.a, "log_modulus": p.log_modulus, "log_noise_factor": p.log_noise}
-    spreads = {}
-    for j, name in enumerate(COEFFICIENTS):
-        values[f"b{2 * j + 1}"] = p.mu[j] + shift
-        spreads[f"tau_{name}"] = p.tau[j], getattr(priors, f"tau_{name}")
-    for name in ("modulus_scatter", "shape_scatter"):
-        spreads[name] = getattr(p, name), getattr(priors, name)
-    for k, v in enumerate(model.effects):
-        values[f"{v.mechanism}_size"] = (v.sign or 1) * p.theta[k] / v.plausible[0]
-    values |= {name: p.theta[k] for k, name in enumerate(model.forms.names) if k >= len(model.effects)}
-    for j, v in enumerate(v for v in model.effects if v.mechanism in model.varying):
-        spreads[f"tau_{v.mechanism}"] = p.theta_scatter[j], model.spread_prior(v)
-    values |= {f"{name}_coordinate": SpreadCoordinate(prior).coordinate(s) for name, (s, prior) in spreads.items()}
-    return {name: values[name] for name in coordinate_names(model)}
-
-
-@compiled
-def log_priors(population: Population, model: Model, flatness: Array) -> dict[str, Array]:
-    """Log density of the prior of every sampled site, at draws of the population with a leading axis."""
-
-    def one(at: Population) -> dict[str, Array]:
-        values = values_of(at, model, flatness)
-        with standard_promotion():
-            prior = handlers.substitute(seeded(model.population), data=values)
-            trace = handlers.trace(prior).get_trace(Shapes(flatness))
-            return {name: trace[name]["fn"].log_prob(values[name]) for name in values}
-
-    return jax.vmap(one)(population)
-
-
-@compiled
-def prior_populations(keys: Array, model: Model, flatness: Array) -> Population:
-    """Draws of the population from its prior, one a key."""
-
-    def one(key: Array) -> Population:
-        with standard_promotion():
-            return handlers.seed(model.population, key)(Shapes(flatness))
-
-    return jax.vmap(one)(keys)
 
 
 @compiled

@@ -26,7 +26,7 @@ from .forward import Forms, Linear, Point, linearise
 from .marginal import Marginal
 from .noise import FREEDOM, Along, Correlation, Noise, Whitening, whitening
 from .population import COEFFICIENTS, Population, Scatter, particles_at
-from .priors import ALMOST, NakagamiPrior, Priors
+from .priors import NakagamiPrior, Priors, bounds_of_a
 
 sample: Any = numpyro.sample
 deterministic: Any = numpyro.deterministic
@@ -158,11 +158,9 @@ class Model:
         """
         p = self.chosen_priors
         weight = jnp.ones_like(shapes.flatness) if shapes.weight is None else shapes.weight
-        # Every shape factor must be positive.
-        most, least = jnp.maximum(jnp.max(shapes.flatness), 1e-3), jnp.minimum(jnp.min(shapes.flatness), -1e-3)
+        low, high = bounds_of_a(shapes.flatness)
         reach = max(8 * p.a.sd, 8.0)  # the bounds scale a coordinate; they are no belief
-        low = jnp.maximum(-ALMOST / most, p.a.mean - reach)
-        high = jnp.minimum(-ALMOST / least, p.a.mean + reach)
+        low, high = jnp.maximum(low, p.a.mean - reach), jnp.minimum(high, p.a.mean + reach)
         a = sample("a", dist.TruncatedNormal(p.a.mean, p.a.sd, low=low, high=high))
         modulus = p.effective_modulus_MPa
         log_modulus = sample("log_modulus", dist.Normal(np.log(modulus.median), modulus.log_sd))

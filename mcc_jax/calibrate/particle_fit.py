@@ -10,8 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._types import Path, Scalar
-from ..geometry import Particle
 from .compiling import compiled
 from .data import Tests
 from .forward import Forms, Point, linearise, snap
@@ -37,59 +35,48 @@ class ParticleFits(eqx.Module):
     settled: Bool[Array, " particles"]
 
 
-def _polynomial(x: Path, stress: Path, weight: Path) -> Float[Array, " 3"]:
-    """K1, K3, K5 by linear least squares."""
-    design = jnp.stack([x, -(x**3), x**5], 1) * weight[:, None]
-    scale = jnp.sqrt(jnp.sum(design**2, axis=0)) + 1e-30
-    scaled = design / scale[None]
-    ridge = jnp.eye(3) * 1e-9
-    return Cholesky(scaled.T @ scaled + ridge).solve(scaled.T @ (stress * weight)) / scale
-
-
-def linear_start(
-    particle: Particle, force: Path, measured: Path, loading: Bool[Array, " steps"], contact: Scalar
-) -> tuple[Float[Array, " 3"], Scalar]:
-    """Coefficients (as b) and zero of one particle from its loading, without iteration.
+def linear_start(stress: np.ndarray, strain: np.ndarray) -> tuple[np.ndarray, float]:
+    """Coefficients (as b) of one particle and the strain at its zero, from its loading, without iteration.
 
     Stress is linear in the three coefficients at a given zero, so zeros are tried on a grid; deviations of stress are
     divided by the slope, which makes them deviations of strain.
     """
-    stress = particle.stress(force)
-    reach = particle.effective_diameter
-    top = jnp.max(jnp.where(loading, stress, 0.0))
-
-    def at(shift):
-        x = jnp.where(loading, (measured - contact) / reach - shift, 0.0)
-        possible = jnp.all(jnp.where(loading, x > 1e-4, True))
-        x = jnp.maximum(x, 1e-4)
-        used = jnp.where(loading, 1.0, 0.0)
-        K = _polynomial(x, stress, used)
-
-        def slope(K):
-            return jnp.maximum(K[0] - 3 * K[1] * x**2 + 5 * K[2] * x**4, 0.05 * top / jnp.max(x))
-
-        for _ in range(2):
-            K = _polynomial(x, stress, used / slope(K))
-        # Each term carries at least a hundredth of the largest stress: logarithms follow.
-        far = jnp.max(x)
-        K = jnp.maximum(K, 0.01 * top / jnp.stack([far, far**3, far**5]))
-        deviation = (K[0] * x - K[1] * x**3 + K[2] * x**5 - stress) / slope(K)
-        return jnp.where(possible, jnp.sum(used * deviation**2), jnp.inf), K
-
-    shifts = jnp.linspace(-FIT.zero_reach, FIT.zero_reach, FIT.zeros)
-    losses, coefficients = jax.vmap(at)(shifts)
-    best = jnp.argmin(losses)
-    K = jnp.where(jnp.isfinite(losses[best]), coefficients[best], jnp.array([6.0, 27.0, 144.0]))
-    return jnp.log(K) / jnp.array([1.0, 3.0, 5.0]), contact + shifts[best] * reach
+    top, shifts = np.max(stress, initial=0.0), np.linspace(-FIT.zero_reach, FIT.zero_reach, FIT.zeros)
+    x = strain - shifts[:, None]
+    possible, x = (x > 1e-4).all(1), np.maximum(x, 1e-4)
+    far, square = x.max(1, initial=1e-4)[:, None], x**2
+    design = np.stack([x, -x * square, x * square**2], -1)
+    slope, K = np.ones_like(x), np.zeros((len(x), 3))
+    for _ in range(3):
+        weighted = design / slope[..., None]
+        scale = np.sqrt(np.sum(weighted**2, 1, keepdims=True)) + 1e-30
+        scaled = np.swapaxes(weighted / scale, 1, 2)
+        normal = scaled @ np.swapaxes(scaled, 1, 2) + 1e-9 * np.eye(3)
+        K = np.linalg.solve(normal, scaled @ (stress / slope)[..., None])[..., 0] / scale[:, 0]
+        slope = np.maximum(K[:, :1] - 3 * K[:, 1:2] * square + 5 * K[:, 2:] * square**2, 0.05 * top / far)
+    # Each term carries at least a hundredth of the largest stress: logarithms follow.
+    K = np.maximum(K, 0.01 * top / far ** np.array([1, 3, 5]))
+    slope = np.maximum(K[:, :1] - 3 * K[:, 1:2] * square + 5 * K[:, 2:] * square**2, 0.05 * top / far)
+    deviation = ((design @ K[..., None])[..., 0] - stress) / slope
+    losses = np.where(possible, np.sum(deviation**2, 1), np.inf)
+    best = int(np.argmin(losses))
+    K = K[best] if np.isfinite(losses[best]) else np.array([6.0, 27.0, 144.0])
+    return np.log(K) / np.array([1.0, 3.0, 5.0]), float(shifts[best])
 
 
-@compiled
-def linear_starts(tests: Tests, log_modulus: Scalar) -> Float[Array, "starts particles 5"]:
-    """Several starts for every particle: the linear one and variations of it."""
-    assert tests.displacement is not None
-    b, zero = jax.vmap(linear_start)(tests.particle, tests.force, tests.displacement, tests.loading, tests.contact)
-    first = jnp.concatenate([b, jnp.full((len(tests), 1), log_modulus), zero[:, None]], 1)
-    return first[None] + jnp.pad(jnp.asarray(FIT.variations), ((0, 0), (0, 2)))[:, None]
+def linear_starts(tests: Tests, log_modulus: float) -> np.ndarray:
+    """Several starts for every particle, shape (starts, particles, 5): the linear one and variations of it."""
+    force, displacement, loading, contact = (
+        np.asarray(x) for x in (tests.force, tests.displacement, tests.loading, tests.contact)
+    )
+    reach = np.asarray(tests.effective_diameter)
+    first = np.full((len(tests), 5), log_modulus)
+    for row, used in enumerate(loading):
+        # [mN] over [um^2] is 1e3 MPa.
+        stress = 1e3 * force[row, used] / (np.pi / 4 * reach[row] ** 2)
+        first[row, :3], shift = linear_start(stress, (displacement[row, used] - contact[row]) / reach[row])
+        first[row, 4] = contact[row] + shift * reach[row]
+    return first + np.pad(FIT.variations, ((0, 0), (0, 2)))[:, None]
 
 
 def fit_particles(

@@ -216,14 +216,18 @@ class Priors:
         return [(f.name, getattr(self, f.name)) for f in dataclasses.fields(self) if f.name != "changed"]
 
 
+def bounds_of_a(flatness: Any) -> tuple[Any, Any]:
+    """Between which values of `a` every particle's shape factor is positive, of NumPy's or JAX's arrays."""
+    return -ALMOST / flatness.max().clip(1e-3), -ALMOST / flatness.min().clip(None, -1e-3)
+
+
 def check_prior_of_a(priors: Priors, flatness: np.ndarray) -> None:
     """Make sure that the prior of `a` leaves values under which every particle's shape factor is positive.
 
     Raises:
         InputError: if it does not.
     """
-    most, least = max(flatness.max(), 1e-3), min(flatness.min(), -1e-3)
-    low, high = -ALMOST / most, -ALMOST / least
+    low, high = bounds_of_a(flatness)
     if not (low < priors.a.mean + 6 * priors.a.sd and high > priors.a.mean - 6 * priors.a.sd):
         raise InputError(
             f"the prior of a ({priors.a.mean:g} +- {priors.a.sd:g}) leaves no value under which every particle's shape "

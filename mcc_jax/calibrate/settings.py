@@ -19,7 +19,6 @@ class PaperSettings:
         smallest_share: a factor of the quintic is kept at least this share of the largest stress, so that its logarithm
             exists.
         spread_from: the spread of stress is fitted from so many thresholds on, 1 MPa in the paper.
-        shape_starts: values of a from which the collapse is sought.
         shape_factor: shape factors beyond this, twice the paper's largest, come from curves that do not collapse.
         reading_um: what no record of displacement is better than [um]: counted as misfit at every point, so that the
             noise of a record without any, of a simulation say, is small but not nothing.
@@ -28,7 +27,6 @@ class PaperSettings:
     unloaded_from: float = 0.05
     smallest_share: float = 1e-6
     spread_from: float = 5.0
-    shape_starts: tuple[float, ...] = (-0.5, 0.0, 1.0, 3.0)
     shape_factor: float = 4.0
     reading_um: float = 2e-4
 

@@ -12,13 +12,13 @@ def blocks_only(folder: Path, process: int) -> None:
     """One cheap function of five particles in blocks of two, and the random numbers of every block."""
     from joint_cases import five_tests
 
-    from mcc_jax.calibrate.particle_fit import linear_starts
     from mcc_jax.calibrate.sharding import Blocks, filled_up, require_same
+    from mcc_jax.calibrate.straightening import products
 
     tests = filled_up(five_tests(), 2)
     require_same(tests)
     blocks = Blocks(len(tests), 2)
-    starts = blocks.whole(blocks.each(linear_starts, blocks.cut(tests), jax.numpy.asarray(np.asarray(9.0)), axis=1))
+    starts = blocks.all(products, blocks.cut(tests.force[:, None]))
     np.savez(folder / f"arrays_{process}.npz", starts=np.asarray(starts))
 
 

@@ -33,7 +33,7 @@ def fit(tests, noise, unloading=Unloading.PRINTED, starts=None):
         jnp.asarray(centre),
         jnp.asarray(width),
         jnp.zeros((len(tests), 0)),
-        linear_starts(tests, jnp.asarray(middle[3])) if starts is None else starts,
+        jnp.asarray(linear_starts(tests, middle[3])) if starts is None else starts,
         Forms(unloading),
     )
 

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from joint_cases import NOISE, random_marginal, simulated
 from numpyro.infer import Predictive
-from numpyro.infer.util import potential_energy
+from numpyro.infer.util import constrain_fn, potential_energy
 from scipy.integrate import trapezoid
 from scipy.stats import halfnorm, kstest, lognorm, nakagami, norm
 
@@ -23,8 +23,9 @@ from mcc_jax.calibrate import NakagamiPrior, NormalPrior, select_tests
 from mcc_jax.calibrate.distributions import Amplitude, SpreadCoordinate, nuisance_prior
 from mcc_jax.calibrate.fit_result import population_of
 from mcc_jax.calibrate.forward import Point
-from mcc_jax.calibrate.mode import LogPosterior, Shapes, log_priors, most_probable, populations, values_of
+from mcc_jax.calibrate.mode import LogPosterior, Shapes, most_probable, populations, seeded
 from mcc_jax.calibrate.noise import standard_promotion
+from mcc_jax.calibrate.prior_draws import log_priors
 from mcc_jax.calibrate.priors import check_prior_of_a
 from mcc_jax.effects import LIBRARY, find_variant
 
@@ -205,14 +206,18 @@ def density(target):
     return eqx.filter_jit(jax.value_and_grad(lambda free: target.log_density(free)))
 
 
+def values_at(free, target):
+    with standard_promotion():
+        return constrain_fn(seeded(target.model.population), (target.marginal,), {}, target.sites(free))
+
+
 def test_the_density_is_priors_times_likelihood_times_volume(target, density):
     """Priors of the sites as `log_priors` has them; the volume is that of the map from unbounded coordinates."""
 
     @eqx.filter_jit
     def parts(free):
         def sites(x):
-            values = values_of(target.population(x), target.model, target.marginal.flatness)
-            return jnp.stack([values[name] for name in target.names])
+            return jnp.stack([values_at(x, target)[name] for name in target.names])
 
         population = target.population(free)
         return jax.jacfwd(sites)(free), population, jnp.sum(target.marginal.log_likelihood(population))
@@ -221,8 +226,8 @@ def test_the_density_is_priors_times_likelihood_times_volume(target, density):
     for _ in range(3):
         free = jnp.asarray(0.7 * rng.standard_normal(len(target.names)))
         jacobian, population, expected = parts(free)
-        one = jax.tree.map(lambda x: x[None], population)
-        expected += sum(v[0] for v in log_priors(one, target.model, target.marginal.flatness).values())
+        one = jax.tree.map(lambda x: np.asarray(x)[None], population)
+        expected += sum(v[0] for v in log_priors(one, target.model, np.asarray(target.marginal.flatness)).values())
         expected += np.linalg.slogdet(np.asarray(jacobian))[1]
         np.testing.assert_allclose(float(density(free)[0]), expected, rtol=1e-9)
 
@@ -232,7 +237,7 @@ def test_coordinates_and_back(target):
     free[target.signed()] = np.abs(free[target.signed()])
     free = jnp.asarray(free)
     population = population_of(free, target)
-    again = target.unconstrain(values_of(population, target.model, target.marginal.flatness))
+    again = target.unconstrain(values_at(free, target))
     np.testing.assert_allclose(again, free, rtol=1e-8, atol=1e-8)
     many = populations(jnp.stack([free, free]), target)
     for one, both in zip(jax.tree.leaves(population), jax.tree.leaves(many), strict=True):

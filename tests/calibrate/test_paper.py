@@ -17,7 +17,6 @@ from mcc_jax import (
     read_tester_file,
 )
 from mcc_jax.calibrate import sharding
-from mcc_jax.calibrate.paper import modulus, shape
 
 
 @pytest.fixture(scope="module")
@@ -54,24 +53,13 @@ def test_noise_is_the_instrument_s(result):
     assert result.displacement_noise_um == pytest.approx(0.02, rel=0.25)
 
 
-def test_campaigns_of_similar_size_share_their_compilations(result):
-    compiled = shape._solve, modulus._fit
-    before = [function._cache_size() for function in compiled]
-    for count in (18, 19):
-        assert calibrate_paper(result.campaign.select(np.arange(20) < count)).converged
-    assert [function._cache_size() for function in compiled] == before
-
-
 def test_what_fills_up_counts_for_nothing(result, monkeypatch):
     few = result.campaign.select(np.arange(20) < 5)
     numbers = []
     for size in (5, 20):
         monkeypatch.setattr(sharding, "NUMERICS", replace(sharding.NUMERICS, blocks=(size,)))
         found = calibrate_paper(few)
-        shapes = [number for fit in (found.shape, found.shape_reference) for number in (fit.a, fit.objective)]
-        own = [number for one in found.particles for number in (*one.plastic, one.rms_um)]
-        elastic = found.elastic
-        numbers.append([*shapes, elastic.effective_modulus_MPa, *elastic.per_branch_MPa, elastic.rms_strain, *own])
+        numbers.append([number for one in found.particles for number in (*one.plastic, one.rms_um)])
     np.testing.assert_allclose(numbers[1], numbers[0], rtol=1e-8)
 
 

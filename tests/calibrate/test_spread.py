@@ -8,16 +8,15 @@ import sys
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from joint_cases import NOISE, Programme, five_tests, simulated
 
 from mcc_jax import sample
 from mcc_jax.calibrate.data import select_tests
-from mcc_jax.calibrate.particle_fit import linear_starts
 from mcc_jax.calibrate.settings import NUMERICS
 from mcc_jax.calibrate.sharding import Blocks, Parts, block_size, count_of, filled_up
+from mcc_jax.calibrate.straightening import products
 
 LIMIT_S = 400
 HERE = Path(__file__).parent
@@ -97,8 +96,8 @@ def test_blocks_of_two_processes_with_two_devices_are_those_of_one(tmp_path):
     port = free_port()
     finish(tmp_path, [start(tmp_path, 2, 2, i, port, everything=False) for i in range(2)])
     alone = Blocks(6, 2)
-    here = alone.cut(filled_up(five_tests(), 2))
-    wanted = alone.whole(alone.each(linear_starts, here, jnp.asarray(np.asarray(9.0)), axis=1))
+    here = alone.cut(filled_up(five_tests(), 2).force[:, None])
+    wanted = alone.all(products, here)
     for process in range(2):
         told = json.loads((tmp_path / f"devices_{process}.json").read_text())
         assert told == {"devices": 2, "processes": 2}

@@ -4,22 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from jaxtyping import Array, Float, Int
 
 from ... import arguments
 from ..._format import described
-from ..._types import Scalar
 from ...campaign import Adjustment, Campaign, Curve, Segment, check_campaign, stress_and_strain
 from ...formulas import recovery
 from ...law import StrainScaling, Unloading
 from ..settings import PAPER
-from ..sharding import filled_rows
 
 MIN_RATIO = PAPER.unloaded_from
 
@@ -133,58 +128,24 @@ def campaign_branches(campaign: Campaign, adjustment: Adjustment) -> list[Elasti
     ]
 
 
-def recoverable_strain(
-    log_modulus: Scalar,
-    stress_max: Float[Array, " branches"],
-    strain_max: Float[Array, " branches"],
-    shape_power: Float[Array, " branches"],
-    unloading: Unloading,
-) -> Float[Array, " branches"]:
-    """Recoverable strain from the *measured* peak of each branch, whatever the loading law."""
-    modulus = jnp.exp(log_modulus)
+def _unit_recoverable(branches: Sequence[ElasticBranch], shape_power: np.ndarray, unloading: Unloading) -> np.ndarray:
+    """Recoverable strain from the *measured* peak of each branch at a modulus of 1 MPa, whatever the loading law."""
+    top, deepest = np.array([(b.stress_max_MPa, b.strain_max) for b in branches]).T
     if unloading is Unloading.PRINTED:
-        return jnp.sqrt(stress_max / (unloading.constant * modulus * shape_power * strain_max))
-    return stress_max / (modulus * jnp.sqrt(unloading.constant * shape_power * strain_max))
+        return np.sqrt(top / (unloading.constant * shape_power * deepest))
+    return top / np.sqrt(unloading.constant * shape_power * deepest)
 
 
-@partial(jax.jit, static_argnames="unloading")
-def _fit(
-    start: Scalar,
-    stress_max: Float[Array, " branches"],
-    strain_max: Float[Array, " branches"],
-    shape_power: Float[Array, " branches"],
-    strain: Float[Array, " points"],
-    ratio: Float[Array, " points"],
-    branch: Int[Array, " points"],
-    counted: Float[Array, " points"],
-    *,
-    unloading: Unloading,
-):
-    released, count = recovery(ratio), len(stress_max)
-    points = jnp.maximum(jax.ops.segment_sum(counted, branch, count), 1.0)
+def _released(branches: Sequence[ElasticBranch]) -> list[np.ndarray]:
+    """Recovered share of strain at the measured stresses of each branch."""
+    ratio = np.concatenate([b.stress_MPa / b.stress_max_MPa for b in branches])
+    # Filled up to a power of two: every new length would be compiled anew.
+    padded = np.pad(ratio, (0, (1 << (len(ratio) - 1).bit_length()) - len(ratio)))
+    released = np.asarray(_recovery(jnp.asarray(padded)))[: len(ratio)]
+    return np.split(released, np.cumsum([len(b.strain) for b in branches])[:-1])
 
-    def about_mean_of_branch(values):
-        """Each value less the mean of its branch; nothing where it only fills up."""
-        mean = jax.ops.segment_sum(counted * values, branch, count) / points
-        return counted * (values - mean[branch])
 
-    def residuals(log_modulus, _):
-        delta = recoverable_strain(log_modulus, stress_max, strain_max, shape_power, unloading)
-        # The zero of every branch is free; least squares over it is the branch's mean.
-        return about_mean_of_branch(strain - (strain_max[branch] - delta[branch] * released))
-
-    # Each branch alone, from the slope of strain over the recovery curve: linear, so in closed form.
-    centred = about_mean_of_branch(released)
-    slope = -jax.ops.segment_sum(strain * centred, branch, count) / jax.ops.segment_sum(centred**2, branch, count)
-    unit = recoverable_strain(jnp.zeros_like(start), stress_max, strain_max, shape_power, unloading)
-    exponent = 2 if unloading is Unloading.PRINTED else 1
-    alone = (unit / jnp.where(slope > 0, slope, jnp.nan)) ** exponent
-    solver = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-12)
-    first = jnp.where(jnp.isfinite(jnp.nanmedian(alone)), jnp.log(jnp.nanmedian(alone)), start)
-    solution = optx.least_squares(residuals, solver, first, max_steps=200, throw=False)
-    final = residuals(solution.value, None)
-    rms = jnp.sqrt(jnp.sum(final**2) / jnp.sum(counted))
-    return solution.value, rms, alone, solution.result == optx.RESULTS.successful
+_recovery = jax.jit(recovery)
 
 
 def fit_effective_modulus(
@@ -216,28 +177,18 @@ def fit_effective_modulus(
     branches = tuple(branches)
     if not branches:
         return ElasticFit(None, np.nan, np.empty(0), (), False, "no unloading branch was measured")
-    index = np.concatenate([np.full(len(b.strain), i) for i, b in enumerate(branches)])
-    top = np.array([b.stress_max_MPa for b in branches])
-    stress = np.concatenate([b.stress_MPa for b in branches])
-    eta = np.asarray(shape_factor)[[b.particle for b in branches]]
-    of_branches = (top, np.array([b.strain_max for b in branches]), eta**strain_scaling.power)
-    of_points = (np.concatenate([b.strain for b in branches]), stress / top[index], index)
-    # Copies of the last branch and point, of which none counts, so that campaigns share one compilation.
-    rows, points = filled_rows(len(top)), 1 << (len(index) - 1).bit_length()
-    at = np.minimum(np.arange(points), len(index) - 1)
-    value, rms, alone, converged = _fit(
-        jnp.log(jnp.asarray(1e4)),
-        *(jnp.asarray(x[rows], float) for x in of_branches),
-        *(jnp.asarray(x[at]) for x in of_points),
-        jnp.asarray(np.arange(points) < len(index), float),
-        unloading=unloading,
-    )
-    alone = np.asarray(alone)[: len(branches)]
-    modulus = float(jnp.exp(value))
-    if not (np.isfinite(modulus) and modulus > 0):
+    unit = _unit_recoverable(branches, shape_factor[[b.particle for b in branches]] ** strain_scaling.power, unloading)
+    # Strain is linear in c = E^(-1/2) of the printed form, E^-1 of a punch. The free zero of a branch is its mean.
+    power = -2 if unloading is Unloading.PRINTED else -1
+    strain = [b.strain - b.strain.mean() for b in branches]
+    slope = [u * (s.mean() - s) for u, s in zip(unit, _released(branches), strict=True)]
+    products = np.array([(x @ y, x @ x) for x, y in zip(slope, strain, strict=True)])
+    own, c = products[:, 0] / products[:, 1], products[:, 0].sum() / products[:, 1].sum()
+    alone = np.where(own > 0, own, np.nan) ** power
+    if not c > 0:
         return ElasticFit(None, np.nan, alone, branches, False, "strain does not fall on unloading")
-    reason = "" if converged else "the optimiser did not meet its tolerances within 200 steps"
-    return ElasticFit(modulus, float(rms), alone, branches, bool(converged), reason)
+    residual = np.concatenate(strain) - c * np.concatenate(slope)
+    return ElasticFit(float(c**power), float(np.sqrt(np.mean(residual**2))), alone, branches, True, "")
 
 
 def collapsed_branches(
@@ -249,15 +200,13 @@ def collapsed_branches(
     """
     if fit.effective_modulus_MPa is None:
         return []
-    top, deepest, eta = jnp.asarray(
-        [(b.stress_max_MPa, b.strain_max, shape_factor[b.particle]) for b in fit.branches]
-    ).T
-    log_modulus = jnp.log(jnp.asarray(float(fit.effective_modulus_MPa)))
-    delta = np.asarray(recoverable_strain(log_modulus, top, deepest, eta**strain_scaling.power, unloading))
+    eta = np.array([shape_factor[b.particle] for b in fit.branches])
+    power = 1 / 2 if unloading is Unloading.PRINTED else 1
+    unit = _unit_recoverable(fit.branches, eta**strain_scaling.power, unloading)
+    recovered = [
+        (b.strain_max - b.strain) / delta
+        for b, delta in zip(fit.branches, unit / fit.effective_modulus_MPa**power, strict=True)
+    ]
     ratios = [b.stress_MPa / b.stress_max_MPa for b in fit.branches]
-    # All branches in one call: every new length would be compiled anew.
-    released = np.split(
-        np.asarray(jax.jit(recovery)(jnp.asarray(np.concatenate(ratios)))), np.cumsum([len(r) for r in ratios])[:-1]
-    )
-    recovered = [(b.strain_max - b.strain) / d for b, d in zip(fit.branches, delta, strict=True)]
-    return [(m - np.mean(m - s), r) for m, s, r in zip(recovered, released, ratios, strict=True)]
+    both = zip(recovered, _released(fit.branches), ratios, strict=True)
+    return [(m - np.mean(m - s), r) for m, s, r in both]

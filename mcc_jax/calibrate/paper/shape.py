@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
-from typing import Literal, get_args
+from typing import Any, Literal, cast, get_args
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from jaxtyping import Array, Bool, Float
+from numpy.polynomial.polynomial import polyder, polyval
 
 from ... import arguments
 from ..._errors import InputError
 from ..._format import described
-from ..._types import Scalar
-from ..settings import PAPER
-from ..sharding import filled_rows
 from .loading import StrainTable, enough
 
 Objective = Literal["full", "reference"]
+GRID, FAR = 2000, 100.0
+"""Minima are bracketed by so many values of `a`, up to shape factors far beyond any particle's. No source: a ratio of
+quadratics changes over steps of 1 over the flatness, 20 times as long."""
 
 
 @dataclass(frozen=True)
@@ -59,14 +55,17 @@ def _weights(stress: np.ndarray, reached: np.ndarray) -> np.ndarray:
     return np.where(last, weights / 2, weights)
 
 
-def full_residuals(
-    a: Scalar,
-    strain: Float[Array, "particles grid"],
-    weights: Float[Array, "particles grid"],
-    reached: Bool[Array, "particles grid"],
-    flatness: Float[Array, " particles"],
-) -> Float[Array, "particles grid"]:
-    r"""Residuals whose sum of squares is the paper's full objective.
+Quadratics = tuple[np.ndarray, np.ndarray]
+"""Of every particle the coefficients of 1, a and a^2 above and below the line, each of shape (3, particles)."""
+
+
+def _square(weights: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Integral of (x + a y)^2 over the grid, as coefficients of 1, a and a^2."""
+    return np.stack([np.sum(weights * product, -1) for product in (x * x, 2 * x * y, y * y)])
+
+
+def full_objective(strain: np.ndarray, weights: np.ndarray, reached: np.ndarray, flatness: np.ndarray) -> Quadratics:
+    r"""The paper's full objective: of every particle a ratio of two quadratics in `a`.
 
     .. math:: \sum_i \frac{\int \left[\bar\epsilon(\sigma) - \eta_{p,i} \epsilon_i(\sigma)\right]^2 d\sigma}
         {\int \bar\epsilon(\sigma)^2 d\sigma}, \qquad \bar\epsilon = \frac{1}{\#S_\sigma}\sum_{j\in S_\sigma}
@@ -75,22 +74,14 @@ def full_residuals(
     References:
         Bommireddy et al. (2018), eq. 14.
     """
-    scaled = (1 + a * flatness)[:, None] * strain
-    count = jnp.sum(reached, axis=0)
-    mean = jnp.sum(jnp.where(reached, scaled, 0.0), axis=0) / jnp.maximum(count, 1).astype(strain.dtype)
-    norm = jnp.sum(weights * mean[None, :] ** 2, axis=1)
-    return jnp.where(reached, mean[None, :] - scaled, 0.0) * (jnp.sqrt(weights) / jnp.sqrt(norm)[:, None])
+    parts = strain, flatness[:, None] * strain
+    means = [np.sum(part, 0, where=reached) / np.maximum(reached.sum(0), 1) for part in parts]
+    away = [np.where(reached, mean - part, 0.0) for mean, part in zip(means, parts, strict=True)]
+    return _square(weights, *away), _square(weights, *means)
 
 
-def reference_residuals(
-    a: Scalar,
-    strain: Float[Array, "particles grid"],
-    weights: Float[Array, "particles grid"],
-    reference_strain: Float[Array, " grid"],
-    flatness: Float[Array, " particles"],
-    reference_flatness: Scalar,
-) -> Float[Array, "particles grid"]:
-    r"""Residuals whose sum of squares is the paper's objective with a reference particle N.
+def reference_objective(strain: np.ndarray, weights: np.ndarray, flatness: np.ndarray, row: int) -> Quadratics:
+    r"""The paper's objective with a reference particle N, in the row-th place.
 
     .. math:: \sum_{i \ne N} \frac{\int \left[\epsilon_N(\sigma) - \frac{\eta_{p,i}}{\eta_{p,N}}
     \epsilon_i(\sigma)\right]^2 d\sigma}
@@ -99,10 +90,20 @@ def reference_residuals(
     References:
         Bommireddy et al. (2018), eq. 15.
     """
-    ratio = (1 + a * flatness) / (1 + a * reference_flatness)
-    norm = jnp.sum(weights * reference_strain[None, :] ** 2, axis=1)
-    deviation = reference_strain[None, :] - ratio[:, None] * strain
-    return deviation * (jnp.sqrt(weights) / jnp.sqrt(norm)[:, None])
+    parts = strain, flatness[:, None] * strain
+    scaled = strain[row], flatness[row] * strain[row]
+    return _square(weights, *(x[row] - x for x in parts)), _square(weights, *scaled)
+
+
+def objective_at(a: Any, quadratics: Quadratics) -> Any:
+    """An objective at one value of `a`, or at many."""
+    above, below = (polyval(a, coefficients) for coefficients in quadratics)
+    return np.sum(above / below, 0)
+
+
+def _slope_at(a: Any, quadratics: Quadratics) -> Any:
+    (above, below), (up, down) = ([polyval(a, f(c)) for c in quadratics] for f in (np.asarray, polyder))
+    return np.sum((up * below - above * down) / below**2, 0)
 
 
 def choose_reference(table: StrainTable) -> int:
@@ -117,24 +118,6 @@ def choose_reference(table: StrainTable) -> int:
     return int(np.argmin(np.where(high, np.abs(table.flatness), np.inf)))
 
 
-@partial(jax.jit, static_argnums=0)
-def _solve(residuals, starts: Float[Array, " starts"], data: tuple[Array, ...]):
-    """Levenberg-Marquardt from every start at once, on exact Jacobians."""
-    solver = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-12)
-
-    def from_start(start):
-        solution = optx.least_squares(
-            lambda a, args: residuals(a, *args), solver, start, args=data, max_steps=200, throw=False
-        )
-        return (
-            solution.value,
-            jnp.sum(residuals(solution.value, *data) ** 2),
-            solution.result == optx.RESULTS.successful,
-        )
-
-    return jax.vmap(from_start)(starts), jnp.sum(residuals(jnp.zeros_like(starts[0]), *data) ** 2)
-
-
 def fit_shape_parameter(table: StrainTable, objective: Objective = "full", reference: int | None = None) -> ShapeFit:
     """Fit `a` by the full objective or by the one with a reference particle.
 
@@ -144,7 +127,7 @@ def fit_shape_parameter(table: StrainTable, objective: Objective = "full", refer
         reference: position in the campaign of the reference particle; by the paper's rule (`choose_reference`) if None.
 
     Returns:
-        The best of several starts; a fit that fails is returned with its reason.
+        The lowest minimum; a fit that fails is returned with its reason.
 
     Raises:
         ValueError: for fewer than two particles, or a reference that was not kept.
@@ -154,20 +137,15 @@ def fit_shape_parameter(table: StrainTable, objective: Objective = "full", refer
     """
     arguments.instance(table, StrainTable, "table", "Take mcc_jax.calibrate.strain_table(adjustment, diameters_um).")
     arguments.choice(objective, get_args(Objective), "objective")
+    from scipy.optimize import brentq  # half a second to import, so only where it is used
+
     if len(table.index) < 2:
         raise InputError("the shape parameter needs at least two particles")
     stress, strain, flatness = table.stress_MPa, table.strain, table.flatness
     reached = table.reached & enough(table)
-    # Particles are filled up to few numbers, and the grid keeps its length, so that campaigns share one compilation: it
-    # takes seconds, the fit none.
-    fill = filled_rows(len(strain))
-    extra = np.arange(len(fill)) >= len(strain)
-    starts = jnp.asarray(PAPER.shape_starts, dtype=float)
+    row = None
     if objective == "full":
-        row = None
-        # Copies reach no stress, so that none counts.
-        data = (strain[fill], _weights(stress, reached)[fill], reached[fill] & ~extra[:, None], flatness[fill])
-        solved, at_zero = _solve(full_residuals, starts, tuple(jnp.asarray(d) for d in data))
+        quadratics = full_objective(strain, _weights(stress, reached), reached, flatness)
     else:
         if reference is None:
             row = choose_reference(table)
@@ -175,31 +153,23 @@ def fit_shape_parameter(table: StrainTable, objective: Objective = "full", refer
             row = int(np.flatnonzero(table.index == reference)[0])
         else:
             raise InputError("the reference particle was not kept")
-        # The reference particle itself, and copies of it, deviate from it by nothing, whatever `a`.
-        fill = np.where(extra, row, fill)
-        weights = _weights(stress, reached[fill] & reached[row])
-        data = (strain[fill], weights, strain[row], flatness[fill], flatness[row])
-        solved, at_zero = _solve(reference_residuals, starts, tuple(jnp.asarray(d, dtype=float) for d in data))
-    values, costs, converged = (np.asarray(x) for x in solved)
+        quadratics = reference_objective(strain, _weights(stress, reached & reached[row]), flatness, row)
+    identifiable = bool(np.ptp(flatness) > 1e-9)
     # A shape factor that is not positive turns the particle inside out; such a minimum is none.
-    valid = np.isfinite(costs) & ((1 + values[:, None] * table.flatness) > 0).all(axis=1)
-    identifiable = bool(np.ptp(table.flatness) > 1e-9)
-    if not valid.any():
+    most, least, far = flatness.max(), flatness.min(), FAR / max(np.abs(flatness).max(), 1e-9)
+    grid = np.linspace(-1 / most if most > 0 else -far, -1 / least if least < 0 else far, GRID + 2)[1:-1]
+    slope = _slope_at(grid, quadratics)
+    minima = [
+        float(cast(Any, brentq)(_slope_at, *grid[k : k + 2], args=(quadratics,), xtol=1e-12))
+        for k in np.flatnonzero((slope[:-1] < 0) & (slope[1:] >= 0) & identifiable)
+    ]
+    a, reason = min(minima, key=lambda a: objective_at(a, quadratics), default=0.0), ""
+    if not minima:
         reason = (
-            "every minimum found makes some shape factor negative; the curves do not collapse under this shape factor"
+            "no minimum has positive shape factors of all particles; the curves do not collapse under this shape factor"
         )
-        return ShapeFit(0.0, float(at_zero), float(at_zero), objective, None, False, reason, identifiable)
-    best = int(np.argmin(np.where(valid, costs, np.inf)))
-    reason = "" if converged[best] else "the optimiser did not meet its tolerances within 200 steps"
     if not identifiable:
         reason = "all particles have the same D3^2/(D1 D2), so the curves do not tell the shape parameter"
-    return ShapeFit(
-        float(values[best]),
-        float(costs[best]),
-        float(at_zero),
-        objective,
-        None if row is None else int(table.index[row]),
-        bool(converged[best]) and identifiable,
-        reason,
-        identifiable,
-    )
+    at, at_zero = (float(objective_at(value, quadratics)) for value in (a, 0.0))
+    kept = None if row is None else int(table.index[row])
+    return ShapeFit(a, at, at_zero, objective, kept, not reason, reason, identifiable)
