@@ -139,6 +139,14 @@ def _compiled_functions_live_for_one_group(request):
     _latest_group = group
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _commands_are_quiet():
+    """How long a command takes depends on the machine; `tests/cli/test_session.py` tests their progress."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mcc_jax.cli.session.QUIET_S", 1e6)
+        yield
+
+
 @pytest.fixture(scope="session")
 def paper_posterior():
     """The default posterior of the simulated campaign from the paper's tables."""
