@@ -8,6 +8,8 @@ from scipy.optimize import least_squares
 
 from mcc_jax.calibrate.hierarchical import Normal, Parameters, minimise, normal_equations
 
+pytestmark = pytest.mark.extended
+
 N, P, Q, K = 4, 3, 2, 7
 
 

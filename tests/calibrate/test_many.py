@@ -78,7 +78,7 @@ def queued(campaigns, told):
     return found, first, seen.names[len(first) :]
 
 
-@pytest.mark.long
+@pytest.mark.extended
 def test_results_come_in_order_and_errors_in_place(queued, campaigns):
     found, *_ = queued
     assert isinstance(found[2], InputError)
@@ -89,14 +89,14 @@ def test_results_come_in_order_and_errors_in_place(queued, campaigns):
         assert found[i].fit.latent.shape == (len(campaigns[i]), 4)
 
 
-@pytest.mark.long
+@pytest.mark.extended
 def test_progress_names_the_campaign(queued, told):
     for i, last in enumerate(["done", "done", "failed", "done"]):
         assert [step for row, step in told if row == i][-1] == last
     assert (0, "sampling the population") in told
 
 
-@pytest.mark.long
+@pytest.mark.extended
 def test_campaigns_of_similar_size_share_their_compilations(queued):
     _, first, further = queued
     for name in FUNCTIONS:
@@ -106,7 +106,7 @@ def test_campaigns_of_similar_size_share_their_compilations(queued):
         assert name not in further
 
 
-@pytest.mark.long
+@pytest.mark.extended
 @pytest.mark.parametrize("i", [0, 1, 3])
 def test_the_numbers_are_those_of_one_by_one(queued, campaigns, i):
     one, many = sample(campaigns[i], **SETTINGS), queued[0][i]
@@ -117,7 +117,7 @@ def test_the_numbers_are_those_of_one_by_one(queued, campaigns, i):
     assert many.warnings() == one.warnings()
 
 
-@pytest.mark.long
+@pytest.mark.extended
 def test_least_squares_with_two_workers(campaigns):
     """Two campaigns of one size, and between them one nothing can be made of."""
     three, told = [campaigns[i] for i in (0, 2, 3)], []

@@ -30,6 +30,7 @@ def one_material():
     return calibrate_paper(paper_campaign(0, shared_material=True), threshold_MPa=0.0)
 
 
+@pytest.mark.extended
 def test_one_material_is_recovered_whole(one_material):
     assert one_material.converged
     assert one_material.a == pytest.approx(1.43, abs=0.02)
@@ -54,6 +55,7 @@ def test_noise_is_the_instrument_s(result):
     assert result.displacement_noise_um == pytest.approx(0.02, rel=0.25)
 
 
+@pytest.mark.extended
 def test_campaigns_of_similar_size_share_their_compilations(result):
     compiled = shape._solve, modulus._fit
     before = [function._cache_size() for function in compiled]
@@ -62,6 +64,7 @@ def test_campaigns_of_similar_size_share_their_compilations(result):
     assert [function._cache_size() for function in compiled] == before
 
 
+@pytest.mark.extended
 def test_what_fills_up_counts_for_nothing(result, monkeypatch):
     few = result.campaign.select(np.arange(20) < 5)
     numbers = []
@@ -96,6 +99,7 @@ def test_json_keeps_the_contract(result):
         assert particle["kept"] is (particle["why_not"] is None)
 
 
+@pytest.mark.extended
 def test_same_campaign_same_json():
     one, two = (calibrate_paper(paper_campaign(4)).to_json() for _ in range(2))
     del one["runtime_s"], two["runtime_s"]
@@ -135,6 +139,7 @@ def test_too_few_particles_are_told():
         calibrate_paper(campaign)
 
 
+@pytest.mark.extended
 def test_without_unloading_there_is_no_modulus_and_the_rest_stands():
 
     campaign = paper_campaign(0, programme=Programme("load", (Ramp(1.0, 2.0),), points=150))
@@ -145,13 +150,14 @@ def test_without_unloading_there_is_no_modulus_and_the_rest_stands():
     assert content["a"]["value"] is not None
 
 
-@pytest.mark.long
+@pytest.mark.extended
 def test_the_offset_step_biases_the_shape_parameter_low():
     # The bias of the paper's own step on data of one material, as documented in benchmarks/results/shape_parameter.md.
     with_step = [calibrate_paper(paper_campaign(s, shared_material=True)).a for s in range(3)]
     assert -0.14 < np.mean(with_step) - 1.43 < -0.07
 
 
+@pytest.mark.extended
 def test_indentation_of_another_material_runs_and_is_called_badly_described():
     campaign = read_tester_file(TESTERS / "FS1.txt", diameters_um=(60.0, 60.0, 60.0))
     result = calibrate_paper(campaign, threshold_MPa=0.2)

@@ -11,6 +11,8 @@ from scipy.stats import multivariate_normal
 
 from mcc_jax.calibrate.small_matrices import Cholesky, eliminate
 
+pytestmark = pytest.mark.extended
+
 SIZES = st.sampled_from([1, 2, 5])
 BATCHES = st.sampled_from([(), (2, 3)])
 SEEDS = st.integers(0, 2**32 - 1)

@@ -39,7 +39,7 @@ def blocks(text):
 
 
 def runnable(page):
-    marks = [pytest.mark.long] if EXPENSIVE.match(ALL[page]) else []
+    marks = [pytest.mark.extended] if EXPENSIVE.match(ALL[page]) else []
     return pytest.param(page, marks=marks, id=page)
 
 
@@ -58,6 +58,7 @@ def run_command(arguments):
 RUN = [page for page, text in ALL.items() if any(b.language in ("python", "sh") for b in blocks(text))]
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("page", [runnable(page) for page in RUN])
 @pytest.mark.filterwarnings("default")
 def test_page_does_what_it_shows(page, tmp_path, monkeypatch):

@@ -60,6 +60,7 @@ def golden(file):
     return np.genfromtxt(file, delimiter=",", names=True, dtype=None, encoding="utf-8")
 
 
+@pytest.mark.extended
 def test_the_header_passes_its_own_golden_tables(run, tmp_path):
     """As a user would: the files alone, whatever the calibration was."""
     folder, out = write(tmp_path / "fit"), tmp_path / "out"
@@ -189,6 +190,7 @@ def test_sizes_are_also_found_where_the_demo_puts_its_campaign(tmp_path):
     assert origin.geometry == "particle A of particles.csv"
 
 
+@pytest.mark.extended
 def test_help_does_not_import_jax():
     code = "import sys; sys.argv = ['mcc-jax', 'export', '--help']; from mcc_jax.cli import run\n"
     code += "try:\n    run()\nexcept SystemExit:\n    assert 'jax' not in sys.modules\n"

@@ -20,7 +20,7 @@ from mcc_jax.simulate import (
     simulate_campaign,
 )
 
-pytestmark = pytest.mark.long  # searches for effects for minutes; `.ci/run` does so once, as its users do
+pytestmark = pytest.mark.extended
 
 COUNT = 10
 
@@ -48,7 +48,6 @@ def texts(figure):
     return [t.get_text() for t in figure.findobj(mpl.text.Text) if t.get_text()]
 
 
-@pytest.mark.long
 def test_verdicts_are_what_the_figures_are_to_show(found):
     assert found["frame"].verdict in {"NAMED", "SET"}
     assert found["null"].verdict == "NO_GAP"
