@@ -53,7 +53,7 @@ def _keep_everything():
 
 
 GROUPS = {
-    "discover": ("tests/discover/", "tests/cli/test_discover", "tests/plots/test_discovery_figures"),
+    "discover": ("tests/discover/", "tests/cli/test_discover"),
     "posterior": (
         *("tests/calibrate/test_posterior", "tests/calibrate/test_arviz_functions"),
         *("tests/plots/test_joint_figures", "tests/plots/test_figures"),
@@ -141,9 +141,19 @@ def _commands_are_quiet():
         yield
 
 
+@pytest.fixture
+def run():
+    """The command line, in this process: `run("calibrate", folder, "--out", out)`."""
+    from click.testing import CliRunner
+
+    from mcc_jax.cli.main import cli  # not before its annotations are checked
+
+    return lambda *arguments: CliRunner().invoke(cli, [str(a) for a in arguments], prog_name="mcc-jax")
+
+
 @pytest.fixture(scope="session")
 def paper_posterior():
     """The default posterior of the simulated campaign from the paper's tables."""
-    from mcc_jax import paper_campaign, sample  # not before its annotations are checked
+    from mcc_jax import paper_campaign, sample
 
     return sample(paper_campaign(0))

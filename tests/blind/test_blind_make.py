@@ -1,6 +1,7 @@
 """Campaigns of both generators: their law, their independence, strengths, noise and faults."""
 
 import ast
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -82,16 +83,9 @@ def test_the_modulus_at_peaks_is_that_of_unloading_from_there(generator, mechani
         assert np.log(found) == pytest.approx(2 * (given_back[0] - given_back[1]), rel=1e-6)
 
 
-QUICK = (("first", "P1"), ("second", "P2"))
-
-
 @pytest.mark.parametrize(
     ("generator", "protocol"),
-    [
-        pytest.param(g, p, marks=() if (g, p) in QUICK else pytest.mark.extended)
-        for g in GENERATORS
-        for p in plan.PROTOCOLS
-    ],
+    list(itertools.product(GENERATORS, plan.PROTOCOLS)),
 )
 def test_generators_agree_with_the_law_without_effects(generator, protocol):
     """Against the library's own law, which neither knows."""

@@ -131,12 +131,6 @@ def test_what_moved_is_told(posterior):
     assert CREEP in told[0]
 
 
-def test_the_noise_is_that_of_the_instrument(posterior):
-    noise = posterior.fit.noise.noise
-    assert float(noise.displacement) == pytest.approx(0.08, rel=0.1)
-    assert posterior.noise_share < 0.5
-
-
 def test_a_particle_left_out_is_less_probable_than_one_that_was_seen(campaign, posterior):
     """The expected log density is ArviZ' leave-one-out, by particle, and below that of the tests themselves."""
     each = posterior.log_likelihood.reshape(-1, len(posterior.particles))

@@ -12,6 +12,7 @@ import pytest
 from asserting import snapshot
 
 COMMAND = [sys.executable, "-m", "mcc_jax"]
+pytestmark = pytest.mark.extended  # processes that load the library for seconds each
 posix = pytest.mark.skipif(os.name != "posix", reason="signals")
 
 
@@ -31,7 +32,6 @@ def errors(stderr):
     return re.sub(r"mcc-jax: +\d+\.\d s  .*\n", "", stderr)
 
 
-@pytest.mark.extended
 def test_help_loads_nothing_heavy():
     code = (
         "import sys, time; start = time.process_time()\n"
@@ -54,7 +54,6 @@ def test_bad_input_is_one_line(tmp_path):
     assert result.stderr.count("\n") == 1
 
 
-@pytest.mark.extended
 def test_a_missing_accelerator_is_one_line(tmp_path):
     """JAX itself says it in a traceback of a hundred lines, or not before it computes."""
     wanted = os.environ | {"JAX_PLATFORMS": "tpu"}  # a machine may have a graphics card, but hardly one of these
@@ -66,7 +65,6 @@ def test_a_missing_accelerator_is_one_line(tmp_path):
     assert not (tmp_path / "simulated").exists()
 
 
-@pytest.mark.extended
 def test_shell_completion():
     source = call(env=os.environ | {"_MCC_JAX_COMPLETE": "bash_source"})
     assert "mcc-jax" in source.stdout
@@ -74,7 +72,6 @@ def test_shell_completion():
     assert "calibrate" in call(env=os.environ | asked).stdout
 
 
-@pytest.mark.extended
 @posix
 def test_full_disk(tmp_path):
     (tmp_path / "curves.csv").write_text("old")
@@ -108,12 +105,11 @@ SEAL = r"[^\n]*sealed, SHA-256:\n  [0-9a-f]{64}\n"
 """All that the demo prints before it is done."""
 
 
-@pytest.mark.extended
 @posix
 @pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize(
     ("number", "status"),
-    [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.extended), (signal.SIGKILL, -9)],
+    [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)],
 )
 def test_killed_in_the_middle(tmp_path, number, status):
     out = tmp_path / "out"
@@ -137,7 +133,6 @@ def test_killed_in_the_middle(tmp_path, number, status):
         assert snapshot(out) == before
 
 
-@pytest.mark.extended
 @posix
 def test_who_interrupts_does_not_wait_for_other_threads():
     code = (
@@ -151,7 +146,6 @@ def test_who_interrupts_does_not_wait_for_other_threads():
     assert (result.returncode, result.stdout, result.stderr) == (130, "", "mcc-jax: interrupted\n")
 
 
-@pytest.mark.extended
 @posix
 @pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize(
@@ -172,7 +166,6 @@ def test_a_signal_within_a_destructor_is_not_lost(number, status, line):
     assert (result.returncode, result.stdout, result.stderr) == (status, "", line)
 
 
-@pytest.mark.extended
 @posix
 def test_two_at_once_and_the_lock_of_a_dead_one(tmp_path):
     holder = (
@@ -193,7 +186,6 @@ def test_two_at_once_and_the_lock_of_a_dead_one(tmp_path):
     assert set(snapshot(tmp_path)) == {"particles.csv", "curves.csv", "campaign.toml"}
 
 
-@pytest.mark.extended
 @posix
 def test_progress_on_a_terminal_is_a_bar_on_standard_error(tmp_path):
     import pty  # not there on Windows, where this test is skipped

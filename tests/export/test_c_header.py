@@ -1,4 +1,3 @@
-import itertools
 import math
 
 import equinox as eqx
@@ -9,6 +8,7 @@ import numpy as np
 import pytest
 from bisecting import pair_force
 from compiling import LANGUAGES, PAIR, PLATES, WALL, build_driver, compile_with, head, run_driver
+from helpers import FORMS
 
 from mcc_jax import (
     History,
@@ -22,7 +22,6 @@ from mcc_jax import (
 )
 from mcc_jax.export import Origin, c_header
 
-FORMS = list(itertools.product(Unloading, StrainScaling))
 MODULUS_MPA = {Unloading.PRINTED: 16000.0, Unloading.PUNCH: 500.0, Unloading.PUNCH_EXACT: 500.0}
 PARTICLE = Particle(213.54, 196.07, 186.33)
 PATHS, STEPS = 100_000, 24
