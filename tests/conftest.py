@@ -53,7 +53,7 @@ def _keep_everything():
 
 
 GROUPS = {
-    "discover": ("tests/discover/", "tests/cli/test_discover", "tests/plots/test_discovery_figures"),
+    "discover": ("tests/discover/", "tests/cli/test_discover"),
     "posterior": (
         *("tests/calibrate/test_posterior", "tests/calibrate/test_arviz_functions"),
         *("tests/plots/test_joint_figures", "tests/plots/test_figures"),
@@ -88,36 +88,30 @@ def pytest_xdist_make_scheduler(config, log):
 
 
 CASES = 3
-"""Of a test with more cases as many run, spread evenly; `--every-case` and `-k` run all."""
+"""Of a test with more cases the core runs as many, spread evenly; the others are `extended`."""
+
+EVERY_CASE = ("tests/campaign/", "tests/cli/test_bad_input", "tests/test_readme", "tests/simulate/test_programme")
+"""Readers and errors: each case is another one, and takes milliseconds."""
 
 
-def pytest_addoption(parser):
-    parser.addoption("--every-case", action="store_true", help=f"also of tests with more than {CASES} cases")
-
-
-def some_of_many(config, items):
-    """The tests to run, and those that are left out."""
-    if config.getoption("--every-case") or config.option.keyword:
-        return items, []
+def mark_further_cases(items):
+    """Mark what the core leaves out of tests with many cases."""
     several = {}
     for item in items:
-        # Every notebook is read by itself: none of them stands for another.
-        name = item.nodeid if item.get_closest_marker("notebook") else item.nodeid.split("[")[0]
-        several.setdefault(name, []).append(item)
-    kept = []
+        marked = item.get_closest_marker("extended") or item.get_closest_marker("notebook")
+        if not marked and not item.nodeid.startswith(EVERY_CASE):
+            several.setdefault(item.nodeid.split("[")[0], []).append(item)
     for cases in several.values():
-        step = max(1, (len(cases) - 1) / (CASES - 1))
-        kept += [cases[round(k * step)] for k in range(min(CASES, len(cases)))]
-    chosen = {id(item) for item in kept}
-    return [i for i in items if id(i) in chosen], [i for i in items if id(i) not in chosen]
+        kept = {round(k * (len(cases) - 1) / (CASES - 1)) for k in range(CASES)}
+        for i, item in enumerate(cases):
+            if i not in kept and len(cases) > CASES:
+                item.add_marker(pytest.mark.extended)
 
 
-@pytest.hookimpl(trylast=True)
-def pytest_collection_modifyitems(config, items):
-    """Tests of one group stand together, the longest first; of tests with many cases some."""
-    items[:], left_out = some_of_many(config, items)
-    if left_out:
-        config.hook.pytest_deselected(items=left_out)
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Before tests are selected by their marks. Tests of one group stand together, the longest first."""
+    mark_further_cases(items)
 
     def place(item):
         group = group_of(item.nodeid)
@@ -139,9 +133,27 @@ def _compiled_functions_live_for_one_group(request):
     _latest_group = group
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _commands_are_quiet():
+    """How long a command takes depends on the machine; `tests/cli/test_session.py` tests their progress."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mcc_jax.cli.session.QUIET_S", 1e6)
+        yield
+
+
+@pytest.fixture
+def run():
+    """The command line, in this process: `run("calibrate", folder, "--out", out)`."""
+    from click.testing import CliRunner
+
+    from mcc_jax.cli.main import cli  # not before its annotations are checked
+
+    return lambda *arguments: CliRunner().invoke(cli, [str(a) for a in arguments], prog_name="mcc-jax")
+
+
 @pytest.fixture(scope="session")
 def paper_posterior():
     """The default posterior of the simulated campaign from the paper's tables."""
-    from mcc_jax import paper_campaign, sample  # not before its annotations are checked
+    from mcc_jax import paper_campaign, sample
 
     return sample(paper_campaign(0))

@@ -32,26 +32,13 @@ K1, K3, K5, A, EBAR = 7.0094, 27.235, 144.23, 1.43, 16000.0
 FORMS = [(u, s) for u in Unloading for s in StrainScaling]
 FORM_NAMES = [f"{u.value}-{s.value}" for u, s in FORMS]
 ALL_FORMS = pytest.mark.parametrize(("unloading", "scaling"), FORMS, ids=FORM_NAMES)
-# The same, of which a quick run takes each form and each way of the shape factor once.
-ALL_IN_TIME = pytest.mark.parametrize(
-    ("unloading", "scaling"),
-    [pytest.param(*f, marks=() if i % 4 == 0 else pytest.mark.long) for i, f in enumerate(FORMS)],
-    ids=FORM_NAMES,
-)
-# Each form and each way of the shape factor once; a quick run takes the ends.
-SOME_FORMS = pytest.mark.parametrize(
-    ("unloading", "scaling"),
-    [
-        pytest.param(*f, marks=pytest.mark.long if i == 4 else (), id=FORM_NAMES[i])
-        for i, f in enumerate(FORMS)
-        if i % 4 == 0
-    ],
-)
+# Each form and each way of the shape factor once.
+SOME_FORMS = pytest.mark.parametrize(("unloading", "scaling"), FORMS[::4], ids=FORM_NAMES[::4])
 
 
-def first_in_time(values, keep=1):
-    """Parameters of which a quick run takes the first; `pytest -m long` takes the others."""
-    return [v if i < keep else pytest.param(v, marks=pytest.mark.long) for i, v in enumerate(values)]
+def first_in_core(values, keep=1):
+    """Parameters of which the core takes the first; the others are `extended`."""
+    return [v if i < keep else pytest.param(v, marks=pytest.mark.extended) for i, v in enumerate(values)]
 
 
 EPS = {np.dtype("float64"): 2.0**-52, np.dtype("float32"): 2.0**-23}

@@ -53,6 +53,7 @@ def test_a_discovery_beside_it_has_it_as_its_before(calibration, tmp_path):
         mcc.load(tmp_path / "discovery.json")
 
 
+@pytest.mark.extended
 def test_its_law_drives_and_is_exported(calibration, tmp_path):
     calibration.save(tmp_path)
     law = mcc.load(tmp_path).law()
@@ -80,6 +81,7 @@ def test_curves_are_those_that_were_compared(calibration, campaign, tmp_path):
         assert 0 < one.used.sum() <= len(one.used)
 
 
+@pytest.mark.extended
 def test_the_page_shows_it(calibration, tmp_path):
     calibration.save(tmp_path)
     found = read_results(tmp_path)
@@ -111,7 +113,7 @@ def test_an_empty_folder_is_one_line(tmp_path):
         mcc.load(tmp_path)
 
 
-@pytest.mark.long
+@pytest.mark.extended
 def test_a_discovery_comes_back_with_its_law(tmp_path):
     from mcc_jax.discover import discover
     from mcc_jax.effects import LIBRARY

@@ -14,7 +14,6 @@ from .compiling import compiled
 from .data import Tests
 from .forward import Forms, Point, linearise, snap
 from .settings import FIT
-from .small_matrices import Cholesky
 
 
 class ParticleFits(eqx.Module):

@@ -11,6 +11,7 @@ import shutil
 import stat
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, wait
 from pathlib import Path
@@ -35,7 +36,7 @@ PACKAGES = ("jax", "jaxlib", "equinox", "optimistix", "numpyro", "arviz", "numpy
 
 @contextlib.contextmanager
 def session(steps: int) -> Iterator[Tell]:
-    """Double precision, and progress on standard error if that is a terminal.
+    """Double precision, and progress on standard error: a bar on a terminal, a line for each step elsewhere.
 
     Yields a function to be called with the name of each step as it begins, `steps` times in all.
     """
@@ -147,8 +148,12 @@ def beside[R](work: Callable[[], R]) -> Iterator[Callable[[], R]]:
 
 @contextlib.contextmanager
 def _progress(steps: int) -> Iterator[Tell]:
-    if sys.stderr is None or not sys.stderr.isatty() or os.environ.get("TERM") == "dumb":
+    if sys.stderr is None:
         yield lambda _: None
+        return
+    if not sys.stderr.isatty() or os.environ.get("TERM") == "dumb":
+        with _logged(sys.stderr) as tell:
+            yield tell
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -157,6 +162,45 @@ def _progress(steps: int) -> Iterator[Tell]:
     with Progress(*columns, console=Console(stderr=True), transient=True, redirect_stdout=False) as bar:
         task = bar.add_task("", total=steps + 1, completed=-1)
         yield lambda step: bar.update(task, description=step, advance=1)
+
+
+QUIET_S = 2.0
+"""Without a terminal, a command that works no longer than this after the library is loaded reports no progress."""
+
+
+@contextlib.contextmanager
+def _logged(stream: Any) -> Iterator[Tell]:
+    """Write a line for each step as it begins, with the seconds since the command began.
+
+    Lines are held back for `QUIET_S`, counted from the second step, so that bad input is answered by its error alone.
+    """
+    began, waiting, lock, shown = time.monotonic(), list[str](), threading.Lock(), threading.Event()
+
+    def tell(step: str) -> None:
+        with lock:
+            waiting.append(f"{PROGRAM}: {time.monotonic() - began:6.1f} s  {step}\n")
+            if len(waiting) == 2 and timer.ident is None:
+                timer.start()
+        if shown.is_set():
+            write()
+
+    def write() -> None:
+        with lock, contextlib.suppress(OSError):  # a reader that is gone does not end the work
+            shown.set()
+            stream.write("".join(waiting))
+            waiting.clear()
+            stream.flush()
+
+    timer = threading.Timer(QUIET_S, write)
+    timer.daemon = True
+    try:
+        yield tell
+    finally:
+        timer.cancel()
+        if timer.ident is not None:
+            timer.join()
+    if shown.is_set():
+        tell("done")
 
 
 def say(text: str = "", **style: Any) -> None:

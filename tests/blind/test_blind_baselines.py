@@ -6,6 +6,8 @@ import pytest
 from benchmarks.blind import adapter, baselines, plan, seal
 from benchmarks.blind.plan import Case
 
+pytestmark = pytest.mark.extended
+
 NAME = "day-5"
 
 
@@ -32,8 +34,8 @@ def made(name, place):
     [
         ("nothing", "NO_GAP", []),
         ("clear", "NAMED", ["thermal_drift"]),
-        pytest.param("bends with its amplitude", "NAMED", ["adhesion"], marks=pytest.mark.long),
-        pytest.param("on no list", "UNLISTED", [], marks=pytest.mark.long),
+        pytest.param("bends with its amplitude", "NAMED", ["adhesion"], marks=pytest.mark.extended),
+        pytest.param("on no list", "UNLISTED", [], marks=pytest.mark.extended),
     ],
 )
 def test_the_oracle_knows(name, verdict, names, tmp_path):
@@ -101,7 +103,6 @@ def test_the_library_of_another_checkout_comes_first(monkeypatch, tmp_path):
     assert sys.path[0] == str(tmp_path)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("solver", [baselines.aic, baselines.discrepancy])
 def test_baselines_on_a_made_campaign(tmp_path, solver):
     found = solver(made("clear", tmp_path))

@@ -1,6 +1,7 @@
 """Campaigns of both generators: their law, their independence, strengths, noise and faults."""
 
 import ast
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ from benchmarks.blind import make, noise, plan, world
 from benchmarks.blind.plan import Case
 from benchmarks.blind.settings import MECHANISMS, SETTINGS
 from benchmarks.blind.strength import Projection, amplitude_for, signature
+
+pytestmark = pytest.mark.extended
 
 BENCH = Path(__file__).parents[2] / "benchmarks/blind"
 GENERATORS = {"first": "generator", "second": "second"}
@@ -80,12 +83,9 @@ def test_the_modulus_at_peaks_is_that_of_unloading_from_there(generator, mechani
         assert np.log(found) == pytest.approx(2 * (given_back[0] - given_back[1]), rel=1e-6)
 
 
-QUICK = (("first", "P1"), ("second", "P2"))
-
-
 @pytest.mark.parametrize(
     ("generator", "protocol"),
-    [pytest.param(g, p, marks=() if (g, p) in QUICK else pytest.mark.long) for g in GENERATORS for p in plan.PROTOCOLS],
+    list(itertools.product(GENERATORS, plan.PROTOCOLS)),
 )
 def test_generators_agree_with_the_law_without_effects(generator, protocol):
     """Against the library's own law, which neither knows."""
@@ -203,7 +203,6 @@ def test_segments_of_a_path():
     assert world.segments(force).tolist() == [*kinds, world.UNLOADING]
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("generator", GENERATORS)
 @pytest.mark.parametrize("mechanism", MECHANISMS)
 def test_every_mechanism_reaches_a_moderate_strength(generator, mechanism):

@@ -9,6 +9,8 @@ import pytest
 from benchmarks.blind import adapter, plan, run, seal, workers
 from benchmarks.blind.settings import Running
 
+pytestmark = pytest.mark.extended
+
 FAST = Running(timeout_s=2.0, start_timeout_s=60.0, renew_after=2)
 
 

@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
 
 from mcc_jax.calibrate.hierarchical import Normal, Parameters, minimise, normal_equations
+
+pytestmark = pytest.mark.extended
 
 N, P, Q, K = 4, 3, 2, 7
 
@@ -94,30 +95,6 @@ def residual(y, data, extra=0):
     """`extra` shared parameters and as many own ones that no residual depends on come last."""
     model = y.local[:, :1] * jnp.exp(-y.shared[0] * TIME)[None] + y.local[:, 1:2] + (y.shared[1] * TIME**2)[None]
     return (data - model,)
-
-
-def test_the_optimum_is_scipy_s():
-    data = decays()
-    found = jax.jit(
-        lambda d: minimise(lambda y: residual(y, d), Parameters(jnp.ones((N, 2)), jnp.asarray([0.5, 0.0])))
-    )(jnp.asarray(data))
-
-    def dense(x):
-        local = x[: 2 * N].reshape(N, 2)
-        return (data - local[:, :1] * np.exp(-x[-2] * TIME) - local[:, 1:] - x[-1] * TIME**2).ravel()
-
-    start = np.concatenate([np.ones(2 * N), [0.5, 0.0]])
-    expected = least_squares(dense, start, xtol=1e-14, ftol=1e-14, gtol=1e-14)
-    assert bool(found.converged)
-    assert 2 < int(found.steps) < 60
-    np.testing.assert_allclose(flat(found.value), expected.x, rtol=1e-6, atol=1e-7)
-    np.testing.assert_allclose(float(found.loss), expected.cost, rtol=1e-10)
-    np.testing.assert_allclose(np.asarray(found.residual[0]).ravel(), expected.fun, atol=1e-6)
-    covariance = np.linalg.inv(expected.jac.T @ expected.jac)
-    np.testing.assert_allclose(found.normal.covariance()[2], covariance[-2:, -2:], rtol=1e-4)
-    # The gradient vanishes, in units of what the parameters are known to.
-    gradient = flat(Parameters(found.normal.gradient_local, found.normal.gradient_shared))
-    assert np.all(np.abs(gradient) * np.sqrt(np.diag(covariance)) < 1e-5)
 
 
 def test_a_parameter_without_data_stays_where_it_is():

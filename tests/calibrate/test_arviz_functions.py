@@ -47,6 +47,7 @@ def test_particles_left_out(by_particle):
     assert np.isfinite(table["elpd"]).all()
 
 
+@pytest.mark.extended
 def test_readings_left_out(by_reading):
     found = az.loo(by_reading)
     assert found.n_data_points == int(np.isfinite(by_reading["observed_data"]["displacement_um"]).sum())
@@ -59,12 +60,14 @@ def test_sensitivity_to_the_prior(by_particle):
     assert np.isfinite(table[["prior", "likelihood"]].astype(float)).all(axis=None)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("draw", ["plot_forest", "plot_trace", "plot_dist", "plot_rank", "plot_ess", "plot_pair"])
 def test_pictures_of_parameters(by_particle, draw):
     getattr(az, draw)(by_particle["first"], var_names=POPULATION[:3], backend="matplotlib")
     matplotlib.pyplot.close("all")
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("draw", ["plot_ppc_dist", "plot_ppc_pit", "plot_loo_pit"])
 def test_pictures_of_predictions(by_reading, draw):
     getattr(az, draw)(by_reading, backend="matplotlib")

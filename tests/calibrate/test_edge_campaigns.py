@@ -19,12 +19,14 @@ from mcc_jax import (
 )
 from mcc_jax.calibrate.data import select, select_tests
 
+pytestmark = pytest.mark.extended
+
 METHODS = {
     "bayes": lambda campaign: sample(campaign, draws=200, chains=2),
     "least-squares": least_squares,
 }
 methods = pytest.mark.parametrize("method", list(METHODS))
-few = pytest.mark.parametrize("method", [pytest.param("bayes", marks=pytest.mark.long), "least-squares"])
+few = pytest.mark.parametrize("method", [pytest.param("bayes", marks=pytest.mark.extended), "least-squares"])
 """The posterior compiles for every number of particles."""
 
 
@@ -178,7 +180,6 @@ def test_a_threshold_must_be_a_stress(campaign):
             select_tests(campaign, threshold_MPa=threshold)
 
 
-@pytest.mark.long
 @few
 def test_one_particle_alone(method):
     campaign = one("alone", 1)
@@ -202,7 +203,6 @@ def test_one_particle_alone(method):
         assert content["a"]["sd"] > 0.5  # the prior's is 1
 
 
-@pytest.mark.long
 @few
 def test_two_particles_of_one_shape(method):
     C, diameters = COEFFICIENTS[:2], np.array([[150.0, 160.0, 120.0], [180.0, 192.0, 144.0]])
@@ -218,7 +218,6 @@ def test_two_particles_of_one_shape(method):
         assert content["a"]["sd"] > 0.5
 
 
-@pytest.mark.long
 @methods
 def test_two_spheres(method):
     """Flatness is exactly zero: a is in no equation at all."""

@@ -17,6 +17,8 @@ from mcc_jax.calibrate.sharding import Blocks
 from mcc_jax.calibrate.straightening import coordinates
 from mcc_jax.effects import find_variant
 
+pytestmark = pytest.mark.extended
+
 CREEP, AMPLITUDE, TAU_S = "creep:logarithmic", 2e-4, 3.0
 
 
@@ -51,7 +53,6 @@ def test_amplitude_time_and_modulus_are_recovered(posterior):
     assert named["creep"].std() < 0.1 * AMPLITUDE
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("tau_s", [0.1, 0.3])
 def test_strong_creep_with_a_time_far_from_the_priors_is_found(tau_s):
     """Undamped steps leave for times of 1e-5 s and 1e5 s in turn, and end in numbers that overflow."""
@@ -95,7 +96,6 @@ def test_tests_bend_with_the_effects_numbers(posterior):
     assert second < 0.3 * first
 
 
-@pytest.mark.long
 def test_creep_beyond_the_record_is_drawn_as_widely_as_tests_leave_it_open():
     """Amplitude over time is known, the time is not: a ridge over a decade, without a divergence."""
     far = mcc.HiddenEffect(find_variant(CREEP), 100 * AMPLITUDE, {"tau_s": 1000.0})
@@ -131,12 +131,6 @@ def test_what_moved_is_told(posterior):
     assert CREEP in told[0]
 
 
-def test_the_noise_is_that_of_the_instrument(posterior):
-    noise = posterior.fit.noise.noise
-    assert float(noise.displacement) == pytest.approx(0.08, rel=0.1)
-    assert posterior.noise_share < 0.5
-
-
 def test_a_particle_left_out_is_less_probable_than_one_that_was_seen(campaign, posterior):
     """The expected log density is ArviZ' leave-one-out, by particle, and below that of the tests themselves."""
     each = posterior.log_likelihood.reshape(-1, len(posterior.particles))
@@ -146,7 +140,6 @@ def test_a_particle_left_out_is_less_probable_than_one_that_was_seen(campaign, p
     assert elpd < (logsumexp(each, axis=0) - np.log(len(each))).sum()
 
 
-@pytest.mark.long
 def test_models_are_compared_by_evidence_and_by_particles_left_out(campaign, posterior):
     table = mcc.compare(campaign, [mcc.Model(), posterior])
     base, with_creep = table.to_dict("records")
@@ -156,7 +149,6 @@ def test_models_are_compared_by_evidence_and_by_particles_left_out(campaign, pos
     assert base["chi2_per_point"] > 2 > with_creep["chi2_per_point"]
 
 
-@pytest.mark.long
 def test_least_squares_agrees_with_the_mode(campaign, posterior):
     squares = mcc.least_squares(campaign, mcc.Model().with_effects(CREEP))
     assert squares.converged

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ALL_IN_TIME
+from helpers import ALL_FORMS
 from joint_cases import COEFFICIENTS, DIAMETERS, SNAPPING, effective_diameter, flatness, simulated, true_latent
 
 from mcc_jax import Instrument, Model, Programme, Unloading
@@ -33,7 +33,7 @@ def point_at(latent, zero=0.0, theta=()):
     )
 
 
-@ALL_IN_TIME
+@ALL_FORMS
 def test_noise_free_tests_leave_no_residual(unloading, scaling):
     """b = log(C eta) and e = log Ebar + p log eta (half of p in the punch forms) are all that a law knows of shape."""
     tests, law = measured_with(unloading, scaling=scaling), Forms(unloading)
@@ -51,12 +51,13 @@ def test_the_zero_is_subtracted_from_what_was_measured():
     np.testing.assert_allclose(residual, np.where(np.asarray(tests.mask), -zero[:, None], 0.0), atol=1e-9)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("law", "theta"),
     [
         (PLAIN, ()),
         (CREEP, (3e-4, 10.0)),
-        pytest.param(Forms(Unloading.PUNCH_EXACT), (), marks=pytest.mark.long),
+        pytest.param(Forms(Unloading.PUNCH_EXACT), (), marks=pytest.mark.extended),
     ],
     ids=["plain", "creep", "punch"],
 )
@@ -117,8 +118,9 @@ def test_stages_joined_by_the_chain_rule_are_the_derivatives_of_the_whole_law(na
     np.testing.assert_allclose(linear.residual, residual_of(point, tests, law), atol=1e-10)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(("law", "theta"), [(PLAIN, ()), (CREEP, (3e-4, 10.0))], ids=["plain", "creep"])
-@pytest.mark.parametrize("hum", [0.0, pytest.param(0.5, marks=pytest.mark.long)], ids=["clean", "noisy"])
+@pytest.mark.parametrize("hum", [0.0, pytest.param(0.5, marks=pytest.mark.extended)], ids=["clean", "noisy"])
 def test_how_errors_of_force_move_a_prediction(law, theta, hum):
     """By a point's own reading, by the peak of its branch, by an error that all forces share: each by differences."""
     tests = measured_with(instrument=Instrument(force_noise_mN=hum), peak_MPa=5.0)

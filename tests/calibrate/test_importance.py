@@ -45,6 +45,7 @@ def normal(paper_posterior):
     return Normal(target.model, target.marginal, jnp.asarray(CENTRE), jnp.asarray(WIDTH))
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("off", [0.0, 0.4], ids=["at the mode", "beside it"])
 def test_weighted_draws_are_those_of_a_known_density(normal, off):
     start = jnp.asarray((CENTRE + off * WIDTH) * np.where(np.arange(9) == 5, -1, 1))  # of either sign
@@ -68,7 +69,7 @@ def test_a_hopeless_proposal_is_refused(normal):
     assert sample_weighted(jax.random.key(0), far, narrow, normal, chains=2, draws=50) is None
 
 
-@pytest.mark.long
+@pytest.mark.extended
 def test_nuts_takes_over_where_weights_are_not_good_enough(paper_posterior, monkeypatch):
     assert paper_posterior.leapfrogs == 0
     monkeypatch.setattr(drawing, "sample_weighted", lambda *_, **__: None)
@@ -81,6 +82,7 @@ def test_nuts_takes_over_where_weights_are_not_good_enough(paper_posterior, monk
         assert found.std() == pytest.approx(sd, rel=0.1), name
 
 
+@pytest.mark.extended
 def test_threads_may_trace_the_model_side_by_side():
     """As the pieces of a proposal do; NumPyro keeps its handlers in one list for all threads."""
     interval = sys.getswitchinterval()

@@ -15,6 +15,8 @@ from mcc_jax.calibrate.forward import Forms, residuals, snap
 from mcc_jax.calibrate.particle_fit import fit_particles, linear_starts
 from mcc_jax.calibrate.settings import FIT
 
+pytestmark = pytest.mark.extended
+
 SNAPS = np.stack([COEFFICIENTS[0], SNAPPING, COEFFICIENTS[2], SNAPPING * np.array([1.0, 1.01, 0.99])])
 
 

@@ -5,7 +5,7 @@ import functools
 import faulty
 import numpy as np
 import pytest
-from helpers import first_in_time
+from helpers import first_in_core
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -45,7 +45,8 @@ def modulus(kind):
 # ---- answers ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", first_in_time(["offset and force", "path", "spiked", "broken"]))
+@pytest.mark.extended
+@pytest.mark.parametrize("kind", first_in_core(["offset and force", "path", "spiked", "broken"]))
 def test_the_modulus_holds_the_truth_and_is_as_sharp_as_the_clean_tests_allow(kind):
     low, high = modulus(kind)["interval_95"]
     clean_low, clean_high = modulus("clean")["interval_95"]
@@ -59,6 +60,7 @@ def test_a_clean_campaign_has_nothing_to_tell():
     assert all(curve.checked is None for curve in calibrated("clean").campaign.curves)
 
 
+@pytest.mark.extended
 def test_what_was_found_and_taken_off_stands_in_the_result():
     content = calibrated("offset and force").to_json()
     assert {one["check"]: one["level"] for one in content["findings"]} == {
@@ -74,6 +76,7 @@ def test_what_was_found_and_taken_off_stands_in_the_result():
     assert raw.curves[0].force_mN[:15].mean() == pytest.approx(-20.0, abs=0.1)
 
 
+@pytest.mark.extended
 def test_a_modulus_that_no_unloading_tells_is_told_as_unknown():
     found = {one.check: one for one in calibrated("hidden").findings}
     assert set(found) == {"saturation", MODULUS_OPEN}
@@ -84,6 +87,7 @@ def test_a_modulus_that_no_unloading_tells_is_told_as_unknown():
     assert low < TRUTH_MPA < high
 
 
+@pytest.mark.extended
 def test_a_broken_particle_is_named_with_the_answer_without_it():
     (found,) = calibrated("broken").findings
     assert (found.check, found.particles) == ("breakage", ("3",))
@@ -93,6 +97,7 @@ def test_a_broken_particle_is_named_with_the_answer_without_it():
     assert "with it the modulus is" in found.sentence
 
 
+@pytest.mark.extended
 def test_the_paper_s_method_censors_too():
     """Its steps are biased by themselves; what is clipped moves them by no more than a percent."""
     before = calibrate_paper(clean(), without_flagged=False).answer()["effective_modulus_MPa"]["value"]

@@ -1,7 +1,6 @@
 """A shortcut for many particles: the exact likelihood by regression."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -10,6 +9,8 @@ from mcc_jax.calibrate import draws as drawing
 from mcc_jax.calibrate import particles
 from mcc_jax.calibrate.particles import correction
 from mcc_jax.calibrate.settings import SamplingSettings
+
+pytestmark = pytest.mark.extended
 
 
 def test_a_slope_is_found_through_any_rotation_of_the_parameters():
@@ -42,7 +43,6 @@ def test_blocks_of_particles_are_drawn_as_all_at_once(paper_posterior):
         np.testing.assert_array_less(np.abs(found.mean(0) - wanted.mean(0)), 0.6 * wanted.std(0), err_msg=name)
 
 
-@pytest.mark.long
 def test_the_shortcuts_agree_with_exact_weights(paper_posterior, monkeypatch):
     monkeypatch.setattr(
         particles, "SAMPLING", SamplingSettings(compared=40_000)
@@ -60,19 +60,3 @@ def test_the_shortcuts_agree_with_exact_weights(paper_posterior, monkeypatch):
         sd = wanted.std((0, 1))
         np.testing.assert_array_less(np.abs(found.mean((0, 1)) - wanted.mean((0, 1))), 0.25 * sd, err_msg=name)
         np.testing.assert_allclose(found.std((0, 1)), sd, rtol=0.25, err_msg=name)
-
-
-@pytest.mark.long
-def test_the_exact_likelihood_corrects_summaries_that_are_off(paper_posterior, monkeypatch):
-    """Summaries of all particles that pull the same way move the population; the regression moves it back."""
-    fit, selection, model = paper_posterior.fit, paper_posterior.selection, paper_posterior.model
-    length = drawing.Length(4, 300, 1000)
-    pulled = fit.summary.score.at[:, 0].add(0.15 * jnp.sqrt(fit.summary.precision[:, 0, 0]))
-    off = type(fit)(**{**vars(fit), "summary": type(fit.summary)(**{**vars(fit.summary), "score": pulled})})
-    monkeypatch.setattr(particles, "SAMPLING", SamplingSettings(compared=40_000))
-    corrected = drawing.draw_fast(jax.random.key(0), selection.tests, model, off, length, 0)["population"].mu[..., 0]
-    monkeypatch.setattr(conditional, "correction", lambda _, draws: (np.zeros(len(draws)), 0.0))
-    raw = drawing.draw_fast(jax.random.key(0), selection.tests, model, off, length, 0)["population"].mu[..., 0]
-    truth = np.asarray(paper_posterior.population.mu)[..., 0]
-    moved, left = abs(raw.mean() - truth.mean()), abs(corrected.mean() - truth.mean())
-    assert left < max(0.3 * moved, 0.1 * truth.std())

@@ -65,6 +65,7 @@ def test_residuals_are_as_large_as_the_noise(result, content):
     np.testing.assert_allclose(content["noise"]["force_mN"]["value"], 0.05, rtol=0.5)
 
 
+@pytest.mark.extended
 def test_nothing_is_open_and_all_starts_agree(content):
     assert content["diagnostics"]["open_combinations"] == []
     agree, count = content["diagnostics"]["agreeing_starts"]
@@ -105,6 +106,7 @@ def by_scipy(result):
     return found, x, sizes
 
 
+@pytest.mark.extended
 def test_the_optimum_is_scipy_s(result, by_scipy):
     found, x, _ = by_scipy
     np.testing.assert_allclose(float(result.solution.loss), found.cost, rtol=1e-6)
@@ -112,6 +114,7 @@ def test_the_optimum_is_scipy_s(result, by_scipy):
     assert np.all(np.abs(x - found.x) < 0.02 * np.sqrt(np.diag(covariance)))
 
 
+@pytest.mark.extended
 def test_the_covariance_is_that_of_scipy_s_jacobian(result, by_scipy):
     found, _, (count, own) = by_scipy
     covariance = np.linalg.inv(found.jac.T @ found.jac)
@@ -128,16 +131,10 @@ def test_the_covariance_is_that_of_scipy_s_jacobian(result, by_scipy):
     np.testing.assert_allclose(sd, scale[count * own], rtol=1e-3)
 
 
-def test_the_same_campaign_gives_the_same_json(result):
-    again = least_squares(result.campaign).to_json()
-    first = result.to_json()
-    del again["runtime_s"], first["runtime_s"]
-    assert json.dumps(again) == json.dumps(first)
-
-
 # ---- what the data leave open ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.extended
 def test_particles_of_one_shape_leave_the_shape_parameter_open():
     """a and the means of log C can then make up for each other."""
     same = np.array([170.0, 180.0, 140.0]) * np.linspace(0.8, 1.2, 8)[:, None]
@@ -170,7 +167,8 @@ def with_outliers():
     return replace(campaign, curves=tuple(curves))
 
 
-@pytest.mark.parametrize("loss", ["soft_l1", pytest.param("cauchy", marks=pytest.mark.long)])
+@pytest.mark.extended
+@pytest.mark.parametrize("loss", ["soft_l1", pytest.param("cauchy", marks=pytest.mark.extended)])
 def test_a_robust_loss_resists_outliers(with_outliers, loss):
     found = least_squares(with_outliers, loss=loss)
     linear = least_squares(with_outliers)
@@ -205,6 +203,7 @@ def test_robust_residuals_are_the_losses_in_words(loss):
     assert slope[40] == 1.0
 
 
+@pytest.mark.extended
 def test_without_noise_every_particle_is_known_exactly():
     """Only a is not: how the particles' own coefficients scatter limits it, however good the tests are."""
     campaign = campaign_of(Instrument())

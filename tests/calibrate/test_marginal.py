@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import first_in_time
+from helpers import first_in_core
 from joint_cases import (
     COEFFICIENTS,
     DIAMETERS,
@@ -30,8 +30,6 @@ from mcc_jax.calibrate.population import Scatter, moments
 from mcc_jax.calibrate.straightening import Straight
 from mcc_jax.campaign import particle_batch
 
-pytestmark = pytest.mark.long  # minutes of compiling; the quick run has the model end to end
-
 FLAT = np.array([0.15, 0.45, -0.1])
 PLAIN = Model().scatter
 EFFECTS = Scatter(varying=((1, False), (0, True)))
@@ -45,7 +43,7 @@ SCATTERS = {
 }
 scatters = pytest.mark.parametrize("scatter", list(SCATTERS.values())[:4], ids=list(SCATTERS)[:4])
 SOME = ["effects", "plain", "both-master"]
-extremes = pytest.mark.parametrize("scatter", first_in_time([SCATTERS[n] for n in SOME]), ids=SOME)
+extremes = pytest.mark.parametrize("scatter", first_in_core([SCATTERS[n] for n in SOME]), ids=SOME)
 
 latent_moments = eqx.filter_jit(moments)
 likelihood = eqx.filter_jit(lambda population, marginal: marginal.log_likelihood(population))
@@ -124,6 +122,7 @@ def integrals(population, marginal):
     return np.logaddexp.reduce(inside, axis=1) + np.linalg.slogdet(turn)[1]
 
 
+@pytest.mark.extended
 @extremes
 @pytest.mark.parametrize(("scale", "tolerance"), [(1e-3, 2e-4), (0.01, 2e-3), (0.05, 0.05)])
 def test_the_likelihood_is_the_integral_over_the_particle(scatter, scale, tolerance):
@@ -132,6 +131,7 @@ def test_the_likelihood_is_the_integral_over_the_particle(scatter, scale, tolera
     np.testing.assert_allclose(likelihood(*one), integrals(*one), rtol=0, atol=tolerance)
 
 
+@pytest.mark.extended
 @extremes
 def test_the_integral_is_the_mean_weight_of_draws(scatter):
     """Draws and their volume are a proposal for the very integral: Monte Carlo instead of quadrature."""
@@ -184,6 +184,7 @@ def test_the_likelihood_of_sharp_tests_is_the_dense_normal_one(scatter):
         np.testing.assert_allclose(drawn.hessian[i], hessian, rtol=0, atol=1e-3 * np.abs(hessian).max())
 
 
+@pytest.mark.extended
 def test_a_direction_without_data_is_no_trouble():
     population, marginal = case(PLAIN)
     blind = replace(marginal, gram=marginal.gram.at[:, 2].set(0.0).at[:, :, 2].set(0.0))
@@ -195,6 +196,7 @@ def test_a_direction_without_data_is_no_trouble():
     np.testing.assert_allclose(two, one, rtol=0, atol=0.6 * (5 * 0.03) ** 2)
 
 
+@pytest.mark.extended
 @extremes
 def test_spreads_of_zero_are_regular_and_their_signs_do_not_matter(scatter):
     population, marginal = case(scatter, 3)
@@ -224,6 +226,7 @@ def test_spreads_of_zero_are_regular_and_their_signs_do_not_matter(scatter):
         np.testing.assert_allclose(float(expand(jnp.asarray(spreads * np.array(signs)))[0]), before, rtol=1e-12)
 
 
+@pytest.mark.extended
 @extremes
 def test_the_gradient_is_that_of_the_value(scatter):
     """The iteration towards the most probable deviations is not differentiated, yet the derivative is whole."""
@@ -236,6 +239,7 @@ def test_the_gradient_is_that_of_the_value(scatter):
         np.testing.assert_allclose(slope[j], expected, rtol=1e-3, atol=1e-3 * np.abs(slope).max())
 
 
+@pytest.mark.extended
 @extremes
 def test_draws_are_made_of_their_deviations_and_the_volume_is_that_of_the_map(scatter):
     population, marginal = case(scatter, 6)
@@ -262,6 +266,7 @@ def test_draws_are_made_of_their_deviations_and_the_volume_is_that_of_the_map(sc
     np.testing.assert_allclose(drawn.log_likelihood, likelihood(population, marginal), rtol=1e-12)
 
 
+@pytest.mark.extended
 def test_a_draw_beyond_the_range_of_the_map_is_finite_and_counts_for_nothing():
     population, marginal = case(PLAIN, 3, scale=0.5)
     drawn = draw(population, marginal, jnp.full((3, 3), -9.0), jnp.zeros(3))
@@ -270,6 +275,7 @@ def test_a_draw_beyond_the_range_of_the_map_is_finite_and_counts_for_nothing():
     assert np.all(np.isfinite(np.asarray(drawn.zero)))
 
 
+@pytest.mark.extended
 def test_a_shape_factor_that_vanishes_gives_no_nan():
     population, marginal = case(PLAIN)
     value = np.asarray(likelihood(replace(population, a=jnp.asarray(-1 / 0.45)), marginal))
@@ -277,6 +283,7 @@ def test_a_shape_factor_that_vanishes_gives_no_nan():
     assert value[1] < value[0] - 100
 
 
+@pytest.mark.extended
 def test_copies_that_fill_up_count_for_nothing():
     population, marginal = case(PLAIN)
     value = likelihood(population, marginal)
@@ -287,6 +294,7 @@ def test_copies_that_fill_up_count_for_nothing():
 # ---- from tests to their summary -------------------------------------------------------------------------------------
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("known", [None, 0.2], ids=["", "errors of zero and peak"])
 def test_summaries_of_linear_tests_are_exact(known):
     """Modulus and an amplitude of either sign enter linearly: then nothing is approximate but the display's steps."""

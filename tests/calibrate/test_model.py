@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro.handlers
 import pytest
-from helpers import first_in_time
+from helpers import first_in_core
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from joint_cases import NOISE, random_marginal, simulated
 from numpyro.infer import Predictive
 from numpyro.infer.util import constrain_fn, potential_energy
 from scipy.integrate import trapezoid
-from scipy.stats import halfnorm, kstest, lognorm, nakagami, norm
+from scipy.stats import kstest, lognorm, nakagami, norm
 
 from mcc_jax import InputError, Model, Priors, Programme
 from mcc_jax.calibrate import NakagamiPrior, NormalPrior, select_tests
@@ -29,11 +29,9 @@ from mcc_jax.calibrate.prior_draws import log_priors
 from mcc_jax.calibrate.priors import check_prior_of_a
 from mcc_jax.effects import LIBRARY, find_variant
 
-pytestmark = pytest.mark.long  # minutes of compiling; the quick run has the model end to end
-
 EFFECTS = Model().with_effects("creep:logarithmic", "unloading_shape:symmetric_bow", varying="creep")
 MODELS = {"effects": EFFECTS, "plain": Model(modulus_scatter=True, shape_scatter=True)}
-models = pytest.mark.parametrize("model", first_in_time(list(MODELS.values())), ids=MODELS)
+models = pytest.mark.parametrize("model", first_in_core(list(MODELS.values())), ids=MODELS)
 FLAT = np.random.default_rng(0).uniform(0.05, 0.5, 12)
 
 
@@ -62,12 +60,7 @@ def test_a_spread_has_the_prior_of_nakagami(shape):
     assert np.all(np.isfinite(jax.vmap(jax.grad(law.log_prob))(jnp.asarray([0.0, 1e-300, 50.0]))))
 
 
-def test_a_shape_of_one_half_is_half_normal_and_one_eighth_leaves_the_order_open():
-    shares = np.array([0.1, 0.2, 0.5])
-    np.testing.assert_allclose(nakagami.ppf(shares, 0.5), halfnorm.ppf(shares))
-    np.testing.assert_allclose(1 / nakagami.ppf(shares, 0.125, scale=0.5), [9000, 560, 14], rtol=0.03)
-
-
+@pytest.mark.extended
 @pytest.mark.parametrize("variant", EFFECTS.effects, ids=["one sign", "both signs"])
 def test_an_amplitude_may_be_of_any_size_that_is_plausible(variant):
     law, most = Amplitude(variant), variant.plausible[1] / variant.plausible[0]
@@ -86,6 +79,7 @@ def test_an_amplitude_may_be_of_any_size_that_is_plausible(variant):
     assert np.all(np.diff(sizes) > 0.1)
 
 
+@pytest.mark.extended
 def test_a_further_number_lies_within_what_is_plausible():
     for variant in (v for m in LIBRARY.values() for v in m):
         for nuisance in variant.nuisances:
@@ -101,6 +95,7 @@ def test_a_further_number_lies_within_what_is_plausible():
 # ---- the model -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.extended
 @models
 def test_potential_and_gradient_are_finite_from_prior_draws_on(model, tests):
     """Of the model that users hand to NumPyro, noise and particles' own numbers sampled."""
@@ -128,7 +123,8 @@ def test_potential_and_gradient_are_finite_from_prior_draws_on(model, tests):
         assert np.any(np.asarray(slope[name]) != 0), name
 
 
-@pytest.mark.parametrize("model", first_in_time([Model(modulus_scatter=True), EFFECTS]), ids=["plain", "effects"])
+@pytest.mark.extended
+@pytest.mark.parametrize("model", first_in_core([Model(modulus_scatter=True), EFFECTS]), ids=["plain", "effects"])
 def test_prior_draws_have_the_moments_of_the_priors(model, tests):
     count, p = 400, model.chosen_priors
 
@@ -170,6 +166,7 @@ def test_prior_draws_have_the_moments_of_the_priors(model, tests):
         assert kstest(drawn["creep.tau_s"], law.cdf).pvalue > 1e-3
 
 
+@pytest.mark.extended
 def test_an_amplitude_keeps_its_physical_sign():
     down = replace(find_variant("creep:logarithmic"), sign=-1)
     model = Model().with_effects(down, "unloading_shape:symmetric_bow")
@@ -196,7 +193,7 @@ def at_random(rng, model, scale=0.03):
     return replace(marginal, gram=marginal.gram * (unit * unit[:, None])[None])
 
 
-@pytest.fixture(scope="module", params=first_in_time(list(MODELS.values())), ids=MODELS)
+@pytest.fixture(scope="module", params=first_in_core(list(MODELS.values())), ids=MODELS)
 def target(request):
     return LogPosterior(request.param, at_random(np.random.default_rng(5), request.param))
 
@@ -232,6 +229,7 @@ def test_the_density_is_priors_times_likelihood_times_volume(target, density):
         np.testing.assert_allclose(float(density(free)[0]), expected, rtol=1e-9)
 
 
+@pytest.mark.extended
 def test_coordinates_and_back(target):
     free = np.random.default_rng(2).standard_normal(len(target.names))
     free[target.signed()] = np.abs(free[target.signed()])
@@ -244,6 +242,7 @@ def test_coordinates_and_back(target):
         np.testing.assert_allclose(both, np.stack([one, one]), rtol=1e-12)
 
 
+@pytest.mark.extended
 @settings(max_examples=40)
 @given(
     st.floats(-800, 800), st.sampled_from([0.0, 1e-300, 1e-8, 0.3]), st.floats(-3, 3), st.sampled_from([-1.0, 0.0, 1.0])
@@ -285,6 +284,7 @@ def mode(target):
     return start, most_probable(start, target)
 
 
+@pytest.mark.extended
 def test_the_mode_is_one_and_the_covariance_the_inverse_curvature(density, mode):
     start, (free, covariance, converged) = mode
     assert converged
@@ -303,6 +303,7 @@ def test_the_mode_is_one_and_the_covariance_the_inverse_curvature(density, mode)
     np.testing.assert_allclose(product, np.eye(len(width)), atol=2e-2)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("seed", range(3))
 def test_the_start_does_not_matter(target, mode, seed):
     start, (free, covariance, _) = mode

@@ -75,6 +75,7 @@ def test_the_density_is_the_dense_normal_one(case, seed, more):
     )
 
 
+@pytest.mark.extended
 def test_the_density_has_a_slope_where_some_peaks_were_worked_out():
     """Peaks that were read have no error of their own: a root there has no derivative."""
     rng = np.random.default_rng(2)
@@ -101,6 +102,7 @@ def test_white_noise_of_two_branches_is_dense_too():
     np.testing.assert_allclose(found_density(four, scale, 1.3, tests, linear, away, KINDS[0]), wanted, rtol=1e-8)
 
 
+@pytest.mark.extended
 @kinds
 def test_correlated_noise_of_two_branches_is_nearly_dense(kind):
     """The filter carries a little of one branch's direction into what follows; as in tests, correlation is weak."""
@@ -118,6 +120,7 @@ def test_correlated_noise_of_two_branches_is_nearly_dense(kind):
         assert np.abs(gap - expected(four, np.ones(1), 1.0, tests, linear, away, kind)).max() < 0.3
 
 
+@pytest.mark.extended
 @kinds
 def test_draws_have_the_covariance_of_the_density(kind):
     """They are linear in standard normal numbers: their covariance is the product of the columns."""
@@ -254,6 +257,7 @@ def test_the_estimate_is_the_maximum_and_its_volume_laplace_s(estimated):
     np.testing.assert_allclose(float(found.log_evidence), float(WEAK.log_density(best)) + volume, rtol=1e-9)
 
 
+@pytest.mark.extended
 def test_the_start_does_not_matter(estimated):
     tests, linear, start, found = estimated
     again = estimate(tests, linear, Noise.of((0.3, 0.01, 0.005, 0.05), start.scale), uncertainty=False)
@@ -262,6 +266,7 @@ def test_the_start_does_not_matter(estimated):
     np.testing.assert_allclose(again.noise.logs, found.noise.logs, atol=5e-3)
 
 
+@pytest.mark.extended
 def test_data_without_noise_end_at_the_bound_and_stay_finite():
     tests, linear = known_tests((1e-9, 0.0, 0.0, 1.0), np.ones(COUNT))
     found = estimate(tests, linear, Noise.of(np.asarray(WEAK.median), jnp.ones(COUNT)))

@@ -124,6 +124,7 @@ def without_time(result):
     return json.dumps(content)
 
 
+@pytest.mark.extended
 def test_another_seed_gives_nearly_the_same_numbers(result):
     other = sample(paper_campaign(0), seed=1)
     assert without_time(other) != without_time(result)
@@ -133,7 +134,7 @@ def test_another_seed_gives_nearly_the_same_numbers(result):
         assert one[name].std() == pytest.approx(two[name].std(), rel=0.2), name
 
 
-@pytest.mark.long
+@pytest.mark.extended
 def test_the_same_seed_gives_the_same_bytes(result):
     assert without_time(sample(paper_campaign(0))) == without_time(result)
 
@@ -285,7 +286,7 @@ def gap(one, two):
     )
 
 
-@pytest.mark.long
+@pytest.mark.extended
 def test_the_fast_mode_gives_the_joint_posterior(both):
     fast, joint = both
     assert (fast.mode, joint.mode) == ("fast", "joint")
@@ -303,7 +304,7 @@ def test_the_fast_mode_gives_the_joint_posterior(both):
         assert width < 0.15 + 3 * error_of_sd, (name, width, error_of_sd)
 
 
-@pytest.mark.long
+@pytest.mark.extended
 def test_the_joint_mode_says_nothing_of_weights(both):
     _, joint = both
     assert joint.pareto_k_joint is None
@@ -311,7 +312,7 @@ def test_the_joint_mode_says_nothing_of_weights(both):
     assert json.dumps(joint.to_json(), allow_nan=False)
 
 
-@pytest.mark.long
+@pytest.mark.extended
 def test_too_few_draws_are_not_called_converged():
     short = sample(paper_campaign(0), draws=20, warmup=20)
     assert not short.converged

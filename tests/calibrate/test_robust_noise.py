@@ -40,7 +40,7 @@ def modulus(result):
     return found["value"], found["sd"]
 
 
-@pytest.mark.long
+@pytest.mark.extended
 @pytest.mark.parametrize("calibrate", [least_squares, sample])
 def test_spikes_count_for_little(clean, spiked, calibrate):
     without, plain, robust = (
@@ -68,7 +68,7 @@ def test_weights_say_what_a_mean_is_known_by(freedom):
     assert np.mean(claimed) == pytest.approx(np.var(means), rel=0.25)
 
 
-@pytest.mark.long
+@pytest.mark.extended
 def test_explicit_model_samples_the_weights(clean):
     """Without a fit the weight of every reading is a number of the model."""
     tests = select_tests(clean)

@@ -1,4 +1,4 @@
-"""Cholesky factors written out entry by entry against LAPACK, and numbers integrated out against SciPy."""
+"""Cholesky factors written out entry by entry against LAPACK."""
 
 import hypothesis.strategies as st
 import jax
@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from joint_cases import random_precision
-from scipy.stats import multivariate_normal
 
 from mcc_jax.calibrate.small_matrices import Cholesky, eliminate
+
+pytestmark = pytest.mark.extended
 
 SIZES = st.sampled_from([1, 2, 5])
 BATCHES = st.sampled_from([(), (2, 3)])
@@ -81,31 +82,6 @@ def test_an_indefinite_matrix_does_not_pass_for_a_definite_one():
 
 
 # ---- numbers integrated out of a linear model ------------------------------------------------------------------------
-
-DATA = 7
-PLACES = st.sampled_from([(1, (0,)), (3, (0, 1, 2)), (4, (3, 1)), (6, (0, 1, 2, 3, 4))])
-"""How many columns there are, and which of them are integrated out."""
-integrated = jax.jit(eliminate, static_argnums=1)
-
-
-@settings(max_examples=40)
-@given(PLACES, BATCHES, SEEDS, st.sampled_from([0.0, 3.0]))
-def test_what_is_eliminated_leaves_the_marginal_normal_distribution(places, batch, seed, far):
-    """y = X x + noise, x_o ~ N(m, 1/P): given the other x, y ~ N(X_o m + X_r x_r, 1 + X_o P^-1 X_o^T)."""
-    rng = np.random.default_rng(seed)
-    size, own = places
-    others = [k for k in range(size) if k not in own]
-    columns = rng.standard_normal((*batch, DATA, size + 1))
-    precision, mean = np.exp(rng.standard_normal((*batch, len(own)))), far * rng.standard_normal((*batch, len(own)))
-    left, log_integral = integrated(np.einsum("...dp,...dq->...pq", columns, columns), own, precision, mean)
-    x = rng.standard_normal((*batch, len(others)))
-    border = np.concatenate([x, -np.ones((*batch, 1))], -1)
-    actual = log_integral - 0.5 * np.einsum("...p,...pq,...q->...", border, left, border)
-    for i in np.ndindex(batch):
-        X, y = columns[i][:, own], columns[i][:, -1]
-        law = multivariate_normal(X @ mean[i], np.eye(DATA) + X @ np.diag(1 / precision[i]) @ X.T)
-        expected = law.logpdf(y - columns[i][:, others] @ x[i]) + 0.5 * DATA * np.log(2 * np.pi)
-        np.testing.assert_allclose(actual[i], expected, rtol=1e-9, atol=1e-9)
 
 
 def test_without_a_mean_it_is_zero():

@@ -18,6 +18,8 @@ from mcc_jax.calibrate.settings import NUMERICS
 from mcc_jax.calibrate.sharding import Blocks, Parts, block_size, count_of, filled_up
 from mcc_jax.calibrate.straightening import products
 
+pytestmark = pytest.mark.extended
+
 LIMIT_S = 400
 HERE = Path(__file__).parent
 
@@ -91,7 +93,6 @@ def assert_same(found, wanted):
             np.testing.assert_allclose(found[name].std((0, 1)), values.std((0, 1)), rtol=1e-8)
 
 
-@pytest.mark.long
 def test_blocks_of_two_processes_with_two_devices_are_those_of_one(tmp_path):
     port = free_port()
     finish(tmp_path, [start(tmp_path, 2, 2, i, port, everything=False) for i in range(2)])
@@ -104,7 +105,6 @@ def test_blocks_of_two_processes_with_two_devices_are_those_of_one(tmp_path):
         np.testing.assert_allclose(arrays(tmp_path, process)["starts"], wanted, rtol=1e-8)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("process", [0, 1])
 def test_two_processes_give_the_numbers_of_one(alone, two_processes, process):
     assert json.loads((two_processes / f"devices_{process}.json").read_text()) == {"devices": 1, "processes": 2}
@@ -114,7 +114,6 @@ def test_two_processes_give_the_numbers_of_one(alone, two_processes, process):
 FITS = ("mode", "covariance", "noise", "noise_log_sd", "scale", "latent", "residual", "variance")
 
 
-@pytest.mark.long
 def test_four_devices_give_the_fits_of_one_and_its_posterior(alone, four_devices):
     """Draws are other draws: a sampler amplifies the last bits, in which devices of a processor differ."""
     assert json.loads((four_devices / "devices_0.json").read_text()) == {"devices": 4, "processes": 1}
@@ -128,7 +127,6 @@ def test_four_devices_give_the_fits_of_one_and_its_posterior(alone, four_devices
         assert abs(found[name].mean() - wanted[name].mean()) < 4 * error, name
 
 
-@pytest.mark.long
 def test_only_the_first_process_writes_files(alone, two_processes):
     written = {path.name for path in two_processes.glob("*") if not path.stem[-1].isdigit()}
     assert written == {"calibration.json", "posterior.nc"}
@@ -136,7 +134,6 @@ def test_only_the_first_process_writes_files(alone, two_processes):
     assert two == one
 
 
-@pytest.mark.long
 def test_processes_with_different_campaigns_are_told(tmp_path):
     port = free_port()
     running = [start(tmp_path, processes=2, process=i, port=port, seed=i) for i in range(2)]

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ALL_IN_TIME
+from helpers import ALL_FORMS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import trapezoid
@@ -126,6 +126,7 @@ def test_master_curve_ends_where_a_fifth_of_the_particles_is_left(scattered):
     assert master.stress_MPa[-1] == pytest.approx(tops[-5], abs=table.stress_MPa[1])
 
 
+@pytest.mark.extended
 def test_master_mean_is_within_three_percent_of_the_true_curves():
     for seed in range(3):
         campaign = paper_campaign(seed)
@@ -139,6 +140,7 @@ def test_master_mean_is_within_three_percent_of_the_true_curves():
         np.testing.assert_allclose(master.mean[use], np.mean(truth, axis=0), rtol=0.03)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("threshold", [0.0, 0.2])
 def test_master_mean_of_one_material_holds_with_a_fitted_shape_parameter_too(threshold):
     campaign = paper_campaign(1, shared_material=True)
@@ -152,6 +154,7 @@ def test_master_mean_of_one_material_holds_with_a_fitted_shape_parameter_too(thr
 # ---- shape parameter ----
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("objective", ["full", "reference"])
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_shape_parameter_of_one_material_is_recovered(objective, seed):
@@ -194,6 +197,7 @@ def test_reference_objective_is_the_paper_s_integral(scattered):
     assert objective_at(a, found) == pytest.approx(total, rel=1e-10)
 
 
+@pytest.mark.extended
 def test_the_minimum_is_one(scattered):
     table = strain_table(adjust(scattered), scattered.diameters_um)
     use = table.reached.sum(axis=0) > 4
@@ -218,6 +222,7 @@ def test_reference_follows_the_paper_s_rule(exact):
     assert abs(table.flatness[row]) <= np.abs(table.flatness[high]).min() + 1e-12
 
 
+@pytest.mark.extended
 def test_equal_particles_cannot_tell_the_shape_parameter():
     grid = np.linspace(0, 5, 50)
     strain = np.sqrt(grid) * np.array([[1.0], [1.1], [0.9]])
@@ -228,6 +233,7 @@ def test_equal_particles_cannot_tell_the_shape_parameter():
     assert "same D3^2" in fit.reason
 
 
+@pytest.mark.extended
 def test_negative_shape_parameters_are_found():
     flatness = np.linspace(0.0, 0.6, 8)
     grid = np.linspace(0, 5, 200)
@@ -298,7 +304,7 @@ def _eta(campaign):
     return 1 + 1.43 * (1 - D3**2 / (D1 * D2))
 
 
-@ALL_IN_TIME
+@ALL_FORMS
 def test_modulus_of_exact_branches_is_recovered_in_every_form(unloading, scaling):
     campaign = paper_campaign(
         2, shared_material=True, instrument=Instrument(), unloading=unloading, strain_scaling=scaling
@@ -308,6 +314,7 @@ def test_modulus_of_exact_branches_is_recovered_in_every_form(unloading, scaling
     assert fit.effective_modulus_MPa == pytest.approx(16e3, rel=2e-3)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("seed", range(3))
 def test_modulus_under_noise_and_offset_step_is_within_three_percent(seed):
     campaign = paper_campaign(seed)

@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 
 from mcc_jax.calibrate.straightening import Straight, box_cox, coordinates, numbers
 
+pytestmark = pytest.mark.extended
+
 PLACES = ((1, 0), (2, 0))
 AT = np.array([0.02, 30.0, 2.0, 0.3])
 exponents = st.floats(-3, 3, allow_subnormal=False)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_csv import CURVES, PARTICLES, assert_same, make
+from test_csv import CURVES, assert_same, make
 
 from mcc_jax._errors import InputError
 from mcc_jax.campaign import Campaign, read_campaign
@@ -62,18 +62,6 @@ def mutated(draw, text: str) -> str:
 def test_mutated_curves(tmp_path_factory, curves):
     folder = make(tmp_path_factory.getbasetemp() / "curves", curves=curves.encode("utf-8", "surrogatepass"))
     check_both_parsers(folder)
-
-
-@settings(max_examples=200, deadline=None)
-@given(particles=mutated(PARTICLES))
-def test_mutated_particles(tmp_path_factory, particles):
-    outcome(make(tmp_path_factory.getbasetemp() / "particles", particles=particles.encode("utf-8", "surrogatepass")))
-
-
-@settings(max_examples=200, deadline=None)
-@given(toml=mutated(TOML))
-def test_mutated_metadata(tmp_path_factory, toml):
-    outcome(make(tmp_path_factory.getbasetemp() / "toml", toml=toml.encode("utf-8", "surrogatepass")))
 
 
 @settings(max_examples=150, deadline=None)

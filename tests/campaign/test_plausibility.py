@@ -329,6 +329,7 @@ SOLIDS = st.one_of(  # modulus [MPa], hardness / modulus, strain at the peak
 )
 
 
+@pytest.mark.extended
 @settings(max_examples=100)
 @given(
     SOLIDS,
@@ -351,6 +352,7 @@ def test_honest_solids_of_many_kinds_and_sizes(solid, size, flatness, count, unl
     assert not accusing(check_plausibility(campaign(diameters, curves)))
 
 
+@pytest.mark.extended
 @settings(max_examples=8)
 @given(
     st.lists(st.floats(0.03, 1.0), min_size=1, max_size=12),

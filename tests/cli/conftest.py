@@ -10,16 +10,6 @@ PARTICLES = (
 )
 
 
-@pytest.fixture
-def run():
-    """The command line, in this process: `run("calibrate", folder, "--out", out)`."""
-
-    def invoke(*arguments):
-        return CliRunner().invoke(cli, [str(a) for a in arguments], prog_name="mcc-jax")
-
-    return invoke
-
-
 @pytest.fixture(scope="session")
 def simulated(tmp_path_factory):
     """A small campaign made by `simulate`; do not write into it."""

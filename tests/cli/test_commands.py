@@ -73,7 +73,7 @@ def test_every_command_has_help_with_an_example(run, command):
     assert "--out DIR" in text
 
 
-@pytest.mark.long  # `.ci/run` runs the demo as its users do
+@pytest.mark.extended  # `.ci/run` runs the demo as its users do
 def test_demo_hides_an_effect_and_finds_it_and_finds_none_where_none_is(run, tmp_path):
     out = tmp_path / "new" / "demo"
     text = done(run("demo", "--out", out))
@@ -160,6 +160,7 @@ def test_the_demo_says_how_the_discovery_did(answer, found, right, words):
     assert words in sentence
 
 
+@pytest.mark.extended
 def test_simulate_then_calibrate_twice_gives_the_same(run, simulated, tmp_path):
     out = tmp_path / "fit"
     (out / "figures").mkdir(parents=True)
@@ -202,6 +203,7 @@ def test_calibrate_into_the_campaigns_own_folder(run, campaign):
     assert card["particle"]["eta_p"] == pytest.approx(content["particles"][1]["eta_p"]["value"], rel=1e-14)
 
 
+@pytest.mark.extended
 def test_calibrate_recovers_what_simulate_put_in(run, tmp_path):
     coefficients = {"C1": 7.0, "C3": 2.5, "C5": 2.7}
     fixed = [word for name, value in coefficients.items() for word in (f"--{name}", value)]
@@ -290,6 +292,7 @@ def test_simulate_by_a_programme_file(run, simulated, tmp_path):
     assert "not a measurement" in campaign.metadata.provenance
 
 
+@pytest.mark.extended
 def test_convert_then_calibrate_says_that_the_law_does_not_fit(run, tmp_path):
     tests, fit = tmp_path / "tests", tmp_path / "fit"
     text = done(run("convert", TESTERS / "FS1.txt", "--out", tests, "--diameters", "200,190,180"))

@@ -12,7 +12,7 @@ from mcc_jax.cli.discover import main_finding
 from mcc_jax.cli.main import cli
 from mcc_jax.effects import LIBRARY
 
-pytestmark = pytest.mark.long  # searches for effects for minutes; `.ci/run` does so once, as its users do
+pytestmark = pytest.mark.extended
 
 # What the contract promises; more may be there.
 KEYS = {
@@ -83,7 +83,6 @@ def found(tests, tmp_path_factory):
     return done(call("discover", tests / "frame", "--out", out, *QUICK)), out
 
 
-@pytest.mark.long
 def test_the_frame_is_found_and_its_size(found):
     _, out = found
     content = json.loads((out / "discovery.json").read_text(encoding="utf-8"))
@@ -118,7 +117,6 @@ def test_the_command_says_what_it_found(found):
         assert (out / name).read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.long
 def test_same_seed_same_file_and_stale_figures_go(found, tests, tmp_path):
     first = json.loads((found[1] / "discovery.json").read_text(encoding="utf-8"))
     out = tmp_path / "again"
@@ -134,7 +132,6 @@ def test_same_seed_same_file_and_stale_figures_go(found, tests, tmp_path):
     assert first == second
 
 
-@pytest.mark.long
 def test_nothing_is_found_where_nothing_is_hidden_and_excluded_names_are_gone(tests, tmp_path):
     excluded = ["--exclude", "toe_asperity", "--exclude", "pop_in"]
     text = done(call("discover", tests / "null", "--out", tmp_path, "--no-held-out", "--no-figures", *excluded))

@@ -1,15 +1,19 @@
-"""What a command does around its work: the folder of what is compiled, and work in a thread beside it."""
+"""Around the work of a command: the folder of what is compiled, work in a thread beside it, progress in a log."""
 
 import contextlib
+import io
 import os
+import re
 import stat
 import threading
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
 import platformdirs
 import pytest
 
+from mcc_jax.cli import session
 from mcc_jax.cli.session import _keep_compiled, beside
 
 posix = pytest.mark.skipif(os.name != "posix", reason="permissions of POSIX")
@@ -164,3 +168,68 @@ def test_a_block_that_is_interrupted_does_not_wait():
         interrupted()
     assert not may_end.is_set()
     may_end.set()
+
+
+class Log(io.StringIO):
+    """Standard error that is no terminal; `steps` are those that it was told, as lines with their seconds."""
+
+    @property
+    def steps(self):
+        lines = [re.fullmatch(r"mcc-jax: +(\d+\.\d) s  (.+)", line) for line in self.getvalue().splitlines()]
+        seconds = [float(line[1]) for line in lines]
+        assert seconds == sorted(seconds)
+        return [line[2] for line in lines]
+
+
+@pytest.fixture
+def log(monkeypatch):
+    monkeypatch.setattr(session, "QUIET_S", 0.05)
+    return Log()
+
+
+def test_in_a_log_each_step_is_a_line_as_it_begins(log):
+    with session._logged(log) as tell:
+        tell("loading")
+        tell("reading")
+        deadline = time.monotonic() + 60
+        while not log.getvalue() and time.monotonic() < deadline:  # lines do not wait for the next step
+            time.sleep(0.01)
+        assert log.steps == ["loading", "reading"]
+        tell("fitting")
+        assert log.steps == ["loading", "reading", "fitting"]
+    assert log.steps == ["loading", "reading", "fitting", "done"]
+
+
+def test_work_that_fails_is_not_reported_as_done(log):
+    def work():
+        with session._logged(log) as tell:
+            tell("loading")
+            tell("reading")
+            time.sleep(0.2)
+            raise ValueError("no result")
+
+    with pytest.raises(ValueError, match="no result"):
+        work()
+    assert log.steps == ["loading", "reading"]
+
+
+@pytest.mark.parametrize("steps", [1, 2])
+def test_in_a_log_short_work_is_not_reported(log, monkeypatch, steps):
+    monkeypatch.setattr(session, "QUIET_S", 1000.0 if steps == 2 else 0.05)
+    with session._logged(log) as tell:
+        for step in range(steps):
+            tell(f"step {step}")
+        time.sleep(0.2)  # loading the library alone is not counted
+    assert log.steps == []
+
+
+def test_a_log_that_nobody_reads_does_not_end_the_work(log, monkeypatch):
+    def gone(_):
+        raise BrokenPipeError
+
+    monkeypatch.setattr(log, "write", gone)
+    with session._logged(log) as tell:
+        tell("loading")
+        tell("reading")
+        time.sleep(0.2)
+        tell("fitting")

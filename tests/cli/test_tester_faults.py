@@ -9,6 +9,8 @@ from asserting import refused
 
 from mcc_jax.campaign import Campaign, write_campaign
 
+pytestmark = pytest.mark.extended
+
 FIT = ("--method", "paper", "--no-figures")
 
 

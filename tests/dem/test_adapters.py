@@ -14,6 +14,8 @@ from mcc_jax import InputError, paper_law
 from mcc_jax.dem import close_pairs, list_edges, pair_force, spheres
 from mcc_jax.dem.adapters import edges_from_jaxmd, jaxdem_force_model
 
+pytestmark = pytest.mark.extended
+
 COUNT = 30
 
 

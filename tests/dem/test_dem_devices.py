@@ -24,6 +24,8 @@ from mcc_jax.dem import (
     start,
 )
 
+pytestmark = pytest.mark.extended
+
 SCRIPT = """
 import json, sys
 import jax
@@ -100,14 +102,12 @@ def check(result):
     assert result["reductions"] == 1
 
 
-@pytest.mark.long
 def test_four_devices_give_the_numbers_of_one():
     result = finished(begun(4))
     assert (result["devices"], result["processes"]) == (4, 1)
     check(result)
 
 
-@pytest.mark.long
 def test_two_processes_give_the_numbers_of_one():
     with socket.socket() as free:
         free.bind(("localhost", 0))
@@ -118,7 +118,6 @@ def test_two_processes_give_the_numbers_of_one():
         check(result)
 
 
-@pytest.mark.long
 def test_single_precision_errs_as_documented():
     """Forces in float32 to about 1e-6, because places stay in float64."""
     packing = spheres(paper_law(), jax.random.uniform(jax.random.key(1), (24,), minval=80.0, maxval=120.0))

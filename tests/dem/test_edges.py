@@ -137,7 +137,7 @@ def unloading():
     return advance(packing(), motion(), state, -PRESSING, 1, 30, SKIN)[0]
 
 
-@pytest.mark.long
+@pytest.mark.extended
 def test_a_new_list_in_the_middle_of_unloading_changes_nothing():
     """T5: rebuilt, permuted and with more room; history bitwise, forces of edges and sums over particles."""
     state = unloading()
@@ -156,6 +156,7 @@ def test_a_new_list_in_the_middle_of_unloading_changes_nothing():
     assert all(remembered(edges)[p][0] == remembered(edges_again)[p][0] for p in both)
 
 
+@pytest.mark.extended
 def test_a_pair_that_left_the_list_is_virgin():
     """Documented: history does not outlive the skin."""
     edges = with_history(list_edges(np.array([[0, 1], [1, 2]]), 3, 4))
@@ -165,6 +166,7 @@ def test_a_pair_that_left_the_list_is_virgin():
     assert remembered(back)[1, 2] == remembered(edges)[1, 2]
 
 
+@pytest.mark.extended
 def test_resumed_run_is_bitwise_the_same(tmp_path):
     state = dense()
     half, _ = advance(packing(), motion(), state, PRESSING, 2, 40, SKIN)

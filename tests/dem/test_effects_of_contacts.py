@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import first_in_time
+from helpers import first_in_core
 from test_pair_law import ON_PATH, PARTICLE, UM, WALL_PATH, cycle, driven, law_of
 
 from benchmarks import energy_paths
@@ -62,7 +62,8 @@ def test_two_halves_are_the_plate_test(unloading):
         assert np.max(np.abs(driven(force, overlaps) - expected)) <= 1e-12 * np.max(expected)
 
 
-@pytest.mark.parametrize("variant", first_in_time(CLOSED, 6), ids=named)
+@pytest.mark.extended
+@pytest.mark.parametrize("variant", first_in_core(CLOSED, 6), ids=named)
 def test_every_closed_effect_releases_as_the_law_does(variant):
     """From a peak under load control, which is in closed form: where the platen is at shares of the peak force."""
     law = law_of()._with((variant.build(variant.typical),))
@@ -97,6 +98,7 @@ def test_an_amplitude_of_zero_changes_nothing():
     assert len(jax.tree.leaves(plain)) == 5  # a law without effects carries nothing of them
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("unloading", list(Unloading))
 def test_force_is_continuous(unloading):
     """At the onset, at full release, and where the peak passes the tested compression, from which on damage rests."""
@@ -111,7 +113,8 @@ def test_force_is_continuous(unloading):
     np.testing.assert_allclose(widths[0], widths[1], rtol=1e-10)
 
 
-@pytest.mark.parametrize("unloading", first_in_time(Unloading))
+@pytest.mark.extended
+@pytest.mark.parametrize("unloading", first_in_core(Unloading))
 def test_no_path_of_a_pair_gains_energy(unloading):
     """Random paths to twice the tested range with damage and densification; sides that would gain are left out."""
     law, particle = energy_paths.draw(8, 400, unloading, StrainScaling.RAW)
@@ -172,7 +175,8 @@ def pair_of(unloading):
     return numbers, force
 
 
-@pytest.mark.parametrize("unloading", first_in_time(Unloading))
+@pytest.mark.extended
+@pytest.mark.parametrize("unloading", first_in_core(Unloading))
 @pytest.mark.parametrize(("peak", "share"), [(0.0, 25.0), (25.0, 0.999), (25.0, 0.99), (50.0, 0.985)])
 def test_derivatives_equal_differences(unloading, peak, share):
     """T7: by every number of the sides, those of effects included, on loading and unloading, both modes."""
@@ -193,6 +197,7 @@ def test_derivatives_equal_differences(unloading, peak, share):
         assert abs(forward[k] - difference) * abs(at[k]) <= 2e-6 * value, k
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("peak", [0.0, 1e-300, 1e-14, 1e-6, 25.0, 60.0])
 def test_finite_everywhere(peak):
     numbers, force = pair_of(Unloading.PRINTED)

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ALL_IN_TIME
+from helpers import ALL_FORMS
 
 from benchmarks import energy_paths
 from mcc_jax import MccLaw, Plastic, StrainScaling, Unloading
@@ -26,7 +26,7 @@ from mcc_jax.geometry import Particle
 ROUNDING = 1e-13
 
 
-@ALL_IN_TIME
+@ALL_FORMS
 def test_random_paths_of_unlike_pairs_gain_nothing(unloading, scaling):
     law, particle = energy_paths.draw(5, 1000, unloading, scaling)
     whole, between = energy_paths.gains(*energy_paths.pair(law, particle, *energy_paths.choices(5, 1000)))
@@ -40,6 +40,7 @@ def law_of(unloading, modulus, C1=9.0):
     return MccLaw(Plastic(C1, 3.0, 2.7), 1.43, modulus, unloading, StrainScaling.RAW)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("unloading", Unloading)
 def test_each_side_of_a_pair_has_its_own_limit(unloading):
     """A soft modulus beside a stiff one: one side at its limit, the other by its formula."""
@@ -53,6 +54,7 @@ def test_each_side_of_a_pair_has_its_own_limit(unloading):
     assert float(each[1] / d_j) < 0.9
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("unloading", Unloading)
 def test_what_a_pair_loses_never_falls(unloading):
     law, particle = energy_paths.draw(6, 200, unloading, StrainScaling.RAW)
@@ -75,7 +77,8 @@ DIAMETER = 100.0
 REST = np.zeros((2, 3))
 
 
-@ALL_IN_TIME
+@pytest.mark.extended
+@ALL_FORMS
 @pytest.mark.parametrize("softened", [1.0, 0.02])
 def test_a_bouncing_sphere_never_gains(unloading, scaling, softened):
     """Between two plates, from very slow to fast enough to leave the tested range: each bounce is at most as fast."""
@@ -124,6 +127,7 @@ def test_a_bouncing_sphere_never_gains(unloading, scaling, softened):
         assert history[flying].max() <= first * (1 + 1e-12)
 
 
+@pytest.mark.extended
 def test_two_bouncing_spheres_never_gain():
     """Unlike spheres that meet head on: kinetic energy after each meeting is at most that before."""
     law = law_of(Unloading.PRINTED, 16000.0)

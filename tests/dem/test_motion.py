@@ -118,6 +118,7 @@ def test_friction_sticks_then_slides():
     assert ratio[2] < ratio[1] < ratio[0]
 
 
+@pytest.mark.extended
 def test_rolling_without_slip_needs_no_friction():
     pack, move, state = two_spheres(friction=0.5)
     # Both surfaces move alike at the contact: equal and opposite spins, like cogs, and no relative translation.
@@ -128,6 +129,7 @@ def test_rolling_without_slip_needs_no_friction():
     assert np.abs(forces.force[:, 1]).max() > 0
 
 
+@pytest.mark.extended
 def test_no_friction_is_friction_of_zero():
     """None leaves the tangential part out; the forces are those of a coefficient of zero."""
     state = stirred(dense())
@@ -139,6 +141,7 @@ def test_no_friction_is_friction_of_zero():
     np.testing.assert_array_equal(without.edges.overlap_max, with_zero.edges.overlap_max)
 
 
+@pytest.mark.extended
 def test_damping_never_pulls():
     pack, _, state = two_spheres(friction=0.0, normal_overlap=1e-8)
     parting = eqx.tree_at(lambda s: s.velocity, state, jnp.asarray([[0.0, 0, 0], [5.0, 0, 0]]))
@@ -146,6 +149,7 @@ def test_damping_never_pulls():
     assert forces.force[0, 0] == 0
 
 
+@pytest.mark.extended
 def test_coincident_centres_are_no_nan():
     state, move = dense(), motion()
     state = eqx.tree_at(lambda s: s.position, state, state.position.at[1].set(state.position[0]))
@@ -158,6 +162,7 @@ def test_coincident_centres_are_no_nan():
     assert np.all(np.isfinite(slope))
 
 
+@pytest.mark.extended
 def test_lists_made_anew_miss_nothing():
     """The same motion with lists made rarely and with a list of all pairs."""
     fine = 4e-6
@@ -172,6 +177,7 @@ def test_lists_made_anew_miss_nothing():
     np.testing.assert_allclose(rows.on_wall, rows_all.on_wall, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.extended
 def test_a_larger_skin_makes_a_new_list_first():
     """A list made with a small skin lacks pairs on which a larger one relies."""
     near = start(packing(), dense().walls, dense().position, 1e-8, CAPACITY)
@@ -182,6 +188,7 @@ def test_a_larger_skin_makes_a_new_list_first():
     np.testing.assert_allclose(end.position, expected.position, rtol=0, atol=1e-15)
 
 
+@pytest.mark.extended
 def test_list_grows_when_full():
     """A list made for fewer pairs gets more room, by itself where none was asked for, and never loses a pair."""
     pairs = close_pairs(np.asarray(dense().position), np.asarray(packing().radius), SKIN)
@@ -192,6 +199,7 @@ def test_list_grows_when_full():
     assert not bool(grown.edges.overflow)
 
 
+@pytest.mark.extended
 def test_press_release_and_eject():
     """Load, unload, eject: force on the punch rises and falls, the tablet leaves the die over its chamfer."""
     move = motion(friction=0.1, drag=2e4)
@@ -285,7 +293,7 @@ def mean_height(log_c1, keep="steps"):
     return jnp.mean(replay(harder(packing(), log_c1), motion(), moving, tape, keep=keep).position[:, 2] * 1e6)
 
 
-@pytest.mark.long
+@pytest.mark.extended
 def test_replay_is_the_motion_and_has_its_derivative():
     """T7 on a trajectory: replayed over recorded lists, reverse mode equals differences."""
     _, end, tape = recorded()
@@ -297,7 +305,7 @@ def test_replay_is_the_motion_and_has_its_derivative():
     np.testing.assert_allclose(slope, difference, rtol=1e-4)
 
 
-@pytest.mark.long
+@pytest.mark.extended
 def test_replay_that_keeps_less_has_the_same_gradient():
     recorded()
     every, lists = (
@@ -306,7 +314,7 @@ def test_replay_that_keeps_less_has_the_same_gradient():
     np.testing.assert_allclose(lists, every, rtol=1e-12)
 
 
-@pytest.mark.long
+@pytest.mark.extended
 def test_replay_forward_mode():
     recorded()
     value, slope = jax.jit(lambda t: jax.jvp(mean_height, (t,), (jnp.ones(()),)))(jnp.zeros(()))
@@ -338,6 +346,7 @@ def test_scattered_spheres_do_not_touch():
     assert 0.05 < relative_density(pack, DIE_RADIUS, 0.0, height) < 0.5
 
 
+@pytest.mark.extended
 def test_cylinder_opens_above_its_rim():
     wall = Cylinder(1.0, 2.0, 0.1, jnp.zeros(3))
     assert wall.distance(jnp.asarray([0.3, 0.4, 1.0])) == pytest.approx(0.5)
@@ -349,6 +358,7 @@ def test_cylinder_opens_above_its_rim():
     assert closed.distance(jnp.asarray([0.0, 0.0, 9.0])) == 1.0
 
 
+@pytest.mark.extended
 def test_each_sphere_may_have_its_own_law():
     laws = jax.vmap(lambda c: MccLaw(Plastic(c, 3.4, 2.7), 1.43, 16000.0))(jnp.asarray([10.0, 20.0]))
     pack = spheres(laws, jnp.asarray([100.0, 100.0]))

@@ -174,6 +174,7 @@ def test_ellipsoid_along_its_axes_is_the_paper():
     np.testing.assert_allclose(sphere.k1, np.pi * 40e-6 * 16e6, rtol=1e-13)
 
 
+@pytest.mark.extended
 def test_ellipsoid_turns_continuously():
     law = law_of()
     angles = jnp.linspace(0.0, np.pi / 2, 181)
@@ -211,6 +212,7 @@ def vector_of(peak, overlap):
     return jnp.asarray([*two_sides(), peak * UM, overlap * UM])
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(("peak", "overlap"), [(0.0, 8.0), (0.0, 25.0), (25.0, 24.9), (25.0, 24.0), (30.0, 29.5)])
 def test_derivatives_equal_differences(peak, overlap):
     """T7: every parameter, on loading and unloading, both modes."""
@@ -231,6 +233,7 @@ def test_derivatives_equal_differences(peak, overlap):
         assert abs(forward[k] - difference) * at[k] <= 1e-6 * value, k
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("soft_i", "soft_j", "peak", "overlap"),
     [(1, 1, 0.05, 0.03), (1e4, 1e4, 2.0, 1.5), (1e4, 1e4, 60.0, 55.0), (1e4, 1, 60.0, 58.0), (1e4, 1, 2.0, 1.8)],
@@ -288,6 +291,7 @@ def test_first_touch_has_finite_gradient():
     assert np.all(np.isfinite(VALUE_AND_GRADIENT(at)[1]))
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("spread_of_sizes", [(40.0, 110.0), (20.0, 150.0)])
 def test_compiled_split_converges(spread_of_sizes):
     """Pitfall: compiled code that tests its bounds strictly bisects again after it has converged."""
@@ -361,6 +365,7 @@ def test_nan_shows():
     assert np.isnan(wall_force(side, jnp.zeros(()), jnp.asarray(jnp.nan)))
 
 
+@pytest.mark.extended
 def test_single_precision():
     side = half_contact(law_of(), PARTICLE)
     small = jax.tree.map(lambda x: x.astype(jnp.float32), side)

@@ -114,6 +114,7 @@ def test_every_row_is_an_equilibrium_and_punches_differ_by_the_springs(pressed):
     assert not np.asarray(end.velocity).any()
 
 
+@pytest.mark.extended
 def test_lists_do_not_change_the_compaction(pressed):
     packing, state, heights, _, rows, _ = pressed
     again = start(packing, state.walls, state.position, 1.2 * float(packing.radius.mean()))
@@ -121,6 +122,7 @@ def test_lists_do_not_change_the_compaction(pressed):
     np.testing.assert_allclose(longer.top, rows.top, rtol=1e-7)
 
 
+@pytest.mark.extended
 def test_a_step_that_does_not_settle_is_halved_and_marked(pressed, monkeypatch):
     packing, state, heights, _, _, _ = pressed
     settle = quasistatic._settle
@@ -139,6 +141,7 @@ def test_a_step_that_does_not_settle_is_halved_and_marked(pressed, monkeypatch):
     assert np.isfinite(rows.top).all()
 
 
+@pytest.mark.extended
 def test_replay_is_the_compaction(pressed):
     packing, state, _, end, rows, tape = pressed
     again = replay_compaction(packing, state, tape, SOLVER)
@@ -150,6 +153,7 @@ def test_replay_is_the_compaction(pressed):
     np.testing.assert_allclose(again.wall_history.overlap_max, end.wall_history.overlap_max, atol=1e-15)
 
 
+@pytest.mark.extended
 def test_euler_identity(sensitivity, pressed):
     _, _, _, _, rows, _ = pressed
     assert sensitivity.converged.all()
@@ -160,6 +164,7 @@ def test_euler_identity(sensitivity, pressed):
     np.testing.assert_allclose(sensitivity.by_parameter, sensitivity.by_stress[:, [0, 3]], atol=1e-10 * rows.top.max())
 
 
+@pytest.mark.extended
 def test_sensitivities_are_those_of_finite_differences(sensitivity, pressed):
     packing, state, _, _, _, tape = pressed
     last, h = np.array([step.last for step in tape]), 1e-5
@@ -172,7 +177,7 @@ def test_sensitivities_are_those_of_finite_differences(sensitivity, pressed):
         np.testing.assert_allclose(sensitivity.by_stress[:, stress], difference, atol=1e-5 * np.abs(difference).max())
 
 
-@pytest.mark.long
+@pytest.mark.extended
 def test_reverse_mode_gives_the_same_sensitivities(sensitivity, pressed):
     packing, state, _, _, _, tape = pressed
     last = np.array([step.last for step in tape])
@@ -241,7 +246,7 @@ def test_packing_of_a_population_has_the_effects_of_its_model_or_refuses_them():
         population_packing(posterior(0.0, "creep"), np.asarray(DIAMETERS))
 
 
-@pytest.mark.long
+@pytest.mark.extended
 def test_bands_agree_for_small_scatter(pressed):
     _, state, heights, _, rows, _ = pressed
     draws = np.random.default_rng(1).normal(0.0, 0.01, (8, 2))
@@ -254,7 +259,7 @@ def test_bands_agree_for_small_scatter(pressed):
     assert np.all(np.diff(first.quantiles, axis=0) > 0)
 
 
-@pytest.mark.long
+@pytest.mark.extended
 def test_fit_recovers_the_mean_C1_and_modulus(pressed):
     _, state, heights, _, rows, _ = pressed
     fit = fit_compaction(packing_of, np.array([0.05, -0.1]), state, heights, rows.top, solver=SOLVER)

@@ -27,6 +27,8 @@ from mcc_jax.discover.refine import refined
 from mcc_jax.discover.settings import POPULATION
 from mcc_jax.effects import find_variant
 
+pytestmark = pytest.mark.extended
+
 COMPLIANCE = 0.004
 
 
@@ -150,7 +152,6 @@ def test_a_step_that_is_cut_short_is_cut_for_all_numbers(base):
     np.testing.assert_allclose(there.point.theta[0], [4.0 * unit, 100.0], rtol=1e-6)
 
 
-@pytest.mark.long
 def test_it_prefers_a_model_as_much_as_importance_sampling_does(base):
     campaign = cached(f"frame_compliance={COMPLIANCE}")
     model = Model(modulus_scatter=True)

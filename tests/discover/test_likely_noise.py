@@ -7,6 +7,8 @@ from campaigns import base_of, cached, with_curves
 from mcc_jax.calibrate.noise import Along, Correlation
 from mcc_jax.discover.likely_noise import with_likely_noise
 
+pytestmark = pytest.mark.extended
+
 WANDER_UM, LENGTH_S = 0.3, 25.0
 
 

@@ -10,6 +10,8 @@ from mcc_jax.discover.base import base_fit
 from mcc_jax.discover.misfit import telling
 from mcc_jax.discover.settings import DECISIONS
 
+pytestmark = pytest.mark.extended
+
 
 def hard_spheres(count, toe, seed=0, rows=300):
     """Spheres of 1 mm whose loading curve is of the law's form, a soft contact, and a wander of each one's own.
@@ -43,7 +45,6 @@ def test_a_record_ends_where_a_sphere_gives_way():
     assert len(gives_way.particles) == 4
 
 
-@pytest.mark.long
 def test_few_readings_are_compared():
     campaign = hard_spheres(8, toe=4e-3)
     base = base_fit(check_tests(campaign), Model(), threshold_MPa=0.0, tell=lambda _: None)
@@ -59,7 +60,6 @@ def test_time_explains_nothing_of_loading_alone():
     assert set(telling(at, mask & (unloading == 0))) == {"load", "unloading"}
 
 
-@pytest.mark.long
 def test_a_soft_contact_of_hard_spheres_is_named():
     found = discover(hard_spheres(8, toe=4e-3), posterior=False, experiments=False, confirm=False)
     assert found.verdict in ("NAMED", "SET")
@@ -67,14 +67,12 @@ def test_a_soft_contact_of_hard_spheres_is_named():
     assert found.effects[0].amplitude == pytest.approx(4e-3, rel=0.15)
 
 
-@pytest.mark.long
 def test_the_gap_of_held_out_spheres_is_closed():
     found = discover(hard_spheres(12, toe=4e-3), posterior=False, experiments=False)
     assert found.candidate_set == (("toe_asperity",),)
     assert found.to_json()["gap"]["closed_fraction"] > 0.8
 
 
-@pytest.mark.long
 def test_hard_spheres_without_a_soft_contact_get_none():
     found = discover(hard_spheres(8, toe=0.0), posterior=False, experiments=False, confirm=False)
     assert "toe_asperity" not in {name for names in found.candidate_set or () for name in names}

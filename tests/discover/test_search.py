@@ -19,6 +19,8 @@ from mcc_jax.discover.search import Search
 from mcc_jax.discover.settings import DECISIONS, NUMERICS
 from mcc_jax.effects import LIBRARY
 
+pytestmark = pytest.mark.extended
+
 FEW = {name: LIBRARY[name] for name in ("frame_compliance", "damage")}
 
 

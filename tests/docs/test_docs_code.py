@@ -13,7 +13,6 @@ from click.testing import CliRunner
 from mcc_jax.cli.main import cli
 
 PAGES = Path(__file__).parents[2] / ".docs" / "pages"
-EXPENSIVE = re.compile(r"\A---\n(?:.*\n)*?expensive: true\n(?:.*\n)*?---\n")
 FENCE = re.compile(r'^```(\w+)(?: title="([^"]+)")?\n(.*?)^```$', re.M | re.S)
 COMMAND = re.compile(r"(?:\w+=\S+ )*(?:uv run )?mcc-jax (.*)")
 ALL = {str(page.relative_to(PAGES)): page.read_text(encoding="utf-8") for page in sorted(PAGES.rglob("*.md"))}
@@ -38,11 +37,6 @@ def blocks(text):
     return [Block(*match.groups(default="")) for match in FENCE.finditer(text)]
 
 
-def runnable(page):
-    marks = [pytest.mark.long] if EXPENSIVE.match(ALL[page]) else []
-    return pytest.param(page, marks=marks, id=page)
-
-
 def write(block, folder):
     name = Path(block.title)
     assert not name.is_absolute()
@@ -58,7 +52,8 @@ def run_command(arguments):
 RUN = [page for page, text in ALL.items() if any(b.language in ("python", "sh") for b in blocks(text))]
 
 
-@pytest.mark.parametrize("page", [runnable(page) for page in RUN])
+@pytest.mark.extended
+@pytest.mark.parametrize("page", RUN)
 @pytest.mark.filterwarnings("default")
 def test_page_does_what_it_shows(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -87,7 +87,7 @@ def test_an_entry_says_everything_and_shows_a_picture(docs, monkeypatch):
     assert [text for text in said if text not in entry] == []
 
 
-@pytest.mark.long
+@pytest.mark.extended
 def test_a_plan_worked_out_again_gives_the_kept_numbers(docs):
     kept, again = docs("gallery").POWER["plans"]["unload"], docs("make_power").worked_out("unload")
     assert again["needs"] == kept["needs"]

@@ -31,7 +31,7 @@ EVERY = pytest.mark.parametrize("variant", VARIANTS, ids=NAMES)
 FIRST = pytest.mark.parametrize(
     "variant",
     [
-        pytest.param(v, id=name, marks=() if v is LIBRARY[v.mechanism].variants[0] else pytest.mark.long)
+        pytest.param(v, id=name, marks=() if v is LIBRARY[v.mechanism].variants[0] else pytest.mark.extended)
         for v, name in zip(VARIANTS, NAMES, strict=True)
     ],
 )
@@ -76,7 +76,8 @@ def test_the_law_of_a_fit_gives_the_same(variant):
     np.testing.assert_allclose(values[6], values[4], rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("every", [pytest.param(True, marks=pytest.mark.long), False], ids=["all", "some"])
+@pytest.mark.extended
+@pytest.mark.parametrize("every", [pytest.param(True, marks=pytest.mark.extended), False], ids=["all", "some"])
 def test_signatures_are_the_derivatives_at_the_null(every):
     rows, again = signature_rows(RECORD, RECORD)
     np.testing.assert_array_equal(rows, again)
@@ -117,12 +118,13 @@ def all_effects(variants, dtype):
 
 
 TOGETHER = pytest.mark.parametrize(
-    "variants", [FEW, pytest.param(VARIANTS, marks=pytest.mark.long)], ids=["few", "all"]
+    "variants", [FEW, pytest.param(VARIANTS, marks=pytest.mark.extended)], ids=["few", "all"]
 )
 
 
+@pytest.mark.extended
 @TOGETHER
-@pytest.mark.parametrize("dtype", [jnp.float64, pytest.param(jnp.float32, marks=pytest.mark.long)])
+@pytest.mark.parametrize("dtype", [jnp.float64, pytest.param(jnp.float32, marks=pytest.mark.extended)])
 def test_effects_at_their_null_leave_the_compiled_law_alone(variants, dtype):
     base, value, reverse, _ = all_effects(variants, dtype)
     assert value.dtype == dtype
@@ -130,6 +132,7 @@ def test_effects_at_their_null_leave_the_compiled_law_alone(variants, dtype):
     assert np.isfinite(reverse).all()
 
 
+@pytest.mark.extended
 @TOGETHER
 def test_reverse_mode_is_forward_mode(variants):
     """The gradient of a weighted sum at the null, by reverse mode all at once, against each derivative by forward."""
@@ -142,6 +145,7 @@ def test_reverse_mode_is_forward_mode(variants):
 SOME = [v for v in VARIANTS if v.name in ("kelvin_voigt", "jkr", "siebel", "heckel", "hertzian_seat", "flow_threshold")]
 
 
+@pytest.mark.extended
 def test_single_precision():
     """At the null every variant is the base law in float32, too; at the typical amplitude close to float64."""
     law, particle, record = (single(t) for t in (LAW, PARTICLE, RECORD))
@@ -154,6 +158,7 @@ def test_single_precision():
         np.testing.assert_allclose(typical, lanes(variant)[0][4], atol=5e-4)
 
 
+@pytest.mark.extended
 def test_derivatives_by_nuisance_law_particle_and_force_are_finite():
     """Everything a refit may differentiate, with one effect of each kind, in both modes at once."""
     names = ("kelvin_voigt", "jkr", "cowper_symonds", "heckel", "levelling", "in_plane_aspect")

@@ -40,6 +40,7 @@ def by_steps(law, force, time, particle=PARTICLE):
     return jax.lax.scan(lambda past, now: law.step_load(particle, past, *now), start, (force, time))
 
 
+@pytest.mark.extended
 def test_closed_form_is_the_scan():
     for law in (EVERYTHING, MEMORIES):
         (state, path), (state_by_steps, steps) = along(law, FORCE, TIME), by_steps(law, FORCE, TIME)
@@ -81,6 +82,7 @@ def test_padding_changes_nothing():
     np.testing.assert_allclose(longer[FORCE.size :], np.full(7, whole[-1]), rtol=1e-13)
 
 
+@pytest.mark.extended
 def test_batch_is_the_loop():
     law = law_with("creep", "rate_dependence", "damage", first_only=True)
     particles = [paper_particle(n) for n in (1, 6, 12)]
@@ -95,6 +97,7 @@ def test_batch_is_the_loop():
         np.testing.assert_allclose(batch[i], single(particle, factors[i]), rtol=1e-11)
 
 
+@pytest.mark.extended
 def test_displacement_control_undoes_load_control():
     """Without the drift, whose displacement may fall while force grows; and where the platen touches."""
     law = law_with("frame_compliance", "creep", "damage", "reload_hysteresis", "platen_friction", first_only=True)
@@ -116,7 +119,7 @@ def test_displacement_control_undoes_load_control():
     assert relaxed[-1] < 0.999 * relaxed[0]
 
 
-@pytest.mark.long
+@pytest.mark.extended
 def test_derivatives_under_displacement_control():
     """Implicit rule in both modes against finite differences: by amplitudes and by the displacement itself."""
     names = ("frame_compliance", "creep", "platen_friction")
@@ -143,6 +146,7 @@ def test_derivatives_under_displacement_control():
         np.testing.assert_allclose(numeric, forward[i], atol=1e-5 * jnp.abs(forward[i]).max())
 
 
+@pytest.mark.extended
 def test_out_of_contact_there_is_no_force():
     law = law_with("creep", "frame_compliance", first_only=True)
     state = law.init(PARTICLE)

@@ -93,7 +93,7 @@ def test_rates_of_very_short_ramps():
     assert np.all(np.isfinite(ramp_rates(np.repeat([0.0, 1.0, 2.0, 3.0], 4), np.linspace(0, 1, 16) ** 2, 7.0)))
 
 
-@pytest.mark.long
+@pytest.mark.extended
 def test_noise_of_force_does_not_change_what_an_effect_adds():
     """To first order, for every variant: what noise of force makes of its signature is small beside it."""
     records = []

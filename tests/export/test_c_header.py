@@ -1,4 +1,3 @@
-import itertools
 import math
 
 import equinox as eqx
@@ -9,6 +8,7 @@ import numpy as np
 import pytest
 from bisecting import pair_force
 from compiling import LANGUAGES, PAIR, PLATES, WALL, build_driver, compile_with, head, run_driver
+from helpers import FORMS
 
 from mcc_jax import (
     History,
@@ -22,7 +22,6 @@ from mcc_jax import (
 )
 from mcc_jax.export import Origin, c_header
 
-FORMS = list(itertools.product(Unloading, StrainScaling))
 MODULUS_MPA = {Unloading.PRINTED: 16000.0, Unloading.PUNCH: 500.0, Unloading.PUNCH_EXACT: 500.0}
 PARTICLE = Particle(213.54, 196.07, 186.33)
 PATHS, STEPS = 100_000, 24
@@ -107,7 +106,7 @@ def recovered_from(law, diameters, peaks):
     return particle.displacement(law.recoverable_strain(particle, particle.strain(peaks)))
 
 
-@pytest.mark.long
+@pytest.mark.extended
 @pytest.mark.parametrize("kind", [PLATES, PAIR], ids=["plates", "equal pair"])
 def test_equals_the_library_where_the_recovery_is_limited(program, kind):
     """Peaks from 1e-9 to twice the tested range, moduli down to that of a rubber: formula, peak and slope as limits."""
@@ -155,6 +154,7 @@ def test_pair_of_unlike_particles_equals_bisection(program):
             np.testing.assert_array_less(np.abs(got[k] - swapped[k]) * unit / largest, (1e-12, 1e-9)[k])
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("unloading", Unloading)
 def test_reference_of_a_pair_equals_thirty_digits(unloading):
     """The bisection itself, from the formulas of the paper, in arithmetic that does not round."""
@@ -237,6 +237,7 @@ def test_what_is_not_a_number_shows(program):
         assert math.isnan(force[0, 1])
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("language", LANGUAGES)
 def test_compiles_without_a_warning_and_holds_the_values(tmp_path, language):
     """Every form, twice included, and the initialiser gives back the law to the last bit."""

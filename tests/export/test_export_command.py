@@ -4,12 +4,11 @@ import sys
 
 import numpy as np
 import pytest
+from asserting import refused
 from calibrations import content, estimate, write
-from click.testing import CliRunner
 from compiling import PAIR, PLATES, WALL, build_driver, head, run_driver
 
 from mcc_jax.cli.export import FORMATS as OFFERED
-from mcc_jax.cli.main import cli
 from mcc_jax.export import FORMATS, read_calibration
 
 FILES = {
@@ -21,23 +20,6 @@ FILES = {
 }
 
 
-@pytest.fixture
-def run():
-    def invoke(*arguments):
-        return CliRunner().invoke(cli, ["export", *map(str, arguments)], prog_name="mcc-jax")
-
-    return invoke
-
-
-def one_line(result):
-    """Assert exit status 2 and one clear line on standard error; the line."""
-    assert result.exit_code == 2, (result.stdout, result.stderr, result.exception)
-    assert result.stdout == ""
-    assert result.stderr.count("\n") == 1
-    assert result.stderr.startswith("mcc-jax: error: ")
-    return result.stderr.strip()
-
-
 def test_the_command_offers_what_there_is():
     assert OFFERED == FORMATS
 
@@ -45,12 +27,12 @@ def test_the_command_offers_what_there_is():
 @pytest.mark.parametrize("form", FILES)
 def test_writes_the_artefact_and_its_golden_table(run, tmp_path, form):
     folder = write(tmp_path / "fit")
-    result = run(folder, "--format", form, "--out", tmp_path / "out")
+    result = run("export", folder, "--format", form, "--out", tmp_path / "out")
     assert (result.exit_code, result.stderr) == (0, "")
     assert {p.name for p in (tmp_path / "out").iterdir()} == FILES[form]
     for name in FILES[form]:
         assert f"  {name}\n" in result.stdout
-    again = run(folder, "--format", form, "--out", tmp_path / "again")
+    again = run("export", folder, "--format", form, "--out", tmp_path / "again")
     assert again.exit_code == 0
     for name in FILES[form]:
         assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
@@ -60,10 +42,11 @@ def golden(file):
     return np.genfromtxt(file, delimiter=",", names=True, dtype=None, encoding="utf-8")
 
 
+@pytest.mark.extended
 def test_the_header_passes_its_own_golden_tables(run, tmp_path):
     """As a user would: the files alone, whatever the calibration was."""
     folder, out = write(tmp_path / "fit"), tmp_path / "out"
-    assert run(folder, "--format", "c", "--out", out, "--particle", "b c", "--seed", 7).exit_code == 0
+    assert run("export", folder, "--format", "c", "--out", out, "--particle", "b c", "--seed", 7).exit_code == 0
     program = build_driver(tmp_path, (out / "mcc_law.h").read_text())
     law, particle, _ = read_calibration(folder, particle="b c")
     size = np.array([[float(d) for d in (particle.D1, particle.D2, particle.D3)]])
@@ -87,12 +70,12 @@ def test_the_header_passes_its_own_golden_tables(run, tmp_path):
 def test_options_arrive(run, tmp_path):
     folder, out = write(tmp_path / "fit"), tmp_path / "out"
     arguments = (folder, "--format", "json", "--out", out)
-    assert run(*arguments, "--diameters", "120,110,100", "--particle", "A", "--seed", 3).exit_code == 0
+    assert run("export", *arguments, "--diameters", "120,110,100", "--particle", "A", "--seed", 3).exit_code == 0
     told = json.loads((out / "parameters.json").read_text())
     assert told["coefficients_of"] == "A"
     assert told["particle"]["D2_um"] == 110.0
     first = (out / "parameters_golden.csv").read_text()
-    assert run(*arguments, "--diameters", folder / "particles.csv", "--particle", "A").exit_code == 0
+    assert run("export", *arguments, "--diameters", folder / "particles.csv", "--particle", "A").exit_code == 0
     told = json.loads((out / "parameters.json").read_text())
     assert told["particle"]["D2_um"] == 190.0
     assert (out / "parameters_golden.csv").read_text() != first
@@ -101,9 +84,9 @@ def test_options_arrive(run, tmp_path):
 def test_what_is_not_monotone_is_exported_only_on_demand_and_said(run, tmp_path):
     folder, out = write(tmp_path / "fit"), tmp_path / "out"
     arguments = (folder, "--format", "c", "--out", out, "--particle", "falling")
-    assert "--allow-not-monotone" in one_line(run(*arguments))
+    assert "--allow-not-monotone" in refused(run("export", *arguments))
     assert not out.exists()
-    result = run(*arguments, "--allow-not-monotone")
+    result = run("export", *arguments, "--allow-not-monotone")
     assert result.exit_code == 0
     assert "Warning: The loading curve is not monotone" in result.stdout
     assert "WARNING" in (out / "mcc_law.h").read_text()
@@ -111,7 +94,7 @@ def test_what_is_not_monotone_is_exported_only_on_demand_and_said(run, tmp_path)
 
 def test_what_did_not_converge_is_exported_and_said(run, tmp_path):
     folder = write(tmp_path / "fit", converged=False, warnings=["the chains disagree"])
-    result = run(folder, "--format", "c", "--out", tmp_path / "out")
+    result = run("export", folder, "--format", "c", "--out", tmp_path / "out")
     assert result.exit_code == 0
     assert "Warning: The calibration of calibration.json did not converge." in result.stdout
     assert "Warning: The chains disagree." in result.stdout
@@ -166,18 +149,18 @@ def test_bad_input_is_one_line_and_writes_nothing(run, tmp_path, kind):
     folder, out = write(tmp_path / "fit"), tmp_path / "out"
     if damage is not None:
         damage(folder)
-    line = one_line(run(folder, "--format", "c", "--out", out, *options))
+    line = refused(run("export", folder, "--format", "c", "--out", out, *options))
     assert words in line
     assert not out.exists()
     out.mkdir()
     (out / "mcc_law.h").write_text("old")
-    one_line(run(folder, "--format", "c", "--out", out, *options))
+    refused(run("export", folder, "--format", "c", "--out", out, *options))
     assert [p.read_text() for p in out.iterdir()] == ["old"]
 
 
 def test_format_is_required_and_checked(run, tmp_path):
-    assert "--format" in one_line(run(write(tmp_path / "fit"), "--out", tmp_path / "out"))
-    assert "'matlab'" in one_line(run(tmp_path / "fit", "--format", "matlab", "--out", tmp_path / "out"))
+    assert "--format" in refused(run("export", write(tmp_path / "fit"), "--out", tmp_path / "out"))
+    assert "'matlab'" in refused(run("export", tmp_path / "fit", "--format", "matlab", "--out", tmp_path / "out"))
 
 
 def test_sizes_are_also_found_where_the_demo_puts_its_campaign(tmp_path):
@@ -189,6 +172,7 @@ def test_sizes_are_also_found_where_the_demo_puts_its_campaign(tmp_path):
     assert origin.geometry == "particle A of particles.csv"
 
 
+@pytest.mark.extended
 def test_help_does_not_import_jax():
     code = "import sys; sys.argv = ['mcc-jax', 'export', '--help']; from mcc_jax.cli import run\n"
     code += "try:\n    run()\nexcept SystemExit:\n    assert 'jax' not in sys.modules\n"

@@ -11,6 +11,8 @@ import pytest
 from mcc_jax import InputError, Particle, StrainScaling, Unloading, paper_law
 from mcc_jax.export import golden_table, jax_artefact, write_export
 
+pytestmark = pytest.mark.extended
+
 PARTICLE = Particle(213.54, 196.07, 186.33)
 
 # Runs where mcc_jax cannot be imported: JAX, NumPy and the files are all there is.
@@ -60,7 +62,7 @@ print(json.dumps(told))
 
 FORMS = [
     (Unloading.PRINTED, StrainScaling.RAW),
-    pytest.param((Unloading.PUNCH, StrainScaling.MASTER), marks=pytest.mark.long),
+    pytest.param((Unloading.PUNCH, StrainScaling.MASTER), marks=pytest.mark.extended),
 ]
 
 

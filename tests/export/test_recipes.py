@@ -46,6 +46,7 @@ def test_the_normal_model_for_lammps_gives_the_headers_forces(tmp_path, form):
     np.testing.assert_array_equal(without_update, want)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("form", FORMS, ids=str)
 def test_the_functors_for_yade_give_the_headers_forces(tmp_path, form):
     law = paper_law(*form)

@@ -1,9 +1,8 @@
-import itertools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import FORMS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -12,15 +11,12 @@ from mcc_jax import (
     MccLaw,
     Particle,
     Plastic,
-    StrainScaling,
-    Unloading,
     drive,
     paper_law,
 )
 from mcc_jax.export import curve_tables, golden_table
 
 TOLERANCE = 1e-5
-FORMS = list(itertools.product(Unloading, StrainScaling))
 numbers = st.tuples(
     st.floats(2, 20), st.floats(0, 0.99), st.floats(1.5, 4), st.floats(100, 1e5), st.sampled_from(FORMS)
 )

@@ -13,10 +13,11 @@ from runner import Watched, run, shares
 from targets import READERS
 from worker import case_of
 
+pytestmark = pytest.mark.extended
+
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.mark.long
 def test_every_fault_is_noticed_and_kept(tmp_path):
     plan = shares("bad_targets", 9)
     table = run(Watched("bad_targets", plan, 0, tmp_path, seconds=0.5, double=False))

@@ -8,6 +8,8 @@ from pathological_kinds import KINDS
 
 from mcc_jax.calibrate.data import select
 
+pytestmark = pytest.mark.extended
+
 BY_NAME = {kind.name: kind for kind in KINDS}
 FITTED = (
     "displacement from a far origin below zero",
@@ -35,7 +37,7 @@ FILES = ("a force that is text", "cut off in the middle of a row", "a diameter o
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.long if i else ()) for i, name in enumerate(FITTED)]
+    "name", [pytest.param(name, marks=pytest.mark.extended if i else ()) for i, name in enumerate(FITTED)]
 )
 def test_ends_in_a_result(name):
     found = run_one(BY_NAME[name], 1, "least-squares")
@@ -45,7 +47,7 @@ def test_ends_in_a_result(name):
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(kind.name, marks=() if kind.name.startswith("100 ") else pytest.mark.long)
+        pytest.param(kind.name, marks=() if kind.name.startswith("100 ") else pytest.mark.extended)
         for kind in KINDS
         if " cycles" in kind.name
     ],

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from helpers import (
     ALL_FORMS,
-    ALL_IN_TIME,
     EBAR,
     K1,
     PAPER_THETA,
@@ -262,7 +261,7 @@ def test_07_sphere_has_unit_shape_factors():
         assert elastic_shape_factor(sphere(size)) == 1
 
 
-@ALL_IN_TIME
+@ALL_FORMS
 def test_08_reload_retraces_and_rejoins(unloading, scaling):
     law, p = paper_law(unloading, scaling, modulus=3000.0), paper_particle(9)
     top, deep, further = (p.displacement(jnp.array(e)) for e in (0.40, 0.37, 0.45))
@@ -275,7 +274,7 @@ def test_08_reload_retraces_and_rejoins(unloading, scaling):
 
 
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
-@ALL_IN_TIME
+@ALL_FORMS
 def test_09_sum_rule_at_the_onset(unloading, scaling, mode):
     """Along eps = eps_P the branch is the loading curve: d sigma/d eps + d sigma/d eps_P = loading tangent."""
     law, p = paper_law(unloading, scaling), PITFALL[1]

@@ -13,7 +13,7 @@ from helpers import (
     all_finite,
     between,
     close,
-    first_in_time,
+    first_in_core,
     paper_law,
     paper_particle,
     shape_factor,
@@ -95,7 +95,7 @@ def test_forward_is_reverse_is_finite_difference(unloading, scaling, theta, seed
     compare(unloading, scaling, theta, seed, by_scan=False)
 
 
-@pytest.mark.long
+@pytest.mark.extended
 @SOME_FORMS
 @settings(max_examples=6, deadline=None, derandomize=True)
 @given(theta=thetas(softening=between(0.0, 0.8)), seed=st.integers(0, 10**6))
@@ -162,12 +162,13 @@ def finite_everywhere(unloading, scaling, dtype, function):
             assert np.all(np.abs(one - other) <= accuracy * scale)
 
 
+@pytest.mark.extended
 @SOME_FORMS
 def test_value_and_derivatives_are_finite_where_branches_meet(unloading, scaling):
     finite_everywhere(unloading, scaling, jnp.float64, along_a_path)
 
 
-@pytest.mark.long
+@pytest.mark.extended
 @SOME_FORMS
 def test_value_and_derivatives_are_finite_in_single_precision(unloading, scaling):
     finite_everywhere(unloading, scaling, jnp.float32, along_a_path)
@@ -190,7 +191,8 @@ def one_step(law, particle, state, value, load):
     return jnp.stack([response, state.displacement_max])
 
 
-@pytest.mark.parametrize("mode", first_in_time([jax.jacrev, jax.jacfwd]))
+@pytest.mark.extended
+@pytest.mark.parametrize("mode", first_in_core([jax.jacrev, jax.jacfwd]))
 def test_a_tie_has_the_loading_tangent(mode):
     """At the peak again: `step` takes it as loading; along a path the equal values share one loading tangent."""
     theta = jnp.asarray(THETA)
@@ -247,6 +249,7 @@ def test_out_of_contact_nothing_depends_on_the_platen(mode):
         assert mode(lambda f: law.step_load(p, law.init(p), f)[1])(jnp.array(-3.0)) == 0
 
 
+@pytest.mark.extended
 def test_second_derivatives_of_a_fit_are_finite():
     """Hessian of a misfit over the parameters, with unloading inside the branch."""
     law, p = paper_law(), paper_particle(1)

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from helpers import (
     ALL_FORMS,
-    ALL_IN_TIME,
     PAPER_THETA,
     between,
     close,
@@ -51,7 +50,7 @@ def routes(unloading, scaling):
     }
 
 
-@ALL_IN_TIME
+@ALL_FORMS
 @settings(max_examples=10, deadline=None, derandomize=True)
 @given(theta=thetas(), x=scaled_paths(), start=st.one_of(st.just(0.0), between(0.0, 0.6)))
 def test_closed_form_is_the_scan(unloading, scaling, theta, x, start):
@@ -93,7 +92,7 @@ def test_load_control_undoes_displacement_control(unloading, scaling, theta, x, 
     close(again, force, scale=10 * rounding * max(float(force.max()), 1e-3))
 
 
-@ALL_IN_TIME
+@ALL_FORMS
 def test_loading_inverse_meets_the_force(unloading, scaling):
     """Residual of the force under load control: at most 1e-14 of it, from 1e-9 to 1e4 mN."""
     law, p = paper_law(unloading, scaling), paper_particle(4)
@@ -138,6 +137,7 @@ def test_vmap_is_the_loop():
         close(displacement[i], d, rel=1e-13)
 
 
+@pytest.mark.extended
 def test_new_numbers_do_not_recompile():
     @eqx.filter_jit
     @eqx.debug.assert_max_traces(max_traces=1)
@@ -187,6 +187,7 @@ def test_out_of_contact_the_displacement_stays():
     np.testing.assert_array_equal(d, 0)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("number", [1, 6, 12, 16, 20])
 def test_single_precision(number):
     """Printed form: within 3e-6 of the peak stress, from the same rounded inputs."""
@@ -210,7 +211,8 @@ def test_single_precision(number):
     close(displacement[loaded], path[loaded], scale=2e-6 * float(path.max()))
 
 
-@ALL_IN_TIME
+@pytest.mark.extended
+@ALL_FORMS
 def test_every_form_runs_in_single_precision(unloading, scaling):
     law, p = (with_dtype(t, jnp.float32) for t in (paper_law(unloading, scaling, modulus=1000.0), paper_particle(5)))
     path = jnp.concatenate([jnp.linspace(0, 120, 50), jnp.linspace(120, 90, 50)]).astype(jnp.float32)

@@ -11,7 +11,7 @@ from helpers import (
     all_finite,
     between,
     close,
-    first_in_time,
+    first_in_core,
     master_strain,
     master_stress,
     paper_particle,
@@ -85,6 +85,7 @@ def test_the_example_under_both_controls():
     assert jumped[1] > 0.345075622969
 
 
+@pytest.mark.extended
 @SOME_FORMS
 @settings(max_examples=10, deadline=None, derandomize=True)
 @given(theta=thetas(softening=FALLING), x=scaled_paths(low=-0.05, high=1.0), start=between(0.0, 0.5))
@@ -133,7 +134,8 @@ def test_behind_the_peak_there_is_no_way_back():
     close(under_displacement(law, p, state, d)[1], jnp.array([0.5 * at]), rel=1e-12)
 
 
-@pytest.mark.parametrize("dtype", first_in_time([jnp.float64, jnp.float32]))
+@pytest.mark.extended
+@pytest.mark.parametrize("dtype", first_in_core([jnp.float64, jnp.float32]))
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 def test_a_tensile_quintic_carries_nothing(dtype, mode):
     """K3^2 > 4 K1 K5: pushed into the range where the polynomial pulls, the particle has no force and no stiffness."""
@@ -165,6 +167,7 @@ def test_a_tensile_quintic_carries_nothing(dtype, mode):
     assert all_finite(jax.jit(mode(displacements, argnums=(0, 1)))(theta, f))
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 @settings(max_examples=10, deadline=None, derandomize=True)
 @given(theta=thetas(softening=FALLING), x=scaled_paths(steps=16, high=1.0))

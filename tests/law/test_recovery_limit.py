@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from helpers import (
     ALL_FORMS,
-    ALL_IN_TIME,
     FORMS,
     PAPER_THETA,
     SOME_FORMS,
@@ -74,7 +73,8 @@ def test_so_it_is_for_any_softening(softening):
             assert jnp.all(residual > -1e-15)
 
 
-@ALL_IN_TIME
+@pytest.mark.extended
+@ALL_FORMS
 def test_random_paths_gain_nothing(unloading, scaling):
     law, particle = energy_paths.draw(3, 1000, unloading, scaling)
     whole, between = energy_paths.gains(*energy_paths.single(law, particle, *energy_paths.choices(3, 1000)))
@@ -114,9 +114,10 @@ def switch(law, particle):
     return float(particle.displacement(jnp.array(low)))
 
 
+@pytest.mark.extended
 @SOME_FORMS
-@pytest.mark.parametrize("mode", [pytest.param(jax.jacfwd, marks=pytest.mark.long), jax.jacrev])
-@pytest.mark.parametrize("dtype", [pytest.param(jnp.float32, marks=pytest.mark.long), jnp.float64])
+@pytest.mark.parametrize("mode", [pytest.param(jax.jacfwd, marks=pytest.mark.extended), jax.jacrev])
+@pytest.mark.parametrize("dtype", [pytest.param(jnp.float32, marks=pytest.mark.extended), jnp.float64])
 def test_finite_and_continuous_at_the_switch(unloading, scaling, mode, dtype):
     theta = np.array(PAPER_THETA)
     theta[4] = 300.0  # punch forms then switch at a strain that float32 resolves, all forms again at large strain
@@ -147,6 +148,7 @@ def test_finite_and_continuous_at_the_switch(unloading, scaling, mode, dtype):
         close(value[below], value[above], rel=1e-5, scale=3e-6 * float(jnp.max(jnp.abs(value[above]))))
 
 
+@pytest.mark.extended
 @SOME_FORMS
 def test_derivatives_equal_differences_where_the_limit_holds(unloading, scaling):
     """At small strain, where it is the peak, and at large strain, where it is the slope of loading."""

@@ -67,7 +67,7 @@ def test_hertz_shape_factor_to_the_last_digits(ratio):
 
 
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
-@pytest.mark.parametrize("dtype", [pytest.param(jnp.float32, marks=pytest.mark.long), jnp.float64])
+@pytest.mark.parametrize("dtype", [pytest.param(jnp.float32, marks=pytest.mark.extended), jnp.float64])
 def test_hertz_shape_factor_derivatives(mode, dtype):
     function = jax.jit(jax.vmap(lambda D1: hertz_shape_factor(Particle(D1, jnp.asarray(100, dtype), D1))))
     first = jax.jit(jax.vmap(mode(lambda D1: hertz_shape_factor(Particle(D1, jnp.asarray(100, dtype), D1)))))

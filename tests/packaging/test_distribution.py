@@ -62,7 +62,7 @@ def sources():
     return {str(f.relative_to(ROOT)) for f in files if f.is_file() and "__pycache__" not in f.parts}
 
 
-@pytest.mark.long
+@pytest.mark.extended
 def test_the_wheel_holds_the_package_and_nothing_else(built):
     with zipfile.ZipFile(built[0]) as wheel:
         inside = set(wheel.namelist())
@@ -72,7 +72,7 @@ def test_the_wheel_holds_the_package_and_nothing_else(built):
     assert any(name.endswith("LICENSE") for name in inside)
 
 
-@pytest.mark.long
+@pytest.mark.extended
 def test_the_sdist_holds_tests_and_documentation(built):
     with tarfile.open(built[1]) as sdist:
         inside = {name.partition("/")[2] for name in sdist.getnames()}
@@ -80,7 +80,7 @@ def test_the_sdist_holds_tests_and_documentation(built):
     assert {"tests/conftest.py", "README.md", "LICENSE", "CITATION.cff", "CHANGELOG.md", ".docs/mkdocs.yml"} <= inside
 
 
-@pytest.mark.long
+@pytest.mark.extended
 def test_the_wheel_works_in_a_clean_environment(uv, built, tmp_path):
     """Alone it is the library, with the extra `command` the whole: a campaign goes through it from end to end."""
     home = tmp_path / "clean"

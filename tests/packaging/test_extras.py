@@ -164,6 +164,7 @@ def test_the_command_says_in_one_line_what_to_install():
     assert line.endswith("Install the extra 'command': python -m pip install 'mcc-jax[command]'")
 
 
+@pytest.mark.extended
 def test_figures_and_report_each_name_their_own_extra():
     code = "import importlib\n"
     for part in ("plots", "report", "plots.paper"):
@@ -172,6 +173,7 @@ def test_figures_and_report_each_name_their_own_extra():
     assert [line.partition("[")[2] for line in lines] == ["plots]'", "report]'", "plots]'"]
 
 
+@pytest.mark.extended
 def test_every_public_name_of_the_library_comes_without_any_extra():
     """All but figures and report, whose modules say what they need."""
     parts = ("law", "campaign", "effects", "simulate", "calibrate", "discover", "dem", "export")
@@ -181,7 +183,7 @@ def test_every_public_name_of_the_library_comes_without_any_extra():
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.long
+@pytest.mark.extended
 def test_a_small_calibration_needs_no_extra(tmp_path):
     done = run(
         "import jax\njax.config.update('jax_enable_x64', True)\nimport mcc_jax as mcc\n"

@@ -33,7 +33,7 @@ from mcc_jax.plots.paper import adjusted_curve, dimension_statistics, law_strain
 from mcc_jax.plots.style import shape_factors
 
 KINDS = ("paper", "cycles", "two", "dropped", "many")
-QUICK = [pytest.param(kind, marks=pytest.mark.long if kind in ("two", "many", "dropped") else ()) for kind in KINDS]
+QUICK = [pytest.param(kind, marks=pytest.mark.extended if kind in ("two", "many", "dropped") else ()) for kind in KINDS]
 UNIT = re.compile(r"\[(MPa|GPa|mN|µm|-)\]$")
 
 
@@ -107,6 +107,7 @@ def test_every_figure_is_written_as_png(saved, kind):
             assert all(UNIT.search(label) for label in shown), shown
 
 
+@pytest.mark.extended
 def test_nothing_is_clipped_and_no_panels_overlap(saved):
     """Text of a panel stays on the page; labels of one panel stay off the others' data area."""
     for stem, figure in saved[0].items():
@@ -172,6 +173,7 @@ def test_curves_of_chosen_particles(calibrations):
         plot_curves(r, ["nobody"])
 
 
+@pytest.mark.extended
 def test_many_curves_are_coloured_by_shape_factor(calibrations):
     r = calibrations["many"]
     figure = plot_curves(r, r.campaign.particles)
@@ -304,6 +306,7 @@ def test_panels_show_measured_and_predicted(paper):
         )
 
 
+@pytest.mark.extended
 def test_particles_that_were_not_kept_show_the_reason(calibrations):
     r = calibrations["dropped"]
     shown = panels(plot_particles(r))
@@ -315,6 +318,7 @@ def test_particles_that_were_not_kept_show_the_reason(calibrations):
             assert ax.get_title(loc="left").endswith("not used")
 
 
+@pytest.mark.extended
 def test_a_law_that_misses_the_data_is_said_so(calibrations):
     r = calibrations["two"]
     assert not any("misses" in t for t in texts(plot_particles(r)))

@@ -36,7 +36,7 @@ from mcc_jax.plots.posterior import (
 from mcc_jax.plots.style import spread_over
 from mcc_jax.simulate import paper_campaign
 
-KINDS = ("paper", *(pytest.param(kind, marks=pytest.mark.long) for kind in ("one", "odd")))
+KINDS = ("paper", *(pytest.param(kind, marks=pytest.mark.extended) for kind in ("one", "odd")))
 STEMS = ["pairs", "prior_posterior", "forest", "shrinkage", "bands", "new_particle", "whitened", "fits", "estimates"]
 UNIT = re.compile(r"\[(GPa|mN|µm|-)\]$")
 
@@ -128,6 +128,7 @@ def test_every_axis_has_its_unit_and_simulated_data_are_called_so(figures):
             assert all(UNIT.search(label) for label in shown), (stem, shown)
 
 
+@pytest.mark.extended
 def test_nothing_is_clipped_and_no_panels_overlap(figures):
     for stem, figure in figures.items():
         page = figure.bbox.padded(1)
@@ -159,7 +160,7 @@ def test_a_measured_campaign_is_not_called_simulated(calibrations):
         assert "simulated data" not in texts(plot(dataclasses.replace(calibration, campaign=measured)))
 
 
-@pytest.mark.long
+@pytest.mark.extended
 def test_what_must_not_be_relied_on_is_said(calibrations):
     posterior, squares = calibrations["one"]
     assert not posterior.converged

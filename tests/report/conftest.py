@@ -1,10 +1,7 @@
 import shutil
 
 import pytest
-from click.testing import CliRunner
 from results_folder import stand_in, write_results
-
-from mcc_jax.cli.main import cli
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -33,13 +30,3 @@ def page(complete):
     from mcc_jax.report import read_results, report_page
 
     return report_page(read_results(complete, name="complete"))
-
-
-@pytest.fixture
-def run():
-    """The command line, in this process."""
-
-    def invoke(*arguments):
-        return CliRunner().invoke(cli, [str(a) for a in arguments], prog_name="mcc-jax")
-
-    return invoke

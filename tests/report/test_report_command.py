@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+from asserting import refused
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from results_folder import calibration, discovery
@@ -15,14 +16,6 @@ from mcc_jax.report import read_results
 from mcc_jax.report.chart import compare
 from mcc_jax.report.lights import lights
 from mcc_jax.report.page import _environment, context
-
-
-def refused(result):
-    assert result.exit_code == 2, (result.stdout, result.stderr, result.exception)
-    assert result.stdout == ""
-    assert result.stderr.count("\n") == 1
-    assert result.stderr.startswith("mcc-jax: error: ")
-    return result.stderr
 
 
 def test_the_page_lies_in_the_folder_or_where_out_says(run, folder, tmp_path):

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import between, first_in_time
+from helpers import between, first_in_core
 from hypothesis import given, settings
 
 from benchmarks import energy_paths
@@ -90,8 +90,9 @@ def largest_gain(response):
 # ---- physics ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("unloading", first_in_time([Unloading.PUNCH, Unloading.PRINTED, Unloading.PUNCH_EXACT]))
-@pytest.mark.parametrize("variant", first_in_time(AT_PEAK, 2), ids=lambda v: f"{v.mechanism}:{v.name}")
+@pytest.mark.extended
+@pytest.mark.parametrize("unloading", first_in_core([Unloading.PUNCH, Unloading.PRINTED, Unloading.PUNCH_EXACT]))
+@pytest.mark.parametrize("variant", first_in_core(AT_PEAK, 2), ids=lambda v: f"{v.mechanism}:{v.name}")
 @settings(max_examples=40)
 @given(
     amplitude=between(-6.0, 12.0),
@@ -126,6 +127,7 @@ def test_energy_out_is_at_most_energy_in_or_it_is_refused(
         assert largest_gain(driven) <= QUADRATURE
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("unloading", Unloading)
 def test_what_is_refused_would_have_gained(unloading):
     """Loaded to the strain named and released, then loaded further and released: more comes back than went in."""
@@ -162,6 +164,7 @@ def test_only_what_is_driven_counts():
     assert drive(law.without_effects(), PARTICLE, path).result == RESULTS.successful
 
 
+@pytest.mark.extended
 def test_it_is_refused_where_a_particle_code_refuses_it():
     """A particle driven to the end of the tests, and its half contact, whose energies are written apart."""
     law, particle = energy_paths.draw(8, 400, Unloading.PUNCH, StrainScaling.RAW)
@@ -218,6 +221,7 @@ def test_in_a_batch_and_in_a_campaign_the_particle_is_known():
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.extended
 def test_compiled_code_raises_and_derivatives_are_those_of_the_law():
     path, time = jnp.linspace(0.0, load_at_the_end(), 30), jnp.arange(30.0)
 
