@@ -11,15 +11,13 @@ import jax
 import numpy as np
 
 from .. import arguments
-from .._errors import InputError
-from .._format import with_sd
 from ..campaign import THRESHOLD_MPA, Campaign, Finding, check_plausibility, check_tests
 from ..campaign.findings import worst
 from .compiling import imported_meanwhile, one_blas_thread
 from .data import Selection, ranges_um
 from .draws import Draws, draw_fast, draw_joint, named_population
-from .estimates import effect_entries, finite, log_estimate, normal_estimate, summary
-from .fit_result import Fit, population_of
+from .estimates import effect_entries, finite, summary
+from .fit_result import Fit
 from .fitting import Start, checked_settings, prepare
 from .judgement import at_noise_level, judged, numbers_in_reach, unlike_others
 from .model import Model
@@ -287,46 +285,4 @@ def sample(
         return sample(some, model, without_flagged=False, **settings, **few).answer()
 
     findings = judged(campaign, calibration.answer(), outlying, again if without_flagged else None)
-    notes = calibration.notes
-    if model.effects and without_flagged:
-        tell("calibrating without the effects")
-        notes += _moved_by_effects(campaign, model, calibration, threshold_MPa)
-    return replace(calibration, findings=findings, notes=notes, runtime_s=time.perf_counter() - started)
-
-
-def _laplace(fit: Fit) -> dict[str, Any]:
-    """a and the modulus by Laplace's approximation around a fit."""
-    sd = np.sqrt(np.diagonal(np.asarray(fit.covariance)))
-    away = np.where(np.arange(len(sd)) == fit.names.index("a"), sd, 0.0)
-    low, high = (float(population_of(fit.mode + sign * away, fit.target).a) for sign in (-1, 1))
-    log = float(fit.population.log_modulus)
-    return {
-        "a": normal_estimate(float(fit.population.a), abs(high - low) / 2),
-        "effective_modulus_MPa": log_estimate(log, sd[fit.names.index("log_modulus")]),
-    }
-
-
-def _moved_by_effects(
-    campaign: Campaign, model: Model, calibration: Posterior, threshold_MPa: float
-) -> tuple[str, ...]:
-    """A sentence if a or the modulus move by more than their stated error when the effects come into the law."""
-    plain = replace(model, effects=(), varying=())
-    try:
-        _, base, _ = prepare(campaign, plain, threshold_MPa)
-    except InputError:
-        return ()  # without the effects there is no answer to compare with
-    before, after = _laplace(base), calibration.answer()
-    moved = []
-    for name, unit, factor in (("effective_modulus_MPa", " GPa", 1e-3), ("a", "", 1.0)):
-        old, new = before[name], after[name]
-        if old["value"] is None or abs(new["value"] - old["value"]) <= 2 * max(old["sd"] or 0.0, new["sd"]):
-            continue
-        label = "the effective modulus" if unit else "a"
-        moved.append(f"{label} moves from {with_sd(old, factor)}{unit} to {with_sd(new, factor)}{unit}")
-    if not moved:
-        return ()
-    names = ", ".join(model.variants)
-    return (
-        f"With {names} in the law {' and '.join(moved)}, by more than the error it had: without the effect the base "
-        "law's own numbers had taken up what it explains",
-    )
+    return replace(calibration, findings=findings, runtime_s=time.perf_counter() - started)

@@ -125,10 +125,14 @@ def test_products_and_their_derivatives():
     np.testing.assert_allclose(slope, jax.jacfwd(products)(jnp.zeros(2)), rtol=1e-12)
 
 
-def test_what_moved_is_told(posterior):
-    told = [note for note in posterior.warnings() if "effective modulus moves from" in note]
-    assert len(told) == 1
-    assert CREEP in told[0]
+def test_a_posterior_that_begins_at_a_fit_is_the_same(campaign, posterior):
+    again = mcc.sample(campaign, posterior.model, start=posterior.fit)
+    assert again.converged
+    named = posterior.named_population()
+    for name, draws in again.named_population().items():
+        assert abs(draws.mean() - named[name].mean()) < 0.1 * named[name].std() + 1e-12, name
+    with pytest.raises(mcc.InputError, match="start is of other particles or effects"):
+        mcc.sample(campaign, start=posterior.fit)
 
 
 def test_a_particle_left_out_is_less_probable_than_one_that_was_seen(campaign, posterior):
