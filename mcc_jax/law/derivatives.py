@@ -24,7 +24,7 @@ from .. import arguments
 from .._numerics import compiled
 from .._types import Path, Scalar
 from ..effects import AbstractEffect, Context, Record
-from ..formulas import Formulas, Plastic, StrainScaling, Unloading, recovery, tangent_modulus
+from ..formulas import Formulas, Plastic, StrainScaling, Unloading
 from ..geometry import Particle
 from .loading import NEWTON_STEPS, base_strain, newton_step, slope_at, stress_at
 from .mcc import MccLaw
@@ -282,12 +282,8 @@ def signatures(
     arguments.instance(record, Record, "record", "Make one with mcc_jax.effects.record_of(curve).")
     context = replace(base, effects=()).context(particle, record)
     formulas = base.formulas
-    strain = _virgin_strain(formulas, context)
-    x, zero_um = formulas.shape_factor(particle) * strain, jnp.zeros_like(particle.D3)
-    K1, K3, K5 = formulas.plastic.polynomial
-    slope = tangent_modulus(K1, K3, K5, x) * formulas.shape_factor(particle)
-    least = 1e-3 * K1 * formulas.shape_factor(particle)
-    slope = jnp.where(slope > least, slope, least)
+    strain, zero_um = _virgin_strain(formulas, context), jnp.zeros_like(particle.D3)
+    slope = slope_at(formulas, particle, strain, [], [])
 
     def changes(effect: AbstractEffect) -> tuple[Any, Path, Path, Path]:
         """First-order change of the law's parameters, of loading strain, of the modulus, and what is added."""
@@ -300,10 +296,8 @@ def signatures(
             return law, own.loading(formulas, particle, record, strain), own.stiffness(context), added
 
         zero = jnp.zeros_like(effect.amplitude)
-        law, (f1, f3, f5), stiffness, added = jax.jvp(act, (zero,), (jnp.ones_like(zero),))[1]
-        square = x * x
-        shift = -x * (K1 * f1 - square * (K3 * f3 - square * (K5 * f5))) / slope
-        return law, shift, stiffness, added
+        law, factors, stiffness, added = jax.jvp(act, (zero,), (jnp.ones_like(zero),))[1]
+        return law, -stress_at(formulas, particle, strain, [factors]) / slope, stiffness, added
 
     if not effects:
         return jnp.zeros((0, *record.force.shape), record.force.dtype)
@@ -330,15 +324,12 @@ def signatures(
 
 def _virgin_strain(law: Formulas, context: Context) -> Path:
     """Strain of virgin loading at every force, whatever was before."""
-    particle = context.particle
-    return law.plastic.strain(particle.stress(context.record.force)) / law.shape_factor(particle)
+    return base_strain(law, context.particle, _stress(context.particle, (context.record.force,)))
 
 
 def _response(law: Formulas, context: Context, shift: Path, stiffness: Path) -> Path:
     """Displacement of a virgin particle whose loading strain is shifted and whose modulus has a factor."""
-    particle, record = context.particle, context.record
-    virgin = record.force >= context.peak_force
+    particle, record, highest = context.particle, context.record, context.peak_force
     strain = _virgin_strain(law, context) + shift
-    peak = since_peak(record)(jnp.where(virgin, particle.displacement(strain), 0.0))
-    recoverable = law.recoverable_displacement(particle, peak, context.peak_force, stiffness)
-    return peak - jnp.where(record.force < context.peak_force, recoverable * recovery(context.load_share), 0.0)
+    peak = peak_displacement(particle, record, highest, strain, jnp.zeros_like(particle.D3), since_peak(record))
+    return released(Context(particle, law, record, highest, *(peak,) * 3), [stiffness]).displacement
