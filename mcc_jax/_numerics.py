@@ -13,6 +13,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Shaped
 
 from ._types import Path, Values
+from .arguments import is_traced
 
 
 def positive_pow(x: Values, p: float | Values) -> Values:

@@ -22,11 +22,12 @@ from .fit_result import Fit, population_of
 from .forward import Point, linearise
 from .linearisation import Linearisation, start_of_effects
 from .marginal import Marginal, summarise
-from .mode import LogPosterior, careful_enough, expect, gradients, most_probable, values_of
+from .mode import LogPosterior, careful_enough, expect, log_densities, most_probable
 from .model import Model
 from .noise import Noise, NoiseFit, estimate_noise, particle_scales, squared_innovations, student_weights
 from .particle_fit import ParticleFits, fit_particles, linear_starts
 from .population import Population
+from .prior_draws import site_values
 from .priors import Priors, check_prior_of_a
 from .settings import FIT, SELECTION
 from .sharding import Blocks, Parts, block_size, count_of, filled_up, require_same
@@ -158,7 +159,7 @@ class _Fitter:
         own = np.column_stack([point.latent, point.zero, np.asarray(point.theta)[:, list(self.varying)]])
         self.individual = self.alone(np.exp(np.asarray(start.noise.logs)[0]) * scale, point.theta, own[None])
         self.linear = self.linearisation.at(point)
-        return values_of(start.population, self.model, self.tests.flatness)
+        return site_values(start.population, self.model, np.asarray(self.tests.flatness))
 
     def begin(self, read_out_um: float) -> dict[str, float]:
         """Every particle on its own, and from which values of the model's sites to look for the population."""
@@ -421,7 +422,7 @@ def theta_slope(free: Float[Array, " d"], target: LogPosterior) -> Float[Array, 
 
 
 def _density(free: Array, target: LogPosterior) -> float:
-    return -float(gradients(np.asarray(free)[None], target)[0][0])
+    return float(log_densities(np.asarray(free)[None], target)[0])
 
 
 def _rows(tree: Any, rows: np.ndarray) -> Any:

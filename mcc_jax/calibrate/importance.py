@@ -23,20 +23,11 @@ from typing import Any, NamedTuple, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
-from .compiling import compiled, even_batch, side_by_side
-from .mode import LogPosterior, expanded, gradients, populations
+from .mode import LogPosterior, expanded, log_densities, populations
 from .population import Population
-from .settings import FIT, NUMERICS, SAMPLING
-
-
-@compiled
-def log_densities(free: Float[Array, "many d"], target: LogPosterior) -> Float[Array, " many"]:
-    """Log density of the population at many coordinates."""
-    return jax.lax.map(
-        target.log_density, free, batch_size=even_batch(len(free), NUMERICS.densities // len(target.marginal.flatness))
-    )
+from .settings import FIT, SAMPLING
 
 
 class Weighted(NamedTuple):
@@ -80,7 +71,7 @@ def sample_weighted(
 
     kept = chains * draws
     trial = min(SAMPLING.trial // 4, kept) if many else SAMPLING.trial
-    mixture = _Mixture(np.asarray(jax.random.key_data(key)), target, many)
+    mixture = _Mixture(np.asarray(jax.random.key_data(key)), target)
     centre, width = mixture.folded(np.array(mode)), np.asarray(covariance)
     for turn in range(SAMPLING.rounds):
         mixture.propose(centre, width, trial)
@@ -131,7 +122,7 @@ def _along(
             if free[place] < -0.5 * sd[place]:
                 break
             for _ in range(SAMPLING.newton):  # the others follow
-                _, slope, curvature = expanded(free, 1e-3 * np.minimum(sd, 1.0), target)
+                _, slope, curvature = expanded(free, FIT.difference * np.minimum(sd, 1.0), target)
                 if not (np.isfinite(slope).all() and np.isfinite(curvature).all()):
                     return
                 within = _inverse(curvature[np.ix_(others, others)], sd[others])
@@ -167,10 +158,10 @@ class _Mixture:
         log_weight: log density less that of the mixture, in the parts that each distribution has of the draws.
     """
 
-    def __init__(self, seed: np.ndarray, target: LogPosterior, many: bool) -> None:
+    def __init__(self, seed: np.ndarray, target: LogPosterior) -> None:
         from scipy.stats import multivariate_t
 
-        self._rng, self._target, self._many = np.random.default_rng(seed), target, many
+        self._rng, self._target = np.random.default_rng(seed), target
         self._spreads = np.array(target.signed())
         d = len(target.names)
         self._signs = np.array(list(product((1.0, -1.0), repeat=len(self._spreads))))
@@ -190,12 +181,10 @@ class _Mixture:
     def propose(self, centre: np.ndarray, width: np.ndarray, count: int) -> None:
         """Add draws of one more distribution, with its mean and covariance."""
         factor = _factor(width)
-        rows = int(count + -count % FIT.gradients)
-        new = self.folded(centre + np.asarray(self._unit.rvs(size=rows, random_state=self._rng)) @ factor.T)
-        log_density = np.concatenate(side_by_side(self._densities, np.split(new, rows // FIT.gradients)))
-        self.free = np.concatenate([self.free, new[:count]])
-        self._log_density = np.concatenate([self._log_density, log_density[:count]])
-        old = [self._proposal(new[:count], *part[:2]) for part in self._parts]
+        new = self.folded(centre + np.asarray(self._unit.rvs(size=count, random_state=self._rng)) @ factor.T)
+        self.free = np.concatenate([self.free, new])
+        self._log_density = np.concatenate([self._log_density, log_densities(new, self._target)])
+        old = [self._proposal(new, *part[:2]) for part in self._parts]
         known = np.concatenate([self._log_proposals, np.stack(old, 1) if old else np.empty((count, 0))])
         inverse = np.tril(np.linalg.inv(factor))
         self._parts.append((centre, inverse, count))
@@ -231,12 +220,6 @@ class _Mixture:
         pairs = (flipped[:, :, None] * flipped[:, None, :]).reshape(len(flipped), -1)
         alike = np.einsum("nd,nd->n", white, white)
         return np.maximum(alike + 4 * (pairs @ products.T - flipped @ (own * (white @ columns)).T), 0.0)
-
-    def _densities(self, part: np.ndarray) -> np.ndarray:
-        # Of few particles a gradient takes no time to speak of, and what the mode was found by is compiled already.
-        if self._many:
-            return np.asarray(log_densities(jnp.asarray(part), self._target))
-        return -gradients(part, self._target)[0]
 
 
 def _tempered(log_weight: np.ndarray, enough: int) -> np.ndarray | None:

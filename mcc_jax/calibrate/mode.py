@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 from numpyro.infer.util import constrain_fn, potential_energy, unconstrain_fn
 
 from .._types import Scalar
-from .compiling import compiled
+from .compiling import compiled, side_by_side
 from .marginal import Marginal, straighten
 from .model import Model
 from .noise import standard_promotion
@@ -194,30 +194,27 @@ def populations(free: Float[Array, "draws d"], target: LogPosterior) -> Populati
 
 
 @compiled
-def _gradients(
-    free: Float[Array, "rows d"], count: Int[Array, ""], target: LogPosterior
-) -> tuple[Float[Array, " rows"], Float[Array, "rows d"]]:
-    expand = jax.vmap(jax.value_and_grad(lambda one: -target.log_density(one)))
-    few = FIT.gradients_at_once
+def _log_densities(free: Float[Array, "rows d"], count: Int[Array, ""], target: LogPosterior) -> Float[Array, " rows"]:
+    few = FIT.densities_at_once
 
     def add(i, found):
-        at = i * few
-        new = expand(jax.lax.dynamic_slice_in_dim(free, at, few))
-        return jax.tree.map(
-            lambda all_rows, some: jax.lax.dynamic_update_slice_in_dim(all_rows, some, at, 0), found, new
-        )
+        some = jax.vmap(target.log_density)(jax.lax.dynamic_slice_in_dim(free, i * few, few))
+        return jax.lax.dynamic_update_slice_in_dim(found, some, i * few, 0)
 
-    return jax.lax.fori_loop(0, -(-count // few), add, (jnp.zeros_like(free[:, 0]), jnp.zeros_like(free)))
+    return jax.lax.fori_loop(0, -(-count // few), add, jnp.zeros_like(free[:, 0]))
 
 
-def gradients(free: np.ndarray, target: LogPosterior) -> tuple[np.ndarray, np.ndarray]:
-    """Minus the log density at up to `FIT.gradients` coordinates, shape (many, d), and its gradients.
+def log_densities(free: np.ndarray, target: LogPosterior) -> np.ndarray:
+    """Log density of the population at many coordinates, shape (many, d).
 
-    Always compiled for as many, so that few and many of them share their compilation.
+    Compiled for `FIT.densities` at a time, so that few and many of them share their compilation; on two threads.
     """
-    rows = jnp.asarray(np.pad(free, ((0, FIT.gradients - len(free)), (0, 0)), mode="edge"))
-    value, slope = _gradients(rows, jnp.asarray(np.asarray(len(free))), target)
-    return np.asarray(value)[: len(free)], np.asarray(slope)[: len(free)]
+
+    def some(rows: np.ndarray) -> np.ndarray:
+        filled = jnp.asarray(np.pad(rows, ((0, FIT.densities - len(rows)), (0, 0)), mode="edge"))
+        return np.asarray(_log_densities(filled, jnp.asarray(np.asarray(len(rows))), target))[: len(rows)]
+
+    return np.concatenate(side_by_side(some, np.split(free, range(FIT.densities, len(free), FIT.densities))))
 
 
 @np.errstate(over="ignore", invalid="ignore")  # steps may lead to where numbers overflow; they are refused
@@ -226,9 +223,8 @@ def most_probable(
 ) -> tuple[Float[Array, " d"], Float[Array, "d d"], bool]:
     """Mode of the population in unbounded coordinates, covariance there, and whether the optimiser converged.
 
-    Newton's method in a trust region (SciPy), in coordinates scaled by the curvature at the start. The curvature comes
-    from differences of exact gradients, which are quicker than second derivatives are to compile. Where the density has
-    no curvature that is a number, even at the start, the covariance is not one either.
+    Newton's method in a trust region (SciPy), in coordinates scaled by the curvature at the start. Where the density
+    has no curvature that is a number, even at the start, the covariance is not one either.
     """
     origin = np.asarray(start)
     d = len(origin)
@@ -243,7 +239,7 @@ def most_probable(
         return jnp.asarray(origin), jnp.asarray(np.full((d, d), np.nan)), False
     for _ in range(FIT.attempts):
         unit = 1 / np.sqrt(np.maximum(np.abs(np.diagonal(expand(origin)[2])), 1e-8))
-        width = 1e-3 * np.minimum(unit, 1.0)
+        width = FIT.difference * np.minimum(unit, 1.0)
         found = _newton(expand, origin, unit)
         origin = origin + unit * found.x
         success = bool(found.success)
@@ -262,11 +258,19 @@ def most_probable(
 
 
 def expanded(free: np.ndarray, width: np.ndarray, target: LogPosterior) -> tuple[float, np.ndarray, np.ndarray]:
-    """Minus the log density, its gradient, and its curvature from differences of gradients over these widths."""
+    """Minus the log density, its gradient and its curvature, from central differences over these widths.
+
+    A program of gradients would take as long to compile as everything else of a fit.
+    """
     d, steps = len(free), np.diag(width)
-    value, slope = gradients(free + np.concatenate([np.zeros((1, d)), steps, -steps]), target)
-    curvature = (slope[1 : d + 1] - slope[d + 1 :]) / (2 * width[:, None])
-    return float(value[0]), slope[0], (curvature + curvature.T) / 2
+    i, j = np.triu_indices(d, 1)
+    pairs = steps[i] + steps[j]
+    value = -log_densities(free + np.concatenate([np.zeros((1, d)), steps, -steps, pairs, -pairs]), target)
+    here, (up, down), both = value[0], value[1 : 2 * d + 1].reshape(2, d), value[2 * d + 1 :].reshape(2, -1).sum(0)
+    curvature = np.diag((up + down - 2 * here) / width**2)
+    mixed = both - (up + down)[i] - (up + down)[j] + 2 * here
+    curvature[i, j] = curvature[j, i] = mixed / (2 * width[i] * width[j])
+    return float(here), (up - down) / (2 * width), curvature
 
 
 def _newton(expand: Callable[[np.ndarray], tuple[float, np.ndarray, np.ndarray]], origin: np.ndarray, unit: np.ndarray):

@@ -92,3 +92,15 @@ def log_priors(population: Population, model: Model, flatness: np.ndarray) -> di
 
     _visited(visit, model, flatness)
     return found
+
+
+def site_values(population: Population, model: Model, flatness: np.ndarray) -> dict[str, float]:
+    """Values of the sampled sites at one population; of a spread's coordinate the positive one."""
+    found, one = {}, jax.tree.map(lambda x: np.asarray(x)[None], population)
+
+    def visit(name: str, prior: Any, of: Callable[[Population], Any]) -> np.ndarray:
+        found[name] = float(of(one)[0])
+        return of(one)
+
+    _visited(visit, model, flatness)
+    return found

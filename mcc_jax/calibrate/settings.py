@@ -76,8 +76,10 @@ class FitSettings:
         student_steps: how often weights of readings and noise are taken in turn, in each round.
         sharp: posterior standard deviation of the logarithm of a polynomial's coefficient below which one Newton step
             integrates a particle out.
-        gradients, gradients_at_once: most coordinates that gradients of the population's density are asked for in one
-            go, and how many of them are worked out side by side, a part of the former without remainder.
+        densities, densities_at_once: at how many coordinates the population's density is asked for in one go, and how
+            many of them are worked out side by side, a part of the former without remainder.
+        difference: step of differences of that density, in standard deviations: rounding and the next term of the
+            series are both below 1e-4 of the curvature.
         mode_gain: twice the log probability still to gain, by Newton's method, at which the mode is reached.
         attempts: how often the search for the mode begins anew where it stopped.
         outlying: a particle whose noise differs by so many standard deviations keeps its own scale.
@@ -105,8 +107,9 @@ class FitSettings:
     steepest: float = 3.0
     student_steps: int = 4
     sharp: float = 0.03
-    gradients: int = 250
-    gradients_at_once: int = 10
+    densities: int = 250
+    densities_at_once: int = 10
+    difference: float = 0.02
     mode_gain: float = 1e-6
     attempts: int = 4
     outlying: float = 5.0
@@ -231,7 +234,6 @@ class Numerics:
 
     Attributes:
         rows, rows_of_accelerators: single draws of single particles: a processor keeps no more in its cache.
-        densities: particles times draws.
         group: restless particles that are drawn together.
         side_by_side: pieces that draws are cut into on a CPU, on any number of cores.
         blocks: sizes of a campaign that is one block: those between are filled up, so that few sizes are compiled. The
@@ -240,7 +242,6 @@ class Numerics:
 
     rows: int = 640
     rows_of_accelerators: int = 40_000
-    densities: int = 4096
     group: int = 64
     side_by_side: int = 2
     blocks: tuple[int, ...] = (4, 8, 12, 16, 20, 24, 32, 40, 48, 64)
