@@ -90,7 +90,14 @@ def pytest_xdist_make_scheduler(config, log):
 CASES = 3
 """Of a test with more cases the core runs as many, spread evenly; the others are `extended`."""
 
-EVERY_CASE = ("tests/campaign/", "tests/cli/test_bad_input", "tests/test_readme", "tests/simulate/test_programme")
+EVERY_CASE = (
+    *(
+        f"tests/campaign/test_{name}.py"
+        for name in ("csv", "folder", "mapping", "marks_and_times", "readers", "valid_files")
+    ),
+    *("tests/cli/test_bad_input.py", "tests/report/test_report_command.py", "tests/export/test_export_command.py"),
+    *("tests/simulate/test_programme.py", "tests/calibrate/test_priors.py", "tests/test_readme.py"),
+)
 """Readers and errors: each case is another one, and takes milliseconds."""
 
 

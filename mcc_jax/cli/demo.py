@@ -66,7 +66,8 @@ def demo(out: Path, seed: int) -> None:
         (stage.folder / SEALED).write_text(secret.text, encoding="utf-8")
         inner = Stage(stage.directory / NOTHING, stage.folder / NOTHING)
         inner.folder.mkdir()
-        _, nothing = _job(inner, None, none, lambda step: tell(f"nothing hidden: {step}"))
+        absent = dataclasses.replace(secret.effect, amplitude=0.0)  # the law alone, by the program compiled above
+        _, nothing = _job(inner, absent, none, lambda step: tell(f"nothing hidden: {step}"))
         stage.stale += [f"{NOTHING}/{name}" for name in inner.stale]
     answer = json.loads(secret.text)
     say()
@@ -105,7 +106,7 @@ def demo(out: Path, seed: int) -> None:
 
 
 def _job(
-    stage: Stage, effect: HiddenEffect | None, settings: dict[str, Any], tell: Tell
+    stage: Stage, effect: HiddenEffect, settings: dict[str, Any], tell: Tell
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Simulate, calibrate, discover, report; the contents of the two results."""
     from ..calibrate import sample
@@ -136,14 +137,14 @@ def _job(
     return content, missing
 
 
-def _campaign(seed: int, effect: HiddenEffect | None) -> Campaign:
+def _campaign(seed: int, effect: HiddenEffect) -> Campaign:
     """Eight of the paper's particles, tested in the computer; whatever tells the truth is taken out."""
     import numpy as np
 
     from ..simulate import Programme, paper_campaign
 
     programme = Programme.cycles(levels=(0.5, 1.0, 1.0), unload_to=0.3, hold_s=20.0, points=150)
-    made = paper_campaign(seed, programme=programme, effects=() if effect is None else (effect,))
+    made = paper_campaign(seed, programme=programme, effects=(effect,))
     some = made.select(np.arange(len(made)) < PARTICLES)
     return dataclasses.replace(some, columns={}, metadata=dataclasses.replace(some.metadata, other={}))
 
