@@ -27,7 +27,7 @@ from ..arguments import is_traced
 from ..effects import AbstractEffect, Record, Variant
 from ..geometry import Particle
 from ..law import MccLaw, Plastic, StrainScaling, Unloading
-from ..law.derivatives import Formula, Numbers, along
+from ..law.derivatives import Formula, Numbers, along, padded
 from .data import Tests
 
 Latent = Float[Array, " 4"]
@@ -159,7 +159,8 @@ def linearise(
     size = (4 + theta.shape[1]) * with_numbers
     law = xp.insert(xp.exp(xp.asarray(point.latent)), 3, 0.0, axis=1)  # a = 0: the shape is taken in
     # Every number of a particle has a direction of its own; those of the law are logarithms.
-    unit = np.zeros((size + asked, 4 + theta.shape[1]))
+    wanted = size + asked
+    unit = np.zeros((padded(wanted) if forms.effects else wanted, 4 + theta.shape[1]))
     unit[range(size), range(size)] = 1.0
     d_law = unit[:, None, [0, 1, 2, 0, 3]] * law[None]
     d_theta = np.broadcast_to(unit[:, None, 4:], (len(unit), count, theta.shape[1]))
@@ -168,8 +169,8 @@ def linearise(
         own = xp.where(xp.asarray(tests.reading), 1.0, 0.0)
         elastic = xp.where(xp.asarray(tests.peak_error) > 0, 1.0, 0.0)
         # A reading on virgin loading is its own peak; where the estimate stands in for readings, both move together.
-        d_force = xp.concatenate([d_force[:size], xp.stack([own, 1 - own])])
-        d_peak = xp.concatenate([d_peak[:size], xp.stack([1 - elastic, elastic])])
+        parts = ((own, 1 - own), (1 - elastic, elastic))
+        d_force, d_peak = (xp.concatenate([d_peak[:size], xp.stack(p), d_peak[wanted:]]) for p in parts)
 
     def of_effects(numbers: Any) -> tuple[Any, ...]:
         return tuple(numbers[..., list(each)] for each in forms.places)
@@ -179,7 +180,7 @@ def linearise(
     there, directed = (Numbers(*jax.tree.map(jnp.asarray, each)) for each in (numbers, directions))
     kinds = forms.unloading, StrainScaling.RAW
     value, slopes = map(xp.asarray, along(kinds, forms.formulas, tests.particle, record, there, directed))
-    columns = xp.where(xp.asarray(tests.mask)[None], slopes, 0.0)
+    columns = xp.where(xp.asarray(tests.mask)[None], slopes[:wanted], 0.0)
     residual = still = xp.zeros((count, points))
     if tests.displacement is not None:
         away = xp.asarray(tests.displacement) - value - xp.asarray(point.zero)[:, None]

@@ -18,6 +18,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .. import arguments
@@ -33,7 +34,14 @@ from .response import additions, no_memory, peak_displacement, peak_forces, rele
 DIRECTIONS = 12
 """As many as two effects with two further numbers each need; with fewer the rest is padding, so that all formulas share
 programs. More are a program more."""
+
 SETTLED = 1e-9  # relative step of the strain from which on the last step of Newton's method is exact to rounding
+
+
+def padded(directions: int) -> int:
+    """Number of directions, padding included, that `along` takes where formulas act."""
+    return -(-directions // DIRECTIONS) * DIRECTIONS + 1
+
 
 # ---- the law along measured tests ------------------------------------------------------------------------------------
 
@@ -90,12 +98,8 @@ def along(
         formulas: what acts besides.
         particle, record: one of every test; `record.peak` is given.
         numbers: where.
-        directions: with a leading axis.
+        directions: with a leading axis; where formulas act, the last one is along nothing (`padded`).
     """
-    asked = len(directions.law)
-    if formulas:
-        more = -asked % DIRECTIONS + 1
-        directions = jax.tree.map(lambda x: jnp.pad(x, ((0, more), *[(0, 0)] * (x.ndim - 1))), directions)
     tests, law, d_law = (particle, record), numbers.law, directions.law
     loads, d_loads = (numbers.force, numbers.peak), (directions.force, directions.peak)
 
@@ -110,20 +114,19 @@ def along(
         law, d_law = hook("modify", k)
     if loading := with_hook("loading"):
         strain, step = _start(forms, law, loads, particle, []), jnp.inf
-        by_strain = jnp.zeros((len(d_law), *strain.shape)).at[-1].set(1.0)  # the padding has room for one
+        by_strain = np.zeros((len(d_law), *strain.shape))
+        by_strain[-1] = 1.0  # the direction along nothing else
 
-        def factors(strain: Any) -> tuple[Any, Any, Any]:
+        def factors(strain: Any) -> tuple[list[Any], list[Any]]:
             found = [hook("loading", k, strain, by_strain) for k in loading]
-            values, slopes = [one for one, _ in found], [one for _, one in found]
-            return values, jax.tree.map(lambda x: x[-1], slopes), slopes
+            return [one for one, _ in found], [one for _, one in found]
 
         strain = _start(forms, law, loads, particle, factors(strain)[0])
         for _ in range(NEWTON_STEPS):
-            strain, step = _newton(forms, law, loads, particle, strain, *factors(strain)[:2])
+            strain, step = _newton(forms, law, loads, particle, strain, *factors(strain))
             if not arguments.is_traced(step) and step < SETTLED:
                 break
-        values, slopes, d_values = factors(strain)
-        reached, d_reached = _reached(forms, law, loads, *tests, strain, values, slopes, (d_law, d_loads, d_values))
+        reached, d_reached = _reached(forms, law, loads, *tests, strain, *factors(strain), (d_law, d_loads))
         context, d_context = _staged(
             _released, (law, loads, reached, []), (d_law, d_loads, d_reached, []), tests, forms
         )
@@ -137,7 +140,7 @@ def along(
     for k in with_hook("inside", "observe"):
         added, d_added = hook("added", k, context, d_context)
         total, slopes = total + added, slopes + d_added
-    return total, slopes[:asked]
+    return total, slopes
 
 
 @compiled
@@ -218,7 +221,7 @@ def _newton(
     def one(law: Array, loads: Any, particle: Particle, *at: Any) -> Array:
         return newton_step(_law(law, forms), particle, _stress(particle, loads), *at)
 
-    new = jax.vmap(one)(law, loads, particle, strain, factors, slopes)
+    new = jax.vmap(one)(law, loads, particle, strain, factors, jax.tree.map(lambda x: x[-1], slopes))
     return new, jnp.max(jnp.abs(new - strain) / jnp.where(strain > 0, strain, 1.0))
 
 
@@ -245,8 +248,9 @@ def _reached(
         _, _, record, highest = _loaded(law[0], loads, particle, record, forms)
         return peak_displacement(particle, record, highest, strain, jnp.zeros_like(particle.D3), since_peak(record))
 
-    off, change = _staged(residual, (law, loads, factors), directions, (particle, strain), None)
-    slope = jax.vmap(lambda law, *at: slope_at(_law(law, forms), *at))(law, particle, strain, factors, slopes)
+    off, change = _staged(residual, (law, loads, factors), (*directions, slopes), (particle, strain), None)
+    by_strain = jax.tree.map(lambda x: x[-1], slopes)
+    slope = jax.vmap(lambda law, *at: slope_at(_law(law, forms), *at))(law, particle, strain, factors, by_strain)
     given, along = (strain - off / slope, *loads), (-change / slope[None], *directions[1])
     return _staged(peak, given, along, (particle, record), None)
 
