@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from joint_cases import random_precision
 
-from mcc_jax.calibrate.small_matrices import Cholesky, eliminate
+from mcc_jax.calibrate.small_matrices import Cholesky
 
 pytestmark = pytest.mark.extended
 
@@ -79,14 +79,3 @@ def test_the_determinant_s_derivative_is_the_inverse(size):
 
 def test_an_indefinite_matrix_does_not_pass_for_a_definite_one():
     assert np.isnan(np.asarray(Cholesky(jnp.asarray([[1.0, 2.0], [2.0, 1.0]])).solve(jnp.ones(2)))).any()
-
-
-# ---- numbers integrated out of a linear model ------------------------------------------------------------------------
-
-
-def test_without_a_mean_it_is_zero():
-    gram, precision = jnp.asarray(random_precision(np.random.default_rng(2), 1, 4)[0]), jnp.asarray([0.5, 2.0])
-    for one, two in zip(
-        eliminate(gram, (0, 2), precision), eliminate(gram, (0, 2), precision, jnp.zeros(2)), strict=True
-    ):
-        np.testing.assert_array_equal(one, two)

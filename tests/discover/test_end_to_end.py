@@ -16,14 +16,11 @@ QUICK = {"confirm": False, "experiments": False, "posterior": False}
 COMPLIANCE = 0.004
 
 
-FEW = {name: LIBRARY[name] for name in ("frame_compliance", "damage")}
-
-
 @pytest.fixture(scope="module", params=["few", pytest.param("all", marks=pytest.mark.extended)])
 def named(request):
     """What is found among few mechanisms, and among all."""
-    library = FEW if request.param == "few" else None
-    return discover(cached(f"frame_compliance={COMPLIANCE}"), library=library, experiments=False)
+    few = {name: LIBRARY[name] for name in ("frame_compliance", "damage")} if request.param == "few" else None
+    return discover(cached(f"frame_compliance={COMPLIANCE}"), library=few, experiments=False)
 
 
 def content(found):

@@ -174,6 +174,7 @@ def test_value_and_derivatives_are_finite_in_single_precision(unloading, scaling
     finite_everywhere(unloading, scaling, jnp.float32, along_a_path)
 
 
+@pytest.mark.extended
 def test_value_and_derivatives_of_one_step_are_finite():
     finite_everywhere(*FORMS[0], jnp.float64, one_step)
 
@@ -220,7 +221,7 @@ def test_a_tie_has_the_loading_tangent(mode):
     close(one, other, rel=1e-11)
 
 
-@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("mode", first_in_core([jax.jacfwd, jax.jacrev]))
 @pytest.mark.parametrize("form", Unloading)
 def test_slopes_on_the_two_sides_of_the_peak(form, mode):
     law, p = paper_law(form), paper_particle(12)
@@ -237,7 +238,7 @@ def test_slopes_on_the_two_sides_of_the_peak(form, mode):
     assert onset > 2 * loading
 
 
-@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("mode", first_in_core([jax.jacfwd, jax.jacrev]))
 def test_out_of_contact_nothing_depends_on_the_platen(mode):
     law, p = paper_law(), paper_particle(1)
     state = History(80.0)

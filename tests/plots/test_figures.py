@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 import pytest
+from helpers import first_in_core
 from matplotlib._pylab_helpers import Gcf
 from matplotlib.collections import FillBetweenPolyCollection
 from matplotlib.image import imread
@@ -32,8 +33,7 @@ from mcc_jax.plots import (
 from mcc_jax.plots.paper import adjusted_curve, dimension_statistics, law_strain, stretches_outside
 from mcc_jax.plots.style import shape_factors
 
-KINDS = ("paper", "cycles", "two", "dropped", "many")
-QUICK = [pytest.param(kind, marks=pytest.mark.extended if kind in ("two", "many", "dropped") else ()) for kind in KINDS]
+KINDS = first_in_core(["paper", "cycles", "two", "dropped", "many"])
 UNIT = re.compile(r"\[(MPa|GPa|mN|µm|-)\]$")
 
 
@@ -60,7 +60,7 @@ def within(box, page):
     return page.x0 <= box.x0 and box.x1 <= page.x1 and page.y0 <= box.y0 and box.y1 <= page.y1
 
 
-@pytest.fixture(scope="module", params=QUICK)
+@pytest.fixture(scope="module", params=KINDS)
 def kind(request):
     return request.param
 
@@ -152,6 +152,7 @@ def test_curves_span_the_shape_factors(paper):
     assert len(whole.lines) == len(toe.lines) - 1 == 3 * 2 + 1  # the threshold, and in `toe` the strain there
 
 
+@pytest.mark.extended
 def test_adjusted_curves_meet_at_the_threshold(calibrations):
     r = calibrations["dropped"]
     for i in np.flatnonzero(r.adjustment.kept):
@@ -164,6 +165,7 @@ def test_adjusted_curves_meet_at_the_threshold(calibrations):
         np.testing.assert_allclose(strain[2:] * diameters[0] * diameters[1] / diameters[2], rest, rtol=1e-12)
 
 
+@pytest.mark.extended
 def test_curves_of_chosen_particles(calibrations):
     r = calibrations["dropped"]
     figure = plot_curves(r, ["a_b^c", "$x_1$ <script>"])
@@ -281,8 +283,9 @@ def test_law_says_where_it_leaves_the_data(paper):
 # ---- particles -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.extended
 def test_pages(calibrations):
-    assert [particle_pages(calibrations[k]) for k in KINDS] == [1, 1, 1, 1, 2]
+    assert [particle_pages(calibrations[k]) for k in (*calibrations.campaigns, "many")] == [1, 1, 1, 1, 2]
     many = calibrations["many"]
     assert [len(panels(plot_particles(many, page))) for page in (1, 2)] == [20, 3]
     assert "Measured and predicted, page 2 of 2" in texts(plot_particles(many, 2))
