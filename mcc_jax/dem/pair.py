@@ -102,7 +102,8 @@ def wall_force(side: HalfContact, overlap_max: ScalarLike, overlap: ScalarLike) 
     _check_sides(side)
     overlap_max, overlap = _largest(side, overlap_max), _overlap(side, overlap)
     peak = largest_overlap(overlap_max, overlap)
-    return branch_force(side.power, *side.numbers(peak), peak, peak - overlap)
+    *loading, c = side.numbers(peak)
+    return branch_force(side.power, *loading, shared(1 / c), peak, peak - overlap)
 
 
 def pair_split(i: HalfContact, j: HalfContact, overlap: ScalarLike) -> tuple[Scalar, Scalar]:
