@@ -5,10 +5,11 @@ without friction, compressed between a moving and a fixed punch. MDR's modulus a
 are fitted to the paper's mean curve of one sphere between plates, up and down again, with LAMMPS's own wall contact.
 The three take turns, chunk by chunk, in one process on one core and with the same time step; compilation is not
 counted. The skin of LAMMPS's lists is the best of 10, 20 and 30 um; ours is 30 um while spheres fly about and 10 um
-from density 0.5, which `advance` allows as long as it shrinks. Speed per second of CPU time is what a shared machine
-can tell; wall time stands beside it. Contacts are pairs whose spheres of initial size overlap. MDR lets radii grow and
-adds a bulk response where little surface is left free; a sum of pair contacts, as here, has neither, so that lower
-stresses are expected of it at high density.
+from density 0.5, which `advance` allows as long as it shrinks. "mcc single" has forces, velocities and history in
+single precision (`in_single`); LAMMPS and "mcc" compute in double precision. Speed per second of CPU time is what a
+shared machine can tell; wall time stands beside it. Contacts are pairs whose spheres of initial size overlap. MDR lets
+radii grow and adds a bulk response where little surface is left free; a sum of pair contacts, as here, has neither, so
+that lower stresses are expected of it at high density.
 """
 
 from __future__ import annotations
@@ -101,6 +102,7 @@ def compaction(count, speed, contacts, chunk=CHUNK, until=0.875):
         advance,
         close_pairs,
         die,
+        in_single,
         relative_density,
         scattered,
         spheres,
@@ -114,7 +116,8 @@ def compaction(count, speed, contacts, chunk=CHUNK, until=0.875):
     radius = np.asarray(packing.radius)
     time_step = stable_time_step(packing)
     motion = Motion.of(time_step, Interaction(damping=DAMPING))
-    state = start(packing, die(die_radius, height), position, LOOSE)
+    first_state = start(packing, die(die_radius, height), position, LOOSE)
+    ours = {"mcc": (packing, motion, first_state), "mcc single": in_single(packing, motion, first_state)}
     down = jnp.asarray([[0.0, 0.0, 0.0], [0.0, 0.0, -speed], [0.0, 0.0, 0.0]])
     theirs = {
         name: _lammps.DieCompaction(
@@ -127,15 +130,19 @@ def compaction(count, speed, contacts, chunk=CHUNK, until=0.875):
     rows = []
     for k in range(chunks):
         row = {"density": relative_density(packing, die_radius, 0.0, height - speed * (k + 0.5) * chunk * time_step)}
-        before, capacity, skin = state, state.edges.capacity, LOOSE if row["density"] < 0.5 else SKIN
-        (state, out), cpu, wall = _timed(lambda s=before, skin=skin: advance(packing, motion, s, down, 1, chunk, skin))
-        if k == 0 or state.edges.capacity != capacity:  # it compiled: once more, from the same state
-            (state, out), cpu, wall = _timed(
-                lambda s=before, skin=skin: advance(packing, motion, s, down, 1, chunk, skin)
-            )
-        pairs = len(close_pairs(np.asarray(state.position), radius, 0.0))
-        row["mcc"] = (float(out.on_wall[0, 1, 2]), pairs, pairs, cpu, wall)
-        row["beyond"], row["touching"] = int(out.beyond_tested[0]), int(out.contacts[0])
+        skin = LOOSE if row["density"] < 0.5 else SKIN
+        for name, (spheres_, how, before) in ours.items():
+
+            def chunk_of(arguments=(spheres_, how, before), skin=skin):
+                return advance(*arguments, down, 1, chunk, skin)
+
+            (state, out), cpu, wall = _timed(chunk_of)
+            if k == 0 or state.edges.capacity != before.edges.capacity:  # it compiled: once more, from the same state
+                (state, out), cpu, wall = _timed(chunk_of)
+            ours[name] = spheres_, how, state
+            pairs = len(close_pairs(np.asarray(state.position), radius, 0.0))
+            row[name] = (float(out.on_wall[0, 1, 2]), pairs, pairs, cpu, wall)
+            row["beyond"], row["touching"] = int(out.beyond_tested[0]), int(out.contacts[0])
         for name, peer in theirs.items():
             force, cpu, wall = _timed(lambda p=peer: p.advance(chunk))
             row[name] = (force, len(close_pairs(peer.position(), radius, 0.0)), peer.contacts(), cpu, wall)
@@ -153,7 +160,7 @@ def _timed(work):
 
 def summary(count, run):
     """Rows of the tables of densities and of speed."""
-    rows, names = run["rows"], ("mcc", "MDR", "Hertz")
+    rows, names = run["rows"], ("mcc", "mcc single", "MDR", "Hertz")
     density = np.array([row["density"] for row in rows])
     at, speed = [], []
     for mark in MARKS:
@@ -168,7 +175,9 @@ def summary(count, run):
                     "punch [MPa]": force / run["area"] / 1e6,
                     "pairs in contact": pairs,
                     "by its own count": own,
-                    "beyond the tested range": f"{row['beyond']} of {row['touching']}" if name == "mcc" else "-",
+                    "beyond the tested range": f"{row['beyond']} of {row['touching']}"
+                    if name.startswith("mcc")
+                    else "-",
                 }
             )
     for part, least in (("whole stroke", 0.0), ("density above 0.6", 0.6)):
@@ -183,6 +192,8 @@ def summary(count, run):
                     **{f"{n} [particle-steps/s]": f"{x:.3g}" for n, x in rate.items()},
                     "mcc / MDR": rate["mcc"] / rate["MDR"],
                     "mcc / Hertz": rate["mcc"] / rate["Hertz"],
+                    "mcc single / MDR": rate["mcc single"] / rate["MDR"],
+                    "mcc single / Hertz": rate["mcc single"] / rate["Hertz"],
                     "at least MDR": bool(rate["mcc"] >= rate["MDR"]),
                 }
             )

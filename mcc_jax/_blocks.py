@@ -14,9 +14,10 @@ from jax.sharding import Mesh, PartitionSpec
 from . import arguments
 from ._errors import InputError
 
-CONTACTS = 2048
-NUMBERS = 2 * CONTACTS
-"""Of one array in a block: with the dozen arrays between, that is half of a small core's second cache."""
+CONTACTS = 512
+"""In a block: the few arrays that a loop over one takes then come from a core's first cache."""
+NUMBERS = 4096
+"""Of one array in a block of paths: with the dozen arrays between, half of a small core's second cache."""
 
 
 def in_blocks[**P, R](
@@ -36,7 +37,7 @@ def in_blocks[**P, R](
 
     Args:
         function: of one contact; its positional arguments are trees of arrays without a batch axis.
-        block: contacts in a block, >= 1; if None, what suits a cache: 2048, or fewer where each brings a path. The
+        block: contacts in a block, >= 1; if None, what suits a cache: 512, or fewer where each brings a path. The
             actual one may be smaller, so that blocks come out even.
         devices: JAX devices over which the contacts are divided, in equal shares; the default device if None.
 

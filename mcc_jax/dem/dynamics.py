@@ -160,7 +160,6 @@ def run(
         wanted: how many of these steps are taken.
         devices: over which the contacts are divided (`jax.devices()`); not divided if None.
     """
-
     check_arguments(packing, motion, state)
     steps = arguments.whole(steps, "steps")
 
@@ -312,7 +311,6 @@ def stable_time_step(packing: Packing, safety: float = 0.3) -> float:
         packing: the spheres.
         safety: s; 0.3 leaves room for several contacts a particle.
     """
-
     arguments.instance(packing, Packing, "packing", A_PACKING)
     safety = arguments.number(safety, "safety", above=0)
 
@@ -326,15 +324,9 @@ def stable_time_step(packing: Packing, safety: float = 0.3) -> float:
 def in_single(packing: Packing, motion: Motion, state: State) -> tuple[Packing, Motion, State]:
     """The same with forces, velocities and history in float32; positions, walls and time stay in double precision.
 
-    An overlap is a small difference of coordinates, and the way of a particle or a punch in one step is smaller still:
-    in float32 a die of 1 mm knows places to 1e-10 m, more than a slow punch moves in a step, and so the punch would
-    stop or run at a wrong speed. Both are therefore kept in double precision; the law, which takes the time, is not.
-    Forces then err by about 1e-6 of the largest (tested to 1e-5). History takes 16 B an edge instead of 32.
-
-    Args:
-        packing: the spheres.
-        motion: time step, damping, friction.
-        state: where to start; what it remembers is rounded.
+    An overlap is a small difference of coordinates, and the way of a punch in one step is smaller still: in float32 a
+    die of 1 mm knows places to 1e-10 m only. Forces err by about 1e-6 of the largest (tested to 1e-5). History takes
+    16 B an edge instead of 32; what the state remembers is rounded.
     """
     check_arguments(packing, motion, state)
 

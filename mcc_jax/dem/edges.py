@@ -147,11 +147,12 @@ def list_edges(pairs: Any, particles: int, capacity: int, dtype: np.dtype | type
     if given.size and (given.ndim != 2 or given.shape[1] != 2 or not (given == np.floor(given)).all()):
         raise InputError(f"pairs must be pairs of whole numbers, shape (pairs, 2), got the shape {given.shape}")
     pairs = np.asarray(pairs, np.int64).reshape(-1, 2)
-    low, high = pairs.min(axis=1), pairs.max(axis=1)
+    low, high = np.minimum(pairs[:, 0], pairs[:, 1]), np.maximum(pairs[:, 0], pairs[:, 1])
     wrong = np.flatnonzero((low < 0) | (high >= particles) | (low == high))
     if wrong.size:
         raise InputError(f"pair {wrong[0]} joins {pairs[wrong[0]].tolist()}", remedy=f"Name two of {particles}.")
-    key = np.unique(low * particles + high)
+    key = np.sort(low * particles + high)
+    key = key[np.diff(key, prepend=-1) > 0]
     kept = np.full(capacity, PADDING)
     kept[: min(key.size, capacity)] = key[:capacity]
     first, second = np.divmod(np.where(kept == PADDING, 0, kept), particles)

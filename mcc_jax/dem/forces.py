@@ -15,7 +15,7 @@ from .._types import Flag, Scalar, ScalarLike, scalar
 from .edges import Edges
 from .pair import largest_overlap, pair_force, wall_force
 from .side import HalfContact
-from .walls import Wall, Walls
+from .walls import Wall, Walls, dot
 
 Vectors = Float[Array, "particles 3"]
 Vector = Float[Array, " 3"]
@@ -148,7 +148,7 @@ def overlap_and_normal(i: Vector, j: Vector, reach: Scalar, listed: Flag) -> tup
         listed: whether this is a pair at all.
     """
     between = j - i
-    square = jnp.sum(between * between)
+    square = dot(between, between)
     apart = listed & (square > 0)
     distance = shared(jnp.sqrt(jnp.where(apart, square, 1.0)))
     separation = reach.astype(distance.dtype) - distance
@@ -168,19 +168,7 @@ def contact_forces(
     history: WallHistory,
     time_step: Scalar,
 ) -> tuple[Forces, Edges, WallHistory]:
-    """Forces of all contacts, and what the contacts remember after them.
-
-    Args:
-        packing: the spheres.
-        interaction: damping and friction.
-        walls: the walls.
-        position: centres [m].
-        velocity: of the centres [m/s].
-        spin: angular velocities [rad/s].
-        edges: the pairs.
-        history: of the contacts with walls.
-        time_step: over which slip adds up [s].
-    """
+    """Forces of all contacts, and what they remember after them; slip adds up over the time step [s]."""
     arguments.instance(packing, Packing, "packing", A_PACKING)
     arguments.instance(interaction, Interaction, "interaction", "Make one with mcc_jax.dem.Interaction().")
     arguments.instance(edges, Edges, "edges", "Take those of a state.")
@@ -203,9 +191,12 @@ def pair_loads(
     i, j = (jax.tree.map(lambda x, at=at: x[at], bodies) for at in (edges.i, edges.j))
     between = jax.vmap(_between, (None, 0, 0, 0, 0, 0, None))
     pairs = between(interaction, i, j, edges.active, edges.overlap_max, edges.slip, time_step)
-    total = jnp.zeros((bodies.radius.shape[0], 6), bodies.radius.dtype)
-    total = total.at[edges.i].add(_load(pairs.force, i.radius, pairs.couple))
-    total = total.at[edges.j].add(_load(-pairs.force, j.radius, pairs.couple))
+    on_i, on_j = pairs.force, -pairs.force
+    if interaction.friction is not None:  # without it there is no torque to add up
+        on_i, on_j = _load(on_i, i.radius, pairs.couple), _load(on_j, j.radius, pairs.couple)
+    total = jnp.zeros((bodies.radius.shape[0], on_i.shape[1]), bodies.radius.dtype)
+    total = total.at[edges.i].add(on_i).at[edges.j].add(on_j)
+    total = jnp.pad(total, ((0, 0), (0, 6 - total.shape[1])))
     return total, eqx.tree_at(lambda e: (e.overlap_max, e.slip), edges, (pairs.overlap_max, pairs.slip))
 
 
@@ -275,7 +266,7 @@ def _contact(
     time_step: Scalar,
 ) -> _Contact:
     """Force on the first body; the normal points from it to the second, whose surface moves relative to its own."""
-    opening = jnp.sum(relative * normal)
+    opening = dot(relative, normal)
     touching = elastic > 0
     damping = 2 * interaction.damping
     push = elastic - damping * shared(jnp.sqrt(mass * k)) * opening
@@ -286,7 +277,7 @@ def _contact(
 
     # The contact plane turned since the last step: keep the slip's length and put it into the new plane.
     sliding = relative - opening * normal
-    in_plane = slip - jnp.sum(slip * normal) * normal
+    in_plane = slip - dot(slip, normal) * normal
     sliding, push, in_plane = jax.lax.optimization_barrier((sliding, push, in_plane))
     slip = in_plane * shared(_norm(slip) / (_norm(in_plane) + jnp.finfo(slip.dtype).tiny ** 0.5))
     slip = slip + time_step * sliding
@@ -305,6 +296,6 @@ def _contact(
 
 
 def _norm(vector: Vector) -> Scalar:
-    square = jnp.sum(vector * vector)
+    square = dot(vector, vector)
     some = square > 0
     return jnp.where(some, shared(jnp.sqrt(jnp.where(some, square, 1.0))), 0.0)

@@ -23,7 +23,7 @@ from .forces import A_PACKING, Packing, Vectors, WallHistory
 from .walls import Cylinder, Plane, Walls
 
 A_STATE = "Make one with mcc_jax.dem.start(packing, walls, position, skin)."
-SPARE = 1.25
+SPARE = 1.1
 """Room in the list of edges beyond the pairs found when it was made."""
 
 
@@ -63,7 +63,7 @@ def start(packing: Packing, walls: Walls, position: Any, skin: float, capacity: 
         walls: the walls.
         position: centres [m].
         skin: extra distance up to which pairs are listed [m], for example a fifth of a radius.
-        capacity: room for edges; a quarter more than there are pairs if None.
+        capacity: room for edges; a tenth more than there are pairs if None.
 
     Raises:
         InputError: if a position is not finite, a particle is outside the walls, a half contact resists nothing, or
@@ -98,7 +98,7 @@ def listed(packing: Packing, state: State, skin: float, capacity: int | None = N
         packing: the spheres.
         state: any state, also one whose list is stale.
         skin: as in `start`.
-        capacity: room for edges; if None that of the present list, or a quarter more than the pairs if they do not fit.
+        capacity: room for edges; if None that of the present list, or a tenth more than the pairs if they do not fit.
 
     Raises:
         InputError: as `close_pairs`, and if the pairs do not fit a capacity that was asked for.
@@ -188,13 +188,7 @@ def _astray(state: State) -> tuple[Bool[Array, " particles"], Bool[Array, "walls
 
 
 def save_state(path: str | Path, packing: Packing, state: State) -> None:
-    """Write packing and state into one file, replacing an older one only when it is complete.
-
-    Args:
-        path: the file.
-        packing: the spheres.
-        state: all that moves or remembers.
-    """
+    """Write packing and state into one file, replacing an older one only when it is complete."""
     path = arguments.file_path(path, "path")
     arguments.instance(packing, Packing, "packing", A_PACKING)
     arguments.instance(state, State, "state", A_STATE)

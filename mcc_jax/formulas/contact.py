@@ -105,10 +105,6 @@ class Formulas(eqx.Module):
         with p of the `StrainScaling`, and never more than a contact can give back (`recovery_limit`),
 
         .. math:: \delta \le \min\left(\epsilon_P,\ \tfrac{3\pi}{8}\, \sigma_P \Big/ \frac{d\sigma}{d\epsilon}\right).
-
-        The printed form does not vanish at zero strain: below a peak strain of about 0.01 (0.2 MPa) its residual strain
-        would be negative, and a little lower its unloading would create energy. There the limit holds; with the paper's
-        modulus, above it the formula is untouched up to far beyond the tested range.
         """
         eta = self.shape_factor(particle)
         _, _, recoverable = self._elastic(eta, eta * strain_max)
@@ -139,10 +135,13 @@ class Formulas(eqx.Module):
         )
         return particle.displacement(jnp.where(moved & carries, recoverable, 0.0))
 
-    def _elastic(self, eta: Scalar, x: AnyShape) -> tuple[AnyShape, Bool[Array, ...], AnyShape]:
+    def _elastic(
+        self, eta: Scalar, x: AnyShape, modulus: Scalar | None = None
+    ) -> tuple[AnyShape, Bool[Array, ...], AnyShape]:
         """Peak stress, whether it is positive, and the recoverable strain, at the peak scaled strain `x`."""
         secant = secant_modulus(*self.plastic.polynomial, x)
-        return x * secant, *self._recoverable(eta, x, secant, secant, self.effective_modulus)
+        modulus = self.effective_modulus if modulus is None else modulus
+        return x * secant, *self._recoverable(eta, x, secant, secant, modulus)
 
     def _recoverable(
         self, eta: Scalar, x: AnyShape, secant: AnyShape, loading_secant: AnyShape, modulus: AnyShape
@@ -165,9 +164,10 @@ class Formulas(eqx.Module):
         """Force [mN] at platen displacements [um], the largest up to each being `peak`."""
         # A path then depends on its particle through four numbers only.
         eta, diameter = derivative_kept(self.shape_factor(particle)), derivative_kept(particle.effective_diameter)
-        form = self.unloading, self.strain_scaling
-        k1, k3, k5, c = branch_coefficients(*form, *self.plastic.polynomial, self.effective_modulus, eta, diameter)
-        return branch_force(self.unloading.stress_power, k1, k3, k5, c, peak, peak - displacement)
+        size = eta, diameter, particle.inverse_diameter
+        form, law = (self.unloading, self.strain_scaling), (*self.plastic.polynomial, self.effective_modulus)
+        numbers = branch_coefficients(*form, *law, *size)
+        return branch_force(self.unloading.stress_power, *numbers, peak, peak - displacement)
 
     @compiled_whole
     def peak_and_displacement(
@@ -235,12 +235,8 @@ class Formulas(eqx.Module):
         """
         diameter = particle.effective_diameter
         eta = self.shape_factor(particle)
-        formulas = (
-            self
-            if factor is None
-            else eqx.tree_at(lambda f: f.effective_modulus, self, factor * self.effective_modulus)
-        )
-        peak_stress, carries, recoverable = formulas._elastic(eta, eta * peak / diameter)
+        modulus = self.effective_modulus if factor is None else factor * self.effective_modulus
+        peak_stress, carries, recoverable = self._elastic(eta, eta * peak / diameter, modulus)
         s = _recovered((peak - displacement) / diameter, carries, recoverable)
         scale = particle.force(peak_stress) * diameter * jnp.where(carries, recoverable, 0.0)
         at_peak = scale * energy_ratio(jnp.zeros_like(s))

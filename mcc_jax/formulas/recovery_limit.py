@@ -51,7 +51,11 @@ def recovery_limit(peak: Any, secant: Any, tangent: Any) -> tuple[Values, Bool[A
     """
     given = {"peak": peak, "secant": secant, "tangent": tangent}
     peak, secant, tangent = (arguments.values(value, name) for name, value in given.items())
-    least = SHARE * secant
-    steep = tangent > least
-    top = jnp.where(steep, tangent, least)
-    return peak * shared(least / jnp.where(top > 0, top, 1.0)), steep
+    stiffness, steep = least_stiffness(secant, tangent)
+    return peak * shared(secant / jnp.where(stiffness > 0, stiffness, 1.0)), steep
+
+
+def least_stiffness(secant: Values, tangent: Values) -> tuple[Values, Bool[Array, ...]]:
+    """Peak force over the limit, and whether the contact is steep there."""
+    steep = tangent > SHARE * secant
+    return jnp.where(steep, tangent * (1 / SHARE), secant), steep

@@ -25,11 +25,9 @@ class Unloading(enum.Enum):
     With 16 GPa in a punch form, unloading is a vertical line (recovered strain about 5e-4); a punch form describes the
     same curves as the printed one with a modulus of 0.3 to 0.6 GPa. Independent finite elements favour the punch forms.
 
-    No form gives back more energy than it took: the recovered strain is limited to the peak strain and to
-    :math:`\tfrac{3\pi}{8} \sigma_P / (d\sigma/d\epsilon)_P` (`recovery_limit`). With the paper's numbers that matters
-    below a peak strain of 0.010 to 0.014 in the printed form (stresses of 0.07 to 0.18 MPa) and below 2e-7 in the punch
-    forms, where the formulas would create energy. Above, every form is its formula to the last bit throughout the
-    tested range; with a soft modulus the limit matters again beyond that range.
+    No form gives back more energy than it took (`recovery_limit`). With the paper's numbers that matters below a peak
+    strain of 0.010 to 0.014 in the printed form (0.07 to 0.18 MPa) and below 2e-7 in the punch forms; above, every form
+    is its formula throughout the tested range.
 
     References:
         Bommireddy et al. (2018), eq. 24; Mesarovic and Johnson (2000); Hill and Storakers (1990).
