@@ -363,6 +363,8 @@ def estimate_noise(
     from scipy.optimize import minimize
 
     scale = blocks.cut(start.scale)
+    # Without what is never read, so that all models share a program.
+    linear = linear.map(lambda wave: replace(wave, columns=wave.columns[..., :4], bends=None))
 
     def value_and_gradient(logs: np.ndarray) -> tuple[float, np.ndarray]:
         at = jnp.asarray(logs + DIFFERENCES)
