@@ -50,6 +50,11 @@ def test_particles_with_their_own_coefficients_are_described_by_them(result):
         assert len(particle.measured_um) == len(result.campaign.curves[i])
 
 
+def test_noise_is_the_instrument_s(result):
+    # Force noise shows in displacement too, through the slope: a little more than the 0.02 um put in.
+    assert result.displacement_noise_um == pytest.approx(0.02, rel=0.25)
+
+
 @pytest.mark.extended
 def test_campaigns_of_similar_size_share_their_compilations(result):
     compiled = shape._solve, modulus._fit
