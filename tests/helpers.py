@@ -33,11 +33,8 @@ FORMS = [(u, s) for u in Unloading for s in StrainScaling]
 FORM_NAMES = [f"{u.value}-{s.value}" for u, s in FORMS]
 ALL_FORMS = pytest.mark.parametrize(("unloading", "scaling"), FORMS, ids=FORM_NAMES)
 # Each form and each way of the shape factor once, for derivatives, which compile for long: the core takes the first.
-SOME_FORMS = pytest.mark.parametrize(
-    ("unloading", "scaling"),
-    [pytest.param(*f, marks=pytest.mark.extended if i else ()) for i, f in enumerate(FORMS[::4])],
-    ids=FORM_NAMES[::4],
-)
+SOME = [pytest.param(*f, marks=pytest.mark.extended if i else ()) for i, f in enumerate(FORMS[::4])]
+SOME_FORMS = pytest.mark.parametrize(("unloading", "scaling"), SOME, ids=FORM_NAMES[::4])
 
 
 def first_in_core(values, keep=1):

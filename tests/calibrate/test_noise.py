@@ -133,6 +133,7 @@ def test_draws_have_the_covariance_of_the_density(kind):
     np.testing.assert_allclose(covariance, dense(FOUR, 1.0, tests, linear, kind=kind)[used][:, used], rtol=1e-6)
 
 
+@pytest.mark.extended
 def test_draws_of_the_distribution_are_around_the_prediction_and_nan_where_masked():
     rng = np.random.default_rng(8)
     tests, linear = random_tests(rng, zero_sd=0.6, count=2)

@@ -12,7 +12,6 @@ from mcc_jax._errors import InputError
 from mcc_jax.campaign import Campaign, read_campaign
 from mcc_jax.campaign import curves as curves_module
 
-TOML = 'control = "load"\nforce_resolution_mN = 0.1\n[other]\nx = [1, 2]\n'
 PIECES = st.sampled_from(
     [",", "\n", "\r", '"', '""', ";", "\t", " ", "\0", "nan", "inf", "-", ".", "e", "1e400", "A", "01", "\ufeff", "µ",
      "_", "'", "force_mN", "time_s", "particle", "0x1", "1_0", "１", "True", "\x1a", "\u2028", "\x0b"]

@@ -43,6 +43,7 @@ def test_creep_is_the_solution_of_its_equation_by_hand():
     np.testing.assert_allclose(added[:181], by_hand[:181], rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.extended
 def test_amplitude_zero_is_the_base_law():
     null = creeping(0.0, 0.0).with_effects(*(v.build(0.0) for m in LIBRARY.values() for v in list(m)[:1]))
     base = drive(LAW, PARTICLE, FORCE, control="load").displacement
@@ -60,6 +61,7 @@ def test_a_law_without_effects_is_the_base_law_to_the_last_bit():
     )
 
 
+@pytest.mark.extended
 def test_displacement_control_is_the_inverse_and_has_its_derivatives():
     law = creeping()
     path = drive(law, PARTICLE, FORCE, time=TIME, control="load").displacement
@@ -72,6 +74,7 @@ def test_displacement_control_is_the_inverse_and_has_its_derivatives():
     close(slope, (force(COMPLIANCE + h) - force(COMPLIANCE - h)) / (2 * h), rel=1e-5)
 
 
+@pytest.mark.extended
 def test_batches_and_the_state_that_is_carried_on():
     law = creeping()
     laws = jax.tree.map(lambda x: jnp.stack([x, x]), law)
