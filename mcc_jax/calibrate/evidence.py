@@ -46,8 +46,8 @@ def fit(
     campaign = check_tests(campaign)
     tell, model, threshold_MPa = checked_settings(progress, model, threshold_MPa, None)
     with numbers_in_reach(campaign):
-        _, found, _ = prepare(campaign, model, threshold_MPa, fill_up=False, tell=tell)
-    return found
+        selection, found, _ = prepare(campaign, model, threshold_MPa, tell=tell)
+    return found.first(len(selection.kept))
 
 
 @dataclass(frozen=True)

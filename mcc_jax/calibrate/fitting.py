@@ -52,7 +52,6 @@ def prepare(
     model: Model,
     threshold_MPa: float = THRESHOLD_MPA,
     *,
-    fill_up: bool = True,
     block: int | None = None,
     most_points: int = SELECTION.most_points,
     start: Start | None = None,
@@ -63,7 +62,6 @@ def prepare(
 
     Args:
         model: what is assumed; its priors become the campaign's own where they have to (`in_own_units`).
-        fill_up: let copies that count for nothing make up whole blocks; if False, all particles are one block.
         block: particles of a block; by default `block_size` of their number.
         most_points: records longer than this are thinned.
         start: where the fit begins.
@@ -81,8 +79,8 @@ def prepare(
     selection = select(campaign, threshold_MPa=threshold_MPa, most_points=most_points)
     selection = selection if told is None else replace(selection, notes=(*selection.notes, told))
     require_same(selection.tests)
-    size = (block or block_size(len(selection.tests))) if fill_up else len(selection.tests)
-    tests = filled_up(selection.tests, size) if fill_up else selection.tests
+    size = block or block_size(len(selection.tests))
+    tests = filled_up(selection.tests, size)
     if start is not None and start.point.theta.shape != (len(selection.kept), len(model.forms.names)):
         raise InputError(
             "start is of other particles or effects", remedy="Give the fit of the same campaign and the same model."

@@ -258,19 +258,18 @@ def sample(
     fast = mode == "fast"
     with numbers_in_reach(campaign):
         begin = Start(start.point, start.population, start.noise.noise) if isinstance(start, Fit) else start
-        selection, fit, size = prepare(
-            campaign, model, threshold_MPa, fill_up=fast, block=block, start=begin, tell=tell
-        )
+        selection, fit, size = prepare(campaign, model, threshold_MPa, block=block, start=begin, tell=tell)
         tell("sampling the population" if fast else "sampling everything")
         key = jax.random.key(seed)
         likely = worst(check_plausibility(campaign)) != "bad"
-        drawn = draw_fast(key, fit, length, size, patient=likely) if fast else draw_joint(key, fit, length)
+        kept = fit.first(len(selection.kept))
+        drawn = draw_fast(key, fit, length, size, patient=likely) if fast else draw_joint(key, kept, length)
     tell("diagnosing")
     calibration = Posterior(
         campaign=campaign,
         selection=selection,
         model=fit.model,
-        fit=fit.first(len(selection.kept)),
+        fit=kept,
         mode=mode,
         seed=seed,
         runtime_s=time.perf_counter() - started,

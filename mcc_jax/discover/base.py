@@ -164,13 +164,15 @@ def base_fit(campaign: Campaign, model: Model, *, threshold_MPa: float, tell: Ca
     """
     with numbers_in_reach(campaign):
         model, foreign = in_own_units(campaign, model)
-        selection, fit, _ = prepare(campaign, model, threshold_MPa, fill_up=False, tell=tell)
+        selection, fit, _ = prepare(campaign, model, threshold_MPa, tell=tell)
+        fit = fit.first(len(selection.kept))
         share = np.median(root_mean_squares(fit.tests, fit.residual) / ranges_um(fit.tests))
         coarse = foreign is not None and bool(share > DECISIONS.foreign_misfit)
         if coarse:
             branches = int(np.median([len(find_segments(curve)) for curve in campaign.curves]))
             most = DECISIONS.readings * branches
-            selection, fit, _ = prepare(campaign, model, threshold_MPa, fill_up=False, most_points=most, tell=tell)
+            selection, fit, _ = prepare(campaign, model, threshold_MPa, most_points=most, tell=tell)
+            fit = fit.first(len(selection.kept))
     p = fit.population
     shift = float(jnp.mean(jnp.log1p(p.a * fit.tests.flatness)))
     population = jnp.concatenate([jnp.stack([p.a, p.log_modulus]), p.mu + shift])

@@ -157,7 +157,8 @@ def _staged(
 
 
 def _law(numbers: Array, forms: Forms) -> Formulas:
-    return Formulas(Plastic(*numbers[:3]), *numbers[3:], *forms)
+    C1, C3, C5, a, modulus = numbers
+    return Formulas(Plastic(C1, C3, C5), a, modulus, *forms)
 
 
 def _loaded(
@@ -176,7 +177,8 @@ def _base(given: Any, particle: Particle, record: Record, forms: Forms) -> tuple
 
 def _released(given: Any, particle: Particle, record: Record, forms: Forms) -> tuple[Path, Path, Path]:
     law, loads, reached, factors = given
-    context = released(Context(*_loaded(law, loads, particle, record, forms), *(reached,) * 3), factors)
+    loaded = _loaded(law, loads, particle, record, forms)
+    context = released(Context(*loaded, reached, reached, reached), factors)
     return reached, context.recoverable, context.displacement
 
 
