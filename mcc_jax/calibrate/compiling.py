@@ -46,5 +46,8 @@ def one_blas_thread[**P, R](function: Callable[P, R]) -> Callable[P, R]:
 
 def side_by_side[A, B](function: Callable[[A], B], arguments: Iterable[A]) -> list[B]:
     """What a function returns for each of its arguments, on as many threads as there are cores."""
+    arguments = list(arguments)
+    if len(arguments) == 1:
+        return [function(arguments[0])]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         return list(pool.map(function, arguments))

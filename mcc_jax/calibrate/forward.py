@@ -152,14 +152,27 @@ def linearise(
         with_numbers: whether derivatives by the particle's numbers are wanted; none if not.
         with_force: whether derivatives by force are wanted; 0 if not.
     """
-    record, theta = tests.record, point.theta
+    residual, columns, by_force, by_peak = derivatives(
+        point.latent, point.zero, point.theta, tests, forms, with_numbers, with_force
+    )
+    found = residual, columns, by_force, by_peak, by_force + by_peak
+    return Linear(*map(jnp.asarray, found))
+
+
+def derivatives(
+    latent: Any, zero: Any, theta: Any, tests: Tests, forms: Forms, with_numbers: bool = True, with_force: bool = True
+) -> tuple[Any, Any, Any, Any]:
+    """Residual, columns, and derivatives by force and peak as in `Linear`: of NumPy, where nothing is traced."""
+    record = tests.record
     assert record.peak is not None
-    xp: Any = jnp if any(is_traced(x) for x in jax.tree.leaves((point, tests))) else np
-    count, points, asked = len(tests), tests.force.shape[1], 2 * with_force
+    traced = any(is_traced(x) for x in jax.tree.leaves((latent, zero, theta, tests)))
+    xp: Any = jnp if traced else np
+    latent, zero, theta, mask = (xp.asarray(x) for x in (latent, zero, theta, tests.mask))
+    (count, points), asked = tests.force.shape, 2 * with_force
     size = (4 + theta.shape[1]) * with_numbers
-    law = xp.insert(xp.exp(xp.asarray(point.latent)), 3, 0.0, axis=1)  # a = 0: the shape is taken in
-    # Every number of a particle has a direction of its own; those of the law are logarithms.
     wanted = size + asked
+    law = xp.insert(xp.exp(latent), 3, 0.0, axis=1)  # a = 0: the shape is taken in
+    # Every number of a particle has a direction of its own; those of the law are logarithms.
     unit = np.zeros((padded(wanted) if forms.effects else wanted, 4 + theta.shape[1]))
     unit[range(size), range(size)] = 1.0
     d_law = unit[:, None, [0, 1, 2, 0, 3]] * law[None]
@@ -175,19 +188,16 @@ def linearise(
     def of_effects(numbers: Any) -> tuple[Any, ...]:
         return tuple(numbers[..., list(each)] for each in forms.places)
 
-    numbers = law, tests.force, record.peak, of_effects(xp.asarray(theta))
-    directions = d_law, d_force, d_peak, of_effects(d_theta)
-    there, directed = (Numbers(*jax.tree.map(jnp.asarray, each)) for each in (numbers, directions))
+    there = Numbers(law, tests.force, record.peak, of_effects(theta))
+    directions = Numbers(d_law, d_force, d_peak, of_effects(d_theta))
     kinds = forms.unloading, StrainScaling.RAW
-    value, slopes = map(xp.asarray, along(kinds, forms.formulas, tests.particle, record, there, directed))
-    columns = xp.where(xp.asarray(tests.mask)[None], slopes[:wanted], 0.0)
+    value, slopes = map(xp.asarray, along(kinds, forms.formulas, tests.particle, record, there, directions))
+    slopes = xp.where(mask[None], slopes[:wanted], 0.0)
     residual = still = xp.zeros((count, points))
     if tests.displacement is not None:
-        away = xp.asarray(tests.displacement) - value - xp.asarray(point.zero)[:, None]
-        residual = xp.where(xp.asarray(tests.mask), away, 0.0)
-    by_force, by_peak = columns[size:] if with_force else (still, still)
-    found = residual, xp.moveaxis(columns[:size], 0, -1), by_force, by_peak, by_force + by_peak
-    return Linear(*map(jnp.asarray, found))
+        residual = xp.where(mask, xp.asarray(tests.displacement) - value - zero[:, None], 0.0)
+    by_force, by_peak = slopes[size:] if with_force else (still, still)
+    return residual, xp.moveaxis(slopes[:size], 0, -1), by_force, by_peak
 
 
 def snap(latent: Latent, particle: Particle) -> Scalar:

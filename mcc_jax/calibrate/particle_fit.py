@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from .compiling import compiled
 from .data import Tests
-from .forward import Forms, Point, linearise, snap
+from .forward import Forms, Point, derivatives, snap
 from .settings import FIT
 
 
@@ -100,22 +100,22 @@ def fit_particles(
     tests = jax.tree.map(np.asarray, tests)
     points = np.maximum(tests.mask.sum(1), 1)
 
-    def at(y: np.ndarray, rows: np.ndarray) -> Point:
+    def at(y: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         own = theta[rows].copy()
         own[:, places] = y[:, 5:]
-        return Point(jnp.asarray(y[:, :4]), jnp.asarray(y[:, 4]), jnp.asarray(own))
+        return y[:, :4], y[:, 4], own
 
     def normal_equations(y: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Loss, gradient and curvature of some particles, as many as there are at most."""
         filled = np.resize(np.arange(len(rows)), N)  # of one shape, for one compilation
         some = tests if np.array_equal(rows, np.arange(N)) else jax.tree.map(lambda x: x[rows[filled]], tests)
-        linear = linearise(at(y[filled], rows[filled]), some, forms)
+        residual, columns, _, _ = derivatives(*at(y[filled], rows[filled]), some, forms)
         ones = np.where(some.mask, 1.0, 0.0)[..., None]
-        J = np.concatenate([linear.columns[..., :4], ones, linear.columns[..., [4 + k for k in places]]], -1)
+        J = np.concatenate([columns[..., :4], ones, columns[..., [4 + k for k in places]]], -1)
         scale = noise[rows[filled]][:, None]
         if some.reading_weight is not None:
             scale = scale / np.sqrt(some.reading_weight)
-        r, J = (np.asarray(linear.residual) / scale)[: len(rows)], (-J / scale[..., None])[: len(rows)]
+        r, J = (residual / scale)[: len(rows)], (-J / scale[..., None])[: len(rows)]
         away = (y - centre[rows]) / width[rows]
         H = J.mT @ J + np.eye(size) / width[rows][..., None] ** 2
         g = np.einsum("nkp,nk->np", J, r) + away / width[rows]
@@ -162,8 +162,10 @@ def fit_particles(
     near = seen.min(0) < FIT.unseen * loss.min(0) + FIT.unseen
     best = np.where(near, seen, loss).argmin(0), np.arange(N)
     rms = noise * np.sqrt(2 * loss[best] / points)
-    found = at(y[best], np.arange(N)), rms, done[best], np.moveaxis(y, 0, 1), done.all(0)
-    return ParticleFits(*jax.tree.map(jnp.asarray, found))
+    point, *found = jax.tree.map(
+        jnp.asarray, (at(y[best], np.arange(N)), rms, done[best], np.moveaxis(y, 0, 1), done.all(0))
+    )
+    return ParticleFits(Point(*point), *found)
 
 
 snaps = compiled(jax.vmap(snap))

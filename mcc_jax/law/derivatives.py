@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -46,19 +46,19 @@ def padded(directions: int) -> int:
 # ---- the law along measured tests ------------------------------------------------------------------------------------
 
 
-class Numbers(eqx.Module):
-    """What displacement depends on, of every test.
+class Numbers(NamedTuple):
+    """What displacement depends on, of every test; arrays of JAX or NumPy.
 
     Attributes:
-        law: C1, C3, C5, a and the effective modulus.
-        force, peak: force of every point, and that from which its branch starts [mN].
-        effects: amplitude and further numbers of each effect.
+        law: C1, C3, C5, a and the effective modulus, shape (tests, 5).
+        force, peak: force of every point, and that from which its branch starts [mN], shape (tests, points).
+        effects: amplitude and further numbers of each effect, shape (tests, numbers).
     """
 
-    law: Float[Array, "*tests 5"]
-    force: Float[Array, "*tests points"]
-    peak: Float[Array, "*tests points"]
-    effects: tuple[Float[Array, "*tests _"], ...]
+    law: Any
+    force: Any
+    peak: Any
+    effects: tuple[Any, ...]
 
 
 @dataclass(frozen=True)
