@@ -168,7 +168,7 @@ def derivatives(
     traced = any(is_traced(x) for x in jax.tree.leaves((latent, zero, theta, tests)))
     xp: Any = jnp if traced else np
     latent, zero, theta, mask = (xp.asarray(x) for x in (latent, zero, theta, tests.mask))
-    (count, points), asked = tests.force.shape, 2 * with_force
+    (count, points), asked = record.force.shape, 2 * with_force
     size = (4 + theta.shape[1]) * with_numbers
     wanted = size + asked
     law = xp.insert(xp.exp(latent), 3, 0.0, axis=1)  # a = 0: the shape is taken in
@@ -188,7 +188,7 @@ def derivatives(
     def of_effects(numbers: Any) -> tuple[Any, ...]:
         return tuple(numbers[..., list(each)] for each in forms.places)
 
-    there = Numbers(law, tests.force, record.peak, of_effects(theta))
+    there = Numbers(law, record.force, record.peak, of_effects(theta))
     directions = Numbers(d_law, d_force, d_peak, of_effects(d_theta))
     kinds = forms.unloading, StrainScaling.RAW
     value, slopes = map(xp.asarray, along(kinds, forms.formulas, tests.particle, record, there, directions))

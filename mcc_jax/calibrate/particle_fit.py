@@ -112,10 +112,10 @@ def fit_particles(
         residual, columns, _, _ = derivatives(*at(y[filled], rows[filled]), some, forms)
         ones = np.where(some.mask, 1.0, 0.0)[..., None]
         J = np.concatenate([columns[..., :4], ones, columns[..., [4 + k for k in places]]], -1)
-        scale = noise[rows[filled]][:, None]
+        root = 1 / noise[rows[filled]][:, None]
         if some.reading_weight is not None:
-            scale = scale / np.sqrt(some.reading_weight)
-        r, J = (residual / scale)[: len(rows)], (-J / scale[..., None])[: len(rows)]
+            root = root * np.sqrt(some.reading_weight)
+        r, J = (residual * root)[: len(rows)], (-J * root[..., None])[: len(rows)]
         away = (y - centre[rows]) / width[rows]
         H = J.mT @ J + np.eye(size) / width[rows][..., None] ** 2
         g = np.einsum("nkp,nk->np", J, r) + away / width[rows]
@@ -155,7 +155,7 @@ def fit_particles(
     y, loss, done = (v.reshape(count, N, *v.shape[1:]) for v in (y, loss, done))
     # A snap-through below the first load that counts is no part of the test: nothing shows it. A sharp rise from
     # nothing is fitted so if it may be, and the fit then presses the snap-through against that first load for good.
-    first = np.where(tests.mask & tests.loading, tests.force, np.inf).min(1)
+    first = np.where(tests.mask & tests.loading, tests.record.force, np.inf).min(1)
     unseen = np.stack([np.asarray(snaps(jnp.asarray(one[:, :4]), tests.particle)) for one in y]) < np.log(first)
     seen = np.where(unseen, np.inf, loss)
     # Unless nothing else comes near the data: then the particle has snapped through before anybody looked.
