@@ -9,17 +9,8 @@ Switch JAX to double precision first, unless you mean single:
 
 import lazy_loader as _lazy
 
-from ._renamed import RENAMED as _RENAMED
-from ._renamed import RenamedError as _RenamedError
-
 __version__ = "0.1.0"
 
 # The public names stand in `__init__.pyi`, one by one, and are loaded at first use: `mcc-jax --help` has answered
 # before JAX could be imported.
-_load, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)
-
-
-def __getattr__(name: str) -> object:
-    if name in _RENAMED:
-        raise _RenamedError(name)
-    return _load(name)
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

@@ -1,4 +1,4 @@
-"""Old names lead to the new ones, and nothing in the package needs one system."""
+"""Names that CHANGELOG.md promises are there, and nothing in the package needs one system."""
 
 import ast
 import re
@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 import mcc_jax as mcc
-from mcc_jax._renamed import NOTES, RENAMED
 
 ROOT = Path(__file__).parents[2]
 # Modules and functions that only POSIX has; a use of one stands behind a question whether it is there.
@@ -16,27 +15,10 @@ POSIX_FUNCTIONS = {"chown", "fork", "getpgid", "getuid", "killpg", "mkfifo", "ni
 POSIX_SIGNALS = {"SIGALRM", "SIGCHLD", "SIGHUP", "SIGKILL", "SIGPIPE", "SIGUSR1"}
 
 
-@pytest.mark.parametrize("old", RENAMED)
-def test_an_old_name_names_the_new_one(old):
-    assert hasattr(mcc, RENAMED[old])
-    for use in (f"mcc_jax.{old}", f"from mcc_jax import {old}"):
-        with pytest.raises(ImportError, match=rf"mcc_jax\.{old} is called mcc_jax\.{RENAMED[old]} now") as caught:
-            exec(use, {"mcc_jax": mcc})
-        assert "CHANGELOG.md" in str(caught.value)
-    assert old not in mcc.__all__
-
-
-def test_other_names_are_missing_as_usual():
+def test_a_name_that_is_not_there_is_missing_as_usual():
     with pytest.raises(AttributeError, match="no_such_name"):
         _ = mcc.no_such_name
     assert not hasattr(mcc, "no_such_name")
-    assert set(NOTES) <= set(RENAMED)
-
-
-def test_the_changelog_holds_the_same_table():
-    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
-    rows = re.findall(r"^\| `mcc_jax\.(\w+)` \| `mcc_jax\.(\w+)` \|", text, flags=re.M)
-    assert dict(rows) == RENAMED
 
 
 def test_every_new_name_of_the_table_is_there():
