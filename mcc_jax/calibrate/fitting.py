@@ -155,7 +155,8 @@ class _Fitter:
         point, scale = longer((start.point, start.noise.scale), N)
         self.point, self.noise = point, NoiseFit.unsure(replace(start.noise, scale=scale), converged=True)
         own = np.column_stack([point.latent, point.zero, np.asarray(point.theta)[:, list(self.varying)]])
-        self.individual = self.alone(np.exp(np.asarray(start.noise.logs)[0]) * scale, point.theta, own[None])
+        white = np.exp(np.asarray(start.noise.logs)[0]) * np.asarray(scale)
+        self.individual = self.alone(white, point.theta, own[None])
         self.linear = self.linearisation.at(point)
         return site_values(start.population, self.model, np.asarray(self.tests.flatness))
 
