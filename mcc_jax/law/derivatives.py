@@ -177,8 +177,8 @@ def _base(given: Any, particle: Particle, record: Record, forms: Forms) -> tuple
 
 def _released(given: Any, particle: Particle, record: Record, forms: Forms) -> tuple[Path, Path, Path]:
     law, loads, reached, factors = given
-    loaded = _loaded(law, loads, particle, record, forms)
-    context = released(Context(*loaded, reached, reached, reached), factors)
+    particle, formulas, record, highest = _loaded(law, loads, particle, record, forms)
+    context = released(Context(particle, formulas, record, highest, reached, reached, reached), factors)
     return reached, context.recoverable, context.displacement
 
 
