@@ -170,7 +170,8 @@ def _loaded(
 
 
 def _base(given: Any, particle: Particle, record: Record, forms: Forms) -> tuple[Path, Path, Path]:
-    _, law, record, highest = _loaded(*given, particle, record, forms)
+    numbers, loads = given
+    _, law, record, highest = _loaded(numbers, loads, particle, record, forms)
     reached, moved = law.peak_and_displacement(particle, jnp.zeros_like(particle.D3), record.force, highest)
     return reached, law.recoverable_displacement(particle, reached, highest, jnp.ones_like(reached)), moved
 
