@@ -150,7 +150,7 @@ def white_of(
 @compiled
 def slope_of(weights: tuple[Array, Array, Array], logs: Float[Array, " 4"], *given: Any) -> Float[Array, " 4"]:
     """Derivatives of a weighted sum of what `white_of` gives by the logarithms of the noise's four numbers."""
-    _, back = jax.vjp(lambda at: white_of.__wrapped__(at, *given)[:3], logs)  # pyright: ignore[reportFunctionMemberAccess]
+    _, back = jax.vjp(lambda at: white_of(at, *given)[:3], logs)
     return back(weights)[0]
 
 
