@@ -206,7 +206,7 @@ def _triangular(solver: QuasisepSolver, values: Float[Array, "steps columns"]) -
     def step(state: Array, at: tuple[Array, ...]) -> tuple[Array, Array]:
         diagonal, left, right, transition, value = at
         white = (value - jnp.sum(left[:, None] * state, 0)) / diagonal
-        return jnp.sum(transition[:, :, None] * state, 1) + right[:, None] * white, white
+        return jnp.sum(transition[:, :, None] * state[None], 1) + right[:, None] * white[None], white
 
     start = jnp.zeros((left.shape[1], values.shape[1]), values.dtype)
     return jax.lax.scan(step, start, (diagonal, left, right, transition, values))[1]
