@@ -55,8 +55,8 @@ def _keep_everything():
 GROUPS = {
     "discover": ("tests/discover/", "tests/cli/test_discover"),
     "posterior": (
-        *("tests/calibrate/test_posterior", "tests/calibrate/test_arviz_functions"),
-        *("tests/plots/test_joint_figures", "tests/plots/test_figures"),
+        *("tests/calibrate/test_posterior", "tests/calibrate/test_arviz_functions", "tests/calibrate/test_importance"),
+        *("tests/plots/test_joint_figures", "tests/plots/test_figures", "tests/test_repr", "tests/test_saved_results"),
     ),
     "calibrate": ("tests/calibrate/",),
     "effects": ("tests/effects/",),
@@ -87,8 +87,8 @@ def pytest_xdist_make_scheduler(config, log):
     return ByGroup(config, log) if config.getoption("dist") == "loadfile" else None
 
 
-CASES = 3
-"""Of a test with more cases the core runs as many, spread evenly; the others are `extended`."""
+CASES = 2
+"""Of a test with more cases the core runs as many, the first and the last; the others are `extended`."""
 
 EVERY_CASE = (
     *("tests/campaign/test_csv.", "tests/campaign/test_folder", "tests/campaign/test_mapping"),

@@ -40,6 +40,7 @@ def test_values_are_those_of_vmap(count):
     assert_same(jax.jit(in_blocks(step, block=32))(*arguments), jax.vmap(step)(*arguments))
 
 
+@pytest.mark.extended
 def test_gradients_inside_outside_and_forward():
     arguments = contacts(101)
     each = jax.vmap(jax.grad(force))(*arguments)
@@ -77,6 +78,7 @@ def test_what_is_not_one_batch_is_refused(arguments, words):
         in_blocks(lambda x: x, block=0)
 
 
+@pytest.mark.extended
 def test_over_devices_the_same():
     program = (
         "import jax, jax.numpy as jnp, numpy as np; jax.config.update('jax_num_cpu_devices', 4)\n"

@@ -104,6 +104,7 @@ def test_what_is_made_in_a_moment_is_told_in_a_few_lines(some):
         check(thing)
 
 
+@pytest.mark.extended
 def test_calibrations_and_what_they_return_are_told_in_a_few_lines(paper_posterior):
     posterior = paper_posterior
     curves = mcc.predict_new_particle(posterior, (200.0, 190.0, 160.0), force_mN=posterior.campaign.curves[0].force_mN)

@@ -154,49 +154,71 @@ def slope_of(weights: tuple[Array, Array, Array], logs: Float[Array, " 4"], *giv
     return back(weights)[0]
 
 
+class Whitened(NamedTuple):
+    """Whitened columns, padding included, and the Gram matrices of all columns of the design."""
+
+    white: White
+    gram: np.ndarray
+
+
 class Columns:
     """Columns of a design cut into pieces of one shape; those of nothing are left out."""
 
     def __init__(self, columns: np.ndarray, design: Design) -> None:
         self.shape = columns.shape
-        self._last: tuple[tuple[float, ...], White] | None = None
+        self._last: tuple[bytes, Whitened] | None = None
         self.some = np.flatnonzero(np.any(columns != 0, axis=(0, 1)))
         least, most = NUMERICS.columns
         size = min(max(NUMERICS.entries // (self.shape[0] * self.shape[1]), least), most)
         count = -(-max(len(self.some), 1) // size)
-        room = np.zeros((*self.shape[:2], count * size))
-        room[..., : len(self.some)] = columns[..., self.some]
-        self.pieces = [jnp.asarray(piece) for piece in np.split(room, count, -1)]
+        padded = np.zeros((*self.shape[:2], count * size))
+        padded[..., : len(self.some)] = columns[..., self.some]
+        self.pieces = [jnp.asarray(piece) for piece in np.split(padded, count, -1)]
         tests, kinds = design.tests, design.kinds
         if kinds.along is Along.TIME:  # one program for both
             tests = replace(tests, path=tests.record.time)
         self.arrays, self.correlation = (jnp.asarray(design.scale), tests, design.linear), kinds.correlation
 
     def _given(self, free: np.ndarray, piece: Array) -> tuple[Any, ...]:
-        return jnp.asarray(free[:4]), *self.arrays, piece, self.correlation
+        return free[:4], *self.arrays, piece, self.correlation
 
-    def white(self, free: np.ndarray) -> White:
-        """Whitened at the hyperparameters; those of the last call are kept, since most are asked for more than once."""
-        noise = tuple(map(float, free[:4]))
+    def _whitened(self, free: np.ndarray) -> Whitened:
+        """At the hyperparameters; those of the last call are kept, since most are asked for more than once."""
+        noise = np.asarray(free[:4], float).tobytes()
         last = self._last  # another thread may put its own in place meanwhile
         if last is not None and last[0] == noise:
             return last[1]
         found = [jax.tree.map(np.asarray, white_of(*self._given(free, piece))) for piece in self.pieces]
-        columns = np.zeros(self.shape)
-        columns[..., self.some] = np.concatenate([one.columns for one in found], -1)[..., : len(self.some)]
-        white = found[0]._replace(columns=columns)
+        columns = found[0].columns if len(found) == 1 else np.concatenate([one.columns for one in found], -1)
+        gram = np.zeros((self.shape[0], self.shape[2], self.shape[2]))
+        k = len(self.some)
+        gram[:, self.some[:, None], self.some] = (np.swapaxes(columns, 1, 2) @ columns)[:, :k, :k]
+        gram[:, -1, -1] += found[0].reading
+        white = Whitened(found[0]._replace(columns=columns), gram)
         self._last = noise, white
         return white
 
-    def slope(self, free: np.ndarray, of_white: np.ndarray, of_reading: float) -> np.ndarray:
-        """Derivatives of something by the noise's numbers, from those by the whitened columns and by the readings; the
-        noise's log density is part of it."""
-        room = np.zeros((*self.shape[:2], sum(piece.shape[-1] for piece in self.pieces)))
-        room[..., : len(self.some)] = of_white[..., self.some]
-        each, ones = np.split(room, len(self.pieces), -1), np.ones(self.shape[0])
-        total = np.zeros(4)
-        for k, piece in enumerate(self.pieces):
-            once = ones if k == 0 else 0.0 * ones
-            weights = jnp.asarray(each[k]), jnp.asarray(once), jnp.asarray(of_reading * once)
-            total += np.asarray(slope_of(weights, *self._given(free, piece)))
+    def white(self, free: np.ndarray) -> White:
+        """Whitened at the hyperparameters."""
+        white = self._whitened(free).white
+        columns = np.zeros(self.shape)
+        columns[..., self.some] = white.columns[..., : len(self.some)]
+        return white._replace(columns=columns)
+
+    def gram(self, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Gram matrix of every particle's whitened columns, the readings' squares with the data's; log density of the
+        noise at 0."""
+        white = self._whitened(free)
+        return white.gram, white.white.log_density
+
+    def slope(self, free: np.ndarray, of_gram: np.ndarray) -> np.ndarray:
+        """Derivatives of something by the noise's numbers, from those by the Gram matrices; the noise's log density is
+        part of it."""
+        white, k = self._whitened(free).white.columns, len(self.some)
+        padded = np.zeros((self.shape[0], white.shape[-1], white.shape[-1]))
+        padded[:, :k, :k] = 2 * of_gram[:, self.some[:, None], self.some]
+        weights, ones, total = np.split(white @ padded, len(self.pieces), -1), np.ones(self.shape[0]), np.zeros(4)
+        for piece, weight in zip(self.pieces, weights, strict=True):
+            total += np.asarray(slope_of((weight, ones, of_gram[:, -1, -1] * ones), *self._given(free, piece)))
+            ones = 0.0 * ones  # density and readings count once
         return total

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +23,7 @@ from jaxtyping import Float
 from scipy.special import log_ndtr
 
 from ..calibrate.distributions import SCALES, SpreadCoordinate
-from .columns import LOG_2PI, Columns, Design, White, with_amplitudes
+from .columns import LOG_2PI, Columns, Design, with_amplitudes
 from .settings import NUMERICS
 
 
@@ -42,13 +43,17 @@ class Spreads(NamedTuple):
     log_prob_slope: np.ndarray
 
 
+@lru_cache
+def _constants(priors: tuple[Any, ...]) -> tuple[np.ndarray, ...]:
+    """Power, unit and constant of the spreads' coordinates, and the priors' standard deviations."""
+    each = [SpreadCoordinate(prior) for prior in priors]
+    numbers = [[float(getattr(one, name)) for one in each] for name in ("power", "unit", "constant")]
+    return *map(np.array, numbers), np.array([prior.sd for prior in priors], float)
+
+
 def spreads_of(x: np.ndarray, priors: tuple[Any, ...]) -> Spreads:
     """The spreads at their coordinates."""
-    each = [SpreadCoordinate(prior) for prior in priors]
-    power, unit, constant = (
-        np.array([getattr(one, name) for one in each], float) for name in ("power", "unit", "constant")
-    )
-    sd = np.array([prior.sd for prior in priors], float)
+    power, unit, constant, sd = _constants(priors)
     size = np.abs(x)
     value = unit * np.sinh(size) ** power
     slope = unit * power * np.sinh(np.maximum(size, 1e-300)) ** (power - 1) * np.cosh(size) * np.sign(x)
@@ -71,18 +76,18 @@ def _factor(free: np.ndarray, design: Design) -> np.ndarray:
     return np.concatenate([*scales_of(free, design), np.ones(design.amplitude.shape[-1] + 1)])
 
 
-def _gram(white: White, factor: np.ndarray) -> np.ndarray:
-    scaled = white.columns * factor
-    gram = np.swapaxes(scaled, 1, 2) @ scaled
-    gram[:, -1, -1] += white.reading
-    return gram
+def _gram(free: np.ndarray, design: Design) -> tuple[np.ndarray, np.ndarray]:
+    """Gram matrix of every particle's scaled columns; log density of the noise at 0."""
+    gram, log_density = design.columns.gram(free)
+    factor = _factor(free, design)
+    return gram * factor * factor[:, None], log_density
 
 
 def left_by_particle(free: np.ndarray, design: Design) -> Left:
     """Integrate every particle's own numbers out."""
-    white = design.columns.white(free)
-    left, log_integral = without_first(_gram(white, _factor(free, design)), design.own.shape[-1])
-    return Left(left, log_integral + white.log_density)
+    gram, log_density = _gram(free, design)
+    left, log_integral = without_first(gram, design.own.shape[-1])
+    return Left(left, log_integral + log_density)
 
 
 def _root(matrix: np.ndarray) -> np.ndarray:
@@ -201,16 +206,16 @@ def value_and_gradient(free: np.ndarray, design: Design) -> tuple[float, np.ndar
     """Log marginal likelihood at the hyperparameters, times their prior, and its derivatives."""
     spreads, o, c = design.kinds.spreads, design.own.shape[-1], design.common.shape[-1]
     with np.errstate(all="ignore"):  # of steps into numbers beyond arithmetic
-        white, factor = design.columns.white(free), _factor(free, design)
-        gram = _gram(white, factor)
+        gram, log_density = _gram(free, design)
         by_particle = _integrated(gram, o)
         shared = _integrated(by_particle.left.sum(0), c)
         effects = amplitudes(shared.left, design.sign, design.largest)
         prior, slope = _prior(free, design)
-        integrals = by_particle.log_integral + white.log_density
+        integrals = by_particle.log_integral + log_density
         value = float(integrals.sum() + shared.log_integral) + effects.log_integral + prior
         of_gram = by_particle.slope(shared.slope(effects.slope))
-        slope[:4] += design.columns.slope(free, (white.columns * factor) @ (2 * of_gram) * factor, of_gram[0, -1, -1])
+        factor = _factor(free, design)
+        slope[:4] += design.columns.slope(free, of_gram * factor * factor[:, None])
         of_log = 2 * np.sum(of_gram * gram, (0, 2))  # derivatives by the logarithms of the columns' scales
         spread = spreads_of(free[4 : 4 + len(spreads)], spreads)
         own = np.delete(of_log[:o], 4)
@@ -225,10 +230,11 @@ class OfMisfits:
     def __init__(self, free: np.ndarray, design: Design) -> None:
         o, c = design.own.shape[-1], design.common.shape[-1]
         self.design, self.fixed = design, free[: 4 + len(design.kinds.spreads)]
-        white, factor = design.columns.white(free), _factor(free, design)
+        gram, log_density = design.columns.gram(free)
+        factor = _factor(free, design)
         factor[o : o + c] = 1.0
-        by_particle = _integrated(_gram(white, factor), o)
-        self.gram, self.integrals = by_particle.left.sum(0), float((by_particle.log_integral + white.log_density).sum())
+        by_particle = _integrated(gram * factor * factor[:, None], o)
+        self.gram, self.integrals = by_particle.left.sum(0), float((by_particle.log_integral + log_density).sum())
 
     def __call__(self, logs: np.ndarray) -> tuple[float, np.ndarray]:
         """Value and derivatives at the logarithms of the scales."""
@@ -280,7 +286,7 @@ def solve(free: np.ndarray, design: Design) -> Solution:
     """Posterior means of all numbers, an amplitude of a forbidden sign at zero."""
     own, common = scales_of(free, design)
     o, c = design.own.shape[-1], design.common.shape[-1]
-    by_particle = _integrated(_gram(design.columns.white(free), _factor(free, design)), o)
+    by_particle = _integrated(_gram(free, design)[0], o)
     shared = _integrated(by_particle.left.sum(0), c)
     _, theta, sd, _ = amplitudes(shared.left, design.sign, design.largest)
     theta = np.where(design.sign * theta < 0, 0.0, theta)
@@ -454,7 +460,7 @@ def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, witho
 def visible(free: np.ndarray, design: Design, curves: np.ndarray) -> np.ndarray:
     """What the particles' own numbers and the population leave of each curve [um], as a share, in units of noise."""
     with_curves = with_amplitudes(design, curves)
-    gram = _gram(with_curves.columns.white(free), _factor(free, with_curves))
+    gram, _ = _gram(free, with_curves)
     whole = np.diagonal(gram.sum(0))[-1 - curves.shape[-1] : -1]
     left, _ = without_first(without_first(gram, design.own.shape[-1])[0].sum(0), design.common.shape[-1])
     return np.sqrt(np.clip(np.diagonal(left)[:-1] / np.maximum(whole, 1e-300), 0.0, 1.0))

@@ -14,6 +14,8 @@ matplotlib.use("agg")
 NAMES = ("first", "second")
 POPULATION = ["a", "effective_modulus_MPa", "C1_median", "C5_median", "tau_C1", "tau_C5"]
 
+pytestmark = pytest.mark.extended
+
 
 @pytest.fixture(scope="module")
 def posteriors(paper_posterior):
@@ -47,7 +49,6 @@ def test_particles_left_out(by_particle):
     assert np.isfinite(table["elpd"]).all()
 
 
-@pytest.mark.extended
 def test_readings_left_out(by_reading):
     found = az.loo(by_reading)
     assert found.n_data_points == int(np.isfinite(by_reading["observed_data"]["displacement_um"]).sum())
@@ -60,14 +61,12 @@ def test_sensitivity_to_the_prior(by_particle):
     assert np.isfinite(table[["prior", "likelihood"]].astype(float)).all(axis=None)
 
 
-@pytest.mark.extended
 @pytest.mark.parametrize("draw", ["plot_forest", "plot_trace", "plot_dist", "plot_rank", "plot_ess", "plot_pair"])
 def test_pictures_of_parameters(by_particle, draw):
     getattr(az, draw)(by_particle["first"], var_names=POPULATION[:3], backend="matplotlib")
     matplotlib.pyplot.close("all")
 
 
-@pytest.mark.extended
 @pytest.mark.parametrize("draw", ["plot_ppc_dist", "plot_ppc_pit", "plot_loo_pit"])
 def test_pictures_of_predictions(by_reading, draw):
     getattr(az, draw)(by_reading, backend="matplotlib")

@@ -55,6 +55,7 @@ def test_the_modulus_holds_the_truth_and_is_as_sharp_as_the_clean_tests_allow(ki
     assert calibrated(kind).converged
 
 
+@pytest.mark.extended
 def test_a_clean_campaign_has_nothing_to_tell():
     assert calibrated("clean").findings == ()
     assert all(curve.checked is None for curve in calibrated("clean").campaign.curves)

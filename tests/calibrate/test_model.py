@@ -44,6 +44,7 @@ def tests():
 # ---- distributions ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("shape", [0.5, 0.25, 0.125])
 def test_a_spread_has_the_prior_of_nakagami(shape):
     law = SpreadCoordinate(NakagamiPrior(0.2, shape))

@@ -56,6 +56,7 @@ def mutated(draw, text: str) -> str:
     return text
 
 
+@pytest.mark.extended
 @settings(max_examples=400, deadline=None)
 @given(curves=mutated(CURVES))
 def test_mutated_curves(tmp_path_factory, curves):

@@ -14,6 +14,7 @@ SEEDS = st.integers(0, 2**31 - 1)
 quickly = settings(max_examples=15)
 
 
+@pytest.mark.extended
 @quickly
 @given(SEEDS, st.floats(0.85, 0.98))
 def test_the_turning_point_that_the_force_channel_did_not_see_is_worked_out(seed, share):

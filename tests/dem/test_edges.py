@@ -56,6 +56,7 @@ pairs_strategy = st.lists(
 )
 
 
+@pytest.mark.extended
 @settings(max_examples=25, deadline=None)
 @given(old=pairs_strategy, new=pairs_strategy, seed=st.integers(0, 3))
 def test_history_follows_the_pair(old, new, seed):

@@ -135,6 +135,7 @@ def test_no_path_of_a_pair_gains_energy(unloading):
     assert between.max() <= 1e-13
 
 
+@pytest.mark.extended
 def test_what_would_gain_energy_is_refused_and_flagged():
     law = law_of(Unloading.PUNCH)._with((find_variant("damage:square").build(4.0),))
     with pytest.raises(InputError, match="damage:square a contact would give back more energy") as caught:

@@ -72,6 +72,7 @@ def test_pairs_conserve_momentum_and_angular_momentum():
     assert np.abs(moment).max() <= 1e-12 * size * len(state.position)
 
 
+@pytest.mark.extended
 def test_no_damping_no_friction_no_torque_and_energy_only_lost():
     """Without damping and friction what is missing is what the law dissipates."""
     plain = Motion.of(float(motion().time_step) / 4)

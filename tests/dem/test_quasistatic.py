@@ -84,6 +84,7 @@ def test_chain_between_punches_is_the_plate_test():
     assert np.all(rows.proximal_share[pressed] < 1e-3)
 
 
+@pytest.mark.extended
 def test_net_force_is_minus_the_gradient_of_the_energy_and_has_its_stiffness(pressed):
     packing, _, _, end, _, _ = pressed
     shift = 1e-3 * packing.radius[:, None] * jax.random.normal(jax.random.key(0), end.position.shape)
@@ -225,6 +226,7 @@ def test_packing_of_a_population_without_scatter_is_one_law():
         np.testing.assert_allclose(got, expected, rtol=1e-12)
 
 
+@pytest.mark.extended
 def test_packing_of_a_population_scatters_the_same_particles_in_every_draw():
     made = population_packing(posterior(0.2), np.asarray(DIAMETERS), seed=1)
     first, second = (np.asarray(made.packing_of(jnp.asarray(made.draws[k])).sides.k1) for k in (0, 4))
@@ -234,6 +236,7 @@ def test_packing_of_a_population_scatters_the_same_particles_in_every_draw():
     np.testing.assert_allclose(slope, first, rtol=1e-12)
 
 
+@pytest.mark.extended
 def test_packing_of_a_population_has_the_effects_of_its_model_or_refuses_them():
     made = population_packing(posterior(0.2, "damage"), np.asarray(DIAMETERS), seed=1)
     assert made.draws.shape == (5, len(made.names))

@@ -112,6 +112,7 @@ def test_an_excluded_name_is_not_named():
     assert "frame_compliance" not in {one["mechanism"] for one in told["ranking"]}
 
 
+@pytest.mark.extended
 def test_an_unknown_name_to_exclude_is_an_error():
     with pytest.raises(InputError, match="no mechanism 'wobble'"):
         discover(campaign(), exclude=("wobble",))

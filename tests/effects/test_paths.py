@@ -50,6 +50,7 @@ def test_closed_form_is_the_scan():
             np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.extended
 def test_a_path_can_be_continued_from_its_state():
     _, whole = along(EVERYTHING, FORCE, TIME)
     half = FORCE.size // 2

@@ -79,6 +79,7 @@ def test_the_linear_frame_is_a_spring():
     np.testing.assert_allclose(shift(variant), variant.typical * np.asarray(FORCE), atol=1e-11)
 
 
+@pytest.mark.extended
 def test_drift_knows_only_time():
     variants = LIBRARY["thermal_drift"].variants
     other = signatures(LAW, PARTICLE, clean_record(0.3 * FORCE, TIME), [v.build(0.0) for v in variants])

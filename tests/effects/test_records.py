@@ -66,6 +66,7 @@ def test_a_change_of_speed_on_the_way_up_is_seen():
             np.testing.assert_allclose(np.asarray(measured.loading_rate)[inside], rate, rtol=0.02)
 
 
+@pytest.mark.extended
 @given(
     jump=st.sampled_from((0.1, 0.4, 2.5, 10.0)),
     place=st.floats(0.25, 0.75),

@@ -22,6 +22,7 @@ numbers = st.tuples(
 )
 
 
+@pytest.mark.extended
 @settings(max_examples=20)
 @given(numbers)
 def test_linear_interpolation_is_within_the_stated_error(drawn):

@@ -154,6 +154,7 @@ def test_names_are_drawn_as_they_stand(calibrations):
         assert any(t.startswith("\N{REPLACEMENT CHARACTER}\N{REPLACEMENT CHARACTER} (no. 4)\n") for t in shown)
 
 
+@pytest.mark.extended
 def test_a_measured_campaign_is_not_called_simulated(calibrations):
     for calibration, plot in zip(calibrations["paper"], (plot_bands, plot_fits), strict=True):
         measured = dataclasses.replace(calibration.campaign, metadata=Metadata(provenance="tester file x.tri"))

@@ -143,6 +143,7 @@ def test_what_is_refused_would_have_gained(unloading):
     assert largest_gain(response) > 5 * QUADRATURE
 
 
+@pytest.mark.extended
 def test_only_what_is_driven_counts():
     """Up to the strain of the message the same law is driven, in both ways of control; just beyond, in neither."""
     law = gaining(5.0)
@@ -204,6 +205,7 @@ def test_other_effects_do_not_hide_it():
 # ---- machinery -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.extended
 def test_in_a_batch_and_in_a_campaign_the_particle_is_known():
     laws = eqx.filter_vmap(gaining)(jnp.array([0.5, 5.0, 1.0]))
     three = jax.tree.map(lambda x: jnp.repeat(x[None], 3), PARTICLE)

@@ -62,6 +62,7 @@ def test_the_seed_decides_and_each_test_has_a_stream_of_its_own():
     assert (fixed["location_MPa"] == 2).all()
 
 
+@pytest.mark.extended
 def test_displacement_control_works_with_effects():
     programme = Programme.cycles(control="displacement", rate=1.0, points=40)
     arguments = {"instrument": Instrument(), "programme": programme}
