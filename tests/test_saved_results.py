@@ -24,7 +24,7 @@ SIZES = mcc.Particle(200.0, 190.0, 160.0)
 @pytest.fixture(scope="module")
 def campaign():
     whole = mcc.paper_campaign(0)
-    return whole.select(np.arange(len(whole)) < 6)
+    return whole.select(np.arange(len(whole)) < 8)
 
 
 @pytest.fixture(scope="module", params=METHODS)

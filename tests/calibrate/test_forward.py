@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ALL_FORMS
+from helpers import ALL_FORMS, first_in_core
 from joint_cases import COEFFICIENTS, DIAMETERS, SNAPPING, effective_diameter, flatness, simulated, true_latent
 
 from mcc_jax import Instrument, Model, Programme, Unloading
@@ -95,7 +95,9 @@ def test_derivatives_are_finite_differences(law, theta):
 
 @pytest.mark.parametrize(
     "names",
-    [("rate_dependence", "damage"), ("size_effect", "creep:logarithmic"), ("platen_friction", "rate_dependence")],
+    first_in_core(
+        [("rate_dependence", "damage"), ("size_effect", "creep:logarithmic"), ("platen_friction", "rate_dependence")]
+    ),
     ids="+".join,
 )
 def test_stages_joined_by_the_chain_rule_are_the_derivatives_of_the_whole_law(names):

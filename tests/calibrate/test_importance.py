@@ -63,6 +63,7 @@ def test_weighted_draws_are_those_of_a_known_density(normal, off):
     assert found.error < 0.05
 
 
+@pytest.mark.extended
 def test_a_hopeless_proposal_is_refused(normal):
     # So far off that no draw is near the posterior: the weights cannot tell where it is.
     far, narrow = jnp.asarray(CENTRE + 50 * WIDTH), jnp.diag(jnp.asarray(1e-6 * WIDTH**2))

@@ -299,6 +299,7 @@ def test_missing_file(tmp_path):
     assert "no tester's file in the folder" in message(tmp_path)
 
 
+@pytest.mark.extended
 @settings(max_examples=60, deadline=None)
 @given(name=st.sampled_from(FILES), data=st.data())
 def test_broken_bytes_never_crash(tmp_path_factory, name, data):

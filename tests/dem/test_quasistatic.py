@@ -102,6 +102,7 @@ def test_net_force_is_minus_the_gradient_of_the_energy_and_has_its_stiffness(pre
     assert np.linalg.eigvalsh(here.material.dense()).min() > 0
 
 
+@pytest.mark.extended
 def test_every_row_is_an_equilibrium_and_punches_differ_by_the_springs(pressed):
     _, _, heights, end, rows, tape = pressed
     assert rows.converged.all()

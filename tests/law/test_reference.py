@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 import pytest
-from helpers import EBAR, K1, between, check, close, paper_particle, sphere
+from helpers import EBAR, K1, between, check, close, first_in_core, paper_particle, sphere
 from hypothesis import given, settings
 
 from mcc_jax.geometry import Particle
@@ -66,7 +66,7 @@ def test_hertz_shape_factor_to_the_last_digits(ratio):
     close(factor(Particle(*(jnp.float32(v) for v in (ratio, 1, 1)))), exact_factor(ratio), rel=1e-6)
 
 
-@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("mode", first_in_core([jax.jacfwd, jax.jacrev]))
 @pytest.mark.parametrize("dtype", [pytest.param(jnp.float32, marks=pytest.mark.extended), jnp.float64])
 def test_hertz_shape_factor_derivatives(mode, dtype):
     function = jax.jit(jax.vmap(lambda D1: hertz_shape_factor(Particle(D1, jnp.asarray(100, dtype), D1))))
