@@ -144,7 +144,6 @@ def public(name):
     return ast.parse((file if name else file.with_suffix(".pyi")).read_text(encoding="utf-8"))
 
 
-@pytest.mark.extended
 def test_the_top_of_the_package_loads_lazily_and_holds_every_name_of_its_stub():
     code = (
         "import sys, mcc_jax\n"

@@ -26,7 +26,7 @@ def test_readme_is_one_page():
     assert len(README.splitlines()) <= 120
 
 
-@pytest.mark.extended
+@pytest.mark.notebook
 def test_python_blocks_run(capsys):
     blocks = re.findall(r"```python\n(.*?)```", README, flags=re.S)
     assert blocks
