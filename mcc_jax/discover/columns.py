@@ -180,7 +180,7 @@ class Columns:
         self.arrays, self.correlation = (jnp.asarray(design.scale), tests, design.linear), kinds.correlation
 
     def _given(self, free: np.ndarray, piece: Array) -> tuple[Any, ...]:
-        return free[:4], *self.arrays, piece, self.correlation
+        return jnp.asarray(free[:4]), *self.arrays, piece, self.correlation
 
     def _whitened(self, free: np.ndarray) -> Whitened:
         """At the hyperparameters; those of the last call are kept, since most are asked for more than once."""
@@ -219,6 +219,7 @@ class Columns:
         padded[:, :k, :k] = 2 * of_gram[:, self.some[:, None], self.some]
         weights, ones, total = np.split(white @ padded, len(self.pieces), -1), np.ones(self.shape[0]), np.zeros(4)
         for piece, weight in zip(self.pieces, weights, strict=True):
-            total += np.asarray(slope_of((weight, ones, of_gram[:, -1, -1] * ones), *self._given(free, piece)))
+            of_white = (jnp.asarray(weight), jnp.asarray(ones), jnp.asarray(of_gram[:, -1, -1] * ones))
+            total += np.asarray(slope_of(of_white, *self._given(free, piece)))
             ones = 0.0 * ones  # density and readings count once
         return total
