@@ -17,7 +17,7 @@ from .compiling import compiled
 from .data import Tests
 from .draws import named_population
 from .model import Model
-from .noise import Whitening, standard_promotion
+from .noise import Whitening, forward_substitution
 from .population import COEFFICIENTS, Population, flattened
 from .posterior import Posterior
 from .predict import A_CALIBRATION, laws_with, predicted_at, predicted_by
@@ -223,8 +223,7 @@ def _one_ahead(laws: MccLaw, zero: Array, factor: Array, test: Tests, noise: Whi
     def one(given: Any) -> Array:
         law, z, f = given
         away = jnp.where(test.mask, measured - law.respond(test.particle, test.record) - z, 0.0)
-        with standard_promotion():
-            innovation = noise.solver.solve_triangular(away)
+        innovation = forward_substitution(noise.solver, away[:, None])[:, 0]
         sd = noise.solver.factor.diag.d * f
         return -0.5 * (innovation / f) ** 2 - jnp.log(sd) - 0.5 * jnp.log(2 * jnp.pi)
 

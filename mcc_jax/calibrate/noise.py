@@ -121,7 +121,7 @@ class Whitening(eqx.Module):
 
     def __call__(self, values: Float[Array, "steps columns"]) -> Float[Array, "steps columns"]:
         """Columns of values over the points, independent and of variance 1; they must be 0 where masked."""
-        white = _triangular(self.solver, values)
+        white = forward_substitution(self.solver, values)
         # 1 + p is the variance along a branch's direction: along it, and only there, divide by its root.
         shrink = _shrink(self._power())
         along = jax.ops.segment_sum(self.peak[:, None] * white, self.branch, len(self.peak))
@@ -195,7 +195,9 @@ def standard_promotion() -> Iterator[None]:
         yield
 
 
-def _triangular(solver: QuasisepSolver, values: Float[Array, "steps columns"]) -> Float[Array, "steps columns"]:
+def forward_substitution(
+    solver: QuasisepSolver, values: Float[Array, "steps columns"]
+) -> Float[Array, "steps columns"]:
     """Solve the factor's lower triangular system by forward substitution.
 
     The same as tinygp's `solve_triangular`, at half its time on a CPU: its products of tiny matrices are calls of a
@@ -232,7 +234,7 @@ def whitening(
     directions = [error * linear.by_peak]
     if tests.force_zero_sd is not None:
         directions.append(tests.force_zero_sd * linear.by_offset)
-    white = _triangular(solver, jnp.stack(directions, 1))
+    white = forward_substitution(solver, jnp.stack(directions, 1))
     still = Whitening(solver, tests.mask, white[:, 0], tests.branch, None, tests.reading_weight)
     if tests.force_zero_sd is None:
         return still

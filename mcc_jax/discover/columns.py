@@ -154,11 +154,22 @@ def slope_of(weights: tuple[Array, Array, Array], logs: Float[Array, " 4"], *giv
     return back(weights)[0]
 
 
-class Whitened(NamedTuple):
-    """Whitened columns, padding included, and the Gram matrices of all columns of the design."""
+@dataclass(frozen=True)
+class Whitened:
+    """Whitened columns, padding included: the first of them are `some` of `count` columns, the others are nil."""
 
     white: White
-    gram: np.ndarray
+    some: np.ndarray
+    count: int
+
+    @cached_property
+    def gram(self) -> np.ndarray:
+        """Gram matrices of all columns, the readings' squares with the data's."""
+        columns, k = self.white.columns, len(self.some)
+        gram = np.zeros((len(columns), self.count, self.count))
+        gram[:, self.some[:, None], self.some] = (np.swapaxes(columns, 1, 2) @ columns)[:, :k, :k]
+        gram[:, -1, -1] += self.white.reading
+        return gram
 
 
 class Columns:
@@ -190,11 +201,7 @@ class Columns:
             return last[1]
         found = [jax.tree.map(np.asarray, white_of(*self._given(free, piece))) for piece in self.pieces]
         columns = found[0].columns if len(found) == 1 else np.concatenate([one.columns for one in found], -1)
-        gram = np.zeros((self.shape[0], self.shape[2], self.shape[2]))
-        k = len(self.some)
-        gram[:, self.some[:, None], self.some] = (np.swapaxes(columns, 1, 2) @ columns)[:, :k, :k]
-        gram[:, -1, -1] += found[0].reading
-        white = Whitened(found[0]._replace(columns=columns), gram)
+        white = Whitened(found[0]._replace(columns=columns), self.some, self.shape[2])
         self._last = noise, white
         return white
 

@@ -76,11 +76,15 @@ def _factor(free: np.ndarray, design: Design) -> np.ndarray:
     return np.concatenate([*scales_of(free, design), np.ones(design.amplitude.shape[-1] + 1)])
 
 
+def _scaled(form: np.ndarray, factor: np.ndarray) -> np.ndarray:
+    """Quadratic forms whose columns are scaled."""
+    return form * factor * factor[:, None]
+
+
 def _gram(free: np.ndarray, design: Design) -> tuple[np.ndarray, np.ndarray]:
     """Gram matrix of every particle's scaled columns; log density of the noise at 0."""
     gram, log_density = design.columns.gram(free)
-    factor = _factor(free, design)
-    return gram * factor * factor[:, None], log_density
+    return _scaled(gram, _factor(free, design)), log_density
 
 
 def left_by_particle(free: np.ndarray, design: Design) -> Left:
@@ -206,7 +210,9 @@ def value_and_gradient(free: np.ndarray, design: Design) -> tuple[float, np.ndar
     """Log marginal likelihood at the hyperparameters, times their prior, and its derivatives."""
     spreads, o, c = design.kinds.spreads, design.own.shape[-1], design.common.shape[-1]
     with np.errstate(all="ignore"):  # of steps into numbers beyond arithmetic
-        gram, log_density = _gram(free, design)
+        plain, log_density = design.columns.gram(free)
+        factor = _factor(free, design)
+        gram = _scaled(plain, factor)
         by_particle = _integrated(gram, o)
         shared = _integrated(by_particle.left.sum(0), c)
         effects = amplitudes(shared.left, design.sign, design.largest)
@@ -214,8 +220,7 @@ def value_and_gradient(free: np.ndarray, design: Design) -> tuple[float, np.ndar
         integrals = by_particle.log_integral + log_density
         value = float(integrals.sum() + shared.log_integral) + effects.log_integral + prior
         of_gram = by_particle.slope(shared.slope(effects.slope))
-        factor = _factor(free, design)
-        slope[:4] += design.columns.slope(free, of_gram * factor * factor[:, None])
+        slope[:4] += design.columns.slope(free, _scaled(of_gram, factor))
         of_log = 2 * np.sum(of_gram * gram, (0, 2))  # derivatives by the logarithms of the columns' scales
         spread = spreads_of(free[4 : 4 + len(spreads)], spreads)
         own = np.delete(of_log[:o], 4)
@@ -233,7 +238,7 @@ class OfMisfits:
         gram, log_density = design.columns.gram(free)
         factor = _factor(free, design)
         factor[o : o + c] = 1.0
-        by_particle = _integrated(gram * factor * factor[:, None], o)
+        by_particle = _integrated(_scaled(gram, factor), o)
         self.gram, self.integrals = by_particle.left.sum(0), float((by_particle.log_integral + log_density).sum())
 
     def __call__(self, logs: np.ndarray) -> tuple[float, np.ndarray]:
@@ -243,7 +248,7 @@ class OfMisfits:
         factor = np.ones(len(self.gram))
         factor[:c] = scales_of(free, design)[1]
         with np.errstate(all="ignore"):
-            gram = self.gram * factor * factor[:, None]
+            gram = _scaled(self.gram, factor)
             shared = _integrated(gram, c)
             effects = amplitudes(shared.left, design.sign, design.largest)
             prior, slope = _prior(free, design)
