@@ -206,8 +206,11 @@ def _prior(free: np.ndarray, design: Design) -> tuple[float, np.ndarray]:
     return float(np.sum(each)), slopes
 
 
-def value_and_gradient(free: np.ndarray, design: Design) -> tuple[float, np.ndarray]:
-    """Log marginal likelihood at the hyperparameters, times their prior, and its derivatives."""
+def value_and_gradient(free: np.ndarray, design: Design, *, of_noise: bool = True) -> tuple[float, np.ndarray]:
+    """Log marginal likelihood at the hyperparameters, times their prior, and its derivatives.
+
+    Those by the noise's four numbers cost more than all else; without `of_noise` they lack the likelihood's part.
+    """
     spreads, o, c = design.kinds.spreads, design.own.shape[-1], design.common.shape[-1]
     with np.errstate(all="ignore"):  # of steps into numbers beyond arithmetic
         plain, log_density = design.columns.gram(free)
@@ -220,7 +223,8 @@ def value_and_gradient(free: np.ndarray, design: Design) -> tuple[float, np.ndar
         integrals = by_particle.log_integral + log_density
         value = float(integrals.sum() + shared.log_integral) + effects.log_integral + prior
         of_gram = by_particle.slope(shared.slope(effects.slope))
-        slope[:4] += design.columns.slope(free, _scaled(of_gram, factor))
+        if of_noise:
+            slope[:4] += design.columns.slope(free, _scaled(of_gram, factor))
         of_log = 2 * np.sum(of_gram * gram, (0, 2))  # derivatives by the logarithms of the columns' scales
         spread = spreads_of(free[4 : 4 + len(spreads)], spreads)
         own = np.delete(of_log[:o], 4)
@@ -349,9 +353,9 @@ class _Surface:
             return 1e30, np.zeros(len(slope))
         return -value, -slope * self.scale[len(self.scale) - len(slope) :]
 
-    def at(self, x: np.ndarray) -> tuple[float, np.ndarray]:
-        """Value and slope."""
-        return self._upside_down(*value_and_gradient(x * self.scale, self.design))
+    def at(self, x: np.ndarray, *, of_noise: bool = True) -> tuple[float, np.ndarray]:
+        """Value and slope, as of `value_and_gradient`."""
+        return self._upside_down(*value_and_gradient(x * self.scale, self.design, of_noise=of_noise))
 
     def of_misfits(self, x: np.ndarray) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:
         """Value and slope as a function of the scales of misfits alone."""
@@ -399,27 +403,19 @@ class _Surface:
         Args:
             x: the mode.
             jac: the slope there.
-            known: how many are integrated elsewhere; if any, the curvature is that of the scales of misfits alone.
+            known: how many are integrated elsewhere.
         """
         scale, first = self.scale, self.first
         bound = x * scale >= self.most * scale - 1e-6
         volume = -float(np.sum(np.log(np.maximum(-jac[bound] / scale[bound], 1.0))))  # an exponential, cut off
         wanted = np.flatnonzero(~bound)
         wanted = wanted[wanted >= known]
-        some = self.of_misfits(x) if known else None
-
-        def slope(x: np.ndarray, j: int) -> np.ndarray:
-            if some is None or j < first:
-                return self.at(x)[1]
-            return np.append(jac[:first], some(x[first:])[1])
-
         columns = np.zeros((len(wanted), len(wanted)))
         for row, j in enumerate(wanted.tolist()):
             e = np.where(np.arange(len(x)) == j, NUMERICS.aside, 0.0)
-            columns[row] = (slope(x + e, j) - jac)[wanted] / NUMERICS.aside
-        if some is not None:  # the rows of misfits know nothing of the others
-            rest = int(np.sum(wanted < first))
-            columns[rest:, :rest] = columns[:rest, rest:].T
+            columns[row] = (self.at(x + e, of_noise=j < 4)[1] - jac)[wanted] / NUMERICS.aside
+        noise = int(np.sum(wanted < 4))
+        columns[noise:, :noise] = columns[:noise, noise:].T
         values, vectors = np.linalg.eigh((columns + columns.T) / 2)
         values = np.maximum(values, 1e-3)
         # A spread's coordinate stands for either sign: close to none, both are the same.

@@ -74,6 +74,7 @@ def recovery(ratio: Any) -> Values:
 
 
 @jax.custom_jvp
+@jax.jit  # traced once for all its users
 def _recovery(ratio: Values) -> Values:
     r = jnp.clip(ratio, 0, 1)
     w = two_thirds_power(r)

@@ -199,7 +199,7 @@ def _hook(given: Any, particle: Particle, record: Record, static: Any, effect: A
     if which == "stiffness":
         return effect.stiffness(context)
     before = no_memory((effect,), jnp.zeros_like(particle.D3))
-    return additions((effect,), eqx.tree_at(lambda m: m.point.time, before, record.time[0]), context)[1]
+    return additions((effect,), eqx.tree_at(lambda m: m.point.time, before, record.time[0]), context)[-1]
 
 
 def _stress(particle: Particle, loads: Any) -> Path:
@@ -292,19 +292,21 @@ def signatures(
     strain, zero_um = _virgin_strain(formulas, context), jnp.zeros_like(particle.D3)
     slope = slope_at(formulas, particle, strain, [], [])
 
-    def changes(effect: AbstractEffect) -> tuple[Any, Path, Path, Path]:
-        """First-order change of the law's parameters, of loading strain, of the modulus, and what is added."""
+    def changes(effect: AbstractEffect) -> tuple[Any, Path]:
+        """First-order change of parameters, loading strain and modulus if it acts there, and of what is added."""
+        loads, inside = effect.overrides("loading"), effect.overrides("modify", "loading", "stiffness")
 
-        def act(amplitude: Scalar) -> tuple[Any, Any, Path, Path]:
+        def act(amplitude: Scalar) -> tuple[Any, Any, Any, Path]:
             own = eqx.tree_at(lambda e: e.amplitude, effect, amplitude)
-            law = eqx.filter(own.modify(formulas, particle, record), eqx.is_inexact_array)
+            law = eqx.filter(own.modify(formulas, particle, record), eqx.is_inexact_array) if inside else None
+            factors = own.loading(formulas, particle, record, strain) if loads else None
             start = eqx.tree_at(lambda m: m.point.time, no_memory((own,), zero_um), record.time[0])
-            added = additions((own,), start, context)[1]
-            return law, own.loading(formulas, particle, record, strain), own.stiffness(context), added
+            return law, factors, own.stiffness(context) if inside else None, additions((own,), start, context)[-1]
 
         zero = jnp.zeros_like(effect.amplitude)
         law, factors, stiffness, added = jax.jvp(act, (zero,), (jnp.ones_like(zero),))[1]
-        return law, -stress_at(formulas, particle, strain, [factors]) / slope, stiffness, added
+        shift = -stress_at(formulas, particle, strain, [factors]) / slope if loads else jnp.zeros_like(strain)
+        return (law, shift, stiffness) if inside else None, added
 
     if not effects:
         return jnp.zeros((0, *record.force.shape), record.force.dtype)
@@ -312,21 +314,24 @@ def signatures(
     effects = [replace(effect, label="") for effect in effects]  # which would keep apart what is compiled at once
     for i, effect in enumerate(effects):
         groups.setdefault((type(effect), jax.tree.structure(effect)), []).append(i)
-    order, parts = [], []
+    within: list[tuple[list[int], Any, Path]] = []
+    beside: list[tuple[list[int], Path]] = []
     for members in groups.values():
         alike = [jax.tree.map(jnp.asarray, effects[i]) for i in members]
-        parts.append(jax.vmap(changes)(jax.tree.map(lambda *leaves: jnp.stack(leaves), *alike)))
-        order.extend(members)
-    law, shift, stiffness, added = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
-    parameters, rest = eqx.partition(formulas, eqx.is_inexact_array)
-    still, one = jnp.zeros_like(strain), jnp.ones_like(strain)
+        inside, added = jax.vmap(changes)(jax.tree.map(lambda *leaves: jnp.stack(leaves), *alike))
+        beside.append((members, added)) if inside is None else within.append((members, inside, added))
+    rows = [added for _, added in beside]
+    if within:
+        parameters, rest = eqx.partition(formulas, eqx.is_inexact_array)
 
-    def response(parameters: Any, shift: Path, stiffness: Path) -> Path:
-        return _response(eqx.combine(parameters, rest), context, shift, stiffness)
+        def response(parameters: Any, shift: Path, stiffness: Path) -> Path:
+            return _response(eqx.combine(parameters, rest), context, shift, stiffness)
 
-    _, push = jax.linearize(response, parameters, still, one)
-    rows = jax.vmap(push)(law, shift, stiffness) + added
-    return rows[jnp.argsort(jnp.asarray(order))]
+        _, push = jax.linearize(response, parameters, jnp.zeros_like(strain), jnp.ones_like(strain))
+        directions = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *(inside for _, inside, _ in within))
+        rows.append(jax.vmap(push)(*directions) + jnp.concatenate([added for _, _, added in within]))
+    order = [i for members, *_ in (*beside, *within) for i in members]
+    return jnp.concatenate(rows)[np.argsort(order)]
 
 
 def _virgin_strain(law: Formulas, context: Context) -> Path:

@@ -84,7 +84,8 @@ def one_point(
         driver = effect.driver(context)
         return *effect.evolve(own, driven, driver, time - before.time), driver
 
-    after, values = _remember(effects, memory, record, highest, remember)
+    own, drivers, values = _remember(effects, memory, remember)
+    after = Memory(record, highest, own, drivers)
     return context.peak_displacement, after, context.displacement + _added(effects, context, values)
 
 
@@ -94,7 +95,9 @@ def whole_path(
     """The same after all points of a record, closed form but for the memories."""
     highest = peak_forces(record, memory.peak_force)
     context = modified(law, effects, particle, displacement_max, record, highest, since_peak(record))
-    after, added = additions(effects, memory, context)
+    own, drivers, added = additions(effects, memory, context)
+    point, highest = jax.tree.map(lambda x: x[-1], (record.at_points, highest))
+    after = Memory(point, highest, own, drivers)
     return context.peak_displacement[-1], after, context.displacement + added
 
 
@@ -156,8 +159,8 @@ def released(context: Context, factors: Sequence[Values]) -> Context:
     return replace(context, recoverable=recoverable, displacement=reached - recoverable * share)
 
 
-def additions(effects: Effects, memory: Memory, context: Context) -> tuple[Memory, Path]:
-    """Memories after a path under load control, and what is added along it inside the law and by the tester [um].
+def additions(effects: Effects, memory: Memory, context: Context) -> tuple[tuple[Any, ...], tuple[Any, ...], Path]:
+    """The effects' memories after a path under load control, what drove them last, and what is added along it [um].
 
     Args:
         effects: what acts.
@@ -173,9 +176,8 @@ def additions(effects: Effects, memory: Memory, context: Context) -> tuple[Memor
         own, value = jax.lax.scan(lambda past, now: effect.evolve(past, *now), own, (earlier, along, seconds))
         return own, value, along[-1]
 
-    point, highest = jax.tree.map(lambda x: x[-1], (record.at_points, context.peak_force))
-    after, values = _remember(effects, memory, point, highest, remember)
-    return after, _added(effects, context, values)
+    own, drivers, values = _remember(effects, memory, remember)
+    return own, drivers, _added(effects, context, values)
 
 
 def force_at(
@@ -255,22 +257,16 @@ def factor_at_peak(effects: tuple[AbstractModulusAtPeak, ...], strain: Values, s
 
 
 def _remember(
-    effects: Effects,
-    memory: Memory,
-    point: Record,
-    highest: Scalar,
-    remember: Callable[[AbstractEffect, Any, Scalar], tuple[Any, Any, Scalar]],
-) -> tuple[Memory, list[Any]]:
-    """The memory after the last point, and what each effect's own tells it."""
-    own, values, drivers = [], [], []
-    for effect, mine, before in zip(effects, memory.of_effects, memory.drivers, strict=True):
-        told = (None, None, None) if mine is None else remember(effect, mine, before)
-        for entries, entry in zip((own, values, drivers), told, strict=True):
-            entries.append(entry)
-    return Memory(point, highest, tuple(own), tuple(drivers)), values
+    effects: Effects, memory: Memory, remember: Callable[[AbstractEffect, Any, Scalar], tuple[Any, Any, Scalar]]
+) -> tuple[tuple[Any, ...], tuple[Any, ...], tuple[Any, ...]]:
+    """The effects' memories after the last point, what drove them there, and the value of each for `inside`."""
+    each = zip(effects, memory.of_effects, memory.drivers, strict=True)
+    found = [(None, None, None) if own is None else remember(effect, own, before) for effect, own, before in each]
+    own, values, drivers = zip(*found, strict=True) if found else ((), (), ())
+    return own, drivers, values
 
 
-def _added(effects: Effects, context: Context, values: list[Any]) -> Values:
+def _added(effects: Effects, context: Context, values: tuple[Any, ...]) -> Values:
     total = jnp.zeros_like(context.displacement)
     for effect, value in zip(effects, values, strict=True):
         if effect.overrides("inside", "observe"):
