@@ -21,7 +21,9 @@ from .own_numbers import OwnNumbers
 from .refine import Refined
 from .result import Effect, Likeness, Residuals
 from .search import Search
-from .settings import AT_PEAKS, DECISIONS, POPULATION, TELLING
+from .settings import AT_PEAKS, DECISIONS, DETECTABLE, POPULATION
+
+LEAD = 3.0  # log posterior odds from which on what remains next to a name is reported
 
 
 def parameters_alone(base: Base) -> dict[str, Any]:
@@ -261,7 +263,7 @@ def ranking_of(search: Search) -> tuple[dict[str, Any], ...]:
                 "variant": c.variant.name,
                 "statistic": finite(float(z[k])),
                 "estimate": finite(float(first.score[k] / information[k] * unit)),
-                "detection_limit": finite(float(TELLING.detectable / np.sqrt(information[k]) * unit)),
+                "detection_limit": finite(float(DETECTABLE / np.sqrt(information[k]) * unit)),
                 "unit": c.variant.unit,
                 "parameter": c.variant.parameter,
                 "probability": weight[c.mechanism] / total,
@@ -320,7 +322,7 @@ def leads_of(search: Search, winner: Names) -> tuple[dict[str, Any], ...]:
     gap = max(alone.log_evidence - search.null.log_evidence, 1e-300)
     found = []
     for names, pair in search.found.items():
-        if len(names) == 2 and winner[0] in names and pair.log_evidence > alone.log_evidence + TELLING.lead:
+        if len(names) == 2 and winner[0] in names and pair.log_evidence > alone.log_evidence + LEAD:
             (second,) = set(names) - set(winner)
             share = (pair.log_evidence - alone.log_evidence) / (gap + pair.log_evidence - alone.log_evidence)
             found.append({"mechanism": second, "share": float(share), "resembles": []})

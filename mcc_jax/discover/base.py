@@ -21,7 +21,9 @@ from ..calibrate.judgement import numbers_in_reach
 from ..calibrate.model import Model
 from ..calibrate.sharding import Blocks, Parts
 from ..campaign import Campaign, find_segments
-from .settings import DECISIONS, NUMERICS
+from .settings import DECISIONS
+
+BLOCK = 8  # particles that are linearised at once: one program for any number of them
 
 
 class State(eqx.Module):
@@ -120,8 +122,8 @@ class Base:
     @cached_property
     def blocks(self) -> tuple[Blocks, Parts]:
         """How particles are cut into blocks, and the tests so cut."""
-        count = len(self.tests) + -len(self.tests) % NUMERICS.block
-        blocks = Blocks(count, NUMERICS.block)
+        count = len(self.tests) + -len(self.tests) % BLOCK
+        blocks = Blocks(count, BLOCK)
         return blocks, blocks.cut(longer(self.tests, count))
 
     def each(self, function: Callable[..., Any], point: Point, *shared: Any) -> Any:

@@ -9,7 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..effects import AbstractEffect, Mechanism, Need, Variant
-from .settings import NUMERICS
+
+# Values tried of a number that differs from test to test.
+LOCATIONS = 32  # of a place between two that lie far apart, which must be met closely
+PHASES = 14  # of a phase
 
 
 @dataclass(frozen=True)
@@ -95,8 +98,4 @@ def _words(variants: Sequence[Variant], present: frozenset[Need]) -> str:
 
 def _spaced(low: float, high: float) -> np.ndarray:
     """Values over a range, by ratio where it spans more than a factor of three."""
-    return (
-        np.geomspace(low, high, NUMERICS.locations)
-        if low > 0 and high > 3 * low
-        else np.linspace(low, high, NUMERICS.phases)
-    )
+    return np.geomspace(low, high, LOCATIONS) if low > 0 and high > 3 * low else np.linspace(low, high, PHASES)

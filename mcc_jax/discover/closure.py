@@ -14,7 +14,10 @@ from .columns import Design, with_amplitudes, without_misfits
 from .evidence import left_by_particle, scales_of, without_first
 from .hypothesis import UNLISTED
 from .search import Search
-from .settings import HYPERPARAMETERS, NUMERICS, TELLING
+from .settings import HYPERPARAMETERS, WAVES
+
+POINTS = 60  # of the curve
+ONE_TERM = 0.9  # share of what two terms of a formula explain from which on one term will do
 
 LETTERS = {
     "strain": ("e", "reduced peak strain (1 + a H) epsilon_P"),
@@ -99,7 +102,7 @@ def terms_of(name: str, low: float, high: float) -> list[Term]:
         s = _rounded(share * reach)
         found.append(Term(name, f"(1 - exp(-{letter}/{s:g}))", lambda x, s=s: 1 - np.exp(-np.maximum(x, 0.0) / s)))
         found.append(Term(name, f"ln(1 + {letter}/{s:g})", lambda x, s=s: np.log1p(np.maximum(x, 0.0) / s)))
-    for k in range(2, 2 * NUMERICS.waves):
+    for k in range(2, 2 * WAVES):
         p = _rounded(2 * reach / k, 3)
         found.append(Term(name, f"sin(2 pi {letter}/{p:g})", lambda x, p=p: np.sin(2 * np.pi * x / p)))
         found.append(Term(name, f"cos(2 pi {letter}/{p:g})", lambda x, p=p: np.cos(2 * np.pi * x / p)))
@@ -145,7 +148,7 @@ def closure(search: Search, seed: int) -> Closure:
         for _ in range(20)
     ]
     name = terms[chosen[0]].coordinate
-    x = np.linspace(*span[name], NUMERICS.shares)
+    x = np.linspace(*span[name], POINTS)
     texts = [f"{_rounded(w / scale[k]):+g} {terms[k].text}" for k, w in zip(chosen, weights, strict=True)]
     letters = dict.fromkeys(terms[k].coordinate for k in chosen)
     meaning = ", ".join(f"{LETTERS[n][0]} = {LETTERS[n][1]}" for n in letters)
@@ -188,7 +191,7 @@ def _best_terms(
         if np.linalg.cond(inner) < 1e6:
             w = np.linalg.solve(inner, s[[i, j]])
             pairs.append((float(w @ s[[i, j]]), (i, j), w))
-    if not pairs or single[first] > TELLING.one_term * max(p[0] for p in pairs):
+    if not pairs or single[first] > ONE_TERM * max(p[0] for p in pairs):
         return (first,), np.array([s[first] / power[first]])
     _, two, w = max(pairs, key=lambda p: p[0])
     return two, w
@@ -213,7 +216,7 @@ def _along(search: Search, name: str, x: np.ndarray, span: tuple[float, float]) 
     """The discrepancy as a function of one coordinate, in units of strain, and its standard error."""
     smooth = search.found[UNLISTED].smooth
     assert smooth is not None
-    tests, N = search.base.tests, 2 * NUMERICS.waves
+    tests, N = search.base.tests, 2 * WAVES
     size = np.asarray(tests.effective_diameter)
     at = np.asarray(search.at[name])
 

@@ -20,9 +20,11 @@ from ..calibrate.data import Tests
 from ..calibrate.forward import Linear
 from ..calibrate.model import Model
 from ..calibrate.noise import Along, Correlation, Noise, whitening
-from .settings import NUMERICS
 
 LOG_2PI = float(np.log(2 * np.pi))
+
+AT_ONCE = 6, 18  # columns that are whitened in one call, at least and at most
+ENTRIES = 270_000  # numbers that these hold together, about, so that they stay in a processor's own memory
 
 
 @dataclass(frozen=True)
@@ -179,8 +181,8 @@ class Columns:
         self.shape = columns.shape
         self._last: tuple[bytes, Whitened] | None = None
         self.some = np.flatnonzero(np.any(columns != 0, axis=(0, 1)))
-        least, most = NUMERICS.columns
-        size = min(max(NUMERICS.entries // (self.shape[0] * self.shape[1]), least), most)
+        least, most = AT_ONCE
+        size = min(max(ENTRIES // (self.shape[0] * self.shape[1]), least), most)
         count = -(-max(len(self.some), 1) // size)
         padded = np.zeros((*self.shape[:2], count * size))
         padded[..., : len(self.some)] = columns[..., self.some]

@@ -24,7 +24,12 @@ from scipy.special import log_ndtr
 
 from ..calibrate.distributions import SCALES, SpreadCoordinate
 from .columns import LOG_2PI, Columns, Design, with_amplitudes
-from .settings import NUMERICS
+from .settings import LENGTH_FACTORS, NOISE_FACTORS, STRONG
+
+LITTLE = 0.1  # factor on correlated noise that has swallowed a gap, where what explains it begins to be fitted
+FLAT = 0.2  # slope at which a mode is reached, per expected standard deviation: 0.02 nats away
+ITERATIONS = 40  # of L-BFGS at most
+ASIDE = 0.1  # how far from the mode slopes are compared for its curvature, in expected standard deviations
 
 
 class Left(NamedTuple):
@@ -272,7 +277,7 @@ def log_joint(free: np.ndarray, design: Design) -> float:
 def with_little_noise(free: np.ndarray) -> np.ndarray:
     """Hyperparameters with correlated noise that has not swallowed a gap."""
     at = free.copy()
-    at[2] += np.log(NUMERICS.little)
+    at[2] += np.log(LITTLE)
     return at
 
 
@@ -340,7 +345,7 @@ class _Surface:
         expected = [noise, np.full(spreads, 2.0 * len(design.tests)), np.full(len(design.misfits), 2.0)]
         self.scale = 1 / np.sqrt(np.concatenate(expected))
         self.most = np.concatenate([np.full(self.first, np.inf), design.misfits[:, 2]]) / self.scale
-        self.options: Any = {"ftol": 1e-7, "gtol": NUMERICS.flat, "maxiter": NUMERICS.evaluations}
+        self.options: Any = {"ftol": 1e-7, "gtol": FLAT, "maxiter": ITERATIONS}
 
     def _minimise(self, function: Callable[[np.ndarray], tuple[float, np.ndarray]], start: np.ndarray, **more: Any):
         from scipy.optimize import minimize
@@ -373,11 +378,11 @@ class _Surface:
 
         What was fitted without misfits may have swallowed what they explain.
         """
-        shorter = NUMERICS.length_factors[-1]
-        factors = np.log([(1.0, 1.0), *((factor, shorter) for factor in NUMERICS.noise_factors[1:])])
+        shorter = LENGTH_FACTORS[-1]
+        factors = np.log([(1.0, 1.0), *((factor, shorter) for factor in NOISE_FACTORS[1:])])
         some = [self.followed(np.concatenate([x[:2], x[2:4] + by / self.scale[2:4], x[4:]])) for by in factors]
         best = min(some, key=lambda one: one[0])
-        return best if best[0] < some[0][0] - NUMERICS.strong else some[0]
+        return best if best[0] < some[0][0] - STRONG else some[0]
 
     def mode(self, start: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, int]:
         """The lowest point met by L-BFGS: value, coordinates, slope, and evaluations."""
@@ -412,8 +417,8 @@ class _Surface:
         wanted = wanted[wanted >= known]
         columns = np.zeros((len(wanted), len(wanted)))
         for row, j in enumerate(wanted.tolist()):
-            e = np.where(np.arange(len(x)) == j, NUMERICS.aside, 0.0)
-            columns[row] = (self.at(x + e, of_noise=j < 4)[1] - jac)[wanted] / NUMERICS.aside
+            e = np.where(np.arange(len(x)) == j, ASIDE, 0.0)
+            columns[row] = (self.at(x + e, of_noise=j < 4)[1] - jac)[wanted] / ASIDE
         noise = int(np.sum(wanted < 4))
         columns[noise:, :noise] = columns[:noise, noise:].T
         values, vectors = np.linalg.eigh((columns + columns.T) / 2)

@@ -15,7 +15,12 @@ from .candidates import Candidate
 from .plan import Plan, planned_base
 from .screen import Screen, first_order
 from .search import Search
-from .settings import DECISIONS, NUMERICS, TELLING
+from .settings import DECISIONS, ENOUGH
+
+COPIES = 0.5, 1, 2, 3, 5, 10  # further particles that are tried, over those of the campaign
+MOST_PARTICLES = 200  # further ones, at most
+TURNS = 16  # points that turning points may add to a programme's own
+EVEN = 0.5  # the least power with which a test is proposed: particles are too dear for less than an even chance
 
 
 def menu(points: int) -> tuple[Plan, ...]:
@@ -50,7 +55,7 @@ def next_experiments(search: Search, names: tuple[str, ...]) -> list[dict[str, A
     if len(members) < 2:
         return []
     base = search.base
-    points = max(base.tests.force.shape[1] - NUMERICS.turns, 32)
+    points = max(base.tests.force.shape[1] - TURNS, 32)
     assert search.screen is not None
     options: list[tuple[str, Screen, int]] = [
         ("more particles, tested in the same way", search.screen, len(base.tests))
@@ -59,13 +64,13 @@ def next_experiments(search: Search, names: tuple[str, ...]) -> list[dict[str, A
     options += [(plan.name, *_screened(base, plan, library)) for plan in menu(points)]
     found = []
     for text, other, count in options:
-        tried = [n for n in (round(c * count) for c in NUMERICS.copies) if 0 < n <= NUMERICS.particles] or [count]
+        tried = [n for n in (round(c * count) for c in COPIES) if 0 < n <= MOST_PARTICLES] or [count]
         powers = [_power(search, members, other, n / count) for n in tried]
-        enough = [k for k, p in enumerate(powers) if p >= TELLING.enough]
+        enough = [k for k, p in enumerate(powers) if p >= ENOUGH]
         k = enough[0] if enough else len(tried) - 1
-        if powers[k] >= TELLING.even:
+        if powers[k] >= EVEN:
             found.append({"experiment": text, "separates": members, "particles": tried[k], "power": powers[k]})
-    found.sort(key=lambda one: (-min(one["power"], TELLING.enough), one["particles"]))
+    found.sort(key=lambda one: (-min(one["power"], ENOUGH), one["particles"]))
     return found
 
 

@@ -14,7 +14,9 @@ from .columns import Design
 from .evidence import amplitudes, left_by_particle, scales_of, without_first
 from .hypothesis import UNLISTED, Names
 from .search import Search
-from .settings import DECISIONS, HYPERPARAMETERS, NUMERICS
+from .settings import CONTENDERS, DECISIONS, HYPERPARAMETERS
+
+SHARES = 60  # points of the common path on which the residuals of two tests are multiplied
 
 
 @dataclass(frozen=True)
@@ -162,7 +164,7 @@ def held_out(search: Search, winner: Names) -> HeldOut:
     null, everyone = search.null, np.arange(len(search.base.tests))
     logs = search.log_posteriors()
     contestants: dict[Names, _Contestant] = {}
-    for names in dict.fromkeys([*list(logs)[: NUMERICS.contenders], winner]):
+    for names in dict.fromkeys([*list(logs)[:CONTENDERS], winner]):
         if names and search.found[names].fitted is not None:
             contestants[names] = _Contestant.of(*search.found[names].likely_form(misfit=False))
     # The base law under the winner's noise and spreads: gaps are measured by the noise of what closes them.
@@ -197,7 +199,7 @@ def _repeating(search: Search, residual: np.ndarray) -> np.ndarray:
     """Mean product of the residuals of two different particles at the same share of the path, at every step."""
     tests = search.base.tests
     mask, path = np.asarray(tests.mask), np.asarray(tests.path)
-    shares = (np.arange(NUMERICS.shares) + 0.5) / NUMERICS.shares
+    shares = (np.arange(SHARES) + 0.5) / SHARES
     size = np.asarray(tests.effective_diameter)
     found = []
     for one in residual:

@@ -15,7 +15,7 @@ from .base import Base
 from .columns import Design, with_noise
 from .design import design_of
 from .evidence import Optimum, optimise, residual_of, solve, whitened
-from .settings import NUMERICS
+from .settings import STRONG
 
 
 def with_other_noise(design: Design, free: np.ndarray, model: Model) -> Optimum:
@@ -40,7 +40,7 @@ def with_likely_noise(base: Base) -> tuple[Base, Optimum]:
     own = optimise(design, base.hyperparameters, curvature=False)
     others = [(*with_own_scales(design, own.free, model), model) for model in noise_models(base)]
     best, scale, model = max(others, key=lambda one: one[0].log_joint)
-    if best.log_joint > own.log_joint + NUMERICS.strong:
+    if best.log_joint > own.log_joint + STRONG:
         return replace(base, model=model, scale=scale), best
     return base, own
 

@@ -10,9 +10,10 @@ import numpy as np
 
 from ..effects.record import HOLD, LOAD, RELOAD, UNLOAD
 from .base import Base
-from .settings import NUMERICS, TELLING
 
 KINDS = {LOAD: "loading", HOLD: "hold", UNLOAD: "unloading", RELOAD: "reloading"}
+BINS = 5  # of load in which disagreement is looked for
+REPORTED = 0.85  # places are reported until they hold this share of the disagreement
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ def places(base: Base, left: np.ndarray) -> tuple[Place, ...]:
     force = np.asarray(base.tests.force)
     load = force / np.max(np.where(mask, force, 0.0), axis=1, keepdims=True)
     total = max(float(np.sum(left[mask] ** 2)), 1e-300)
-    edges = np.linspace(0, 1, NUMERICS.places + 1)
+    edges = np.linspace(0, 1, BINS + 1)
     found = []
     for code, name in KINDS.items():
         if not (mask & (kind == code)).any():
@@ -72,7 +73,7 @@ def where(base: Base, places: tuple[Place, ...]) -> list[dict[str, Any]]:
     known = sorted((p for p in places if p.share > 0), key=lambda p: -p.share)
     strain, held, told = _strains(base), 0.0, []
     for place in known:
-        if held >= TELLING.place:
+        if held >= REPORTED:
             break
         held += place.share
         rows = list(place.particles)

@@ -14,7 +14,7 @@ from ..calibrate.compiling import compiled_quickly
 from ..calibrate.data import Tests
 from ..calibrate.forward import Forms, Linear, Point
 from ..effects.record import RELOAD, UNLOAD
-from .settings import NUMERICS
+from .settings import WAVES
 
 COORDINATES = {
     "frame_compliance": ("force",),
@@ -42,6 +42,10 @@ COORDINATES = {
 
 ANY = ("peak", "load", "since")
 """The same of a mechanism that is not of the library."""
+
+HATS, DEGREE = 8, 2  # hat functions of each coordinate of a misfit, and total degree of its smooth products
+SPLINES, FINE_SPLINES = 12, 24  # cosines of each coordinate of a discrepancy on no list, and of stress
+DRIVE_WAVES = 26  # periods over the range of micrometres, which is the widest among particles of several sizes
 
 
 @compiled_quickly
@@ -108,7 +112,7 @@ def scaled(at: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]
 
 
 def functions(
-    names: tuple[str, ...], at: Mapping[str, np.ndarray], *, degree: int = NUMERICS.degree, hats: int = NUMERICS.hats
+    names: tuple[str, ...], at: Mapping[str, np.ndarray], *, degree: int = DEGREE, hats: int = HATS
 ) -> np.ndarray:
     """Smooth products of cosines and hat functions over some coordinates, shape (N, points, functions).
 
@@ -148,7 +152,7 @@ def splines(x: np.ndarray, count: int) -> np.ndarray:
     return weight * np.cos(np.pi * k * x[..., None])
 
 
-def waves(x: np.ndarray, count: int = NUMERICS.waves) -> np.ndarray:
+def waves(x: np.ndarray, count: int = WAVES) -> np.ndarray:
     """Sines and cosines of two periods and more over a coordinate between 0 and 1, with a variance of 1 together."""
     angle = 2 * np.pi * np.arange(2, count) * x[..., None]
     return np.concatenate([np.cos(angle), np.sin(angle)], -1) / np.sqrt(count - 2)
@@ -172,32 +176,32 @@ def general(at: dict[str, np.ndarray], tests: Tests, linear: Linear) -> tuple[np
     """
     mask, size = np.asarray(tests.mask), np.asarray(tests.effective_diameter)
     share = (size / np.mean(size))[:, None, None]
-    since = splines(at["since"], NUMERICS.hats)
+    since = splines(at["since"], HATS)
     turned = [
         np.concatenate([at[way][..., None], since * at[way][..., None]], -1) for way in ("unloading", "reloading")
     ]
     products = splines(at["peak"], 3)[..., :, None] * splines(at["load"], 3)[..., None, :]
     timed = tuple(name for name in ("clock",) if name in at)
     reduced = [
-        splines(at["peak"], NUMERICS.fine_splines),
-        *(splines(at[name], NUMERICS.splines) for name in ("strain", "travel", "load", *timed)),
-        splines(at["load"], NUMERICS.splines) * at["reloading"][..., None],
+        splines(at["peak"], FINE_SPLINES),
+        *(splines(at[name], SPLINES) for name in ("strain", "travel", "load", *timed)),
+        splines(at["load"], SPLINES) * at["reloading"][..., None],
         products.reshape(*products.shape[:-2], -1),
         *(waves(at[name]) for name in ("travel", *timed)),
     ]
     by_force, by_peak = (np.where(mask, x, 0.0)[..., None] for x in (linear.by_force, linear.by_peak))
     yielding = np.where(np.asarray(tests.loading)[..., None], by_force, by_peak)
-    stress = splines(at["strain"], NUMERICS.splines) * yielding * size[:, None, None] ** 2
+    stress = splines(at["strain"], SPLINES) * yielding * size[:, None, None] ** 2
     cell = by_force * cell_errors(at["force"]) + by_peak * cell_errors(at["peak_force"])
     parts = [*(part * share for part in reduced), of_unit(stress, mask), of_unit(cell, mask)]
-    parts += [*turned, waves(at["drive"], NUMERICS.drive_waves)]
+    parts += [*turned, waves(at["drive"], DRIVE_WAVES)]
     groups = [k for k, part in enumerate(parts, 1) for _ in range(part.shape[-1])]
     return np.where(mask[..., None], np.concatenate(parts, -1), 0.0), groups
 
 
 def cell_errors(force: np.ndarray) -> np.ndarray:
     """Smooth and periodic errors of a load cell."""
-    return np.concatenate([splines(force, NUMERICS.splines), waves(force)], -1)
+    return np.concatenate([splines(force, SPLINES), waves(force)], -1)
 
 
 def of_unit(part: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -16,10 +16,13 @@ from .evidence import Optimum, likely_start, optimise, solve, visible
 from .hypothesis import Hypothesis, Smooth
 from .misfit import ANY, COORDINATES, functions
 from .refine import Refined
-from .settings import DECISIONS, HYPERPARAMETERS, NUMERICS
+from .settings import DECISIONS, EARLY, HYPERPARAMETERS, VERY_STRONG
 
 SCATTER = NakagamiPrior(DECISIONS.scatter)
 """Prior of the spread of an amplitude over the particles, as a share of it."""
+
+FOLLOWED = 4  # times at most that the prior of a misfit follows the amplitude of its formula
+AGREE = 0.1  # difference of the logarithms of the two at which it need not
 
 Coordinates = Mapping[str, np.ndarray]
 Signatures = Callable[[str], Mapping[str, np.ndarray]]
@@ -50,9 +53,9 @@ def fit_with_misfit(
     start = np.concatenate([r.optimum.free, [some] * len(r.variants), design.misfits[:, 0]])
     optimum = optimise(design, start, without=r.optimum)
     sizes, shift = design.misfits, np.zeros(len(design.misfits))
-    for _ in range(NUMERICS.followed):
+    for _ in range(FOLLOWED):
         away = _amplitudes(r, design, optimum) - shift
-        if optimum.log_evidence < r.log_evidence or np.all(np.abs(away) < NUMERICS.agree):
+        if optimum.log_evidence < r.log_evidence or np.all(np.abs(away) < AGREE):
             break
         shift = shift + away / 2  # all of the way would overshoot
         design = replace(design, misfits=sizes + shift[:, None] * [1.0, 0.0, 1.0])
@@ -123,21 +126,21 @@ class Discrepancy:
     def beside(self, base: Base, r: Refined, at_least: float = -np.inf) -> Smooth | None:
         """The discrepancy beside the law, or beside what is named, at its optimum.
 
-        None where it begins `Numerics.very_strong` below a log evidence to compare with: it would not come near.
+        None where it begins `VERY_STRONG` below a log evidence to compare with: it would not come near.
         """
         unit, parts = float(np.log(DECISIONS.general)) + self.log_white, max(self.group)
         sizes = [(unit, DECISIONS.general_log_sd, np.inf)] * parts
         more = More(basis=self.basis, group=self.group, sizes=sizes)
         design = design_of(base, r.state, r.variants, more)
         start, value = likely_start(design, np.append(r.optimum.free, [unit - 1.0] * parts))
-        if value < at_least - NUMERICS.very_strong:
+        if value < at_least - VERY_STRONG:
             return None
         optimum = optimise(design, start, without=r.optimum)
         at = Refined(r.variants, r.state, design, optimum, solve(optimum.free, design))
-        if not r.variants and optimum.log_joint > r.optimum.log_joint + NUMERICS.very_strong:
+        if not r.variants and optimum.log_joint > r.optimum.log_joint + VERY_STRONG:
             # What it takes away from the law's numbers moves these as far as a name does; beside one that is done.
             there = at
-            for _ in range(NUMERICS.early):
+            for _ in range(EARLY):
                 state = moved(base, there.state, r.variants, there.solution)
                 design = design_of(base, state, r.variants, more)
                 there = replace(there, state=state, design=design, solution=solve(optimum.free, design))

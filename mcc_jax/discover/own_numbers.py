@@ -18,10 +18,13 @@ from .design import More, design_of, linear_at
 from .evidence import Optimum, log_joint, optimise, scales_of, solve, with_little_noise
 from .refine import Refined, refined
 from .screen import single_integrals
-from .settings import DECISIONS, HYPERPARAMETERS, NUMERICS
+from .settings import DECISIONS, HYPERPARAMETERS
 
 SPREAD = NakagamiPrior(1.0, shape=0.25)
 """Prior of a spread over the tests in units of the largest plausible one, open in its order of magnitude."""
+
+DRIFTS = 6  # drifts of every test's own that are fitted at their own optimum
+MOST_STEPS = 3  # sudden ones of one test
 
 
 @dataclass(frozen=True)
@@ -117,7 +120,7 @@ def differing(base: Base, start: Refined, columns: np.ndarray, candidates: Seque
     values: dict[str, list[float]] = {}
     best: tuple[Optimum, Candidate, Design, More] | None = None
     for turn, (value, at, c, design, more) in enumerate(tried):
-        if turn < NUMERICS.drifts:
+        if turn < DRIFTS:
             optimum = optimise(design, at, curvature=False)
             value = optimum.log_joint
             if best is None or value > best[0].log_joint:
@@ -153,7 +156,7 @@ def step_scores(now: Refined) -> tuple[np.ndarray, np.ndarray]:
 
 
 def sudden_steps(base: Base, start: Refined, variant: Variant) -> OwnNumbers | None:
-    """Sudden steps in some tests, found one after the other: at most `Numerics.jumps` in each.
+    """Sudden steps in some tests, found one after the other: at most `MOST_STEPS` in each.
 
     A test has one with a probability that is itself unknown, uniformly; it may be at any point of its loading.
 
@@ -169,7 +172,7 @@ def sudden_steps(base: Base, start: Refined, variant: Variant) -> OwnNumbers | N
     columns = np.zeros((N, P, 0))
     found: list[Step] = []
     now, best, value, steps = start, None, -np.inf, list[Step]()
-    for turn in range(NUMERICS.jumps + 1):
+    for turn in range(MOST_STEPS + 1):
         if turn:
             more = More(columns, (SPREAD,) * turn)
             design = design_of(base, start.state, start.variants, more)
@@ -180,7 +183,7 @@ def sudden_steps(base: Base, start: Refined, variant: Variant) -> OwnNumbers | N
             value = optimum.log_joint + log_prior
             now = solved(design, optimum, start)
             best, steps = OwnNumbers(variant, {}, value, now, more), list(found)
-        if turn == NUMERICS.jumps:
+        if turn == MOST_STEPS:
             break
         score, information = step_scores(now)
         new, added = np.zeros((N, P, 1)), False

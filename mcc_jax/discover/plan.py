@@ -27,9 +27,10 @@ from .base import Base, State, base_fit
 from .candidates import untestable
 from .design import particle_means
 from .screen import Screen, first_order
-from .settings import TELLING
+from .settings import DETECTABLE
 
 _A_PROGRAMME = "Take mcc_jax.Programme.cycles()."
+ALIKE = 0.9  # correlation of projected signatures from which on two mechanisms look alike
 
 
 @dataclass(frozen=True)
@@ -154,7 +155,7 @@ def power_of(found: Screen, missing: Sequence[dict[str, str]]) -> Power:
     for name, ks in members.items():
         # The first formula is the common one; the limit is that of the family's first formula that leaves a trace.
         variant = found.candidates[ks[0]].variant
-        limits[name] = float(TELLING.detectable / np.sqrt(strength[ks[0]]) * variant.plausible[0])
+        limits[name] = float(DETECTABLE / np.sqrt(strength[ks[0]]) * variant.plausible[0])
         units[name] = variant.unit
         plausible[name] = variant.plausible
     alike = []
@@ -164,7 +165,7 @@ def power_of(found: Screen, missing: Sequence[dict[str, str]]) -> Power:
             block = both[np.ix_(members[one], members[other])]
             product = found.signs[members[one]][:, None] * found.signs[members[other]][None]
             value = float(np.max(np.where(product == 0, np.abs(block), block * product)))
-            if value >= TELLING.alike:
+            if value >= ALIKE:
                 alike.append((one, other, value))
     alike.sort(key=lambda item: -item[2])
     return Power(tuple(names), limits, units, plausible, tuple(alike), tuple(missing))

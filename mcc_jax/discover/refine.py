@@ -15,7 +15,11 @@ from .base import Base, State
 from .columns import Design
 from .design import NOTHING_MORE, More, between, design_of, moved
 from .evidence import Optimum, Solution, optimise, solve, spreads_of
-from .settings import NUMERICS
+from .settings import EARLY
+
+STEPS = 25  # of Gauss-Newton at most
+STILL = 0.05  # change of the log posterior at which they end, and by which later ones may make it worse [nats]
+WORSE = 5.0  # nats by which each of the `EARLY` first steps may make it worse before half of it is taken back
 
 
 @dataclass(frozen=True)
@@ -86,17 +90,17 @@ def refined(
     state, value = state.with_numbers(numbers), -np.inf
     before = state
     design = design_of(base, state, variants, more)
-    for k in range(NUMERICS.steps):
+    for k in range(STEPS):
         try:
             optimum = optimise(design, free, curvature=False)
         except FloatingPointError:
             if k == 0:
                 raise
             optimum = None  # a step beyond arithmetic is as bad as can be
-        last = k == NUMERICS.steps - 1
+        last = k == STEPS - 1
         # First order from an amplitude of zero promises too much: the first steps may take some of it back. Later a
         # step that makes things worse goes to and fro around the optimum.
-        worse = value - (NUMERICS.worse if k < NUMERICS.early else NUMERICS.still)
+        worse = value - (WORSE if k < EARLY else STILL)
         if not last and (optimum is None or optimum.log_joint < worse):
             state, value = between(before, state), -np.inf  # what was linear there is not here
         else:
@@ -105,7 +109,7 @@ def refined(
                 design = design_of(base, state, variants, more)
                 break
             free = optimum.free
-            if last or (k > 1 and abs(optimum.log_joint - value) < NUMERICS.still):
+            if last or (k > 1 and abs(optimum.log_joint - value) < STILL):
                 break
             before, value = state, optimum.log_joint
             state = moved(base, state, variants, solve(free, design))

@@ -23,7 +23,9 @@ from .candidates import Candidate, candidates_of
 from .columns import with_amplitudes
 from .design import design_of
 from .evidence import left_by_particle, log_prior, without_first
-from .settings import NUMERICS
+from .settings import LENGTH_FACTORS, NOISE_FACTORS
+
+SPREAD_FACTORS = 1.0, 0.5  # on the spreads of the base fit, at which all formulas are screened
 
 
 @compiled_quickly
@@ -184,7 +186,7 @@ def screen(
     """
     design = with_amplitudes(design_of(base, state), columns)
     settings = []
-    grid = itertools.product(NUMERICS.noise_factors, NUMERICS.length_factors, NUMERICS.spread_factors)
+    grid = itertools.product(NOISE_FACTORS, LENGTH_FACTORS, SPREAD_FACTORS)
     for sd, length, spread in grid if several else [(1.0, 1.0, 1.0)]:
         at = free.copy()
         at[2:4] += np.log([sd, length])

@@ -26,8 +26,11 @@ from .misfit_form import Discrepancy, fit_with_misfit
 from .own_numbers import OwnNumbers, differing, sudden_steps
 from .refine import Refined, refined
 from .screen import Screen, Setting, pair_integrals, screen, single_integrals, testable_columns
-from .settings import DECISIONS, NUMERICS
+from .settings import CONTENDERS, DECISIONS, STRONG, VERY_STRONG
 from .weighing import log_posteriors, posterior
+
+FORMULAS, ALL_FORMULAS = 2, 8  # of each contender that are fitted where one is `VERY_STRONG`, and of the leading two
+SECONDS = 3  # second names tried next to each of the two leading ones, and pairs that lead to first order
 
 OPPOSITE = {frozenset(("damage", "densification_stiffening"))}
 """One quantity with two signs is no pair."""
@@ -225,7 +228,7 @@ class Search:
         assert self.screen is not None
         tried: dict[Names, int] = {}
         for gain, k in ordered:
-            if gain < 0 or len(tried) >= NUMERICS.seconds:
+            if gain < 0 or len(tried) >= SECONDS:
                 break
             tried.setdefault(pair_of(first, self.screen.candidates[k].mechanism), k)
         return tried
@@ -269,7 +272,7 @@ class Search:
             names = pair_of(*(self.screen.candidates[j[k]].mechanism for j in (a, b)))
             if frozenset(names) not in OPPOSITE:
                 found.setdefault(names, (int(a[k]), int(b[k])))
-            if len(found) >= NUMERICS.seconds:
+            if len(found) >= SECONDS:
                 break
         return found
 
@@ -292,7 +295,7 @@ class Search:
             tried = {self.screen.candidates[other].variant.name}
             for _, j in self.seconds(beside, beside.variants[0], beside.design.amplitude[..., :1]):
                 c = self.screen.candidates[j]
-                if c.mechanism == mechanism and c.variant.name not in tried and len(tried) < NUMERICS.all_formulas:
+                if c.mechanism == mechanism and c.variant.name not in tried and len(tried) < ALL_FORMULAS:
                     tried.add(c.variant.name)
                     wanted.append((k, j))
         every = [pair.best, *side_by_side(self.fit, wanted)]
@@ -343,10 +346,10 @@ class Search:
         order = self.first_order
         rank = {m: float(logsumexp([v for v, _ in f.values()]) - np.log(len(f))) for m, f in order.items()}
         names = sorted(rank, key=lambda m: -rank[m])
-        strong = bool(names) and rank[names[0]] - nothing > NUMERICS.strong
+        strong = bool(names) and rank[names[0]] - nothing > STRONG
         self.tell("the serious names, fitted as they are")
-        serious = names[: NUMERICS.contenders]
-        each = NUMERICS.formulas if names and rank[names[0]] - nothing > NUMERICS.very_strong else 1
+        serious = names[:CONTENDERS]
+        each = FORMULAS if names and rank[names[0]] - nothing > VERY_STRONG else 1
         self.fit_ahead(serious, each)
         for m in serious:
             self.single(m, each)
@@ -354,11 +357,11 @@ class Search:
             leading = [
                 one.names[0] for one in sorted(self.found.values(), key=lambda x: -x.log_evidence)[:2] if one.names
             ]
-            self.fit_ahead(leading, NUMERICS.all_formulas)
+            self.fit_ahead(leading, ALL_FORMULAS)
             for m in leading:
-                self.single(m, NUMERICS.all_formulas)
+                self.single(m, ALL_FORMULAS)
         side_by_side(self.with_misfit, [self.found[(m,)] for m in serious])
-        for m in names[NUMERICS.contenders :]:
+        for m in names[CONTENDERS:]:
             self.found[(m,)] = Hypothesis((m,), rank[m])
         self.tell("what differs from test to test, and a discrepancy on no list")
         tasks: list[Callable[[], Any]] = [partial(self.discrepancy.beside, self.base, self.null)]
@@ -371,7 +374,7 @@ class Search:
         self.found[UNLISTED] = Hypothesis(UNLISTED, smooth.at.log_evidence, smooth=smooth)
         leaders = sorted((x for x in self.found.values() if x.names and x.best is not None), key=lambda x: -x.alone)
         most = max(x.log_evidence for x in self.found.values())
-        if leaders and most - nothing > NUMERICS.strong:
+        if leaders and most - nothing > STRONG:
             self.tell("two names")
             leading = leaders[:2]
             tasks = [partial(self.pairs_of_each, leading), *(partial(self.with_discrepancy, x, most) for x in leading)]
@@ -408,10 +411,10 @@ class Search:
             return
         kinds = noise_models(self.base)
         values: dict[Names, OtherNoise] = {(): self.by_noise((), kinds)}
-        wanted = list(logs)[: NUMERICS.seconds]
+        wanted = list(logs)[:SECONDS]
         if len(leader) == 2:
-            wanted += [names for names in logs if len(names) == 1][: NUMERICS.seconds]
-        elif logs[()] + max(values[()].gains) < logs[leader] - NUMERICS.strong:
+            wanted += [names for names in logs if len(names) == 1][:SECONDS]
+        elif logs[()] + max(values[()].gains) < logs[leader] - STRONG:
             return
         for names in wanted:
             if names not in values and self.found[names].fitted is not None:

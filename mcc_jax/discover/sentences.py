@@ -6,10 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 from .._format import interval, listed, plain, with_sd
 from ..calibrate.judgement import told_by_no_test
-from .settings import AT_PEAKS, DECISIONS, TELLING
+from .settings import AT_PEAKS, DECISIONS, ENOUGH, WITHIN
 
 if TYPE_CHECKING:
     from .result import Discovery, Effect
+
+JUMPS, CHECKS = 5, 3  # sudden steps and checks that a summary lists
 
 
 def summary_of(found: Discovery) -> str:
@@ -84,7 +86,7 @@ def _gap(found: Discovery) -> list[str]:
         f"On held-out particles it closes {100 * gap['closed_fraction']:.0f} % of the gap "
         f"(chi2 per point {first:.3g} before, {last:.3g} after; 1 is noise alone)."
     ]
-    if open_still is not None and open_still > 1 + TELLING.within:
+    if open_still is not None and open_still > 1 + WITHIN:
         told.append("The gap is named, not closed: the formula does not describe all of it.")
     return told
 
@@ -92,7 +94,7 @@ def _gap(found: Discovery) -> list[str]:
 def _next(found: Discovery) -> list[str]:
     told = []
     best = found.next_experiments[0] if found.next_experiments else None
-    sure = best is not None and best["power"] >= TELLING.enough
+    sure = best is not None and best["power"] >= ENOUGH
     if best is not None:
         names = listed([plain(n) for n in best["separates"]], "or")
         doubt = "" if sure else f"No further test of those tried on paper would surely separate {names}. "
@@ -101,14 +103,14 @@ def _next(found: Discovery) -> list[str]:
             f"with these it would separate {names} with probability {best['power']:.2f}."
         )
     if found.checks and not sure:
-        each = "; ".join(f"{plain(one['mechanism'])}: {one['check']}" for one in found.checks[: TELLING.checks])
+        each = "; ".join(f"{plain(one['mechanism'])}: {one['check']}" for one in found.checks[:CHECKS])
         told.append(f"Each would show by itself ({each}).")
     return told
 
 
 def _jumps(found: Discovery, effect: Effect) -> str:
     """The largest sudden steps, one by one."""
-    largest = sorted(effect.jumps, key=lambda jump: -jump.size)[: TELLING.jumps]
+    largest = sorted(effect.jumps, key=lambda jump: -jump.size)[:JUMPS]
     unit = effect.variant.unit
     each = [f"{j.size:.2g} {unit} at {j.stress_MPa:.2g} MPa in {found.name_of(j.particle)}" for j in largest]
     more = len(effect.jumps) - len(largest)

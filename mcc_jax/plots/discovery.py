@@ -17,7 +17,7 @@ from .._errors import InputError
 from .._format import plain
 from ..discover import Discovery
 from ..discover.locate import Place
-from ..discover.settings import TELLING
+from ..discover.settings import DETECTABLE
 from . import style
 from .curves import plot_before_after
 
@@ -118,7 +118,7 @@ def plot_ranking(found: Discovery) -> Figure:
     figure = style.new_figure(9.4, 1.3 + 0.235 * count)
     ax = figure.subplots()
     beside: style.Look = {"transform": ax.get_yaxis_transform(), "va": "center", "fontsize": style.SMALL}
-    scale = max([1.6 * TELLING.detectable, *(abs(e["statistic"]) for e in entries)])
+    scale = max([1.6 * DETECTABLE, *(abs(e["statistic"]) for e in entries)])
     any_impossible = False
     for row, entry in enumerate(entries):
         name, unit = entry["mechanism"], entry["unit"]
@@ -137,7 +137,7 @@ def plot_ranking(found: Discovery) -> Figure:
     for row, missing in enumerate(found.untestable, start=len(entries)):
         needs = f"needs {missing['needs']}"
         ax.text(0.012 * scale, row, needs, va="center", fontsize=style.SMALL, color=style.GREY, zorder=5, bbox=patch)
-    ax.axvline(TELLING.detectable, **_FLOOR)
+    ax.axvline(DETECTABLE, **_FLOOR)
     ax.set_yticks(range(count), [plain(e["mechanism"]) for e in (*entries, *found.untestable)])
     for tick in ax.get_yticklabels()[len(entries) :]:
         tick.set_color(style.GREY)

@@ -6,7 +6,7 @@ import shlex
 from typing import Any
 
 from .._format import interval, listed, number, percent, plain, probability
-from ..discover.settings import TELLING
+from ..discover.settings import ENOUGH, WITHIN
 from ..plots.style import is_simulated
 from .read import Results
 
@@ -118,7 +118,7 @@ def within_noise(gap: dict[str, Any]) -> bool | None:
             pass
         case _:
             low = last["chi2_per_dof"]
-    return low is not None and low <= 1 + TELLING.within
+    return low is not None and low <= 1 + WITHIN
 
 
 def next_steps(results: Results, folder: str) -> list[tuple[str, str]]:
@@ -175,7 +175,7 @@ def _after(found: dict[str, Any], *, told: bool) -> list[tuple[str, str]]:
         best = found["next_experiments"][0]
         names, power = listed([plain(n) for n in best["separates"]]), probability(best["power"])
         test = f"{best['experiment']}, {number(best['particles'])} further particles"
-        if best["power"] >= TELLING.enough:
+        if best["power"] >= ENOUGH:
             return [(f"Measure: {test}. It would separate {names} with probability {power}.", "")]
         doubt = f"No further test of those tried on paper would surely separate {names}."
         return [(f"{doubt} The best: {test}, would do so with probability {power}.", "")]

@@ -16,7 +16,7 @@ from mcc_jax.discover.heldout import held_out
 from mcc_jax.discover.hypothesis import UNLISTED, Hypothesis
 from mcc_jax.discover.locate import difference, places, where
 from mcc_jax.discover.search import Search
-from mcc_jax.discover.settings import DECISIONS, NUMERICS
+from mcc_jax.discover.settings import DECISIONS, VERY_STRONG
 from mcc_jax.effects import LIBRARY
 
 pytestmark = pytest.mark.extended
@@ -247,12 +247,12 @@ def test_a_discrepancy_begins_where_noise_leaves_it_most(named):
     swallowed = np.where(np.arange(len(start)) == 2, start + 2.0, start)
     likely, _ = likely_start(design, swallowed)
     one, best = (optimise(design, begun, without=r.optimum) for begun in (swallowed, likely))
-    assert best.log_joint > one.log_joint - 0.02 * len(start)  # as near as a mode is met (`Numerics.flat`)
+    assert best.log_joint > one.log_joint - 0.02 * len(start)  # as near as a mode is met (`FLAT`)
     assert best.evaluations <= one.evaluations
-    far = best.log_joint + NUMERICS.very_strong + 10.0
+    far = best.log_joint + VERY_STRONG + 10.0
     assert of.beside(named.base, r, far) is None
     leader = replace(named.found[("frame_compliance",)], beside=-np.inf)
-    named.with_discrepancy(leader, leader.alone + 2 * NUMERICS.very_strong)
+    named.with_discrepancy(leader, leader.alone + 2 * VERY_STRONG)
     assert leader.beside == -np.inf
     named.with_discrepancy(leader, -np.inf)
     assert np.isfinite(leader.beside)
