@@ -41,5 +41,5 @@ def without_punch(library: Mapping[str, Mechanism], base: Base) -> dict[str, Mec
     for name, mechanism in library.items():
         variants = tuple(v for v in map(known, mechanism.variants) if v is not None)
         if variants:
-            kept[name] = Mechanism(name, mechanism.explanation, variants, mechanism.equivalences)
+            kept[name] = dataclasses.replace(mechanism, variants=variants)
     return kept

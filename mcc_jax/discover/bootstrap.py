@@ -12,7 +12,7 @@ from ..calibrate.distributions import SCALES
 from .columns import with_amplitudes
 from .evidence import left_by_particle
 from .screen import single_integrals
-from .search import SUDDEN, Search
+from .search import Search
 from .settings import DECISIONS, POPULATION
 
 CAMPAIGNS = 400  # drawn for the p value: its standard error at a level of 0.05 is 0.011
@@ -40,12 +40,13 @@ class _Statistic:
         self.parts = np.array(parts)
         own, self.own_names, self.own_ratio = [], [], []
         for name in search.library:
-            if name not in search.shared and name != SUDDEN:
+            if name not in search.shared and not search.library[name].sudden:
                 candidates, columns = search.formulas_of({name})
                 own.append(columns)
                 self.own_names += [name] * len(candidates)
                 self.own_ratio += [c.variant.plausible[1] / c.variant.plausible[0] for c in candidates]
-        steps = self._steps(search) if SUDDEN in search.library else np.zeros((*basis.shape[:2], 0))
+        sudden = next((m.variants[0] for m in search.library.values() if m.sudden), None)
+        steps = np.zeros((*basis.shape[:2], 0)) if sudden is None else self._steps(search, sudden.plausible[0])
         formulas = np.zeros((*basis.shape[:2], 0)) if screen is None else screen.columns
         self.counts = [POPULATION, formulas.shape[-1], basis.shape[-1], len(self.own_names), steps.shape[-1]]
         every = np.concatenate([design.common[..., :POPULATION], formulas, basis, *own, steps], -1)
@@ -54,10 +55,7 @@ class _Statistic:
         self.scores = Scores(left[:, :-1, :-1], left[:, :-1, -1])
         self.library = len(search.library)
         self.unit = float(DECISIONS.general * np.exp(search.null.optimum.free[0]))
-        self.ratio_of_steps = 1.0
-        if SUDDEN in search.library:
-            low, high = search.library[SUDDEN].variants[0].plausible
-            self.ratio_of_steps = high / low
+        self.ratio_of_steps = 1.0 if sudden is None else sudden.plausible[1] / sudden.plausible[0]
         if screen is not None:
             self.signs, self.largest = screen.signs, screen.largest
             names = [(c.mechanism, c.variant.name) for c in screen.candidates]
@@ -66,7 +64,7 @@ class _Statistic:
             self.weight = -np.log([mechanisms[n[0]] * grid[n] for n in names])
 
     @staticmethod
-    def _steps(search: Search) -> np.ndarray:
+    def _steps(search: Search, height: float) -> np.ndarray:
         """Steps at some points of every test's loading."""
         loading = np.asarray(search.base.tests.loading & search.base.tests.mask)
         mask = np.asarray(search.base.tests.mask)
@@ -74,7 +72,7 @@ class _Statistic:
         for i, rows in enumerate(map(np.flatnonzero, loading)):
             if len(rows) > 1:
                 for k, j in enumerate(rows[np.linspace(1, len(rows) - 1, PLACES_OF_STEPS).astype(int)]):
-                    columns[i, j:, k] = np.where(mask[i, j:], search.library[SUDDEN].variants[0].plausible[0], 0.0)
+                    columns[i, j:, k] = np.where(mask[i, j:], height, 0.0)
         return columns
 
     def __call__(self, score: np.ndarray) -> np.ndarray:

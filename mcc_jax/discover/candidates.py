@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -59,7 +59,7 @@ def candidates_of(library: Mapping[str, Mechanism]) -> tuple[Candidate, ...]:
 
 
 def located(variant: Variant) -> bool:
-    """Whether a further number of the formula differs from test to test."""
+    """Whether a further number of the formula differs from test to test, which no `Model` holds."""
     return any(n.random_per_test for n in variant.nuisances)
 
 
@@ -84,7 +84,7 @@ def untestable(
     for name, mechanism in library.items():
         possible = tuple(v for v in mechanism.variants if set(v.needs) <= present)
         if possible:
-            testable[name] = Mechanism(name, mechanism.explanation, possible, mechanism.equivalences)
+            testable[name] = replace(mechanism, variants=possible)
         else:
             missing.append({"mechanism": name, "needs": _words(mechanism.variants, present)})
     return testable, missing

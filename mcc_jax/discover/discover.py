@@ -44,7 +44,7 @@ from .answer import (
 from .applicability import without_punch
 from .base import Base, base_fit
 from .bootstrap import p_anything
-from .candidates import untestable
+from .candidates import located, untestable
 from .closure import closure
 from .experiments import next_experiments
 from .heldout import held_out
@@ -52,7 +52,7 @@ from .hypothesis import UNLISTED, Names
 from .locate import difference, places, where
 from .plan import without_effects
 from .result import Discovery, Effect
-from .search import Search, differs_from_test_to_test
+from .search import Search
 from .sentences import summary_of
 from .settings import AT_PEAKS, DECISIONS
 
@@ -149,7 +149,7 @@ def discover(
         if objection is not None:
             return _finished(_taken_back(_of_law_alone(found, search), winner, objection), findings, started)
     found = _named(found, search, known, tell)
-    apart = [e.mechanism for e in found.effects if differs_from_test_to_test(e.variant)]
+    apart = [e.mechanism for e in found.effects if located(e.variant)]
     if apart:
         note = (
             f"{', '.join(apart)} differs from test to test: it is no part of the model found, and amplitudes and "
@@ -302,7 +302,7 @@ def _named(found: Discovery, search: Search, known: Mapping[str, Mechanism], tel
     sets = sets_of(search, winner, effects, pairs)
     model = found.model
     assert model is not None
-    model = model.with_effects(*(e.variant for e in effects if not differs_from_test_to_test(e.variant)))
+    model = model.with_effects(*(e.variant for e in effects if not located(e.variant)))
     return replace(
         found,
         verdict="SET" if any(len(names) > 1 for names in sets) else "NAMED",

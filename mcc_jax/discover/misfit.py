@@ -16,33 +16,6 @@ from ..calibrate.forward import Forms, Linear, Point
 from ..effects.record import RELOAD, UNLOAD
 from .settings import WAVES
 
-COORDINATES = {
-    "frame_compliance": ("force",),
-    "thermal_drift": ("time",),
-    "creep": ("time", "since", "load", "peak"),
-    "rate_dependence": ("peak", "rate"),
-    "adhesion": ("load", "peak"),
-    "damage": ("peak", "cycles"),
-    "densification_stiffening": ("peak",),
-    "reload_hysteresis": ("load", "reload", "peak"),
-    "ratcheting": ("cycles", "peak", "reload"),
-    "finite_hardening_exponent": ("peak", "load"),
-    "unloading_shape": ("load", "peak"),
-    "size_effect": ("size", "peak"),
-    "shape_second_order": ("shape", "outline"),
-    "pop_in": (),
-    "toe_asperity": ("peak", "load"),
-    "platen_friction": ("peak", "shape"),
-    "misalignment": ("peak", "load", "size"),
-    "platen_sink_in": ("peak", "load", "size"),
-    "reverse_plasticity": ("load", "peak", "reload"),
-    "humidity": ("humidity", "peak"),
-}
-"""In what a formula of each mechanism may be wrong: what its own formulas depend on."""
-
-ANY = ("peak", "load", "since")
-"""The same of a mechanism that is not of the library."""
-
 HATS, DEGREE = 8, 2  # hat functions of each coordinate of a misfit, and total degree of its smooth products
 SPLINES, FINE_SPLINES = 12, 24  # cosines of each coordinate of a discrepancy on no list, and of stress
 DRIVE_WAVES = 26  # periods over the range of micrometres, which is the widest among particles of several sizes

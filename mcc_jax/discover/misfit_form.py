@@ -9,12 +9,13 @@ import numpy as np
 
 from ..calibrate.distributions import SpreadCoordinate
 from ..calibrate.priors import NakagamiPrior
+from ..effects import Mechanism
 from .base import Base
 from .columns import Design, without_further
 from .design import NOTHING_MORE, More, design_of, moved
 from .evidence import Optimum, likely_start, optimise, solve, visible
 from .hypothesis import Hypothesis, Smooth
-from .misfit import ANY, COORDINATES, functions
+from .misfit import functions
 from .refine import Refined
 from .settings import DECISIONS, EARLY, HYPERPARAMETERS, VERY_STRONG
 
@@ -30,7 +31,7 @@ Signatures = Callable[[str], Mapping[str, np.ndarray]]
 
 
 def fit_with_misfit(
-    base: Base, one: Hypothesis, at: Coordinates, signatures: Signatures
+    base: Base, one: Hypothesis, at: Coordinates, signatures: Signatures, library: Mapping[str, Mechanism]
 ) -> tuple[tuple[Design, np.ndarray], float]:
     """A hypothesis where every name's formula may be wrong by a share of the effect.
 
@@ -43,11 +44,12 @@ def fit_with_misfit(
         one: the hypothesis by its formulas alone.
         at: coordinates of all points, between 0 and 1.
         signatures: of the formulas of each mechanism.
+        library: the mechanisms, which name the coordinates that their formulas may be wrong in.
 
     Returns:
         Its design and hyperparameters at the mode, and its log evidence.
     """
-    r, design = one.formulas, _design(base, one, at, signatures)
+    r, design = one.formulas, _design(base, one, at, signatures, library)
     assert r is not None
     some = float(SpreadCoordinate(SCATTER).coordinate(SCATTER.sd))
     start = np.concatenate([r.optimum.free, [some] * len(r.variants), design.misfits[:, 0]])
@@ -73,18 +75,20 @@ def _amplitudes(r: Refined, design: Design, optimum: Optimum) -> np.ndarray:
     return np.append(np.log(np.maximum(np.abs(now), 1e-300) / alone), np.zeros(len(design.misfits) - names))
 
 
-def _design(base: Base, one: Hypothesis, at: Coordinates, signatures: Signatures) -> Design:
+def _design(
+    base: Base, one: Hypothesis, at: Coordinates, signatures: Signatures, library: Mapping[str, Mechanism]
+) -> Design:
     """Every formula with its misfit, and an amplitude that differs from particle to particle."""
     r = one.formulas
     assert r is not None
-    basis, more = [_columns(r, i, at, signatures) for i in range(len(r.variants))], NOTHING_MORE
+    basis, more = [_columns(r, i, at, signatures, library) for i in range(len(r.variants))], NOTHING_MORE
     # A formula is wrong by a share of what can be seen of it: most of some is like a particle's own numbers.
     seen = list(visible(r.optimum.free, r.design, r.curves_um))
     if one.own is not None:
         more = one.own.more
         if not one.own.jumps:
             curve = one.own.curve_um[..., None]
-            basis.append(curve * functions(COORDINATES.get(one.own.variant.mechanism, ANY), at))
+            basis.append(curve * functions(library[one.own.variant.mechanism].coordinates, at))
             seen.extend(visible(r.optimum.free[:HYPERPARAMETERS], without_further(r.design), curve))
     basis = [share * columns for share, columns in zip(seen, basis, strict=True)]
     sizes = [(np.log(DECISIONS.misfit), DECISIONS.misfit_log_sd, float(np.log(DECISIONS.misfit_most)))] * len(basis)
@@ -94,10 +98,12 @@ def _design(base: Base, one: Hypothesis, at: Coordinates, signatures: Signatures
     return design_of(base, r.state, r.variants, more)
 
 
-def _columns(r: Refined, which: int, at: Coordinates, signatures: Signatures) -> np.ndarray:
+def _columns(
+    r: Refined, which: int, at: Coordinates, signatures: Signatures, library: Mapping[str, Mechanism]
+) -> np.ndarray:
     """Columns by which one of the formulas may be wrong: at its amplitude, and towards each of its siblings."""
     variant, own = r.variants[which], r.curves_um[..., which]
-    smooth = own[..., None] * functions(COORDINATES.get(variant.mechanism, ANY), at)
+    smooth = own[..., None] * functions(library[variant.mechanism].coordinates, at)
     size = float(np.sqrt(np.sum(own**2)))
     others = []
     for formula, column in signatures(variant.mechanism).items():

@@ -15,7 +15,7 @@ from ..calibrate.compiling import side_by_side
 from ..calibrate.model import Model
 from ..effects import Mechanism, Variant
 from .base import Base, State
-from .candidates import Candidate, located
+from .candidates import Candidate
 from .columns import with_amplitudes
 from .design import at_priors
 from .evidence import left_by_particle, log_joint, with_little_noise, without_first
@@ -31,12 +31,6 @@ from .weighing import log_posteriors, posterior
 
 FORMULAS, ALL_FORMULAS = 2, 8  # of each contender that are fitted where one is `VERY_STRONG`, and of the leading two
 SECONDS = 3  # second names tried next to each of the two leading ones, and pairs that lead to first order
-
-OPPOSITE = {frozenset(("damage", "densification_stiffening"))}
-"""One quantity with two signs is no pair."""
-
-SUDDEN = "pop_in"
-"""The mechanism whose sudden steps are looked for at every point of a test."""
 
 
 class Search:
@@ -76,7 +70,7 @@ class Search:
         self.natural = telling(natural, np.asarray(base.tests.mask))
         self.at = scaled(self.natural, np.asarray(base.tests.mask))
         self.shared = {
-            name: m for name, m in library.items() if name != SUDDEN and not any(v.random_per_test for v in m.variants)
+            name: m for name, m in library.items() if not m.sudden and not any(v.random_per_test for v in m.variants)
         }
         self.candidates, self.columns = testable_columns(base, self.state, whole or library, library)
         self.screen = self.screened(self.shared) if self.shared else None
@@ -181,7 +175,7 @@ class Search:
 
     def with_misfit(self, one: Hypothesis) -> None:
         """Log evidence where every name's formula may be wrong."""
-        one.misfit_form, one.with_misfit = fit_with_misfit(self.base, one, self.at, self.signatures_of)
+        one.misfit_form, one.with_misfit = fit_with_misfit(self.base, one, self.at, self.signatures_of, self.library)
 
     @cached_property
     def discrepancy(self) -> Discrepancy:
@@ -220,7 +214,7 @@ class Search:
         return [
             (float(value[k]), int(k))
             for k in np.argsort(-value)
-            if cs[k].mechanism != first.mechanism and frozenset((first.mechanism, cs[k].mechanism)) not in OPPOSITE
+            if cs[k].mechanism not in (first.mechanism, self.library[first.mechanism].opposite)
         ]
 
     def best_seconds(self, ordered: Sequence[tuple[float, int]], first: str) -> dict[Names, int]:
@@ -270,7 +264,7 @@ class Search:
             if value[k] < least:
                 break
             names = pair_of(*(self.screen.candidates[j[k]].mechanism for j in (a, b)))
-            if frozenset(names) not in OPPOSITE:
+            if self.library[names[0]].opposite != names[1]:
                 found.setdefault(names, (int(a[k]), int(b[k])))
             if len(found) >= SECONDS:
                 break
@@ -398,7 +392,7 @@ class Search:
 
     def of_their_own(self, name: str, start: Refined) -> OwnNumbers | None:
         """A mechanism whose numbers differ from test to test, beside what is there at the start."""
-        if name == SUDDEN:
+        if self.library[name].sudden:
             return sudden_steps(self.base, start, self.library[name].variants[0])
         candidates, columns = self.formulas_of({name})
         return differing(self.base, start, columns, candidates)
@@ -448,8 +442,3 @@ def pair_of(one: str, other: str) -> Names:
     """Two names in their order."""
     first, second = sorted((one, other))
     return first, second
-
-
-def differs_from_test_to_test(variant: Variant) -> bool:
-    """Whether a formula has numbers of every test's own, which no `Model` holds."""
-    return variant.mechanism == SUDDEN or located(variant)

@@ -110,6 +110,7 @@ TOE = Mechanism(
     ),
     ("zero of displacement, where the toe lies below all data",),
     check="measure how rough particles and platens are; on a reload asperities stay flat",
+    coordinates=("peak", "load"),
 )  # fmt: skip
 
 
@@ -160,6 +161,7 @@ MISALIGNMENT = Mechanism(
               fixed={"shrinks": True}),
     ),
     check="turn the punch by 90 degrees, level the platens, and repeat",
+    coordinates=("peak", "load", "size"),
 )  # fmt: skip
 
 
@@ -212,4 +214,6 @@ POP_IN = Mechanism(
     ),
     ("the law's own snap-through, where a loading curve is not monotone",),
     check="watch the particle from the side, or listen to it, while the step occurs",
+    coordinates=(),
+    sudden=True,
 )  # fmt: skip

@@ -257,4 +257,5 @@ CREEP = Mechanism(
                nuisances=_tau(5.0, 20.0, 80.0)),
     ),
     check="hold at the largest load, and repeat at a tenth and at ten times the rate",
+    coordinates=("time", "since", "load", "peak"),
 )  # fmt: skip

@@ -94,6 +94,7 @@ HYSTERESIS = Mechanism(
              "Friction at the contact is overcome first."),
     ),
     check="reload at two rates: a loop of friction dissipates as much at both",
+    coordinates=("load", "reload", "peak"),
 )  # fmt: skip
 
 
@@ -209,4 +210,5 @@ RATCHETING = Mechanism(
     ),
     ("creep, as long as there is one reload only and no hold",),
     check="cycle one particle ten times or more to the same load",
+    coordinates=("cycles", "peak", "reload"),
 )  # fmt: skip

@@ -187,6 +187,7 @@ RATE = Mechanism(
     ),
     ("size_effect, at one force rate",),
     check="load at two rates or more within one class of sizes",
+    coordinates=("peak", "rate"),
 )  # fmt: skip
 
 
@@ -289,6 +290,7 @@ FRICTION = Mechanism(
                   "first-order form"),
     ),
     check="repeat with lubricated and with roughened platens",
+    coordinates=("peak", "shape"),
 )  # fmt: skip
 
 
@@ -437,4 +439,5 @@ HARDENING = Mechanism(
                    plausible=(0.02, 2.0)),
     ),
     check="repeat between polished platens, or indent a compact of the same powder",
+    coordinates=("peak", "load"),
 )  # fmt: skip

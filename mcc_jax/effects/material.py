@@ -114,6 +114,7 @@ SIZE = Mechanism(
     ),
     ("rate_dependence, at one force rate",),
     check="test sieved classes of size, each at the rate that strains it as fast as the others",
+    coordinates=("size", "peak"),
 )  # fmt: skip
 
 
@@ -204,6 +205,7 @@ SHAPE = Mechanism(
     ),
     ("shape parameter a and mean coefficients, if all particles have one shape",),
     check="test elongated particles both lying and standing",
+    coordinates=("shape", "outline"),
 )  # fmt: skip
 
 
@@ -275,6 +277,7 @@ HUMIDITY = Mechanism(
                   nuisances=(Nuisance("threshold_percent", (40.0, 60.0), (5.0, 90.0), "humidity where it begins"),)),
     ),
     check="test in a chamber at 10, 40 and 75 % relative humidity",
+    coordinates=("humidity", "peak"),
 )  # fmt: skip
 
 
@@ -365,6 +368,8 @@ DAMAGE = Mechanism(
     ),
     ("densification_stiffening with a negative amplitude",),
     check="cycle one particle to rising peaks: from peak to peak it unloads softer",
+    coordinates=("peak", "cycles"),
+    opposite="densification_stiffening",
 )  # fmt: skip
 
 
@@ -407,4 +412,6 @@ DENSIFICATION = Mechanism(
     ),
     ("damage with a negative amplitude",),
     check="cycle one particle to rising peaks, its porosity measured by tomography before and after",
+    coordinates=("peak",),
+    opposite="damage",
 )  # fmt: skip

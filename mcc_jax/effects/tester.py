@@ -179,6 +179,7 @@ FRAME = Mechanism(
     ),
     ("thermal_drift linear, while force grows at one rate",),
     check="press the punch on the bare platen, without a particle: what gives way there is the frame",
+    coordinates=("force",),
 )  # fmt: skip
 
 
@@ -224,6 +225,7 @@ DRIFT = Mechanism(
     ),
     ("frame_compliance linear, while force grows at one rate",),
     check="hold for a minute close to zero load before and after each test: what moves there is drift",
+    coordinates=("time",),
 )  # fmt: skip
 
 
@@ -257,4 +259,5 @@ SINK_IN = Mechanism(
     ),
     ("the width of the punch, as long as no contact is wider",),
     check="repeat on a platen of diamond or sapphire",
+    coordinates=("peak", "load", "size"),
 )  # fmt: skip

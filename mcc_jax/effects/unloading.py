@@ -114,6 +114,7 @@ SHAPE_OF_UNLOADING = Mechanism(
              nuisances=(Nuisance("exponent", (1.2, 2.0), (1.0, 3.0), "exponent of the power law"),)),
     ),
     check="unload slowly to zero under control of displacement, with a point for every percent of load",
+    coordinates=("load", "peak"),
 )  # fmt: skip
 
 
@@ -261,6 +262,7 @@ ADHESION = Mechanism(
                   "Derjaguin, Muller and Toporov (1975), J. Colloid Interface Sci. 53, 314", over_section=True),
     ),
     check="pull off under control of displacement, and repeat with a dry punch that does not stick",
+    coordinates=("load", "peak"),
 )  # fmt: skip
 
 
@@ -387,4 +389,5 @@ REVERSAL = Mechanism(
                   "As the quadratic form, but a reload does not retrace it.", fixed={"power": 2}),
     ),
     check="unload, hold close to zero load, reload and unload once more",
+    coordinates=("load", "peak", "reload"),
 )  # fmt: skip

@@ -182,7 +182,10 @@ class Mechanism:
         explanation: what it is, in plain words.
         variants: its formulas, the most common first.
         equivalences: what no data of this kind can tell from it; to be declared, never discovered.
-        check: what would show it by itself, apart from what more tests of the same kind would tell.
+        check: what would show it by itself, apart from what more tests of the same kind would show.
+        coordinates: names of what its formulas depend on, and may be wrong in (`mcc_jax.discover.misfit`).
+        opposite: the mechanism that is this one with the other sign: the two are no pair.
+        sudden: whether it is a step that may be at any point of a test, to be looked for at each.
     """
 
     name: str
@@ -190,6 +193,9 @@ class Mechanism:
     variants: tuple[Variant, ...]
     equivalences: tuple[str, ...] = ()
     check: str = ""
+    coordinates: tuple[str, ...] = ("peak", "load", "since")
+    opposite: str = ""
+    sudden: bool = False
 
     def __post_init__(self) -> None:
         remedy = "Give a list of mcc_jax.effects.Variant."
