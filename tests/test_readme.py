@@ -23,7 +23,7 @@ RESULTS = ROOT / "benchmarks" / "results"
 
 
 def test_readme_is_one_page():
-    assert len(README.splitlines()) <= 120
+    assert len(README.splitlines()) <= 110
 
 
 @pytest.mark.notebook
@@ -47,7 +47,7 @@ def test_every_block_is_of_a_kind_that_is_run():
 
 
 def cell(file: str, keys: tuple[str, ...], column: str) -> str:
-    """What stands in a column of the first table that has it, in the first row that begins with the keys."""
+    """The entry in a column of the first table that has it, in the first row that begins with the keys."""
     header: list[str] = []
     for line in (RESULTS / file).read_text(encoding="utf-8").splitlines():
         cells = [part.strip() for part in line.strip().strip("|").split(" | ")] if line.startswith("|") else []
@@ -61,7 +61,7 @@ SET = "2026-11-27-84117"
 BLIND = f"blind/{SET}/score.md"
 HARDER = "2026-11-28-29852-final"
 BASELINES = {"oracle": "oracle", "aic": "AIC", "discrepancy": "discrepancy"}
-"""Labels of runs beside ours, and what README calls them."""
+"""Labels of the runs of other methods, and what README calls them."""
 SEALED = {
     "right name alone": "right name alone, lambda >= 10",
     "both named": "two effects, both named, lambda >= 20, correlation < 0.8",
@@ -87,7 +87,7 @@ CLAIMS = [
     ("fastmath", "law.md", ("contacts", "numba fastmath"), "median [ms]"),
     *(("LAMMPS", "dem_lammps.md", LAMMPS, f"{code} [particle-steps/s]") for code in ("mcc", "MDR", "Hertz")),
 ]
-"""A word of a row of README's scoreboard, and where its number stands: table, first cells of the row, column."""
+"""A word of a row of README's scoreboard, and the source of its number: table, first cells of the row, column."""
 
 
 def drifted(readme: str) -> list[str]:
@@ -95,14 +95,14 @@ def drifted(readme: str) -> list[str]:
     found = []
     for word, file, keys, column in CLAIMS:
         (row,) = [line for line in readme.splitlines() if line.startswith("| ") and word in line]
-        told = cell(file, keys, column).split("%")[0].split(" (")[0].lstrip("<>= ").strip()
+        number = cell(file, keys, column).split("%")[0].split(" (")[0].lstrip("<>= ").strip()
         baseline = BASELINES.get(column.removeprefix(f"{SET}-"))
         if baseline:
-            told = f"{baseline} {told}"
+            number = f"{baseline} {number}"
         elif file == BLIND and column == "found":
-            told = f"{told} % of"
-        if not re.search(rf"(?<![\d.]){re.escape(told)}(?!\d|\.\d)", row):
-            found.append(f"{file} {keys} {column}: {told} is not in {row}")
+            number = f"{number} % of"
+        if not re.search(rf"(?<![\d.]){re.escape(number)}(?!\d|\.\d)", row):
+            found.append(f"{file} {keys} {column}: {number} is not in {row}")
     return found
 
 
@@ -114,9 +114,9 @@ def test_the_scoreboard_says_what_the_tables_say():
         assert len(drifted(README.replace(number, "7777"))) == 1, number
 
 
-def test_a_harder_set_is_told_beside_the_scoreboard():
-    told = [cell(f"blind/{HARDER}/score.md", (row,), "found").split("%")[0].strip() for row in SEALED.values()]
-    assert f"in this order, {' %, '.join(told[:-1])} % and {told[-1]} %" in " ".join(README.split())
+def test_the_harder_set_is_reported_below_the_scoreboard():
+    found = [cell(f"blind/{HARDER}/score.md", (row,), "found").split("%")[0].strip() for row in SEALED.values()]
+    assert f"in this order, {' %, '.join(found[:-1])} % and {found[-1]} %" in " ".join(README.split())
     assert "114 of 460 campaigns answered" in (RESULTS / f"blind/{HARDER}/score.md").read_text(encoding="utf-8")
 
 
@@ -124,8 +124,8 @@ def test_the_list_of_benchmarks_is_gathered_from_their_tables(monkeypatch):
     monkeypatch.syspath_prepend(ROOT / "benchmarks")
     run_all = importlib.import_module("run_all")
     text = (ROOT / "benchmarks" / "README.md").read_text(encoding="utf-8")
-    told = text.partition(run_all.START)[2].partition(run_all.END)[0]
-    assert told.strip().splitlines() == run_all.gathered()
+    listed = text.partition(run_all.START)[2].partition(run_all.END)[0]
+    assert listed.strip().splitlines() == run_all.gathered()
 
 
 def test_the_peers_of_the_scoreboard_did_not_converge():
@@ -138,7 +138,7 @@ def test_the_sealed_campaigns_are_all_there():
 
 
 def exports(folder: Path, campaign: Campaign) -> None:
-    """What README speaks of: a tester's files, one for a particle, and a table of sizes."""
+    """The files that README assumes: exports of a test machine, one per particle, and a table of sizes."""
     (folder / "exports").mkdir()
     rows = ["particle,D1_um,D2_um,D3_um"]
     for name, sizes, curve in zip(campaign.particles, campaign.diameters_um, campaign.curves, strict=True):
