@@ -28,7 +28,6 @@ from .plausible_ranges import PlausibilityOptions as PlausibilityOptions
 from .plausible_ranges import SolidClass as SolidClass
 from .quality import campaign_findings as campaign_findings
 from .quality import check_tests as check_tests
-from .quality_options import QualityOptions as QualityOptions
 from .readers import read_diameters as read_diameters
 from .readers import read_tester_file as read_tester_file
 from .record import available_data as available_data
@@ -44,7 +43,6 @@ from .segments import SegmentKind as SegmentKind
 from .segments import find_segments as find_segments
 from .segments import summarise_segments as summarise_segments
 from .turning import TurningForces as TurningForces
-from .turning import TurningOptions as TurningOptions
 from .turning import turning_forces as turning_forces
 from .validate import check_campaign as check_campaign
 from .validate import join_campaigns as join_campaigns

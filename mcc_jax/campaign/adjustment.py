@@ -9,32 +9,18 @@ import numpy as np
 
 from .. import arguments
 from .._format import described
-from .reasons import USABLE, below_threshold, far_apart, no_climb, no_loading, too_few
+from .reasons import below_threshold, far_apart, no_climb, no_loading, too_few
 from .schema import Campaign, Curve
 from .segments import Segment, check_segmented, find_segments
 from .validate import check_campaign
 
-
-@dataclass(frozen=True)
-class AdjustmentOptions:
-    """The offset step, and where a test's displacement counts from.
-
-    Attributes:
-        threshold_MPa: stress below which surface irregularities, not the particle, deform [MPa] (Bommireddy et al.
-            2018, section 3).
-        testers_zero: where the first displacement of a record without approach may lie, as a share of the test's range
-            of displacement, for the tester's zero to be the contact. Below, the platens would touch long before they
-            meet; above, the test would have begun after more compression than it then shows. Beyond, the first reading
-            is the contact.
-    """
-
-    threshold_MPa: float = 0.2
-    testers_zero: tuple[float, float] = (-0.25, 1.0)
-
-
-ADJUSTMENT = AdjustmentOptions()
-THRESHOLD_MPA = ADJUSTMENT.threshold_MPa
-"""Stress [MPa] from which on tests count; see `AdjustmentOptions`."""
+THRESHOLD_MPA = 0.2
+"""Stress below which surface irregularities, not the particle, deform [MPa] (Bommireddy et al. 2018, section 3)."""
+MACHINE_ZERO = (-0.25, 1.0)
+"""Where the first displacement of a record without approach may lie, in shares of the range of displacement, for the
+test machine's zero to be the contact. Below, the platens would touch long before they meet; above, the test would have
+begun after more compression than it then shows. Beyond, the first reading is the contact."""
+LEAST_LEVELS = 2  # a loading curve of fewer points above the threshold has no course there
 
 
 @dataclass(frozen=True)
@@ -86,7 +72,7 @@ def stress_and_strain(
 
     Strain counts from :math:`\gamma_0`, the platen's position at first contact: where the approach ends if the record
     has one, the tester's own zero otherwise, or the first reading if that zero lies far from the test
-    (`AdjustmentOptions`).
+    (`MACHINE_ZERO`).
 
     References:
         Bommireddy et al. (2018), eqs. 3 and 4.
@@ -103,7 +89,7 @@ def _contact_um(curve: Curve, segments: tuple[Segment, ...]) -> float:
     if segments[0].kind == "approach" and len(segments) > 1:
         return float(curve.displacement_um[segments[0].stop])
     first, reach = float(curve.displacement_um[0]), float(np.ptp(curve.displacement_um))
-    low, high = ADJUSTMENT.testers_zero
+    low, high = MACHINE_ZERO
     return 0.0 if low * reach <= first <= high * reach else first
 
 
@@ -233,8 +219,8 @@ def _why_not(
     if loading.stress_max_MPa <= threshold_MPa:
         return below_threshold(loading.stress_max_MPa, threshold_MPa)
     strain = loading.strain[1:][loading.stress_MPa[1:] > threshold_MPa]
-    if len(strain) < USABLE.least_levels:
-        return too_few(len(strain), USABLE.least_levels)
+    if len(strain) < LEAST_LEVELS:
+        return too_few(len(strain), LEAST_LEVELS)
     third = max(len(strain) // 3, 1)
     rise = float(strain[-third:].mean() - strain[:third].mean())
     return None if rise > 0 else no_climb(rise * effective_diameter_um(diameters_um))

@@ -8,16 +8,11 @@ import numpy as np
 
 from .signal import branch_envelope, median, noise_level, turning_points
 
-
-@dataclass(frozen=True)
-class DriveOptions:
-    """Thresholds; `find_segments` says what they mean."""
-
-    smallest_turn: float
-    noise_multiple: float
-    band: float
-    slowness: float
-    samples: int
+SMALLEST_TURN = 0.005  # least depth of a turn, as a share of the signal's range
+TURN_NOISE = 8.0  # the same in standard deviations of the noise
+BAND = 0.0025  # height that a ramp must pass to be none of a hold, as a share of the range; or four deviations
+SLOWNESS = 6.0  # times longer than the ramps next to it that a hold takes for the width of the band
+HOLD_SAMPLES = 4  # of a hold, at least
 
 
 @dataclass(frozen=True)
@@ -32,16 +27,16 @@ class Hold:
 class Drive:
     """A signal with its noise, turning points and, per branch between them, its monotone envelope."""
 
-    def __init__(self, values: np.ndarray, clock: np.ndarray, options: DriveOptions) -> None:
+    def __init__(self, values: np.ndarray, clock: np.ndarray) -> None:
         span = float(np.ptp(values))
         # From 0 to 1 (or 0 alone), so that nothing depends on units or on how small the numbers are.
         self.values = (values - values.min()) / span if span > 0 else np.zeros(len(values))
-        self.clock, self.options = clock, options
+        self.clock = clock
         self.span = 1.0 if span > 0 else 0.0
         values = self.values
         self.noise = noise_level(values, self.span)
-        self.band = max(options.band * self.span, 4 * self.noise)
-        turn = max(options.smallest_turn * self.span, options.noise_multiple * self.noise)
+        self.band = max(BAND * self.span, 4 * self.noise)
+        turn = max(SMALLEST_TURN * self.span, TURN_NOISE * self.noise)
         self.turns = turning_points(values, turn)
         # A rising or falling signal per branch, made rising by its sign.
         self.signs = [1 if values[b] >= values[a] else -1 for a, b in zip(self.turns, self.turns[1:], strict=False)]
@@ -86,7 +81,7 @@ class Drive:
         kept: list[Hold] = []
         for hold in found:
             start = max(hold.start, kept[-1].stop) if kept else hold.start
-            if hold.stop - start >= self.options.samples:
+            if hold.stop - start >= HOLD_SAMPLES:
                 kept.append(Hold(start, hold.stop, hold.level))
         return kept
 
@@ -103,7 +98,7 @@ class Drive:
         level = median(inside) if len(inside) else top
         start, before = self._edge(left, level, at, rising=True) if has_left else (float(self.clock[at]), 0.0)
         stop, after = self._edge(right, -level, at, rising=False) if has_right else (float(self.clock[at]), 0.0)
-        if stop - start <= self.options.slowness * max(before, after):
+        if stop - start <= SLOWNESS * max(before, after):
             return None
         first, last = self.index(start), self.index(stop)
         return Hold(first, last + (0 if has_right else 1), sign * level)
@@ -134,7 +129,7 @@ class Drive:
         stay = clock[np.minimum(ahead, count - 1)] - clock
         after = (clock[np.minimum(further, count - 1)] - clock[np.minimum(ahead, count - 1)]) / 2
         before = (clock - clock[np.maximum(behind, 0)]) / 2
-        slow = whole & (stay > (self.options.slowness + 1) * np.maximum(before, after))
+        slow = whole & (stay > (SLOWNESS + 1) * np.maximum(before, after))
         if not slow.any():
             return []
         edges = np.flatnonzero(np.diff(np.concatenate(([0], slow.view(np.int8), [0]))))
@@ -146,6 +141,6 @@ class Drive:
             entry, _ = self._edge(branch, level, offset + int(ahead[best]) - 1, rising=True)
             leave, _ = self._edge(branch, level, offset + int(best), rising=False)
             hold = Hold(self.index(entry), self.index(leave), sign * level)
-            if hold.stop - hold.start >= self.options.samples:
+            if hold.stop - hold.start >= HOLD_SAMPLES:
                 found.append(hold)
         return found

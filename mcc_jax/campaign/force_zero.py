@@ -7,10 +7,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .quality_options import QualityOptions
 from .schema import Campaign, Control, Curve, Note
 from .segments import find_segments
 from .signal import differences, median, point_noise, two_lines
+
+AIR_READINGS = 5  # before contact, at least: fewer do not give the zero's error
+AIR_SAID = 3.0  # standard deviations from which on an offset is reported
+AIR_SHARE = 1e-3  # of the largest force, likewise: below it no answer moves by a tenth of its error
+DRIFT_SAID = 5.0  # standard deviations of its slope from which on a drift before contact is reported
+DRIFT_SLOWER = 0.1  # of loading's slope: a straight rise before loading is a drift up to here, as is any straight fall
+DRIFT_LIKE = 0.7  # up to this share it may be one, and is reported; first contact of asperities is not straight
+OTHER_STIFFNESS = 1.5  # factor in force over displacement; with less, only the speed of the test machine changed
+START_SHARE = 0.1  # of the largest force, up to which a drift is looked for: no preload is larger, and loading bends
 
 
 @dataclass(frozen=True)
@@ -30,7 +38,9 @@ class ZeroOfForce:
     notes: tuple[Note, ...] = ()
 
 
-def zero_of_force(curve: Curve, control: Control | None, options: QualityOptions) -> ZeroOfForce | None:
+def zero_of_force(
+    curve: Curve, control: Control | None, zero_mN: tuple[float, float] | None = None
+) -> ZeroOfForce | None:
     """The force that is read in the air before contact; None if nothing tells of another zero than the file's own.
 
     Without a drift it is the readings' mean, with the error of a mean of readings that hang together (as of an
@@ -38,11 +48,11 @@ def zero_of_force(curve: Curve, control: Control | None, options: QualityOptions
     value there from then on; what the drift did during the test nobody knows, so its change in the air is the error.
     Without readings in the air a record is looked at that begins far from zero.
     """
-    contact, ahead = air_until(curve, control, options)
+    contact, ahead = air_until(curve, control)
     if contact is None:
-        return _perhaps_drift(curve, ahead, options) or _begins_elsewhere(curve, options)
+        return _perhaps_drift(curve, ahead) or _begins_elsewhere(curve, zero_mN)
     # The last readings before the platens touch may already feel the first asperities.
-    stop = max(options.air_readings, int(0.9 * contact))
+    stop = max(AIR_READINGS, int(0.9 * contact))
     air, when = curve.force_mN[:stop], curve.time_s[:stop]
     mean, sd = float(np.mean(air)), float(np.std(air, ddof=1))
     largest = max(float(np.max(curve.force_mN) - mean), 1e-300)
@@ -54,7 +64,7 @@ def zero_of_force(curve: Curve, control: Control | None, options: QualityOptions
         left = air - mean - slope * centred
         slope_sd = float(np.std(left, ddof=2) / np.sqrt(spread)) * _inflation(left)
         change = slope * float(when[-1] - when[0])
-        if abs(slope) > options.drift_said * slope_sd and abs(change) > options.air_share * largest:
+        if abs(slope) > DRIFT_SAID * slope_sd and abs(change) > AIR_SHARE * largest:
             path = mean + slope * (np.minimum(curve.time_s, curve.time_s[contact - 1]) - when.mean())
             error = float(np.hypot(np.std(left, ddof=2) / np.sqrt(len(air)), abs(change) / np.sqrt(12)))
             note = Note(
@@ -68,15 +78,15 @@ def zero_of_force(curve: Curve, control: Control | None, options: QualityOptions
             return ZeroOfForce(path, float(path[-1]), error, (note,))
         error = float(sd / np.sqrt(len(air)) * _inflation(air - mean))
     notes: tuple[Note, ...] = ()
-    if abs(mean) > options.air_said * error and abs(mean) > options.air_share * largest:
+    if abs(mean) > AIR_SAID * error and abs(mean) > AIR_SHARE * largest:
         sentence = "force reads {} mN in the air before contact; this was taken off"
         notes = (Note("zero of force", "told", sentence, (mean,)),)
     return ZeroOfForce(np.full(len(curve), mean), mean, error, notes)
 
 
-def _perhaps_drift(curve: Curve, ahead: SlowStart | None, options: QualityOptions) -> ZeroOfForce | None:
+def _perhaps_drift(curve: Curve, ahead: SlowStart | None) -> ZeroOfForce | None:
     """A rise in front of the loading which is too quick to be taken for a drift, and too straight for a contact."""
-    if ahead is None or abs(ahead.change) <= options.air_share * float(np.ptp(curve.force_mN)):
+    if ahead is None or abs(ahead.change) <= AIR_SHARE * float(np.ptp(curve.force_mN)):
         return None
     note = Note(
         "zero of force",
@@ -119,7 +129,7 @@ def _one_zero(curves: Sequence[Curve], sentence: str) -> tuple[float, float] | N
         return None
     taken_off = (0.0 if curve.checked is None else curve.checked.force_zero_mN for curve in curves)
     begins = np.array([curve.force_mN[0] + off for curve, off in zip(curves, taken_off, strict=True)])
-    steps = np.array([_first_steps(curve, QualityOptions()) for curve in curves])
+    steps = np.array([_first_steps(curve) for curve in curves])
     noise = max(point_noise(curve.force_mN) for curve in curves)
     lowest = int(np.argmin(begins))
     zero, error = float(begins[lowest]), float(steps[lowest] / np.sqrt(12))
@@ -130,30 +140,30 @@ def _one_zero(curves: Sequence[Curve], sentence: str) -> tuple[float, float] | N
         spread = float(np.sqrt(left / np.sum((1 / steps - np.mean(1 / steps)) ** 2)))
         if spread < error and crossing <= zero:
             zero, error = float(crossing), max(spread, noise / np.sqrt(len(steps)))
-    together = np.all(begins - zero <= steps + QualityOptions().air_said * noise)
+    together = np.all(begins - zero <= steps + AIR_SAID * noise)
     return (zero, error) if together else None
 
 
-def _first_steps(curve: Curve, options: QualityOptions) -> float:
+def _first_steps(curve: Curve) -> float:
     """By how much force grows from one reading to the next where a record begins [mN]."""
-    return median(np.abs(differences(curve.force_mN[: options.air_readings + 1])))
+    return median(np.abs(differences(curve.force_mN[: AIR_READINGS + 1])))
 
 
-def _begins_elsewhere(curve: Curve, options: QualityOptions) -> ZeroOfForce | None:
+def _begins_elsewhere(curve: Curve, zero_mN: tuple[float, float] | None) -> ZeroOfForce | None:
     """A record in contact whose first reading is below zero, or more than a step of the ramp above it.
 
-    One that begins above `start_share` of its largest force has lost its loading, and tells no zero at all. Below zero
+    One that begins above `START_SHARE` of its largest force has lost its loading, and tells no zero at all. Below zero
     the load cell was not tared: the reading is taken off, and its error is as large as itself, unless all tests share a
     zero, which is known better. Above it, that and a preload look alike, and the file's zero stays.
     """
     first = float(curve.force_mN[0])
-    if options.zero_mN is not None:
-        zero, error = options.zero_mN
+    if zero_mN is not None:
+        zero, error = zero_mN
         notes = (Note("zero of force", "look", _BELOW, (first, zero), _TARE),) if zero < 0 else ()
         return ZeroOfForce(np.full(len(curve), zero), zero, error, notes)
-    step = _first_steps(curve, options)
-    least = max(options.air_share * float(np.ptp(curve.force_mN)), options.air_said * point_noise(curve.force_mN))
-    if -least <= first <= step + least or abs(first) > options.start_share * float(curve.force_mN.max()):
+    step = _first_steps(curve)
+    least = max(AIR_SHARE * float(np.ptp(curve.force_mN)), AIR_SAID * point_noise(curve.force_mN))
+    if -least <= first <= step + least or abs(first) > START_SHARE * float(curve.force_mN.max()):
         return None
     if first < 0:
         note = Note("zero of force", "look", _BELOW, (first, first), _TARE)
@@ -169,7 +179,7 @@ def _inflation(scatter: np.ndarray) -> float:
     return float(np.sqrt((1 + lag) / (1 - lag)))
 
 
-def air_until(curve: Curve, control: Control | None, options: QualityOptions) -> tuple[int | None, SlowStart | None]:
+def air_until(curve: Curve, control: Control | None) -> tuple[int | None, SlowStart | None]:
     """How many readings were taken before contact; None if too few, and then the slow start, if there is one.
 
     The approach of `find_segments`; where it finds none, a straight and much slower rise in front of the loading is a
@@ -179,14 +189,14 @@ def air_until(curve: Curve, control: Control | None, options: QualityOptions) ->
     def found(curve: Curve) -> int | None:
         segments = find_segments(curve, control=control)
         first = segments[0]
-        enough = first.kind == "approach" and len(segments) > 1 and len(first) > options.air_readings
+        enough = first.kind == "approach" and len(segments) > 1 and len(first) > AIR_READINGS
         return first.stop if enough else None
 
     contact = found(curve)
     if contact is not None:
         return contact, None
-    ahead = slow_start(curve, options)
-    if ahead is None or ahead.share > options.drift_slower:
+    ahead = slow_start(curve)
+    if ahead is None or ahead.share > DRIFT_SLOWER:
         return None, ahead
     time = np.minimum(curve.time_s, curve.time_s[ahead.stop - 1])
     return found(replace(curve, force_mN=curve.force_mN - ahead.line(time))), ahead
@@ -209,17 +219,17 @@ class SlowStart:
     share: float
 
 
-def slow_start(curve: Curve, options: QualityOptions) -> SlowStart | None:
+def slow_start(curve: Curve) -> SlowStart | None:
     """A straight and slower course of force in front of the loading, of a load cell that drifts; None without one.
 
     A slower speed of the tester alone bends force and displacement alike: it is none.
     """
     force, time, path = curve.force_mN, curve.time_s, curve.displacement_um
-    first = int(np.argmax(force > force[0] + options.start_share * (force.max() - force[0])))
-    if first < 2 * options.air_readings + 4:
+    first = int(np.argmax(force > force[0] + START_SHARE * (force.max() - force[0])))
+    if first < 2 * AIR_READINGS + 4:
         return None
     kink = two_lines(time[: first + 1], force[: first + 1])
-    if kink <= options.air_readings or kink > first - 3:
+    if kink <= AIR_READINGS or kink > first - 3:
         return None
     ahead, behind = slice(kink), slice(kink, first + 1)
     if not (time[kink - 1] > time[0] and time[first] > time[kink]):
@@ -230,11 +240,11 @@ def slow_start(curve: Curve, options: QualityOptions) -> SlowStart | None:
         float(clock @ force[rows]) / s for clock, rows, s in zip(clocks, (ahead, behind), spreads, strict=True)
     )
     way, on = (float(clock @ path[rows]) / s for clock, rows, s in zip(clocks, (ahead, behind), spreads, strict=True))
-    bends = fast - slow > options.drift_said * point_noise(force) * np.hypot(*(1 / np.sqrt(spreads)))
+    bends = fast - slow > DRIFT_SAID * point_noise(force) * np.hypot(*(1 / np.sqrt(spreads)))
     share, pace = slow / max(fast, 1e-300), way / max(on, 1e-300)
-    if not bends or share > options.drift_like:
+    if not bends or share > DRIFT_LIKE:
         return None
-    if pace > 0 and share > 0 and 1 / options.other_stiffness < share / pace < options.other_stiffness:
+    if pace > 0 and share > 0 and 1 / OTHER_STIFFNESS < share / pace < OTHER_STIFFNESS:
         return None
     line = np.polynomial.Polynomial.fit(time[ahead], force[ahead], 1)
     if np.std(force[ahead] - line(time[ahead])) > 2 * point_noise(force[ahead]) + 1e-12 * float(np.ptp(force)):

@@ -21,7 +21,6 @@ import numpy as np
 from .findings import Finding
 from .force_zero import untared_zero, zero_of_force
 from .plausibility import wrong_signs
-from .quality_options import QualityOptions
 from .saturation import censor_displacement, censor_force
 from .schema import Campaign, Checked, Control, Curve, Note
 from .segments import find_segments
@@ -29,12 +28,12 @@ from .signal import differences, median, point_noise, quantile, runs
 from .validate import check_campaign
 
 
-def check_tests(campaign: Campaign, options: QualityOptions | None = None) -> Campaign:
+def check_tests(campaign: Campaign, *, zero_mN: tuple[float, float] | None = None) -> Campaign:
     """The campaign with what its testers did found, corrected where the record allows, and told.
 
     Args:
         campaign: raw tests. One that was checked already comes back as it is.
-        options: what counts as a fault.
+        zero_mN: zero of force of records that begin in contact, and its error [mN]; the file's own if None.
 
     Returns:
         A campaign whose curves hold the readings that count, with the zero of force taken off; `raw` is the campaign
@@ -46,33 +45,32 @@ def check_tests(campaign: Campaign, options: QualityOptions | None = None) -> Ca
     check_campaign(campaign)
     if campaign.raw is not None:
         return campaign
-    options = options or QualityOptions()
     if wrong_signs(campaign):
         return replace(campaign, raw=campaign)  # what looks like air or breakage is the test read backwards
     control = campaign.metadata.control
-    curves = tuple(check_test(curve, control, options) for curve in campaign.curves)
+    curves = tuple(check_test(curve, control, zero_mN) for curve in campaign.curves)
     zero = untared_zero(curves)
-    if zero is not None and options.zero_mN is None:
-        return check_tests(campaign, replace(options, zero_mN=zero))
+    if zero is not None and zero_mN is None:
+        return check_tests(campaign, zero_mN=zero)
     return replace(campaign, curves=curves, raw=campaign)
 
 
-def check_test(curve: Curve, control: Control | None, options: QualityOptions) -> Curve:
+def check_test(curve: Curve, control: Control | None, zero_mN: tuple[float, float] | None = None) -> Curve:
     """One test, checked; see the top of the file for the steps."""
     notes: list[Note] = []
     rows = np.arange(len(curve))
     for wrong, check, sentence, remedy in _SINGLE_READINGS:
         for channel, name in ((curve.force_mN, "force"), (curve.displacement_um, "displacement")):
-            found = wrong(channel[rows], options)
+            found = wrong(channel[rows])
             if found.any():
                 notes.append(Note(check, "told", sentence.replace("CHANNEL", name), (int(found.sum()),), remedy))
                 rows = rows[~found]
     clean = _taken(curve, rows)
-    if begins_at_peak(clean, options):
+    if begins_at_peak(clean):
         sentence = "the record begins at its largest force ({} mN), so its loading is missing"
         remedy = "Join the loading part of the test to it: some testers store the two apart"
         notes.append(Note("loading", "look", sentence, (float(clean.force_mN[0]),), remedy))
-    broke = breakage(clean, options)
+    broke = breakage(clean)
     if broke is not None:
         last, lost = broke
         sentence = "the particle broke at {} mN (the force falls by {} % at once); its record counts up to there"
@@ -80,7 +78,7 @@ def check_test(curve: Curve, control: Control | None, options: QualityOptions) -
         notes.append(Note("breakage", "look", sentence, (float(curve.force_mN[rows[last]]), 100 * lost), remedy))
         rows = rows[: last + 1]
         clean = _taken(curve, rows)
-    slipping = gives_way(clean, control, options)
+    slipping = gives_way(clean, control)
     if slipping.any():
         sentence = (
             "force falls from {} mN on while the platens go on closing (the particle gives way or slips): {} readings "
@@ -91,17 +89,17 @@ def check_test(curve: Curve, control: Control | None, options: QualityOptions) -
         notes.append(Note("breakage", "told", sentence, numbers, remedy))
         rows = rows[~slipping]
         clean = _taken(curve, rows)
-    zero = zero_of_force(clean, control, options)
+    zero = zero_of_force(clean, control, zero_mN)
     if zero is not None:
         notes += zero.notes
         clean = replace(clean, force_mN=clean.force_mN - zero.path)
-    seen = censor_force(clean, options.saturation)
+    seen = censor_force(clean)
     compared = np.ones(len(clean), bool)
     force_sd = np.zeros(len(clean))
     if seen is not None:
         clean, rows, compared, force_sd = seen.curve, rows[seen.rows], seen.compared, seen.force_sd_mN
         notes.append(seen.note)
-    hidden = censor_displacement(clean, options.saturation)
+    hidden = censor_displacement(clean)
     if hidden is not None:
         compared &= ~hidden[0]
         notes.append(hidden[1])
@@ -117,10 +115,27 @@ def _taken(curve: Curve, rows: np.ndarray) -> Curve:
     return Curve(curve.time_s[rows], curve.force_mN[rows], curve.displacement_um[rows])
 
 
+# Every threshold is such that no sound record reaches it.
+SPIKE_NOISE = 15.0  # standard deviations; of 1e6 normal readings the farthest lies at 5, the rest is for other noise
+SPIKE_STEPS = 5.0  # steps between neighbours; a turning point of a ramp lies within 3 steps of the running median
+SPIKE_READ_OUT = 2.5  # smallest steps of the read-out
+SPIKE_RANGE = 0.02  # of the channel's range from 5 to 95 %
+STUCK_READINGS = 6  # repeats at least; also three times the repeats elsewhere, as of a coarse read-out
+STUCK_CATCH_UP = 0.5  # share of the ramp's progress in that time that the jump behind the repeats makes up for
+STUCK_JUMP = 2.5  # times any step near it: a coarse read-out jumps by one step at a time
+BEGINS_AT = 0.95  # share of the largest force that the first readings of a record without loading reach
+LOSS_OF_FORCE = 0.25  # of the largest force; settling and rotation of ceramic pebbles lose up to a tenth at once
+LOSS_READINGS = 3  # within which this force is lost
+LOSS_PACE = 5.0  # times the pace of force elsewhere
+LOSS_FROM = 0.05  # of the largest force: below it, the platens bounce on asperities
+LOSS_NOISE = 10.0  # standard deviations of the noise
+GOES_ON = 0.5  # of the platens' speed before; in unloading they part, and creep at its start is slower than loading
+
+
 # ---- single steps ----------------------------------------------------------------------------------------------------
 
 
-def spikes(values: np.ndarray, options: QualityOptions) -> np.ndarray:
+def spikes(values: np.ndarray) -> np.ndarray:
     """Which readings, one or two at a time, lie far from the median of the seven around them; booleans."""
     count = len(values)
     if count < 12:
@@ -134,12 +149,12 @@ def spikes(values: np.ndarray, options: QualityOptions) -> np.ndarray:
     pace = _edged(np.abs(differences(middle)), 10, 11)
     windows = np.lib.stride_tricks.sliding_window_view(pace, 21)[:count]
     local = np.maximum(windows[:, :6].max(axis=1), windows[:, 15:].max(axis=1))
-    least = max(options.spike_noise * point_noise(values), options.spike_range * (high - low))
-    least = np.maximum(least, options.spike_steps * np.maximum(step, local))
+    least = max(SPIKE_NOISE * point_noise(values), SPIKE_RANGE * (high - low))
+    least = np.maximum(least, SPIKE_STEPS * np.maximum(step, local))
     far = np.abs(values - middle) > np.maximum(least, 1e-300)
     far[[0, 1, -2, -1]] = False  # at the ends the median of the neighbours is no middle
     if moves.any():  # one step of a coarse read-out is none
-        far &= np.abs(values - middle) > options.spike_read_out * float(moves[moves > 0].min())
+        far &= np.abs(values - middle) > SPIKE_READ_OUT * float(moves[moves > 0].min())
     if not far.any():
         return far
     # Three or more in a row are no slip of the read-out but something that happened.
@@ -155,12 +170,12 @@ def _edged(values: np.ndarray, before: int, behind: int) -> np.ndarray:
     return np.concatenate((np.full(before, values[0]), values, np.full(behind, values[-1])))
 
 
-def stuck(values: np.ndarray, options: QualityOptions) -> np.ndarray:
+def stuck(values: np.ndarray) -> np.ndarray:
     """Which readings only repeat the one before, and are made up for by a jump behind them; booleans."""
     found = np.zeros(len(values), bool)
     starts, stops = runs(values)
     lengths = stops - starts
-    least = max(options.stuck_readings, 3 * quantile(lengths, 0.9))
+    least = max(STUCK_READINGS, 3 * quantile(lengths, 0.9))
     if len(lengths) < 8 or lengths.max() < least:
         return found
     steps = np.abs(differences(values))
@@ -173,21 +188,21 @@ def stuck(values: np.ndarray, options: QualityOptions) -> np.ndarray:
         near = np.concatenate([before, after])
         if not len(near):
             continue
-        caught_up = options.stuck_catch_up * (stop - start) * median(near)
-        if steps[stop - 1] > max(caught_up, options.stuck_jump * max(typical, float(np.max(near)))):
+        caught_up = STUCK_CATCH_UP * (stop - start) * median(near)
+        if steps[stop - 1] > max(caught_up, STUCK_JUMP * max(typical, float(np.max(near)))):
             found[start + 1 : stop] = True
     return found
 
 
-def begins_at_peak(curve: Curve, options: QualityOptions) -> bool:
+def begins_at_peak(curve: Curve) -> bool:
     """Whether a record has lost its loading: it begins at its largest force and unloads."""
     force = curve.force_mN
     largest, first = float(force.max()), median(force[:3])
     # One that ends there as well never unloads; one with the sign of its force reversed has no largest force.
-    return first > 0.5 * float(-force.min()) and first >= options.begins_at * largest > 2 * median(force[-3:])
+    return first > 0.5 * float(-force.min()) and first >= BEGINS_AT * largest > 2 * median(force[-3:])
 
 
-def breakage(curve: Curve, options: QualityOptions) -> tuple[int, float] | None:
+def breakage(curve: Curve) -> tuple[int, float] | None:
     """The last reading before the particle broke, and the share of its force that it lost at once; None if it held.
 
     A particle that breaks loses force while the platens do not part: the force falls within a few readings, much faster
@@ -205,20 +220,20 @@ def breakage(curve: Curve, options: QualityOptions) -> tuple[int, float] | None:
     interval = differences(time)
     moving = steps > 0.05 * max(median(steps), 1e-300)
     pace = median(steps[moving] / np.maximum(interval[moving], 1e-300)) if moving.any() else 0.0
-    least = options.loss_noise * point_noise(force)
+    least = LOSS_NOISE * point_noise(force)
     first: tuple[int, float] | None = None
-    for width in range(1, options.loss_readings + 1):
+    for width in range(1, LOSS_READINGS + 1):
         drop = force[:-width] - force[width:]
         with np.errstate(over="ignore"):  # at the first readings, which are not judged
             share = drop / np.maximum(reached[:-width], 1e-300)
-        fast = drop > options.loss_pace * pace * (time[width:] - time[:-width])
-        sudden = (share > options.loss_of_force) & fast & (path[width:] - path[:-width] > -back)
-        sudden &= (reached[:-width] > options.loss_from * reached[-1]) & (drop > least)
+        fast = drop > LOSS_PACE * pace * (time[width:] - time[:-width])
+        sudden = (share > LOSS_OF_FORCE) & fast & (path[width:] - path[:-width] > -back)
+        sudden &= (reached[:-width] > LOSS_FROM * reached[-1]) & (drop > least)
         for i in np.flatnonzero(sudden):
             if first is not None and i >= first[0]:
                 break
             later = slice(i + width, min(i + width + 50, count))
-            weak = force[later] - base < (1 - options.loss_of_force) * (force[i] - base)
+            weak = force[later] - base < (1 - LOSS_OF_FORCE) * (force[i] - base)
             goes_on = bool(np.any(weak & (path[later] > path[i] + back)))
             ends = count - i - width <= 10 and bool(np.all(path[i + width :] > path[i] - back))
             if goes_on or ends:
@@ -227,7 +242,7 @@ def breakage(curve: Curve, options: QualityOptions) -> tuple[int, float] | None:
     return first if first is not None and first[0] >= 8 else None
 
 
-def gives_way(curve: Curve, control: Control | None, options: QualityOptions) -> np.ndarray:
+def gives_way(curve: Curve, control: Control | None) -> np.ndarray:
     """Which readings come after the particle gave way or slipped, until its force is back; booleans.
 
     Force falls while the platens go on closing at about the speed they had: no unloading, in which they part or, of a
@@ -246,7 +261,7 @@ def gives_way(curve: Curve, control: Control | None, options: QualityOptions) ->
         before = int(risen[-1]) if len(risen) else 0
         way, gone = path[last] - path[start], path[start] - path[before]
         # Both speeds times both durations: a clock that stood still divides nothing.
-        as_fast = way * (time[start] - time[before]) > options.goes_on * gone * (time[last] - time[start])
+        as_fast = way * (time[start] - time[before]) > GOES_ON * gone * (time[last] - time[start])
         if gone > 0 and way > back and as_fast and float(np.min(path[start : last + 1])) > path[start] - back:
             again = np.flatnonzero(force[last:] >= force[start])
             found[start + 1 : last + int(again[0]) if len(again) else len(curve)] = True

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,27 +12,10 @@ from .schema import Campaign, Curve
 from .segments import Segment
 from .signal import median
 
-
-@dataclass(frozen=True)
-class UsableOptions:
-    """When a test cannot be used.
-
-    Attributes:
-        few_forces: a record with no more different forces than this shows steps of its read-out, not a curve of three
-            coefficients.
-        far_apart: tests on one material end within this factor of each other in stress and in strain: the paper's end
-            between 7 and 16 MPa, and of the 801 stresses at which its method compares them a test so far below would
-            see eight.
-        least_levels: a loading curve of fewer points above the threshold has no course there.
-    """
-
-    few_forces: int = 5
-    far_apart: float = 100.0
-    least_levels: int = 2
-
-
-USABLE = UsableOptions()
-
+FEW_FORCES = 5  # a record with no more different forces shows steps of its read-out, not a curve of three coefficients
+FAR_APART = 100.0
+"""Tests on one material end within this factor of each other in stress and in strain: the paper's end between 7 and 16
+MPa, and of the 801 stresses at which its method compares them a test so far below would see eight."""
 SHOWN = 3
 """Most particles that an error names with their reasons."""
 
@@ -61,7 +43,7 @@ def no_loading(curve: Curve, segments: tuple[Segment, ...], stress_MPa: np.ndarr
             "join the loading part of the test to it: some testers store the two apart"
         )
     levels = np.unique(force)
-    if len(levels) <= USABLE.few_forces:
+    if len(levels) <= FEW_FORCES:
         return (
             f"has {len(levels)} different forces only, in steps of {np.diff(levels).min():.4g} mN; "
             "export the force with more digits, or test with a finer load cell"
@@ -136,7 +118,7 @@ def _others_median(own: float | None, ordered: np.ndarray) -> float | None:
     if own is None or len(ordered) < 2:
         return None
     usual = median(np.delete(ordered, np.searchsorted(ordered, own)))
-    return None if usual / USABLE.far_apart <= own <= usual * USABLE.far_apart else usual
+    return None if usual / FAR_APART <= own <= usual * FAR_APART else usual
 
 
 def refusal(campaign: Campaign, problem: str, why_not: Sequence[str | None]) -> InputError:

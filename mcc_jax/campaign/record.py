@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,23 +19,9 @@ from .segments import Segment
 from .signal import straight_line
 from .validate import check_campaign
 
-
-@dataclass(frozen=True)
-class RampOptions:
-    """When rates of force count as different.
-
-    Attributes:
-        jump: where the larger is so many times the smaller: less is what testers' control leaves.
-        readings: of a ramp from which on changes of its speed are looked for: two lines that meet have four numbers.
-        kinks: of a ramp at most: a change between two readings makes two.
-    """
-
-    jump: float = 1.3
-    readings: int = 6
-    kinks: int = 6
-
-
-RAMPS = RampOptions()
+JUMP = 1.3  # factor by which rates of force differ at least; less is what the control of test machines leaves
+READINGS = 6  # of a ramp from which on changes of its speed are looked for: two lines that meet have four numbers
+KINKS = 6  # of a ramp at most: a change between two readings makes two
 
 
 def record_of(curve: Curve, segments: tuple[Segment, ...], *, relative_humidity_percent: float | None = None) -> Record:
@@ -200,7 +185,7 @@ def ramp_rates(time: Float[np.ndarray, " n"], force: Float[np.ndarray, " n"], be
 def _kinks(time: np.ndarray, force: np.ndarray) -> list[int]:
     """The readings at which a ramp changes its speed, in order; see `ramp_rates`."""
     n = len(time)
-    if n < RAMPS.readings:
+    if n < READINGS:
         return []
     x, y = (2 * (v - v.mean()) / max(float(np.ptp(v)), 1e-300) for v in (time, force))
 
@@ -217,7 +202,7 @@ def _kinks(time: np.ndarray, force: np.ndarray) -> list[int]:
 
     kinks: list[int] = []
     best, found = of_lines([]), []
-    for _ in range(min(RAMPS.kinks, (n - 4) // 2)):
+    for _ in range(min(KINKS, (n - 4) // 2)):
         ends = [0, *kinks, n - 1]
         gains = [_best_kink(x[i : j + 1], y[i : j + 1]) for i, j in itertools.pairwise(ends)]
         piece = int(np.argmax([gain for gain, _ in gains]))
@@ -233,11 +218,11 @@ def _kinks(time: np.ndarray, force: np.ndarray) -> list[int]:
         if value > best:
             break
         best, found = value, fewer
-    curves = np.polynomial.chebyshev.chebvander(x, min(1 + 2 * RAMPS.kinks, n - 3))
+    curves = np.polynomial.chebyshev.chebvander(x, min(1 + 2 * KINKS, n - 3))
     if not found or best >= min(criterion(curves[:, :k], k) for k in range(3, curves.shape[1] + 1)):
         return []
     slopes = np.cumsum(np.linalg.lstsq(lines(found), y)[0][1:])
-    return found if _apart(np.abs(slopes).tolist(), RAMPS.jump) else []
+    return found if _apart(np.abs(slopes).tolist(), JUMP) else []
 
 
 def _best_kink(x: np.ndarray, y: np.ndarray) -> tuple[float, int]:
@@ -295,7 +280,7 @@ def available_data(campaign: Campaign, segments: tuple[tuple[Segment, ...], ...]
         Need.RELOAD: often("reload"),
         Need.SECOND_RELOAD: often("reload", 2),
         Need.LONG_TIME: float(np.median(durations)) > 200,
-        Need.TWO_RATES: _apart(rates, RAMPS.jump),
+        Need.TWO_RATES: _apart(rates, JUMP),
         Need.SEVERAL_SIZES: _apart((D1 * D2 / D3).tolist(), 1.1),
         Need.SEVERAL_SHAPES: bool(np.ptp(1 - D3**2 / (D1 * D2)) > 0.1),
         Need.SEVERAL_PEAKS: _apart(peaks, 1.3),

@@ -21,38 +21,20 @@ import numpy as np
 from .schema import Curve, Note
 from .signal import differences, point_noise, quantile, runs
 
-
-@dataclass(frozen=True)
-class SaturationOptions:
-    """When a channel counts as saturated, and how its turning point is found.
-
-    Attributes:
-        repeats: readings that repeat the extreme, at least. Two equal readings around a turning point are not rare.
-        coarse: and so many times as many as the channel repeats elsewhere: a coarse read-out repeats every value.
-        steps: of its read-out that the channel itself would have gone on by, at least, at its pace before.
-        goes_on: share of its pace before that the other channel keeps up to where it comes farthest, at least. In a
-            hold it stands still, or creeps. One that comes farther and then back while the readings repeat has passed a
-            turning point: in a hold it would not, so there its pace does not matter.
-        before: readings before the stretch that tell the pace. Fewer do not, more reach into another part of the ramp.
-        errors: standard deviations of the noise by which it must come farther. Of 1000 stretches without any advance
-            one does, and its pace must agree as well.
-        near_end: standard deviations of a channel's noise below the end of its range within which its readings are
-            a choice of the low ones; beyond, one in 700 of them is hidden.
-        fitted_from: share of the end of the range from which on loading is fitted: below it, asperities deform, not
-            the particle.
-        trusted: share of the end of the range by which the turning point may lie beyond it: of simulated tests clipped
-            at 98, 95, 90 and 85 % the intervals of the modulus hold the truth; farther on nobody has looked.
-    """
-
-    repeats: int = 4
-    coarse: float = 3.0
-    steps: float = 2.0
-    goes_on: float = 0.5
-    before: int = 12
-    errors: float = 3.0
-    near_end: float = 3.0
-    fitted_from: float = 0.25
-    trusted: float = 0.25
+REPEATS = 4  # readings that repeat the extreme, at least; two equal ones around a turning point are not rare
+COARSE = 3.0  # and this many times as many as the channel repeats elsewhere: a coarse read-out repeats every value
+STEPS = 2.0  # of its read-out that the channel itself would have gone on by, at least, at its pace before
+GOES_ON = 0.5
+"""Share of its pace before that the other channel keeps up to where it comes farthest, at least: in a hold it stands
+still, or creeps. One that comes farther and then back while the readings repeat has passed a turning point: in a hold
+it would not, so there its pace does not matter."""
+BEFORE = 12  # readings that give the pace: fewer do not, more reach into another part of the ramp
+ERRORS = 3.0  # standard deviations by which it must come farther; without any advance one stretch in 1000 does
+NEAR_END = 3.0  # standard deviations below the end within which only low readings are left; one in 700 lies beyond
+FITTED_FROM = 0.25  # of the end of the range: below, asperities deform, not the particle
+TRUSTED = 0.25
+"""Share of the end of the range by which the turning point may lie beyond it: of simulated tests clipped at 98, 95, 90
+and 85 % the intervals of the modulus hold the truth; farther on nobody has looked."""
 
 
 class CensoredForce(NamedTuple):
@@ -74,9 +56,7 @@ class CensoredForce(NamedTuple):
     note: Note
 
 
-def plateaus(
-    values: np.ndarray, other: np.ndarray, time: np.ndarray, noise: float, options: SaturationOptions
-) -> list[tuple[int, int]]:
+def plateaus(values: np.ndarray, other: np.ndarray, time: np.ndarray, noise: float) -> list[tuple[int, int]]:
     """Stretches [start, stop) at the largest value of a channel during which the other, of this noise, goes on."""
     count = len(values)
     if count < 12:
@@ -93,9 +73,9 @@ def plateaus(
     found = []
     for start, stop in at_end:
         length = stop - start
-        if length < max(options.repeats, options.coarse * usual) or start < 4:
+        if length < max(REPEATS, COARSE * usual) or start < 4:
             continue
-        before = np.arange(max(start - options.before, 0), start)
+        before = np.arange(max(start - BEFORE, 0), start)
         line = np.polynomial.Polynomial.fit(time[before], other[before], 1)
         pace = float(line.deriv()(time[start - 1]))
         # How far the other channel comes, and by how much it comes back, as means of three readings.
@@ -103,13 +83,13 @@ def plateaus(
         top = int(np.argmax(part >= part.max() - noise / np.sqrt(3)))  # around a turn it hardly moves
         elapsed, advance = float(when[top] - time[start - 1]), float(part[top] - line(time[start - 1]))
         error = noise * np.sqrt(1 / 3 + 4 / len(before))
-        turned = float(part[top] - part[-1]) > options.errors * error
-        goes_on = advance > options.goes_on * pace * elapsed
+        turned = float(part[top] - part[-1]) > ERRORS * error
+        goes_on = advance > GOES_ON * pace * elapsed
         # A coarse read-out rests at its last step while the true value stays below the next one.
         own = float(np.polynomial.Polynomial.fit(time[before], values[before], 1).deriv()(time[start - 1]))
-        if own * elapsed < options.steps * step:
+        if own * elapsed < STEPS * step:
             continue
-        if pace > 0 and elapsed > 0 and advance > options.errors * error and (goes_on or turned):
+        if pace > 0 and elapsed > 0 and advance > ERRORS * error and (goes_on or turned):
             found.append((start, stop))
     if not found:
         return []
@@ -117,22 +97,21 @@ def plateaus(
     return [one for one in at_end if one[1] - one[0] >= 2 or one in found]
 
 
-def censor_force(curve: Curve, options: SaturationOptions | None = None) -> CensoredForce | None:
+def censor_force(curve: Curve) -> CensoredForce | None:
     """The test, its zero of force taken off, with the turning points that its force channel did not see; None if there
     are none.
     """
-    options = options or SaturationOptions()
     force, path = curve.force_mN, curve.displacement_um
     noise = point_noise(path)
-    found = plateaus(force, path, curve.time_s, noise, options)
+    found = plateaus(force, path, curve.time_s, noise)
     if not found:
         return None
     end = float(force.max())
     hidden = np.zeros(len(force), bool)
     for start, stop in found:
         hidden[start:stop] = True
-    fitted = _loading(force, path, hidden, found[0][0], end, options.fitted_from)
-    before = slice(max(found[0][0] - 12, 0), found[0][0])
+    fitted = _loading(force, path, hidden, found[0][0], end)
+    before = slice(max(found[0][0] - BEFORE, 0), found[0][0])
     way = float(np.ptp(path[before]))
     pace = float(np.ptp(force[before])) / way if way > 0 else 0.0  # [mN/um]
     new_force, new_path, sd = force.copy(), path.copy(), np.zeros(len(force))
@@ -149,16 +128,15 @@ def censor_force(curve: Curve, options: SaturationOptions | None = None) -> Cens
             value, error = end, noise * pace
         new_force[row], new_path[row], sd[row], turning[row] = value, top, error, True
         reached = top
-    note = _note(end, int(hidden.sum()), new_force[turning], sd[turning], options.trusted)
+    note = _note(end, int(hidden.sum()), new_force[turning], sd[turning])
     keep = ~hidden | turning
     checked = Curve(curve.time_s[keep], new_force[keep], new_path[keep])
     return CensoredForce(checked, np.flatnonzero(keep), ~turning[keep], sd[keep], note)
 
 
-def censor_displacement(curve: Curve, options: SaturationOptions | None = None) -> tuple[np.ndarray, Note] | None:
+def censor_displacement(curve: Curve) -> tuple[np.ndarray, Note] | None:
     """Which readings of displacement stand at the end of its range, and a note; None if there are none."""
-    options = options or SaturationOptions()
-    found = plateaus(curve.displacement_um, curve.force_mN, curve.time_s, point_noise(curve.force_mN), options)
+    found = plateaus(curve.displacement_um, curve.force_mN, curve.time_s, point_noise(curve.force_mN))
     if not found:
         return None
     path = curve.displacement_um
@@ -166,7 +144,7 @@ def censor_displacement(curve: Curve, options: SaturationOptions | None = None) 
     rows = np.zeros(len(curve), bool)
     for start, stop in found:
         rows[start:stop] = True
-    rows |= path >= float(path.max()) - options.near_end * point_noise(path[~rows])
+    rows |= path >= float(path.max()) - NEAR_END * point_noise(path[~rows])
     note = Note(
         "saturation",
         "look",
@@ -178,7 +156,7 @@ def censor_displacement(curve: Curve, options: SaturationOptions | None = None) 
     return rows, note
 
 
-def _note(end: float, count: int, largest: np.ndarray, sds: np.ndarray, trusted: float) -> Note:
+def _note(end: float, count: int, largest: np.ndarray, sds: np.ndarray) -> Note:
     remedy = "Measure with a load cell of a larger range"
     if not len(largest):
         sentence = "force stands at {} mN, the end of its range, for {} readings, which are left out"
@@ -188,7 +166,7 @@ def _note(end: float, count: int, largest: np.ndarray, sds: np.ndarray, trusted:
         "force stands at {} mN, the end of its range, for {} readings while the platens go on; they are left out and "
         "the turning point is taken from the displacement ({} +- {} mN)"
     )
-    far = top > (1 + trusted) * end or not sd < 0.5 * trusted * end
+    far = top > (1 + TRUSTED) * end or not sd < 0.5 * TRUSTED * end
     if far:
         sentence += ", too far beyond the range to be relied on"
     return Note("saturation", "bad" if far else "look", sentence, (end, count, top, sd), remedy)
@@ -230,19 +208,17 @@ def _slopes(x: np.ndarray | float) -> np.ndarray:
     return np.stack([np.ones_like(x), -3 * np.square(x), 5 * np.power(x, 4)], -1)
 
 
-def _loading(
-    force: np.ndarray, path: np.ndarray, hidden: np.ndarray, start: int, end: float, fitted_from: float
-) -> _Loading | None:
+def _loading(force: np.ndarray, path: np.ndarray, hidden: np.ndarray, start: int, end: float) -> _Loading | None:
     """The loading curve before the force channel saturates for the first time."""
     from scipy.optimize import least_squares
 
     before = slice(start)
-    virgin = (path[before] >= np.maximum.accumulate(path[before])) & (force[before] >= fitted_from * end)
+    virgin = (path[before] >= np.maximum.accumulate(path[before])) & (force[before] >= FITTED_FROM * end)
     rows = np.flatnonzero(virgin & ~hidden[before])
     if len(rows) < 8:
         return None
     f, d = force[rows], path[rows]
-    scale = float(d[-1] - d[0]) / (1 - fitted_from)
+    scale = float(d[-1] - d[0]) / (1 - FITTED_FROM)
     if not scale > 0:
         return None
 
@@ -251,7 +227,7 @@ def _loading(
         slope = np.maximum(_slopes(x) @ parameters[1:] / scale, 1e-3 * end / scale)
         return (_powers(x) @ parameters[1:] - f) / slope
 
-    first = d[0] / scale - fitted_from
+    first = d[0] / scale - FITTED_FROM
     begin = np.concatenate([[first], np.linalg.lstsq(_powers(d / scale - first), f, rcond=None)[0]])
     found = least_squares(misfit, begin, x_scale=np.maximum(np.abs(begin), 1e-3), max_nfev=100)
     variance = float(np.sum(found.fun**2) / max(len(d) - 4, 1))

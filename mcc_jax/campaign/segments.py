@@ -18,7 +18,7 @@ import numpy as np
 
 from .. import arguments
 from .._errors import InputError
-from .excursions import Drive, DriveOptions, Hold
+from .excursions import Drive, Hold
 from .memory import remembered
 from .schema import A_CURVE, Control, Curve
 from .signal import branch_envelope, median, steady_clock, two_lines
@@ -53,77 +53,55 @@ class Segment:
         return self.stop - self.start
 
 
+CONTACT = 0.01  # share of the range of force up to which the beginning may count as approach
 BEGINS_LOADED = 0.05
 """Share of the range of force from which on a record that begins by unloading begins under load: less is the dip by
 which adhesion pulls the platens together."""
 
 
-def find_segments(
-    curve: Curve,
-    *,
-    control: Control | None = None,
-    smallest_turn: float = 0.005,
-    noise_multiple: float = 8.0,
-    band: float = 0.0025,
-    hold_slowness: float = 6.0,
-    hold_samples: int = 4,
-    contact: float = 0.01,
-) -> tuple[Segment, ...]:
+def find_segments(curve: Curve, *, control: Control | None = None) -> tuple[Segment, ...]:
     """Cut a test into segments that follow each other without gap or overlap.
 
     A reload that goes beyond the greatest force reached before is cut there: what follows is virgin "load". A pause
     that left no samples (a gap in time) is no segment of its own. Where the force stays at its lowest level while
     the platen moves away, that is still "unload". Small cycles that drown in noise are not found: a turn must be
-    deeper than `noise_multiple` times the noise's standard deviation, which is estimated from the curve. A turning
+    deeper than eight times the noise's standard deviation, which is estimated from the curve. A turning
     point belongs to the segment that starts there.
 
     Args:
         curve: the test, raw.
         control: the controlled quantity. By default it is judged from the data: displacement where it stands still
             while the force relaxes, else force.
-        smallest_turn: the least depth of a turn, as a share of the signal's range.
-        noise_multiple: the least depth of a turn, in standard deviations of the noise.
-        band: the height that a ramp must pass to be none of a hold, as a share of the range; four standard
-            deviations of the noise where that is more.
-        hold_slowness: how many times longer than the ramps beside it a hold takes for the width of the band.
-        hold_samples: the least number of samples of a hold.
-        contact: the share of the force's range up to which the beginning may count as approach.
 
     Returns:
         The segments in order; the first starts at 0, each starts where the one before stops, the last stops at
         the number of samples.
 
     Raises:
-        InputError: for a curve without a point or with one that is not finite, a control that does not exist, or a
-            threshold that is not positive.
+        InputError: for a curve without a point or with one that is not finite, or a control that does not exist.
     """
     arguments.instance(curve, Curve, "curve", A_CURVE)
     if control is not None:
         arguments.choice(control, get_args(Control), "control")
-    thresholds = {"smallest_turn": smallest_turn, "noise_multiple": noise_multiple, "band": band}
-    for name, value in (thresholds | {"contact": contact, "hold_slowness": hold_slowness}).items():
-        arguments.number(value, name, least=0)
-    arguments.whole(hold_samples, "hold_samples", least=1)
     if not len(curve):
         raise InputError("the curve has no point", remedy="Give a test with two points or more.")
     for name in ("time_s", "force_mN", "displacement_um"):
         check_finite(getattr(curve, name), f"the {name} of a curve", InputError)
-    options = DriveOptions(smallest_turn, noise_multiple, band, hold_slowness, hold_samples)
-    return remembered(curve, (control, options, contact), lambda: _found(curve, control, options, contact))
+    return remembered(curve, ("segments", control), lambda: _found(curve, control))
 
 
-def _found(curve: Curve, control: Control | None, options: DriveOptions, contact: float) -> tuple[Segment, ...]:
+def _found(curve: Curve, control: Control | None) -> tuple[Segment, ...]:
     """The segments of a curve, see `find_segments`."""
     force, displacement = np.asarray(curve.force_mN, float), np.asarray(curve.displacement_um, float)
     clock = steady_clock(np.asarray(curve.time_s, float))
-    drive = Drive(force, clock, options)
+    drive = Drive(force, clock)
     if not drive.span > 0:
         return (Segment("hold", 0, len(force)),)
     chosen, holds = drive, drive.holds()
     if control is None:
         holds = [hold for hold in holds if not _moves_away(hold, drive, displacement, clock)]
     if control != "load":
-        other = Drive(displacement, clock, options)
+        other = Drive(displacement, clock)
         # Stiff unloading may drown in the displacement's noise; then only the force knows of it.
         if len(other.turns) >= len(drive.turns):
             other_holds = other.holds()
@@ -132,7 +110,7 @@ def _found(curve: Curve, control: Control | None, options: DriveOptions, contact
                 2 * len(relaxing) > len(other_holds) and (not _covered(relaxing, holds) or _sags(holds, drive))
             ):
                 chosen, holds = other, other_holds
-    onset = 0 if _begins_loaded(drive) else _contact_onset(drive, displacement, clock, contact)
+    onset = 0 if _begins_loaded(drive) else _contact_onset(drive, displacement, clock)
     return _assemble(chosen, holds, drive, onset)
 
 
@@ -209,14 +187,14 @@ def _sags(holds: list[Hold], force: Drive) -> bool:
     return bool(2 * count > len(holds))
 
 
-def _contact_onset(force: Drive, displacement: np.ndarray, clock: np.ndarray, contact: float) -> int:
+def _contact_onset(force: Drive, displacement: np.ndarray, clock: np.ndarray) -> int:
     """The index at which the force begins to rise; 0 if the curve begins in contact.
 
     Up to a small force, a flat stretch followed by a rise lies far below the straight line from its first to its
     last point; a smooth rise from the first sample on does not.
     """
     values, least = force.values, 10 * force.noise
-    rise = max(contact * force.span, least)
+    rise = max(CONTACT * force.span, least)
     peaks = (
         b
         for a, b, sign in zip(force.turns, force.turns[1:], force.signs, strict=False)

@@ -2,48 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-
-@dataclass(frozen=True)
-class SignalOptions:
-    """By what noise, steps of a read-out and gaps of a clock are recognised.
-
-    Attributes:
-        long_branch: samples between turning points from which on third differences tell noise: no more than a quarter
-            of them straddle a turning point there, which shifts their median by less than half.
-        deep_turn: share of the signal's range that noise does not reach, for a first look at how quickly it turns.
-        many_turns: turning points, more than which make a signal one of quick cycles.
-        spread_of_peaks: the extremes of white noise scatter by about two thirds of its standard deviation.
-        least_samples: fewer do not tell noise by third differences.
-        least_peaks: fewer turning points do not tell it by how peaks repeat.
-        smallest_step: share of the range below which a difference of two readings is rounding of the arithmetic.
-        whole_step: a difference counts as a whole number of smallest steps if it is so close to one.
-        whole_share: more than this share of the differences must, for the smallest one to be the read-out's step: in
-            continuous readings a share of twice `whole_step` is by chance.
-        jumps: share of those differences that begin anew after a rest, from which on a read-out is coarse; an even
-            ramp that starts out of a hold jumps once.
-        longest_gap: in typical intervals, what a gap of the clock counts for at most: nothing was seen in it.
-        shortest_gap: and a repeated time, at least: two readings are two.
-    """
-
-    long_branch: int = 16
-    deep_turn: float = 0.1
-    many_turns: int = 8
-    spread_of_peaks: float = 1.5
-    least_samples: int = 8
-    least_peaks: int = 16
-    smallest_step: float = 1e-9
-    whole_step: float = 0.01
-    whole_share: float = 0.95
-    jumps: float = 0.1
-    longest_gap: float = 5.0
-    shortest_gap: float = 0.2
-
-
-SIGNAL = SignalOptions()
+LONG_BRANCH = 16
+"""Samples between turning points from which on third differences give the noise: no more than a quarter of them
+straddle a turning point there, which shifts their median by less than half."""
+DEEP_TURN = 0.1  # share of the range that noise does not reach, for a first look at how quickly a signal turns
+MANY_TURNS = 8  # more turning points make a signal one of quick cycles
+SPREAD_OF_PEAKS = 1.5  # the extremes of white noise scatter by about two thirds of its standard deviation
+LEAST_SAMPLES = 8  # fewer do not give noise by third differences
+LEAST_PEAKS = 16  # fewer turning points do not give it by how peaks repeat
+SMALLEST_STEP = 1e-9  # share of the range below which a difference of two readings is rounding of the arithmetic
+WHOLE_STEP = 0.01  # a difference counts as a whole number of smallest steps if it is so close to one
+WHOLE_SHARE = 0.95  # of the differences must, for a read-out's step: of continuous readings 2 * WHOLE_STEP do by chance
+JUMPS = 0.1  # share of those differences that follow a rest, of a coarse read-out; a ramp out of a hold jumps once
+LONGEST_GAP = 5.0  # typical intervals that a gap of the clock counts for at most: nothing was seen in it
+SHORTEST_GAP = 0.2  # and a repeated time, at least: two readings are two
 
 
 def noise_level(values: np.ndarray, span: float) -> float:
@@ -54,12 +28,12 @@ def noise_level(values: np.ndarray, span: float) -> float:
     what the differences between two turning points show, nor than what cycles that repeat do from one to the next.
     """
     scatter = 0.0
-    if len(values) >= SIGNAL.least_samples:
+    if len(values) >= LEAST_SAMPLES:
         third = differences(values, 3)
         scatter = _scatter(third)
         if scatter > 0:
-            turns = np.array(turning_points(values, SIGNAL.deep_turn * span))
-            if len(turns) > SIGNAL.many_turns and len(values) < SIGNAL.long_branch * (len(turns) - 1):
+            turns = np.array(turning_points(values, DEEP_TURN * span))
+            if len(turns) > MANY_TURNS and len(values) < LONG_BRANCH * (len(turns) - 1):
                 scatter = min([scatter, *_scatter_of_cycles(values, third, turns)])
     return float(np.hypot(scatter, _resolution(values, span) / 2))
 
@@ -130,29 +104,29 @@ def _scatter_of_cycles(values: np.ndarray, third: np.ndarray, turns: np.ndarray)
     away = np.ones(len(third), bool)
     for back in range(4):
         away[(turns - back)[(turns >= back) & (turns - back < len(third))]] = False
-    if away.sum() >= max(SIGNAL.least_samples, len(third) // 8):
+    if away.sum() >= max(LEAST_SAMPLES, len(third) // 8):
         found.append(_scatter(third[away]))
     inner = values[turns[1:-1]]
-    if len(inner) >= SIGNAL.least_peaks:
+    if len(inner) >= LEAST_PEAKS:
         ends = (differences(part, 3) for part in (inner[::2], inner[1::2]))
-        found.append(SIGNAL.spread_of_peaks * max(_scatter(part) for part in ends))
+        found.append(SPREAD_OF_PEAKS * max(_scatter(part) for part in ends))
     return found
 
 
 def _resolution(values: np.ndarray, span: float) -> float:
     """The step of a read-out that is rounded so coarsely that it stays and jumps; else 0."""
     steps = np.abs(differences(values))
-    moves = steps > SIGNAL.smallest_step * span
+    moves = steps > SMALLEST_STEP * span
     if not moves.any():
         return 0.0
     smallest = float(steps[moves].min())
     multiples = steps[moves] / smallest
     whole = np.round(multiples)
-    if np.mean(np.abs(multiples - whole) < SIGNAL.whole_step) <= SIGNAL.whole_share:
+    if np.mean(np.abs(multiples - whole) < WHOLE_STEP) <= WHOLE_SHARE:
         return 0.0
     # Even ramps also have few steps; but one that starts out of a hold jumps once, a rounded one again and again.
     jumps = np.count_nonzero(moves[1:] & ~moves[:-1])
-    return smallest if jumps > SIGNAL.jumps * len(multiples) or len(np.unique(whole)) > 2 else 0.0
+    return smallest if jumps > JUMPS * len(multiples) or len(np.unique(whole)) > 2 else 0.0
 
 
 def steady_clock(time: np.ndarray) -> np.ndarray:
@@ -165,7 +139,7 @@ def steady_clock(time: np.ndarray) -> np.ndarray:
     if not len(positive):
         return np.arange(len(time), dtype=float)
     typical = median(positive)
-    intervals = np.maximum(np.minimum(steps, SIGNAL.longest_gap * typical) / typical, SIGNAL.shortest_gap)
+    intervals = np.maximum(np.minimum(steps, LONGEST_GAP * typical) / typical, SHORTEST_GAP)
     return np.concatenate(([0.0], np.cumsum(intervals)))
 
 

@@ -7,51 +7,30 @@ the hold between them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from .. import arguments
 from .._format import described
 from .schema import Curve
 from .segments import Segment, check_segmented
 from .signal import median, noise_level, straight_line
 
-
-@dataclass(frozen=True)
-class TurningOptions:
-    """How the force at a turning point is estimated.
-
-    Attributes:
-        share: of the peak force within which readings on both sides tell the turning point. A ramp under displacement
-            control is bent; over so short a part of it a parabola follows it to less than the noise.
-        most: readings on each side at most; more than these say nothing new against the bend.
-        curved: readings from which on a parabola is drawn through them, not a straight line.
-        least: fewer readings draw no line: the reading itself is taken.
-        trend: a hold whose readings change by more standard errors than this relaxes, and its mean says nothing.
-        inside: readings of a hold within so many robust standard deviations of its median are of the hold.
-        fits: a line follows the readings if they scatter about it by less than so many times the noise; else fewer of
-            them, nearer the turning point, are taken.
-        resolved: noise below this share of the peak is none: the reading itself is exact.
-        apart: an estimate further from the reading than this many standard deviations is refused.
-        rounded: where one of the five readings at a turning point misses the lines that meet there by so many standard
-            deviations, the tip is rounded, and the largest reading is nearer to it than the meeting point. A sharp tip
-            is taken for one in 0.2 % of the cases. Rounding within half a reading cannot be told.
-    """
-
-    share: float = 0.1
-    most: int = 41
-    curved: int = 9
-    least: int = 4
-    trend: float = 4.0
-    inside: float = 3.0
-    fits: float = 2.0
-    resolved: float = 1e-6
-    apart: float = 6.0
-    rounded: float = 3.5
-
-    __repr__ = described()
+SHARE = 0.1
+"""Share of the peak force within which readings on both sides give the turning point. A ramp under displacement control
+is bent; over so short a part of it a parabola follows it to less than the noise."""
+MOST = 41  # readings on each side at most; more say nothing new against the bend
+CURVED = 9  # readings from which on a parabola is drawn through them, not a straight line
+LEAST = 4  # fewer readings draw no line: the reading itself is taken
+TREND = 4.0  # standard errors; a hold that changes by more relaxes, and its mean says nothing
+INSIDE = 3.0  # robust standard deviations from its median within which readings are of a hold
+FITS = 2.0  # times the noise that readings may scatter about a line; else fewer of them, nearer the turn, are taken
+RESOLVED = 1e-6  # noise below this share of the peak is none: the reading itself is exact
+APART = 6.0  # standard deviations; an estimate further from the reading is refused
+ROUNDED = 3.5
+"""Where one of the five readings at a turning point misses the lines that meet there by so many standard deviations,
+the tip is rounded, and the largest reading is nearer to it than the meeting point. A sharp tip is taken for one in
+0.2 % of the cases. Rounding within half a reading cannot be seen."""
 
 
 class TurningForces(NamedTuple):
@@ -72,18 +51,16 @@ class TurningForces(NamedTuple):
     __repr__ = described()
 
 
-def turning_forces(curve: Curve, segments: tuple[Segment, ...], options: TurningOptions | None = None) -> TurningForces:
+def turning_forces(curve: Curve, segments: tuple[Segment, ...]) -> TurningForces:
     """Estimate the force at which every branch of a test, cut by `find_segments`, begins."""
     check_segmented(curve, segments)
-    options = TurningOptions() if options is None else options
-    arguments.instance(options, TurningOptions, "options", "Make one with mcc_jax.campaign.TurningOptions().")
     time, raw = np.asarray(curve.time_s, float), np.asarray(curve.force_mN, float)
     force, peak = raw.copy(), raw.copy()
     error, reading = np.zeros(len(raw)), np.ones(len(raw), bool)
     level, level_error = None, 0.0
     noise = noise_level(raw, float(np.ptp(raw)))
-    if np.any(curve.worked_out):  # readings that saturate are replaced by what the ramps say, with an error of its own
-        options = replace(options, share=0.0)
+    # Turning points that saturated were worked out with an error of their own: nothing around them improves on that.
+    share = 0.0 if np.any(curve.worked_out) else SHARE
     for k, part in enumerate(segments):
         rows = slice(part.start, part.stop)
         if part.kind == "approach":
@@ -91,7 +68,7 @@ def turning_forces(curve: Curve, segments: tuple[Segment, ...], options: Turning
         if part.kind == "load":
             before, before_error, level = level, level_error, None
             if k + 1 < len(segments):
-                level, level_error = _level(time, raw, part, segments[k + 1], noise, options)
+                level, level_error = _level(time, raw, part, segments[k + 1], noise, share)
                 force[rows] = peak[rows] = np.minimum(raw[rows], level)
             if before is not None:  # up to the force reached before, loading goes along the last branch
                 elastic = part.start + np.flatnonzero(force[rows] <= before)
@@ -99,9 +76,9 @@ def turning_forces(curve: Curve, segments: tuple[Segment, ...], options: Turning
             continue
         if level is None:  # the record begins behind its peak
             level, level_error = float(raw[part.start]), 1.0
-            if len(raw[rows]) >= options.least:
-                clock = time[rows][: options.most] - time[part.start]
-                level = max(straight_line(clock, raw[rows][: options.most])[1], level)
+            if len(raw[rows]) >= LEAST:
+                clock = time[rows][:MOST] - time[part.start]
+                level = max(straight_line(clock, raw[rows][:MOST])[1], level)
         peak[rows], error[rows] = level, level_error
         force[rows] = np.minimum(raw[rows], level)
         if part.kind == "reload" and k + 1 < len(segments) and segments[k + 1].kind == "load":
@@ -110,7 +87,7 @@ def turning_forces(curve: Curve, segments: tuple[Segment, ...], options: Turning
             error[beyond] = 0.0
         if segments[k - 1].kind == "load":
             # A hold repeats the force at which it began; of a turning point that is its first point alone.
-            held = _held(time, raw, part, noise, options) if part.kind == "hold" else None
+            held = _held(time, raw, part, noise) if part.kind == "hold" else None
             if held is None:
                 held = np.array([part.start])
             force[held], reading[held] = level, False
@@ -121,35 +98,35 @@ def turning_forces(curve: Curve, segments: tuple[Segment, ...], options: Turning
 
 
 def _level(
-    time: np.ndarray, raw: np.ndarray, up: Segment, after: Segment, noise: float, options: TurningOptions
+    time: np.ndarray, raw: np.ndarray, up: Segment, after: Segment, noise: float, share: float
 ) -> tuple[float, float]:
     """The force at which loading ends, and its standard error in those of a reading."""
-    held = _held(time, raw, after, noise, options) if after.kind == "hold" and options.share else None
+    held = _held(time, raw, after, noise) if after.kind == "hold" and share else None
     if held is not None:
         return float(np.mean(raw[held])), 1 / np.sqrt(len(held))
     largest = float(raw[up.start : min(after.start + 1, after.stop)].max())
-    if noise <= options.resolved * abs(largest):
+    if noise <= RESOLVED * abs(largest):
         return largest, 1.0
-    near = raw > (1 - options.share) * largest
+    near = raw > (1 - share) * largest
     turn = float(time[after.start])
-    before = _run(near, up.start, up.stop, -1, options.most)
-    behind = _run(near, after.start, after.stop, 1, options.most)
+    before = _run(near, up.start, up.stop, -1, MOST)
+    behind = _run(near, after.start, after.stop, 1, MOST)
     held = after.kind == "hold"  # a relaxing force: only the ramp tells where it began
     # The readings beside the turn may be on either side of it: first without them, then each where it belongs.
     beside = 0 if held else 1
-    rising = _Curve.through(time, raw, before[: len(before) - beside], turn, noise, options)
-    falling = _Curve.through(time, raw, behind[beside:], turn, noise, options)
+    rising = _Curve.through(time, raw, before[: len(before) - beside], turn, noise)
+    falling = _Curve.through(time, raw, behind[beside:], turn, noise)
     if rising is None or falling is None:
         return largest, 1.0
     if held:
         level, variance = rising.at(0.0)
-        return (largest, 1.0) if abs(level - largest) > options.apart * noise else (level, min(variance**0.5, 1.0))
+        return (largest, 1.0) if abs(level - largest) > APART * noise else (level, min(variance**0.5, 1.0))
     step = max(
         turn - float(time[max(after.start - 1, up.start)]), float(time[min(after.start + 1, len(time) - 1)]) - turn
     )
     both = np.concatenate([before, behind])
     early = time[both] < turn + _meeting(rising, falling, step)
-    again = [_Curve.through(time, raw, both[side], turn, noise, options) for side in (early, ~early)]
+    again = [_Curve.through(time, raw, both[side], turn, noise) for side in (early, ~early)]
     if again[0] is not None and again[1] is not None:
         rising, falling = again[0], again[1]
     meet = _meeting(rising, falling, step)
@@ -159,12 +136,12 @@ def _level(
     share = down / (down - steep) if steep > 0 > down else 0.5
     level, variance = share * one + (1 - share) * other, share**2 * first + (1 - share) ** 2 * second
     # Between two readings the force rises further than the larger of them, but not past the readings themselves.
-    if not abs(level - largest) <= options.apart * noise + step * max(steep, -down, 0.0):
+    if not abs(level - largest) <= APART * noise + step * max(steep, -down, 0.0):
         return largest, 1.0
     for row in range(max(up.start, after.start - 2), min(after.start + 3, after.stop)):
         at = float(time[row]) - turn
         there, error = rising.at(at) if at < meet else falling.at(at)
-        if abs(raw[row] - there) > options.rounded * noise * np.sqrt(1 + error):
+        if abs(raw[row] - there) > ROUNDED * noise * np.sqrt(1 + error):
             return largest, 1.0
     return float(level), float(min(np.sqrt(variance), 1.0))
 
@@ -182,7 +159,7 @@ def _run(near: np.ndarray, start: int, stop: int, direction: int, most: int) -> 
     return np.sort(order[:most])
 
 
-def _held(time: np.ndarray, raw: np.ndarray, part: Segment, noise: float, options: TurningOptions) -> np.ndarray | None:
+def _held(time: np.ndarray, raw: np.ndarray, part: Segment, noise: float) -> np.ndarray | None:
     """Rows of a hold whose readings scatter about one force; None where the force relaxes.
 
     A hold begins and ends with readings of the ramps beside it that come close to it: they lie apart from the others.
@@ -190,16 +167,16 @@ def _held(time: np.ndarray, raw: np.ndarray, part: Segment, noise: float, option
     force = raw[part.start : part.stop]
     away = np.abs(force - median(force))
     sd = 1.4826 * median(away)
-    rows = part.start + np.flatnonzero(away <= options.inside * sd)
-    if len(rows) < options.least:  # too few to tell what they scatter about: those as high as the highest
-        return part.start + np.flatnonzero(force >= force.max() - options.inside * noise)
+    rows = part.start + np.flatnonzero(away <= INSIDE * sd)
+    if len(rows) < LEAST:  # too few to tell what they scatter about: those as high as the highest
+        return part.start + np.flatnonzero(force >= force.max() - INSIDE * noise)
     clock, values = time[rows] - time[rows].mean(), raw[rows]
     if not np.any(clock):
         return rows
     slope = clock @ values / (clock @ clock)
     left = values - values.mean() - slope * clock
     error = np.sqrt(left @ left / (len(values) - 2) / (clock @ clock))
-    return rows if abs(slope) <= options.trend * error or sd == 0 else None
+    return rows if abs(slope) <= TREND * error or sd == 0 else None
 
 
 class _Curve(NamedTuple):
@@ -210,17 +187,15 @@ class _Curve(NamedTuple):
     unit: float
 
     @classmethod
-    def through(
-        cls, time: np.ndarray, raw: np.ndarray, rows: np.ndarray, turn: float, noise: float, options: TurningOptions
-    ) -> _Curve | None:
+    def through(cls, time: np.ndarray, raw: np.ndarray, rows: np.ndarray, turn: float, noise: float) -> _Curve | None:
         """The one through as many of the rows nearest the turning point as it follows to within the noise."""
-        while len(rows) >= options.least and np.ptp(time[rows]) > 0:
+        while len(rows) >= LEAST and np.ptp(time[rows]) > 0:
             x, force = time[rows] - turn, raw[rows]
             unit = float(np.abs(x).max())
-            design = np.vander(x / unit, 3 if len(rows) >= options.curved else 2, increasing=True)
+            design = np.vander(x / unit, 3 if len(rows) >= CURVED else 2, increasing=True)
             values, _, rank, _ = np.linalg.lstsq(design, force, rcond=None)
             left = force - design @ values
-            if rank == design.shape[1] and left @ left <= (options.fits * noise) ** 2 * len(rows):
+            if rank == design.shape[1] and left @ left <= (FITS * noise) ** 2 * len(rows):
                 return cls(values, np.linalg.inv(design.T @ design), unit)
             nearest = np.argsort(np.abs(x), kind="stable")[: len(rows) // 2]
             rows = np.sort(rows[nearest])

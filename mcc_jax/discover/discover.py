@@ -22,7 +22,6 @@ from ..calibrate.settings import JUDGEMENT
 from ..campaign import Campaign, Finding, available_data, campaign_findings, check_plausibility, check_tests
 from ..campaign.force_zero import open_zero
 from ..campaign.quality import named
-from ..campaign.quality_options import QualityOptions
 from ..effects import LIBRARY, Mechanism
 from ..effects.library import checked_library
 from .answer import (
@@ -233,7 +232,7 @@ def _not_tared(
         return None
     tell("the same, had the load cell not been tared")
     assert campaign.raw is not None
-    tared = check_tests(campaign.raw, QualityOptions(zero_mN=zero))
+    tared = check_tests(campaign.raw, zero_mN=zero)
     other, missing, left_out = begun(tared, campaign_findings(tared))
     best = max(one.log_evidence for one in search.found.values())
     # Readings without force are not compared, so evidence counts by the reading.

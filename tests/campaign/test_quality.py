@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from mcc_jax.campaign import Curve, Finding, campaign_findings, check_tests
 from mcc_jax.campaign.findings import worst
 from mcc_jax.campaign.force_zero import open_zero
-from mcc_jax.campaign.quality_options import QualityOptions
 
 SEEDS = st.integers(0, 2**31 - 1)
 quickly = settings(max_examples=15)
@@ -138,7 +137,7 @@ def test_a_record_that_begins_above_zero_without_air_leaves_its_zero_open():
     assert zero == pytest.approx(20.0, abs=0.5)
     assert 0.1 < error < 3.0
     # Had the load cell not been tared: every test of it is off, seen by itself or not.
-    tared = check_tests(checked.raw, QualityOptions(zero_mN=(20.0, error)))
+    tared = check_tests(checked.raw, zero_mN=(20.0, error))
     assert open_zero(tared) is None
     assert all(c.checked.force_zero_mN == 20.0 for c in tared.curves)
 

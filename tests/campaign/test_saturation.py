@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mcc_jax.campaign import Curve, campaign_findings, check_tests
-from mcc_jax.campaign.saturation import SaturationOptions, censor_displacement, censor_force
+from mcc_jax.campaign.saturation import censor_displacement, censor_force
 
 SEEDS = st.integers(0, 2**31 - 1)
 quickly = settings(max_examples=15)
@@ -98,10 +98,3 @@ def test_a_record_that_ends_at_the_end_of_the_range_is_seen_too():
     seen = censor_force(Curve(curve.time_s[half], curve.force_mN[half], curve.displacement_um[half]))
     assert seen is not None
     assert abs(seen.curve.force_mN[-1] - 140) < 5 * seen.force_sd_mN[-1]
-
-
-def test_the_settings_decide():
-    curve = ramp(0.9)
-    assert censor_force(curve, SaturationOptions(repeats=1000)) is None
-    assert censor_force(curve, SaturationOptions(trusted=0.05)).note.level == "bad"
-    assert censor_force(curve, SaturationOptions(trusted=0.25)).note.level == "look"
