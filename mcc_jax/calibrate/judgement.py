@@ -16,7 +16,7 @@ import numpy as np
 
 from .._errors import InputError
 from ..campaign import Campaign, Finding, campaign_findings, check_plausibility
-from ..campaign.plausibility import or_slip
+from ..campaign.plausibility import add_likely_unit_error
 from ..campaign.quality import named
 from .fit_result import Fit
 from .settings import JUDGEMENT, JudgementSettings
@@ -175,7 +175,7 @@ def numbers_in_reach(campaign: Campaign) -> Iterator[None]:
         # A ValueError of ours is about an argument; those of NumPy and SciPy that are meant here speak of NaN.
         if isinstance(error, ValueError) and not isinstance(error, np.linalg.LinAlgError) and "infs or NaN" not in text:
             raise
-        problem, remedy = or_slip(
+        problem, remedy = add_likely_unit_error(
             campaign,
             f"the law cannot be fitted to these tests: their numbers are beyond what arithmetic can resolve ({text})",
             "Look at the curves, leave out the test that is unlike the others, and check the units",

@@ -24,8 +24,6 @@ from .paper import PAPER_LOG_C as PAPER_LOG_C
 from .paper import PAPER_SHAPE_PARAMETER as PAPER_SHAPE_PARAMETER
 from .plausibility import check_plausibility as check_plausibility
 from .plausibility import other_material as other_material
-from .plausible_ranges import PlausibilityOptions as PlausibilityOptions
-from .plausible_ranges import SolidClass as SolidClass
 from .quality import campaign_findings as campaign_findings
 from .quality import check_tests as check_tests
 from .readers import read_diameters as read_diameters

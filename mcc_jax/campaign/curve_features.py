@@ -2,40 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from .segments import Segment
 from .signal import differences, median
 
-
-@dataclass(frozen=True)
-class FeatureOptions:
-    """Where a test's features are read.
-
-    Attributes:
-        contact: share of the peak force at which contact counts as made. Low, because soft particles deform much under
-            little force: cellulose takes a quarter of its displacement below 3 % of its force.
-        contact_noise: the same in standard deviations of the force's noise, where that is more.
-        loaded: multiple of the force at which contact counts as made that no reading before contact reaches. Unloadings
-            after it are part of the test; a first cycle below it, 2 % of the peak, is taken for part of the approach.
-        unloading: shares of the peak force between which unloading is taken as a line. Below one half, the unloading of
-            a plastic contact bends (Oliver and Pharr 1992); above nine tenths it still creeps.
-        least_retreat: share of the displacement that must be given back for the lost work to count.
-        correlation: the least correlation of force and displacement from contact to peak, over forces not reached
-            before; a record of the tester's idling has less, loading of any material more than 0.8.
-        most_samples: longer records are thinned to this many samples, enough for features of a curve's size.
-    """
-
-    contact: float = 0.005
-    contact_noise: float = 4.0
-    loaded: float = 4.0
-    unloading: tuple[float, float] = (0.9, 0.5)
-    least_retreat: float = 0.2
-    correlation: float = 0.6
-    most_samples: int = 4000
+CONTACT = 0.005
+"""Share of the peak force at which contact counts as made. Low, because soft particles deform much under little force:
+cellulose takes a quarter of its displacement below 3 % of its force."""
+CONTACT_NOISE = 4.0  # the same in standard deviations of the force's noise, where that is more
+LOADED = 4.0
+"""Multiple of the force at which contact counts as made that no reading before contact reaches. Unloadings after it are
+part of the test; a first cycle below it, 2 % of the peak, is taken for part of the approach."""
+UNLOADING = (0.9, 0.5)
+"""Shares of the peak force between which unloading is taken as a line: below, the unloading of a plastic contact bends
+(Oliver and Pharr 1992); above, it still creeps."""
+LEAST_RETREAT = 0.2  # share of the displacement that must be given back for the lost work to count
+CORRELATION = 0.6
+"""Least correlation of force and displacement from contact to peak, over forces not reached before: without a particle
+it is less, in loading of any material more than 0.8."""
+MOST_SAMPLES = 4000  # longer records are thinned: enough for features of a curve's size
 
 
 @dataclass(frozen=True)
@@ -66,24 +53,9 @@ class CurveFeatures:
     interval_s: float
 
 
-def curve_features(
-    time_s: np.ndarray,
-    force_mN: np.ndarray,
-    displacement_um: np.ndarray,
-    *,
-    segments: Sequence[Segment] = (),
-    options: FeatureOptions | None = None,
-) -> CurveFeatures | None:
-    """The features of one test; None for a record that shows no loading or holds values that are not finite.
-
-    Args:
-        time_s, force_mN, displacement_um: the test, each of shape (n,).
-        segments: what `find_segments` gave, if it is known; the end of an approach is then taken from there, unless
-            forces turn out negative.
-        options: where features are read.
-    """
-    options = options or FeatureOptions()
-    step = -(-len(time_s) // options.most_samples)
+def curve_features(time_s: np.ndarray, force_mN: np.ndarray, displacement_um: np.ndarray) -> CurveFeatures | None:
+    """The features of one test; None for a record that shows no loading or holds values that are not finite."""
+    step = -(-len(time_s) // MOST_SAMPLES)
     time, force, displacement = (np.asarray(v, float)[::step] for v in (time_s, force_mN, displacement_um))
     if len(time) < 2 or not all(np.isfinite(v).all() for v in (time, force, displacement)):
         return None
@@ -94,13 +66,11 @@ def curve_features(
         if not (np.isfinite(rise[peak]) and rise[peak] > 0):
             return None
         begins_at_peak = peak < 0.05 * len(rise)
-        contact, base = (0, 0.0) if begins_at_peak else _contact(rise[: peak + 1], options)
-        if segments and segments[0].kind == "approach" and force_sign > 0 and not begins_at_peak:
-            contact = min(segments[0].stop // step, peak)
+        contact, base = (0, 0.0) if begins_at_peak else _contact(rise[: peak + 1])
         load = rise - base
         part = slice(peak, None) if begins_at_peak else slice(contact, peak + 1)
         together = _correlation(load[part], displacement[part])
-        if abs(together) < options.correlation:
+        if abs(together) < CORRELATION:
             return None
         displacement_sign = 1 if together > 0 else -1
         depth = displacement_sign * displacement
@@ -112,14 +82,14 @@ def curve_features(
             fullness = float(np.trapezoid(load[rows], depth[rows])) / (height * way)
             first, last = (rows[np.argmax(load[rows] >= share * height)] for share in (0.1, 0.9))
             loading_s = float(time[last] - time[first])
-            if depth[peak] - depth[peak:].min() > options.least_retreat * way and fullness > 0:
+            if depth[peak] - depth[peak:].min() > LEAST_RETREAT * way and fullness > 0:
                 loss = 1 + float(np.trapezoid(load[peak:], depth[peak:])) / (fullness * height * way)
         return CurveFeatures(
             force_sign,
             displacement_sign,
             force_mN=height,
             displacement_um=way if way > 0 else np.nan,
-            slope_mN_per_um=_unloading_slope(load[peak:], depth[peak:], options),
+            slope_mN_per_um=_unloading_slope(load[peak:], depth[peak:]),
             fullness=fullness,
             loss=loss,
             loading_s=loading_s,
@@ -155,12 +125,12 @@ def _compression_positive(force: np.ndarray) -> tuple[int, np.ndarray]:
     return sign, sign * force
 
 
-def _contact(rise: np.ndarray, options: FeatureOptions) -> tuple[int, float]:
+def _contact(rise: np.ndarray) -> tuple[int, float]:
     """The last sample before the force first rises for good, and the force there; later unloadings do not count."""
     noise = _noise(rise)
     base = float(rise.min()) + 2 * noise  # the least of some hundred readings lies about two deviations below
-    level = max(options.contact * (float(rise[-1]) - base), options.contact_noise * noise)
-    first_rise = int(np.argmax(rise - base >= options.loaded * level))
+    level = max(CONTACT * (float(rise[-1]) - base), CONTACT_NOISE * noise)
+    first_rise = int(np.argmax(rise - base >= LOADED * level))
     below = np.flatnonzero(rise[:first_rise] <= base + level)
     return (int(below[-1]) if len(below) and below[-1] < len(rise) - 1 else 0), base
 
@@ -176,9 +146,9 @@ def _correlation(load: np.ndarray, depth: np.ndarray) -> float:
     return float((a @ b) / np.sqrt((a @ a) * (b @ b)))
 
 
-def _unloading_slope(load: np.ndarray, depth: np.ndarray, options: FeatureOptions) -> float:
+def _unloading_slope(load: np.ndarray, depth: np.ndarray) -> float:
     """Slope of the first unloading; NaN where none is seen, or the displacement goes on as the force falls."""
-    begin, end = (share * load[0] for share in options.unloading)
+    begin, end = (share * load[0] for share in UNLOADING)
     if not (load < begin).any():
         return np.nan
     first = int(np.argmax(load < begin))

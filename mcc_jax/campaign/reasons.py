@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from .._errors import InputError
-from .plausibility import or_slip
+from .plausibility import add_likely_unit_error
 from .schema import Campaign, Curve
 from .segments import Segment
 from .signal import median
@@ -143,5 +143,5 @@ def refusal(campaign: Campaign, problem: str, why_not: Sequence[str | None]) -> 
     if len(names) > SHOWN:
         parts.append("...")
     said = ". ".join(remedy[:1].upper() + remedy[1:] for remedy in remedies if remedy)
-    problem, said = or_slip(campaign, f"{problem}: {'; '.join(parts)}", said)
+    problem, said = add_likely_unit_error(campaign, f"{problem}: {'; '.join(parts)}", said)
     return InputError(problem, file=campaign.source or None, remedy=f"{said}.")
