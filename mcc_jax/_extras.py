@@ -22,7 +22,7 @@ def own_version() -> str:
 EXTRAS = {
     "command": ("the command mcc-jax needs", ("click", "rich", "platformdirs")),
     "plots": ("figures need", ("matplotlib",)),
-    "report": ("the report needs", ("matplotlib", "bokeh", "jinja2", "markupsafe", "jsonschema")),
+    "report": ("the report needs", ("matplotlib", "bokeh", "jinja2", "markupsafe")),
     "export": ("this export needs", ("jinja2", "flatbuffers")),
     "netcdf": ("writing posterior.nc needs", ("h5netcdf", "h5py")),
     "excel": ("reading an Excel workbook needs", ("python_calamine",)),

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import json
 import os
 import re
 import stat
@@ -16,7 +15,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BufferedReader
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ._errors import InputError
 
@@ -249,16 +248,3 @@ def _cannot(error: OSError | ValueError, file: Path) -> InputError:
         return InputError("this is a link that leads back to itself", file=file, remedy="Give the file itself")
     why = (isinstance(error, OSError) and error.strerror) or str(error)
     return InputError(f"cannot be read: {why}", file=file, remedy="Check the permissions and the path")
-
-
-def check_text(content: Any, file: Path, remedy: str) -> None:
-    """Refuse a JSON value that holds lone surrogates, which JSON can write and no file can hold.
-
-    Raises `InputError` naming the file.
-    """
-    try:
-        json.dumps(content, ensure_ascii=False).encode("utf-8")
-    except UnicodeEncodeError as error:
-        half = error.object[error.start]
-        problem = f"holds text that is not Unicode: half of a pair, {half!a}"
-        raise InputError(problem, file=file, remedy=remedy) from None

@@ -12,7 +12,7 @@ from hypothesis.extra.numpy import arrays
 
 from mcc_jax import InputError, load, paper_law
 from mcc_jax._archive import encode, read_archive
-from mcc_jax.calibrate import OldCalibration
+from mcc_jax.discover import Discovery
 from mcc_jax.effects import AbstractEffect
 from mcc_jax.law import Unloading
 
@@ -81,8 +81,8 @@ def damaged(file, change):
     ids=["truncated", "foreign", "empty", "no text", "newer", "another format", "changed"],
 )
 def test_a_damaged_foreign_or_newer_file_is_one_line(tmp_path, change, words):
-    file = tmp_path / "calibration.msgpack"
-    file.write_bytes(encode(OldCalibration({"schema": 1})))
+    file = tmp_path / "discovery.msgpack"
+    file.write_bytes(encode(Discovery("NO_GAP", "Nothing is missing.", None, None, 0, 0.0)))
     change(file)
     with pytest.raises(InputError) as caught:
         load(tmp_path)
@@ -119,11 +119,11 @@ def test_only_classes_of_the_package_are_built(tmp_path, name):
 def test_a_field_that_nobody_knows_is_another_version(tmp_path):
     @dataclasses.dataclass
     class Stranger:
-        content: dict
+        verdict: str
         more: int = 0
 
-    Stranger.__module__, Stranger.__qualname__ = OldCalibration.__module__, OldCalibration.__qualname__
+    Stranger.__module__, Stranger.__qualname__ = Discovery.__module__, Discovery.__qualname__
     file = tmp_path / "calibration.msgpack"
-    file.write_bytes(encode(Stranger({})))
+    file.write_bytes(encode(Stranger("NO_GAP")))
     with pytest.raises(InputError, match="no field 'more'"):
         load(tmp_path)

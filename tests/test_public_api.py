@@ -16,7 +16,7 @@ MADE_BY_THE_LIBRARY = {
     *(f"mcc_jax.effects.{name}" for name in ("Context", "Equivalence", "Nuisance")),
     *(f"mcc_jax.calibrate.{name}" for name in ("ElasticBranch", "ElasticFit", "MasterCurve", "ParticleFit")),
     *(f"mcc_jax.calibrate.{name}" for name in ("PlasticFit", "ShapeFit", "StrainTable")),
-    *("mcc_jax.calibrate.FittedCurve", "mcc_jax.calibrate.OldCalibration"),
+    "mcc_jax.calibrate.FittedCurve",
     *(f"mcc_jax.discover.{name}" for name in ("Closure", "Effect")),
     *(f"mcc_jax.dem.{name}" for name in ("Band", "Compaction", "CompactionFit", "ContactEnergy", "Edges", "Forces")),
     *(f"mcc_jax.dem.{name}" for name in ("HalfContact", "LoadStep", "Motion", "Packing", "PopulationPacking")),

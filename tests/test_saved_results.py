@@ -7,7 +7,6 @@ import pytest
 import mcc_jax as mcc
 from mcc_jax import InputError
 from mcc_jax._archive import encode
-from mcc_jax.calibrate import OldCalibration
 from mcc_jax.discover import Discovery
 from mcc_jax.export import read_calibration, write_export
 from mcc_jax.report import read_results, report_page
@@ -89,16 +88,6 @@ def test_the_page_shows_it(calibration, tmp_path):
     page = report_page(found)
     assert "chart-data" in page
     assert ("band" in page) or calibration.to_json()["method"] != "bayes"
-
-
-def test_of_an_older_version_the_numbers_are_left(calibration, tmp_path):
-    calibration.save(tmp_path)
-    (tmp_path / "calibration.msgpack").unlink()
-    old = mcc.load(tmp_path)
-    assert isinstance(old, OldCalibration)
-    assert float(old.law().a) == float(calibration.law().a)
-    assert float(old.law("2").plastic.C1) == float(calibration.law("2").plastic.C1)
-    assert "Calibration" in report_page(read_results(tmp_path))
 
 
 def test_a_campaign_is_loaded_too(campaign, tmp_path):

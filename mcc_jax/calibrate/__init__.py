@@ -49,5 +49,4 @@ from .priors import NormalPrior as NormalPrior
 from .priors import Priors as Priors
 from .priors import read_priors as read_priors
 from .results import Calibration as Calibration
-from .results import OldCalibration as OldCalibration
 from .results import load as load

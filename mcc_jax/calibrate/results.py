@@ -1,40 +1,36 @@
-"""What every calibration can do once it is made: give its law, its curves, be saved and be read again.
-
-What is read is strict JSON of a known schema, or one line on what is wrong.
-"""
+"""What every calibration can do once it is made: give its law, its curves, be saved and be read again."""
 
 from __future__ import annotations
 
 import abc
-import json
-import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from functools import cache, cached_property
-from importlib.resources import files
+from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, NoReturn
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from .. import arguments
 from .._archive import encode, read_archive
 from .._errors import InputError
-from .._extras import extra
-from .._format import table, with_sd
+from .._format import table
 from .._store import json_text, results
 from ..campaign import Campaign, read_campaign
 from ..effects import Variant
-from ..files import LIMITS, check_text, read_regular
 from ..law import MccLaw
 from .curves import FittedCurve, fitted_curves
 from .data import Selection, compared_rows, ranges_um, root_mean_squares
 from .estimates import estimate, finite, force_zero, log_estimate, misfit_note, noise_note
 from .fit_result import Fit
-from .judgement import modulus_is_open, noise_share
+from .judgement import noise_share
 from .laws import law_of
 from .model import Model
 from .population import COEFFICIENTS, Population
+from .summary import quantities, summary_table
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 ARCHIVE, CONTENT, DISCOVERY_ARCHIVE = "calibration.msgpack", "calibration.json", "discovery.msgpack"
 A_FOLDER = "Give a folder that a result's save, mcc-jax calibrate or mcc-jax discover wrote into."
@@ -82,23 +78,23 @@ class Calibration(Saved):
 
     content_file, archive_file = CONTENT, ARCHIVE
     archived: ClassVar[tuple[str, ...]] = ("curves",)  # kept with the fields: nobody works them out again
-    campaign: Any  # the tests, or None where only numbers are left
+    campaign: Campaign
 
     def __repr__(self) -> str:
         content = self.to_json()
         used = sum(entry["kept"] for entry in content["particles"])
         title = f"{type(self).__name__} of {used} of {len(content['particles'])} particles, "
         title += "converged" if content["converged"] else "NOT converged"
-        rows = [("shape parameter a", with_sd(content["a"]))]
-        modulus = f"{with_sd(content['effective_modulus_MPa'], 1e-3)} GPa"
-        rows.append(("effective modulus", "these tests do not tell it" if modulus_is_open(content) else modulus))
-        for name in COEFFICIENTS:
-            log = content[f"log_{name}"]
-            rows.append((f"log {name}", f"mean {with_sd(log['mean'])}, sd between particles {with_sd(log['sd'])}"))
+        rows = [(one.label, one.text) for one in quantities(content)]
         law = content["law"]
         rows.append(("law", f"unloading {law['unloading']}, strain scaling {law['strain_scaling']}"))
         rows += [("warning", text[:100]) for text in content.get("warnings", [])]
         return table(title, rows)
+
+    def summary(self) -> pd.DataFrame:
+        """Value, standard deviation and ends of the 95 % interval (columns) of the law's numbers (rows); NaN if
+        unknown."""
+        return summary_table(self.to_json())
 
     def law(self, particle: str | None = None) -> MccLaw:
         """The calibrated law.
@@ -109,11 +105,8 @@ class Calibration(Saved):
         Raises:
             InputError: for a particle that took no part, or numbers that the calibration does not have.
         """
-        campaign = self.campaign
-        if campaign is None or particle not in campaign.particles:
-            return law_of(self.to_json(), particle, variants=self.variants)
-        size = campaign.diameters_um[campaign.index(particle)]
-        return law_of(self.to_json(), particle, size, self.variants)
+        sizes = dict(zip(self.campaign.particles, self.campaign.diameters_um, strict=True))
+        return law_of(self.to_json(), particle, None if particle is None else sizes.get(particle), self.variants)
 
     @property
     def variants(self) -> dict[str, Variant]:
@@ -123,8 +116,6 @@ class Calibration(Saved):
     @cached_property
     def curves(self) -> tuple[FittedCurve, ...]:
         """Every test of the campaign from contact on: measured, compared, and as the law has it."""
-        if self.campaign is None:
-            return ()
         return fitted_curves(self.to_json(), self.campaign, self.compared(), self.predictions, self.variants)
 
     def compared(self) -> Mapping[int, tuple[np.ndarray, np.ndarray]]:
@@ -235,36 +226,16 @@ class PosteriorDraws(JointCalibration):
         """Draws of the population by the names used in files, shape (chains, draws)."""
 
 
-@dataclass(frozen=True, repr=False)
-class OldCalibration(Calibration):
-    """A calibration of which nothing but `calibration.json` (schema 1) is left: numbers, but neither fit nor curves.
-
-    Attributes:
-        content: the contents of the file.
-        campaign: its tests, where they are known.
-    """
-
-    content: dict[str, Any]
-    campaign: Campaign | None = None
-
-    def to_json(self) -> dict[str, Any]:
-        """The contents of `calibration.json`."""
-        return self.content
-
-
 def load(folder: str | Path) -> Any:
     """What a folder holds: a discovery, else a calibration, else a campaign, as it was saved.
 
-    A discovery beside a calibration has it as its `before`.
-
-    A calibration of an older version, of which only `calibration.json` is there, gives its numbers and its law.
+    A discovery next to a calibration has it as its `before`.
 
     Args:
         folder: where `save`, `mcc-jax calibrate` or `mcc-jax discover` wrote; or one of the `.msgpack` files in it.
 
     Returns:
-        A `Discovery`, a `PaperCalibration`, `LeastSquares`, `Posterior` or `OldCalibration`, or a
-        `Campaign`.
+        A `Discovery`, a `PaperCalibration`, `LeastSquares`, `Posterior`, or a `Campaign`.
 
     Raises:
         InputError: if the folder holds none, or a file is damaged, foreign or of a newer version.
@@ -272,110 +243,28 @@ def load(folder: str | Path) -> Any:
     path = arguments.file_path(folder, "folder")
     if path.is_file():
         if path.name in (DISCOVERY_ARCHIVE, ARCHIVE):
-            return _read(path)
+            return read_saved(path)
         raise InputError("is a file, and not one that a result is read from", file=path, remedy=A_FOLDER)
     if not path.is_dir():
         raise InputError("there is no such folder", file=path, remedy=A_FOLDER)
     there = {entry.name for entry in path.iterdir()}
-    saved = [_read(path / archive) for archive in (DISCOVERY_ARCHIVE, ARCHIVE) if archive in there]
+    saved = [read_saved(path / archive) for archive in (DISCOVERY_ARCHIVE, ARCHIVE) if archive in there]
     if len(saved) == 2:
         return replace(saved[0], before=saved[1])
     if saved:
         return saved[0]
-    tests = {"particles.csv", "curves.csv"} <= there
-    if CONTENT in there:
-        return OldCalibration(read_result(path / CONTENT, "mcc-jax calibrate"), read_campaign(path) if tests else None)
-    if tests:
+    if {"particles.csv", "curves.csv"} <= there:
         return read_campaign(path)
-    raise InputError(f"{CONTENT} is missing: holds no result and no campaign", file=path, remedy=A_FOLDER)
+    raise InputError(f"{ARCHIVE} is missing: holds no result and no campaign", file=path, remedy=A_FOLDER)
 
 
-def _read(archive: Path) -> Any:
-    """What an archive holds, which its name must say."""
+def read_saved(archive: Path) -> Any:
+    """The result in an archive, whose name says of which kind it is.
+
+    Raises:
+        InputError: if it is damaged, foreign or of a newer version.
+    """
     found = read_archive(archive)
     if not isinstance(found, Saved) or found.archive_file != archive.name:
         raise InputError(f"holds a {type(found).__name__}", file=archive, remedy=A_FOLDER)
     return found
-
-
-SCHEMA = 1
-LONGEST = 160
-"""So much of a validator's message is shown; it may quote the whole file."""
-
-
-@cache
-def _validator(stem: str) -> Any:
-    with extra("report"):
-        from jsonschema import Draft202012Validator
-
-    text = files("mcc_jax.calibrate").joinpath("schemas", f"{stem}.json").read_text(encoding="utf-8")
-    return Draft202012Validator(json.loads(text))
-
-
-def _no_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is no number of JSON")
-
-
-def _finite(text: str) -> float:
-    """A number that JSON can hold again: Python also reads 1e400, and would not write it."""
-    number = float(text)
-    if not math.isfinite(number):
-        raise ValueError(f"{text[:40]} is no number of JSON")
-    return number
-
-
-def read_result(file: Path, again: str) -> dict[str, Any]:
-    """The contents of a result.
-
-    `again` is the command that writes it, for the remedy.
-
-    Raises:
-        InputError: if it cannot be read, is no JSON, of another schema, or lacks something.
-    """
-    remedy = f"Write it again: {again}"
-    try:
-        data = read_regular(file, LIMITS.result_bytes, remedy)
-        content = json.loads(data.decode("utf-8"), parse_constant=_no_constant, parse_float=_finite)
-    except InputError:
-        raise
-    except json.JSONDecodeError as error:
-        raise InputError(f"is no JSON: {error.msg}", file=file, row=error.lineno, remedy=remedy) from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"is no JSON: {str(error)[:LONGEST]}", file=file, remedy=remedy) from None
-    check_text(content, file, remedy)
-    number = content.get("schema") if isinstance(content, dict) else None
-    if isinstance(number, int) and number != SCHEMA:
-        raise InputError(
-            f"is of schema {number}, this mcc-jax knows {SCHEMA}", file=file, remedy=f"Update mcc-jax, or {again}"
-        )
-    _check(content, file, remedy)
-    schema = _validator(file.stem).schema
-    return _filled(content, schema, schema["$defs"])
-
-
-def _check(content: Any, file: Path, remedy: str) -> None:
-    validator = _validator(file.stem)  # says which extra it needs
-    from jsonschema.exceptions import best_match
-
-    error = best_match(validator.iter_errors(content))
-    if error is None:
-        return
-    place = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in error.absolute_path).lstrip(".")
-    message = error.message if len(error.message) <= LONGEST else f"{error.message[:LONGEST]}..."
-    raise InputError(f"does not hold what it should: {message}", file=file, column=place or None, remedy=remedy)
-
-
-def _filled(content: Any, schema: dict[str, Any], definitions: dict[str, Any]) -> Any:
-    """The content with the schema's defaults where it leaves something out."""
-    if "$ref" in schema:
-        schema = definitions[schema["$ref"].rpartition("/")[2]]
-    if isinstance(content, dict):
-        for branch in schema.get("anyOf", []):
-            content = _filled(content, branch, definitions)
-        parts = schema.get("properties", {})
-        left = schema.get("additionalProperties", {})
-        own = {name: _filled(value, parts.get(name, left), definitions) for name, value in content.items()}
-        return {name: part["default"] for name, part in parts.items() if "default" in part} | own
-    if isinstance(content, list):
-        return [_filled(item, schema.get("items", {}), definitions) for item in content]
-    return content

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 import shlex
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -141,11 +140,13 @@ def calibrate(
         with results(out) as stage, beside(writers):
             calibration = _calibrated(data, method, options, tell)
             content = write_calibration(calibration, stage, origin=origin, figures=not no_figures, tell=tell)
+    from ..calibrate.summary import quantities
+
     if as_json:
         say_json(content)
     else:
         say_state(content)
-        say_table(("quantity", "value"), main_numbers(content))
+        say_table(("quantity", "value"), [(one.label, one.text) for one in quantities(content)])
         misfit = content["diagnostics"].get("relative_misfit")
         if misfit is not None:
             say(
@@ -207,49 +208,6 @@ def _draw(calibration: Calibration) -> Mapping[str, Any]:
     draw: dict[str, Callable[[Any], Mapping[str, Any]]]
     draw = {"paper": paper_figures, "least-squares": least_squares_figures, "bayes": posterior_figures}
     return draw[calibration.to_json()["method"]](calibration)
-
-
-def main_numbers(content: dict[str, Any]) -> list[tuple[str, str]]:
-    """Name and value of what matters most in a `calibration.json`."""
-    from ..calibrate.judgement import modulus_is_open
-
-    modulus = content["effective_modulus_MPa"]
-    unknown = modulus["value"] is None or modulus_is_open(content)
-    rows = [
-        ("shape parameter a", estimate_text(content["a"])),
-        ("effective modulus", "unknown" if unknown else f"{estimate_text(modulus, 1e-3)} GPa"),
-    ]
-    for name in ("C1", "C3", "C5"):
-        rows.append((f"{name}, median", median_text(content[f"log_{name}"]["mean"])))
-        rows.append((f"{name}, sd of its logarithm", estimate_text(content[f"log_{name}"]["sd"])))
-    for effect in content["effects"]:
-        label = f"{effect['mechanism']}, {effect['variant']}"
-        rows += [(f"{label}: {name}", estimate_text(value)) for name, value in effect["parameters"].items()]
-    rows.append(("yield stress sigma_y", f"{estimate_text(content['yield_stress_MPa'])} MPa"))
-    return rows
-
-
-def median_text(log: dict[str, Any]) -> str:
-    """The exponential of an estimate of a logarithm, with its standard deviation."""
-    value = log["value"]
-    median = None if value is None or value > 700 else math.exp(value)
-    return estimate_text({"value": median, "sd": None if log["sd"] is None or median is None else median * log["sd"]})
-
-
-def estimate_text(estimate: dict[str, Any], factor: float = 1.0) -> str:
-    """A value with its standard deviation, which decides the digits of both."""
-    from .._format import decimals
-
-    value, sd = estimate["value"], estimate["sd"]
-    if value is None:
-        return "unknown"
-    value *= factor
-    if sd is None or not sd > 0:
-        return f"{value:.4g}"
-    places = decimals(value, sd * factor)
-    if places is None:
-        return f"{value:.4g} +- {sd * factor:.2g}"
-    return f"{value:.{places}f} +- {sd * factor:.{places}f}"
 
 
 def say_state(content: dict[str, Any]) -> None:

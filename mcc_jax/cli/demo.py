@@ -15,8 +15,8 @@ import click
 
 from .._store import Stage, results
 from . import options as common
-from .calibrate import estimate_text, median_text, say_state, say_warnings, write_calibration
-from .discover import DISCOVERY, main_finding, write_discovery
+from .calibrate import say_state, say_warnings, write_calibration
+from .discover import DISCOVERY, write_discovery
 from .report import REPORT
 from .session import Tell, beside, import_writers, provenance, say, say_files, say_table, session
 
@@ -84,8 +84,10 @@ def demo(out: Path, seed: int) -> None:
     say(sentence, fg="green" if agrees else "red", bold=True)
     say(f"  (The seal is the SHA-256 of {SEALED}: sha256sum {shlex.quote(str(out / SEALED))})")
     say()
+    from ..discover.sentences import headline
+
     right = nothing["verdict"] == "NO_GAP"
-    say(f"Once more with nothing hidden: {nothing['verdict']}, {main_finding(nothing)}.", nl=False)
+    say(f"The same with nothing hidden: {headline(nothing)}", nl=False)
     say("" if right else " That is a FALSE ALARM.", fg="red", bold=True)
     say()
     figures = [*calibration["figures"], *found["figures"]]
@@ -151,13 +153,17 @@ def _campaign(seed: int, effect: HiddenEffect) -> Campaign:
 
 def _say_found(calibration: dict[str, Any], found: dict[str, Any]) -> None:
     """Print what the law alone said, where it fails, the name, and what adding it did."""
+    from ..calibrate.summary import quantities
+    from ..campaign import PAPER_EFFECTIVE_MODULUS_MPA, PAPER_LOG_C, PAPER_SHAPE_PARAMETER
+    from ..discover.sentences import headline
+
     say_state(calibration)
     say_warnings(calibration)
     for place in found["where"][:3]:
         low, high = (100 * share for share in place["load_fraction"])
         at = "" if place["segment"] == "hold" else f" between {low:.0f} and {high:.0f} % of the largest load"
         say(f"Where: {100 * place['share']:.0f} % of the disagreement is on {place['segment']}{at}.")
-    say(f"Discovery ({found['verdict']}): {main_finding(found)}.", bold=True)
+    say(f"Discovery: {headline(found, 'simulated tests')}", bold=True)
     gap = found["gap"]
     if gap["closed_fraction"] is not None:
         before, after = (gap["steps"][i]["chi2_per_dof"] for i in (0, -1))
@@ -167,24 +173,18 @@ def _say_found(calibration: dict[str, Any], found: dict[str, Any]) -> None:
         )
     say()
     sides = {"law alone": found["parameters_before"], "with what was added": found["parameters_after"]}
-    sides = {name: numbers for name, numbers in sides.items() if numbers}
-    say_table(("quantity", *sides, "the truth"), _numbers(list(sides.values())))
-    say("After +-: the standard deviation.")
-
-
-def _numbers(sides: list[dict[str, Any]]) -> list[tuple[str, ...]]:
-    """Quantity, its value on every side, and the true one."""
-    from ..campaign import PAPER_EFFECTIVE_MODULUS_MPA, PAPER_LOG_C, PAPER_SHAPE_PARAMETER
-
-    moduli = [f"{estimate_text(s['effective_modulus_MPa'], 1e-3)} GPa" for s in sides]
-    return [
-        ("shape parameter a", *(estimate_text(s["a"]) for s in sides), f"{PAPER_SHAPE_PARAMETER:g}"),
-        ("effective modulus", *moduli, f"{PAPER_EFFECTIVE_MODULUS_MPA / 1e3:g} GPa"),
-        *(
-            (f"{name}, median", *(median_text(s[f"log_{name}"]["mean"]) for s in sides), f"{math.exp(mean):.4g}")
-            for name, (mean, _) in PAPER_LOG_C.items()
-        ),
-    ]
+    rows: dict[str, list[str]] = {}
+    for side in filter(None, sides.values()):
+        for one in quantities(side):
+            rows.setdefault(one.label, []).append(one.text)
+    truth = {
+        "shape parameter a": f"{PAPER_SHAPE_PARAMETER:g}",
+        "effective modulus": f"{PAPER_EFFECTIVE_MODULUS_MPA / 1e3:g} GPa",
+        **{f"{name}, median": f"{math.exp(mean):.4g}" for name, (mean, _) in PAPER_LOG_C.items()},
+    }
+    header = ("quantity", *(name for name, side in sides.items() if side), "the truth")
+    say_table(header, [(label, *rows[label], value) for label, value in truth.items()])
+    say("After ±: the standard deviation.")
 
 
 @dataclass(frozen=True)
@@ -230,11 +230,12 @@ def sealed_answer(seed: int) -> Sealed:
 def compared(answer: dict[str, Any], found: dict[str, Any]) -> tuple[bool, str]:
     """Whether a discovery (discovery.json) named what was hidden (sealed.json), and in a sentence how both agree."""
     from .._format import plain
+    from ..discover.sentences import verdict_in_words
 
     hidden = answer["mechanism"]
     named = [effect["mechanism"] for effect in found["effects"]]
     if named != [hidden]:
-        told = " and ".join(map(plain, named)) or f"no name (verdict {found['verdict']})"
+        told = " and ".join(map(plain, named)) or f"no name ({verdict_in_words(found)})"
         return False, f"The discovery is WRONG: hidden was {plain(hidden)}, found was {told}."
     effect = found["effects"][0]
     rivals = [plain(name) for name in found["candidate_set"][0] if name != hidden]

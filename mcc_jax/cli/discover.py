@@ -146,7 +146,9 @@ def say_discovery(content: dict[str, Any]) -> None:
     """Print verdict, summary, notes, and the head of the ranking."""
     import textwrap
 
-    say(f"Verdict: {content['verdict']}", bold=True)
+    from ..discover.sentences import verdict_in_words
+
+    say(f"Verdict: {verdict_in_words(content)}", bold=True)
     for line in textwrap.wrap(content["summary"], 100, break_on_hyphens=False):
         say(line)
     for text in content["notes"]:
@@ -170,24 +172,6 @@ def say_discovery(content: dict[str, Any]) -> None:
 
 def _number(value: float | None, form: str, unit: str = "-") -> str:
     return ("unknown" if value is None else format(value, form)) + ("" if unit == "-" else f" {unit}")
-
-
-def main_finding(content: dict[str, Any]) -> str:
-    """What a discovery found, in one line."""
-    verdict = content["verdict"]
-    if verdict == "NO_GAP":
-        return "nothing is missing in the law that these tests could show"
-    if verdict == "FIT_NOT_CONVERGED":
-        return "the law cannot be fitted well enough to ask what it lacks"
-    if verdict == "UNLISTED":
-        return "something is missing that no listed mechanism explains; a formula for it is in discovery.json"
-    from .._format import listed, plain
-
-    names = listed([plain(effect["mechanism"]) for effect in content["effects"]])
-    sure = "" if verdict == "NAMED" else ", or what these tests cannot tell from it"
-    closed = content["gap"]["closed_fraction"]
-    gap = "" if closed is None else f"; it closes {100 * closed:.0f} % of the gap on held-out particles"
-    return f"missing is {names}{sure}{gap}"
 
 
 @click.command(short_help="Say what a planned campaign could show.")

@@ -1,7 +1,8 @@
-"""The answer as a paragraph that a person can read."""
+"""The answer in a few words, in one sentence, and as a paragraph."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from .._format import interval, listed, plain, with_sd
@@ -12,6 +13,49 @@ if TYPE_CHECKING:
     from .result import Discovery, Effect
 
 JUMPS, CHECKS = 5, 3  # sudden steps and checks that a summary lists
+
+
+def within_noise(gap: Mapping[str, Any]) -> bool | None:
+    """Whether held-out particles agree with what was added within the noise; None where nobody knows."""
+    if gap["closed_fraction"] is None or not gap["steps"]:
+        return None
+    last = gap["steps"][-1]
+    low = (last.get("chi2_interval_95") or [None])[0]
+    return (last["chi2_per_dof"] if low is None else low) <= 1 + WITHIN
+
+
+def verdict_in_words(content: Mapping[str, Any]) -> str:
+    """The verdict of a `discovery.json` for people, in a few words."""
+    match content["verdict"]:
+        case "NO_GAP":
+            return "nothing missing"
+        case "FIT_NOT_CONVERGED":
+            return "no answer, the law could not be fitted"
+        case "UNLISTED":
+            return "unlisted effect, described by a formula"
+    names = listed([plain(effect["mechanism"]) for effect in content["effects"]])
+    if content["verdict"] == "SET":
+        return f"effect not unique: {names} or what looks like it"
+    return f"effect{'s' if len(content['effects']) > 1 else ''} identified: {names}"
+
+
+def headline(content: Mapping[str, Any], tests: str = "tests") -> str:
+    """The answer of a `discovery.json` in one sentence; `tests` is what the tests are called."""
+    match content["verdict"]:
+        case "NO_GAP":
+            return "Nothing is missing in the law that these tests could show."
+        case "FIT_NOT_CONVERGED":
+            return "The law could not be fitted well enough to ask what it lacks."
+    closed = within_noise(content["gap"])
+    agree = f"law and {tests} agree within the noise" if closed else "part of the gap closes, and part remains"
+    return f"{_missing(content)}{'' if closed is None else f'; with it added, {agree}'}."
+
+
+def _missing(content: Mapping[str, Any]) -> str:
+    if content["verdict"] == "UNLISTED" or not content["effects"]:
+        return "The law misses something that no listed mechanism explains"
+    names = listed([plain(effect["mechanism"]) for effect in content["effects"]])
+    return f"The law misses {names}{', or what looks like it' if content['verdict'] == 'SET' else ''}"
 
 
 def summary_of(found: Discovery) -> str:

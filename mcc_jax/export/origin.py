@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,8 +14,9 @@ import numpy as np
 from .. import arguments
 from .._errors import InputError
 from .._format import described
-from ..calibrate.laws import COEFFICIENTS, entry_of, law_of
-from ..calibrate.results import CONTENT, Calibration, OldCalibration, load
+from ..calibrate.laws import COEFFICIENTS, entry_of
+from ..calibrate.results import ARCHIVE, load
+from ..calibrate.summary import exponential
 from ..campaign import Campaign, read_diameters
 from ..geometry import Particle
 from ..law import MccLaw
@@ -154,14 +154,13 @@ def read_calibration(
         arguments.instance(particle, str, "particle", "Give the name of one.")
     found = load(path)
     if isinstance(found, Campaign):
-        raise InputError(f"{CONTENT} is missing", file=path, remedy=_AGAIN)
+        raise InputError(f"{ARCHIVE} is missing", file=path, remedy=_AGAIN)
     content = found.to_json()
-    file = path / (CONTENT if isinstance(found, Calibration) else "discovery.json")
+    file = path / found.content_file
     try:
         entry = None if particle is None else entry_of(content, particle)
         sizes, geometry = _sizes(found, path, particle, diameters)
-        three = np.array([float(d) for d in (sizes.D1, sizes.D2, sizes.D3)])
-        law = law_of(content, particle, three) if isinstance(found, OldCalibration) else found.law(particle)
+        law = found.law(particle)
         testers = [effect.name for effect in law.effects if effect.of_tester]
         law = law.of_particle()
         notes = check(law, sizes, allow_not_monotone=allow_not_monotone)
@@ -188,7 +187,7 @@ def _told(
     logs = {f"log_{name}": numbers[f"log_{name}"] for name in COEFFICIENTS}
     estimates = {name: numbers[name] for name in ("a", "effective_modulus_MPa")}
     if entry is None:
-        estimates |= {name: _median(logs[f"log_{name}"]["mean"]) for name in COEFFICIENTS}
+        estimates |= {name: exponential(logs[f"log_{name}"]["mean"]) for name in COEFFICIENTS}
     else:
         estimates |= {name: entry[name] for name in COEFFICIENTS}
         if float(law.a) != numbers["a"]["value"]:
@@ -205,15 +204,6 @@ def _told(
         "seed": content.get("seed"),
     }
     return Origin(estimates, logs, calibration, particle, geometry, (*told, *notes))
-
-
-def _median(log: Mapping[str, Any]) -> dict[str, Any]:
-    value, sd, interval = math.exp(log["value"]), log["sd"], log["interval_95"]
-    return {
-        "value": value,
-        "sd": None if sd is None else value * sd,
-        "interval_95": None if interval is None else [math.exp(min(end, 700.0)) for end in interval],
-    }
 
 
 def _sizes(found: Any, folder: Path, particle: str | None, diameters: str | None) -> tuple[Particle, str]:

@@ -13,8 +13,9 @@ from ..calibrate.curves import FittedCurve
 from ..calibrate.settings import JUDGEMENT, SAMPLING
 from ..campaign import Finding, campaign_findings, check_plausibility, check_tests
 from ..campaign.findings import worst
-from .read import DATA, Results, checksums_told
-from .sentences import beside_the_law, within_noise
+from ..discover.sentences import headline, verdict_in_words, within_noise
+from .read import CALIBRATION, DATA, Results
+from .sentences import beside_the_law
 
 Level = Literal["good", "look", "bad", "unknown"]
 RHAT_BAD, ESS_BAD, PARETO_K_BAD = 1.05, 100.0, 1.0
@@ -97,22 +98,14 @@ CHECKS = {
 """What every check should be, and what it means."""
 
 COMPLETE = "Law is complete"
-VERDICTS: dict[str, tuple[Level, str, str]] = {
-    "NO_GAP": ("good", "Nothing missing", "Nothing is missing in the law that these tests could show."),
-    "NAMED": (
-        "look",
-        "Missing and named",
-        "The law alone is incomplete: use its parameters together with the effect that was added.",
-    ),
-    "SET": (
-        "look",
-        "Missing, several candidates",
-        "The law alone is incomplete, and these tests cannot tell several causes apart.",
-    ),
-    "UNLISTED": ("look", "Missing, unlisted", "The law alone is incomplete, and no listed mechanism explains it."),
-    "FIT_NOT_CONVERGED": ("bad", "Cannot ask", "The law could not be fitted well enough to ask what it lacks."),
+VERDICTS: dict[str, Level] = {
+    "NO_GAP": "good",
+    "NAMED": "look",
+    "SET": "look",
+    "UNLISTED": "look",
+    "FIT_NOT_CONVERGED": "bad",
 }
-"""Level of a verdict, what it says in words, and what that means."""
+"""What a verdict means for the law without what was found."""
 
 
 def lights(results: Results, shown: Sequence[FittedCurve] = ()) -> list[Light]:
@@ -133,28 +126,33 @@ def lights(results: Results, shown: Sequence[FittedCurve] = ()) -> list[Light]:
         level = "good" if INSIDE[0] <= inside <= INSIDE[1] else "look"
         found.append(_light("Prediction bands hold", level, f"{percent(inside, 3)} of points inside"))
     if content is not None:
-        found.append(_data(results, content))
+        found.append(_data(results))
     if results.discovery is not None:
-        level, answer, meaning = (
-            _with_found(results, results.discovery["gap"])
-            if results.has_found
-            else VERDICTS[results.discovery["verdict"]]
-        )
-        found.append(Light(level, COMPLETE, answer, VERDICTS["NO_GAP"][1].lower(), meaning))
+        found.append(_complete(results, results.discovery))
     if worst(findings) == "bad":
         # Beside numbers that cannot be true nothing is fine: what would be is not judged.
         found = [replace(light, level="unknown") if light.level == "good" else light for light in found]
     return found
 
 
-def _with_found(results: Results, gap: dict[str, Any]) -> tuple[Level, str, str]:
-    """Level, answer and meaning for the law with what was added: whether held-out tests still differ from it."""
-    closed, law = within_noise(gap), f"The law{beside_the_law(results)}"
-    if closed is None:
-        return "unknown", "not known", f"{law} was not tried on held-out particles."
-    if closed:
-        return "good", "Nothing missing", f"{law} agrees with held-out particles within the noise."
-    return "look", "Part is missing", f"{law} closes a part of the gap; held-out particles still differ from it."
+def _complete(results: Results, found: dict[str, Any]) -> Light:
+    """Whether the law lacks something: by the verdict or, with what was found added, by held-out particles."""
+    law = f"The law{beside_the_law(results)}"
+    if not results.has_found:
+        return Light(VERDICTS[found["verdict"]], COMPLETE, verdict_in_words(found), "nothing missing", headline(found))
+    match within_noise(found["gap"]):
+        case None:
+            level, answer, meaning = "unknown", "not known", "was not tried on held-out particles"
+        case True:
+            level, answer, meaning = (
+                "good",
+                "nothing more is missing",
+                "agrees with held-out particles within the noise",
+            )
+        case False:
+            level, answer = "look", "part is missing"
+            meaning = "closes a part of the gap; held-out particles still differ from it"
+    return Light(level, COMPLETE, answer, "nothing missing", f"{law} {meaning}.")
 
 
 def tested(results: Results) -> tuple[Finding, ...]:
@@ -241,12 +239,12 @@ def share_inside(shown: Sequence[FittedCurve]) -> float | None:
     return float(np.mean(np.concatenate(inside))) if sum(map(len, inside)) else None
 
 
-def _data(results: Results, content: dict[str, Any]) -> Light:
-    told = checksums_told(content)
-    if not told or not results.checksums:
+def _data(results: Results) -> Light:
+    tests = results.provenance[CALIBRATION].campaign
+    if tests is None or not tests.sha256 or not results.checksums:
         why = "Checksums or the campaign's files are missing."
         return Light("unknown", "Same data", "cannot tell", "checksums agree", why)
-    same = all(results.checksums.get(name) == told.get(name) for name in DATA)
+    same = all(results.checksums.get(name) == tests.sha256.get(name) for name in DATA)
     level = "good" if same and not results.cautions else "bad"
     return _light("Same data", level, "checksums agree" if same else "checksums differ")
 

@@ -14,15 +14,17 @@ from .. import arguments
 from .._extras import extra, own_version
 from .._format import interval, listed, number, percent, plain, probability, with_sd
 from ..calibrate.curves import KINDS, FittedCurve
+from ..calibrate.summary import exponential
 from ..campaign import PAPER_EFFECTIVE_MODULUS_MPA, PAPER_LOG_C, PAPER_SHAPE_PARAMETER
 from ..campaign.findings import worst
+from ..discover.sentences import verdict_in_words
 from .read import Results
 
 with extra("report"):
     from ..plots.style import particle_labels
     from . import pictures as pictures
     from .chart import LOOKS, chart_data, chart_items, chart_scripts, compare
-    from .lights import COMPLETE, lights, share_inside, tested
+    from .lights import lights, share_inside, tested
     from .sentences import (
         METHODS,
         beside_the_law,
@@ -33,7 +35,7 @@ with extra("report"):
         simulated,
     )
     from .story import story
-    from .tables import changes, equation, exponential, measured, particle_facts, particle_rows, spread
+    from .tables import changes, equation, measured, particle_facts, particle_rows, spread
 
 CAPTIONS = {
     "bands": ("compare", "Measured curves and the central 95 % of what the posterior expects"),
@@ -122,6 +124,7 @@ def _environment() -> Any:
         "with_sd": with_sd,
         "interval": interval,
         "plain": plain,
+        "verdict": verdict_in_words,
         "listed": listed,
         "exponential": exponential,
         "spread": spread,
@@ -173,7 +176,6 @@ def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
         "grid": pictures.grid(shown),
         "marginals": [] if results.posterior is None else pictures.marginals(results.posterior),
         "lights": checks,
-        "verdict": next((one for one in checks if one.check == COMPLETE), None),
         "changes": [] if results.discovery is None else changes(results.discovery),
         "before_after": CAPTIONS["discovery_before_after"][1],
         "figures_of": _figures(results),
@@ -182,7 +184,7 @@ def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
         "law_alone": is_law_alone(results),
         "style": Markup(_source("style.css")),
         "script": Markup(_closed(_source("page.js"))),
-        "versions": next((v for _, c in results.results.items() if (v := c["provenance"]["versions"])), {}),
+        "versions": next((one.versions for one in results.provenance.values() if one.versions), {}),
     }
 
 

@@ -4,27 +4,51 @@ from __future__ import annotations
 
 import datetime
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from .. import arguments
-from .._archive import read_archive
 from .._errors import InputError
 from .._format import described
-from ..calibrate.results import ARCHIVE, DISCOVERY_ARCHIVE, Calibration, OldCalibration, PosteriorDraws, read_result
+from ..calibrate.results import ARCHIVE, CONTENT, DISCOVERY_ARCHIVE, Calibration, PosteriorDraws, read_saved
 from ..campaign import Campaign, check_tests, file_checksums, read_campaign
 from ..discover import Discovery
-from ..files import read_regular
+from ..files import LIMITS, read_regular
 
-CALIBRATION, DISCOVERY, CAMPAIGN = "calibration.json", "discovery.json", "campaign"
-MADE_BY = {CALIBRATION: "mcc-jax calibrate", DISCOVERY: "mcc-jax discover"}
+CALIBRATION, DISCOVERY, CAMPAIGN = CONTENT, "discovery.json", "campaign"
+ARCHIVES = {CALIBRATION: ARCHIVE, DISCOVERY: DISCOVERY_ARCHIVE}
 DATA = ("particles.csv", "curves.csv")
 FIGURE = re.compile(r"figures/([A-Za-z0-9_-]+)\.png")
 PNG = b"\x89PNG\r\n\x1a\n"
 LARGEST_FIGURE = 2**21
 """Bytes; a page must stay small enough to send."""
+
+
+class Tests(msgspec.Struct):
+    """Where a result had its tests from, and the SHA-256 of their files by name."""
+
+    folder: str = ""
+    sha256: dict[str, str] = {}
+
+
+class Provenance(msgspec.Struct):
+    """How a result came about."""
+
+    campaign: Tests | None = None
+    settings: dict[str, Any] = {}
+    versions: dict[str, str] = {}
+
+
+class Written(msgspec.Struct):
+    """What only the JSON of a result says; all else is in its archive."""
+
+    runtime_s: float | None = None
+    figures: list[str] = []
+    provenance: Provenance = msgspec.field(default_factory=Provenance)
 
 
 @dataclass(frozen=True)
@@ -37,12 +61,13 @@ class Results:
         checksums: of their files, SHA-256 by name.
         calibration: contents of `calibration.json`.
         discovery: contents of `discovery.json`.
-        saved: the calibration itself, as `mcc_jax.load` gives it, or its numbers alone where nothing else is left.
+        provenance: how the two came about, by the names of these files.
+        saved: the calibration itself, as `mcc_jax.load` gives it.
         figures: files of `figures/` that the two results name as theirs, by stem.
         written: the day of the newest result.
         cautions: where parts contradict each other.
         missing_campaign: why there is no campaign, if there is none.
-        found: the discovery itself, where it was saved.
+        found: the discovery itself.
     """
 
     name: str
@@ -50,6 +75,7 @@ class Results:
     checksums: Mapping[str, str]
     calibration: dict[str, Any] | None
     discovery: dict[str, Any] | None
+    provenance: Mapping[str, Provenance]
     saved: Calibration | None
     figures: Mapping[str, bytes]
     written: datetime.date | None
@@ -83,8 +109,8 @@ class Results:
         posterior, found = self.with_found, self.discovery
         if posterior is None or found is None:
             return self
-        content = posterior.to_json() | {"figures": [], "provenance": found["provenance"]}
-        return replace(self, calibration=content, saved=posterior)
+        provenance = {**self.provenance, CALIBRATION: self.provenance[DISCOVERY]}
+        return replace(self, calibration=posterior.to_json(), provenance=provenance, saved=posterior)
 
     @property
     def has_found(self) -> bool:
@@ -121,51 +147,57 @@ def read_results(folder: str | Path, campaign: str | Path | None = None, *, name
         name: what to call the folder.
 
     Raises:
-        InputError: if a file is damaged, of another schema, or there is nothing to report.
+        InputError: if a file is damaged or there is nothing to report.
     """
     path = arguments.file_path(folder, "folder")
     if campaign is not None:
         campaign = arguments.file_path(campaign, "campaign")
     there = _listed(path)
-    results = {name: read_result(path / name, again) for name, again in MADE_BY.items() if name in there}
-    calibration, discovery = results.get(CALIBRATION), results.get(DISCOVERY)
-    where, why = _find(path, there, campaign, list(results.values()))
+    saved = {name: read_saved(path / archive) for name, archive in ARCHIVES.items() if archive in there}
+    contents = {name: result.to_json() for name, result in saved.items()}
+    cautions, written = [], {}
+    for name, content in contents.items():
+        written[name] = _written(path / name) if name in there else Written()
+        if name in there and written[name].runtime_s != content["runtime_s"]:
+            cautions.append(f"{name} is not of the {ARCHIVES[name]} next to it, and is left out")
+            written[name] = Written()
+    for name in (name for name in ARCHIVES if name in there and name not in saved):
+        raise InputError(f"{ARCHIVES[name]} is missing next to {name}", file=path, remedy="Calibrate or discover again")
+    provenance = {name: one.provenance for name, one in written.items()}
+    where, why = _find(path, there, campaign, provenance)
     data = None if where is None else check_tests(read_campaign(where))
     checksums = {} if where is None else file_checksums(where)
-    if data is None and not results:
+    if data is None and not saved:
         found = ", ".join(sorted(there)[:8]) or "nothing"
         raise InputError(
             "there is nothing to report",
             file=path,
             remedy=f"Give a folder that mcc-jax demo, calibrate or discover wrote into; found there: {found}",
         )
-    cautions = list(_cautions(data, checksums, results))
-    saved = None if calibration is None else OldCalibration(calibration, data)
-    if calibration is not None and ARCHIVE in there:
-        kept = read_archive(path / ARCHIVE)
-        if isinstance(kept, Calibration) and _belongs(kept, calibration):
-            saved, data = kept, kept.campaign if data is None else data
-        else:
-            cautions.append(f"{ARCHIVE} is not of the {CALIBRATION} beside it, and is left out")
-    found = None
-    if discovery is not None and DISCOVERY_ARCHIVE in there:
-        found = read_archive(path / DISCOVERY_ARCHIVE)
-        if not isinstance(found, Discovery) or found.to_json()["summary"] != discovery["summary"]:
-            found = None
-            cautions.append(f"{DISCOVERY_ARCHIVE} is not of the {DISCOVERY} beside it, and is left out")
+    calibration = saved.get(CALIBRATION)
     return Results(
         name or path.resolve().name or str(path),
-        data,
+        calibration.campaign if data is None and calibration is not None else data,
         checksums,
+        contents.get(CALIBRATION),
+        contents.get(DISCOVERY),
+        provenance,
         calibration,
-        discovery,
-        saved,
-        _figures(path, [name for content in results.values() for name in content["figures"]]),
-        max((datetime.date.fromtimestamp((path / name).stat().st_mtime) for name in results), default=None),
-        tuple(cautions),
+        _figures(path, [name for one in written.values() for name in one.figures]),
+        max((datetime.date.fromtimestamp((path / ARCHIVES[name]).stat().st_mtime) for name in saved), default=None),
+        (*cautions, *_cautions(data, checksums, provenance, contents.get(CALIBRATION))),
         why,
-        found,
+        saved.get(DISCOVERY),
     )
+
+
+def _written(file: Path) -> Written:
+    """What the JSON of a result says of its making. Raises `InputError` if it is damaged."""
+    remedy = "Calibrate or discover again"
+    try:
+        return msgspec.json.decode(read_regular(file, LIMITS.result_bytes, remedy), type=Written)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"is damaged: {error}", file=file, remedy=remedy) from None
 
 
 def _listed(path: Path) -> set[str]:
@@ -181,7 +213,7 @@ def _listed(path: Path) -> set[str]:
 
 
 def _find(
-    path: Path, there: set[str], given: str | Path | None, results: list[dict[str, Any]]
+    path: Path, there: set[str], given: str | Path | None, provenance: Mapping[str, Provenance]
 ) -> tuple[Path | None, str]:
     """The campaign's folder, or why there is none."""
     if given is not None:
@@ -190,41 +222,38 @@ def _find(
         return path, ""
     if CAMPAIGN in there:
         return path / CAMPAIGN, ""
-    told = [r["provenance"]["campaign"]["folder"] for r in results if r["provenance"]["campaign"]]
-    for folder in told:
+    recorded = [one.campaign.folder for one in provenance.values() if one.campaign is not None]
+    for folder in recorded:
         try:
             if all((path / folder / name).is_file() for name in DATA):
                 return path / folder, ""
         except (OSError, ValueError):  # a text that is no path
             continue
-    if told:
+    if recorded:
         return None, "The campaign's folder is no longer where the results found it."
     return None, "The results do not say where their campaign is."
 
 
-def _cautions(data: Campaign | None, checksums: Mapping[str, str], results: Mapping[str, dict[str, Any]]):
-    told = {name: checksums_told(content) for name, content in results.items()}
-    for name, sums in told.items():
+def _cautions(
+    data: Campaign | None,
+    checksums: Mapping[str, str],
+    provenance: Mapping[str, Provenance],
+    calibration: dict[str, Any] | None,
+) -> Iterator[str]:
+    recorded = {name: {} if one.campaign is None else one.campaign.sha256 for name, one in provenance.items()}
+    for name, sums in recorded.items():
         changed = [f for f in DATA if f in sums and f in checksums and sums[f] != checksums[f]]
         if changed:
             yield f"{name} was made from other data: {' and '.join(changed)} of the campaign differ in their checksums"
-    if len(told) == 2 and all(told.values()) and any(told[CALIBRATION].get(f) != told[DISCOVERY].get(f) for f in DATA):
-        yield f"{CALIBRATION} and {DISCOVERY} were made from different data"
-    if data is not None and CALIBRATION in results:
-        names = [entry["particle"] for entry in results[CALIBRATION]["particles"]]
+    if len(recorded) == 2 and all(recorded.values()):
+        one, other = recorded.values()
+        if any(one.get(f) != other.get(f) for f in DATA):
+            yield f"{CALIBRATION} and {DISCOVERY} were made from different data"
+    if data is not None and calibration is not None:
+        names = [entry["particle"] for entry in calibration["particles"]]
         missing = [name for name in names if name not in data.particles]
         if missing:
             yield f"{len(missing)} particles of {CALIBRATION} are not in the campaign, {missing[0]!r} first"
-
-
-def checksums_told(content: dict[str, Any]) -> dict[str, str]:
-    """SHA-256 of the campaign's files as a result records them; empty where it does not."""
-    return (content["provenance"]["campaign"] or {}).get("sha256", {})
-
-
-def _belongs(saved: Calibration, content: dict[str, Any]) -> bool:
-    told = saved.to_json()
-    return all(told[name] == content[name] for name in ("method", "a", "effective_modulus_MPa", "log_C1"))
 
 
 def _figures(path: Path, names: list[str]) -> dict[str, bytes]:

@@ -6,7 +6,7 @@ import shlex
 from typing import Any
 
 from .._format import interval, listed, number, percent, plain, probability
-from ..discover.settings import ENOUGH, WITHIN
+from ..discover.settings import ENOUGH
 from ..plots.style import is_simulated
 from .read import Results
 
@@ -84,41 +84,6 @@ def calibration_sentences(content: dict[str, Any], beside: str = "", *, alone: b
             f"displacement to {percent(misfit)} of its range (median over the particles)."
         )
     return found
-
-
-def discovery_sentence(content: dict[str, Any], tests: str = "tests") -> str:
-    """The discovery in one sentence.
-
-    Args:
-        content: contents of `discovery.json`.
-        tests: what the tests are called.
-    """
-    verdict = content["verdict"]
-    if verdict == "NO_GAP":
-        return "Nothing is missing in the law that these tests could show."
-    if verdict == "FIT_NOT_CONVERGED":
-        return "The law could not be fitted well enough to ask what it lacks."
-    closed = within_noise(content["gap"])
-    told = f"law and {tests} agree within the noise" if closed else "part of the gap closes, and part stays"
-    gap = "" if closed is None else f"; with it added, {told}"
-    if verdict == "UNLISTED" or not content["effects"]:
-        return f"Something is missing that no listed mechanism explains{gap}."
-    names = listed([plain(effect["mechanism"]) for effect in content["effects"]])
-    sure = ", or what these tests cannot tell from it" if verdict == "SET" else ""
-    return f"The law misses {names}{sure}{gap}."
-
-
-def within_noise(gap: dict[str, Any]) -> bool | None:
-    """Whether held-out particles agree with what was added within the noise; None where nobody knows."""
-    if gap["closed_fraction"] is None or not gap["steps"]:
-        return None
-    last = gap["steps"][-1]
-    match last.get("chi2_interval_95"):
-        case [float() | int() as low, _]:
-            pass
-        case _:
-            low = last["chi2_per_dof"]
-    return low is not None and low <= 1 + WITHIN
 
 
 def next_steps(results: Results, folder: str) -> list[tuple[str, str]]:

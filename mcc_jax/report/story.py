@@ -11,10 +11,11 @@ import numpy as np
 from .._format import listed, number, percent, plain, probability, with_sd
 from ..calibrate.curves import FittedCurve
 from ..discover import Discovery
+from ..discover.sentences import headline
 from ..plots.style import is_simulated
 from .pictures import Telling, telling_pictures
 from .read import Results
-from .sentences import discovery_sentence, quantity, simulated
+from .sentences import quantity, simulated
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ def story(results: Results, shown: Sequence[FittedCurve]) -> Story:
         told = telling_test(results.found) if results.found is not None else None
         told = told or _of_fit(shown)
         tests = "simulated tests" if simulated(results) else "tests"
-        return Story(discovery_sentence(found, tests), *_drawn(told), _gap_tiles(found))
+        return Story(headline(found, tests), *_drawn(told), _gap_tiles(found))
     if results.calibration is not None:
         content = results.calibration
         used = sum(entry["kept"] for entry in content["particles"])

@@ -12,6 +12,7 @@ import numpy as np
 
 from .._format import interval, number, plain, span, with_sd
 from ..calibrate.curves import FittedCurve
+from ..calibrate.summary import quantities
 from ..campaign import Campaign, campaign_segments, effective_diameter_um
 from .read import Results
 
@@ -64,35 +65,19 @@ def measured(campaign: Campaign) -> list[tuple[str, str]]:
 
 def changes(found: dict[str, Any]) -> list[tuple[str, list[tuple[str, str | None]]]]:
     """What a discovery did to the parameters: name, and before and after the value with its error, and its interval."""
-    sides = found["parameters_before"], found["parameters_after"]
+    sides = [
+        {one.name: one for one in quantities(side)} if side else {}
+        for side in (found["parameters_before"], found["parameters_after"])
+    ]
     rows = []
-    for name, label, factor in (
-        ("a", "a", 1.0),
-        ("effective_modulus_MPa", "Ē [GPa]", 1e-3),
-        ("modulus_at_peaks_MPa", "Ē at the peaks [GPa]", 1e-3),
-        *((f"log_C{k}", f"C{'₀₁₂₃₄₅'[k]}", 1.0) for k in (1, 3, 5)),
-    ):
-        pair = [one.get("mean", one) for side in sides if (one := side.get(name)) is not None]
-        if name.startswith("log_"):
-            pair = [exponential(one) for one in pair]
-        if len(pair) == 2 and all(one["value"] is not None for one in pair):
-            rows.append((label, [(with_sd(one, factor), interval(one, factor)) for one in pair]))
+    for name in sides[0]:
+        pair = [side[name] for side in sides if name in side]
+        if len(pair) == 2 and not name.endswith("_sd_of_log") and all(q.estimate["value"] is not None for q in pair):
+            first = pair[0]
+            label = f"{first.label} [{first.unit}]" if first.unit else first.label
+            cells = [(with_sd(q.estimate, q.factor), interval(q.estimate, q.factor)) for q in pair]
+            rows.append((label, cells))
     return rows
-
-
-def exponential(estimate: dict[str, Any]) -> dict[str, Any]:
-    """The estimate of exp of what is estimated."""
-
-    def exp(value: float | int) -> float:
-        return math.exp(min(value, 700.0))
-
-    value, sd, ends = estimate["value"], estimate["sd"], estimate["interval_95"]
-    middle = None if value is None else exp(value)
-    return {
-        "value": middle,
-        "sd": None if middle is None or sd is None else middle * sd,
-        "interval_95": None if ends is None else [exp(end) for end in ends],
-    }
 
 
 def equation(text: str) -> Any:

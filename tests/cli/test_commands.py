@@ -151,7 +151,7 @@ HIDDEN = {"mechanism": "creep", "variant": "kelvin_voigt", "parameters": {"c": 1
         ({"variant": "logarithmic"}, {}, True, "the formula is another (kelvin voigt, hidden was logarithmic)"),
         ({"mechanism": "frame_compliance"}, {}, False, "WRONG: hidden was frame compliance, found was creep"),
         ({}, {"candidate_set": [["creep", "thermal_drift"]]}, True, "cannot tell it from thermal drift"),
-        ({}, {"verdict": "NO_GAP", "effects": []}, False, "found was no name (verdict NO_GAP)"),
+        ({}, {"verdict": "NO_GAP", "effects": []}, False, "found was no name (nothing missing)"),
     ],
 )
 def test_the_demo_says_how_the_discovery_did(answer, found, right, words):

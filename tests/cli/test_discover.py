@@ -8,8 +8,8 @@ from asserting import snapshot
 from click.testing import CliRunner
 
 from mcc_jax.campaign import PAPER_DIAMETERS_UM
-from mcc_jax.cli.discover import main_finding
 from mcc_jax.cli.main import cli
+from mcc_jax.discover.sentences import verdict_in_words
 from mcc_jax.effects import LIBRARY
 
 pytestmark = pytest.mark.extended
@@ -107,7 +107,7 @@ def test_the_frame_is_found_and_its_size(found):
 def test_the_command_says_what_it_found(found):
     text, out = found
     content = json.loads((out / "discovery.json").read_text(encoding="utf-8"))
-    assert f"Verdict: {content['verdict']}" in text
+    assert f"Verdict: {verdict_in_words(content)}" in text
     assert " ".join(content["summary"].split()) in " ".join(text.split())
     for word in ("mechanism", "statistic", "detection limit", "probability", "frame_compliance", str(out)):
         assert word in text
@@ -137,7 +137,7 @@ def test_nothing_is_found_where_nothing_is_hidden_and_excluded_names_are_gone(te
     text = done(call("discover", tests / "null", "--out", tmp_path, "--no-held-out", "--no-figures", *excluded))
     content = json.loads((tmp_path / "discovery.json").read_text(encoding="utf-8"))
     assert content["verdict"] == "NO_GAP"
-    assert "Verdict: NO_GAP" in text
+    assert "Verdict: nothing missing" in text
     assert content["effects"] == []
     assert content["gap"]["steps"] == []
     names = {entry["mechanism"] for entry in (*content["ranking"], *content["untestable"])}
@@ -170,15 +170,12 @@ def test_power_says_what_the_tests_could_show(tests, tmp_path):
 @pytest.mark.parametrize(
     ("verdict", "words"),
     [
-        ("NO_GAP", "nothing is missing"),
-        ("FIT_NOT_CONVERGED", "cannot be fitted"),
-        ("UNLISTED", "no listed mechanism"),
-        ("NAMED", "missing is pop in; it closes 90 %"),
-        ("SET", "or what these tests cannot tell from it"),
+        ("NO_GAP", "nothing missing"),
+        ("FIT_NOT_CONVERGED", "could not be fitted"),
+        ("UNLISTED", "unlisted effect"),
+        ("NAMED", "effect identified: pop in"),
+        ("SET", "effect not unique: pop in or what looks like it"),
     ],
 )
-def test_every_verdict_in_one_line(verdict, words):
-    content = {"verdict": verdict, "effects": [{"mechanism": "pop_in"}], "gap": {"closed_fraction": 0.9}}
-    line = main_finding(content)
-    assert words in line
-    assert "\n" not in line
+def test_every_verdict_in_words(verdict, words):
+    assert words in verdict_in_words({"verdict": verdict, "effects": [{"mechanism": "pop_in"}]})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -47,7 +46,6 @@ def samples(folder: str) -> Case:
 
 
 CAMPAIGN = {f"campaign/{name}": content for name, content in samples("campaign").items()}
-RESULTS = samples("results")
 OTHERS = [sample(name) for name in ("fischer.txt", "hysitron.hld", "hysitron_lc.txt", "campaign/curves.csv")]
 
 
@@ -139,18 +137,6 @@ def report(folder: Path) -> None:
     report_page(read_results(folder)).encode("utf-8")
 
 
-def export(folder: Path) -> None:
-    from mcc_jax.export import read_calibration, write_export
-
-    law, shown, origin = read_calibration(folder, particle="1")
-    out = folder / "out"
-    out.mkdir()
-    try:
-        write_export("json", law, shown, out, origin=origin, seed=0)
-    finally:
-        shutil.rmtree(out)
-
-
 def read_state(folder: Path) -> None:
     from mcc_jax.dem import load_state
 
@@ -159,21 +145,20 @@ def read_state(folder: Path) -> None:
 
 FOLDER, MAPPED, HEADED = samples("campaign"), samples("mapped"), samples("headed")
 ZIP = {"tests.zip": plain_archive(sample("micromaterials.txt"))}
-BOTH = ("calibration.json", "discovery.json")
 TESTERS = (
     ("Fischer", "fischer.txt"),
     ("Hysitron hld", "hysitron.hld"),
     ("Hysitron text", "hysitron_lc.txt"),
     ("Micro Materials", "micromaterials.txt"),
 )
-SAVED = "calibration.msgpack"
+SAVED = "discovery.msgpack"
 
 
-def saved_calibration() -> bytes:
+def saved_discovery() -> bytes:
     from mcc_jax._archive import encode
-    from mcc_jax.calibrate import OldCalibration
+    from mcc_jax.discover import Discovery
 
-    return encode(OldCalibration(json.loads(RESULTS["calibration.json"])))
+    return encode(Discovery("NO_GAP", "Nothing is missing.", None, None, 0, 2.0))
 
 
 def load_result(folder: Path) -> object:
@@ -182,6 +167,7 @@ def load_result(folder: Path) -> object:
     return load(folder)
 
 
+DISCOVERY = {"discovery.json": sample("results/discovery.json"), SAVED: saved_discovery()}
 READERS = (
     *(Reader(name, 4, FOLDER, bytes_of(name), read_campaign) for name in FOLDER),
     Reader("diameters", 2, {"particles.csv": FOLDER["particles.csv"]}, diameters, read_diameters),
@@ -193,9 +179,8 @@ READERS = (
     Reader("headed mapping", 4, HEADED, bytes_of("mapping.toml"), convert("table.txt", "mapping.toml")),
     Reader("priors", 2, {"priors.toml": sample("priors.toml")}, bytes_of("priors.toml"), read_priors),
     Reader("programme", 2, {"programme.toml": sample("programme.toml")}, bytes_of("programme.toml"), read_programme),
-    *(Reader(name, 2, CAMPAIGN | {name: RESULTS[name]}, values_of(name), read_results) for name in BOTH),
-    Reader("saved calibration", 2, {SAVED: saved_calibration()}, bytes_of(SAVED), load_result),
+    Reader("discovery.json", 2, CAMPAIGN | DISCOVERY, values_of("discovery.json"), read_results),
+    Reader("saved discovery", 2, {SAVED: DISCOVERY[SAVED]}, bytes_of(SAVED), load_result),
     Reader("saved state", 1, {"state.msgpack": sample("state.msgpack")}, bytes_of("state.msgpack"), read_state),
-    Reader("export", 0.2, CAMPAIGN | RESULTS, values_of("calibration.json"), export),
-    Reader("report page", 0.05, CAMPAIGN | RESULTS, values_of(*BOTH), report),
+    Reader("report page", 0.05, CAMPAIGN | DISCOVERY, values_of("discovery.json"), report),
 )

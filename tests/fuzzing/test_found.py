@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import time
 import zipfile
 from pathlib import Path
@@ -13,8 +12,6 @@ import pytest
 from mcc_jax import InputError
 from mcc_jax.calibrate import read_priors
 from mcc_jax.campaign import read_diameters, read_tester_file
-from mcc_jax.export import read_calibration
-from mcc_jax.report import read_results
 
 SAMPLES = Path(__file__).parent / "samples"
 SIZES = [200.0, 190.0, 180.0]
@@ -110,39 +107,3 @@ def test_open_quotes_before_a_long_text(tmp_path, text):
 def test_three_long_numbers_are_no_file():
     assert "too large" in refused(read_diameters, f"1,2,{'9' * 300}")
     assert "not a number" in refused(read_diameters, f"1,2,{'x' * 300}")
-
-
-def test_integers_that_no_float_holds(tmp_path):
-    content = json.loads((SAMPLES / "results" / "calibration.json").read_bytes())
-    content["a"]["value"] = 10**400
-    (tmp_path / "calibration.json").write_text(json.dumps(content))
-    assert "column 'a.value'" in refused(read_calibration, tmp_path)
-
-
-@pytest.mark.parametrize(("seed", "words"), [("NaN", "no number of JSON"), ("1e400", "no number of JSON"), ("5", None)])
-def test_what_json_cannot_hold_again(tmp_path, seed, words):
-    content = json.loads((SAMPLES / "results" / "calibration.json").read_bytes()) | {"seed": "here"}
-    (tmp_path / "calibration.json").write_text(json.dumps(content).replace('"here"', seed))
-    if words is None:
-        assert read_calibration(tmp_path)[2].calibration["seed"] == 5
-    else:
-        assert words in refused(read_calibration, tmp_path)
-
-
-def test_a_coefficient_whose_fifth_power_is_no_number(tmp_path):
-    """It went through, and the parameter card then could not be written."""
-    content = json.loads((SAMPLES / "results" / "calibration.json").read_bytes())
-    content["particles"][0]["C5"]["value"] = 1e300
-    (tmp_path / "calibration.json").write_text(json.dumps(content))
-    name = content["particles"][0]["particle"]
-    message = refused(read_calibration, tmp_path, particle=name, diameters="200,190,180")
-    assert "all below 1e+44" in message
-
-
-@pytest.mark.parametrize("read", [read_results, read_calibration])
-def test_half_a_character(tmp_path, read):
-    text = (SAMPLES / "results" / "calibration.json").read_text(encoding="utf-8")
-    assert '"warnings": [' in text
-    text = text.replace('"warnings": [', '"warnings": ["\\ud800"' + ("" if '"warnings": []' in text else ", "), 1)
-    (tmp_path / "calibration.json").write_text(text, encoding="utf-8")
-    assert "not Unicode" in refused(read, tmp_path)

@@ -14,7 +14,6 @@ import pytest
 import mcc_jax as mcc
 from mcc_jax._errors import InputError
 from mcc_jax._extras import EXTRAS, MissingExtraError, extra
-from mcc_jax.calibrate import results
 
 ROOT = Path(__file__).parents[2]
 SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -92,7 +91,7 @@ def _export():
 def _report(_):
     from mcc_jax.report import Results, report_page
 
-    nothing = Results("nothing", None, {}, None, None, None, {}, None, (), "")
+    nothing = Results("nothing", None, {}, None, None, {}, None, {}, None, (), "")
     return report_page(nothing)
 
 
@@ -123,15 +122,6 @@ def test_jax_artefacts_name_what_they_need(monkeypatch):
     without(monkeypatch, "flatbuffers")
     with pytest.raises(MissingExtraError, match=r"flatbuffers.*mcc-jax\[export\]"):
         _export().jax_artefact(mcc.paper_law(), mcc.Particle(200.0, 190.0, 180.0))
-
-
-def test_results_of_a_file_name_what_checks_them(monkeypatch, tmp_path):
-    file = tmp_path / "calibration.json"
-    file.write_text('{"schema": 1}', encoding="utf-8")
-    results._validator.cache_clear()
-    without(monkeypatch, "jsonschema")
-    with pytest.raises(MissingExtraError, match=r"jsonschema.*mcc-jax\[report\]"):
-        results.read_result(file, "mcc-jax calibrate")
 
 
 def test_what_is_broken_otherwise_is_told_as_it_is():

@@ -8,7 +8,7 @@ from results_folder import stand_in, write_results
 def _saved_calibrations_are_stand_ins():
     """What is saved in these tests is the truth and not the result of a calibration, which takes long."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mcc_jax.report.read.read_archive", stand_in)
+        patch.setattr("mcc_jax.report.read.read_saved", stand_in)
         yield
 
 

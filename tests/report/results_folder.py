@@ -9,10 +9,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mcc_jax._archive import read_archive
 from mcc_jax.calibrate.data import rows_from_contact
-from mcc_jax.calibrate.results import PosteriorDraws
+from mcc_jax.calibrate.results import Calibration, PosteriorDraws, read_saved
 from mcc_jax.campaign import Campaign, campaign_segments, file_checksums, write_campaign
+from mcc_jax.discover import Discovery
 from mcc_jax.law import MccLaw, Plastic
 from mcc_jax.simulate import Hold, Programme, Ramp, simulate_campaign
 
@@ -77,6 +77,8 @@ def calibration(names=NAMES, **changes):
         "probability_not_monotone": estimate(0.02),
         "noise": {"displacement_um": estimate(NOISE, 0.001)},
         "priors": {"a": {"distribution": "normal", "mean": 1.0, "sd": 1.0}},
+        "effects": [],
+        "findings": [],
         "particles": particles,
         "warnings": ["particle 'left out' could not be used"],
         "diagnostics": {
@@ -153,6 +155,11 @@ def discovery(**changes):
         "runtime_s": 2.0,
         "seed": 0,
         "notes": ["few particles"],
+        "checks": [],
+        "findings": [],
+        "leads": [],
+        "equivalent_by_construction": [],
+        "p_anything_missing": None,
         "figures": ["figures/discovery_before_after.png"],
     } | changes
 
@@ -196,20 +203,38 @@ class Draws(PosteriorDraws):
         return um + NOISE * np.random.default_rng(i).standard_normal((500, len(um)))
 
 
-ARCHIVE = "calibration.msgpack"
+@dataclass(frozen=True, repr=False)
+class Numbers(Calibration):
+    """Stands in for a saved calibration without draws."""
+
+    campaign: Campaign
+    content: dict
+
+    def to_json(self):
+        return self.content
+
+
+class Found(Discovery):
+    """Stands in for a saved discovery: its contents alone."""
 
 
 def stand_in(file):
-    """What `read_archive` gives in these tests: the draws that belong to the folder of a file."""
-    if not file.read_bytes().startswith(b"["):
-        return read_archive(file)
-    content = calibration(json.loads(file.read_text()))
-    rng = np.random.default_rng(0)
-    return Draws(campaign(json.loads(file.read_text())), content, A + 0.01 * rng.standard_normal((4, 100)))
+    """What `read_saved` gives in these tests: results that state what is written in the file."""
+    if not file.read_bytes().startswith(b"{"):
+        return read_saved(file)
+    content = json.loads(file.read_text())
+    if "verdict" in content:
+        found = Found(content["verdict"], content["summary"], None, None, 0, 0.0)
+        found.__dict__["content"] = content
+        return found
+    tests = campaign([entry["particle"] for entry in content["particles"]])
+    if content["method"] != "bayes":
+        return Numbers(tests, content)
+    return Draws(tests, content, A + 0.01 * np.random.default_rng(0).standard_normal((4, 100)))
 
 
 def write_results(folder, names=NAMES):
-    """Campaign, calibration, posterior, discovery and figures in one folder."""
+    """Campaign, calibration, discovery and figures in one folder."""
     tests = campaign(names)
     write_campaign(tests, folder)
     origin = {
@@ -217,12 +242,9 @@ def write_results(folder, names=NAMES):
         "settings": {"threshold_MPa": 0.2, "seed": 3},
         "versions": {"mcc_jax": "0.1.0", "jax": "0.10"},
     }
-    for name, content in (
-        ("calibration.json", calibration(names, provenance=origin)),
-        ("discovery.json", discovery(provenance=origin)),
-    ):
-        (folder / name).write_text(json.dumps(content), encoding="utf-8")
-    (folder / ARCHIVE).write_text(json.dumps(list(names)))
+    for name, content in (("calibration", calibration(names)), ("discovery", discovery())):
+        (folder / f"{name}.json").write_text(json.dumps(content | {"provenance": origin}), encoding="utf-8")
+        (folder / f"{name}.msgpack").write_text(json.dumps(content), encoding="utf-8")
     (folder / "figures").mkdir()
     for stem in ("forest", "discovery_before_after"):
         (folder / "figures" / f"{stem}.png").write_bytes(PNG)

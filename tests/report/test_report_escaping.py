@@ -35,6 +35,7 @@ def evil(tmp_path_factory):
         else:
             content = evil_texts(content)
         (folder / name).write_text(json.dumps(content), encoding="utf-8")
+        (folder / name).with_suffix(".msgpack").write_text(json.dumps(content), encoding="utf-8")
     return folder
 
 
