@@ -178,7 +178,7 @@ def how_to_read():
         top = int(added.argmax())
         most = _signed(added[top])
         above.annotate(
-            f"at most {most[1:]} µm more than\nby the law alone: {most} µm\nstands below a small picture",
+            f"at most {most[1:]} µm more than\nby the law alone: {most} µm\nis printed below the small picture",
             (law.time_s[top], added[top]), (0.02, 0.97), textcoords="axes fraction", va="top",
             arrowprops={"arrowstyle": "->", "color": GREY},
         )  # fmt: skip
@@ -197,7 +197,7 @@ def _signed(value):
 # ---- the gallery -----------------------------------------------------------------------------------------------------
 
 CAUSES = {
-    "tester": "Of the tester",
+    "tester": "Of the instrument",
     "contact": "Where particle and platen meet",
     "loading": "Of loading",
     "unloading": "Of unloading",
@@ -240,10 +240,10 @@ def entry(mechanism):
         f"| The tests need | {_listed(need.value for need in first.needs) or 'nothing special'} |",
     ]
     if first.helps:
-        facts.append(f"| Easier to tell with | {_listed(need.value for need in first.helps)} |")
+        facts.append(f"| Easier to identify with | {_listed(need.value for need in first.helps)} |")
     facts.append(f"| Mistaken for | {mistaken_for(name)} |")
     if mechanism.equivalences:
-        facts.append(f"| Cannot be told from, by tests of force and displacement | {_listed(mechanism.equivalences)} |")
+        facts.append(f"| Cannot be distinguished, by tests of force and displacement, from | {_listed(mechanism.equivalences)} |")
     facts.append(f"| What shows it by itself | {mechanism.check} |")
     sources = list(dict.fromkeys(variant.source for variant in mechanism))
     rows = [
@@ -263,7 +263,7 @@ def entry(mechanism):
             f"![What {plain(name)} adds over time](../{FOLDER}/{name}-added.png)",
             "</div>",
             "",
-            f"*Drawn: {_code(first)} with {strength}, strong so that it shows.*",
+            f"*Plotted: {_code(first)} with {strength}, large enough to be visible.*",
             "",
             "| In short | |",
             "|---|---|",
@@ -324,14 +324,14 @@ def _code(variant):
 
 
 def _own_range(variant, first):
-    """Number and range where a formula has other ones than the first."""
+    """Parameter and range of a formula if they differ from those of the first."""
     if (variant.parameter, variant.plausible) == (first.parameter, first.plausible):
         return ""
     return f"`{variant.parameter}`, {_range(variant)}. "
 
 
 def _further(variant):
-    """Further numbers of a formula."""
+    """Further parameters of a formula."""
     found = [
         f"`{n.name}` {written(n.plausible[0])} to {written(n.plausible[1])}: {n.explanation}" for n in variant.nuisances
     ]
@@ -348,7 +348,7 @@ def visible_share(mechanism, limit):
 
 
 def which_test():
-    """A table: mechanisms down, plans across, from which size on each is found."""
+    """A table of detection limits: mechanisms down, plans across."""
     from mcc_jax.effects import LIBRARY
 
     plans = POWER["plans"].values()
@@ -388,14 +388,14 @@ def look_alikes():
         "|---|" + "---|" * len(shown),
     ]
     for (a, b), values in sorted(pairs.items(), key=lambda item: -max(item[1].values())):
-        cells = [_percent(values[plan]) if plan in values else _apart(plan, a, b) for plan in shown]
+        cells = [_percent(values[plan]) if plan in values else _distinct(plan, a, b) for plan in shown]
         lines.append(f"| {plain(a)}, {plain(b)} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
-def _apart(plan, *pair):
-    """ "apart", or a dash where one of the two cannot be seen at all."""
-    return "apart" if all(name in POWER["plans"][plan]["limits"] for name in pair) else "–"
+def _distinct(plan, *pair):
+    """ "distinct", or a dash where one of the two cannot be seen at all."""
+    return "distinct" if all(name in POWER["plans"][plan]["limits"] for name in pair) else "–"
 
 
 def which_test_picture():
