@@ -243,7 +243,9 @@ def entry(mechanism):
         facts.append(f"| Easier to identify with | {_listed(need.value for need in first.helps)} |")
     facts.append(f"| Mistaken for | {mistaken_for(name)} |")
     if mechanism.equivalences:
-        facts.append(f"| Cannot be distinguished, by tests of force and displacement, from | {_listed(mechanism.equivalences)} |")
+        facts.append(
+            f"| Cannot be distinguished, by tests of force and displacement, from | {_listed(mechanism.equivalences)} |"
+        )
     facts.append(f"| What shows it by itself | {mechanism.check} |")
     sources = list(dict.fromkeys(variant.source for variant in mechanism))
     rows = [
