@@ -127,7 +127,7 @@ def read_particles(
     path = arguments.file_path(file, "file")
     data = read_bytes(path)
     if is_workbook(data):
-        return parse_particles(make_table(read_sheet(data, path, preferred=Path(PARTICLES).stem), path), named)
+        return parse_particles(make_table(iter([read_sheet(data, path, preferred=Path(PARTICLES).stem)]), path), named)
     return parse_particles(parse_table(decode(data, path), path), named)
 
 

@@ -38,8 +38,8 @@ def read_sheet(
     preferred: str | None = None,
     decimal_mark: str = ".",
     how: str = "",
-) -> list[tuple[int, list[str]]]:
-    """The rows of a sheet: the number of each and its cells as text, numbers with all their digits.
+) -> tuple[range, list[list[str]]]:
+    """The rows of a sheet: their numbers and their cells as text, numbers with all their digits.
 
     Raises `InputError` if it is damaged or too large, the sheet is not there or not told, or calamine is not installed.
 
@@ -78,7 +78,7 @@ def read_sheet(
         return repr(value).replace(".", decimal_mark) if isinstance(value, float) else str(value)
 
     rows = frame.itertuples(index=False, name=None)
-    return [(number, [text(value) for value in row]) for number, row in enumerate(rows, start=1)]
+    return range(1, len(frame) + 1), [[text(value) for value in row] for row in rows]
 
 
 def _choose(names: list[str], sheet: str | int | None, preferred: str | None, file: Path) -> str | None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from mcc_jax._errors import InputError
 from mcc_jax.campaign import Campaign, Curve, Metadata, read_campaign, write_campaign
-from mcc_jax.campaign import curves as curves_module
+from mcc_jax.campaign.table import NotANumber, numbers
 
 PARTICLES = "particle,D1_um,D2_um,D3_um,batch\nA,200,190,180,x\n01,150,140,130,\n"
 CURVES = (
@@ -343,16 +343,23 @@ def test_names_stay_as_they_are(tmp_path, name):
     assert_same(read_campaign(tmp_path / "c"), campaign)
 
 
-def test_fast_and_strict_parser_agree(tmp_path, monkeypatch):
+def test_numbers_are_rounded_as_python_rounds_them():
     rng = np.random.default_rng(0)
-    names = ("a", "NA", "01", 'x"y', "p,q")
-    curves = tuple(Curve(np.sort(rng.normal(size=50)), *rng.normal(size=(2, 50)) * 1e-3) for _ in names)
-    campaign = Campaign(names, np.full((5, 3), 100.0), curves)
-    write_campaign(campaign, tmp_path / "c")
-    fast = read_campaign(tmp_path / "c")
-    monkeypatch.setattr(curves_module, "_split_fast", lambda *_: None)
-    assert_same(read_campaign(tmp_path / "c"), fast)
-    assert_same(fast, campaign)
+    values = rng.integers(0, 2**64, 20_000, dtype=np.uint64).view(float)
+    values = values[np.isfinite(values) & (np.abs(values) < 1e27)]
+    cells = [f"{value:.{digits}e}" for value, digits in zip(values, rng.integers(0, 25, len(values)), strict=True)]
+    cells += ["-0", "0", "-0.0", "5e-324", "2.4703282292062327e-324", "9007199254740993", "1" + "0" * 26]
+    expected = np.array([float(cell) for cell in cells])
+    for mark in ".,":
+        found = numbers([cell.replace(".", mark) for cell in cells], mark)
+        assert found.tobytes() == expected.tobytes()
+
+
+@pytest.mark.parametrize("cell", ["1_0", "0x1", "１", "null", "true", "[1]", "1,2", "1]", "", "nan", "1e28", '"1"'])
+def test_what_is_no_number_is_named_wherever_it_is(cell):
+    with pytest.raises(NotANumber) as caught:
+        numbers(["1"] * 40_000 + [cell] + ["1", "x"])
+    assert caught.value.index == 40_000
 
 
 LINE = Curve(np.array([0.0, 1]), np.array([0.0, 1]), np.array([0.0, 1]))

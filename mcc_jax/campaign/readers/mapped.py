@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import re
 from collections import Counter
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
@@ -27,7 +29,7 @@ from ..table import (
 from ..validate import check_magnitudes
 from .diameters import check_triple
 from .mapping import DIMENSIONS, InHeader, MappingFile
-from .text import Rows, Sheet, Tests, checked_curve, read_rows
+from .text import Rows, Tests, checked_curve, read_rows
 
 _FURTHEST = 200
 """Rows above a header found by `begin`, within which it is looked for again; a tester's preamble has a few dozen."""
@@ -58,6 +60,7 @@ def read_mapped(data: bytes, file: Path, mapping: MappingFile) -> Tests:
 
 
 _Sample = tuple[int, int, list[float]]  # its row in the file, the row's number in the test, and the readings
+_Reading = float | None  # NaN where it is marked as missing, None where the cell holds something else
 
 
 @dataclass
@@ -70,7 +73,7 @@ class _Reader:
     samples: dict[str, list[_Sample]] = field(default_factory=dict)
     missing: Counter[str] = field(default_factory=Counter)
     diameters_um: dict[str, list[float] | InputError] = field(default_factory=dict)
-    parted: bool = False  # whether the next sample begins a test
+    between: bool = False  # whether the next sample begins a test
     header_came_again: bool = False
 
     def wrong(self, problem: str, remedy: str, i: int | None = None, column: str | int | None = None) -> InputError:
@@ -92,48 +95,49 @@ class _Reader:
         i = head + mapping.header_rows
         while i < self.stop:
             if rows.blank(i):
-                self.parted = self.parted or mapping.tests == "blank line"
+                self.between = self.between or mapping.tests == "blank line"
                 ended = ended and mapping.tests != "blank line"
-                i += 1
             elif mapping.comment_prefix is not None and rows.begins(i, mapping.comment_prefix):
-                i += 1
-            elif (below := self._rows_above_again(i)) is not None:
+                pass
+            elif None in (readings := self._readings(i)) and (below := self._rows_above_again(i)) is not None:
                 sizes = self._diameters(i, below)
-                i = below
-            elif (again := self._header_again(i)) is not None:
+                i = below - 1
+            elif None in readings and (again := self._header_again(i)) is not None:
                 if mapping.tests == "file" and mapping.pace is not None:
                     remedy = f'Write tests = "header" in {mapping.file.name}'
                     raise self.wrong("the header comes again, so this is more than one test", remedy, again)
                 sizes = self._diameters(i, again) if again > i else sizes
-                self.parted, ended = self.parted or mapping.tests == "header", False
+                self.between, ended = self.between or mapping.tests == "header", False
                 self.header_came_again = True
-                i = again + mapping.header_rows
+                i = again + mapping.header_rows - 1
             else:
                 ended = ended or (mapping.end is not None and rows.begins(i, mapping.end))
                 if not ended:
                     if mapping.tests in ("blank line", "header"):
-                        block += self.parted and bool(self.samples or self.missing)
-                    self._take(i, block, sizes)
-                i += 1
+                        block += self.between and bool(self.samples or self.missing)
+                    self._take(i, readings, block, sizes)
+            i += 1
         self._refuse_groups()
 
-    def _take(self, i: int, block: int, sizes: list[float] | InputError | None) -> None:
+    def _take(self, i: int, readings: list[_Reading], block: int, sizes: list[float] | InputError | None) -> None:
         """Keep a row of data, of the test of this number where the file does not name it, with its diameters."""
         cells = self._fit(i)
-        numbers = self._numbers(cells, i)
+        missing = any(number != number for number in readings)
+        if None in readings and not missing:
+            raise self._no_number(cells, readings.index(None), i)
         name = self._name(cells, block, i)
-        self.parted = False
-        if numbers is None:
+        self.between = False
+        if missing:
             self.missing[name] += 1
         else:
             rows = self.samples.setdefault(name, [])
-            rows.append((i + 1, len(rows) + self.missing[name], numbers))
+            rows.append((i + 1, len(rows) + self.missing[name], cast(list[float], readings)))
         if sizes is not None:
             self.diameters_um.setdefault(name, sizes)
 
     def _refuse_groups(self) -> None:
         """Refuse a column of text whose decimal mark looks like one between thousands, unless the mapping says none."""
-        if self.mapping.thousands is not None or isinstance(self.rows, Sheet):
+        if self.mapping.thousands is not None or not isinstance(self.rows.rows[0], str):
             return
         mark = self.mapping.decimal_mark
         for quantity in self.wanted:
@@ -199,7 +203,7 @@ class _Reader:
     def _header_again(self, i: int) -> int | None:
         """The index of the header if it comes again at this row, or below rows that are no samples; else None."""
         rows, mapping = self.rows, self.mapping
-        if self.header is None or self._is_sample(i):
+        if self.header is None:
             return None
         above = mapping.skip_rows if mapping.begin is None else _FURTHEST
         for j in range(i, min(i + above + 1, self.stop)):
@@ -213,13 +217,12 @@ class _Reader:
 
     def _rows_above_again(self, i: int) -> int | None:
         """The index of a test's first sample if rows like those above the first test, without a header, precede it."""
-        if self.header is not None or not self.parted or not (self.samples or self.missing) or self._is_sample(i):
+        if self.header is not None or not self.between or not (self.samples or self.missing):
             return None
         for j in range(i, min(i + self.mapping.skip_rows + 1, self.stop)):
             if self._is_sample(j):
                 return j
-            cells = [] if self.rows.blank(j) else self.rows.cells(j)
-            if any(self._is_number(cells[place]) for q in self.wanted if (place := self.where[q]) < len(cells)):
+            if any(number is not None and number == number for number in self._readings(j)):
                 return None
         return None
 
@@ -233,14 +236,23 @@ class _Reader:
                 raise self.wrong(problem, "Put tests with other columns into a file of their own", i)
         return i
 
+    def _readings(self, i: int) -> list[_Reading]:
+        """The readings of a row, as numbers without a unit."""
+        cells = [] if self.rows.blank(i) else self.rows.cells(i)
+        places = [self.where[quantity] for quantity in self.wanted]
+        return [self._reading(cells[place]) if place < len(cells) else None for place in places]
+
+    def _reading(self, cell: str) -> _Reading:
+        texts, numbers = self.missing_marks
+        try:
+            number = self._number(cell)
+        except ValueError:
+            return math.nan if cell.strip().lower() in texts else None
+        return math.nan if number in numbers or (texts and cell.strip().lower() in texts) else number
+
     def _is_sample(self, i: int) -> bool:
         """Whether every reading of a row is a number, or marked as missing."""
-        if self.rows.blank(i):
-            return False
-        cells, places = self.rows.cells(i), [self.where[quantity] for quantity in self.wanted]
-        return max(places) < len(cells) and all(
-            self._is_number(cells[place]) or self._is_missing(cells[place]) for place in places
-        )
+        return None not in self._readings(i)
 
     def _number(self, cell: str) -> float:
         return parse_number(cell, self.mapping.decimal_mark, self.mapping.thousands or "")
@@ -269,28 +281,16 @@ class _Reader:
             remedy = "Fill the row or delete it; if the file was cut off here, export it again"
         raise self.wrong(f"{number_of_cells(count)} where {self.width} are expected", remedy, i)
 
-    def _numbers(self, cells: list[str], i: int) -> list[float] | None:
-        """The readings of a row, None where one of them is missing."""
-        mapping = self.mapping
-        if mapping.missing and any(self._is_missing(cells[self.where[q]]) for q in self.wanted):
-            return None
-        found = []
-        for quantity in self.wanted:
-            cell = cells[self.where[quantity]]
-            try:
-                found.append(self._number(cell))
-            except ValueError as error:
-                remedy = self._number_remedy(cell.strip(), i)
-                raise self.wrong(str(error), remedy, i, mapping.columns[quantity].column) from None
-        return found
-
-    def _is_missing(self, cell: str) -> bool:
-        cell = cell.strip()
-        texts, numbers = self.missing_marks
+    def _no_number(self, cells: list[str], which: int, i: int) -> InputError:
+        """The error for the cell of a row that should hold a reading."""
+        quantity = self.wanted[which]
+        cell = cells[self.where[quantity]]
+        remedy = self._number_remedy(cell.strip(), i)
         try:
-            return cell.lower() in texts or (bool(numbers) and self._number(cell) in numbers)
-        except ValueError:
-            return False
+            self._number(cell)
+        except ValueError as error:
+            return self.wrong(str(error), remedy, i, self.mapping.columns[quantity].column)
+        raise AssertionError
 
     @cached_property
     def missing_marks(self) -> tuple[set[str], set[float]]:
@@ -319,7 +319,7 @@ class _Reader:
         word = any(c.isalpha() for c in cell) and not _is_no_reading(cell)
         if word and not (self.samples or self.missing):
             return f"If this row belongs to the header, correct skip_rows or header_rows in {name}"
-        if word and self.parted:
+        if word and self.between:
             return f"If the rows above this test are not those above the first, name the header with begin in {name}"
         if _is_no_reading(cell):
             return f"Mend the cell, or write missing = [{_quoted(cell)}] in {name} to drop such readings"
@@ -330,7 +330,7 @@ class _Reader:
         text = _first(self.rows.cells(i))
         if not (self.samples or self.missing) or self._is_number(text) or _is_no_reading(text):
             return False
-        stop = self.stop if self.parted else self._end_of_test(i)
+        stop = self.stop if self.between else self._end_of_test(i)
         return not any(self._is_sample(j) for j in range(i, stop))
 
     def _end_of_test(self, i: int) -> int:

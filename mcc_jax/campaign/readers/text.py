@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -14,7 +13,7 @@ import numpy as np
 
 from ..._errors import InputError
 from ..schema import Control, Curve
-from ..table import binary_kind, number_of_cells, parse_number, same_text
+from ..table import NotANumber, binary_kind, number_of_cells, numbers, same_text, split
 from ..workbook import is_workbook, read_sheet
 from .mapping import MappingFile
 
@@ -69,18 +68,18 @@ def number_block(
 
     Raises `InputError` at the first row or cell that is damaged.
     """
-    block = np.empty((stop - first, len(names)))
-    for i in range(first, stop):
-        cells = lines[i].rstrip("\t ").split("\t")
+    rows = [lines[i].rstrip("\t ").split("\t") for i in range(first, stop)]
+    for i, cells in enumerate(rows, start=first + 1):
         if len(cells) != len(names):
             problem = f"{number_of_cells(len(cells))} where {len(names)} are expected ({', '.join(names)})"
-            raise InputError(problem, file=file, row=i + 1, remedy="The file is damaged or cut off; export it again")
-        for j, cell in enumerate(cells):
-            try:
-                block[i - first, j] = parse_number(cell, decimal_mark)
-            except ValueError as error:
-                remedy = "Export the file again"
-                raise InputError(str(error), file=file, row=i + 1, column=names[j], remedy=remedy) from None
+            raise InputError(problem, file=file, row=i, remedy="The file is damaged or cut off; export it again")
+    block = np.empty((len(rows), len(names)))
+    for j, cells in enumerate(zip(*rows, strict=True)):
+        try:
+            block[:, j] = numbers(cells, decimal_mark)
+        except NotANumber as error:
+            row, remedy = first + error.index + 1, "Export the file again"
+            raise InputError(str(error), file=file, row=row, column=names[j], remedy=remedy) from None
     return block
 
 
@@ -117,61 +116,43 @@ def leading_number(text: str) -> float | None:
 
 
 class Rows:
-    """Lines of text, split when they are asked for."""
+    """Rows of a table, lines of text or the cells of a workbook's sheet; text is split when it is asked for."""
 
-    def __init__(self, lines: list[str], file: Path, mapping: MappingFile) -> None:
-        self.lines, self.file, self.delimiter, self.mapping = lines, file, mapping.delimiter, mapping.file.name
+    def __init__(self, rows: Sequence[str] | Sequence[list[str]], file: Path, mapping: MappingFile) -> None:
+        self.rows, self.file, self.delimiter, self.mapping = rows, file, mapping.delimiter, mapping.file.name
         self.nothing = '" \t' if mapping.delimiter == " " else mapping.delimiter + '" \t'
-
-    def __len__(self) -> int:
-        return len(self.lines)
-
-    def blank(self, i: int) -> bool:
-        """Whether a row holds nothing but delimiters."""
-        return not self.lines[i].strip(self.nothing)
-
-    def begins(self, i: int, text: str) -> bool:
-        """Whether a row, or the first thing that it holds, begins with a text."""
-        line, text = same_text(self.lines[i].lstrip()), same_text(text)
-        return line.startswith(text) or line.lstrip(self.nothing).startswith(text)
-
-    def cells(self, i: int) -> list[str]:
-        """The cells of a row."""
-        line = self.lines[i]
-        if self.delimiter == " ":
-            return line.split()
-        if '"' not in line:
-            return line.split(self.delimiter)
-        try:
-            return next(csv.reader([line], delimiter=self.delimiter, strict=True))
-        except (csv.Error, StopIteration) as error:
-            problem = f"quotes are damaged ({error})"
-            remedy = f"Close every double quote, or correct delimiter in {self.mapping}"
-            raise InputError(problem, file=self.file, row=i + 1, remedy=remedy) from None
-
-
-class Sheet(Rows):
-    """Rows of a workbook's sheet, as they are."""
-
-    def __init__(self, rows: list[list[str]], file: Path, mapping: MappingFile) -> None:
-        super().__init__([], file, mapping)
-        self.rows = rows
 
     def __len__(self) -> int:
         return len(self.rows)
 
+    def line(self, i: int) -> str:
+        """A row as one text."""
+        row = self.rows[i]
+        return row if isinstance(row, str) else "\t".join(row)
+
     def blank(self, i: int) -> bool:
-        """Whether a row holds nothing."""
-        return not any(cell.strip() for cell in self.rows[i])
+        """Whether a row holds nothing but delimiters."""
+        return not self.line(i).strip(self.nothing)
 
     def begins(self, i: int, text: str) -> bool:
-        """Whether the first thing that a row holds begins with a text."""
-        first = next((cell for cell in self.rows[i] if cell.strip()), "")
-        return same_text(first.lstrip()).startswith(same_text(text))
+        """Whether a row, or the first thing that it holds, begins with a text."""
+        line, text = same_text(self.line(i).lstrip()), same_text(text)
+        return line.startswith(text) or line.lstrip(self.nothing).startswith(text)
 
     def cells(self, i: int) -> list[str]:
         """The cells of a row."""
-        return self.rows[i]
+        row = self.rows[i]
+        if not isinstance(row, str):
+            return row
+        if self.delimiter == " ":
+            return row.split()
+        if '"' not in row:
+            return row.split(self.delimiter)
+        try:
+            return next(split(row, self.file, self.delimiter))[1][0]
+        except InputError as error:
+            remedy = f"Close every double quote, or correct delimiter in {self.mapping}"
+            raise error.changed(row=i + 1, remedy=remedy) from None
 
 
 def read_rows(data: bytes, file: Path, mapping: MappingFile) -> Rows:
@@ -179,7 +160,7 @@ def read_rows(data: bytes, file: Path, mapping: MappingFile) -> Rows:
     if is_workbook(data):
         how = f'Write sheet = "..." in {mapping.file.name}'
         rows = read_sheet(data, file, mapping.sheet, decimal_mark=mapping.decimal_mark, how=how)
-        return Sheet([cells for _, cells in rows], file, mapping)
+        return Rows(rows[1], file, mapping)
     if mapping.sheet is not None:
         problem = f"is no Excel workbook (xlsx), though {mapping.file.name} names a sheet"
         raise InputError(problem, file=file, remedy="Remove the key sheet, or save the file as xlsx")
