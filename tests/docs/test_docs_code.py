@@ -1,4 +1,4 @@
-"""Every page of the documentation does what it shows: files are written, Python runs, commands run, in their order."""
+"""Every page of the documentation works as shown: its files, Python blocks and commands are executed in order."""
 
 import re
 import shlex
@@ -16,7 +16,7 @@ PAGES = Path(__file__).parents[2] / ".docs" / "pages"
 FENCE = re.compile(r'^```(\w+)(?: title="([^"]+)")?\n(.*?)^```$', re.M | re.S)
 COMMAND = re.compile(r"(?:\w+=\S+ )*(?:uv run )?mcc-jax (.*)")
 ALL = {str(page.relative_to(PAGES)): page.read_text(encoding="utf-8") for page in sorted(PAGES.rglob("*.md"))}
-# Languages: files where a title names one; `sh` is run, `console` speaks of the reader's files and is only parsed.
+# Languages: a title names a file to write; `sh` is run, `console` refers to the reader's files and is only parsed.
 KNOWN = {"python", "sh", "console", "toml", "csv", "text", "c"}
 
 
@@ -55,15 +55,15 @@ RUN = [page for page, text in ALL.items() if any(b.language in ("python", "sh") 
 @pytest.mark.extended
 @pytest.mark.parametrize("page", RUN)
 @pytest.mark.filterwarnings("default")
-def test_page_does_what_it_shows(page, tmp_path, monkeypatch):
+def test_page_works_as_shown(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = {"__name__": "page"}
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # as at a reader's
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # as in a reader's session
         follow(page, names, tmp_path)
 
 
 def follow(page, names, folder):
-    """Carry out every block of a page in its order."""
+    """Execute the blocks of a page in order."""
     for number, block in enumerate(blocks(ALL[page]), start=1):
         if block.language == "python":
             exec(compile(block.text, f"{page}, block {number}", "exec"), names)
@@ -110,14 +110,14 @@ def test_the_check_of_commands_finds_mistakes(wrong):
 
 
 @pytest.mark.parametrize("page", list(ALL))
-def test_every_block_is_of_a_language_that_is_checked(page):
+def test_every_block_has_a_language_that_is_checked(page):
     languages = {b.language for b in blocks(ALL[page])}
     assert languages <= KNOWN, languages - KNOWN
     assert len(re.findall(r"^ *```", ALL[page], flags=re.M)) == 2 * len(blocks(ALL[page])), "a block is not closed"
 
 
 @pytest.mark.parametrize("page", list(ALL))
-def test_pages_load_nothing_from_elsewhere(page):
+def test_pages_load_no_external_resources(page):
     assert not re.search(r"!\[[^\]]*\]\(https?:|<(?:script|link|img|iframe)\b", ALL[page])
 
 

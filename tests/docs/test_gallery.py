@@ -1,4 +1,4 @@
-"""What the gallery of effects and the table of tests against effects say is what the library does."""
+"""The gallery of effects and the table of tests against effects agree with the library."""
 
 import importlib
 import re
@@ -15,7 +15,7 @@ VARIANTS = [variant for mechanism in LIBRARY.values() for variant in mechanism]
 
 @pytest.fixture(scope="module")
 def docs():
-    """The modules beside the pages, by name."""
+    """The modules in the folder of the pages, by name."""
     sys.path.insert(0, str(DOCS))
     yield importlib.import_module
     sys.path.remove(str(DOCS))
@@ -42,7 +42,7 @@ def test_formulas_keep_their_meaning(docs, text, tex):
     assert docs("equations").in_tex(text) == tex
 
 
-def test_the_kept_numbers_are_of_the_mechanisms_that_there_are(docs):
+def test_the_stored_numbers_cover_all_mechanisms(docs):
     plans = docs("gallery").POWER["plans"]
     assert [docs("make_power").PLANS[name][0] for name in plans] == [plan["title"] for plan in plans.values()]
     for plan in plans.values():
@@ -51,7 +51,7 @@ def test_the_kept_numbers_are_of_the_mechanisms_that_there_are(docs):
         assert {name for pair in plan["alike"] for name in pair[:2]} <= set(plan["limits"])
 
 
-def test_every_mechanism_stands_in_the_tables(docs):
+def test_every_mechanism_is_in_the_tables(docs):
     gallery = docs("gallery")
     table = gallery.which_test().splitlines()
     assert len(table) == 2 + len(LIBRARY)
@@ -62,7 +62,7 @@ def test_every_mechanism_stands_in_the_tables(docs):
         assert gallery.mistaken_for(name)
 
 
-def test_an_entry_says_everything_and_shows_a_picture(docs, monkeypatch):
+def test_an_entry_is_complete_and_shows_a_picture(docs, monkeypatch):
     gallery = docs("gallery")
     creep = LIBRARY["creep"]
     strength, most, *pictures = gallery.picture(creep)
@@ -88,17 +88,17 @@ def test_an_entry_says_everything_and_shows_a_picture(docs, monkeypatch):
 
 
 @pytest.mark.extended
-def test_a_plan_worked_out_again_gives_the_kept_numbers(docs):
+def test_a_plan_computed_again_gives_the_stored_numbers(docs):
     kept, again = docs("gallery").POWER["plans"]["unload"], docs("make_power").worked_out("unload")
     assert again["needs"] == kept["needs"]
     assert again["limits"] == pytest.approx(kept["limits"], rel=0.05)
 
 
-def test_every_mechanism_stands_once_among_those_of_its_cause(docs, monkeypatch):
+def test_every_mechanism_is_listed_once_under_its_cause(docs, monkeypatch):
     gallery = docs("gallery")
     monkeypatch.setattr(gallery, "pictures", lambda: dict.fromkeys(LIBRARY, (1.0, 2.5)))
     sheet = gallery.sheet()
     assert sorted(re.findall(r"\(#(\w+)\)", sheet)) == sorted(LIBRARY)
-    of_tester = sheet.split("**")[2]
-    assert re.findall(r"\(#(\w+)\)", of_tester) == ["frame_compliance", "thermal_drift", "platen_sink_in"]
-    assert "2.5 µm" in of_tester
+    of_instrument = sheet.split("**")[2]
+    assert re.findall(r"\(#(\w+)\)", of_instrument) == ["frame_compliance", "thermal_drift", "platen_sink_in"]
+    assert "2.5 µm" in of_instrument
