@@ -1,7 +1,8 @@
-"""Arguments of public functions: what is obviously meant is converted, the rest refused in one line that names it.
+"""Values of arguments of public functions: what is obviously meant is converted, what gives wrong numbers is refused.
 
-What is refused raises `InputError`. Only what can be looked at is checked: a tracer (inside `jax.jit`, `vmap` or
-`grad`) passes, so nothing here is part of what is compiled; in plain Python a check takes microseconds.
+What is refused raises `InputError`, in one line that names it; an object of a wrong class is left to Python. Only what
+can be looked at is checked: a tracer (inside `jax.jit`, `vmap` or `grad`) passes, so nothing here is part of what is
+compiled; in plain Python a check takes microseconds.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import enum
 import math
 import numbers
 import os
-from collections.abc import Callable, Collection, Iterable, Sized
+from collections.abc import Collection, Iterable, Sized
 from pathlib import Path, PurePath
 from typing import Any, cast
 
@@ -57,15 +58,6 @@ def member[E: enum.Enum](value: E | str, choices: type[E], name: str) -> E:
         return value
     texts = {one.value: one for one in choices}
     return texts[choice(value, texts, name)]
-
-
-def instance[T](value: Any, kind: type[T] | tuple[type[T], ...], name: str, remedy: str) -> T:
-    """The value, if it is of a kind; `remedy` says how to make what is wanted."""
-    if isinstance(value, kind):
-        return value
-    kinds = kind if isinstance(kind, tuple) else (kind,)
-    wanted = " or ".join(one.__name__.removeprefix("Abstract") for one in kinds)
-    raise InputError(f"{name} must be a {wanted}, got {kind_of(value)}", remedy=remedy)
 
 
 def is_number(value: Any) -> bool:
@@ -255,10 +247,3 @@ def file_path(value: Any, name: str) -> Path:
     if not isinstance(value, str | os.PathLike) or not str(value):
         raise InputError(f"{name} must be the path of a file or folder, got {kind_of(value)}")
     return Path(value)
-
-
-def teller(progress: Any, name: str = "progress") -> Callable[[str], None]:
-    """The function that is told the name of each step; one that does nothing for None."""
-    if progress is not None and not callable(progress):
-        raise InputError(f"{name} must be a function of the name of a step, got {kind_of(progress)}")
-    return (lambda _: None) if progress is None else cast(Callable[[str], None], progress)

@@ -20,7 +20,7 @@ from .model import Model
 from .noise import Whitening, forward_substitution
 from .population import COEFFICIENTS, Population, flattened
 from .posterior import Posterior
-from .predict import A_CALIBRATION, laws_with, predicted_at, predicted_by
+from .predict import laws_with, predicted_at, predicted_by
 from .prior_draws import log_priors, prior_populations
 from .settings import SAMPLING
 
@@ -87,7 +87,6 @@ def to_arviz(calibration: Posterior, *, prior_count: int = 500, points: bool = F
     """
     from arviz_base import from_dict
 
-    arguments.instance(calibration, Posterior, "calibration", A_CALIBRATION)
     prior_count = arguments.whole(prior_count, "prior_count", least=1)
     seed = arguments.seed(seed)
     points = arguments.flag(points, "points")
@@ -250,7 +249,6 @@ def write_posterior(calibration: Posterior, file: str | Path) -> None:
 
     Of several processes, which all have the same posterior, only the first one writes.
     """
-    arguments.instance(calibration, Posterior, "calibration", A_CALIBRATION)
     file = arguments.file_path(file, "file")
     with extra("netcdf"):
         import h5netcdf  # noqa: F401

@@ -361,7 +361,6 @@ def _prepare(
 
 def point_noise_um(curve: Curve) -> float:
     """Standard deviation of displacement from point to point [um]: second differences cancel any smooth course."""
-    arguments.instance(curve, Curve, "curve", "Make one with mcc_jax.Curve(time_s, force_mN, displacement_um).")
     return point_noise(curve.displacement_um)
 
 

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .. import arguments
 from .._errors import InputError
 from .._format import described
 from ..campaign import THRESHOLD_MPA, Campaign, check_tests
@@ -106,11 +105,9 @@ def compare(campaign: Campaign, models: Sequence[Model | Posterior], *, seed: in
     import pandas as pd
     from scipy.special import logsumexp
 
-    arguments.instance(models, Sequence, "models", "Give a list of mcc_jax.Model.")
     if not models:
         raise InputError("there is no model to compare")
     for one in models:
-        arguments.instance(one, (Model, Posterior), "models", "Give a list of mcc_jax.Model.")
         _refuse_robust(one.model if isinstance(one, Posterior) else one)
     found = [one if isinstance(one, Posterior) else sample(campaign, one, seed=seed) for one in models]
     counted = [np.asarray(one.selection.tests.mask).sum(1) for one in found]

@@ -464,9 +464,7 @@ def checked_settings(
     progress: Callable[[str], None] | None, model: Model | None, threshold_MPa: Any, block: int | None
 ) -> tuple[Callable[[str], None], Model, float]:
     """What all calibrations share, with defaults filled in; refuses what is of the wrong kind or out of its range."""
-    tell = arguments.teller(progress)
-    if model is not None:
-        arguments.instance(model, Model, "model", "Make one with mcc_jax.Model().")
+    tell = progress or (lambda _: None)
     if block is not None:
         arguments.whole(block, "block", least=1)
     threshold = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -78,8 +77,6 @@ class Model:
         along: Along | str = Along.LOAD,
         robust: bool = False,
     ) -> None:
-        if priors is not None:
-            arguments.instance(priors, Priors, "priors", "Read them with mcc_jax.read_priors(file).")
         chosen = tuple(_variant(one) for one in _several(effects))
         names = [v.mechanism for v in chosen]
         twice = sorted({name for name in names if names.count(name) > 1})
@@ -302,14 +299,11 @@ def spread(name: str, prior: NakagamiPrior) -> Scalar:
 def _several(value: Any) -> tuple[Any, ...]:
     if isinstance(value, str | Variant):
         return (value,)
-    remedy = 'Give a list of names such as ["creep:logarithmic"].'
-    return tuple(arguments.instance(value, Sequence, "a list of effects", remedy))
+    return tuple(value)
 
 
 def _variant(effect: Any) -> Variant:
     found = find_variant(effect) if isinstance(effect, str) else effect
-    remedy = 'Give a name such as "creep:logarithmic", or a mcc_jax.Variant.'
-    found = arguments.instance(found, Variant, "an effect of a model", remedy)
     for nuisance in found.nuisances:
         if nuisance.random_per_test:
             raise InputError(

@@ -25,8 +25,6 @@ from .noise import Whitening
 from .population import COEFFICIENTS, flattened
 from .results import PosteriorDraws
 
-A_CALIBRATION = "Make one with mcc_jax.sample(campaign)."
-
 
 @dataclass(frozen=True)
 class PredictedCurves:
@@ -114,7 +112,6 @@ def sample_laws(calibration: PosteriorDraws, count: int, *, seed: int = 0) -> Mc
     Returns:
         A batched law, every array field with a leading axis.
     """
-    arguments.instance(calibration, PosteriorDraws, "calibration", A_CALIBRATION)
     count = arguments.whole(count, "count", least=1)
     rng = np.random.default_rng(arguments.seed(seed))
     p = flattened(calibration.population)
@@ -151,7 +148,6 @@ def predict_new_particle(
     Raises:
         InputError: for diameters that are not positive, or a path that is none.
     """
-    arguments.instance(calibration, PosteriorDraws, "calibration", A_CALIBRATION)
     sizes = arguments.one_particle(diameters_um)
     force_mN = np.asarray(arguments.path(force_mN, "force_mN"))
     if not np.isfinite(force_mN).all():
@@ -175,7 +171,6 @@ def predict_measured(calibration: PosteriorDraws, particle: str, *, count: int =
     Raises:
         InputError: if the particle did not take part.
     """
-    arguments.instance(calibration, PosteriorDraws, "calibration", A_CALIBRATION)
     count = arguments.whole(count, "count", least=1)
     seed = arguments.seed(seed)
     if particle not in calibration.particles:
@@ -213,7 +208,6 @@ def predicted_at(calibration: PosteriorDraws, row: int, pick: np.ndarray, seed: 
 
 def compare_with_paper(calibration: PosteriorDraws) -> list[dict[str, Any]]:
     """The paper's Table 2, a and modulus beside ours: one row per quantity, with mean, sd and 95 % interval of ours."""
-    arguments.instance(calibration, PosteriorDraws, "calibration", A_CALIBRATION)
     named = calibration.named_population()
     paper: dict[str, float | None] = {"a": PAPER_SHAPE_PARAMETER}
     printed = calibration.model.unloading.value == "printed"

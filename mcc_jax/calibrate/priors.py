@@ -140,13 +140,6 @@ class Priors:
 
     __repr__ = described()
 
-    def __post_init__(self) -> None:
-        for f in dataclasses.fields(self):
-            if f.name != "changed":
-                kind = type(f.default)
-                remedy = f"Give mcc_jax.{kind.__name__}({', '.join(g.name for g in dataclasses.fields(kind))})."  # pyright: ignore[reportArgumentType]
-                arguments.instance(getattr(self, f.name), kind, f"the prior {f.name}", remedy)
-
     @classmethod
     def default(cls, unloading: Unloading | str = Unloading.PRINTED) -> Priors:
         """The defaults; the modulus of a punch form is some twenty times smaller than that of the printed one."""

@@ -11,7 +11,7 @@ from .. import arguments
 from .._format import described
 from .reasons import below_threshold, far_apart, no_climb, no_loading, too_few
 from .schema import Campaign, Curve
-from .segments import Segment, check_segmented, find_segments
+from .segments import Segment, find_segments
 from .validate import check_campaign
 
 THRESHOLD_MPA = 0.2
@@ -77,7 +77,6 @@ def stress_and_strain(
     References:
         Bommireddy et al. (2018), eqs. 3 and 4.
     """
-    check_segmented(curve, segments)
     diameters_um = arguments.one_particle(diameters_um)
     diameter = effective_diameter_um(diameters_um)
     zero = _contact_um(curve, segments)
@@ -102,7 +101,6 @@ def loading_curve(curve: Curve, diameters_um: np.ndarray, segments: tuple[Segmen
     Returns:
         The curve, or None if the test never loads.
     """
-    check_segmented(curve, segments)
     diameters_um = arguments.one_particle(diameters_um)
     from scipy.optimize import isotonic_regression  # half a second to import, so only where it is used
 

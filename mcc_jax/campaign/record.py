@@ -47,7 +47,6 @@ def record_columns(
     curve: Curve, segments: tuple[Segment, ...], *, relative_humidity_percent: float | None = None
 ) -> dict[str, np.ndarray]:
     """The record of a measured test as arrays of NumPy by name, to be put together with others; see `record_of`."""
-    arguments.instance(curve, Curve, "curve", "Make one with mcc_jax.Curve(time_s, force_mN, displacement_um).")
     if relative_humidity_percent is not None:
         arguments.number(relative_humidity_percent, "relative_humidity_percent", least=0, most=100)
     count = len(curve)

@@ -142,10 +142,7 @@ class Metadata:
         for name in ("force_resolution_mN", "displacement_resolution_um", "punch_diameter_um"):
             if (value := getattr(self, name)) is not None:
                 object.__setattr__(self, name, arguments.number(value, name, above=0))
-        if self.provenance is not None:
-            arguments.instance(self.provenance, str, "provenance", "Say in words where the data come from.")
         object.__setattr__(self, "corrections", _texts(self.corrections, "corrections"))
-        arguments.instance(self.other, Mapping, "other", "Give a dictionary.")
 
 
 @dataclass(frozen=True, repr=False)
@@ -190,15 +187,12 @@ class Campaign:
         sizes = sizes.reshape(0, 3) if sizes.size == 0 else sizes
         if sizes.shape != (len(names), 3):
             raise InputError(f"diameters_um has the shape {sizes.shape} where ({len(names)}, 3) is expected: {_SIZES}")
-        curves = arguments.instance(curves, Iterable, "curves", "Give a list with one Curve for every particle.")
-        tests = tuple(arguments.instance(one, Curve, "every one of curves", A_CURVE) for one in curves)
+        tests = tuple(curves)
         arguments.same_length(particles=names, curves=tests)
-        given = arguments.instance(columns or {}, Mapping, "columns", "Give a dictionary of columns.")
-        further = {name: _texts(cells, f"the column {name!r}") for name, cells in given.items()}
+        further = {name: _texts(cells, f"the column {name!r}") for name, cells in (columns or {}).items()}
         for name, cells in further.items():
             arguments.same_length(**{"particles": names, f"the column {name!r}": cells})
         told = Metadata() if metadata is None else metadata
-        arguments.instance(told, Metadata, "metadata", "Give mcc_jax.Metadata(control=...).")
         fields = {"particles": names, "diameters_um": sizes, "curves": tests, "columns": further, "metadata": told}
         for name, value in (fields | {"source": str(source), "raw": raw}).items():
             object.__setattr__(self, name, value)
@@ -260,7 +254,6 @@ class Campaign:
 
 
 _SIZES = "D1, D2, D3 [um] of every particle, shape (N, 3)"
-A_CURVE = "Make one with mcc_jax.Curve(time_s, force_mN, displacement_um)."
 
 
 def _texts(values: Any, name: str) -> tuple[str, ...]:

@@ -9,7 +9,6 @@ approach. All thresholds are shares of the curve's own range, or multiples of it
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal, cast, get_args
@@ -20,7 +19,7 @@ from .. import arguments
 from .._errors import InputError
 from .excursions import Drive, Hold
 from .memory import remembered
-from .schema import A_CURVE, Control, Curve
+from .schema import Control, Curve
 from .signal import branch_envelope, median, steady_clock, two_lines
 from .validate import check_finite
 
@@ -80,7 +79,6 @@ def find_segments(curve: Curve, *, control: Control | None = None) -> tuple[Segm
     Raises:
         InputError: for a curve without a point or with one that is not finite, or a control that does not exist.
     """
-    arguments.instance(curve, Curve, "curve", A_CURVE)
     if control is not None:
         arguments.choice(control, get_args(Control), "control")
     if not len(curve):
@@ -121,7 +119,6 @@ def summarise_segments(curve: Curve, segments: tuple[Segment, ...]) -> list[dict
         Rows with `kind`, `samples`, `start_s`, `stop_s`, `force_from_mN`, `force_to_mN`, `displacement_from_um` and
         `displacement_to_um`; times, forces and displacements are those of the first and the last sample.
     """
-    check_segmented(curve, segments)
     columns = {
         ("start_s", "stop_s"): curve.time_s,
         ("force_from_mN", "force_to_mN"): curve.force_mN,
@@ -275,11 +272,3 @@ def _assemble(drive: Drive, holds: list[Hold], force: Drive, onset: int) -> tupl
     cuts = np.flatnonzero(kinds[1:] != kinds[:-1]) + 1
     edges = [0, *cuts.tolist(), count]
     return tuple(Segment(cast(SegmentKind, str(kinds[a])), a, b) for a, b in pairwise(edges))
-
-
-def check_segmented(curve: Any, segments: Any) -> None:
-    """Refuse what is no curve, or no segments of one."""
-    arguments.instance(curve, Curve, "curve", A_CURVE)
-    remedy = "Take those of mcc_jax.find_segments(curve)."
-    for one in arguments.instance(segments, Sequence, "segments", remedy):
-        arguments.instance(one, Segment, "every one of segments", remedy)

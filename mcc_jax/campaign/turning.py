@@ -13,7 +13,7 @@ import numpy as np
 
 from .._format import described
 from .schema import Curve
-from .segments import Segment, check_segmented
+from .segments import Segment
 from .signal import median, noise_level, straight_line
 
 SHARE = 0.1
@@ -53,7 +53,6 @@ class TurningForces(NamedTuple):
 
 def turning_forces(curve: Curve, segments: tuple[Segment, ...]) -> TurningForces:
     """Estimate the force at which every branch of a test, cut by `find_segments`, begins."""
-    check_segmented(curve, segments)
     time, raw = np.asarray(curve.time_s, float), np.asarray(curve.force_mN, float)
     force, peak = raw.copy(), raw.copy()
     error, reading = np.zeros(len(raw)), np.ones(len(raw), bool)

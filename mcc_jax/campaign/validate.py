@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from .. import arguments
 from .._errors import InputError
 from .columns import LARGEST_MAGNITUDE
 from .schema import Campaign, Curve, Metadata
@@ -53,7 +52,6 @@ def check_campaign(campaign: Any, name: str = "campaign", *, file: str | Path = 
     if isinstance(campaign, str | PurePath):
         remedy = f"Read it first: mcc_jax.read_campaign({str(campaign)!r})."
         raise InputError(f"{name} must be a Campaign, got the path {str(campaign)!r}", remedy=remedy)
-    arguments.instance(campaign, Campaign, name, "Read one with mcc_jax.read_campaign(folder), or make one in memory.")
     place = file or campaign.source or f"the {name}"
 
     def fail(problem: str, remedy: str = "Mend the campaign before it is used") -> InputError:

@@ -91,8 +91,6 @@ def population_packing(
     Raises:
         InputError: if the population hardly has a monotone law; for effects that contacts cannot have, by name.
     """
-    remedy = "Make one with mcc_jax.sample(campaign)."
-    arguments.instance(calibration, Posterior, "calibration", remedy)
     diameter = arguments.path(diameter, "diameter", many="Give one diameter [um] for each sphere.")
     arguments.positive(diameter, "diameter [um]")
     seed = arguments.seed(seed)

@@ -19,11 +19,11 @@ from .._format import described
 from .._numerics import shared
 from .._types import Scalar
 from .edges import relisted, stacked_lists
-from .forces import A_PACKING, Forces, Interaction, Packing, Vector, contact_forces
+from .forces import Forces, Interaction, Packing, Vector, contact_forces
 from .measured import Sample, Trajectory, measured
 from .pair import wall_force, wall_recovery
 from .sharded import Contacts, Devices, at_home, divided
-from .state import A_STATE, State, check_state, listed
+from .state import State, check_state, listed
 from .walls import set_velocity
 
 
@@ -63,24 +63,11 @@ class Motion(eqx.Module):
         acceleration = arguments.floats(gravity, "gravity", shape="three components [m/s^2]")
         if acceleration.shape != (3,) or not np.isfinite(acceleration).all():
             raise InputError(f"gravity must be three finite components [m/s^2], got {arguments.shown(gravity)}")
-        if interaction is not None:
-            arguments.instance(interaction, Interaction, "interaction", "Make one with mcc_jax.dem.Interaction().")
         given = jax.tree.map(lambda x: x.astype(dtype), interaction or Interaction())
         return cls(jnp.asarray(time_step, dtype), given, jnp.asarray(drag, dtype), jnp.asarray(acceleration, dtype))
 
 
 Keep = Literal["steps", "lists"]
-
-
-def check_arguments(packing: Packing, motion: Motion, state: State) -> None:
-    """Refuse what is no packing, motion or state.
-
-    Raises:
-        InputError: saying how to make one.
-    """
-    arguments.instance(packing, Packing, "packing", A_PACKING)
-    arguments.instance(motion, Motion, "motion", "Make one with mcc_jax.dem.Motion.of(time_step).")
-    arguments.instance(state, State, "state", A_STATE)
 
 
 class Segment(NamedTuple):
@@ -99,7 +86,6 @@ def step(packing: Packing, motion: Motion, state: State, contacts: Contacts = co
 
     The list of edges is taken as it is; `advance` makes it anew in time. `contacts` computes the forces.
     """
-    check_arguments(packing, motion, state)
     forces, edges, history = contacts(
         packing,
         motion.interaction,
@@ -160,7 +146,6 @@ def run(
         wanted: how many of these steps are taken.
         devices: over which the contacts are divided (`jax.devices()`); not divided if None.
     """
-    check_arguments(packing, motion, state)
     steps = arguments.whole(steps, "steps")
 
     def loop(contacts: Contacts, packing: Packing, motion: Motion, state: State, wanted: Array) -> tuple[State, tuple]:
@@ -233,7 +218,6 @@ def advance(
     Raises:
         InputError: if a particle left the walls, a position became NaN. The state passed in is untouched.
     """
-    check_arguments(packing, motion, state)
     rows, steps = arguments.whole(rows, "rows"), arguments.whole(steps, "steps")
     skin = arguments.number(skin, "skin [m]", least=0)
     state = eqx.tree_at(lambda s: s.walls, state, set_velocity(state.walls, velocity))
@@ -283,7 +267,6 @@ def replay(
         keep: what reverse mode keeps on its way: the states of all steps, or, for long motions, those between lists
             only; each step is then computed once more.
     """
-    check_arguments(packing, motion, state)
     arguments.choice(keep, get_args(Keep), "keep")
     if not tape:
         return state
@@ -311,7 +294,6 @@ def stable_time_step(packing: Packing, safety: float = 0.3) -> float:
         packing: the spheres.
         safety: s; 0.3 leaves room for several contacts a particle.
     """
-    arguments.instance(packing, Packing, "packing", A_PACKING)
     safety = arguments.number(safety, "safety", above=0)
 
     def steepest(side):
@@ -328,7 +310,6 @@ def in_single(packing: Packing, motion: Motion, state: State) -> tuple[Packing, 
     die of 1 mm knows places to 1e-10 m only. Forces err by about 1e-6 of the largest (tested to 1e-5). History takes
     16 B an edge instead of 32; what the state remembers is rounded.
     """
-    check_arguments(packing, motion, state)
 
     def fields(state: State) -> tuple[Any, ...]:
         return state.velocity, state.spin, state.edges, state.wall_history

@@ -42,9 +42,6 @@ class Packing(eqx.Module):
         return 4 / 3 * jnp.pi * jnp.sum(self.radius**3)
 
 
-A_PACKING = "Make one with mcc_jax.dem.spheres(law, diameter)."
-
-
 def _share(value: ScalarLike) -> Scalar:
     arguments.positive(value, "damping or tangential_ratio [-]", zero=True, plain=True)
     return scalar(value)
@@ -169,9 +166,6 @@ def contact_forces(
     time_step: Scalar,
 ) -> tuple[Forces, Edges, WallHistory]:
     """Forces of all contacts, and what they remember after them; slip adds up over the time step [s]."""
-    arguments.instance(packing, Packing, "packing", A_PACKING)
-    arguments.instance(interaction, Interaction, "interaction", "Make one with mcc_jax.dem.Interaction().")
-    arguments.instance(edges, Edges, "edges", "Take those of a state.")
     bodies = bodies_of(packing, position, velocity, spin)
     load, edges = pair_loads(interaction, bodies, edges, time_step)
     at_walls, on_wall, history = wall_loads(interaction, walls, bodies, history, time_step)

@@ -13,10 +13,10 @@ from jaxtyping import Array
 from .. import arguments
 from .._errors import InputError
 from .._format import described
-from .load_steps import TOP, LoadStep, Solver, checked_solver, replay_stacked, stacked
+from .load_steps import TOP, LoadStep, Solver, replay_stacked, stacked
 from .quasistatic import Compaction, compact
 from .sensitivity import PackingOf
-from .state import A_STATE, State
+from .state import State
 
 ROUNDS = 5
 
@@ -72,8 +72,7 @@ def fit_compaction(
     Raises:
         InputError: as `compact`; if heights and forces are not equally many, or fewer than the parameters.
     """
-    solver = checked_solver(solver)
-    arguments.instance(state, State, "state", A_STATE)
+    solver = solver or Solver()
     tolerance = arguments.number(tolerance, "tolerance", above=0)
     values = arguments.path(start, "start")
     measured = arguments.floats(force, "force", shape="the force on the top punch [N] at every height")

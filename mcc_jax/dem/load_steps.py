@@ -16,8 +16,8 @@ from .._format import described
 from .._types import Scalar
 from .edges import Edges, relisted, stacked_lists
 from .equilibrium import settle
-from .forces import A_PACKING, Packing, Vectors, WallHistory
-from .state import A_STATE, State
+from .forces import Packing, Vectors, WallHistory
+from .state import State
 from .stiffness import Held, force_on_walls, net_force, remembered
 from .walls import Cylinder, Plane, Walls
 
@@ -55,15 +55,6 @@ class Solver(eqx.Module):
         arguments.number(self.skin, "skin", above=0)
         if not self.springs:
             raise InputError("a solver without springs", remedy="Give at least one.")
-
-
-def checked_solver(solver: Solver | None) -> Solver:
-    """The solver, or the default one.
-
-    Raises:
-        InputError: if it is none.
-    """
-    return Solver() if solver is None else arguments.instance(solver, Solver, "solver", "Make one with Solver().")
 
 
 class LoadStep(NamedTuple):
@@ -131,9 +122,7 @@ def replay_compaction(
     Raises:
         InputError: if the tape is empty.
     """
-    arguments.instance(packing, Packing, "packing", A_PACKING)
-    arguments.instance(state, State, "state", A_STATE)
-    return eqx.filter_jit(replay_stacked)(packing, state, stacked(tape), checked_solver(solver))
+    return eqx.filter_jit(replay_stacked)(packing, state, stacked(tape), solver or Solver())
 
 
 def stacked(tape: Sequence[LoadStep]) -> LoadStep:

@@ -14,7 +14,7 @@ from .. import arguments
 from .._errors import InputError
 from ..geometry import Particle
 from ..law import MccLaw
-from .forces import A_PACKING, Packing
+from .forces import Packing
 from .side import half_contact, passive
 
 MCC_DENSITY = 1540.0
@@ -32,7 +32,6 @@ def spheres(law: MccLaw, diameter: Any, density: float = MCC_DENSITY) -> Packing
     Raises:
         InputError: if a diameter or the density is not positive.
     """
-    arguments.instance(law, MccLaw, "law", "Take mcc_jax.paper_law(), or the law of a calibration.")
     diameter = arguments.path(diameter, "diameter", many="Give one diameter [um] for each sphere.")
     arguments.positive(diameter, "diameter [um]")  # traced ones pass
     density = arguments.number(density, "density [kg/m^3]", above=0)
@@ -88,7 +87,6 @@ def scattered(
 
 def relative_density(packing: Packing, radius: float, bottom: float, top: float) -> float:
     """Volume of the spheres over that of the die between the punches [-]."""
-    arguments.instance(packing, Packing, "packing", A_PACKING)
     radius = arguments.number(radius, "radius [m]", above=0)
     bottom = arguments.number(bottom, "bottom [m]")
     top = arguments.number(top, "top [m]", above=bottom)

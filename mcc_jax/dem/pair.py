@@ -76,7 +76,6 @@ def pair_force(i: HalfContact, j: HalfContact, overlap_max: ScalarLike, overlap:
     Raises:
         InputError: if one side unloads by the printed form and the other by a punch form.
     """
-    _check_sides(i, j)
     if i.power != j.power:
         raise InputError(
             "a pair whose sides unload by different forms shares no unloading curve",
@@ -99,7 +98,6 @@ def wall_force(side: HalfContact, overlap_max: ScalarLike, overlap: ScalarLike) 
         overlap_max: largest overlap before this one [m].
         overlap: overlap with the wall now [m].
     """
-    _check_sides(side)
     overlap_max, overlap = _largest(side, overlap_max), _overlap(side, overlap)
     peak = largest_overlap(overlap_max, overlap)
     *loading, c = side.numbers(peak)
@@ -108,7 +106,6 @@ def wall_force(side: HalfContact, overlap_max: ScalarLike, overlap: ScalarLike) 
 
 def pair_split(i: HalfContact, j: HalfContact, overlap: ScalarLike) -> tuple[Scalar, Scalar]:
     """Compressions [m] of the two sides while loading at an overlap [m], and so of the peak of any unloading."""
-    _check_sides(i, j)
     overlap = _overlap(i, overlap)
     series = _series(_numbers(i), _numbers(j), overlap)
     return series.d_i, series.d_j
@@ -119,14 +116,12 @@ def pair_recovery(i: HalfContact, j: HalfContact, overlap_max: ScalarLike) -> Sc
 
     It is 1 where no force was carried.
     """
-    _check_sides(i, j)
     overlap_max = _largest(i, overlap_max)
     return _both_spans(i, j, _series(_numbers(i), _numbers(j), overlap_max))
 
 
 def wall_recovery(side: HalfContact, overlap_max: ScalarLike) -> Scalar:
     r"""Overlap [m] that a rigid wall is given back, :math:`\Delta`; see `pair_recovery`."""
-    _check_sides(side)
     overlap_max = _largest(side, overlap_max)
     force = overlap_max * secant_modulus(side.k1, side.k3, side.k5, overlap_max)
     return _span(side, force, overlap_max)
@@ -140,7 +135,6 @@ def pair_energy(i: HalfContact, j: HalfContact, overlap_max: ScalarLike, overlap
 
     with g of `law.energy_ratio`. Arguments as in `pair_force`.
     """
-    _check_sides(i, j)
     overlap_max, overlap = _largest(i, overlap_max), _overlap(i, overlap)
     peak = largest_overlap(overlap_max, overlap)
     series = _series(_numbers(i), _numbers(j), peak)
@@ -155,16 +149,10 @@ def pair_energy(i: HalfContact, j: HalfContact, overlap_max: ScalarLike, overlap
 
 def wall_energy(side: HalfContact, overlap_max: ScalarLike, overlap: ScalarLike) -> ContactEnergy:
     """Energy [J] of a contact with a rigid wall; see `pair_energy`."""
-    _check_sides(side)
     overlap_max, overlap = _largest(side, overlap_max), _overlap(side, overlap)
     peak = largest_overlap(overlap_max, overlap)
     force = peak * secant_modulus(side.k1, side.k3, side.k5, peak)
     return _energy(loading_work(side.k1, side.k3, side.k5, peak), force, _span(side, force, peak), peak - overlap)
-
-
-def _check_sides(*sides: HalfContact) -> None:
-    for side in sides:
-        arguments.instance(side, HalfContact, "a side", "Make one with mcc_jax.dem.half_contact(law, particle).")
 
 
 def _overlap(

@@ -16,9 +16,9 @@ from .._types import Scalar
 from .edges import Edges
 from .equilibrium import Settled, settle
 from .forces import Packing
-from .load_steps import BOTTOM, TOP, LoadStep, Solver, checked_solver, die_walls, lowered
+from .load_steps import BOTTOM, TOP, LoadStep, Solver, die_walls, lowered
 from .measured import measured
-from .state import A_STATE, State, check_packing, check_state, listed, start
+from .state import State, check_packing, check_state, listed, start
 from .stiffness import Held, pair_geometry, remembered
 from .walls import Walls
 
@@ -89,7 +89,7 @@ def relaxed(packing: Packing, walls: Walls, position: Any, solver: Solver | None
     Raises:
         InputError: as `start`.
     """
-    solver = checked_solver(solver)
+    solver = solver or Solver()
     passes = arguments.whole(passes, "passes")
     check_packing(packing)
     skin = solver.skin * float(jnp.mean(packing.radius))
@@ -135,9 +135,8 @@ def compact(
         InputError: for walls that are not a die, a height that is not positive, or a particle outside the walls. The
             state passed in is untouched.
     """
-    solver = checked_solver(solver)
+    solver = solver or Solver()
     check_packing(packing)
-    arguments.instance(state, State, "state", A_STATE)
     die_walls(state.walls)
     heights = arguments.floats(heights, "heights", shape="heights of the top punch [m], shape (rows,)")
     if heights.ndim != 1 or not (np.isfinite(heights).all() and (heights > 0).all()):

@@ -14,9 +14,9 @@ from jaxtyping import Array, Float
 from .. import arguments
 from .._errors import InputError
 from .._format import described
-from .forces import A_PACKING, Packing
+from .forces import Packing
 from .load_steps import TOP, LoadStep, Replayed, Solver, replay_stacked, stacked
-from .state import A_STATE, State
+from .state import State
 
 STRESSES = ("K1", "K3", "K5", "Ebar", "springs")
 """What has the dimension of a stress: K1 = C1, K3 = C3^3, K5 = C5^5, the effective modulus, the proximal springs."""
@@ -58,7 +58,6 @@ def rescaled(packing: Packing, log_scale: Float[Array, " 4"]) -> Packing:
         packing: the spheres.
         log_scale: s of K1 = C1, K3 = C3^3, K5 = C5^5 and Ebar.
     """
-    arguments.instance(packing, Packing, "packing", A_PACKING)
     sides = packing.sides
     k1, k3, k5, modulus = (jnp.exp(s) for s in log_scale)
     scaled = (sides.k1 * k1, sides.k3 * k3, sides.k5 * k5, sides.c / modulus**sides.power)
@@ -91,7 +90,6 @@ def punch_sensitivity(
     """
     if not callable(packing_of):
         raise InputError(f"packing_of must be a function of the values, got {arguments.kind_of(packing_of)}")
-    arguments.instance(state, State, "state", A_STATE)
     values = jnp.asarray(values, float)
     last = np.array([step.last for step in tape])
     # Outside the compiled function: that one then is the same for all parametrisations.

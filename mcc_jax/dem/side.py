@@ -116,7 +116,6 @@ class HalfContact(eqx.Module):
 
 def sides_of(sides: HalfContact, index: Int[Array | np.ndarray, " contacts"]) -> HalfContact:
     """The half contacts of the particles at an index, from a batch with one for each particle."""
-    arguments.instance(sides, HalfContact, "sides", "Make them with jax.vmap(mcc_jax.dem.half_contact).")
     return jax.tree.map(lambda x: x[index], sides)
 
 
@@ -179,8 +178,6 @@ def half_contact(law: MccLaw, particle: Particle, normal: Normal | None = None) 
     References:
         Bommireddy et al. (2018), eqs. 3 to 5, 13, 16 and 24, for e3.
     """
-    arguments.instance(law, MccLaw, "law", "Take mcc_jax.paper_law(), or the law of a calibration.")
-    arguments.instance(particle, Particle, "particle", "Make one with mcc_jax.Particle(D1, D2, D3), diameters in um.")
     semi = 0.5e-6 * jnp.stack([particle.D1, particle.D2, particle.D3])  # m
     square = semi[2] * semi[2] if normal is None else jnp.sum((semi * normal) ** 2)
     radius = shared(jnp.prod(semi) / square)

@@ -19,10 +19,9 @@ from .._format import described
 from .._store import write_file
 from .._types import Scalar
 from .edges import Edges, carry_history, close_pairs, list_edges
-from .forces import A_PACKING, Packing, Vectors, WallHistory
-from .walls import Cylinder, Plane, Walls
+from .forces import Packing, Vectors, WallHistory
+from .walls import Walls
 
-A_STATE = "Make one with mcc_jax.dem.start(packing, walls, position, skin)."
 SPARE = 1.1
 """Room in the list of edges beyond the pairs found when it was made."""
 
@@ -70,7 +69,6 @@ def start(packing: Packing, walls: Walls, position: Any, skin: float, capacity: 
             the pairs do not fit the capacity.
     """
     check_packing(packing)
-    check_walls(walls)
     position = arguments.values(position, "position", shape="centres [m], shape (N, 3)")
     if position.shape != (len(packing.radius), 3):
         raise InputError(f"position has the shape {position.shape} where ({len(packing.radius)}, 3) is expected")
@@ -103,8 +101,6 @@ def listed(packing: Packing, state: State, skin: float, capacity: int | None = N
     Raises:
         InputError: as `close_pairs`, and if the pairs do not fit a capacity that was asked for.
     """
-    arguments.instance(packing, Packing, "packing", A_PACKING)
-    arguments.instance(state, State, "state", A_STATE)
     skin = arguments.number(skin, "skin [m]", least=0)
     if capacity is not None:
         capacity = arguments.whole(capacity, "capacity")
@@ -126,7 +122,6 @@ def check_packing(packing: Packing) -> None:
     Raises:
         InputError: naming the first such particle.
     """
-    arguments.instance(packing, Packing, "packing", A_PACKING)
     valid = np.asarray(jax.vmap(lambda side: side.is_valid)(packing.sides))
     valid = valid & np.asarray((packing.radius > 0) & (packing.mass > 0))
     if not valid.all():
@@ -136,21 +131,8 @@ def check_packing(packing: Packing) -> None:
         )
 
 
-def check_walls(walls: Walls) -> None:
-    """Refuse what are no walls.
-
-    Raises:
-        InputError: naming what was given.
-    """
-    remedy = "Make them with mcc_jax.dem.die(radius, height)."
-    arguments.instance(walls, tuple, "walls", remedy)
-    for wall in walls:
-        arguments.instance(wall, (Plane, Cylinder), "every one of walls", remedy)
-
-
 def not_monotone(packing: Packing) -> Bool[np.ndarray, " particles"]:
     """Which particles soften until their force falls; the split of their contacts is not unique. Draw them anew."""
-    arguments.instance(packing, Packing, "packing", A_PACKING)
     return ~np.asarray(jax.vmap(lambda side: side.is_monotone)(packing.sides))
 
 
@@ -160,7 +142,6 @@ def check_state(state: State) -> None:
     Raises:
         InputError: if a position is not finite or a particle's centre is behind a wall; it names particle and wall.
     """
-    arguments.instance(state, State, "state", A_STATE)
     lost, behind = (np.asarray(x) for x in _astray(state))
     if lost.any():
         raise InputError(
@@ -190,8 +171,6 @@ def _astray(state: State) -> tuple[Bool[Array, " particles"], Bool[Array, "walls
 def save_state(path: str | Path, packing: Packing, state: State) -> None:
     """Write packing and state into one file, replacing an older one only when it is complete."""
     path = arguments.file_path(path, "path")
-    arguments.instance(packing, Packing, "packing", A_PACKING)
-    arguments.instance(state, State, "state", A_STATE)
     if not path.parent.is_dir():
         raise InputError("no such folder", file=path.parent, remedy="Make it first.")
     content = encode((packing, state))

@@ -21,7 +21,6 @@ from ..calibrate.fitting import checked_settings
 from ..calibrate.forward import Point
 from ..campaign import Campaign, Curve, Metadata, available_data, check_campaign, particle_batch
 from ..effects import LIBRARY, Mechanism
-from ..effects.library import checked_library
 from ..simulate import Programme, simulate_campaign
 from .base import Base, State, base_fit
 from .candidates import untestable
@@ -29,7 +28,6 @@ from .design import particle_means
 from .screen import Screen, first_order
 from .settings import DETECTABLE
 
-_A_PROGRAMME = "Take mcc_jax.Programme.cycles()."
 ALIKE = 0.9  # correlation of projected signatures from which on two mechanisms look alike
 
 
@@ -51,13 +49,9 @@ class Plan:
     __repr__ = described()
 
     def __post_init__(self) -> None:
-        arguments.instance(self.name, str, "name", "Say in words what is done.")
-        given = arguments.instance(self.programmes, Sequence, "programmes", _A_PROGRAMME)
-        if not given:
-            raise InputError("a plan needs at least one programme", remedy=_A_PROGRAMME)
-        for one in given:
-            arguments.instance(one, Programme, "every one of programmes", _A_PROGRAMME)
-        object.__setattr__(self, "programmes", tuple(given))
+        if not self.programmes:
+            raise InputError("a plan needs at least one programme", remedy="Take mcc_jax.Programme.cycles().")
+        object.__setattr__(self, "programmes", tuple(self.programmes))
 
 
 def planned_campaign(laws, diameters_um: np.ndarray, peaks_mN: np.ndarray, plan: Plan) -> Campaign:
@@ -69,8 +63,6 @@ def planned_campaign(laws, diameters_um: np.ndarray, peaks_mN: np.ndarray, plan:
 
 def planned_base(base: Base, plan: Plan) -> Base:
     """A base fit as it would be if the same particles were tested by a plan, with the same noise."""
-    arguments.instance(base, Base, "base", "Take the base of a discovery.")
-    arguments.instance(plan, Plan, "plan", "Make one with mcc_jax.Plan(name, [programme]).")
     peaks = np.asarray(jnp.max(base.tests.force, axis=1))
     diameters = base.campaign.diameters_um[list(base.selection.kept)]
     return _expected(base, plan, diameters, peaks, base.state.point.latent, base.scale)
@@ -192,9 +184,6 @@ def power(
     peaks_mN = np.atleast_1d(arguments.floats(peaks_mN, "peaks_mN", shape="the largest force of each, shape (N,)"))
     arguments.same_length(diameters_um=diameters_um, peaks_mN=peaks_mN)
     arguments.positive(peaks_mN, "peaks_mN")
-    arguments.instance(plan, Plan, "plan", "Make one with mcc_jax.Plan(name, [programme]).")
-    arguments.instance(base, Base, "base", "Take the base of a discovery.")
-    checked_library(library)
     flat = eqx.filter_vmap(lambda particle: particle.flatness)(particle_batch(diameters_um))
     latent = particle_means(base.state.population, flat, base.model.shape_power)
     planned = _expected(base, plan, np.asarray(diameters_um, float), peaks_mN, latent, np.ones(len(diameters_um)))
@@ -222,7 +211,6 @@ def power_of_campaign(
         InputError: if no particle can be used.
     """
     check_campaign(campaign)
-    checked_library(library)
     tell, assumed, threshold_MPa = checked_settings(progress, model, threshold_MPa, None)
     base = base_fit(campaign, without_effects(assumed), threshold_MPa=threshold_MPa, tell=tell)
     tell("signatures of all effects")

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any
 
-from .. import arguments
 from .._errors import InputError
 from .contact import MISALIGNMENT, POP_IN, TOE
 from .creep import CREEP
@@ -70,27 +68,12 @@ def default_library() -> dict[str, Mechanism]:
     return dict(LIBRARY)
 
 
-def checked_library(library: Any) -> Mapping[str, Mechanism]:
-    """A library of mechanisms, if it is one.
-
-    Raises:
-        InputError: if it is anything else.
-    """
-    remedy = "Take mcc_jax.effects.default_library() and add to it."
-    arguments.instance(library, Mapping, "library", remedy)
-    for name, mechanism in library.items():
-        arguments.instance(mechanism, Mechanism, f"the entry {name!r} of library", remedy)
-    return library
-
-
 def find_variant(name: str, library: Mapping[str, Mechanism] = LIBRARY) -> Variant:
     """The variant called `mechanism:variant`, or a mechanism's first variant by the mechanism's name alone.
 
     Raises:
         ValueError: naming the choices there are.
     """
-    arguments.instance(name, str, "the name of a formula", 'Write "mechanism" or "mechanism:variant".')
-    checked_library(library)
     mechanism, _, variant = name.partition(":")
     if mechanism not in library:
         raise InputError(f"there is no mechanism {mechanism!r}", remedy=f"Known: {', '.join(library)}.")

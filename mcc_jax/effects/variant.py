@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -198,9 +198,6 @@ class Mechanism:
     sudden: bool = False
 
     def __post_init__(self) -> None:
-        remedy = "Give a list of mcc_jax.effects.Variant."
-        for one in arguments.instance(self.variants, Sequence, "variants", remedy):
-            arguments.instance(one, Variant, "every one of variants", remedy)
         names = [variant.name for variant in self.variants]
         if len(set(names)) < len(names):
             raise InputError(f"{self.name} has two variants of one name")

@@ -76,13 +76,8 @@ def checked(law: Any, particle: Any, origin: Any = None, *, needed: bool = True)
     Raises:
         InputError: for one of another kind, a batch of laws, or a law or particle that is not usable.
     """
-    arguments.instance(law, MccLaw, "law", "Take mcc_jax.paper_law(), or the law of a calibration.")
-    if particle is not None or needed:
-        arguments.instance(particle, Particle, "particle", "Make one with mcc_jax.Particle(D1, D2, D3), in um.")
     if law.plastic.C1.ndim or law.a.ndim or (particle is not None and particle.D3.ndim):
         raise InputError("a batch of laws or particles cannot be exported", remedy="Export one law.")
-    if origin is not None:
-        arguments.instance(origin, Origin, "origin", "Take what mcc_jax.export.read_calibration gives.")
     sphere = Particle(1.0, 1.0, 1.0)  # every law carries it
     check(law, sphere if particle is None else particle, allow_not_monotone=True)
     return origin or Origin()
@@ -150,8 +145,6 @@ def read_calibration(
         InputError: naming the file, what is wrong with it and what to do.
     """
     path = arguments.file_path(folder, "folder")
-    if particle is not None:
-        arguments.instance(particle, str, "particle", "Give the name of one.")
     found = load(path)
     if isinstance(found, Campaign):
         raise InputError(f"{ARCHIVE} is missing", file=path, remedy=_AGAIN)

@@ -284,9 +284,6 @@ def signatures(
     Returns:
         Derivatives [um per unit of amplitude].
     """
-    arguments.instance(base, MccLaw, "base", "Take mcc_jax.paper_law(), or the law of a calibration.")
-    arguments.instance(particle, Particle, "particle", "Make one with mcc_jax.Particle(D1, D2, D3), in um.")
-    arguments.instance(record, Record, "record", "Make one with mcc_jax.effects.record_of(curve).")
     context = replace(base, effects=()).context(particle, record)
     formulas = base.formulas
     strain, zero_um = _virgin_strain(formulas, context), jnp.zeros_like(particle.D3)

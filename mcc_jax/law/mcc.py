@@ -84,7 +84,7 @@ def _effects(value: Any) -> tuple[AbstractEffect, ...]:
     remedy = 'Take law.with_effects("creep"), or mcc_jax.effects.find_variant("creep").build(0.02).'
     if isinstance(value, str | AbstractEffect) or not isinstance(value, Iterable):
         raise InputError(f"effects must be a list of effects, got {arguments.kind_of(value)}", remedy=remedy)
-    return tuple(arguments.instance(one, AbstractEffect, "every one of effects", remedy) for one in value)
+    return tuple(value)
 
 
 class MccLaw(Formulas, AbstractContactLaw[History]):
@@ -356,5 +356,4 @@ def _one_effect(effect: Any) -> AbstractEffect:
         effect = find_variant(effect)
     if isinstance(effect, Variant):
         return effect.build(effect.typical)
-    remedy = 'Give a name such as "creep:logarithmic", a Variant, or what its build(amplitude) makes.'
-    return arguments.instance(effect, AbstractEffect, "an effect", remedy)
+    return effect

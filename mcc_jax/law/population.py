@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from .. import arguments
 from .._format import described
 from .._types import Scalar, ScalarLike, scalar
 from ..arguments import finite, positive, whole
@@ -74,10 +73,6 @@ class PlasticPopulation(eqx.Module):
     C5: LogNormal
 
     __repr__ = described()
-
-    def __check_init__(self) -> None:
-        for name in ("C1", "C3", "C5"):
-            arguments.instance(getattr(self, name), LogNormal, name, "Make one with mcc_jax.LogNormal(mean, sd).")
 
     @property
     def mean_law(self) -> Plastic:

@@ -268,7 +268,6 @@ def plot_new_particle(calibration: Posterior, diameters_um: Any = None) -> Figur
 # ---- the paper's calibration -----------------------------------------------------------------------------------------
 
 
-@style.of_its_kind
 def particle_pages(calibration: PaperCalibration) -> int:
     """Number of pages that `plot_particles` needs for all particles."""
     return -(-len(calibration.campaign) // style.SETTINGS.page)

@@ -24,7 +24,6 @@ from .curves import plot_before_after
 _FLOOR: style.Look = {"color": style.BLACK, "linestyle": "--", "linewidth": 1.0}
 
 
-@style.of_its_kind
 def discovery_figures(found: Discovery) -> dict[str, Figure]:
     """Every figure of a discovery, by the stem of its file's name.
 

@@ -33,7 +33,6 @@ _MEAN: style.Look = {
 _BAND: style.Look = {"color": style.BLUE, "alpha": 0.25, "linewidth": 0}
 
 
-@style.of_its_kind
 def paper_figures(calibration: PaperCalibration) -> dict[str, Figure]:
     """Every figure of the calibration, by the stem of its file's name.
 

@@ -58,7 +58,6 @@ PARAMETERS = {
 """In the order in which they are drawn."""
 
 
-@style.of_its_kind
 def posterior_figures(calibration: Posterior) -> dict[str, Figure]:
     """Every figure of the posterior, by the stem of its file's name.
 
@@ -69,7 +68,6 @@ def posterior_figures(calibration: Posterior) -> dict[str, Figure]:
     return {plot.__name__.removeprefix("plot_"): plot(calibration) for plot in plots}
 
 
-@style.of_its_kind
 def least_squares_figures(calibration: LeastSquares) -> dict[str, Figure]:
     """Every figure of the joint least squares, by the stem of its file's name.
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import functools
-import inspect
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +14,7 @@ from .. import arguments
 from .._errors import InputError
 from .._extras import extra
 from ..calibrate import LeastSquares, PaperCalibration, Posterior
-from ..campaign import Campaign, Metadata, check_campaign
+from ..campaign import Metadata
 
 with extra("plots"):  # every other file of the package imports this one or `curves` first
     from matplotlib import colormaps, rc_context
@@ -114,43 +112,12 @@ RC: dict[Any, Any] = {
     "savefig.bbox": None,
     "figure.facecolor": "white",
 }
-_MADE_BY = {
-    "PaperCalibration": "mcc_jax.calibrate_paper(campaign)",
-    "LeastSquares": "mcc_jax.least_squares(campaign)",
-    "Posterior": "mcc_jax.sample(campaign)",
-    "Discovery": "mcc_jax.discover(campaign)",
-}
-
-
 type Look = dict[str, Any]
 """Keywords of what is drawn."""
 
 
-def of_its_kind[**P, R](function: Callable[P, R]) -> Callable[P, R]:
-    """Decorator: what is not of the kind of the function's first argument is refused in words, before anything else."""
-
-    @functools.cache
-    def wanted() -> tuple[str, Any]:
-        bare = inspect.unwrap(function)
-        name = next(iter(inspect.signature(bare).parameters))
-        return name, get_type_hints(bare)[name]
-
-    @functools.wraps(function)
-    def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        name, kind = wanted()
-        given = args[0] if args else kwargs.get(name)
-        if kind is Campaign:
-            check_campaign(given, name)
-        else:
-            arguments.instance(given, kind, name, f"Make one with {_MADE_BY[kind.__name__]}.")
-        return function(*args, **kwargs)
-
-    return call
-
-
-def styled[**P, R](function: Callable[P, R]) -> Callable[P, R]:
-    """Decorator: the function runs under these settings, leaves the caller's as they were, and checks what it draws."""
-    return of_its_kind(rc_context(RC)(function))
+styled = rc_context(RC)
+"""Decorator: the function runs under these settings and leaves the caller's as they were."""
 
 
 @rc_context(RC)
@@ -165,10 +132,6 @@ def save_figures(figures: Mapping[str, Figure], directory: str | Path, *, dpi: i
     Returns:
         The files, in the order of the figures.
     """
-    remedy = "Give a dictionary of figures by stem, as mcc_jax.plots.paper_figures makes it."
-    arguments.instance(figures, Mapping, "figures", remedy)
-    for stem, figure in figures.items():
-        arguments.instance(figure, Figure, f"the figure {stem!r}", remedy)
     folder = arguments.file_path(directory, "directory")
     dpi = arguments.whole(dpi, "dpi", least=1)
     if not folder.is_dir():

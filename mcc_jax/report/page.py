@@ -78,7 +78,6 @@ def report_page(results: Results, *, seed: int = 0, progress: Callable[[str], No
     Raises:
         RuntimeError: in single precision.
     """
-    arguments.instance(results, Results, "results", "Read them with mcc_jax.report.read_results(folder).")
     seed = arguments.seed(seed)
     _require_double()
     with extra("report"):

@@ -30,7 +30,7 @@ from ..campaign import (
 from ..effects import HUMIDITY_COLUMN, REFERENCE_HUMIDITY_PERCENT, Need
 from ..geometry import Particle
 from ..law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainScaling, Unloading
-from .drive import A_LAW, gains_energy, simulate_batch
+from .drive import gains_energy, simulate_batch
 from .effects import HiddenEffect, hidden_effects, humidities_of
 from .programme import Instrument, Programme
 
@@ -87,7 +87,6 @@ def law_for_each(
     Raises:
         InputError: for coefficients without a leading axis, a number out of its range, or an unknown form.
     """
-    arguments.instance(plastic, Plastic, "plastic", "Draw some with mcc_jax.paper_population().sample(key, count).")
     if jnp.ndim(plastic.C1) != 1:
         raise InputError("plastic has no leading axis", remedy="For one particle make a MccLaw.")
     return eqx.filter_vmap(lambda one: MccLaw(one, a, effective_modulus_MPa, unloading, strain_scaling))(plastic)
@@ -130,12 +129,9 @@ def simulate_campaign(
         ValueError: if lengths disagree, an effect of humidity gets no humidities, or the law refuses a particle
             (`RESULTS` says why).
     """
-    arguments.instance(laws, MccLaw, "laws", A_LAW)
     if jnp.ndim(laws.plastic.C1) != 1:
         raise InputError("laws has no leading axis", remedy="Make one law for each with mcc_jax.law_for_each.")
-    arguments.instance(programme, Programme, "programme", "Take mcc_jax.Programme.cycles().")
     instrument = Instrument() if instrument is None else instrument
-    arguments.instance(instrument, Instrument, "instrument", "Make one with mcc_jax.Instrument().")
     seed = arguments.seed(seed)
     effects = hidden_effects(effects)
     diameters_um = arguments.diameters(diameters_um)
@@ -256,7 +252,6 @@ def paper_campaign(
     seed = arguments.seed(seed)
     shared_material = arguments.flag(shared_material, "shared_material")
     programme = Programme.cycles(rate=PAPER_LOAD_RATE_MN_PER_S) if programme is None else programme
-    arguments.instance(programme, Programme, "programme", "Take mcc_jax.Programme.cycles().")
     instrument = Instrument(displacement_noise_um=0.02, force_noise_mN=0.05) if instrument is None else instrument
     unloading = arguments.member(unloading, Unloading, "unloading")
     strain_scaling = arguments.member(strain_scaling, StrainScaling, "strain_scaling")

@@ -20,8 +20,6 @@ from ..geometry import Particle
 from ..law import AbstractContactLaw, MccLaw
 
 CONTROLS: tuple[Control, ...] = get_args(Control)
-A_LAW = "Take mcc_jax.paper_law(), or the law of a calibration."
-A_PARTICLE = "Make one with mcc_jax.Particle(D1, D2, D3), diameters in um."
 
 
 class Response(eqx.Module):
@@ -82,8 +80,6 @@ def drive(
         EquinoxRuntimeError: with `throw`, if anything in the response is not finite or the particle can carry no
             stress; within compiled code also if the particle would gain energy.
     """
-    arguments.instance(law, AbstractContactLaw, "law", A_LAW)
-    arguments.instance(particle, Particle, "particle", A_PARTICLE)
     arguments.choice(control, CONTROLS, "control")
     arguments.flag(throw, "throw")
     path = arguments.path(path, "path", many="Several particles at once: simulate_batch, or equinox.filter_vmap.")
@@ -170,8 +166,6 @@ def simulate_batch(
         InputError: for a control that does not exist, or laws, particles, paths, times and humidities that are not as
             many.
     """
-    arguments.instance(laws, AbstractContactLaw, "laws", A_LAW)
-    arguments.instance(particles, Particle, "particles", A_PARTICLE)
     arguments.choice(control, CONTROLS, "control")
     _check_times(laws, times is not None, "times")
     if relative_humidity is not None and not getattr(laws, "effects", ()):

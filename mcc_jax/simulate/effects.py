@@ -40,8 +40,6 @@ class HiddenEffect:
     nuisance: Mapping[str, float] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
-        arguments.instance(self.variant, Variant, "variant", 'Take mcc_jax.effects.find_variant("creep").')
-        arguments.instance(self.nuisance, Mapping, "nuisance", "Give a dictionary of numbers by name.")
         variant, name = self.variant, f"{self.variant.mechanism}:{self.variant.name}"
 
         def wrong(what: str, must: str, value: Any) -> InputError:
@@ -126,7 +124,6 @@ def read_effect(text: str, library: Mapping[str, Mechanism] = LIBRARY) -> Hidden
     Raises:
         ValueError: in words, naming the valid choices.
     """
-    arguments.instance(text, str, "an effect as text", 'Write for instance "creep:logarithmic=0.02".')
     head, *rest = text.split(",")
     name, equals, value = head.partition("=")
     variant = find_variant(name.strip(), library)
@@ -161,7 +158,7 @@ def hidden_effects(effects: Any) -> tuple[HiddenEffect, ...]:
     remedy = 'Make each with mcc_jax.simulate.read_effect("creep").'
     if isinstance(effects, str | Variant) or not isinstance(effects, Iterable):
         raise InputError(f"effects must be a list of HiddenEffect, got {arguments.kind_of(effects)}", remedy=remedy)
-    return tuple(arguments.instance(one, HiddenEffect, "every one of effects", remedy) for one in effects)
+    return tuple(effects)
 
 
 def humidities_of(values: Any, count: int) -> np.ndarray:

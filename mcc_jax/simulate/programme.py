@@ -82,12 +82,9 @@ class Programme:
         if self.points is not None:
             object.__setattr__(self, "points", arguments.whole(self.points, "points", least=2))
         arguments.choice(self.control, get_args(Control), "control")
-        given = arguments.instance(self.steps, Sequence, "steps", "Give a list of Ramp and Hold.")
-        if not given:
+        if not self.steps:
             raise InputError("a programme needs at least one step")
-        for step in given:
-            arguments.instance(step, (Ramp, Hold), "every one of steps", "Give mcc_jax.Ramp or mcc_jax.Hold.")
-        object.__setattr__(self, "steps", tuple(given))
+        object.__setattr__(self, "steps", tuple(self.steps))
 
     def __repr__(self) -> str:
         unit, sampling = ("mN/s" if self.control == "load" else "um/s"), f"every {self.interval_s} s"

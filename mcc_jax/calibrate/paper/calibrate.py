@@ -259,7 +259,7 @@ def calibrate_paper(
     unloading = arguments.member(unloading, Unloading, "unloading")
     strain_scaling = arguments.member(strain_scaling, StrainScaling, "strain_scaling")
     seed = arguments.seed(seed)
-    tell = arguments.teller(progress)
+    tell = progress or (lambda _: None)
     tell("adjusting the curves")
     adjustment = adjust(campaign, threshold_MPa)
     if adjustment.kept.sum() < 2:

@@ -51,7 +51,6 @@ def strain_table(adjustment: Adjustment, diameters_um: np.ndarray, points: int =
     Raises:
         ValueError: if no particle is kept.
     """
-    arguments.instance(adjustment, Adjustment, "adjustment", "Take mcc_jax.adjust(campaign).")
     diameters_um = arguments.diameters(diameters_um)
     points = arguments.whole(points, "points", least=2)
     index = np.flatnonzero(adjustment.kept)
@@ -99,7 +98,6 @@ def enough(table: StrainTable) -> np.ndarray:
 
 def master_curve(table: StrainTable, a: float) -> MasterCurve:
     """Mean and standard deviation of the master strain for a shape parameter `a`."""
-    arguments.instance(table, StrainTable, "table", "Take mcc_jax.calibrate.strain_table(adjustment, diameters_um).")
     a = arguments.number(a, "the shape parameter a")
     use = enough(table)
     reached = table.reached[:, use]
@@ -185,7 +183,6 @@ def fit_population(master: MasterCurve, threshold_MPa: float = 0.0) -> PlasticFi
     References:
         Bommireddy et al. (2018), eqs. 16 to 18 and Table 2.
     """
-    arguments.instance(master, MasterCurve, "master", "Take mcc_jax.calibrate.master_curve(table, a).")
     threshold_MPa = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
     from scipy.optimize import nnls
 

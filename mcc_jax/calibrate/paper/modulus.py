@@ -19,9 +19,6 @@ from ..settings import PAPER
 MIN_RATIO = PAPER.unloaded_from
 
 
-BRANCHES = "Take those of mcc_jax.calibrate.campaign_branches(campaign, adjustment)."
-
-
 @dataclass(frozen=True)
 class ElasticBranch:
     r"""One elastic branch: unloading from a peak and, if any, the reloading that follows, up to further virgin loading.
@@ -118,7 +115,6 @@ def elastic_branches(
 def campaign_branches(campaign: Campaign, adjustment: Adjustment) -> list[ElasticBranch]:
     """The elastic branches of every particle that the offset step kept, in its adjusted strain."""
     check_campaign(campaign)
-    arguments.instance(adjustment, Adjustment, "adjustment", "Take mcc_jax.adjust(campaign).")
     return [
         branch
         for i in np.flatnonzero(adjustment.kept)
@@ -171,8 +167,6 @@ def fit_effective_modulus(
     References:
         Bommireddy et al. (2018), section 6, eqs. 23 and 24.
     """
-    for one in arguments.instance(branches, Sequence, "branches", BRANCHES):
-        arguments.instance(one, ElasticBranch, "every one of branches", BRANCHES)
     shape_factor = arguments.floats(shape_factor, "shape_factor", shape="a shape factor for every particle")
     branches = tuple(branches)
     if not branches:

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ... import arguments
 from ..._format import described
 from ...campaign import Adjustment, Campaign, check_campaign, effective_diameter_um, particle_batch, stress_and_strain
 from ...law import MccLaw, Plastic
@@ -67,8 +66,6 @@ def predict_particles(
         One entry per particle of the campaign, None where it was not kept.
     """
     check_campaign(campaign)
-    arguments.instance(adjustment, Adjustment, "adjustment", "Take mcc_jax.adjust(campaign).")
-    arguments.instance(law, MccLaw, "law", "Take mcc_jax.paper_law(), or the law of a calibration.")
     kept = np.flatnonzero(adjustment.kept)
     own = []
     for i in kept:

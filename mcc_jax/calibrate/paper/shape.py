@@ -112,7 +112,6 @@ def choose_reference(table: StrainTable) -> int:
     Returns:
         Row of the table (not position in the campaign).
     """
-    arguments.instance(table, StrainTable, "table", "Take mcc_jax.calibrate.strain_table(adjustment, diameters_um).")
     top = table.reached.sum(axis=1)
     high = top >= np.median(top)
     return int(np.argmin(np.where(high, np.abs(table.flatness), np.inf)))
@@ -135,7 +134,6 @@ def fit_shape_parameter(table: StrainTable, objective: Objective = "full", refer
     References:
         Bommireddy et al. (2018), eqs. 13 to 15.
     """
-    arguments.instance(table, StrainTable, "table", "Take mcc_jax.calibrate.strain_table(adjustment, diameters_um).")
     arguments.choice(objective, get_args(Objective), "objective")
     from scipy.optimize import brentq  # half a second to import, so only where it is used
 
