@@ -13,7 +13,7 @@ import numpy as np
 from ._format import value_of
 from ._numerics import compiled_whole, positive_pow, shared
 from ._types import Scalar, ScalarLike, Values, scalar
-from .arguments import diameters, finite, instance, is_traced, positive
+from .arguments import diameters, finite, is_traced, positive
 
 
 def _diameter(value: ScalarLike) -> Scalar:
@@ -105,10 +105,6 @@ class Particle(eqx.Module):
         return stress * self.effective_area * 1e-3
 
 
-def _particle(value: Particle) -> Particle:
-    return instance(value, Particle, "particle", "Make one with mcc_jax.Particle(D1, D2, D3), diameters in um.")
-
-
 def plastic_shape_factor(particle: Particle, a: ScalarLike) -> Scalar:
     r"""Shape factor of plastic loading.
 
@@ -126,7 +122,7 @@ def plastic_shape_factor(particle: Particle, a: ScalarLike) -> Scalar:
         Bommireddy et al. (2018), eq. 13.
     """
     finite(a, "the geometric parameter a")
-    return _plastic_shape_factor(_particle(particle), scalar(a))
+    return _plastic_shape_factor(particle, scalar(a))
 
 
 @compiled_whole
@@ -150,7 +146,6 @@ def elastic_shape_factor(particle: Particle) -> Scalar:
         Bommireddy et al. (2018), eq. 2, after Zheng et al. (2013); made symmetric here.
     """
     # The modulus of a logarithm, not max/min: exactly symmetric, and at D1 = D2 no diameter wins the tie.
-    _particle(particle)
     log_ratio = jnp.abs(jnp.log(particle.D1) - jnp.log(particle.D2))
     return 1 / (1 - positive_pow(jnp.expm1(0.1368 * log_ratio), 1.531))
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from .._format import table, value_of
 from .._numerics import compiled_whole, derivative_kept, shared
 from .._types import Flag, Scalar, ScalarLike, Values, scalar
-from ..arguments import finite, instance, member, positive
+from ..arguments import finite, member, positive
 from ..geometry import Particle, plastic_shape_factor
 from .branch import AREA, branch_coefficients, branch_force
 from .loading_inverse import loading_strain, secant_modulus, tangent_modulus
@@ -20,10 +20,6 @@ from .recovery_limit import recovery_limit
 from .unloading import StrainScaling, Unloading
 
 AnyShape = Float[Array, "..."]
-
-
-def _coefficients(value: Plastic) -> Plastic:
-    return instance(value, Plastic, "plastic", "Give mcc_jax.Plastic(C1, C3, C5).")
 
 
 def _shape(value: ScalarLike) -> Scalar:
@@ -51,7 +47,7 @@ class Formulas(eqx.Module):
     effects and control. Attributes and validity are those of `MccLaw`.
     """
 
-    plastic: Plastic = eqx.field(converter=_coefficients)
+    plastic: Plastic
     a: Scalar = eqx.field(converter=_shape)
     effective_modulus: Scalar = eqx.field(converter=_modulus)
     unloading: Unloading = eqx.field(static=True, converter=_unloading, default=Unloading.PRINTED)
