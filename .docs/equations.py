@@ -50,7 +50,7 @@ def in_tex(equation: str) -> str:
 
 
 def _bracketed(text: str) -> tuple[str, str]:
-    """What stands in the brackets at the beginning, or the one number or letter there; and what follows it."""
+    """The content of the leading brackets, or the single leading number or letter; and the rest."""
     if text[0] in "([":
         depth = 0
         for end, sign in enumerate(text):

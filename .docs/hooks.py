@@ -1,4 +1,4 @@
-"""What the build of the pages adds to MkDocs: lists of names, the gallery, formulae as MathML, a look at the result."""
+"""Additions to the MkDocs build: lists of names, the gallery, formulae as MathML, checks of the result."""
 
 import ast
 import html
@@ -43,10 +43,10 @@ def on_files(files, config, **_):
 
 
 def on_page_markdown(markdown, **_):
-    """`!api mcc_jax.law` stands for an entry for each name of the module, `!names mcc_jax` for links to them.
+    """Replace `!api mcc_jax.law` by an entry for each name of the module, `!names mcc_jax` by links to them.
 
-    `!gallery`, `!sheet`, `!which-test` and `!look-alikes` stand for what `gallery.py` writes of the effects,
-    `!file NAME` for a file at the top of the repository, `!table FILE HEADING` for a table of `benchmarks/results/`.
+    `!gallery`, `!sheet`, `!which-test` and `!look-alikes` are replaced by the output of `gallery.py`,
+    `!file NAME` by a file at the top of the repository, `!table FILE HEADING` by a table of `benchmarks/results/`.
     """
 
     def entries(match):

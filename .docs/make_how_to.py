@@ -2,7 +2,7 @@
 
     uv run python .docs/make_how_to.py [NAME ...]
 
-Takes a minute. The tests are simulated; nobody measured them. The report's picture is taken by a browser, if CHROMIUM
+Takes a minute. The tests are simulated, not measured. The report's picture is taken by a browser, if CHROMIUM
 names one and REPORT a report.html of the demo.
 """
 
@@ -73,7 +73,7 @@ def law():
 
 
 def calibrate():
-    """What twenty tests say of the shape parameter and the modulus, beside the truth."""
+    """Posterior of the shape parameter and the modulus from twenty tests, with the true values."""
     draws = mcc.sample(mcc.paper_campaign(seed=0)).named_population()
     figure, ax = panel("shape parameter a [-]", "effective modulus / GPa")
     ax.plot(draws["a"].ravel(), draws["effective_modulus_MPa"].ravel() / 1e3, ".", ms=2.5, mew=0, alpha=0.5, color=BLUE)
@@ -83,7 +83,7 @@ def calibrate():
 
 
 def segments():
-    """What a reader makes of a tester's file: a test, told apart into its segments."""
+    """An instrument file after reading: a test divided into its segments."""
     campaign = mcc.paper_campaign(0, programme=CYCLES)
     curve = campaign.curves[0]
     figure, ax = panel("time / s", MN)
@@ -97,7 +97,7 @@ def segments():
 
 
 def checks():
-    """A gauge that comes to its end: force goes on, displacement does not."""
+    """A gauge at the end of its range: the force continues, the displacement does not."""
     curve = mcc.paper_campaign(0).curves[1]
     figure, ax = panel(UM, MN)
     end = 0.9 * curve.displacement_um.max()
@@ -112,7 +112,7 @@ def checks():
 
 
 def effects():
-    """A law that has effects, beside the bare one."""
+    """A law with effects, and the law without."""
     figure, ax = panel(UM, MN)
     for one, colour, label in (
         (mcc.paper_law(), GREY, "the law"),
@@ -128,7 +128,7 @@ def effects():
 
 
 def plan():
-    """From which size on a plan would show each effect, beside what is plausible."""
+    """The detection limit of each effect for a plan, with its plausible range."""
     limits = json.loads(POWER.read_text())["plans"]["rising"]["limits"]
     names = [name for name in limits if name in mcc.LIBRARY][:12]
     figure, ax = plt.subplots(figsize=(5.4, 3.6), layout="constrained")
@@ -162,7 +162,7 @@ def reload():
 
 
 def priors():
-    """The default prior of a, somebody's own, and what twenty tests say."""
+    """The default prior of a, a narrow one, and the posterior of twenty tests."""
     figure, ax = panel("shape parameter a [-]", "density (each to its height)")
     x = np.linspace(-1, 4, 20_000)
     for mean, sd, colour, label in (
@@ -177,7 +177,7 @@ def priors():
 
 
 def model():
-    """What the model expects before any test, and a test."""
+    """Draws from the prior, and a test."""
     campaign = mcc.paper_campaign(seed=0)
     tests = mcc.select_tests(campaign)
     drawn = Predictive(mcc.Model(), num_samples=40)(jax.random.key(0), tests.unobserved())
@@ -192,7 +192,7 @@ def model():
 
 
 def single():
-    """One particle's curve, and laws that a model of one's own finds possible."""
+    """The curve of one particle, and posterior draws of a user's NumPyro model."""
     campaign = mcc.paper_campaign(0, instrument=mcc.Instrument(force_noise_mN=5.0))
     curve, particle = campaign.curves[0], mcc.Particle(*campaign.diameters_um[0])
     true = [float(campaign.columns[f"true_{name}"][0]) for name in ("C1", "C3", "C5")]
@@ -241,7 +241,7 @@ def pair():
 
 
 def export():
-    """The two curves that every artefact holds: loading, and unloading from a peak."""
+    """The two curves of every export: loading, and unloading from a peak."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(5.4, 2.6), layout="constrained")
     plastic = mcc.paper_law().plastic
     strain, s = np.linspace(0, 0.67, 200), np.linspace(0, 1, 200)

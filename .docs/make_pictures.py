@@ -2,7 +2,7 @@
 
     uv run python .docs/make_pictures.py [NAME ...]
 
-The tests are simulated from the paper's tables; nobody measured them. Takes about three minutes.
+The tests are simulated from the paper's tables, not measured. Takes about three minutes.
 """
 
 import sys
@@ -30,7 +30,7 @@ NOISE = mcc.Instrument(displacement_noise_um=0.02, force_noise_mN=0.05)
 
 
 def panel(title, xlabel, ylabel):
-    """One picture; all are of one size, so that they stand side by side."""
+    """One picture; all have the same size, to be shown side by side."""
     figure, ax = plt.subplots(figsize=(4.3, 3.5), layout="constrained")
     ax.set_title(title, fontsize=11, loc="left")
     ax.set(xlabel=xlabel, ylabel=ylabel)
@@ -52,7 +52,7 @@ def law():
 
 
 def posterior():
-    """What twenty tests say about the shape parameter and C3: more about both together than about each."""
+    """Posterior of the shape parameter and C3 from twenty tests, which determine a combination better than each."""
     draws = mcc.sample(mcc.paper_campaign(seed=0, instrument=NOISE)).named_population()
     a, C3 = draws["a"].ravel(), np.exp(draws["mu_C3"].ravel())
     true_C3 = float(np.exp(mcc.paper_population().C3.mean))
@@ -65,7 +65,7 @@ def posterior():
 
 
 def discovery():
-    """Creep hidden in twenty tests: what the law leaves of one of them, before and after the effect is found."""
+    """Creep hidden in twenty tests: the residuals of one of them, before and after the effect is found."""
     programme = mcc.Programme.cycles(levels=(0.5, 1.0, 1.0), unload_to=0.3, hold_s=30.0, points=150)
     hidden = mcc.HiddenEffect(find_variant("creep"))
     campaign = mcc.paper_campaign(seed=0, instrument=NOISE, programme=programme, effects=(hidden,))
@@ -81,7 +81,7 @@ def discovery():
     ax.fill_between(time, -show["noise"], show["noise"], color=ORANGE, alpha=0.5, lw=0, label="noise")
     ax.plot(time, show["before"], color=VERMILION, lw=1.1, label="law alone")
     ax.plot(time, show["after"], color=BLUE, lw=1.1, label="with what was found")
-    # At first contact the law alone is off by several times what it is off later: told, not drawn.
+    # At first contact the residual of the law alone is several times larger than later: stated, not plotted.
     largest = np.nanmax(np.abs(show["before"]))
     reach = 3.5 * np.nanstd(show["before"][len(time) // 10 :])
     ax.set_ylim(-reach, reach)
@@ -94,7 +94,7 @@ def discovery():
 
 
 def found():
-    """Creep hidden in eight tests: one test, the law, the law with what was found, and what each leaves."""
+    """Creep hidden in eight tests: one test, the law, the law with the effect found, and the residuals of each."""
     programme = mcc.Programme.cycles(levels=(0.5, 1.0, 1.0), unload_to=0.3, hold_s=20.0, points=150)
     hidden = mcc.HiddenEffect(find_variant("creep"), 5e-4)
     campaign = mcc.paper_campaign(seed=2, instrument=NOISE, programme=programme, effects=(hidden,))

@@ -2,9 +2,9 @@
 
     uv run python .docs/make_power.py
 
-Writes `power.json` beside this file, in about six minutes. It is kept because the pages must build in two. Each plan
-is played with the paper's twenty particles and a tester of stated noise, and `mcc_jax.discover.power_of_campaign` says
-from which size on each mechanism would be found. The test in `tests/docs/test_gallery.py` works one plan out again.
+Writes `power.json` next to this file, in about six minutes. It is stored because the pages must build in two. Each plan
+is simulated with the paper's twenty particles and an instrument of stated noise; `mcc_jax.discover.power_of_campaign`
+calculates the detection limits. A test in `tests/docs/test_gallery.py` computes one plan again.
 """
 
 import json
@@ -29,7 +29,7 @@ RISING = {"levels": (0.5, 1.0, 1.0), "unload_to": 0.3, "hold_s": 20.0}
 
 
 def cycles(rate=RATE_MN_PER_S, **what):
-    """Load and unload; what else is done is said by name."""
+    """Load and unload; everything else is given by keyword."""
     return mcc.Programme.cycles(rate=rate, points=POINTS, **what)
 
 
@@ -57,11 +57,11 @@ PLANS = {
         lambda: two_rates(relative_humidity_percent=np.array([20.0, 45.0, 70.0])[np.arange(20) % 3]),
     ),
 }
-"""By name: the title of its column, and the tests. From left to right each plan has more in it."""
+"""By name: the title of its column, and the tests. The plans become richer from left to right."""
 
 
 def worked_out(name):
-    """What `power.json` holds of a plan."""
+    """The entry of a plan in `power.json`."""
     title, make = PLANS[name]
     found = power_of_campaign(make()).to_json()
     limits = {m["mechanism"]: float(f"{m['detection_limit']:.3g}") for m in found["mechanisms"]}
