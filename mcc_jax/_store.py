@@ -8,20 +8,17 @@ import json
 import math
 import os
 import shutil
-import signal
 import tempfile
-import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from ._errors import InputError
-from .files import LIMITS, read_regular
 
 WORK, LOCK = ".mcc-jax-work-", ".mcc-jax.lock"
-MOVES = "moves.json"
-"""In the work folder, while its results are moved into place: which files, so that the next run can finish the job."""
+READY, STALE = ".mcc-jax-ready", ".stale.json"
+"""Results that are complete and only have to be moved into place, and the list of files to drop, in that folder."""
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _CANNOT_WRITE = (*_FULL, errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO, errno.ENOTDIR, errno.ENAMETOOLONG)
 _NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
@@ -33,7 +30,7 @@ class Stage:
 
     Attributes:
         directory: the folder of the results.
-        folder: the folder to write into; what lies there at the end is moved to `directory`, subfolders included.
+        folder: the folder to write into; its files are moved to `directory` at the end, subfolders included.
         stale: names, relative to `directory`, of files of an earlier run that this one replaces or drops.
     """
 
@@ -44,37 +41,117 @@ class Stage:
 
 @contextlib.contextmanager
 def results(directory: Path) -> Iterator[Stage]:
-    """A stage for results; they are moved into the folder if the body ends well.
+    """A stage for results, which are moved into the folder if the body ends well; else the folder stays as it was.
 
-    If it does not, or they cannot be moved, the folder is as it was, and folders made for it are gone. Only files that
-    the run wrote, or named as stale, are touched. The folder is locked meanwhile. A process killed before the results
-    are complete leaves the folder as it was; one killed while they are moved leaves the rest to the next run. Raises
+    The folder is locked meanwhile. The stage is renamed when it is complete: a process killed before leaves the old
+    results, and after one that is killed later the next run in this folder moves what is left of the new ones. Only
+    files that the run wrote, or named as stale, are touched. A folder within a stage is written as it is. Raises
     `InputError` if the folder cannot be written, or another run is writing there.
 
     Args:
         directory: the folder, made with its parents if need be.
     """
-    made: list[Path] = []
+    if WORK in str(directory):
+        directory.mkdir(parents=True, exist_ok=True)
+        yield Stage(directory, directory)
+        return
+    made = [folder for folder in (directory, *directory.parents) if not folder.exists()]
     try:
-        _make(directory, made)
+        if directory.exists() and not directory.is_dir():
+            raise InputError("is a file, not a folder", file=directory, remedy="Give another folder")  # noqa: TRY301
+        directory.mkdir(parents=True, exist_ok=True)
         with _locked(directory):
-            work = _work_folder(directory)
+            _finish(directory)
+            # Inside the folder itself: the same file system for certain, even where the folder is a mount point.
+            work = Path(tempfile.mkdtemp(prefix=WORK, dir=directory))
             try:
                 stage = Stage(directory, work / "new")
                 stage.folder.mkdir()
                 yield stage
-                _place(stage, work, made)
+                _complete(stage)
+                _finish(directory)
             finally:
-                with _undisturbed():  # by the second Ctrl-C of somebody impatient
-                    shutil.rmtree(work, ignore_errors=True)
+                shutil.rmtree(work, ignore_errors=True)
     except BaseException as error:
-        for folder in reversed(made):
+        for folder in made:
             with contextlib.suppress(OSError):
                 folder.rmdir()
-        told = _told(directory, error)
-        if told is error:
+        reported = _as_input_error(directory, error)
+        if reported is error:
             raise
-        raise told from error
+        raise reported from error
+
+
+def _complete(stage: Stage) -> None:
+    """Make the stage ready to be moved, at once, when all of it is on the disk."""
+    stale = [name for name in stage.stale if not (stage.folder / name).exists()]
+    (stage.folder / STALE).write_text(json.dumps(stale), encoding="utf-8")
+    for file in stage.folder.rglob("*"):
+        target = stage.directory / file.relative_to(stage.folder)
+        if target.exists() and target.is_dir() != file.is_dir():
+            number = errno.EISDIR if target.is_dir() else errno.ENOTDIR
+            raise OSError(number, os.strerror(number), str(target))
+        if file.is_file():
+            with file.open("rb") as stream:
+                os.fsync(stream.fileno())  # a full disk shows here at the latest
+    stage.folder.replace(stage.directory / READY)
+
+
+def _finish(directory: Path) -> None:
+    """Move results that are ready into place, and remove what killed runs left behind; the folder is locked."""
+    ready = directory / READY
+    if (ready / STALE).is_file():
+        for file in sorted(ready.rglob("*")):
+            target = directory / file.relative_to(ready)
+            if file.is_dir():
+                target.mkdir(exist_ok=True)
+            elif file.name != STALE:
+                file.replace(target)
+        for name in json.loads((ready / STALE).read_text(encoding="utf-8")):
+            (directory / name).unlink(missing_ok=True)
+    for left_over in (ready, *directory.glob(WORK + "*")):
+        shutil.rmtree(left_over, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def _locked(directory: Path) -> Iterator[None]:
+    """Keep other runs out of a folder; the system drops the lock when the process ends, however it ends."""
+    from filelock import FileLock, Timeout
+
+    # It waits for a moment only, in which a run that ends removes its file.
+    lock = FileLock(directory / LOCK, timeout=0.1, thread_local=False, fallback_to_soft=False)
+    try:
+        lock.acquire()
+    except Timeout:
+        remedy = "Wait for it to end, or give another folder"
+        raise InputError("another mcc-jax run is writing there", file=directory, remedy=remedy) from None
+    except OSError as error:
+        if error.errno not in _NO_LOCKS:  # without locks files are still replaced one by one, each whole
+            raise
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):  # Windows removes no open file
+            (directory / LOCK).unlink()
+        lock.release()
+
+
+def _as_input_error(directory: Path, error: BaseException) -> BaseException:
+    """The error for the user, who knows the folder but not the stage."""
+    if isinstance(error, InputError) and error.file is not None and WORK in str(error.file):
+        return error.changed(file=directory)
+    if not isinstance(error, OSError) or isinstance(error, InputError):
+        return error
+    # Making the folder can fail at a parent of it, writing at anything inside.
+    place = "" if error.filename is None else str(error.filename)
+    ours = bool(place) and (place.startswith(str(directory)) or str(directory).startswith(place))
+    if not ours and error.errno not in _CANNOT_WRITE:
+        return error
+    why = error.strerror or str(error)
+    if error.errno == errno.EISDIR and place:
+        why = f"{Path(place).name} there is a folder, where a file is to be written"
+    remedy = "Make room and run again" if error.errno in _FULL else "Give a folder you may write to"
+    return InputError(f"results cannot be written there: {why}", file=directory, remedy=remedy)
 
 
 def write_file(file: Path, write: Callable[[BinaryIO], object]) -> None:
@@ -102,127 +179,3 @@ def _strict(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_strict(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _told(directory: Path, error: BaseException) -> BaseException:
-    """The error as the user is told it, who knows the folder but not the stage."""
-    if isinstance(error, InputError) and error.file is not None and WORK in str(error.file):
-        return InputError(error.problem, file=directory, row=error.row, column=error.column, remedy=error.remedy)
-    if not isinstance(error, OSError) or isinstance(error, InputError):
-        return error
-    # Making the folder can fail at a parent of it, writing at anything inside.
-    place = "" if error.filename is None else str(error.filename)
-    ours = bool(place) and (place.startswith(str(directory)) or str(directory).startswith(place))
-    if not ours and error.errno not in _CANNOT_WRITE:
-        return error
-    why = error.strerror or str(error)
-    if error.errno == errno.EISDIR and place:
-        why = f"{Path(place).name} there is a folder, where a file is to be written"
-    remedy = "Make room and run again" if error.errno in _FULL else "Give a folder you may write to"
-    return InputError(f"results cannot be written there: {why}", file=directory, remedy=remedy)
-
-
-def _make(directory: Path, made: list[Path]) -> None:
-    """Make a folder and its parents; those that were missing are appended to the list."""
-    if directory.exists() and not directory.is_dir():
-        raise InputError("is a file, not a folder", file=directory, remedy="Give another folder")
-    for folder in (*reversed(directory.parents), directory):
-        if not folder.exists():
-            folder.mkdir(exist_ok=True)
-            made.append(folder)
-
-
-@contextlib.contextmanager
-def _locked(directory: Path) -> Iterator[None]:
-    """Keep other runs out of a folder; the system drops the lock when the process ends, however it ends."""
-    from filelock import FileLock, Timeout
-
-    file = directory / LOCK
-    if file.is_symlink() or (file.exists() and not file.is_file()):
-        raise InputError("is no regular file, and cannot lock the folder", file=file, remedy="Remove it")
-    # It waits for a moment only, in which a run that ends removes its file.
-    lock = FileLock(file, timeout=0.1, thread_local=False, fallback_to_soft=False)
-    try:
-        lock.acquire()
-    except Timeout:
-        owner = next((f.name[len(WORK) :].partition("-")[0] for f in directory.glob(WORK + "*")), "")
-        who = f"another mcc-jax run (process {owner})" if owner.isdigit() else "another mcc-jax run"
-        remedy = "Wait for it to end, or give another folder"
-        raise InputError(f"{who} is writing there", file=directory, remedy=remedy) from None
-    except OSError as error:
-        if error.errno not in _NO_LOCKS:  # without locks files are still replaced one by one, each whole
-            raise
-    try:
-        yield
-    finally:
-        with contextlib.suppress(OSError):  # Windows removes no open file
-            file.unlink()
-        lock.release()
-
-
-def _work_folder(directory: Path) -> Path:
-    for left_over in directory.glob(WORK + "*"):  # of runs that were killed: we hold the lock
-        new, stale = [], []
-        # All results were complete where this file is; one that cannot be read is not of us, who make it whole.
-        with contextlib.suppress(ValueError, KeyError, TypeError):
-            moves = json.loads(read_regular(left_over / MOVES, LIMITS.result_bytes, ""))
-            new, stale = ([str(name) for name in moves[key]] for key in ("new", "stale"))
-        if not any(Path(name).is_absolute() or ".." in Path(name).parts for name in (*new, *stale)):
-            _move(directory, left_over, new, stale)
-        shutil.rmtree(left_over, ignore_errors=True)
-    # Inside the folder itself: the same file system for certain, even where the folder is a mount point.
-    return Path(tempfile.mkdtemp(prefix=f"{WORK}{os.getpid()}-", dir=directory))
-
-
-def _move(directory: Path, work: Path, new: list[str], stale: list[str]) -> None:
-    for name in new:
-        if (work / "new" / name).is_file():
-            (directory / name).parent.mkdir(parents=True, exist_ok=True)
-            (work / "new" / name).replace(directory / name)
-    for name in stale:
-        (directory / name).unlink(missing_ok=True)
-
-
-def _place(stage: Stage, work: Path, made: list[Path]) -> None:
-    """Move the files into the folder; if one cannot be moved, put all back as it was."""
-    new = [str(file.relative_to(stage.folder)) for file in sorted(stage.folder.rglob("*")) if file.is_file()]
-    stale = [name for name in stage.stale if name not in new and (stage.directory / name).is_file()]
-    for name in new:
-        with (stage.folder / name).open("rb") as stream:
-            os.fsync(stream.fileno())  # onto the disk, where a full one shows at the latest
-        _make((stage.directory / name).parent, made)
-    for name in (*new, *stale):
-        target, copy = stage.directory / name, work / "old" / name
-        if target.is_dir():
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(target))
-        if target.exists():
-            copy.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                copy.hardlink_to(target)
-            except OSError:  # not every file system has hard links
-                shutil.copy2(target, copy)
-    with _undisturbed():
-        try:
-            write_file(work / MOVES, lambda stream: stream.write(json.dumps({"new": new, "stale": stale}).encode()))
-            _move(stage.directory, work, new, stale)
-        except BaseException:
-            (work / MOVES).unlink(missing_ok=True)  # first: from here on nobody may finish this
-            for name in (*new, *stale):
-                if (work / "old" / name).exists():
-                    (work / "old" / name).replace(stage.directory / name)
-                else:
-                    (stage.directory / name).unlink(missing_ok=True)
-            raise
-
-
-@contextlib.contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Without interruption by Ctrl-C; for moments only."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)

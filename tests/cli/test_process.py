@@ -176,7 +176,7 @@ def test_two_at_once_and_the_lock_of_a_dead_one(tmp_path):
         assert process.stdout.readline() == b"in\n"
         result = call("simulate", "--out", tmp_path, "--points", "20")
         assert result.returncode == 2
-        assert f"another mcc-jax run (process {process.pid}) is writing there" in result.stderr
+        assert "another mcc-jax run is writing there" in result.stderr
         process.kill()
         process.wait()
     assert any(name.startswith(".mcc-jax") for name in snapshot(tmp_path))
