@@ -1,4 +1,4 @@
-"""What an effect is told at a point of a test: load history, state of the contact, response of the law."""
+"""What an effect is given at a point of a test: load history, state of the contact, response of the law."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Context(eqx.Module):
         particle: the particle.
         law: the law as modified by the effects that act on its parameters; they already contain the shape where the
             fit has taken it in (`a` = 0), so effects use strain and never the shape factor.
-        record: what the tester did.
+        record: what the instrument did.
         peak_force: largest force so far [mN].
         peak_displacement: largest displacement of the law so far [um].
         recoverable: displacement that the law recovers on full release from there [um].
@@ -75,8 +75,7 @@ class Context(eqx.Module):
     @property
     def load_share(self) -> Values:
         """u = F / F_P [-]: 1 on virgin loading, 0 on full release."""
-        loaded = self.peak_force > jnp.finfo(self.peak_force.dtype).tiny ** 0.5
-        share = jnp.where(loaded, self.force, 0.0) / jnp.where(loaded, self.peak_force, 1.0)
+        loaded, share = self._over_peak(self.force)
         return jnp.where(loaded & (share < 1), share, 1.0)
 
     @property
@@ -102,9 +101,12 @@ class Context(eqx.Module):
     @property
     def reload_from_share(self) -> Values:
         """Force at which the latest reload began, over the peak force [-]."""
+        return jnp.clip(self._over_peak(self.record.reload_from)[1], 0.0, 1.0)
+
+    def _over_peak(self, force: Values) -> tuple[Values, Values]:
+        """Whether there has been a load, and a force over its peak, 0 without one."""
         loaded = self.peak_force > jnp.finfo(self.peak_force.dtype).tiny ** 0.5
-        share = jnp.where(loaded, self.record.reload_from, 0.0) / jnp.where(loaded, self.peak_force, 1.0)
-        return jnp.clip(share, 0.0, 1.0)
+        return loaded, jnp.where(loaded, force, 0.0) / jnp.where(loaded, self.peak_force, 1.0)
 
     @property
     def unloading(self) -> Values:

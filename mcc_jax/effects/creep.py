@@ -3,38 +3,45 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import gammaln
 from jaxtyping import Array, Float
 
-from .._types import Scalar, Values, scalar
+from .._types import Scalar, Values
 from .context import Context
-from .effect import AbstractEffect
+from .effect import AbstractEffect, AbstractFormulas, further, pick, switch
 from .record import HOLD
-from .variant import Mechanism, Need, Nuisance, Variant
+from .variant import Need, Nuisance, family, row
 
 REFERENCE_TIME_S = 100.0
 ELEMENTS_PER_DECADE = 2
 
 Elements = Float[Array, " elements"]
+Spectrum = tuple[Elements, Elements, Scalar]
 
 
-class AbstractLinearCreep(AbstractEffect):
+class LinearCreep(AbstractFormulas):
     r"""Linear viscoelastic strain by Boltzmann's superposition, as a sum of Kelvin-Voigt elements.
 
     .. math:: \Delta = D_e c \sum_j w_j y_j + D_e c\, w_0 \sigma, \qquad \dot y_j / s_j + y_j = \sigma
 
     Every completely monotone creep function is such a sum; elements lie half a decade apart. A step during which stress
-    is linear in time is integrated exactly, so that the result does not depend on how densely a ramp is sampled.
+    is linear in time is integrated exactly, so that the result does not depend on how densely a ramp is sampled. A
+    formula gives the rates s_j [1/s], the weights w_j and the instantaneous weight w_0.
     """
 
-    def spectrum(self) -> tuple[Elements, Elements, Scalar]:
-        """Rates s_j [1/s], weights w_j and the instantaneous weight w_0."""
-        raise NotImplementedError
+    tau_s: Scalar | None = further()
+    exponent: Scalar | None = further()
+
+    formulas: ClassVar = {
+        "kelvin_voigt": lambda e: _one_time(e.tau_s),
+        "distributed": lambda e: _distributed(e.tau_s),
+        "logarithmic": lambda e: _logarithmic(e.tau_s),
+        "power_law": lambda e: _power_law(e.exponent),
+    }
 
     def driver(self, context: Context) -> Values:
         """Stress [MPa]."""
@@ -42,11 +49,11 @@ class AbstractLinearCreep(AbstractEffect):
 
     def start(self, like: Scalar) -> Elements:
         """All elements at rest."""
-        return jnp.zeros(self.spectrum()[0].shape, like.dtype)
+        return jnp.zeros(self.of()[0].shape, like.dtype)
 
     def evolve(self, memory: Elements, before: Scalar, now: Scalar, seconds: Scalar) -> tuple[Elements, Elements]:
         """Exact solution for a stress that goes linearly from `before` to `now`."""
-        rates = self.spectrum()[0]
+        rates = self.of()[0]
         h = rates * seconds
         some = h > 1e-6
         decay = jnp.exp(-h)
@@ -56,71 +63,51 @@ class AbstractLinearCreep(AbstractEffect):
 
     def inside(self, context: Context) -> Values:
         """Strain of all elements times D_e."""
-        _, weights, instant = self.spectrum()
-        strain = jnp.sum(context.memory * _like(weights, context.memory), axis=-1) + instant * context.stress
+        _, weights, instant = self.of()
+        weights = weights.reshape((1,) * (context.memory.ndim - 1) + weights.shape)
+        strain = jnp.sum(context.memory * weights, axis=-1) + instant * context.stress
         return self.amplitude * context.particle.displacement(strain)
 
 
-def _like(weights: Elements, memory: Array) -> Array:
-    return weights.reshape((1,) * (memory.ndim - 1) + weights.shape)
+def _one_time(tau: Scalar) -> Spectrum:
+    """J = 1 - exp(-t / tau)."""
+    one = jnp.ones_like(tau)[None]
+    return one / tau, one, jnp.zeros_like(tau)
 
 
-class KelvinVoigt(AbstractLinearCreep):
-    """One retardation time."""
-
-    tau_s: Scalar = eqx.field(converter=scalar)
-
-    def spectrum(self) -> tuple[Elements, Elements, Scalar]:
-        """J = 1 - exp(-t / tau)."""
-        one = jnp.ones_like(self.tau_s)[None]
-        return one / self.tau_s, one, jnp.zeros_like(self.tau_s)
+def _distributed(tau: Scalar) -> Spectrum:
+    """J = mean of 1 - exp(-t / tau'), ln tau' normal about ln tau with standard deviation ln 5."""
+    steps = np.arange(-4, 5) / ELEMENTS_PER_DECADE * math.log(10)
+    weights = np.exp(-0.5 * (steps / math.log(5)) ** 2)
+    factors = jnp.asarray(np.exp(steps), tau.dtype)
+    return factors / tau, jnp.asarray(weights / weights.sum(), tau.dtype), jnp.zeros_like(tau)
 
 
-class DistributedCreep(AbstractLinearCreep):
-    """Retardation times spread log-normally over about two decades around one."""
-
-    tau_s: Scalar = eqx.field(converter=scalar)
-
-    def spectrum(self) -> tuple[Elements, Elements, Scalar]:
-        """J = mean of 1 - exp(-t / tau'), ln tau' normal about ln tau with standard deviation ln 5."""
-        steps = np.arange(-4, 5) / ELEMENTS_PER_DECADE * math.log(10)
-        weights = np.exp(-0.5 * (steps / math.log(5)) ** 2)
-        factors = jnp.asarray(np.exp(steps), self.tau_s.dtype)
-        return factors / self.tau_s, jnp.asarray(weights / weights.sum(), self.tau_s.dtype), jnp.zeros_like(self.tau_s)
+def _logarithmic(tau: Scalar) -> Spectrum:
+    """J = ln(1 + t / tau), the integral of (1 - exp(-s t)) exp(-s tau) over ln s."""
+    span = math.log(10) / ELEMENTS_PER_DECADE
+    shares = 30 * np.exp(-span * np.arange(18))
+    weights = jnp.asarray(span * np.exp(-shares), tau.dtype)
+    return jnp.asarray(shares, tau.dtype) / tau, weights, jnp.zeros_like(tau)
 
 
-class LogarithmicCreep(AbstractLinearCreep):
-    """Creep without end, slower and slower."""
-
-    tau_s: Scalar = eqx.field(converter=scalar)
-
-    def spectrum(self) -> tuple[Elements, Elements, Scalar]:
-        """J = ln(1 + t / tau), the integral of (1 - exp(-s t)) exp(-s tau) over ln s."""
-        span = math.log(10) / ELEMENTS_PER_DECADE
-        shares = 30 * np.exp(-span * np.arange(18))
-        weights = jnp.asarray(span * np.exp(-shares), self.tau_s.dtype)
-        return jnp.asarray(shares, self.tau_s.dtype) / self.tau_s, weights, jnp.zeros_like(self.tau_s)
+def _power_law(n: Scalar) -> Spectrum:
+    """J = (t / 100 s)^n, n / Gamma(1 - n) times the integral of (1 - exp(-s t)) (100 s * s)^-n over ln s."""
+    span = math.log(10) / ELEMENTS_PER_DECADE
+    rates = jnp.asarray(1e2 * np.exp(-span * np.arange(19)), n.dtype)
+    gamma = jnp.exp(gammaln(1 - n))
+    weights = span * n / gamma * (rates * REFERENCE_TIME_S) ** (-n)
+    # What is faster than the fastest element follows at once.
+    fastest = 1e2 * math.exp(span / 2)
+    return rates, weights, (fastest * REFERENCE_TIME_S) ** (-n) / gamma
 
 
-class PowerLawCreep(AbstractLinearCreep):
-    """Andrade-like creep; the amplitude is the compliance at 100 s."""
+class ViscousFlow(AbstractEffect):
+    """Steady flow: strain rate in proportion to stress, never recovered; the amplitude counts 100 s."""
 
-    exponent: Scalar = eqx.field(converter=scalar)
-
-    def spectrum(self) -> tuple[Elements, Elements, Scalar]:
-        """J = (t / 100 s)^n, n / Gamma(1 - n) times the integral of (1 - exp(-s t)) (100 s * s)^-n over ln s."""
-        n = self.exponent
-        span = math.log(10) / ELEMENTS_PER_DECADE
-        rates = jnp.asarray(1e2 * np.exp(-span * np.arange(19)), n.dtype)
-        gamma = jnp.exp(gammaln(1 - n))
-        weights = span * n / gamma * (rates * REFERENCE_TIME_S) ** (-n)
-        # What is faster than the fastest element follows at once.
-        fastest = 1e2 * math.exp(span / 2)
-        return rates, weights, (fastest * REFERENCE_TIME_S) ** (-n) / gamma
-
-
-class AbstractIntegral(AbstractEffect):
-    """A memory of the driver's integral over time."""
+    def driver(self, context: Context) -> Values:
+        """Stress [MPa]."""
+        return context.stress
 
     def start(self, like: Scalar) -> Scalar:
         """Nothing yet."""
@@ -131,24 +118,16 @@ class AbstractIntegral(AbstractEffect):
         memory = memory + 0.5 * (before + now) * seconds
         return memory, memory
 
-
-class ViscousFlow(AbstractIntegral):
-    """Steady flow: strain rate in proportion to stress, never recovered; the amplitude counts 100 s."""
-
-    def driver(self, context: Context) -> Values:
-        """Stress [MPa]."""
-        return context.stress
-
     def inside(self, context: Context) -> Values:
         """D_e c (integral of sigma dt) / 100 s."""
         return self.amplitude * context.particle.displacement(context.memory / REFERENCE_TIME_S)
 
 
-class ViscoplasticCreep(AbstractIntegral):
+class ViscoplasticCreep(ViscousFlow):
     """Permanent creep, only near the largest load: logarithmic in the time spent there, or its cube root."""
 
-    tau_s: Scalar = eqx.field(converter=scalar)
-    root: bool = eqx.field(static=True, default=False, kw_only=True)
+    tau_s: Scalar = further()
+    root: float = switch()
 
     def driver(self, context: Context) -> Values:
         """u^8: unloading by a tenth more than halves it."""
@@ -158,18 +137,22 @@ class ViscoplasticCreep(AbstractIntegral):
     def inside(self, context: Context) -> Values:
         """D_e c sigma_P ln(1 + t_load / tau), or sigma_P [(1 + t_load / tau)^(1/3) - 1]."""
         time = jnp.log1p(context.memory / self.tau_s)
-        grown = jnp.expm1(time / 3) if self.root else time
+        grown = pick(self.root, jnp.expm1(time / 3), time)
         return self.amplitude * context.particle.displacement(context.peak_stress * grown)
 
 
-class AbstractHoldCreep(AbstractEffect):
-    """Creep under constant load only: it begins anew with every hold, and what crept stays."""
+class HoldCreep(AbstractFormulas):
+    """Creep under constant load only: it begins again with every hold, and what crept stays.
 
-    tau_s: Scalar = eqx.field(converter=scalar)
+    A formula is the creep function of the time since the hold began, 0 at 0.
+    """
 
-    def grown(self, seconds: Values) -> Values:
-        """Creep function at a time since the hold began, 0 at 0."""
-        raise NotImplementedError
+    tau_s: Scalar = further()
+
+    formulas: ClassVar = {
+        "logarithmic": lambda e, t: jnp.log1p(t / e.tau_s),
+        "kelvin": lambda e, t: -jnp.expm1(-t / e.tau_s),
+    }
 
     def driver(self, context: Context) -> Values:
         """Stress [MPa] where the load is held, else 0."""
@@ -185,7 +168,7 @@ class AbstractHoldCreep(AbstractEffect):
         """What crept in all holds, and how long the present one has lasted."""
         crept, held = memory
         longer = jnp.where(now > 0, held + seconds, 0.0)
-        crept = crept + now * jnp.where(now > 0, self.grown(longer) - self.grown(held), 0.0)
+        crept = crept + now * jnp.where(now > 0, self.of(longer) - self.of(held), 0.0)
         return (crept, longer), crept
 
     def inside(self, context: Context) -> Values:
@@ -193,69 +176,46 @@ class AbstractHoldCreep(AbstractEffect):
         return self.amplitude * context.particle.displacement(context.memory)
 
 
-class LogarithmicHold(AbstractHoldCreep):
-    """Slower and slower in each hold."""
-
-    def grown(self, seconds: Values) -> Values:
-        """ln(1 + t / tau)."""
-        return jnp.log1p(seconds / self.tau_s)
-
-
-class KelvinHold(AbstractHoldCreep):
-    """A Kelvin-Voigt element under each step of constant load."""
-
-    def grown(self, seconds: Values) -> Values:
-        """1 - exp(-t / tau)."""
-        return -jnp.expm1(-seconds / self.tau_s)
-
-
-def _creep(name: str, make: type[AbstractEffect], equation: str, explanation: str, source: str, **more: Any) -> Variant:
-    return Variant(
-        "creep", name, make, "creep_compliance_per_MPa", "1/MPa", 1, (2e-5, 2e-3), equation, explanation, source,
-        **{"needs": (Need.UNLOADING,), "helps": (Need.HOLD, Need.TWO_RATES), **more},
-    )  # fmt: skip
-
-
-def _tau(*grid: float) -> tuple[Nuisance, ...]:
-    return (Nuisance("tau_s", grid, (0.3, 3000.0), "retardation time"),)
+def _tau(*grid: float) -> dict[str, Any]:
+    return {"nuisances": (Nuisance("tau_s", grid, (0.3, 3000.0), "retardation time"),)}
 
 
 _MCC = "Zhupanska et al. (2002), creep and relaxation of MCC; Oyen and Cook (2003), J. Mater. Res. 18, 139"
+_HELD = {"make": HoldCreep, "needs": (Need.HOLD,), "helps": (Need.SEVERAL_PEAKS,)}
 
-CREEP = Mechanism(
+CREEP = family(
+    LinearCreep,
     "creep",
     "The particle goes on deforming under constant force; at reversal the displacement still grows for a while.",
-    (
-        _creep("kelvin_voigt", KelvinVoigt, "tau dy/dt + y = sigma; d = D_e c y",
-               "A spring with a dashpot beside it: delayed, bounded and fully recovered.", _MCC,
-               nuisances=_tau(5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0)),
-        _creep("logarithmic", LogarithmicCreep, "d = D_e c [ln(1 + t / tau) convolved with d sigma]",
-               "Many retardation times: slower and slower, without end.", "Nowick and Berry (1972), ch. 4",
-               nuisances=_tau(1.0, 10.0, 100.0)),
-        _creep("power_law", PowerLawCreep, "d = D_e c [(t / 100 s)^n convolved with d sigma]",
-               "Creep as a power of time.", "Andrade (1910); Findley et al. (1976)",
-               nuisances=(Nuisance("exponent", (0.2, 0.4), (0.05, 0.8), "power of time"),)),
-        _creep("distributed", DistributedCreep, "d = D_e c [mean of 1 - exp(-t / tau') convolved with d sigma]",
-               "Retardation times spread over two decades.", "Ferry (1980), ch. 3",
-               nuisances=_tau(20.0, 60.0, 200.0, 600.0)),
-        _creep("viscous_flow", ViscousFlow, "d = D_e c (integral of sigma dt) / 100 s",
-               "Steady flow in proportion to stress; none of it comes back.", "Maxwell model; Ferry (1980)"),
-        _creep("viscoplastic", ViscoplasticCreep, "d = D_e c sigma_P ln(1 + t_load / tau), t_load = integral of u^8 dt",
-               "Permanent creep while the load is near its maximum, logarithmic in the time spent there.",
-               "Oyen and Cook (2003); logarithmic indentation creep", nuisances=_tau(1.0, 10.0, 100.0)),
-        _creep("viscoplastic_root", ViscoplasticCreep,
-               "d = D_e c sigma_P [(1 + t_load / tau)^(1/3) - 1], t_load = integral of u^8 dt",
-               "Permanent creep while the load is near its maximum, as the cube root of the time spent there.",
-               "Andrade (1910), Proc. R. Soc. A 84, 1", nuisances=_tau(1.0, 10.0, 100.0), fixed={"root": True}),
-        _creep("hold_logarithmic", LogarithmicHold, "d = D_e c [sum over holds of sigma ln(1 + t_hold / tau)]",
-               "Creep under constant load only, logarithmic in the time of each hold; it stays.",
-               "Chudoba and Richter (2001), Surf. Coat. Technol. 148, 191", needs=(Need.HOLD,),
-               helps=(Need.SEVERAL_PEAKS,), nuisances=_tau(1.0, 10.0, 100.0)),
-        _creep("hold_kelvin", KelvinHold, "d = D_e c [sum over holds of sigma (1 - exp(-t_hold / tau))]",
-               "A Kelvin-Voigt element that acts in steps: bounded creep in each hold; it stays.",
-               "Findley, Lai and Onaran (1976), ch. 5", needs=(Need.HOLD,), helps=(Need.SEVERAL_PEAKS,),
-               nuisances=_tau(5.0, 20.0, 80.0)),
-    ),
+    row("kelvin_voigt", "tau dy/dt + y = sigma; d = D_e c y",
+        "A spring in parallel with a dashpot: delayed, bounded and fully recovered.", source=_MCC,
+        **_tau(5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0)),
+    row("logarithmic", "d = D_e c [ln(1 + t / tau) convolved with d sigma]",
+        "Many retardation times: slower and slower, without end.", source="Nowick and Berry (1972), ch. 4",
+        **_tau(1.0, 10.0, 100.0)),
+    row("power_law", "d = D_e c [(t / 100 s)^n convolved with d sigma]", "Creep as a power of time.",
+        source="Andrade (1910); Findley et al. (1976)",
+        nuisances=(Nuisance("exponent", (0.2, 0.4), (0.05, 0.8), "power of time"),)),
+    row("distributed", "d = D_e c [mean of 1 - exp(-t / tau') convolved with d sigma]",
+        "Retardation times spread over two decades.", source="Ferry (1980), ch. 3", **_tau(20.0, 60.0, 200.0, 600.0)),
+    row("viscous_flow", "d = D_e c (integral of sigma dt) / 100 s",
+        "Steady flow in proportion to stress; none of it comes back.", source="Maxwell model; Ferry (1980)",
+        make=ViscousFlow),
+    row("viscoplastic", "d = D_e c sigma_P ln(1 + t_load / tau), t_load = integral of u^8 dt",
+        "Permanent creep while the load is near its maximum, logarithmic in the time spent there.",
+        source="Oyen and Cook (2003); logarithmic indentation creep", **_tau(1.0, 10.0, 100.0), make=ViscoplasticCreep),
+    row("viscoplastic_root", "d = D_e c sigma_P [(1 + t_load / tau)^(1/3) - 1], t_load = integral of u^8 dt",
+        "Permanent creep while the load is near its maximum, as the cube root of the time spent there.",
+        source="Andrade (1910), Proc. R. Soc. A 84, 1", **_tau(1.0, 10.0, 100.0), make=ViscoplasticCreep, root=True),
+    row("hold_logarithmic", "d = D_e c [sum over holds of sigma ln(1 + t_hold / tau)]",
+        "Creep under constant load only, logarithmic in the time of each hold; it stays.",
+        source="Chudoba and Richter (2001), Surf. Coat. Technol. 148, 191", **_tau(1.0, 10.0, 100.0), **_HELD,
+        formula="logarithmic"),
+    row("hold_kelvin", "d = D_e c [sum over holds of sigma (1 - exp(-t_hold / tau))]",
+        "A Kelvin-Voigt element that acts in steps: bounded creep in each hold; it stays.",
+        source="Findley, Lai and Onaran (1976), ch. 5", **_tau(5.0, 20.0, 80.0), **_HELD, formula="kelvin"),
+    parameter="creep_compliance_per_MPa", unit="1/MPa", plausible=(2e-5, 2e-3), needs=(Need.UNLOADING,),
+    helps=(Need.HOLD, Need.TWO_RATES),
     check="hold at the largest load, and repeat at a tenth and at ten times the rate",
     coordinates=("time", "since", "load", "peak"),
 )  # fmt: skip

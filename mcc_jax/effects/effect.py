@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import Any, ClassVar
 
@@ -16,6 +17,8 @@ from .context import Context
 from .record import Record
 
 Factors = tuple[Values, Values, Values]
+MIN_FACTOR = 0.05
+"""Floor of every factor, so that an amplitude far from null does not turn it negative."""
 
 
 class AbstractEffect(eqx.Module):
@@ -27,9 +30,9 @@ class AbstractEffect(eqx.Module):
     2. `loading`: factors on the three terms of the loading curve at a strain (rate, friction, hardening).
     3. `stiffness`: factor on the effective modulus at a peak (damage, densification).
     4. `inside`: displacement added inside the law (creep, pop-in, adhesion); additions of several effects add up.
-    5. `observe`: displacement added to what the tester measures only (frame, drift, platens).
+    5. `observe`: displacement added to what the instrument measures only (frame, drift, platens).
 
-    An effect with a memory of its own also gives `driver`, `start` and `evolve`; what `evolve` returns stands in
+    An effect with a memory of its own also gives `driver`, `start` and `evolve`; what `evolve` returns is
     `context.memory` when `inside` is called.
 
     Hooks are plain arithmetic on scalars or arrays over points, so that `vmap`, `jvp` and `grad` pass through. They
@@ -117,6 +120,58 @@ class AbstractModulusAtPeak(AbstractEffect):
         return self.factor(context.peak_strain, context.peak_stress)
 
 
-def at_least(x: Values, least: float) -> Values:
+def further() -> Any:
+    """A field for a further number that only some of a class's formulas have; None for the others."""
+    return eqx.field(converter=lambda x: None if x is None else scalar(x), default=None, kw_only=True)
+
+
+def switch(on: bool = False) -> Any:
+    """A field that turns a part of a formula on: a number, so that formulas that differ in it alone are compiled once
+    where many are derived together (`mcc_jax.law.signatures`)."""
+    return eqx.field(converter=_number, default=float(on), kw_only=True)
+
+
+def terms(first: bool = True, second: bool = False, third: bool = False) -> Any:
+    """A field of three switches, for instance of the linear, cubic and quintic term."""
+    default = float(first), float(second), float(third)
+    return eqx.field(converter=lambda given: tuple(map(_number, given)), default=default, kw_only=True)
+
+
+def _number(on: Any) -> Any:
+    return float(on) if isinstance(on, bool) else on
+
+
+def pick(on: Any, yes: Any, no: Any) -> Any:
+    """One of two values by a `switch`."""
+    if isinstance(on, float):
+        return yes if on else no
+    return jnp.where(on != 0, yes, no)
+
+
+def on_terms(chosen: tuple[Any, Any, Any], factor: Values) -> Factors:
+    """A factor on the chosen ones of three `terms`, 1 on the others."""
+    one = jnp.ones_like(factor)
+    first, second, third = (pick(on, factor, one) for on in chosen)
+    return first, second, third
+
+
+class AbstractFormulas(AbstractEffect):
+    """An effect whose hook is the same for several formulas that differ in one expression.
+
+    Attributes:
+        formulas: the expressions by name, functions of the effect and of what its hook gives them. Set it on the class.
+        formula: the name of this one's.
+    """
+
+    formulas: ClassVar[Mapping[str, Callable[..., Any]]] = {}
+
+    formula: str = eqx.field(static=True, kw_only=True)
+
+    def of(self, *given: Any) -> Any:
+        """The expression of this formula."""
+        return self.formulas[self.formula](self, *given)
+
+
+def at_least(x: Values, least: float | Values) -> Values:
     """`x`, but not below a floor: keeps a factor positive that an amplitude far from null would turn negative."""
     return jnp.where(x > least, x, least)

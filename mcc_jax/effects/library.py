@@ -6,37 +6,15 @@ import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 
 from .._errors import InputError
-from .contact import MISALIGNMENT, POP_IN, TOE
-from .creep import CREEP
-from .cycles import HYSTERESIS, RATCHETING
-from .loading import FRICTION, HARDENING, RATE
-from .material import DAMAGE, DENSIFICATION, HUMIDITY, SHAPE, SIZE
-from .tester import DRIFT, FRAME, SINK_IN
-from .unloading import ADHESION, REVERSAL, SHAPE_OF_UNLOADING
+from . import contact, creep, cycles, loading, material, tester, unloading
 from .variant import Mechanism, Variant
 
 _ALL = (
-    FRAME,
-    DRIFT,
-    CREEP,
-    RATE,
-    ADHESION,
-    DAMAGE,
-    DENSIFICATION,
-    HYSTERESIS,
-    RATCHETING,
-    HARDENING,
-    SHAPE_OF_UNLOADING,
-    SIZE,
-    SHAPE,
-    POP_IN,
-    TOE,
-    FRICTION,
-    MISALIGNMENT,
-    SINK_IN,
-    REVERSAL,
-    HUMIDITY,
-)
+    tester.FRAME, tester.DRIFT, creep.CREEP, loading.RATE, unloading.ADHESION, material.DAMAGE, material.DENSIFICATION,
+    cycles.HYSTERESIS, cycles.RATCHETING, loading.HARDENING, unloading.SHAPE_OF_UNLOADING, material.SIZE,
+    material.SHAPE, contact.POP_IN, contact.TOE, loading.FRICTION, contact.MISALIGNMENT, tester.SINK_IN,
+    unloading.REVERSAL, material.HUMIDITY,
+)  # fmt: skip
 
 
 class _Library(Mapping[str, Mechanism]):

@@ -1,4 +1,4 @@
-"""What the tester did, point by point: force, time, branch, cycle, rates. Pieces of a test, not noisy differences."""
+"""What the instrument did, point by point: force, time, branch, cycle, rates, from segments of a test."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Codes = Int[Array, "..."]
 class Record(eqx.Module):
     """One test as an effect sees it; the same class holds one point of it (scalars) and many tests (a leading axis).
 
-    Real forces are noisy. So everything that follows from differences of force stands here as data, found by the
+    Real forces are noisy. So everything that follows from differences of force is data here, found by the
     segmentation of a campaign (`mcc_jax.campaign.record_of`) or, for a clean path, by its turning points
     (`clean_record`). A point that repeats the one before, time included, changes nothing: padding is harmless.
 
@@ -42,7 +42,7 @@ class Record(eqx.Module):
         loading_rate: the same of the latest loading or reloading ramp [mN/s].
         relative_humidity: relative humidity of the room [%], one number per test.
         peak: force from which the branch of each point starts [mN], on virgin loading its own force, where a measured
-            record tells it better than its largest reading does (`mcc_jax.campaign.turning_forces`); None for the
+            record shows it better than its largest reading does (`mcc_jax.campaign.turning_forces`); None for the
             largest force so far.
     """
 
@@ -60,14 +60,9 @@ class Record(eqx.Module):
     peak: Values | None = None
 
     __repr__ = described(
-        force="mN",
-        time="s",
-        unload_from="mN",
-        reload_from="mN",
-        rate="mN/s",
-        loading_rate="mN/s",
+        force="mN", time="s", unload_from="mN", reload_from="mN", rate="mN/s", loading_rate="mN/s",
         relative_humidity="%",
-    )
+    )  # fmt: skip
 
     @property
     def at_points(self) -> Record:
@@ -153,6 +148,6 @@ def clean_record(
         return (point, jnp.maximum(peak, point.force)), point
 
     _, points = jax.lax.scan(one, (start, highest), (force, time))
-    # The tester's programme is data: derivatives by force act through the law, not through where the branches begin.
+    # The programme of the test is data: derivatives by force act through the law, not through where the branches begin.
     points = eqx.tree_at(lambda r: (r.force, r.time), jax.lax.stop_gradient(points), (force, time))
     return eqx.tree_at(lambda r: r.relative_humidity, points, start.relative_humidity)

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .._types import Scalar, Values, scalar
+from .._types import Scalar, Values
 from ..formulas import PUNCH_AREA, recovery, stress_ratio
 from .context import Context, contact_of, positive
-from .effect import AbstractEffect
+from .cycles import NORM
+from .effect import AbstractEffect, AbstractFormulas, further, pick, switch
 from .record import RELOAD, reload_progress
-from .variant import Mechanism, Need, Nuisance, Variant
+from .variant import Need, Nuisance, family, row
 
-_NORM = 27 / 4
 BISECTIONS = 50
 LAST_CONTACT = 0.3  # radius over that at the peak: there, at 1 % of the load, half of a constant pull is left
 
@@ -23,52 +23,31 @@ LAST_CONTACT = 0.3  # radius over that at the peak: there, at 1 % of the load, h
 # ---- shape of unloading ----------------------------------------------------------------------------------------------
 
 
-class AbstractBow(AbstractEffect):
-    """A bow on the elastic branch, its ends fixed; the amplitude is a share of the recoverable displacement."""
+def _power_law(e: Bow, share: Values) -> Values:
+    """From the arcsine towards a power law of what is still to recover, as indentation records are reduced by."""
+    some = share > 0
+    power = jnp.exp(jnp.log(jnp.where(some, share, 1.0)) / e.exponent)
+    return jnp.where(some, recovery(share) - (1 - power), 0.0)
 
-    def bow(self, share: Values) -> Values:
-        """Height of the bow at u = F / F_P, 0 at both ends, 1 at most."""
-        raise NotImplementedError
+
+class Bow(AbstractFormulas):
+    """A bow on the elastic branch, its ends fixed; the amplitude is a share of the recoverable displacement.
+
+    A formula is the height of the bow at u = F / F_P, 0 at both ends, 1 at most.
+    """
+
+    exponent: Scalar | None = further()
+
+    formulas: ClassVar = {
+        "symmetric_bow": lambda e, u: 4 * u * (1 - u),
+        "tail_bow": lambda e, u: NORM * u * (1 - u) ** 2,
+        "onset_bow": lambda e, u: NORM * u**2 * (1 - u),
+        "power_law": _power_law,
+    }
 
     def inside(self, context: Context) -> Values:
         """Delta k g(u)."""
-        return self.amplitude * context.recoverable * self.bow(context.load_share)
-
-
-class SymmetricBow(AbstractBow):
-    """The same at half load."""
-
-    def bow(self, share: Values) -> Values:
-        """4 u (1 - u)."""
-        return 4 * share * (1 - share)
-
-
-class TailBow(AbstractBow):
-    """Most at a third of the load."""
-
-    def bow(self, share: Values) -> Values:
-        """6.75 u (1 - u)^2."""
-        return _NORM * share * (1 - share) ** 2
-
-
-class OnsetBow(AbstractBow):
-    """Most at two thirds of the load."""
-
-    def bow(self, share: Values) -> Values:
-        """6.75 u^2 (1 - u)."""
-        return _NORM * share**2 * (1 - share)
-
-
-class PowerLawBow(AbstractBow):
-    """From the arcsine towards a power law of what is still to recover, as indentation records are reduced by."""
-
-    exponent: Scalar = eqx.field(converter=scalar)
-
-    def bow(self, share: Values) -> Values:
-        """s(u) - (1 - u^(1/m))."""
-        some = share > 0
-        power = jnp.exp(jnp.log(jnp.where(some, share, 1.0)) / self.exponent)
-        return jnp.where(some, recovery(share) - (1 - power), 0.0)
+        return self.amplitude * context.recoverable * self.of(context.load_share)
 
 
 class RecoveryExponent(AbstractEffect):
@@ -82,37 +61,21 @@ class RecoveryExponent(AbstractEffect):
         return context.recoverable * jnp.where(some, s * (1 - power), 0.0)
 
 
-def _bow(
-    name: str,
-    make: type[AbstractEffect],
-    equation: str,
-    explanation: str,
-    *,
-    parameter: str = "bow",
-    plausible: tuple[float, float] = (0.01, 0.3),
-    nuisances: tuple[Nuisance, ...] = (),
-) -> Variant:
-    return Variant(
-        "unloading_shape", name, make, parameter, "-", 0, plausible, equation, explanation,
-        "Oliver and Pharr (1992); Etsion, Kligerman and Kadin (2005), Int. J. Solids Struct. 42, 3716",
-        nuisances=nuisances, needs=(Need.UNLOADING,),
-    )  # fmt: skip
-
-
-SHAPE_OF_UNLOADING = Mechanism(
+SHAPE_OF_UNLOADING = family(
+    Bow,
     "unloading_shape",
     "The unloading curve has another shape than the arcsine, with the same two ends.",
-    (
-        _bow("symmetric_bow", SymmetricBow, "d = Delta k 4 u (1 - u)", "Bent most at half load."),
-        _bow("tail_bow", TailBow, "d = Delta k 6.75 u (1 - u)^2", "Bent most towards release."),
-        _bow("onset_bow", OnsetBow, "d = Delta k 6.75 u^2 (1 - u)", "Bent most near the peak."),
-        _bow("recovery_exponent", RecoveryExponent, "d = Delta (s - s^(1 + k))", "Another exponent of recovery."),
-        _bow("power_law", PowerLawBow, "d = Delta k (s - 1 + u^(1/m))",
-             "In part a power law, F ~ (d - d_0)^m, as indentation records are reduced by: m = 1 for a flat contact, "
-             "2 for a cone; with m = 3/2 it is nearly the arcsine.",
-             parameter="power_law_share", plausible=(0.05, 1.0),
-             nuisances=(Nuisance("exponent", (1.2, 2.0), (1.0, 3.0), "exponent of the power law"),)),
-    ),
+    row("symmetric_bow", "d = Delta k 4 u (1 - u)", "Bent most at half load."),
+    row("tail_bow", "d = Delta k 6.75 u (1 - u)^2", "Bent most towards release."),
+    row("onset_bow", "d = Delta k 6.75 u^2 (1 - u)", "Bent most near the peak."),
+    row("recovery_exponent", "d = Delta (s - s^(1 + k))", "Another exponent of recovery.", make=RecoveryExponent),
+    row("power_law", "d = Delta k (s - 1 + u^(1/m))",
+        "In part a power law, F ~ (d - d_0)^m, as indentation records are reduced by: m = 1 for a flat contact, "
+        "2 for a cone; with m = 3/2 it is nearly the arcsine.",
+        parameter="power_law_share", plausible=(0.05, 1.0),
+        nuisances=(Nuisance("exponent", (1.2, 2.0), (1.0, 3.0), "exponent of the power law"),)),
+    parameter="bow", sign=0, plausible=(0.01, 0.3), needs=(Need.UNLOADING,),
+    source="Oliver and Pharr (1992); Etsion, Kligerman and Kadin (2005), Int. J. Solids Struct. 42, 3716",
     check="unload slowly to zero under control of displacement, with a point for every percent of load",
     coordinates=("load", "peak"),
 )  # fmt: skip
@@ -121,35 +84,59 @@ SHAPE_OF_UNLOADING = Mechanism(
 # ---- adhesion --------------------------------------------------------------------------------------------------------
 
 
-class AbstractAdhesion(AbstractEffect):
+def _peeled(recovered: Values) -> Values:
+    """phi^1.5, phi = a / a_P: the force of a crack that closes in from the edge, at the recovered share s."""
+    phi = contact_of(recovered)
+    return phi * jnp.sqrt(phi + 1e-12)
+
+
+def _mobilised(e: Adhesion, s: Values) -> Values:
+    opened = s**2
+    return _peeled(s) * opened / (opened + e.mobilised_share**2)
+
+
+def _constant(e: Adhesion, s: Values) -> Values:
+    """(1 - u') phi^2 / (phi^2 + 0.3^2): what counts is how far the law's own force has fallen."""
+    contact = (1 - s) * (1 + s)
+    return (1 - stress_ratio(s)) * contact / (contact + LAST_CONTACT**2)
+
+
+class Adhesion(AbstractFormulas):
     r"""Attraction over the contact while the particle is unloaded; it vanishes at the onset and with the contact.
 
-    The law's branch carries what the tester measures plus the attraction, :math:`u' = u + \kappa g(s(u'))`, with
+    The law's branch carries what the instrument measures plus the attraction, :math:`u' = u + \kappa g(s(u'))`, with
     :math:`\kappa = 4 c^2 \epsilon_P s_{ad} / \sigma_P`, the stress over the contact's area at the peak, or
     :math:`\kappa = s_{ad} / \sigma_P` if it is counted over the particle's section as all stresses of the law are. Of
-    its solutions the largest is stable. Derivatives follow from the implicit-function rule.
+    its solutions the largest is stable. Derivatives follow from the implicit-function rule. A formula is g, attraction
+    over its strength at the recovered share s.
 
     Attributes:
         over_section: whether the stress is counted over the section.
+        mobilised_share: recovered share at which half of the attraction acts.
     """
 
-    over_section: bool = eqx.field(static=True, default=False, kw_only=True)
+    over_section: float = switch()
+    mobilised_share: Scalar | None = further()
 
-    def attraction(self, recovered: Values) -> Values:
-        """Attraction over its strength, at the recovered share s."""
-        raise NotImplementedError
+    formulas: ClassVar = {
+        "jkr": lambda e, s: _peeled(s) * s,
+        "bond": lambda e, s: (1 - s) * (1 + s) * s,
+        "stretched_tail": lambda e, s: _peeled(s) * s**4,
+        "mobilised": _mobilised,
+        "constant": _constant,
+    }
 
     def inside(self, context: Context) -> Values:
         """Delta [s(u) - s(u')]."""
         share = context.load_share
         carries = context.peak_stress > 1e-6
-        share_of_section = 1.0 if self.over_section else 4 * PUNCH_AREA * context.peak_strain
+        share_of_section = pick(self.over_section, 1.0, 4 * PUNCH_AREA * context.peak_strain)
         area = share_of_section / jnp.where(carries, context.peak_stress, 1.0)
         strength = self.amplitude * jnp.where(carries, area, 0.0)
         frozen, fixed = jax.lax.stop_gradient(share), jax.lax.stop_gradient(strength)
 
         def excess(value: Values, share: Values, strength: Values) -> Values:
-            return value - share - strength * self.attraction(recovery(value))
+            return value - share - strength * self.of(recovery(value))
 
         def halve(_: Any, bracket: tuple[Values, Values]) -> tuple[Values, Values]:
             low, high = bracket
@@ -166,101 +153,39 @@ class AbstractAdhesion(AbstractEffect):
         return context.recoverable * (recovery(share) - recovery(value))
 
 
-class JkrAdhesion(AbstractAdhesion):
-    """Force of a crack that closes in from the edge."""
-
-    def attraction(self, recovered: Values) -> Values:
-        """phi^1.5 s, phi = a / a_P."""
-        phi = contact_of(recovered)
-        return phi * jnp.sqrt(phi + 1e-12) * recovered
-
-
-class BondAdhesion(AbstractAdhesion):
-    """Stress of bonds over the contact that is left."""
-
-    def attraction(self, recovered: Values) -> Values:
-        """phi^2 s."""
-        return (1 - recovered) * (1 + recovered) * recovered
-
-
-class TailAdhesion(AbstractAdhesion):
-    """Bridges that are stretched before they pull."""
-
-    def attraction(self, recovered: Values) -> Values:
-        """phi^1.5 s^4."""
-        phi = contact_of(recovered)
-        return phi * jnp.sqrt(phi + 1e-12) * recovered**4
-
-
-class MobilisedAdhesion(AbstractAdhesion):
-    """Attraction that is there in full once the contact has opened a little."""
-
-    mobilised_share: Scalar = eqx.field(converter=scalar)
-
-    def attraction(self, recovered: Values) -> Values:
-        """phi^1.5 s^2 / (s^2 + s_0^2)."""
-        phi = contact_of(recovered)
-        opened = recovered**2
-        return phi * jnp.sqrt(phi + 1e-12) * opened / (opened + self.mobilised_share**2)
-
-
-class ConstantPull(AbstractAdhesion):
-    """A pull that does not fade with unloading and is gone with the last of the contact."""
-
-    def attraction(self, recovered: Values) -> Values:
-        """(1 - u') phi^2 / (phi^2 + 0.3^2): what counts is how far the law's own force has fallen."""
-        contact = (1 - recovered) * (1 + recovered)
-        return (1 - stress_ratio(recovered)) * contact / (contact + LAST_CONTACT**2)
-
-
-def _adhesion(
-    name: str,
-    make: type[AbstractEffect],
-    equation: str,
-    explanation: str,
-    source: str,
-    *,
-    over_section: bool = False,
-    nuisances: tuple[Nuisance, ...] = (),
-) -> Variant:
-    return Variant(
-        "adhesion", name, make, "adhesive_stress_MPa", "MPa", 1, (0.02, 2.0), equation, explanation, source,
-        needs=(Need.UNLOADING,), helps=(Need.SEVERAL_PEAKS,), fixed={"over_section": over_section}, nuisances=nuisances,
-    )  # fmt: skip
-
-
 _SECTION = "phi = a/a_P, u' = u + s_ad / sigma_P g, d = Delta [s(u) - s(u')]"
 _GENERAL = "phi = a/a_P, u' = u + 4 c^2 eps_P s_ad / sigma_P g, d = Delta [s(u) - s(u')]"
-
 _COHESIVE = "Needleman (1987), J. Appl. Mech. 54, 525; Olsson and Larsson (2013)"
 _MOBILISED = Nuisance("mobilised_share", (0.25, 0.4, 0.6), (0.05, 1.0), "recovered share at which half of it pulls")
 
-ADHESION = Mechanism(
+ADHESION = family(
+    Adhesion,
     "adhesion",
     "The particle sticks to the platens: on unloading it recovers less at the same force.",
-    (
-        _adhesion("jkr_nominal", JkrAdhesion, f"g = phi^1.5 s; {_SECTION}",
-                  "A crack closes in from the contact's edge; the stress is counted over the particle's section.",
-                  "Johnson, Kendall and Roberts (1971); Mesarovic and Johnson (2000), J. Mech. Phys. Solids 48, 2009",
-                  over_section=True),
-        _adhesion("jkr", JkrAdhesion, f"g = phi^1.5 s; {_GENERAL}",
-                  "The same with the stress of the contact itself: larger contacts stick more strongly.",
-                  "Johnson, Kendall and Roberts (1971)"),
-        _adhesion("bond", BondAdhesion, f"g = phi^2 s; {_GENERAL}", "Bonds over the area of contact that is left.",
-                  "Olsson and Larsson (2013); Gonzalez (2019), J. Mech. Phys. Solids"),
-        _adhesion("stretched_tail", TailAdhesion, f"g = phi^1.5 s^4; {_GENERAL}",
-                  "Bridges or fibres that pull only once they are stretched, close to release.", "liquid bridges"),
-        _adhesion("mobilised_nominal", MobilisedAdhesion, f"g = phi^1.5 s^2 / (s^2 + s_0^2); {_SECTION}",
-                  "A cohesive zone that pulls in full once the contact has opened a little, counted over the section.",
-                  _COHESIVE, over_section=True, nuisances=(_MOBILISED,)),
-        _adhesion("mobilised", MobilisedAdhesion, f"g = phi^1.5 s^2 / (s^2 + s_0^2); {_GENERAL}",
-                  "The same with the stress of the contact itself.", _COHESIVE, nuisances=(_MOBILISED,)),
-        _adhesion("bond_nominal", BondAdhesion, f"g = phi^2 s; {_SECTION}", "As bond, counted over the section.",
-                  "Gonzalez (2019)", over_section=True),
-        _adhesion("constant_nominal", ConstantPull, f"g = (1 - u') phi^2 / (phi^2 + 0.3^2); {_SECTION}",
-                  "A pull that stays the same until the last of the contact opens, counted over the section.",
-                  "Derjaguin, Muller and Toporov (1975), J. Colloid Interface Sci. 53, 314", over_section=True),
-    ),
+    row("jkr_nominal", f"g = phi^1.5 s; {_SECTION}",
+        "A crack closes in from the contact's edge; the stress is counted over the particle's section.",
+        source="Johnson, Kendall and Roberts (1971); Mesarovic and Johnson (2000), J. Mech. Phys. Solids 48, 2009",
+        formula="jkr", over_section=True),
+    row("jkr", f"g = phi^1.5 s; {_GENERAL}",
+        "The same with the stress of the contact itself: larger contacts stick more strongly.",
+        source="Johnson, Kendall and Roberts (1971)"),
+    row("bond", f"g = phi^2 s; {_GENERAL}", "Bonds over the area of contact that is left.",
+        source="Olsson and Larsson (2013); Gonzalez (2019), J. Mech. Phys. Solids"),
+    row("stretched_tail", f"g = phi^1.5 s^4; {_GENERAL}",
+        "Bridges or fibres that pull only once they are stretched, close to release.", source="ad hoc (this work)"),
+    row("mobilised_nominal", f"g = phi^1.5 s^2 / (s^2 + s_0^2); {_SECTION}",
+        "A cohesive zone that pulls in full once the contact has opened a little, counted over the section.",
+        source=_COHESIVE, nuisances=(_MOBILISED,), formula="mobilised", over_section=True),
+    row("mobilised", f"g = phi^1.5 s^2 / (s^2 + s_0^2); {_GENERAL}", "The same with the stress of the contact itself.",
+        source=_COHESIVE, nuisances=(_MOBILISED,)),
+    row("bond_nominal", f"g = phi^2 s; {_SECTION}", "As bond, counted over the section.", source="Gonzalez (2019)",
+        formula="bond", over_section=True),
+    row("constant_nominal", f"g = (1 - u') phi^2 / (phi^2 + 0.3^2); {_SECTION}",
+        "A pull that stays the same until the last of the contact opens, counted over the section.",
+        source="Derjaguin, Muller and Toporov (1975), J. Colloid Interface Sci. 53, 314",
+        formula="constant", over_section=True),
+    parameter="adhesive_stress_MPa", unit="MPa", plausible=(0.02, 2.0), needs=(Need.UNLOADING,),
+    helps=(Need.SEVERAL_PEAKS,),
     check="pull off under control of displacement, and repeat with a dry punch that does not stick",
     coordinates=("load", "peak"),
 )  # fmt: skip
@@ -269,125 +194,84 @@ ADHESION = Mechanism(
 # ---- reverse plasticity ----------------------------------------------------------------------------------------------
 
 
-class AbstractReversal(AbstractEffect):
+def _power(e: Reversal, u: Values) -> Values:
+    left = 1 - u
+    return pick(e.quadratic, left**2, left**4)
+
+
+def _exponential(e: Reversal, u: Values) -> Values:
+    """Reverse flow that grows exponentially towards release."""
+    end = jnp.exp(-1 / e.decay_share)
+    return (jnp.exp(-u / e.decay_share) - end) / (1 - end)
+
+
+class Reversal(AbstractFormulas):
     """Extra recovery towards release, from the compressed core that yields backwards.
 
+    A formula is its course, 1 on full release, 0 at the peak.
+
     Attributes:
-        of: what the amplitude is a share of: the particle's size D_e ("size"), the displacement at the peak gamma_P
-            ("peak"), or what the law recovers, Delta ("recovery").
+        of_size, of_recovery: whether the amplitude is a share of the particle's size D_e, or of what the law recovers,
+            Delta; else it is one of the displacement at the peak, gamma_P.
+        stays: whether a reload takes it back only in proportion to force.
+        quadratic: (1 - u)^2 for (1 - u)^4.
     """
 
-    of: str = eqx.field(static=True, default="peak", kw_only=True)
+    of_size: float = switch()
+    of_recovery: float = switch()
+    quadratic: float = switch()
+    stays: bool = eqx.field(static=True, default=False, kw_only=True)
+    onset_share: Scalar | None = further()
+    decay_share: Scalar | None = further()
 
-    def tail(self, share: Values) -> Values:
-        """1 on full release, 0 at the peak."""
-        raise NotImplementedError
-
-    def whole(self, context: Context) -> Values:
-        """L: D_e, gamma_P or Delta [um]."""
-        if self.of == "size":
-            return context.particle.effective_diameter
-        return context.recoverable if self.of == "recovery" else context.peak_displacement
-
-    def inside(self, context: Context) -> Values:
-        """-L c g(u)."""
-        return -self.amplitude * self.whole(context) * self.tail(context.load_share)
-
-
-class PowerReversal(AbstractReversal):
-    """A power of what is unloaded."""
-
-    power: int = eqx.field(static=True, default=4)
-
-    def tail(self, share: Values) -> Values:
-        """(1 - u)^power."""
-        return (1 - share) ** self.power
-
-
-class ThresholdReversal(AbstractReversal):
-    """Reverse yield that begins at a share of the load."""
-
-    onset_share: Scalar = eqx.field(converter=scalar)
-
-    def tail(self, share: Values) -> Values:
-        """((u_0 - u) / u_0)^2 below u_0."""
-        return (positive(self.onset_share - share) / self.onset_share) ** 2
-
-
-class ExponentialReversal(AbstractReversal):
-    """Reverse flow that grows exponentially towards release."""
-
-    decay_share: Scalar = eqx.field(converter=scalar)
-
-    def tail(self, share: Values) -> Values:
-        """(exp(-u / w) - exp(-1 / w)) / (1 - exp(-1 / w))."""
-        end = jnp.exp(-1 / self.decay_share)
-        return (jnp.exp(-share / self.decay_share) - end) / (1 - end)
-
-
-class StayingReversal(AbstractReversal):
-    """Reverse yield that a reload takes back only in proportion to force."""
-
-    power: int = eqx.field(static=True, default=4, kw_only=True)
-
-    def tail(self, share: Values) -> Values:
-        """(1 - u)^4, or ^2."""
-        return (1 - share) ** self.power
+    formulas: ClassVar = {
+        "power": _power,
+        "threshold": lambda e, u: (positive(e.onset_share - u) / e.onset_share) ** 2,
+        "exponential": _exponential,
+    }
 
     def inside(self, context: Context) -> Values:
-        """On a reload g(u_r) (1 - u) / (1 - u_r)."""
+        """-L c g(u), L = D_e, gamma_P or Delta; if it stays, on a reload g(u_r) (1 - u) / (1 - u_r)."""
         share = context.load_share
-        start = context.reload_from_share
-        back = 1 - reload_progress(share, start, jnp.ones_like(share))
-        tail = jnp.where(context.record.branch == RELOAD, self.tail(start) * back, self.tail(share))
-        return -self.amplitude * self.whole(context) * tail
+        whole = pick(self.of_recovery, context.recoverable, context.peak_displacement)
+        whole = pick(self.of_size, context.particle.effective_diameter, whole)
+        tail = self.of(share)
+        if self.stays:
+            start = context.reload_from_share
+            back = 1 - reload_progress(share, start, jnp.ones_like(share))
+            tail = jnp.where(context.record.branch == RELOAD, self.of(start) * back, tail)
+        return -self.amplitude * whole * tail
 
 
-_REVERSED = {
-    "size": ("reverse_strain", (2e-4, 1e-2)),
-    "peak": ("reverse_share", (5e-4, 3e-2)),
-    "recovery": ("recovery_share", (1e-2, 0.5)),
-}
-"""Name of the amplitude and its plausible range, by what it is a share of."""
+_OF_SIZE = {"of_size": True, "parameter": "reverse_strain", "plausible": (2e-4, 1e-2)}
+_OF_RECOVERY = {"of_recovery": True, "parameter": "recovery_share", "plausible": (1e-2, 0.5)}
 
-
-def _reversal(
-    name: str, make: type[AbstractEffect], equation: str, explanation: str, *, of: str = "peak", **more: Any
-) -> Variant:
-    parameter, plausible = _REVERSED[of]
-    return Variant(
-        "reverse_plasticity", name, make, parameter, "-", 1, plausible, equation, explanation,
-        "Palomaki et al. (2015), Int. J. Pharm. (seen in MCC); Kadin, Kligerman and Etsion (2006)",
-        needs=(Need.UNLOADING,), helps=(Need.RELOAD,), **{**more, "fixed": {"of": of, **more.get("fixed", {})}},
-    )  # fmt: skip
-
-
-REVERSAL = Mechanism(
+REVERSAL = family(
+    Reversal,
     "reverse_plasticity",
     "Close to release the compressed core yields backwards: the particle recovers more than elastically.",
-    (
-        _reversal("quartic_strain", PowerReversal, "d = -D_e c (1 - u)^4",
-                  "Most of it close to release, the same strain for every particle.", of="size"),
-        _reversal("quartic", PowerReversal, "d = -gamma_P c (1 - u)^4", "Most of it close to release."),
-        _reversal("quartic_recovery", PowerReversal, "d = -Delta c (1 - u)^4",
-                  "Most of it close to release, in proportion to what recovers elastically.", of="recovery"),
-        _reversal("threshold_recovery", ThresholdReversal, "d = -Delta c ((u_0 - u) / u_0)^2 below u_0",
-                  "Reverse yield begins at a share of the peak load, in proportion to what recovers elastically.",
-                  of="recovery",
-                  nuisances=(Nuisance("onset_share", (0.35, 0.5, 0.65, 0.8), (0.05, 0.95), "share of the peak load"),)),
-        _reversal("quadratic", PowerReversal, "d = -gamma_P c (1 - u)^2", "All along the branch.", fixed={"power": 2}),
-        _reversal("threshold", ThresholdReversal, "d = -gamma_P c ((u_0 - u) / u_0)^2 below u_0",
-                  "Reverse yield begins at a share of the peak load.",
-                  nuisances=(Nuisance("onset_share", (0.25, 0.35, 0.5, 0.7), (0.05, 0.95), "share of the peak load"),)),
-        _reversal("exponential", ExponentialReversal, "d = -gamma_P c (exp(-u / w) - e) / (1 - e), e = exp(-1 / w)",
-                  "Reverse flow with an exponential tail.",
-                  nuisances=(Nuisance("decay_share", (0.05, 0.1, 0.2, 0.4), (0.01, 1.0), "share of the peak load"),)),
-        _reversal("staying", StayingReversal, "d = -gamma_P c (1 - u)^4; on a reload (1 - u_r)^4 (1 - u) / (1 - u_r)",
-                  "As the quartic form, but a reload does not retrace it."),
-        _reversal("staying_quadratic", StayingReversal,
-                  "d = -gamma_P c (1 - u)^2; on a reload (1 - u_r)^2 (1 - u) / (1 - u_r)",
-                  "As the quadratic form, but a reload does not retrace it.", fixed={"power": 2}),
-    ),
+    row("quartic_strain", "d = -D_e c (1 - u)^4", "Most of it close to release, the same strain for every particle.",
+        formula="power", **_OF_SIZE),
+    row("quartic", "d = -gamma_P c (1 - u)^4", "Most of it close to release.", formula="power"),
+    row("quartic_recovery", "d = -Delta c (1 - u)^4",
+        "Most of it close to release, in proportion to what recovers elastically.", formula="power", **_OF_RECOVERY),
+    row("threshold_recovery", "d = -Delta c ((u_0 - u) / u_0)^2 below u_0",
+        "Reverse yield begins at a share of the peak load, in proportion to what recovers elastically.",
+        nuisances=(Nuisance("onset_share", (0.35, 0.5, 0.65, 0.8), (0.05, 0.95), "share of the peak load"),),
+        formula="threshold", **_OF_RECOVERY),
+    row("quadratic", "d = -gamma_P c (1 - u)^2", "All along the branch.", formula="power", quadratic=True),
+    row("threshold", "d = -gamma_P c ((u_0 - u) / u_0)^2 below u_0",
+        "Reverse yield begins at a share of the peak load.",
+        nuisances=(Nuisance("onset_share", (0.25, 0.35, 0.5, 0.7), (0.05, 0.95), "share of the peak load"),)),
+    row("exponential", "d = -gamma_P c (exp(-u / w) - e) / (1 - e), e = exp(-1 / w)",
+        "Reverse flow with an exponential tail.",
+        nuisances=(Nuisance("decay_share", (0.05, 0.1, 0.2, 0.4), (0.01, 1.0), "share of the peak load"),)),
+    row("staying", "d = -gamma_P c (1 - u)^4; on a reload (1 - u_r)^4 (1 - u) / (1 - u_r)",
+        "As the quartic form, but a reload does not retrace it.", formula="power", stays=True),
+    row("staying_quadratic", "d = -gamma_P c (1 - u)^2; on a reload (1 - u_r)^2 (1 - u) / (1 - u_r)",
+        "As the quadratic form, but a reload does not retrace it.", formula="power", stays=True, quadratic=True),
+    parameter="reverse_share", plausible=(5e-4, 3e-2), needs=(Need.UNLOADING,), helps=(Need.RELOAD,),
+    source="Palomaki et al. (2015), Int. J. Pharm. (seen in MCC); Kadin, Kligerman and Etsion (2006)",
     check="unload, hold close to zero load, reload and unload once more",
     coordinates=("load", "peak", "reload"),
 )  # fmt: skip

@@ -6,7 +6,7 @@ import enum
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from .. import arguments
 from .._errors import InputError
 from .._format import described, in_words, number, table
 from .._types import ScalarLike, scalar
-from .effect import AbstractEffect
+from .effect import AbstractEffect, AbstractFormulas
 
 
 class Need(enum.Enum):
@@ -80,7 +80,7 @@ class Variant:
         source: where the formula is from.
         nuisances: further numbers of the formula.
         needs: what the data must contain, all of it.
-        helps: what would make the effect easier to tell from others.
+        helps: what would make the effect easier to distinguish from others.
         random_per_test: whether the amplitude differs at random from test to test, with either sign.
         fixed: settings of the class that make this formula.
     """
@@ -104,26 +104,25 @@ class Variant:
     def __post_init__(self) -> None:
         plausible = arguments.floats(self.plausible, "plausible", shape="two magnitudes, the smaller first")
         if plausible.shape != (2,) or not 0 < plausible[0] < plausible[1] < math.inf:
-            raise InputError(f"{self.mechanism}:{self.name}: plausible must be two magnitudes, the smaller first")
-        arguments.choice(self.sign, (-1, 0, 1), f"sign of {self.mechanism}:{self.name}")
+            raise InputError(f"{self.label}: plausible must be two magnitudes, the smaller first")
+        arguments.choice(self.sign, (-1, 0, 1), f"sign of {self.label}")
         for nuisance in self.nuisances:
             least, most = nuisance.plausible
             if not (nuisance.grid and all(least <= value <= most for value in nuisance.grid)):
-                raise InputError(
-                    f"{self.mechanism}:{self.name}: the grid of {nuisance.name} leaves its plausible range"
-                )
+                raise InputError(f"{self.label}: the grid of {nuisance.name} leaves its plausible range")
 
     def __repr__(self) -> str:
         sign = {1: "above zero", -1: "below zero", 0: "of either sign"}[self.sign]
         low, high = (number(value) for value in self.plausible)
         unit = "" if self.unit == "-" else f" {self.unit}"
+        further = [
+            (n.name, f"{in_words(n.plausible[0])} to {in_words(n.plausible[1])}: {n.explanation}")
+            for n in self.nuisances
+        ]
         rows = [
             ("formula", self.equation),
             (self.parameter, f"{sign}, plausible from {low} to {high}{unit}"),
-            *(
-                (n.name, f"{in_words(n.plausible[0])} to {in_words(n.plausible[1])}: {n.explanation}")
-                for n in self.nuisances
-            ),
+            *further,
             ("what happens", self.explanation),
             ("needs", ", ".join(need.value for need in self.needs) or "nothing special"),
             ("source", self.source),
@@ -151,26 +150,24 @@ class Variant:
         Raises:
             ValueError: for a parameter that the formula does not have.
         """
-        known = {n.name: n.middle for n in self.nuisances}
-        unknown = sorted(set(nuisance) - set(known))
-        if unknown:
-            raise InputError(
-                f"{self.mechanism}:{self.name} has no parameter {unknown[0]!r}; "
-                f"it has: {', '.join([self.parameter, *known])}"
-            )
+        self.check_names(nuisance)
         strength = scalar(amplitude)
         others = {
             name: jnp.asarray(value, strength.dtype) if isinstance(value, int | float) else value
-            for name, value in {**known, **nuisance}.items()
+            for name, value in {**{n.name: n.middle for n in self.nuisances}, **nuisance}.items()
         }
         return replace(self.make(strength, **others, **self.fixed), label=self.label)
 
+    def check_names(self, nuisance: Mapping[str, Any]) -> None:
+        """Raise `InputError` for a further number that the formula does not have."""
+        known = [n.name for n in self.nuisances]
+        for name in sorted(set(nuisance) - set(known)):
+            raise InputError(f"{self.label} has no parameter {name!r}; it has: {', '.join([self.parameter, *known])}")
+
     def grid(self) -> list[dict[str, float]]:
         """All combinations of the nuisance parameters' values; one empty dictionary if there are none."""
-        names = [n.name for n in self.nuisances]
-        return [
-            dict(zip(names, values, strict=True)) for values in itertools.product(*(n.grid for n in self.nuisances))
-        ]
+        names, grids = [n.name for n in self.nuisances], [n.grid for n in self.nuisances]
+        return [dict(zip(names, values, strict=True)) for values in itertools.product(*grids)]
 
 
 @dataclass(frozen=True)
@@ -181,7 +178,7 @@ class Mechanism:
         name: its name.
         explanation: what it is, in plain words.
         variants: its formulas, the most common first.
-        equivalences: what no data of this kind can tell from it; to be declared, never discovered.
+        equivalences: what no data of this kind can distinguish from it; to be declared, never discovered.
         check: what would show it by itself, apart from what more tests of the same kind would show.
         coordinates: names of what its formulas depend on, and may be wrong in (`mcc_jax.discover.misfit`).
         opposite: the mechanism that is this one with the other sign: the two are no pair.
@@ -223,14 +220,55 @@ class Mechanism:
         raise KeyError(f"{self.name} has no variant {name!r}; it has: {', '.join(v.name for v in self.variants)}")
 
 
+def row(name: str, equation: str, explanation: str, **own: Any) -> dict[str, Any]:
+    """One formula of a `family`: its name, equation and explanation, and what differs from the others'.
+
+    `own` are fields of `Variant`; all else are settings of the effect's class. Of an `AbstractFormulas` the formula is
+    the one of the row's name unless `formula` is among them.
+    """
+    return {"name": name, "equation": equation, "explanation": explanation, **own}
+
+
+def family(
+    make: type[AbstractEffect],
+    name: str,
+    explanation: str,
+    *rows: Mapping[str, Any],
+    equivalences: tuple[str, ...] = (),
+    check: str,
+    coordinates: tuple[str, ...],
+    opposite: str = "",
+    sudden: bool = False,
+    **common: Any,
+) -> Mechanism:
+    """A mechanism from its rows.
+
+    Args:
+        make: class of the effects; a row may name another.
+        name, explanation: of the mechanism.
+        rows: its formulas.
+        equivalences, check, coordinates, opposite, sudden: of the mechanism.
+        common: fields of `Variant` that rows do not give; without unit and of positive sign if nobody says otherwise.
+    """
+    known = {f.name for f in fields(Variant)}
+    variants = []
+    for own in rows:
+        given = {"mechanism": name, "make": make, "unit": "-", "sign": 1, **common, **own}
+        fixed = {key: given.pop(key) for key in list(given) if key not in known}
+        if issubclass(given["make"], AbstractFormulas):
+            fixed.setdefault("formula", given["name"])
+        variants.append(Variant(**given, fixed=fixed))
+    return Mechanism(name, explanation, tuple(variants), equivalences, check, coordinates, opposite, sudden)
+
+
 @dataclass(frozen=True)
 class Equivalence:
     """Two or more descriptions that fit every possible measurement equally well.
 
     Attributes:
-        names: what cannot be told apart.
+        names: what cannot be distinguished.
         explanation: why.
-        broken_by: the measurement that would tell them apart.
+        broken_by: the measurement that would distinguish them.
     """
 
     names: tuple[str, ...]

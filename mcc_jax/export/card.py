@@ -1,4 +1,4 @@
-"""The parameter card: everything that a person needs to code the law anew, as JSON."""
+"""The parameter card: everything that a person needs to code the law again, as JSON."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def card(law: MccLaw, particle: Particle | None = None, *, origin: Origin | None
 
 def described(law: MccLaw) -> list[dict[str, Any]]:
     """The effects of a law: name, equation, the amplitude's unit where it is known, and numbers by name."""
-    told = []
+    effects = []
     for effect in law.effects:
         mechanism, _, name = effect.name.partition(":")
         known = next((v for v in LIBRARY.get(mechanism, ()) if v.name == name), None)
@@ -114,17 +114,14 @@ def described(law: MccLaw) -> list[dict[str, Any]]:
         else:
             more = {"equation": known.equation, "unit": known.unit}
             numbers = {known.parameter if name == "amplitude" else name: value for name, value in numbers.items()}
-        told.append({"name": effect.name, **more, "numbers": numbers})
-    return told
+        effects.append({"name": effect.name, **more, "numbers": numbers})
+    return effects
 
 
 def in_words(law: MccLaw) -> list[str]:
     """A line for each effect of a law."""
-    lines = []
-    for effect in described(law):
-        numbers = ", ".join(f"{name} = {value:.6g}" for name, value in effect["numbers"].items())
-        lines.append(f"Effect {effect['name']}: {effect['equation']}; {numbers}.")
-    return lines
+    numbers = lambda effect: ", ".join(f"{name} = {value:.6g}" for name, value in effect["numbers"].items())  # noqa: E731
+    return [f"Effect {one['name']}: {one['equation']}; {numbers(one)}." for one in described(law)]
 
 
 def checksum(content: Any) -> str:
@@ -134,9 +131,7 @@ def checksum(content: Any) -> str:
 
 def _geometry(law: MccLaw, particle: Particle, origin: Origin) -> dict[str, Any]:
     return {
-        "D1_um": float(particle.D1),
-        "D2_um": float(particle.D2),
-        "D3_um": float(particle.D3),
+        **{f"{name}_um": float(getattr(particle, name)) for name in ("D1", "D2", "D3")},
         "effective_diameter_um": float(particle.effective_diameter),
         "effective_area_um2": float(particle.effective_area),
         "eta_p": float(law.shape_factor(particle)),

@@ -14,7 +14,6 @@ from .. import arguments
 from .._errors import InputError
 from .._extras import extra
 from .._format import described
-from .._types import Scalar
 from ..geometry import Particle
 from ..law import History, MccLaw, Plastic
 from .origin import checked
@@ -44,13 +43,7 @@ def signatures(law: MccLaw) -> dict[Which, dict[str, Any]]:
 
 @dataclass(frozen=True)
 class Artefact:
-    """A serialised function.
-
-    Attributes:
-        name: which function and precision.
-        content: what `jax.export.deserialize` takes.
-        signature: arguments, results, precision, platforms.
-    """
+    """A serialised function: its name, what `jax.export.deserialize` takes, and its arguments and results in words."""
 
     name: str
     content: bytes
@@ -132,27 +125,11 @@ def jax_artefact(
 
 def _memory(law: MccLaw, particle: Particle) -> list[dict[str, Any]]:
     """The memory of a virgin particle, array by array."""
-    return [
-        {
-            "name": jax.tree_util.keystr(path).removeprefix("."),
-            "shape": list(leaf.shape),
-            "dtype": str(leaf.dtype),
-            "start": leaf.tolist(),
-        }
+    leaves = [
+        (jax.tree_util.keystr(path).removeprefix("."), leaf)
         for path, leaf in jax.tree_util.tree_flatten_with_path(law.init(particle))[0]
     ]
-
-
-def respond(
-    law: MccLaw, particle: Particle, state: History, displacement: Scalar, time: Scalar | None = None
-) -> tuple[Scalar, Scalar, History]:
-    """Force [mN], its derivative with respect to the displacement [mN/um], and the state after the step."""
-
-    def step(x: Scalar) -> tuple[Scalar, History]:
-        after, force = law.step(particle, state, x, time)
-        return force, after
-
-    return jax.jvp(step, (displacement,), (jnp.ones_like(displacement),), has_aux=True)
+    return [{"name": n, "shape": list(x.shape), "dtype": str(x.dtype), "start": x.tolist()} for n, x in leaves]
 
 
 def _function(law: MccLaw, particle: Particle, which: Which, structure: Any) -> Callable[..., Any]:
@@ -160,7 +137,8 @@ def _function(law: MccLaw, particle: Particle, which: Which, structure: Any) -> 
 
     def step(x: jax.Array, second: jax.Array, *memory: jax.Array, law: MccLaw = law, body: Particle = particle) -> Any:
         state, time = (jax.tree.unflatten(structure, memory), second) if law.effects else (History(second), None)
-        force, tangent, after = respond(law, body, state, x, time)
+        move = lambda x: law.step(body, state, x, time)[::-1]  # noqa: E731
+        force, tangent, after = jax.jvp(move, (x,), (jnp.ones_like(x),), has_aux=True)
         return force, tangent, *jax.tree.leaves(after)
 
     def force(x: jax.Array, past: jax.Array) -> jax.Array:

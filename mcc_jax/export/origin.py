@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from .. import arguments
@@ -51,13 +52,9 @@ class Origin:
 
 def numbers(law: MccLaw) -> dict[str, float]:
     """The five numbers of a law by name, as Python floats."""
-    return {
-        "C1": float(law.plastic.C1),
-        "C3": float(law.plastic.C3),
-        "C5": float(law.plastic.C5),
-        "a": float(law.a),
-        "effective_modulus_MPa": float(law.effective_modulus),
-    }
+    C = law.plastic
+    values = {"C1": C.C1, "C3": C.C3, "C5": C.C5, "a": law.a, "effective_modulus_MPa": law.effective_modulus}
+    return {name: float(value) for name, value in values.items()}
 
 
 HUGE = 1e44
@@ -65,13 +62,7 @@ HUGE = 1e44
 
 
 def checked(law: Any, particle: Any, origin: Any = None, *, needed: bool = True) -> Origin:
-    """The origin, or an empty one, once law and particle are known to be what can be exported.
-
-    Args:
-        law: the law.
-        particle: a particle that it must carry, or None.
-        origin: where the law comes from, or None.
-        needed: whether there must be a particle.
+    """The origin, or an empty one, of a law that can be exported and a particle that it carries, if one is `needed`.
 
     Raises:
         InputError: for one of another kind, a batch of laws, or a law or particle that is not usable.
@@ -84,18 +75,11 @@ def checked(law: Any, particle: Any, origin: Any = None, *, needed: bool = True)
 
 
 def check(law: MccLaw, particle: Particle, *, allow_not_monotone: bool = False) -> tuple[str, ...]:
-    """Refuse a law that other engines could not use.
-
-    Args:
-        law: the law.
-        particle: a particle that it must carry.
-        allow_not_monotone: warn of a loading curve that falls, instead of refusing it.
-
-    Returns:
-        Warnings.
+    """Warnings about a law for other engines.
 
     Raises:
-        InputError: if a parameter is out of its range, the particle carries no stress, or the curve falls.
+        InputError: if a parameter is out of its range, the particle carries no stress, or the loading curve falls and
+            that is not allowed.
     """
     if not bool(law.is_valid) or not all(abs(number) < HUGE for number in numbers(law).values()):
         raise InputError(
@@ -103,7 +87,7 @@ def check(law: MccLaw, particle: Particle, *, allow_not_monotone: bool = False) 
             remedy=f"C1, C5 and the modulus must be positive, and all below {HUGE:g}",
         )
     if not bool(law.carries_stress(particle)):
-        sizes = ", ".join(f"{float(d):g}" for d in (particle.D1, particle.D2, particle.D3))
+        sizes = ", ".join(f"{float(d):g}" for d in jax.tree.leaves(particle))
         raise InputError(
             f"the shape factor of a particle of {sizes} um is {float(law.shape_factor(particle)):.4g} "
             f"with a = {float(law.a):.4g}",
@@ -154,19 +138,19 @@ def read_calibration(
         entry = None if particle is None else entry_of(content, particle)
         sizes, geometry = _sizes(found, path, particle, diameters)
         law = found.law(particle)
-        testers = [effect.name for effect in law.effects if effect.of_tester]
+        observed = [effect.name for effect in law.effects if effect.of_tester]
         law = law.of_particle()
         notes = check(law, sizes, allow_not_monotone=allow_not_monotone)
     except InputError as error:
         if error.file is not None:
             raise
         raise InputError(error.problem, file=file, remedy=error.remedy) from error
-    if testers:
-        notes = (*notes, f"{', '.join(testers)} belong to the tester, not to the particle, and are left out")
-    return law, sizes, _told(content, entry, law, file, particle, geometry, notes)
+    if observed:
+        notes = (*notes, f"{', '.join(observed)} belong to the tester, not to the particle, and are left out")
+    return law, sizes, _origin(content, entry, law, file, particle, geometry, notes)
 
 
-def _told(
+def _origin(
     content: Mapping[str, Any],
     entry: Mapping[str, Any] | None,
     law: MccLaw,
@@ -175,8 +159,7 @@ def _told(
     geometry: str,
     notes: tuple[str, ...],
 ) -> Origin:
-    after = content.get("parameters_after") or content.get("parameters_before")  # of a discovery
-    numbers = after or content
+    numbers = content.get("parameters_after") or content.get("parameters_before") or content  # of a discovery
     logs = {f"log_{name}": numbers[f"log_{name}"] for name in COEFFICIENTS}
     estimates = {name: numbers[name] for name in ("a", "effective_modulus_MPa")}
     if entry is None:
@@ -185,10 +168,10 @@ def _told(
         estimates |= {name: entry[name] for name in COEFFICIENTS}
         if float(law.a) != numbers["a"]["value"]:
             estimates["a"] = {"value": float(law.a), "sd": None, "interval_95": None}
-    told = [f"the calibration of {file.name} did not converge"] if not content.get("converged", True) else []
-    told += content.get("warnings", [])
+    warnings = [] if content.get("converged", True) else [f"the calibration of {file.name} did not converge"]
+    warnings += content.get("warnings", [])
     if entry is None and content.get("modulus_scatter") is not None:
-        told.append("moduli scatter between particles in this calibration; this is the population's")
+        warnings.append("moduli scatter between particles in this calibration; this is the population's")
     calibration = {
         "file": file.name,
         "sha256": hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else None,
@@ -196,7 +179,7 @@ def _told(
         "converged": content.get("converged", True),
         "seed": content.get("seed"),
     }
-    return Origin(estimates, logs, calibration, particle, geometry, (*told, *notes))
+    return Origin(estimates, logs, calibration, particle, geometry, (*warnings, *notes))
 
 
 def _sizes(found: Any, folder: Path, particle: str | None, diameters: str | None) -> tuple[Particle, str]:

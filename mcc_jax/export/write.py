@@ -47,15 +47,15 @@ def _csv(law: MccLaw, particle: Particle, origin: Origin, seed: int) -> Files:
 
 
 def _jax(law: MccLaw, particle: Particle, origin: Origin, seed: int) -> Files:
-    told = {}
+    files = {}
     for dtype in ("float64", "float32"):
         for which in signatures(law):
             artefact = jax_artefact(law, particle, which, dtype=dtype)
             name = f"mcc_{artefact.name}.jax_export"
-            told[name] = artefact.signature
+            files[name] = artefact.signature
             yield name, artefact.content
     use = "jax.export.deserialize(bytearray(Path(file).read_bytes())).call(...), with the packages jax and flatbuffers"
-    artefacts = {"use": use, "files": told}
+    artefacts = {"use": use, "files": files}
     yield "mcc_jax_export.json", {**card(law, particle, origin=origin), "artefacts": artefacts}
     yield "mcc_jax_export_golden.csv", golden_table(law, particle, seed=seed)
 

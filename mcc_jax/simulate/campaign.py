@@ -30,7 +30,7 @@ from ..campaign import (
 from ..effects import HUMIDITY_COLUMN, REFERENCE_HUMIDITY_PERCENT, Need
 from ..geometry import Particle
 from ..law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainScaling, Unloading
-from .drive import gains_energy, simulate_batch
+from .drive import refusal, simulate_batch
 from .effects import HiddenEffect, hidden_effects, humidities_of
 from .programme import Instrument, Programme
 
@@ -53,7 +53,7 @@ def paper_law(
 
 
 def draw_plastic(count: int, seed: int, *, shared: bool) -> Plastic:
-    """Coefficients of so many particles, drawn from Table 2; `shared`: the mean law's for all."""
+    """Coefficients of `count` particles, drawn from Table 2; `shared`: the mean law's for all."""
     population = paper_population()
     if shared:
         return jax.tree.map(lambda x: jnp.broadcast_to(x, (count,)), population.mean_law)
@@ -61,7 +61,7 @@ def draw_plastic(count: int, seed: int, *, shared: bool) -> Plastic:
 
 
 def draw_evenly(between: Sequence[float] | np.ndarray, count: int, seed: int) -> Array:
-    """So many numbers from a range; a stream apart from those of coefficients and noise."""
+    """`count` numbers from a range, from another stream than those of coefficients and noise."""
     rng = np.random.default_rng(np.random.SeedSequence(seed).generate_state(4))
     low, high = between
     return jnp.asarray(rng.uniform(low, high, count))
@@ -111,11 +111,11 @@ def simulate_campaign(
         laws: one law per particle, every array field with a leading axis N (`law_for_each`), with or without effects.
         diameters_um: D1, D2, D3 [um], shape (N, 3).
         peaks: each particle's peak, force [mN] under load control or displacement [um], shape (N,), > 0.
-        programme: what the tester does, relative to the peak.
+        programme: what the instrument does, relative to the peak.
         instrument: how it reads; perfect if None.
         particles: names; "1" to "N" if None.
-        effects: what else acts, besides the law; strengths that differ from test to test are drawn with the seed,
-            and stand in `columns`.
+        effects: what acts in addition to the law; strengths that differ from test to test are drawn with the seed,
+            and are in `columns`.
         relative_humidity_percent: of the room during each test, shape (N,); it becomes a column.
         seed: seed of the read-out's noise and of the effects. Each particle has a stream of its own: adding one leaves
             the others as they were.
@@ -159,12 +159,14 @@ def simulate_campaign(
         for rows in zip(*samples, strict=True)
     )
     drawn = [effect.draw(seed, i, count) for i, effect in enumerate(effects)]
-    wet = [e.variant.mechanism for e in effects if Need.HUMIDITY_COLUMN in e.variant.needs]
-    if wet and relative_humidity_percent is None:
-        raise InputError(f"the effect {wet[0]} needs the relative humidity of every test ({HUMIDITY_COLUMN})")
-    acting = laws.with_effects(*(effect for effect, _ in drawn))
     humidity = relative_humidity_percent
-    humidity = np.full(count, REFERENCE_HUMIDITY_PERCENT) if humidity is None else humidity
+    if humidity is None:
+        for effect in effects:
+            if Need.HUMIDITY_COLUMN in effect.variant.needs:
+                name = effect.variant.mechanism
+                raise InputError(f"the effect {name} needs the relative humidity of every test ({HUMIDITY_COLUMN})")
+        humidity = np.full(count, REFERENCE_HUMIDITY_PERCENT)
+    acting = laws.with_effects(*(effect for effect, _ in drawn))
     response = simulate_batch(
         acting,
         particle_batch(diameters_um),
@@ -177,9 +179,7 @@ def simulate_campaign(
     bad = np.flatnonzero(np.asarray(response.result != RESULTS.successful))
     if len(bad):
         law, particle, one = jax.tree.map(lambda x: x[bad[0]], (acting, particle_batch(diameters_um), response))
-        if one.result == RESULTS.gains_energy:
-            raise gains_energy(law, particle, one.state, f"particle {names[bad[0]]!r}")
-        raise InputError(f"particle {names[bad[0]]!r}: {RESULTS[one.result]}")
+        raise refusal(law, particle, one, f"particle {names[bad[0]]!r}")
     streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(count)]
     curves = [
         Curve(time, *instrument.read(rng, force[i, : len(time)], displacement[i, : len(time)]))
@@ -239,11 +239,11 @@ def paper_campaign(
         seed: seed of coefficients, peaks and noise.
         shared_material: give every particle the mean law instead of a draw.
         instrument: read-out; 0.02 um and 0.05 mN of noise if None.
-        programme: what the tester does; one cycle at 2 mN/s if None.
+        programme: what the instrument does; one cycle at 2 mN/s if None.
         unloading: form of the unloading law (16 GPa belongs to the printed one).
         strain_scaling: how the shape factor enters unloading.
         peak_stress_MPa: range of the maximum stress [MPa].
-        effects: what else acts, besides the law.
+        effects: what acts in addition to the law.
         relative_humidity_percent: of the room during each test [%], shape (20,).
 
     Raises:

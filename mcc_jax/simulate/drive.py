@@ -89,17 +89,21 @@ def drive(
         time = arguments.path(time, "time")
         arguments.same_length(path=path, time=time)
     _check_times(law, time is not None, "time")
-    traced = any(map(arguments.is_traced, jax.tree.leaves((law, particle, path, time, state))))
-    response = _drive(law, particle, path, time, control, state, throw, traced)
-    if throw and not traced and response.result == RESULTS.gains_energy:
-        raise gains_energy(law, particle, response.state)
-    return response
+    response = _drive(law, particle, path, time, control, state)
+    if not throw:
+        return response
+    result = response.result
+    if not any(map(arguments.is_traced, jax.tree.leaves(result))) and result == RESULTS.gains_energy:
+        raise refusal(law, particle, response)
+    return result.error_if(response, result != RESULTS.successful)
 
 
-def gains_energy(law: AbstractContactLaw, particle: Particle, state: Any, name: str = "the particle") -> InputError:
-    """What to tell of a law and particle that gain energy (`RESULTS.gains_energy`): effects, strain and remedy."""
+def refusal(law: AbstractContactLaw, particle: Particle, response: Response, name: str = "the particle") -> InputError:
+    """Why the numbers of a response must not be used: of a gain of energy with effects, strain and remedy."""
+    if response.result != RESULTS.gains_energy:
+        return InputError(f"{name}: {RESULTS[response.result]}")
     names = ", ".join(e.name for e in getattr(law, "effects", ()) if isinstance(e, AbstractModulusAtPeak))
-    beyond = f"loaded beyond a strain of {float(law.gain_strain(particle, state)):.2g}"
+    beyond = f"loaded beyond a strain of {float(law.gain_strain(particle, response.state)):.2g}"
     return InputError(
         f"with {names or 'its law'} {name}, {beyond} and released, would give back more energy than that took",
         remedy="Take a smaller amplitude, a stiffer effective modulus, or a path that ends below that strain.",
@@ -114,10 +118,8 @@ def _drive(
     time: Path | None,
     control: Control,
     state: Any,
-    throw: bool,
-    traced: bool,
 ) -> Response:
-    """The compiled part of `drive`, its arguments checked; a gain of energy raises here only where `traced`."""
+    """The compiled part of `drive`, its arguments checked."""
     start = law.init(particle) if state is None else state
     times = () if time is None else (time,)
     if control == "load":
@@ -132,11 +134,7 @@ def _drive(
     result = RESULTS.where(finite, result, RESULTS.nonfinite_response)
     result = RESULTS.where(law.carries_stress(particle), result, RESULTS.no_stress)
     result = RESULTS.where(law.is_valid, result, RESULTS.bad_parameter)
-    response = Response(displacement, force, law.is_monotone, end, result)
-    if not throw:
-        return response
-    raises = result != RESULTS.successful
-    return result.error_if(response, raises if traced else raises & (result != RESULTS.gains_energy))
+    return Response(displacement, force, law.is_monotone, end, result)
 
 
 def simulate_batch(

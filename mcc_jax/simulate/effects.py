@@ -17,7 +17,7 @@ from .._format import number
 from ..effects import LIBRARY, AbstractEffect, Mechanism, Variant, find_variant
 
 _STREAM = 0x0EFF_EC75
-"""Keeps the draws of effects apart from those of noise, coefficients and peaks."""
+"""Separates the draws of effects from those of noise, coefficients and peaks."""
 
 
 @dataclass(frozen=True)
@@ -40,10 +40,10 @@ class HiddenEffect:
     nuisance: Mapping[str, float] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
-        variant, name = self.variant, f"{self.variant.mechanism}:{self.variant.name}"
+        variant = self.variant
 
         def wrong(what: str, must: str, value: Any) -> InputError:
-            return InputError(f"{name}: {what} must be {must}, got {value}")
+            return InputError(f"{variant.label}: {what} must be {must}, got {value}")
 
         if self.amplitude is not None and not arguments.is_number(self.amplitude):
             raise wrong(variant.parameter, "a number", arguments.shown(self.amplitude))
@@ -52,15 +52,13 @@ class HiddenEffect:
         if self.strength * variant.sign < 0:
             sign = "positive" if variant.sign > 0 else "negative"
             raise wrong(variant.parameter, f"zero or {sign} to be physical", f"{self.strength:g}")
-        known = {n.name: n.plausible[0] for n in variant.nuisances}
+        variant.check_names(self.nuisance)
+        least = {n.name: n.plausible[0] for n in variant.nuisances}
         for key, value in self.nuisance.items():
-            if key not in known:
-                names = ", ".join([variant.parameter, *known])
-                raise InputError(f"{name} has no parameter {key!r}; it has: {names}")
             if not arguments.is_number(value):
                 raise wrong(key, "a number", arguments.shown(value))
-            if not math.isfinite(value) or abs(value) > 1e9 or (known[key] > 0 and value <= 0):
-                raise wrong(key, "above 0" if known[key] > 0 else "finite", f"{value:g}")
+            if not math.isfinite(value) or abs(value) > 1e9 or (least[key] > 0 and value <= 0):
+                raise wrong(key, "above 0" if least[key] > 0 else "finite", f"{value:g}")
 
     def __repr__(self) -> str:
         numbers = {self.variant.parameter: self.strength} | {n.name: n.middle for n in self.variant.nuisances}

@@ -1,4 +1,4 @@
-"""What the tester is told to do, ramps, holds and cycles, and what it makes of the truth: noise, resolution, a zero."""
+"""What the instrument does, ramps, holds and cycles, and how it reads the truth: noise, resolution, a zero."""
 
 from __future__ import annotations
 
@@ -90,14 +90,14 @@ class Programme:
         unit, sampling = ("mN/s" if self.control == "load" else "um/s"), f"every {self.interval_s} s"
         if self.points is not None:
             sampling = f"{self.points} samples"
-        told = [
+        shown = [
             f"hold {number(step.seconds)} s"
             if isinstance(step, Hold)
             else f"to {percent(step.to)} of the peak at {number(step.rate)} {unit}"
             for step in self.steps
         ]
         title = f"Programme under control of {self.control}, {sampling}"
-        return table(title, [(str(i), text) for i, text in enumerate(told, start=1)])
+        return table(title, [(str(i), text) for i, text in enumerate(shown, start=1)])
 
     @classmethod
     def cycles(
@@ -172,14 +172,14 @@ class Programme:
 
 @dataclass(frozen=True)
 class Instrument:
-    """Read-out of a tester; the default is perfect.
+    """Read-out of an instrument; the default is perfect.
 
     Attributes:
         displacement_noise_um: standard deviation of white noise on displacement [um].
         force_noise_mN: standard deviation of white noise on force [mN].
         displacement_resolution_um: smallest step of displacement [um]; 0 for none.
         force_resolution_mN: smallest step of force [mN]; 0 for none.
-        zero_um: standard deviation of each test's zero of displacement [um]: where the tester believed to touch.
+        zero_um: standard deviation of each test's zero of displacement [um]: where the instrument found contact.
 
     Raises:
         InputError: for a value that is negative or not finite.
@@ -203,9 +203,9 @@ class Instrument:
         """Force [mN] and displacement [um] as recorded, from the true ones, shapes (n,)."""
         n = len(force_mN)
         # All draws are made whatever the settings, so that switching one effect on leaves the others' draws alone.
-        zero, wobble, hum = rng.standard_normal(), rng.standard_normal(n), rng.standard_normal(n)
-        displacement = displacement_um + self.zero_um * zero + self.displacement_noise_um * wobble
-        force = force_mN + self.force_noise_mN * hum
+        zero, displacement_noise, force_noise = rng.standard_normal(), rng.standard_normal(n), rng.standard_normal(n)
+        displacement = displacement_um + self.zero_um * zero + self.displacement_noise_um * displacement_noise
+        force = force_mN + self.force_noise_mN * force_noise
         return _rounded(force, self.force_resolution_mN), _rounded(displacement, self.displacement_resolution_um)
 
 
@@ -238,25 +238,21 @@ def read_programme(file: str | Path) -> Programme:
     where = "the programme"
     try:
         _only(content, ("control", "rate", "points", "interval_s", "step"), where)
-        if not isinstance(content.get("step"), list) or not content["step"]:
+        entries = content.get("step")
+        if not isinstance(entries, list) or not entries:
             raise InputError("has no [[step]]")  # noqa: TRY301
-        for i, entry in enumerate(content["step"], start=1):
+        for i, entry in enumerate(entries, start=1):
             where = f"step {i}"
             if not isinstance(entry, dict) or ("ramp_to" in entry) == ("hold_s" in entry):
                 raise InputError("exactly one of ramp_to and hold_s is needed")  # noqa: TRY301
             _only(entry, ("ramp_to", "rate", "hold_s"), where)
-            if "hold_s" in entry:
-                steps.append(Hold(arguments.number(entry["hold_s"], "hold_s")))
-            elif "rate" in entry or "rate" in content:
-                rate = arguments.number(entry.get("rate", content.get("rate")), "rate")
-                steps.append(Ramp(arguments.number(entry["ramp_to"], "ramp_to"), rate))
-            else:
+            rate = entry.get("rate", content.get("rate"))
+            if "ramp_to" in entry and rate is None:
                 raise InputError("no rate: give it one, or one for all at the top")  # noqa: TRY301
-        where = "the programme"
-        control = arguments.choice(content.get("control", "load"), get_args(Control), "control")
-        interval_s = arguments.number(content["interval_s"], "interval_s") if "interval_s" in content else None
+            steps.append(Ramp(entry["ramp_to"], rate) if "ramp_to" in entry else Hold(entry["hold_s"]))
+        where, interval_s = "the programme", content.get("interval_s")
         points = content.get("points", 300 if interval_s is None else None)
-        return Programme(control, steps, interval_s, None if points is None else arguments.whole(points, "points"))
+        return Programme(content.get("control", "load"), steps, interval_s, points)
     except InputError as error:
         remedy = error.remedy or "See the example in `mcc-jax simulate --help`."
         raise InputError(f"{where}: {error.problem}", file=file, remedy=remedy) from None

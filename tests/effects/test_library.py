@@ -23,27 +23,11 @@ from mcc_jax.effects import (
 )
 
 CONTRACT = [
-    "frame_compliance",
-    "thermal_drift",
-    "creep",
-    "rate_dependence",
-    "adhesion",
-    "damage",
-    "densification_stiffening",
-    "reload_hysteresis",
-    "ratcheting",
-    "finite_hardening_exponent",
-    "unloading_shape",
-    "size_effect",
-    "shape_second_order",
-    "pop_in",
-    "toe_asperity",
-    "platen_friction",
-    "misalignment",
-    "platen_sink_in",
-    "reverse_plasticity",
-    "humidity",
-]
+    "frame_compliance", "thermal_drift", "creep", "rate_dependence", "adhesion", "damage", "densification_stiffening",
+    "reload_hysteresis", "ratcheting", "finite_hardening_exponent", "unloading_shape", "size_effect",
+    "shape_second_order", "pop_in", "toe_asperity", "platen_friction", "misalignment", "platen_sink_in",
+    "reverse_plasticity", "humidity",
+]  # fmt: skip
 UNITS = {"um/mN": "_um_per_mN", "um/s": "_um_per_s", "1/MPa": "_per_MPa", "1/GPa": "_per_GPa", "MPa": "_MPa"}
 UNITS |= {"um": "_um", "rad": "_rad", "1/%": "_per_percent_humidity"}
 NUISANCE_UNITS = ("_s", "_MPa", "_mN", "_um", "_rad", "_percent", "_strain", "_share", "exponent", "cycles_to_rest")

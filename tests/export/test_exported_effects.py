@@ -15,6 +15,7 @@ from compiling import PAIR, PLATES, WALL, build_driver, head, run_driver
 from helpers import first_in_core
 from test_c_header import history, random_laws, random_paths, scales
 from test_recipes import run_recipe
+from test_tables import assert_rebuilt
 
 from mcc_jax import InputError, Particle, StrainScaling, Unloading, drive, paper_law
 from mcc_jax.dem import half_contact, pair_force, wall_force
@@ -105,21 +106,7 @@ def test_recipes_give_the_headers_forces(tmp_path, recipe):
 def test_the_law_rebuilt_from_the_tables_alone(names):
     law, particle = paper_law(Unloading.PUNCH, StrainScaling.CONTACT), Particle(213.54, 196.07, 150.0)
     law = type(law)(law.plastic, law.a, 500.0, law.unloading, law.strain_scaling).with_effects(*names)
-    tables, golden = curve_tables(law, particle), golden_table(law, particle)
-    eta, diameter = float(law.shape_factor(particle)), float(particle.effective_diameter)
-    x, peak = eta * golden["displacement_um"] / diameter, eta * golden["displacement_max_um"] / diameter
-    loading, unloading = tables.loading, tables.unloading
-
-    def at(column, where):
-        return np.interp(where, loading["scaled_strain"], loading[column])
-
-    delta = eta * at("recovered_strain_formula_at_eta_1", peak)
-    delta = np.minimum(delta, np.minimum(peak, 3 * np.pi / 8 * at("stress_MPa", peak) / at("tangent_MPa", peak)))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.where(x < peak, (peak - x) / delta, 0.0)
-    stress = at("stress_MPa", peak) * np.interp(share, unloading["recovered_share"], unloading["stress_share"])
-    force = stress * float(particle.effective_area) * 1e-3
-    assert np.abs(force - golden["force_mN"]).max() <= 2e-4 * golden["force_mN"].max()
+    assert_rebuilt(law, particle, curve_tables(law, particle))
     with pytest.raises(InputError, match="particle must be"):
         curve_tables(law)
 

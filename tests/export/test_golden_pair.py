@@ -6,12 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from bisecting import pair_force as bisected
+from test_c_header import MODULUS_MPA
 
 from mcc_jax import MccLaw, Particle, Plastic, StrainScaling, Unloading
 from mcc_jax.dem import half_contact, pair_force, pair_recovery, wall_force, wall_recovery
 from mcc_jax.export import golden_pair_table
 
-MODULUS_MPA = {Unloading.PRINTED: 16000.0, Unloading.PUNCH: 500.0, Unloading.PUNCH_EXACT: 500.0}
 ONE = Particle(213.54, 196.07, 186.33)
 OTHER = Particle(90.0, 120.0, 100.0)
 

@@ -7,7 +7,6 @@ from mcc_jax import (
     Curve,
     Instrument,
     MccLaw,
-    Particle,
     Plastic,
     Programme,
     paper_campaign,
@@ -119,7 +118,3 @@ def test_parameters_without_sense_are_told():
     )
     with pytest.raises(ValueError, match="must be positive"):
         simulate_campaign(laws, np.full((1, 3), 100.0), np.ones(1) * 20, Programme.cycles())
-
-
-def test_particle_of_the_table_is_a_particle():
-    assert float(Particle(1, 2, 3).effective_diameter) == pytest.approx(2 / 3)
