@@ -18,6 +18,7 @@ from ..campaign import (
     THRESHOLD_MPA,
     Campaign,
     Curve,
+    Finding,
     Segment,
     campaign_segments,
     check_tests,
@@ -120,16 +121,21 @@ class Selection:
     Attributes:
         tests: the arrays of those that do.
         kept: their positions in the campaign.
-        why_not: for each particle of the campaign, None if kept, else the reason.
+        reasons: for each particle of the campaign, None if kept, else why it is not.
         rows: for each kept particle, the rows of its curve, as `check_tests` left it, that stand in `tests`.
         notes: what a reader must know about particles that are kept.
     """
 
     tests: Tests
     kept: tuple[int, ...]
-    why_not: tuple[str | None, ...]
+    reasons: tuple[Finding | None, ...]
     rows: tuple[np.ndarray, ...]
     notes: tuple[str, ...]
+
+    @property
+    def why_not(self) -> tuple[str | None, ...]:
+        """The reasons in words."""
+        return tuple(None if one is None else one.reason for one in self.reasons)
 
 
 MOST = SELECTION.most_points
@@ -169,14 +175,14 @@ def select(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_poi
         _prepare(curve, diameters, parts, threshold_MPa, most_points)
         for curve, diameters, parts in zip(campaign.curves, campaign.diameters_um, segments, strict=True)
     ]
-    stress = [None if isinstance(one, str) else one.stress_max_MPa for one in prepared]
-    strain = [None if isinstance(one, str) else one.strain_range for one in prepared]
+    stress = [None if isinstance(one, Finding) else one.stress_max_MPa for one in prepared]
+    strain = [None if isinstance(one, Finding) else one.strain_range for one in prepared]
     prepared = [apart or one for one, apart in zip(prepared, far_apart(stress, strain), strict=True)]
-    why_not = tuple(one if isinstance(one, str) else None for one in prepared)
-    kept = tuple(i for i, one in enumerate(prepared) if not isinstance(one, str))
+    reasons = tuple(one if isinstance(one, Finding) else None for one in prepared)
+    kept = tuple(i for i, one in enumerate(prepared) if not isinstance(one, Finding))
     if not kept:
-        raise refusal(campaign, "no particle can be used", why_not)
-    used = [one for one in prepared if not isinstance(one, str)]
+        raise refusal(campaign, "no particle can be used", reasons)
+    used = [one for one in prepared if not isinstance(one, Finding)]
     longest = padded_length(max(len(one.rows) for one in used))
 
     def padded(values: list[np.ndarray], mode: Literal["edge", "constant"] = "constant") -> np.ndarray:
@@ -202,7 +208,7 @@ def select(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_poi
         *_errors_of_force(curves, used, branch),
     )
     return Selection(
-        tests, kept, why_not, tuple(one.rows for one in used), tuple(_notes(campaign, kept, used, most_points))
+        tests, kept, reasons, tuple(one.rows for one in used), tuple(_notes(campaign, kept, used, most_points))
     )
 
 
@@ -327,7 +333,7 @@ def rows_from_contact(curve: Curve, segments: tuple[Segment, ...], most_points: 
 
 def _prepare(
     curve: Curve, diameters: np.ndarray, segments: tuple[Segment, ...], threshold: float, most_points: int
-) -> _Prepared | str:
+) -> _Prepared | Finding:
     """The rows of one test that are used, or why there are none."""
     stress, strain = stress_and_strain(curve, diameters, segments)
     kind = np.empty(len(curve), dtype="<U8")

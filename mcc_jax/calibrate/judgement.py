@@ -16,8 +16,8 @@ import numpy as np
 
 from .._errors import InputError
 from ..campaign import Campaign, Finding, campaign_findings, check_plausibility
+from ..campaign.findings import named
 from ..campaign.plausibility import add_likely_unit_error
-from ..campaign.quality import named
 from .fit_result import Fit
 from .settings import JUDGEMENT, JudgementSettings
 
@@ -71,7 +71,7 @@ def unlike_others(
     low, high = f"{times.min():.2g}", f"{times.max():.2g}"
     text = f"{named(which, len(names))}: the residual is {low if low == high else f'{low} to {high}'} times the others'"
     return Finding(
-        "unlike the others", "look", text, "Look at the curve, and leave the particle out if it is no test", which
+        "unlike the others", "warning", text, "Look at the curve, and leave the particle out if it is no test", which
     )
 
 
@@ -87,16 +87,12 @@ def unknown_modulus(
     interval = modulus.get("interval_95")
     between = "" if interval is None else f" (between {1e-3 * interval[0]:.2g} and {1e-3 * interval[1]:.2g} GPa)"
     # Of several channels at the end of their range it is that of the displacement which hides unloading.
-    ends = [
-        note for curve in campaign.curves if curve.checked for note in curve.checked.notes if note.check == "saturation"
-    ]
-    ends.sort(key=lambda note: not note.sentence.startswith("displacement"))
-    if ends:
-        channel = ends[0].sentence.split()[0]
-        why, remedy = f": {channel} stands at the end of its range where they unload", ends[0].remedy
-    else:
-        why, remedy = ": too little of their unloading can be compared with the law", UNLOAD
-    return Finding(MODULUS_OPEN, "look", f"The tests do not tell the modulus{between}{why}", remedy)
+    found = {one.code: one for curve in campaign.curves if curve.checked for one in curve.checked.findings}
+    why, remedy = ": too little of their unloading can be compared with the law", UNLOAD
+    for channel in ("force", "displacement"):
+        if (end := found.get(f"{channel} range")) is not None:
+            why, remedy = f": {channel} stands at the end of its range where they unload", end.remedy
+    return Finding(MODULUS_OPEN, "warning", f"The tests do not tell the modulus{between}{why}", remedy)
 
 
 def told_by_no_test(modulus: Mapping[str, Any], options: JudgementSettings = JUDGEMENT) -> bool:
@@ -148,7 +144,7 @@ def judged(
     for one in found:
         count = len(one.particles)
         some = options.few * len(campaign) <= count <= len(campaign) / 2 and count > 0
-        if one.level != "told" and some and len(campaign) - count >= options.left:
+        if one.level != "info" and some and len(campaign) - count >= options.left:
             if one.particles not in answers and len(answers) < options.answers:
                 answers[one.particles] = _without(campaign, answer, one.particles, again)
             other = answers.get(one.particles)

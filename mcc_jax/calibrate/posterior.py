@@ -261,7 +261,7 @@ def sample(
         selection, fit, size = prepare(campaign, model, threshold_MPa, block=block, start=begin, tell=tell)
         tell("sampling the population" if fast else "sampling everything")
         key = jax.random.key(seed)
-        likely = worst(check_plausibility(campaign)) != "bad"
+        likely = worst(check_plausibility(campaign)) != "error"
         kept = fit.first(len(selection.kept))
         drawn = draw_fast(key, fit, length, size, patient=likely) if fast else draw_joint(key, kept, length)
     tell("diagnosing")

@@ -9,6 +9,7 @@ import numpy as np
 
 from .. import arguments
 from .._format import described
+from .findings import Finding
 from .reasons import below_threshold, far_apart, no_climb, no_loading, too_few
 from .schema import Campaign, Curve
 from .segments import Segment, find_segments
@@ -132,7 +133,7 @@ class Adjustment:
         shift: what was added to each particle's strain [-], shape (N,); 0 where not kept.
         threshold_MPa: the stress at which all adjusted curves meet; 0 if no offset step was made.
         strain: their common strain there, the mean over the particles.
-        why_not: for each particle, None if kept, else the reason.
+        reasons: for each particle, None if kept, else why it is not.
         segments: the segments of every test, for whoever needs them next.
     """
 
@@ -140,7 +141,7 @@ class Adjustment:
     shift: np.ndarray
     threshold_MPa: float
     strain: float
-    why_not: tuple[str | None, ...]
+    reasons: tuple[Finding | None, ...]
     segments: tuple[tuple[Segment, ...], ...]
 
     __repr__ = described()
@@ -148,7 +149,12 @@ class Adjustment:
     @property
     def kept(self) -> np.ndarray:
         """Which particles are kept, booleans of shape (N,)."""
-        return np.array([reason is None for reason in self.why_not])
+        return np.array([reason is None for reason in self.reasons])
+
+    @property
+    def why_not(self) -> tuple[str | None, ...]:
+        """The reasons in words."""
+        return tuple(None if one is None else one.reason for one in self.reasons)
 
 
 def adjust(campaign: Campaign, threshold_MPa: float = THRESHOLD_MPA) -> Adjustment:
@@ -174,25 +180,25 @@ def adjust(campaign: Campaign, threshold_MPa: float = THRESHOLD_MPA) -> Adjustme
     threshold_MPa = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
     segments = campaign_segments(campaign)
     raw = [loading_curve(*one) for one in zip(campaign.curves, campaign.diameters_um, segments, strict=True)]
-    why_not = [
+    reasons = [
         _why_not(*one, threshold_MPa) for one in zip(raw, campaign.curves, campaign.diameters_um, segments, strict=True)
     ]
-    used = [c if r is None else None for c, r in zip(raw, why_not, strict=True)]
+    used = [c if r is None else None for c, r in zip(raw, reasons, strict=True)]
     stress = [None if c is None else c.stress_max_MPa for c in used]
     strain = [None if c is None else float(np.ptp(c.strain[1:])) for c in used]
-    why_not = [reason or apart for reason, apart in zip(why_not, far_apart(stress, strain), strict=True)]
-    kept = tuple(c if r is None else None for c, r in zip(raw, why_not, strict=True))
+    reasons = [reason or apart for reason, apart in zip(reasons, far_apart(stress, strain), strict=True)]
+    kept = tuple(c if r is None else None for c, r in zip(raw, reasons, strict=True))
     at_threshold = [None if c is None else float(c.at(threshold_MPa)) for c in kept]
     known = [value for value in at_threshold if value is not None]
     if threshold_MPa == 0 or not known:
-        return Adjustment(kept, np.zeros(len(raw)), threshold_MPa, 0.0, tuple(why_not), segments)
+        return Adjustment(kept, np.zeros(len(raw)), threshold_MPa, 0.0, tuple(reasons), segments)
     mean = float(np.mean(known))
     shift = np.array([0.0 if value is None else mean - value for value in at_threshold])
     adjusted = tuple(
         None if curve is None else _through(curve, offset, threshold_MPa, mean)
         for curve, offset in zip(kept, shift, strict=True)
     )
-    return Adjustment(adjusted, shift, threshold_MPa, mean, tuple(why_not), segments)
+    return Adjustment(adjusted, shift, threshold_MPa, mean, tuple(reasons), segments)
 
 
 def _through(curve: LoadingCurve, offset: float, threshold_MPa: float, strain: float) -> LoadingCurve:
@@ -210,7 +216,7 @@ def _why_not(
     diameters_um: np.ndarray,
     segments: tuple[Segment, ...],
     threshold_MPa: float,
-) -> str | None:
+) -> Finding | None:
     """Why a test cannot be used; None if it can."""
     if loading is None:
         return no_loading(curve, segments, stress_and_strain(curve, diameters_um, segments)[0], threshold_MPa)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .signal import branch_envelope, median, noise_level, turning_points
+from .signal import branch_envelope, median, noise_level, stretches, turning_points
 
 SMALLEST_TURN = 0.005  # least depth of a turn, as a share of the signal's range
 TURN_NOISE = 8.0  # the same in standard deviations of the noise
@@ -130,11 +130,8 @@ class Drive:
         after = (clock[np.minimum(further, count - 1)] - clock[np.minimum(ahead, count - 1)]) / 2
         before = (clock - clock[np.maximum(behind, 0)]) / 2
         slow = whole & (stay > (SLOWNESS + 1) * np.maximum(before, after))
-        if not slow.any():
-            return []
-        edges = np.flatnonzero(np.diff(np.concatenate(([0], slow.view(np.int8), [0]))))
         found = []
-        for first, last in zip(edges[::2], edges[1::2], strict=True):
+        for first, last in stretches(slow):
             # The longest stay of the run begins at the hold itself, or less than one band before.
             best = first + int(np.argmax(stay[first:last]))
             level = median(envelope[best : ahead[best]])

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from .._format import described
 
-Level = Literal["told", "look", "bad"]
+Level = Literal["info", "warning", "error"]
 
 
 @dataclass(frozen=True)
@@ -18,11 +18,14 @@ class Finding:
     Attributes:
         check: what was checked, in two or three words: "zero of force", "saturation", "breakage", "plausibility",
             "fitted modulus".
-        level: "told" where the data allowed it to be settled (corrected, or readings left out), "look" where the
-            numbers are to be used with care, "bad" where they are not to be trusted before it is settled.
-        sentence: what was found and what was done about it; one sentence, without its full stop.
+        level: "info" where the data allowed it to be settled (corrected, or readings left out), "warning" where the
+            numbers are to be used with care, "error" where they are not to be trusted before it is settled.
+        sentence: what was found and what was done about it; one sentence, without its full stop. Of a single test it
+            has `{}` in place of its numbers.
         remedy: what a person can do; one sentence without its full stop, empty where nothing need be done.
         particles: names of the particles concerned; empty where it concerns the whole campaign.
+        code: what was found, for programs that decide by it; not in files.
+        numbers: of a single test, one for each `{}`; not in files.
     """
 
     check: str
@@ -30,21 +33,27 @@ class Finding:
     sentence: str
     remedy: str = ""
     particles: tuple[str, ...] = ()
+    code: str = ""
+    numbers: tuple[float | int, ...] = ()
 
     __repr__ = described()
 
     def __str__(self) -> str:
         return ". ".join(text for text in (self.sentence, self.remedy) if text) + "."
 
+    def of(self, *numbers: float | int) -> Finding:
+        """The same finding of a test, with its numbers."""
+        return replace(self, numbers=numbers)
+
+    @property
+    def reason(self) -> str:
+        """The same as a clause behind the name of a particle."""
+        return f"{self.sentence}; {self.remedy}"
+
     def to_json(self) -> dict[str, Any]:
         """The same as an entry of `calibration.json` and `discovery.json`."""
-        return {
-            "check": self.check,
-            "level": self.level,
-            "sentence": self.sentence,
-            "remedy": self.remedy,
-            "particles": list(self.particles),
-        }
+        names = ("check", "level", "sentence", "remedy")
+        return {name: getattr(self, name) for name in names} | {"particles": list(self.particles)}
 
     @classmethod
     def from_json(cls, entry: Mapping[str, Any]) -> Finding:
@@ -54,6 +63,37 @@ class Finding:
 
 def worst(findings: Iterable[Finding]) -> Level | None:
     """The most serious level among findings, None where there are none."""
-    order: tuple[Level, ...] = ("told", "look", "bad")
-    levels = {f.level for f in findings}
-    return next((level for level in reversed(order) if level in levels), None)
+    levels = {one.level for one in findings}
+    order: tuple[Level, ...] = ("error", "warning", "info")
+    return next((level for level in order if level in levels), None)
+
+
+def named(names: tuple[str, ...], of: int, most: int = 5) -> str:
+    """Particles by their names, as the beginning of a sentence; of many the first ones and how many there are."""
+    if len(names) == 1:
+        return f"Particle {names[0]}"
+    shown = ", ".join(names[:most])
+    return f"Particles {shown}" if len(names) <= most else f"Particles {shown}, ... ({len(names)} of {of})"
+
+
+def joined(each: Mapping[str, Iterable[Finding]]) -> tuple[Finding, ...]:
+    """One finding for all tests in which the same was found, with the ranges of their numbers.
+
+    Args:
+        each: what was found in each test, by the name of its particle.
+    """
+    groups: dict[Finding, dict[str, tuple[float | int, ...]]] = {}
+    for name, found in each.items():
+        for one in found:
+            groups.setdefault(one.of(), {})[name] = one.numbers
+    together = []
+    for one, numbers in groups.items():
+        texts = [_range(column) for column in zip(*numbers.values(), strict=True)]
+        sentence = f"{named(tuple(numbers), len(each))}: {one.sentence.format(*texts)}"
+        together.append(replace(one, sentence=sentence, particles=tuple(numbers)))
+    return tuple(together)
+
+
+def _range(values: tuple[float | int, ...]) -> str:
+    low, high = f"{min(values):.4g}", f"{max(values):.4g}"
+    return low if low == high else f"{low} to {high}"

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .schema import Campaign, Control, Curve, Note
+from .findings import Finding
+from .schema import Campaign, Control, Curve
 from .segments import find_segments
 from .signal import differences, median, point_noise, two_lines
 
@@ -21,6 +22,40 @@ OTHER_STIFFNESS = 1.5  # factor in force over displacement; with less, only the 
 START_SHARE = 0.1  # of the largest force, up to which a drift is looked for: no preload is larger, and loading bends
 
 
+CHECK = "zero of force"
+OFFSET = Finding(CHECK, "info", "force reads {} mN in the air before contact; this was taken off", code="offset")
+DRIFT = Finding(
+    CHECK,
+    "warning",
+    "force drifts by {} mN in the air before contact; the zero at contact ({} mN) was taken off, with this drift as "
+    "its error",
+    "Let the load cell settle before a test",
+    code="drift",
+)
+PERHAPS_DRIFT = Finding(
+    CHECK,
+    "warning",
+    "force changes linearly by {} mN before loading starts; it is counted as contact, but would be a drift of the load "
+    "cell if the platens did not touch yet",
+    "Cut these readings off if the platens did not touch yet, and let the load cell settle before a test",
+    code="possible drift",
+)
+NOT_TARED = Finding(
+    CHECK,
+    "warning",
+    "force begins at {} mN without a reading in the air; {} mN was taken off",
+    "Tare the load cell, and begin in the air",
+    code="not tared",
+)
+OPEN = Finding(
+    CHECK,
+    "info",
+    "force begins at {} mN without a reading in the air: a preload, or a load cell that was not tared",
+    "Tell the two apart by readings in the air before contact",
+    code="preload or not tared",
+)
+
+
 @dataclass(frozen=True)
 class ZeroOfForce:
     """What the force channel reads without contact.
@@ -29,13 +64,13 @@ class ZeroOfForce:
         path: what to take off at each reading [mN]; constant from contact on.
         value: the zero at contact [mN].
         sd: its standard deviation [mN].
-        notes: what there is to say of it.
+        findings: what there is to say of it.
     """
 
     path: np.ndarray
     value: float
     sd: float
-    notes: tuple[Note, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 def zero_of_force(
@@ -67,65 +102,39 @@ def zero_of_force(
         if abs(slope) > DRIFT_SAID * slope_sd and abs(change) > AIR_SHARE * largest:
             path = mean + slope * (np.minimum(curve.time_s, curve.time_s[contact - 1]) - when.mean())
             error = float(np.hypot(np.std(left, ddof=2) / np.sqrt(len(air)), abs(change) / np.sqrt(12)))
-            note = Note(
-                "zero of force",
-                "look",
-                "force drifts by {} mN in the air before contact; the zero at contact ({} mN) was taken off, with this "
-                "drift as its error",
-                (abs(change), float(path[-1])),
-                "Let the load cell settle before a test",
-            )
-            return ZeroOfForce(path, float(path[-1]), error, (note,))
+            return ZeroOfForce(path, float(path[-1]), error, (DRIFT.of(abs(change), float(path[-1])),))
         error = float(sd / np.sqrt(len(air)) * _inflation(air - mean))
-    notes: tuple[Note, ...] = ()
-    if abs(mean) > AIR_SAID * error and abs(mean) > AIR_SHARE * largest:
-        sentence = "force reads {} mN in the air before contact; this was taken off"
-        notes = (Note("zero of force", "told", sentence, (mean,)),)
-    return ZeroOfForce(np.full(len(curve), mean), mean, error, notes)
+    said = abs(mean) > AIR_SAID * error and abs(mean) > AIR_SHARE * largest
+    return ZeroOfForce(np.full(len(curve), mean), mean, error, (OFFSET.of(mean),) if said else ())
 
 
 def _perhaps_drift(curve: Curve, ahead: SlowStart | None) -> ZeroOfForce | None:
     """A rise in front of the loading which is too quick to be taken for a drift, and too straight for a contact."""
     if ahead is None or abs(ahead.change) <= AIR_SHARE * float(np.ptp(curve.force_mN)):
         return None
-    note = Note(
-        "zero of force",
-        "look",
-        "force goes straight by {} mN in front of the loading; it is counted as contact, but would be a drift of the "
-        "load cell if the platens did not touch yet",
-        (ahead.change,),
-        "Cut these readings off if the platens did not touch yet, and let the load cell settle before a test",
-    )
-    return ZeroOfForce(np.zeros(len(curve)), 0.0, 0.0, (note,))
-
-
-_OPEN = "force begins at {} mN without a reading in the air: a preload, or a load cell that was not tared"
-
-
-_TARE = "Tare the load cell, and begin in the air"
-_BELOW = "force begins at {} mN without a reading in the air; {} mN was taken off"
+    return ZeroOfForce(np.zeros(len(curve)), 0.0, 0.0, (PERHAPS_DRIFT.of(ahead.change),))
 
 
 def open_zero(campaign: Campaign) -> tuple[float, float] | None:
     """The zero of force [mN] and its error, if checked tests were not tared of which some may have been preloaded."""
-    zero = _one_zero(campaign.curves, _OPEN)
+    zero = _one_zero(campaign.curves, OPEN)
     return zero if zero is not None and zero[0] > 0 else None
 
 
 def untared_zero(curves: Sequence[Curve]) -> tuple[float, float] | None:
     """The zero of force [mN] and its error, if checked tests begin below zero which one load cell explains."""
-    return _one_zero(curves, _BELOW)
+    return _one_zero(curves, NOT_TARED)
 
 
-def _one_zero(curves: Sequence[Curve], sentence: str) -> tuple[float, float] | None:
-    """The zero that all tests share, and its error [mN]; None if they share none, or no test tells this of its zero.
+def _one_zero(curves: Sequence[Curve], needed: Finding) -> tuple[float, float] | None:
+    """The zero that all tests share, and its error [mN]; None if they share none, or none has this finding.
 
     One load cell has one zero, and nothing pulled: every test begins within a step of its ramp above it. The line of
     first readings over first steps, weighted by the step, meets the zero where the step is nil; of fewer than three
     tests the lowest reading is taken, which may be any part of its step beyond contact.
     """
-    notes = (note for curve in curves if curve.checked is not None for note in curve.checked.notes)
-    if not any(note.sentence == sentence for note in notes):
+    found = (one.code for curve in curves if curve.checked is not None for one in curve.checked.findings)
+    if needed.code not in found:
         return None
     taken_off = (0.0 if curve.checked is None else curve.checked.force_zero_mN for curve in curves)
     begins = np.array([curve.force_mN[0] + off for curve, off in zip(curves, taken_off, strict=True)])
@@ -159,17 +168,15 @@ def _begins_elsewhere(curve: Curve, zero_mN: tuple[float, float] | None) -> Zero
     first = float(curve.force_mN[0])
     if zero_mN is not None:
         zero, error = zero_mN
-        notes = (Note("zero of force", "look", _BELOW, (first, zero), _TARE),) if zero < 0 else ()
-        return ZeroOfForce(np.full(len(curve), zero), zero, error, notes)
+        found = (NOT_TARED.of(first, zero),) if zero < 0 else ()
+        return ZeroOfForce(np.full(len(curve), zero), zero, error, found)
     step = _first_steps(curve)
     least = max(AIR_SHARE * float(np.ptp(curve.force_mN)), AIR_SAID * point_noise(curve.force_mN))
     if -least <= first <= step + least or abs(first) > START_SHARE * float(curve.force_mN.max()):
         return None
     if first < 0:
-        note = Note("zero of force", "look", _BELOW, (first, first), _TARE)
-        return ZeroOfForce(np.full(len(curve), first), first, -first, (note,))
-    note = Note("zero of force", "told", _OPEN, (first,), "Tell the two apart by readings in the air before contact")
-    return ZeroOfForce(np.zeros(len(curve)), 0.0, 0.0, (note,))
+        return ZeroOfForce(np.full(len(curve), first), first, -first, (NOT_TARED.of(first, first),))
+    return ZeroOfForce(np.zeros(len(curve)), 0.0, 0.0, (OPEN.of(first),))
 
 
 def _inflation(scatter: np.ndarray) -> float:

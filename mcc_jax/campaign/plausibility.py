@@ -72,7 +72,7 @@ def check_plausibility(campaign: Campaign, *, modulus_MPa: float | None = None) 
         modulus_MPa: the effective modulus of a fit [MPa], which is then compared with the moduli of solids.
 
     Returns:
-        Findings: "bad" for a likely error, with the column and the remedy, and for numbers that no solid has; "told"
+        Findings: "error" for a likely error, with the column and the remedy, and for numbers that no solid has; "info"
         where the material is not like micro-crystalline cellulose, which is no fault. Empty where nothing is found.
         What concerns a fitted modulus is of the check "fitted modulus" and points to no unit; all else is of the check
         "plausibility". `Finding.particles` names the particles where not all are concerned.
@@ -80,7 +80,7 @@ def check_plausibility(campaign: Campaign, *, modulus_MPa: float | None = None) 
     if not isinstance(campaign, Campaign):
         check_campaign(campaign)  # what is no campaign; one with wrong values is still looked at, to name their cause
     found = _diagnose(campaign.raw or campaign)
-    if found.typical is None or worst(found.findings) == "bad":
+    if found.typical is None or worst(found.findings) == "error":
         return found.findings
     return (*found.findings, *_fitted_modulus(found.typical, modulus_MPa), *found.remark)
 
@@ -105,12 +105,12 @@ def other_material(campaign: Campaign) -> Material | None:
     wrong unit or sign is more likely."""
     check_campaign(campaign)
     found = _diagnose(campaign.raw or campaign)
-    return None if worst(found.findings) == "bad" else found.material
+    return None if worst(found.findings) == "error" else found.material
 
 
 def add_likely_unit_error(campaign: Campaign, problem: str, remedy: str) -> tuple[str, str]:
     """A problem and its remedy; with the likely wrong unit, sign or column that explains it, where there is one."""
-    errors = [one for one in check_plausibility(campaign) if one.level == "bad"]
+    errors = [one for one in check_plausibility(campaign) if one.level == "error"]
     # What a wrong unit explains needs no other remedy.
     return (f"{problem}; {errors[0].sentence}", errors[0].remedy) if errors else (problem, remedy)
 
@@ -255,7 +255,7 @@ def _unit_finding(tests: _Tests, errors: Sequence[UnitError], odds: np.ndarray, 
         f" MPa at a strain of {_number(it.strain)} with a modulus of {_modulus(modulus)} and diameters of"
         f" {_number(numbers[2:5].mean())} um, which fits {'neither the others nor any' if names else 'no'} usual solid"
     )
-    return Finding(CHECK, "bad", _capital(sentence), _capital(remedy), names)
+    return Finding(CHECK, "error", _capital(sentence), _capital(remedy), names)
 
 
 # ---- signs, times, order of diameters --------------------------------------------------------------------------------
@@ -288,7 +288,7 @@ def _signs(tests: _Tests) -> list[Finding]:
             f"Turn the sign of {headers} in curves.csv, or write sign = -1 for {' and '.join(columns)} in the mapping"
             " file"
         )
-        found.append(Finding(CHECK, "bad", sentence, remedy, names))
+        found.append(Finding(CHECK, "error", sentence, remedy, names))
     return found
 
 
@@ -308,7 +308,7 @@ def _clock(tests: _Tests) -> list[Finding]:
         f"{likely}: as given, loading takes {_number(_median(loading))} s with a reading every"
         f" {_number(_median(interval))} s"
     )
-    return [Finding(CHECK, "bad", _capital(sentence), _capital(remedy))]
+    return [Finding(CHECK, "error", _capital(sentence), _capital(remedy))]
 
 
 def _order_of_diameters(tests: _Tests) -> list[Finding]:
@@ -333,7 +333,7 @@ def _order_of_diameters(tests: _Tests) -> list[Finding]:
         f"D3 is the diameter along the compression; exchange D{best + 1}_um and D3_um in particles.csv, unless the"
         " particles stood upright"
     )
-    return [Finding(CHECK, "bad", sentence, remedy)]
+    return [Finding(CHECK, "error", sentence, remedy)]
 
 
 # ---- numbers that no solid has, and other materials ------------------------------------------------------------------
@@ -347,7 +347,7 @@ def _outside(tests: _Tests) -> list[Finding]:
         names = tests.some(closed)
         sentence = f"The displacement of {_who(names)} exceeds the diameter D3, so that the platens would have touched"
         remedy = "Check the diameters and the zero of displacement"
-        found.append(Finding(CHECK, "look" if names else "bad", sentence, remedy, names))
+        found.append(Finding(CHECK, "warning" if names else "error", sentence, remedy, names))
     numbers = _typical(tests.numbers)
     it = apparent(numbers)
     hulls = (
@@ -363,7 +363,7 @@ def _outside(tests: _Tests) -> list[Finding]:
                 f" {high:g} {unit}), and no single slip of a unit explains it"
             )
             remedy = "Check the units of force, displacement and diameters, and that tests are of single particles"
-            return [*found, Finding(CHECK, "bad", sentence, remedy)]
+            return [*found, Finding(CHECK, "error", sentence, remedy)]
     return found
 
 
@@ -383,7 +383,7 @@ def _fitted_modulus(typical: np.ndarray, modulus_MPa: float | None) -> list[Find
         f" though the tests are those of an ordinary one, {own}"
     )
     remedy = "Do not use it: the fitted form of unloading is not that of these tests; another form may be"
-    return [Finding("fitted modulus", "bad", sentence, remedy)]
+    return [Finding("fitted modulus", "error", sentence, remedy)]
 
 
 def _material(tests: _Tests) -> tuple[Material | None, tuple[Finding, ...]]:
@@ -402,7 +402,7 @@ def _material(tests: _Tests) -> tuple[Material | None, tuple[Finding, ...]]:
         f" {_number(_median(it.strain))}; a typical solid otherwise"
     )
     material = Material(ratio, float(10 ** _median(it.stress)), float(np.nanmedian(x)))
-    return material, (Finding(CHECK, "told", sentence),)
+    return material, (Finding(CHECK, "info", sentence),)
 
 
 # ---- numbers and words -----------------------------------------------------------------------------------------------

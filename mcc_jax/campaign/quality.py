@@ -1,35 +1,39 @@
-"""What the tester did in each test: told in words, and modelled where the record allows.
+"""Faults of tests and instruments: found, reported in words, and corrected where the record allows.
 
-`check_tests` goes over every test in this order. Each step sees what the steps before it left.
+`check_tests` applies these checks to every test in this order; each sees what those before it left.
 
 1. single readings far from all their neighbours (spikes) are left out;
 2. readings that repeat while the test goes on, and then catch up in one jump (a stuck channel), are left out;
-3. a sudden loss of force (the particle broke) ends the record; where force falls while the platens go on closing as
-   fast as before (it gives way or slips), readings are left out until the force is back, or to the end;
-4. the mean force in the air before contact is the zero of force: it is taken off, its error is kept;
-5. readings at the end of a channel's range are not compared with the law (`saturation`).
+3. a record that begins at its largest force has lost its loading, which is reported;
+4. a sudden loss of force (the particle broke) ends the record; where force falls while the platens close as fast as
+   before (it gives way or slips), readings are left out until the force is back, or to the end;
+5. the mean force before contact is the zero of force: it is taken off, its error is kept (`force_zero`);
+6. readings at the end of a channel's range are not compared with the law (`saturation`).
 
 A test in which nothing is found stays what it is, to the last bit.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from .findings import Finding
+from .findings import Finding, joined
 from .force_zero import untared_zero, zero_of_force
 from .plausibility import wrong_signs
 from .saturation import censor_displacement, censor_force
-from .schema import Campaign, Checked, Control, Curve, Note
+from .schema import Campaign, Checked, Control, Curve
 from .segments import find_segments
-from .signal import differences, median, point_noise, quantile, runs
+from .signal import differences, median, point_noise, quantile, runs, stretches
 from .validate import check_campaign
 
+Zero = tuple[float, float] | None
 
-def check_tests(campaign: Campaign, *, zero_mN: tuple[float, float] | None = None) -> Campaign:
-    """The campaign with what its testers did found, corrected where the record allows, and told.
+
+def check_tests(campaign: Campaign, *, zero_mN: Zero = None) -> Campaign:
+    """The campaign with the faults of its tests found, corrected where the record allows, and reported.
 
     Args:
         campaign: raw tests. One that was checked already comes back as it is.
@@ -49,71 +53,149 @@ def check_tests(campaign: Campaign, *, zero_mN: tuple[float, float] | None = Non
         return replace(campaign, raw=campaign)  # what looks like air or breakage is the test read backwards
     control = campaign.metadata.control
     curves = tuple(check_test(curve, control, zero_mN) for curve in campaign.curves)
-    zero = untared_zero(curves)
-    if zero is not None and zero_mN is None:
+    zero = untared_zero(curves) if zero_mN is None else None
+    if zero is not None:
         return check_tests(campaign, zero_mN=zero)
     return replace(campaign, curves=curves, raw=campaign)
 
 
-def check_test(curve: Curve, control: Control | None, zero_mN: tuple[float, float] | None = None) -> Curve:
-    """One test, checked; see the top of the file for the steps."""
-    notes: list[Note] = []
-    rows = np.arange(len(curve))
-    for wrong, check, sentence, remedy in _SINGLE_READINGS:
-        for channel, name in ((curve.force_mN, "force"), (curve.displacement_um, "displacement")):
-            found = wrong(channel[rows])
-            if found.any():
-                notes.append(Note(check, "told", sentence.replace("CHANNEL", name), (int(found.sum()),), remedy))
-                rows = rows[~found]
-    clean = _taken(curve, rows)
-    if begins_at_peak(clean):
-        sentence = "the record begins at its largest force ({} mN), so its loading is missing"
-        remedy = "Join the loading part of the test to it: some testers store the two apart"
-        notes.append(Note("loading", "look", sentence, (float(clean.force_mN[0]),), remedy))
-    broke = breakage(clean)
+def campaign_findings(campaign: Campaign) -> tuple[Finding, ...]:
+    """What the checks of a campaign found, one finding for all tests with the same fault.
+
+    Args:
+        campaign: what `check_tests` made.
+    """
+    check_campaign(campaign)
+    checked = zip(campaign.particles, (curve.checked for curve in campaign.curves), strict=True)
+    return joined({name: () if one is None else one.findings for name, one in checked})
+
+
+@dataclass
+class _Test:
+    """A test on its way through the checks: what is left of it, and what was found."""
+
+    curve: Curve
+    control: Control | None
+    given_zero: Zero
+    rows: np.ndarray
+    compared: np.ndarray
+    force_sd: np.ndarray
+    zero: Zero = None
+    findings: list[Finding] = field(default_factory=list)
+
+    def leave_out(self, gone: np.ndarray, finding: Finding) -> None:
+        """Leave out readings, booleans, if there are any."""
+        if not gone.any():
+            return
+        self.findings.append(finding)
+        curve, keep = self.curve, ~gone
+        self.curve = Curve(curve.time_s[keep], curve.force_mN[keep], curve.displacement_um[keep])
+        self.rows, self.compared, self.force_sd = self.rows[keep], self.compared[keep], self.force_sd[keep]
+
+
+def check_test(curve: Curve, control: Control | None, zero_mN: Zero = None) -> Curve:
+    """One test, checked; see the top of the file for the checks."""
+    count = len(curve)
+    test = _Test(curve, control, zero_mN, np.arange(count), np.ones(count, bool), np.zeros(count))
+    for check in CHECKS:
+        check(test)
+    if not test.findings and test.zero is None:
+        return curve
+    zero = test.zero or (0.0, 0.0)
+    return replace(test.curve, checked=Checked(test.rows, test.compared, *zero, test.force_sd, tuple(test.findings)))
+
+
+def _check_readings(test: _Test) -> None:
+    for wrong, finding in ((spikes, SPIKES), (stuck, STUCK)):
+        for name in ("force", "displacement"):
+            gone = wrong(test.curve.force_mN if name == "force" else test.curve.displacement_um)
+            said = replace(finding, sentence=finding.sentence.replace("CHANNEL", name))
+            test.leave_out(gone, said.of(int(gone.sum())))
+
+
+def _check_loading(test: _Test) -> None:
+    if begins_at_peak(test.curve):
+        test.findings.append(NO_LOADING.of(float(test.curve.force_mN[0])))
+
+
+def _check_breakage(test: _Test) -> None:
+    broke = breakage(test.curve)
     if broke is not None:
         last, lost = broke
-        sentence = "the particle broke at {} mN (the force falls by {} % at once); its record counts up to there"
-        remedy = "Load particles of this batch less, or leave this one out"
-        notes.append(Note("breakage", "look", sentence, (float(curve.force_mN[rows[last]]), 100 * lost), remedy))
-        rows = rows[: last + 1]
-        clean = _taken(curve, rows)
-    slipping = gives_way(clean, control)
-    if slipping.any():
-        sentence = (
-            "force falls from {} mN on while the platens go on closing (the particle gives way or slips): {} readings "
-            "are left out"
-        )
-        remedy = "Look whether the particle still is one, and load it less if it is not"
-        numbers = float(clean.force_mN[np.argmax(slipping) - 1]), int(slipping.sum())
-        notes.append(Note("breakage", "told", sentence, numbers, remedy))
-        rows = rows[~slipping]
-        clean = _taken(curve, rows)
-    zero = zero_of_force(clean, control, zero_mN)
+        behind = np.arange(len(test.curve)) > last
+        test.leave_out(behind, BROKE.of(float(test.curve.force_mN[last]), 100 * lost))
+
+
+def _check_slip(test: _Test) -> None:
+    gone = gives_way(test.curve, test.control)
+    test.leave_out(gone, GIVES_WAY.of(float(test.curve.force_mN[np.argmax(gone) - 1]), int(gone.sum())))
+
+
+def _check_zero(test: _Test) -> None:
+    zero = zero_of_force(test.curve, test.control, test.given_zero)
     if zero is not None:
-        notes += zero.notes
-        clean = replace(clean, force_mN=clean.force_mN - zero.path)
-    seen = censor_force(clean)
-    compared = np.ones(len(clean), bool)
-    force_sd = np.zeros(len(clean))
+        test.zero = zero.value, zero.sd
+        test.findings += zero.findings
+        test.curve = replace(test.curve, force_mN=test.curve.force_mN - zero.path)
+
+
+def _check_force_range(test: _Test) -> None:
+    seen = censor_force(test.curve)
     if seen is not None:
-        clean, rows, compared, force_sd = seen.curve, rows[seen.rows], seen.compared, seen.force_sd_mN
-        notes.append(seen.note)
-    hidden = censor_displacement(clean)
+        test.findings.append(seen.finding)
+        test.curve, test.rows = seen.curve, test.rows[seen.rows]
+        test.compared, test.force_sd = seen.compared, seen.force_sd_mN
+
+
+def _check_displacement_range(test: _Test) -> None:
+    hidden = censor_displacement(test.curve)
     if hidden is not None:
-        compared &= ~hidden[0]
-        notes.append(hidden[1])
-    if not notes and zero is None:
-        return curve
-    taken_off, error = (0.0, 0.0) if zero is None else (zero.value, zero.sd)
-    return replace(clean, checked=Checked(rows, compared, taken_off, error, force_sd, tuple(notes)))
+        test.compared = test.compared & ~hidden[0]
+        test.findings.append(hidden[1])
 
 
-def _taken(curve: Curve, rows: np.ndarray) -> Curve:
-    if len(rows) == len(curve):
-        return curve
-    return Curve(curve.time_s[rows], curve.force_mN[rows], curve.displacement_um[rows])
+CHECKS: tuple[Callable[[_Test], None], ...] = (
+    _check_readings,
+    _check_loading,
+    _check_breakage,
+    _check_slip,
+    _check_zero,
+    _check_force_range,
+    _check_displacement_range,
+)
 
+SPIKES = Finding(
+    *("spikes", "info", "single readings of CHANNEL ({}) lie far from their neighbours and are left out"), code="spike"
+)
+STUCK = Finding(
+    "stuck readings",
+    "info",
+    "{} readings of CHANNEL repeat the one before while the test goes on, and are left out",
+    "Look for a loose cable or a full buffer of the logger",
+    code="stuck",
+)
+NO_LOADING = Finding(
+    "loading",
+    "warning",
+    "the record begins at its largest force ({} mN), so its loading is missing",
+    "Join the loading part of the test to it: some test machines store the two separately",
+    code="no loading",
+)
+BROKE = Finding(
+    "breakage",
+    "warning",
+    "the particle broke at {} mN (the force falls by {} % at once); its record counts up to there",
+    "Load particles of this batch less, or leave this one out",
+    code="broke",
+)
+GIVES_WAY = Finding(
+    "breakage",
+    "info",
+    "force falls from {} mN on while the platens go on closing (the particle gives way or slips): {} readings are left "
+    "out",
+    "Check whether the particle has broken; if so, load it less",
+    code="gives way",
+)
 
 # Every threshold is such that no sound record reaches it.
 SPIKE_NOISE = 15.0  # standard deviations; of 1e6 normal readings the farthest lies at 5, the rest is for other noise
@@ -157,9 +239,8 @@ def spikes(values: np.ndarray) -> np.ndarray:
         far &= np.abs(values - middle) > SPIKE_READ_OUT * float(moves[moves > 0].min())
     if not far.any():
         return far
-    # Three or more in a row are no slip of the read-out but something that happened.
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], far.astype(int), [0]])))
-    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+    # Three or more in a row are no error of the read-out but something that happened.
+    for start, stop in stretches(far):
         if stop - start > 2:
             far[start:stop] = False
     return far
@@ -272,46 +353,3 @@ def _way_back(path: np.ndarray) -> float:
     """How far displacement must move to have moved at all [um]: four times its noise, or a thousandth of its range."""
     # Never nil: displacement that stands still has not gone back.
     return max(4 * point_noise(path), 1e-3 * float(np.ptp(path)), 1e-303)
-
-
-_SINGLE_READINGS = (
-    (spikes, "spikes", "single readings of CHANNEL ({}) lie far from their neighbours and are left out", ""),
-    (
-        *(stuck, "stuck readings"),
-        "{} readings of CHANNEL repeat the one before while the test goes on, and are left out",
-        "Look for a loose cable or a full buffer of the logger",
-    ),
-)
-"""What single readings may be: how they are found, the check's name, sentence and remedy."""
-
-
-def campaign_findings(campaign: Campaign) -> tuple[Finding, ...]:
-    """What the checks of a campaign found, one finding for all tests with the same fault.
-
-    Args:
-        campaign: what `check_tests` made.
-    """
-    check_campaign(campaign)
-    groups: dict[Note, dict[str, tuple[float | int, ...]]] = {}
-    for name, curve in zip(campaign.particles, campaign.curves, strict=True):
-        for note in curve.checked.notes if curve.checked is not None else ():
-            groups.setdefault(replace(note, numbers=()), {})[name] = note.numbers
-    found = []
-    for note, numbers in groups.items():
-        texts = [_range(column) for column in zip(*numbers.values(), strict=True)]
-        text = f"{named(tuple(numbers), len(campaign))}: {note.sentence.format(*texts)}"
-        found.append(Finding(note.check, note.level, text, note.remedy, tuple(numbers)))
-    return tuple(found)
-
-
-def named(names: tuple[str, ...], of: int, most: int = 5) -> str:
-    """Particles by their names, as the beginning of a sentence; of many the first ones and how many there are."""
-    if len(names) == 1:
-        return f"Particle {names[0]}"
-    shown = ", ".join(names[:most])
-    return f"Particles {shown}" if len(names) <= most else f"Particles {shown}, ... ({len(names)} of {of})"
-
-
-def _range(values: tuple[float | int, ...]) -> str:
-    low, high = f"{min(values):.4g}", f"{max(values):.4g}"
-    return low if low == high else f"{low} to {high}"

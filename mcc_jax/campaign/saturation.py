@@ -13,12 +13,13 @@ the fit and the noise of the turning point give the force's standard deviation.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from .schema import Curve, Note
+from .findings import Finding
+from .schema import Curve
 from .signal import differences, point_noise, quantile, runs
 
 REPEATS = 4  # readings that repeat the extreme, at least; two equal ones around a turning point are not rare
@@ -37,6 +38,33 @@ TRUSTED = 0.25
 and 85 % the intervals of the modulus hold the truth; farther on nobody has looked."""
 
 
+FORCE_RANGE = Finding(
+    "saturation",
+    "warning",
+    "force stands at {} mN, the end of its range, for {} readings, which are left out",
+    "Measure with a load cell of a larger range",
+    code="force range",
+)
+TURNING_POINT = replace(
+    FORCE_RANGE,
+    sentence="force stands at {} mN, the end of its range, for {} readings while the platens go on; they are left out "
+    "and the turning point is taken from the displacement ({} +- {} mN)",
+)
+FAR_BEYOND = replace(
+    TURNING_POINT,
+    level="error",
+    sentence=f"{TURNING_POINT.sentence}, too far beyond the range to be relied on",
+)
+DISPLACEMENT_RANGE = Finding(
+    "saturation",
+    "warning",
+    "displacement stands at {} um, the end of its range, for {} readings while the force goes on; they are not "
+    "compared with the law",
+    "Measure with a larger range of displacement",
+    code="displacement range",
+)
+
+
 class CensoredForce(NamedTuple):
     """A test whose force channel saturated.
 
@@ -46,14 +74,14 @@ class CensoredForce(NamedTuple):
         rows: which readings of the given curve these are.
         compared: False at the turning points.
         force_sd_mN: standard deviation of the force at the turning points, 0 elsewhere [mN].
-        note: in words.
+        finding: in words.
     """
 
     curve: Curve
     rows: np.ndarray
     compared: np.ndarray
     force_sd_mN: np.ndarray
-    note: Note
+    finding: Finding
 
 
 def plateaus(values: np.ndarray, other: np.ndarray, time: np.ndarray, noise: float) -> list[tuple[int, int]]:
@@ -128,13 +156,13 @@ def censor_force(curve: Curve) -> CensoredForce | None:
             value, error = end, noise * pace
         new_force[row], new_path[row], sd[row], turning[row] = value, top, error, True
         reached = top
-    note = _note(end, int(hidden.sum()), new_force[turning], sd[turning])
+    finding = _finding(end, int(hidden.sum()), new_force[turning], sd[turning])
     keep = ~hidden | turning
     checked = Curve(curve.time_s[keep], new_force[keep], new_path[keep])
-    return CensoredForce(checked, np.flatnonzero(keep), ~turning[keep], sd[keep], note)
+    return CensoredForce(checked, np.flatnonzero(keep), ~turning[keep], sd[keep], finding)
 
 
-def censor_displacement(curve: Curve) -> tuple[np.ndarray, Note] | None:
+def censor_displacement(curve: Curve) -> tuple[np.ndarray, Finding] | None:
     """Which readings of displacement stand at the end of its range, and a note; None if there are none."""
     found = plateaus(curve.displacement_um, curve.force_mN, curve.time_s, point_noise(curve.force_mN))
     if not found:
@@ -145,31 +173,15 @@ def censor_displacement(curve: Curve) -> tuple[np.ndarray, Note] | None:
     for start, stop in found:
         rows[start:stop] = True
     rows |= path >= float(path.max()) - NEAR_END * point_noise(path[~rows])
-    note = Note(
-        "saturation",
-        "look",
-        "displacement stands at {} um, the end of its range, for {} readings while the force goes on; they are not "
-        "compared with the law",
-        (float(path.max()), int(rows.sum())),
-        "Measure with a larger range of displacement",
-    )
-    return rows, note
+    return rows, DISPLACEMENT_RANGE.of(float(path.max()), int(rows.sum()))
 
 
-def _note(end: float, count: int, largest: np.ndarray, sds: np.ndarray) -> Note:
-    remedy = "Measure with a load cell of a larger range"
+def _finding(end: float, count: int, largest: np.ndarray, sds: np.ndarray) -> Finding:
     if not len(largest):
-        sentence = "force stands at {} mN, the end of its range, for {} readings, which are left out"
-        return Note("saturation", "look", sentence, (end, count), remedy)
+        return FORCE_RANGE.of(end, count)
     top, sd = float(largest.max()), float(sds.max())
-    sentence = (
-        "force stands at {} mN, the end of its range, for {} readings while the platens go on; they are left out and "
-        "the turning point is taken from the displacement ({} +- {} mN)"
-    )
     far = top > (1 + TRUSTED) * end or not sd < 0.5 * TRUSTED * end
-    if far:
-        sentence += ", too far beyond the range to be relied on"
-    return Note("saturation", "bad" if far else "look", sentence, (end, count, top, sd), remedy)
+    return (FAR_BEYOND if far else TURNING_POINT).of(end, count, top, sd)
 
 
 def _turning(part: np.ndarray, top: int, noise: float) -> float:

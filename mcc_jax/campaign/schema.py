@@ -12,28 +12,9 @@ import numpy as np
 from .. import arguments
 from .._errors import InputError
 from .._format import described, number, span, table
-from .findings import Level
+from .findings import Finding
 
 Control = Literal["load", "displacement"]
-
-
-@dataclass(frozen=True)
-class Note:
-    """What the check of one test found.
-
-    Attributes:
-        check: what was checked, as in `Finding`.
-        level: how serious it is, as in `Finding`.
-        sentence: in words, with `{}` where the numbers stand.
-        numbers: one for each `{}`.
-        remedy: what a person can do, as in `Finding`.
-    """
-
-    check: str
-    level: Level
-    sentence: str
-    numbers: tuple[float | int, ...] = ()
-    remedy: str = ""
 
 
 @dataclass(frozen=True)
@@ -47,7 +28,7 @@ class Checked:
         force_zero_mN: the zero of force that was taken off [mN].
         force_zero_sd_mN: its standard deviation [mN]: an error that all readings share.
         force_sd_mN: standard deviation of a force that was worked out, 0 of one that was read [mN].
-        notes: what was found.
+        findings: what was found.
     """
 
     rows: np.ndarray
@@ -55,7 +36,7 @@ class Checked:
     force_zero_mN: float
     force_zero_sd_mN: float
     force_sd_mN: np.ndarray
-    notes: tuple[Note, ...]
+    findings: tuple[Finding, ...]
 
 
 @dataclass(frozen=True, repr=False)

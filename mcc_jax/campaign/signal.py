@@ -52,6 +52,12 @@ def runs(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return edges[:-1], edges[1:]
 
 
+def stretches(chosen: np.ndarray) -> list[tuple[int, int]]:
+    """Stretches [start, stop) of consecutive readings that are chosen by booleans of shape (n,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], chosen, [False])).view(np.int8)))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
 # NumPy's own median, quantile and diff take ten times as long for records of some hundred readings; these give the same
 # to the last bit. Of thousands of particles every test is asked for fifty of them.
 

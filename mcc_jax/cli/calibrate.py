@@ -217,7 +217,7 @@ def say_state(content: dict[str, Any]) -> None:
     state = "converged."
     if not content["converged"]:
         state = "NOT converged."
-    elif any(one["level"] == "bad" for one in content["findings"]):
+    elif any(one["level"] == "error" for one in content["findings"]):
         state = "the optimisers converged, but NOT TO BE TRUSTED: see below."
     say(
         f"Method {content['method']}: {used} of {len(content['particles'])} particles, {objective}"
@@ -229,7 +229,7 @@ def say_warnings(content: dict[str, Any]) -> None:
     """Print what a reader of the numbers must know."""
     from ..campaign import Finding
 
-    bad = {str(Finding.from_json(one)) for one in content["findings"] if one["level"] == "bad"}
+    bad = {str(Finding.from_json(one)) for one in content["findings"] if one["level"] == "error"}
     for warning in sorted(content["warnings"], key=lambda text: text not in bad):
         colour = "red" if warning in bad else "yellow"
         say(f"Warning: {sentence(warning)}", fg=colour, bold=warning in bad)

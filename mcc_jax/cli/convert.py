@@ -119,7 +119,7 @@ def convert(
     for finding in conversion.get("findings", ()):
         say(f"Note: {finding['sentence']}." + (f" {finding['remedy']}." if finding["remedy"] else ""))
     for one in (*check_plausibility(campaign), *campaign_findings(check_tests(campaign))):
-        say(f"{'Warning' if one.level != 'told' else 'Note'}: {one}", fg="red" if one.level == "bad" else "yellow")
+        say(f"{'Warning' if one.level != 'info' else 'Note'}: {one}", fg="red" if one.level == "error" else "yellow")
     say(f"Written into {out}: particles.csv, curves.csv, campaign.toml")
     say_next((f"mcc-jax calibrate {shlex.quote(str(out))} --out fit", "the law and its uncertainty"))
 

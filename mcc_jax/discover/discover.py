@@ -20,8 +20,8 @@ from ..calibrate.fitting import checked_settings
 from ..calibrate.judgement import numbers_in_reach, unlike_others
 from ..calibrate.settings import JUDGEMENT
 from ..campaign import Campaign, Finding, available_data, campaign_findings, check_plausibility, check_tests
+from ..campaign.findings import named
 from ..campaign.force_zero import open_zero
-from ..campaign.quality import named
 from ..effects import LIBRARY, Mechanism
 from .answer import (
     checks_of,
@@ -106,7 +106,7 @@ def discover(
         arguments.flag(value, name)
     known = _searched(library, exclude)
     findings = campaign_findings(campaign)
-    wrong = [one for one in check_plausibility(campaign.raw or campaign) if one.level == "bad"]
+    wrong = [one for one in check_plausibility(campaign.raw or campaign) if one.level == "error"]
     if wrong:
         summary = (
             f"These numbers cannot be true as they stand: {wrong[0]} Nothing is looked for before that is settled."
@@ -243,7 +243,7 @@ def _not_tared(
         "a load cell that was not tared is explanation enough, and nothing is named"
     )
     remedy = "Take a record that begins in the air; if the particles were preloaded, something is missing after all"
-    return other, p_any, missing, [Finding("zero of force", "look", text, remedy), *left_out]
+    return other, p_any, missing, [Finding("zero of force", "warning", text, remedy), *left_out]
 
 
 def _settled_fit(
@@ -254,11 +254,11 @@ def _settled_fit(
     Particles whose turning point cannot be relied on, and those whose residual is unlike all others', would be taken
     for physics. They take no part in the search.
     """
-    unsafe = tuple(dict.fromkeys(name for one in findings if one.level == "bad" for name in one.particles))
+    unsafe = tuple(dict.fromkeys(name for one in findings if one.level == "error" for name in one.particles))
     told = []
     if unsafe and len(unsafe) < len(campaign):
         text = f"{named(unsafe, len(campaign))}: cannot be relied on, as said above; no part in the search"
-        told.append(Finding("left out", "look", text, "", unsafe))
+        told.append(Finding("left out", "warning", text, "", unsafe))
         campaign = campaign.without(*unsafe)
     base = base_fit(campaign, model, threshold_MPa=threshold_MPa, tell=tell)
     outlying, snapping = unlike_others(base.names, base.rms_um, base.range_um), base.snapping
@@ -269,7 +269,7 @@ def _settled_fit(
     left = len(base.tests) - len({*snapping, *without})
     if snapping and not base.coarse and left >= JUDGEMENT.left:
         text = f"{named(snapping, len(campaign))}: the law snaps through in its loading; it takes no part in the search"
-        told.append(Finding("snap-through", "told", text, "", snapping))
+        told.append(Finding("snap-through", "info", text, "", snapping))
         without = (*without, *(name for name in snapping if name not in without))
     if without:
         base = base_fit(campaign.without(*without), model, threshold_MPa=threshold_MPa, tell=tell)

@@ -129,7 +129,7 @@ def lights(results: Results, shown: Sequence[FittedCurve] = ()) -> list[Light]:
         found.append(_data(results))
     if results.discovery is not None:
         found.append(_complete(results, results.discovery))
-    if worst(findings) == "bad":
+    if worst(findings) == "error":
         # Beside numbers that cannot be true nothing is fine: what would be is not judged.
         found = [replace(light, level="unknown") if light.level == "good" else light for light in found]
     return found
@@ -175,9 +175,9 @@ def _light(check: str, level: Level, value: str) -> Light:
 
 def _finding(one: Finding) -> Light:
     told: dict[str, tuple[Level, str]] = {
-        "told": ("good", "settled"),
-        "look": ("look", "look at it"),
-        "bad": ("bad", "cannot be true as it stands"),
+        "info": ("good", "settled"),
+        "warning": ("look", "look at it"),
+        "error": ("bad", "cannot be true as it stands"),
     }
     level, value = told[one.level]
     return Light(level, f"Tests: {one.check}", value, "nothing found", str(one))

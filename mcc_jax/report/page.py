@@ -203,7 +203,7 @@ def _cards(results: Results, checks: list[Any]) -> list[dict[str, str]]:
         content, alone = results.calibration, is_law_alone(results)
         used = sum(entry["kept"] for entry in content["particles"])
         law = f" of the law{beside}" if (beside := beside_the_law(results)) else ""
-        done, trusted = content["converged"], worst(tested(results)) != "bad"
+        done, trusted = content["converged"], worst(tested(results)) != "error"
         found.append(
             {
                 "level": "good" if done and trusted else "bad",

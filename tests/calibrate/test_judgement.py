@@ -65,8 +65,8 @@ def test_a_clean_campaign_has_nothing_to_tell():
 def test_what_was_found_and_taken_off_stands_in_the_result():
     content = calibrated("offset and force").to_json()
     assert {one["check"]: one["level"] for one in content["findings"]} == {
-        "zero of force": "told",
-        "saturation": "look",
+        "zero of force": "info",
+        "saturation": "warning",
     }
     for told in content["findings"]:
         assert any(told["sentence"] in warning for warning in content["warnings"])
@@ -83,7 +83,7 @@ def test_a_modulus_that_no_unloading_tells_is_told_as_unknown():
     assert set(found) == {"saturation", MODULUS_OPEN}
     assert "displacement stands at the end of its range" in found[MODULUS_OPEN].sentence
     assert "larger range of displacement" in found[MODULUS_OPEN].remedy
-    assert found[MODULUS_OPEN].level == "look"
+    assert found[MODULUS_OPEN].level == "warning"
     low, high = modulus("hidden")["interval_95"]
     assert low < TRUTH_MPA < high
 
@@ -120,7 +120,7 @@ def test_one_particle_far_from_all_others_is_named(seed, which, times):
     found = unlike_others(NAMES, rms, reach)
     assert found.particles == (NAMES[which],)
     assert f"Particle {NAMES[which]}" in found.sentence
-    assert found.level == "look"
+    assert found.level == "warning"
 
 
 def test_a_larger_particle_with_a_larger_residual_is_like_the_others():

@@ -135,7 +135,7 @@ def test_the_same_bytes_twice_are_told(tmp_path):
     assert len(campaign) == 4
     (finding,) = campaign.metadata.other["conversion"]["findings"]
     assert finding["check"] == "duplicates"
-    assert finding["level"] == "look"
+    assert finding["level"] == "warning"
     assert "P9.txt, P11.txt hold the same bytes" in finding["sentence"]
     assert finding["remedy"].endswith("--skip P11.txt")
 

@@ -152,13 +152,13 @@ def made(name, seed):
 
 
 def accusing(findings):
-    return [str(finding) for finding in findings if finding.level != "told"]
+    return [str(finding) for finding in findings if finding.level != "info"]
 
 
 def says(findings, kind):
     _, sentence, remedy = SLIPS[kind]
     first = findings[0]
-    return first.level == "bad" and re.match(sentence, first.sentence) and re.search(remedy, first.remedy)
+    return first.level == "error" and re.match(sentence, first.sentence) and re.search(remedy, first.remedy)
 
 
 @pytest.mark.parametrize("name", CAMPAIGNS)
@@ -219,7 +219,7 @@ def test_twelve_of_twelve_slips_of_files_are_named(make, tmp_path):
     named = []
     for kind, (units, numbers, sentence) in TWELVE.items():
         findings = check_plausibility(written(tests, tmp_path, units, numbers))
-        if len(findings) == 1 and findings[0].level == "bad" and findings[0].sentence.startswith(sentence):
+        if len(findings) == 1 and findings[0].level == "error" and findings[0].sentence.startswith(sentence):
             named.append(kind)
     assert named == list(TWELVE)
 
@@ -293,7 +293,7 @@ def test_sign_and_unit_are_both_said():
 
 def test_another_material_is_told_without_accusing_units():
     (finding,) = check_plausibility(ceramic())
-    assert finding.level == "told"
+    assert finding.level == "info"
     assert not re.search("unit|slip|wrong", str(finding))
     assert not check_plausibility(cellulose())
 
@@ -306,12 +306,12 @@ ACCUSES = re.compile(r"\bunits?\b|seem|slip|radi|swap|wrong|too (large|small)|[m
 def test_a_fitted_modulus_of_no_solid_is_said_and_accuses_no_unit(name, modulus):
     """A wrong unit moves it as it moves the stiffness of the record itself, so it is the fitted law that is wrong."""
     tests = made(name, 0)
-    bad = [f for f in check_plausibility(tests, modulus_MPa=modulus) if f.level != "told"]
-    assert [(f.check, f.level) for f in bad] == [("fitted modulus", "bad")]
+    bad = [f for f in check_plausibility(tests, modulus_MPa=modulus) if f.level != "info"]
+    assert [(f.check, f.level) for f in bad] == [("fitted modulus", "error")]
     assert not ACCUSES.search(str(bad[0]))
     assert not accusing(check_plausibility(tests, modulus_MPa=16e3))
     answer = {"effective_modulus_MPa": {"value": modulus, "sd": None}}
-    assert bad == [f for f in judged(tests, answer, None, None) if f.level == "bad"]  # as every method asks
+    assert bad == [f for f in judged(tests, answer, None, None) if f.level == "error"]  # as every method asks
 
 
 @EACH_SLIP
@@ -434,5 +434,5 @@ def test_indentations_with_a_made_up_diameter_are_not_accused(name):
             assert not accusing(check_plausibility(tests.select(np.arange(len(tests)) == i)))
         # The printed form of the law finds 4 to 150 TPa in them, which no unit explains.
         found = check_plausibility(tests, modulus_MPa=3e7)
-        assert [f.check for f in found if f.level != "told"] == ["fitted modulus"]
+        assert [f.check for f in found if f.level != "info"] == ["fitted modulus"]
         assert not ACCUSES.search(str(found[0]))

@@ -96,12 +96,12 @@ def test_the_zero_of_force_in_the_air_is_taken_off_with_its_error(seed, offset_m
         assert abs(kept.force_zero_mN - offset_mN) < 5 * kept.force_zero_sd_mN
     told = [one for one in campaign_findings(checked) if one.check == "zero of force"]
     assert bool(told) or abs(offset_mN) < 1
-    assert worst(told) in (None, "told")
+    assert worst(told) in (None, "info")
 
 
 def test_an_offset_is_told_in_a_sentence_with_its_size():
     _, found = only(faulty.in_air(noisy(exact(), 0), offset_mN=20.0), "zero of force")
-    assert found.level == "told"
+    assert found.level == "info"
     assert found.particles == exact().particles
     assert "in the air before contact; this was taken off" in found.sentence
     assert "20" in found.sentence
@@ -120,7 +120,7 @@ def shifted(campaign, offset_mN):
 
 def test_a_record_that_begins_below_zero_without_air_was_not_tared():
     checked, found = only(shifted(noisy(exact(), 0), -10.0), "zero of force")
-    assert found.level == "look"
+    assert found.level == "warning"
     assert found.particles == exact().particles
     assert "Tare the load cell" in found.remedy
     for curve in checked.curves:
@@ -130,7 +130,7 @@ def test_a_record_that_begins_below_zero_without_air_was_not_tared():
 
 def test_a_record_that_begins_above_zero_without_air_leaves_its_zero_open():
     checked, found = only(shifted(noisy(exact(), 0), 20.0), "zero of force")
-    assert found.level == "told"
+    assert found.level == "info"
     assert "preload" in found.sentence
     assert all(c.checked is None or c.checked.force_zero_mN == 0.0 for c in checked.curves)
     zero, error = open_zero(checked)
@@ -182,7 +182,7 @@ def test_a_drift_in_the_air_is_told_with_its_change_as_error(drift_mN):
     checked = check_tests(campaign)
     found = campaign_findings(checked)
     assert {one.check for one in found} == {"zero of force"}
-    assert worst(found) == "look"
+    assert worst(found) == "warning"
     assert {name for one in found for name in one.particles} == set(campaign.particles)
     assert all("drift" in one.sentence and "settle" in one.remedy for one in found)
     corrected = [curve.checked for curve in checked.curves if curve.checked.force_zero_sd_mN > 0]
@@ -217,7 +217,7 @@ def test_a_spike_is_left_out_and_nothing_else_is(seed, at, height, sign, channel
     reach = float(np.ptp(curve.force_mN if channel == "force" else curve.displacement_um))
     faulted = faulty.spiked(campaign, height=sign * height * reach, channel=channel, at=at, only=("2",))
     checked, found = only(faulted, "spikes")
-    assert (found.level, found.particles) == ("told", ("2",))
+    assert (found.level, found.particles) == ("info", ("2",))
     assert channel in found.sentence
     np.testing.assert_array_equal(checked.curves[1].checked.rows, np.delete(np.arange(len(curve)), at))
     assert checked.curves[0] is faulted.curves[0]
@@ -228,7 +228,7 @@ def test_a_spike_is_left_out_and_nothing_else_is(seed, at, height, sign, channel
 def test_readings_that_stick_are_left_out(seed, start, readings, channel):
     campaign = faulty.stuck(noisy(exact(), seed), start=start, readings=readings, channel=channel, only=("3",))
     checked, found = only(campaign, "stuck readings")
-    assert (found.level, found.particles) == ("told", ("3",))
+    assert (found.level, found.particles) == ("info", ("3",))
     gone = np.setdiff1d(np.arange(len(campaign.curves[2])), checked.curves[2].checked.rows)
     np.testing.assert_array_equal(gone, np.arange(start + 1, start + readings))
     assert "force" in found.sentence or channel == "displacement"
@@ -242,7 +242,7 @@ def test_readings_that_stick_are_left_out(seed, start, readings, channel):
 def test_a_record_counts_up_to_where_the_particle_broke(seed, at, left):
     campaign = faulty.broken(noisy(exact(), seed), at=at, left=left, only=("2",))
     checked, found = only(campaign, "breakage")
-    assert (found.level, found.particles) == ("look", ("2",))
+    assert (found.level, found.particles) == ("warning", ("2",))
     assert "Particle 2" in found.sentence
     assert "broke" in found.sentence
     assert found.remedy
@@ -287,7 +287,7 @@ def test_force_that_falls_while_the_platens_close_on_is_no_unloading(seed, at, r
 
     slipped = faulty.changed(exact(), slipping, only=("2",))
     checked, found = only(noisy(slipped, seed), "breakage")
-    assert (found.level, found.particles) == ("told", ("2",))
+    assert (found.level, found.particles) == ("info", ("2",))
     assert "gives way or slips" in found.sentence
     raw = slipped.curves[1]
     first = int(np.argmax(raw.force_mN >= at * exact().curves[1].force_mN.max()))
@@ -310,7 +310,7 @@ def test_a_record_that_begins_at_its_largest_force_is_named(seed, earlier):
 
     campaign = faulty.changed(noisy(exact(), seed), unloading, only=("2", "4"))
     _, found = only(campaign, "loading")
-    assert (found.level, found.particles) == ("look", ("2", "4"))
+    assert (found.level, found.particles) == ("warning", ("2", "4"))
     assert "begins at its largest force" in found.sentence
     assert "Join" in found.remedy
 
@@ -347,7 +347,7 @@ def test_leaving_particles_out_keeps_raw_and_checked_together():
 
 
 def test_a_finding_survives_json():
-    one = Finding("breakage", "look", "Particle 2: it broke", "Leave it out", ("2",))
+    one = Finding("breakage", "warning", "Particle 2: it broke", "Leave it out", ("2",))
     assert Finding.from_json(one.to_json()) == one
     assert str(one) == "Particle 2: it broke. Leave it out."
-    assert worst([one, replace(one, level="told")]) == "look"
+    assert worst([one, replace(one, level="info")]) == "warning"

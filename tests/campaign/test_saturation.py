@@ -21,7 +21,7 @@ def test_the_turning_point_that_the_force_channel_did_not_see_is_worked_out(seed
     campaign = noisy(exact(), seed)
     checked = check_tests(faulty.clipped(campaign, share))
     (found,) = campaign_findings(checked)
-    assert (found.check, found.level, found.particles) == ("saturation", "look", campaign.particles)
+    assert (found.check, found.level, found.particles) == ("saturation", "warning", campaign.particles)
     assert "force stands at" in found.sentence
     assert "larger range" in found.remedy
     for true, raw, curve in zip(exact().curves, checked.raw.curves, checked.curves, strict=True):
@@ -43,7 +43,7 @@ def test_the_turning_point_that_the_force_channel_did_not_see_is_worked_out(seed
 
 def test_far_beyond_the_range_the_turning_point_is_not_relied_on():
     (found,) = campaign_findings(check_tests(faulty.clipped(noisy(exact(), 0), 0.6)))
-    assert found.level == "bad"
+    assert found.level == "error"
     assert "too far beyond the range" in found.sentence
 
 
@@ -53,7 +53,7 @@ def test_a_displacement_at_the_end_of_its_range_is_not_compared(seed, share):
     campaign = noisy(exact(), seed)
     checked = check_tests(faulty.clipped(campaign, share, channel="displacement"))
     (found,) = campaign_findings(checked)
-    assert (found.check, found.level, found.particles) == ("saturation", "look", campaign.particles)
+    assert (found.check, found.level, found.particles) == ("saturation", "warning", campaign.particles)
     assert "displacement stands at" in found.sentence
     assert "larger range of displacement" in found.remedy
     for raw, curve in zip(checked.raw.curves, checked.curves, strict=True):

@@ -41,7 +41,7 @@ def test_findings_stand_in_the_result_and_on_the_terminal(fitted):
     result, out, _ = fitted
     content = json.loads((out / "calibration.json").read_text())
     found = {one["check"]: one for one in content["findings"]}
-    assert found["zero of force"]["level"] == "told"
+    assert found["zero of force"]["level"] == "info"
     assert found["breakage"]["particles"] == ["3"]
     assert "without it the modulus is" in found["breakage"]["sentence"]
     for one in found.values():

@@ -63,7 +63,7 @@ def repeated(calibration, count):
             adjustment,
             curves=again(adjustment.curves),
             shift=adjustment.shift[index],
-            why_not=again(adjustment.why_not),
+            reasons=again(adjustment.reasons),
             segments=again(adjustment.segments),
         ),
         table=replace(

@@ -271,7 +271,7 @@ def calibrate_paper(
             )
         usable = int(adjustment.kept.sum())
         problem = f"the calibration needs two usable particles or more, {usable} can be used"
-        raise refusal(campaign, problem, adjustment.why_not)
+        raise refusal(campaign, problem, adjustment.reasons)
     with numbers_in_reach(campaign):
         table = strain_table(adjustment, campaign.diameters_um)
         tell("fitting the shape parameter")

@@ -135,12 +135,12 @@ def _files(folder: Path, skip: Sequence[str]) -> tuple[list[Path], list[Finding]
     findings = []
     if quiet:
         sentence = f"{_count(quiet)} passed over, by name no tester's: {_listed(quiet)}"
-        findings.append(Finding("files", "told", sentence))
+        findings.append(Finding("files", "info", sentence))
     if inside:
         what = "1 folder" if len(inside) == 1 else f"{len(inside)} folders"
-        findings.append(Finding("files", "told", f"{what} in it not entered: {_listed(inside)}"))
+        findings.append(Finding("files", "info", f"{what} in it not entered: {_listed(inside)}"))
     if skipped:
-        findings.append(Finding("files", "told", f"{_count(skipped)} skipped as asked: {_listed(skipped)}"))
+        findings.append(Finding("files", "info", f"{_count(skipped)} skipped as asked: {_listed(skipped)}"))
     return files, findings
 
 
@@ -181,7 +181,7 @@ def _twice(files: Sequence[Path]) -> Finding:
     rest = " ".join(f"--skip {shlex.quote(file.name)}" for file in files[1:])
     return Finding(
         "duplicates",
-        "look",
+        "warning",
         f"{_listed(files)} hold the same bytes, so one test counts {len(files)} times",
         f"If it is one particle, leave it out with {rest}",
         tuple(same_text(file.stem) for file in files),

@@ -93,10 +93,10 @@ def read_tester_file(
         rows = "1 row with a missing reading was" if dropped == 1 else f"{dropped} rows with a missing reading were"
         where = "1 test" if len(tests.missing) == 1 else f"{len(tests.missing)} tests"
         sentence = f"{rows} dropped, in {where}"
-        findings.append(Finding("missing readings", "told", sentence, "", tuple(tests.missing)))
+        findings.append(Finding("missing readings", "info", sentence, "", tuple(tests.missing)))
     if unused:
         rows = "1 row of the diameters is" if unused == 1 else f"{unused} rows of the diameters are"
-        findings.append(Finding("diameters", "told", f"{rows} for no test here and not used"))
+        findings.append(Finding("diameters", "info", f"{rows} for no test here and not used"))
     other = dict(tests.other)
     if findings:
         other["conversion"] = {"findings": [finding.to_json() for finding in findings]}
