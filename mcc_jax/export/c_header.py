@@ -1,4 +1,4 @@
-"""The law as a C99 header, and how to put it into LAMMPS and Yade: text from the templates beside it."""
+"""The law as a C99 header, and how to put it into LAMMPS and Yade: text from `templates`."""
 
 from __future__ import annotations
 
@@ -28,17 +28,13 @@ def c_header(law: MccLaw, particle: Particle | None = None, *, origin: Origin | 
 
     It holds force, tangent and history of one particle between platens, and of a pair of half contacts, for all forms
     of unloading and strain scaling. Coefficients are passed as a struct, so that every particle can have its own.
-    Effects that are closed formulas are part of it (`AbstractEffect.closed`), with their numbers as constants.
-
-    Args:
-        law: the law.
-        particle: if given, the law is checked to carry it, and a comment names its size.
-        origin: where the law comes from, for the comment on top.
+    Effects that are closed formulas are part of it (`AbstractEffect.closed`), with their numbers as constants. The
+    comment on top says where the law comes from (`origin`) and, of a `particle` that the law must carry, its size.
 
     Raises:
         InputError: if a parameter is out of its range, the particle carries no stress, or an effect is no closed
-            formula or makes a contact gain energy. A law that is not monotone is
-            passed on; `read_calibration` refuses it, and so should you unless you know what a pair of them means.
+            formula or makes a contact gain energy. A law that is not monotone is passed on, unlike by
+            `read_calibration`: a pair of such contacts has several solutions.
     """
     origin = checked(law, particle, origin, needed=False)
     return _render(
@@ -60,13 +56,7 @@ def c_header(law: MccLaw, particle: Particle | None = None, *, origin: Origin | 
 def lammps_recipe(law: MccLaw, particle: Particle, *, origin: Origin | None = None) -> str:
     """Markdown: a normal model for LAMMPS' `pair_style granular` around the header of `c_header`, with the values.
 
-    Args:
-        law: the law.
-        particle: the particle of the golden table beside it.
-        origin: where the law comes from.
-
-    Raises:
-        InputError: if the law or the particle is not usable, or the law has an effect that `c_header` refuses.
+    Arguments and errors as of `c_header`; the particle is that of the golden table.
     """
     return _recipe("lammps.md.j2", law, particle, origin)
 

@@ -39,16 +39,11 @@ FORMULAE = {
 
 
 def card(law: MccLaw, particle: Particle | None = None, *, origin: Origin | None = None) -> dict[str, Any]:
-    """The parameter card of a law.
+    """The parameter card of a law, ready for `json.dump`.
 
-    Args:
-        law: the law.
-        particle: if given, its size and shape factor are part of the card.
-        origin: estimates with their uncertainty, and where they are from; nothing is claimed without.
-
-    Returns:
-        Parameters with unit and uncertainty, form of the law, its effects with equation and numbers, validity, formulae
-        in words, provenance, warnings and a checksum (SHA-256) over the law and its numbers; ready for `json.dump`.
+    It has parameters with unit and uncertainty, form of the law, its effects with equation and numbers, validity,
+    formulae in words, provenance, warnings and a checksum (SHA-256) over the law and its numbers; of a particle its
+    size and shape factor. Uncertainty and provenance are those of `origin`; nothing is claimed without.
 
     References:
         Bommireddy et al. (2018), eqs. 13, 16, 23, 24.

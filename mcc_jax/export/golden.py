@@ -34,13 +34,7 @@ def golden_table(law: MccLaw, particle: Particle, *, seed: int = 0, units: Liter
     """Paths of one particle between two platens with the law's force and tangent.
 
     The first path loads, releases, reloads and overtakes its peak, up to a scaled strain of 0.67, with points close to
-    every place where branches meet; the last unloads from small peaks; the others are random.
-
-    Args:
-        law: the law.
-        particle: the particle.
-        seed: of the random paths.
-        units: `um_mN` or `SI`.
+    every place where branches meet; the last unloads from small peaks; the others are random, by the seed.
 
     Returns:
         A pandas table with a column `path`, 0 for the first, and displacement, largest displacement so far, force and

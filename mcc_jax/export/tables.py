@@ -62,7 +62,7 @@ def curve_tables(
 
     Args:
         law: the law.
-        particle: whose tables these are if the law has effects; without effects they are every particle's.
+        particle: the one that the tables hold for if the law has effects; without effects they hold for all.
         strain_max: where the loading table ends [-].
         tolerance: largest error of linear interpolation, as a share of each column's largest value.
 

@@ -88,13 +88,8 @@ def write_export(
 ) -> list[str]:
     """Write a law in a format of `FORMATS`, and the golden table that goes with it, into a folder that exists.
 
-    Args:
-        format: one of `FORMATS`.
-        law: the law.
-        particle: the particle of the golden table, whose size is part of `jax` artefacts.
-        folder: where to write; files of the same names are replaced.
-        origin: where the law comes from.
-        seed: of the golden table's random paths.
+    Files of the same names are replaced. The particle is that of the golden table, whose random paths the seed decides;
+    its size is part of `jax` artefacts.
 
     Returns:
         Names of the files.

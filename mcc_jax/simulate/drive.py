@@ -23,7 +23,7 @@ CONTROLS: tuple[Control, ...] = get_args(Control)
 
 
 class Response(eqx.Module):
-    """What a particle did along a path.
+    """Response of a particle along a path.
 
     Attributes:
         displacement: platen displacement [um].
@@ -112,12 +112,7 @@ def refusal(law: AbstractContactLaw, particle: Particle, response: Response, nam
 
 @eqx.filter_jit
 def _drive(
-    law: AbstractContactLaw,
-    particle: Particle,
-    path: Path,
-    time: Path | None,
-    control: Control,
-    state: Any,
+    law: AbstractContactLaw, particle: Particle, path: Path, time: Path | None, control: Control, state: Any
 ) -> Response:
     """The compiled part of `drive`, its arguments checked."""
     start = law.init(particle) if state is None else state

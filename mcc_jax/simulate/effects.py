@@ -61,8 +61,7 @@ class HiddenEffect:
                 raise wrong(key, "above 0" if least[key] > 0 else "finite", f"{value:g}")
 
     def __repr__(self) -> str:
-        numbers = {self.variant.parameter: self.strength} | {n.name: n.middle for n in self.variant.nuisances}
-        named = ", ".join(f"{name} {number(value)}" for name, value in (numbers | dict(self.nuisance)).items())
+        named = ", ".join(f"{name} {number(value)}" for name, value in self.numbers.items())
         drawn = f"; drawn for every test: {', '.join(self.random)}" if self.random else ""
         return f"HiddenEffect {self.variant.label}: {named}{drawn}"
 
@@ -71,14 +70,18 @@ class HiddenEffect:
         """The amplitude, or the middle of the plausible range."""
         return self.variant.typical if self.amplitude is None else self.amplitude
 
+    @property
+    def numbers(self) -> dict[str, float]:
+        """Amplitude and nuisance parameters by name, as given or the variant's own."""
+        middle = {n.name: n.middle for n in self.variant.nuisances}
+        return {self.variant.parameter: self.strength, **middle, **self.nuisance}
+
     def draw(self, seed: int, place: int, count: int) -> tuple[AbstractEffect, dict[str, np.ndarray]]:
         """The effect of every test: one whose every field has a leading axis N, and its parameters by name, shape (N,).
 
         Each effect of a campaign has a stream of draws of its own, by the campaign's seed and its place among them.
         """
-        values = {self.variant.parameter: np.full(count, self.strength)}
-        for nuisance in self.variant.nuisances:
-            values[nuisance.name] = np.full(count, self.nuisance.get(nuisance.name, nuisance.middle))
+        values = {name: np.full(count, value) for name, value in self.numbers.items()}
         for i, name in enumerate(self.random):
             # A stream for each test: adding one leaves the others as they were.
             sources = np.random.SeedSequence([seed, _STREAM, place, i]).spawn(count)
@@ -92,10 +95,10 @@ class HiddenEffect:
                     low, high = min(nuisance.grid), max(nuisance.grid)
                 share = np.array([rng.random() for rng in streams])
                 values[name] = low * (high / low) ** share if low > 0 else low + (high - low) * share
-        amplitude, *others = (jnp.asarray(v, dtype=float) for v in values.values())
-        names = [n.name for n in self.variant.nuisances]
-        build: Any = lambda a, *n: self.variant.build(a, **dict(zip(names, n, strict=True)))  # noqa: E731
-        return eqx.filter_vmap(build)(amplitude, *others), values
+        arrays = {name: jnp.asarray(drawn, dtype=float) for name, drawn in values.items()}
+        amplitude = arrays.pop(self.variant.parameter)
+        build: Any = lambda amplitude, further: self.variant.build(amplitude, **further)  # noqa: E731
+        return eqx.filter_vmap(build)(amplitude, arrays), values
 
     @property
     def random(self) -> tuple[str, ...]:
@@ -106,12 +109,11 @@ class HiddenEffect:
 
     def describe(self) -> dict[str, Any]:
         """For the campaign's metadata."""
-        fixed = {n.name: float(self.nuisance.get(n.name, n.middle)) for n in self.variant.nuisances}
+        drawn = [name for name in self.random if name != self.variant.parameter]
         return {
             "mechanism": self.variant.mechanism,
             "variant": self.variant.name,
-            self.variant.parameter: float(self.strength),
-            **{name: value for name, value in fixed.items() if name not in self.random},
+            **{name: float(value) for name, value in self.numbers.items() if name not in drawn},
             "random_per_test": list(self.random),
         }
 
@@ -125,28 +127,21 @@ def read_effect(text: str, library: Mapping[str, Mechanism] = LIBRARY) -> Hidden
     head, *rest = text.split(",")
     name, equals, value = head.partition("=")
     variant = find_variant(name.strip(), library)
-    amplitude = _number(variant.parameter, value) if equals else None
-    nuisance: dict[str, float] = {}
+    given = [(variant.parameter, value)] if equals else []
     for part in rest:
         key, equals, value = (piece.strip() for piece in part.partition("="))
         if not equals:
             raise InputError(f"{part!r} is no parameter=value")
-        if key == variant.parameter:
-            if amplitude is not None:
-                raise InputError(f"{key} is given twice")
-            amplitude = _number(key, value)
-        elif key in nuisance:
+        given.append((key, value))
+    numbers: dict[str, float] = {}
+    for key, value in given:
+        if key in numbers:
             raise InputError(f"{key} is given twice")
-        else:
-            nuisance[key] = _number(key, value)
-    return HiddenEffect(variant, amplitude, nuisance)
-
-
-def _number(name: str, text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise InputError(f"{name} must be a number, got {text!r}") from None
+        try:
+            numbers[key] = float(value)
+        except ValueError:
+            raise InputError(f"{key} must be a number, got {value!r}") from None
+    return HiddenEffect(variant, numbers.pop(variant.parameter, None), numbers)
 
 
 def hidden_effects(effects: Any) -> tuple[HiddenEffect, ...]:

@@ -8,19 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import with_dtype
-from tested import (
-    FORCE,
-    LAW,
-    NAMES,
-    PARTICLE,
-    RECORD,
-    START,
-    VARIANTS,
-    lanes,
-    respond,
-    signature_rows,
-    single,
-)
+from tested import FORCE, LAW, NAMES, PARTICLE, RECORD, START, VARIANTS, lanes, respond, signature_rows, single
 
 from mcc_jax.effects import LIBRARY
 

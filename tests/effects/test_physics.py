@@ -123,10 +123,7 @@ def test_creep_functions_are_those_of_their_names():
 def test_creep_of_a_slow_ramp_is_the_closed_form():
     """Ramp of stress with Kelvin-Voigt and logarithmic creep functions, whatever the sampling."""
     end, amplitude = 100.0, 1e-4
-    exact = {
-        "kelvin_voigt": end - 20 * -np.expm1(-end / 20),
-        "logarithmic": (end + 20) * np.log1p(end / 20) - end,
-    }
+    exact = {"kelvin_voigt": end - 20 * -np.expm1(-end / 20), "logarithmic": (end + 20) * np.log1p(end / 20) - end}
     for points in (3, 40):
         time = filled(np.linspace(0.0, end, points))
         record = clean_record(2.0 * time, time)

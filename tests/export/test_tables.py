@@ -6,14 +6,7 @@ from helpers import FORMS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcc_jax import (
-    InputError,
-    MccLaw,
-    Particle,
-    Plastic,
-    drive,
-    paper_law,
-)
+from mcc_jax import InputError, MccLaw, Particle, Plastic, drive, paper_law
 from mcc_jax.export import curve_tables, golden_table
 
 TOLERANCE = 1e-5

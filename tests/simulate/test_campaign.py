@@ -3,15 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mcc_jax import (
-    Curve,
-    Instrument,
-    MccLaw,
-    Plastic,
-    Programme,
-    paper_campaign,
-    simulate_campaign,
-)
+from mcc_jax import Curve, Instrument, MccLaw, Plastic, Programme, paper_campaign, simulate_campaign
 from mcc_jax.simulate import PAPER_PEAK_STRESS_MPA, law_for_each, paper_population
 
 

@@ -6,16 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mcc_jax import (
-    RESULTS,
-    MccLaw,
-    Particle,
-    Plastic,
-    drive,
-    paper_law,
-    paper_population,
-    simulate_batch,
-)
+from mcc_jax import RESULTS, MccLaw, Particle, Plastic, drive, paper_law, paper_population, simulate_batch
 
 PARTICLE = Particle(213.54, 196.07, 186.33)
 

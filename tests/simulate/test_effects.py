@@ -4,15 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mcc_jax import (
-    HiddenEffect,
-    Instrument,
-    Programme,
-    drive,
-    paper_campaign,
-    paper_law,
-    simulate_batch,
-)
+from mcc_jax import HiddenEffect, Instrument, Programme, drive, paper_campaign, paper_law, simulate_batch
 from mcc_jax.campaign import particle_batch
 from mcc_jax.effects import LIBRARY
 from mcc_jax.geometry import Particle
