@@ -23,7 +23,7 @@ import numpy as np
 
 from ._errors import InputError
 from ._extras import own_version
-from .files import LIMITS, read_regular
+from .files import POSTERIOR_BYTES, read_regular
 
 FORMAT, VERSION = "mcc_jax result", 1
 AGAIN = "Write it again with the command or function that made it, or move it away."
@@ -56,7 +56,7 @@ def read_archive(file: Path) -> Any:
 
     Raises `InputError` if it is missing, cut off, changed, of a newer version, or something else.
     """
-    raw = read_regular(file, LIMITS.posterior_bytes, AGAIN)
+    raw = read_regular(file, POSTERIOR_BYTES, AGAIN)
     try:
         archive = msgspec.msgpack.decode(raw, type=_Archive)
         known = archive.format == FORMAT

@@ -14,7 +14,7 @@ import numpy as np
 from .. import arguments
 from .._errors import InputError
 from .._store import results
-from ..files import LIMITS, FileLimits, open_regular
+from ..files import TABLE_BYTES, open_regular
 from .columns import LENGTH, convert, find_column
 from .curves import PARTICLES, CurveRows, name_column, read_curves
 from .metadata import format_metadata, parse_metadata, read_settings
@@ -26,7 +26,7 @@ from .workbook import is_workbook, read_sheet
 CURVES, METADATA = "curves.csv", "campaign.toml"
 
 
-def read_campaign(folder: str | os.PathLike[str], *, limits: FileLimits = LIMITS) -> Campaign:
+def read_campaign(folder: str | os.PathLike[str]) -> Campaign:
     """Read a campaign folder and check all of it.
 
     Lengths become um, forces mN, times s, whatever units the columns are named with. Rows of different particles
@@ -34,7 +34,6 @@ def read_campaign(folder: str | os.PathLike[str], *, limits: FileLimits = LIMITS
 
     Args:
         folder: the folder that holds `particles.csv`, `curves.csv` and perhaps `campaign.toml`.
-        limits: how large these files may be.
 
     Returns:
         The campaign, with every value finite, every diameter positive and every curve at least two rows long.
@@ -44,9 +43,9 @@ def read_campaign(folder: str | os.PathLike[str], *, limits: FileLimits = LIMITS
     """
     path = arguments.file_path(folder, "folder")
     check_folder(path)
-    table = read_table(path / PARTICLES, limits)
+    table = read_table(path / PARTICLES)
     names, diameters, columns = parse_particles(table)
-    curves = read_curves(path / CURVES, limits).named_as(names)
+    curves = read_curves(path / CURVES).named_as(names)
     _check_match(table, names, curves)
     metadata_file = path / METADATA
     campaign = Campaign(
@@ -54,7 +53,7 @@ def read_campaign(folder: str | os.PathLike[str], *, limits: FileLimits = LIMITS
         diameters_um=diameters,
         curves=tuple(curves.curve(name) for name in names),
         columns=columns,
-        metadata=parse_metadata(_metadata_text(metadata_file, limits), metadata_file),
+        metadata=parse_metadata(_metadata_text(metadata_file), metadata_file),
         source=str(path),
     )
     for name, curve in zip(names, campaign.curves, strict=True):
@@ -95,12 +94,12 @@ def check_folder(path: str | Path) -> None:
             raise InputError(f"{name} is missing", file=path, remedy=remedy)
 
 
-def _metadata_text(file: Path, limits: FileLimits) -> str:
+def _metadata_text(file: Path) -> str:
     """The text of `campaign.toml`; empty if there is none. What has nearly that name, which nobody would look for, is
     refused.
     """
     if os.path.lexists(file):
-        return read_settings(file, limits)
+        return read_settings(file)
     for entry in file.parent.iterdir():
         plain = unicodedata.normalize("NFKC", entry.name).strip().casefold()
         if plain in (METADATA, f"{METADATA}.txt"):
@@ -194,7 +193,7 @@ def file_checksums(folder: str | Path) -> dict[str, str]:
         file = path / name
         if not os.path.lexists(file):
             continue
-        with open_regular(file, LIMITS.table_bytes, "Split the campaign into several folders") as stream:
+        with open_regular(file, TABLE_BYTES, "Split the campaign into several folders") as stream:
             found[name] = hashlib.file_digest(stream, "sha256").hexdigest()
     return found
 

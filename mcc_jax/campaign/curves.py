@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from .._errors import InputError
-from ..files import LIMITS, FileLimits
 from .columns import FORCE, LENGTH, TIME, convert, find_column, missing_column
 from .schema import Curve
 from .table import Table, read_table, same_text
@@ -71,11 +70,11 @@ class CurveRows:
                 raise self.wrong(problem, records[0], "Export the test again or remove the particle", column)
 
 
-def read_curves(file: Path, limits: FileLimits = LIMITS) -> CurveRows:
+def read_curves(file: Path) -> CurveRows:
     """The rows of a file of curves, grouped by particle."""
     import pandas as pd
 
-    table = read_table(file, limits, lambda header: [i for i, _ in _measured(header, file)])
+    table = read_table(file, lambda header: [i for i, _ in _measured(header, file)])
     measured = _measured(table.header, file)
     columns = tuple(i for i, _ in measured)
     values = [convert(raw, factor) for raw, (_, factor) in zip(table.numbers(columns), measured, strict=True)]

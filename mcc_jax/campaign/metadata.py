@@ -15,46 +15,41 @@ import numpy as np
 
 from .. import arguments
 from .._errors import InputError
-from ..files import LIMITS, FileLimits, check_toml, read_regular
+from ..files import SETTINGS_BYTES, read_regular
 from .columns import FORCE, LENGTH, convert, find_column
 from .schema import Control, Metadata
 from .table import decode
 
 _QUANTITIES = {"force_resolution": FORCE, "displacement_resolution": LENGTH, "punch_diameter": LENGTH}
 _WORDS = ("control", "provenance", "corrections")
-_DEEPEST = 100
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 
 def load_toml(text: str, file: Path) -> dict[str, Any]:
     """Parse TOML; the line with a mistake is named."""
-    check_toml(text, file)
     try:
         entries = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
+        long = _long_integer(entries)
+    except RecursionError:
+        raise InputError("is nested too deep", file=file, remedy="Write flat keys") from None
+    except ValueError as error:
         place = re.search(r" \(at line (\d+), column \d+\)", str(error))
         problem = str(error)[: place.start()] if place else str(error).removesuffix(" (at end of document)")
         row = int(place[1]) if place else text.rstrip().count("\n") + 1
         remedy = 'Write key = value lines, text in double quotes, for example control = "load"'
         raise InputError(f"this is not TOML: {problem}", file=file, row=row, remedy=remedy) from None
-    _check_sizes(entries, file)
+    if long is not None:
+        problem = "holds an integer of more than 64 bits"
+        raise InputError(problem, file=file, column=long, remedy="Write it with a decimal point")
     return entries
 
 
-def _check_sizes(value: Any, file: Path, key: str = "", depth: int = 0) -> None:
-    """Refuse what Python reads and then fails on: integers that no float holds, tables too deep to walk through."""
-    if depth > _DEEPEST:
-        raise InputError(f"is nested more than {_DEEPEST} deep", file=file, column=key, remedy="Flatten it")
-    # TOML promises 64 bits only.
-    if isinstance(value, int) and not -(2**63) <= value < 2**63:
-        problem = "holds an integer of more than 64 bits"
-        raise InputError(problem, file=file, column=key, remedy="Write it with a decimal point")
-    if isinstance(value, dict):
-        for name, item in value.items():
-            _check_sizes(item, file, key or name, depth + 1)
-    elif isinstance(value, list):
-        for item in value:
-            _check_sizes(item, file, key, depth + 1)
+def _long_integer(value: Any, key: str = "") -> str | None:
+    """The key of an integer that no float may hold, if there is one; TOML promises 64 bits only."""
+    if isinstance(value, int):
+        return None if -(2**63) <= value < 2**63 else key
+    inside = value.items() if isinstance(value, dict) else [("", v) for v in value] if isinstance(value, list) else ()
+    return next((long for name, v in inside if (long := _long_integer(v, key or name)) is not None), None)
 
 
 def load_toml_file(path: str | Path, what: str) -> dict[str, Any]:
@@ -75,9 +70,9 @@ def load_toml_file(path: str | Path, what: str) -> dict[str, Any]:
     return load_toml(text, file)
 
 
-def read_settings(file: Path, limits: FileLimits = LIMITS) -> str:
+def read_settings(file: Path) -> str:
     """The text of a TOML file, which may be empty."""
-    data = read_regular(file, limits.settings_bytes, "Keep settings alone in it; readings belong in a table")
+    data = read_regular(file, SETTINGS_BYTES, "Keep settings alone in it; readings belong in a table")
     return decode(data, file, "plain text in UTF-8")
 
 

@@ -24,7 +24,7 @@ import msgspec
 import numpy as np
 
 from .._errors import InputError
-from ..files import LIMITS, FileLimits, read_table_bytes
+from ..files import TABLE_BYTES, read_regular
 from .columns import LARGEST_MAGNITUDE
 
 SPACES = " \u00a0\u2007\u2009\u202f"
@@ -55,12 +55,12 @@ def binary_kind(data: bytes) -> str | None:
     return "binary (it holds NUL bytes)" if b"\0" in data else None
 
 
-def read_bytes(file: Path, limits: FileLimits = LIMITS) -> bytes:
+def read_bytes(file: Path) -> bytes:
     """The bytes of a table or a tester's export.
 
     Raises `InputError` if it cannot be read, is empty or too large; see `mcc_jax.files`.
     """
-    data = read_table_bytes(file, limits)
+    data = read_regular(file, TABLE_BYTES, "Split it into several, or thin its readings")
     if not data.strip(b" \t\r\n\xef\xbb\xbf"):
         raise InputError("the file is empty", file=file, remedy="Export it again")
     return data
@@ -417,9 +417,9 @@ def split(text: str, file: Path, delimiter: str, first: int = 1) -> Iterator[Bat
         raise InputError(problem, file=file, row=row, remedy="Close every double quote") from None
 
 
-def read_table(file: Path, limits: FileLimits = LIMITS, numeric: Numeric | None = None) -> Table:
+def read_table(file: Path, numeric: Numeric | None = None) -> Table:
     """Read and split a table; see `read_bytes`, `decode` and `parse_table` for what is refused."""
-    return parse_table(decode(read_bytes(file, limits), file), file, numeric)
+    return parse_table(decode(read_bytes(file), file), file, numeric)
 
 
 def parse_table(text: str, file: Path, numeric: Numeric | None = None) -> Table:

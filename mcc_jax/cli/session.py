@@ -21,7 +21,7 @@ import click
 
 from .._errors import InputError
 from .._store import Stage, json_text
-from ..files import LIMITS, read_regular
+from ..files import RESULT_BYTES, read_regular
 
 if TYPE_CHECKING:
     from ..calibrate import Model
@@ -276,7 +276,7 @@ def listed(result: Path, key: str, pattern: str) -> list[str]:
     """Files that an earlier result names as its own; what is no such result names none."""
     names: Any = None
     with contextlib.suppress(ValueError, KeyError, TypeError, RecursionError):
-        names = json.loads(read_regular(result, LIMITS.result_bytes, ""))[key]
+        names = json.loads(read_regular(result, RESULT_BYTES, ""))[key]
     return [n for n in names if isinstance(n, str) and re.fullmatch(pattern, n)] if isinstance(names, list) else []
 
 

@@ -17,7 +17,7 @@ from .._format import described
 from ..calibrate.results import ARCHIVE, CONTENT, DISCOVERY_ARCHIVE, Calibration, PosteriorDraws, read_saved
 from ..campaign import Campaign, check_tests, file_checksums, read_campaign
 from ..discover import Discovery
-from ..files import LIMITS, read_regular
+from ..files import RESULT_BYTES, read_regular
 
 CALIBRATION, DISCOVERY, CAMPAIGN = CONTENT, "discovery.json", "campaign"
 ARCHIVES = {CALIBRATION: ARCHIVE, DISCOVERY: DISCOVERY_ARCHIVE}
@@ -195,7 +195,7 @@ def _written(file: Path) -> Written:
     """What the JSON of a result says of its making. Raises `InputError` if it is damaged."""
     remedy = "Calibrate or discover again"
     try:
-        return msgspec.json.decode(read_regular(file, LIMITS.result_bytes, remedy), type=Written)
+        return msgspec.json.decode(read_regular(file, RESULT_BYTES, remedy), type=Written)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"is damaged: {error}", file=file, remedy=remedy) from None
 

@@ -259,7 +259,7 @@ def test_unreadable_file(tmp_path, monkeypatch):
     def refuse(*_):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(os, "open", refuse)
+    monkeypatch.setattr(Path, "open", refuse)
     text = message(folder)
     assert "particles.csv: cannot be read: Permission denied" in text
     assert "Check the permissions" in text

@@ -359,22 +359,6 @@ def test_workbooks_that_do_not_fit(tmp_path):
         read_tester_file(tmp_path / "t.txt", mapping=tmp_path / "m.toml", diameters_um=SIZES)
 
 
-def test_a_cell_far_away_does_not_ask_for_the_memory_of_all_before_it(tmp_path):
-    write_book(tmp_path / "x.xlsx", {"a": [HEAD, *rows_of(1)]})
-    with zipfile.ZipFile(tmp_path / "x.xlsx") as archive:
-        parts = {name: archive.read(name) for name in archive.namelist()}
-    sheet = "xl/worksheets/sheet1.xml"
-    parts[sheet] = parts[sheet].replace(
-        b"</sheetData>", b'<row r="1048576"><c r="XFD1048576"><v>1</v></c></row></sheetData>'
-    )
-    with zipfile.ZipFile(tmp_path / "x.xlsx", "w") as archive:
-        for name, content in parts.items():
-            archive.writestr(name, content)
-    (tmp_path / "m.toml").write_text(MAPPING)
-    with pytest.raises(InputError, match="row 1048576 and column 16384, which is too large"):
-        read_tester_file(tmp_path / "x.xlsx", mapping=tmp_path / "m.toml", diameters_um=SIZES)
-
-
 def test_without_the_package_for_workbooks(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "python_calamine", None)
     text = book_told(tmp_path, "", {"a": [HEAD, *rows_of(1)]})

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from mcc_jax._errors import InputError
 from mcc_jax.campaign import read_campaign, read_diameters, read_tester_file, write_campaign
 from mcc_jax.campaign.readers import micromaterials
-from mcc_jax.files import FileLimits
 
 FILES = ("FS1.txt", "Exp-50mN_0000.hld", "RobinSteel0000LC.txt", "multipleIndentations.zip")
 SIZES = [200.0, 190.0, 180.0]
@@ -250,7 +249,7 @@ def bomb() -> bytes:
     [
         (zipped(), "holds no file"),
         (zipped(**{"a.txt": ROWS, "x__a.txt": ROWS}), "two tests are called 'a'"),
-        (zipped(**{"a.txt": zipped(**{"b.txt": ROWS})}), "itself an archive"),
+        (zipped(**{"a.txt": zipped(**{"b.txt": ROWS})}), "no Micro Materials text"),
         (zipped(**{"a.txt": b"hello\n"}), "no Micro Materials text"),
         (zipped(**{"a.txt": ROWS + b"3.000000\tx\t1.000000\n"}), "row 4, column 'h'"),
         (zipped(**{"a.txt": ROWS + b"3.000000\t1.000000"}), "row 4: 2 cells"),
@@ -269,7 +268,7 @@ def test_bad_archives(tmp_path, data, piece):
 
 def test_too_large_archive(tmp_path, monkeypatch):
     (tmp_path / "a.zip").write_bytes(zipped(**{"a.txt": ROWS}))
-    monkeypatch.setattr(micromaterials, "LIMITS", FileLimits(unpacked_bytes=50))
+    monkeypatch.setattr(micromaterials, "UNPACKED_BYTES", 50)
     assert "too large" in message(tmp_path / "a.zip")
 
 

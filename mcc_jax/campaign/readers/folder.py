@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 from ..._errors import InputError
-from ...files import LIMITS, FileLimits
 from ..findings import Finding
 from ..schema import Control, Curve
 from ..table import read_bytes, same_text
@@ -55,7 +54,7 @@ def natural(name: str) -> list[tuple[int, int, str]]:
 
 
 def read_folder(
-    folder: Path, read: Callable[[Path, bytes], Tests], skip: Sequence[str], limits: FileLimits = LIMITS
+    folder: Path, read: Callable[[Path, bytes], Tests], skip: Sequence[str]
 ) -> tuple[Tests, dict[str, tuple[str, ...]], list[Finding]]:
     """The tests of all files of a folder.
 
@@ -75,7 +74,7 @@ def read_folder(
     for file in files:
         try:
             file.name.encode("utf-8")  # a name in another encoding than the system's cannot be written into a file
-            data = read_bytes(file, limits)
+            data = read_bytes(file)
             found[file] = read(file, data)
             same.setdefault(hashlib.sha256(data).hexdigest(), []).append(file)
         except UnicodeEncodeError:

@@ -9,7 +9,6 @@ from typing import Any
 
 from ... import arguments
 from ..._errors import InputError
-from ...files import LIMITS, FileLimits
 from ..findings import Finding
 from ..schema import Campaign, Metadata
 from ..table import binary_kind, read_bytes
@@ -37,7 +36,6 @@ def read_tester_file(
     diameters_um: Diameters | None = None,
     mapping: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | None = None,
     skip: Sequence[str] = (),
-    limits: FileLimits = LIMITS,
 ) -> Campaign:
     """A tester's export, or a folder of exports, as a campaign; the format is told by the content, not by the name.
 
@@ -53,7 +51,6 @@ def read_tester_file(
         mapping: a TOML file that describes the table, see `mcc_jax.campaign.readers.mapping`; or several, for a folder
             with files of several kinds: each file is read by the one that fits it.
         skip: names of files in the folder that are left out; may hold "*", "?".
-        limits: how large a file may be.
 
     Returns:
         The campaign; particles have the tests' names.
@@ -74,12 +71,12 @@ def read_tester_file(
             if one.test_name is not None:
                 problem = "is for one file, not for a folder"
                 raise InputError(problem, file=one.file, column="test_name", remedy="Remove it")
-        tests, keys, findings = read_folder(place, read, skip, limits)
+        tests, keys, findings = read_folder(place, read, skip)
         origin = f"folder {place.resolve().name}, {tests.format}"
     else:
         if skip:
             raise InputError("is a file, so there is nothing to skip", file=place, remedy="Give --skip with a folder")
-        tests = read(place, read_bytes(place, limits))
+        tests = read(place, read_bytes(place))
         alone = names_of(place) if len(tests.curves) == 1 else ()
         keys = {name: (name, *alone) for name in tests.curves}
         origin = f"{place.name}, {tests.format}"
