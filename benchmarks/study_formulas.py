@@ -8,7 +8,7 @@ integrated out, is taken for nature's and out of the library, to first order. Th
 
 - sd: its strength, less than `LAMBDA` where its largest plausible amplitude gives less;
 - left: what the best sibling, over all of its grid, leaves of it, as a share of its square;
-- in the span: how much of that the misfit explains that `discover` gives to the sibling (`Search.misfit_columns`), its
+- in the span: how much of that the misfit explains that `discover` gives to the sibling (`misfit_columns`), its
   coefficients normal with the prior's median size and the amplitude free;
 - rest: what then remains, in sd. Below 3 or so no second name can gain by it.
 Bold: more than 0.2 of the length is left, and less than 90 % of that lies in the span. Formulas whose numbers differ
@@ -31,10 +31,10 @@ from mcc_jax.discover.base import Base, base_fit
 from mcc_jax.discover.candidates import Candidate, candidates_of, located
 from mcc_jax.discover.columns import with_amplitudes
 from mcc_jax.discover.design import design_of
-from mcc_jax.discover.evidence import left_by_particle, visible, without_first
+from mcc_jax.discover.evidence import LinearModel, visible
 from mcc_jax.discover.misfit import coordinates, scaled
+from mcc_jax.discover.misfit_form import misfit_columns
 from mcc_jax.discover.screen import signature_columns
-from mcc_jax.discover.search import Search
 from mcc_jax.discover.settings import DECISIONS
 from mcc_jax.effects import LIBRARY, Variant
 
@@ -70,8 +70,7 @@ def campaign(effects: Sequence[mcc.HiddenEffect] = ()) -> mcc.Campaign:
 def gram(base: Base, columns: Any) -> np.ndarray:
     """Products of columns in units of noise, particles' own numbers and the population integrated out."""
     design = with_amplitudes(design_of(base, base.state), columns)
-    left, _ = left_by_particle(base.hyperparameters, design)
-    return without_first(left.sum(0), design.common.shape[-1])[0][:-1, :-1]
+    return LinearModel(base.hyperparameters, design).shared().information
 
 
 def remaining(products: np.ndarray, precision: np.ndarray) -> float:
@@ -89,13 +88,11 @@ def in_span(
     products = gram(base, columns[..., [k, s]])
     unit = min(LAMBDA / np.sqrt(products[0, 0]), truth.plausible[1] / truth.plausible[0])
     amplitude = unit * products[0, 1] / products[1, 1]
-    first_order = {sibling.mechanism: {name: (0.0, j) for name, j in best.items()}}
-    searching: Any = SimpleNamespace(at=at, screen=SimpleNamespace(columns=columns), first_order=first_order)
-    design, theta = SimpleNamespace(amplitude=columns[..., s : s + 1]), np.array([amplitude * sibling.plausible[0]])
-    fitted: Any = SimpleNamespace(variants=(sibling,), design=design, theta=theta)
+    siblings = {name: columns[..., j] for name, j in best.items()}
+    fitted: Any = SimpleNamespace(variants=(sibling,), curves_um=amplitude * columns[..., s : s + 1])
     here = design_of(base, base.state)
     seen = visible(base.hyperparameters, here, columns[..., s : s + 1])[0]
-    span = seen * Search.misfit_columns(searching, fitted, 0)
+    span = seen * misfit_columns(fitted, 0, at, lambda _: siblings, LIBRARY)
     count = span.shape[-1]
     products = gram(base, np.concatenate([unit * columns[..., [k, s]], span], -1))
     alone = remaining(products[:2, :2], np.zeros(1))
@@ -114,7 +111,10 @@ def rows_of(base: Base, candidates: list[Candidate]) -> list[Row]:
     every = [*at_their_middle(variants), *candidates]
     columns = signature_columns(base, base.state, every)
     at = scaled(
-        {k: np.asarray(x) for k, x in base.each(coordinates, base.state.point, base.forms).items()},
+        {
+            k: np.asarray(x)
+            for k, x in base.each(coordinates, base.state.point, base.forms, base.state.population[0]).items()
+        },
         np.asarray(base.tests.mask),
     )
     products, rows = gram(base, columns), []

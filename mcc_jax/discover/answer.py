@@ -1,4 +1,4 @@
-"""From a search to what is said: effects with their numbers, sets, rankings, residuals, what remains."""
+"""From a search to its answer: effects with their numbers, sets, rankings, residuals, what remains."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.special import softmax
 
 from ..calibrate import Posterior
 from ..calibrate.estimates import estimate, finite, summary
@@ -15,10 +16,10 @@ from .at_peaks import of_modulus_at_peaks
 from .base import Base
 from .columns import Design
 from .design import design_of
-from .evidence import left_by_particle, residual_of, scales_of, solve, whitened
+from .evidence import LinearModel, residual_of, whitened
+from .fit import Fitted
 from .hypothesis import UNLISTED, Hypothesis, Names
-from .own_numbers import OwnNumbers
-from .refine import Refined
+from .random_effects import RandomEffects
 from .result import Effect, Likeness, Residuals
 from .search import Search
 from .settings import AT_PEAKS, DECISIONS, DETECTABLE, POPULATION
@@ -28,19 +29,17 @@ LEAD = 3.0  # log posterior odds from which on what remains next to a name is re
 
 def parameters_alone(base: Base) -> dict[str, Any]:
     """The population's parameters by the law alone, under the model's own noise: those of a calibration."""
-    alone = _population(base, None, design_of(base, base.state), base.hyperparameters)
+    alone = _population(base, None, base.hyperparameters, design_of(base, base.state))
     return _averaged([alone], np.ones(1), len(base.tests))
 
 
 def parameters_with(search: Search, probabilities: Mapping[Names, float]) -> dict[str, Any]:
     """The population's parameters, averaged over hypotheses (Bayesian model averaging, Hoeting et al. 1999).
 
-    Args:
-        search: the hypotheses.
-        probabilities: of those that are averaged over; their sum need not be 1.
+    The sum of the `probabilities` of those that are averaged over need not be 1.
     """
     found = [search.found[names] for names in probabilities]
-    each = [_population(search.base, one.formulas, *one.likely_form()) for one in found]
+    each = [_population(search.base, one.at, *one.likely_form()) for one in found]
     weights = np.array(list(probabilities.values())) / sum(probabilities.values())
     return _averaged(each, weights, len(search.base.tests))
 
@@ -86,13 +85,13 @@ def likely(search: Search) -> dict[Names, float]:
     """The most probable hypotheses that are fitted, as many as hold what a set must."""
     found: dict[Names, float] = {}
     for names, probability in search.posterior().items():
-        if sum(found.values()) < DECISIONS.set_mass and search.found[names].fitted is not None:
+        if sum(found.values()) < DECISIONS.set_mass and search.found[names].at is not None:
             found[names] = probability
     return found
 
 
 def _population(
-    base: Base, formulas: Refined | None, design: Design, free: np.ndarray
+    base: Base, formulas: Fitted | None, hyper: np.ndarray, design: Design
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Means of a, log modulus, log C1, C3, C5 and log modulus at the peaks under a hypothesis, their errors, and the
     spreads of the coefficients.
@@ -100,10 +99,10 @@ def _population(
     Errors are those of the linear model. Where the formulas are off, so is the law that would answer for it: the misfit
     is integrated out, too, and widens the errors (Brynjarsdottir and O'Hagan 2014).
     """
-    solution = solve(free, design)
+    model = LinearModel(hyper, design)
+    solution, covariance, width = model.solve(), model.covariance(), design.common.shape[-1]
     mean, factor = base.population_prior
     beta = mean + factor @ np.asarray(solution.common[:POPULATION])
-    covariance, width = _covariance(design, free), design.common.shape[-1]
     rows = np.zeros((POPULATION + 1, len(covariance)))
     rows[:POPULATION, :POPULATION] = factor
     change, slope = (0.0, np.zeros(0)) if formulas is None else of_modulus_at_peaks(base, formulas, solution)
@@ -114,7 +113,7 @@ def _population(
     sd = np.sqrt(np.diagonal(rows @ covariance @ rows.T))
     at_peaks = beta[1] + change
     beta[2:] -= np.mean(np.log1p(np.maximum(beta[0] * base.flatness, -0.99)))
-    return np.append(beta, at_peaks), sd, np.asarray(scales_of(free, design)[0])[:3]
+    return np.append(beta, at_peaks), sd, model.scales[0][:3]
 
 
 def _quantiles(q: float, weights: np.ndarray, mean: np.ndarray, sd: np.ndarray, freedom: np.ndarray) -> list[float]:
@@ -130,24 +129,16 @@ def _quantiles(q: float, weights: np.ndarray, mean: np.ndarray, sd: np.ndarray, 
     return [root_scalar(below, args=(j,), bracket=(low[j], high[j])).root for j in range(mean.shape[1])]
 
 
-def _covariance(design: Design, free: np.ndarray) -> np.ndarray:
-    """Posterior covariance of the common numbers, the amplitudes integrated out with flat priors."""
-    left = left_by_particle(free, design).gram.sum(0)[:-1, :-1]
-    c = design.common.shape[-1]
-    prior = np.concatenate([np.ones(c), 1 / np.asarray(design.largest) ** 2])
-    return np.linalg.inv(left + np.diag(prior))
-
-
 def effects_of(search: Search, names: Names, probabilities: Mapping[str, float], p_any: float) -> tuple[Effect, ...]:
     """The effects of a hypothesis with their numbers."""
     one = search.found[names]
     own = () if one.own is None else (_of_their_own(one.own, probabilities[one.own.variant.mechanism], p_any),)
-    r = one.formulas
+    r = one.at
     if r is None:
         return ()
-    # As wide as with the misfit and the scatter that the tests prefer, as the parameters beside it are.
-    design, free = one.likely_form()
-    cov, c = _covariance(design, free), design.common.shape[-1]
+    # As wide as with the misfit and the scatter that the tests prefer, as the population's parameters are.
+    hyper, design = one.likely_form()
+    cov, c = LinearModel(hyper, design).covariance(), design.common.shape[-1]
     place, found = len(r.variants), []
     for k, variant in enumerate(r.variants):
         nuisance = {n.name: float(r.theta[place + i]) for i, n in enumerate(variant.nuisances)}
@@ -160,7 +151,7 @@ def effects_of(search: Search, names: Names, probabilities: Mapping[str, float],
     return tuple(sorted((*found, *own), key=lambda e: order[e.mechanism]))
 
 
-def _of_their_own(own: OwnNumbers, probability: float, p_any: float) -> Effect:
+def _of_their_own(own: RandomEffects, probability: float, p_any: float) -> Effect:
     """A mechanism whose amplitude differs from test to test, or sudden steps."""
     unit = own.variant.plausible[0]
     if own.jumps:
@@ -169,7 +160,7 @@ def _of_their_own(own: OwnNumbers, probability: float, p_any: float) -> Effect:
         sd = float(np.sqrt(max(spread, np.mean([j.sd**2 for j in own.jumps])) / len(size)))
         places = {n.name: float(np.median([j.stress_MPa for j in own.jumps])) for n in own.variant.nuisances}
         return Effect(own.variant, places, float(size.mean()), sd, probability, p_any, True, jumps=own.jumps)
-    place, solution = len(own.at.variants), own.at.solution  # its amplitude comes after that of a formula beside it
+    place, solution = len(own.at.variants), own.at.solution  # its amplitude comes after that of a formula
     amplitude, sd = float(solution.amplitude[place]) * unit, float(solution.sd[place]) * unit
     return Effect(own.variant, own.nuisance, amplitude, sd, probability, p_any, True)
 
@@ -198,34 +189,32 @@ def name_probabilities(search: Search) -> dict[str, float]:
 def sets_of(
     search: Search, leader: Names, effects: Sequence[Effect], pairs: Sequence[Names]
 ) -> tuple[tuple[str, ...], ...]:
-    """For each effect the mechanisms that may be in its place, most probable first, itself among them.
+    """For each effect that was added, the mechanisms that may be in its place, most probable first, itself among them.
 
-    Args:
-        search: the hypotheses.
-        leader: names that were added.
-        effects: theirs.
-        pairs: two names each that may be in place of a single one, which come last.
+    Those of `pairs`, two names each that may be in place of a single one, come last.
     """
-    logs = {names: one.log_evidence for names, one in search.found.items()}
+    alike = {names: one for names, one in search.found.items() if len(names) == len(leader) and names != UNLISTED}
     found = []
     for effect in effects:
-        others = [e.mechanism for e in effects if e is not effect]
-        rivals = {}
-        for names, value in logs.items():
-            if len(names) == len(leader) and names != UNLISTED and set(others) <= set(names):
-                (own,) = set(names) - set(others) if set(names) - set(others) else (None,)
-                if own is not None:
-                    rivals[own] = value
-        best = max(rivals.values())
-        weight = {name: float(np.exp(value - best)) for name, value in rivals.items()}
-        total, held, members = sum(weight.values()), 0.0, []
-        for name in sorted(weight, key=lambda n: -weight[n]):
-            members.append(name)
-            held += weight[name] / total
-            if held >= DECISIONS.set_mass:
-                break
+        others = {e.mechanism for e in effects if e is not effect}
+        rivals = {
+            name: one.log_evidence
+            for names, one in alike.items()
+            if others <= set(names)
+            for name in set(names) - others
+        }
+        held, members = 0.0, []
+        for name, share in sorted(_shares(rivals).items(), key=lambda one: -one[1]):
+            if held < DECISIONS.set_mass:
+                members.append(name)
+                held += share
         found.append(tuple(dict.fromkeys([effect.mechanism, *members, *(n for pair in pairs for n in pair)])))
     return tuple(found)
+
+
+def _shares(logs: Mapping[str, float]) -> dict[str, float]:
+    """Probabilities of names among each other, from their log evidences."""
+    return dict(zip(logs, softmax(list(logs.values())).tolist(), strict=True))
 
 
 def instead_of(search: Search, leader: Names) -> tuple[Names, ...]:
@@ -239,9 +228,7 @@ def instead_of(search: Search, leader: Names) -> tuple[Names, ...]:
 def ranking_of(search: Search) -> tuple[dict[str, Any], ...]:
     """Every mechanism alone against the base law, most probable first."""
     logs = {m: search.found[(m,)].log_evidence if (m,) in search.found else -np.inf for m in search.library}
-    best = max(logs.values())
-    weight = {m: float(np.exp(v - best)) for m, v in logs.items()}
-    total = max(sum(weight.values()), 1e-300)
+    probability = _shares(logs)
     own = {m: x for m, x in search.library.items() if m not in search.shared}
     views = [search.screen] if search.screen is not None else []
     if own:
@@ -266,7 +253,7 @@ def ranking_of(search: Search) -> tuple[dict[str, Any], ...]:
                 "detection_limit": finite(float(DETECTABLE / np.sqrt(information[k]) * unit)),
                 "unit": c.variant.unit,
                 "parameter": c.variant.parameter,
-                "probability": weight[c.mechanism] / total,
+                "probability": probability[c.mechanism],
                 "sign": c.variant.sign,
             }
     return tuple(sorted(entries.values(), key=lambda e: -e["probability"]))
@@ -294,12 +281,11 @@ def residuals_of(search: Search, winner: Names | None) -> Residuals:
     base: Base = search.base
     nothing = search.null
     before = residual_of(nothing.solution, nothing.design)
-    fitted = search.found[winner or ()].fitted
+    fitted = search.found[winner or ()].at
     assert fitted is not None
-    design, optimum, solution = fitted
-    after = residual_of(solution, design)
-    white_before, _ = whitened(optimum.free, design, before)
-    white_after, sd = whitened(optimum.free, design, after)
+    after = residual_of(fitted.solution, fitted.design)
+    white_before, _ = whitened(fitted.optimum.hyper, fitted.design, before)
+    white_after, sd = whitened(fitted.optimum.hyper, fitted.design, after)
     mask = np.asarray(base.tests.mask)
     return Residuals(
         np.asarray(base.tests.record.time),

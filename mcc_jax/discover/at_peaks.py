@@ -20,19 +20,13 @@ from ..geometry import Particle
 from .base import Base
 from .design import moved
 from .evidence import Solution
-from .refine import Refined
+from .fit import Fitted
 
 
-def of_modulus_at_peaks(base: Base, formulas: Refined, solution: Solution) -> tuple[float, np.ndarray]:
-    """Mean logarithm of what effects make of the modulus at every test's largest force, and its slopes.
+def of_modulus_at_peaks(base: Base, formulas: Fitted, solution: Solution) -> tuple[float, np.ndarray]:
+    """Mean logarithm of what effects make of the modulus at every test's largest force, and its derivatives.
 
-    Args:
-        base: the tests.
-        formulas: of the effects.
-        solution: their numbers.
-
-    Returns:
-        The mean, and its derivatives by the amplitudes and then by the further numbers, each in units of its column.
+    These are by the amplitudes and then by the further numbers, each in units of its column.
     """
     variants, names = formulas.variants, len(formulas.variants)
     forms, state = Forms(base.model.unloading, variants), formulas.state

@@ -27,15 +27,10 @@ BLOCK = 8  # particles that are linearised at once: one program for any number o
 
 
 class State(eqx.Module):
-    """Where a hypothesis is linear.
+    """Where a hypothesis is linearised."""
 
-    Attributes:
-        point: every particle's numbers, its zero, and those of the effects.
-        population: a, log modulus, and the means of b1, b3, b5 at the campaign's average shape.
-    """
-
-    point: Point
-    population: Float[Array, " 5"]
+    point: Point  # every particle's numbers, its zero, and those of the effects
+    population: Float[Array, " 5"]  # a, log modulus, and the means of b1, b3, b5 at the campaign's average shape
 
     def with_numbers(self, numbers: np.ndarray) -> State:
         """The same with numbers of effects, the same for all particles."""
@@ -45,34 +40,20 @@ class State(eqx.Module):
 
 @dataclass(frozen=True)
 class Base:
-    """The tests, what is assumed, and the base law at its fit.
-
-    Attributes:
-        campaign: the tests that took part in the search.
-        selection: which of their points.
-        model: without effects; the modulus may scatter between particles.
-        tests: as arrays.
-        scale: each particle's own factor on the noise [-].
-        state: where the base law fits.
-        hyperparameters: logarithms of the noise's four numbers, coordinates of the spreads of b1, b3, b5 and e.
-        converged: whether noise and population did.
-        threshold_MPa: stress below which points do not count [MPa].
-        coarse: whether few readings of each branch are compared, see `base_fit`.
-        rms_um, range_um: of every test, residuals of the particle's own fit and range of displacement [um].
-    """
+    """The tests that take part, what is assumed, and the base law at its fit."""
 
     campaign: Campaign
-    selection: Selection
-    model: Model
+    selection: Selection  # which points of the tests
+    model: Model  # without effects; the modulus may scatter between particles
     tests: Tests
-    scale: np.ndarray
-    state: State
-    hyperparameters: np.ndarray
-    converged: bool
-    threshold_MPa: float
-    coarse: bool
-    rms_um: np.ndarray
-    range_um: np.ndarray
+    scale: np.ndarray  # each particle's own factor on the noise [-]
+    state: State  # where the base law fits
+    hyperparameters: np.ndarray  # logs of the noise's four numbers, coordinates of the spreads of b1, b3, b5 and e
+    converged: bool  # whether noise and population did
+    threshold_MPa: float  # stress below which points do not count
+    coarse: bool  # whether few readings of each branch are compared, see `base_fit`
+    rms_um: np.ndarray  # residual of each particle's own fit
+    range_um: np.ndarray  # of the displacement of every test
 
     @property
     def forms(self) -> Forms:
@@ -157,7 +138,7 @@ def base_fit(campaign: Campaign, model: Model, *, threshold_MPa: float, tell: Ca
     """Fit the base law to a campaign.
 
     Of a material that the law was not made for, and does not fit, only some readings of each branch are compared: what
-    is left is every particle's own over a good part of its branch, so that neighbouring readings say the same, and
+    is left is every particle's own over a good part of its branch, so that neighbouring readings agree, and
     hundreds of them would decide by how smooth they are. That is a coarsened posterior (Miller and Dunson 2019, J. Am.
     Stat. Assoc. 114, 1113).
 
@@ -198,6 +179,6 @@ def base_fit(campaign: Campaign, model: Model, *, threshold_MPa: float, tell: Ca
         float(SpreadCoordinate(prior).coordinate(max(float(tau), 1e-4)))
         for prior, tau in zip(base.spreads, spreads, strict=True)
     ]
-    # Where a spread is nil its coordinate has no slope: begin a little beside it.
+    # Where a spread is zero its coordinate has no slope: begin a little above it.
     logs = np.asarray(fit.noise.noise.logs)
     return replace(base, hyperparameters=np.concatenate([logs, np.maximum(x, 0.3)]))

@@ -3,32 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.special import logsumexp
 
 from ..calibrate.distributions import SCALES
 from .columns import with_amplitudes
-from .evidence import left_by_particle
+from .evidence import LinearModel, marginalise
 from .screen import single_integrals
 from .search import Search
 from .settings import DECISIONS, POPULATION
 
 CAMPAIGNS = 400  # drawn for the p value: its standard error at a level of 0.05 is 0.011
 PLACES_OF_STEPS = 24  # of a sudden step in each test
-
-
-class Scores(NamedTuple):
-    """Scores of columns in every particle, its own numbers integrated out.
-
-    Attributes:
-        gram: information, shape (N, c, c); the population's columns come first.
-        score: shape (N, c).
-    """
-
-    gram: np.ndarray
-    score: np.ndarray
 
 
 class _Statistic:
@@ -38,23 +26,19 @@ class _Statistic:
         design, screen = search.null.design, search.screen
         basis, parts = search.discrepancy.basis, search.discrepancy.group
         self.parts = np.array(parts)
-        own, self.own_names, self.own_ratio = [], [], []
-        for name in search.library:
-            if name not in search.shared and not search.library[name].sudden:
-                candidates, columns = search.formulas_of({name})
-                own.append(columns)
-                self.own_names += [name] * len(candidates)
-                self.own_ratio += [c.variant.plausible[1] / c.variant.plausible[0] for c in candidates]
+        own, of_own = search.formulas_of([name for name in search.not_shared if not search.library[name].sudden])
+        self.own_names = [c.mechanism for c in own]
+        self.own_ratio = [c.variant.plausible[1] / c.variant.plausible[0] for c in own]
         sudden = next((m.variants[0] for m in search.library.values() if m.sudden), None)
         steps = np.zeros((*basis.shape[:2], 0)) if sudden is None else self._steps(search, sudden.plausible[0])
         formulas = np.zeros((*basis.shape[:2], 0)) if screen is None else screen.columns
-        self.counts = [POPULATION, formulas.shape[-1], basis.shape[-1], len(self.own_names), steps.shape[-1]]
-        every = np.concatenate([design.common[..., :POPULATION], formulas, basis, *own, steps], -1)
+        self.counts = [POPULATION, formulas.shape[-1], basis.shape[-1], len(own), steps.shape[-1]]
+        every = np.concatenate([design.common[..., :POPULATION], formulas, basis, of_own, steps], -1)
         nothing = with_amplitudes(replace(design, common=every[..., :0], group=design.group[:0]), every)
-        left = left_by_particle(search.null.optimum.free, nothing).gram
-        self.scores = Scores(left[:, :-1, :-1], left[:, :-1, -1])
+        particles = LinearModel(search.null.optimum.hyper, nothing).particles
+        self.gram, self.score = particles.information, particles.score  # of every particle; the population's come first
         self.library = len(search.library)
-        self.unit = float(DECISIONS.general * np.exp(search.null.optimum.free[0]))
+        self.unit = float(DECISIONS.general * np.exp(search.null.optimum.hyper[0]))
         self.ratio_of_steps = 1.0 if sudden is None else sudden.plausible[1] / sudden.plausible[0]
         if screen is not None:
             self.signs, self.largest = screen.signs, screen.largest
@@ -78,12 +62,11 @@ class _Statistic:
     def __call__(self, score: np.ndarray) -> np.ndarray:
         """Log evidence ratios of campaigns, from scores of shape (campaigns, N, columns)."""
         _, formulas, _, own, steps = np.split(np.arange(score.shape[-1]), np.cumsum(self.counts)[:-1])
-        gram, shared = self.scores.gram, np.arange(sum(self.counts[:3]))
-        G, f = gram[:, shared[:, None], shared].sum(0), len(formulas)
-        inner = np.linalg.inv(np.eye(POPULATION) + G[:POPULATION, :POPULATION])
-        total = score[..., shared].sum(1)
-        s = total[:, POPULATION:] - total[:, :POPULATION] @ inner @ G[:POPULATION, POPULATION:]
-        G = G[POPULATION:, POPULATION:] - G[POPULATION:, :POPULATION] @ inner @ G[:POPULATION, POPULATION:]
+        gram, shared, f = self.gram, np.arange(sum(self.counts[:3])), len(formulas)
+        whole, total = gram[:, shared[:, None], shared].sum(0), score[..., shared].sum(1)
+        inner = np.linalg.inv(np.eye(POPULATION) + whole[:POPULATION, :POPULATION])
+        law = marginalise(whole, POPULATION)
+        G, s = law.schur, total[:, POPULATION:] - total[:, :POPULATION] @ law.weights.T
         logs: list[Any] = []
         prior = -float(np.log(self.library))
         if f:
@@ -125,9 +108,8 @@ def p_anything(search: Search, seed: int) -> float:
     as their covariance.
     """
     statistic = _Statistic(search)
-    gram, score = statistic.scores
-    values, vectors = np.linalg.eigh(gram)
+    values, vectors = np.linalg.eigh(statistic.gram)
     root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
-    normal = np.random.default_rng([seed, 41]).standard_normal((CAMPAIGNS, *score.shape))
+    normal = np.random.default_rng([seed, 41]).standard_normal((CAMPAIGNS, *statistic.score.shape))
     drawn = statistic(np.einsum("ncd,mnd->mnc", root, normal, optimize=True))
-    return (1 + int(np.sum(drawn >= statistic(score[None])[0]))) / (1 + CAMPAIGNS)
+    return (1 + int(np.sum(drawn >= statistic(statistic.score[None])[0]))) / (1 + CAMPAIGNS)

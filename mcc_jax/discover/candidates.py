@@ -8,21 +8,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..effects import AbstractEffect, Mechanism, Need, Variant
+from ..effects import AbstractEffect, Mechanism, Need, Nuisance, Variant
+from ..law import PUNCH_AREA
+from .base import Base
 
 # Values tried of a number that differs from test to test.
 LOCATIONS = 32  # of a place between two that lie far apart, which must be met closely
 PHASES = 14  # of a phase
 
+PUNCH = "punch_radius_um"
+
 
 @dataclass(frozen=True)
 class Candidate:
-    """One formula with fixed nuisance parameters, of which only the amplitude is unknown.
-
-    Attributes:
-        variant: the formula.
-        nuisance: its further parameters.
-    """
+    """One formula with fixed nuisance parameters, of which only the amplitude is unknown."""
 
     variant: Variant
     nuisance: Mapping[str, float]
@@ -33,19 +32,9 @@ class Candidate:
         return self.variant.mechanism
 
     @property
-    def between_particles(self) -> bool:
-        """Whether the effect shows by how particles differ, and in none of them alone."""
-        return bool({Need.SEVERAL_SIZES, Need.SEVERAL_SHAPES, Need.HUMIDITY_COLUMN} & set(self.variant.needs))
-
-    @property
     def effect(self) -> AbstractEffect:
         """The effect at amplitude zero."""
         return self.variant.build(0.0, **self.nuisance)
-
-    @property
-    def unit_amplitude(self) -> float:
-        """The largest amplitude one would believe: the natural unit of the search."""
-        return self.variant.plausible[1]
 
 
 def candidates_of(library: Mapping[str, Mechanism]) -> tuple[Candidate, ...]:
@@ -73,12 +62,7 @@ def _grid(variant: Variant) -> list[dict[str, float]]:
 def untestable(
     library: Mapping[str, Mechanism], present: frozenset[Need]
 ) -> tuple[dict[str, Mechanism], list[dict[str, str]]]:
-    """What is left of a library where the data hold less than some formulas need, and what the others wait for.
-
-    Returns:
-        The library with those mechanisms and variants whose needs are met; for each mechanism of which nothing is left,
-        its name and what it needs.
-    """
+    """The mechanisms and variants whose needs the data meet; name and needs of each mechanism that has none."""
     testable: dict[str, Mechanism] = {}
     missing = []
     for name, mechanism in library.items():
@@ -90,8 +74,39 @@ def untestable(
     return testable, missing
 
 
+def without_punch(library: Mapping[str, Mechanism], base: Base) -> dict[str, Mechanism]:
+    """The library without the finite width of the punch, unless a contact grows wider than the punch is known to be.
+
+    A formula that knows neither would be nothing but another name for the compliance of the frame.
+    """
+    diameter = base.campaign.metadata.punch_diameter_um
+    tests = base.tests
+    size = np.asarray(tests.effective_diameter)
+    travel = np.where(np.asarray(tests.mask), np.asarray(tests.displacement), -np.inf).max(1) - np.asarray(
+        base.state.point.zero
+    )
+    widest = float(np.max(np.sqrt(PUNCH_AREA * size * np.maximum(travel, 0.0))))
+    outgrown = diameter is not None and 2 * widest > diameter
+
+    def known(variant: Variant) -> Variant | None:
+        if not any(n.name == PUNCH for n in variant.nuisances):
+            return variant
+        if not outgrown or diameter is None:
+            return None
+        radius = Nuisance(PUNCH, (diameter / 2,), (diameter / 2, diameter / 2), "radius of the flat punch, as recorded")
+        others = tuple(n for n in variant.nuisances if n.name != PUNCH)
+        return replace(variant, nuisances=(*others, radius))
+
+    kept = {}
+    for name, mechanism in library.items():
+        variants = tuple(v for v in map(known, mechanism.variants) if v is not None)
+        if variants:
+            kept[name] = replace(mechanism, variants=variants)
+    return kept
+
+
 def _words(variants: Sequence[Variant], present: frozenset[Need]) -> str:
-    """What the variant that lacks least is waiting for."""
+    """What the variant that lacks least needs."""
     lacking = min((set(v.needs) - present for v in variants), key=len)
     return " and ".join(sorted(need.value for need in lacking))
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from .._format import described
-from .columns import Design, with_amplitudes, without_misfits
-from .evidence import left_by_particle, scales_of, without_first
+from .columns import with_amplitudes, without_misfits
+from .evidence import LinearModel
 from .hypothesis import UNLISTED
 from .search import Search
 from .settings import HYPERPARAMETERS, WAVES
@@ -32,16 +32,10 @@ LETTERS = {
 
 @dataclass(frozen=True)
 class Term:
-    """A term of a formula: a function of one coordinate.
-
-    Attributes:
-        coordinate: which one.
-        text: as it is printed.
-        function: its value.
-    """
+    """A term of a formula: a function of one coordinate."""
 
     coordinate: str
-    text: str
+    text: str  # as it is printed
     function: Callable[[np.ndarray], np.ndarray]
 
 
@@ -118,13 +112,8 @@ def _rounded(x: float, digits: int = 2) -> float:
 
 
 def closure(search: Search, seed: int) -> Closure:
-    """Curve and formula of the smooth discrepancy that was found.
-
-    Args:
-        search: whose leading hypothesis it is.
-        seed: of the resamples of particles.
-    """
-    smooth = search.found[UNLISTED].smooth
+    """Curve and formula of the smooth discrepancy that was found; `seed` is that of the resamples of particles."""
+    smooth = search.found[UNLISTED].at
     assert smooth is not None
     tests = search.base.tests
     mask, size = np.asarray(tests.mask), np.asarray(tests.effective_diameter)
@@ -134,19 +123,15 @@ def closure(search: Search, seed: int) -> Closure:
     values = np.stack([t.function(natural[t.coordinate]) * size[:, None] for t in terms], -1)
     values = np.where(mask[..., None], values, 0.0)
     scale = np.maximum(np.sqrt((values**2).mean((0, 1))), 1e-300)
-    law, free = without_misfits(smooth.at.design), smooth.at.optimum.free[:HYPERPARAMETERS]
-    curve = smooth.curve_um[..., None]
+    law, hyper = without_misfits(smooth.design), smooth.optimum.hyper[:HYPERPARAMETERS]
+    curve = search.discrepancy.curve_um(smooth)[..., None]
     known = np.zeros((*curve.shape[:2], 0)) if search.screen is None else search.screen.columns
     every = np.concatenate([values / scale, curve, known], -1)
-    left = left_by_particle(free, with_amplitudes(law, every)).gram
-    T = len(terms)
-    everyone = np.arange(len(left))
-    chosen, weights = _best_terms(left, law.common.shape[-1], T, everyone)
+    model, T = LinearModel(hyper, with_amplitudes(law, every)), len(terms)
+    everyone = np.arange(len(size))
+    chosen, weights = _best_terms(model, T, everyone)
     rng = np.random.default_rng([seed, 47])
-    again = [
-        terms[_best_terms(left, law.common.shape[-1], T, rng.choice(everyone, len(everyone)), one=True)[0][0]]
-        for _ in range(20)
-    ]
+    again = [terms[_best_terms(model, T, rng.choice(everyone, len(everyone)), one=True)[0][0]] for _ in range(20)]
     name = terms[chosen[0]].coordinate
     x = np.linspace(*span[name], POINTS)
     texts = [f"{_rounded(w / scale[k]):+g} {terms[k].text}" for k, w in zip(chosen, weights, strict=True)]
@@ -160,25 +145,19 @@ def closure(search: Search, seed: int) -> Closure:
         added,
         sd,
         float(np.mean([t.coordinate == name for t in again])),
-        _resembling(search, left, law.common.shape[-1], T),
+        _resembling(search, model, T),
         span,
         curve[..., 0],
-        _held_out(smooth.at.design, smooth.at.optimum.free, smooth.basis),
+        _held_out(LinearModel(smooth.optimum.hyper, smooth.design), search.discrepancy.basis),
     )
 
 
-def _shared(left: np.ndarray, common: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Information and scores of the amplitudes, what all particles share integrated out."""
-    total, _ = without_first(left[rows].sum(0), common)
-    return total[:-1, :-1], total[:-1, -1]
-
-
 def _best_terms(
-    left: np.ndarray, common: int, count: int, rows: np.ndarray, *, one: bool = False
+    model: LinearModel, count: int, rows: np.ndarray, *, one: bool = False
 ) -> tuple[tuple[int, ...], np.ndarray]:
-    """The term, or the two, that explain most, and their weights."""
-    G, s = _shared(left, common, rows)
-    G, s = G[:count, :count], s[:count]
+    """The term, or the two, that explain most in some particles, and their weights."""
+    shared = model.shared(rows)
+    G, s = shared.information[:count, :count], shared.score[:count]
     power = np.maximum(np.diagonal(G), 1e-300)
     single = s**2 / power
     first = int(np.argmax(single))
@@ -197,11 +176,11 @@ def _best_terms(
     return two, w
 
 
-def _resembling(search: Search, left: np.ndarray, common: int, place: int) -> tuple[tuple[str, float], ...]:
+def _resembling(search: Search, model: LinearModel, place: int) -> tuple[tuple[str, float], ...]:
     """Mechanisms whose projected signatures are like the curve's, with the cosine, best first."""
     if search.screen is None:
         return ()
-    G, _ = _shared(left, common, np.arange(len(left)))
+    G = model.shared().information
     own = max(G[place, place], 1e-300)
     cosine = G[place, place + 1 :] / np.sqrt(own * np.maximum(np.diagonal(G)[place + 1 :], 1e-300))
     signs = search.screen.signs
@@ -214,7 +193,7 @@ def _resembling(search: Search, left: np.ndarray, common: int, place: int) -> tu
 
 def _along(search: Search, name: str, x: np.ndarray, span: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
     """The discrepancy as a function of one coordinate, in units of strain, and its standard error."""
-    smooth = search.found[UNLISTED].smooth
+    smooth = search.found[UNLISTED].at
     assert smooth is not None
     tests, N = search.base.tests, 2 * WAVES
     size = np.asarray(tests.effective_diameter)
@@ -225,26 +204,18 @@ def _along(search: Search, name: str, x: np.ndarray, span: tuple[float, float]) 
 
     basis = functions(at) * size[:, None, None] / np.sqrt(N)
     basis = np.where(np.asarray(tests.mask)[..., None], basis, 0.0)
-    law, free = without_misfits(smooth.at.design), smooth.at.optimum.free[:HYPERPARAMETERS]
-    left = left_by_particle(free, with_amplitudes(law, basis))
-    total, _ = without_first(left.gram.sum(0), law.common.shape[-1])
-    G, s = total[:-1, :-1], total[:-1, -1]
+    law, hyper = without_misfits(smooth.design), smooth.optimum.hyper[:HYPERPARAMETERS]
+    shared = LinearModel(hyper, with_amplitudes(law, basis)).shared()
     # Weights have the size that the smooth discrepancy was found to have, in units of strain.
-    unit = float(np.sqrt(np.mean((smooth.curve_um / size[:, None])[np.asarray(tests.mask)] ** 2)))
-    covariance = np.linalg.inv(G + np.eye(len(G)) / max(unit, 1e-12) ** 2)
+    unit = float(np.sqrt(np.mean((search.discrepancy.curve_um(smooth) / size[:, None])[np.asarray(tests.mask)] ** 2)))
+    covariance = np.linalg.inv(shared.information + np.eye(N - 1) / max(unit, 1e-12) ** 2)
     there = functions((x - span[0]) / max(span[1] - span[0], 1e-300)) / np.sqrt(N)
     sd = np.sqrt(np.maximum(np.einsum("xk,kl,xl->x", there, covariance, there), 0.0))
-    return there @ (covariance @ s), sd
+    return there @ (covariance @ shared.score), sd
 
 
-def _held_out(design: Design, free: np.ndarray, basis: np.ndarray) -> np.ndarray:
+def _held_out(model: LinearModel, basis: np.ndarray) -> np.ndarray:
     """What the discrepancy adds to every test by the weights that the others make [um]."""
-    left = left_by_particle(free, design).gram
-    _, common = scales_of(free, design)
-    total, c = left.sum(0), design.common.shape[-1]
-    found = []
-    for i, own in enumerate(left):
-        others = total - own
-        numbers = np.linalg.solve(others[:c, :c] + np.eye(c), others[:c, -1]) * common
-        found.append(basis[i] @ numbers[design.of_misfits])
-    return np.array(found)
+    every, misfits = np.arange(len(basis)), model.design.of_misfits
+    weights = [model.numbers(np.delete(every, i))[0][misfits] * model.scales[1][misfits] for i in every]
+    return np.einsum("npc,nc->np", basis, np.array(weights))

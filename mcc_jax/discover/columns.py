@@ -1,7 +1,7 @@
-"""The columns of a hypothesis, and what is left of them once the noise is taken out.
+"""The design matrix of a hypothesis, and its whitening.
 
-The noise's filter is all that is compiled of a hypothesis's evidence: for a few columns at a time, so that one program
-serves all hypotheses.
+Of a hypothesis's evidence only the noise's filter is compiled: for a few columns at a time, so that one program serves
+all hypotheses.
 """
 
 from __future__ import annotations
@@ -29,34 +29,20 @@ ENTRIES = 270_000  # numbers that these hold together, about, so that they stay 
 
 @dataclass(frozen=True)
 class Design:
-    """The columns of a hypothesis around a state, every number in units of its prior's standard deviation.
-
-    Attributes:
-        tests, linear: the tests, and how noise of force moves them.
-        own: columns of each particle's own numbers: b1, b3, b5, e (per unit), the zero, further ones.
-        common: of what all particles share: the population's five, further numbers of effects, misfits.
-        amplitude: of the amplitudes, per unit of `unit`.
-        data: what is explained [um].
-        scale: each particle's own factor on the noise.
-        group: which scale a common column has: 0 where it is fixed at 1, else its place among `misfits`.
-        noise: prior of the four numbers of the noise: means and standard deviations of the logarithms, shape (2, 4).
-        largest: largest scale of each amplitude's prior in its unit, over the smallest, which is the unit.
-        spreads: scale and shape of the priors of the spreads of b1, b3, b5, e and of further own numbers.
-        misfits: of the logarithm of each misfit's scale: median, standard deviation, and the most it can be.
-    """
+    """The design matrix of a hypothesis around a state, every number in units of its prior's standard deviation."""
 
     tests: Tests
-    linear: Linear
-    own: Float[np.ndarray, "particles points o"]
-    common: Float[np.ndarray, "particles points c"]
-    amplitude: Float[np.ndarray, "particles points k"]
-    data: Float[np.ndarray, "particles points"]
-    scale: Float[np.ndarray, " particles"]
-    group: np.ndarray
-    noise: Float[np.ndarray, "2 4"]
-    largest: Float[np.ndarray, " k"]
+    linear: Linear  # how noise of force moves the tests
+    own: Float[np.ndarray, "particles points o"]  # of random effects: b1, b3, b5, e (per unit), the zero, further ones
+    common: Float[np.ndarray, "particles points c"]  # of the population's five, further numbers of effects, misfits
+    amplitude: Float[np.ndarray, "particles points k"]  # of effects, per smallest plausible amplitude
+    data: Float[np.ndarray, "particles points"]  # what is explained [um]
+    scale: Float[np.ndarray, " particles"]  # each particle's own factor on the noise
+    group: np.ndarray  # which scale a common column has: 0 where it is fixed at 1, else its place among `misfits`
+    noise: Float[np.ndarray, "2 4"]  # prior of the noise's four numbers: means and sds of their logarithms
+    largest: Float[np.ndarray, " k"]  # largest scale of each amplitude's prior over the smallest, which is the unit
     sign: Float[np.ndarray, " k"]
-    misfits: Float[np.ndarray, "g 3"]
+    misfits: Float[np.ndarray, "g 3"]  # of the logarithm of each misfit's scale: median, sd, and the most it can be
     kinds: Kinds
 
     @cached_property
@@ -72,14 +58,9 @@ class Design:
 
 @dataclass(frozen=True)
 class Kinds:
-    """Of what kind noise and spreads are.
+    """Of what kind noise and spreads are."""
 
-    Attributes:
-        spreads: priors of the spreads of b1, b3, b5, e, and of further own numbers.
-        correlation, along: of the noise.
-    """
-
-    spreads: tuple[Any, ...]
+    spreads: tuple[Any, ...]  # priors of the spreads of b1, b3, b5, e, and of further own numbers
     correlation: Correlation
     along: Along
 
@@ -97,7 +78,7 @@ def prior_of_noise(model: Model) -> np.ndarray:
 
 
 def with_amplitudes(design: Design, columns: np.ndarray) -> Design:
-    """The design with other amplitudes, of either sign, whose priors nobody asks for."""
+    """The design with other amplitudes, of either sign, whose priors are not used."""
     count = columns.shape[-1]
     return replace(design, amplitude=np.asarray(columns), sign=np.zeros(count), largest=np.ones(count))
 
@@ -114,19 +95,12 @@ def without_misfits(design: Design) -> Design:
 
 
 class White(NamedTuple):
-    """Columns freed of the noise.
-
-    Attributes:
-        columns: independent and of variance 1.
-        log_density: of the noise at 0.
-        reading: sum of squares that reading a display alone brings about.
-        sd: of each point given those before it.
-    """
+    """Whitened columns: their noise is independent from point to point and of variance 1."""
 
     columns: Any
-    log_density: Any
-    reading: Any
-    sd: Any
+    log_density: Any  # of the noise at 0
+    reading: Any  # sum of squares that reading a display alone brings about
+    sd: Any  # of each point given those before it
 
 
 @compiled
@@ -158,7 +132,7 @@ def slope_of(weights: tuple[Array, Array, Array], logs: Float[Array, " 4"], *giv
 
 @dataclass(frozen=True)
 class Whitened:
-    """Whitened columns, padding included: the first of them are `some` of `count` columns, the others are nil."""
+    """Whitened columns with padding: the first of them are `some` of `count` columns, the others are zero."""
 
     white: White
     some: np.ndarray
@@ -175,7 +149,7 @@ class Whitened:
 
 
 class Columns:
-    """Columns of a design cut into pieces of one shape; those of nothing are left out."""
+    """Columns of a design cut into pieces of one shape; columns of zeros are left out."""
 
     def __init__(self, columns: np.ndarray, design: Design) -> None:
         self.shape = columns.shape
@@ -192,43 +166,43 @@ class Columns:
             tests = replace(tests, path=tests.record.time)
         self.arrays, self.correlation = (jnp.asarray(design.scale), tests, design.linear), kinds.correlation
 
-    def _given(self, free: np.ndarray, piece: Array) -> tuple[Any, ...]:
-        return jnp.asarray(free[:4]), *self.arrays, piece, self.correlation
+    def _given(self, hyper: np.ndarray, piece: Array) -> tuple[Any, ...]:
+        return jnp.asarray(hyper[:4]), *self.arrays, piece, self.correlation
 
-    def _whitened(self, free: np.ndarray) -> Whitened:
+    def _whitened(self, hyper: np.ndarray) -> Whitened:
         """At the hyperparameters; those of the last call are kept, since most are asked for more than once."""
-        noise = np.asarray(free[:4], float).tobytes()
+        noise = np.asarray(hyper[:4], float).tobytes()
         last = self._last  # another thread may put its own in place meanwhile
         if last is not None and last[0] == noise:
             return last[1]
-        found = [jax.tree.map(np.asarray, white_of(*self._given(free, piece))) for piece in self.pieces]
+        found = [jax.tree.map(np.asarray, white_of(*self._given(hyper, piece))) for piece in self.pieces]
         columns = found[0].columns if len(found) == 1 else np.concatenate([one.columns for one in found], -1)
         white = Whitened(found[0]._replace(columns=columns), self.some, self.shape[2])
         self._last = noise, white
         return white
 
-    def white(self, free: np.ndarray) -> White:
+    def white(self, hyper: np.ndarray) -> White:
         """Whitened at the hyperparameters."""
-        white = self._whitened(free).white
+        white = self._whitened(hyper).white
         columns = np.zeros(self.shape)
         columns[..., self.some] = white.columns[..., : len(self.some)]
         return white._replace(columns=columns)
 
-    def gram(self, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def gram(self, hyper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Gram matrix of every particle's whitened columns, the readings' squares with the data's; log density of the
         noise at 0."""
-        white = self._whitened(free)
+        white = self._whitened(hyper)
         return white.gram, white.white.log_density
 
-    def slope(self, free: np.ndarray, of_gram: np.ndarray) -> np.ndarray:
+    def slope(self, hyper: np.ndarray, of_gram: np.ndarray) -> np.ndarray:
         """Derivatives of something by the noise's numbers, from those by the Gram matrices; the noise's log density is
         part of it."""
-        white, k = self._whitened(free).white.columns, len(self.some)
+        white, k = self._whitened(hyper).white.columns, len(self.some)
         padded = np.zeros((self.shape[0], white.shape[-1], white.shape[-1]))
         padded[:, :k, :k] = 2 * of_gram[:, self.some[:, None], self.some]
         weights, ones, total = np.split(white @ padded, len(self.pieces), -1), np.ones(self.shape[0]), np.zeros(4)
         for piece, weight in zip(self.pieces, weights, strict=True):
             of_white = (jnp.asarray(weight), jnp.asarray(ones), jnp.asarray(of_gram[:, -1, -1] * ones))
-            total += np.asarray(slope_of(of_white, *self._given(free, piece)))
+            total += np.asarray(slope_of(of_white, *self._given(hyper, piece)))
             ones = 0.0 * ones  # density and readings count once
         return total

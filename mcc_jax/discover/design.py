@@ -1,9 +1,9 @@
-"""The columns of a hypothesis around a state, and where the state moves to."""
+"""The design matrix of a hypothesis around a state, and where the state moves to."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -34,53 +34,37 @@ def particle_means(beta: Float[Array, " 5"], flatness: Array, power: float) -> F
 
 
 @compiled
-def base_columns(
-    latent: Array,
-    population: Array,
-    flatness: Array,
-    own: Array,
-    residual: Array,
-    prior: tuple[Array, Array],
-    power: float,
-) -> tuple[Array, Array]:
-    """Columns of the population, and the data less what the priors' means say, from a test's own columns."""
-    mean, factor = prior
-    at = particle_means(population, flatness, power)
-    slope = jax.jacfwd(lambda b: particle_means(b, flatness, power))(population)
-    columns = jnp.einsum("npk,nkb,bc->npc", own, slope, factor)
-    away = at + jnp.einsum("nkb,b->nk", slope, mean - population) - latent
-    return columns, residual - jnp.einsum("npk,nk->np", own, away)
+def means_and_slope(beta: Float[Array, " 5"], flatness: Array, power: float) -> tuple[Array, Array]:
+    """Means of the particles' b1, b3, b5, e, and their derivatives by the population."""
+    return particle_means(beta, flatness, power), jax.jacfwd(lambda b: particle_means(b, flatness, power))(beta)
+
+
+def linear_means(base: Base, state: State) -> tuple[np.ndarray, np.ndarray]:
+    """`means_and_slope` at a state, as arrays of NumPy."""
+    at, slope = means_and_slope(state.population, jnp.asarray(base.flatness), base.model.shape_power)
+    return np.asarray(at), np.asarray(slope)
 
 
 @dataclass(frozen=True)
-class More:
-    """Columns of a hypothesis besides those of its formulas.
+class ExtraColumns:
+    """Columns of a hypothesis in addition to those of its formulas."""
 
-    Attributes:
-        own, own_spreads: of numbers that every test has of its own, and the priors of their spreads.
-        amplitude, largest, sign: of further amplitudes in units of the smallest plausible one, the largest of each in
-            that unit, and its physical sign.
-        basis: of misfits.
-        group: which misfit each of these columns belongs to, from 1 on.
-        sizes: of the logarithm of each misfit's size: median, standard deviation, and the most it can be.
-    """
-
-    own: np.ndarray | None = None
-    own_spreads: tuple[Any, ...] = ()
-    amplitude: np.ndarray | None = None
-    largest: tuple[float, ...] = ()
+    own: np.ndarray | None = None  # of numbers that every test has of its own
+    own_spreads: tuple[Any, ...] = ()  # the priors of their spreads
+    amplitude: np.ndarray | None = None  # of further amplitudes in units of the smallest plausible one
+    largest: tuple[float, ...] = ()  # plausible amplitude of each in that unit
     sign: tuple[int, ...] = ()
-    basis: np.ndarray | None = None
-    group: Sequence[int] = ()
-    sizes: Sequence[tuple[float, float, float]] = field(default=())
+    basis: np.ndarray | None = None  # of misfits
+    group: Sequence[int] = ()  # which misfit each of these columns belongs to, from 1 on
+    sizes: Sequence[tuple[float, float, float]] = ()  # of the logarithm of each one's size: median, sd, the most
 
-    def with_own(self, columns: np.ndarray, spreads: Sequence[Any]) -> More:
-        """Further numbers that every test has of its own, beside those there are."""
+    def with_own(self, columns: np.ndarray, spreads: Sequence[Any]) -> ExtraColumns:
+        """Further numbers that every test has of its own, in addition."""
         own = columns if self.own is None else np.concatenate([self.own, columns], -1)
         return replace(self, own=own, own_spreads=(*self.own_spreads, *spreads))
 
 
-NOTHING_MORE = More()
+NO_EXTRA = ExtraColumns()
 
 
 def linear_at(base: Base, state: State, variants: tuple[Variant, ...]) -> Linear:
@@ -92,7 +76,7 @@ def design_of(
     base: Base,
     state: State,
     variants: tuple[Variant, ...] = (),
-    more: More = NOTHING_MORE,
+    more: ExtraColumns = NO_EXTRA,
     linear: Linear | None = None,
 ) -> Design:
     """The design of a hypothesis around a state, from the tests linearised there if they are already."""
@@ -100,38 +84,34 @@ def design_of(
     linear = linear_at(base, state, variants) if linear is None else linear
     point, columns = state.point, np.asarray(linear.columns)
     of_particle, effect = columns[..., :4], columns[..., 4:]
-    population, data = base_columns(
-        point.latent,
-        state.population,
-        jnp.asarray(base.flatness),
-        linear.columns[..., :4],
-        linear.residual,
-        (jnp.asarray(middle), jnp.asarray(factor)),
-        model.shape_power,
-    )
+    at, slope = linear_means(base, state)
+    population = of_particle @ (slope @ factor)
+    # The data less what the priors' means say.
+    away = at + slope @ (middle - np.asarray(state.population)) - np.asarray(point.latent)
+    data = np.asarray(linear.residual) - np.einsum("npk,nk->np", of_particle, away)
     zero_mean, zero_sd = base.zero_prior
     ones = np.where(tests.mask, 1.0, 0.0)
-    data = np.asarray(data) - (np.asarray(tests.contact) + zero_mean - np.asarray(point.zero))[:, None] * ones
+    data = data - (np.asarray(tests.contact) + zero_mean - np.asarray(point.zero))[:, None] * ones
     own = [of_particle, (zero_sd * ones)[..., None], *([] if more.own is None else [more.own])]
     K, theta = len(variants), np.asarray(point.theta)
     units = np.array([v.plausible[0] for v in variants])
     amplitude = [effect[..., :K] * units, *([] if more.amplitude is None else [more.amplitude])]
     data = data + np.einsum("npk,nk->np", effect[..., :K], theta[:, :K])
-    common, place = [np.asarray(population)], K
+    common, place = [population], K
     for v in variants:
         for n in v.nuisances:
             mean, sd = nuisance_moments(n)
-            at, column = theta[0, place], effect[..., place]
+            now, column = theta[0, place], effect[..., place]
             if n.plausible[0] > 0:
-                column, at = column * at, np.log(at)
-            data = data - column * (mean - at)
+                column, now = column * now, np.log(now)
+            data = data - column * (mean - now)
             common.append((sd * column)[..., None])
             place += 1
     shared = np.concatenate([*common, *([] if more.basis is None else [more.basis])], -1)
     largest = [*(v.plausible[1] / v.plausible[0] for v in variants), *more.largest]
     return Design(
         tests,
-        replace(linear, columns=linear.columns[..., :0]),  # they stand in the design: one shape for all formulas
+        replace(linear, columns=linear.columns[..., :0]),  # they are part of the design: one shape for all formulas
         np.concatenate(own, -1),
         shared,
         np.concatenate(amplitude, -1),
@@ -149,13 +129,12 @@ def design_of(
 def moved(base: Base, state: State, variants: tuple[Variant, ...], solution: Solution) -> State:
     """The state at a solution, or on the way there: no positive number moves by more than a factor of e.
 
-    All numbers go the same share of the way, since an amplitude that is right at the solution is wrong beside further
-    numbers that stayed behind. Further numbers of an effect whose amplitude is zero stay: nothing tells of them there.
+    All numbers go the same share of the way, since an amplitude that is right at the solution is wrong with further
+    numbers that stayed behind. Further numbers of an effect whose amplitude is zero stay: the data say nothing of them.
     """
-    tests, model = base.tests, base.model
-    mean, factor = base.population_prior
+    tests, (mean, factor) = base.tests, base.population_prior
     beta = mean + factor @ solution.common[:POPULATION]
-    at, slope = map(np.asarray, means_and_slope(state.population, jnp.asarray(base.flatness), model.shape_power))
+    at, slope = linear_means(base, state)
     latent = at + slope @ (beta - np.asarray(state.population)) + solution.own[:, :4]
     zero_mean, zero_sd = base.zero_prior
     zero = np.asarray(tests.contact) + zero_mean + zero_sd * solution.own[:, 4]
@@ -179,12 +158,6 @@ def moved(base: Base, state: State, variants: tuple[Variant, ...], solution: Sol
 
     there = State(Point(jnp.asarray(latent), jnp.asarray(zero), state.point.theta), jnp.asarray(beta))
     return between(state, there, share).with_numbers(numbers)
-
-
-@compiled
-def means_and_slope(beta: Float[Array, " 5"], flatness: Array, power: float) -> tuple[Array, Array]:
-    """Means of the particles' b1, b3, b5, e, and their derivatives by the population."""
-    return particle_means(beta, flatness, power), jax.jacfwd(lambda b: particle_means(b, flatness, power))(beta)
 
 
 def at_priors(base: Base, rows: np.ndarray) -> State:

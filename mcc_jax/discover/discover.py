@@ -23,26 +23,10 @@ from ..campaign import Campaign, Finding, available_data, campaign_findings, che
 from ..campaign.findings import named
 from ..campaign.force_zero import open_zero
 from ..effects import LIBRARY, Mechanism
-from .answer import (
-    checks_of,
-    effects_of,
-    instead_of,
-    leader_of,
-    leads_of,
-    likely,
-    likeness_of,
-    name_probabilities,
-    parameters_alone,
-    parameters_with,
-    ranking_of,
-    residuals_of,
-    sets_of,
-    with_draws,
-)
-from .applicability import without_punch
+from . import answer
 from .base import Base, base_fit
 from .bootstrap import p_anything
-from .candidates import located, untestable
+from .candidates import located, untestable, without_punch
 from .closure import closure
 from .experiments import next_experiments
 from .heldout import held_out
@@ -76,7 +60,7 @@ def discover(
 
     Hypotheses are models: nothing is missing; one mechanism, or two, in a formula of the library or one near it; or
     something that no mechanism explains. Their log marginal likelihoods and stated prior odds decide. A verdict other
-    than NO_GAP needs, besides, that so much evidence of anything at all would not come about by chance.
+    than NO_GAP also needs that so much evidence of anything at all would not come about by chance.
 
     Args:
         campaign: the tests.
@@ -85,8 +69,8 @@ def discover(
         exclude: names of mechanisms to leave out.
         threshold_MPa: points below this stress do not count [MPa]. All count by default, unlike in a calibration: what
             surface asperities do is an effect of its own, and at low load many effects show most.
-        confirm: choose and fit once more without each particle, and see how far that particle is then from the law.
-        experiments: work out which further test would tell the members of a set apart.
+        confirm: choose and fit again without each particle, and see how far that particle is then from the law.
+        experiments: work out which further test would separate the members of a set.
         posterior: sample the posterior of the law with what was found; without it, amplitudes and parameters come with
             the standard errors of the linear model.
         seed: of the bootstrap and the sampler.
@@ -120,7 +104,7 @@ def discover(
         explained = _not_tared(campaign, search, begun, seed, tell)
         search, p_any, missing, left_out = explained or (search, p_any, missing, left_out)
     base, findings = search.base, (*findings, *left_out)
-    ranking = ranking_of(search)
+    ranking = answer.ranking_of(search)
     found = Discovery(
         "NO_GAP",
         "",
@@ -131,13 +115,13 @@ def discover(
         ranking=ranking,
         untestable=tuple(missing),
         p_any=p_any,
-        parameters_before=parameters_alone(base),
+        parameters_before=answer.parameters_alone(base),
         notes=_notes(base),
-        likeness=likeness_of(search, (), ranking),
+        likeness=answer.likeness_of(search, (), ranking),
     )
     if not _is_gap(search, p_any):
         return _finished(_of_law_alone(found, search), findings, started)
-    winner = leader_of(search).names
+    winner = answer.leader_of(search).names
     if confirm and base.holds_out:
         tell("held-out particles")
         held = held_out(search, winner)
@@ -147,10 +131,10 @@ def discover(
         if objection is not None:
             return _finished(_taken_back(_of_law_alone(found, search), winner, objection), findings, started)
     found = _named(found, search, known, tell)
-    apart = [e.mechanism for e in found.effects if located(e.variant)]
-    if apart:
+    separate = [e.mechanism for e in found.effects if located(e.variant)]
+    if separate:
         note = (
-            f"{', '.join(apart)} differs from test to test: it is no part of the model found, and amplitudes and "
+            f"{', '.join(separate)} differs from test to test: it is no part of the model found, and amplitudes and "
             "parameters are those of the linear model at its optimum"
         )
         found = replace(found, notes=(*found.notes, note))
@@ -164,11 +148,7 @@ def discover(
 
 
 def _searched(library: Mapping[str, Mechanism] | None, exclude: Sequence[str]) -> dict[str, Mechanism]:
-    """The mechanisms to look for.
-
-    Raises:
-        InputError: for a name that is not in the library.
-    """
+    """The mechanisms to look for."""
     if isinstance(exclude, str) or not isinstance(exclude, Iterable):
         remedy = f"Write exclude=({exclude!r},)." if isinstance(exclude, str) else None
         raise InputError(f"exclude must be a list of names, got {arguments.kind_of(exclude)}", remedy=remedy)
@@ -189,11 +169,7 @@ def _begun(
     threshold_MPa: float,
     tell: Tell,
 ) -> _Begun:
-    """The search with the law alone in it, what these tests cannot say, and what was left out.
-
-    Raises:
-        InputError: if no particle can be used, or no mechanism is left to look for.
-    """
+    """The search with the law alone in it, what these tests cannot say, and what was left out."""
     base, left_out = _settled_fit(campaign, findings, model, threshold_MPa, tell)
     known = without_punch(known, base)
     testable, missing = untestable(known, available_data(campaign))
@@ -255,47 +231,47 @@ def _settled_fit(
     for physics. They take no part in the search.
     """
     unsafe = tuple(dict.fromkeys(name for one in findings if one.level == "error" for name in one.particles))
-    told = []
+    left_out = []
     if unsafe and len(unsafe) < len(campaign):
         text = f"{named(unsafe, len(campaign))}: cannot be relied on, as said above; no part in the search"
-        told.append(Finding("left out", "warning", text, "", unsafe))
+        left_out.append(Finding("left out", "warning", text, "", unsafe))
         campaign = campaign.without(*unsafe)
     base = base_fit(campaign, model, threshold_MPa=threshold_MPa, tell=tell)
     outlying, snapping = unlike_others(base.names, base.rms_um, base.range_um), base.snapping
     without: tuple[str, ...] = ()
     if outlying is not None:
-        told.append(replace(outlying, sentence=f"{outlying.sentence}; it takes no part in the search"))
+        left_out.append(replace(outlying, sentence=f"{outlying.sentence}; it takes no part in the search"))
         without = outlying.particles
     left = len(base.tests) - len({*snapping, *without})
     if snapping and not base.coarse and left >= JUDGEMENT.left:
         text = f"{named(snapping, len(campaign))}: the law snaps through in its loading; it takes no part in the search"
-        told.append(Finding("snap-through", "info", text, "", snapping))
+        left_out.append(Finding("snap-through", "info", text, "", snapping))
         without = (*without, *(name for name in snapping if name not in without))
     if without:
         base = base_fit(campaign.without(*without), model, threshold_MPa=threshold_MPa, tell=tell)
-    return base, told
+    return base, left_out
 
 
 def _named(found: Discovery, search: Search, known: Mapping[str, Mechanism], tell: Tell) -> Discovery:
     """The answer with the leading hypothesis: effects or a formula, where, and what it did to the parameters."""
-    leader = leader_of(search)
+    leader = answer.leader_of(search)
     winner: Names = leader.names
-    left = residuals_of(search, winner)
+    left = answer.residuals_of(search, winner)
     map_ = places(search.base, difference(left.before, left.after, left.used))
     found = replace(
         found,
         residuals=left,
         places=map_,
         where=tuple(where(search.base, map_)),
-        parameters_after=parameters_with(search, likely(search)),
-        leads=leads_of(search, winner),
+        parameters_after=answer.parameters_with(search, answer.likely(search)),
+        leads=answer.leads_of(search, winner),
     )
     if winner == UNLISTED:
         tell("a formula of its own")
         return replace(found, verdict="UNLISTED", closure=closure(search, found.seed))
-    effects = effects_of(search, winner, name_probabilities(search), found.p_any)
-    pairs = instead_of(search, winner)
-    sets = sets_of(search, winner, effects, pairs)
+    effects = answer.effects_of(search, winner, answer.name_probabilities(search), found.p_any)
+    pairs = answer.instead_of(search, winner)
+    sets = answer.sets_of(search, winner, effects, pairs)
     model = found.model
     assert model is not None
     model = model.with_effects(*(e.variant for e in effects if not located(e.variant)))
@@ -306,14 +282,14 @@ def _named(found: Discovery, search: Search, known: Mapping[str, Mechanism], tel
         effects=effects,
         candidate_set=sets,
         pairs=pairs,
-        checks=checks_of(known, sets),
-        likeness=likeness_of(search, sets, found.ranking),
+        checks=answer.checks_of(known, sets),
+        likeness=answer.likeness_of(search, sets, found.ranking),
     )
 
 
 def _of_law_alone(found: Discovery, search: Search) -> Discovery:
     """The answer with what the law alone leaves, and where."""
-    left = residuals_of(search, None)
+    left = answer.residuals_of(search, None)
     return replace(found, residuals=left, places=places(search.base, difference(left.before, None, left.used)))
 
 
@@ -332,7 +308,7 @@ def _taken_back(found: Discovery, winner: Names, objection: str) -> Discovery:
 def _sampled(found: Discovery, search: Search, threshold_MPa: float, seed: int, tell: Tell) -> Discovery:
     """The answer with the posterior of the law with effects, if it may be believed."""
     tell("posterior of the law with effects")
-    base, fitted = search.base, leader_of(search).best
+    base, fitted = search.base, answer.leader_of(search).at
     same = fitted is not None and found.model is not None and fitted.variants == found.model.effects
     drawn: Posterior = sample(
         base.campaign,
@@ -349,11 +325,11 @@ def _sampled(found: Discovery, search: Search, threshold_MPa: float, seed: int, 
             "parameters are those of the linear model at its optimum"
         )
         return replace(found, posterior=drawn, notes=(*found.notes, note))
-    answer: dict[str, Any] = {k: v for k, v in drawn.answer().items() if k != "converged"}
+    parameters: dict[str, Any] = {k: v for k, v in drawn.answer().items() if k != "converged"}
     linear = found.parameters_after
     same = linear[AT_PEAKS]["value"] == linear["effective_modulus_MPa"]["value"]
-    answer[AT_PEAKS] = answer["effective_modulus_MPa"] if same else linear[AT_PEAKS]
-    effects: tuple[Effect, ...] = tuple(with_draws(effect, drawn) for effect in found.effects)
+    parameters[AT_PEAKS] = parameters["effective_modulus_MPa"] if same else linear[AT_PEAKS]
+    effects: tuple[Effect, ...] = tuple(answer.with_draws(effect, drawn) for effect in found.effects)
     if found.verdict == "SET" or any(effect.misfit for effect in effects):
         # The draws take the leading formula for true: their errors would be too small.
         note = (
@@ -361,7 +337,7 @@ def _sampled(found: Discovery, search: Search, threshold_MPa: float, seed: int, 
             "posterior's draws take the formula as it stands"
         )
         return replace(found, posterior=drawn, effects=effects, notes=(*found.notes, note))
-    return replace(found, posterior=drawn, effects=effects, parameters_after=answer)
+    return replace(found, posterior=drawn, effects=effects, parameters_after=parameters)
 
 
 def _notes(base: Base) -> tuple[str, ...]:

@@ -32,13 +32,6 @@ ITERATIONS = 40  # of L-BFGS at most
 ASIDE = 0.1  # how far from the mode slopes are compared for its curvature, in expected standard deviations
 
 
-class Left(NamedTuple):
-    """What the particles leave: Gram matrices of the common columns, the amplitudes and the data, and log integrals."""
-
-    gram: Float[np.ndarray, "particles r r"]
-    log_integral: Float[np.ndarray, " particles"]
-
-
 class Spreads(NamedTuple):
     """Spreads at their coordinates and the log densities of the coordinates, of either sign together, with slopes."""
 
@@ -66,19 +59,19 @@ def spreads_of(x: np.ndarray, priors: tuple[Any, ...]) -> Spreads:
     return Spreads(value, slope, log_prob, np.tanh(x) - value / sd**2 * slope)
 
 
-def scales_of(free: np.ndarray, design: Design) -> tuple[np.ndarray, np.ndarray]:
+def scales_of(hyper: np.ndarray, design: Design) -> tuple[np.ndarray, np.ndarray]:
     """Scales of the own columns and of the common ones, at the hyperparameters.
 
     They are logarithms of the noise's four numbers, the spreads' coordinates, and logarithms of the misfits' scales.
     """
     spreads = design.kinds.spreads
-    tau = spreads_of(free[4 : 4 + len(spreads)], spreads).value
-    misfit = np.append(1.0, np.exp(free[4 + len(spreads) :]))
+    tau = spreads_of(hyper[4 : 4 + len(spreads)], spreads).value
+    misfit = np.append(1.0, np.exp(hyper[4 + len(spreads) :]))
     return np.concatenate([tau[:4], [1.0], tau[4:]]), misfit[design.group]
 
 
-def _factor(free: np.ndarray, design: Design) -> np.ndarray:
-    return np.concatenate([*scales_of(free, design), np.ones(design.amplitude.shape[-1] + 1)])
+def _factor(hyper: np.ndarray, design: Design) -> np.ndarray:
+    return np.concatenate([*scales_of(hyper, design), np.ones(design.amplitude.shape[-1] + 1)])
 
 
 def _scaled(form: np.ndarray, factor: np.ndarray) -> np.ndarray:
@@ -86,68 +79,53 @@ def _scaled(form: np.ndarray, factor: np.ndarray) -> np.ndarray:
     return form * factor * factor[:, None]
 
 
-def _gram(free: np.ndarray, design: Design) -> tuple[np.ndarray, np.ndarray]:
-    """Gram matrix of every particle's scaled columns; log density of the noise at 0."""
-    gram, log_density = design.columns.gram(free)
-    return _scaled(gram, _factor(free, design)), log_density
-
-
-def left_by_particle(free: np.ndarray, design: Design) -> Left:
-    """Integrate every particle's own numbers out."""
-    gram, log_density = _gram(free, design)
-    left, log_integral = without_first(gram, design.own.shape[-1])
-    return Left(left, log_integral + log_density)
-
-
 def _root(matrix: np.ndarray) -> np.ndarray:
-    """The lower root of positive definite matrices; no numbers where they are none."""
+    """The Cholesky factor of positive definite matrices; not a number where one is not positive definite."""
     try:
         return np.linalg.cholesky(matrix)
     except np.linalg.LinAlgError:
         return np.full(matrix.shape, np.nan)
 
 
-class Integrated(NamedTuple):
-    """What is left of quadratic forms after the first numbers, which are standard normal, are integrated out.
+class Marginalised(NamedTuple):
+    """Quadratic forms of columns and data after their first numbers, standard normal, are integrated out."""
 
-    Attributes:
-        left: the form in the others.
-        log_integral: what the integral adds.
-        root: of the precision of the first numbers.
-        weights: how they answer to the others.
-    """
-
-    left: np.ndarray
+    schur: np.ndarray  # the form in the other numbers and the data: the Schur complement
     log_integral: Any
-    root: np.ndarray
-    weights: np.ndarray
+    root: np.ndarray  # of the precision of the first numbers
+    weights: np.ndarray  # of the first numbers' means on the others
 
-    def slope(self, of_left: np.ndarray) -> np.ndarray:
-        """Derivatives by the form before, of something and the log integral, from those by what is left."""
+    @property
+    def information(self) -> np.ndarray:
+        """Information on the other numbers."""
+        return self.schur[..., :-1, :-1]
+
+    @property
+    def score(self) -> np.ndarray:
+        """Scores of the other numbers at zero."""
+        return self.schur[..., :-1, -1]
+
+    def slope(self, of_schur: np.ndarray) -> np.ndarray:
+        """Derivatives by the whole form, of something plus the log integral, from those of something by `schur`."""
         down = -np.swapaxes(self.weights, -1, -2)
-        beside = down @ of_left
+        cross = down @ of_schur
         eye = np.eye(self.root.shape[-1])
         half = np.linalg.solve(self.root, np.broadcast_to(eye, self.root.shape))
-        inner = beside @ np.swapaxes(down, -1, -2) - 0.5 * np.swapaxes(half, -1, -2) @ half
-        outer = np.broadcast_to(of_left, (*inner.shape[:-2], *of_left.shape[-2:]))
+        inner = cross @ np.swapaxes(down, -1, -2) - 0.5 * np.swapaxes(half, -1, -2) @ half
+        outer = np.broadcast_to(of_schur, (*inner.shape[:-2], *of_schur.shape[-2:]))
         return np.concatenate(
-            [np.concatenate([inner, beside], -1), np.concatenate([np.swapaxes(beside, -1, -2), outer], -1)], -2
+            [np.concatenate([inner, cross], -1), np.concatenate([np.swapaxes(cross, -1, -2), outer], -1)], -2
         )
 
 
-def _integrated(gram: np.ndarray, count: int) -> Integrated:
+def marginalise(gram: np.ndarray, count: int) -> Marginalised:
+    """Integrate the first numbers out, which are standard normal."""
     root = _root(gram[..., :count, :count] + np.eye(count))
     half = np.linalg.solve(root, gram[..., :count, count:])
-    turned = np.swapaxes(half, -1, -2)
+    schur = gram[..., count:, count:] - np.swapaxes(half, -1, -2) @ half
     log_integral = -np.sum(np.log(np.diagonal(root, axis1=-2, axis2=-1)), -1)
     weights = np.swapaxes(np.linalg.solve(np.swapaxes(root, -1, -2), half), -1, -2)
-    return Integrated(gram[..., count:, count:] - turned @ half, log_integral, root, weights)
-
-
-def without_first(gram: np.ndarray, count: int) -> tuple[np.ndarray, Any]:
-    """Integrate the first columns out, whose numbers are standard normal: what is left of the form, log integral."""
-    found = _integrated(gram, count)
-    return found.left, found.log_integral
+    return Marginalised(schur, log_integral, root, weights)
 
 
 class Amplitudes(NamedTuple):
@@ -193,45 +171,46 @@ def amplitudes(left: np.ndarray, sign: np.ndarray, largest: np.ndarray) -> Ampli
     return Amplitudes(total - count * float(np.log(SCALES)) - 0.5 * left[-1, -1], mean[best], sd[best], slope)
 
 
-def log_prior(free: np.ndarray, design: Design) -> float:
-    """Log prior of the hyperparameters, of a spread's coordinate of either sign together."""
-    return _prior(free, design)[0]
-
-
-def _prior(free: np.ndarray, design: Design) -> tuple[float, np.ndarray]:
-    """The log prior and its derivatives."""
+def log_prior(hyper: np.ndarray, design: Design) -> tuple[float, np.ndarray]:
+    """Log prior of the hyperparameters, and its derivatives; of a spread's coordinate of either sign together."""
     count = 4 + len(design.kinds.spreads)
-    spreads = spreads_of(free[4:count], design.kinds.spreads)
+    spreads = spreads_of(hyper[4:count], design.kinds.spreads)
     means = np.concatenate([design.noise[0], design.misfits[:, 0]])
     sds = np.concatenate([design.noise[1], design.misfits[:, 1]])
-    z = (np.concatenate([free[:4], free[count:]]) - means) / sds
+    z = (np.concatenate([hyper[:4], hyper[count:]]) - means) / sds
     normal, slope = -0.5 * z**2 - np.log(sds) - 0.5 * LOG_2PI, -z / sds
     each = np.concatenate([normal[:4], spreads.log_prob, normal[4:]])
     slopes = np.concatenate([slope[:4], spreads.log_prob_slope, slope[4:]])
     return float(np.sum(each)), slopes
 
 
-def value_and_gradient(free: np.ndarray, design: Design, *, of_noise: bool = True) -> tuple[float, np.ndarray]:
+def _of_shared(gram: np.ndarray, design: Design) -> tuple[float, float, np.ndarray]:
+    """Log integrals over common numbers and over amplitudes, and the derivatives of their sum by the scaled form."""
+    shared = marginalise(gram, design.common.shape[-1])
+    effects = amplitudes(shared.schur, design.sign, design.largest)
+    return shared.log_integral, effects.log_integral, shared.slope(effects.slope)
+
+
+def value_and_gradient(hyper: np.ndarray, design: Design, *, of_noise: bool = True) -> tuple[float, np.ndarray]:
     """Log marginal likelihood at the hyperparameters, times their prior, and its derivatives.
 
-    Those by the noise's four numbers cost more than all else; without `of_noise` they lack the likelihood's part.
+    Those by the noise's four numbers cost more than all others; without `of_noise` they lack the likelihood's part.
     """
     spreads, o, c = design.kinds.spreads, design.own.shape[-1], design.common.shape[-1]
     with np.errstate(all="ignore"):  # of steps into numbers beyond arithmetic
-        plain, log_density = design.columns.gram(free)
-        factor = _factor(free, design)
+        plain, log_density = design.columns.gram(hyper)
+        factor = _factor(hyper, design)
         gram = _scaled(plain, factor)
-        by_particle = _integrated(gram, o)
-        shared = _integrated(by_particle.left.sum(0), c)
-        effects = amplitudes(shared.left, design.sign, design.largest)
-        prior, slope = _prior(free, design)
+        by_particle = marginalise(gram, o)
+        common, effects, of_schur = _of_shared(by_particle.schur.sum(0), design)
+        prior, slope = log_prior(hyper, design)
         integrals = by_particle.log_integral + log_density
-        value = float(integrals.sum() + shared.log_integral) + effects.log_integral + prior
-        of_gram = by_particle.slope(shared.slope(effects.slope))
+        value = float(integrals.sum() + common) + effects + prior
+        of_gram = by_particle.slope(of_schur)
         if of_noise:
-            slope[:4] += design.columns.slope(free, _scaled(of_gram, factor))
+            slope[:4] += design.columns.slope(hyper, _scaled(of_gram, factor))
         of_log = 2 * np.sum(of_gram * gram, (0, 2))  # derivatives by the logarithms of the columns' scales
-        spread = spreads_of(free[4 : 4 + len(spreads)], spreads)
+        spread = spreads_of(hyper[4 : 4 + len(spreads)], spreads)
         own = np.delete(of_log[:o], 4)
         slope[4 : 4 + len(spreads)] += own * spread.slope / np.maximum(spread.value, 1e-300)
         slope[4 + len(spreads) :] += np.bincount(design.group, of_log[o : o + c], len(design.misfits) + 1)[1:]
@@ -241,109 +220,116 @@ def value_and_gradient(free: np.ndarray, design: Design, *, of_noise: bool = Tru
 class OfMisfits:
     """The log joint density as a function of the misfits' scales alone: at fixed noise and spreads it costs nothing."""
 
-    def __init__(self, free: np.ndarray, design: Design) -> None:
+    def __init__(self, hyper: np.ndarray, design: Design) -> None:
         o, c = design.own.shape[-1], design.common.shape[-1]
-        self.design, self.fixed = design, free[: 4 + len(design.kinds.spreads)]
-        gram, log_density = design.columns.gram(free)
-        factor = _factor(free, design)
+        self.design, self.fixed = design, hyper[: 4 + len(design.kinds.spreads)]
+        gram, log_density = design.columns.gram(hyper)
+        factor = _factor(hyper, design)
         factor[o : o + c] = 1.0
-        by_particle = _integrated(_scaled(gram, factor), o)
-        self.gram, self.integrals = by_particle.left.sum(0), float((by_particle.log_integral + log_density).sum())
+        by_particle = marginalise(_scaled(gram, factor), o)
+        self.gram, self.integrals = by_particle.schur.sum(0), float((by_particle.log_integral + log_density).sum())
 
     def __call__(self, logs: np.ndarray) -> tuple[float, np.ndarray]:
         """Value and derivatives at the logarithms of the scales."""
         design, c = self.design, self.design.common.shape[-1]
-        free = np.concatenate([self.fixed, logs])
+        hyper = np.concatenate([self.fixed, logs])
         factor = np.ones(len(self.gram))
-        factor[:c] = scales_of(free, design)[1]
+        factor[:c] = scales_of(hyper, design)[1]
         with np.errstate(all="ignore"):
             gram = _scaled(self.gram, factor)
-            shared = _integrated(gram, c)
-            effects = amplitudes(shared.left, design.sign, design.largest)
-            prior, slope = _prior(free, design)
-            of_log = 2 * np.sum(shared.slope(effects.slope) * gram, 0)[:c]
-        value = self.integrals + float(shared.log_integral) + effects.log_integral + prior
+            common, effects, of_gram = _of_shared(gram, design)
+            prior, slope = log_prior(hyper, design)
+            of_log = 2 * np.sum(of_gram * gram, 0)[:c]
+        value = self.integrals + float(common) + effects + prior
         return value, slope[len(self.fixed) :] + np.bincount(design.group, of_log, len(logs) + 1)[1:]
 
 
-def log_joint(free: np.ndarray, design: Design) -> float:
-    """Log marginal likelihood at the hyperparameters, times their prior."""
-    left = left_by_particle(free, design)
-    gram, integral = without_first(left.gram.sum(0), design.common.shape[-1])
-    effects = amplitudes(gram, design.sign, design.largest)
-    return float(left.log_integral.sum() + integral) + effects.log_integral + log_prior(free, design)
-
-
-def with_little_noise(free: np.ndarray) -> np.ndarray:
-    """Hyperparameters with correlated noise that has not swallowed a gap."""
-    at = free.copy()
-    at[2] += np.log(LITTLE)
-    return at
-
-
 class Solution(NamedTuple):
-    """Posterior means at the hyperparameters.
-
-    Attributes:
-        own: of every particle's own numbers, in units of `Design.own`.
-        common: of what all share, in units of `Design.common`.
-        amplitude, sd: of the amplitudes.
-    """
+    """Posterior means at the hyperparameters, in units of the columns of the design."""
 
     own: Float[np.ndarray, "particles o"]
     common: Float[np.ndarray, " c"]
     amplitude: Float[np.ndarray, " k"]
-    sd: Float[np.ndarray, " k"]
+    sd: Float[np.ndarray, " k"]  # of the amplitudes
 
 
-def solve(free: np.ndarray, design: Design) -> Solution:
-    """Posterior means of all numbers, an amplitude of a forbidden sign at zero."""
-    own, common = scales_of(free, design)
-    o, c = design.own.shape[-1], design.common.shape[-1]
-    by_particle = _integrated(_gram(free, design)[0], o)
-    shared = _integrated(by_particle.left.sum(0), c)
-    _, theta, sd, _ = amplitudes(shared.left, design.sign, design.largest)
-    theta = np.where(design.sign * theta < 0, 0.0, theta)
-    numbers = np.append(-theta, 1.0)
-    epsilon = numbers @ shared.weights
-    v = np.concatenate([-epsilon, numbers]) @ by_particle.weights
-    return Solution(v * own, epsilon * common, theta, sd)
+EVERY = slice(None)
+
+
+class LinearModel:
+    """A hypothesis at fixed hyperparameters: linear and Gaussian, each particle's own numbers integrated out."""
+
+    def __init__(self, hyper: np.ndarray, design: Design) -> None:
+        gram, log_density = design.columns.gram(hyper)
+        self.hyper, self.design, self.scales = hyper, design, scales_of(hyper, design)
+        self.gram = _scaled(gram, _factor(hyper, design))
+        self.particles = marginalise(self.gram, design.own.shape[-1])
+        self.log_integral = self.particles.log_integral + log_density
+
+    def shared(self, rows: Any = EVERY) -> Marginalised:
+        """What some particles say of the amplitudes, once what all particles share is integrated out, too."""
+        return marginalise(self.particles.schur[rows].sum(0), self.design.common.shape[-1])
+
+    def log_evidence(self, rows: Any = EVERY) -> float:
+        """Log marginal likelihood of some particles."""
+        shared = self.shared(rows)
+        effects = amplitudes(shared.schur, self.design.sign, self.design.largest)
+        return float(self.log_integral[rows].sum() + shared.log_integral) + effects.log_integral
+
+    def numbers(self, rows: Any = EVERY) -> tuple[np.ndarray, np.ndarray]:
+        """Means of the scaled common numbers and of the amplitudes by some particles, and the amplitudes' errors.
+
+        An amplitude of a forbidden sign is zero.
+        """
+        shared = self.shared(rows)
+        found = amplitudes(shared.schur, self.design.sign, self.design.largest)
+        theta = np.where(self.design.sign * found.mean < 0, 0.0, found.mean)
+        return np.concatenate([np.append(-theta, 1.0) @ shared.weights, theta]), found.sd
+
+    def solve(self) -> Solution:
+        """Posterior means of all numbers."""
+        numbers, sd = self.numbers()
+        own, c = np.append(-numbers, 1.0) @ self.particles.weights, self.design.common.shape[-1]
+        return Solution(own * self.scales[0], numbers[:c] * self.scales[1], numbers[c:], sd)
+
+    def covariance(self) -> np.ndarray:
+        """Posterior covariance of the scaled common numbers and of the amplitudes, these with their widest prior."""
+        information = self.particles.schur.sum(0)[:-1, :-1]
+        prior = np.concatenate([np.ones(self.design.common.shape[-1]), 1 / self.design.largest**2])
+        return np.linalg.inv(information + np.diag(prior))
+
+
+def log_joint(hyper: np.ndarray, design: Design) -> float:
+    """Log marginal likelihood at the hyperparameters, times their prior."""
+    return LinearModel(hyper, design).log_evidence() + log_prior(hyper, design)[0]
+
+
+def with_little_noise(hyper: np.ndarray) -> np.ndarray:
+    """Hyperparameters with correlated noise that has not swallowed a gap."""
+    at = hyper.copy()
+    at[2] += np.log(LITTLE)
+    return at
 
 
 @dataclass(frozen=True)
 class Optimum:
-    """The mode of the hyperparameters.
+    """The mode of the hyperparameters."""
 
-    Attributes:
-        free: the hyperparameters.
-        log_evidence: log marginal likelihood, the hyperparameters integrated out by Laplace's method.
-        log_joint: at the mode.
-        evaluations: of the density.
-    """
-
-    free: np.ndarray
-    log_evidence: float
-    log_joint: float
-    evaluations: int
+    hyper: np.ndarray
+    log_evidence: float  # log marginal likelihood, the hyperparameters integrated out by Laplace's method
+    log_joint: float  # at the mode
+    evaluations: int  # of the density
 
 
 class _Surface:
-    """The log posterior of a design's hyperparameters upside down, in coordinates scaled by their expected curvature.
-
-    Attributes:
-        design: of a hypothesis.
-        first: number of hyperparameters that are no scales of misfits.
-        scale: unit of each coordinate.
-        most: the largest value of each.
-        options: of L-BFGS.
-    """
+    """Minus the log posterior of a design's hyperparameters, in coordinates scaled by their expected curvature."""
 
     def __init__(self, design: Design) -> None:
         count, spreads = float(np.asarray(design.tests.mask).sum()), len(design.kinds.spreads)
-        self.design, self.first = design, 4 + spreads
+        self.design, self.first = design, 4 + spreads  # hyperparameters that are no scales of misfits
         noise = count * np.array([1.5, 0.2, 0.1, 0.02])
         expected = [noise, np.full(spreads, 2.0 * len(design.tests)), np.full(len(design.misfits), 2.0)]
-        self.scale = 1 / np.sqrt(np.concatenate(expected))
+        self.scale = 1 / np.sqrt(np.concatenate(expected))  # unit of each coordinate
         self.most = np.concatenate([np.full(self.first, np.inf), design.misfits[:, 2]]) / self.scale
         self.options: Any = {"ftol": 1e-7, "gtol": FLAT, "maxiter": ITERATIONS}
 
@@ -352,20 +338,20 @@ class _Surface:
 
         return minimize(function, start, jac=True, method="L-BFGS-B", options=self.options, **more)
 
-    def _upside_down(self, value: float, slope: np.ndarray) -> tuple[float, np.ndarray]:
-        """A step into numbers beyond arithmetic is taken back."""
+    def _negative(self, value: float, slope: np.ndarray) -> tuple[float, np.ndarray]:
+        """Minus value and slope; a step into numbers beyond arithmetic is taken back."""
         if not (np.isfinite(value) and np.isfinite(slope).all()):
             return 1e30, np.zeros(len(slope))
         return -value, -slope * self.scale[len(self.scale) - len(slope) :]
 
     def at(self, x: np.ndarray, *, of_noise: bool = True) -> tuple[float, np.ndarray]:
         """Value and slope, as of `value_and_gradient`."""
-        return self._upside_down(*value_and_gradient(x * self.scale, self.design, of_noise=of_noise))
+        return self._negative(*value_and_gradient(x * self.scale, self.design, of_noise=of_noise))
 
     def of_misfits(self, x: np.ndarray) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:
         """Value and slope as a function of the scales of misfits alone."""
         some = OfMisfits(x * self.scale, self.design)
-        return lambda y: self._upside_down(*some(y * self.scale[self.first :]))
+        return lambda y: self._negative(*some(y * self.scale[self.first :]))
 
     def followed(self, x: np.ndarray) -> tuple[float, np.ndarray]:
         """Where the scales of misfits are at their mode, all else as it is: the value there, and all coordinates."""
@@ -403,12 +389,9 @@ class _Surface:
         return *least, int(found.nfev)
 
     def log_volume(self, x: np.ndarray, jac: np.ndarray, known: int) -> float:
-        """What Laplace's method adds for the hyperparameters at their mode, but for the first `known` ones.
+        """What Laplace's method adds for the hyperparameters at their mode, where the slope is `jac`.
 
-        Args:
-            x: the mode.
-            jac: the slope there.
-            known: how many are integrated elsewhere.
+        The first `known` ones are integrated elsewhere.
         """
         scale, first = self.scale, self.first
         bound = x * scale >= self.most * scale - 1e-6
@@ -423,7 +406,7 @@ class _Surface:
         columns[noise:, :noise] = columns[:noise, noise:].T
         values, vectors = np.linalg.eigh((columns + columns.T) / 2)
         values = np.maximum(values, 1e-3)
-        # A spread's coordinate stands for either sign: close to none, both are the same.
+        # A spread's coordinate is of either sign: close to zero, both are the same.
         of_spreads = (wanted >= 4) & (wanted < first)
         sd = np.sqrt(np.sum(vectors**2 / values, 1))
         volume += float(np.sum(log_ndtr(np.abs(x[wanted]) / sd)[of_spreads]))
@@ -432,8 +415,10 @@ class _Surface:
 
 
 def likely_start(design: Design, start: np.ndarray) -> tuple[np.ndarray, float]:
-    """Where to look for the mode of a hypothesis with misfits: as given, or with correlated noise that is clearly
-    likelier beside them; and the log posterior there."""
+    """Where to look for the mode of a hypothesis with misfits, and the log posterior there.
+
+    That is as given, or with correlated noise that is clearly likelier together with the misfits.
+    """
     surface = _Surface(design)
     value, x = surface.likely(np.minimum(start / surface.scale, surface.most))
     return x * surface.scale, -value
@@ -457,19 +442,17 @@ def optimise(design: Design, start: np.ndarray, *, curvature: bool = True, witho
     if joint < -1e29:
         raise FloatingPointError("the evidence of a hypothesis is no number")
     if curvature:
-        known = 0 if without is None else len(without.free)
+        known = 0 if without is None else len(without.hyper)
         evidence += surface.log_volume(x, jac, known)
         evidence += 0.0 if without is None else without.log_evidence - without.log_joint
     return Optimum(x * surface.scale, float(evidence), joint, evaluations)
 
 
-def visible(free: np.ndarray, design: Design, curves: np.ndarray) -> np.ndarray:
+def visible(hyper: np.ndarray, design: Design, curves: np.ndarray) -> np.ndarray:
     """What the particles' own numbers and the population leave of each curve [um], as a share, in units of noise."""
-    with_curves = with_amplitudes(design, curves)
-    gram, _ = _gram(free, with_curves)
-    whole = np.diagonal(gram.sum(0))[-1 - curves.shape[-1] : -1]
-    left, _ = without_first(without_first(gram, design.own.shape[-1])[0].sum(0), design.common.shape[-1])
-    return np.sqrt(np.clip(np.diagonal(left)[:-1] / np.maximum(whole, 1e-300), 0.0, 1.0))
+    model = LinearModel(hyper, with_amplitudes(design, curves))
+    whole = np.diagonal(model.gram.sum(0))[-1 - curves.shape[-1] : -1]
+    return np.sqrt(np.clip(np.diagonal(model.shared().information) / np.maximum(whole, 1e-300), 0.0, 1.0))
 
 
 def residual_of(solution: Solution, design: Design) -> Float[np.ndarray, "particles points"]:
@@ -478,8 +461,8 @@ def residual_of(solution: Solution, design: Design) -> Float[np.ndarray, "partic
     return design.data - own - design.common @ solution.common - design.amplitude @ solution.amplitude
 
 
-def whitened(free: np.ndarray, design: Design, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def whitened(hyper: np.ndarray, design: Design, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Values over the points [um], independent and of variance 1, and the standard deviation of each point given those
     before it."""
-    white = Columns(values[..., None], design).white(free)
+    white = Columns(values[..., None], design).white(hyper)
     return white.columns[..., 0], white.sd

@@ -1,17 +1,13 @@
-"""Which further tests would tell apart what these cannot: expected log Bayes factors of tests that are not made yet."""
+"""Which further tests would separate what these cannot: expected log Bayes factors of tests that are not made yet."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from scipy.special import ndtr
 
-from ..effects import Mechanism
 from ..simulate import Programme
-from .base import Base
-from .candidates import Candidate
 from .plan import Plan, planned_base
 from .screen import Screen, first_order
 from .search import Search
@@ -24,7 +20,7 @@ EVEN = 0.5  # the least power with which a test is proposed: particles are too d
 
 
 def menu(points: int) -> tuple[Plan, ...]:
-    """Further tests that every tester can do, sampled into about so many points."""
+    """Further tests that every instrument can do, sampled into about so many points."""
     cycles: dict[str, Any] = {"levels": (0.5, 1.0, 1.0), "unload_to": 0.3, "hold_s": 60.0, "points": points}
     return (
         Plan("a hold of 60 s at the largest load", (Programme.cycles(hold_s=60.0, points=points),)),
@@ -40,18 +36,14 @@ def next_experiments(search: Search, names: tuple[str, ...]) -> list[dict[str, A
     """Further tests by the probability that with them the right one of several names is left alone.
 
     Each name is taken for true in turn, in the formula and as large as it was fitted. The log Bayes factor of the true
-    one over a rival, whose amplitude is fitted anew, is normal with mean m/2 and variance m, m the squared signature
+    one over a rival, whose amplitude is fitted again, is normal with mean m/2 and variance m, m the squared signature
     that the rival's leaves; these tests and the further ones add up. `power` is the probability that it exceeds the
     odds which a single name needs, for the rival that is worst.
 
-    Args:
-        search: all hypotheses.
-        names: the members of the set.
-
     Returns:
-        As in `discovery.json`, the most telling first; none that has less than an even chance.
+        As in `discovery.json`, the most powerful first; none that has less than an even chance.
     """
-    members = [n for n in names if n in search.shared and search.found[(n,)].best is not None]
+    members = [n for n in names if n in search.shared and search.found[(n,)].at is not None]
     if len(members) < 2:
         return []
     base = search.base
@@ -61,7 +53,9 @@ def next_experiments(search: Search, names: tuple[str, ...]) -> list[dict[str, A
         ("more particles, tested in the same way", search.screen, len(base.tests))
     ]
     library = {name: search.library[name] for name in members}
-    options += [(plan.name, *_screened(base, plan, library)) for plan in menu(points)]
+    for plan in menu(points):
+        planned = planned_base(base, plan)
+        options.append((plan.name, first_order(planned, library), len(planned.tests)))
     found = []
     for text, other, count in options:
         tried = [n for n in (round(c * count) for c in COPIES) if 0 < n <= MOST_PARTICLES] or [count]
@@ -74,32 +68,22 @@ def next_experiments(search: Search, names: tuple[str, ...]) -> list[dict[str, A
     return found
 
 
-def _screened(base: Base, plan: Plan, library: Mapping[str, Mechanism]) -> tuple[Screen, int]:
-    planned = planned_base(base, plan)
-    return first_order(planned, library), len(planned.tests)
-
-
 def _power(search: Search, members: list[str], other: Screen, copies: float) -> float:
     """Least probability over the true names that further tests leave it alone."""
     assert search.screen is not None
     needed = np.log(DECISIONS.set_mass / (1 - DECISIONS.set_mass))
-    there = {_key(c): k for k, c in enumerate(other.candidates)}
     at: dict[str, int] = {}
     amplitude: dict[str, float] = {}
     information = search.screen.information
     for name in members:
-        best = search.found[(name,)].best
+        best = search.found[(name,)].at
         assert best is not None
         variant = best.variants[0]
-        family = [
-            (k, c)
-            for k, c in enumerate(search.screen.candidates)
-            if (c.mechanism, c.variant.name) == (name, variant.name)
-        ]
-        _, c = max(family, key=lambda one: information[one[0]])
-        if _key(c) not in there:
+        family = [(information[k], k) for k, c in enumerate(search.screen.candidates) if c.variant == variant]
+        candidate = search.screen.candidates[max(family)[1]]
+        if candidate not in other.candidates:
             return 0.0
-        at[name] = there[_key(c)]
+        at[name] = other.candidates.index(candidate)
         amplitude[name] = float(best.theta[0]) / variant.plausible[0]
     worst = 1.0
     new = other.settings[0].gram
@@ -114,8 +98,3 @@ def _power(search: Search, members: list[str], other: Screen, copies: float) -> 
             squares = float(amplitude[name] ** 2 * max(left, 0.0))
             worst = min(worst, float(ndtr((squares / 2 + lead - needed) / np.sqrt(max(squares, 1e-12)))))
     return worst
-
-
-def _key(candidate: Candidate) -> tuple[Any, ...]:
-    """What names a formula at one value of its grid."""
-    return (candidate.mechanism, candidate.variant.name, *sorted(candidate.nuisance.items()))

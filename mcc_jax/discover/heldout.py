@@ -10,8 +10,7 @@ import numpy as np
 
 from ..calibrate.estimates import finite
 from ..calibrate.settings import JUDGEMENT
-from .columns import Design
-from .evidence import amplitudes, left_by_particle, scales_of, without_first
+from .evidence import LinearModel
 from .hypothesis import UNLISTED, Names
 from .search import Search
 from .settings import CONTENDERS, DECISIONS, HYPERPARAMETERS
@@ -29,8 +28,7 @@ class HeldOut:
         points: of every particle.
         elpd: log predictive density of every particle, shape (steps, N).
         repeating_um2: mean product of the residuals of two different particles at one share of the path [um^2].
-        residual_um: measured less predicted displacement of every particle [um], shape (steps, N, points); None of
-            results of older versions.
+        residual_um: measured less predicted displacement of every particle [um], shape (steps, N, points).
     """
 
     labels: tuple[str | None, ...]
@@ -73,7 +71,7 @@ class HeldOut:
         return None
 
     def to_json(self) -> dict[str, Any]:
-        """The gap as in `discovery.json`; shares never stand without chi2 per point beside them."""
+        """The gap as in `discovery.json`; a share is never given without chi2 per point."""
         chi2, steps = self.chi2_per_dof, []
         for k, label in enumerate(self.labels):
             away = self.elpd[k] - self.elpd[0]
@@ -108,47 +106,15 @@ NOT_ASKED: dict[str, Any] = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class _Contestant:
-    """A hypothesis at fixed hyperparameters, and what every particle leaves of it."""
-
-    design: Design
-    free: np.ndarray
-    left: np.ndarray
-    log_integral: np.ndarray
-
-    @classmethod
-    def of(cls, design: Design, free: np.ndarray) -> _Contestant:
-        left = left_by_particle(free, design)
-        return cls(design, free, left.gram, left.log_integral)
-
-    def log_evidence(self, rows: np.ndarray) -> float:
-        """Log marginal likelihood of some particles."""
-        c = self.design.common.shape[-1]
-        gram, integral = without_first(self.left[rows].sum(0), c)
-        value = amplitudes(gram, self.design.sign, self.design.largest).log_integral
-        return float(self.log_integral[rows].sum() + integral + value)
-
-    def numbers(self, rows: np.ndarray) -> np.ndarray:
-        """Common numbers and amplitudes that some particles make, in units of their columns as `scales_of` has them."""
-        c = self.design.common.shape[-1]
-        total = self.left[rows].sum(0)
-        gram, _ = without_first(total, c)
-        theta = amplitudes(gram, self.design.sign, self.design.largest).mean
-        theta = np.where(self.design.sign * theta < 0, 0.0, theta)
-        data = total[:c, -1] - total[:c, c:-1] @ theta
-        return np.concatenate([np.linalg.solve(total[:c, :c] + np.eye(c), data), theta])
-
-    def residual(self, row: int, numbers: np.ndarray) -> np.ndarray:
-        """What is left of a particle [um], its own numbers fitted to it."""
-        d = self.design
-        own, common = scales_of(self.free, d)
-        c = d.common.shape[-1]
-        y = d.data[row] - d.common[row] @ (numbers[:c] * common) - d.amplitude[row] @ numbers[c:]
-        X, mask = d.own[row] * own, np.asarray(d.tests.mask[row])
-        sd = float(np.exp(self.free[0]))
-        v = np.linalg.solve(X[mask].T @ X[mask] / sd**2 + np.eye(X.shape[1]), X[mask].T @ y[mask] / sd**2)
-        return np.where(mask, y - X @ v, 0.0)
+def _residual(model: LinearModel, row: int, numbers: np.ndarray) -> np.ndarray:
+    """What common numbers and amplitudes leave of a particle [um], its own numbers fitted to it."""
+    d, (own, common) = model.design, model.scales
+    c = d.common.shape[-1]
+    y = d.data[row] - d.common[row] @ (numbers[:c] * common) - d.amplitude[row] @ numbers[c:]
+    X, mask = d.own[row] * own, np.asarray(d.tests.mask[row])
+    sd = float(np.exp(model.hyper[0]))
+    v = np.linalg.solve(X[mask].T @ X[mask] / sd**2 + np.eye(X.shape[1]), X[mask].T @ y[mask] / sd**2)
+    return np.where(mask, y - X @ v, 0.0)
 
 
 def held_out(search: Search, winner: Names) -> HeldOut:
@@ -156,23 +122,19 @@ def held_out(search: Search, winner: Names) -> HeldOut:
 
     Every hypothesis stays linear where all particles have put it, at the hyperparameters they have; which one is
     chosen, and its numbers, are the others' alone.
-
-    Args:
-        search: all hypotheses.
-        winner: what was found.
     """
     null, everyone = search.null, np.arange(len(search.base.tests))
     logs = search.log_posteriors()
-    contestants: dict[Names, _Contestant] = {}
+    contestants: dict[Names, LinearModel] = {}
     for names in dict.fromkeys([*list(logs)[:CONTENDERS], winner]):
-        if names and search.found[names].fitted is not None:
-            contestants[names] = _Contestant.of(*search.found[names].likely_form(misfit=False))
+        if names and search.found[names].at is not None:
+            contestants[names] = LinearModel(*search.found[names].likely_form(misfit=False))
     # The base law under the winner's noise and spreads: gaps are measured by the noise of what closes them.
     found = contestants[winner]
     kinds = replace(null.design.kinds, correlation=found.design.kinds.correlation, along=found.design.kinds.along)
-    base = _Contestant.of(replace(null.design, kinds=kinds), found.free[:HYPERPARAMETERS])
+    base = LinearModel(found.hyper[:HYPERPARAMETERS], replace(null.design, kinds=kinds))
     every = {(): base, **contestants}
-    whole = {names: c.log_evidence(everyone) for names, c in every.items()}
+    whole = {names: model.log_evidence() for names, model in every.items()}
     # Prior odds, hyperparameters and misfit weigh as they do for all particles.
     weight = {names: logs.get(names, search.found[names].log_evidence) - whole[names] for names in contestants}
     N = len(everyone)
@@ -182,16 +144,16 @@ def held_out(search: Search, winner: Names) -> HeldOut:
     residual = np.zeros((len(labels), *base.design.data.shape))
     for i in range(N):
         others = np.delete(everyone, i) if N > 1 else everyone
-        without = {names: c.log_evidence(others) for names, c in every.items()}
+        without = {names: model.log_evidence(others) for names, model in every.items()}
         best = max(contestants, key=lambda names: without[names] + weight[names])
         first = winner[:1] if winner[:1] in contestants else best
         for k, names in enumerate([(), *([first] if len(winner) == 2 else []), best]):
-            c = every[names]
-            numbers = c.numbers(others)
+            model = every[names]
+            numbers, _ = model.numbers(others)
             form = np.append(numbers, -1.0)
-            chi2[k, i] = form @ c.left[i] @ form
+            chi2[k, i] = form @ model.particles.schur[i] @ form
             elpd[k, i] = whole[names] - without[names]
-            residual[k, i] = c.residual(i, numbers)
+            residual[k, i] = _residual(model, i, numbers)
     return HeldOut(labels, chi2, points.astype(float), elpd, _repeating(search, residual), residual)
 
 

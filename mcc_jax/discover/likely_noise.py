@@ -14,20 +14,20 @@ from ..calibrate.settings import JUDGEMENT
 from .base import Base
 from .columns import Design, with_noise
 from .design import design_of
-from .evidence import Optimum, optimise, residual_of, solve, whitened
+from .evidence import LinearModel, Optimum, optimise, residual_of, whitened
 from .settings import STRONG
 
 
-def with_other_noise(design: Design, free: np.ndarray, model: Model) -> Optimum:
+def with_other_noise(design: Design, hyper: np.ndarray, model: Model) -> Optimum:
     """The mode of the hyperparameters under the noise of a model, from the mode under another.
 
     Its log density is -inf where the correlated noise is more than a misfit may be: a smooth curve of every test's own
     describes any test, and leaves nothing for a law to explain.
     """
-    other, start = with_noise(design, model), free.copy()
+    other, start = with_noise(design, model), hyper.copy()
     start[3] = other.noise[0, 3]  # the length's unit may be another
     found = optimise(other, start, curvature=False)
-    share = np.median(np.exp(found.free[2]) * design.scale / ranges_um(design.tests))
+    share = np.median(np.exp(found.hyper[2]) * design.scale / ranges_um(design.tests))
     return found if share < JUDGEMENT.misfit else replace(found, log_evidence=-np.inf, log_joint=-np.inf)
 
 
@@ -38,25 +38,25 @@ def with_likely_noise(base: Base) -> tuple[Base, Optimum]:
     """
     design = design_of(base, base.state)
     own = optimise(design, base.hyperparameters, curvature=False)
-    others = [(*with_own_scales(design, own.free, model), model) for model in noise_models(base)]
+    others = [(*with_own_scales(design, own.hyper, model), model) for model in noise_models(base)]
     best, scale, model = max(others, key=lambda one: one[0].log_joint)
     if best.log_joint > own.log_joint + STRONG:
         return replace(base, model=model, scale=scale), best
     return base, own
 
 
-def with_own_scales(design: Design, free: np.ndarray, model: Model) -> tuple[Optimum, np.ndarray]:
+def with_own_scales(design: Design, hyper: np.ndarray, model: Model) -> tuple[Optimum, np.ndarray]:
     """As `with_other_noise`, with the particles' own factors that belong to this kind of noise, and these factors.
 
     Under noise of another kind what wanders for long makes some particles look noisier than others.
     """
     alike = with_noise(replace(design, scale=np.ones(len(design.scale))), model)
-    found = with_other_noise(alike, free, model)
-    white, _ = whitened(found.free, alike, residual_of(solve(found.free, alike), alike))
+    found = with_other_noise(alike, hyper, model)
+    white, _ = whitened(found.hyper, alike, residual_of(LinearModel(found.hyper, alike).solve(), alike))
     mask = np.asarray(design.tests.mask)
     scale = particle_scales(alike.scale, np.sum(np.where(mask, white, 0.0) ** 2, 1), mask.sum(1) - 4)
     if np.any(scale != 1.0):
-        found = with_other_noise(replace(design, scale=scale), found.free, model)
+        found = with_other_noise(replace(design, scale=scale), found.hyper, model)
     return found, scale
 
 

@@ -36,12 +36,7 @@ class Place:
 
 
 def difference(before: np.ndarray, after: np.ndarray | None, mask: np.ndarray) -> np.ndarray:
-    """What the base law leaves and the extended one does not [um]; without one, what the tests leave in common.
-
-    Args:
-        before, after: residuals, shape (N, points); `after` is None where nothing was added.
-        mask: which points count.
-    """
+    """What the base law leaves and the extended one does not [um]; the former alone where nothing was added."""
     return np.where(mask, before if after is None else before - after, 0.0)
 
 
@@ -71,13 +66,13 @@ def places(base: Base, left: np.ndarray) -> tuple[Place, ...]:
 def where(base: Base, places: tuple[Place, ...]) -> list[dict[str, Any]]:
     """The places that together hold most of the disagreement, largest first."""
     known = sorted((p for p in places if p.share > 0), key=lambda p: -p.share)
-    strain, held, told = _strains(base), 0.0, []
+    strain, held, found = _strains(base), 0.0, []
     for place in known:
         if held >= REPORTED:
             break
         held += place.share
         rows = list(place.particles)
-        told.append(
+        found.append(
             {
                 "segment": place.segment,
                 "load_fraction": list(place.load_fraction),
@@ -87,7 +82,7 @@ def where(base: Base, places: tuple[Place, ...]) -> list[dict[str, Any]]:
                 "direction": f"{'more' if place.sign > 0 else 'less'} displacement than the law",
             }
         )
-    return told
+    return found
 
 
 def _strains(base: Base) -> np.ndarray:

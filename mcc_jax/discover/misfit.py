@@ -60,8 +60,8 @@ def coordinates(point: Point, tests: Tests, forms: Forms, a: Array) -> dict[str,
     return jax.vmap(one)(point.latent, tests)
 
 
-def telling(at: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]:
-    """Coordinates that say something: time does where most tests unload.
+def informative(at: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]:
+    """Coordinates that carry information: time does where most tests unload.
 
     Of loading alone it is what is measured: a drive that closes at one speed makes it the displacement itself.
     """
@@ -136,16 +136,11 @@ def general(at: dict[str, np.ndarray], tests: Tests, linear: Linear) -> tuple[np
 
     It is a sum of Gaussian processes, each in one coordinate and with a scale of its own, so that coordinates that
     explain nothing cost next to nothing (automatic relevance determination; Duvenaud et al. 2011). All are common to
-    all particles and in proportion to their size, but for what a tester does, which depends on micrometres and
+    all particles and in proportion to their size, but for errors of the instrument, which depend on micrometres and
     millinewtons alone. In stress they are fine: a particle's layers and flaws yield within a narrow range of it. What a
     drive loses at a reversal, it loses at once: there the time since the reversal is a coordinate, and reloading has
     parts of its own. A stress that the loading curve lacks, and a force that the cell gets wrong, move every
     particle as far as it is soft.
-
-    Args:
-        at: coordinates of all points, between 0 and 1.
-        tests: the tests.
-        linear: how displacement moves with force.
     """
     mask, size = np.asarray(tests.mask), np.asarray(tests.effective_diameter)
     share = (size / np.mean(size))[:, None, None]

@@ -54,13 +54,6 @@ class Plan:
         object.__setattr__(self, "programmes", tuple(self.programmes))
 
 
-def planned_campaign(laws, diameters_um: np.ndarray, peaks_mN: np.ndarray, plan: Plan) -> Campaign:
-    """The campaign that a plan would give without noise and without any missing effect."""
-    parts = [simulate_campaign(laws, diameters_um, peaks_mN, programme) for programme in plan.programmes]
-    curves: list[Curve] = [parts[i % len(parts)].curves[i] for i in range(len(diameters_um))]
-    return Campaign(parts[0].particles, parts[0].diameters_um, tuple(curves), {}, Metadata(control="load"))
-
-
 def planned_base(base: Base, plan: Plan) -> Base:
     """A base fit as it would be if the same particles were tested by a plan, with the same noise."""
     peaks = np.asarray(jnp.max(base.tests.force, axis=1))
@@ -69,9 +62,11 @@ def planned_base(base: Base, plan: Plan) -> Base:
 
 
 def _expected(base: Base, plan: Plan, diameters: np.ndarray, peaks: np.ndarray, latent: Array, scale: Any) -> Base:
-    """The base of a campaign that is as the law says, of particles with these numbers."""
+    """The base of a campaign by a plan, of particles with these numbers, without noise or any missing effect."""
     laws = eqx.filter_vmap(lambda w: base.forms.law(w, jnp.zeros(0)))(latent)
-    campaign = planned_campaign(laws, diameters, peaks, plan)
+    parts = [simulate_campaign(laws, diameters, peaks, programme) for programme in plan.programmes]
+    curves: list[Curve] = [parts[i % len(parts)].curves[i] for i in range(len(diameters))]
+    campaign = Campaign(parts[0].particles, parts[0].diameters_um, tuple(curves), {}, Metadata(control="load"))
     selection = select(campaign, threshold_MPa=base.threshold_MPa)
     kept, tests = np.asarray(selection.kept), selection.tests
     point = Point(latent[kept], jnp.zeros(len(kept)), jnp.zeros((len(kept), 0)))
@@ -97,7 +92,7 @@ class Power:
         mechanisms: names.
         limits: smallest amplitude of each mechanism's most visible formula that is found with 95 % probability.
         units, plausible: its unit and the range one would believe.
-        inseparable: pairs whose projected signatures are so alike that these data cannot tell them apart.
+        inseparable: pairs whose projected signatures are so alike that these data cannot separate them.
         untestable: mechanisms that need what the campaign does not hold.
     """
 
@@ -114,8 +109,8 @@ class Power:
             unit = "" if self.units[name] == "-" else f" {self.units[name]}"
             low, high = (number(value) for value in self.plausible[name])
             rows.append((name, f"found from {number(self.limits[name], 2)}{unit} on; plausible {low} to {high}"))
-        told = f"{len(rows)} mechanisms can be seen, {len(self.untestable)} cannot"
-        return table(f"Power: {told}, {len(self.inseparable)} pairs look alike", rows)
+        title = f"Power: {len(rows)} mechanisms can be seen, {len(self.untestable)} cannot"
+        return table(f"{title}, {len(self.inseparable)} pairs look alike", rows)
 
     def to_json(self) -> dict[str, Any]:
         """The contents of `power.json`."""
@@ -198,7 +193,7 @@ def power_of_campaign(
     threshold_MPa: float = 0.0,
     progress: Callable[[str], None] | None = None,
 ) -> Power:
-    """What a campaign can show: one that was simulated as planned, with the tester's noise, or one that was measured.
+    """What a campaign can show: one that was simulated as planned, noise included, or one that was measured.
 
     Args:
         campaign: the tests.

@@ -21,7 +21,7 @@ from .base import Base
 from .closure import Closure
 from .heldout import NOT_ASKED, HeldOut
 from .locate import Place
-from .own_numbers import Jump
+from .random_effects import Jump
 
 Verdict = Literal["NO_GAP", "NAMED", "SET", "UNLISTED", "FIT_NOT_CONVERGED"]
 
@@ -114,8 +114,8 @@ class Likeness:
 
     Attributes:
         names: members of the sets first, then the ranking from the top; shape (K,).
-        correlation: of their projected best formulas, each with its physical sign: 1 means that these data cannot tell
-            the two apart, -1 that one would look like the other with the impossible sign; shape (K, K).
+        correlation: of their projected best formulas, each with its physical sign: 1 means that these data cannot
+            separate the two, -1 that one would look like the other with the impossible sign; shape (K, K).
     """
 
     names: tuple[str, ...]
@@ -124,7 +124,7 @@ class Likeness:
 
 @dataclass(frozen=True, repr=False)
 class Discovery(Saved):
-    """What is missing in the law, how sure that is, and what would tell more.
+    """What is missing in the law, how sure that is, and which tests would show more.
 
     Attributes:
         verdict: NO_GAP, NAMED, SET, UNLISTED or FIT_NOT_CONVERGED.
@@ -143,9 +143,9 @@ class Discovery(Saved):
         p_any: probability of so much evidence of anything if nothing were missing.
         parameters_before, parameters_after: the population's parameters by the law alone, as a calibration has them,
             and with the effects.
-        next_experiments: further tests that would probably tell the members of a set apart.
+        next_experiments: further tests that would probably separate the members of a set.
         seed, runtime_s: for the record.
-        leads: what remains beside the names and is not added to the law.
+        leads: what remains in addition to the names and is not added to the law.
         checks: for every member of a set with rivals, what would show it by itself: `mechanism`, `check`.
         posterior: of the law with effects; None where nothing was added that a `Model` holds, or it was not asked for.
         notes: what a reader must know.
@@ -204,7 +204,7 @@ class Discovery(Saved):
                 one test is asked for where the law with effects has no posterior.
         """
         if self.closure is not None:
-            remedy = "Draw or tabulate it: its terms stand in discovery.json."
+            remedy = "Draw or tabulate it: its terms are in discovery.json."
             raise InputError("the formula of this discovery is no effect of the library", remedy=remedy)
         if self.base is None:
             raise InputError("this discovery has no law: its fit did not converge", remedy="Calibrate first.")
@@ -252,7 +252,7 @@ class Discovery(Saved):
     def _jumps(self, effect: Effect) -> dict[str, Any]:
         """The sudden steps of an effect."""
         unit = effect.variant.unit
-        told = [
+        jumps = [
             {
                 "particle": self.name_of(jump.particle),
                 "stress_MPa": jump.stress_MPa,
@@ -262,7 +262,7 @@ class Discovery(Saved):
             }
             for jump in effect.jumps
         ]
-        return {"jumps": told} if told else {}
+        return {"jumps": jumps} if jumps else {}
 
     def to_json(self) -> dict[str, Any]:
         """The contents of `discovery.json`."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +23,7 @@ from .base import Base, State
 from .candidates import Candidate, candidates_of
 from .columns import with_amplitudes
 from .design import design_of
-from .evidence import left_by_particle, log_prior, without_first
+from .evidence import LinearModel, log_prior
 from .settings import LENGTH_FACTORS, NOISE_FACTORS
 
 SPREAD_FACTORS = 1.0, 0.5  # on the spreads of the base fit, at which all formulas are screened
@@ -39,35 +40,21 @@ def candidate_columns(point: Point, tests: Tests, effects: tuple[AbstractEffect,
     return jax.vmap(one)(point.latent, tests)
 
 
-@dataclass(frozen=True)
-class Setting:
-    """The candidates' scores at some hyperparameters, all else integrated out.
+class Setting(NamedTuple):
+    """Candidates at some hyperparameters, all else integrated out, in units of their smallest plausible amplitudes."""
 
-    Attributes:
-        log_null: log marginal likelihood without any, times the hyperparameters' prior.
-        gram: information among candidates, in units of their smallest plausible amplitudes.
-        score: their scores.
-    """
-
-    free: np.ndarray
-    log_null: float
-    gram: np.ndarray
+    log_null: float  # log marginal likelihood without any, times the hyperparameters' prior
+    gram: np.ndarray  # information among candidates
     score: np.ndarray
 
 
 @dataclass(frozen=True)
 class Screen:
-    """All candidates against the base law.
-
-    Attributes:
-        candidates: the formulas.
-        settings: hyperparameters that were tried.
-        columns: signatures of the candidates, per smallest plausible amplitude.
-    """
+    """All candidates against the base law, at each of the hyperparameters that were tried."""
 
     candidates: tuple[Candidate, ...]
     settings: tuple[Setting, ...]
-    columns: np.ndarray
+    columns: np.ndarray  # signatures of the candidates, per smallest plausible amplitude
 
     @property
     def null(self) -> float:
@@ -102,7 +89,7 @@ class Screen:
         names = np.array([c.mechanism for c in self.candidates])
         two = names[a] != names[b]
         a, b = a[two], b[two]
-        each = [s.log_null + pair_integrals(s, a, b, self.signs, self.largest) for s in self.settings]
+        each = [s.log_null + pair_integrals(s.gram, s.score, a, b, self.signs, self.largest) for s in self.settings]
         return a, b, np.max(each, 0)
 
     @property
@@ -130,16 +117,18 @@ def single_integrals(
     return logsumexp(value, axis=0) - np.log(SCALES), mean[best, np.arange(len(score))]
 
 
-def pair_integrals(s: Setting, a: np.ndarray, b: np.ndarray, signs: np.ndarray, largest: np.ndarray) -> np.ndarray:
-    """Log integral over two amplitudes, for many pairs."""
+def pair_integrals(
+    gram: np.ndarray, score: np.ndarray, a: np.ndarray, b: np.ndarray, signs: np.ndarray, largest: np.ndarray
+) -> np.ndarray:
+    """Log integral over two amplitudes, for many pairs of rows `a` and `b`."""
     found = []
     for one in np.linspace(0, 1, SCALES):
         for two in np.linspace(0, 1, SCALES):
             sa, sb = largest[a] ** one, largest[b] ** two
-            p, q, r = s.gram[a, a] + sa**-2.0, s.gram[b, b] + sb**-2.0, s.gram[a, b]
+            p, q, r = gram[a, a] + sa**-2.0, gram[b, b] + sb**-2.0, gram[a, b]
             det = np.maximum(p * q - r * r, 1e-12 * p * q)
-            ma, mb = (q * s.score[a] - r * s.score[b]) / det, (p * s.score[b] - r * s.score[a]) / det
-            value = 0.5 * (s.score[a] * ma + s.score[b] * mb) - 0.5 * np.log(det) - np.log(sa * sb)
+            ma, mb = (q * score[a] - r * score[b]) / det, (p * score[b] - r * score[a]) / det
+            value = 0.5 * (score[a] * ma + score[b] * mb) - 0.5 * np.log(det) - np.log(sa * sb)
             for m, sd, sign in ((ma, np.sqrt(q / det), signs[a]), (mb, np.sqrt(p / det), signs[b])):
                 value = value + np.where(sign == 0, 0.0, np.log(2) + log_ndtr(sign * m / sd))
             found.append(value)
@@ -168,33 +157,27 @@ def signature_columns(base: Base, state: State, candidates: Sequence[Candidate])
 def screen(
     base: Base,
     state: State,
-    free: np.ndarray,
+    hyper: np.ndarray,
     candidates: Sequence[Candidate],
     columns: np.ndarray,
     *,
     several: bool = True,
 ) -> Screen:
-    """Scores of all candidates around the base law, at several settings of noise and spreads.
+    """Scores of candidates around the base law, at its hyperparameters first and at `several` other settings of them.
 
-    Args:
-        base: the tests.
-        state: where the base law fits.
-        free: its hyperparameters, the first setting.
-        candidates: the formulas.
-        columns: as of `signature_columns`.
-        several: whether other settings than the first are wanted.
+    `columns` are the candidates' signatures as `signature_columns` gives them.
     """
     design = with_amplitudes(design_of(base, state), columns)
     settings = []
     grid = itertools.product(NOISE_FACTORS, LENGTH_FACTORS, SPREAD_FACTORS)
     for sd, length, spread in grid if several else [(1.0, 1.0, 1.0)]:
-        at = free.copy()
+        at = hyper.copy()
         at[2:4] += np.log([sd, length])
         at[4:8] *= spread
-        left, integral = left_by_particle(at, design)
-        total, log_population = without_first(left.sum(0), design.common.shape[-1])
-        null = float(np.sum(integral) + log_population) - 0.5 * total[-1, -1] + log_prior(at, design)
-        settings.append(Setting(at, null, total[:-1, :-1], total[:-1, -1]))
+        model = LinearModel(at, design)
+        shared = model.shared()
+        null = float(np.sum(model.log_integral) + shared.log_integral) - 0.5 * shared.schur[-1, -1]
+        settings.append(Setting(null + log_prior(at, design)[0], shared.information, shared.score))
     return Screen(tuple(candidates), tuple(settings), columns)
 
 

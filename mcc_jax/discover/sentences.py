@@ -126,30 +126,30 @@ def _gap(found: Discovery) -> list[str]:
         return []
     first, last = (step["chi2_per_dof"] for step in (gap["steps"][0], gap["steps"][-1]))
     open_still = gap["steps"][-1]["chi2_interval_95"][0]
-    told = [
+    sentences = [
         f"On held-out particles it closes {100 * gap['closed_fraction']:.0f} % of the gap "
         f"(chi2 per point {first:.3g} before, {last:.3g} after; 1 is noise alone)."
     ]
     if open_still is not None and open_still > 1 + WITHIN:
-        told.append("The gap is named, not closed: the formula does not describe all of it.")
-    return told
+        sentences.append("The gap is named, not closed: the formula does not describe all of it.")
+    return sentences
 
 
 def _next(found: Discovery) -> list[str]:
-    told = []
+    sentences = []
     best = found.next_experiments[0] if found.next_experiments else None
     sure = best is not None and best["power"] >= ENOUGH
     if best is not None:
         names = listed([plain(n) for n in best["separates"]], "or")
         doubt = "" if sure else f"No further test of those tried on paper would surely separate {names}. "
-        told.append(
+        sentences.append(
             f"{doubt}{'Next' if sure else 'The best'}: {best['experiment']}, {best['particles']} further particles; "
             f"with these it would separate {names} with probability {best['power']:.2f}."
         )
     if found.checks and not sure:
         each = "; ".join(f"{plain(one['mechanism'])}: {one['check']}" for one in found.checks[:CHECKS])
-        told.append(f"Each would show by itself ({each}).")
-    return told
+        sentences.append(f"Each would show by itself ({each}).")
+    return sentences
 
 
 def _jumps(found: Discovery, effect: Effect) -> str:

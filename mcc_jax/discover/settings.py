@@ -17,8 +17,8 @@ class Decisions:
             prototypes was right in 88 of 106 campaigns with it.
         margin: nats by which two names must lead everything with at most one: one more than the odds, since what a
             name's misfit leaves invites a second; 91 of the same 106, true pairs led by 12 to 482.
-        unlisted: log prior odds of a listed name against a smooth discrepancy that no mechanism explains; beside a
-            name it costs `pair`, too, as any second cause does.
+        unlisted: log prior odds of a listed name against a smooth discrepancy that no mechanism explains; in
+            addition to a name it costs `pair`, too, as any second cause does.
         set_mass: names are reported, best first, until they hold this posterior probability together.
         misfit, misfit_log_sd, misfit_most: size of what a mechanism's formulas miss of its effect, median, standard
             deviation of the logarithm, and the most: 0.03 to 0.3 is what the library's own formulas leave of each
@@ -26,13 +26,13 @@ class Decisions:
         scatter: scale of the half-normal prior of how much an amplitude differs from particle to particle, as a share
             of it: toes need 0.1 (`misfit` and this are integrated out together).
         general, general_log_sd: size of a smooth discrepancy in standard deviations of white noise, likewise.
-        jump: share of the tests in which a sudden step is expected, a priori: where it is looked for once more.
+        jump: share of the tests in which a sudden step is expected, a priori, and so how much evidence one needs.
         contradicted: standard errors by which held-out particles must be predicted worse with what was found before it
             is taken back: beyond two a difference is hardly chance.
         readings: of a branch that are compared, about, of a material that the law was not made for: what the law
             misses there is each particle's own over a fifth of a branch, and a few readings in each such piece show it.
         foreign_misfit: share of the range of displacement that the law must miss for that; with its own data and a
-            tester's noise it misses less.
+            instrument's noise it misses less.
     """
 
     level: float = 0.05

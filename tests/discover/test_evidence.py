@@ -11,19 +11,18 @@ from scipy.stats import multivariate_normal, norm
 
 from mcc_jax import Model, log_evidence
 from mcc_jax.calibrate.distributions import SCALES, nuisance_moments
-from mcc_jax.discover.design import More, between, design_of, moved
+from mcc_jax.discover.design import ExtraColumns, between, design_of, moved
 from mcc_jax.discover.evidence import (
+    LinearModel,
     amplitudes,
     log_joint,
-    log_prior,
     optimise,
     residual_of,
     scales_of,
-    solve,
     value_and_gradient,
     whitened,
 )
-from mcc_jax.discover.refine import refined
+from mcc_jax.discover.fit import fit_hypothesis
 from mcc_jax.discover.settings import POPULATION
 from mcc_jax.effects import find_variant
 
@@ -42,13 +41,13 @@ def design(base):
     return design_of(base, base.state)
 
 
-def covariance(design, free):
+def covariance(design, hyper):
     """Of all tests together: noise, every particle's own numbers, and what all share."""
-    own, common = scales_of(free, design)
+    own, common = scales_of(hyper, design)
     N, P = design.data.shape
     mask = np.asarray(design.tests.mask)
     unit = np.broadcast_to(np.eye(P), (N, P, P))
-    columns = [whitened(free, design, unit[:, :, k])[0] for k in range(P)]
+    columns = [whitened(hyper, design, unit[:, :, k])[0] for k in range(P)]
     whole = np.zeros((N * P, N * P))
     for i in range(N):
         W = np.stack([column[i] for column in columns], 1)[np.ix_(mask[i], mask[i])]
@@ -64,9 +63,9 @@ def test_it_is_the_density_of_the_multivariate_normal(base, design):
     """Particles first, then what all share: integrals in closed form. Readings of a display add a known constant."""
     names = ("tests", "linear", "own", "common", "amplitude", "data", "scale")
     small = replace(design, **{name: jax.tree.map(lambda x: x[:3], getattr(design, name)) for name in names})
-    free = base.hyperparameters
-    found = log_joint(free, small) - log_prior(free, small)
-    matrix, data = covariance(small, free)
+    hyper = base.hyperparameters
+    found = LinearModel(hyper, small).log_evidence()
+    matrix, data = covariance(small, hyper)
     wanted = multivariate_normal(np.zeros(len(data)), matrix, allow_singular=False).logpdf(data)
     assert found == pytest.approx(wanted, abs=0.5)  # the finite steps of a display
 
@@ -91,25 +90,25 @@ def test_its_derivatives_are_those_of_differences(base, design):
     variants = find_variant("frame_compliance:linear"), find_variant("thermal_drift:linear")
     rng, mask = np.random.default_rng(1), np.asarray(base.tests.mask)
     basis = rng.normal(scale=0.1, size=(*mask.shape, 3)) * mask[..., None]
-    more = More(basis=basis, group=[1, 1, 2], sizes=[(-1.0, 1.0, np.inf), (-2.0, 0.8, np.inf)])
+    more = ExtraColumns(basis=basis, group=[1, 1, 2], sizes=[(-1.0, 1.0, np.inf), (-2.0, 0.8, np.inf)])
     two = design_of(base, base.state.with_numbers(np.zeros(2)), variants, more)
-    for one, free in ((design, base.hyperparameters), (two, np.append(base.hyperparameters, [-1.0, -2.0]))):
-        value, slope = value_and_gradient(free, one)
-        assert value == pytest.approx(log_joint(free, one), rel=1e-12)
-        steps = 1e-5 * np.eye(len(free))
-        wanted = [(log_joint(free + e, one) - log_joint(free - e, one)) / 2e-5 for e in steps]
+    for one, hyper in ((design, base.hyperparameters), (two, np.append(base.hyperparameters, [-1.0, -2.0]))):
+        value, slope = value_and_gradient(hyper, one)
+        assert value == pytest.approx(log_joint(hyper, one), rel=1e-12)
+        steps = 1e-5 * np.eye(len(hyper))
+        wanted = [(log_joint(hyper + e, one) - log_joint(hyper - e, one)) / 2e-5 for e in steps]
         np.testing.assert_allclose(slope, wanted, rtol=1e-4, atol=1e-3)
 
 
 def test_columns_of_nothing_have_no_say(base, design):
     """Room for a misfit that is not there: the same evidence, the same numbers."""
-    nothing = More(basis=np.zeros((*design.data.shape, 3)), group=[1] * 3, sizes=[(0.0, 1.0, np.inf)])
+    nothing = ExtraColumns(basis=np.zeros((*design.data.shape, 3)), group=[1] * 3, sizes=[(0.0, 1.0, np.inf)])
     roomy = design_of(base, base.state, (), nothing)
     one, other = optimise(design, base.hyperparameters), optimise(roomy, np.append(base.hyperparameters, 0.0))
     assert other.log_evidence == pytest.approx(one.log_evidence, abs=0.02)
-    np.testing.assert_allclose(other.free[:8], one.free, atol=0.02)
-    beside = optimise(roomy, np.append(one.free, 0.0), without=one)
-    assert beside.log_evidence == pytest.approx(one.log_evidence, abs=0.02)
+    np.testing.assert_allclose(other.hyper[:8], one.hyper, atol=0.02)
+    both = optimise(roomy, np.append(one.hyper, 0.0), without=one)
+    assert both.log_evidence == pytest.approx(one.log_evidence, abs=0.02)
 
 
 def test_what_a_solution_leaves_is_what_the_law_leaves_there(base):
@@ -117,21 +116,13 @@ def test_what_a_solution_leaves_is_what_the_law_leaves_there(base):
     variant = find_variant("frame_compliance:linear")
     state = base.state.with_numbers(np.zeros(1))
     design = design_of(base, state, (variant,))
-    solution = solve(base.hyperparameters, design)
+    solution = LinearModel(base.hyperparameters, design).solve()
     there = design_of(base, moved(base, state, (variant,), solution), (variant,))
-    still = residual_of(solve(base.hyperparameters, there), there)
+    still = residual_of(LinearModel(base.hyperparameters, there).solve(), there)
     mask = np.asarray(base.tests.mask)
     assert np.sqrt(np.mean((residual_of(solution, design) - still)[mask] ** 2)) < 0.02
     half = between(state, moved(base, state, (variant,), solution))
     assert float(half.point.theta[0, 0]) == pytest.approx(0.5 * float(solution.amplitude[0]) * variant.plausible[0])
-
-
-def test_a_formula_is_fitted_at_its_own_optimum(base):
-    variant = find_variant("frame_compliance:linear")
-    nothing = refined(base, base.state, (), np.zeros(0), base.hyperparameters)
-    found = refined(base, nothing.state, (variant,), np.zeros(1), nothing.optimum.free)
-    assert found.log_evidence > nothing.log_evidence + 50
-    assert found.theta[0] == pytest.approx(COMPLIANCE, rel=0.1)
 
 
 def test_a_step_that_is_cut_short_is_cut_for_all_numbers(base):
@@ -140,7 +131,7 @@ def test_a_step_that_is_cut_short_is_cut_for_all_numbers(base):
     variant = find_variant("creep:kelvin_voigt")
     (time,), unit = variant.nuisances, variant.plausible[0]
     state = base.state.with_numbers(np.array([unit, 100.0]))
-    found = solve(base.hyperparameters, design_of(base, state, (variant,)))
+    found = LinearModel(base.hyperparameters, design_of(base, state, (variant,))).solve()
     mean, sd = nuisance_moments(time)
     common = found.common.copy()
     common[POPULATION] = (np.log(100.0) + 3.0 - mean) / sd  # three powers of e away
@@ -156,7 +147,8 @@ def test_it_prefers_a_model_as_much_as_importance_sampling_does(base):
     campaign = cached(f"frame_compliance={COMPLIANCE}")
     model = Model(modulus_scatter=True)
     found = [log_evidence(campaign, m).value for m in (model, model.with_effects("frame_compliance:linear"))]
-    nothing = refined(base, base.state, (), np.zeros(0), base.hyperparameters)
+    nothing = fit_hypothesis(base, base.state, (), np.zeros(0), base.hyperparameters)
     variant = find_variant("frame_compliance:linear")
-    frame = refined(base, nothing.state, (variant,), np.zeros(1), nothing.optimum.free)
+    frame = fit_hypothesis(base, nothing.state, (variant,), np.zeros(1), nothing.optimum.hyper)
+    assert frame.theta[0] == pytest.approx(COMPLIANCE, rel=0.1)
     assert frame.log_evidence - nothing.log_evidence == pytest.approx(found[1] - found[0], rel=0.1)

@@ -28,7 +28,7 @@ def wandering(whole, smooth, seed=3):
 def test_noise_that_wanders_in_time(smooth, correlation):
     base, optimum = with_likely_noise(base_of(wandering(cached(seed=1), smooth)))
     assert (base.model.correlation, base.model.along) == (correlation, Along.TIME)
-    wander, length = np.exp(optimum.free[2:4])
+    wander, length = np.exp(optimum.hyper[2:4])
     assert wander * np.median(base.scale) == pytest.approx(WANDER_UM, rel=0.3)
     assert length == pytest.approx(LENGTH_S, rel=0.5)
     assert np.std(np.log(base.scale)) < 0.1  # 0.2 to 0.3 under noise along the load

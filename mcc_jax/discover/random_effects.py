@@ -14,9 +14,9 @@ from ..effects import Variant
 from .base import Base, State
 from .candidates import Candidate
 from .columns import Columns, Design
-from .design import More, design_of, linear_at
-from .evidence import Optimum, log_joint, optimise, scales_of, solve, with_little_noise
-from .refine import Refined, refined
+from .design import ExtraColumns, design_of, linear_at
+from .evidence import log_joint, optimise, scales_of, with_little_noise
+from .fit import Fitted, fit_hypothesis
 from .screen import single_integrals
 from .settings import DECISIONS, HYPERPARAMETERS
 
@@ -46,23 +46,15 @@ class Jump:
 
 
 @dataclass(frozen=True)
-class OwnNumbers:
-    """A hypothesis of numbers that each test has of its own, with a formula that all tests share beside them or none.
-
-    Attributes:
-        variant, nuisance: the formula and its further numbers.
-        log_evidence: log marginal likelihood.
-        at: the hypothesis at its optimum.
-        more: columns of its own numbers.
-        jumps: sudden steps, if it is about these.
-    """
+class RandomEffects:
+    """A hypothesis of random effects of every test, alone or with a formula that all tests share."""
 
     variant: Variant
-    nuisance: dict[str, float]
+    nuisance: dict[str, float]  # further numbers of the formula
     log_evidence: float
-    at: Refined
-    more: More
-    jumps: tuple[Jump, ...] = ()
+    at: Fitted  # the hypothesis at its optimum
+    more: ExtraColumns  # columns of its own numbers
+    jumps: tuple[Jump, ...] = ()  # sudden steps, if it is about these
 
     @property
     def curve_um(self) -> np.ndarray:
@@ -71,12 +63,12 @@ class OwnNumbers:
         own = np.einsum("npo,no->np", self.at.design.own[..., 5:], solution.own[:, 5:])
         return own + self.at.design.amplitude[..., K:] @ solution.amplitude[K:]
 
-    def beside(
-        self, base: Base, state: State, variants: tuple[Variant, ...], numbers: np.ndarray, free: np.ndarray
-    ) -> OwnNumbers:
-        """The same numbers with a formula beside them, at its optimum."""
-        spreads = self.at.optimum.free[HYPERPARAMETERS : HYPERPARAMETERS + len(self.more.own_spreads)]
-        at = refined(base, state, variants, numbers, np.concatenate([free, spreads]), self.more)
+    def next_to(
+        self, base: Base, state: State, variants: tuple[Variant, ...], numbers: np.ndarray, hyper: np.ndarray
+    ) -> RandomEffects:
+        """The same numbers with a formula in addition, at its optimum."""
+        spreads = self.at.optimum.hyper[HYPERPARAMETERS : HYPERPARAMETERS + len(self.more.own_spreads)]
+        at = fit_hypothesis(base, state, variants, numbers, np.concatenate([hyper, spreads]), self.more)
         return replace(self, at=at, log_evidence=at.log_evidence + self.of_choices)
 
     @property
@@ -85,67 +77,54 @@ class OwnNumbers:
         return self.log_evidence - self.at.log_evidence
 
 
-def solved(design: Design, optimum: Optimum, start: Refined) -> Refined:
-    """A design at its optimum, linear where another hypothesis is."""
-    return Refined(start.variants, start.state, design, optimum, solve(optimum.free, design))
-
-
-def differing(base: Base, start: Refined, columns: np.ndarray, candidates: Sequence[Candidate]) -> OwnNumbers | None:
+def random_amplitude(
+    base: Base, start: Fitted, columns: np.ndarray, candidates: Sequence[Candidate]
+) -> RandomEffects | None:
     """An amplitude that scatters around a common one, over all formulas of a mechanism; None if none does.
 
-    Args:
-        base: the tests.
-        start: the hypothesis beside which they are: the base law, or one with a formula.
-        columns: signatures of the formulas in units of their smallest plausible amplitudes.
-        candidates: the formulas.
+    It is added to a hypothesis at its optimum: the base law, or one with a formula. `columns` are the candidates'
+    signatures in units of their smallest plausible amplitudes.
     """
-    free = np.append(start.optimum.free, 1.0)
+    hyper = np.append(start.optimum.hyper, 1.0)
     linear = linear_at(base, start.state, start.variants)
-    tried: list[tuple[float, np.ndarray, Candidate, Design, More]] = []
+    tried: list[tuple[float, np.ndarray, Candidate, Design, ExtraColumns]] = []
     for k, c in enumerate(candidates):
         if not c.variant.random_per_test:
             continue
         ratio = c.variant.plausible[1] / c.variant.plausible[0]
         column = columns[..., k : k + 1]
-        more = More(ratio * column, (SPREAD,), column, (ratio,), (0,))
+        more = ExtraColumns(ratio * column, (SPREAD,), column, (ratio,), (0,))
         design = design_of(base, start.state, start.variants, more, linear)
-        value, at = max(
-            ((log_joint(x, design), x) for x in (free, with_little_noise(free))),
-            key=lambda one: one[0],
-        )
+        value, at = max(((log_joint(x, design), x) for x in (hyper, with_little_noise(hyper))), key=lambda one: one[0])
         tried.append((value, at, c, design, more))
     if not tried:
         return None
     tried.sort(key=lambda one: -one[0])
+    fits = [optimise(design, at, curvature=False) for _, at, _, design, _ in tried[:DRIFTS]]
     values: dict[str, list[float]] = {}
-    best: tuple[Optimum, Candidate, Design, More] | None = None
-    for turn, (value, at, c, design, more) in enumerate(tried):
-        if turn < DRIFTS:
-            optimum = optimise(design, at, curvature=False)
-            value = optimum.log_joint
-            if best is None or value > best[0].log_joint:
-                best = optimum, c, design, more
+    logs = [*(fit.log_joint for fit in fits), *(first for first, *_ in tried[DRIFTS:])]
+    for value, (_, _, c, _, _) in zip(logs, tried, strict=True):
         values.setdefault(c.variant.name, []).append(value)
-    assert best is not None
-    optimum, c, design, more = best
+    row = int(np.argmax([fit.log_joint for fit in fits]))
+    optimum, (_, _, c, design, more) = fits[row], tried[row]
     if optimum.log_joint > start.optimum.log_joint:
         # Numbers of its own may be as large as anything else: what was linear without them is not with them.
-        at = refined(base, start.state, start.variants, start.theta, optimum.free, more)
+        at = fit_hypothesis(base, start.state, start.variants, start.theta, optimum.hyper, more)
     else:
-        at = solved(design, optimise(design, optimum.free), start)
+        at = replace(start, design=design, optimum=optimise(design, optimum.hyper))
     each = [logsumexp(v) - np.log(len(v)) for v in values.values()]
     total = float(logsumexp(each) - np.log(len(each))) + at.log_evidence - optimum.log_joint
-    return OwnNumbers(c.variant, dict(c.nuisance), total, at, more)
+    return RandomEffects(c.variant, dict(c.nuisance), total, at, more)
 
 
-def step_scores(now: Refined) -> tuple[np.ndarray, np.ndarray]:
+def step_scores(now: Fitted) -> tuple[np.ndarray, np.ndarray]:
     """Score and information of a step of 1 um at every point, each particle's own numbers integrated out."""
-    design, free = now.design, now.optimum.free
+    design, hyper = now.design, now.optimum.hyper
     _, P, o = design.own.shape
-    own, _ = scales_of(free, design)
+    own, _ = scales_of(hyper, design)
     residual = design.data - design.common @ now.solution.common - design.amplitude @ now.solution.amplitude
     steps = np.where(np.asarray(design.tests.mask)[..., None], np.tril(np.ones((P, P))), 0.0)
-    white = Columns(np.concatenate([design.own * own, steps, residual[..., None]], -1), design).white(free).columns
+    white = Columns(np.concatenate([design.own * own, steps, residual[..., None]], -1), design).white(hyper).columns
     turned = np.swapaxes(white[..., :o], 1, 2)
     root = np.linalg.cholesky(turned @ white[..., :o] + np.eye(o))
     half = np.linalg.solve(root, turned @ white[..., o:])
@@ -155,15 +134,11 @@ def step_scores(now: Refined) -> tuple[np.ndarray, np.ndarray]:
     return score, np.sum(white[..., o:-1] ** 2, 1) - np.sum(half[..., :-1] ** 2, 1)
 
 
-def sudden_steps(base: Base, start: Refined, variant: Variant) -> OwnNumbers | None:
+def sudden_steps(base: Base, start: Fitted, variant: Variant) -> RandomEffects | None:
     """Sudden steps in some tests, found one after the other: at most `MOST_STEPS` in each.
 
-    A test has one with a probability that is itself unknown, uniformly; it may be at any point of its loading.
-
-    Args:
-        base: the tests.
-        start: the hypothesis beside which they are: the base law, or one with a formula.
-        variant: the formula.
+    A test has one with a probability that is itself unknown, uniformly; it may be at any point of its loading. They
+    are added to a hypothesis at its optimum: the base law, or one with a formula.
     """
     N, P = np.asarray(base.tests.mask).shape
     loading, mask = np.asarray(base.tests.loading & base.tests.mask), np.asarray(base.tests.mask)
@@ -174,15 +149,15 @@ def sudden_steps(base: Base, start: Refined, variant: Variant) -> OwnNumbers | N
     now, best, value, steps = start, None, -np.inf, list[Step]()
     for turn in range(MOST_STEPS + 1):
         if turn:
-            more = More(columns, (SPREAD,) * turn)
+            more = ExtraColumns(columns, (SPREAD,) * turn)
             design = design_of(base, start.state, start.variants, more)
-            optimum = optimise(design, np.concatenate([start.optimum.free, np.ones(turn)]), curvature=False)
+            optimum = optimise(design, np.concatenate([start.optimum.hyper, np.ones(turn)]), curvature=False)
             log_prior = _log_prior_of_steps(found, loading)
             if optimum.log_joint + log_prior <= value:
                 break
             value = optimum.log_joint + log_prior
-            now = solved(design, optimum, start)
-            best, steps = OwnNumbers(variant, {}, value, now, more), list(found)
+            now = replace(start, design=design, optimum=optimum)
+            best, steps = RandomEffects(variant, {}, value, now, more), list(found)
         if turn == MOST_STEPS:
             break
         score, information = step_scores(now)
@@ -203,7 +178,7 @@ def sudden_steps(base: Base, start: Refined, variant: Variant) -> OwnNumbers | N
         columns = np.concatenate([columns, new], -1)
     if best is None:
         return None
-    at = refined(base, start.state, start.variants, start.theta, best.at.optimum.free, best.more)
+    at = fit_hypothesis(base, start.state, start.variants, start.theta, best.at.optimum.hyper, best.more)
     jumps = _jumps(base, steps, unit * at.solution.own[:, 5:])
     return replace(best, at=at, log_evidence=at.log_evidence + best.of_choices, jumps=jumps) if jumps else None
 
@@ -228,12 +203,12 @@ def _log_prior_of_steps(found: Sequence[Step], loading: np.ndarray) -> float:
 def _jumps(base: Base, found: Sequence[Step], sizes: np.ndarray) -> tuple[Jump, ...]:
     """The steps with their sizes, those of a turn in the turn's column."""
     force, diameter = np.asarray(base.tests.force), np.asarray(base.tests.effective_diameter)
-    told = []
+    jumps = []
     for step in found:
         i = step.test
         stress = 1e3 * force[i, step.point] / (np.pi * diameter[i] ** 2 / 4)
         size = float(sizes[i, step.turn])
         if size > 0:
             probability = float(expit((size / step.sd) ** 2 / 2 - np.log(len(force[i]))))
-            told.append(Jump(i, float(stress), size, step.sd, probability))
-    return tuple(told)
+            jumps.append(Jump(i, float(stress), size, step.sd, probability))
+    return tuple(jumps)

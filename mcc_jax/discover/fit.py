@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,8 +14,8 @@ from ..calibrate.population import Population
 from ..effects import Variant
 from .base import Base, State
 from .columns import Design
-from .design import NOTHING_MORE, More, between, design_of, moved
-from .evidence import Optimum, Solution, optimise, solve, spreads_of
+from .design import NO_EXTRA, ExtraColumns, between, design_of, moved
+from .evidence import LinearModel, Optimum, Solution, optimise, spreads_of
 from .settings import EARLY
 
 STEPS = 25  # of Gauss-Newton at most
@@ -23,20 +24,18 @@ WORSE = 5.0  # nats by which each of the `EARLY` first steps may make it worse b
 
 
 @dataclass(frozen=True)
-class Refined:
-    """A hypothesis at its optimum.
-
-    Attributes:
-        variants: its formulas.
-        state: where it is linear, which is where its numbers are.
-        design, optimum, solution: there; evidence and numbers come from the same accepted step.
-    """
+class Fitted:
+    """A hypothesis at its optimum: evidence and numbers come from the same accepted step."""
 
     variants: tuple[Variant, ...]
-    state: State
+    state: State  # where it is linear, which is where its numbers are
     design: Design
     optimum: Optimum
-    solution: Solution
+
+    @cached_property
+    def solution(self) -> Solution:
+        """Means of all numbers there."""
+        return LinearModel(self.optimum.hyper, self.design).solve()
 
     @property
     def log_evidence(self) -> float:
@@ -50,16 +49,16 @@ class Refined:
 
     def start(self, base: Base) -> Start:
         """Where a posterior of the law with these formulas begins: the numbers of this optimum."""
-        free, population = self.optimum.free, np.asarray(self.state.population)
+        hyper, population = self.optimum.hyper, np.asarray(self.state.population)
         shift = np.mean(np.log1p(population[0] * base.flatness))
-        spreads = spreads_of(free[4:8], base.spreads).value
+        spreads = spreads_of(hyper[4:8], base.spreads).value
         return Start(
             self.state.point,
             Population(
                 *map(jnp.asarray, (population[0], population[1], population[2:] - shift, spreads[:3], spreads[3])),
                 *map(jnp.asarray, (0.0, 0.0, self.theta, np.zeros(0))),
             ),
-            Noise.from_logs(jnp.asarray(free[:4]), jnp.asarray(base.scale)),
+            Noise.from_logs(jnp.asarray(hyper[:4]), jnp.asarray(base.scale)),
         )
 
     @property
@@ -69,30 +68,29 @@ class Refined:
         return self.design.amplitude[..., : len(units)] * (self.theta[: len(units)] / units)
 
 
-def refined(
+def fit_hypothesis(
     base: Base,
     state: State,
     variants: tuple[Variant, ...],
     numbers: np.ndarray,
-    free: np.ndarray,
-    more: More = NOTHING_MORE,
-) -> Refined:
+    hyper: np.ndarray,
+    more: ExtraColumns = NO_EXTRA,
+) -> Fitted:
     """The optimum of a hypothesis, from a state of the base law on.
 
     Args:
-        base: tests and priors.
-        state: where particles are.
+        base, state: tests and priors; where particles are.
         variants: the formulas.
         numbers: where the effects' numbers are linearised first: amplitudes of zero and further numbers.
-        free: hyperparameters to start from.
-        more: columns besides those of the formulas.
+        hyper: hyperparameters to start from.
+        more: columns in addition to those of the formulas.
     """
     state, value = state.with_numbers(numbers), -np.inf
     before = state
     design = design_of(base, state, variants, more)
     for k in range(STEPS):
         try:
-            optimum = optimise(design, free, curvature=False)
+            optimum = optimise(design, hyper, curvature=False)
         except FloatingPointError:
             if k == 0:
                 raise
@@ -108,11 +106,10 @@ def refined(
                 state = before
                 design = design_of(base, state, variants, more)
                 break
-            free = optimum.free
+            hyper = optimum.hyper
             if last or (k > 1 and abs(optimum.log_joint - value) < STILL):
                 break
             before, value = state, optimum.log_joint
-            state = moved(base, state, variants, solve(free, design))
+            state = moved(base, state, variants, LinearModel(hyper, design).solve())
         design = design_of(base, state, variants, more)
-    optimum = optimise(design, free)
-    return Refined(variants, state, design, optimum, solve(optimum.free, design))
+    return Fitted(variants, state, design, optimise(design, hyper))
