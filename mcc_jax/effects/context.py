@@ -6,6 +6,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+from jaxtyping import Array, Bool
 
 from .._format import described
 from .._types import Values
@@ -103,7 +104,7 @@ class Context(eqx.Module):
         """Force at which the latest reload began, over the peak force [-]."""
         return jnp.clip(self._over_peak(self.record.reload_from)[1], 0.0, 1.0)
 
-    def _over_peak(self, force: Values) -> tuple[Values, Values]:
+    def _over_peak(self, force: Values) -> tuple[Bool[Array, ...], Values]:
         """Whether there has been a load, and a force over its peak, 0 without one."""
         loaded = self.peak_force > jnp.finfo(self.peak_force.dtype).tiny ** 0.5
         return loaded, jnp.where(loaded, force, 0.0) / jnp.where(loaded, self.peak_force, 1.0)

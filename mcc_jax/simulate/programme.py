@@ -246,13 +246,18 @@ def read_programme(file: str | Path) -> Programme:
             if not isinstance(entry, dict) or ("ramp_to" in entry) == ("hold_s" in entry):
                 raise InputError("exactly one of ramp_to and hold_s is needed")  # noqa: TRY301
             _only(entry, ("ramp_to", "rate", "hold_s"), where)
+            if "hold_s" in entry:
+                steps.append(Hold(arguments.number(entry["hold_s"], "hold_s")))
+                continue
             rate = entry.get("rate", content.get("rate"))
-            if "ramp_to" in entry and rate is None:
+            if rate is None:
                 raise InputError("no rate: give it one, or one for all at the top")  # noqa: TRY301
-            steps.append(Ramp(entry["ramp_to"], rate) if "ramp_to" in entry else Hold(entry["hold_s"]))
-        where, interval_s = "the programme", content.get("interval_s")
+            steps.append(Ramp(arguments.number(entry["ramp_to"], "ramp_to"), arguments.number(rate, "rate")))
+        where = "the programme"
+        control = arguments.choice(content.get("control", "load"), get_args(Control), "control")
+        interval_s = arguments.number(content["interval_s"], "interval_s") if "interval_s" in content else None
         points = content.get("points", 300 if interval_s is None else None)
-        return Programme(content.get("control", "load"), steps, interval_s, points)
+        return Programme(control, steps, interval_s, None if points is None else arguments.whole(points, "points"))
     except InputError as error:
         remedy = error.remedy or "See the example in `mcc-jax simulate --help`."
         raise InputError(f"{where}: {error.problem}", file=file, remedy=remedy) from None
