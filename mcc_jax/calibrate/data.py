@@ -28,6 +28,7 @@ from ..campaign import (
 )
 from ..campaign.reasons import SHOWN, below_threshold, far_apart, no_climb, no_loading, refusal, too_few
 from ..campaign.record import humidities, record_columns
+from ..campaign.segments import contact_index
 from ..campaign.signal import point_noise
 from ..effects import Record
 from ..geometry import Particle
@@ -301,8 +302,7 @@ def rows_from_contact(curve: Curve, segments: tuple[Segment, ...], most_points: 
     Of hundreds of cycles, whole unloadings and reloadings are left out of longer records, evenly; what they started
     from stays, and so does the law's state, which knows the largest force only.
     """
-    first = segments[0]
-    start = first.stop if first.kind == "approach" and len(segments) > 1 else 0
+    start = contact_index(segments)
     rows = np.arange(start, len(curve))
     if len(rows) <= most_points:
         return rows
@@ -341,8 +341,6 @@ def _prepare(
         kind[part.start : part.stop] = part.kind
     if not (kind == "load").any():
         return no_loading(curve, segments, stress, threshold)
-    first = segments[0]
-    contact = float(curve.displacement_um[first.stop]) if first.kind == "approach" and len(segments) > 1 else None
     rows = rows_from_contact(curve, segments, most_points)
     peak = np.maximum.accumulate(stress[rows])
     loading = (kind[rows] == "load") & (stress[rows] >= threshold) & (stress[rows] > 0)
@@ -360,7 +358,7 @@ def _prepare(
     rise, noise = climb[-third:].mean() - climb[:third].mean(), max(point_noise_um(curve), PAPER.reading_um)
     if rise <= SELECTION.climb * noise / np.sqrt(third):
         return no_climb(float(rise) if rise >= 0 or -rise > SELECTION.climb * noise / np.sqrt(third) else 0.0)
-    contact = float(curve.displacement_um[0]) if contact is None else contact
+    contact = float(curve.displacement_um[contact_index(segments)])
     largest, reach = float(stress[rows][mask].max()), float(np.ptp(strain[rows][mask]))
     return _Prepared(rows, mask, loading, contact, largest, reach, hidden)
 

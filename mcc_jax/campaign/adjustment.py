@@ -12,7 +12,7 @@ from .._format import described
 from .findings import Finding
 from .reasons import below_threshold, far_apart, no_climb, no_loading, too_few
 from .schema import Campaign, Curve
-from .segments import Segment, find_segments
+from .segments import Segment, contact_index, find_segments
 from .validate import check_campaign
 
 THRESHOLD_MPA = 0.2
@@ -86,8 +86,8 @@ def stress_and_strain(
 
 def _contact_um(curve: Curve, segments: tuple[Segment, ...]) -> float:
     """The displacement at first contact [um]."""
-    if segments[0].kind == "approach" and len(segments) > 1:
-        return float(curve.displacement_um[segments[0].stop])
+    if contact := contact_index(segments):
+        return float(curve.displacement_um[contact])
     first, reach = float(curve.displacement_um[0]), float(np.ptp(curve.displacement_um))
     low, high = MACHINE_ZERO
     return 0.0 if low * reach <= first <= high * reach else first
@@ -176,9 +176,8 @@ def adjust(campaign: Campaign, threshold_MPa: float = THRESHOLD_MPA) -> Adjustme
     References:
         Bommireddy et al. (2018), section 3.
     """
-    check_campaign(campaign)
-    threshold_MPa = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
     segments = campaign_segments(campaign)
+    threshold_MPa = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
     raw = [loading_curve(*one) for one in zip(campaign.curves, campaign.diameters_um, segments, strict=True)]
     reasons = [
         _why_not(*one, threshold_MPa) for one in zip(raw, campaign.curves, campaign.diameters_um, segments, strict=True)

@@ -10,7 +10,7 @@ import numpy as np
 from .findings import Finding
 from .schema import Campaign, Control, Curve
 from .segments import find_segments
-from .signal import differences, median, point_noise, two_lines
+from .signal import Line, differences, median, point_noise, two_lines
 
 AIR_READINGS = 5  # before contact, at least: fewer do not give the zero's error
 AIR_SAID = 3.0  # standard deviations from which on an offset is reported
@@ -89,19 +89,15 @@ def zero_of_force(
     # The last readings before the platens touch may already feel the first asperities.
     stop = max(AIR_READINGS, int(0.9 * contact))
     air, when = curve.force_mN[:stop], curve.time_s[:stop]
-    mean, sd = float(np.mean(air)), float(np.std(air, ddof=1))
+    mean, sd, line = float(np.mean(air)), float(np.std(air, ddof=1)), Line.through(when, air)
     largest = max(float(np.max(curve.force_mN) - mean), 1e-300)
-    centred = when - when.mean()
-    spread = float(np.sum(centred**2))
     error = 0.0
-    if sd > 0 and spread > 0:
-        slope = float(np.sum(centred * air) / spread)
-        left = air - mean - slope * centred
-        slope_sd = float(np.std(left, ddof=2) / np.sqrt(spread)) * _inflation(left)
-        change = slope * float(when[-1] - when[0])
-        if abs(slope) > DRIFT_SAID * slope_sd and abs(change) > AIR_SHARE * largest:
-            path = mean + slope * (np.minimum(curve.time_s, curve.time_s[contact - 1]) - when.mean())
-            error = float(np.hypot(np.std(left, ddof=2) / np.sqrt(len(air)), abs(change) / np.sqrt(12)))
+    if sd > 0 and line.spread > 0:
+        change = line.slope * float(when[-1] - when[0])
+        drifts = abs(line.slope) > DRIFT_SAID * line.slope_sd * _inflation(line.left)
+        if drifts and abs(change) > AIR_SHARE * largest:
+            path = line.at(np.minimum(curve.time_s, curve.time_s[contact - 1]))
+            error = float(np.hypot(line.sd / np.sqrt(len(air)), abs(change) / np.sqrt(12)))
             return ZeroOfForce(path, float(path[-1]), error, (DRIFT.of(abs(change), float(path[-1])),))
         error = float(sd / np.sqrt(len(air)) * _inflation(air - mean))
     said = abs(mean) > AIR_SAID * error and abs(mean) > AIR_SHARE * largest
@@ -143,12 +139,9 @@ def _one_zero(curves: Sequence[Curve], needed: Finding) -> tuple[float, float] |
     lowest = int(np.argmin(begins))
     zero, error = float(begins[lowest]), float(steps[lowest] / np.sqrt(12))
     if len(curves) > 2 and np.all(steps > noise):
-        design = np.stack([1 / steps, np.ones(len(steps))], 1)
-        (crossing, part), *_ = np.linalg.lstsq(design, begins / steps, rcond=None)
-        left = np.sum((begins / steps - design @ (crossing, part)) ** 2) / (len(steps) - 2)
-        spread = float(np.sqrt(left / np.sum((1 / steps - np.mean(1 / steps)) ** 2)))
-        if spread < error and crossing <= zero:
-            zero, error = float(crossing), max(spread, noise / np.sqrt(len(steps)))
+        line = Line.through(1 / steps, begins / steps)
+        if line.spread > 0 and line.slope_sd < error and line.slope <= zero:
+            zero, error = line.slope, max(line.slope_sd, noise / np.sqrt(len(steps)))
     together = np.all(begins - zero <= steps + AIR_SAID * noise)
     return (zero, error) if together else None
 
@@ -206,7 +199,7 @@ def air_until(curve: Curve, control: Control | None) -> tuple[int | None, SlowSt
     if ahead is None or ahead.share > DRIFT_SLOWER:
         return None, ahead
     time = np.minimum(curve.time_s, curve.time_s[ahead.stop - 1])
-    return found(replace(curve, force_mN=curve.force_mN - ahead.line(time))), ahead
+    return found(replace(curve, force_mN=curve.force_mN - ahead.line.at(time))), ahead
 
 
 @dataclass(frozen=True)
@@ -220,7 +213,7 @@ class SlowStart:
         share: its slope as a share of the loading's; negative where it falls.
     """
 
-    line: np.polynomial.Polynomial
+    line: Line
     stop: int
     change: float
     share: float
@@ -241,19 +234,14 @@ def slow_start(curve: Curve) -> SlowStart | None:
     ahead, behind = slice(kink), slice(kink, first + 1)
     if not (time[kink - 1] > time[0] and time[first] > time[kink]):
         return None
-    clocks = [time[rows] - time[rows].mean() for rows in (ahead, behind)]
-    spreads = [max(float(clock @ clock), 1e-300) for clock in clocks]
-    slow, fast = (
-        float(clock @ force[rows]) / s for clock, rows, s in zip(clocks, (ahead, behind), spreads, strict=True)
-    )
-    way, on = (float(clock @ path[rows]) / s for clock, rows, s in zip(clocks, (ahead, behind), spreads, strict=True))
-    bends = fast - slow > DRIFT_SAID * point_noise(force) * np.hypot(*(1 / np.sqrt(spreads)))
-    share, pace = slow / max(fast, 1e-300), way / max(on, 1e-300)
-    if not bends or share > DRIFT_LIKE:
+    slow, fast = (Line.through(time[rows], force[rows]) for rows in (ahead, behind))
+    way, on = (Line.through(time[rows], path[rows]).slope for rows in (ahead, behind))
+    error = point_noise(force) * np.sqrt(1 / slow.spread + 1 / fast.spread)
+    share, pace = slow.slope / max(fast.slope, 1e-300), way / max(on, 1e-300)
+    if fast.slope - slow.slope <= DRIFT_SAID * error or share > DRIFT_LIKE:
         return None
     if pace > 0 and share > 0 and 1 / OTHER_STIFFNESS < share / pace < OTHER_STIFFNESS:
         return None
-    line = np.polynomial.Polynomial.fit(time[ahead], force[ahead], 1)
-    if np.std(force[ahead] - line(time[ahead])) > 2 * point_noise(force[ahead]) + 1e-12 * float(np.ptp(force)):
+    if np.std(slow.left) > 2 * point_noise(force[ahead]) + 1e-12 * float(np.ptp(force)):
         return None
-    return SlowStart(line, kink, float(line(time[kink - 1]) - line(time[0])), share)
+    return SlowStart(slow, kink, slow.slope * float(time[kink - 1] - time[0]), share)

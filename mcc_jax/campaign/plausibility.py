@@ -24,9 +24,8 @@ import numpy as np
 
 from .curve_features import CurveFeatures, curve_features
 from .findings import Finding, worst
-from .memory import remembered
 from .paper import PAPER_LOG_C, PAPER_SHAPE_PARAMETER
-from .schema import Campaign, Curve
+from .schema import Campaign, Curve, remembered
 from .unit_errors import (
     CLOCKS,
     DIAMETER_UM,

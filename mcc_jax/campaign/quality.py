@@ -15,8 +15,7 @@ A test in which nothing is found stays what it is, to the last bit.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -70,99 +69,45 @@ def campaign_findings(campaign: Campaign) -> tuple[Finding, ...]:
     return joined({name: () if one is None else one.findings for name, one in checked})
 
 
-@dataclass
-class _Test:
-    """A test on its way through the checks: what is left of it, and what was found."""
-
-    curve: Curve
-    control: Control | None
-    given_zero: Zero
-    rows: np.ndarray
-    compared: np.ndarray
-    force_sd: np.ndarray
-    zero: Zero = None
-    findings: list[Finding] = field(default_factory=list)
-
-    def leave_out(self, gone: np.ndarray, finding: Finding) -> None:
-        """Leave out readings, booleans, if there are any."""
-        if not gone.any():
-            return
-        self.findings.append(finding)
-        curve, keep = self.curve, ~gone
-        self.curve = Curve(curve.time_s[keep], curve.force_mN[keep], curve.displacement_um[keep])
-        self.rows, self.compared, self.force_sd = self.rows[keep], self.compared[keep], self.force_sd[keep]
-
-
 def check_test(curve: Curve, control: Control | None, zero_mN: Zero = None) -> Curve:
     """One test, checked; see the top of the file for the checks."""
-    count = len(curve)
-    test = _Test(curve, control, zero_mN, np.arange(count), np.ones(count, bool), np.zeros(count))
-    for check in CHECKS:
-        check(test)
-    if not test.findings and test.zero is None:
-        return curve
-    zero = test.zero or (0.0, 0.0)
-    return replace(test.curve, checked=Checked(test.rows, test.compared, *zero, test.force_sd, tuple(test.findings)))
+    clean, rows = curve, np.arange(len(curve))
+    found: list[Finding] = []
 
+    def leave_out(gone: np.ndarray, finding: Finding) -> None:
+        nonlocal clean, rows
+        if gone.any():
+            found.append(finding)
+            rows, keep = rows[~gone], ~gone
+            clean = Curve(clean.time_s[keep], clean.force_mN[keep], clean.displacement_um[keep])
 
-def _check_readings(test: _Test) -> None:
     for wrong, finding in ((spikes, SPIKES), (stuck, STUCK)):
-        for name in ("force", "displacement"):
-            gone = wrong(test.curve.force_mN if name == "force" else test.curve.displacement_um)
+        for channel, name in (("force_mN", "force"), ("displacement_um", "displacement")):
+            gone = wrong(getattr(clean, channel))
             said = replace(finding, sentence=finding.sentence.replace("CHANNEL", name))
-            test.leave_out(gone, said.of(int(gone.sum())))
-
-
-def _check_loading(test: _Test) -> None:
-    if begins_at_peak(test.curve):
-        test.findings.append(NO_LOADING.of(float(test.curve.force_mN[0])))
-
-
-def _check_breakage(test: _Test) -> None:
-    broke = breakage(test.curve)
-    if broke is not None:
+            leave_out(gone, said.of(int(gone.sum())))
+    if begins_at_peak(clean):
+        found.append(NO_LOADING.of(float(clean.force_mN[0])))
+    if (broke := breakage(clean)) is not None:
         last, lost = broke
-        behind = np.arange(len(test.curve)) > last
-        test.leave_out(behind, BROKE.of(float(test.curve.force_mN[last]), 100 * lost))
+        leave_out(np.arange(len(clean)) > last, BROKE.of(float(clean.force_mN[last]), 100 * lost))
+    gone = gives_way(clean, control)
+    leave_out(gone, GIVES_WAY.of(float(clean.force_mN[np.argmax(gone) - 1]), int(gone.sum())))
+    if (zero := zero_of_force(clean, control, zero_mN)) is not None:
+        found += zero.findings
+        clean = replace(clean, force_mN=clean.force_mN - zero.path)
+    compared, force_sd = np.ones(len(clean), bool), np.zeros(len(clean))
+    if (seen := censor_force(clean)) is not None:
+        found.append(seen.finding)
+        clean, rows, compared, force_sd = seen.curve, rows[seen.rows], seen.compared, seen.force_sd_mN
+    if (hidden := censor_displacement(clean)) is not None:
+        found.append(hidden[1])
+        compared = compared & ~hidden[0]
+    if not found and zero is None:
+        return curve
+    off = (0.0, 0.0) if zero is None else (zero.value, zero.sd)
+    return replace(clean, checked=Checked(rows, compared, *off, force_sd, tuple(found)))
 
-
-def _check_slip(test: _Test) -> None:
-    gone = gives_way(test.curve, test.control)
-    test.leave_out(gone, GIVES_WAY.of(float(test.curve.force_mN[np.argmax(gone) - 1]), int(gone.sum())))
-
-
-def _check_zero(test: _Test) -> None:
-    zero = zero_of_force(test.curve, test.control, test.given_zero)
-    if zero is not None:
-        test.zero = zero.value, zero.sd
-        test.findings += zero.findings
-        test.curve = replace(test.curve, force_mN=test.curve.force_mN - zero.path)
-
-
-def _check_force_range(test: _Test) -> None:
-    seen = censor_force(test.curve)
-    if seen is not None:
-        test.findings.append(seen.finding)
-        test.curve, test.rows = seen.curve, test.rows[seen.rows]
-        test.compared, test.force_sd = seen.compared, seen.force_sd_mN
-
-
-def _check_displacement_range(test: _Test) -> None:
-    hidden = censor_displacement(test.curve)
-    if hidden is not None:
-        test.compared = test.compared & ~hidden[0]
-        test.findings.append(hidden[1])
-
-
-CHECKS: tuple[Callable[[_Test], None], ...] = (
-    _check_readings,
-    _check_loading,
-    _check_breakage,
-    _check_slip,
-    _check_zero,
-    _check_force_range,
-    _check_displacement_range,
-)
 
 SPIKES = Finding(
     *("spikes", "info", "single readings of CHANNEL ({}) lie far from their neighbours and are left out"), code="spike"

@@ -16,7 +16,7 @@ from ..effects.record import APPROACH, HOLD, KINDS, LOAD, UNLOAD
 from .adjustment import campaign_segments
 from .schema import Campaign, Curve
 from .segments import Segment
-from .signal import straight_line
+from .signal import Line
 from .validate import check_campaign
 
 JUMP = 1.3  # factor by which rates of force differ at least; less is what the control of test machines leaves
@@ -66,7 +66,7 @@ def record_columns(
             first = slice(part.start, min(part.start + 9, part.stop))
             begins = float(force[part.start])
             if len(force[first]) >= 3 and np.ptp(time[first]) > 0:
-                begins = straight_line(time[first] - time[part.start], force[first])[1]
+                begins = float(Line.through(time[first], force[first]).at(time[part.start]))
             if kind == UNLOAD and branch != UNLOAD:
                 unload_from = begins
             if kind != UNLOAD and branch == UNLOAD:
@@ -134,7 +134,6 @@ def humidities(campaign: Campaign) -> Float[np.ndarray, " particles"] | None:
     Raises:
         InputError: naming the particle whose entry is no number from 0 to 100.
     """
-    check_campaign(campaign)
     return humidity_column(campaign.particles, campaign.columns, campaign.source)
 
 
@@ -176,8 +175,8 @@ def ramp_rates(time: Float[np.ndarray, " n"], force: Float[np.ndarray, " n"], be
     ends = [0, *_kinks(time, force), len(time) - 1]
     rates = np.empty(len(time))
     for first, last in itertools.pairwise(ends):
-        x = time[first : last + 1] - time[first : last + 1].mean()
-        rates[first + (first > 0) : last + 1] = abs(x @ force[first : last + 1]) / max(float(x @ x), 1e-300)
+        piece = slice(first, last + 1)
+        rates[first + (first > 0) : last + 1] = abs(Line.through(time[piece], force[piece]).slope)
     return rates
 
 

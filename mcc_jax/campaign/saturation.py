@@ -20,7 +20,7 @@ import numpy as np
 
 from .findings import Finding
 from .schema import Curve
-from .signal import differences, point_noise, quantile, runs
+from .signal import Line, differences, point_noise, quantile, runs
 
 REPEATS = 4  # readings that repeat the extreme, at least; two equal ones around a turning point are not rare
 COARSE = 3.0  # and this many times as many as the channel repeats elsewhere: a coarse read-out repeats every value
@@ -104,20 +104,18 @@ def plateaus(values: np.ndarray, other: np.ndarray, time: np.ndarray, noise: flo
         if length < max(REPEATS, COARSE * usual) or start < 4:
             continue
         before = np.arange(max(start - BEFORE, 0), start)
-        line = np.polynomial.Polynomial.fit(time[before], other[before], 1)
-        pace = float(line.deriv()(time[start - 1]))
+        line = Line.through(time[before], other[before])
         # How far the other channel comes, and by how much it comes back, as means of three readings.
         part, when = (np.convolve(x[start:stop], np.ones(3) / 3, "valid") for x in (other, time))
         top = int(np.argmax(part >= part.max() - noise / np.sqrt(3)))  # around a turn it hardly moves
-        elapsed, advance = float(when[top] - time[start - 1]), float(part[top] - line(time[start - 1]))
+        elapsed, advance = float(when[top] - time[start - 1]), float(part[top] - line.at(time[start - 1]))
         error = noise * np.sqrt(1 / 3 + 4 / len(before))
         turned = float(part[top] - part[-1]) > ERRORS * error
-        goes_on = advance > GOES_ON * pace * elapsed
+        goes_on = advance > GOES_ON * line.slope * elapsed
         # A coarse read-out rests at its last step while the true value stays below the next one.
-        own = float(np.polynomial.Polynomial.fit(time[before], values[before], 1).deriv()(time[start - 1]))
-        if own * elapsed < STEPS * step:
+        if Line.through(time[before], values[before]).slope * elapsed < STEPS * step:
             continue
-        if pace > 0 and elapsed > 0 and advance > ERRORS * error and (goes_on or turned):
+        if line.slope > 0 and elapsed > 0 and advance > ERRORS * error and (goes_on or turned):
             found.append((start, stop))
     if not found:
         return []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import PurePath
 from typing import Any, Literal, get_args
@@ -15,6 +15,22 @@ from .._format import described, number, span, table
 from .findings import Finding
 
 Control = Literal["load", "displacement"]
+
+
+def remembered[T](of: Curve | Campaign, question: Hashable, find: Callable[[], T]) -> T:
+    """What was found of a curve or a campaign, whose arrays cannot change; looked for at the first time only."""
+    known: dict[Hashable, Any] = vars(of).setdefault("_found", {})
+    if question not in known:
+        known[question] = find()
+    return known[question]
+
+
+def _fixed(values: np.ndarray) -> np.ndarray:
+    """The same numbers in an array that nobody can write to."""
+    if values.flags.writeable:
+        values = values.copy()
+        values.flags.writeable = False
+    return values
 
 
 @dataclass(frozen=True)
@@ -49,7 +65,7 @@ class Curve:
         displacement_um: relative displacement of the two platens [um], shape (n,).
         checked: what `check_tests` changed, of a curve that it made; None of a raw one.
 
-    Lists, Series and arrays of any kind become numpy arrays.
+    Lists, Series and arrays of any kind become numpy arrays that cannot be written to.
 
     Raises:
         InputError: if one of them is no 1-D array of numbers, or they differ in length.
@@ -66,7 +82,7 @@ class Curve:
             values = arguments.floats(column, name, shape="a 1-D array of numbers")
             if values.ndim != 1:
                 raise InputError(f"the {name} of a curve has the shape {values.shape} where a 1-D array is expected")
-            object.__setattr__(self, name, values)
+            object.__setattr__(self, name, _fixed(values))
         arguments.same_length(time_s=self.time_s, force_mN=self.force_mN, displacement_um=self.displacement_um)
         object.__setattr__(self, "checked", checked)
 
@@ -173,9 +189,9 @@ class Campaign:
         further = {name: _texts(cells, f"the column {name!r}") for name, cells in (columns or {}).items()}
         for name, cells in further.items():
             arguments.same_length(**{"particles": names, f"the column {name!r}": cells})
-        told = Metadata() if metadata is None else metadata
-        fields = {"particles": names, "diameters_um": sizes, "curves": tests, "columns": further, "metadata": told}
-        for name, value in (fields | {"source": str(source), "raw": raw}).items():
+        fields = {"particles": names, "diameters_um": _fixed(sizes), "curves": tests, "columns": further}
+        fields |= {"metadata": metadata or Metadata(), "source": str(source), "raw": raw}
+        for name, value in fields.items():
             object.__setattr__(self, name, value)
 
     def __len__(self) -> int:

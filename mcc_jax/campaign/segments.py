@@ -18,8 +18,7 @@ import numpy as np
 from .. import arguments
 from .._errors import InputError
 from .excursions import Drive, Hold
-from .memory import remembered
-from .schema import Control, Curve
+from .schema import Control, Curve, remembered
 from .signal import branch_envelope, median, steady_clock, two_lines
 from .validate import check_finite
 
@@ -81,15 +80,15 @@ def find_segments(curve: Curve, *, control: Control | None = None) -> tuple[Segm
     """
     if control is not None:
         arguments.choice(control, get_args(Control), "control")
-    if not len(curve):
-        raise InputError("the curve has no point", remedy="Give a test with two points or more.")
-    for name in ("time_s", "force_mN", "displacement_um"):
-        check_finite(getattr(curve, name), f"the {name} of a curve", InputError)
     return remembered(curve, ("segments", control), lambda: _found(curve, control))
 
 
 def _found(curve: Curve, control: Control | None) -> tuple[Segment, ...]:
     """The segments of a curve, see `find_segments`."""
+    if not len(curve):
+        raise InputError("the curve has no point", remedy="Give a test with two points or more.")
+    for name in ("time_s", "force_mN", "displacement_um"):
+        check_finite(getattr(curve, name), f"the {name} of a curve", InputError)
     force, displacement = np.asarray(curve.force_mN, float), np.asarray(curve.displacement_um, float)
     clock = steady_clock(np.asarray(curve.time_s, float))
     drive = Drive(force, clock)
@@ -133,6 +132,11 @@ def summarise_segments(curve: Curve, segments: tuple[Segment, ...]) -> list[dict
         }
         rows.append({"kind": part.kind, "samples": len(part)} | ends)
     return rows
+
+
+def contact_index(segments: Sequence[Segment]) -> int:
+    """The first reading behind the approach; 0 of a record without one."""
+    return segments[0].stop if segments[0].kind == "approach" and len(segments) > 1 else 0
 
 
 def _begins_loaded(force: Drive) -> bool:

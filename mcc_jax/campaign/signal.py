@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 LONG_BRANCH = 16
@@ -90,13 +92,43 @@ def differences(values: np.ndarray, order: int = 1) -> np.ndarray:
     return values
 
 
-def straight_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Slope and value at 0 of the straight line through points of shape (n,), n >= 2, by least squares."""
-    design = np.ones((len(x), 2))
-    design[:, 0] = x
-    scale = np.sqrt((design * design).sum(axis=0))
-    slope, level = np.linalg.lstsq(design / scale, y, rcond=len(x) * np.finfo(float).eps)[0] / scale
-    return float(slope), float(level)
+class Line(NamedTuple):
+    """A straight line through n points by least squares.
+
+    Attributes:
+        slope: of y over x.
+        x, y: means of the points.
+        spread: sum of squares of x about its mean; where it is nil, so is the slope.
+        left: residuals, shape (n,).
+    """
+
+    slope: float
+    x: float
+    y: float
+    spread: float
+    left: np.ndarray
+
+    @classmethod
+    def through(cls, x: np.ndarray, y: np.ndarray) -> Line:
+        """The line through points of shape (n,)."""
+        away, level = x - x.mean(), float(y.mean())
+        spread = float(away @ away)
+        slope = float(away @ y) / spread if spread > 0 else 0.0
+        return cls(slope, float(x.mean()), level, spread, y - level - slope * away)
+
+    def at(self, x: Any) -> Any:
+        """Its value at x."""
+        return self.y + self.slope * (x - self.x)
+
+    @property
+    def sd(self) -> float:
+        """Standard deviation of the points about it."""
+        return float(np.sqrt(self.left @ self.left / (len(self.left) - 2)))
+
+    @property
+    def slope_sd(self) -> float:
+        """Standard error of the slope."""
+        return float(self.sd / np.sqrt(self.spread))
 
 
 def _scatter(third: np.ndarray) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 from .._format import described
 from .schema import Curve
 from .segments import Segment
-from .signal import median, noise_level, straight_line
+from .signal import Line, median, noise_level
 
 SHARE = 0.1
 """Share of the peak force within which readings on both sides give the turning point. A ramp under displacement control
@@ -76,8 +76,7 @@ def turning_forces(curve: Curve, segments: tuple[Segment, ...]) -> TurningForces
         if level is None:  # the record begins behind its peak
             level, level_error = float(raw[part.start]), 1.0
             if len(raw[rows]) >= LEAST:
-                clock = time[rows][:MOST] - time[part.start]
-                level = max(straight_line(clock, raw[rows][:MOST])[1], level)
+                level = max(float(Line.through(time[rows][:MOST], raw[rows][:MOST]).at(time[part.start])), level)
         peak[rows], error[rows] = level, level_error
         force[rows] = np.minimum(raw[rows], level)
         if part.kind == "reload" and k + 1 < len(segments) and segments[k + 1].kind == "load":
@@ -169,13 +168,8 @@ def _held(time: np.ndarray, raw: np.ndarray, part: Segment, noise: float) -> np.
     rows = part.start + np.flatnonzero(away <= INSIDE * sd)
     if len(rows) < LEAST:  # too few to tell what they scatter about: those as high as the highest
         return part.start + np.flatnonzero(force >= force.max() - INSIDE * noise)
-    clock, values = time[rows] - time[rows].mean(), raw[rows]
-    if not np.any(clock):
-        return rows
-    slope = clock @ values / (clock @ clock)
-    left = values - values.mean() - slope * clock
-    error = np.sqrt(left @ left / (len(values) - 2) / (clock @ clock))
-    return rows if abs(slope) <= TREND * error or sd == 0 else None
+    line = Line.through(time[rows], raw[rows])
+    return rows if line.spread == 0 or sd == 0 or abs(line.slope) <= TREND * line.slope_sd else None
 
 
 class _Curve(NamedTuple):

@@ -12,7 +12,7 @@ import numpy as np
 
 from .._errors import InputError
 from .columns import LARGEST_MAGNITUDE
-from .schema import Campaign, Curve, Metadata
+from .schema import Campaign, Curve, Metadata, remembered
 
 SMALLEST_DIAMETER_UM = 1e-6
 _TAKEN = ("particle", "D1_um", "D2_um", "D3_um")
@@ -52,7 +52,12 @@ def check_campaign(campaign: Any, name: str = "campaign", *, file: str | Path = 
     if isinstance(campaign, str | PurePath):
         remedy = f"Read it first: mcc_jax.read_campaign({str(campaign)!r})."
         raise InputError(f"{name} must be a Campaign, got the path {str(campaign)!r}", remedy=remedy)
-    place = file or campaign.source or f"the {name}"
+    remembered(campaign, "valid", lambda: _check(campaign, file or campaign.source or f"the {name}"))
+    return campaign
+
+
+def _check(campaign: Campaign, place: str | Path) -> None:
+    """Refuse unfit names, shapes and values."""
 
     def fail(problem: str, remedy: str = "Mend the campaign before it is used") -> InputError:
         return InputError(problem, file=place, remedy=remedy)
@@ -75,7 +80,6 @@ def check_campaign(campaign: Any, name: str = "campaign", *, file: str | Path = 
             raise fail(f"{column!r} cannot be the name of a further column")
         for text in (column, *cells):
             _check_text(text, f"the text {text!r} of column {column!r}", fail)
-    return campaign
 
 
 _DIAMETER = ("D1_", "D2_", "D3_")
