@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mcc_jax.calibrate.settings import FIT
+from mcc_jax.calibrate.hierarchical import LEAST_SPREAD
 
 FIELDS = ("D1", "D2", "D3")
 
@@ -28,7 +28,7 @@ def numpy_residual(tests, settings):
     # The noise is whitened by a linear map: written out, it costs SciPy and lmfit least.
     with jax.numpy_dtype_promotion("standard"):
         maps = np.asarray(jax.vmap(lambda one: one(jnp.eye(force.shape[1])))(settings.whitening))
-    tau = np.maximum(np.asarray(settings.population.tau), FIT.least_spread)
+    tau = np.maximum(np.asarray(settings.population.tau), LEAST_SPREAD)
     mean_zero, zero_sd = (float(v) for v in settings.zero_prior)
     count = len(force)
 

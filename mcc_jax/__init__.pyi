@@ -2,9 +2,7 @@ from . import discover as discover
 from ._blocks import in_blocks as in_blocks
 from ._errors import InputError as InputError
 from ._results import RESULTS as RESULTS
-from .calibrate import Evidence as Evidence
 from .calibrate import Fit as Fit
-from .calibrate import Identifiability as Identifiability
 from .calibrate import LeastSquares as LeastSquares
 from .calibrate import LogNormalPrior as LogNormalPrior
 from .calibrate import Model as Model
@@ -12,7 +10,6 @@ from .calibrate import NakagamiPrior as NakagamiPrior
 from .calibrate import NormalPrior as NormalPrior
 from .calibrate import PaperCalibration as PaperCalibration
 from .calibrate import Posterior as Posterior
-from .calibrate import PredictedCurves as PredictedCurves
 from .calibrate import Priors as Priors
 from .calibrate import calibrate_many as calibrate_many
 from .calibrate import calibrate_paper as calibrate_paper

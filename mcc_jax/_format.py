@@ -49,7 +49,7 @@ def decimals(value: float | int, sd: float | int) -> int | None:
     return None if places > 6 or abs(value) >= 1e6 else places
 
 
-def with_sd(estimate: dict[str, Any], factor: float = 1.0) -> str:
+def with_sd(estimate: Mapping[str, Any], factor: float = 1.0) -> str:
     """Value ± standard deviation, which decides the digits of both."""
     value, sd = estimate["value"], estimate["sd"]
     if value is None or sd is None or not sd > 0:

@@ -129,9 +129,6 @@ def examples(folder: Path) -> dict[str, Example]:
         "adjust": Example(mcc.adjust, campaign=tests, threshold_MPa=0.2),
         "strain_table": Example(calibrate.strain_table, adjustment=adjustment, diameters_um=sizes, points=50),
         "fit_shape_parameter": Example(calibrate.fit_shape_parameter, table=table, objective="full"),
-        "fit_polynomial": Example(
-            calibrate.fit_polynomial, strain=np.linspace(0.01, 0.3, 9), stress_MPa=np.linspace(0.1, 3.0, 9)
-        ),
         "Model": Example(
             mcc.Model, unloading="printed", strain_scaling="raw", modulus_scatter=False, shape_scatter=False
         ),
@@ -163,7 +160,7 @@ def examples(folder: Path) -> dict[str, Example]:
             run=False,
         ),
         "calibrate_many": Example(
-            mcc.calibrate_many, campaigns=[tests], method="least_squares", threshold_MPa=0.2, workers=1, run=False
+            mcc.calibrate_many, campaigns=[tests], method="least_squares", threshold_MPa=0.2, run=False
         ),
         "discover": Example(
             discover.discover, campaign=tests, exclude=[], threshold_MPa=0.2, confirm=True, seed=0, run=False

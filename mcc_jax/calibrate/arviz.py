@@ -22,7 +22,6 @@ from .population import COEFFICIENTS, Population, flattened
 from .posterior import Posterior
 from .predict import laws_with, predicted_at, predicted_by
 from .prior_draws import log_priors, prior_populations
-from .settings import SAMPLING
 
 if TYPE_CHECKING:
     from xarray import DataTree
@@ -49,7 +48,12 @@ VARIABLES: dict[str, tuple[str, list[str]]] = {
     "pareto_k": ("1", ["particle"]),
     "lp_test": ("nat", []),
 }
-"""Unit and dimensions of what stands in the groups."""
+"""Unit and dimensions of the variables."""
+
+
+CURVES = 50  # per chain and particle that are predicted
+POINTS = 2_000_000  # most points of all curves together: of large campaigns the first particles only
+POINTS_DRAWS = 250  # per chain that are kept where every point has a likelihood of its own
 
 
 def prior_draws(calibration: Posterior, count: int, seed: int) -> dict[str, np.ndarray]:
@@ -93,7 +97,7 @@ def to_arviz(calibration: Posterior, *, prior_count: int = 500, points: bool = F
     c, tests = calibration, calibration.selection.tests
     particles, mask = list(c.particles), np.asarray(tests.mask)
     chains, draws = np.asarray(c.population.a).shape
-    thin = slice(None, None, -(-draws // SAMPLING.points_draws) if points else 1)
+    thin = slice(None, None, -(-draws // POINTS_DRAWS) if points else 1)
     population = jax.tree.map(lambda x: np.asarray(x)[:, thin], c.population)
     posterior: dict[str, Any] = _variables(population, c.model) | {
         "yield_stress_MPa": c.yield_stress_MPa()[:, thin],
@@ -177,25 +181,25 @@ def _predictive(
 ) -> tuple[int, np.ndarray, np.ndarray]:
     """How many particles are shown, and draws of their displacements by posterior and prior; NaN where masked.
 
-    Of the posterior either draws and particles enough for a picture, or, thinned, the draws that likelihoods stand for.
+    Of the posterior either draws and particles enough for a picture, or, thinned, the draws that likelihoods belong to.
     """
     mask = np.asarray(c.selection.tests.mask)
     chains, draws = np.asarray(c.population.a).shape
     points = mask.shape[1]
     shown = len(mask)
     if thin is None:
-        shown = max(1, min(shown, SAMPLING.points // (chains * SAMPLING.curves * points)))
-        thin = slice(None, None, -(-draws // SAMPLING.curves))
+        shown = max(1, min(shown, POINTS // (chains * CURVES * points)))
+        thin = slice(None, None, -(-draws // CURVES))
     pick = np.arange(chains * draws).reshape(chains, draws)[:, thin]
     predicted = np.full((*pick.shape, shown, points), np.nan, np.float32)
-    before = np.full((1, SAMPLING.curves, shown, points), np.nan, np.float32)
+    before = np.full((1, CURVES, shown, points), np.nan, np.float32)
     for row in range(shown):
         curves = predicted_at(c, row, pick.ravel(), seed + row)
         assert curves.observed_um is not None
         length = curves.observed_um.shape[1]
         shaped = curves.observed_um.reshape(*pick.shape, length)
         predicted[:, :, row, :length] = np.where(mask[row, :length], shaped, np.nan)
-        before[0, :, row] = np.where(mask[row], _prior_curves(c, prior, row, SAMPLING.curves, seed), np.nan)
+        before[0, :, row] = np.where(mask[row], _prior_curves(c, prior, row, CURVES, seed), np.nan)
     return shown, predicted, before
 
 

@@ -22,7 +22,7 @@ def compiled_quickly[**P, R](function: Callable[P, R]) -> Callable[P, R]:
 def even_batch(count: int, most: int) -> int:
     """How many of `count` to work on at once, at most `most`: without a remainder, if that is not far fewer.
 
-    `jax.lax.map` compiles its function once more for the remainder.
+    `jax.lax.map` compiles its function again for the remainder.
     """
     most = max(1, min(count, most))
     even = next(size for size in range(most, 0, -1) if count % size == 0)
@@ -30,7 +30,7 @@ def even_batch(count: int, most: int) -> int:
 
 
 def imported_meanwhile(*names: str) -> None:
-    """Import what is needed later beside what is compiled first: together they would take seconds longer."""
+    """Import what is needed later while the first programs are compiled: together they would take seconds longer."""
     for name in names:
         threading.Thread(target=importlib.import_module, args=(name,), daemon=True).start()
 

@@ -1,8 +1,8 @@
-"""Every test of a campaign beside its calibrated law: what report and figures show, worked out once."""
+"""Every test of a campaign next to its calibrated law: what report and figures show, worked out once."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,7 +19,7 @@ from .compiling import compiled
 from .data import padded_length, records_of, rows_from_contact
 from .laws import Variants, laws_of
 from .population import COEFFICIENTS
-from .settings import SELECTION
+from .settings import MOST_POINTS
 
 KINDS = ("load", "hold", "unload", "reload")
 
@@ -73,27 +73,26 @@ def fitted_curves(
     predictions: Callable[[str], np.ndarray | None],
     variants: Variants | None = None,
 ) -> tuple[FittedCurve, ...]:
-    """The tests of a campaign beside its calibrated law. Needs double precision, as calibration does.
-
-    For `compared` and `predictions` see `Calibration`; `variants` are formulas that are not in the library.
-    """
+    """The tests of a campaign with what its calibrated law predicts. Needs double precision, as calibration does."""
     segments = campaign_segments(campaign)
     shown = [_measured(campaign, i, parts, compared.get(i)) for i, parts in enumerate(segments)]
     entries = {entry["particle"]: entry for entry in content["particles"]}
-    told = [replace(one, why_not=entries[one.name]["why_not"]) for one in shown]
-    rows = [i for i, one in enumerate(told) if _known(entries[one.name])]
+    curves = [replace(one, why_not=entries[one.name]["why_not"]) for one in shown]
+    rows = [i for i, one in enumerate(curves) if _known(entries[one.name])]
     if not rows:
-        return tuple(told)
-    for row, um in zip(
-        rows,
-        _displacements(content, campaign, segments, [told[i] for i in rows], rows, compared, variants),
-        strict=True,
-    ):
-        zero = entries[told[row].name]["zero_um"]["value"] or 0.0
-        told[row] = replace(told[row], own_um=um[0] + zero, typical_um=um[1] + zero)
-        if row in compared:
-            told[row] = _with_band(told[row], predictions(told[row].name))
-    return tuple(told)
+        return tuple(curves)
+    used = [compared[i][0] if i in compared else _rows(campaign, i, segments[i]) for i in rows]
+    # Campaigns of similar length share one compilation.
+    records = records_of(campaign, rows, segments, used, padded_length(max(map(len, used)))).record
+    sizes = campaign.diameters_um[rows]
+    both = laws_of(content, [curves[i].name for i in rows], sizes, variants)
+    own, typical = (np.asarray(responses(laws, particle_batch(sizes), records)) for laws in both)
+    for row, own_um, typical_um in zip(rows, own, typical, strict=True):
+        one, zero = curves[row], entries[curves[row].name]["zero_um"]["value"] or 0.0
+        length = len(one.kind)
+        one = replace(one, own_um=own_um[:length] + zero, typical_um=typical_um[:length] + zero)
+        curves[row] = _with_band(one, predictions(one.name)) if row in compared else one
+    return tuple(curves)
 
 
 def _known(entry: Mapping[str, Any]) -> bool:
@@ -117,29 +116,7 @@ def _measured(
 
 
 def _rows(campaign: Campaign, i: int, segments: tuple[Segment, ...]) -> np.ndarray:
-    return rows_from_contact(campaign.curves[i], segments, SELECTION.most_points)
-
-
-def _displacements(
-    content: Mapping[str, Any],
-    campaign: Campaign,
-    segments: Sequence[tuple[Segment, ...]],
-    shown: list[FittedCurve],
-    places: list[int],
-    compared: Mapping[int, tuple[np.ndarray, np.ndarray]],
-    variants: Variants | None,
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Displacement [um] of every test under its measured force, by its own law and by the typical one."""
-    rows = [compared[i][0] if i in compared else _rows(campaign, i, segments[i]) for i in places]
-    sizes = campaign.diameters_um[places]
-    # Campaigns of similar length share one compilation.
-    records = records_of(campaign, places, segments, rows, padded_length(max(map(len, rows)))).record
-    particles = particle_batch(sizes)
-    own, typical = (
-        np.asarray(responses(laws, particles, records))
-        for laws in laws_of(content, [one.name for one in shown], sizes, variants)
-    )
-    return [(o[: len(one.kind)], t[: len(one.kind)]) for one, o, t in zip(shown, own, typical, strict=True)]
+    return rows_from_contact(campaign.curves[i], segments, MOST_POINTS)
 
 
 @compiled

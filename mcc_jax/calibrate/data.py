@@ -32,7 +32,15 @@ from ..campaign.segments import contact_index
 from ..campaign.signal import point_noise
 from ..effects import Record
 from ..geometry import Particle
-from .settings import PAPER, SELECTION
+from .settings import MOST_POINTS, READING_UM, UNLOADED_FROM
+
+LEAST_POINTS = 12  # fewer usable points cannot carry three coefficients, a zero and their noise
+CLIMB = 8.0  # displacement must grow over loading by this many times its noise, or there is no curve to fit
+# Of records with more segments than one for so many rows that are kept, hundreds of cycles, whole cycles are left out:
+# turning points that are always kept would be most of what is left.
+TURNS_SHARE = 4
+# Records are padded to one of these lengths, beyond them in steps of the last: similar campaigns share a compilation.
+LENGTHS = (64, 128, 192, 320, 448)
 
 
 class Tests(eqx.Module):
@@ -40,17 +48,17 @@ class Tests(eqx.Module):
 
     Attributes:
         particle: sizes and shapes, leading axis N.
-        record: what the tester did, point by point; its forces are those of `turning_forces`.
+        record: what the instrument did, point by point; its forces are those of `turning_forces`.
         displacement: measured displacement [um], raw; None to predict it.
         mask: which points are compared with the law.
         loading: which of them lie on virgin loading.
         contact: displacement at which the record says that the platen touches [um].
-        path: where a point stands on its path of force: the sum of all changes of force up to it, in shares of the
+        path: where a point is on its path of force: the sum of all changes of force up to it, in shares of the
             largest force [-]. Correlated residuals live along it.
         branch: index of the point from which a point's branch starts; its own on virgin loading.
         reading: whether a point's force is a reading of its own.
         peak_error: standard error of the force from which its branch starts, in those of a reading [-].
-        weight: 1 for particles, 0 for copies that only fill up; None where all are particles.
+        weight: 1 for particles, 0 for padding; None where all are particles.
         force_zero_sd: standard deviation of each test's zero of force [mN]; None where none was measured.
         peak_sd: standard deviation of the force of each point's branch peak where it was worked out otherwise, from
             readings that saturate [mN]; None where none was.
@@ -112,7 +120,7 @@ def longer(tree: Any, particles: int) -> Any:
 
 def padded_length(points: int) -> int:
     """The length that records of so many points are padded to."""
-    return next((length for length in SELECTION.lengths if length >= points), points + -points % SELECTION.lengths[-1])
+    return next((length for length in LENGTHS if length >= points), points + -points % LENGTHS[-1])
 
 
 @dataclass(frozen=True)
@@ -123,7 +131,7 @@ class Selection:
         tests: the arrays of those that do.
         kept: their positions in the campaign.
         reasons: for each particle of the campaign, None if kept, else why it is not.
-        rows: for each kept particle, the rows of its curve, as `check_tests` left it, that stand in `tests`.
+        rows: for each kept particle, the rows of its curve, as `check_tests` left it, that are in `tests`.
         notes: what a reader must know about particles that are kept.
     """
 
@@ -139,20 +147,17 @@ class Selection:
         return tuple(None if one is None else one.reason for one in self.reasons)
 
 
-MOST = SELECTION.most_points
-
-
-def select_tests(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_points: int = MOST) -> Tests:
+def select_tests(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA) -> Tests:
     """The tests as a `Model` takes them: points and particles chosen, padded to rectangular arrays; see `select`."""
-    return select(campaign, threshold_MPa=threshold_MPa, most_points=most_points).tests
+    return select(campaign, threshold_MPa=threshold_MPa).tests
 
 
-def select(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_points: int = MOST) -> Selection:
+def select(campaign: Campaign, *, threshold_MPa: float = THRESHOLD_MPA, most_points: int = MOST_POINTS) -> Selection:
     """Choose what the joint calibration uses.
 
     Points count from the threshold stress on, below which surface asperities and not the particle deform. On unloading
-    and reloading they count from `MIN_RATIO` of the peak, below which displacement depends on force with an infinite
-    slope. The approach never counts. Of longer records every n-th row is used, turning points always.
+    and reloading they count from `UNLOADED_FROM` of the peak, below which displacement depends on force with an
+    infinite slope. The approach never counts. Of longer records every n-th row is used, turning points always.
 
     Args:
         campaign: the tests.
@@ -243,12 +248,7 @@ def _branches(levels: np.ndarray, elastic: np.ndarray) -> np.ndarray:
 
 
 class Records(NamedTuple):
-    """What the testers did, as laws and noise are told; every array of shape (N, points).
-
-    Attributes:
-        record: with the forces and peaks of `turning_forces`.
-        reading, error: as there.
-    """
+    """What the instruments did, as laws and noise see it, with forces and peaks of `turning_forces`; (N, points)."""
 
     record: Record
     reading: np.ndarray
@@ -262,14 +262,7 @@ def records_of(
     rows: Sequence[np.ndarray],
     longest: int,
 ) -> Records:
-    """Records of some tests at some of their rows, padded with the last one.
-
-    Args:
-        places: which tests.
-        segments: of all tests.
-        rows: of the chosen ones.
-        longest: length to pad to.
-    """
+    """Records of the tests at some places of a campaign, at some rows of each, padded with the last to a length."""
     humidity = humidities(campaign)
     records, reading, error = [], [], []
     for i, some in zip(places, rows, strict=True):
@@ -307,12 +300,12 @@ def rows_from_contact(curve: Curve, segments: tuple[Segment, ...], most_points: 
     if len(rows) <= most_points:
         return rows
     turns = [int(np.argmax(curve.force_mN))]
-    if len(segments) <= most_points // SELECTION.turns_share:
+    if len(segments) <= most_points // TURNS_SHARE:
         turns += [part.start for part in segments] + [part.stop - 1 for part in segments]
         thinned = [rows[:: -(-len(rows) // most_points)]]
     else:
         elastic = [k for k, part in enumerate(segments) if part.kind in ("hold", "unload", "reload")]
-        some = [segments[k] for k in elastic[:: -(-len(elastic) // (most_points // SELECTION.turns_share))]]
+        some = [segments[k] for k in elastic[:: -(-len(elastic) // (most_points // TURNS_SHARE))]]
         turns += [part.start for part in some] + [part.stop - 1 for part in some]
         force = np.asarray(curve.force_mN)
         # The largest force before each, from which the law unloads.
@@ -344,20 +337,20 @@ def _prepare(
     rows = rows_from_contact(curve, segments, most_points)
     peak = np.maximum.accumulate(stress[rows])
     loading = (kind[rows] == "load") & (stress[rows] >= threshold) & (stress[rows] > 0)
-    elastic = np.isin(kind[rows], ("hold", "unload", "reload")) & (stress[rows] >= PAPER.unloaded_from * peak)
+    elastic = np.isin(kind[rows], ("hold", "unload", "reload")) & (stress[rows] >= UNLOADED_FROM * peak)
     mask = loading | (elastic & (stress[rows] >= threshold) & (peak > 0))
     hidden = bool((mask & ~loading).any())
     mask, loading = mask & curve.compared[rows], loading & curve.compared[rows]
     hidden &= not (mask & ~loading).any()
     if stress.max() <= threshold:
         return below_threshold(float(stress.max()), threshold)
-    if loading.sum() < SELECTION.least_points:
-        return too_few(int(loading.sum()), SELECTION.least_points)
+    if loading.sum() < LEAST_POINTS:
+        return too_few(int(loading.sum()), LEAST_POINTS)
     climb = curve.displacement_um[rows[loading]]
     third = max(len(climb) // 3, 1)
-    rise, noise = climb[-third:].mean() - climb[:third].mean(), max(point_noise_um(curve), PAPER.reading_um)
-    if rise <= SELECTION.climb * noise / np.sqrt(third):
-        return no_climb(float(rise) if rise >= 0 or -rise > SELECTION.climb * noise / np.sqrt(third) else 0.0)
+    rise, noise = climb[-third:].mean() - climb[:third].mean(), max(point_noise_um(curve), READING_UM)
+    if rise <= CLIMB * noise / np.sqrt(third):
+        return no_climb(float(rise) if rise >= 0 or -rise > CLIMB * noise / np.sqrt(third) else 0.0)
     contact = float(curve.displacement_um[contact_index(segments)])
     largest, reach = float(stress[rows][mask].max()), float(np.ptp(strain[rows][mask]))
     return _Prepared(rows, mask, loading, contact, largest, reach, hidden)

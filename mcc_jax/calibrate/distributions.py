@@ -130,13 +130,7 @@ def nuisance_prior(nuisance: Nuisance) -> dist.Distribution:
 
 
 class RecordNoise(dist.Distribution):
-    """Displacements of whole tests: one event is one test, so that log likelihoods are by particle.
-
-    Attributes:
-        loc: predicted displacement [um].
-        filters: the noise of every test.
-        factor: a common factor on it.
-    """
+    """Displacements of whole tests around a prediction [um]: one event is one test, log likelihoods are by particle."""
 
     arg_constraints: Any = {}  # noqa: RUF012  # as NumPyro has it
     support: Any = constraints.real_vector

@@ -14,13 +14,16 @@ from .compiling import compiled
 from .estimates import effect_numbers
 from .fit_result import Fit
 from .importance import diagnostics, sample_weighted
-from .mode import LogPosterior, density_of, populations
+from .mode import LogPosterior, log_densities, populations
 from .model import Model
 from .noise import standard_promotion
-from .particles import Drawer, ExactLikelihood, Length, chunk_of, corrected, every, stride_of, weighted
+from .particles import PROBES, Drawer, ExactLikelihood, Length, chunk_of, corrected, every, stride_of, weighted
 from .population import COEFFICIENTS, Population
-from .settings import SAMPLING
 from .sharding import count_of
+
+# Of NUTS where importance sampling failed. Around its mode, in coordinates scaled by the curvature there, a density
+# that is near normal takes 15 leapfrog steps a draw; one that needs over 31 would take minutes, and shows in R-hat.
+FALLBACK_ACCEPT, TREE_DEPTH = 0.95, 5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,22 +77,22 @@ def exact_likelihood(fit: Fit) -> ExactLikelihood:
     return ExactLikelihood(fit.tests, fit.filters, fit.marginal, (mean, sd), fit.model.forms)
 
 
-def draw_fast(key: Array, fit: Fit, length: Length, block: int, *, patient: bool = True) -> Draws:
+def draw_fast(key: Array, fit: Fit, length: Length, block: int, *, fallback: bool = True) -> Draws:
     """The population sampled, the particles drawn back and corrected by exact weights.
 
-    Without patience, and where the fit did not converge, the sampler never runs, which takes minutes there: the draws
-    are then those of the proposal.
+    Without `fallback`, and where the fit did not converge, NUTS never runs, which takes minutes there: the draws are
+    then those of the proposal.
     """
     count, exact = count_of(fit.tests), exact_likelihood(fit)
     population_key, particle_key, check_key, pick_key = jax.random.split(key, 4)
     few = stride_of(count, length.total) == 1
-    patient = patient and bool(np.all(np.asarray(fit.converged)[1:]))
-    run, good, (integral, error) = _sampled(population_key, fit, length, not few, patient)
+    fallback = fallback and bool(np.all(np.asarray(fit.converged)[1:]))
+    run, good, (integral, error) = _sampled(population_key, fit, length, not few, fallback)
     if few:
         drawer = Drawer(exact, block, chunk_of(length.total))
         found = weighted(drawer, run.population, length, check_key, pick_key)
     else:
-        drawer = Drawer(exact, block, SAMPLING.probes)
+        drawer = Drawer(exact, block, PROBES)
         parameters = _stack(run.population, fit, length)[1].reshape(length.total, -1)
         found = corrected(drawer, run.population, parameters, length, check_key, pick_key, particle_key)
     run = run._replace(population=every(run.population, found.chosen))
@@ -102,23 +105,17 @@ def draw_fast(key: Array, fit: Fit, length: Length, block: int, *, patient: bool
 
 
 class Run(NamedTuple):
-    """Draws of the population, all chains in a row, and how the sampler ran.
-
-    Attributes:
-        population: the draws.
-        divergences: number of divergent trajectories.
-        leapfrogs: mean number of leapfrog steps of a draw; 0 of independent draws.
-    """
+    """Draws of the population, chains in a row, divergences, and leapfrog steps a draw (0 of independent draws)."""
 
     population: Population
     divergences: int = 0
     leapfrogs: float = 0.0
 
 
-def _sampled(key: Array, fit: Fit, length: Length, many: bool, patient: bool) -> tuple[Run, bool, tuple[float, float]]:
+def _sampled(key: Array, fit: Fit, length: Length, many: bool, fallback: bool) -> tuple[Run, bool, tuple[float, float]]:
     """Draws of the population: independent ones, weighted, if the weights are good enough, else NUTS's.
 
-    And whether they are good (without patience NUTS does not run), and the log of the density's integral with its
+    And whether they are good (without `fallback` NUTS does not run), and the log of the density's integral with its
     standard error, by Laplace's method where NUTS drew.
     """
     target = fit.target
@@ -127,9 +124,9 @@ def _sampled(key: Array, fit: Fit, length: Length, many: bool, patient: bool) ->
     if found is not None:
         return Run(found.population), True, (found.log_evidence, found.error)
     volume = 0.5 * np.linalg.slogdet(2 * np.pi * np.asarray(fit.covariance))[1] + len(target.signed()) * np.log(2)
-    laplace = float(density_of(fit.mode, target)) + float(volume), np.inf
-    if not patient:
-        bad = sample_weighted(key, fit.mode, fit.covariance, target, **shape, however_bad=True)
+    laplace = float(log_densities(np.asarray(fit.mode)[None], target)[0]) + float(volume), np.inf
+    if not fallback:
+        bad = sample_weighted(key, fit.mode, fit.covariance, target, **shape, allow_bad_weights=True)
         assert bad is not None
         return Run(bad.population), False, laplace
     free, divergent, steps = _sample_density(
@@ -145,7 +142,7 @@ def _sample_density(
 ) -> tuple[Array, Array, Array]:
     """NUTS on the population's density: draws of all chains, which diverged, and leapfrog steps.
 
-    A function of the data, compiled once for a shape: NumPyro's `MCMC` compiles anew for every data set.
+    A function of the data, compiled once for a shape: NumPyro's `MCMC` compiles again for every data set.
     """
     from numpyro.infer import NUTS
 
@@ -155,7 +152,7 @@ def _sample_density(
         value = -target.log_density(mode + factor @ z)
         return jnp.where(jnp.isnan(value), jnp.inf, value)
 
-    options: dict[str, Any] = {"target_accept_prob": SAMPLING.fallback_accept, "max_tree_depth": SAMPLING.tree_depth}
+    options: dict[str, Any] = {"target_accept_prob": FALLBACK_ACCEPT, "max_tree_depth": TREE_DEPTH}
 
     def chain(key: Array) -> tuple[Array, Array, Array]:
         kernel = NUTS(potential_fn=potential, **options)

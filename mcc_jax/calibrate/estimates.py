@@ -56,7 +56,7 @@ def estimate(
 
 
 def force_zero(curve: Curve) -> dict[str, Any]:
-    """The zero of force [mN] that was taken off a test; null where no reading in the air tells it."""
+    """The zero of force [mN] that was taken off a test; null where no reading in the air shows it."""
     checked = curve.checked
     if checked is None or not (checked.force_zero_mN or checked.force_zero_sd_mN):
         return estimate(None)
@@ -104,14 +104,14 @@ def effect_entries(model: Model, draws: Mapping[str, Any], estimates: bool = Fal
     `draws` are those of every number by the name of its site, or estimates already.
     """
 
-    def told(name: str) -> dict[str, Any]:
+    def of(name: str) -> dict[str, Any]:
         value = draws[name]
         return value if estimates else (summary(value) if np.ndim(value) else estimate(float(value)))
 
     entries = []
     for v in model.effects:
-        parameters = {v.parameter: told(v.mechanism)}
-        parameters |= {n.name: told(f"{v.mechanism}.{n.name}") for n in v.nuisances}
+        parameters = {v.parameter: of(v.mechanism)}
+        parameters |= {n.name: of(f"{v.mechanism}.{n.name}") for n in v.nuisances}
         entry: dict[str, Any] = {
             "mechanism": v.mechanism,
             "variant": v.name,
@@ -119,6 +119,6 @@ def effect_entries(model: Model, draws: Mapping[str, Any], estimates: bool = Fal
             "parameters": parameters,
         }
         if v.mechanism in model.varying:
-            entry["differs_between_particles"] = told(f"tau_{v.mechanism}")
+            entry["differs_between_particles"] = of(f"tau_{v.mechanism}")
         entries.append(entry)
     return entries

@@ -33,17 +33,13 @@ def fit(
 ) -> Fit:
     """Fit particles, noise and population of a campaign: where samplers start, and in what coordinates.
 
-    Args:
-        campaign: the tests.
-        model: what is assumed.
-        threshold_MPa: points below this stress on loading do not count [MPa].
-        progress: called with the name of each step.
+    For the arguments see `sample`.
 
     Raises:
         InputError: if no particle can be used; for an argument of the wrong kind or out of its range.
     """
     campaign = check_tests(campaign)
-    tell, model, threshold_MPa = checked_settings(progress, model, threshold_MPa, None)
+    tell, model, threshold_MPa = checked_settings(progress, model, threshold_MPa)
     with numbers_in_reach(campaign):
         selection, found, _ = prepare(campaign, model, threshold_MPa, tell=tell)
     return found.first(len(selection.kept))

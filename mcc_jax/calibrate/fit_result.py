@@ -26,7 +26,10 @@ from .model import Model
 from .noise import NoiseFit, Whitening
 from .particle_fit import ParticleFits
 from .population import Population
-from .settings import SAMPLING
+
+# Acceptance that NUTS aims at. Where spreads are small what all particles share is narrow (a funnel), and with fewer
+# than some ten particles the usual 0.8 lets trajectories diverge there.
+ACCEPT = 0.99
 
 
 class Fit(eqx.Module):
@@ -98,12 +101,10 @@ class Fit(eqx.Module):
         arguments.flag(explicit, "explicit")
         size = len(self.names) + explicit * len(self.tests) * (self.marginal.scatter.size + 1)
         start = init_to_value(values={"coordinates": jnp.zeros(size)})
-        return NUTS(
-            FitCoordinates(self, size), **{"target_accept_prob": SAMPLING.accept, **settings}, init_strategy=start
-        )
+        return NUTS(FitCoordinates(self, size), **{"target_accept_prob": ACCEPT, **settings}, init_strategy=start)
 
     def first(self, count: int) -> Fit:
-        """The same of the first `count` particles: without copies that only fill up."""
+        """The same of the first `count` particles: without padding."""
 
         def some(tree: Any) -> Any:
             return jax.tree.map(lambda x: x[:count], tree)
@@ -139,13 +140,13 @@ class FitCoordinates:
         d = len(fit.names)
         free = fit.mode + jnp.linalg.cholesky(fit.covariance) @ position[:d]
         sites = fit.target.sites(free)
-        told = {} if marginal is not None else {"filters": fit.filters, "around": fit.marginal}
+        options = {} if marginal is not None else {"filters": fit.filters, "around": fit.marginal}
         if marginal is None:
             sites["own"] = position[d:].reshape(len(tests), -1)
-        with handlers.block():  # the model is evaluated here, and stands for no sites of its own
-            potential: Any = potential_energy(fit.model, (tests, marginal), told, sites)
+        with handlers.block():  # the model is evaluated here, and adds no sites of its own
+            potential: Any = potential_energy(fit.model, (tests, marginal), options, sites)
             model = handlers.seed(fit.model, jax.random.key(0))
-            values = constrain_fn(model, (tests, marginal), told, sites, return_deterministic=True)
+            values = constrain_fn(model, (tests, marginal), options, sites, return_deterministic=True)
         numpyro.factor("density", -potential)
         for name, value in values.items():
             numpyro.deterministic(name, value)

@@ -25,22 +25,27 @@ from .marginal import Marginal, summarise
 from .mode import LogPosterior, careful_enough, expect, log_densities, most_probable
 from .model import Model
 from .noise import Noise, NoiseFit, estimate_noise, particle_scales, squared_innovations, student_weights
-from .particle_fit import ParticleFits, fit_particles, linear_starts
+from .particle_fit import STEPS, ParticleFits, fit_particles, linear_starts
 from .population import Population
 from .prior_draws import site_values
 from .priors import Priors, check_prior_of_a
-from .settings import FIT, SELECTION
+from .settings import MOST_POINTS
 from .sharding import Blocks, Parts, block_size, count_of, filled_up, require_same
+
+# Found by trial on simulated campaigns (`benchmarks/study_posterior.py`, `study_noise.py`, `bench_scale.py`).
+FIRST_STEPS = 10  # that all particles of many blocks take before the late ones go on by themselves
+ALONE = 1.5  # standard deviation of the logarithms that a particle by itself is allowed around the prior's centre
+NARROWEST = 1e-3  # least such standard deviation under the population: any smaller is badly scaled
+NOISE_BLOCKS = 4  # the noise of campaigns of more blocks is estimated from the particles of so many
+ROUNDS, MOST_ROUNDS = 2, 20  # turns of noise, population and particles: at least, and at most, with effects
+STILL = 0.005  # log density still to gain at which effects are not linearised again: a tenth of a standard deviation
+HALVINGS = 8  # most halvings of a step of a model with effects until it raises the density
+WIDEST = 1.0  # sd of the log of an effect's number over which the bend is taken; beyond, the exact likelihood corrects
+STUDENT_STEPS = 4  # how often weights of readings and noise are taken in turn, in each round
 
 
 class Start(NamedTuple):
-    """Where a fit may begin instead of from nothing: what another fit of the same tests found.
-
-    Attributes:
-        point: the particles.
-        population: what they share.
-        noise: the noise.
-    """
+    """Where a fit may begin instead of from nothing: what another fit of the same tests found."""
 
     point: Point
     population: Population
@@ -52,34 +57,28 @@ def prepare(
     model: Model,
     threshold_MPa: float = THRESHOLD_MPA,
     *,
-    block: int | None = None,
-    most_points: int = SELECTION.most_points,
+    most_points: int = MOST_POINTS,
     start: Start | None = None,
     tell: Callable[[str], None] = lambda _: None,
     **settings: Any,
 ) -> tuple[Selection, Fit, int]:
-    """What every calibration begins with: points and particles selected, filled up to blocks, and fitted.
+    """Select points and particles, pad to whole blocks, and fit: what every calibration begins with.
 
-    Args:
-        model: what is assumed; its priors become the campaign's own where they have to (`in_own_units`).
-        block: particles of a block; by default `block_size` of their number.
-        most_points: records longer than this are thinned.
-        start: where the fit begins.
-        settings: of `fit_tests`.
+    The model's priors become the campaign's own where they have to (`in_own_units`). Settings are those of `fit_tests`.
 
     Returns:
-        What was selected, the fit of the tests with copies that fill up, and the size of a block.
+        What was selected, the fit of the tests with padding, and the size of a block.
 
     Raises:
         InputError: if no particle can be used, numbers overflow, or processes were given different tests.
     """
     make_room()
-    model, told = in_own_units(campaign, model)
+    model, note = in_own_units(campaign, model)
     tell("selecting points")
     selection = select(campaign, threshold_MPa=threshold_MPa, most_points=most_points)
-    selection = selection if told is None else replace(selection, notes=(*selection.notes, told))
+    selection = selection if note is None else replace(selection, notes=(*selection.notes, note))
     require_same(selection.tests)
-    size = block or block_size(len(selection.tests))
+    size = block_size(len(selection.tests))
     tests = filled_up(selection.tests, size)
     if start is not None and start.point.theta.shape != (len(selection.kept), len(model.forms.names)):
         raise InputError(
@@ -128,15 +127,9 @@ def beyond_numbers(campaign: Campaign, selection: Selection) -> InputError:
 
 
 class _Fitter:
-    """A fit under way.
+    """A fit under way: particles, noise and summaries at the current point, as attributes.
 
-    Attributes:
-        tests, own: all tests with the weights of their readings, and this process's own.
-        weighted: the same as inference takes them.
-        individual: every particle on its own.
-        point, linear: the particles, and the tests linearised there.
-        noise: the noise.
-        marginal, filters, white: summaries under it, this process's own filters, and white noise of equal weight.
+    `own` are this process's tests, `weighted` all and its own tests with the weights that inference takes.
     """
 
     def __init__(self, tests: Tests, model: Model, blocks: Blocks, tell: Callable[[str], None]) -> None:
@@ -203,7 +196,7 @@ class _Fitter:
         under it."""
         self.estimate_noise(uncertainty)
         self.summarise()
-        for _ in range(FIT.student_steps if self.model.robust else 0):
+        for _ in range(STUDENT_STEPS if self.model.robust else 0):
             self.weigh()
             self.estimate_noise(uncertainty)
             self.summarise()
@@ -227,8 +220,8 @@ class _Fitter:
         """The four numbers of the noise, of very many particles from some of them."""
         self.tell("estimating the noise")
         m, blocks, own, linear, start = self.model, self.blocks, self.own, self.linear, self.noise.noise
-        if blocks.number > FIT.noise_blocks:
-            rows = np.linspace(0, self.count - 1, FIT.noise_blocks * blocks.size).astype(int)
+        if blocks.number > NOISE_BLOCKS:
+            rows = np.linspace(0, self.count - 1, NOISE_BLOCKS * blocks.size).astype(int)
             blocks = Blocks(len(rows), blocks.size)
             own = blocks.cut(_rows(self.tests, rows))
             linear = blocks.each(linearise, blocks.cut(_rows(self.point, rows)), own, m.forms)
@@ -240,7 +233,7 @@ class _Fitter:
         self.noise = replace(found, noise=replace(found.noise, scale=self.noise.noise.scale))
 
     def weigh(self) -> None:
-        """Weights of the readings under Student noise, anew."""
+        """New weights of the readings under Student noise."""
         blocks, noise = self.blocks, self.blocks.cut(self.noise.noise)
         squares = np.asarray(blocks.all(squared_innovations, self.weighted[1], self.filters, self.linear, noise))
         weight, overstated = student_weights(squares, np.asarray(self.tests.mask))
@@ -265,15 +258,15 @@ class _Fitter:
             return blocks.all(fit_particles, own, *cut, starts, self.model.forms, self.varying, most_steps)
 
         if self.blocks.whole_here:
-            return fit(self.blocks, self.own, arrays, starts, FIT.steps)
-        found = fit(self.blocks, self.own, arrays, starts, FIT.first_steps)
+            return fit(self.blocks, self.own, arrays, starts, STEPS)
+        found = fit(self.blocks, self.own, arrays, starts, FIRST_STEPS)
         late = np.flatnonzero(~np.asarray(found.settled))
         if not len(late):
             return found
         rows = np.pad(late, (0, -len(late) % self.blocks.size), mode="edge")
         few = Blocks(len(rows), self.blocks.size)
         ends = few.cut(np.moveaxis(np.asarray(found.ends)[rows], 1, 0), axis=1)
-        again = fit(few, few.cut(_rows(self.tests, rows)), _rows(arrays, rows), ends, FIT.steps)
+        again = fit(few, few.cut(_rows(self.tests, rows)), _rows(arrays, rows), ends, STEPS)
         return jax.tree.map(lambda x, y: x.at[late].set(y[: len(late)]), found, again)
 
     def alone(self, white: np.ndarray, theta: Any, starts: np.ndarray | None = None) -> ParticleFits:
@@ -282,7 +275,7 @@ class _Fitter:
         middle = np.append(_centre(priors), 0.0)
         centre = np.broadcast_to(middle, (N, 5)).copy()
         centre[:, 4] = self.zero_mean
-        width = np.broadcast_to(np.array([FIT.alone] * 4 + [priors.zero_um.sd]), (N, 5))
+        width = np.broadcast_to(np.array([ALONE] * 4 + [priors.zero_um.sd]), (N, 5))
         width = np.pad(width, ((0, 0), (0, varying)), constant_values=1e-12)
         centre = np.concatenate([centre, np.asarray(theta)[:, list(self.varying)]], 1)
         if starts is None:
@@ -292,7 +285,7 @@ class _Fitter:
     def together(self, target: LogPosterior, free: Float[Array, " d"]) -> Point:
         """Every particle under the population, from where it was and where the summaries expect it."""
         before, expected, varying = self.point, expect(free, target), list(self.varying)
-        width = np.maximum(np.asarray(expected.sd), FIT.narrowest)
+        width = np.maximum(np.asarray(expected.sd), NARROWEST)
         zero_sd = np.full(len(self.tests), self.model.chosen_priors.zero_um.sd)
         spread = np.maximum(np.asarray(expected.theta_sd), 1e-12)
         centre = np.column_stack([expected.mean, self.zero_mean, np.asarray(expected.theta_mean)])
@@ -311,14 +304,14 @@ class _Fitter:
     def step(self, target: LogPosterior, before: Array, after: Array) -> Array:
         """A step of Gauss-Newton of population and particles, halved while the density, with the tests linearised where
         it ends, is lower than where it begins; where the population then is."""
-        least, share = _density(before, target) - FIT.still, 1.0
+        least, share = _density(before, target) - STILL, 1.0
         while True:
             free = before + share * (after - before)
             point = self.together(target, free)
             linear = self.linearisation.at(point)
             marginal = replace(self.summaries(point, linear)[0], scatter=target.marginal.scatter)
             share /= 2
-            if _density(free, replace(target, marginal=marginal)) > least or share < 0.5**FIT.halvings:
+            if _density(free, replace(target, marginal=marginal)) > least or share < 0.5**HALVINGS:
                 self.point, self.linear = point, linear
                 return free
 
@@ -329,7 +322,7 @@ def fit_tests(
     read_out_um: float,
     *,
     correlated: bool = True,
-    rounds: int = FIT.rounds,
+    rounds: int = ROUNDS,
     block: int = 0,
     start: Start | None = None,
     tell: Callable[[str], None] = lambda _: None,
@@ -346,7 +339,7 @@ def fit_tests(
         correlated: estimate the whole noise; if False, white noise of the residuals' median modulus, which outliers do
             not move.
         rounds: how often noise, population and particles take turns, at least.
-        block: particles of a block (`Blocks`), of which there is a whole number; 0 for all in one.
+        block: particles of a block, of which there is a whole number; 0 for all in one.
         start: where to begin; the last turn is then the only one, unless the tests want more.
     """
     check_prior_of_a(model.chosen_priors, np.asarray(tests.flatness))
@@ -356,7 +349,7 @@ def fit_tests(
     begun = 0 if start is None else rounds
     free, turn = None, begun
     while True:
-        last = turn >= (max(rounds, FIT.most_rounds) if effects else rounds)
+        last = turn >= (max(rounds, MOST_ROUNDS) if effects else rounds)
         if not correlated:
             fitter.take_white_noise()
         elif (last and turn > begun) or (effects and not turn):
@@ -368,10 +361,10 @@ def fit_tests(
         before = target.unconstrain(first) if free is None else free
         target = careful_enough(before, target, count)
         free, covariance, mode_converged = most_probable(before, target)
-        if effects and not turn:  # amplitudes of zero tell nothing of further numbers
+        if effects and not turn:  # amplitudes of zero say nothing about further numbers
             free = jnp.where(jnp.asarray(["." in name for name in target.names]), before, free)
         gain = _density(free, target) - _density(before, target) if effects else 0.0
-        at_rest = turn >= rounds and (not effects or gain < FIT.still)
+        at_rest = turn >= rounds and (not effects or gain < STILL)
         if last or at_rest:
             break
         turn += 1
@@ -381,7 +374,7 @@ def fit_tests(
             fitter.point = fitter.together(target, free)
             fitter.linear = fitter.linearisation.at(fitter.point)
     if effects:
-        # Once more, with how the law bends over what is still open of the effects' numbers.
+        # Again, with how the law bends over what is still open of the effects' numbers.
         fitter.linear = fitter.linearisation.at(fitter.point, _widths(free, covariance, target))
         fitter.summarise()
         target = careful_enough(free, LogPosterior(model, fitter.marginal), count)
@@ -404,13 +397,13 @@ def fit_tests(
 
 def _widths(free: Array, covariance: Array, target: LogPosterior) -> np.ndarray:
     """Standard deviations of the effects' numbers that all particles share, each within half of a number that is not
-    0; of the logarithm of a positive one, up to `FIT.widest`."""
+    0; of the logarithm of a positive one, up to `WIDEST`."""
     slope = np.asarray(theta_slope(free, target))
     sd = np.sqrt(np.maximum(np.einsum("kd,de,ke->k", slope, np.asarray(covariance), slope), 1e-300))
     middle = np.abs(np.asarray(population_of(free, target).theta))
     width = np.minimum(sd, np.where(middle > 0, 0.5 * middle, np.inf))
     for k, _ in target.marginal.scatter.positive:
-        width[k] = min(sd[k] / middle[k], FIT.widest)
+        width[k] = min(sd[k] / middle[k], WIDEST)
     return width
 
 
@@ -461,11 +454,9 @@ def _start(latent: np.ndarray, flatness: np.ndarray, model: Model) -> dict[str, 
 
 
 def checked_settings(
-    progress: Callable[[str], None] | None, model: Model | None, threshold_MPa: Any, block: int | None
+    progress: Callable[[str], None] | None, model: Model | None, threshold_MPa: Any
 ) -> tuple[Callable[[str], None], Model, float]:
     """What all calibrations share, with defaults filled in; refuses what is of the wrong kind or out of its range."""
     tell = progress or (lambda _: None)
-    if block is not None:
-        arguments.whole(block, "block", least=1)
     threshold = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
     return tell, model or Model(), threshold

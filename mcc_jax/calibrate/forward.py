@@ -1,6 +1,6 @@
 r"""The forward model of every calibration: displacement at measured force, and its derivatives.
 
-The tester controls force and noise lives in displacement, so a test of particle i is
+The test machine controls force and noise is in displacement, so a test of particle i is
 
 .. math:: d_{ik} = z_i + \gamma(F_{i1} \dots F_{ik};\, b_i, e_i, \theta_i) + \text{noise}
 
@@ -40,12 +40,7 @@ def _formula(variant: Variant) -> Formula:
 
 
 class Forms(eqx.Module):
-    """What does not change while a law is fitted: its form of unloading and the formulas of its effects.
-
-    Attributes:
-        unloading: form of unloading.
-        effects: formulas of the effects.
-    """
+    """What does not change while a law is fitted: its form of unloading and the formulas of its effects."""
 
     unloading: Unloading = eqx.field(static=True)
     effects: tuple[Variant, ...] = eqx.field(static=True, default=())
@@ -113,16 +108,12 @@ class Point(eqx.Module):
 
 
 class Linear(eqx.Module):
-    """Residuals of N tests, linear in everything the prediction depends on.
+    """Residuals of N tests [um], linear in everything the prediction depends on, 0 where masked.
 
-    Attributes:
-        residual: measured less predicted displacement at the point [um], 0 where masked.
-        columns: derivatives of the prediction by b1, b3, b5, e and the effects' numbers, 0 where masked.
-        by_force: by a point's own reading of force [um/mN].
-        by_peak: by the force from which its branch starts [um/mN].
-        by_offset: by an error that all forces of a test share [um/mN].
-        bends: how the columns change with each of the effects' numbers: those of the first number, then of the next;
-            None for a law without effects.
+    `columns` are derivatives of the prediction by b1, b3, b5, e and the effects' numbers; `by_force`, `by_peak` and
+    `by_offset` by a point's own reading of force, the force from which its branch starts, and an error that all forces
+    of a test share [um/mN]. `bends` are derivatives of the columns by each of the effects' numbers, one number after
+    the other; None for a law without effects.
     """
 
     residual: Float[Array, "particles points"]
@@ -146,11 +137,7 @@ def linearise(
     """Linearise all tests, by forward derivatives in as many directions as one particle has numbers.
 
     Nothing that is compiled on the way holds both the law and the formula of an effect (`mcc_jax.law.derivatives`), so
-    this is not to be compiled itself.
-
-    Args:
-        with_numbers: whether derivatives by the particle's numbers are wanted; none if not.
-        with_force: whether derivatives by force are wanted; 0 if not.
+    this is not to be compiled itself. Derivatives by the numbers, and by force, may be left out.
     """
     residual, columns, by_force, by_peak = derivatives(
         point.latent, point.zero, point.theta, tests, forms, with_numbers, with_force
@@ -181,7 +168,7 @@ def derivatives(
     if with_force:
         own = xp.where(xp.asarray(tests.reading), 1.0, 0.0)
         elastic = xp.where(xp.asarray(tests.peak_error) > 0, 1.0, 0.0)
-        # A reading on virgin loading is its own peak; where the estimate stands in for readings, both move together.
+        # A reading on virgin loading is its own peak; where an estimate replaces readings, both move together.
         parts = ((own, 1 - own), (1 - elastic, elastic))
         d_force, d_peak = (xp.concatenate([d_peak[:size], xp.stack(p), d_peak[wanted:]]) for p in parts)
 

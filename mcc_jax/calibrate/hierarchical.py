@@ -28,7 +28,6 @@ from .data import Tests
 from .forward import Forms, Point, residuals
 from .noise import Whitening
 from .population import Population, Scatter, moments
-from .settings import FIT
 from .small_matrices import Cholesky
 
 
@@ -52,8 +51,7 @@ class Normal(eqx.Module):
         """Factor of D, D^-1 B and the Schur complement, each diagonal enlarged by 1 + damping."""
         D = _damped(self.local, damping)
         factor = Cholesky(D)
-        columns = [factor.solve(self.border[..., q]) for q in range(self.border.shape[-1])]
-        inner = jnp.stack(columns, -1) if columns else jnp.zeros_like(self.border)
+        inner = jnp.stack([factor.solve(self.border[..., q]) for q in range(self.border.shape[-1])], -1)
         complement = _damped(self.shared, damping) - jnp.einsum("npq,npr->qr", self.border, inner)
         return factor, inner, complement
 
@@ -61,8 +59,6 @@ class Normal(eqx.Module):
         """The damped Gauss-Newton step."""
         factor, inner, complement = self.schur(damping)
         forward = factor.solve(self.gradient_local)
-        if self.shared.shape[0] == 0:
-            return Parameters(-forward, self.gradient_shared)
         right = self.gradient_shared - jnp.einsum("npq,np->q", self.border, forward)
         shared = -Cholesky(complement).solve(right)
         return Parameters(-forward - jnp.einsum("npq,q->np", inner, shared), shared)
@@ -138,16 +134,7 @@ class ArrowLevenbergMarquardt(optx.AbstractGaussNewton[Parameters, Any, Any]):
 
 
 class Solution(eqx.Module):
-    """Where the optimiser ended.
-
-    Attributes:
-        value: the parameters.
-        residual: residuals there.
-        normal: normal equations there.
-        loss: half the sum of squares.
-        converged: whether the tolerances were met.
-        steps: how many steps it took.
-    """
+    """Where the optimiser ended, with residuals and normal equations there, and half the sum of squares."""
 
     value: Parameters
     residual: Any
@@ -172,12 +159,7 @@ class Solution(eqx.Module):
 def minimise(
     residual: Callable[[Parameters], Any], start: Parameters, *, max_steps: int = 100, tolerance: float = 1e-9
 ) -> Solution:
-    """Minimise the sum of squares of an arrow problem's residuals.
-
-    Args:
-        residual: a pytree whose every leaf has the particles as its first axis.
-        tolerance: relative and absolute tolerance on parameters and residuals.
-    """
+    """Minimise the sum of squares of an arrow problem's residuals, a pytree whose leaves have the particles first."""
     solver = ArrowLevenbergMarquardt(rtol=tolerance, atol=tolerance)
     found = optx.least_squares(lambda y, _: residual(y), solver, start, max_steps=max_steps, throw=False)
     # What the solver linearised last, at the value it returns: no second linearisation to compile and to compute.
@@ -205,17 +187,14 @@ def robust(loss: str, r: Values) -> Values:
     return r * jnp.sqrt(quotient)
 
 
+LEAST_SPREAD = 1e-4  # least standard deviation of log C in the residuals: with any smaller they are badly scaled
+
+
 class Pooled(eqx.Module):
     """Settings of the pooled least squares.
 
-    Attributes:
-        whitening: the noise filters.
-        population: whose spreads weigh the deviations of the particles.
-        zero_prior: mean and standard deviation of the zeros, from the recorded contact [um].
-        further: mean and standard deviation of every further number of an effect, of its logarithm if it is positive.
-        forms: the law.
-        scatter: what differs from particle to particle.
-        loss: "linear", "soft_l1" or "cauchy", applied to the whitened residuals.
+    The zeros' prior is their distance from the recorded contact [um], `further` that of every further number of an
+    effect, of its logarithm if it is positive: mean and standard deviation each. `loss` applies to whitened residuals.
     """
 
     whitening: Whitening
@@ -228,7 +207,7 @@ class Pooled(eqx.Module):
 
 
 SHARED = ("a", "log effective modulus", "mu_C1", "mu_C3", "mu_C5")
-"""The shared parameters, behind which the effects' amplitudes stand and the logarithms of their further numbers."""
+"""The shared parameters; the effects' amplitudes and the logarithms of their further numbers come behind them."""
 
 
 def unpack(y: Parameters, settings: Pooled, tests: Tests) -> Point:
@@ -257,8 +236,8 @@ def pooled_residual(settings: Pooled, tests: Tests) -> Callable[[Parameters], tu
     """
     scatter, at = settings.scatter, settings.population
     size = 4 if scatter.modulus else 3
-    tau = jnp.maximum(at.tau, FIT.least_spread)
-    modulus = jnp.maximum(at.modulus_scatter, FIT.least_spread)
+    tau = jnp.maximum(at.tau, LEAST_SPREAD)
+    modulus = jnp.maximum(at.modulus_scatter, LEAST_SPREAD)
     mean_zero, sd_zero = settings.zero_prior
     count = jnp.asarray(float(len(tests))) if tests.weight is None else jnp.sum(tests.weight)
 
@@ -274,7 +253,7 @@ def pooled_residual(settings: Pooled, tests: Tests) -> Callable[[Parameters], tu
         found = [robust(settings.loss, data), pooled, zero]
         for j, (k, signed) in enumerate(scatter.varying):
             shared = y.shared[len(SHARED) + k]
-            unit = jnp.maximum(at.theta_scatter[j], FIT.least_spread) * (1.0 if signed else jnp.abs(at.theta[k]))
+            unit = jnp.maximum(at.theta_scatter[j], LEAST_SPREAD) * (1.0 if signed else jnp.abs(at.theta[k]))
             found.append(((point.theta[:, k] - shared) / unit)[:, None])
         if len(settings.further):
             # A prior that all share, in equal parts of all particles.

@@ -25,19 +25,28 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .mode import LogPosterior, expanded, log_densities, populations
+from .mode import DIFFERENCE, LogPosterior, expanded, log_densities, populations
 from .population import Population
-from .settings import FIT, SAMPLING
+from .settings import SAMPLING
+
+# Found by trial on simulated campaigns (`benchmarks/study_modes.py`, `study_posterior.py`).
+FREEDOM = 10  # degrees of freedom of the Student proposal: its tails are wider than the posterior's
+ROUNDS = 6  # most distributions that are proposed from
+TRIAL = 4000  # draws that a proposal is tried on, and fitted to; of large campaigns a quarter
+ENOUGH = 5  # effective draws per coordinate that a distribution may be fitted to; weights are tempered if need be
+GOOD_SHARE = 0.5  # effective share of the proposed draws from which on no further distribution is fitted
+# Where the first is not good enough: distributions around the most probable population at so many values on either side
+# of each spread, one standard deviation from each other, found in so many steps; each gets one such part of a trial.
+NODES, NEWTON, PARTS = 3, 4, 4
+LEAST = 800.0  # least effective number of proposed draws with which they are used; fewer, and NUTS runs
+# So many times as many effective draws as are kept are proposed, at most as many as all rounds would.
+PROPOSED = 1.5
 
 
 class Weighted(NamedTuple):
-    """Draws of the population by importance resampling.
+    """Draws of the population by importance resampling, in unbounded coordinates and as populations, chains in a row.
 
-    Attributes:
-        free: the draws in unbounded coordinates, all chains in a row.
-        population: the same as populations.
-        log_evidence: logarithm of the integral of the density: of the mean weight.
-        error: its standard error.
+    `log_evidence` is the logarithm of the integral of the density, of the mean weight, and `error` its standard error.
     """
 
     free: np.ndarray
@@ -55,7 +64,7 @@ def sample_weighted(
     chains: int,
     draws: int,
     many: bool = False,
-    however_bad: bool = False,
+    allow_bad_weights: bool = False,
 ) -> Weighted | None:
     """Draws of the population by importance resampling; None if the weights are not good enough.
 
@@ -64,33 +73,33 @@ def sample_weighted(
     Args:
         mode, covariance: of the population in unbounded coordinates.
         chains, draws: shape of what is returned; each chain is resampled from proposals of its own.
-        many: propose no more than is kept: a density is dear.
-        however_bad: give the draws of the first round whatever their weights.
+        many: propose no more than is kept: a density is expensive.
+        allow_bad_weights: give the draws of the first round whatever their weights.
     """
     from scipy.special import logsumexp
 
     kept = chains * draws
-    trial = min(SAMPLING.trial // 4, kept) if many else SAMPLING.trial
+    trial = min(TRIAL // 4, kept) if many else TRIAL
     mixture = _Mixture(np.asarray(jax.random.key_data(key)), target)
     centre, width = mixture.folded(np.array(mode)), np.asarray(covariance)
-    for turn in range(SAMPLING.rounds):
+    for turn in range(ROUNDS):
         mixture.propose(centre, width, trial)
         free, log_weight = mixture.free, mixture.log_weight
-        if however_bad:
+        if allow_bad_weights:
             finite = np.where(np.isfinite(log_weight), log_weight, -np.inf)
             weight = np.exp(finite - finite.max()) if np.isfinite(finite).any() else np.ones(len(finite))
             return Weighted(*_resampled(free, weight / weight.sum(), target, chains, draws), np.nan, np.inf)
         weight, k = smoothed_weights(log_weight)
         share = effective_share(weight)
-        last = turn == SAMPLING.rounds - 1
-        if k <= SAMPLING.pareto_k and (share >= SAMPLING.good_share or share * len(free) >= kept or last):
-            total = kept if many else min(math.ceil(SAMPLING.proposed * kept / share), SAMPLING.rounds * trial)
+        last = turn == ROUNDS - 1
+        if k <= SAMPLING.pareto_k and (share >= GOOD_SHARE or share * len(free) >= kept or last):
+            total = kept if many else min(math.ceil(PROPOSED * kept / share), ROUNDS * trial)
             if total > len(free):
                 mixture.propose(centre, width, total - len(free))
                 free, log_weight = mixture.free, mixture.log_weight
                 weight, k = smoothed_weights(log_weight)
                 share = effective_share(weight)
-            if k <= SAMPLING.pareto_k and share * len(free) >= SAMPLING.least:
+            if k <= SAMPLING.pareto_k and share * len(free) >= LEAST:
                 value = float(cast(Any, logsumexp(log_weight))) - math.log(len(log_weight))
                 error = math.sqrt(max(1 / share - 1, 0.0) / len(weight))
                 return Weighted(*_resampled(free, weight, target, chains, draws), value, error)
@@ -99,9 +108,9 @@ def sample_weighted(
             # distributions reach, each around the most probable population at one value of a spread.
             for place in target.signed():
                 for centre, width in _along(place, np.array(mode), np.asarray(covariance), target):
-                    mixture.propose(mixture.folded(centre), width, trial // SAMPLING.parts)
+                    mixture.propose(mixture.folded(centre), width, trial // PARTS)
             log_weight, free = mixture.log_weight, mixture.free
-        weight = _tempered(log_weight, SAMPLING.enough * len(mode))
+        weight = _tempered(log_weight, ENOUGH * len(mode))
         if weight is None:
             return None
         centre = weight @ free
@@ -117,12 +126,12 @@ def _along(
     others = np.delete(np.arange(len(mode)), place)
     for side in (-1, 1):
         free, within, curvature = np.array(mode), covariance[np.ix_(others, others)], np.zeros_like(covariance)
-        for _ in range(SAMPLING.nodes):
+        for _ in range(NODES):
             free[place] += side * sd[place]
             if free[place] < -0.5 * sd[place]:
                 break
-            for _ in range(SAMPLING.newton):  # the others follow
-                _, slope, curvature = expanded(free, FIT.difference * np.minimum(sd, 1.0), target)
+            for _ in range(NEWTON):  # the others follow
+                _, slope, curvature = expanded(free, DIFFERENCE * np.minimum(sd, 1.0), target)
                 if not (np.isfinite(slope).all() and np.isfinite(curvature).all()):
                     return
                 within = _inverse(curvature[np.ix_(others, others)], sd[others])
@@ -153,9 +162,7 @@ def _factor(covariance: np.ndarray) -> np.ndarray:
 class _Mixture:
     """Draws of one Student distribution after another, all weighted by the mixture of them.
 
-    Attributes:
-        free: the draws.
-        log_weight: log density less that of the mixture, in the parts that each distribution has of the draws.
+    `log_weight` is the log density less that of the mixture, in the parts that each distribution has of the draws.
     """
 
     def __init__(self, seed: np.ndarray, target: LogPosterior) -> None:
@@ -166,8 +173,8 @@ class _Mixture:
         d = len(target.names)
         self._signs = np.array(list(product((1.0, -1.0), repeat=len(self._spreads))))
         # Standard deviations of coordinates differ by many powers of ten, for which SciPy takes a matrix for singular.
-        shape = cast(Any, np.eye(d) * (1 - 2 / SAMPLING.freedom))  # its stub takes a number
-        self._unit = multivariate_t(np.zeros(d), shape, SAMPLING.freedom)
+        shape = cast(Any, np.eye(d) * (1 - 2 / FREEDOM))  # its stub takes a number
+        self._unit = multivariate_t(np.zeros(d), shape, FREEDOM)
         self._constant = float(self._unit.logpdf(np.zeros(d)))
         self._parts: list[tuple[np.ndarray, np.ndarray, int]] = []
         self.free, self._log_density = np.empty((0, d)), np.empty(0)
@@ -202,8 +209,8 @@ class _Mixture:
 
     def _proposal(self, free: np.ndarray, centre: np.ndarray, inverse: np.ndarray) -> np.ndarray:
         """Log density of a distribution, given the inverse of its covariance's factor."""
-        away = 1 + self._squares(free, centre, inverse) / (SAMPLING.freedom - 2)
-        least, power = away.min(0), 0.5 * (SAMPLING.freedom + len(inverse))
+        away = 1 + self._squares(free, centre, inverse) / (FREEDOM - 2)
+        least, power = away.min(0), 0.5 * (FREEDOM + len(inverse))
         density = np.log(((least / away) ** power).sum(0)) - power * np.log(least)
         return self._constant + density + np.sum(np.log(np.diagonal(inverse)))
 
@@ -262,7 +269,7 @@ def diagnostics(names: list[str], draws: np.ndarray) -> tuple[dict[str, float], 
     return named(rhat), named(bulk), named(tail)
 
 
-def unrest(log_weight: np.ndarray) -> np.ndarray:
+def relative_scatter(log_weight: np.ndarray) -> np.ndarray:
     """Standard deviation of each particle's weights over their mean, draws along the first axis."""
     relative = np.exp(np.maximum(log_weight - np.maximum(log_weight.max(0), -1e300), -700.0))
     return relative.std(0) / np.maximum(relative.mean(0), 1e-300)

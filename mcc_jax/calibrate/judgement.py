@@ -1,7 +1,7 @@
 """What a reader of a calibration must know of its tests: faults, outlying particles, implausible numbers.
 
-Whatever is found of single particles is told with the answer without them, so that no flagged test moves or widens the
-answer of the others in silence.
+Whatever is found of single particles is reported with the answer without them, so that no flagged test moves or widens
+the answer of the others in silence.
 """
 
 from __future__ import annotations
@@ -19,10 +19,25 @@ from ..campaign import Campaign, Finding, campaign_findings, check_plausibility
 from ..campaign.findings import named
 from ..campaign.plausibility import add_likely_unit_error
 from .fit_result import Fit
-from .settings import JUDGEMENT, JudgementSettings
+from .settings import JUDGEMENT
 
 MODULUS_OPEN = "unknown modulus"
 """The `check` of the finding that the tests leave the modulus open."""
+
+# Found by trial on simulated campaigns.
+# A particle is unlike the others if the logarithm of its residual lies so many robust standard deviations (1.4826 times
+# the median absolute deviation) above their median, of which no one in 1000 normal ones does, and the residual is so
+# many times their median, at least: smaller differences do no harm.
+OUTLYING, TIMES = 5.0, 3.0
+SHARE = 0.2  # of the particles, at most, can be unlike all others; more are a mixture
+LEAST = 5  # particles to know what is usual
+ANSWERS = 4  # sets of flagged particles that are left out in turn for an answer without them, at most
+# Flagged particles are left out for such an answer if they are at least this share of all: fewer hardly move what all
+# share, and the answer would cost a whole calibration of many particles.
+FEW = 0.01
+# The modulus is unknown if its standard deviation is at least this share of it: the 95 % interval then spans a factor
+# of seven, nearly that of the prior (50), in which most solids lie.
+UNKNOWN = 0.5
 
 
 def noise_share(fit: Fit) -> float:
@@ -51,20 +66,18 @@ def _variances(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
     return variance, (np.asarray(noise.scale) * float(noise.correlated)) ** 2
 
 
-def unlike_others(
-    names: Sequence[str], rms_um: np.ndarray, range_um: np.ndarray, options: JudgementSettings = JUDGEMENT
-) -> Finding | None:
+def unlike_others(names: Sequence[str], rms_um: np.ndarray, range_um: np.ndarray) -> Finding | None:
     """The particles whose residual is unlike all others', both in micrometres and as a share of their range.
 
     `rms_um` are root mean square residuals and `range_um` the ranges of displacement of all particles [um].
     """
     rms, reach = np.asarray(rms_um, float), np.asarray(range_um, float)
     known = np.isfinite(rms) & (rms > 0) & (reach > 0)
-    if known.sum() < options.least:
+    if known.sum() < LEAST:
         return None
     far = np.zeros(len(rms), bool)
-    far[known] = _far(np.log(rms[known]), options) & _far(np.log(rms[known] / reach[known]), options)
-    if not far.any() or far.sum() > max(1, options.share * len(rms)):
+    far[known] = _far(np.log(rms[known])) & _far(np.log(rms[known] / reach[known]))
+    if not far.any() or far.sum() > max(1, SHARE * len(rms)):
         return None
     which = tuple(n for n, out in zip(names, far, strict=True) if out)
     times = rms[far] / np.median(rms[known])
@@ -75,14 +88,12 @@ def unlike_others(
     )
 
 
-def unknown_modulus(
-    campaign: Campaign, modulus: Mapping[str, Any], options: JudgementSettings = JUDGEMENT
-) -> Finding | None:
-    """That the tests leave the modulus open, and why; None if they tell it, or the method gives no error.
+def unknown_modulus(campaign: Campaign, modulus: Mapping[str, Any]) -> Finding | None:
+    """That the tests leave the modulus open, and why; None if they determine it, or the method gives no error.
 
     `modulus` has value, sd and interval_95 [MPa].
     """
-    if not told_by_no_test(modulus, options):
+    if not told_by_no_test(modulus):
         return None
     interval = modulus.get("interval_95")
     between = "" if interval is None else f" (between {1e-3 * interval[0]:.2g} and {1e-3 * interval[1]:.2g} GPa)"
@@ -95,10 +106,10 @@ def unknown_modulus(
     return Finding(MODULUS_OPEN, "warning", f"The tests do not tell the modulus{between}{why}", remedy)
 
 
-def told_by_no_test(modulus: Mapping[str, Any], options: JudgementSettings = JUDGEMENT) -> bool:
-    """Whether an estimate of the modulus is so wide that it tells nothing; not where the method gives no error."""
+def told_by_no_test(modulus: Mapping[str, Any]) -> bool:
+    """Whether an estimate of the modulus is so wide that it says nothing; not where the method gives no error."""
     value, sd = modulus["value"], modulus["sd"]
-    return value is not None and sd is not None and sd >= options.unknown * abs(value)
+    return value is not None and sd is not None and sd >= UNKNOWN * abs(value)
 
 
 def modulus_is_open(content: Mapping[str, Any]) -> bool:
@@ -109,10 +120,10 @@ def modulus_is_open(content: Mapping[str, Any]) -> bool:
 UNLOAD = "Unload the particles before the test ends, and record the unloading with as many readings as the loading"
 
 
-def _far(logs: np.ndarray, options: JudgementSettings) -> np.ndarray:
+def _far(logs: np.ndarray) -> np.ndarray:
     away = logs - np.median(logs)
     spread = 1.4826 * float(np.median(np.abs(away)))
-    return away > max(options.outlying * spread, np.log(options.times))
+    return away > max(OUTLYING * spread, np.log(TIMES))
 
 
 def judged(
@@ -120,7 +131,6 @@ def judged(
     answer: Mapping[str, Any],
     outlying: Finding | None,
     again: Callable[[Campaign], Mapping[str, Any]] | None,
-    options: JudgementSettings = JUDGEMENT,
 ) -> tuple[Finding, ...]:
     """All findings of a calibrated campaign, each with what the answer is without the particles that it names.
 
@@ -132,25 +142,25 @@ def judged(
     found = [*campaign_findings(campaign), *([] if outlying is None else [outlying])]
     modulus = answer["effective_modulus_MPa"]
     if not answer.get("converged", True):
-        modulus = {**modulus, "interval_95": None}  # not to be believed, so not told
-    unknown = unknown_modulus(campaign, modulus, options)
+        modulus = {**modulus, "interval_95": None}  # not to be believed, so not reported
+    unknown = unknown_modulus(campaign, modulus)
     value = modulus["value"] if unknown is None else None  # what is not known cannot be implausible
     found += [] if unknown is None else [unknown]
     found += check_plausibility(campaign, modulus_MPa=value)
     if again is None:
         return tuple(found)
     answers: dict[tuple[str, ...], str] = {}
-    told = []
+    findings = []
     for one in found:
         count = len(one.particles)
-        some = options.few * len(campaign) <= count <= len(campaign) / 2 and count > 0
-        if one.level != "info" and some and len(campaign) - count >= options.left:
-            if one.particles not in answers and len(answers) < options.answers:
+        some = FEW * len(campaign) <= count <= len(campaign) / 2 and count > 0
+        if one.level != "info" and some and len(campaign) - count >= JUDGEMENT.left:
+            if one.particles not in answers and len(answers) < ANSWERS:
                 answers[one.particles] = _without(campaign, answer, one.particles, again)
             other = answers.get(one.particles)
             one = one if other is None else replace(one, sentence=f"{one.sentence}; {other}")
-        told.append(one)
-    return tuple(told)
+        findings.append(one)
+    return tuple(findings)
 
 
 @contextlib.contextmanager

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._errors import InputError
-from ..effects import AbstractEffect, Variant, find_variant
+from ..effects import AbstractEffect, Variant
 from ..law import LogNormal, MccLaw, Plastic, PlasticPopulation, StrainScaling, Unloading
 from .population import COEFFICIENTS
 
@@ -20,7 +20,7 @@ RIGID_MPA = 1e9
 
 
 Variants = Mapping[str, Variant]
-"""Formulas that are not in the library, by "mechanism:variant"."""
+"""The formulas of a law's effects, by "mechanism:variant"."""
 
 
 def law_of(
@@ -37,14 +37,22 @@ def law_of(
         C = [_number(entry[name], name) for name in COEFFICIENTS]
     a = _number(content["a"], "a")
     modulus = _number(content["effective_modulus_MPa"], "effective_modulus_MPa")
+    return _law(content, C, a, modulus, variants, entry, diameters_um)
+
+
+def _law(
+    content: Mapping[str, Any], C: Any, a: float, modulus: float, variants: Variants | None,
+    entry: Mapping[str, Any] | None = None, size: np.ndarray | None = None,
+) -> MccLaw:  # fmt: skip
+    """The law with these numbers, and with those of a particle's entry that differ between particles."""
+    amplitudes: Mapping[str, Any] = {}
     if entry is not None:
-        a, modulus = _own_shape(content, entry, diameters_um, a), _own_modulus(entry, modulus)
-    return _law(content, C, a, modulus, entry, variants)
-
-
-def _law(content: Mapping[str, Any], C: Any, a: float, modulus: float, entry: Any, variants: Variants | None) -> MccLaw:
+        a = _own_shape(content, entry, size, a)
+        modulus = (entry.get("effective_modulus_MPa") or {}).get("value") or modulus
+        amplitudes = entry.get("amplitudes") or {}
     form = Unloading(content["law"]["unloading"]), StrainScaling(content["law"]["strain_scaling"])
-    return MccLaw(Plastic(*C), a, modulus, *form, effects=_effects(content, entry, variants))
+    effects = (built(one, variants, amplitudes.get(one["mechanism"])) for one in content.get("effects", ()))
+    return MccLaw(Plastic(*C), a, modulus, *form, effects=tuple(effects))
 
 
 def laws_of(
@@ -60,15 +68,13 @@ def laws_of(
     for name, size in zip(names, diameters_um, strict=True):
         entry = entry_of(content, name)
         C = [entry[coefficient]["value"] for coefficient in COEFFICIENTS]
-        shape = _own_shape(content, entry, size, a)
-        own.append(_law(content, C, shape, _own_modulus(entry, modulus), entry, variants))
-    typical = [_law(content, _typical(content), a, modulus, None, variants)] * len(names)
-    return _together(own), _together(typical)
+        own.append(_law(content, C, a, modulus, variants, entry, size))
+    typical = [_law(content, _typical(content), a, modulus, variants)] * len(names)
 
+    def together(laws: list[MccLaw]) -> MccLaw:
+        return jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v, float) for v in x]), *laws)
 
-def _together(laws: list[MccLaw]) -> MccLaw:
-    """Laws of one form as one, every array field with a leading axis."""
-    return jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v, float) for v in x]), *laws)
+    return together(own), together(typical)
 
 
 def entry_of(content: Mapping[str, Any], particle: str) -> Mapping[str, Any]:
@@ -98,18 +104,6 @@ def _number(estimate: Mapping[str, Any], name: str) -> float:
     return float(value)
 
 
-def _effects(
-    content: Mapping[str, Any], entry: Mapping[str, Any] | None, variants: Variants | None
-) -> tuple[AbstractEffect, ...]:
-    """The effects, with a particle's own amplitudes where they differ."""
-    own = {} if entry is None else entry.get("amplitudes") or {}
-    return tuple(built(one, variants, own.get(one["mechanism"])) for one in content.get("effects", ()))
-
-
-def _own_modulus(entry: Mapping[str, Any], modulus: float) -> float:
-    return (entry.get("effective_modulus_MPa") or {}).get("value") or modulus
-
-
 def _own_shape(content: Mapping[str, Any], entry: Mapping[str, Any], size: np.ndarray | None, a: float) -> float:
     """This particle's own a, where it differs from particle to particle: eta_p = 1 + a (1 - D3^2/(D1 D2))."""
     eta = entry["eta_p"]["value"]
@@ -130,17 +124,10 @@ def _typical(content: Mapping[str, Any]) -> np.ndarray:
     return np.array([float(law.C1), float(law.C3), float(law.C5)])
 
 
-def built(
-    entry: Mapping[str, Any], variants: Mapping[str, Variant] | None = None, amplitude: Mapping[str, Any] | None = None
-) -> AbstractEffect:
-    """The effect that an entry of a result describes.
-
-    Args:
-        variants: formulas that are not in the library, by "mechanism:variant".
-        amplitude: of one particle, where it differs.
-    """
+def built(entry: Mapping[str, Any], variants: Variants | None, amplitude: Mapping[str, Any] | None) -> AbstractEffect:
+    """The effect that an entry of a result describes; with the amplitude of one particle, where it differs."""
     name = f"{entry['mechanism']}:{entry['variant']}"
-    variant = (variants or {}).get(name) or find_variant(name)
+    variant = (variants or {})[name]
     values = {key: one["value"] for key, one in entry["parameters"].items()}
     strength = values.pop(variant.parameter) if amplitude is None else amplitude["value"]
     values.pop(variant.parameter, None)

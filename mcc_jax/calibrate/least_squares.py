@@ -27,9 +27,12 @@ from .judgement import judged, numbers_in_reach, unlike_others
 from .model import Model
 from .population import COEFFICIENTS
 from .results import JointCalibration
-from .settings import FIT
 
 Loss = Literal["linear", "soft_l1", "cauchy"]
+
+
+SHAPES = (0.0, 2.5)  # values of a that least squares begins from in addition to the population's mode; found by trial
+OPEN = 1e-3  # a combination of shared parameters is open where its curvature, each scaled to its own, is smaller
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,7 @@ class Identifiability:
         """Combinations that the data leave open, in words."""
         found = []
         for value, row in zip(self.singular_values, self.directions, strict=True):
-            if value < FIT.open:
+            if value < OPEN:
                 terms = [f"{w:+.2f} {n}" for w, n in zip(row, self.names, strict=True) if abs(w) > 0.1]
                 found.append(" ".join(terms))
         return found
@@ -227,7 +230,7 @@ class LeastSquares(JointCalibration):
     def _told_sd(self) -> np.ndarray:
         """The same; NaN where the data leave a parameter open."""
         found = self.identifiability
-        rows = found.directions[found.singular_values < FIT.open]
+        rows = found.directions[found.singular_values < OPEN]
         is_open = (np.sum(rows**2, 0) > 0.1) & bool(found.open)
         return np.where(is_open, np.nan, self._shared_sd)
 
@@ -284,7 +287,6 @@ def least_squares(
     threshold_MPa: float = THRESHOLD_MPA,
     loss: Loss = "linear",
     seed: int = 0,
-    block: int | None = None,
     without_flagged: bool = True,
     progress: Callable[[str], None] | None = None,
 ) -> LeastSquares:
@@ -303,8 +305,6 @@ def least_squares(
         threshold_MPa: points below this stress on loading do not count [MPa].
         loss: "linear", or a robust one of the whitened residuals, "soft_l1" or "cauchy".
         seed: kept for the record.
-        block: particles of a block, as in `sample`; the last step, the fit of all together, is done by every
-            process for itself on one device.
         without_flagged: where single particles are flagged (a broken one, one unlike all others), calibrate again
             without them and say what the answer is then.
         progress: called with the name of each step.
@@ -314,15 +314,13 @@ def least_squares(
     """
     started = time.perf_counter()
     campaign = check_tests(campaign)
-    tell, model, threshold_MPa = checked_settings(progress, model, threshold_MPa, block)
+    tell, model, threshold_MPa = checked_settings(progress, model, threshold_MPa)
     seed = arguments.seed(seed)
     arguments.choice(loss, get_args(Loss), "loss")
     if model.robust and loss != "linear":
         raise InputError("robust noise and a robust loss exclude each other", remedy="Take one of them.")
     with numbers_in_reach(campaign):
-        selection, fit, _ = prepare(
-            campaign, model, threshold_MPa, block=block, tell=tell, correlated=loss == "linear", rounds=1
-        )
+        selection, fit, _ = prepare(campaign, model, threshold_MPa, tell=tell, correlated=loss == "linear", rounds=1)
         tests, population = fit.tests, fit.population
         further = [nuisance_moments(n) for v in model.effects for n in v.nuisances]
         priors = model.zero_prior, jnp.asarray(np.array(further).reshape(-1, 2))
@@ -330,7 +328,7 @@ def least_squares(
         tell("fitting all particles together")
         flatness = np.asarray(tests.flatness)
         low, high = -0.9 / max(flatness.max(), 1e-3), -0.9 / min(flatness.min(), -1e-3)
-        starts = [float(population.a), *(a for a in FIT.shapes if low < a < high)]
+        starts = [float(population.a), *(a for a in SHAPES if low < a < high)]
         mu, log_modulus = np.asarray(population.mu), float(population.log_modulus)
         found = [solve(fit, settings, tests, a, mu, log_modulus) for a in starts]
         losses = np.array([float(one.loss) for one in found])
@@ -357,7 +355,7 @@ def least_squares(
     outlying = unlike_others(calibration.particles, calibration.rms_um(), ranges_um(selection.tests))
 
     def again(some: Campaign) -> dict[str, Any]:
-        settings: dict[str, Any] = {"threshold_MPa": threshold_MPa, "loss": loss, "seed": seed, "block": block}
+        settings: dict[str, Any] = {"threshold_MPa": threshold_MPa, "loss": loss, "seed": seed}
         return least_squares(some, model, without_flagged=False, **settings).answer()
 
     findings = judged(campaign, calibration.answer(), outlying, again if without_flagged else None)

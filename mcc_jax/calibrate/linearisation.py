@@ -17,10 +17,11 @@ from .data import Tests
 from .forward import Forms, Linear, Point, linearise
 from .model import Model
 from .noise import Along, Correlation, Noise, whitening
-from .settings import FIT
 from .sharding import Blocks, Parts
 from .small_matrices import eliminate
 from .straightening import Straight, box_cox, moved, products
+
+STEEPEST = 3.0  # largest shear or power of the coordinates of an effect's numbers (`straightening`); found by trial
 
 
 @compiled
@@ -31,14 +32,10 @@ def _sheared(linear: Linear, slope: Float[Array, "particles numbers numbers"]) -
 
 
 class Linearisation:
-    """How the tests of a fit are linearised.
-
-    Attributes:
-        straight: coordinates of the effects' numbers.
-    """
+    """How the tests of a fit are linearised, in the coordinates `straight` of the effects' numbers."""
 
     def __init__(self, own: Parts, count: int, model: Model, blocks: Blocks) -> None:
-        """Keep this process's own tests, and of how many particles all tests are, without copies that only fill up."""
+        """Keep this process's own tests, and the number of all, without padding."""
         self._own, self._count, self._model, self._blocks = own, count, model, blocks
         still = np.zeros(len(model.forms.names))
         self.straight = Straight.of(blocks.count, still, still)
@@ -74,13 +71,13 @@ class Linearisation:
         for k, owner in self._model.scatter.positive:
             size = weight @ (start[:, owner] ** 2 * here[:, owner, owner])
             shear[k] = start[0, k] * (weight @ (start[:, owner] * here[:, owner, k])) / size if size > 0 else 0.0
-        shear = np.clip(shear, -FIT.steepest, FIT.steepest)
+        shear = np.clip(shear, -STEEPEST, STEEPEST)
         self.straight = Straight.of(self._blocks.count, shear, power)
         for k, _ in self._model.scatter.positive:
             step = np.where(np.arange(len(still)) == k, start[0, k] * sd[k], 0.0)
             up, down = (weight @ gram(by)[:, k, k] for by in (step, -step))
             power[k] = np.log(up / down) / (4 * sd[k]) if min(up, down) > 0 else 0.0
-        return Straight.of(self._blocks.count, shear, np.clip(power, -FIT.steepest, FIT.steepest))
+        return Straight.of(self._blocks.count, shear, np.clip(power, -STEEPEST, STEEPEST))
 
     def _moved(self, point: Point, away: np.ndarray) -> Parts:
         """All tests linearised where the effects' numbers have these coordinates, by these coordinates."""

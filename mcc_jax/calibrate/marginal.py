@@ -63,7 +63,7 @@ class Marginal(eqx.Module):
         count: n, number of points.
         zero, zero_slope, zero_sd: distribution of the zero [um].
         flatness: 1 - D3^2/(D1 D2) of every particle [-].
-        weight: 1 for particles, 0 for copies that only fill up; None where all are particles.
+        weight: 1 for particles, 0 for padding; None where all are particles.
         scatter: what differs from particle to particle.
     """
 
@@ -80,7 +80,7 @@ class Marginal(eqx.Module):
     scatter: Scatter
 
     def log_likelihood(self, population: Population) -> Float[Array, " particles"]:
-        """Log likelihood of each test, the particle's own numbers integrated out; 0 of copies that only fill up."""
+        """Log likelihood of each test, the particle's own numbers integrated out; 0 of padding."""
         each = self.laplace(population).log_likelihood
         return each if self.weight is None else self.weight * each
 
@@ -196,13 +196,9 @@ def with_products(
 
 
 class Placed(NamedTuple):
-    """Where particles are.
+    """Where particles are: their latent vector w and numbers of effects, and u, the difference from the point.
 
-    Attributes:
-        latent: w.
-        theta: numbers of their effects.
-        u: their difference from the point, in the coordinates of the Gram matrix.
-        jacobian: derivatives of u by the deviations.
+    u is in the coordinates of the Gram matrix, `jacobian` its derivatives by the deviations.
     """
 
     latent: Float[Array, "particles 4"]
@@ -212,14 +208,10 @@ class Placed(NamedTuple):
 
 
 class Laplace(eqx.Module):
-    """Deviations of all particles given the population, around the most probable ones.
+    r"""Most probable deviations of all particles given the population, and the curvature there.
 
-    Attributes:
-        deviations: most probable xi, shape (N, k).
-        hessian: curvature there in the straightened coordinates nu.
-        stretch: :math:`j \\tau_j` by which :math:`\\xi_j = \\hat\\xi_j + \\log(1 + j\\tau_j\\nu_j)/(j\\tau_j)`.
-        log_likelihood: of each test, integrated.
-        placed: where the particles are.
+    The curvature is in straightened coordinates nu, :math:`\xi_j = \hat\xi_j + \log(1 + j\tau_j\nu_j)/(j\tau_j)`, with
+    :math:`j \tau_j` in `stretch`. `log_likelihood` is that of each test, integrated.
     """
 
     deviations: Float[Array, "particles k"]
@@ -230,16 +222,10 @@ class Laplace(eqx.Module):
 
 
 class ParticleDraw(NamedTuple):
-    """One draw of all particles given the population.
+    """One draw of all particles given the population: w, numbers of effects, zeros [um], and deviations xi.
 
-    Attributes:
-        latent: w, shape (N, 4).
-        theta: numbers of their effects.
-        zero: zero of displacement [um].
-        deviations: xi, shape (N, k).
-        log_volume: log of the volume by which the map from standard normal numbers to xi and zero stretches; minus
-            infinity outside its range.
-        log_likelihood: of each test, integrated.
+    `log_volume` is the log of the volume by which the map from standard normal numbers to xi and zero stretches, minus
+    infinity outside its range; `log_likelihood` that of each test, integrated.
     """
 
     latent: Float[Array, "particles 4"]
@@ -260,12 +246,9 @@ def straighten(away: Float[Array, "*batch 4"]) -> tuple[Float[Array, "*batch 4"]
 
 
 class Summaries(NamedTuple):
-    """What `summarise` gives.
+    """What `summarise` gives: the tests summarised, and the noise, noise of force turned into noise of displacement.
 
-    Attributes:
-        marginal: the tests with their zeros integrated out.
-        filters: the noise, in which noise of force has become noise of displacement.
-        white: standard deviation [um] of white noise that would weigh a test as much as its noise does.
+    `white` is the effective standard deviation [um]: white noise of it would weigh a test as much as its noise does.
     """
 
     marginal: Marginal
@@ -305,7 +288,7 @@ def summarise(
     )
     seen = jnp.concatenate([slope, jnp.zeros((len(tests), gram.shape[-1] - 5)), offset[:, None]], 1)
     gram += weight[:, None, None] * seen[:, :, None] * seen[:, None, :]
-    # It bounds where a particle may go, and is no datum: where the point stands it costs nothing.
+    # It bounds where a particle may go, and is no datum: at the point itself it costs nothing.
     gram = gram.at[:, -1, -1].add(jax.vmap(lambda f: f.reading)(filters) - weight * offset**2)
     place = gram.shape[-1] - 2
     away = tests.contact + zero_prior[0] - point.zero
@@ -337,7 +320,7 @@ def _snap_evidence(latent, particle, force, used):
     """What a jump says that no residual does: that the curve's peak lies between the two forces around it.
 
     The likelihood of a particle that snaps through falls off a cliff where the jump would move to another point of the
-    record. A normal distribution of the logarithm of the force at the peak, as wide as the interval, stands in for it.
+    record. A normal distribution of the logarithm of the force at the peak, as wide as the interval, takes its place.
 
     Returns:
         Derivative of that logarithm by the latent vector, distance of the interval's middle from it, and its precision:

@@ -23,9 +23,16 @@ from .marginal import Marginal, straighten
 from .model import Model
 from .noise import standard_promotion
 from .population import Population
-from .settings import FIT
 
 handlers: Any = numpyro.handlers
+
+
+# Found by trial on simulated campaigns (`benchmarks/study_modes.py`).
+SHARP = 0.03  # sd of the log of a polynomial's coefficient below which one Newton step integrates a particle out
+DENSITIES, DENSITIES_AT_ONCE = 250, 10  # coordinates in one call, and side by side: a part of the former, no remainder
+DIFFERENCE = 0.02  # step of differences, in sd: rounding and the series' next term are below 1e-4 of the curvature
+MODE_GAIN = 1e-6  # twice the log probability still to gain, by Newton's method, at which the mode is reached
+ATTEMPTS = 4  # how often the search for the mode begins again where it stopped
 
 
 def seeded(model: Any) -> Any:
@@ -34,12 +41,7 @@ def seeded(model: Any) -> Any:
 
 
 class Shapes(eqx.Module):
-    """What the population's priors need to know of the particles where there is no `Marginal`.
-
-    Attributes:
-        flatness: 1 - D3^2/(D1 D2) [-].
-        weight: 1 for particles, 0 for copies that only fill up; None where all are particles.
-    """
+    """Flatness and weights of the particles: what the priors of the population need where there is no `Marginal`."""
 
     flatness: Float[Array, " particles"]
     weight: Float[Array, " particles"] | None = None
@@ -60,12 +62,7 @@ def coordinate_names(model: Model) -> tuple[str, ...]:
 
 
 class LogPosterior(eqx.Module):
-    """The density of the population given all tests, as a function of unbounded coordinates.
-
-    Attributes:
-        model: whose priors.
-        marginal: the tests.
-    """
+    """The density of the population given all tests, as a function of unbounded coordinates."""
 
     model: Model = eqx.field(static=True)
     marginal: Marginal
@@ -114,22 +111,11 @@ def _unconstrained(values: Float[Array, " d"], target: LogPosterior) -> Float[Ar
     return jnp.stack([jnp.asarray(free[name]) for name in target.names])
 
 
-@compiled
-def density_of(free: Float[Array, " d"], target: LogPosterior) -> Scalar:
-    """Log density at unbounded coordinates."""
-    return target.log_density(free)
-
-
 class Expected(eqx.Module):
     """What a population says of its particles, and what the tests add.
 
-    Attributes:
-        mean, sd: of b1, b3, b5, e under the population, shape (N, 4).
-        latent: most probable ones given the tests, too, shape (N, 4).
-        theta: most probable numbers of the effects.
-        theta_mean, theta_sd: of the amplitudes that vary, under the population.
-        zero: most probable zeros [um], shape (N,).
-        hessian, stretch: of `Laplace`.
+    `mean` and `sd` of b1, b3, b5, e, and `theta_mean` and `theta_sd` of the amplitudes that vary, are those under the
+    population; `latent`, `theta` and `zero` [um] the most probable ones given the tests; the rest is that of `Laplace`.
     """
 
     mean: Float[Array, "particles 4"]
@@ -171,20 +157,16 @@ def expect(free: Float[Array, " d"], target: LogPosterior) -> Expected:
 
 
 def careful_enough(free: Float[Array, " d"], target: LogPosterior, count: int) -> LogPosterior:
-    """The target with as many Newton steps as the integration over the particles needs: none if every coefficient is
-    known sharply.
+    """The target with as many Newton steps as the integration over the particles needs.
 
-    Args:
-        free: population in unbounded coordinates.
-        target: of the tests.
-        count: number of particles, without copies that only fill up.
+    None are needed if every coefficient of the first `count` particles, those that are no padding, is known sharply.
     """
     scatter = replace(target.marginal.scatter, newton=0)
     sharp = replace(target, marginal=replace(target.marginal, scatter=scatter))
     at = expect(free, sharp)
     variance = np.diagonal(np.linalg.inv(np.asarray(at.hessian)[:count]), axis1=1, axis2=2)
     widest = float(np.max(np.sqrt(variance) * np.asarray(at.stretch)))
-    return sharp if widest < FIT.sharp else target
+    return sharp if widest < SHARP else target
 
 
 @compiled
@@ -195,7 +177,7 @@ def populations(free: Float[Array, "draws d"], target: LogPosterior) -> Populati
 
 @compiled
 def _log_densities(free: Float[Array, "rows d"], count: Int[Array, ""], target: LogPosterior) -> Float[Array, " rows"]:
-    few = FIT.densities_at_once
+    few = DENSITIES_AT_ONCE
 
     def add(i, found):
         some = jax.vmap(target.log_density)(jax.lax.dynamic_slice_in_dim(free, i * few, few))
@@ -207,14 +189,14 @@ def _log_densities(free: Float[Array, "rows d"], count: Int[Array, ""], target: 
 def log_densities(free: np.ndarray, target: LogPosterior) -> np.ndarray:
     """Log density of the population at many coordinates, shape (many, d).
 
-    Compiled for `FIT.densities` at a time, so that few and many of them share their compilation; on two threads.
+    Compiled for `DENSITIES` at a time, so that few and many of them share their compilation; on two threads.
     """
 
     def some(rows: np.ndarray) -> np.ndarray:
-        filled = jnp.asarray(np.pad(rows, ((0, FIT.densities - len(rows)), (0, 0)), mode="edge"))
+        filled = jnp.asarray(np.pad(rows, ((0, DENSITIES - len(rows)), (0, 0)), mode="edge"))
         return np.asarray(_log_densities(filled, jnp.asarray(np.asarray(len(rows))), target))[: len(rows)]
 
-    return np.concatenate(side_by_side(some, np.split(free, range(FIT.densities, len(free), FIT.densities))))
+    return np.concatenate(side_by_side(some, np.split(free, range(DENSITIES, len(free), DENSITIES))))
 
 
 @np.errstate(over="ignore", invalid="ignore")  # steps may lead to where numbers overflow; they are refused
@@ -233,13 +215,13 @@ def most_probable(
     def expand(free: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         return expanded(free, width, target)
 
-    # Where data are very exact the scales at the start are far from those at the mode: then once more from there.
+    # Where data are very exact the scales at the start are far from those at the mode: then again from there.
     success = False
     if not all(np.isfinite(part).all() for part in expand(origin)):
         return jnp.asarray(origin), jnp.asarray(np.full((d, d), np.nan)), False
-    for _ in range(FIT.attempts):
+    for _ in range(ATTEMPTS):
         unit = 1 / np.sqrt(np.maximum(np.abs(np.diagonal(expand(origin)[2])), 1e-8))
-        width = FIT.difference * np.minimum(unit, 1.0)
+        width = DIFFERENCE * np.minimum(unit, 1.0)
         found = _newton(expand, origin, unit)
         origin = origin + unit * found.x
         success = bool(found.success)
@@ -253,7 +235,7 @@ def most_probable(
     values = np.where(values > 1e-7, values, 0.01)
     covariance = (vectors / values) @ vectors.T * scale * scale[:, None]
     # Rounding may keep the optimiser from its tolerance at the very mode: what counts is what is left to gain.
-    there = convex and float(slope @ covariance @ slope) < FIT.mode_gain
+    there = convex and float(slope @ covariance @ slope) < MODE_GAIN
     return jnp.asarray(origin), jnp.asarray(covariance), success or there
 
 

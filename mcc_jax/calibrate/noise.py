@@ -32,13 +32,13 @@ from .compiling import compiled
 from .data import Tests
 from .forward import Linear
 from .priors import NoisePrior
-from .settings import FIT, PAPER
+from .settings import READING_UM
 from .sharding import Blocks, Parts
 from .small_matrices import eliminate
 
 
 class Correlation(enum.Enum):
-    """How residuals that are not white hang together: how rough they are."""
+    """How residuals that are not white are autocorrelated: how rough they are."""
 
     EXPONENTIAL = "exponential"
     MATERN_32 = "matern-3/2"
@@ -103,13 +103,9 @@ MASKED_UM2 = 1e12
 class Whitening(eqx.Module):
     """The factored covariance of one test's noise, ready to turn residuals into independent ones of variance 1.
 
-    Attributes:
-        solver: factor of the quasiseparable part: white and correlated noise.
-        mask: which points count.
-        peak: whitened change of every point with the error of its branch's peak, 0 on loading.
-        branch: which branch a point belongs to.
-        common: whitened change of every point with the error of the zero of force; None where no zero was measured.
-        weights: of the readings; None where all count alike.
+    `solver` is the factor of the quasiseparable part, white and correlated noise; `peak` the whitened change of every
+    point with the error of its branch's peak, 0 on loading; `branch` which branch a point belongs to; `common` the
+    whitened change with the error of the zero of force, None where none was measured; `weights` those of the readings.
     """
 
     solver: QuasisepSolver
@@ -170,7 +166,7 @@ class Whitening(eqx.Module):
     @property
     def reading(self) -> Scalar:
         """Sum of squares that reading a display of finite steps alone brings about, however well the law fits."""
-        return PAPER.reading_um**2 * self.information
+        return READING_UM**2 * self.information
 
     def _power(self) -> Path:
         return jax.ops.segment_sum(self.peak**2, self.branch, len(self.peak))
@@ -269,12 +265,8 @@ def squared_innovations(
 def student_weights(squares: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, float]:
     r"""Weights :math:`(\nu + 1)/(\nu + z^2)` of readings under Student noise, and by how much they overstate them.
 
-    They are those of the EM algorithm. Taken for known they make the readings look more exact than they are, by the
-    ratio of Huber's sandwich variance of a mean to the weighted one.
-
-    Args:
-        squares: z^2, shape (N, points).
-        mask: which points count.
+    They are those of the EM algorithm, for squares z^2 of shape (N, points). Taken for known they make the readings
+    look more exact than they are, by the ratio of Huber's sandwich variance of a mean to the weighted one.
     """
     weight = np.where(mask, (FREEDOM + 1) / (FREEDOM + squares), 1.0)
     z2, w = squares[mask], weight[mask]
@@ -311,7 +303,7 @@ def likelihoods(
     correlation: Correlation,
     along: Along,
 ) -> Float[Array, "many particles"]:
-    """Log likelihood of each test under each of many noises; 0 of copies that only fill up."""
+    """Log likelihood of each test under each of many noises; 0 of padding."""
     each = jax.vmap(
         lambda one: restricted_likelihood(Noise.from_logs(one, scale), tests, linear, zero_sd, correlation, along)
     )(logs)
@@ -331,7 +323,7 @@ class NoiseFit(eqx.Module):
     Attributes:
         noise: its numbers.
         covariance: of the logarithms of the four numbers; NaN where it was not worked out.
-        log_evidence: what the four numbers add to a log marginal likelihood at them: log prior and Laplace's volume.
+        log_evidence: what the four numbers add to a log marginal likelihood: log prior and Laplace's volume.
         converged: whether the optimiser met its tolerances.
     """
 
@@ -365,14 +357,8 @@ def estimate_noise(
 ) -> NoiseFit:
     """Noise by restricted maximum likelihood with its prior.
 
-    The particles' scales stay as they are (`particle_scales`). Derivatives with respect to four numbers are cheaper as
-    differences, all of them in one batch, than to compile.
-
-    Args:
-        tests, linear: of this process's own particles.
-        zero_sd: standard deviation of the zeros [um].
-        start: where to begin, and the particles' scales.
-        uncertainty: whether to work out the covariance.
+    The particles' scales stay as they are in `start` (`particle_scales`). Derivatives with respect to four numbers are
+    cheaper as differences, all of them in one batch, than to compile. The zeros' standard deviation is in um.
     """
     from scipy.optimize import minimize
 
@@ -387,7 +373,7 @@ def estimate_noise(
         values = -(np.sum(np.asarray(each), axis=1) + prior.log_density(np.asarray(at)))
         return float(values[0]), (values[1:5] - values[5:]) / (2 * STEP)
 
-    # No tester reads better than a few tenths of a nanometre: noise-free data, of a simulation say, get that much.
+    # No instrument reads better than a few tenths of a nanometre: noise-free data, of a simulation say, get that much.
     bounds = [(m - 3 * s, m + 6 * s) for m, s in zip(np.log(prior.median), np.asarray(prior.log_sd), strict=True)]
     inside = np.clip(np.asarray(start.logs), *np.transpose(bounds))
     found = minimize(value_and_gradient, inside, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-9})
@@ -408,13 +394,13 @@ def estimate_noise(
     return NoiseFit(noise, covariance, jnp.asarray(volume), bool(found.success))
 
 
+OUTLYING = 5.0  # a particle whose noise differs by so many standard deviations keeps its own scale; found by trial
+
+
 def particle_scales(scale: np.ndarray, squares: np.ndarray, freedom: np.ndarray) -> np.ndarray:
     """Every particle's scale from its whitened sum of squares, pulled towards 1 unless they scatter beyond chance.
 
-    Args:
-        scale: scales that the sums were whitened with, shape (N,).
-        squares: sums of squares of whitened residuals, shape (N,).
-        freedom: degrees of freedom, shape (N,).
+    The sums of squares were whitened with the given scales and have so many degrees of freedom, all of shape (N,).
     """
     freedom = np.maximum(freedom, 1)
     log_scale = np.log(scale) + 0.5 * np.log(np.maximum(squares / freedom, 1e-12))
@@ -425,5 +411,5 @@ def particle_scales(scale: np.ndarray, squares: np.ndarray, freedom: np.ndarray)
     # Up to twice the uncertainty of this estimate itself, all particles share one scale, but for outliers.
     if scatter <= 2 * np.median(chance) * np.sqrt(2 / len(log_scale)):
         scatter = 0.0
-    outlier = np.abs(away) > FIT.outlying * np.sqrt(scatter + chance)
+    outlier = np.abs(away) > OUTLYING * np.sqrt(scatter + chance)
     return np.exp(np.where(outlier, away, scatter / (scatter + chance) * away))

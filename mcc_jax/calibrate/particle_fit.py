@@ -13,7 +13,14 @@ from jaxtyping import Array, Bool, Float
 from .compiling import compiled
 from .data import Tests
 from .forward import Forms, Point, derivatives, snap
-from .settings import FIT
+
+# Found by trial on simulated campaigns.
+ZEROS, ZERO_REACH = 21, 0.04  # zeros of displacement that are tried, within this share of the effective diameter
+# What is added to the linear start's b1, b3, b5 for further starts.
+VARIATIONS = ((0.0, 0.0, 0.0), (0.05, -0.1, 0.03), (-0.05, 0.06, -0.02))
+STEPS = 200  # most steps of a particle's fit
+UNSEEN = 4.0  # a fit without unseen snap-through is preferred up to so many times the least sum of squares
+GAIN = 1e-6  # log probability still to gain at which a fit is finished, where residuals are as large as the noise
 
 
 class ParticleFits(eqx.Module):
@@ -40,7 +47,7 @@ def linear_start(stress: np.ndarray, strain: np.ndarray) -> tuple[np.ndarray, fl
     Stress is linear in the three coefficients at a given zero, so zeros are tried on a grid; deviations of stress are
     divided by the slope, which makes them deviations of strain.
     """
-    top, shifts = np.max(stress, initial=0.0), np.linspace(-FIT.zero_reach, FIT.zero_reach, FIT.zeros)
+    top, shifts = np.max(stress, initial=0.0), np.linspace(-ZERO_REACH, ZERO_REACH, ZEROS)
     x = strain - shifts[:, None]
     possible, x = (x > 1e-4).all(1), np.maximum(x, 1e-4)
     far, square = x.max(1, initial=1e-4)[:, None], x**2
@@ -75,12 +82,12 @@ def linear_starts(tests: Tests, log_modulus: float) -> np.ndarray:
         stress = 1e3 * force[row, used] / (np.pi / 4 * reach[row] ** 2)
         first[row, :3], shift = linear_start(stress, (displacement[row, used] - contact[row]) / reach[row])
         first[row, 4] = contact[row] + shift * reach[row]
-    return first + np.pad(FIT.variations, ((0, 0), (0, 2)))[:, None]
+    return first + np.pad(VARIATIONS, ((0, 0), (0, 2)))[:, None]
 
 
 def fit_particles(
     tests: Tests, noise: Any, centre: Any, width: Any, theta: Any, starts: Any, forms: Forms,
-    varying: tuple[int, ...] = (), most_steps: int = FIT.steps,
+    varying: tuple[int, ...] = (), most_steps: int = STEPS,
 ) -> ParticleFits:  # fmt: skip
     """Fit every particle by itself, its modulus included, from several starts, by Levenberg's and Marquardt's method.
 
@@ -148,7 +155,7 @@ def fit_particles(
         # curve, that is many times the noise.
         scatter = 1 + 2 * np.where(np.isfinite(loss[now]), loss[now], 0.0) / points[rows]
         gain = np.abs(np.einsum("np,np->n", move, g[now]))
-        done[now] = (gain < FIT.gain * scatter) | (damping[now] > 1e8)
+        done[now] = (gain < GAIN * scatter) | (damping[now] > 1e8)
         damping[now] = np.where(better, np.maximum(damping[now] / 8, 1e-9), damping[now] * 4)
         for old, new in ((y, tried), (loss, new_loss), (g, new_g), (H, new_H)):
             old[now[better]] = new[better]
@@ -159,7 +166,7 @@ def fit_particles(
     unseen = np.stack([np.asarray(snaps(jnp.asarray(one[:, :4]), tests.particle)) for one in y]) < np.log(first)
     seen = np.where(unseen, np.inf, loss)
     # Unless nothing else comes near the data: then the particle has snapped through before anybody looked.
-    near = seen.min(0) < FIT.unseen * loss.min(0) + FIT.unseen
+    near = seen.min(0) < UNSEEN * loss.min(0) + UNSEEN
     best = np.where(near, seen, loss).argmin(0), np.arange(N)
     rms = noise * np.sqrt(2 * loss[best] / points)
     point, *found = jax.tree.map(

@@ -11,7 +11,7 @@
 The exact weight of a draw of the population is the product of all particles' ratios of exact to quadratic likelihood.
 Of many particles the product scatters far more than it says: nearly all of its scatter is that of the particles' own
 draws. With the same random numbers for every draw of the population that scatter cancels, and the sum of log ratios is
-smooth in the population's parameters, linear over the little that the posterior leaves open: some tens of draws tell
+smooth in the population's parameters, linear over the little that the posterior leaves open: some tens of draws show
 it (`correction`).
 """
 
@@ -31,12 +31,34 @@ from .._types import Scalar
 from .compiling import compiled, even_batch, side_by_side
 from .data import Tests
 from .forward import Forms, Point, residuals
-from .importance import ordered_resample, pareto_k, smoothed_weights, unrest
+from .importance import ordered_resample, pareto_k, relative_scatter, smoothed_weights
 from .marginal import Marginal, ParticleDraw
 from .noise import Whitening
 from .population import Population
-from .settings import NUMERICS, SAMPLING
+from .settings import SAMPLING
 from .sharding import Blocks, count_of
+
+# Found by trial on simulated campaigns (`benchmarks/study_modes.py`, `bench_scale.py`).
+# A particle whose weight scatters by more than this share of its mean gets several candidates per draw; of many
+# particles, whose weights are not applied, a mean is then wrong by at most this share of its standard deviation.
+SCATTERING, SCATTERING_OF_MANY = 0.3, 0.1
+CANDIDATES, CANDIDATES_OF_MANY = (16, 32), (2, 16)  # how many it gets: first, and the few that scatter even then
+FEW = 4  # how many particles get most candidates; of many particles one in a hundred
+REACH = 3.0  # every other candidate is drawn so many times as wide: there lies what a summary is too narrow for
+# Up to so many draws of single particles every one is compared with the exact likelihood and the weights are applied;
+# of larger campaigns some are, and the population is corrected by regression.
+COMPARED = 400_000
+PROBES = 25  # draws of the population at which the sum of all particles' log ratios is worked out for that
+# Most that a particle's log ratio may change over the posterior of many particles, which is narrow for one of them:
+# what changes more gets more candidates, or does not count.
+MOST_CHANGE = 0.1
+LOWEST = -1e3  # log ratio that counts where the exact likelihood vanishes: differences of infinities say nothing
+UNSURE = 0.3  # standard error of the correction, in standard deviations of the posterior, that is reported
+KEPT = 4_000_000  # most draws of single particles that are kept; of very large campaigns every n-th draw
+# These change the time, and not the answer beyond rounding.
+ROWS, ROWS_OF_ACCELERATORS = 640, 40_000  # single draws of single particles at once: no more fit into a CPU's cache
+GROUP = 64  # particles that are drawn together from several candidates
+SIDE_BY_SIDE = 2  # pieces that draws are cut into on a CPU, on any number of cores
 
 
 class ParticleDraws(NamedTuple):
@@ -53,15 +75,9 @@ class ParticleDraws(NamedTuple):
 
 
 class ExactLikelihood(eqx.Module):
-    """Tests with their exact likelihood, and what particles are drawn by.
+    """Tests with their noise and their exact likelihood, and the summaries that particles are drawn by.
 
-    Attributes:
-        tests: the measurements.
-        filters: their noise.
-        marginal: the same tests, summarised.
-        zero_prior: mean and standard deviation of the zeros, from the recorded contact [um]; two numbers, which cutting
-            into blocks leaves alone.
-        forms: the law.
+    The zero's prior is two numbers, mean and standard deviation [um], which cutting into blocks leaves alone.
     """
 
     tests: Tests
@@ -127,7 +143,7 @@ def draw_particles(
                 square = 0.5 * (jnp.sum(normal**2, -1) + normal_zero**2)
                 proposal = -square - drawn.log_volume
                 if candidates > 1:
-                    far = -square / SAMPLING.reach**2 - (exact.marginal.scatter.size + 1) * math.log(SAMPLING.reach)
+                    far = -square / REACH**2 - (exact.marginal.scatter.size + 1) * math.log(REACH)
                     proposal = jnp.logaddexp(-square, far) - math.log(2) - drawn.log_volume
                 ratio = truth + prior - proposal - drawn.log_likelihood
                 ratio = jnp.where(jnp.isfinite(ratio), ratio, -jnp.inf)
@@ -138,7 +154,7 @@ def draw_particles(
         latent, theta, zero, likelihood, ratio = jax.vmap(candidate)(
             jax.random.normal(deviate, (*shape, exact.marginal.scatter.size)),
             jax.random.normal(zeros, shape),
-            jnp.where(jnp.arange(shape[0]) % 2 == 0, 1.0, SAMPLING.reach),
+            jnp.where(jnp.arange(shape[0]) % 2 == 0, 1.0, REACH),
         )
         if candidates <= 1:
             return latent[0], theta[0] if numbers else theta, zero[0], likelihood[0], ratio[0]
@@ -150,7 +166,7 @@ def draw_particles(
 
         return take(latent), take(theta) if numbers else theta, take(zero), likelihood[0], mean
 
-    rows = NUMERICS.rows if jax.default_backend() == "cpu" else NUMERICS.rows_of_accelerators
+    rows = ROWS if jax.default_backend() == "cpu" else ROWS_OF_ACCELERATORS
     batch = even_batch(draws, rows // (count * max(candidates, 1)))
     each = jnp.where(common, keys, jax.random.split(keys[0], draws))
     # Arrays without an entry are left out: `map` cannot cut them in batches.
@@ -173,12 +189,12 @@ class Length(NamedTuple):
 
 def stride_of(count: int, total: int) -> int:
     """Every how many-th draw is compared with the exact likelihood: all of them for few particles."""
-    return max(1, -(-total * count // SAMPLING.compared))
+    return max(1, -(-total * count // COMPARED))
 
 
 def chunk_of(total: int) -> int | None:
     """Draws of a chunk where all are compared: on a CPU two of them run side by side, on any number of cores."""
-    return -(-total // NUMERICS.side_by_side) if jax.default_backend() == "cpu" else None
+    return -(-total // SIDE_BY_SIDE) if jax.default_backend() == "cpu" else None
 
 
 def every(population: Population, which: int | np.ndarray) -> Population:
@@ -188,21 +204,14 @@ def every(population: Population, which: int | np.ndarray) -> Population:
 
 
 class Drawer:
-    """Draws of the particles, as arrays of NumPy with the axes (draw, particle), without copies that only fill up.
+    """Draws of the particles, as arrays of NumPy with the axes (draw, particle), without padding.
 
-    Attributes:
-        count: number of particles.
+    `chunk` draws of the population are worked on in one call, so that one compilation serves any number of them; all
+    by default. Chunks run next to each other where all particles are one block (`block` = 0).
     """
 
     def __init__(self, exact: ExactLikelihood, block: int, chunk: int | None = None) -> None:
-        """Cut the tests into blocks.
-
-        Args:
-            exact: the tests.
-            block: particles of a block; 0 for a single one.
-            chunk: draws of the population worked on in one go, so that one compilation serves any number of them; all
-                by default. Chunks run side by side where all particles are one block.
-        """
+        """Cut the tests into blocks of so many particles."""
         self.count = count_of(exact.tests)
         self._exact, self._blocks, self._chunk = exact, Blocks(len(exact.tests), block), chunk
         self._own = self._blocks.cut(exact, kept=False)
@@ -213,7 +222,7 @@ class Drawer:
         chunk, same = self._chunk or draws, jnp.asarray(np.asarray(common))
 
         def one(first: int) -> list[np.ndarray]:
-            rows = np.minimum(np.arange(first, first + chunk), draws - 1)  # the last one fills up the last chunk
+            rows = np.minimum(np.arange(first, first + chunk), draws - 1)  # the last one pads the last chunk
             keys = blocks.keys(key if common or not first else jax.random.fold_in(key, first))
             some = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[rows]), population)
             found = blocks.all(draw_particles, keys, some, self._own, candidates, same, axis=1)
@@ -228,58 +237,52 @@ class Drawer:
     ) -> ParticleDraws:
         """Some particles. They are few: every process draws all of them."""
         found = []
-        for i in range(0, len(which), NUMERICS.group):
-            group = which[i : i + NUMERICS.group]
-            # Always of one of a few sizes, the first one repeated: every size would be compiled anew.
-            size = min(self.count, NUMERICS.group, 4 ** int(np.ceil(np.log(max(len(group), 2)) / np.log(4))))
+        for i in range(0, len(which), GROUP):
+            group = which[i : i + GROUP]
+            # Always of one of a few sizes, the first one repeated: every size would be compiled again.
+            size = min(self.count, GROUP, 4 ** int(np.ceil(np.log(max(len(group), 2)) / np.log(4))))
             padded = jnp.asarray(np.pad(group, (0, size - len(group)), constant_values=group[0]))
             own = jax.random.fold_in(key, 1000 * i + candidates)
             drawn = Drawer(self._exact.some(padded), 0, self._chunk).all(own, population, candidates, common=common)
             found.append([np.asarray(v)[:, : len(group)] for v in drawn])
         return ParticleDraws(*(cast(Any, np.concatenate(several, 1)) for several in zip(*found, strict=True)))
 
-    def settle(
+    def redraw(
         self,
         key: Array,
         drawn: ParticleDraws,
         population: Population,
         k: np.ndarray,
-        restless: np.ndarray,
+        scattering: np.ndarray,
         candidates: Iterable[int],
     ) -> None:
-        """Draw restless particles anew from many candidates, in place, and their Pareto k, until none is left.
+        """Draw particles with scattering weights again, in place, from many candidates; update their Pareto k, too.
 
         Args:
             drawn: all particles under `population`; theirs are replaced.
             k: Pareto k of every particle.
-            restless: positions of the restless ones.
+            scattering: positions of those whose weights scatter.
             candidates: how many per draw: first, and for the few that scatter most even then.
         """
         latent, theta, zero, _, ratio = (cast(np.ndarray, v) for v in drawn)
-        few = max(SAMPLING.few, self.count // 100)
+        few = max(FEW, self.count // 100)
         for many in candidates:
-            if not len(restless):
+            if not len(scattering):
                 return
-            better = self.some(key, restless, population, many)
-            latent[:, restless], zero[:, restless] = better.latent, better.zero
-            theta[:, restless] = better.theta
-            ratio[:, restless] = better.log_ratio
-            k[restless] = pareto_k(ratio[:, restless])
-            restless = restless[np.argsort(-unrest(ratio[:, restless]))][:few]
-            restless = restless[unrest(ratio[:, restless]) > SAMPLING.restless]
+            better = self.some(key, scattering, population, many)
+            latent[:, scattering], zero[:, scattering] = better.latent, better.zero
+            theta[:, scattering] = better.theta
+            ratio[:, scattering] = better.log_ratio
+            k[scattering] = pareto_k(ratio[:, scattering])
+            scattering = scattering[np.argsort(-relative_scatter(ratio[:, scattering]))][:few]
+            scattering = scattering[relative_scatter(ratio[:, scattering]) > SCATTERING]
 
 
 class Drawn(NamedTuple):
-    """Particles drawn back.
+    """Particles drawn back under every `keep`-th of the draws of the population that were chosen by weight.
 
-    Attributes:
-        chosen: which draws of the population stand for the weighted ones.
-        particles: under every `keep`-th of these.
-        k: Pareto k of every particle's weights.
-        k_joint: of the population's.
-        keep: see `particles`.
-        log_ratio: logarithm of the mean ratio of exact to quadratic likelihood of all tests, and its standard error.
-        notes: what a reader must know.
+    `k` is the Pareto k of every particle's weights, `k_joint` that of the population's; `log_ratio` the logarithm of
+    the mean ratio of exact to quadratic likelihood of all tests, and its standard error.
     """
 
     chosen: np.ndarray
@@ -296,8 +299,8 @@ def weighted(drawer: Drawer, population: Population, length: Length, check_key: 
     particles = drawer.all(check_key, population)
     ratio = np.asarray(particles.log_ratio)
     k = pareto_k(ratio)
-    restless = np.flatnonzero((unrest(ratio) > SAMPLING.restless) | (k > SAMPLING.pareto_k))
-    drawer.settle(pick_key, particles, population, k, restless, SAMPLING.candidates)
+    scattering = np.flatnonzero((relative_scatter(ratio) > SCATTERING) | (k > SAMPLING.pareto_k))
+    drawer.redraw(pick_key, particles, population, k, scattering, CANDIDATES)
     total = ratio.sum(1)
     chosen, k_joint = _resampled(total, length)
     return Drawn(chosen, jax.tree.map(lambda x: x[chosen], particles), k, k_joint, mean_ratio(total))
@@ -317,36 +320,36 @@ def corrected(
     Of each particle some draws are compared with the exact likelihood. Those whose weights scatter are drawn from
     several candidates; of the others the draws are left as they are.
     """
-    checks = SAMPLING.probes * max(2, SAMPLING.compared // (SAMPLING.probes * drawer.count))
+    checks = PROBES * max(2, COMPARED // (PROBES * drawer.count))
     ratio = np.asarray(drawer.all(check_key, every(population, evenly(length.total, checks))).log_ratio)
-    scatter, k = unrest(ratio), pareto_k(ratio)
-    wild: set[int] = set()
+    scatter, k = relative_scatter(ratio), pareto_k(ratio)
+    left_out: set[int] = set()
 
     def total(which: int, rows: np.ndarray) -> np.ndarray:
         probes, own = every(population, rows), jax.random.fold_in(check_key, which)
-        ratio = np.maximum(drawer.all(own, probes, common=True).log_ratio, SAMPLING.lowest)
+        ratio = np.maximum(drawer.all(own, probes, common=True).log_ratio, LOWEST)
         # A single candidate may fall off a cliff of the likelihood as the population moves, which says nothing of all.
-        if len(unsteady := np.flatnonzero(np.ptp(ratio, axis=0) > SAMPLING.unsteady)):
-            better = drawer.some(own, unsteady, probes, SAMPLING.candidates[-1], common=True).log_ratio
-            ratio[:, unsteady] = np.maximum(better, SAMPLING.lowest)
-        if len(unsteady := np.flatnonzero(np.ptp(ratio, axis=0) > SAMPLING.unsteady)):
-            wild.update(unsteady.tolist())
-            ratio[:, unsteady] = 0.0
+        if len(changing := np.flatnonzero(np.ptp(ratio, axis=0) > MOST_CHANGE)):
+            better = drawer.some(own, changing, probes, CANDIDATES[-1], common=True).log_ratio
+            ratio[:, changing] = np.maximum(better, LOWEST)
+        if len(changing := np.flatnonzero(np.ptp(ratio, axis=0) > MOST_CHANGE)):
+            left_out.update(changing.tolist())
+            ratio[:, changing] = 0.0
         return ratio.sum(1)
 
     log_weight, error = correction(total, parameters)
     notes = []
-    if error > SAMPLING.unsure:
+    if error > UNSURE:
         notes.append(f"the means of the population are known to {error:.2f} of their standard deviations only")
-    if wild:
-        notes.append(f"{len(wild)} particles act on the population through their quadratic summary alone")
+    if left_out:
+        notes.append(f"{len(left_out)} particles act on the population through their quadratic summary alone")
     chosen, k_joint = _resampled(log_weight, length)
-    keep = max(1, -(-length.total * drawer.count // SAMPLING.kept))
+    keep = max(1, -(-length.total * drawer.count // KEPT))
     some = every(every(population, chosen), keep)
     particles = drawer.all(particle_key, some, 0)
-    restless = np.flatnonzero((scatter > SAMPLING.restless_of_many) | (k > SAMPLING.pareto_k))
-    drawer.settle(pick_key, particles, some, k, restless, SAMPLING.candidates_of_many)
-    # The regression tells how the correction changes over the posterior; how large it is, every particle tells alone.
+    scattering = np.flatnonzero((scatter > SCATTERING_OF_MANY) | (k > SAMPLING.pareto_k))
+    drawer.redraw(pick_key, particles, some, k, scattering, CANDIDATES_OF_MANY)
+    # The regression shows how the correction changes over the posterior; how large it is, every particle shows alone.
     each = [mean_ratio(ratio[:, i]) for i in range(ratio.shape[1])]
     log_ratio = float(sum(v for v, _ in each)), float(np.sqrt(sum(error**2 for _, error in each)))
     return Drawn(chosen, particles, k, k_joint, log_ratio, keep, tuple(notes))
@@ -362,7 +365,7 @@ def mean_ratio(log_ratio: np.ndarray) -> tuple[float, float]:
 
 
 def _resampled(log_weight: np.ndarray, length: Length) -> tuple[np.ndarray, float]:
-    """Which draws stand for the weighted ones, in order within each chain, and the Pareto k of the weights."""
+    """Which draws represent the weighted ones, in order within each chain, and the Pareto k of the weights."""
     weight, k = smoothed_weights(log_weight)
     rows = (slice(c * length.draws, (c + 1) * length.draws) for c in range(length.chains))
     return np.concatenate([row.start + ordered_resample(weight[row], length.draws) for row in rows]), k
@@ -374,11 +377,9 @@ def evenly(count: int, some: int) -> np.ndarray:
 
 
 class Correction(NamedTuple):
-    """What the exact likelihood adds to the log density of the population.
+    """What the exact likelihood adds to the log density of the population at every draw, up to a constant.
 
-    Attributes:
-        log_weight: of every draw, up to a constant.
-        error: standard error of its slope, in standard deviations of the posterior by which it would move the means.
+    `error` is the standard error of its slope: by how many standard deviations of the posterior means would move.
     """
 
     log_weight: np.ndarray
@@ -391,7 +392,7 @@ def correction(total: Callable[[int, np.ndarray], np.ndarray], draws: np.ndarray
     `total` gives the sums at rows of `draws`, with random numbers that depend on its first argument, 0 or 1; `draws`
     are those of the parameters, shape (draws, parameters).
     """
-    rows = evenly(len(draws), SAMPLING.probes)
+    rows = evenly(len(draws), PROBES)
     unit, values, _ = np.linalg.svd(draws - draws.mean(0), full_matrices=False)
     # Uncorrelated and of standard deviation 1, so that a slope is the shift of a mean in standard deviations.
     white = unit[:, values > 1e-9 * values[0]] * np.sqrt(len(draws))

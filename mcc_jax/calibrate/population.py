@@ -44,17 +44,13 @@ class Population(eqx.Module):
 
 
 class Scatter(eqx.Module):
-    """How particles differ, and how carefully they are integrated out.
+    """How particles differ, and with how many Newton steps they are integrated out.
 
     Attributes:
-        modulus: whether the modulus scatters, too.
-        shape: whether `a` does.
+        modulus, shape: whether the modulus, and `a`, differ.
         power: power with which the shape factor enters unloading.
-        varying: of each amplitude that differs from particle to particle its place, and whether both signs are
-            physical.
+        varying: of each amplitude that differs its place, and whether both signs are physical.
         positive: of each of the effects' numbers that must be positive its place, and that of its amplitude.
-        newton: Newton steps from the linear solution to the most probable deviations; none are needed where the tests
-            pin all coefficients down.
     """
 
     modulus: bool = eqx.field(static=True, default=False)
@@ -94,13 +90,9 @@ def moments(
 
 
 class Particles(eqx.Module):
-    """Particles at their deviations from the population.
+    """Particles at their deviations from the population: b1, b3, b5, e and the numbers of their effects.
 
-    Attributes:
-        latent: b1, b3, b5, e.
-        theta: numbers of their effects.
-        factor: derivatives of `latent` by the deviations.
-        slope: derivatives of the amplitudes that vary by their deviations.
+    `factor` and `slope` are the derivatives of the former and of the amplitudes that vary by the deviations.
     """
 
     latent: Float[Array, "particles 4"]

@@ -212,7 +212,6 @@ def sample(
     warmup: int = 300,
     draws: int = 1000,
     seed: int = 0,
-    block: int | None = None,
     without_flagged: bool = True,
     start: Start | Fit | None = None,
     progress: Callable[[str], None] | None = None,
@@ -238,8 +237,6 @@ def sample(
         warmup: steps of each that tune NUTS, where it runs, and are thrown away.
         draws: of each that are kept.
         seed: random seed.
-        block: particles of a block; by default all in one up to 64, and about 64 of larger campaigns. Other blocks make
-            other draws of the same posterior. The mode "joint" has a single one.
         start: where the fit begins, for one: what `fit` gave of the same campaign and model.
         progress: called with the name of each step.
 
@@ -250,7 +247,7 @@ def sample(
     started = time.perf_counter()
     imported_meanwhile("scipy.stats", "arviz_stats.base.array")
     campaign = check_tests(campaign)
-    tell, model, threshold_MPa = checked_settings(progress, model, threshold_MPa, block)
+    tell, model, threshold_MPa = checked_settings(progress, model, threshold_MPa)
     seed = arguments.seed(seed)
     arguments.choice(mode, get_args(Mode), "mode")
     chains, draws = (arguments.whole(n, name, least=1) for n, name in ((chains, "chains"), (draws, "draws")))
@@ -258,12 +255,12 @@ def sample(
     fast = mode == "fast"
     with numbers_in_reach(campaign):
         begin = Start(start.point, start.population, start.noise.noise) if isinstance(start, Fit) else start
-        selection, fit, size = prepare(campaign, model, threshold_MPa, block=block, start=begin, tell=tell)
+        selection, fit, size = prepare(campaign, model, threshold_MPa, start=begin, tell=tell)
         tell("sampling the population" if fast else "sampling everything")
         key = jax.random.key(seed)
         likely = worst(check_plausibility(campaign)) != "error"
         kept = fit.first(len(selection.kept))
-        drawn = draw_fast(key, fit, length, size, patient=likely) if fast else draw_joint(key, kept, length)
+        drawn = draw_fast(key, fit, length, size, fallback=likely) if fast else draw_joint(key, kept, length)
     tell("diagnosing")
     calibration = Posterior(
         campaign=campaign,
@@ -279,7 +276,7 @@ def sample(
     outlying = unlike_others(calibration.particles, calibration.rms_um(), ranges_um(tests))
 
     def again(some: Campaign) -> dict[str, Any]:
-        settings: dict[str, Any] = {"threshold_MPa": threshold_MPa, "mode": mode, "seed": seed, "block": block}
+        settings: dict[str, Any] = {"threshold_MPa": threshold_MPa, "mode": mode, "seed": seed}
         few: dict[str, Any] = {"chains": chains, "warmup": warmup, "draws": draws}
         return sample(some, model, without_flagged=False, **settings, **few).answer()
 

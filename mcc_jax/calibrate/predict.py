@@ -102,7 +102,7 @@ def sample_laws(calibration: PosteriorDraws, count: int, *, seed: int = 0) -> Mc
     """Laws of particles never measured, for DEM or any other use: one posterior draw of the population each.
 
     They carry both the scatter of the particles and the uncertainty of the population. Laws that are not monotone are
-    kept, as the population has them (`MccLaw.is_monotone` tells).
+    kept, as the population has them (see `MccLaw.is_monotone`).
 
     Args:
         calibration: the posterior.
@@ -207,7 +207,7 @@ def predicted_at(calibration: PosteriorDraws, row: int, pick: np.ndarray, seed: 
 
 
 def compare_with_paper(calibration: PosteriorDraws) -> list[dict[str, Any]]:
-    """The paper's Table 2, a and modulus beside ours: one row per quantity, with mean, sd and 95 % interval of ours."""
+    """The paper's Table 2, a and modulus next to ours: one row per quantity, with mean, sd and interval of ours."""
     named = calibration.named_population()
     paper: dict[str, float | None] = {"a": PAPER_SHAPE_PARAMETER}
     printed = calibration.model.unloading.value == "printed"

@@ -108,8 +108,8 @@ class Priors:
         C1: median of C1 over the particles [-], the initial slope of the master curve in MPa.
         C5: median of C5 over the particles [-].
         softening: :math:`9 C_3^6 / (20 C_1 C_5^5)` of the median particle [-], 0.33 in the paper: the share of the
-            initial slope that is lost at the curve's bend. It stands in for C3, whose median follows. At 1 the curve is
-            flat there, beyond 1 its stress falls; most powders stay well below, single particles need not.
+            initial slope that is lost at the curve's bend. It replaces C3, whose median follows. At 1 the curve is flat
+            there, beyond 1 its stress falls; most powders stay well below, single particles need not.
         tau_C1, tau_C3, tau_C5: standard deviation of log C over the particles. That of C3 is open in its order of
             magnitude: the paper's 20 particles show none at all (Table 2), and the smaller it is, the better a and the
             means are known.

@@ -37,12 +37,7 @@ A_FOLDER = "Give a folder that a result's save, mcc-jax calibrate or mcc-jax dis
 
 
 class Saved(abc.ABC):
-    """What is written as JSON for people and as an archive that `mcc_jax.load` reads.
-
-    Attributes:
-        content_file: name of the JSON.
-        archive_file: name of the archive.
-    """
+    """What is written as JSON for people and as an archive that `mcc_jax.load` reads."""
 
     content_file: ClassVar[str]
     archive_file: ClassVar[str]
@@ -147,7 +142,7 @@ class JointCalibration(Calibration):
         return tuple(self.campaign.particles[i] for i in self.selection.kept)
 
     def compared(self) -> Mapping[int, tuple[np.ndarray, np.ndarray]]:
-        """Rows of every particle's curve that stand in the tests, and which of them are compared."""
+        """Rows of every particle's curve that are in the tests, and which of them are compared."""
         return compared_rows(self.selection)
 
     def residual(self) -> np.ndarray:
@@ -175,7 +170,7 @@ class JointCalibration(Calibration):
         return noise_share(self.fit)
 
     def _notes_of_the_fit(self) -> list[str]:
-        """Warnings that stand in the tests, in how they were calibrated, and in what the law misses."""
+        """Warnings about the tests, about how they were calibrated, and about what the law misses."""
         notes = [*self.selection.notes, *self.notes]
         notes += filter(None, (misfit_note(self.own_misfit), noise_note(self.noise_share, self._missed)))
         dropped = sum(reason is not None for reason in self.selection.why_not)
@@ -189,20 +184,20 @@ class JointCalibration(Calibration):
         return {name: log_estimate(m, s) if np.isfinite(m) else estimate(0.0) for name, m, s in numbers}
 
     def _entries(self, numbers: Callable[[int], dict[str, Any]], **more: np.ndarray) -> list[dict[str, Any]]:
-        """What stands in files of every particle of the campaign.
+        """Entries of every particle of the campaign in files.
 
         Args:
             numbers: estimates of a row of the tests.
             more: further numbers of all rows.
         """
         row_of = {i: row for row, i in enumerate(self.selection.kept)}
-        told = {"rms_um": self.rms_um(), "noise_scale": np.asarray(self.fit.noise.noise.scale)} | more
+        further = {"rms_um": self.rms_um(), "noise_scale": np.asarray(self.fit.noise.noise.scale)} | more
         nothing: dict[str, Any] = dict.fromkeys(("eta_p", *COEFFICIENTS, "zero_um"), estimate(None))
         return [
             {
                 "particle": name,
                 **(nothing if (row := row_of.get(i)) is None else numbers(row)),
-                **{key: None if row is None else finite(float(values[row])) for key, values in told.items()},
+                **{key: None if row is None else finite(float(values[row])) for key, values in further.items()},
                 "kept": row is not None,
                 "why_not": self.selection.why_not[i],
                 "force_zero_mN": force_zero(self.campaign.curves[i]),

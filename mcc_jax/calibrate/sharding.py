@@ -26,17 +26,21 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from .._errors import InputError
 from .compiling import compiled
 from .data import Tests, longer
-from .settings import NUMERICS
 
 AXIS = "particles"
 """Name of the only axis of the mesh of a process's devices."""
 
 
+# Sizes of a campaign that is one block: those between are padded, so that few sizes are compiled. The last is the
+# most particles of a block: on a processor larger ones are no faster, smaller ones slower (`bench_scale.py`).
+BLOCKS = (4, 8, 12, 16, 20, 24, 32, 40, 48, 64)
+
+
 def block_size(count: int) -> int:
     """Particles of each block of a campaign of that many."""
-    most = NUMERICS.blocks[-1]
+    most = BLOCKS[-1]
     if count <= most:
-        return next(size for size in NUMERICS.blocks if size >= count)
+        return next(size for size in BLOCKS if size >= count)
     size = -(-count // -(-count // most))
     return size + -size % 4
 
@@ -57,18 +61,13 @@ def filled_up(tests: Tests, block: int) -> Tests:
 
 
 def count_of(tests: Tests) -> int:
-    """Number of particles, without copies that only fill up."""
+    """Number of particles, without padding."""
     return len(tests) if tests.weight is None else int(np.asarray(tests.weight).sum())
 
 
 @dataclass(frozen=True)
 class Parts:
-    """Arrays of this process's own particles, cut along one axis.
-
-    Attributes:
-        waves: what all its devices work on at the same time, a block each; one after the other.
-        axis: that of the particles.
-    """
+    """This process's own particles, cut along `axis` into waves: a block for each of its devices at the same time."""
 
     waves: Sequence[Any]
     axis: int = 0
@@ -81,12 +80,7 @@ class Parts:
 
 @dataclass(frozen=True)
 class _Cut(Sequence[Any]):
-    """Waves that are cut out each time they are asked for.
-
-    Attributes:
-        part: what a row of blocks holds.
-        own: the rows.
-    """
+    """Waves that are cut out each time they are asked for: `part` of each row of blocks in `own`."""
 
     part: Callable[[np.ndarray], Any]
     own: np.ndarray
@@ -99,13 +93,7 @@ class _Cut(Sequence[Any]):
 
 
 class Blocks:
-    """How the particles are cut into blocks, and which of them are this process's own.
-
-    Attributes:
-        count: number of particles, copies that fill up included.
-        size: particles of a block.
-        number: number of blocks.
-    """
+    """How `count` particles, padding included, are cut into `number` blocks of `size`; which are this process's own."""
 
     def __init__(self, count: int, size: int = 0) -> None:
         """Cut `count` particles into blocks of `size`; 0 for a single block.
@@ -125,7 +113,7 @@ class Blocks:
         self.mesh = Mesh(np.array(devices), (AXIS,)) if len(devices) > 1 else None
         self._share = share
         rounds = -(-share // len(devices))
-        # Where blocks do not come out even, the last one is computed once more, and thrown away.
+        # Where blocks do not come out even, the last one is computed again, and discarded.
         own = np.minimum(process * share + np.minimum(np.arange(rounds * len(devices)), share - 1), self.number - 1)
         self._own = own.reshape(rounds, len(devices))
 

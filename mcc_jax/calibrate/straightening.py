@@ -34,12 +34,7 @@ FARTHEST = 20.0
 
 
 class Straight(eqx.Module):
-    """Shear and power of every number of the effects; 0 of amplitudes, and of numbers that may be 0.
-
-    Attributes:
-        shear: p, the same for all particles.
-        power: q.
-    """
+    """Shear p and power q of every number of the effects; 0 of amplitudes, and of numbers that may be 0."""
 
     shear: Float[Array, "particles numbers"]
     power: Float[Array, "particles numbers"]

@@ -84,7 +84,7 @@ def discover(
     """
     started = time.perf_counter()
     campaign = check_tests(campaign)
-    tell, assumed, threshold_MPa = checked_settings(progress, model, threshold_MPa, None)
+    tell, assumed, threshold_MPa = checked_settings(progress, model, threshold_MPa)
     seed = arguments.seed(seed)
     for name, value in (("confirm", confirm), ("experiments", experiments), ("posterior", posterior)):
         arguments.flag(value, name)

@@ -206,7 +206,7 @@ def power_of_campaign(
         InputError: if no particle can be used.
     """
     check_campaign(campaign)
-    tell, assumed, threshold_MPa = checked_settings(progress, model, threshold_MPa, None)
+    tell, assumed, threshold_MPa = checked_settings(progress, model, threshold_MPa)
     base = base_fit(campaign, without_effects(assumed), threshold_MPa=threshold_MPa, tell=tell)
     tell("signatures of all effects")
     return power_of(*screened(base, library))

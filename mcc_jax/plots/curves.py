@@ -14,11 +14,11 @@ from .._extras import extra
 from ..calibrate import (
     LeastSquares,
     PaperCalibration,
-    ParticleFit,
     Posterior,
     predict_new_particle,
 )
 from ..calibrate.curves import FittedCurve
+from ..calibrate.paper.prediction import ParticleFit
 from ..campaign import PAPER_DIAMETERS_UM, Curve, effective_diameter_um
 from ..discover import Discovery
 from ..effects.record import HOLD, RELOAD, UNLOAD

@@ -13,8 +13,9 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogFormatterSciNotation, ScalarFormatter
 
 from .._errors import InputError
-from ..calibrate import MIN_RATIO, PaperCalibration
+from ..calibrate import PaperCalibration
 from ..calibrate.paper.modulus import collapsed_branches
+from ..calibrate.settings import UNLOADED_FROM
 from ..campaign import Campaign, stress_and_strain
 from ..law import stress_ratio
 from . import style
@@ -413,9 +414,9 @@ def plot_elastic(calibration: PaperCalibration) -> Figure:
     left.plot(
         s, np.asarray(jax.jit(stress_ratio)(jnp.asarray(s))), color=style.BLACK, linewidth=1.0, label="law, $f(s)$"
     )
-    left.axhline(MIN_RATIO, **_DOTTED)
+    left.axhline(UNLOADED_FROM, **_DOTTED)
     told: style.Look = {"transform": left.get_yaxis_transform(), "va": "bottom", "fontsize": 7, "color": style.GREY}
-    left.text(0.02, MIN_RATIO, "each branch has a zero of its own;\nnot used below", **told)
+    left.text(0.02, UNLOADED_FROM, "each branch has a zero of its own;\nnot used below", **told)
     left.set_xlabel("recovered strain over recoverable strain $s$ [-]")
     left.set_ylabel("stress over peak stress $\\sigma/\\sigma_P$ [-]")
     left.set_ylim(0, 1.05)

@@ -37,11 +37,12 @@ def main(folder: Path, address: str, processes: int, process: int, seed: int, ev
     # Not before: nothing may ask for devices before the processes know of each other.
     from joint_cases import five_particles
 
-    from mcc_jax.calibrate import sample, write_posterior
+    from mcc_jax.calibrate import fitting, sample, write_posterior
 
+    fitting.block_size = lambda count: 2
     campaign = five_particles(seed)
     try:
-        found = sample(campaign, chains=2, warmup=100, draws=60, seed=3, block=2)
+        found = sample(campaign, chains=2, warmup=100, draws=60, seed=3)
     except Exception as error:
         (folder / f"error_{process}.txt").write_text(f"{type(error).__name__}: {error}", encoding="utf-8")
         raise

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mcc_jax.calibrate.hierarchical import Normal, Parameters, minimise, normal_equations
+from mcc_jax.calibrate.hierarchical import Parameters, minimise, normal_equations
 
 pytestmark = pytest.mark.extended
 
@@ -25,30 +25,18 @@ def linear():
     return A, B, r, dense
 
 
-def normal_of(A, B, r, shared=Q):
+def normal_of(A, B, r):
     def push(y):
-        moved = jnp.einsum("nkp,np->nk", A, y.local) + jnp.einsum("nkq,q->nk", B[..., :shared], y.shared)
+        moved = jnp.einsum("nkp,np->nk", A, y.local) + jnp.einsum("nkq,q->nk", B, y.shared)
         # Two leaves, one with a further axis, as the pooled residuals have.
         return moved[:, :3], moved[:, 3:].reshape(N, 2, 2)
 
     residual = (jnp.asarray(r[:, :3]), jnp.asarray(r[:, 3:].reshape(N, 2, 2)))
-    return normal_equations(push, residual, Parameters(jnp.zeros((N, P)), jnp.zeros(shared)))
+    return normal_equations(push, residual, Parameters(jnp.zeros((N, P)), jnp.zeros(Q)))
 
 
 def flat(parameters):
     return np.concatenate([np.asarray(parameters.local).ravel(), np.asarray(parameters.shared)])
-
-
-def test_normal_equations_are_the_dense_ones(linear):
-    *parts, dense = linear
-    normal = normal_of(*parts)
-    H, g = dense.T @ dense, dense.T @ parts[2].ravel()
-    for n in range(N):
-        own = slice(n * P, (n + 1) * P)
-        np.testing.assert_allclose(normal.local[n], H[own, own], rtol=1e-12, atol=1e-12)
-        np.testing.assert_allclose(normal.border[n], H[own, N * P :], rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(normal.shared, H[N * P :, N * P :], rtol=1e-12)
-    np.testing.assert_allclose(flat(Parameters(normal.gradient_local, normal.gradient_shared)), g, rtol=1e-11)
 
 
 @pytest.mark.parametrize("damping", [0.0, 1e-3, 10.0])
@@ -57,26 +45,6 @@ def test_the_step_is_the_dense_one(linear, damping):
     H, g = dense.T @ dense, dense.T @ parts[2].ravel()
     expected = -np.linalg.solve(H + damping * np.diag(np.diag(H)), g)
     np.testing.assert_allclose(flat(normal_of(*parts).solve(damping)), expected, rtol=1e-9, atol=1e-11)
-
-
-def test_the_step_without_shared_parameters(linear):
-    A, B, r, _ = linear
-    step = normal_of(A, B, r, shared=0).solve(0.0)
-    assert step.shared.shape == (0,)
-    for n in range(N):
-        expected = -np.linalg.lstsq(A[n], r[n], rcond=None)[0]
-        np.testing.assert_allclose(step.local[n], expected, rtol=1e-9)
-
-
-def test_the_covariance_is_the_inverse(linear):
-    *parts, dense = linear
-    own, between, shared = normal_of(*parts).covariance()
-    expected = np.linalg.inv(dense.T @ dense)
-    for n in range(N):
-        rows = slice(n * P, (n + 1) * P)
-        np.testing.assert_allclose(own[n], expected[rows, rows], rtol=1e-9, atol=1e-11)
-        np.testing.assert_allclose(between[n], expected[rows, N * P :], rtol=1e-9, atol=1e-11)
-    np.testing.assert_allclose(shared, expected[N * P :, N * P :], rtol=1e-9, atol=1e-11)
 
 
 # ---- a small nonlinear problem: decays of own height and level, with a rate and a drift that all share ---------------
@@ -91,8 +59,7 @@ def decays():
     return clean + 0.05 * rng.standard_normal(clean.shape)
 
 
-def residual(y, data, extra=0):
-    """`extra` shared parameters and as many own ones that no residual depends on come last."""
+def residual(y, data):
     model = y.local[:, :1] * jnp.exp(-y.shared[0] * TIME)[None] + y.local[:, 1:2] + (y.shared[1] * TIME**2)[None]
     return (data - model,)
 
@@ -112,18 +79,3 @@ def test_too_few_steps_are_no_convergence():
         lambda d: minimise(lambda y: residual(y, d), Parameters(jnp.ones((N, 2)), jnp.asarray([0.5, 0.0])), max_steps=2)
     )(jnp.asarray(decays()))
     assert not bool(found.converged)
-
-
-def test_a_particle_without_any_data_leaves_the_others_alone(linear):
-    A, B, r, _ = linear
-    A, B, r = A.copy(), B.copy(), r.copy()
-    A[1], B[1], r[1] = 0.0, 0.0, 0.0
-    normal = normal_of(A, B, r)
-    step = normal.solve(0.0)
-    np.testing.assert_array_equal(step.local[1], 0.0)
-    keep = np.arange(N) != 1
-    parts = (normal.local, normal.border, normal.gradient_local)
-    local, border, gradient = (jnp.asarray(np.asarray(v)[keep]) for v in parts)
-    alone = Normal(local, border, normal.shared, gradient, normal.gradient_shared).solve(0.0)
-    np.testing.assert_allclose(step.shared, alone.shared, rtol=1e-10)
-    np.testing.assert_allclose(np.asarray(step.local)[keep], alone.local, rtol=1e-10)

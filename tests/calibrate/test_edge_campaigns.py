@@ -17,7 +17,7 @@ from mcc_jax import (
     least_squares,
     sample,
 )
-from mcc_jax.calibrate.data import select, select_tests
+from mcc_jax.calibrate.data import select
 
 pytestmark = pytest.mark.extended
 
@@ -111,10 +111,6 @@ def contents(campaign):
     return {name: method(campaign).to_json() for name, method in METHODS.items()}
 
 
-def test_the_campaign_is_ragged(campaign):
-    assert len({len(curve) for curve in campaign.curves}) >= 5
-
-
 @few
 def test_every_particle_has_numbers_or_a_reason(campaign, contents, method):
     content = contents[method]
@@ -172,12 +168,6 @@ def test_selected_points_are_those_of_the_record(campaign):
     force = np.asarray(tests.force[cycles])
     highest = np.maximum.accumulate(force)
     assert np.all(force[loading] > highest[loading] - 0.05 * highest.max())
-
-
-def test_a_threshold_must_be_a_stress(campaign):
-    for threshold in (-0.1, math.nan, math.inf):
-        with pytest.raises(ValueError, match="threshold"):
-            select_tests(campaign, threshold_MPa=threshold)
 
 
 @few

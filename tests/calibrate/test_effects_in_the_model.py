@@ -111,20 +111,6 @@ def test_creep_beyond_the_record_is_drawn_as_widely_as_tests_leave_it_open():
     assert ratio.std() < 0.3 * np.log(named["creep.tau_s"]).std()
 
 
-def test_products_and_their_derivatives():
-    rng = np.random.default_rng(0)
-    base, along = jnp.asarray(rng.standard_normal((3, 7))), jnp.asarray(rng.standard_normal((3, 7, 2)))
-
-    def products(x):
-        return with_products(base + jnp.einsum("nqk,k->nq", along, x), along)[0]
-
-    value, slope = with_products(base, along)
-    assert value.shape == (3, 7 + 3 * 7)
-    np.testing.assert_allclose(value[:, 7 + 7 + 4], base[:, 5] * base[:, 4] / 2)  # second number with the first
-    np.testing.assert_allclose(value[:, 7 + 2], base[:, 4] * base[:, 2])  # first number with b5
-    np.testing.assert_allclose(slope, jax.jacfwd(products)(jnp.zeros(2)), rtol=1e-12)
-
-
 def test_a_posterior_that_begins_at_a_fit_is_the_same(campaign, posterior):
     again = mcc.sample(campaign, posterior.model, start=posterior.fit)
     assert again.converged
@@ -168,26 +154,6 @@ def test_least_squares_agrees_with_the_mode(campaign, posterior):
     named = posterior.named_population()
     for name, (optimum, most_probable) in pairs.items():
         assert abs(optimum["value"] - float(most_probable)) < 0.2 * named[name].std(), name
-
-
-def test_a_saved_law_with_its_effect_drives(posterior, tmp_path):
-    posterior.save(tmp_path / "result")
-    law = mcc.load(tmp_path / "result").law()
-    assert [effect.name for effect in law.effects] == [CREEP]
-    particle = mcc.Particle(200.0, 190.0, 180.0)
-    force, time = jnp.asarray([0.0, 200.0, 200.0]), jnp.asarray([0.0, 10.0, 60.0])
-    moved = mcc.drive(law, particle, force, time=time, control="load").displacement
-    still = mcc.drive(law.without_effects(), particle, force, control="load").displacement
-    # D c [ln(1 + t/tau) convolved with d sigma]: a ramp of 10 s, then 50 s at its end.
-    effect, tau = law.effects[0], float(law.effects[0].tau_s)
-    stress, diameter = float(particle.stress(force[1])), float(particle.effective_diameter)
-
-    def integral(t):
-        return (t + tau) * np.log1p(t / tau) - t
-
-    by_hand = diameter * float(effect.amplitude) * stress / 10 * (integral(60) - integral(50) - integral(10))
-    assert float(moved[2] - moved[1]) == pytest.approx(by_hand, rel=0.05)
-    np.testing.assert_allclose(still[2], still[1])
 
 
 def test_two_formulas_of_one_mechanism_are_refused():

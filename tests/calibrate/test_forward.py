@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import ALL_FORMS, first_in_core
-from joint_cases import COEFFICIENTS, DIAMETERS, SNAPPING, effective_diameter, flatness, simulated, true_latent
+from joint_cases import COEFFICIENTS, DIAMETERS, SNAPPING, effective_diameter, simulated, true_latent
 
 from mcc_jax import Instrument, Model, Programme, Unloading
 from mcc_jax.calibrate import select_tests
@@ -191,9 +191,3 @@ def test_the_start_of_an_impossible_record_is_finite():
     for displaced in (-50.0, 0.0):
         measured = jnp.full_like(tests.displacement, displaced)
         assert np.all(np.isfinite(linear_starts(replace(tests, displacement=measured), 9.0)))
-
-
-def test_flatness_and_eta_are_the_geometry_s():
-    tests = measured_with()
-    actual = eqx.filter_vmap(lambda p: p.flatness)(tests.particle)
-    np.testing.assert_allclose(actual, flatness(DIAMETERS), rtol=1e-14)

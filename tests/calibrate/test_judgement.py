@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from mcc_jax import calibrate_paper, least_squares
 from mcc_jax._errors import InputError
+from mcc_jax.calibrate import judgement
 from mcc_jax.calibrate.judgement import MODULUS_OPEN, judged, unknown_modulus, unlike_others
-from mcc_jax.calibrate.settings import JudgementSettings
 from mcc_jax.campaign import check_tests
 
 TRUTH_MPA = faulty.MODULUS_MPA
@@ -130,12 +130,13 @@ def test_a_larger_particle_with_a_larger_residual_is_like_the_others():
     assert unlike_others(NAMES, rms, reach) is None
 
 
-def test_a_mixture_has_no_outlier_and_few_particles_no_usual_residual():
+def test_a_mixture_has_no_outlier_and_few_particles_no_usual_residual(monkeypatch):
     rms, reach = np.full(12, 0.05), np.full(12, 50.0)
     rms[:5] *= 20
     assert unlike_others(NAMES, rms, reach) is None
     assert unlike_others(NAMES[:4], np.array([0.05, 0.05, 0.05, 5.0]), np.full(4, 50.0)) is None
-    named = unlike_others(NAMES[:4], np.array([0.05, 0.05, 0.05, 5.0]), np.full(4, 50.0), JudgementSettings(least=4))
+    monkeypatch.setattr(judgement, "LEAST", 4)
+    named = unlike_others(NAMES[:4], np.array([0.05, 0.05, 0.05, 5.0]), np.full(4, 50.0))
     assert named.particles == ("P3",)
 
 
@@ -174,12 +175,14 @@ def test_a_flag_of_most_particles_is_not_answered_without_them():
     assert found.check == "saturation"
 
 
-def test_few_flagged_particles_of_many_are_told_without_another_calibration():
+def test_few_flagged_particles_of_many_are_reported_without_another_calibration(monkeypatch):
     campaign = check_tests(faulty.broken(clean(), only=("2",)))
     one = 1 / len(campaign)
-    (found,) = judged(campaign, answer(), None, lambda some: answer(), JudgementSettings(few=0.99 * one))
+    monkeypatch.setattr(judgement, "FEW", 0.99 * one)
+    (found,) = judged(campaign, answer(), None, lambda some: answer())
     assert "without it" in found.sentence
-    told = judged(campaign, answer(), None, lambda some: pytest.fail("too dear"), JudgementSettings(few=1.01 * one))
+    monkeypatch.setattr(judgement, "FEW", 1.01 * one)
+    told = judged(campaign, answer(), None, lambda some: pytest.fail("too dear"))
     assert [one.check for one in told] == ["breakage"]
 
 

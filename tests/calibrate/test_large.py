@@ -8,7 +8,6 @@ from mcc_jax import paper_campaign, sample
 from mcc_jax.calibrate import draws as drawing
 from mcc_jax.calibrate import particles
 from mcc_jax.calibrate.particles import correction
-from mcc_jax.calibrate.settings import SamplingSettings
 
 pytestmark = pytest.mark.extended
 
@@ -44,9 +43,7 @@ def test_blocks_of_particles_are_drawn_as_all_at_once(paper_posterior):
 
 
 def test_the_shortcuts_agree_with_exact_weights(paper_posterior, monkeypatch):
-    monkeypatch.setattr(
-        particles, "SAMPLING", SamplingSettings(compared=40_000)
-    )  # so that twenty particles count as many
+    monkeypatch.setattr(particles, "COMPARED", 40_000)  # so that twenty particles count as many
     many = sample(paper_campaign(0))
     assert many.leapfrogs == 0
     assert not many.weights_applied

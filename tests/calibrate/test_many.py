@@ -8,8 +8,7 @@ import pytest
 from joint_cases import COEFFICIENTS, DIAMETERS, NOISE, Programme, simulated
 
 from mcc_jax import InputError, calibrate_many, least_squares, sample
-from mcc_jax.calibrate.data import padded_length
-from mcc_jax.calibrate.settings import SELECTION
+from mcc_jax.calibrate.data import LENGTHS, padded_length
 
 SETTINGS = {"chains": 2, "warmup": 150, "draws": 100, "seed": 3}
 SHORT, LONG = Programme.cycles(points=70), Programme.cycles(points=110)
@@ -64,13 +63,6 @@ def test_results_come_in_order_and_errors_in_place(queued, campaigns):
 
 
 @pytest.mark.extended
-def test_progress_names_the_campaign(queued, told):
-    for i, last in enumerate(["done", "done", "failed", "done"]):
-        assert [step for row, step in told if row == i][-1] == last
-    assert (0, "sampling the population") in told
-
-
-@pytest.mark.extended
 def test_campaigns_of_similar_size_share_their_compilations(queued):
     _, first, further = queued
     assert len(first) > 5
@@ -89,10 +81,10 @@ def test_the_numbers_are_those_of_one_by_one(queued, campaigns, i):
 
 
 @pytest.mark.extended
-def test_least_squares_with_two_workers(campaigns):
+def test_least_squares_reports_its_progress(campaigns):
     """Two campaigns of one size, and between them one nothing can be made of."""
     three, told = [campaigns[i] for i in (0, 2, 3)], []
-    found = calibrate_many(three, method="least-squares", workers=2, progress=lambda i, step: told.append((i, step)))
+    found = calibrate_many(three, method="least-squares", progress=lambda i, step: told.append((i, step)))
     assert isinstance(found[1], InputError)
     assert "no particle can be used" in str(found[1])
     assert {(0, "done"), (1, "failed"), (2, "done")} <= set(told)
@@ -106,14 +98,12 @@ def test_least_squares_with_two_workers(campaigns):
 
 def test_records_are_padded_to_few_lengths():
     assert [padded_length(n) for n in (1, 64, 65, 301, 448, 449)] == [64, 64, 128, 320, 448, 896]
-    assert all(padded_length(n) == n for n in SELECTION.lengths)
+    assert all(padded_length(n) == n for n in LENGTHS)
 
 
 def test_wrong_arguments_are_told(campaigns):
     with pytest.raises(ValueError, match="method"):
         calibrate_many(campaigns, method="guess")
-    with pytest.raises(ValueError, match="worker"):
-        calibrate_many(campaigns, workers=0)
     with pytest.raises(TypeError, match="speed"):
         calibrate_many(campaigns, speed=3)
     assert calibrate_many([]) == []

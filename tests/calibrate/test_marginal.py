@@ -131,34 +131,6 @@ def test_the_likelihood_is_the_integral_over_the_particle(scatter, scale, tolera
     np.testing.assert_allclose(likelihood(*one), integrals(*one), rtol=0, atol=tolerance)
 
 
-@pytest.mark.extended
-@extremes
-def test_the_integral_is_the_mean_weight_of_draws(scatter):
-    """Draws and their volume are a proposal for the very integral: Monte Carlo instead of quadrature."""
-    population, marginal = case(scatter, 2)
-    numbers = jnp.asarray(np.random.default_rng(0).standard_normal((4000, 3, scatter.size + 1)))
-
-    @jax.jit
-    def many(numbers):
-        def one(n):
-            drawn = marginal.draw(population, n[:, :-1], n[:, -1])
-            return drawn.deviations, drawn.log_volume
-
-        return jax.lax.map(one, numbers, batch_size=500)
-
-    deviations, volume = (np.moveaxis(np.asarray(v), 0, 1) for v in many(numbers))
-    sd = np.asarray(marginal.zero_sd) * np.exp(float(population.log_noise))
-    square = np.sum(np.moveaxis(np.asarray(numbers), 0, 1)[..., :-1] ** 2 - deviations**2, -1)
-    log_weight = log_tests(population, marginal, deviations) + 0.5 * square + volume - np.log(sd)[:, None]
-    found = np.logaddexp.reduce(log_weight, axis=1) - np.log(4000)
-    error = np.std(np.exp(log_weight - found[:, None]), axis=1) / np.sqrt(4000)
-    assert np.all(np.abs(found - integrals(population, marginal)) < 5 * error + 1e-3)
-    # A proposal that fits: the weights hardly scatter, and hardly a draw is out of range.
-    possible = np.isfinite(log_weight)
-    assert possible.mean() > 0.995
-    assert np.std(np.where(possible, log_weight - found[:, None], 0.0)) < 0.8
-
-
 @pytest.mark.parametrize("scatter", first_in_core(SCATTERS.values()), ids=SCATTERS)
 def test_the_likelihood_of_sharp_tests_is_the_dense_normal_one(scatter):
     """Where kappa is as good as the latent vector itself, all is normal; and draws are those of the conditional."""
@@ -281,14 +253,6 @@ def test_a_shape_factor_that_vanishes_gives_no_nan():
     value = np.asarray(likelihood(replace(population, a=jnp.asarray(-1 / 0.45)), marginal))
     assert not np.any(np.isnan(value))
     assert value[1] < value[0] - 100
-
-
-@pytest.mark.extended
-def test_copies_that_fill_up_count_for_nothing():
-    population, marginal = case(PLAIN)
-    value = likelihood(population, marginal)
-    weighted = likelihood(population, replace(marginal, weight=jnp.asarray([1.0, 0.0, 1.0])))
-    np.testing.assert_array_equal(weighted, np.asarray(value) * [1, 0, 1])
 
 
 # ---- from tests to their summary -------------------------------------------------------------------------------------

@@ -1,7 +1,6 @@
 """The joint posterior of a simulated campaign against its truth, against the plain joint sampler, and as it is kept."""
 
 import json
-import warnings
 
 import equinox as eqx
 import numpy as np
@@ -134,11 +133,6 @@ def test_another_seed_gives_nearly_the_same_numbers(result):
         assert one[name].std() == pytest.approx(two[name].std(), rel=0.2), name
 
 
-@pytest.mark.extended
-def test_the_same_seed_gives_the_same_bytes(result):
-    assert without_time(sample(paper_campaign(0))) == without_time(result)
-
-
 def test_probability_not_monotone_is_that_of_draws_from_the_population(result):
     laws = sample_laws(result, 4000, seed=3)
     share = 1 - np.mean(np.asarray(eqx.filter_vmap(lambda law: law.is_monotone)(laws)))
@@ -221,25 +215,6 @@ def test_padded_points_are_nan_and_no_others(result, tree):
     assert np.all(np.isfinite(tree["log_likelihood"]["test"].values))
 
 
-def test_prior_draws_have_the_prior_s_quantiles(result, tree):
-    prior = result.model.chosen_priors
-    a = tree["prior"]["a"].values.ravel()
-    assert abs(a.mean() - prior.a.mean) < 5 * prior.a.sd / np.sqrt(len(a)) + 0.1
-    modulus = np.log(tree["prior"]["effective_modulus_MPa"].values)
-    assert np.median(modulus) == pytest.approx(np.log(prior.effective_modulus_MPa.median), abs=0.3)
-    assert np.all(tree["prior"]["tau"].values >= 0)
-
-
-def test_leave_one_particle_out_runs(tree):
-    import arviz as az
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        loo = az.loo(tree, var_name="test")
-    assert np.isfinite(loo.elpd)
-    assert loo.n_data_points == 20
-
-
 def test_the_file_comes_back_as_it_was_and_twice_the_same(result, tree, tmp_path):
     import xarray
 
@@ -305,14 +280,6 @@ def test_the_fast_mode_gives_the_joint_posterior(both):
 
 
 @pytest.mark.extended
-def test_the_joint_mode_says_nothing_of_weights(both):
-    _, joint = both
-    assert joint.pareto_k_joint is None
-    assert not joint.weights_applied
-    assert json.dumps(joint.to_json(), allow_nan=False)
-
-
-@pytest.mark.extended
 def test_too_few_draws_are_not_called_converged():
     short = sample(paper_campaign(0), draws=20, warmup=20)
     assert not short.converged
@@ -326,10 +293,6 @@ def test_too_few_draws_are_not_called_converged():
 
 
 # ---- weights ---------------------------------------------------------------------------------------------------------
-
-
-def test_resampling_by_equal_weights_changes_nothing():
-    np.testing.assert_array_equal(ordered_resample(np.full(50, 0.02), 50), np.arange(50))
 
 
 def test_resampling_keeps_the_order_and_the_shares():

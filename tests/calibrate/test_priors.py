@@ -3,14 +3,11 @@
 import dataclasses
 import json
 
-import jax
 import numpy as np
 import pytest
-from scipy.stats import halfnorm, nakagami
 
 from mcc_jax import InputError, Model, Priors, Unloading, read_priors
 from mcc_jax.calibrate import LogNormalPrior, NakagamiPrior, NormalPrior
-from mcc_jax.calibrate.distributions import SpreadCoordinate
 
 
 @pytest.fixture
@@ -39,17 +36,8 @@ def test_whole_numbers_and_several_tables(read):
     assert isinstance(found.a.mean, float)
 
 
-def test_a_mean_may_be_negative(read):
-    assert read("[a]\nmean = -0.5\n").a.mean == -0.5
-
-
 def test_a_file_without_tables_changes_nothing(read):
     assert read("# nothing\n") == Priors()
-
-
-def test_the_path_may_be_text(read, tmp_path):
-    read("[a]\nsd = 0.3\n")
-    assert read_priors(str(tmp_path / "priors.toml")).a.sd == 0.3
 
 
 @pytest.mark.parametrize("unloading", [Unloading.PUNCH, Unloading.PUNCH_EXACT])
@@ -119,24 +107,3 @@ def test_json_holds_every_prior_with_its_numbers():
 def test_no_prior_of_a_spread(sd, shape):
     with pytest.raises(InputError, match=r"spread"):
         NakagamiPrior(sd, shape)
-
-
-@pytest.mark.parametrize("shape", [0.5, 0.125])
-def test_draws_of_a_spread_s_prior(shape):
-    coordinate = SpreadCoordinate(NakagamiPrior(0.2, shape))
-    tau = np.asarray(coordinate.spread(coordinate.sample(jax.random.key(0), (100_000,))))
-    theirs = nakagami(shape, scale=0.2 * np.sqrt(2 * shape))
-    for share in (0.1, 0.2, 0.5, 0.9):
-        assert abs((tau < theirs.ppf(share)).mean() - share) < 4 * np.sqrt(share * (1 - share) / 100_000)
-
-
-def test_a_shape_of_one_half_is_half_normal_and_one_eighth_leaves_the_order_open():
-    shares = np.array([0.1, 0.2, 0.5])
-    np.testing.assert_allclose(nakagami.ppf(shares, 0.5), halfnorm.ppf(shares))
-    np.testing.assert_allclose(1 / nakagami.ppf(shares, 0.125, scale=0.5), [9000, 560, 14], rtol=0.03)
-
-
-def test_the_noise_s_priors_stand_together():
-    noise = Priors().noise
-    assert [float(v) for v in noise.median] == [0.02, 0.05, 0.01, 0.2]
-    assert float(noise.log_density(np.zeros(4))) < 0

@@ -2,7 +2,6 @@
 
 import hypothesis.strategies as st
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -57,25 +56,3 @@ def test_forward_and_backward_are_the_factor_and_its_transpose(size, batch, seed
     np.testing.assert_allclose(forward, np.linalg.solve(L, b[..., None])[..., 0], rtol=0, atol=10 * tolerance * scale)
     transposed = np.linalg.solve(np.swapaxes(L, -1, -2), b[..., None])[..., 0]
     np.testing.assert_allclose(backward, transposed, rtol=0, atol=10 * tolerance * scale)
-
-
-@settings(max_examples=40)
-@given(SIZES, SEEDS, SPREADS)
-def test_backward_gives_draws_with_the_inverse_as_covariance(size, seed, spread):
-    A, _, tolerance = problem(size, (), seed, spread)
-    columns = np.asarray(everything(np.broadcast_to(A, (size, size, size)), np.eye(size))[2]).T
-    expected = np.linalg.inv(A)
-    np.testing.assert_allclose(columns @ columns.T, expected, rtol=0, atol=10 * tolerance * np.abs(expected).max())
-
-
-@pytest.mark.parametrize("size", [1, 4])
-def test_the_determinant_s_derivative_is_the_inverse(size):
-    A = random_precision(np.random.default_rng(1), 1, size)[0]
-    slope = np.asarray(jax.grad(lambda M: Cholesky(M).log_det())(jnp.asarray(A)))
-    # Only the lower triangle is read, so an entry below the diagonal stands for two.
-    np.testing.assert_allclose((slope + slope.T) / 2, np.linalg.inv(A), rtol=1e-10, atol=1e-12)
-    assert np.all(np.triu(slope, 1) == 0)
-
-
-def test_an_indefinite_matrix_does_not_pass_for_a_definite_one():
-    assert np.isnan(np.asarray(Cholesky(jnp.asarray([[1.0, 2.0], [2.0, 1.0]])).solve(jnp.ones(2)))).any()

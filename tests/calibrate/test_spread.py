@@ -12,10 +12,8 @@ import numpy as np
 import pytest
 from joint_cases import NOISE, Programme, five_tests, simulated
 
-from mcc_jax import sample
 from mcc_jax.calibrate.data import select_tests
-from mcc_jax.calibrate.settings import NUMERICS
-from mcc_jax.calibrate.sharding import Blocks, Parts, block_size, count_of, filled_up
+from mcc_jax.calibrate.sharding import BLOCKS, Blocks, Parts, block_size, count_of, filled_up
 from mcc_jax.calibrate.straightening import products
 
 pytestmark = pytest.mark.extended
@@ -146,9 +144,9 @@ def test_processes_with_different_campaigns_are_told(tmp_path):
 def test_blocks_waste_little_and_have_few_sizes(count):
     size = block_size(count)
     filled = count + -count % size
-    assert size <= NUMERICS.blocks[-1]
-    assert size in NUMERICS.blocks or count > NUMERICS.blocks[-1]
-    assert filled - count <= max(3, count // 3 if count <= NUMERICS.blocks[-1] else count // 8)
+    assert size <= BLOCKS[-1]
+    assert size in BLOCKS or count > BLOCKS[-1]
+    assert filled - count <= max(3, count // 3 if count <= BLOCKS[-1] else count // 8)
     assert block_size(filled) == size  # what is filled up once stays as it is
 
 
@@ -169,9 +167,6 @@ def test_what_is_cut_makes_up_the_whole(axis):
 def test_blocks_that_do_not_come_out_even_are_told():
     with pytest.raises(ValueError, match="whole number of blocks"):
         Blocks(5, 2)
-    campaign = simulated(instrument=NOISE, programme=Programme.cycles(points=40))
-    with pytest.raises(ValueError, match="block must be a whole number >= 1"):
-        sample(campaign, block=0)
 
 
 def test_what_fills_up_counts_for_nothing():

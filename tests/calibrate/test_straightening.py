@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcc_jax.calibrate.straightening import Straight, box_cox, coordinates, numbers
+from mcc_jax.calibrate.straightening import Straight, coordinates, numbers
 
 pytestmark = pytest.mark.extended
 
@@ -35,18 +35,6 @@ def test_there_and_back(shear, power, logs):
     np.testing.assert_allclose(away[3], theta[3] - AT[3], rtol=1e-12, atol=1e-15)
 
 
-def test_where_the_tests_are_linearised_all_are_zero_and_derivatives_are_one():
-    straight, at = of_one((-1.0, 0.5), (-1.0, 2.0)), jnp.asarray(AT)
-
-    def there(theta):
-        return coordinates(theta, at, straight, PLACES)[0]
-
-    np.testing.assert_allclose(there(at), 0.0, atol=1e-12)
-    slope = jax.jacfwd(there)(at)
-    np.testing.assert_allclose(np.diagonal(slope), 1.0, rtol=1e-12)
-    np.testing.assert_allclose(slope[0, 1:3], AT[0] * np.array([-1.0, 0.5]) / AT[1:3], rtol=1e-12)
-
-
 @pytest.mark.parametrize("time", [3.0, 30.0, 3000.0])
 def test_creep_far_beyond_the_record_is_a_straight_line_of_its_coordinates(time):
     """A ln(1 + t/tau) is A/tau (t - t^2/(2 tau)) there: with shear and power of -1 it is u t - ..., linear in both."""
@@ -62,12 +50,3 @@ def test_creep_far_beyond_the_record_is_a_straight_line_of_its_coordinates(time)
     exact = prediction(there)
     bent = np.abs(np.asarray(linear - exact)) / np.asarray(exact)
     assert bent.max() < (10 / time) ** 2  # the next term of the series is a third of it
-
-
-def test_a_step_is_that_of_the_coordinate():
-    for power in (-2.0, 0.0, 1e-9, 1.5):
-        straight = row(np.zeros(2), np.array([0.0, power]))
-        theta = jnp.asarray(np.array([1.0, 5.0 * np.exp(0.4)]))
-        away = coordinates(theta, jnp.asarray(np.array([1.0, 5.0])), straight, ((1, 0),))[0]
-        step = 5.0 * box_cox(jnp.asarray(0.4), jnp.asarray(power))
-        assert float(step) == pytest.approx(float(away[1]), rel=1e-6)

@@ -14,8 +14,7 @@ from matplotlib.collections import FillBetweenPolyCollection
 from matplotlib.image import imread
 
 from mcc_jax import plots
-from mcc_jax.calibrate import ElasticFit
-from mcc_jax.calibrate.paper.modulus import collapsed_branches
+from mcc_jax.calibrate.paper.modulus import ElasticFit, collapsed_branches
 from mcc_jax.campaign import Metadata
 from mcc_jax.plots import (
     paper_figures,

@@ -29,11 +29,13 @@ from ..data import point_noise_um, rows_from_contact
 from ..estimates import NO_SAMPLER, estimate, finite, force_zero, misfit_note
 from ..judgement import judged, numbers_in_reach, unlike_others
 from ..results import Calibration
-from ..settings import PAPER, SELECTION
+from ..settings import MOST_POINTS
 from .loading import MasterCurve, PlasticFit, StrainTable, fit_population, master_curve, strain_table
 from .modulus import ElasticFit, campaign_branches, fit_effective_modulus
 from .prediction import ParticleFit, predict_particles
 from .shape import Objective, ShapeFit, fit_shape_parameter
+
+LARGEST_SHAPE_FACTOR = 4.0  # twice the paper's largest: shape factors beyond come from curves that do not collapse
 
 
 @dataclass(frozen=True, repr=False)
@@ -81,7 +83,7 @@ class PaperCalibration(Calibration):
         found = {}
         for i, fit in enumerate(self.particles):
             if fit is not None:
-                rows = rows_from_contact(self.campaign.curves[i], segments[i], SELECTION.most_points)
+                rows = rows_from_contact(self.campaign.curves[i], segments[i], MOST_POINTS)
                 found[i] = rows, fit.used[rows]
         return found
 
@@ -118,7 +120,7 @@ class PaperCalibration(Calibration):
         dropped = int((~self.adjustment.kept).sum())
         if dropped:
             notes.append(f"{dropped} of {len(self.campaign)} particles could not be used")
-        if self.shape_factor_max > PAPER.shape_factor:
+        if self.shape_factor_max > LARGEST_SHAPE_FACTOR:
             notes.append(
                 f"a = {self.a:.3g} makes shape factors of up to {self.shape_factor_max:.3g}: "
                 "the shape factor does not bring these curves together"

@@ -12,7 +12,9 @@ from ..._errors import InputError
 from ..._format import described
 from ...campaign import Adjustment, of_each_particle
 from ...law import LogNormal, PlasticPopulation
-from ..settings import PAPER
+
+SMALLEST_SHARE = 1e-6  # of the largest stress: a factor of the quintic is kept at least so large; its logarithm exists
+SPREAD_FROM = 5.0  # thresholds from which on the spread of stress is fitted; the paper's threshold is 1 MPa
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,6 @@ def enough(table: StrainTable) -> np.ndarray:
 
 def master_curve(table: StrainTable, a: float) -> MasterCurve:
     """Mean and standard deviation of the master strain for a shape parameter `a`."""
-    a = arguments.number(a, "the shape parameter a")
     use = enough(table)
     reached = table.reached[:, use]
     scaled = table.shape_factor(a)[:, None] * table.strain[:, use]
@@ -131,28 +132,19 @@ class PlasticFit:
 
 
 def fit_polynomial(strain: np.ndarray, stress_MPa: np.ndarray) -> np.ndarray:
-    r"""Least squares for :math:`\sigma = K_1 x - K_3 x^3 + K_5 x^5` with all factors > 0, in relative stress.
+    r"""Least squares for :math:`\sigma = K_1 x - K_3 x^3 + K_5 x^5` with all factors > 0 [MPa], in relative stress.
 
     Relative, since the scatter between particles grows in proportion to stress: weighing MPa alike lets the few
-    particles that reach the highest stress decide all three factors.
-
-    Args:
-        strain: scaled strains x [-], shape (n,).
-        stress_MPa: stresses [MPa] > 0, shape (n,).
-
-    Returns:
-        The three factors [MPa]. One that would be negative is put at a small share of the largest stress.
+    particles that reach the highest stress decide all three factors. A factor that would be negative is put at a small
+    share of the largest stress.
     """
-    strain = arguments.floats(strain, "strain", shape="a 1-D array of strains")
-    stress_MPa = arguments.floats(stress_MPa, "stress_MPa", shape="a 1-D array of stresses [MPa]")
-    arguments.same_length(strain=strain, stress_MPa=stress_MPa)
     from scipy.optimize import nnls  # half a second to import, so only where it is used
 
     design = np.stack([strain, -(strain**3), strain**5], axis=1) / stress_MPa[:, None]
     # Columns of one size: the three powers differ by orders of magnitude at small strains.
     scale = np.linalg.norm(design, axis=0)
     factors, _ = nnls(design / scale, np.ones_like(stress_MPa))
-    smallest = PAPER.smallest_share * stress_MPa.max() / np.abs(strain).max() ** np.array([1, 3, 5])
+    smallest = SMALLEST_SHARE * stress_MPa.max() / np.abs(strain).max() ** np.array([1, 3, 5])
     return np.maximum(factors / scale, smallest)
 
 
@@ -183,7 +175,6 @@ def fit_population(master: MasterCurve, threshold_MPa: float = 0.0) -> PlasticFi
     References:
         Bommireddy et al. (2018), eqs. 16 to 18 and Table 2.
     """
-    threshold_MPa = arguments.number(threshold_MPa, "threshold_MPa, a stress,", least=0)
     from scipy.optimize import nnls
 
     use = (master.stress_MPa >= threshold_MPa) & (master.stress_MPa > 0) & (master.mean > 0)
@@ -198,7 +189,7 @@ def fit_population(master: MasterCurve, threshold_MPa: float = 0.0) -> PlasticFi
     fitted = K1 * x - K3 * x**3 + K5 * x**5
     variance = ((K1 - 3 * K3 * x**2 + 5 * K5 * x**4) * sd) ** 2
     # The offset step makes all curves meet at the threshold: the spread near it is its doing, not the particles'.
-    known = np.isfinite(variance) & (variance > 0) & (count > 1) & (stress >= PAPER.spread_from * threshold_MPa)
+    known = np.isfinite(variance) & (variance > 0) & (count > 1) & (stress >= SPREAD_FROM * threshold_MPa)
     variances = np.zeros(3)
     if known.sum() >= 3:
         # A variance has a standard error in proportion to itself: relative residuals here too.
@@ -206,7 +197,7 @@ def fit_population(master: MasterCurve, threshold_MPa: float = 0.0) -> PlasticFi
         scale = np.linalg.norm(design, axis=0)
         variances = nnls(design / scale, np.ones(int(known.sum())))[0] / scale
     names, orders = ("C1", "C3", "C5"), (1, 3, 5)
-    smallest = PAPER.smallest_share * stress.max() / x.max() ** np.array(orders)
+    smallest = SMALLEST_SHARE * stress.max() / x.max() ** np.array(orders)
     distributions = (
         LogNormal.from_power_moments(order, jnp.asarray(mean), jnp.asarray(variance))
         for order, mean, variance in zip(orders, means, variances, strict=True)

@@ -9,14 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ... import arguments
 from ..._format import described
-from ...campaign import Adjustment, Campaign, Curve, Segment, check_campaign, stress_and_strain
+from ...campaign import Adjustment, Campaign, Curve, Segment, stress_and_strain
 from ...formulas import recovery
 from ...law import StrainScaling, Unloading
-from ..settings import PAPER
-
-MIN_RATIO = PAPER.unloaded_from
+from ..settings import UNLOADED_FROM
 
 
 @dataclass(frozen=True)
@@ -76,7 +73,7 @@ def elastic_branches(
         shift: offset of strain from the offset step [-].
 
     Returns:
-        Branches with at least five points between `MIN_RATIO` and the peak.
+        Branches with at least five points between `UNLOADED_FROM` and the peak.
     """
     stress, strain = stress_and_strain(curve, diameters_um, segments)
     strain = strain + shift
@@ -95,7 +92,7 @@ def elastic_branches(
         top, deepest = float(stress[around].mean()), float(strain[around].max())
         points = np.concatenate(rows)
         points = points[curve.compared[points]]
-        points = points[(stress[points] > MIN_RATIO * top) & (stress[points] <= top)]
+        points = points[(stress[points] > UNLOADED_FROM * top) & (stress[points] <= top)]
         if len(points) >= 5 and deepest > 0 and top > 0:
             branches.append(ElasticBranch(particle, deepest, top, strain[points], stress[points]))
 
@@ -114,7 +111,6 @@ def elastic_branches(
 
 def campaign_branches(campaign: Campaign, adjustment: Adjustment) -> list[ElasticBranch]:
     """The elastic branches of every particle that the offset step kept, in its adjusted strain."""
-    check_campaign(campaign)
     return [
         branch
         for i in np.flatnonzero(adjustment.kept)
@@ -135,7 +131,7 @@ def _unit_recoverable(branches: Sequence[ElasticBranch], shape_power: np.ndarray
 def _released(branches: Sequence[ElasticBranch]) -> list[np.ndarray]:
     """Recovered share of strain at the measured stresses of each branch."""
     ratio = np.concatenate([b.stress_MPa / b.stress_max_MPa for b in branches])
-    # Filled up to a power of two: every new length would be compiled anew.
+    # Padded to a power of two: every new length would be compiled again.
     padded = np.pad(ratio, (0, (1 << (len(ratio) - 1).bit_length()) - len(ratio)))
     released = np.asarray(_recovery(jnp.asarray(padded)))[: len(ratio)]
     return np.split(released, np.cumsum([len(b.strain) for b in branches])[:-1])
@@ -167,7 +163,6 @@ def fit_effective_modulus(
     References:
         Bommireddy et al. (2018), section 6, eqs. 23 and 24.
     """
-    shape_factor = arguments.floats(shape_factor, "shape_factor", shape="a shape factor for every particle")
     branches = tuple(branches)
     if not branches:
         return ElasticFit(None, np.nan, np.empty(0), (), False, "no unloading branch was measured")

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..._format import described
-from ...campaign import Adjustment, Campaign, check_campaign, effective_diameter_um, particle_batch, stress_and_strain
+from ...campaign import Adjustment, Campaign, effective_diameter_um, particle_batch, stress_and_strain
 from ...law import MccLaw, Plastic
 from ..curves import responses
 from ..data import padded_length, records_of
@@ -54,18 +54,10 @@ class ParticleFit:
 def predict_particles(
     campaign: Campaign, adjustment: Adjustment, law: MccLaw, eta: np.ndarray
 ) -> tuple[ParticleFit | None, ...]:
-    """Predict every kept particle's displacement under its measured force, by the mean law and by its own coefficients.
+    """Every kept particle's displacement under its measured force, by the mean law and by its own coefficients.
 
-    Args:
-        campaign: the tests.
-        adjustment: their offset step.
-        law: the calibrated mean law.
-        eta: shape factor of every particle, shape (N,).
-
-    Returns:
-        One entry per particle of the campaign, None where it was not kept.
+    `eta` are the shape factors of all particles, shape (N,). One entry per particle, None where it was not kept.
     """
-    check_campaign(campaign)
     kept = np.flatnonzero(adjustment.kept)
     own = []
     for i in kept:
