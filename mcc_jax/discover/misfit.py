@@ -84,9 +84,7 @@ def scaled(at: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]
     return found
 
 
-def functions(
-    names: tuple[str, ...], at: Mapping[str, np.ndarray], *, degree: int = DEGREE, hats: int = HATS
-) -> np.ndarray:
+def functions(names: tuple[str, ...], at: Mapping[str, np.ndarray]) -> np.ndarray:
     """Smooth products of cosines and hat functions over some coordinates, shape (N, points, functions).
 
     Their squares add up to about 1 at every point for the products and for the hats of each coordinate together, so
@@ -94,8 +92,8 @@ def functions(
     """
     columns = []
     some = [n for n in names if float(np.max(at[n]) - np.min(at[n])) > 0]
-    for powers in itertools.product(range(degree + 1), repeat=len(some)):
-        if not 0 < sum(powers) <= degree:
+    for powers in itertools.product(range(DEGREE + 1), repeat=len(some)):
+        if not 0 < sum(powers) <= DEGREE:
             continue
         x = np.ones_like(next(iter(at.values())))
         for n, k in zip(some, powers, strict=True):
@@ -104,7 +102,7 @@ def functions(
     smooth = [x * np.sqrt(1.0 / max(len(columns), 1)) * np.sqrt(2) for x in columns]
     if not columns:
         return np.zeros((*next(iter(at.values())).shape, 0))
-    rough = [hats_of(at[n], hats) / np.sqrt(len(some)) for n in some]
+    rough = [hats_of(at[n], HATS) / np.sqrt(len(some)) for n in some]
     return np.concatenate([np.stack(smooth, -1), *rough], -1)
 
 

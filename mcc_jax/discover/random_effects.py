@@ -147,19 +147,7 @@ def sudden_steps(base: Base, start: Fitted, variant: Variant) -> RandomEffects |
     columns = np.zeros((N, P, 0))
     found: list[Step] = []
     now, best, value, steps = start, None, -np.inf, list[Step]()
-    for turn in range(MOST_STEPS + 1):
-        if turn:
-            more = ExtraColumns(columns, (SPREAD,) * turn)
-            design = design_of(base, start.state, start.variants, more)
-            optimum = optimise(design, np.concatenate([start.optimum.hyper, np.ones(turn)]), curvature=False)
-            log_prior = _log_prior_of_steps(found, loading)
-            if optimum.log_joint + log_prior <= value:
-                break
-            value = optimum.log_joint + log_prior
-            now = replace(start, design=design, optimum=optimum)
-            best, steps = RandomEffects(variant, {}, value, now, more), list(found)
-        if turn == MOST_STEPS:
-            break
+    for turn in range(MOST_STEPS):
         score, information = step_scores(now)
         new, added = np.zeros((N, P, 1)), False
         for i in range(N):
@@ -176,6 +164,14 @@ def sudden_steps(base: Base, start: Fitted, variant: Variant) -> RandomEffects |
         if not added:
             break
         columns = np.concatenate([columns, new], -1)
+        more = ExtraColumns(columns, (SPREAD,) * (turn + 1))
+        design = design_of(base, start.state, start.variants, more)
+        optimum = optimise(design, np.concatenate([start.optimum.hyper, np.ones(turn + 1)]), curvature=False)
+        with_prior = optimum.log_joint + _log_prior_of_steps(found, loading)
+        if with_prior <= value:
+            break
+        value, now = with_prior, replace(start, design=design, optimum=optimum)
+        best, steps = RandomEffects(variant, {}, value, now, more), list(found)
     if best is None:
         return None
     at = fit_hypothesis(base, start.state, start.variants, start.theta, best.at.optimum.hyper, best.more)

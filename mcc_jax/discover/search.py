@@ -14,7 +14,7 @@ from scipy.special import logsumexp
 from ..calibrate.compiling import side_by_side
 from ..calibrate.model import Model
 from ..effects import Mechanism, Variant
-from .base import Base, State
+from .base import Base
 from .candidates import Candidate
 from .columns import with_amplitudes
 from .design import at_priors
@@ -63,23 +63,18 @@ class Search:
         # Hypotheses look for their optimum from the null's state; of a material that the law was not made for from the
         # priors' middle, too, since such tests have several optima.
         self.starts = [self.null.state, *places[1:][-1:]]
-        each = base.each(coordinates, self.state.point, base.forms, self.state.population[0])
+        each = base.each(coordinates, self.null.state.point, base.forms, self.null.state.population[0])
         natural = {k: np.asarray(x) for k, x in each.items()}
         self.natural = informative(natural, np.asarray(base.tests.mask))  # coordinates of all points
         self.at = scaled(self.natural, np.asarray(base.tests.mask))  # the same between 0 and 1
         self.shared = {
             name: m for name, m in library.items() if not m.sudden and not any(v.random_per_test for v in m.variants)
         }
-        self.candidates, self.columns = testable_columns(base, self.state, whole or library, library)
+        self.candidates, self.columns = testable_columns(base, self.null.state, whole or library, library)
         self.screen = self.screened(self.shared) if self.shared else None
         self.small = with_little_noise(self.null.optimum.hyper)
         self.fits: dict[tuple[int, ...], Fitted] = {}  # by the rows of the candidates in `screen`
         self.found: dict[Names, Hypothesis] = {(): Hypothesis((), self.null.log_evidence, at=self.null)}
-
-    @property
-    def state(self) -> State:
-        """Where the base law fits."""
-        return self.null.state
 
     def formulas_of(self, mechanisms: Collection[str]) -> tuple[tuple[Candidate, ...], np.ndarray]:
         """The formulas of some mechanisms, and their signatures."""
@@ -88,7 +83,9 @@ class Search:
 
     def screened(self, mechanisms: Collection[str], *, several: bool = True) -> Screen:
         """Some mechanisms to first order, around the base law."""
-        return screen(self.base, self.state, self.null.optimum.hyper, *self.formulas_of(mechanisms), several=several)
+        return screen(
+            self.base, self.null.state, self.null.optimum.hyper, *self.formulas_of(mechanisms), several=several
+        )
 
     # ---- posterior ---------------------------------------------------------------------------------------------------
 
@@ -221,7 +218,7 @@ class Search:
         else:
             pairs, further = [], list(seconds)
             ones = side_by_side(
-                lambda k: own.next_to(self.base, self.state, *self.start_of((k,)), self.small), seconds.values()
+                lambda k: own.next_to(self.base, self.null.state, *self.start_of((k,)), self.small), seconds.values()
             )
         for names, one in zip(further, ones, strict=True):
             self.keep(names, one)
@@ -362,7 +359,7 @@ class Search:
         if not leader:
             return
         kinds = noise_models(self.base)
-        gains = {(): self.gains_by_noise(self.found[()], kinds)}
+        gains: dict[Names, list[float]] = {(): self.gains_by_noise(self.found[()], kinds)}
         wanted = list(logs)[:SECONDS]
         if len(leader) == 2:
             wanted += [names for names in logs if len(names) == 1][:SECONDS]
