@@ -163,12 +163,7 @@ def particle_batch(diameters_um: Any) -> Particle:
 
 
 def of_each_particle(diameters_um: Any, quantity: Callable[[Particle], Scalar]) -> np.ndarray:
-    """A quantity of every particle, shape (N,).
-
-    Args:
-        diameters_um: D1, D2, D3 [um], shape (N, 3).
-        quantity: function of one `Particle`, for instance its flatness or its plastic shape factor.
-    """
+    """A quantity of every particle, shape (N,), from diameters [um] of shape (N, 3)."""
     # What files and figures show is in double precision, whatever precision the caller computes in.
     with jax.enable_x64(True):
         return np.array(eqx.filter_vmap(quantity)(particle_batch(diameters_um)))

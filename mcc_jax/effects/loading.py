@@ -191,58 +191,38 @@ FRICTION = family(
 # ---- hardening exponent ----------------------------------------------------------------------------------------------
 
 
-def _logarithm(strain: Values) -> Values:
-    """ln(eps / 0.2)."""
-    return jnp.log(jnp.where(strain > 1e-9, strain, 1e-9) / REFERENCE_STRAIN)
-
-
 class Hardening(AbstractFormulas):
     """Hardening as a power of strain in place of flow at one stress; the amplitude is 1/m, 1 for Hertz.
 
-    A formula is the logarithm of which the factor on the chosen terms is the (1/2m)-th power.
+    A formula is a logarithm, and the factor on the chosen terms its exponential to the power 1/2m. With `every_term` the
+    terms of order j = 1, 3, 5 have the j-th power of that, as where a power of strain takes the place of strain.
     """
 
     terms: tuple[float, float, float] = terms(True, True, True)
+    every_term: bool = eqx.field(static=True, default=False, kw_only=True)
     yield_strain: Scalar | None = further()
 
     formulas: ClassVar = {
-        "power": lambda e, eps: _logarithm(eps),
+        "power": lambda e, eps: jnp.log(jnp.where(eps > 1e-9, eps, 1e-9) / REFERENCE_STRAIN),
         "ludwik": lambda e, eps: jnp.log1p(eps / e.yield_strain) - jnp.log1p(REFERENCE_STRAIN / e.yield_strain),
     }
 
     def loading(self, law: Formulas, particle: Particle, record: Record, strain: Values) -> Factors:
-        """(eps / 0.2)^(1/2m), or with a yield strain, on the chosen terms."""
-        return on_terms(self.terms, jnp.exp(0.5 * self.amplitude * self.of(strain)))
-
-
-class StrainPower(Hardening):
-    """A power of strain in place of strain in every term."""
-
-    def loading(self, law: Formulas, particle: Particle, record: Record, strain: Values) -> Factors:
-        """(eps / 0.2)^(j / 2m) on the terms of order j = 1, 3, 5."""
-        first = jnp.exp(0.5 * self.amplitude * self.of(strain))
-        return first, first**3, first**5
-
-
-def _power_of_load(effect: Hardening, context: Context) -> Values:
-    """Delta [s(u) - s(u^(1 / (1 + 1/2m)))]: the same exponent on the pressure that unloading releases."""
-    half_inverse, share = 0.5 * effect.amplitude, context.load_share
-    some = share > 0
-    log = jnp.log(jnp.where(some, share, 1.0))
-    moved = jnp.where(some, share * jnp.exp(-half_inverse / (1 + half_inverse) * log), share)
-    return context.recoverable * (recovery(share) - recovery(jnp.where(moved < 1, moved, 1.0)))
+        """(eps / 0.2)^(1/2m), or with a yield strain."""
+        factor = jnp.exp(0.5 * self.amplitude * self.of(strain))
+        return (factor, factor**3, factor**5) if self.every_term else on_terms(self.terms, factor)
 
 
 class HardeningAndLoad(Hardening):
-    """The same exponent on the elastic branch."""
+    """The same exponent on the pressure that unloading releases."""
 
-    inside = _power_of_load
-
-
-class StrainPowerAndLoad(StrainPower):
-    """The same exponent on the elastic branch."""
-
-    inside = _power_of_load
+    def inside(self, context: Context) -> Values:
+        """Delta [s(u) - s(u^(1 / (1 + 1/2m)))]."""
+        half_inverse, share = 0.5 * self.amplitude, context.load_share
+        some = share > 0
+        log = jnp.log(jnp.where(some, share, 1.0))
+        moved = jnp.where(some, share * jnp.exp(-half_inverse / (1 + half_inverse) * log), share)
+        return context.recoverable * (recovery(share) - recovery(jnp.where(moved < 1, moved, 1.0)))
 
 
 class HardeningAndContact(Hardening):
@@ -278,10 +258,10 @@ HARDENING = family(
         nuisances=(Nuisance("yield_strain", (0.01, 0.05), (0.001, 0.3), "strain where hardening sets in"),)),
     row("every_term", "sigma(0.2 (eps / 0.2)^(1 + 1/2m))",
         "A power of strain in place of strain in every term; 1/m = 1 is an elastic contact after Hertz, "
-        "ceramic pebbles show 1.2 to 1.6.", plausible=(0.02, 2.0), make=StrainPower),
+        "ceramic pebbles show 1.2 to 1.6.", plausible=(0.02, 2.0), every_term=True),
     row("every_term_and_unloading", "sigma(0.2 (eps / 0.2)^(1 + 1/2m)); on unloading u^(1/(1 + 1/2m)) for u",
         "The same, and on the pressure that unloading releases.", source=_OLSSON, plausible=(0.02, 2.0),
-        make=StrainPowerAndLoad),
+        make=HardeningAndLoad, every_term=True),
     formula="power", parameter="inverse_exponent", plausible=(0.01, 0.5), source=_STORAKERS, helps=(Need.LOW_LOAD,),
     check="repeat between polished platens, or indent a compact of the same powder",
     coordinates=("peak", "load"),

@@ -113,13 +113,13 @@ def read_calibration(
     """The law that a calibration or a discovery found, for the population or one particle, and a particle for it.
 
     The population's law has the medians of its coefficients, exp(mean of log C). A discovery's has the effects that
-    were added, but for those of the tester.
+    were added, except those of the instrument.
 
     Args:
         folder: what `mcc_jax.load` reads.
         particle: take this particle's coefficients.
         diameters: `D1,D2,D3` [um], or a table of particles (its row of that particle, or its mean). If None, those of
-            the calibrated campaign or of a `particles.csv` beside it; without one, a sphere of 200 um.
+            the calibrated campaign or of a `particles.csv` next to it; without one, a sphere of 200 um.
         allow_not_monotone: warn of a loading curve that falls, instead of refusing it.
 
     Returns:

@@ -62,8 +62,8 @@ def drive(
     Args:
         law: any contact law, with or without effects.
         particle: size and shape.
-        path: what the tester imposes, displacements [um] or forces [mN]; negative values are out of contact. A list, a
-            Series or an array with one axis.
+        path: what the instrument imposes, displacements [um] or forces [mN]; negative values are out of contact. A
+            list, a Series or an array with one axis.
         time: times [s] of the path; a law with effects needs them, others know no time.
         control: which of the two `path` is, "displacement" or "load".
         state: the state to start from; a virgin particle if None.

@@ -90,13 +90,13 @@ def test_rates_of_very_short_ramps():
     assert ramp_rates(np.array([3.0]), np.array([1.0]), 7.0).tolist() == [7.0]
     assert ramp_rates(np.array([3.0, 3.0]), np.array([1.0, 2.0]), 7.0).tolist() == [7.0, 7.0]
     np.testing.assert_allclose(ramp_rates(np.array([1.0, 2.0]), np.array([4.0, 1.0]), 7.0), 3.0)
-    # Readings that share one time, as testers with coarse clocks write them.
+    # Readings that share one time, as instruments with coarse clocks write them.
     assert np.all(np.isfinite(ramp_rates(np.repeat([0.0, 1.0, 2.0, 3.0], 4), np.linspace(0, 1, 16) ** 2, 7.0)))
 
 
 @pytest.mark.extended
 def test_noise_of_force_does_not_change_what_an_effect_adds():
-    """To first order, for every variant: what noise of force makes of its signature is small beside it."""
+    """To first order, for every variant: what noise of force makes of its signature is small in comparison."""
     records = []
     for noise in (0.0, 0.03):
         curve = campaign(noise).curves[1]

@@ -15,12 +15,12 @@ PARTICLE = Particle(213.54, 196.07, 186.33)
 @pytest.mark.parametrize("unloading", Unloading)
 @pytest.mark.parametrize("scaling", StrainScaling)
 def test_the_formulae_in_words_are_the_law(unloading, scaling):
-    """Coded anew from the card's numbers and sentences alone, on loading and unloading."""
+    """Coded again from the card's numbers and sentences alone, on loading and unloading."""
     law = paper_law(unloading, scaling)
-    told = json.loads(json.dumps(card(law, PARTICLE)))
-    C1, C3, C5, a, E = (told["parameters"][k]["value"] for k in ("C1", "C3", "C5", "a", "effective_modulus_MPa"))
-    k, n, p = (told["law"][key] for key in "knp")
-    size = told["particle"]
+    written = json.loads(json.dumps(card(law, PARTICLE)))
+    C1, C3, C5, a, E = (written["parameters"][k]["value"] for k in ("C1", "C3", "C5", "a", "effective_modulus_MPa"))
+    k, n, p = (written["law"][key] for key in "knp")
+    size = written["particle"]
     D1, D2, D3 = (size[f"D{i}_um"] for i in (1, 2, 3))
     diameter, eta = D1 * D2 / D3, 1 + a * (1 - D3**2 / (D1 * D2))
     assert size["effective_diameter_um"] == pytest.approx(diameter, rel=1e-14)
@@ -38,7 +38,7 @@ def test_the_formulae_in_words_are_the_law(unloading, scaling):
     want = [float(law.loading_stress(PARTICLE, jnp.asarray(strain)))]
     want.append(float(law.unloading_stress(PARTICLE, jnp.asarray(strain - s * delta), jnp.asarray(strain))))
     assert [stress, unloaded] == pytest.approx(want, rel=1e-12)
-    assert told["validity"]["stress_there_MPa"] == pytest.approx(loading(size["displacement_valid_um"]), rel=1e-12)
+    assert written["validity"]["stress_there_MPa"] == pytest.approx(loading(size["displacement_valid_um"]), rel=1e-12)
 
 
 def test_checksum_is_that_of_the_numbers():
@@ -51,16 +51,16 @@ def test_checksum_is_that_of_the_numbers():
 
 def test_population_has_the_medians_and_their_uncertainty(tmp_path):
     law, particle, origin = read_calibration(write(tmp_path / "fit"))
-    told = card(law, particle, origin=origin)
-    assert told["parameters"]["C1"]["value"] == pytest.approx(6.7, rel=1e-12)
-    assert told["parameters"]["C1"]["sd"] == pytest.approx(6.7 * 0.05, rel=1e-12)
-    low, high = told["parameters"]["C1"]["interval_95"]
+    written = card(law, particle, origin=origin)
+    assert written["parameters"]["C1"]["value"] == pytest.approx(6.7, rel=1e-12)
+    assert written["parameters"]["C1"]["sd"] == pytest.approx(6.7 * 0.05, rel=1e-12)
+    low, high = written["parameters"]["C1"]["interval_95"]
     assert (low * high, high / low) == pytest.approx((6.7**2, math.exp(2 * 1.96 * 0.05)), rel=1e-12)
-    assert told["population"]["log_C1"]["sd"]["value"] == 0.3
-    assert told["law"]["unloading"] == "punch"
-    assert told["provenance"]["calibration"]["method"] == "bayes"
-    assert told["particle"]["D1_um"] == 150.0  # the mean of the table
-    assert told["warnings"] == []
+    assert written["population"]["log_C1"]["sd"]["value"] == 0.3
+    assert written["law"]["unloading"] == "punch"
+    assert written["provenance"]["calibration"]["method"] == "bayes"
+    assert written["particle"]["D1_um"] == 150.0  # the mean of the table
+    assert written["warnings"] == []
 
 
 def test_a_particle_has_its_own_coefficients_and_size(tmp_path):
@@ -89,9 +89,9 @@ def test_a_falling_curve_is_refused_or_flagged(tmp_path):
     with pytest.raises(InputError, match="not monotone"):
         read_calibration(folder, particle="falling")
     law, particle, origin = read_calibration(folder, particle="falling", allow_not_monotone=True)
-    told = card(law, particle, origin=origin)
-    assert told["is_monotone"] is False
-    assert "not monotone" in told["warnings"][0]
+    written = card(law, particle, origin=origin)
+    assert written["is_monotone"] is False
+    assert "not monotone" in written["warnings"][0]
 
 
 def test_what_did_not_converge_is_flagged(tmp_path):

@@ -71,13 +71,13 @@ def test_options_arrive(run, tmp_path):
     folder, out = write(tmp_path / "fit"), tmp_path / "out"
     arguments = (folder, "--format", "json", "--out", out)
     assert run("export", *arguments, "--diameters", "120,110,100", "--particle", "A", "--seed", 3).exit_code == 0
-    told = json.loads((out / "parameters.json").read_text())
-    assert told["coefficients_of"] == "A"
-    assert told["particle"]["D2_um"] == 110.0
+    written = json.loads((out / "parameters.json").read_text())
+    assert written["coefficients_of"] == "A"
+    assert written["particle"]["D2_um"] == 110.0
     first = (out / "parameters_golden.csv").read_text()
     assert run("export", *arguments, "--diameters", folder / "particles.csv", "--particle", "A").exit_code == 0
-    told = json.loads((out / "parameters.json").read_text())
-    assert told["particle"]["D2_um"] == 190.0
+    written = json.loads((out / "parameters.json").read_text())
+    assert written["particle"]["D2_um"] == 190.0
     assert (out / "parameters_golden.csv").read_text() != first
 
 

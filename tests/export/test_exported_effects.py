@@ -122,8 +122,8 @@ def test_golden_table_of_closed_effects_is_the_law_driven(tmp_path):
 
 def test_card_names_effects_with_equation_and_numbers():
     law = paper_law().with_effects("damage:threshold", "creep:logarithmic", Softer(0.4))
-    told = json.loads(json.dumps(card(law, PARTICLE)))
-    damage, creep, own = told["effects"]
+    written = json.loads(json.dumps(card(law, PARTICLE)))
+    damage, creep, own = written["effects"]
     assert damage == {
         "name": "damage:threshold",
         "equation": "E exp(-kappa (eps_P - eps_0)) above eps_0",
@@ -138,9 +138,10 @@ def test_card_names_effects_with_equation_and_numbers():
     }
     plain = card(paper_law())
     assert "effects" not in plain
-    assert told["sha256"] != plain["sha256"]
+    assert written["sha256"] != plain["sha256"]
     assert (
-        told["sha256"] != card(paper_law().with_effects("damage:threshold", "creep:logarithmic", Softer(0.3)))["sha256"]
+        written["sha256"]
+        != card(paper_law().with_effects("damage:threshold", "creep:logarithmic", Softer(0.3)))["sha256"]
     )
 
 
@@ -206,13 +207,13 @@ def test_a_fresh_process_with_jax_alone_follows_memory_and_time(names, tmp_path)
         ("step_each", force, by_displacement.state),
         ("step_load", by_load.displacement, by_load.state),
     ):
-        told = np.load(tmp_path / f"{which}.npz")
-        np.testing.assert_allclose(told["answer"], want, rtol=0, atol=1e-12 * np.abs(want).max())
+        written = np.load(tmp_path / f"{which}.npz")
+        np.testing.assert_allclose(written["answer"], want, rtol=0, atol=1e-12 * np.abs(want).max())
         leaves = jax.tree.leaves(state)
-        assert len(leaves) == sum(name.startswith("m") for name in told.files)
+        assert len(leaves) == sum(name.startswith("m") for name in written.files)
         for k, leaf in enumerate(leaves):
-            np.testing.assert_allclose(told[f"m{k}"], leaf, rtol=1e-12, atol=1e-12)
-        assert np.isfinite(told["slope"])
+            np.testing.assert_allclose(written[f"m{k}"], leaf, rtol=1e-12, atol=1e-12)
+        assert np.isfinite(written["slope"])
     table = np.genfromtxt(tmp_path / "mcc_jax_export_golden.csv", delimiter=",", names=True)
     path = table[table["path"] == 1]
     again = drive(law, PARTICLE, path["displacement_um"], time=path["time_s"])

@@ -1,4 +1,4 @@
-"""The library's pair law, which other engines are checked against, beside a bisection of the paper's own formulas."""
+"""The library's pair law, which other engines are checked against, next to a bisection of the paper's own formulas."""
 
 import equinox as eqx
 import jax

@@ -23,7 +23,7 @@ import jax, jax.numpy as jnp, numpy as np
 jax.config.update("jax_enable_x64", True)
 folder = Path(sys.argv[1])
 table = np.genfromtxt(folder / "mcc_jax_export_golden.csv", delimiter=",", names=True)
-told = {}
+found = {}
 largest, stiffest = table["force_mN"].max(), table["tangent_mN_per_um"].max()
 reloading = table["displacement_um"] < table["displacement_max_um"]
 
@@ -45,18 +45,18 @@ for dtype in ("float64", "float32"):
     step = load("step", dtype)
     results = step.call(x, past)
     assert {v.dtype for v in results} == {jnp.dtype(dtype)}
-    told[dtype] = {"step": misses(results), "platforms": list(step.platforms)}
-    told[dtype]["force"] = misses([load("force", dtype).call(x, past)])
-    told[dtype]["step_each"] = misses(load("step_each", dtype).call(x, past, sizes, own))
+    found[dtype] = {"step": misses(results), "platforms": list(step.platforms)}
+    found[dtype]["force"] = misses([load("force", dtype).call(x, past)])
+    found[dtype]["step_each"] = misses(load("step_each", dtype).call(x, past, sizes, own))
 x, past, sizes, own = arguments("float64")
 force, tangent, _ = load("step", "float64").call(x, past)
-told["one of many"] = float(load("step", "float64").call(x[10:11], past[10:11])[0][0] - force[10])
+found["one of many"] = float(load("step", "float64").call(x[10:11], past[10:11])[0][0] - force[10])
 only, each = load("force", "float64"), load("step_each", "float64")
 slope = jax.grad(lambda x: only.call(x, past).sum())(x)
-told["gradient"] = float(jnp.abs(slope - tangent).max() / stiffest)
-told["sensitivity"] = jax.grad(lambda own: each.call(x, past, sizes, own)[0].sum())(own).sum(0).tolist()
+found["gradient"] = float(jnp.abs(slope - tangent).max() / stiffest)
+found["sensitivity"] = jax.grad(lambda own: each.call(x, past, sizes, own)[0].sum())(own).sum(0).tolist()
 assert not [name for name in sys.modules if name.startswith(("mcc_jax", "equinox"))]
-print(json.dumps(told))
+print(json.dumps(found))
 """
 
 
@@ -85,8 +85,8 @@ def test_a_fresh_process_with_jax_alone_gets_the_golden_table(tmp_path, form):
         capture_output=True, text=True, timeout=120, env=environment, cwd=tmp_path,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
-    double, single = told["float64"], told["float32"]
+    found = json.loads(done.stdout)
+    double, single = found["float64"], found["float32"]
     assert double["platforms"] == ["cpu", "cuda", "rocm", "tpu"]
     for function in ("force", "step", "step_each"):
         assert double[function][0] < 1e-13
@@ -96,9 +96,9 @@ def test_a_fresh_process_with_jax_alone_gets_the_golden_table(tmp_path, form):
         assert double[function][1] < 1e-11  # the tangent has a square root at full release
         assert double[function][2] < 1e-15
         assert single[function][2] < 1e-7
-    assert told["one of many"] == 0.0
-    assert told["gradient"] < 1e-11
-    np.testing.assert_allclose(told["sensitivity"], sensitivity(law), rtol=1e-10)
+    assert found["one of many"] == 0.0
+    assert found["gradient"] < 1e-11
+    np.testing.assert_allclose(found["sensitivity"], sensitivity(law), rtol=1e-10)
 
 
 def sensitivity(law):

@@ -80,7 +80,7 @@ def test_python_of_the_yade_recipe_is_python():
     compile(block, "yade.md", "exec")
 
 
-def test_template_files_are_beside_the_code():
+def test_template_files_are_next_to_the_code():
     from mcc_jax import export
 
     folder = Path(export.__file__).parent / "templates"

@@ -72,7 +72,7 @@ def test_displacement_control_reaches_the_asked_stress():
 
 
 def test_padding_changes_no_particle():
-    # The same particle alone, and beside one whose test is ten times as long.
+    # The same particle alone, and next to one whose test is ten times as long.
     plastic = eqx.filter_vmap(Plastic)(jnp.array([7.0, 7.0]), jnp.array([3.0, 3.0]), jnp.array([2.7, 2.7]))
     laws = law_for_each(plastic, 1.43, 16e3)
     sizes = np.array([[200.0, 190, 160], [200.0, 190, 160]])

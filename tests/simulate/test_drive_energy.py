@@ -167,7 +167,7 @@ def test_only_what_is_driven_counts():
 
 @pytest.mark.extended
 def test_it_is_refused_where_a_particle_code_refuses_it():
-    """A particle driven to the end of the tests, and its half contact, whose energies are written apart."""
+    """A particle driven to the end of the tests, and its half contact, whose energies are written separately."""
     law, particle = energy_paths.draw(8, 400, Unloading.PUNCH, StrainScaling.RAW)
     rng = np.random.default_rng(2)
     effects = tuple(

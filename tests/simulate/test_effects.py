@@ -33,11 +33,11 @@ def test_effects_reach_the_curves_with_their_time():
     for one, other, speed in zip(plain.curves, both.curves, drift, strict=True):
         added = 0.002 * one.force_mN + speed * one.time_s
         np.testing.assert_allclose(other.displacement_um, one.displacement_um + added, atol=1e-9)
-    told = both.metadata.other["simulation"]["effects"]
-    assert told[0] == {
+    described = both.metadata.other["simulation"]["effects"]
+    assert described[0] == {
         "mechanism": "frame_compliance", "variant": "linear", "compliance_um_per_mN": 0.002, "random_per_test": []
     }  # fmt: skip
-    assert told[1]["random_per_test"] == ["drift_um_per_s"]
+    assert described[1]["random_per_test"] == ["drift_um_per_s"]
 
 
 def test_the_seed_decides_and_each_test_has_a_stream_of_its_own():
@@ -108,7 +108,3 @@ def test_times_go_with_effects_only():
         drive(law, particle, path, time=path, control="load")
     with pytest.raises(ValueError, match="only a law with effects"):
         simulate_batch(law, particle_batch(np.array([[200.0, 190, 160]])), path[None], times=path[None])
-    null = law.with_effects(LIBRARY["creep"].variants[0].build(0.0))
-    response = drive(null, particle, path, time=path, control="load")
-    base = drive(law, particle, path, control="load").displacement
-    np.testing.assert_allclose(response.displacement, base, rtol=1e-12)

@@ -49,7 +49,7 @@ def test_sampled_paths_increase_in_time_and_stay_within_the_levels(steps, peak, 
     assert (np.diff(time) > 0).all()
     assert value.min() >= 0
     assert value.max() == pytest.approx(highest)
-    # No ramp is faster than it was told to be.
+    # No ramp is faster than its rate.
     fastest = max([0.0] + [s.rate for s in steps if isinstance(s, Ramp)])
     assert np.abs(np.diff(value) / np.diff(time)).max() <= fastest * (1 + 1e-6) + 1e-9
 
@@ -117,7 +117,7 @@ def test_programme_file_round_trip(tmp_path):
         ("rate=true\n[[step]]\nramp_to = 1", "must be a finite number"),
     ],
 )
-def test_bad_programme_files_are_told_in_one_line(tmp_path, text, message):
+def test_bad_programme_files_are_refused_in_one_line(tmp_path, text, message):
     file = tmp_path / "programme.toml"
     file.write_text(text)
     with pytest.raises(InputError) as error:
@@ -127,7 +127,7 @@ def test_bad_programme_files_are_told_in_one_line(tmp_path, text, message):
     assert "\n" not in str(error.value)
 
 
-def test_missing_programme_file_is_told(tmp_path):
+def test_missing_programme_file_is_refused(tmp_path):
     with pytest.raises(InputError, match="there is no such file"):
         read_programme(tmp_path / "none.toml")
     (tmp_path / "latin.toml").write_bytes(b"# \xe9\n")
