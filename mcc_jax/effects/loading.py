@@ -194,8 +194,8 @@ FRICTION = family(
 class Hardening(AbstractFormulas):
     """Hardening as a power of strain in place of flow at one stress; the amplitude is 1/m, 1 for Hertz.
 
-    A formula is a logarithm, and the factor on the chosen terms its exponential to the power 1/2m. With `every_term` the
-    terms of order j = 1, 3, 5 have the j-th power of that, as where a power of strain takes the place of strain.
+    A formula is a logarithm, and the factor on the chosen terms its exponential to the power 1/2m. With `every_term`
+    the terms of order j = 1, 3, 5 have the j-th power of that, as where a power of strain takes the place of strain.
     """
 
     terms: tuple[float, float, float] = terms(True, True, True)
