@@ -22,7 +22,7 @@ from mcc_jax._format import plain
 from mcc_jax.discover import discover
 from mcc_jax.effects import find_variant
 from mcc_jax.report.pictures import draw_enlarged, draw_left_over
-from mcc_jax.report.story import telling_test
+from mcc_jax.report.story import most_informative_test
 
 FOLDER = Path(__file__).parent / "pages" / "images"
 BLUE, VERMILION, ORANGE, GREY = "#0072B2", "#D55E00", "#E69F00", "0.45"
@@ -101,7 +101,7 @@ def found():
     answer = discover(campaign.select(np.arange(20) < 8), experiments=False, posterior=False)
     print(answer.summary)
     before, after = (step["chi2_per_dof"] for step in answer.gap()["steps"])
-    told = telling_test(answer)
+    told = most_informative_test(answer)
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.2, 3.9), layout="constrained")
     handles = draw_enlarged(left, told)
     text = "A simulated particle with creep put in, pressed three times:\nthe contact law alone misses the loop"

@@ -32,7 +32,7 @@ _PLAIN = (bool, int, float, str, bytes, type(None))
 
 
 class _Archive(msgspec.Struct):
-    """What stands in a file."""
+    """The contents of a file."""
 
     format: str
     version: int

@@ -7,7 +7,7 @@ from typing import Any
 
 
 class InputError(ValueError):
-    """Input that a person can mend, told in one line.
+    """Input that a person can correct, reported in one line.
 
     The message names the file, the row and the column where they are known, what is wrong there, and what to do.
     The command line prints it on standard error and exits with status 2; nothing is written.
@@ -16,7 +16,7 @@ class InputError(ValueError):
         problem: what is wrong, in words.
         file: the file or folder concerned.
         row: the row as a person counts it in an editor, the header being row 1.
-        column: the column's name as it stands in the file.
+        column: the column's name as it is in the file.
         remedy: what to do about it.
     """
 

@@ -52,6 +52,6 @@ def extra(name: str, file: str | Path | None = None) -> Iterator[None]:
         yield
     except ModuleNotFoundError as error:
         missing = (error.name or "").partition(".")[0]
-        if missing not in EXTRAS[name][1]:  # something else is broken: that is told as it is
+        if missing not in EXTRAS[name][1]:  # something else is broken: that is raised as it is
             raise
         raise MissingExtraError(name, missing, file) from None

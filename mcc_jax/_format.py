@@ -100,7 +100,7 @@ def span(values: Any, unit: str, digits: int = 4) -> str:
 
 
 def value_of(value: Any, unit: str = "") -> str:
-    """A parameter of a module in words: its value, the range of a batch, or what stands for it while JAX traces."""
+    """A parameter of a module in words: its value, the range of a batch, or its placeholder while JAX traces."""
     mark = f" {unit}" if unit else ""
     if is_traced(value) or not hasattr(value, "shape"):
         return f"{value}{mark}"
@@ -118,15 +118,11 @@ def table(title: str, rows: list[tuple[str, str]], most: int = 20) -> str:
 
 
 WIDE, LONG = 100, 70
-"""Characters of an object told in one line, and of one value in a table."""
+"""Characters of an object in one line, and of one value in a table."""
 
 
 def described(**units: str) -> Any:
-    """A `__repr__` that shows every field with its value in a few words: one line, or a small table.
-
-    Args:
-        units: of fields whose names do not carry them.
-    """
+    """A `__repr__` of every field in a few words, in a line or a table; `units` of fields that do not name them."""
 
     def __repr__(self: Any) -> str:
         names = getattr(type(self), "_fields", None) or [f.name for f in dataclasses.fields(self) if f.repr]

@@ -33,7 +33,7 @@ def is_traced(value: Any) -> bool:
 
 
 def shown(value: Any) -> str:
-    """A value as it stands in a message: its text, cut short."""
+    """A value for a message: its text, cut short."""
     text = repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
 
@@ -80,14 +80,11 @@ def number(
 ) -> float:
     """A number, finite and within bounds, as a Python float: `least` and `most` are allowed, `above` and `below` not.
 
-    Args:
-        value: anything that is one number: also of numpy, JAX or pandas.
-        name: for messages, with its unit.
-        infinite: whether infinity is allowed.
+    It may be of numpy, JAX or pandas, and infinite if that is allowed. The name is for messages, with its unit.
     """
     bounds = {">=": least, ">": above, "<=": most, "<": below}
-    told = " and ".join(f"{sign} {bound:g}" for sign, bound in bounds.items() if math.isfinite(bound))
-    must = f"{name} must be a {'' if infinite else 'finite '}number {told}".rstrip()
+    limits = " and ".join(f"{sign} {bound:g}" for sign, bound in bounds.items() if math.isfinite(bound))
+    must = f"{name} must be a {'' if infinite else 'finite '}number {limits}".rstrip()
     if not is_number(value):
         raise InputError(f"{must}, got {shown(value)}")
     found = float(value)
@@ -132,10 +129,7 @@ def _array_of(value: Any) -> np.ndarray | None:
 def floats(value: Any, name: str, *, shape: str = "an array of numbers") -> np.ndarray:
     """Numbers as a numpy array of floating-point numbers: from a list, a Series, an array of any kind.
 
-    An array that is one already is handed back itself.
-
-    Args:
-        value: what was given; not traced.
+    An array that is one already is handed back itself; tracers are not for this function.
     """
     if isinstance(value, Iterable) and not isinstance(value, str | bytes) and not hasattr(value, "__array__"):
         value = list(value)
@@ -166,12 +160,9 @@ def values(value: Any, name: str, *, shape: str = "a number or an array of numbe
 
 
 def path(value: Any, name: str, *, many: str = "") -> jax.Array:
-    """A path: a 1-D array of at least one point, from a list, a Series, an array of any kind.
+    """A path: a 1-D array of at least one point, from a list, a Series, an array of any kind; tracers pass.
 
-    Args:
-        value: what was given; it may be traced.
-        name: for messages.
-        many: what to do with several paths at once, in words.
+    `many` says in words what to do with several paths at once.
     """
     array = values(value, name, shape="a 1-D array of at least one point")
     if array.ndim == 1 and array.shape[0] > 0:
@@ -219,13 +210,9 @@ def one_particle(value: Any, name: str = "diameters_um") -> np.ndarray:
 
 
 def positive(value: Any, name: str, *, zero: bool = False, plain: bool = False) -> None:
-    """Refuse a size that is not positive and finite, where it can be looked at.
+    """Refuse a size that is not positive (or `zero`) and finite, where it can be looked at.
 
-    Args:
-        value: a number or an array, which may be traced.
-        name: for messages, with its unit.
-        zero: whether 0 is allowed.
-        plain: look at numbers of Python and numpy only, not at results of a computation.
+    With `plain` only numbers of Python and numpy are, not results of a computation.
     """
     checked = not is_traced(value) and not (plain and isinstance(value, jax.Array))
     array = np.asarray(value) if checked else None

@@ -17,8 +17,6 @@ from . import options as common
 from .session import (
     NOT_CONVERGED,
     Tell,
-    beside,
-    import_writers,
     joint_model,
     listed,
     provenance,
@@ -76,7 +74,11 @@ NO_SETTINGS = ("campaign", "out", "no_figures", "as_json")
     metavar="MECHANISM",
     help="Such an effect whose amplitude differs from particle to particle; repeatable.  [least-squares, bayes]",
 )
-@click.option("--shape-scatter", is_flag=True, help="Let a differ from particle to particle.  [least-squares, bayes]")
+@click.option(
+    "--shape-scatter",
+    is_flag=True,
+    help="Allow the shape parameter a to vary between particles.  [least-squares, bayes]",
+)
 @click.option("--robust", is_flag=True, help="Noise with heavy tails: spikes count for little.  [least-squares, bayes]")
 @common.one_of(
     "--mode", ("fast", "joint"), "Integrate the particles out, or sample everything at once (minutes).  [bayes]"
@@ -88,7 +90,7 @@ NO_SETTINGS = ("campaign", "out", "no_figures", "as_json")
 @common.one_of(
     "--loss",
     ("linear", "soft_l1", "cauchy"),
-    "Loss of the residuals; all but linear bear outliers.  [least-squares]",
+    "Loss of the residuals; soft_l1 and cauchy are robust to outliers.  [least-squares]",
 )
 @common.one_of(
     "--objective", ("full", "reference"), "Which objective's a the rest is built on; both are reported.  [paper]"
@@ -134,10 +136,11 @@ def calibrate(
         if options["reference"] is not None:
             require_particle(options["reference"], data, "--reference")
         # What says how a result of this method comes about.
-        told = {n: v for n, v in context.params.items() if n not in NO_SETTINGS and method in BELONGS.get(n, METHODS)}
-        origin = provenance("calibrate", campaign, told)
-        writers = functools.partial(import_writers, figures=not no_figures, posterior=method == "bayes")
-        with results(out) as stage, beside(writers):
+        settings = {
+            n: v for n, v in context.params.items() if n not in NO_SETTINGS and method in BELONGS.get(n, METHODS)
+        }
+        origin = provenance("calibrate", campaign, settings)
+        with results(out) as stage:
             calibration = _calibrated(data, method, options, tell)
             content = write_calibration(calibration, stage, origin=origin, figures=not no_figures, tell=tell)
     from ..calibrate.summary import quantities
@@ -187,7 +190,7 @@ def write_calibration(
     """Write the calibration, the figures and, if there is one, the posterior into the stage.
 
     Files that an earlier calibration lists as its own, and this one does not write, become stale: they would contradict
-    what lies beside them now. `origin` is what `provenance` gives. Returns the contents of `calibration.json`.
+    what is next to them now. `origin` is what `provenance` gives. Returns the contents of `calibration.json`.
     """
     from ..calibrate import Posterior, write_posterior
 

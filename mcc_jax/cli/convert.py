@@ -18,7 +18,7 @@ SHOWN = 12
 KINDS = ("approach", "load", "hold", "unload", "reload")
 
 
-@click.command(short_help="Turn a tester's file, or a folder of them, into a campaign.")
+@click.command(short_help="Turn an instrument's file, or a folder of them, into a campaign.")
 @click.argument("file", type=common.Location(), metavar="FILE|FOLDER")
 @common.out(required=True)
 @click.option(
@@ -32,11 +32,12 @@ KINDS = ("approach", "load", "hold", "unload", "reload")
     type=common.Location(),
     multiple=True,
     metavar="FILE",
-    help="TOML file that says what stands where, for any other text table or Excel workbook; repeatable, for a FOLDER "
+    help="TOML file that describes the columns, for any other text table or Excel workbook; repeatable, for a FOLDER "
     "of several kinds of files: each is read by the one that fits.",
 )
 @click.option(
-    "--skip",
+    "--leave-out",
+    "skip",
     multiple=True,
     metavar="NAME",
     help='A file of FOLDER to leave out; may hold "*" and "?"; repeatable.',
@@ -45,15 +46,15 @@ KINDS = ("approach", "load", "hold", "unload", "reload")
 def convert(
     file: Path, out: Path, diameters: str | None, mapping: tuple[Path, ...], skip: tuple[str, ...], seed: int
 ) -> None:
-    """Turn FILE, a tester's export, or all exports of FOLDER into a campaign.
+    """Turn FILE, an instrument's export, or all exports of FOLDER into a campaign.
 
-    Known formats: Fischer HM, Hysitron hld, Hysitron load-control text, Micro Materials text or zip; they are told
-    apart by content. Any other text table, or Excel workbook, needs a mapping file. Units are converted; nothing is
-    shifted or smoothed.
+    Known formats: Fischer HM, Hysitron hld, Hysitron load-control text, Micro Materials text or zip, recognised by
+    content. Any other text table, or Excel workbook, needs a mapping file. Units are converted; nothing is shifted or
+    smoothed.
 
     Of a folder every file is read, in natural order, but for hidden files, READMEs, licences, pictures, documents and
     settings (.md, .pdf, .png, .toml, .ini, .db, ...) and folders in it; they are counted. A test is called like its
-    file; a file that cannot be read stops all, until it is left out with --skip.
+    file; a file that cannot be read stops all, until it is left out with --leave-out.
 
     \b
     Example of a mapping file (--mapping):
@@ -69,7 +70,7 @@ def convert(
       time = { column = "t", unit = "s" }     # or { speed = 0.05, unit = "mm/s" }
       force = { column = "Load", unit = "N" }
       displacement = { column = "Depth", unit = "nm", sign = -1 }
-      [diameters]                   # if a row above the samples tells the diameter
+      [diameters]                   # if a row above the samples gives the diameter
       header = "Gage length"
     """
     if diameters is not None and not diameters.strip():

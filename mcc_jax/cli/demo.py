@@ -18,7 +18,7 @@ from . import options as common
 from .calibrate import say_state, say_warnings, write_calibration
 from .discover import DISCOVERY, write_discovery
 from .report import REPORT
-from .session import Tell, beside, import_writers, provenance, say, say_files, say_table, session
+from .session import Tell, provenance, say, say_files, say_table, session
 
 if TYPE_CHECKING:
     from ..campaign import Campaign
@@ -41,7 +41,7 @@ NOTHING = "nothing-hidden"
 PARTICLES = 8
 
 
-@click.command(short_help="Hide an effect, find it, and once more with nothing hidden.")
+@click.command(short_help="Hide an effect and find it, and repeat with nothing hidden.")
 @common.out(default="mcc-jax-demo", show_default=True)
 @common.seed("Draws what is hidden, the particles and the noise.")
 def demo(out: Path, seed: int) -> None:
@@ -50,7 +50,7 @@ def demo(out: Path, seed: int) -> None:
     Eight particles are simulated from the paper's tables (Bommireddy et al. 2018), which publishes its measured curves
     as pictures only. The seed draws what is hidden; a SHA-256 of the answer is printed before anything is computed.
     DIR gets campaign/, calibration.json of the law alone, posterior.nc, discovery.json, figures/, report.html, which
-    shows it all in a browser, and the broken seal, sealed.json. In DIR/nothing-hidden lies the same once more for
+    shows it all in a browser, and the broken seal, sealed.json. In DIR/nothing-hidden is the same for
     tests in which nothing is hidden: there nothing may be found.
 
     \b
@@ -101,7 +101,7 @@ def demo(out: Path, seed: int) -> None:
         ("the same particles by the paper's own steps", f"calibrate {folder} --out paper --method paper"),
         ("hide something yourself", "simulate --out hidden --levels 0.5,1 --hold-s 30 --noise-um 0.02 --effect creep"),
         ("find it", "discover hidden --out found"),
-        ("your own tests, from a tester's file", "convert FILE --out tests --diameters 200,190,180"),
+        ("your own tests, from an instrument's file", "convert FILE --out tests --diameters 200,190,180"),
     ):
         say(f"  mcc-jax {command}", nl=False)
         say(f"   # {comment}", dim=True)
@@ -113,26 +113,18 @@ def _job(
     """Simulate, calibrate, discover, report; the contents of the two results."""
     from ..calibrate import sample
     from ..campaign import write_campaign
+    from ..discover import discover
+    from ..report import read_results, report_page
 
     tell("simulating the campaign")
     campaign, seed = _campaign(settings["seed"], effect), settings["seed"]
     write_campaign(campaign, stage.folder / "campaign")
-    origin = provenance("demo", stage.folder / "campaign", settings, told="campaign")
-
-    def rest() -> None:
-        from .. import discover, report  # noqa: F401
-
-        import_writers(figures=True, posterior=True)
-
-    with beside(rest):  # seconds to import, for which compilers leave a core to Python
-        calibration = sample(campaign, seed=seed, progress=tell)
-    from ..discover import discover
-    from ..report import read_results, report_page
-
-    # One core draws while the others compile.
-    with beside(lambda: discover(campaign, experiments=False, seed=seed, progress=tell)) as found:
-        content = write_calibration(calibration, stage, origin=origin, figures=True, tell=tell)
-    missing = write_discovery(found(), stage, origin=origin, figures=True, tell=tell)
+    origin = provenance("demo", stage.folder / "campaign", settings, folder="campaign")
+    content = write_calibration(
+        sample(campaign, seed=seed, progress=tell), stage, origin=origin, figures=True, tell=tell
+    )
+    found = discover(campaign, experiments=False, seed=seed, progress=tell)
+    missing = write_discovery(found, stage, origin=origin, figures=True, tell=tell)
     name = stage.directory.resolve().name
     page = report_page(read_results(stage.folder, name=name), seed=seed, progress=tell)
     (stage.folder / REPORT).write_text(page, encoding="utf-8")
@@ -140,7 +132,7 @@ def _job(
 
 
 def _campaign(seed: int, effect: HiddenEffect) -> Campaign:
-    """Eight of the paper's particles, tested in the computer; whatever tells the truth is taken out."""
+    """Eight of the paper's particles, tested in the computer; whatever gives the truth is taken out."""
     import numpy as np
 
     from ..simulate import Programme, paper_campaign
@@ -235,11 +227,11 @@ def compared(answer: dict[str, Any], found: dict[str, Any]) -> tuple[bool, str]:
     hidden = answer["mechanism"]
     named = [effect["mechanism"] for effect in found["effects"]]
     if named != [hidden]:
-        told = " and ".join(map(plain, named)) or f"no name ({verdict_in_words(found)})"
-        return False, f"The discovery is WRONG: hidden was {plain(hidden)}, found was {told}."
+        answer = " and ".join(map(plain, named)) or f"no name ({verdict_in_words(found)})"
+        return False, f"The discovery is WRONG: hidden was {plain(hidden)}, found was {answer}."
     effect = found["effects"][0]
     rivals = [plain(name) for name in found["candidate_set"][0] if name != hidden]
-    doubt = f", though these tests cannot tell it from {' or '.join(rivals)}" if rivals else ""
+    doubt = f", though these tests cannot distinguish it from {' or '.join(rivals)}" if rivals else ""
     if effect["variant"] != answer["variant"]:
         formulas = f"{plain(effect['variant'])}, hidden was {plain(answer['variant'])}"
         return True, f"The name agrees{doubt}; the formula is another ({formulas}), so amplitudes do not compare."

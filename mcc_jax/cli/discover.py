@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,8 +14,6 @@ from .._store import Stage, results
 from . import options as common
 from .session import (
     Tell,
-    beside,
-    import_writers,
     joint_model,
     provenance,
     read_without,
@@ -36,7 +33,7 @@ if TYPE_CHECKING:
 
 DISCOVERY, POWER = "discovery.json", "power.json"
 ROWS = 6
-"""So many mechanisms stand in the table; the file has all."""
+"""Rows of the table; the file has all mechanisms."""
 
 
 @click.command(short_help="Find, name and add what the law misses.")
@@ -50,7 +47,7 @@ ROWS = 6
 @click.option(
     "--no-held-out", is_flag=True, help="Do not repeat the search without each particle: no gap on unseen particles."
 )
-@click.option("--no-experiments", is_flag=True, help="Do not work out which further test would tell more.")
+@click.option("--no-experiments", is_flag=True, help="Do not work out which further test would show more.")
 @click.option(
     "--no-posterior", is_flag=True, help="Do not sample the law with effects: standard errors of its fit instead."
 )
@@ -76,7 +73,7 @@ def discover(
     Verdicts, all of them answers (exit status 0):
       NO_GAP             law and tests agree within the noise
       NAMED              one mechanism explains the gap, or several together
-      SET                these data cannot tell several mechanisms apart
+      SET                these data cannot distinguish several mechanisms
       UNLISTED           no listed mechanism explains it; a formula does
       FIT_NOT_CONVERGED  the law cannot be fitted well enough to ask
 
@@ -92,8 +89,7 @@ def discover(
         data = read_without(campaign, options["leave_out"], tell)
         parts = {"experiments": not no_experiments, "posterior": not no_posterior}
         origin = provenance("discover", campaign, options | {"held_out": not no_held_out} | parts)
-        writers = functools.partial(import_writers, figures=not no_figures, posterior=False)
-        with results(out) as stage, beside(writers):
+        with results(out) as stage:
             model = joint_model(options)
             chosen = {name: options[name] for name in ("exclude", "threshold_MPa", "seed")}
             found = find(data, model=model, confirm=not no_held_out, progress=tell, **parts, **chosen)
@@ -181,11 +177,11 @@ def _number(value: float | None, form: str, unit: str = "-") -> str:
 @common.threshold(default=0.0)
 @common.priors()
 @common.law
-@common.seed("For the record: nothing here is random.")
 @common.json(POWER, "a table")
-def power(campaign: Path, out: Path, seed: int, as_json: bool, **options: Any) -> None:
-    """Say how large each mechanism must be for the tests in the folder CAMPAIGN to show it, and which they cannot tell
-    apart. CAMPAIGN is what `mcc-jax simulate` makes of your plan with your tester's noise, or a measured campaign.
+def power(campaign: Path, out: Path, as_json: bool, **options: Any) -> None:
+    """Say how large each mechanism must be for the tests in the folder CAMPAIGN to show it, and which they cannot
+    distinguish. CAMPAIGN is what `mcc-jax simulate` makes of your plan with your instrument's noise, or a measured
+    campaign.
 
     Writes power.json into DIR.
 
@@ -208,7 +204,7 @@ def power(campaign: Path, out: Path, seed: int, as_json: bool, **options: Any) -
                 threshold_MPa=options["threshold_MPa"],
                 progress=tell,
             )
-            content: dict[str, Any] = found.to_json() | {"seed": seed}
+            content = found.to_json()
             write_result(stage, POWER, content)
     if as_json:
         say_json(content)

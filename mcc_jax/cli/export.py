@@ -37,9 +37,9 @@ def export(
     allow_not_monotone: bool,
     seed: int,
 ) -> None:
-    """Write the law in DIR/calibration.json, of any method, for use in other engines.
+    """Write the law that a calibration of any method, or a discovery, wrote into DIR, for use in other engines.
 
-    Takes the population's law, each coefficient at its median exp(mean of log C), or one particle's. Beside every
+    Takes the population's law, each coefficient at its median exp(mean of log C), or one particle's. Next to every
     artefact lies a golden table: paths with force and tangent to check an implementation against.
 
     \b

@@ -42,7 +42,8 @@ curves.csv (particle,time_s,force_mN,displacement_um) and, optionally,
 campaign.toml.
 
 \b
-Exit status: 0 done; 2 bad input, told in one line, nothing written;
+Exit status: 0 done; 2 bad input, reported in one line, nothing written;
+3 done, but the calibration did not converge;
 130 interrupted; 1 a defect of mcc-jax, please report it.
 
 \b
@@ -65,7 +66,7 @@ def one_line(text: str) -> str:
 
 
 def explain(error: BaseException, debug: bool) -> Stop:
-    """What a run that ended with this error tells its user; `debug` prints the traceback of a defect."""
+    """What a run that ended with this error reports; `debug` prints the traceback of a defect."""
     match error:
         case Stop():
             return error
@@ -171,7 +172,7 @@ for _command in (demo, simulate, convert, calibrate, discover, power, report, ex
 
 
 class _Terminated(SystemExit):
-    """The process was told to end; on the way out everything it had begun is cleared up."""
+    """The process was asked to end; before it does, everything it had begun is cleared up."""
 
 
 def _terminate(number: int, _: Any) -> None:
@@ -179,7 +180,7 @@ def _terminate(number: int, _: Any) -> None:
 
 
 def _send(number: int, after_s: float) -> None:
-    """Send the signal once more, unless the process is gone by then."""
+    """Send the signal again, unless the process is gone by then."""
     again = threading.Timer(after_s, _thread.interrupt_main, (number,))
     again.daemon = True
     again.start()
@@ -209,7 +210,7 @@ def main() -> None:
     sys.unraisablehook = _unraisable
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _interrupt)
-    for name in ("SIGTERM", "SIGHUP"):  # so that a run which is told to end clears up behind itself
+    for name in ("SIGTERM", "SIGHUP"):  # so that a run that is asked to end clears up
         if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) is signal.SIG_DFL:
             signal.signal(getattr(signal, name), _terminate)
     if isinstance(sys.stdout, io.TextIOWrapper):

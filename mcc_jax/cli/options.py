@@ -128,7 +128,7 @@ def law(command: Any) -> Any:
 
 
 exclude = click.option(
-    "--exclude", multiple=True, metavar="NAME", help="A mechanism that cannot be there, on your authority; repeatable."
+    "--exclude", multiple=True, metavar="NAME", help="Mechanism to exclude from the search; repeatable."
 )
 leave_out = click.option(
     "--leave-out", multiple=True, metavar="NAME", help="Leave this particle out; may be given several times."

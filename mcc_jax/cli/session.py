@@ -7,13 +7,11 @@ import json
 import logging
 import os
 import re
-import shutil
 import stat
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Future, wait
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,7 +51,7 @@ def session(steps: int) -> Iterator[Tell]:
 
 
 def require_device() -> None:
-    """Start JAX on the device that it was told to use. Raises `InputError` if there is none of that kind."""
+    """Start JAX on the device that it is set to use. Raises `InputError` if there is none of that kind."""
     import jax
 
     try:
@@ -66,16 +64,15 @@ def require_device() -> None:
         raise InputError(problem, remedy=remedy) from None
 
 
-CACHE_BYTES = 300 * 2**20
-"""At most so much of the disk is used for compiled functions; the oldest make room."""
+CACHE_BYTES = 300 * 2**20  # most disk used for compiled functions; the oldest are removed
 
 
 def _keep_compiled(config: Any) -> None:
     """Let the next process find what this one compiles, in the user's folder for caches.
 
-    A setting of one's own (JAX_COMPILATION_CACHE_DIR, JAX_ENABLE_COMPILATION_CACHE=0) has precedence. Compiled code
-    belongs to one machine: where several share a home, each has a folder. It is code that will be run, so nobody else
-    may be able to write it: a folder that is not ours alone is made so, or left where it cannot be.
+    JAX_COMPILATION_CACHE_DIR and JAX_ENABLE_COMPILATION_CACHE=0 have precedence. Compiled code belongs to one machine:
+    where several share a home, each has a folder. It is code that will be run, so a folder that others could write to
+    is not used.
     """
     if config.jax_compilation_cache_dir is not None or not config.jax_enable_compilation_cache:
         return
@@ -93,57 +90,15 @@ def _keep_compiled(config: Any) -> None:
 
 
 def _private(folder: Path) -> bool:
-    """Whether a folder is there, no link, ours, and open to nobody else; made so where it can be."""
+    """Whether a folder is no link, ours, and nobody else may write to it; made where it is missing."""
     try:
-        for one in (*reversed(folder.parents), folder):  # mkdir(parents=True) would leave those above to the umask
-            one.mkdir(mode=0o700, exist_ok=True)
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         found = folder.lstat()
-        if not stat.S_ISDIR(found.st_mode):
-            return False
-        if hasattr(os, "geteuid") and found.st_uid != os.geteuid():
-            return False
-        if os.name == "posix" and stat.S_IMODE(found.st_mode) != 0o700:
-            if stat.S_IMODE(found.st_mode) & 0o022:
-                # Others could write here until now, so what lies here may be theirs.
-                shutil.rmtree(folder)
-                folder.mkdir(mode=0o700)
-            folder.chmod(0o700)
     except OSError:
         return False
-    return os.access(folder, os.W_OK)
-
-
-def import_writers(*, figures: bool, posterior: bool) -> None:
-    """Import what draws and what writes posteriors: seconds of Python, beside compilers that leave it a core."""
-    if figures:
-        from .. import plots  # noqa: F401
-    if posterior:
-        import arviz  # noqa: F401
-
-
-@contextlib.contextmanager
-def beside[R](work: Callable[[], R]) -> Iterator[Callable[[], R]]:
-    """Let work go on in a thread of its own while the block runs; yields a function that waits for its result.
-
-    The block ends when the work has ended, too: an interpreter that ends under a compiler or an import may crash. Only
-    an interrupt does not wait, since nothing of the work is kept and the process ends at once. What the work raised is
-    raised where its result is asked for; work of which nobody asks may fail unnoticed.
-    """
-    future: Future[R] = Future()
-
-    def run() -> None:
-        try:
-            future.set_result(work())
-        except BaseException as error:  # whatever it is, it is raised where the result is asked for
-            future.set_exception(error)
-
-    threading.Thread(target=run, daemon=True).start()
-    try:
-        yield future.result
-    except Exception:
-        wait([future])
-        raise
-    wait([future])
+    if not stat.S_ISDIR(found.st_mode) or not os.access(folder, os.W_OK):
+        return False
+    return os.name != "posix" or (found.st_uid == os.geteuid() and not found.st_mode & 0o022)
 
 
 @contextlib.contextmanager
@@ -250,10 +205,12 @@ def joint_model(options: Mapping[str, Any], *, modulus_scatter: bool = True, sha
     return Model(form, StrainScaling(options["strain_scaling"]), modulus_scatter, shape_scatter, priors)
 
 
-def provenance(command: str, campaign: Path, settings: Mapping[str, Any], *, told: str | None = None) -> dict[str, Any]:
+def provenance(
+    command: str, campaign: Path, settings: Mapping[str, Any], *, folder: str | None = None
+) -> dict[str, Any]:
     """Folder and checksums of the campaign, settings of the command in force, versions of what computed.
 
-    The result names the folder by its absolute path, or as `told`.
+    The result names the folder by its absolute path, or as `folder`.
     """
     import platform
     from importlib.metadata import version
@@ -266,7 +223,7 @@ def provenance(command: str, campaign: Path, settings: Mapping[str, Any], *, tol
 
     versions = {"mcc_jax": own_version(), "python": platform.python_version(), **{n: version(n) for n in PACKAGES}}
     return {
-        "campaign": {"folder": told or str(campaign.resolve()), "sha256": file_checksums(campaign)},
+        "campaign": {"folder": folder or str(campaign.resolve()), "sha256": file_checksums(campaign)},
         "settings": {"command": command} | {name: plain(value) for name, value in settings.items()},
         "versions": versions,
     }
@@ -303,7 +260,7 @@ def write_result(stage: Stage, result: str, content: dict[str, Any]) -> None:
 
 
 def say_json(content: dict[str, Any]) -> None:
-    """Print a result as it stands in its file: JSON is UTF-8, whatever the terminal speaks."""
+    """Print a result as it is in its file: JSON is UTF-8, whatever the terminal's encoding."""
     click.echo(json_text(content).encode(), nl=False)
 
 

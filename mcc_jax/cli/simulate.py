@@ -129,8 +129,8 @@ def simulate(out: Path, **options: Any) -> None:
             write_campaign(campaign, stage.folder)
     points = [len(curve) for curve in campaign.curves]
     forces = [curve.force_mN.max() for curve in campaign.curves]
-    told = f"{sum(points)} points, {programme.control} control, seed {options['seed']}"
-    say(f"Simulated {len(campaign)} particles, {told}.")
+    what = f"{sum(points)} points, {programme.control} control, seed {options['seed']}"
+    say(f"Simulated {len(campaign)} particles, {what}.")
     longest = max(float(curve.time_s[-1]) for curve in campaign.curves)
     say(f"Peak forces {min(forces):.4g} to {max(forces):.4g} mN; the tests take up to {longest:.4g} s.")
     for effect in hidden:
@@ -218,7 +218,7 @@ def _laws(options: Mapping[str, Any], sizes: Sizes) -> MccLaw:
 
 
 def _programme(options: Mapping[str, Any]) -> Programme:
-    """What the tester does."""
+    """What the instrument does."""
     from ..simulate import Programme, read_programme
 
     if options["programme"] is not None:

@@ -1,4 +1,4 @@
-"""Measured tests beside what a calibration or a discovery says of them, and residuals over load and time."""
+"""Measured tests and what a calibration or a discovery says of them, and residuals over load and time."""
 
 from __future__ import annotations
 
@@ -32,6 +32,12 @@ with extra("plots"):
     from matplotlib.patches import Patch
 
 LOADING, UNLOADING = style.BLUE, style.VERMILION
+PANELS, COLUMNS = 12, 3  # most particles in a grid of curves, and how many are in a row
+PAGE, PAGE_COLUMNS = 20, 4  # the same on a page of all particles
+GAP_PANELS = 6  # most tests whose residuals are shown over time
+POINTS = 20_000  # no more residuals than these are drawn; the histogram next to them counts them all
+SMALL_POINTS = 8000  # of more points in a panel, dots are small and faint
+NEW_DRAWS, SINGLE_DRAWS = 1000, 6  # curves of a new particle in its band, and of these drawn as lines
 _DOT: style.Look = {"marker": "o", "linestyle": "", "markersize": 3.5, "markeredgewidth": 0}
 
 
@@ -52,13 +58,13 @@ def _draw_curve(ax: Axes, strip: Axes, curve: FittedCurve) -> None:
     measured, force, used = curve.displacement_um, curve.force_mN, curve.used
     ax.plot(measured[~used], force[~used], ".", color=style.PALE, markersize=2.5, markeredgewidth=0)
     strip.axvline(0.0, color=style.GREY, linewidth=0.7)
-    away, apart = measured - curve.own_um, style.every(len(force), style.SETTINGS.curve_points)
+    away, thinned = measured - curve.own_um, style.every(len(force), style.CURVE_POINTS)
     segments = np.split(np.arange(len(force)), np.flatnonzero(np.diff(curve.kind)) + 1)
     small: style.Look = _DOT | {"markersize": 3, "alpha": 0.7}
     for loading, colour in ((True, LOADING), (False, UNLOADING)):
         parts = [rows[used[rows]] for rows in segments if (curve.kind[rows[0]] == 0) == loading]
         for rows in parts:
-            shown = rows[apart]
+            shown = rows[thinned]
             ax.plot(measured[shown], force[shown], color=colour, **small)
             _fill(ax, curve, rows, 0.0, colour, 0.35)
         together = np.concatenate([np.empty(0, int), *parts])
@@ -78,10 +84,10 @@ def _draw_curve(ax: Axes, strip: Axes, curve: FittedCurve) -> None:
 
 
 def _draw_grid(curves: Sequence[FittedCurve], titles: Sequence[str]) -> Figure:
-    """Force over displacement of some particles, with a strip of residuals beside each."""
-    columns = min(style.SETTINGS.columns, len(curves))
+    """Force over displacement of some particles, with a strip of residuals next to each."""
+    columns = min(COLUMNS, len(curves))
     rows = -(-len(curves) // columns)
-    scale = 1.0 if columns == style.SETTINGS.columns else 1.5
+    scale = 1.0 if columns == COLUMNS else 1.5
     figure = style.new_figure(max(scale * 3.2 * columns, 6.4), max(scale * 2.05 * rows + 1.0, 3.4))
     grid = figure.subplots(rows, 2 * columns, squeeze=False, width_ratios=[1.9, 1.0] * columns)
     for ax in grid.ravel()[2 * len(curves) :]:
@@ -102,10 +108,10 @@ def _draw_grid(curves: Sequence[FittedCurve], titles: Sequence[str]) -> Figure:
 def _beside(calibration: Posterior | LeastSquares, what: str, line: str, extra: Sequence[Patch] = ()) -> Figure:
     """At most so many particles that took part, spread over the campaign, measured and as the calibration has them."""
     kept = calibration.selection.kept
-    chosen = [kept[row] for row in style.spread_over(len(kept), style.SETTINGS.panels)]
+    chosen = [kept[row] for row in style.spread_over(len(kept), PANELS)]
     labels, eta = style.particle_labels(calibration.campaign.particles), style.shape_factors(calibration)
     curves = [calibration.curves[i] for i in chosen]
-    titles = [f"{labels[i]}\n$\\eta_p$ = {eta[i]:.2f}{_told(c)}" for i, c in zip(chosen, curves, strict=True)]
+    titles = [f"{labels[i]}\n$\\eta_p$ = {eta[i]:.2f}{_quality(c)}" for i, c in zip(chosen, curves, strict=True)]
     figure = _draw_grid(curves, titles)
     handles: list[Line2D | Patch] = [
         Line2D([], [], color=LOADING, label="measured, loading", **_DOT),
@@ -118,7 +124,7 @@ def _beside(calibration: Posterior | LeastSquares, what: str, line: str, extra: 
     return style.finish_joint(figure, calibration, title, handles)
 
 
-def _told(curve: FittedCurve) -> str:
+def _quality(curve: FittedCurve) -> str:
     """How well a curve is met: the share of points in the band, where there is one, or the rms residual."""
     known = curve.used & np.isfinite(curve.low_um)
     if known.any():
@@ -131,8 +137,8 @@ def _told(curve: FittedCurve) -> str:
 def plot_bands(calibration: Posterior) -> Figure:
     """Force [mN] over displacement [um] of at most 12 particles, and what the posterior expects of each.
 
-    The particles are spread evenly over the campaign. Points: measured, light where they are not compared with the law.
-    Line and band: mean and central 95 % of what would be measured at these forces, noise included. The strip beside
+    The particles are spread evenly over the campaign. Points: measured, pale where they are not compared with the law.
+    Line and band: mean and central 95 % of what would be measured at these forces, noise included. The strip next to
     each panel is the residual, measured less mean [um], with the same band: it shows what the panel is too coarse for.
     The title counts the points inside.
     """
@@ -144,7 +150,7 @@ def plot_bands(calibration: Posterior) -> Figure:
 def plot_fits(calibration: LeastSquares) -> Figure:
     """Force [mN] over displacement [um] of at most 12 particles, spread over the campaign, measured and fitted.
 
-    Points: measured, light where they are not compared with the law. Line: the joint fit. The strip beside each panel
+    Points: measured, pale where they are not compared with the law. Line: the joint fit. The strip next to each panel
     is the residual, measured less fitted [um]; the title gives its root mean square.
     """
     return _beside(calibration, "Measured and fitted", "fitted")
@@ -170,14 +176,14 @@ def plot_whitened(calibration: LeastSquares) -> Figure:
     reach = max(4.0, 1.1 * float(np.quantile(np.abs(values), 0.999)))
     figure = style.new_figure(8.6, 4.0)
     panels = figure.subplots(1, 3, sharey=True, width_ratios=[2, 2, 1])
-    few = len(values) <= style.SETTINGS.small_points
+    few = len(values) <= SMALL_POINTS
     dots: style.Look = {"s": 4 if few else 2, "alpha": 0.7 if few else 0.4, "linewidths": 0, "rasterized": True}
     for ax, rows, title in (
         (panels[0], loading & mask, "loading"),
         (panels[1], mask & ~loading, "unloading, reloading"),
     ):
         picked = np.flatnonzero(rows)
-        picked = picked[style.every(len(picked), style.SETTINGS.points)]
+        picked = picked[style.every(len(picked), POINTS)]
         ax.axhspan(-1.96, 1.96, color=style.ORANGE, alpha=0.25, linewidth=0, zorder=0)
         ax.axhline(0.0, color=style.GREY, linewidth=0.8)
         ax.scatter(share.ravel()[picked], residual.ravel()[picked], c=rgba[picked // force.shape[1]], **dots)
@@ -226,17 +232,12 @@ def plot_new_particle(calibration: Posterior, diameters_um: Any = None) -> Figur
     the population together, without read-out noise. Line: their median. Thin lines: single draws, each the curve of
     one possible particle. It is loaded to the campaign's median peak stress.
 
-    Args:
-        calibration: the posterior.
-        diameters_um: its D1, D2, D3 [um]; by default the medians of the paper's Table 1.
-
-    Raises:
-        InputError: for diameters that are not three positive numbers.
+    By default D1, D2, D3 [um] are the medians of the paper's Table 1.
     """
     sizes = np.median(PAPER_DIAMETERS_UM, axis=0) if diameters_um is None else arguments.one_particle(diameters_um)
     up = np.linspace(0.0, _usual_force(calibration, sizes), 101)
     path = np.concatenate([up, up[-2::-1]])
-    curves = predict_new_particle(calibration, sizes.tolist(), path, count=style.SETTINGS.new_draws)
+    curves = predict_new_particle(calibration, sizes.tolist(), path, count=NEW_DRAWS)
     figure = style.new_figure(7.8, 4.1)
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
     branches = (slice(0, len(up)), slice(len(up) - 1, None))
@@ -245,7 +246,7 @@ def plot_new_particle(calibration: Posterior, diameters_um: Any = None) -> Figur
         for share, opacity in ((0.95, 0.2), (0.5, 0.35)):
             low, high = curves.band(share)
             ax.fill_betweenx(force, low[rows], high[rows], color=colour, alpha=opacity, linewidth=0)
-        for draw in curves.displacement_um[: style.SETTINGS.single_draws, rows]:
+        for draw in curves.displacement_um[:SINGLE_DRAWS, rows]:
             ax.plot(draw, force, color=style.GREY, linewidth=0.6)
         ax.plot(np.median(curves.displacement_um, axis=0)[rows], force, color=style.BLACK, linewidth=1.3)
         ax.set_title(title)
@@ -270,13 +271,13 @@ def plot_new_particle(calibration: Posterior, diameters_um: Any = None) -> Figur
 
 def particle_pages(calibration: PaperCalibration) -> int:
     """Number of pages that `plot_particles` needs for all particles."""
-    return -(-len(calibration.campaign) // style.SETTINGS.page)
+    return -(-len(calibration.campaign) // PAGE)
 
 
 def _kept_panel(ax: Axes, curve: Curve, fit: ParticleFit) -> None:
     dots: style.Look = {"markersize": 3, "markeredgewidth": 0, "alpha": 0.8}
     for rows, colour in ((~fit.used, style.SKY), (fit.used, style.BLUE)):
-        shown = np.flatnonzero(rows)[style.every(len(curve), style.SETTINGS.curve_points)]
+        shown = np.flatnonzero(rows)[style.every(len(curve), style.CURVE_POINTS)]
         ax.plot(fit.measured_um[shown], curve.force_mN[shown], "o", color=colour, **dots)
     ax.plot(fit.predicted_um, curve.force_mN, color=style.VERMILION, linewidth=1.3)
     ax.plot(fit.own_um, curve.force_mN, color=style.BLACK, linewidth=0.7)
@@ -293,29 +294,23 @@ def _dropped_panel(ax: Axes, curve: Curve, reason: str) -> None:
 
 
 @style.styled
-def plot_particles(calibration: PaperCalibration, page: int | None = None) -> Figure:
+def plot_particles(calibration: PaperCalibration, page: int = 1) -> Figure:
     """Force [mN] over displacement [um], loading and unloading, one panel per particle, measured and predicted.
 
-    Points: measured, after the offset step (light where they do not enter the rms). Thick line: the mean law scaled
+    Points: measured, after the offset step (pale where they do not enter the rms). Thick line: the mean law scaled
     by the particle's size and shape, under the measured force. Thin line: the same with the particle's own C1, C3,
     C5. The title gives the shape factor and the root mean square deviation from the mean law. Particles that could
     not be used are grey, as recorded, with the reason. If the law misses the data altogether, a line below the title
     says so. Follows the paper's three figures of experimental values and predictions.
 
-    Args:
-        calibration: the calibration.
-        page: from 1, with at most 20 particles each (`particle_pages` gives their number); the first if None.
-
-    Raises:
-        ValueError: if there is no such page.
+    Pages count from 1, with at most 20 particles each (`particle_pages` gives their number).
     """
-    pages, most = particle_pages(calibration), style.SETTINGS.page
-    number = 1 if page is None else page
-    if number not in range(1, pages + 1):
-        raise InputError(f"there is no page {number}; there are {pages}, counted from 1")
+    pages, most = particle_pages(calibration), PAGE
+    if page not in range(1, pages + 1):
+        raise InputError(f"there is no page {page}; there are {pages}, counted from 1")
     campaign = calibration.campaign
-    chosen = range((number - 1) * most, min(number * most, len(campaign)))
-    columns = style.SETTINGS.page_columns if pages > 1 else min(style.SETTINGS.page_columns, len(chosen))
+    chosen = range((page - 1) * most, min(page * most, len(campaign)))
+    columns = PAGE_COLUMNS if pages > 1 else min(PAGE_COLUMNS, len(chosen))
     rows = -(-len(chosen) // columns)
     scale = 1.5 if columns < 3 else 1.0
     figure = style.new_figure(max(scale * 2.35 * columns, 6.4), scale * 2.05 * rows + 0.9)
@@ -344,7 +339,7 @@ def plot_particles(calibration: PaperCalibration, page: int | None = None) -> Fi
     ]
     if any(calibration.particles[i] is None for i in chosen):
         handles.append(Line2D([], [], color=style.PALE, label="not used"))
-    title = "Measured and predicted" + (f", page {number} of {pages}" if pages > 1 else "")
+    title = "Measured and predicted" + (f", page {page} of {pages}" if pages > 1 else "")
     lines = style.wrapped(style.plain(calibration.misfit_note or "", 400), figure)
     return style.finish(figure, campaign.metadata, title=title, lines=lines, handles=handles)
 
@@ -372,11 +367,8 @@ def plot_before_after(found: Discovery) -> Figure:
 
     The six tests that gain most (without a gap: that fit worst). In both cases every particle's own coefficients,
     modulus and zero are fitted, so that what is shown is what they could not take up. The orange band is the standard
-    deviation of what earlier points do not foretell. The numbers are root mean squares of the residuals in units of the
+    deviation of what earlier points do not predict. The numbers are root mean squares of the residuals in units of the
     noise, independent from point to point: 1 is the floor.
-
-    Raises:
-        InputError: if the base law was not fitted well enough.
     """
     left, base = found.residuals, found.base
     if left is None or base is None:
@@ -385,8 +377,8 @@ def plot_before_after(found: Discovery) -> Figure:
     points = np.maximum(left.used.sum(1), 1)
     before, after = (np.sum(white**2, 1) for white in (left.white_before, left.white_after))
     worth = before - after if added else before / points
-    rows = np.sort(np.argsort(-worth, kind="stable")[: style.SETTINGS.gap_panels])
-    columns = min(style.SETTINGS.columns, len(rows))
+    rows = np.sort(np.argsort(-worth, kind="stable")[:GAP_PANELS])
+    columns = min(COLUMNS, len(rows))
     lines = -(-len(rows) // columns)
     figure = style.new_figure(8.6, 1.0 + 2.15 * lines)
     panels = figure.subplots(lines, columns, squeeze=False)

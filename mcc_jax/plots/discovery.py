@@ -19,8 +19,10 @@ from ..discover import Discovery
 from ..discover.locate import Place
 from ..discover.settings import DETECTABLE
 from . import style
-from .curves import plot_before_after
+from .curves import plot_bands, plot_before_after
+from .posterior import plot_prior_posterior
 
+ALIKE = 10  # mechanisms in the table of those that look alike, members of the sets aside
 _FLOOR: style.Look = {"color": style.BLACK, "linestyle": "--", "linewidth": 1.0}
 
 
@@ -29,7 +31,8 @@ def discovery_figures(found: Discovery) -> dict[str, Figure]:
 
     Returns:
         `discovery_where`, `discovery_before_after`, `discovery_ranking`, `discovery_gap`, `discovery_similarity`,
-        `discovery_shifts`; none if the base law could not be fitted; no gap and no shifts if nothing was added.
+        `discovery_shifts`; none if the base law could not be fitted; no gap and no shifts if nothing was added. Of the
+        posterior of the law with what was added, if there is one: `discovery_bands`, `discovery_prior_posterior`.
     """
     if found.residuals is None:
         return {}
@@ -43,6 +46,9 @@ def discovery_figures(found: Discovery) -> dict[str, Figure]:
         figures["discovery_gap"] = plot_gap(found)
     if found.effects or found.closure is not None:
         figures["discovery_shifts"] = plot_shifts(found)
+    if found.posterior is not None:
+        figures["discovery_bands"] = plot_bands(found.posterior)
+        figures["discovery_prior_posterior"] = plot_prior_posterior(found.posterior)
     return figures
 
 
@@ -105,9 +111,9 @@ def plot_ranking(found: Discovery) -> Figure:
     """Every mechanism's statistic [-]: the estimate of its best formula alone over its standard error.
 
     The dashed line is the detection limit: a mechanism whose true strength reaches it is found with 95 % probability.
-    Beside each bar stand its probability among all, the estimate, and the limit in the mechanism's own unit. Bars of
+    Next to each bar are its probability among all, the estimate, and the limit in the mechanism's own unit. Bars of
     the set (what explains the gap as well as the best) are blue. An empty bar is an estimate of the physically
-    impossible sign, which explains nothing. Mechanisms that these data cannot show stand below, grey, with what they
+    impossible sign, which explains nothing. Mechanisms that these data cannot show are below, grey, with what they
     need.
     """
     entries = found.to_json()["ranking"]
@@ -116,7 +122,7 @@ def plot_ranking(found: Discovery) -> Figure:
     count = len(entries) + len(found.untestable)
     figure = style.new_figure(9.4, 1.3 + 0.235 * count)
     ax = figure.subplots()
-    beside: style.Look = {"transform": ax.get_yaxis_transform(), "va": "center", "fontsize": style.SMALL}
+    column: style.Look = {"transform": ax.get_yaxis_transform(), "va": "center", "fontsize": style.SMALL}
     scale = max([1.6 * DETECTABLE, *(abs(e["statistic"]) for e in entries)])
     any_impossible = False
     for row, entry in enumerate(entries):
@@ -129,9 +135,9 @@ def plot_ranking(found: Discovery) -> Figure:
         look: style.Look = {"color": "white" if impossible else colour, "edgecolor": colour, "linewidth": 0.9}
         ax.barh(row, abs(entry["statistic"]), height=0.66, **look)
         chance = f"{entry['probability']:.2f}" if entry["probability"] >= 0.005 else "< 0.01"
-        ax.text(1.1, row, chance, ha="right", **beside)
+        ax.text(1.1, row, chance, ha="right", **column)
         limit = _with_unit(entry["detection_limit"], unit)
-        ax.text(1.13, row, f"{_with_unit(entry['estimate'], unit)}  (limit {limit})", **beside)
+        ax.text(1.13, row, f"{_with_unit(entry['estimate'], unit)}  (limit {limit})", **column)
     patch: style.Look = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
     for row, missing in enumerate(found.untestable, start=len(entries)):
         needs = f"needs {missing['needs']}"
@@ -164,12 +170,12 @@ def plot_ranking(found: Discovery) -> Figure:
 def plot_similarity(found: Discovery) -> Figure:
     """Correlation [-] of what mechanisms would leave in the tests once the law has taken up what it can.
 
-    Members of the set first (bold). Above 0.9 no analysis of these data tells two mechanisms apart; other data may.
+    Members of the set first (bold). Above 0.9 no analysis of these data distinguishes two mechanisms; other data may.
     """
     if found.likeness is None:
         raise InputError("the base law was not fitted well enough; there is nothing to compare")
     members = {name for group in found.candidate_set for name in group}
-    count = min(max(style.SETTINGS.alike, len(members)), len(found.likeness.names))
+    count = min(max(ALIKE, len(members)), len(found.likeness.names))
     names, both = found.likeness.names[:count], found.likeness.correlation[:count, :count]
     figure = style.new_figure(3.6 + 0.42 * count, 2.6 + 0.36 * count)
     ax = figure.subplots()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,9 @@ from ..campaign import Campaign, stress_and_strain
 from ..law import stress_ratio
 from . import style
 from .curves import particle_pages, plot_particles
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _CYCLE = (style.BLUE, style.VERMILION, style.GREEN, style.PURPLE, style.ORANGE, style.SKY, style.BLACK)
 _DOTTED: style.Look = {"color": style.GREY, "linewidth": 0.8, "dashes": (1, 1.5)}
@@ -60,7 +63,7 @@ def paper_figures(calibration: PaperCalibration) -> dict[str, Figure]:
 def adjusted_curve(calibration: PaperCalibration, index: int) -> tuple[np.ndarray, np.ndarray]:
     """Strain [-] and stress [MPa] of a whole kept test after the offset step, unloading included.
 
-    The straight line of the offset step stands for everything before the threshold is first passed.
+    The straight line of the offset step replaces everything before the threshold is first passed.
     """
     campaign, adjustment = calibration.campaign, calibration.adjustment
     segments = adjustment.segments[index]
@@ -96,13 +99,8 @@ def plot_curves(calibration: PaperCalibration, particles: Sequence[str] | None =
     panel enlarges the threshold; without an offset step there are no dashed lines. Follows the paper's figure of raw
     and adjusted curves of particles 1 to 3.
 
-    Args:
-        calibration: the calibration.
-        particles: names; by default up to three kept particles over the range of shape factors. Particles that were not
-            kept have no dashed line. More than seven are coloured by shape factor in place of a legend.
-
-    Raises:
-        InputError: for a name that is not in the campaign.
+    By default up to three kept particles over the range of shape factors are shown. Particles that were not kept have
+    no dashed line. More than seven are coloured by shape factor in place of a legend.
     """
     campaign, adjustment, eta = calibration.campaign, calibration.adjustment, style.shape_factors(calibration)
     threshold = adjustment.threshold_MPa
@@ -154,41 +152,15 @@ def plot_curves(calibration: PaperCalibration, particles: Sequence[str] | None =
 # ---- dimensions ------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class DimensionStatistics:
-    """How average and effective diameter of a campaign's particles relate.
+def dimensions(campaign: Campaign) -> pd.DataFrame:
+    """Average diameter (D1 + D2 + D3)/3 and effective diameter D1 D2 / D3 [um] of every particle, and their ratios."""
+    import pandas as pd
 
-    Attributes:
-        average_um: (D1 + D2 + D3)/3 [um], shape (N,).
-        effective_um: D1 D2 / D3 [um], shape (N,).
-        slope: effective over average diameter, by least squares through the origin [-].
-        effective_over_average: mean and sample standard deviation of the ratio [-].
-        average_over_effective: the same of its inverse.
-        correlation: Pearson's; NaN for fewer than three particles or equal sizes.
-    """
-
-    average_um: np.ndarray
-    effective_um: np.ndarray
-    slope: float
-    effective_over_average: tuple[float, float]
-    average_over_effective: tuple[float, float]
-    correlation: float
-
-
-def dimension_statistics(campaign: Campaign) -> DimensionStatistics:
-    """The numbers of `plot_dimensions`."""
-    average = campaign.diameters_um.mean(axis=1)
-    D1, D2, D3 = campaign.diameters_um.T
-    effective = D1 * D2 / D3
-    varied = len(average) > 2 and np.ptp(average) > 0 and np.ptp(effective) > 0
-
-    def moments(ratio: np.ndarray) -> tuple[float, float]:
-        return float(ratio.mean()), float(ratio.std(ddof=1)) if len(ratio) > 1 else float("nan")
-
-    slope = float(average @ effective / (average @ average))
-    correlation = float(np.corrcoef(average, effective)[0, 1]) if varied else float("nan")
-    ratios = moments(effective / average), moments(average / effective)
-    return DimensionStatistics(average, effective, slope, *ratios, correlation)
+    average, (D1, D2, D3) = campaign.diameters_um.mean(axis=1), campaign.diameters_um.T
+    sizes = pd.DataFrame({"average_um": average, "effective_um": D1 * D2 / D3})
+    sizes["effective_over_average"] = sizeeffective / average
+    sizes["average_over_effective"] = average / sizeeffective
+    return sizes
 
 
 @style.styled
@@ -199,32 +171,35 @@ def plot_dimensions(campaign: Campaign) -> Figure:
     deviation. Colour is D3 over the geometric mean of D1 and D2: flat particles lie high. Follows the paper's figure
     of dimensions, but says what the data give; for the paper's own table the ratios are 1.31 and 0.78, not 1.5.
     """
-    s = dimension_statistics(campaign)
+    sizes = dimensions(campaign)
+    average, effective = sizeaverage.to_numpy(), sizeeffective.to_numpy()
+    slope = float(average @ effective / (average @ average))
     flat = campaign.diameters_um[:, 2] / np.sqrt(campaign.diameters_um[:, 0] * campaign.diameters_um[:, 1])
     colours = style.sequential(flat)
     figure = style.new_figure(5.2, 4.4)
     ax = figure.subplots()
-    right = 1.08 * float(s.average_um.max())
+    right = 1.08 * float(average.max())
     ends = np.array([0.0, right])
     ax.plot(ends, ends, color=style.GREY, linewidth=1.0, dashes=(4, 2), label="1:1")
-    ax.plot(
-        ends, s.slope * ends, color=style.VERMILION, label=f"fit through the origin, $D_e$ = {s.slope:.3f} × average"
-    )
+    ax.plot(ends, slope * ends, color=style.VERMILION, label=f"fit through the origin, $D_e$ = {slope:.3f} × average")
     ax.scatter(
-        s.average_um, s.effective_um, c=colours.to_rgba(flat), s=28, edgecolors=style.BLACK,
+        average, effective, c=colours.to_rgba(flat), s=28, edgecolors=style.BLACK,
         linewidths=0.5, alpha=0.9, zorder=3, label=f"particles ({len(campaign)})",
     )  # fmt: skip
     figure.colorbar(colours, ax=ax, label="$D_3/\\sqrt{D_1 D_2}$ [-]")
     ax.set_xlim(0, right)
-    ax.set_ylim(0, max(1.08 * float(s.effective_um.max()), right, s.slope * right))
+    ax.set_ylim(0, max(1.08 * float(effective.max()), right, slope * right))
     ax.set_xlabel("average diameter $(D_1 + D_2 + D_3)/3$ [µm]")
     ax.set_ylabel("effective diameter $D_e = D_1 D_2/D_3$ [µm]")
     ax.legend(loc="upper left")
     lines = []
-    for name, (mean, sd) in (("$D_e$/average", s.effective_over_average), ("average/$D_e$", s.average_over_effective)):
-        lines.append(f"mean of {name}: {mean:.2f}" + (f" ± {sd:.2f}" if np.isfinite(sd) else ""))
-    if np.isfinite(s.correlation):
-        lines.append(f"correlation: {s.correlation:.2f}")
+    for name, ratio in (
+        ("$D_e$/average", sizes.effective_over_average),
+        ("average/$D_e$", sizes.average_over_effective),
+    ):
+        lines.append(f"mean of {name}: {ratio.mean():.2f}" + (f" ± {ratio.std():.2f}" if len(ratio) > 1 else ""))
+    if len(sizes) > 2 and sizes.average_um.nunique() > 1 and sizes.effective_um.nunique() > 1:
+        lines.append(f"correlation: {sizes.average_um.corr(sizes.effective_um):.2f}")
     style.note(ax, "\n".join(lines), place="lower right")
     return style.finish(figure, campaign.metadata)
 
@@ -289,7 +264,7 @@ def plot_master(calibration: PaperCalibration) -> Figure:
     known = np.isfinite(master.sd)
     low, high = ((master.mean + sign * master.sd)[known] for sign in (-1, 1))
     upper.fill_between(master.stress_MPa[known], low, high, label="mean ± 1 sd", **_BAND)
-    step = style.every(len(master.mean), style.SETTINGS.mean_markers).step
+    step = style.every(len(master.mean), style.MEAN_MARKERS).step
     upper.plot(master.stress_MPa, master.mean, markevery=step, label="mean", **_MEAN)
     upper.set_ylabel(style.SCALED_STRAIN)
     upper.set_ylim(bottom=0)
@@ -318,8 +293,7 @@ def law_strain(calibration: PaperCalibration) -> np.ndarray:
 def stretches_outside(calibration: PaperCalibration) -> list[tuple[int, int]]:
     """Where the mean law is more than one sample standard deviation of strain off, above the threshold.
 
-    Returns:
-        First and last position on the master curve of every stretch of at least three points; fewer say nothing.
+    First and last position on the master curve of every stretch of at least three points; fewer say nothing.
     """
     master = calibration.master
     with np.errstate(invalid="ignore"):
@@ -358,7 +332,7 @@ def plot_law(calibration: PaperCalibration) -> Figure:
     known = np.isfinite(master.sd)
     low, high = ((master.mean + sign * master.sd)[known] for sign in (-1, 1))
     ax.fill_betweenx(master.stress_MPa[known], low, high, label="sample mean ± 1 sd of strain", **_BAND)
-    step = style.every(len(master.mean), style.SETTINGS.mean_markers).step
+    step = style.every(len(master.mean), style.MEAN_MARKERS).step
     ax.plot(master.mean, master.stress_MPa, markevery=step, label="sample mean", **_MEAN)
     ax.plot(x, mean, color=style.VERMILION, linewidth=1.6, label="mean law")
     ax.plot(x, mean + sd, color=style.VERMILION, linewidth=1.0, dashes=(4, 2), label="± 1 sd of stress")
@@ -405,7 +379,7 @@ def plot_elastic(calibration: PaperCalibration) -> Figure:
     eta = every_eta[[b.particle for b in fit.branches]]
     colours = style.sequential(eta)
     rgba = colours.to_rgba(eta)
-    few = len(fit.branches) <= style.SETTINGS.thin_curves
+    few = len(fit.branches) <= style.THIN_CURVES
     dots: style.Look = {"markersize": 3 if few else 1.8, "alpha": 0.7 if few else 0.35, "markeredgewidth": 0}
     branches = collapsed_branches(fit, every_eta, law.unloading, law.strain_scaling)
     for (recovered, ratio), colour in zip(branches, rgba, strict=True):
@@ -415,8 +389,8 @@ def plot_elastic(calibration: PaperCalibration) -> Figure:
         s, np.asarray(jax.jit(stress_ratio)(jnp.asarray(s))), color=style.BLACK, linewidth=1.0, label="law, $f(s)$"
     )
     left.axhline(UNLOADED_FROM, **_DOTTED)
-    told: style.Look = {"transform": left.get_yaxis_transform(), "va": "bottom", "fontsize": 7, "color": style.GREY}
-    left.text(0.02, UNLOADED_FROM, "each branch has a zero of its own;\nnot used below", **told)
+    words: style.Look = {"transform": left.get_yaxis_transform(), "va": "bottom", "fontsize": 7, "color": style.GREY}
+    left.text(0.02, UNLOADED_FROM, "each branch has a zero of its own;\nnot used below", **words)
     left.set_xlabel("recovered strain over recoverable strain $s$ [-]")
     left.set_ylabel("stress over peak stress $\\sigma/\\sigma_P$ [-]")
     left.set_ylim(0, 1.05)

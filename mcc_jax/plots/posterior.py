@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from arviz_stats.base import array_stats
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -19,6 +20,12 @@ from ..calibrate.population import COEFFICIENTS
 from . import style
 from .curves import plot_bands, plot_fits, plot_new_particle, plot_whitened
 
+LABELLED = 40  # so many particles have a labelled row each; of more an ordered sample is shown without labels
+ROWS = 200  # size of that sample
+MANY_ARROWS = 100  # of more particles, arrows and dots are small and faint
+DOTS = 800  # draws in a cloud of dots
+PRIOR_DRAWS = 2000
+NEAR_DRAWS = 100  # from so many draws near a posterior on, the prior's density there is made from these alone
 _SYMBOLS = ("$C_1$", "$C_3$", "$C_5$")
 _PAPER: style.Look = {"color": style.VERMILION, "dashes": (3, 1.5)}
 
@@ -29,22 +36,20 @@ class Parameter:
 
     Attributes:
         label: symbol and unit.
-        meaning: in words, told once for those that are alike.
+        meaning: in words, given once for those that are alike.
         scale: what its numbers are multiplied with.
         positive: it may pile up at 0.
-        log: it is positive and skewed.
     """
 
     label: str
     meaning: str = ""
     scale: float = 1.0
     positive: bool = False
-    log: bool = False
 
 
 PARAMETERS = {
     "a": Parameter("$a$ [-]", "$a$: shape parameter"),
-    "effective_modulus_MPa": Parameter("$\\bar{E}$ [GPa]", "$\\bar{E}$: effective modulus", scale=1e-3, log=True),
+    "effective_modulus_MPa": Parameter("$\\bar{E}$ [GPa]", "$\\bar{E}$: effective modulus", scale=1e-3),
     "mu_C1": Parameter("$\\mu_1$ [-]", "$\\mu_j$: mean of log $C_j$"),
     "tau_C1": Parameter("$\\tau_1$ [-]", "$\\tau_j$: its standard deviation over the particles", positive=True),
     "mu_C3": Parameter("$\\mu_3$ [-]"),
@@ -53,7 +58,7 @@ PARAMETERS = {
     "tau_C5": Parameter("$\\tau_5$ [-]", positive=True),
     "modulus_scatter": Parameter("$s_E$ [-]", "$s_E$: standard deviation of log modulus", positive=True),
     "shape_scatter": Parameter("$s_a$ [-]", "$s_a$: standard deviation of $a$", positive=True),
-    "noise_factor": Parameter("noise factor [-]", log=True),
+    "noise_factor": Parameter("noise factor [-]"),
 }
 """In the order in which they are drawn."""
 
@@ -86,38 +91,10 @@ def _scaled(named: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {name: named[name] * p.scale for name, p in PARAMETERS.items() if name in named}
 
 
-def density(draws: np.ndarray, x: np.ndarray, *, positive: bool = False, log: bool = False) -> np.ndarray:
-    """Kernel density of draws at x, over its largest value there.
-
-    Args:
-        draws: any shape.
-        x: where, in order.
-        positive: draws cannot be negative and may pile up at 0, where the kernel is reflected.
-        log: draws are positive and skewed: the kernel is even in the logarithm.
-    """
-    from scipy.stats import gaussian_kde
-
-    row = _row(draws)
-    kernel = gaussian_kde(np.log(row) if log else row)
-    if log:
-        at = np.maximum(x, 1e-300)
-        values = np.where(x > 0, kernel(np.log(at)) / at, 0.0)
-    else:
-        values = np.where(x >= 0, kernel(x) + kernel(-x), 0.0) if positive else kernel(x)
-    return values / max(float(values.max()), 1e-300)
-
-
-def _row(draws: np.ndarray) -> np.ndarray:
-    """Draws of all chains in one row, thinned."""
-    row = np.asarray(draws, float).ravel()
-    return row[style.every(len(row), style.SETTINGS.density_draws)]
-
-
-def _span(values: np.ndarray, parameter: Parameter, points: int = 200) -> np.ndarray:
-    """Where the density of draws is drawn."""
-    low, high = np.quantile(values, [0.001, 0.999])
-    margin = 0.15 * (high - low)
-    return np.linspace(0.0 if parameter.positive else low - margin, high + margin, points)
+def density(draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where the kernel density of draws is drawn, and its values over the largest; ends of the range do not blur it."""
+    x, y, _ = array_stats.kde(np.ravel(draws))
+    return x, y / y.max()
 
 
 def _area(ax: Axes, x: np.ndarray, y: np.ndarray, fill: str, edge: str) -> None:
@@ -125,7 +102,7 @@ def _area(ax: Axes, x: np.ndarray, y: np.ndarray, fill: str, edge: str) -> None:
     ax.plot(x, y, color=edge, linewidth=1.0)
 
 
-def _told(draws: np.ndarray) -> str:
+def _mean_and_sd(draws: np.ndarray) -> str:
     """Mean and standard deviation of draws."""
     return with_sd({"value": float(draws.mean()), "sd": float(draws.std())})
 
@@ -144,7 +121,7 @@ def plot_pairs(calibration: Posterior) -> Figure:
     size = len(names)
     figure = style.new_figure(1.05 * size + 1.0, 1.0 * size + 1.0)
     grid = figure.subplots(size, size, squeeze=False, sharex="col")
-    shown = style.every(draws["a"].size, style.SETTINGS.dots)
+    shown = style.every(draws["a"].size, DOTS)
     dots: style.Look = {"color": style.BLUE, "markersize": 2.5, "markeredgewidth": 0, "alpha": 0.45}
     for i, name in enumerate(names):
         values, parameter = draws[name].ravel(), PARAMETERS[name]
@@ -153,12 +130,11 @@ def plot_pairs(calibration: Posterior) -> Figure:
                 ax.set_axis_off()
                 continue
             if j == i:
-                x = _span(values, parameter)
-                _area(ax, x, density(values, x, positive=parameter.positive, log=parameter.log), style.SKY, style.BLUE)
+                _area(ax, *density(values), style.SKY, style.BLUE)
                 ax.set_ylim(0, 1.08)
                 ax.set_yticks([])
                 ax.spines["left"].set_visible(False)
-                ax.set_title(_told(values), fontsize=7, loc="center")
+                ax.set_title(_mean_and_sd(values), fontsize=7, loc="center")
             else:
                 ax.plot(draws[names[j]].ravel()[shown], values[shown], ".", **dots)
                 ax.yaxis.set_major_locator(MaxNLocator(3))
@@ -179,7 +155,7 @@ def plot_pairs(calibration: Posterior) -> Figure:
 
 def prior_of(calibration: Posterior) -> dict[str, np.ndarray]:
     """Draws of the population's prior, by the names and in the units of the figures."""
-    found = prior_draws(calibration, style.SETTINGS.density_draws, 0)
+    found = prior_draws(calibration, PRIOR_DRAWS, 0)
     for vector in ("mu", "tau"):
         found |= {f"{vector}_{name}": found[vector][..., j] for j, name in enumerate(COEFFICIENTS)}
     return _scaled(found)
@@ -216,47 +192,39 @@ def plot_prior_posterior(calibration: Posterior) -> Figure:
 def _prior_posterior(
     whole: Axes, near: Axes, prior: np.ndarray, posterior: np.ndarray, paper: float | None, parameter: Parameter
 ) -> None:
-    close, far = _span(posterior, parameter), _span(_row(prior), parameter)
-    ends = [far[0], far[-1], close[0], close[-1], *([] if paper is None else [paper])]
-    # The posterior's own points as well: on the prior's range it may be narrower than one step.
-    far = np.unique(np.concatenate([np.linspace(min(ends), max(ends), 300), close]))
-    reach = close[-1] - close[0]
-    inside = paper is not None and close[0] - reach <= paper <= close[-1] + reach
-    if inside and not close[0] <= paper <= close[-1]:
-        close = np.linspace(min(close[0], paper - 0.1 * reach), max(close[-1], paper + 0.1 * reach), 300)
-    options: style.Look = {"positive": parameter.positive, "log": parameter.log}
-    everywhere = density(prior, far, **options)
-    enlarged = enlarged_prior(prior, far, everywhere, close, parameter)
-    for ax, x, before in ((whole, far, everywhere), (near, close, enlarged)):
-        _area(ax, x, before, style.PALE, style.GREY)
-        _area(ax, x, density(posterior, x, **options), style.SKY, style.BLUE)
-        margin = 0.02 * (x[-1] - x[0])
-        ax.set_xlim(x[0] - margin, x[-1] + margin)
+    close = density(posterior)
+    low, high = close[0][[0, -1]]
+    enlarged = enlarged_prior(prior, high, parameter)
+    reach = high - low
+    inside = paper is not None and low - reach <= paper <= high + reach
+    if inside:
+        low, high = min(low, paper - 0.1 * reach), max(high, paper + 0.1 * reach)
+    # Beyond these ends a few draws of a prior with long tails would squeeze all others.
+    ends = [*np.quantile(prior, [0.001, 0.999]), low, high, *([] if paper is None else [paper])]
+    for ax, before, x in ((whole, density(prior), (min(ends), max(ends))), (near, enlarged, (low, high))):
+        _area(ax, *before, style.PALE, style.GREY)
+        _area(ax, *close, style.SKY, style.BLUE)
+        margin = 0.02 * (x[1] - x[0])
+        ax.set_xlim(x[0] - margin, x[1] + margin)
         ax.set_ylim(0, 1.1)
         ax.set_yticks([0, 1])
         ax.xaxis.set_major_locator(MaxNLocator(3))
         ax.set_xlabel(parameter.label)
-        if paper is not None and x[0] <= paper <= x[-1]:
+        if paper is not None and x[0] <= paper <= x[1]:
             ax.axvline(paper, linewidth=1.3, **_PAPER)
     near.set_yticks([])
-    near.set_title(_told(posterior), fontsize=8, color=style.BLACK)
+    near.set_title(_mean_and_sd(posterior), fontsize=8, color=style.BLACK)
     if paper is not None and not inside:
-        style.note(near, f"paper {paper:.4g}", place="upper left" if paper < close[0] else "upper right")
+        style.note(near, f"paper {paper:.4g}", place="upper left" if paper < low else "upper right")
 
 
-def enlarged_prior(
-    prior: np.ndarray, far: np.ndarray, everywhere: np.ndarray, close: np.ndarray, parameter: Parameter
-) -> np.ndarray:
-    """The prior's density where the posterior is.
+def enlarged_prior(prior: np.ndarray, end: float, parameter: Parameter) -> tuple[np.ndarray, np.ndarray]:
+    """The prior's density up to where the posterior ends.
 
-    That of a spread may pile up at 0 far within one kernel of all draws: then from those near by alone, over the
-    largest value there.
+    That of a spread may pile up at 0 far within one kernel of all draws: then from those near by alone.
     """
-    row = _row(prior)
-    beside = row[row <= 2 * close[-1]]
-    if parameter.positive and len(beside) >= style.SETTINGS.near_draws:
-        return density(beside, close, positive=True)
-    return np.interp(close, far, everywhere)
+    near = prior[prior <= 2 * end]
+    return density(near if parameter.positive and len(near) >= NEAR_DRAWS else prior)
 
 
 # ---- the particles ---------------------------------------------------------------------------------------------------
@@ -324,13 +292,13 @@ def _rows(ax: Axes, table: CoefficientTable, j: int, chosen: np.ndarray, y: np.n
 def draw_forest(table: CoefficientTable, labels: Sequence[str]) -> tuple[Figure, list[Line2D | Patch]]:
     """Three panels of intervals, and the handles of their legend."""
     count = len(labels)
-    labelled = count <= style.SETTINGS.labelled
+    labelled = count <= LABELLED
     figure = style.new_figure(8.2, max(2.4, 0.19 * count + 1.3) if labelled else 6.0)
     panels = figure.subplots(1, 3, sharey=True)
     for j, ax in enumerate(panels):
         chosen, y = np.arange(count), np.arange(float(count))
         if not labelled:
-            chosen = np.argsort(table.centre[:, j], kind="stable")[style.spread_over(count, style.SETTINGS.rows)]
+            chosen = np.argsort(table.centre[:, j], kind="stable")[style.spread_over(count, ROWS)]
             y = np.linspace(0, 1, len(chosen))
         _rows(ax, table, j, chosen, y, labelled=labelled)
     if labelled:
@@ -355,8 +323,8 @@ def _forest(calibration: Posterior | LeastSquares, table: CoefficientTable) -> F
     labels = [names[i] for i in calibration.selection.kept]
     figure, handles = draw_forest(table, labels)
     title, count = "Coefficients of the particles", len(labels)
-    if count > style.SETTINGS.labelled:
-        shown = f"{style.SETTINGS.rows} of {count}" if count > style.SETTINGS.rows else f"{count}"
+    if count > LABELLED:
+        shown = f"{ROWS} of {count}" if count > ROWS else f"{count}"
         title += f", {shown} particles, each panel in its own order"
     return style.finish_joint(figure, calibration, title, handles)
 
@@ -376,7 +344,7 @@ def plot_forest(calibration: Posterior) -> Figure:
 def plot_estimates(calibration: LeastSquares) -> Figure:
     """C1, C3, C5 [-] of every particle by joint least squares, with 95 % error bars.
 
-    Line and band are the population's median and the interval of 95 % of its particles. Particles stand as in
+    Line and band are the population's median and the interval of 95 % of its particles. Particles are ordered as in
     `plot_forest`. Without error bars where the data leave the coefficients open.
     """
     return _forest(calibration, least_squares_table(calibration))
@@ -402,7 +370,7 @@ def plot_shrinkage(calibration: Posterior) -> Figure:
     alone, together = shrinkage(calibration)
     mu = np.asarray(calibration.population.mu).reshape(-1, 3).mean(axis=0)
     tau = np.asarray(calibration.population.tau).reshape(-1, 3).mean(axis=0)
-    many, move = len(alone) > style.SETTINGS.many_arrows, together - alone
+    many, move = len(alone) > MANY_ARROWS, together - alone
     ring: style.Look = {"color": style.SKY, "markerfacecolor": "white", "marker": "o", "linestyle": ""}
     dot: style.Look = {"color": style.BLUE, "marker": "o", "linestyle": ""}
     cross: style.Look = {"color": style.VERMILION, "marker": "+", "linestyle": ""}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,56 +25,14 @@ with extra("plots"):  # every other file of the package imports this one or `cur
     from matplotlib.font_manager import findfont, get_font
 
 
-@dataclass(frozen=True)
-class Settings:
-    """How much a figure draws.
-
-    Attributes:
-        panels, columns: most particles in a grid of curves, and how many stand in a row.
-        page, page_columns: the same on a page of all particles.
-        gap_panels: most tests whose residuals are shown over time.
-        curve_points: about so many points of a curve are drawn, so that dots stay apart.
-        mean_markers: about so many symbols on a mean curve.
-        thin_curves: of more curves in one panel, lines are thin and faint.
-        points: no more residuals than these are drawn; a histogram beside counts them all.
-        small_points: of more points in a panel, dots are small and faint.
-        labelled: so many particles have a labelled row each; of more an ordered sample is shown without labels.
-        rows: size of that sample.
-        many_arrows: of more particles, arrows and dots are small and faint.
-        dots: draws in a cloud of dots.
-        density_draws: no more draws go into one density.
-        near_draws: from so many draws near a posterior on, the prior's density there is made from these alone.
-        new_draws, single_draws: curves of a new particle in its band, and of these drawn as lines.
-        alike: mechanisms in the table of those that look alike, members of the sets aside.
-    """
-
-    panels: int = 12
-    columns: int = 3
-    page: int = 20
-    page_columns: int = 4
-    gap_panels: int = 6
-    curve_points: int = 100
-    mean_markers: int = 32
-    thin_curves: int = 30
-    points: int = 20_000
-    small_points: int = 8000
-    labelled: int = 40
-    rows: int = 200
-    many_arrows: int = 100
-    dots: int = 800
-    density_draws: int = 2000
-    near_draws: int = 100
-    new_draws: int = 1000
-    single_draws: int = 6
-    alike: int = 10
-
-
-SETTINGS = Settings()
+CURVE_POINTS = 100  # about so many points of a curve are drawn, so that dots do not overlap
+MEAN_MARKERS = 32  # about so many symbols on a mean curve
+THIN_CURVES = 30  # of more curves in one panel, lines are thin and faint
 
 BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILION, PURPLE = (
     "#000000", "#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7",
 )  # fmt: skip
-"""Okabe and Ito's palette, told apart by colour-blind readers."""
+"""Okabe and Ito's palette, distinguishable by colour-blind readers."""
 GREY, PALE = "#767676", "#B8B8B8"
 
 STRAIN = "strain $\\varepsilon$ [-]"
@@ -124,13 +81,7 @@ styled = rc_context(RC)
 def save_figures(figures: Mapping[str, Figure], directory: str | Path, *, dpi: int = 150) -> list[Path]:
     """Write figures as `<stem>.png` into a directory that exists.
 
-    Args:
-        figures: figures by stem, as `paper_figures` gives them.
-        directory: where to; files of these names are overwritten.
-        dpi: resolution [dots per inch].
-
-    Returns:
-        The files, in the order of the figures.
+    Files of these names are overwritten; they are returned in the order of the figures. `dpi`: dots per inch.
     """
     folder = arguments.file_path(directory, "directory")
     dpi = arguments.whole(dpi, "dpi", least=1)
@@ -147,7 +98,7 @@ def save_figures(figures: Mapping[str, Figure], directory: str | Path, *, dpi: i
 
 
 def plain(text: str, longest: int = 24) -> str:
-    """Any text as one short line that matplotlib draws as it stands.
+    """Any text as one short line that matplotlib draws literally.
 
     White space and characters that do not print become single blanks, characters that the font lacks the replacement
     character, a long text loses its middle, and `$` is escaped, which would begin mathematics.
@@ -208,7 +159,7 @@ _NOTE_IN, _LEGEND_IN, _TITLE_IN, _LINE_IN = 0.2, 0.3, 0.3, 0.19
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """An empty figure of that size, apart from pyplot."""
+    """An empty figure of that size, not known to pyplot."""
     return Figure(figsize=(width_in, height_in), layout="constrained")
 
 
@@ -220,15 +171,7 @@ def finish(
     lines: Sequence[str] = (),
     handles: Sequence[Artist] = (),
 ) -> Figure:
-    """Add title, lines below it, a legend for the whole figure and, for simulated data, a note; the panels make room.
-
-    Args:
-        figure: the figure, with its panels.
-        metadata: the campaign's.
-        title: one line at the top left.
-        lines: warnings below the title.
-        handles: artists with labels, for a legend below the panels.
-    """
+    """Add a title, lines of warnings below it, a legend below the panels and, for simulated data, a note."""
     width, height = figure.get_size_inches()
     below = above = 0.0
     if is_simulated(metadata):
@@ -299,7 +242,7 @@ def sequential(values: np.ndarray) -> ScalarMappable:
 
 def faintness(count: int) -> dict[str, float]:
     """Line width and opacity for so many curves in one panel."""
-    few = count <= SETTINGS.thin_curves
+    few = count <= THIN_CURVES
     return {"linewidth": 1.1, "alpha": 0.9} if few else {"linewidth": 0.7, "alpha": 0.55}
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from importlib.resources import files
 from typing import Any
 
@@ -22,7 +22,7 @@ LOOKS = {
     "unload": ("triangle", VERMILION, "unloading"),
     "reload": ("square", GREEN, "reloading"),
 }
-"""Marker, colour (Okabe and Ito) and word of every kind of segment: never told apart by colour alone."""
+"""Marker, colour (Okabe and Ito) and word of every kind of segment: never distinguished by colour alone."""
 
 COLUMNS = ("displacement", "force", "residual", "marker", "colour", "alpha", "particle", "segment", "time", "compared")
 
@@ -31,27 +31,12 @@ LOADED_FROM = re.compile(r"https://(?:cdn\.jsdelivr\.net|maps\.googleapis\.com)/
 """What Bokeh's script would load from elsewhere: MathJax, icons and maps, none of which the page uses."""
 
 
-@dataclass(frozen=True)
-class PageOptions:
-    """How much of the curves stands in the page.
-
-    Attributes:
-        points: about so many in all, shared among the particles: 40,000 make a page of 3 MB that still scrolls.
-        fewest: of one particle, at least; of more particles than that allows, those that the law misses by most.
-    """
-
-    points: int = 40_000
-    fewest: int = 40
+POINTS = 40_000  # about so many in all, shared among the particles: they make a page of 3 MB that still scrolls
+FEWEST = 40  # of one particle, at least; of more particles than that allows, those that the law misses by most
 
 
-def compare(results: Results, options: PageOptions | None = None) -> list[FittedCurve]:
-    """Every particle, or those that the law misses by most if there are too many; empty without tests.
-
-    Args:
-        results: of one campaign.
-        options: how much stands in the page.
-    """
-    options = options or PageOptions()
+def compare(results: Results) -> list[FittedCurve]:
+    """Every particle, or those that the law misses by most if there are too many; empty without tests."""
     if results.saved is not None:
         curves: Sequence[FittedCurve] = results.saved.curves
     else:
@@ -59,8 +44,8 @@ def compare(results: Results, options: PageOptions | None = None) -> list[Fitted
     if not curves:
         return []
     rms = np.array([one.rms_um or 0.0 for one in curves])
-    chosen = np.sort(np.argsort(-rms, kind="stable")[: options.points // options.fewest])
-    most = max(options.points // len(chosen), options.fewest)
+    chosen = np.sort(np.argsort(-rms, kind="stable")[: POINTS // FEWEST])
+    most = max(POINTS // len(chosen), FEWEST)
     return [_thinned(curves[i], most) for i in chosen]
 
 
@@ -77,7 +62,7 @@ def _thinned(one: FittedCurve, most: int) -> FittedCurve:
 
 
 def chart_scripts() -> str:
-    """Bokeh's own script, to stand in the page; the addresses that it might load more from are taken out."""
+    """Bokeh's own script, as part of the page; the addresses that it might load more from are taken out."""
     script = files("bokeh").joinpath("server", "static", "js", "bokeh.min.js").read_text(encoding="utf-8")
     return LOADED_FROM.sub("about:blank", script)
 
@@ -179,14 +164,14 @@ def chart_data(shown: list[FittedCurve], labels: list[str], facts: list[str]) ->
     }
 
 
-def _short(values: np.ndarray, *beside: np.ndarray) -> list[float | None] | None:
+def _short(values: np.ndarray, *others: np.ndarray) -> list[float | None] | None:
     """The values with five digits of their range, or of what is left between two columns; None if there are none."""
     finite = values[np.isfinite(values)]
     if not len(finite):
         return None
     reach = float(np.ptp(finite)) or float(np.abs(finite).max()) or 1.0
-    if beside:
-        away = np.abs(beside[0] - beside[1])
+    if others:
+        away = np.abs(others[0] - others[1])
         away = away[np.isfinite(away) & (away > 0)]
         reach = min(reach, float(np.median(away)) * 30) if len(away) else reach
     digits = int(np.clip(5 - np.floor(np.log10(reach)), 0, 12))

@@ -24,7 +24,7 @@ with extra("report"):
     from ..plots.style import particle_labels
     from . import pictures as pictures
     from .chart import LOOKS, chart_data, chart_items, chart_scripts, compare
-    from .lights import lights, share_inside, tested
+    from .checks import check_results, share_inside, tested
     from .sentences import (
         METHODS,
         beside_the_law,
@@ -61,6 +61,8 @@ CAPTIONS = {
     "discovery_gap": ("discovery", "The gap on held-out particles"),
     "discovery_similarity": ("discovery", "How alike the mechanisms look in these tests"),
     "discovery_shifts": ("discovery", "What the missing effect had done to the parameters"),
+    "discovery_bands": ("compare", "Measured curves and the central 95 % of what the posterior expects"),
+    "discovery_prior_posterior": ("posterior", "What the data added to the priors"),
 }
 """Section and caption of every figure, by its stem."""
 WITHIN_A_NUMBER = re.compile(r"(?<=[\d)]) (?=[±×%]|(?:µm|[GM]Pa|mN|s)\b)|(?<=[±×]) (?=[\d(])")
@@ -68,12 +70,9 @@ WITHIN_A_NUMBER = re.compile(r"(?<=[\d)]) (?=[±×%]|(?:µm|[GM]Pa|mN|s)\b)|(?<=
 
 
 def report_page(results: Results, *, seed: int = 0, progress: Callable[[str], None] | None = None) -> str:
-    """One self-contained HTML page of results; equal input, equal page.
+    """One self-contained HTML page of what `read_results` gives; equal input, equal page.
 
-    Args:
-        results: what a folder holds, see `read_results`.
-        seed: for the record; nothing here is random.
-        progress: called with the name of each step.
+    The seed is for the record: nothing here is random. `progress` is called with the name of each step.
 
     Raises:
         RuntimeError: in single precision.
@@ -85,10 +84,10 @@ def report_page(results: Results, *, seed: int = 0, progress: Callable[[str], No
         import jinja2  # noqa: F401
     tell = progress or (lambda _: None)
     tell("predicting every particle")
-    told = results.told
-    shown = compare(told)
+    results = results.with_discovery
+    shown = compare(results)
     tell("drawing the page")
-    return _environment().get_template("page.html").render(context(told, shown), seed=seed)
+    return _environment().get_template("page.html").render(context(results, shown), seed=seed)
 
 
 def _require_double() -> None:
@@ -138,17 +137,12 @@ def _unbroken(value: Any) -> Any:
 
 
 def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
-    """What the templates show.
-
-    Args:
-        results: of one campaign.
-        shown: its tests and the law in them.
-    """
+    """What the templates show of results and of the curves `shown`."""
     from markupsafe import Markup, escape
 
     labels = particle_labels([one.name for one in shown], 40)
     folder = shlex.quote(results.name)
-    checks = lights(results, shown)
+    checks = check_results(results, shown)
     return {
         "results": results,
         "version": own_version(),
@@ -172,9 +166,8 @@ def context(results: Results, shown: list[FittedCurve]) -> dict[str, Any]:
         if shown
         else None,
         "bokeh": Markup(_closed(chart_scripts())) if shown else "",
-        "grid": pictures.grid(shown),
-        "marginals": [] if results.posterior is None else pictures.marginals(results.posterior),
-        "lights": checks,
+        "draws": results.posterior is not None,
+        "checks": checks,
         "changes": [] if results.discovery is None else changes(results.discovery),
         "before_after": CAPTIONS["discovery_before_after"][1],
         "figures_of": _figures(results),
@@ -232,12 +225,12 @@ def _count(failed: int, checks: int) -> str:
 def _not_fine(names: list[str], alone: bool) -> str:
     """Which checks failed; that some must fail where the law alone lacks what was found."""
     if not names:
-        return "nothing stands out"
+        return "nothing is conspicuous"
     return listed(names) + (": to be expected, since it lacks what was found" if alone else "")
 
 
 def _summary(results: Results) -> list[str]:
-    """What stands below the first screen, in sentences."""
+    """What is below the first screen, in sentences."""
     if results.calibration is None:
         return []
     return calibration_sentences(results.calibration, beside_the_law(results), alone=is_law_alone(results))
@@ -260,15 +253,16 @@ def _sections(results: Results, shown: list[FittedCurve], checks: list[Any]) -> 
 
 
 def _figures(results: Results) -> dict[str, list[tuple[str, str]]]:
-    """Pictures and captions by section; where the page is of the law with what was found, those without it apart."""
+    """Pictures and captions by section; on a page of the law with what was found, those without it separately."""
     found: dict[str, list[tuple[str, str]]] = {
         name: [] for name in ("measured", "law", "compare", "posterior", "discovery", "alone")
     }
     order = list(CAPTIONS)
     for stem in sorted(results.figures, key=lambda s: (order.index(_kind(s)) if _kind(s) in order else 99, s)):
         section, caption = CAPTIONS.get(_kind(stem), ("posterior", stem.replace("_", " ")))
-        alone = results.has_found and section in ("law", "compare", "posterior")
-        found["alone" if alone else section].append((pictures.data_uri(results.figures[stem]), caption))
+        if section in ("law", "compare", "posterior") and results.has_found != stem.startswith("discovery"):
+            section = "alone" if results.has_found else "discovery"
+        found[section].append((pictures.data_uri(results.figures[stem]), caption))
     return found
 
 

@@ -1,4 +1,4 @@
-"""Pictures that stand still: the most telling test, every particle at a glance, the posterior's marginals, as SVG."""
+"""Static pictures as SVG: the test that shows best what was found."""
 
 from __future__ import annotations
 
@@ -14,31 +14,14 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.transforms import ScaledTranslation
 
-from ..calibrate.curves import FittedCurve
-from ..calibrate.results import PosteriorDraws
-from ..plots.style import BLACK, BLUE, GREY, ORANGE, PALE, RC, SKY, VERMILION, Look, new_figure, particle_labels
-
-GRID = 30
-"""At most so many particles stand in the grid; of more, those with the largest misfit."""
+from ..plots.style import BLACK, BLUE, GREY, ORANGE, PALE, RC, VERMILION, Look, new_figure
 
 FEWEST = 12
-"""At least so many readings stand in the enlarged part of a test that has them."""
-GRID_COLUMNS = 5
-BINS = 40
-PANELS = {
-    "a": ("shape parameter a [-]", 1.0),
-    "effective_modulus_MPa": ("effective modulus [GPa]", 1e-3),
-    "C1_median": ("C₁, median particle [-]", 1.0),
-    "C1_spread": ("sd of log C₁ [-]", 1.0),
-    "C3_median": ("C₃, median particle [-]", 1.0),
-    "C3_spread": ("sd of log C₃ [-]", 1.0),
-    "C5_median": ("C₅, median particle [-]", 1.0),
-    "C5_spread": ("sd of log C₅ [-]", 1.0),
-}
+"""Least number of readings in the enlarged part of a test that has them."""
 
 
 @dataclass(frozen=True)
-class Telling:
+class Example:
     """The test that shows best what was found.
 
     Attributes:
@@ -78,7 +61,7 @@ class Telling:
 
     @property
     def near(self) -> np.ndarray:
-        """Which readings stand in the enlarged part: a strip of displacement, where law and test differ most in all."""
+        """Which readings are in the enlarged part: a strip of displacement, where law and test differ most in all."""
         gap = np.abs(self.before_um - (0.0 if self.after_um is None else self.after_um))
         width = max(10 * float(np.quantile(gap, 0.9)), 0.03 * float(np.ptp(self.displacement_um)))
         left = self.displacement_um[:, None]
@@ -91,7 +74,7 @@ class Telling:
 
 
 @rc_context(RC)
-def telling_pictures(told: Telling) -> list[tuple[str, str]]:
+def example_pictures(example: Example) -> list[tuple[str, str]]:
     """Force over displacement, a part of it enlarged; and what each law leaves over time. With each, what it shows."""
     found = []
     for draw, title, words in (
@@ -105,64 +88,66 @@ def telling_pictures(told: Telling) -> list[tuple[str, str]]:
         # No wider than a phone: its type is read there at the size in which it is set.
         figure = new_figure(4.6, 3.6)
         ax = figure.subplots()
-        handles = draw(ax, told)
+        handles = draw(ax, example)
         ax.set_title(title, fontsize=9.5, color=BLACK, pad=4)
         figure.legend(handles=handles, loc="outside upper center", ncols=3, columnspacing=1.2, handlelength=1.6)
         figure.set_layout_engine("constrained")
-        found.append((_svg(figure), f"{words}: {told.caption}"))
+        found.append((_svg(figure), f"{words}: {example.caption}"))
     return found
 
 
-def draw_enlarged(ax: Axes, told: Telling) -> list[Any]:
-    """Force over displacement where law and test differ most, in a corner the whole test; what stands in a legend."""
-    near = told.near
-    _force_over_displacement(ax, told)
-    across, up = told.displacement_um[near], told.force_mN[near]
+def draw_enlarged(ax: Axes, example: Example) -> list[Any]:
+    """Force over displacement where law and test differ most, in a corner the whole test; entries of a legend."""
+    near = example.near
+    _force_over_displacement(ax, example)
+    across, up = example.displacement_um[near], example.force_mN[near]
     ax.set_xlim(across.min() - 0.05 * np.ptp(across), across.max() + 0.05 * np.ptp(across))
     ax.set_ylim(up.min() - 0.05 * np.ptp(up), up.max() + 0.05 * np.ptp(up))
     ax.set_xlabel("displacement [µm]")
     ax.set_ylabel("force [mN]")
     inset = ax.inset_axes(_emptiest(across, up))
-    _force_over_displacement(inset, told, 0.3)
+    _force_over_displacement(inset, example, 0.3)
     inset.set(xticks=[], yticks=[])
     inset.spines[["top", "right"]].set_visible(True)
     inset.set_title("the whole test", fontsize=8.5, color=BLACK, pad=2, loc="center")
     corner = across.min(), up.min()
     inset.add_patch(Rectangle(corner, np.ptp(across), np.ptp(up), fill=False, edgecolor=BLACK, linewidth=1.1, zorder=9))
-    _arrows(ax, told)
-    dots = Line2D([], [], marker="o", linestyle="", markersize=4.5, color=PALE, markeredgecolor=GREY, label=told.test)
-    return [dots, *(Line2D([], [], **look) for _, look in told.laws)]
+    _arrows(ax, example)
+    dots = Line2D(
+        [], [], marker="o", linestyle="", markersize=4.5, color=PALE, markeredgecolor=GREY, label=example.test
+    )
+    return [dots, *(Line2D([], [], **look) for _, look in example.laws)]
 
 
-def draw_left_over(ax: Axes, told: Telling) -> list[Any]:
-    """What each law leaves over time, beside the noise; what stands in a legend."""
+def draw_left_over(ax: Axes, example: Example) -> list[Any]:
+    """What each law leaves over time, next to the noise; entries of a legend."""
     handles: list[Any] = []
-    if told.noise_um is not None:
+    if example.noise_um is not None:
         look: Look = {"color": ORANGE, "alpha": 0.45, "linewidth": 0, "label": "noise (± 1 sd)"}
-        handles.append(ax.fill_between(told.time_s, -told.noise_um, told.noise_um, **look))
+        handles.append(ax.fill_between(example.time_s, -example.noise_um, example.noise_um, **look))
     ax.axhline(0.0, color=GREY, linewidth=0.7)
-    for away, look in told.laws:
-        handles += ax.plot(told.time_s, away, **look)
+    for away, look in example.laws:
+        handles += ax.plot(example.time_s, away, **look)
     ax.set_xlabel("time [s]")
     ax.set_ylabel("test − law [µm]")
     ax.margins(x=0.01)
     return handles
 
 
-def _arrows(ax: Axes, told: Telling) -> None:
-    """Which way the test goes: an arrow beside the loading and the release that cover most force in sight."""
-    near, rising = told.near, np.append(np.diff(told.force_mN), 0.0) > 0
+def _arrows(ax: Axes, example: Example) -> None:
+    """Which way the test goes: an arrow next to the loading and the release that cover most force in sight."""
+    near, rising = example.near, np.append(np.diff(example.force_mN), 0.0) > 0
     for up, above in ((True, (-7, 7)), (False, (9, -5))):
         edges = np.flatnonzero(np.diff(np.concatenate([[0], (near & (rising == up)).astype(int), [0]])))
         runs = [slice(a, b) for a, b in edges.reshape(-1, 2) if b - a > 2]
         if not runs:
             continue
-        run = max(runs, key=lambda r: float(np.ptp(told.force_mN[r])))
+        run = max(runs, key=lambda r: float(np.ptp(example.force_mN[r])))
         place = run.start + (run.stop - 1 - run.start) * np.array([0.4, 0.7])
-        start, end = ((told.displacement_um[k], told.force_mN[k]) for k in place.astype(int))
-        beside = ax.transData + ScaledTranslation(above[0] / 72, above[1] / 72, ax.figure.dpi_scale_trans)
+        start, end = ((example.displacement_um[k], example.force_mN[k]) for k in place.astype(int))
+        offset = ax.transData + ScaledTranslation(above[0] / 72, above[1] / 72, ax.figure.dpi_scale_trans)
         look = {"arrowstyle": "-|>", "color": GREY, "linewidth": 1.0}
-        ax.annotate("", end, start, xycoords=beside, textcoords=beside, arrowprops=look)
+        ax.annotate("", end, start, xycoords=offset, textcoords=offset, arrowprops=look)
 
 
 def _emptiest(across: np.ndarray, up: np.ndarray) -> tuple[float, float, float, float]:
@@ -175,11 +160,11 @@ def _emptiest(across: np.ndarray, up: np.ndarray) -> tuple[float, float, float, 
     return 0.03 + 0.94 * left, 0.03 + 0.9 * low, 0.94 * wide, 0.9 * high
 
 
-def _force_over_displacement(ax: Axes, told: Telling, scale: float = 1.0) -> None:
+def _force_over_displacement(ax: Axes, example: Example, scale: float = 1.0) -> None:
     dots: Look = {"markersize": 4.5 * scale, "color": PALE, "markeredgecolor": GREY, "markeredgewidth": 0.4}
-    ax.plot(told.displacement_um, told.force_mN, "o", **dots)
-    for away, look in told.laws:
-        ax.plot(told.displacement_um - away, told.force_mN, **look | {"linewidth": scale * look["linewidth"]})
+    ax.plot(example.displacement_um, example.force_mN, "o", **dots)
+    for away, look in example.laws:
+        ax.plot(example.displacement_um - away, example.force_mN, **look | {"linewidth": scale * look["linewidth"]})
 
 
 def data_uri(picture: bytes, kind: str = "png") -> str:
@@ -193,67 +178,3 @@ def _svg(figure: Any) -> str:
     with rc_context({"svg.hashsalt": "mcc_jax", "svg.fonttype": "none"}):
         figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
     return data_uri(stream.getvalue(), "svg+xml")
-
-
-@rc_context(RC)
-def marginals(posterior: PosteriorDraws) -> list[tuple[str, str, str]]:
-    """For each number of the population: a picture of its posterior, its name, and what the picture shows in words."""
-    named = {name: values.ravel() for name, values in posterior.named_population().items()}
-    medians = {f"{name[3:]}_median": np.exp(values) for name, values in named.items() if name.startswith("mu_")}
-    spreads = {f"{name[4:]}_spread": values for name, values in named.items() if name.startswith("tau_")}
-    draws = named | medians | spreads
-    found = []
-    for name, (label, factor) in PANELS.items():
-        values = draws[name] * factor
-        low, middle, high = np.quantile(values, [0.025, 0.5, 0.975])
-        figure = new_figure(3.2, 2.1)
-        ax = figure.subplots()
-        # Outside this range stand a few draws that would squeeze all others.
-        ends = np.quantile(values, [0.001, 0.999])
-        heights, edges = np.histogram(values, BINS, (ends[0], ends[1]) if ends[1] > ends[0] else None)
-        ax.stairs(heights, edges, fill=True, color=SKY, alpha=0.75, linewidth=0)
-        foot = -0.06 * heights.max()
-        ax.hlines(foot, low, high, color=BLUE, linewidth=2.5)
-        ax.plot(middle, foot, "o", color=BLACK, markersize=4.5)
-        ax.set_ylim(2 * foot, None)
-        ax.set_xlim(edges[0], edges[-1])
-        ax.set_xlabel(label)
-        ax.set_yticks([])
-        ax.spines["left"].set_visible(False)
-        ax.locator_params(axis="x", nbins=4)
-        words = f"Posterior of {label}: median {middle:.4g}, 95 % between {low:.4g} and {high:.4g}"
-        found.append((_svg(figure), label, words))
-    return found
-
-
-@rc_context(RC)
-def grid(shown: list[FittedCurve]) -> tuple[str, int] | None:
-    """Force over displacement of every particle, measured and predicted; and how many stand in it."""
-    if not shown:
-        return None
-    misfit = np.array([one.rms_um or 0.0 for one in shown])
-    chosen = np.sort(np.argsort(-misfit, kind="stable")[:GRID])
-    labels = particle_labels([one.name for one in shown], 18)
-    columns = min(GRID_COLUMNS, len(chosen))
-    rows = -(-len(chosen) // columns)
-    figure = new_figure(2.0 * columns + 0.3, 1.5 * rows + 0.4)
-    panels = figure.subplots(rows, columns, squeeze=False)
-    for ax in panels.flat[len(chosen) :]:
-        ax.set_axis_off()
-    for ax, i in zip(panels.flat, chosen, strict=False):
-        one = shown[i]
-        colour = np.where(one.kind == 0, BLUE, VERMILION)
-        colour = np.where(one.used, colour, PALE)
-        every = max(1, len(colour) // 60)
-        ax.scatter(
-            one.displacement_um[::every], one.force_mN[::every], s=3, c=list(colour[::every]), linewidths=0, zorder=2
-        )
-        ax.plot(one.own_um, one.force_mN, color=BLACK, linewidth=0.7, zorder=3)
-        ax.set_title(labels[i], fontsize=7.5, color=GREY if one.why_not else BLACK)
-        ax.tick_params(labelsize=6.5, length=2, pad=1.5)
-        ax.locator_params(nbins=3)
-        ax.margins(0.04)
-    figure.supxlabel("displacement [µm]", fontsize=8)
-    figure.supylabel("force [mN]", fontsize=8)
-    figure.set_layout_engine("constrained")
-    return _svg(figure), len(chosen)

@@ -94,7 +94,7 @@ class Results:
     def with_found(self) -> PosteriorDraws | None:
         """The posterior of the law with what discovery added, if it may be believed and is of all these particles.
 
-        None, too, where the calibration is of a law with effects itself, or there is none that it would be beside.
+        None, too, where the calibration is of a law with effects itself, or there is none to compare it with.
         """
         found, campaign = self.found, self.campaign
         if self.calibration is None or self.calibration.get("effects"):
@@ -104,7 +104,7 @@ class Results:
         return found.posterior if found.posterior.campaign.particles == campaign.particles else None
 
     @property
-    def told(self) -> Results:
+    def with_discovery(self) -> Results:
         """What a page shows: of the law with what discovery added where that may be believed, else as it is."""
         posterior, found = self.with_found, self.discovery
         if posterior is None or found is None:

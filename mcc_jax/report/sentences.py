@@ -48,13 +48,10 @@ def beside_the_law(results: Results) -> str:
 
 
 def calibration_sentences(content: dict[str, Any], beside: str = "", *, alone: bool = False) -> list[str]:
-    """The calibration in a few sentences.
+    """A `calibration.json` in a few sentences; `beside` is what follows "the law", see `beside_the_law`.
 
-    Args:
-        content: contents of `calibration.json`.
-        beside: what follows "the law", see `beside_the_law`.
-        alone: whether it is of the law without effects that were found to be missing. Its numbers are those of a law
-            that is known to be wrong, not to be told in front of the right ones.
+    If it is of the law `alone`, without effects that were found to be missing, its numbers are those of a law that is
+    known to be wrong: they are not shown.
     """
     count, used = len(content["particles"]), sum(entry["kept"] for entry in content["particles"])
     found = [
@@ -95,7 +92,7 @@ def next_steps(results: Results, folder: str) -> list[tuple[str, str]]:
     if content is None:
         steps.append(("Calibrate the law on these tests:", f"mcc-jax calibrate CAMPAIGN --out {folder}"))
     elif not content["converged"]:
-        steps.append((_mend(found), ""))
+        steps.append((_resolve(found), ""))
     elif content["method"] != "bayes":
         what = (
             "the uncertainty of every number" if content["method"] == "paper" else "the posterior, not only a best fit"
@@ -104,18 +101,16 @@ def next_steps(results: Results, folder: str) -> list[tuple[str, str]]:
     if found is None:
         steps.append(("Ask what the law misses:", f"mcc-jax discover CAMPAIGN --out {folder}"))
     else:
-        steps += _after(found, told=results.has_found)
+        steps += _after(found, added=results.has_found)
     if content is not None and content["converged"] and (found is None or found["verdict"] == "NO_GAP"):
         steps.append(("Predict tests that you plan:", "mcc-jax simulate --out planned"))
     return steps
 
 
 def calibration_with_found(found: dict[str, Any], campaign: str) -> str:
-    """The command that calibrates the law with the effects found; empty where no options can say what was added.
+    """The command that calibrates the law with the effects of a `discovery.json`; empty where no options can say it.
 
-    Args:
-        found: contents of `discovery.json`.
-        campaign: folder of the tests, as a shell reads it.
+    `campaign` is the folder of the tests, quoted for a shell.
     """
     named = [":".join(filter(None, (effect["mechanism"], effect["variant"]))) for effect in found["effects"]]
     if not named or found["closure"]:
@@ -124,17 +119,17 @@ def calibration_with_found(found: dict[str, Any], campaign: str) -> str:
     return f"mcc-jax calibrate {campaign} {options} --out with-effect"
 
 
-def _mend(found: dict[str, Any] | None) -> str:
+def _resolve(found: dict[str, Any] | None) -> str:
     if found is not None and found["effects"]:
         return (
             "The law alone does not fit these tests, which may be why its calibration did not converge; what failed "
-            "stands under Checks."
+            "is listed under Checks."
         )
-    return "Mend the checks that failed under Checks before anything else."
+    return "Resolve what failed under Checks before anything else."
 
 
-def _after(found: dict[str, Any], *, told: bool) -> list[tuple[str, str]]:
-    """What to do after a discovery; `told` if the page is of the law with what was added already."""
+def _after(found: dict[str, Any], *, added: bool) -> list[tuple[str, str]]:
+    """What to do after a discovery; `added` if the page is of the law with what was added already."""
     verdict = found["verdict"]
     if found["next_experiments"]:
         best = found["next_experiments"][0]
@@ -148,7 +143,7 @@ def _after(found: dict[str, Any], *, told: bool) -> list[tuple[str, str]]:
         first = found["checks"][0]
         return [(f"Check directly. For {plain(first['mechanism'])}: {first['check']}. For the others, see below.", "")]
     if verdict in ("NAMED", "SET", "UNLISTED"):
-        if told:
+        if added:
             return [("Use the law together with what was added: the parameters below are of both.", "")]
         use = "Use the law together with what was added (parameters “after” below), not alone"
         command = calibration_with_found(found, "CAMPAIGN")

@@ -13,14 +13,14 @@ from ..calibrate.curves import FittedCurve
 from ..discover import Discovery
 from ..discover.sentences import headline
 from ..plots.style import is_simulated
-from .pictures import Telling, telling_pictures
+from .pictures import Example, example_pictures
 from .read import Results
 from .sentences import quantity, simulated
 
 
 @dataclass(frozen=True)
 class Story:
-    """What stands at the top.
+    """The top of the page.
 
     Attributes:
         verdict: the answer in one sentence.
@@ -39,10 +39,10 @@ def story(results: Results, shown: Sequence[FittedCurve]) -> Story:
     """The first screen of what a folder holds."""
     found = results.discovery
     if found is not None:
-        told = telling_test(results.found) if results.found is not None else None
-        told = told or _of_fit(shown)
+        example = most_informative_test(results.found) if results.found is not None else None
+        example = example or _of_fit(shown)
         tests = "simulated tests" if simulated(results) else "tests"
-        return Story(headline(found, tests), *_drawn(told), _gap_tiles(found))
+        return Story(headline(found, tests), *_drawn(example), _gap_tiles(found))
     if results.calibration is not None:
         content = results.calibration
         used = sum(entry["kept"] for entry in content["particles"])
@@ -53,11 +53,11 @@ def story(results: Results, shown: Sequence[FittedCurve]) -> Story:
     return Story(f"{count} particles were measured; nothing has been calibrated on them yet.", [], "", [])
 
 
-def _drawn(told: Telling | None) -> tuple[list[tuple[str, str]], str]:
-    return ([], "") if told is None else (telling_pictures(told), told.caption)
+def _drawn(example: Example | None) -> tuple[list[tuple[str, str]], str]:
+    return ([], "") if example is None else (example_pictures(example), example.caption)
 
 
-def telling_test(found: Discovery) -> Telling | None:
+def most_informative_test(found: Discovery) -> Example | None:
     """The test whose gap closes most, or where nothing was added the one that the law fits worst."""
     left, base = found.residuals, found.base
     if left is None or base is None:
@@ -68,7 +68,7 @@ def telling_test(found: Discovery) -> Telling | None:
     if added and found.held_out is not None and found.held_out.residual_um is not None:
         before, after = found.held_out.residual_um[0], found.held_out.residual_um[-1]
         source = (
-            f" Here {name} is as the other particles tell it; only what each particle has of its own (curve of "
+            f" Here {name} is as estimated from the other particles; only what belongs to each particle (curve of "
             "loading, modulus, zero) is fitted to its test."
         )
     count = np.maximum(left.used.sum(1), 1)
@@ -87,13 +87,13 @@ def telling_test(found: Discovery) -> Telling | None:
     caption = f"Shown: {shown}. On average the law is off by {off}.{source}"
     columns = (column[j, : len(used)][used] for column in (before, after, left.noise))
     one, two, noise = columns
-    return Telling(
+    return Example(
         curve.time_s[rows], curve.force_mN[rows], curve.displacement_um[rows], one, two if added else None, noise,
         f"law with {name}" if added else "", caption, is_simulated(base.campaign.metadata),
     )  # fmt: skip
 
 
-def _of_fit(shown: Sequence[FittedCurve]) -> Telling | None:
+def _of_fit(shown: Sequence[FittedCurve]) -> Example | None:
     """The calibrated test that the law misses most."""
     known = [one for one in shown if one.rms_um is not None]
     if not known:
@@ -105,7 +105,7 @@ def _of_fit(shown: Sequence[FittedCurve]) -> Telling | None:
         f"{number(one.rms_um, 2)} µm on average."
     )
     away = one.displacement_um - one.own_um
-    return Telling(
+    return Example(
         one.time_s[use], one.force_mN[use], one.displacement_um[use], away[use], None, None, "", caption
     )  # fmt: skip
 
@@ -137,9 +137,9 @@ def _gap_tiles(found: dict[str, Any]) -> list[tuple[str, str, str]]:
         if not parameters:
             continue
         (name, first), *others = parameters
-        beside = "".join(f"; {quantity(other)} {with_sd(value)}" for other, value in others)
+        more = "".join(f"; {quantity(other)} {with_sd(value)}" for other, value in others)
         meaning = (
-            f"{quantity(name)}, ± one standard deviation{beside}. That it is this one, of {len(found['ranking'])} "
+            f"{quantity(name)}, ± one standard deviation{more}. That it is this one, of {len(found['ranking'])} "
             f"effects that these tests could show, has probability {probability(effect['probability'])}."
         )
         tiles.append((plain(effect["mechanism"]).capitalize(), with_sd(first), meaning))

@@ -103,7 +103,7 @@ def spread(log: dict[str, Any]) -> str:
     """How much particles differ in a coefficient, in words: of mean and standard deviation of its logarithm."""
     mean, sd = log["mean"]["value"], log["sd"]["value"]
     if mean is None or sd is None or not abs(mean) + abs(sd) < 300:
-        return "How much particles differ; these data do not tell."
+        return "How much particles differ; these data do not show it."
     if sd < 1e-3:
         return "How much particles differ: hardly at all in these data."
     low, high = number(math.exp(mean - sd), 3), number(math.exp(mean + sd), 3)

@@ -97,12 +97,12 @@ def test_a_file_that_cannot_be_read_is_named_with_the_way_to_leave_it_out(tmp_pa
     text = told(folder)
     assert "notes.txt, row 1" in text
     assert "2 of 5 files cannot be read" in text
-    assert text.endswith("--skip notes.txt --skip 'P 2.txt'")
+    assert text.endswith("--leave-out notes.txt --leave-out 'P 2.txt'")
     for skip in (["notes.txt", "P 2.txt"], ["notes", "P 2"], ["no*", "P ?.txt"]):
         campaign = read(folder, skip=skip)
         assert campaign.particles == ("p1", "P9", "P10")
         assert findings(campaign) == ["2 files skipped as asked: notes.txt, P 2.txt"]
-    assert "--skip Notes fits no file" in told(folder, skip=["Notes"])
+    assert "--leave-out Notes fits no file" in told(folder, skip=["Notes"])
     assert "there is no tester's file" in told(folder, skip=["*"])
     assert "So it is with all 2 files" in told(_all_bad(tmp_path))
 
@@ -127,7 +127,7 @@ def test_names_that_no_file_can_hold(tmp_path):
 def test_names_must_differ(tmp_path):
     text = told(folder_of(tmp_path, TESTS | {"P9.csv": text_of(2)}))
     assert "P9.csv both give a test the name 'P9'" in text or "P9.txt both give a test the name 'P9'" in text
-    assert "--skip P9." in text
+    assert "--leave-out P9." in text
 
 
 def test_the_same_bytes_twice_are_told(tmp_path):
@@ -137,7 +137,7 @@ def test_the_same_bytes_twice_are_told(tmp_path):
     assert finding["check"] == "duplicates"
     assert finding["level"] == "warning"
     assert "P9.txt, P11.txt hold the same bytes" in finding["sentence"]
-    assert finding["remedy"].endswith("--skip P11.txt")
+    assert finding["remedy"].endswith("--leave-out P11.txt")
 
 
 def test_several_tests_in_a_file(tmp_path):
@@ -167,7 +167,7 @@ def test_diameters_of_the_files_and_of_a_table(tmp_path):
     keys = "skip_rows = 1\n" + MAPPING + '[diameters]\nheader = "Gage length"\n'
     text = told(folder, keys, diameters_um=None)
     assert "3.txt, row 1: 'Gage length' holds no number" in text
-    assert "--skip 3.txt" in text
+    assert "--leave-out 3.txt" in text
     assert "--diameters" in text
     assert len(read(folder, keys, diameters_um=None, skip=["3"])) == 2
     sizes = {"3.txt": SIZES}

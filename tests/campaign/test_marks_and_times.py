@@ -192,7 +192,7 @@ def test_two_mappings_that_read_one_file_differently_are_refused(tmp_path):
 
 
 def test_no_mapping_that_fits_and_diameters_in_one_of_two(tmp_path):
-    with pytest.raises(InputError, match=r"2\.txt.*by first\.toml, and no other mapping file fits.*--skip 2\.txt"):
+    with pytest.raises(InputError, match=r"2\.txt.*by first\.toml, and no other mapping file fits.*--leave-out 2\.txt"):
         two_kinds(tmp_path, german="x|y\n")
     with pytest.raises(InputError, match=r"second\.toml, column 'diameters_um'.*Give --diameters"):
         two_kinds(tmp_path, second=GERMAN + "diameters_um.all = [1, 2, 3]\n")

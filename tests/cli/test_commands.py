@@ -150,7 +150,7 @@ HIDDEN = {"mechanism": "creep", "variant": "kelvin_voigt", "parameters": {"c": 1
         ({"parameters": {"c": 2.0}}, {}, True, "the true one lies OUTSIDE"),
         ({"variant": "logarithmic"}, {}, True, "the formula is another (kelvin voigt, hidden was logarithmic)"),
         ({"mechanism": "frame_compliance"}, {}, False, "WRONG: hidden was frame compliance, found was creep"),
-        ({}, {"candidate_set": [["creep", "thermal_drift"]]}, True, "cannot tell it from thermal drift"),
+        ({}, {"candidate_set": [["creep", "thermal_drift"]]}, True, "cannot distinguish it from thermal drift"),
         ({}, {"verdict": "NO_GAP", "effects": []}, False, "found was no name (nothing missing)"),
     ],
 )
@@ -319,7 +319,7 @@ def test_convert_a_folder_keeps_its_words_short(run, tmp_path):
         'displacement = { column = "d", unit = "um" }\n'
     )
     arguments = ("convert", folder, "--out", out, "--mapping", mapping, "--diameters", "200,190,180")
-    text = done(run(*arguments, "--skip", "P7", "--skip", "P1?.txt"))
+    text = done(run(*arguments, "--leave-out", "P7", "--leave-out", "P1?.txt"))
     assert len(text.splitlines()) < 24
     for piece in (
         "29 tests, 87 points (folder my tests, 29 files, mapped by map.toml",
@@ -338,9 +338,9 @@ def test_convert_a_folder_keeps_its_words_short(run, tmp_path):
     assert "1 file skipped as asked: sizes.csv" in text
     assert read_campaign(out).diameters_um[3].tolist() == [204.5, 190, 180]
     table.unlink()
-    refused = run(*arguments, "--skip", "P99")
+    refused = run(*arguments, "--leave-out", "P99")
     assert refused.exit_code == 2
-    assert "--skip P99 fits no file" in refused.stderr
+    assert "--leave-out P99 fits no file" in refused.stderr
 
 
 def test_convert_by_a_mapping_file_with_diameters_from_a_table(run, tmp_path):

@@ -27,7 +27,6 @@ from mcc_jax.plots import (
 from mcc_jax.plots.posterior import (
     PARAMETERS,
     CoefficientTable,
-    density,
     draw_forest,
     enlarged_prior,
     posterior_table,
@@ -280,23 +279,11 @@ def test_whitened_residuals_are_standard(calibrations):
 # ---- helpers ---------------------------------------------------------------------------------------------------------
 
 
-def test_density_is_reflected_at_zero_and_even_in_the_logarithm():
-    rng = np.random.default_rng(0)
-    x = np.linspace(-1, 4, 501)
-    half = density(np.abs(rng.standard_normal(4000)), x, positive=True)
-    assert np.all(half[x < 0] == 0)
-    np.testing.assert_allclose(half[x >= 0], np.exp(-(x[x >= 0] ** 2) / 2), atol=0.15)
-    log = density(np.exp(rng.standard_normal(4000)), x, log=True)
-    assert np.all(log[x <= 0] == 0)
-    assert x[np.argmax(log)] == pytest.approx(np.exp(-1), abs=0.1)
-
-
 def test_a_prior_that_piles_up_at_zero_is_no_level_line_where_it_is_enlarged():
-    prior, tau = nakagami.rvs(0.125, size=20_000, random_state=0), PARAMETERS["tau_C3"]
-    far, close = np.linspace(0, 4, 300), np.linspace(0, 0.01, 300)
-    everywhere = density(prior, far, positive=True)
-    few = enlarged_prior(prior[:50], far, everywhere, close, tau)
-    assert few.min() > 0.9  # too few draws near by: all of them, which know no finer
-    fine = enlarged_prior(prior, far, everywhere, close, tau)
-    assert fine.max() == fine[0] == 1.0
-    assert fine[-1] < 0.2
+    prior = nakagami.rvs(0.125, size=20_000, random_state=0)
+    x, y = enlarged_prior(prior, 0.01, PARAMETERS["tau_C3"])
+    assert y.argmax() == 0
+    assert x[-1] <= 0.02
+    assert np.interp(0.01, x, y) < 0.2
+    x, _ = enlarged_prior(prior[:50], 0.01, PARAMETERS["tau_C3"])
+    assert x[-1] > 0.02  # too few draws near by: all of them

@@ -20,9 +20,9 @@ from mcc_jax.calibrate.curves import KINDS
 from mcc_jax.discover import Discovery
 from mcc_jax.discover.sentences import headline
 from mcc_jax.report import read_results, report_page
-from mcc_jax.report.chart import PageOptions, chart_data, chart_items, compare
-from mcc_jax.report.lights import lights, share_inside
-from mcc_jax.report.pictures import Telling, telling_pictures
+from mcc_jax.report.chart import chart_data, chart_items, compare
+from mcc_jax.report.checks import check_results, share_inside
+from mcc_jax.report.pictures import Example, example_pictures
 from mcc_jax.report.sentences import calibration_sentences, next_steps
 
 SECTIONS = {"summary", "measured", "law", "compare", "posterior", "diagnostics", "discovery", "settings", "cite"}
@@ -142,7 +142,7 @@ def with_posterior_of_the_found(results, kind):
 
 def test_the_page_is_of_the_law_with_what_was_found_where_that_may_be_believed(results):
     found = with_posterior_of_the_found(results, WithWhatWasFound)
-    alone, added = compare(found), compare(found.told)
+    alone, added = compare(found), compare(found.with_discovery)
     for one, other in zip(alone[:-1], added[:-1], strict=True):
         np.testing.assert_allclose((other.own_um - one.own_um)[one.used], 0.5, atol=1e-6)
     page, before = report_page(found), report_page(results)
@@ -158,11 +158,11 @@ def test_the_page_is_of_the_law_with_what_was_found_where_that_may_be_believed(r
     step = found.discovery["gap"]["steps"][-1]
     for chi2, answer in ((1.0, "nothing more is missing"), (2.0, "part is missing")):
         step["chi2_per_dof"] = chi2
-        checks = {one.check: one for one in lights(found.told, added)}
-        assert (checks["Law is complete"].value, len(checks)) == (answer, len(lights(found, alone)))
+        checks = {one.check: one for one in check_results(found.with_discovery, added)}
+        assert (checks["Law is complete"].value, len(checks)) == (answer, len(check_results(found, alone)))
     for other in (results, with_posterior_of_the_found(results, NotConverged)):
         assert other.with_found is None
-        assert other.told is other
+        assert other.with_discovery is other
         assert "Effects that discovery added are not in these lines" in report_page(other)
     content = found.calibration | {"effects": [{"mechanism": "creep"}]}
     other = dataclasses.replace(results, calibration=content)
@@ -194,8 +194,10 @@ def test_bands_hold_what_the_noise_says(results, shown):
     assert np.isnan(shown[-1].low_um).all()
 
 
-def test_of_many_points_turns_stay_and_of_many_particles_the_worst(without_posterior, shown):
-    few = compare(read_results(without_posterior), PageOptions(points=80, fewest=20))
+def test_of_many_points_turns_stay_and_of_many_particles_the_worst(without_posterior, shown, monkeypatch):
+    monkeypatch.setattr("mcc_jax.report.chart.POINTS", 80)
+    monkeypatch.setattr("mcc_jax.report.chart.FEWEST", 20)
+    few = compare(read_results(without_posterior))
     for one, all_of_it in zip(few, shown, strict=True):
         assert len(one.force_mN) < 45 < len(all_of_it.force_mN)
         assert one.force_mN.max() == all_of_it.force_mN.max()
@@ -203,7 +205,8 @@ def test_of_many_points_turns_stay_and_of_many_particles_the_worst(without_poste
     content = calibration()["particles"]
     content[1]["C1"]["value"] *= 1.5
     worst = changed(without_posterior, particles=content)
-    assert [one.name for one in compare(worst, PageOptions(points=20, fewest=20))] == [NAMES[1]]
+    monkeypatch.setattr("mcc_jax.report.chart.POINTS", 20)
+    assert [one.name for one in compare(worst)] == [NAMES[1]]
 
 
 def test_rounding_in_the_page_does_not_show(shown):
@@ -350,7 +353,7 @@ def telling(gap_at, points=60):
     """A test of rising load whose law is wrong in one place."""
     rows = np.arange(points, dtype=float)
     before = np.where(np.abs(rows - gap_at) < 4, 0.5, 0.0)
-    return Telling(rows, rows**2, rows, before, np.zeros(points), None, "law with creep", "Particle 1.")
+    return Example(rows, rows**2, rows, before, np.zeros(points), None, "law with creep", "Particle 1.")
 
 
 def test_parameters_before_and_after_stand_there_as_numbers(page):
@@ -375,7 +378,7 @@ def test_the_enlarged_part_holds_the_largest_gap(gap_at):
     assert telling(2, points=4).near.sum() > 1  # of a record with few readings more is shown, never one
     assert [look["label"] for _, look in told.laws] == ["law alone", "law with creep"]
     assert all(
-        source.startswith("data:image/svg+xml") and "Particle 1" in words for source, words in telling_pictures(told)
+        source.startswith("data:image/svg+xml") and "Particle 1" in words for source, words in example_pictures(told)
     )
 
 
@@ -435,7 +438,7 @@ def test_changed_data_are_noticed(folder):
     found = read_results(folder)
     assert [text.split(" was")[0] for text in found.cautions] == ["calibration.json", "discovery.json"]
     assert "curves.csv" in found.cautions[0]
-    assert next(check.level for check in lights(found) if check.check == "Same data") == "bad"
+    assert next(check.level for check in check_results(found) if check.check == "Same data") == "bad"
 
 
 def test_json_of_another_run_is_left_out(folder):
@@ -492,7 +495,7 @@ def test_figures_are_only_those_that_the_results_name_as_theirs(folder):
 )
 def test_lights_change_where_the_gates_are(results, check, changes, level):
     content = {**results.calibration, "diagnostics": results.calibration["diagnostics"] | changes}
-    found = {one.check: one for one in lights(dataclasses.replace(results, calibration=content))}
+    found = {one.check: one for one in check_results(dataclasses.replace(results, calibration=content))}
     assert found[check].level == level
 
 
@@ -501,13 +504,13 @@ def test_misfit_is_measured_where_the_calibration_does_not_tell_it(results, show
     silent = dataclasses.replace(results, calibration={**results.calibration, "diagnostics": diagnostics})
     bad = [dataclasses.replace(one, displacement_um=1.1 * one.displacement_um) for one in shown]
     for tests, level in ((shown, "good"), (bad, "bad")):
-        assert {one.check: one.level for one in lights(silent, tests)}["The law's form fits"] == level
-    assert "The law's form fits" not in {one.check for one in lights(silent)}
+        assert {one.check: one.level for one in check_results(silent, tests)}["The law's form fits"] == level
+    assert "The law's form fits" not in {one.check for one in check_results(silent)}
 
 
 def test_a_calibration_that_did_not_converge_is_no_green_page(folder):
     found = changed(folder, converged=False)
-    assert lights(found)[0].level == "bad"
+    assert check_results(found)[0].level == "bad"
     assert "NOT converge" in " ".join(calibration_sentences(found.calibration))
     assert "does not fit these tests" in next_steps(found, "x")[0][0]
     text = Page(report_page(found)).sections["summary"]

@@ -96,12 +96,12 @@ def read_folder(
             full = stem if len(tests.curves) == 1 else f"{stem}-{name}"
             if full in curves:
                 problem = f"this file and {origin[full].name} both give a test the name {full!r}"
-                remedy = f"Rename one of them, or leave one out with --skip {shlex.quote(file.name)}"
+                remedy = f"Rename one of them, or leave one out with --leave-out {shlex.quote(file.name)}"
                 raise InputError(problem, file=file, remedy=remedy)
             curves[full], origin[full] = curve, file
             keys[full] = (full, *names_of(file), *([name] if own[name] == 1 else []))
             if (size := tests.diameters_um.get(name)) is not None:
-                told[full] = size if isinstance(size, list) else _or_skip(size, f"--skip {shlex.quote(file.name)}")
+                told[full] = size if isinstance(size, list) else _or_skip(size, f"--leave-out {shlex.quote(file.name)}")
             if name in tests.missing:
                 missing[full] = tests.missing[name]
     formats = sorted({tests.format for tests in found.values()})
@@ -124,7 +124,7 @@ def _files(folder: Path, skip: Sequence[str]) -> tuple[list[Path], list[Finding]
     for pattern in skip:
         fitting = [entry for entry in rest if _fits(entry, pattern)]
         if not fitting and not any(_fits(entry, pattern) for entry in quiet):
-            problem = f"--skip {shlex.quote(pattern)} fits no file"
+            problem = f"--leave-out {shlex.quote(pattern)} fits no file"
             raise InputError(problem, file=folder, remedy="Give a name as in the folder, or a pattern")
         skipped += [entry for entry in fitting if entry not in skipped]
     files = [entry for entry in rest if entry not in skipped]
@@ -164,7 +164,7 @@ def _unreadable(failed: dict[Path, InputError], files: int) -> InputError:
         more = f". So it is with all {files} files" if files > 1 else ""
         remedy = (error.remedy or "").rstrip(".") + more
         return error.changed(remedy=remedy)
-    shown = " ".join(f"--skip {shlex.quote(name)}" for name in names[:_SHOWN])
+    shown = " ".join(f"--leave-out {shlex.quote(name)}" for name in names[:_SHOWN])
     others = f" ({len(names)} of {files} files cannot be read)" if len(names) > 1 else ""
     rest = " ..." if len(names) > _SHOWN else ""
     return _or_skip(error, shown + rest, others)
@@ -177,7 +177,7 @@ def _or_skip(error: InputError, how: str, others: str = "") -> InputError:
 
 
 def _twice(files: Sequence[Path]) -> Finding:
-    rest = " ".join(f"--skip {shlex.quote(file.name)}" for file in files[1:])
+    rest = " ".join(f"--leave-out {shlex.quote(file.name)}" for file in files[1:])
     return Finding(
         "duplicates",
         "warning",
@@ -194,7 +194,7 @@ def _control(found: dict[Path, Tests]) -> Control | None:
         by.setdefault(tests.control, file)
     if "load" in by and "displacement" in by:
         problem = f"the test is controlled by displacement, that of {by['load'].name} by load"
-        raise InputError(problem, file=by["displacement"], remedy="Convert tests of two kinds apart, with --skip")
+        raise InputError(problem, file=by["displacement"], remedy="Convert tests of two kinds apart, with --leave-out")
     return next(iter(by)) if len(by) == 1 else None
 
 

@@ -75,7 +75,9 @@ def read_tester_file(
         origin = f"folder {place.resolve().name}, {tests.format}"
     else:
         if skip:
-            raise InputError("is a file, so there is nothing to skip", file=place, remedy="Give --skip with a folder")
+            raise InputError(
+                "is a file, so there is nothing to skip", file=place, remedy="Give --leave-out with a folder"
+            )
         tests = read(place, read_bytes(place))
         alone = names_of(place) if len(tests.curves) == 1 else ()
         keys = {name: (name, *alone) for name in tests.curves}

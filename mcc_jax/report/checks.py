@@ -1,4 +1,4 @@
-"""Diagnostics as traffic lights: a word, a sign and a colour each, what it means, and what to do."""
+"""Checks of the results: a word, a sign and a colour each, what it means, and what to do."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FEW_PARTICLES = 6
 
 
 @dataclass(frozen=True)
-class Light:
+class Check:
     """One check.
 
     Attributes:
@@ -52,19 +52,19 @@ CHECKS = {
     "Calibration converged": (
         "yes",
         "Every part of the calibration must meet its own tolerances. If not: the numbers are not to be trusted before "
-        "the checks below are mended.",
+        "the checks below have passed.",
     ),
     "Particles used": (
         f"all, and at least {FEW_PARTICLES}",
-        "Few particles say little of how particles differ. Why some are left out stands with what was measured.",
+        "Few particles say little of how particles differ. Why some are left out is said under The tests.",
     ),
     "Chains agree (R-hat)": (
         f"at most {SAMPLING.rhat}",
-        "Chains that started apart must end with one answer. If not: more draws (--draws).",
+        "Independent chains must agree. If not: more draws (--draws).",
     ),
     "Independent draws (bulk ESS)": (
         f"at least {SAMPLING.ess:.0f}",
-        "So many independent draws the chains are worth. If too few: more draws (--draws).",
+        "Number of independent draws that the chains are worth. If too few: more draws (--draws).",
     ),
     "Diverging trajectories": (
         "0",
@@ -72,7 +72,7 @@ CHECKS = {
     ),
     "Fast mode is accurate (Pareto k)": (
         f"at most {SAMPLING.pareto_k}",
-        "How well the quadratic summaries of the fast mode stand for the tests themselves. If not: --mode joint.",
+        "How well the quadratic summaries of the fast mode approximate the tests themselves. If not: --mode joint.",
     ),
     "The law's form fits": (
         f"at most {percent(GOOD_MISFIT)}",
@@ -108,13 +108,8 @@ VERDICTS: dict[str, Level] = {
 """What a verdict means for the law without what was found."""
 
 
-def lights(results: Results, shown: Sequence[FittedCurve] = ()) -> list[Light]:
-    """All checks that these results allow, the convergence of the calibration first.
-
-    Args:
-        results: what a folder holds.
-        shown: its particles with their predictions, for what the calibration itself does not tell.
-    """
+def check_results(results: Results, shown: Sequence[FittedCurve] = ()) -> list[Check]:
+    """All checks that these results allow; `shown` are their predictions, for what the calibration does not say."""
     findings, content, inside = tested(results), results.calibration, share_inside(shown)
     found = [_finding(one) for one in findings]
     if content is not None:
@@ -124,22 +119,22 @@ def lights(results: Results, shown: Sequence[FittedCurve] = ()) -> list[Light]:
         found += _fit(content, shown)
     if inside is not None:
         level = "good" if INSIDE[0] <= inside <= INSIDE[1] else "look"
-        found.append(_light("Prediction bands hold", level, f"{percent(inside, 3)} of points inside"))
+        found.append(_check("Prediction bands hold", level, f"{percent(inside, 3)} of points inside"))
     if content is not None:
         found.append(_data(results))
     if results.discovery is not None:
         found.append(_complete(results, results.discovery))
     if worst(findings) == "error":
-        # Beside numbers that cannot be true nothing is fine: what would be is not judged.
+        # Next to numbers that cannot be true nothing is fine: what would be is not judged.
         found = [replace(light, level="unknown") if light.level == "good" else light for light in found]
     return found
 
 
-def _complete(results: Results, found: dict[str, Any]) -> Light:
+def _complete(results: Results, found: dict[str, Any]) -> Check:
     """Whether the law lacks something: by the verdict or, with what was found added, by held-out particles."""
     law = f"The law{beside_the_law(results)}"
     if not results.has_found:
-        return Light(VERDICTS[found["verdict"]], COMPLETE, verdict_in_words(found), "nothing missing", headline(found))
+        return Check(VERDICTS[found["verdict"]], COMPLETE, verdict_in_words(found), "nothing missing", headline(found))
     match within_noise(found["gap"]):
         case None:
             level, answer, meaning = "unknown", "not known", "was not tried on held-out particles"
@@ -152,14 +147,14 @@ def _complete(results: Results, found: dict[str, Any]) -> Light:
         case False:
             level, answer = "look", "part is missing"
             meaning = "closes a part of the gap; held-out particles still differ from it"
-    return Light(level, COMPLETE, answer, "nothing missing", f"{law} {meaning}.")
+    return Check(level, COMPLETE, answer, "nothing missing", f"{law} {meaning}.")
 
 
 def tested(results: Results) -> tuple[Finding, ...]:
-    """What the checks of the tests found: as the results tell it, or by the campaign itself where there are none."""
-    told = [one for content in results.results.values() for one in content.get("findings", [])]
-    if told:
-        unique = {(one["check"], tuple(one["particles"]), one["sentence"]): one for one in told}
+    """What the checks of the tests found: as the results say, or by the campaign itself where there are none."""
+    recorded = [one for content in results.results.values() for one in content.get("findings", [])]
+    if recorded:
+        unique = {(one["check"], tuple(one["particles"]), one["sentence"]): one for one in recorded}
         return tuple(Finding.from_json(one) for one in unique.values())
     if results.results or results.campaign is None:
         return ()
@@ -169,39 +164,39 @@ def tested(results: Results) -> tuple[Finding, ...]:
     )
 
 
-def _light(check: str, level: Level, value: str) -> Light:
-    return Light(level, check, value, *CHECKS[check])
+def _check(check: str, level: Level, value: str) -> Check:
+    return Check(level, check, value, *CHECKS[check])
 
 
-def _finding(one: Finding) -> Light:
-    told: dict[str, tuple[Level, str]] = {
+def _finding(one: Finding) -> Check:
+    levels: dict[str, tuple[Level, str]] = {
         "info": ("good", "settled"),
         "warning": ("look", "look at it"),
-        "error": ("bad", "cannot be true as it stands"),
+        "error": ("bad", "implausible"),
     }
-    level, value = told[one.level]
-    return Light(level, f"Tests: {one.check}", value, "nothing found", str(one))
+    level, value = levels[one.level]
+    return Check(level, f"Tests: {one.check}", value, "nothing found", str(one))
 
 
-def _calibration(content: dict[str, Any]) -> list[Light]:
+def _calibration(content: dict[str, Any]) -> list[Check]:
     count, used = len(content["particles"]), sum(entry["kept"] for entry in content["particles"])
     enough = "good" if used == count >= FEW_PARTICLES else "look" if used >= max(2, count / 2) else "bad"
     done = content["converged"]
     return [
-        _light("Calibration converged", "good" if done else "bad", "yes" if done else "no"),
-        _light("Particles used", enough, f"{used} of {count}"),
+        _check("Calibration converged", "good" if done else "bad", "yes" if done else "no"),
+        _check("Particles used", enough, f"{used} of {count}"),
     ]
 
 
-def _sampler(d: dict[str, Any]) -> list[Light]:
+def _sampler(d: dict[str, Any]) -> list[Check]:
     rhat, ess, divergences, k = (d.get(n) for n in ("rhat_max", "ess_bulk_min", "divergences", "pareto_k_max"))
     k = None if k is None else max(k, d.get("pareto_k_joint") or k)
     few = _below(None if ess is None else -ess, -SAMPLING.ess, -ESS_BAD)
     return [
-        _light("Chains agree (R-hat)", _below(rhat, SAMPLING.rhat, RHAT_BAD), number(rhat)),
-        _light("Independent draws (bulk ESS)", few, number(ess)),
-        _light("Diverging trajectories", _below(divergences, 0.0, 0.0), number(divergences)),
-        _light("Fast mode is accurate (Pareto k)", _below(k, SAMPLING.pareto_k, PARETO_K_BAD), number(k, 2)),
+        _check("Chains agree (R-hat)", _below(rhat, SAMPLING.rhat, RHAT_BAD), number(rhat)),
+        _check("Independent draws (bulk ESS)", few, number(ess)),
+        _check("Diverging trajectories", _below(divergences, 0.0, 0.0), number(divergences)),
+        _check("Fast mode is accurate (Pareto k)", _below(k, SAMPLING.pareto_k, PARETO_K_BAD), number(k, 2)),
     ]
 
 
@@ -211,7 +206,7 @@ def _own_misfit(shown: Sequence[FittedCurve]) -> float:
     return float(np.median([rms / reach for rms, reach in own if rms is not None and reach > 0] or [np.nan]))
 
 
-def _fit(content: dict[str, Any], shown: Sequence[FittedCurve]) -> list[Light]:
+def _fit(content: dict[str, Any], shown: Sequence[FittedCurve]) -> list[Check]:
     d = content["diagnostics"]
     misfit, noise = d.get("own_misfit"), d.get("noise_share")
     falling = (content.get("probability_not_monotone") or {}).get("value")
@@ -220,16 +215,16 @@ def _fit(content: dict[str, Any], shown: Sequence[FittedCurve]) -> list[Light]:
     found = []
     if misfit is not None and np.isfinite(misfit):
         level = _below(misfit, GOOD_MISFIT, JUDGEMENT.misfit)
-        found.append(_light("The law's form fits", level, f"off by {percent(misfit)}"))
+        found.append(_check("The law's form fits", level, f"off by {percent(misfit)}"))
     if noise is not None:
         level = _below(noise, GOOD_NOISE_SHARE, JUDGEMENT.noise_share)
-        found.append(_light("What is left is noise", level, f"{percent(noise)} hangs together"))
+        found.append(_check("What is left is noise", level, f"{percent(noise)} is autocorrelated"))
     if falling is not None:
         level = "good" if falling <= NOT_MONOTONE else "look"
-        found.append(_light("New particles behave", level, f"{percent(falling)} snap through"))
+        found.append(_check("New particles behave", level, f"{percent(falling)} snap through"))
     gaps = d.get("open_combinations", [])
     name = "Data determine the parameters"
-    return found + [Light("bad", name, "not all", "all", f"The data leave open: {text}.") for text in gaps]
+    return found + [Check("bad", name, "not all", "all", f"The data leave open: {text}.") for text in gaps]
 
 
 def share_inside(shown: Sequence[FittedCurve]) -> float | None:
@@ -239,14 +234,14 @@ def share_inside(shown: Sequence[FittedCurve]) -> float | None:
     return float(np.mean(np.concatenate(inside))) if sum(map(len, inside)) else None
 
 
-def _data(results: Results) -> Light:
+def _data(results: Results) -> Check:
     tests = results.provenance[CALIBRATION].campaign
     if tests is None or not tests.sha256 or not results.checksums:
         why = "Checksums or the campaign's files are missing."
-        return Light("unknown", "Same data", "cannot tell", "checksums agree", why)
+        return Check("unknown", "Same data", "cannot tell", "checksums agree", why)
     same = all(results.checksums.get(name) == tests.sha256.get(name) for name in DATA)
     level = "good" if same and not results.cautions else "bad"
-    return _light("Same data", level, "checksums agree" if same else "checksums differ")
+    return _check("Same data", level, "checksums agree" if same else "checksums differ")
 
 
 def _below(value: float | int | None, good: float, bad: float) -> Level:
