@@ -8,9 +8,11 @@ import math
 import re
 import tomllib
 from collections.abc import Mapping
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, get_args
 
+import msgspec
 import numpy as np
 
 from .. import arguments
@@ -21,7 +23,11 @@ from .schema import Control, Metadata
 from .table import decode
 
 _QUANTITIES = {"force_resolution": FORCE, "displacement_resolution": LENGTH, "punch_diameter": LENGTH}
-_WORDS = ("control", "provenance", "corrections")
+_WRITE = {
+    "control": '"load" or "displacement"',
+    "provenance": 'it in quotes, provenance = "..."',
+    "corrections": 'a list of names, corrections = ["frame_compliance"]',
+}
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 
@@ -52,6 +58,42 @@ def _long_integer(value: Any, key: str = "") -> str | None:
     return next((long for name, v in inside if (long := _long_integer(v, key or name)) is not None), None)
 
 
+def typed[T](entries: Mapping[str, Any], kind: type[T], file: Path, write: Mapping[str, str]) -> T:
+    """Entries of a TOML file as a `msgspec.Struct`.
+
+    Raises `InputError` naming the key that is unknown, missing or of another type.
+
+    Args:
+        entries: what the file holds.
+        kind: the type, a `Struct` that forbids unknown fields.
+        file: the file, for messages.
+        write: what to write for a key, by its last part.
+    """
+    try:
+        return msgspec.convert(entries, kind)
+    except msgspec.ValidationError as error:
+        if isinstance(error.__cause__, InputError):
+            raise error.__cause__.changed(file=file) from None
+        problem, _, place = str(error).partition(" - at `$")
+    path = [part for part in re.sub(r"\[.*?\]", "", place.strip("`")).split(".") if part]
+    field = re.fullmatch(r"Object (contains unknown|missing required) field `(.*)`", problem)
+    key = [*path, field[2]] if field else path
+    remedy = f"Write {write[key[-1]]}" if key[-1] in write else "Correct it"
+    if field and field[1] == "missing required":
+        problem, remedy = "is missing", remedy if key[-1] in write else f"Add [{'.'.join(key)}]"
+    elif field:
+        problem = "is not a known key"
+        for name in path:  # to the type of the table that the key is in
+            inside = next(one.type for one in msgspec.structs.fields(kind) if one.name == name)
+            kind = next(one for one in (inside, *get_args(inside)) if hasattr(one, "__struct_fields__"))
+        known = [one.encode_name for one in msgspec.structs.fields(kind) if one.encode_name]
+        close = get_close_matches(field[2], known, n=1)
+        remedy = f"Did you mean {'.'.join([*path, *close])!r}?" if close else f"Known keys: {', '.join(known)}"
+    elif "matching regex" in problem:
+        problem = "is not allowed"
+    raise InputError(problem, file=file, column=".".join(key), remedy=remedy)
+
+
 def load_toml_file(path: str | Path, what: str) -> dict[str, Any]:
     """Read a TOML file; an empty one holds no entries.
 
@@ -76,30 +118,28 @@ def read_settings(file: Path) -> str:
     return decode(data, file, "plain text in UTF-8")
 
 
+class _Known(msgspec.Struct):
+    control: Control | None = None
+    provenance: str | None = None
+    corrections: tuple[str, ...] = ()
+
+
 def parse_metadata(text: str, file: Path) -> Metadata:
     """The metadata that the text of a `campaign.toml` holds; keys it does not know go to `other`."""
     entries = load_toml(text, file)
     for key in entries:
-        if key.lower() != key and key.lower() in (*_WORDS, *_QUANTITIES):
+        if key.lower() != key and key.lower() in (*_WRITE, *_QUANTITIES):
             raise InputError("is misspelt", file=file, column=key, remedy=f"Did you mean {key.lower()!r}?")
-    control, provenance, corrections = (entries.pop(key, None) for key in _WORDS)
-    if control is not None and control not in get_args(Control):
-        problem, key, remedy = f"{control!r} is no way of control", "control", 'Write "load" or "displacement"'
-    elif provenance is not None and not isinstance(provenance, str):
-        problem, key, remedy = "must be text", "provenance", 'Write it in quotes, provenance = "..."'
-    elif not isinstance(corrections, list | None) or not all(isinstance(name, str) for name in corrections or ()):
-        problem, key, remedy = "must be a list of names", "corrections", 'Write corrections = ["frame_compliance"]'
-    else:
-        return Metadata(
-            control=control,
-            force_resolution_mN=_positive(entries, "force_resolution", file),
-            displacement_resolution_um=_positive(entries, "displacement_resolution", file),
-            punch_diameter_um=_positive(entries, "punch_diameter", file),
-            provenance=provenance,
-            corrections=tuple(corrections or ()),
-            other=entries,
-        )
-    raise InputError(problem, file=file, column=key, remedy=remedy)
+    known = typed({key: entries.pop(key) for key in _WRITE if key in entries}, _Known, file, _WRITE)
+    return Metadata(
+        control=known.control,
+        force_resolution_mN=_positive(entries, "force_resolution", file),
+        displacement_resolution_um=_positive(entries, "displacement_resolution", file),
+        punch_diameter_um=_positive(entries, "punch_diameter", file),
+        provenance=known.provenance,
+        corrections=known.corrections,
+        other=entries,
+    )
 
 
 def _positive(entries: dict[str, Any], quantity: str, file: Path) -> float | None:

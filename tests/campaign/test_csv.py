@@ -215,7 +215,7 @@ BAD = {
     "punch without unit": (T, "punch_diameter = 500", ["'punch_diameter'", "unit is missing", "punch_diameter_um"]),
     "punch in bananas": (T, "punch_diameter_bananas = 500", ["'punch_diameter_bananas'", "unknown"]),
     "punch twice": (T, "punch_diameter_um = 500\npunch_diameter_mm = 0.5", ["2 times", "Keep one"]),
-    "provenance no text": (T, "provenance = 3", ["'provenance'", "must be text"]),
+    "provenance no text": (T, "provenance = 3", ["'provenance'", "`str", "quotes"]),
     "corrections no list": (T, 'corrections = "creep"', ["'corrections'", "list of names"]),
     "corrections of numbers": (T, "corrections = [1]", ["'corrections'", "list of names"]),
     "TOML in Latin-1": (T, 'x = 1\nprovenance = "\xb5"'.encode("latin-1"), ["row 2", "UTF-8"]),

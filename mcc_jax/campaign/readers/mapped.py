@@ -28,7 +28,7 @@ from ..table import (
 )
 from ..validate import check_magnitudes
 from .diameters import check_triple
-from .mapping import DIMENSIONS, InHeader, MappingFile
+from .mapping import DIMENSIONS, MappingFile
 from .text import Rows, Tests, checked_curve, read_rows
 
 _FURTHEST = 200
@@ -87,7 +87,7 @@ class _Reader:
         head = self._head()
         self.header = rows.cells(head) if mapping.header_rows and head < len(rows) else None
         self.stop = self._stop(head + mapping.header_rows)
-        self.where = {name: self._place(column.column, head) for name, column in mapping.columns.items()}
+        self.where = {name: self._place(column.column, head) for name, column in mapping.sources.items()}
         self.wanted = [quantity for quantity in DIMENSIONS if quantity in self.where]
         self.width, self.raw_width = self._widths(head)
         sizes = self._diameters(0, head)
@@ -151,13 +151,13 @@ class _Reader:
                     f'Write thousands = "{word}" and decimal_mark = "{other}" in {self.mapping.file.name}, or '
                     'thousands = "none" if it is a decimal mark'
                 )
-                raise self.wrong(problem, remedy, row - 1, self.mapping.columns[quantity].column)
+                raise self.wrong(problem, remedy, row - 1, self.mapping.sources[quantity].column)
 
     def _head(self) -> int:
         """The index of the header, or of the first row of data where there is none."""
         begin = self.mapping.begin
         if begin is None:
-            return self.mapping.skip_rows
+            return self.mapping.skip_rows or 0
         found = next((i for i in range(len(self.rows)) if self.rows.begins(i, begin)), None)
         if found is None:
             raise self.wrong(f"no row begins with {begin!r}", f"Correct begin in {self.mapping.file.name}")
@@ -205,7 +205,7 @@ class _Reader:
         rows, mapping = self.rows, self.mapping
         if self.header is None:
             return None
-        above = mapping.skip_rows if mapping.begin is None else _FURTHEST
+        above = (mapping.skip_rows or 0) if mapping.begin is None else _FURTHEST
         for j in range(i, min(i + above + 1, self.stop)):
             if mapping.begin is not None and rows.begins(j, mapping.begin):
                 return self._same_columns(j)
@@ -219,7 +219,7 @@ class _Reader:
         """The index of a test's first sample if rows like those above the first test, without a header, precede it."""
         if self.header is not None or not self.between or not (self.samples or self.missing):
             return None
-        for j in range(i, min(i + self.mapping.skip_rows + 1, self.stop)):
+        for j in range(i, min(i + (self.mapping.skip_rows or 0) + 1, self.stop)):
             if self._is_sample(j):
                 return j
             if any(number is not None and number == number for number in self._readings(j)):
@@ -289,15 +289,15 @@ class _Reader:
         try:
             self._number(cell)
         except ValueError as error:
-            return self.wrong(str(error), remedy, i, self.mapping.columns[quantity].column)
+            return self.wrong(str(error), remedy, i, self.mapping.sources[quantity].column)
         raise AssertionError
 
     @cached_property
     def missing_marks(self) -> tuple[set[str], set[float]]:
         """Texts, and numbers, that mean that there is no reading."""
-        texts = {mark.lower() for mark in self.mapping.missing if isinstance(mark, str)}
-        numbers: set[float] = set()
-        for mark in self.mapping.missing:
+        texts, numbers = set[str](), set[float]()
+        for mark in self.mapping.missing or ():
+            texts.add(str(mark).strip().lower())  # TOML has a number nan, which equals nothing, itself included
             with contextlib.suppress(ValueError):
                 numbers.add(parse_number(mark) if isinstance(mark, str) else mark)
         return texts, numbers
@@ -351,7 +351,7 @@ class _Reader:
             case "column":
                 name = same_text(cells[self.where["test"]].strip())
                 if not name:
-                    column = self.mapping.columns["test"].column
+                    column = self.mapping.sources["test"].column
                     raise self.wrong("the test's name is empty", "Fill the cell, or remove the row", i, column)
                 return name
             case "file":
@@ -363,14 +363,14 @@ class _Reader:
         if asked is None:
             return None
         try:
-            found = [self._length(name, asked, start, min(stop, len(self.rows))) for name in asked.names]
+            found = [self._length(name, start, min(stop, len(self.rows))) for name in asked.names]
             triple = found * 3 if len(found) == 1 else found
             check_triple(triple, "the header", self.file)
         except InputError as error:
             return error
         return triple
 
-    def _length(self, name: str, asked: InHeader, start: int, stop: int) -> float:
+    def _length(self, name: str, start: int, stop: int) -> float:
         for i in range(start, stop):
             if not self.rows.begins(i, name):
                 continue
@@ -384,11 +384,11 @@ class _Reader:
             if len(numbers) != 1:
                 problem = f"{name!r} holds {len(numbers) or 'no'} number{'s' if numbers else ''}"
                 raise self.wrong(problem, _OWN_DIAMETER, i)
-            value = self._number(numbers[0])
+            value, factor = self._number(numbers[0]), self.mapping.diameter_factor
             try:
-                if asked.factor is None and not units:
+                if factor is None and not units:
                     raise ValueError("the unit is missing")  # noqa: TRY301
-                factor = unit_factor(units[0], LENGTH) if asked.factor is None else asked.factor
+                factor = unit_factor(units[0], LENGTH) if factor is None else factor
             except ValueError as error:
                 remedy = f'Write unit = "mm" below header in {self.mapping.file.name}'
                 raise self.wrong(str(error), remedy, i, name) from None
@@ -420,12 +420,12 @@ def _is_no_reading(cell: str) -> bool:
 
 
 def _curve(name: str, rows: list[_Sample], mapping: MappingFile, file: Path, again: bool) -> Curve:
-    wanted = [quantity for quantity in DIMENSIONS if quantity in mapping.columns]
+    wanted = [quantity for quantity in DIMENSIONS if quantity in mapping.sources]
     raw = np.array([numbers for _, _, numbers in rows]).T
     at = [row for row, _, _ in rows]
     columns: dict[str, np.ndarray] = {}
     for quantity, values in zip(wanted, raw, strict=True):
-        column = mapping.columns[quantity]
+        column = mapping.sources[quantity]
         columns[quantity] = column.sign * convert(np.ascontiguousarray(values), column.factor)
         check_magnitudes(columns[quantity], file, at, str(column.column))
     if mapping.pace is not None:

@@ -5,19 +5,19 @@ A mapping file has these keys; all but `columns` may be left out, and any other 
     encoding = "utf-8"         # of text: a name that Python knows: "latin-1", "utf-16", "cp1252", "gb18030", ...
     delimiter = "comma"        # of text: "comma", "semicolon", "tab", "space" (any number of blanks), or one character
     sheet = "Data"             # of a workbook: the sheet's name, or its number, 1 for the first
-    decimal_mark = "."         # "." or ","; the same as the delimiter where such numbers stand in double quotes
-    thousands = "point"        # what parts groups of three digits: "point", "comma", "apostrophe", "space" (no-break,
-                               # narrow and thin ones, too), or the character; never guessed. "none": there is none,
-                               # though 1.500 stands beside 500, which is refused otherwise
-    missing = ["NaN", "", -999]   # cells that mean "no reading"; rows with one are dropped, counted and told
+    decimal_mark = "."         # "." or ","; the same as the delimiter where such numbers are in double quotes
+    thousands = "point"        # what separates groups of three digits: "point", "comma", "apostrophe", "space" (also
+                               # no-break, narrow and thin), or the character; never guessed. "none": there is none,
+                               # though 1.500 is next to 500, which is refused otherwise
+    missing = ["NaN", "", -999]   # cells that mean "no reading"; rows with one are dropped, counted and reported
     comment_prefix = "#"       # rows that begin so are passed over
     skip_rows = 0              # rows above the header, whatever they hold
     begin = "Time"             # instead of skip_rows: the header is the first row that begins so
     header_rows = 1            # rows of the header: names in the first, for instance units in the next; 0 for none
     skip_footer = 0            # rows below the samples, at the end of the file
     end = "Maximum"            # the samples end above a row that begins so, in every test
-    tests = "file"             # how tests are told apart: "file" (the file is one test), "blank line" (tests are
-                               # parted by empty rows and called 1, 2, ...), "header" (a test begins wherever the
+    tests = "file"             # how tests are distinguished: "file" (the file is one test), "blank line" (tests are
+                               # separated by empty rows and called 1, 2, ...), "header" (a test begins wherever the
                                # header comes again; called 1, 2, ...) or "column" (a column names the test)
     test_name = "A1"           # for tests = "file": the name; otherwise that of the file without its ending
     control = "load"           # "load" or "displacement", as in campaign.toml
@@ -26,7 +26,7 @@ A mapping file has these keys; all but `columns` may be left out, and any other 
     [columns.time]             # and columns.force, columns.displacement: all three are needed
     column = "Time (s)"        # the name in the header, or the number of the column, 1 for the first
     unit = "s"                 # any unit of time (force, length)
-    sign = 1                   # -1 turns the sign round, where the tester counts compression as negative
+    sign = 1                   # -1 turns the sign round, where the instrument counts compression as negative
 
     [columns.time]             # where the file has no column of time, one of these two instead of column
     speed = 0.05               # the displacement moves at this speed, up and down; unit = "mm/s", "um/min", ...
@@ -38,33 +38,31 @@ A mapping file has these keys; all but `columns` may be left out, and any other 
     [diameters_um]             # instead of --diameters: D1, D2, D3 of all tests, or of each by its name
     all = [200.0, 190.0, 180.0]
 
-    [diameters]                # or: every file tells the diameters above its samples
+    [diameters]                # or: every file holds the diameters above its samples
     header = "Gage length"     # the row that begins so holds the diameter of a sphere; three names for D1, D2 and D3
-    unit = "mm"                # of the number; where left out, the file tells it behind the number
+    unit = "mm"                # of the number; where left out, it is in the file, behind the number
 
 The header, with up to `skip_rows` rows above it, may come again anywhere and is passed over there; without a header
-(`header_rows = 0`) so are up to `skip_rows` rows above each test that is parted by an empty row. Empty cells behind
+(`header_rows = 0`) so are up to `skip_rows` rows above each test that is separated by an empty row. Empty cells behind
 the last column that has a name, and rows of delimiters only, hold nothing.
 """
 
 from __future__ import annotations
 
-import math
 import os
-from collections.abc import Callable
-from collections.abc import Mapping as MappingABC
 from dataclasses import dataclass
-from difflib import get_close_matches
 from fractions import Fraction
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
+from msgspec import Meta, Struct, field
 
 from ..._errors import InputError
 from ..columns import EXAMPLES, FORCE, LENGTH, TIME, unit_factor
-from ..metadata import load_toml_file
+from ..metadata import load_toml_file, typed
 from ..schema import Control
 from ..signal import turning_points
 from ..table import APOSTROPHES, SPACES, same_text
@@ -72,35 +70,33 @@ from .diameters import Diameters, check_triple
 
 DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
 DIMENSIONS = {"time": TIME, "force": FORCE, "displacement": LENGTH}
-Split = Literal["file", "blank line", "header", "column"]
 _THOUSANDS = {"none": "", "point": ".", "comma": ",", "apostrophe": APOSTROPHES, "space": SPACES} | {
     mark: marks for marks in (".", ",", APOSTROPHES, SPACES) for mark in marks
 }
+_REVERSAL_SHARE = 0.02
+"""The displacement turns round where it goes back by more than this share of its range; less is noise, in which no time
+passes. Noise of a displacement is some 1e-4 of its range, elastic recovery on unloading some 1e-1."""
 
 
 @dataclass(frozen=True)
 class Pace:
-    """How time is told where no column holds it.
+    """How time is found where no column holds it.
 
     Attributes:
-        interval_s: time between one sample and the next [s]; None if the speed tells the time.
-        speed_um_per_s: speed of the displacement [um/s]; None if the interval tells the time.
-        reversal_share: the displacement turns round where it goes back by more than this share of its range; less is
-            noise, in which no time passes. Noise of a displacement is some 1e-4 of its range, elastic recovery on
-            unloading some 1e-1: two hundredths lie between.
+        interval_s: time between one sample and the next [s]; None if the speed gives the time.
+        speed_um_per_s: speed of the displacement [um/s]; None if the interval gives the time.
     """
 
     interval_s: float | None = None
     speed_um_per_s: float | None = None
-    reversal_share: float = 0.02
 
     def times(self, displacement_um: np.ndarray, order: np.ndarray) -> np.ndarray:
         """Times [s] of the samples, shape (n,), never decreasing; the first row of the test is at 0.
 
         With a speed v the time is the length of the path gone so far over v. The path runs from one turning point to
         the next; between two of them no time passes until the displacement exceeds what it had reached, so that noise
-        adds nothing. A displacement that stands still (a hold at constant displacement) takes no time, which no file
-        without times can tell otherwise.
+        adds nothing. A displacement at rest (a hold at constant displacement) takes no time: nothing in a file without
+        times shows how long it was.
 
         Args:
             displacement_um: displacement [um], shape (n,).
@@ -111,7 +107,7 @@ class Pace:
         assert self.speed_um_per_s is not None
         path = np.zeros(len(displacement_um))
         gone = 0.0
-        for start, stop in pairwise(turning_points(displacement_um, self.reversal_share * np.ptp(displacement_um))):
+        for start, stop in pairwise(turning_points(displacement_um, _REVERSAL_SHARE * np.ptp(displacement_um))):
             leg = displacement_um[start : stop + 1]
             sign = 1.0 if leg[-1] >= leg[0] else -1.0
             path[start : stop + 1] = gone + np.maximum.accumulate(sign * (leg - leg[0]))
@@ -120,63 +116,188 @@ class Pace:
             return path / self.speed_um_per_s
 
 
-@dataclass(frozen=True)
-class InHeader:
-    """Rows above the samples that hold the diameters.
-
-    Attributes:
-        names: how the rows begin: one for a sphere, or three for D1, D2, D3.
-        factor: micrometres in the unit of the numbers; None where the file tells it.
-    """
-
-    names: tuple[str, ...]
-    factor: Fraction | None = None
+Text = Annotated[str, Meta(pattern=r"\S")]
+Count = Annotated[int, Meta(ge=0)]
+Place = Text | Annotated[int, Meta(ge=1)]
+Rate = Annotated[float, Meta(ge=1e-15, le=1e15)]
 
 
-@dataclass(frozen=True)
-class Column:
-    """Where a quantity stands, and what its numbers mean."""
+class TestColumn(Struct, forbid_unknown_fields=True):
+    """Which column names the test."""
+
+    column: Place
+
+
+class Column(Struct, forbid_unknown_fields=True):
+    """Which column holds a quantity, and what its numbers mean."""
+
+    column: Place
+    unit: str = ""
+    sign: Literal[1, -1] = 1
+
+
+class Time(Struct, forbid_unknown_fields=True):
+    """Which column holds the time, or how it is found without one."""
+
+    column: Place | None = None
+    unit: str = ""
+    sign: Literal[1, -1] = 1
+    speed: Rate | None = None
+    interval: Rate | None = None
+
+
+class Columns(Struct, forbid_unknown_fields=True):
+    """Where the quantities are."""
+
+    time: Time
+    force: Column
+    displacement: Column
+    test: TestColumn | None = None
+
+
+class InHeader(Struct, forbid_unknown_fields=True):
+    """Rows above the samples that hold the diameters; the unit is in the file if it is not given here."""
+
+    header: Text | Annotated[list[Text], Meta(min_length=1, max_length=3)]
+    unit: str | None = None
+
+    @property
+    def names(self) -> list[str]:
+        """How the rows begin: one for a sphere, or three for D1, D2, D3."""
+        return [same_text(name).strip() for name in ([self.header] if isinstance(self.header, str) else self.header)]
+
+
+class Source(NamedTuple):
+    """A column by its name or number, and what turns its numbers into mN, um or s."""
 
     column: str | int
     factor: Fraction = Fraction(1)
     sign: int = 1
 
 
-@dataclass(frozen=True)
-class MappingFile:
+class MappingFile(Struct, forbid_unknown_fields=True, dict=True, kw_only=True):
     """A checked mapping file; the module's text says what each entry means."""
 
-    file: Path
-    columns: dict[str, Column]
-    pace: Pace | None = None
-    encoding: str = "utf-8"
-    delimiter: str = ","
-    sheet: str | int | None = None
-    decimal_mark: str = "."
+    file: Path = field(name="")
+    columns: Columns
+    encoding: Text = "utf-8"
+    delimiter: Annotated[str, Meta(pattern=r"^(comma|semicolon|tab|space|[^\"\r\n\0])\Z")] = ","
+    sheet: Place | None = None
+    decimal_mark: Literal[".", ","] = "."
     thousands: str | None = None
-    missing: tuple[str | float, ...] = ()
-    comment_prefix: str | None = None
-    skip_rows: int = 0
-    begin: str | None = None
-    header_rows: int = 1
-    skip_footer: int = 0
-    end: str | None = None
-    tests: Split = "file"
-    test_name: str | None = None
+    missing: Annotated[list[str | float], Meta(min_length=1)] | None = None
+    comment_prefix: Text | None = None
+    skip_rows: Count | None = None
+    begin: Text | None = None
+    header_rows: Count = 1
+    skip_footer: Count = 0
+    end: Text | None = None
+    tests: Literal["file", "blank line", "header", "column"] = "file"
+    test_name: Text | None = None
     control: Control | None = None
-    provenance: str | None = None
-    diameters_um: Diameters | None = None
+    provenance: Text | None = None
+    diameters_um: dict[str, list[float]] | None = None
     diameters: InHeader | None = None
+
+    def __post_init__(self) -> None:
+        if not _is_encoding(self.encoding):
+            raise _wrong(f"{self.encoding!r} is no encoding", "encoding", f"Write {WRITE['encoding']}")
+        if self.thousands not in (None, *_THOUSANDS):
+            raise _wrong(f"{self.thousands!r} is not allowed", "thousands", f"Write {WRITE['thousands']}")
+        self.delimiter = DELIMITERS.get(self.delimiter, self.delimiter)
+        self.thousands = None if self.thousands is None else _THOUSANDS[self.thousands]
+        if self.decimal_mark in (self.thousands or "") or (self.delimiter == " " and " " in (self.thousands or "")):
+            other = "delimiter" if self.decimal_mark not in (self.thousands or "") else "decimal mark"
+            raise _wrong(f"the mark between thousands is also the {other}", "thousands", "Correct one of them")
+        if self.begin is not None and self.skip_rows is not None:
+            raise _wrong("is given in addition to 'skip_rows'", "begin", "Keep one of them")
+        if self.header_rows == 0 and (self.begin is not None or self.tests == "header"):
+            needing = "tests" if self.begin is None else "begin"
+            raise _wrong("needs a header", needing, "Write header_rows of at least 1")
+        if self.test_name is not None and self.tests != "file":
+            raise _wrong('is for tests = "file" only', "test_name", "Remove it")
+        if (self.columns.test is None) == (self.tests == "column"):
+            remedy = 'If a column names the test, write tests = "column" and [columns.test] with column = "..."'
+            raise _wrong(f"is needed for, and only for, tests = {'"column"'}", "columns.test", remedy)
+        if self.diameters is not None and self.diameters_um is not None:
+            raise _wrong("is given in addition to 'diameters_um'", "diameters", "Keep one of them")
+        if self.diameters is not None and len(self.diameters.names) == 2:
+            raise _wrong("must name one row, or three", "diameters.header", f"Write {WRITE['header']}")
+        for name, triple in (self.diameters_um or {}).items():
+            check_triple(triple, f"{name!r}", self.file)
+        _ = self.pace, self.sources, self.diameter_factor
+
+    @cached_property
+    def pace(self) -> Pace | None:
+        """How time is found where no column holds it."""
+        time = self.columns.time
+        given = [name for name in ("column", "speed", "interval") if getattr(time, name) is not None]
+        if len(given) != 1:
+            problem = f"is given in addition to {given[1]!r}" if given else "is missing"
+            raise _wrong(problem, "columns.time.column", "Keep one of column, speed and interval")
+        if time.interval is not None:
+            return Pace(interval_s=float(time.interval * _factor(time.unit, TIME, "columns.time")))
+        if time.speed is None:
+            return None
+        length, slash, per = time.unit.partition("/")
+        if not slash:
+            problem = f"{time.unit!r} is no unit of speed" if time.unit else "the unit is missing"
+            raise _wrong(problem, "columns.time.unit", "Write one of mm/s, um/s, mm/min")
+        factor = _factor(length.strip(), LENGTH, "columns.time") / _factor(per.strip(), TIME, "columns.time")
+        return Pace(speed_um_per_s=float(time.speed * factor))
+
+    @cached_property
+    def sources(self) -> dict[str, Source]:
+        """The columns to read, by time, force, displacement and test."""
+        found: dict[str, Source] = {}
+        for name in (*DIMENSIONS, "test"):
+            entry = getattr(self.columns, name)
+            if entry is None or entry.column is None:
+                continue
+            if isinstance(entry.column, str) and self.header_rows == 0:
+                remedy = "Count columns from 1; names need header_rows of at least 1"
+                raise _wrong(f"{entry.column!r} cannot be found", f"columns.{name}.column", remedy)
+            found[name] = Source(entry.column)
+            if name in DIMENSIONS:
+                factor = _factor(entry.unit, DIMENSIONS[name], f"columns.{name}")
+                found[name] = Source(entry.column, factor, entry.sign)
+        return found
+
+    @cached_property
+    def diameter_factor(self) -> Fraction | None:
+        """Micrometres in the unit of diameters in the header; None where the file holds the unit."""
+        unit = None if self.diameters is None else self.diameters.unit
+        return None if unit is None else _factor(unit, LENGTH, "diameters")
+
+    @property
+    def sizes_um(self) -> Diameters | None:
+        """D1, D2, D3 [um] of all tests, or of each by its name."""
+        given = self.diameters_um
+        return given["all"] if given is not None and list(given) == ["all"] else given
+
+
+WRITE = {
+    "columns": '[columns.force] with column = "..." and unit = "mN"',
+    "column": 'a name in the header or a number from 1 on, for example column = "Load" or column = 2',
+    "sign": "1 or -1",
+    "encoding": 'a name such as "latin-1"',
+    "delimiter": '"comma", "semicolon", "tab", "space" or one character',
+    "sheet": "the sheet's name, or its number from 1 on",
+    "decimal_mark": '"." or ","',
+    "thousands": '"point", "comma", "apostrophe", "space", "none" or one of these characters',
+    "missing": 'a list of texts and numbers such as ["NaN", "", -999]',
+    "tests": '"file", "blank line", "header" or "column"',
+    "control": '"load" or "displacement"',
+    "diameters_um": "all = [D1, D2, D3], or three numbers in um by the name of each test",
+    "header": 'header = "Gage length", or header = ["D1", "D2", "D3"]; your own diameters belong in [diameters_um]',
+}
+"""What to write for an entry that is wrong."""
 
 
 def read_mapping(path: str | os.PathLike[str]) -> MappingFile:
     """Read and check a mapping file. Raises `InputError` naming the key that is missing, unknown or wrong."""
     file = Path(path)
-    entries = load_toml_file(file, "a TOML mapping file")
-    try:
-        return MappingFile(file=file, **_values(entries, file))
-    except InputError as error:
-        raise error.changed(file=file) from None
+    return typed(load_toml_file(file, "a TOML mapping file") | {"": file}, MappingFile, file, WRITE)
 
 
 def _is_encoding(name: str) -> bool:
@@ -186,182 +307,15 @@ def _is_encoding(name: str) -> bool:
         return False
 
 
-def _are_marks(marks: list[Any]) -> bool:
-    return bool(marks) and all(isinstance(mark, str | int | float) and not isinstance(mark, bool) for mark in marks)
-
-
-_MARKS = '"point", "comma", "apostrophe", "space", "none"'
-_TEXT = str, lambda text: bool(text.strip())
-_COUNT = int, lambda number: number >= 0, "a whole number, 0 or more"
-_PLAIN: dict[str, tuple[type | tuple[type, ...], Callable[[Any], bool], str]] = {
-    "encoding": (str, _is_encoding, 'a name such as "latin-1"'),
-    "delimiter": (
-        str,
-        lambda text: text in DELIMITERS or (len(text) == 1 and text not in '"\r\n\0'),
-        '"comma", "semicolon", "tab", "space" or one character',
-    ),
-    "sheet": (
-        (str, int),
-        lambda sheet: bool(sheet.strip()) if isinstance(sheet, str) else sheet >= 1,
-        "the sheet's name, or its number from 1 on",
-    ),
-    "decimal_mark": (str, (".", ",").__contains__, '"." or ","'),
-    "thousands": (str, _THOUSANDS.__contains__, f"{_MARKS} or one of these characters"),
-    "missing": (list, _are_marks, 'a list of texts and numbers such as ["NaN", "", -999]'),
-    "comment_prefix": (*_TEXT, 'text such as "#"'),
-    "skip_rows": _COUNT,
-    "begin": (*_TEXT, "the text that the header begins with"),
-    "header_rows": _COUNT,
-    "skip_footer": _COUNT,
-    "end": (*_TEXT, "the text that the first row below the samples begins with"),
-    "tests": (str, get_args(Split).__contains__, '"file", "blank line", "header" or "column"'),
-    "test_name": (*_TEXT, "text"),
-    "control": (str, get_args(Control).__contains__, '"load" or "displacement"'),
-    "provenance": (*_TEXT, "text"),
-}
-"""Kinds of the plain entries, what else must hold of them, and what to write."""
-
-
 def _wrong(problem: str, key: str, remedy: str) -> InputError:
     return InputError(problem, column=key, remedy=remedy)
 
 
-def _values(entries: dict[str, Any], file: Path) -> dict[str, Any]:
-    _only(entries, [*_PLAIN, "columns", "diameters_um", "diameters"])
-    values = {key: entries[key] for key in _PLAIN if key in entries}
-    for key, value in values.items():
-        kind, allowed, wanted = _PLAIN[key]
-        if not isinstance(value, kind) or isinstance(value, bool) or not allowed(value):
-            raise _wrong(f"{value!r} is not allowed", key, f"Write {wanted}")
-    if "delimiter" in values:
-        values["delimiter"] = DELIMITERS.get(values["delimiter"], values["delimiter"])
-    if "thousands" in values:
-        values["thousands"] = _THOUSANDS[values["thousands"]]
-    # TOML has a number nan, which equals nothing, itself included.
-    values["missing"] = tuple(
-        float(mark) if not isinstance(mark, str) and math.isfinite(mark) else str(mark).strip()
-        for mark in values.get("missing", ())
-    )
-    _refuse_contradictions(values)
-    values["columns"], values["pace"] = _columns(entries, values)
-    if "diameters" in entries:
-        if "diameters_um" in entries:
-            raise _wrong("is given beside 'diameters_um'", "diameters", "Keep one of them")
-        values["diameters"] = _in_header(entries["diameters"])
-    if "diameters_um" in entries:
-        values["diameters_um"] = _diameters(entries["diameters_um"], file)
-    return values
-
-
-def _refuse_contradictions(values: dict[str, Any]) -> None:
-    thousands = values.get("thousands", "")
-    decimals = values.get("decimal_mark", ".") in thousands
-    if decimals or (values.get("delimiter") == " " and " " in thousands):
-        other = "decimal mark" if decimals else "delimiter"
-        raise _wrong(f"the mark between thousands is also the {other}", "thousands", "Correct one of them")
-    if "begin" in values and "skip_rows" in values:
-        raise _wrong("is given beside 'skip_rows'", "begin", "Keep one of them")
-    needing = "begin" if "begin" in values else "tests" if values.get("tests") == "header" else None
-    if needing is not None and values.get("header_rows", 1) == 0:
-        raise _wrong("needs a header", needing, "Write header_rows of at least 1")
-    if "test_name" in values and values.get("tests", "file") != "file":
-        raise _wrong('is for tests = "file" only', "test_name", "Remove it")
-
-
-def _only(entries: MappingABC[str, Any], known: list[str], inside: str = "") -> None:
-    for key in entries:
-        if key not in known:
-            close = get_close_matches(key, known, n=1)
-            remedy = f"Did you mean {inside + close[0]!r}?" if close else f"Known keys: {', '.join(known)}"
-            raise _wrong("is not a key of a mapping file", inside + key, remedy)
-
-
-def _columns(entries: dict[str, Any], values: dict[str, Any]) -> tuple[dict[str, Column], Pace | None]:
-    tables = entries.get("columns")
-    if not isinstance(tables, dict):
-        remedy = 'Add [columns.force] with column = "..." and unit = "mN"'
-        raise InputError("the table 'columns' is missing", remedy=remedy)
-    needed = [*DIMENSIONS, *(["test"] if values.get("tests") == "column" else [])]
-    for name in ("test", "particle", "sample", "specimen"):
-        if name in tables and name not in needed:
-            remedy = 'If a column names the test, write tests = "column" above [columns] and call it test there'
-            raise _wrong("is not a key of a mapping file", f"columns.{name}", remedy)
-    _only(tables, needed, "columns.")
-    found: dict[str, Column] = {}
-    pace: Pace | None = None
-    for name in needed:
-        place, table = f"columns.{name}", tables.get(name)
-        if not isinstance(table, dict):
-            raise InputError(f"the table {place!r} is missing", remedy=f"Add [{place}]")
-        if name == "time" and ("speed" in table or "interval" in table):
-            pace = _pace(table)
-            continue
-        further = {"time": ["unit", "sign", "speed", "interval"], "test": []}.get(name, ["unit", "sign"])
-        _only(table, ["column", *further], place + ".")
-        column = table.get("column")
-        if isinstance(column, bool) or not isinstance(column, str | int) or column in ("", 0):
-            remedy = 'Write column = "Load" or column = 2'
-            raise _wrong("must be a name in the header or a number from 1 on", f"{place}.column", remedy)
-        if (isinstance(column, int) and column < 1) or (isinstance(column, str) and values.get("header_rows", 1) == 0):
-            remedy = "Count columns from 1; names need header_rows of at least 1"
-            raise _wrong(f"{column!r} cannot be found", f"{place}.column", remedy)
-        found[name] = Column(column)
-        if name in DIMENSIONS:
-            factor, sign = _factor(table.get("unit"), DIMENSIONS[name], place), table.get("sign", 1)
-            if isinstance(sign, bool) or sign not in (1, -1):
-                raise _wrong(f"{sign!r} is not a sign", f"{place}.sign", "Write 1 or -1")
-            found[name] = Column(column, factor, int(sign))
-    return found, pace
-
-
-def _factor(unit: Any, dimension: str, place: str) -> Fraction:
+def _factor(unit: str, dimension: str, place: str) -> Fraction:
     try:
-        if isinstance(unit, str):
+        if unit:
             return unit_factor(unit, dimension)
-        problem = "the unit is missing" if unit is None else f"{unit!r} is not a unit"
+        problem = "the unit is missing"
     except ValueError as error:
         problem = str(error)
     raise _wrong(problem, f"{place}.unit", f"Write one of {EXAMPLES[dimension]}")
-
-
-def _pace(table: dict[str, Any]) -> Pace:
-    """The time from `speed` or `interval`."""
-    which = "speed" if "speed" in table else "interval"
-    place = "columns.time"
-    _only(table, [which, "unit"], f"{place}.")
-    value, unit = table[which], table.get("unit")
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 1e-15 <= value <= 1e15:
-        raise _wrong(f"{value!r} is not a positive number", f"{place}.{which}", "Correct it")
-    if which == "interval":
-        return Pace(interval_s=float(value * _factor(unit, TIME, place)))
-    length, slash, time = str(unit).partition("/")
-    if not slash:
-        problem = "the unit is missing" if unit is None else f"{unit!r} is no unit of speed"
-        raise _wrong(problem, f"{place}.unit", "Write one of mm/s, um/s, mm/min")
-    factor = _factor(length.strip(), LENGTH, place) / _factor(time.strip(), TIME, place)
-    return Pace(speed_um_per_s=float(value * factor))
-
-
-def _in_header(table: Any) -> InHeader:
-    """The rows above the samples that hold the diameters."""
-    names = table.get("header") if isinstance(table, dict) else None
-    names = [names] if isinstance(names, str) else names
-    names = names if isinstance(names, list) else []
-    if len(names) not in (1, 3) or not all(isinstance(name, str) and name.strip() for name in names):
-        remedy = 'Write header = "Gage length", or header = ["D1", "D2", "D3"]; diameters of your own belong in '
-        raise _wrong("must name one row, or three", "diameters.header", remedy + "[diameters_um]")
-    _only(table, ["header", "unit"], "diameters.")
-    factor = _factor(table["unit"], LENGTH, "diameters") if "unit" in table else None
-    return InHeader(tuple(same_text(name).strip() for name in names), factor)
-
-
-def _diameters(table: Any, file: Path) -> Diameters:
-    if not isinstance(table, dict) or not table:
-        raise _wrong("must be a table", "diameters_um", "Write all = [D1, D2, D3]")
-    for name, triple in table.items():
-        if not isinstance(triple, list) or not all(isinstance(v, int | float) and v is not True for v in triple):
-            raise _wrong("must be three numbers", f"diameters_um.{name}", "Write [D1, D2, D3] in um")
-        check_triple(triple, f"{name!r}", file)
-    if list(table) == ["all"]:
-        return [float(value) for value in table["all"]]
-    return {name: [float(value) for value in triple] for name, triple in table.items()}

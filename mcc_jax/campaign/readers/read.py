@@ -86,7 +86,7 @@ def read_tester_file(
         if len(described) > 1 and one.diameters_um is not None:
             problem = "cannot be told apart by mapping file"
             raise InputError(problem, file=one.file, column="diameters_um", remedy="Give --diameters")
-        diameters_um = one.diameters_um if diameters_um is None else diameters_um
+        diameters_um = one.sizes_um if diameters_um is None else diameters_um
     sizes, unused = diameters_for(keys, diameters_um, tests.diameters_um, place)
     if dropped := sum(tests.missing.values()):
         rows = "1 row with a missing reading was" if dropped == 1 else f"{dropped} rows with a missing reading were"
