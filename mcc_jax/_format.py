@@ -65,7 +65,7 @@ def with_sd(estimate: Mapping[str, Any], factor: float = 1.0) -> str:
     return f"({value / 10.0**power:.{places}f} ± {sd / 10.0**power:.{places}f}) × 10{_raised(power)}".replace("-", "−")
 
 
-def interval(estimate: dict[str, Any], factor: float = 1.0) -> str | None:
+def interval(estimate: Mapping[str, Any], factor: float = 1.0) -> str | None:
     """The two ends of the 95 % interval, or None where there is none."""
     ends = estimate["interval_95"]
     if ends is None:

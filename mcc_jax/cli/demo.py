@@ -227,8 +227,8 @@ def compared(answer: dict[str, Any], found: dict[str, Any]) -> tuple[bool, str]:
     hidden = answer["mechanism"]
     named = [effect["mechanism"] for effect in found["effects"]]
     if named != [hidden]:
-        answer = " and ".join(map(plain, named)) or f"no name ({verdict_in_words(found)})"
-        return False, f"The discovery is WRONG: hidden was {plain(hidden)}, found was {answer}."
+        names = " and ".join(map(plain, named)) or f"no name ({verdict_in_words(found)})"
+        return False, f"The discovery is WRONG: hidden was {plain(hidden)}, found was {names}."
     effect = found["effects"][0]
     rivals = [plain(name) for name in found["candidate_set"][0] if name != hidden]
     doubt = f", though these tests cannot distinguish it from {' or '.join(rivals)}" if rivals else ""

@@ -158,8 +158,8 @@ def dimensions(campaign: Campaign) -> pd.DataFrame:
 
     average, (D1, D2, D3) = campaign.diameters_um.mean(axis=1), campaign.diameters_um.T
     sizes = pd.DataFrame({"average_um": average, "effective_um": D1 * D2 / D3})
-    sizes["effective_over_average"] = sizeeffective / average
-    sizes["average_over_effective"] = average / sizeeffective
+    sizes["effective_over_average"] = sizes.effective_um / average
+    sizes["average_over_effective"] = average / sizes.effective_um
     return sizes
 
 
@@ -172,7 +172,7 @@ def plot_dimensions(campaign: Campaign) -> Figure:
     of dimensions, but says what the data give; for the paper's own table the ratios are 1.31 and 0.78, not 1.5.
     """
     sizes = dimensions(campaign)
-    average, effective = sizeaverage.to_numpy(), sizeeffective.to_numpy()
+    average, effective = sizes.average_um.to_numpy(), sizes.effective_um.to_numpy()
     slope = float(average @ effective / (average @ average))
     flat = campaign.diameters_um[:, 2] / np.sqrt(campaign.diameters_um[:, 0] * campaign.diameters_um[:, 1])
     colours = style.sequential(flat)
