@@ -9,6 +9,7 @@ approach. All thresholds are shares of the curve's own range, or multiples of it
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal, cast, get_args
