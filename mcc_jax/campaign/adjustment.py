@@ -40,7 +40,7 @@ class LoadingCurve:
 
     @property
     def stress_max_MPa(self) -> float:
-        """The largest stress that was reached [MPa]."""
+        """The largest stress that was reached."""
         return float(self.stress_MPa[-1])
 
     def at(self, stress_MPa: np.ndarray | float) -> np.ndarray:
@@ -49,11 +49,7 @@ class LoadingCurve:
 
 
 def effective_diameter_um(diameters_um: Any) -> float:
-    """D_e = D1 D2 / D3 [um] of one particle's three diameters [um].
-
-    Raises:
-        InputError: if they are not three positive numbers.
-    """
+    """D_e = D1 D2 / D3 [um] of one particle's three diameters [um]."""
     D1, D2, D3 = arguments.one_particle(diameters_um)
     return float(D1 * D2 / D3)
 
@@ -72,7 +68,7 @@ def stress_and_strain(
     .. math:: \sigma = F / (\pi R_e^2), \qquad \epsilon = (\gamma - \gamma_0) / D_e
 
     Strain counts from :math:`\gamma_0`, the platen's position at first contact: where the approach ends if the record
-    has one, the tester's own zero otherwise, or the first reading if that zero lies far from the test
+    has one, the test machine's own zero otherwise, or the first reading if that zero is far from the test
     (`MACHINE_ZERO`).
 
     References:
@@ -97,10 +93,8 @@ def loading_curve(curve: Curve, diameters_um: np.ndarray, segments: tuple[Segmen
     """The virgin loading of a test, over all its cycles, as strain over stress.
 
     Force is made monotone by isotonic regression, which, unlike a running maximum, is not lifted by noise; points that
-    share one force are averaged. Readings that may not be compared with a law do not count.
-
-    Returns:
-        The curve, or None if the test never loads.
+    share one force are averaged. Readings that may not be compared with a law do not count. None if the test never
+    loads.
     """
     diameters_um = arguments.one_particle(diameters_um)
     from scipy.optimize import isotonic_regression  # half a second to import, so only where it is used
@@ -165,13 +159,6 @@ def adjust(campaign: Campaign, threshold_MPa: float = THRESHOLD_MPA) -> Adjustme
 
     The step also removes true differences in shape below the threshold, which biases `a`; see `calibrate`'s
     documentation for how much. `threshold_MPa = 0` leaves every curve as measured.
-
-    Args:
-        campaign: the tests; its raw data are not touched.
-        threshold_MPa: stress [MPa], 0.2 in the paper.
-
-    Raises:
-        InputError: if the threshold is negative or not finite, or the campaign cannot be used.
 
     References:
         Bommireddy et al. (2018), section 3.

@@ -32,9 +32,9 @@ class CurveFeatures:
     Attributes:
         force_sign: -1 where the forces are negative in compression, else 1.
         displacement_sign: -1 where the displacements fall as the load rises, else 1.
-        force_mN: the largest force [mN].
-        displacement_um: displacement from contact to there [um].
-        slope_mN_per_um: slope at the beginning of unloading [mN/um].
+        force_mN: the largest force.
+        displacement_um: displacement from contact to there.
+        slope_mN_per_um: slope at the beginning of unloading.
         fullness: area below the loading curve as a share of the box of its peak [-], 1 / (1 + n) for a power n of the
             displacement; above one half where stiffness falls.
         loss: share of the work of loading that unloading does not give back [-]; negative where more came back.
@@ -119,7 +119,7 @@ def _compression_positive(force: np.ndarray) -> tuple[int, np.ndarray]:
     """The sign of compression, and forces that count positive in it; zeros where the record shows no loading."""
     low, high = float(force.min()), float(force.max())
     if min(abs(low), abs(high)) > 0.5 * (high - low) and low * high > 0:
-        # Far from zero all the time: a large offset, or the tester idles under a preload.
+        # Far from zero all the time: a large offset, or a preload without a test.
         return 1, np.zeros_like(force)
     sign = 1 if high >= -low else -1
     return sign, sign * force

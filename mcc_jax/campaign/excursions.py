@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,8 +15,7 @@ SLOWNESS = 6.0  # times longer than the ramps next to it that a hold takes for t
 HOLD_SAMPLES = 4  # of a hold, at least
 
 
-@dataclass(frozen=True)
-class Hold:
+class Hold(NamedTuple):
     """Samples `start` to `stop - 1`, where the signal stands at `level`."""
 
     start: int

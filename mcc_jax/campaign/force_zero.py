@@ -1,15 +1,16 @@
-"""The zero of force: what the load cell reads in the air, and drifts by, before the platens touch."""
+"""The zero of force: what the load cell reads, and drifts by, before the platens touch."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from .findings import Finding
 from .schema import Campaign, Control, Curve
-from .segments import find_segments
+from .segments import contact_index, find_segments
 from .signal import Line, differences, median, point_noise, two_lines
 
 AIR_READINGS = 5  # before contact, at least: fewer do not give the zero's error
@@ -23,12 +24,11 @@ START_SHARE = 0.1  # of the largest force, up to which a drift is looked for: no
 
 
 CHECK = "zero of force"
-OFFSET = Finding(CHECK, "info", "force reads {} mN in the air before contact; this was taken off", code="offset")
+OFFSET = Finding(CHECK, "info", "force reads {} mN before contact; this was taken off", code="offset")
 DRIFT = Finding(
     CHECK,
     "warning",
-    "force drifts by {} mN in the air before contact; the zero at contact ({} mN) was taken off, with this drift as "
-    "its error",
+    "force drifts by {} mN before contact; the zero at contact ({} mN) was taken off, with this drift as its error",
     "Let the load cell settle before a test",
     code="drift",
 )
@@ -43,29 +43,22 @@ PERHAPS_DRIFT = Finding(
 NOT_TARED = Finding(
     CHECK,
     "warning",
-    "force begins at {} mN without a reading in the air; {} mN was taken off",
-    "Tare the load cell, and begin in the air",
+    "force begins at {} mN without a reading before contact; {} mN was taken off",
+    "Tare the load cell, and begin before contact",
     code="not tared",
 )
 OPEN = Finding(
     CHECK,
     "info",
-    "force begins at {} mN without a reading in the air: a preload, or a load cell that was not tared",
-    "Tell the two apart by readings in the air before contact",
+    "force begins at {} mN without a reading before contact: a preload, or a load cell that was not tared",
+    "Distinguish the two by readings before contact",
     code="preload or not tared",
 )
 
 
-@dataclass(frozen=True)
-class ZeroOfForce:
-    """What the force channel reads without contact.
-
-    Attributes:
-        path: what to take off at each reading [mN]; constant from contact on.
-        value: the zero at contact [mN].
-        sd: its standard deviation [mN].
-        findings: what there is to say of it.
-    """
+class ZeroOfForce(NamedTuple):
+    """What the force channel reads without contact: what to take off at each reading, constant from contact on; the
+    zero at contact and its standard deviation [mN]; and what was found."""
 
     path: np.ndarray
     value: float
@@ -76,16 +69,19 @@ class ZeroOfForce:
 def zero_of_force(
     curve: Curve, control: Control | None, zero_mN: tuple[float, float] | None = None
 ) -> ZeroOfForce | None:
-    """The force that is read in the air before contact; None if nothing tells of another zero than the file's own.
+    """The force that is read before contact; None if nothing shows another zero than the file's own.
 
-    Without a drift it is the readings' mean, with the error of a mean of readings that hang together (as of an
+    Without a drift it is the readings' mean, with the error of a mean of autocorrelated readings (as of an
     autoregressive process of order 1). With a drift it is their straight line over time up to contact, and the line's
-    value there from then on; what the drift did during the test nobody knows, so its change in the air is the error.
-    Without readings in the air a record is looked at that begins far from zero.
+    value there from then on; what the drift did during the test nobody knows, so its change before contact is the
+    error. Without readings before contact, a record that begins far from zero is reported.
     """
     contact, ahead = air_until(curve, control)
     if contact is None:
-        return _perhaps_drift(curve, ahead) or _begins_elsewhere(curve, zero_mN)
+        # A rise before loading that is too quick to be taken for a drift, and too straight for a contact.
+        if ahead is not None and abs(ahead.change) > AIR_SHARE * float(np.ptp(curve.force_mN)):
+            return ZeroOfForce(np.zeros(len(curve)), 0.0, 0.0, (PERHAPS_DRIFT.of(ahead.change),))
+        return _begins_elsewhere(curve, zero_mN)
     # The last readings before the platens touch may already feel the first asperities.
     stop = max(AIR_READINGS, int(0.9 * contact))
     air, when = curve.force_mN[:stop], curve.time_s[:stop]
@@ -102,13 +98,6 @@ def zero_of_force(
         error = float(sd / np.sqrt(len(air)) * _inflation(air - mean))
     said = abs(mean) > AIR_SAID * error and abs(mean) > AIR_SHARE * largest
     return ZeroOfForce(np.full(len(curve), mean), mean, error, (OFFSET.of(mean),) if said else ())
-
-
-def _perhaps_drift(curve: Curve, ahead: SlowStart | None) -> ZeroOfForce | None:
-    """A rise in front of the loading which is too quick to be taken for a drift, and too straight for a contact."""
-    if ahead is None or abs(ahead.change) <= AIR_SHARE * float(np.ptp(curve.force_mN)):
-        return None
-    return ZeroOfForce(np.zeros(len(curve)), 0.0, 0.0, (PERHAPS_DRIFT.of(ahead.change),))
 
 
 def open_zero(campaign: Campaign) -> tuple[float, float] | None:
@@ -154,7 +143,7 @@ def _first_steps(curve: Curve) -> float:
 def _begins_elsewhere(curve: Curve, zero_mN: tuple[float, float] | None) -> ZeroOfForce | None:
     """A record in contact whose first reading is below zero, or more than a step of the ramp above it.
 
-    One that begins above `START_SHARE` of its largest force has lost its loading, and tells no zero at all. Below zero
+    One that begins above `START_SHARE` of its largest force has lost its loading, and shows no zero at all. Below zero
     the load cell was not tared: the reading is taken off, and its error is as large as itself, unless all tests share a
     zero, which is known better. Above it, that and a preload look alike, and the file's zero stays.
     """
@@ -173,24 +162,21 @@ def _begins_elsewhere(curve: Curve, zero_mN: tuple[float, float] | None) -> Zero
 
 
 def _inflation(scatter: np.ndarray) -> float:
-    """How much larger the error of a mean is since readings hang together, by their lag-1 correlation."""
-    lag = float(np.sum(scatter[1:] * scatter[:-1]) / max(np.sum(scatter**2), 1e-300))
-    lag = min(max(lag, 0.0), 0.9)
+    """How much larger the error of a mean of autocorrelated readings is, by their lag-1 correlation."""
+    lag = min(max(float(scatter[1:] @ scatter[:-1] / max(scatter @ scatter, 1e-300)), 0.0), 0.9)
     return float(np.sqrt((1 + lag) / (1 - lag)))
 
 
 def air_until(curve: Curve, control: Control | None) -> tuple[int | None, SlowStart | None]:
     """How many readings were taken before contact; None if too few, and then the slow start, if there is one.
 
-    The approach of `find_segments`; where it finds none, a straight and much slower rise in front of the loading is a
-    drift of the load cell, and the approach is looked for again without it.
+    The approach of `find_segments`; where it finds none, a straight and much slower rise before loading is a drift of
+    the load cell, and the approach is looked for again without it.
     """
 
     def found(curve: Curve) -> int | None:
-        segments = find_segments(curve, control=control)
-        first = segments[0]
-        enough = first.kind == "approach" and len(segments) > 1 and len(first) > AIR_READINGS
-        return first.stop if enough else None
+        contact = contact_index(find_segments(curve, control=control))
+        return contact if contact > AIR_READINGS else None
 
     contact = found(curve)
     if contact is not None:
@@ -202,16 +188,9 @@ def air_until(curve: Curve, control: Control | None) -> tuple[int | None, SlowSt
     return found(replace(curve, force_mN=curve.force_mN - ahead.line.at(time))), ahead
 
 
-@dataclass(frozen=True)
-class SlowStart:
-    """A straight course of force over time in front of the loading.
-
-    Attributes:
-        line: the force over time [mN].
-        stop: how many readings it has.
-        change: of force along it [mN].
-        share: its slope as a share of the loading's; negative where it falls.
-    """
+class SlowStart(NamedTuple):
+    """A straight course of force over time before loading: how many readings it has, the change of force along it [mN],
+    and its slope as a share of the loading's."""
 
     line: Line
     stop: int
@@ -220,9 +199,9 @@ class SlowStart:
 
 
 def slow_start(curve: Curve) -> SlowStart | None:
-    """A straight and slower course of force in front of the loading, of a load cell that drifts; None without one.
+    """A straight and slower course of force before loading, of a load cell that drifts; None without one.
 
-    A slower speed of the tester alone bends force and displacement alike: it is none.
+    A slower speed of the test machine bends force and displacement alike: it is none.
     """
     force, time, path = curve.force_mN, curve.time_s, curve.displacement_um
     first = int(np.argmax(force > force[0] + START_SHARE * (force.max() - force[0])))

@@ -17,8 +17,8 @@ force / (displacement^1.5 diameter^0.5)), so where the records are ordinary, the
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -64,17 +64,14 @@ def check_plausibility(campaign: Campaign, *, modulus_MPa: float | None = None) 
     """Report what a wrong unit, sign or column would explain in a campaign.
 
     Judges raw tests, before any fit: each test's peak, the stiffness of loading and unloading, the work given back, its
-    sizes and its times. Of a checked campaign those that it was made from. Nothing is changed, and nothing is an error.
-
-    Args:
-        campaign: the tests.
-        modulus_MPa: the effective modulus of a fit [MPa], which is then compared with the moduli of solids.
+    sizes and its times. Of a checked campaign those that it was made from. Nothing is changed, and nothing is refused.
+    The effective modulus of a fit is compared with the moduli of solids.
 
     Returns:
         Findings: "error" for a likely error, with the column and the remedy, and for numbers that no solid has; "info"
-        where the material is not like micro-crystalline cellulose, which is no fault. Empty where nothing is found.
-        What concerns a fitted modulus is of the check "fitted modulus" and points to no unit; all else is of the check
-        "plausibility". `Finding.particles` names the particles where not all are concerned.
+        where the material is not like micro-crystalline cellulose, which is no fault. What concerns a fitted modulus is
+        of the check "fitted modulus" and points to no unit; all else is of the check "plausibility".
+        `Finding.particles` names the particles where not all are concerned.
     """
     if not isinstance(campaign, Campaign):
         check_campaign(campaign)  # what is no campaign; one with wrong values is still looked at, to name their cause
@@ -84,15 +81,9 @@ def check_plausibility(campaign: Campaign, *, modulus_MPa: float | None = None) 
     return (*found.findings, *_fitted_modulus(found.typical, modulus_MPa), *found.remark)
 
 
-@dataclass(frozen=True)
-class Material:
-    """How stiff a campaign's material is compared with micro-crystalline cellulose.
-
-    Attributes:
-        decades: logarithm to the base of 10 of the ratio of stresses at the same strain.
-        stress_MPa: median peak stress.
-        strain: median strain there, scaled with the paper's shape factor [-].
-    """
+class Material(NamedTuple):
+    """How stiff a material is compared with micro-crystalline cellulose: the ratio of stresses at the same strain in
+    decades, the median peak stress, and the median strain there, scaled with the paper's shape factor."""
 
     decades: float
     stress_MPa: float
@@ -121,8 +112,7 @@ def wrong_signs(campaign: Campaign) -> bool:
     return 2 * int(turned.sum()) > len(turned)
 
 
-@dataclass(frozen=True)
-class _Diagnosis:
+class _Diagnosis(NamedTuple):
     """What a campaign shows before any fit: findings, and, where its tests show anything, median numbers of theirs as
     `log_numbers` gives them, how its material differs from cellulose, and a remark on it if nothing else was found."""
 
@@ -358,8 +348,8 @@ def _outside(tests: _Tests) -> list[Finding]:
     for what, unit, value, (low, high) in hulls:
         if value < np.log10(low / BEYOND) or value > np.log10(high * BEYOND):
             sentence = (
-                f"A typical {what} of {_number(value)} {unit} is none of a solid between platens ({low:g} to"
-                f" {high:g} {unit}), and no single slip of a unit explains it"
+                f"A typical {what} of {_number(value)} {unit} is outside the range of any solid between platens"
+                f" ({low:g} to {high:g} {unit}), and no single unit error explains it"
             )
             remedy = "Check the units of force, displacement and diameters, and that tests are of single particles"
             return [*found, Finding(CHECK, "error", sentence, remedy)]
@@ -373,13 +363,13 @@ def _fitted_modulus(typical: np.ndarray, modulus_MPa: float | None) -> list[Find
         return []
     it = apparent(typical)
     own = (
-        f"with about {_modulus(it.modulus)} told by the slope of unloading"
+        f"with about {_modulus(it.modulus)} by the slope of unloading"
         if np.isfinite(it.modulus)
         else f"as stiff in loading as an elastic sphere of {_modulus(it.loading_modulus)}"
     )
     sentence = (
-        f"The fitted modulus of {modulus_MPa / 1e3:.3g} GPa is none of a solid ({low / 1e3:g} to {high / 1e3:g} GPa),"
-        f" though the tests are those of an ordinary one, {own}"
+        f"The fitted modulus of {modulus_MPa / 1e3:.3g} GPa is outside the range of any solid ({low / 1e3:g} to"
+        f" {high / 1e3:g} GPa), though the tests are those of an ordinary one, {own}"
     )
     remedy = "Do not use it: the fitted form of unloading is not that of these tests; another form may be"
     return [Finding("fitted modulus", "error", sentence, remedy)]

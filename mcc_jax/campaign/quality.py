@@ -136,7 +136,7 @@ BROKE = Finding(
 GIVES_WAY = Finding(
     "breakage",
     "info",
-    "force falls from {} mN on while the platens go on closing (the particle gives way or slips): {} readings are left "
+    "force falls from {} mN on while the platens keep closing (the particle gives way or slips): {} readings are left "
     "out",
     "Check whether the particle has broken; if so, load it less",
     code="gives way",
@@ -231,9 +231,10 @@ def begins_at_peak(curve: Curve) -> bool:
 def breakage(curve: Curve) -> tuple[int, float] | None:
     """The last reading before the particle broke, and the share of its force that it lost at once; None if it held.
 
-    A particle that breaks loses force while the platens do not part: the force falls within a few readings, much faster
-    than elsewhere, and at the same or a larger displacement it does not come back at once. A jump of displacement under
-    load control is no sign of it: a law that is not monotone snaps through, and many particles pop in.
+    A particle that breaks loses force while the platens do not separate: the force falls within a few readings, much
+    faster than elsewhere, and at the same or a larger displacement it does not come back at once. A jump of
+    displacement under load control is no sign of it: a law that is not monotone snaps through, and many particles pop
+    in.
     """
     force, path, time = curve.force_mN, curve.displacement_um, curve.time_s
     count = len(force)
@@ -271,8 +272,8 @@ def breakage(curve: Curve) -> tuple[int, float] | None:
 def gives_way(curve: Curve, control: Control | None) -> np.ndarray:
     """Which readings come after the particle gave way or slipped, until its force is back; booleans.
 
-    Force falls while the platens go on closing at about the speed they had: no unloading, in which they part or, of a
-    stiff particle that creeps, stand still. The law knows force on virgin loading, unloading and reloading alone.
+    Force falls while the platens go on closing at about the speed they had: no unloading, in which they separate or, of
+    a stiff particle that creeps, stand still. The law knows force on virgin loading, unloading and reloading alone.
     """
     force, path, time = curve.force_mN, curve.displacement_um, curve.time_s
     found = np.zeros(len(curve), bool)

@@ -77,55 +77,38 @@ def too_few(points: int, least: int) -> Finding:
 
 
 def far_apart(stress_MPa: Sequence[float | None], strain: Sequence[float | None]) -> list[Finding | None]:
-    """Which tests are in other units than the rest: their stresses or strains are far from those of all others.
-
-    Args:
-        stress_MPa: the largest stress of each particle; None for those that are not used anyway.
-        strain: the range of displacement of each, in shares of its effective diameter; None likewise.
-    """
-    found: list[Finding | None] = []
-    stresses, strains = (np.sort([v for v in values if v is not None]) for values in (stress_MPa, strain))
-    for stress, share in zip(stress_MPa, strain, strict=True):
-        reason = None
-        if (usual := _others_median(stress, stresses)) is not None:
-            what = f"reaches {stress:.3g} MPa where the others reach {usual:.3g} MPa"
-            units = "force and its diameters (they turn force into stress)"
-            reason = _reason(what, f"check its unit of {units}, or leave the particle out")
-        elif (usual := _others_median(share, strains)) is not None:
-            what = f"is compressed by {share:.3g} of its size where the others are by {usual:.3g}"
-            reason = _reason(what, "check its unit of displacement and its diameters, or leave the particle out")
-        found.append(reason)
+    """Which tests are in other units than the rest, by the largest stress of each particle and its range of
+    displacement in shares of its effective diameter; None for those that are not used anyway."""
+    found: list[Finding | None] = [None] * len(stress_MPa)
+    weak = (
+        "reaches {:.3g} MPa where the others reach {:.3g} MPa",
+        "force and its diameters (they turn force into stress)",
+    )
+    short = "is compressed by {:.3g} of its size where the others are by {:.3g}", "displacement and its diameters"
+    for values, (what, unit) in ((stress_MPa, weak), (strain, short)):
+        ordered = np.sort([value for value in values if value is not None])
+        for i, own in enumerate(values):
+            if own is None or len(ordered) < 2 or found[i] is not None:
+                continue
+            usual = median(np.delete(ordered, np.searchsorted(ordered, own)))
+            if not usual / FAR_APART <= own <= usual * FAR_APART:
+                found[i] = _reason(what.format(own, usual), f"check its unit of {unit}, or leave the particle out")
     return found
 
 
-def _others_median(own: float | None, ordered: np.ndarray) -> float | None:
-    """The median of the others, of all particles' values in order, if a particle's own is far from it; else None."""
-    if own is None or len(ordered) < 2:
-        return None
-    usual = median(np.delete(ordered, np.searchsorted(ordered, own)))
-    return None if usual / FAR_APART <= own <= usual * FAR_APART else usual
-
-
 def refusal(campaign: Campaign, problem: str, reasons: Sequence[Finding | None]) -> InputError:
-    """The error that says why a campaign's particles cannot be used, with every reason once, and what to do.
-
-    Args:
-        problem: what fails for want of particles.
-        reasons: one for each particle, None for those that can be used.
-    """
-    names: dict[str, list[str]] = {}
-    remedies: dict[str, None] = {}
+    """The error that says why a campaign's particles cannot be used, with every reason once, and what to do; reasons
+    are None for particles that can be used."""
+    groups: dict[tuple[str, str], list[str]] = {}
     for name, reason in zip(campaign.particles, reasons, strict=True):
         if reason is not None:
-            names.setdefault(reason.sentence, []).append(repr(name))
-            if len(names) <= SHOWN:
-                remedies.setdefault(reason.remedy)
-    parts = []
-    for what, those in list(names.items())[:SHOWN]:
-        more = ", ".join(those[1:4]) + (f" and {len(those) - 4} more" if len(those) > 4 else "")
-        parts.append(f"particle {those[0]} {what}" + (f" (likewise {more})" if more else ""))
-    if len(names) > SHOWN:
-        parts.append("...")
-    said = ". ".join(remedy[:1].upper() + remedy[1:] for remedy in remedies)
+            groups.setdefault((reason.sentence, reason.remedy), []).append(repr(name))
+    parts, remedies = [], {}
+    for (what, remedy), names in list(groups.items())[:SHOWN]:
+        more = ", ".join(names[1:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+        parts.append(f"particle {names[0]} {what}" + (f" (likewise {more})" if more else ""))
+        remedies[remedy[:1].upper() + remedy[1:]] = None
+    parts += ["..."] * (len(groups) > SHOWN)
+    said = ". ".join(remedies)
     problem, said = add_likely_unit_error(campaign, f"{problem}: {'; '.join(parts)}", said)
     return InputError(problem, file=campaign.source or None, remedy=f"{said}.")

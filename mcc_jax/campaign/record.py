@@ -25,19 +25,11 @@ KINKS = 6  # of a ramp at most: a change between two readings makes two
 
 
 def record_of(curve: Curve, segments: tuple[Segment, ...], *, relative_humidity_percent: float | None = None) -> Record:
-    """The record of a measured test.
+    """The record of a measured test, cut by `find_segments`.
 
     Rates are the slopes of straight lines through segments, or through their parts where the programme changes its
-    speed (`ramp_rates`). The forces where branches begin come from straight lines through their first points.
-
-    Args:
-        curve: the test, raw.
-        segments: its segments, from `find_segments` or `campaign_segments`.
-        relative_humidity_percent: of the room during the test; the reference, where no effect of humidity acts, if
-            None.
-
-    Raises:
-        ValueError: if the segments do not cover the curve.
+    speed (`ramp_rates`). The forces where branches begin come from straight lines through their first points. Without a
+    humidity of the test it is the reference, at which no effect of humidity acts.
     """
     columns = record_columns(curve, segments, relative_humidity_percent=relative_humidity_percent)
     return Record(**{name: jnp.asarray(values) for name, values in columns.items()})
@@ -54,18 +46,17 @@ def record_columns(
         raise InputError(f"the segments must cover all {count} points of the curve")
     force = np.asarray(curve.force_mN, float)
     time = np.asarray(curve.time_s, float) - float(curve.time_s[0])
-    columns: dict[str, np.ndarray] = {
-        name: np.zeros(count, np.int32 if name in ("kind", "branch", "reloads") else float)
-        for name in ("kind", "branch", "reloads", "progress", "unload_from", "reload_from", "rate", "loading_rate")
-    }
+    names = ("kind", "branch", "reloads", "progress", "unload_from", "reload_from")
+    states: list[tuple[float, ...]] = []
+    rates, loading_rates = np.zeros(count), np.zeros(count)
     branch, reloads, progress, unload_from, reload_from, rate, loading_rate = LOAD, 0, 0.0, 0.0, 0.0, 0.0, 0.0
     for segment in segments:
         kind = KINDS.index(segment.kind)
         part = slice(segment.start, segment.stop)
         if kind not in (HOLD, APPROACH):
-            first = slice(part.start, min(part.start + 9, part.stop))
             begins = float(force[part.start])
-            if len(force[first]) >= 3 and np.ptp(time[first]) > 0:
+            first = slice(part.start, min(part.start + 9, part.stop))
+            if part.stop - part.start >= 3 and np.ptp(time[first]) > 0:
                 begins = float(Line.through(time[first], force[first]).at(time[part.start]))
             if kind == UNLOAD and branch != UNLOAD:
                 unload_from = begins
@@ -77,23 +68,23 @@ def record_columns(
                     progress += min(max(done, 0.0), 1.0)
                 reloads, reload_from = reloads + 1, max(begins, 0.0)
             branch = LOAD if branch == LOAD and kind != UNLOAD else kind
-            columns["rate"][part] = ramp_rates(time[part], force[part], rate)
-            if len(force[part]):
-                rate = float(columns["rate"][part.stop - 1])
+            rates[part], loading_rates[part] = ramp_rates(time[part], force[part], rate), loading_rate
+            rate = float(rates[part.stop - 1]) if len(segment) else rate
             if branch != UNLOAD:
-                columns["loading_rate"][part], loading_rate = columns["rate"][part], rate
-            else:
-                columns["loading_rate"][part] = loading_rate
+                loading_rates[part], loading_rate = rates[part], rate
         else:
-            columns["rate"][part], columns["loading_rate"][part] = rate, loading_rate
-        values = (kind, branch, reloads, progress, unload_from, reload_from)
-        for column, value in zip(columns.values(), values, strict=False):
-            column[part] = value
+            rates[part], loading_rates[part] = rate, loading_rate
+        states.append((kind, branch, reloads, progress, unload_from, reload_from))
     # What comes before the first ramp goes at its rate.
-    known = np.flatnonzero(columns["loading_rate"] > 0)
+    known = np.flatnonzero(loading_rates > 0)
     if len(known):
-        columns["loading_rate"][: known[0]] = columns["loading_rate"][known[0]]
-        columns["rate"][: known[0]] = columns["loading_rate"][known[0]]
+        rates[: known[0]] = loading_rates[: known[0]] = loading_rates[known[0]]
+    lengths = [len(segment) for segment in segments]
+    columns = {
+        name: np.repeat(np.asarray(values, np.int32 if name in names[:3] else float), lengths)
+        for name, values in zip(names, zip(*states, strict=True), strict=True)
+    }
+    columns |= {"rate": rates, "loading_rate": loading_rates}
     humidity = REFERENCE_HUMIDITY_PERCENT if relative_humidity_percent is None else float(relative_humidity_percent)
     return {"force": force, "time": time, **columns, "relative_humidity": np.asarray(humidity, dtype=float)}
 
@@ -103,13 +94,7 @@ def record_batch(
 ) -> Record:
     """The records of all tests of a campaign with a leading axis N, shorter ones padded with their last point.
 
-    Args:
-        campaign: the tests.
-        segments: the segments of each; found anew if None.
-        multiple: round the length up to a multiple of this.
-
-    Raises:
-        InputError: if the campaign cannot be used, or the column of humidities holds what is no number.
+    Segments are found if they are None; the length is rounded up to a multiple of `multiple`.
     """
     check_campaign(campaign)
     multiple = arguments.whole(multiple, "multiple", least=1)
@@ -131,8 +116,7 @@ def record_batch(
 def humidities(campaign: Campaign) -> Float[np.ndarray, " particles"] | None:
     """Relative humidity [%] of every test from the column `relative_humidity_percent`; None without that column.
 
-    Raises:
-        InputError: naming the particle whose entry is no number from 0 to 100.
+    An entry that is no number from 0 to 100 raises `InputError` with its particle.
     """
     return humidity_column(campaign.particles, campaign.columns, campaign.source)
 
@@ -163,12 +147,7 @@ def ramp_rates(time: Float[np.ndarray, " n"], force: Float[np.ndarray, " n"], be
     A change of speed is a kink. Kinks are believed where straight lines that meet describe the force better than one
     line and than any polynomial of as many numbers, by the Bayesian information criterion (Schwarz 1978; a kink counts
     as three numbers, Zhang and Siegmund 2007): a force that bends smoothly, as under a steady platen, keeps one mean
-    rate. The rate changes behind the reading at a kink.
-
-    Args:
-        time: of the readings [s].
-        force: the same [mN].
-        before: what the rate is where the ramp has no duration [mN/s].
+    rate. The rate changes behind the reading at a kink; a ramp without duration keeps the rate `before` it.
     """
     if len(time) < 2 or np.ptp(time) <= 0:
         return np.full(len(time), before)
@@ -220,7 +199,7 @@ def _kinks(time: np.ndarray, force: np.ndarray) -> list[int]:
     if not found or best >= min(criterion(curves[:, :k], k) for k in range(3, curves.shape[1] + 1)):
         return []
     slopes = np.cumsum(np.linalg.lstsq(lines(found), y)[0][1:])
-    return found if _apart(np.abs(slopes).tolist(), JUMP) else []
+    return found if _differ(np.abs(slopes).tolist(), JUMP) else []
 
 
 def _best_kink(x: np.ndarray, y: np.ndarray) -> tuple[float, int]:
@@ -247,7 +226,7 @@ def available_data(campaign: Campaign, segments: tuple[tuple[Segment, ...], ...]
     """What a campaign holds of what effects need.
 
     A kind of segment counts as present when at least one test in five has it; sizes and shapes when they differ by a
-    tenth; peaks and rates when the largest is 1.3 times the smallest. Segments are found anew if None.
+    tenth; peaks and rates when the largest is 1.3 times the smallest. Segments are found if they are None.
     """
     check_campaign(campaign)
     found = campaign_segments(campaign) if segments is None else segments
@@ -278,15 +257,15 @@ def available_data(campaign: Campaign, segments: tuple[tuple[Segment, ...], ...]
         Need.RELOAD: often("reload"),
         Need.SECOND_RELOAD: often("reload", 2),
         Need.LONG_TIME: float(np.median(durations)) > 200,
-        Need.TWO_RATES: _apart(rates, JUMP),
-        Need.SEVERAL_SIZES: _apart((D1 * D2 / D3).tolist(), 1.1),
+        Need.TWO_RATES: _differ(rates, JUMP),
+        Need.SEVERAL_SIZES: _differ((D1 * D2 / D3).tolist(), 1.1),
         Need.SEVERAL_SHAPES: bool(np.ptp(1 - D3**2 / (D1 * D2)) > 0.1),
-        Need.SEVERAL_PEAKS: _apart(peaks, 1.3),
+        Need.SEVERAL_PEAKS: _differ(peaks, 1.3),
         Need.HUMIDITY_COLUMN: humidity is not None and bool(np.ptp(humidity) > 1),
     }
     return frozenset(need for need, there in conditions.items() if there)
 
 
-def _apart(values: list[float], ratio: float) -> bool:
+def _differ(values: list[float], ratio: float) -> bool:
     some = [value for value in values if value > 0]
     return bool(some and max(some) > ratio * min(some))

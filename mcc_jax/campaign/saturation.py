@@ -13,7 +13,8 @@ the fit and the noise of the turning point give the force's standard deviation.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -66,21 +67,13 @@ DISPLACEMENT_RANGE = Finding(
 
 
 class CensoredForce(NamedTuple):
-    """A test whose force channel saturated.
-
-    Attributes:
-        curve: the readings below the end of the range, and one turning point for each stretch at it that goes beyond
-            any displacement reached before.
-        rows: which readings of the given curve these are.
-        compared: False at the turning points.
-        force_sd_mN: standard deviation of the force at the turning points, 0 elsewhere [mN].
-        finding: in words.
-    """
+    """A test whose force channel saturated: the readings below the end of the range, and one turning point, not to be
+    compared, for each stretch at it that goes beyond any displacement reached before."""
 
     curve: Curve
-    rows: np.ndarray
+    rows: np.ndarray  # of the given curve
     compared: np.ndarray
-    force_sd_mN: np.ndarray
+    force_sd_mN: np.ndarray  # 0 but at the turning points
     finding: Finding
 
 
@@ -132,11 +125,8 @@ def censor_force(curve: Curve) -> CensoredForce | None:
     found = plateaus(force, path, curve.time_s, noise)
     if not found:
         return None
-    end = float(force.max())
-    hidden = np.zeros(len(force), bool)
-    for start, stop in found:
-        hidden[start:stop] = True
-    fitted = _loading(force, path, hidden, found[0][0], end)
+    end, hidden = float(force.max()), _inside(found, len(force))
+    fitted = _loading(force, path, hidden, noise)
     before = slice(max(found[0][0] - BEFORE, 0), found[0][0])
     way = float(np.ptp(path[before]))
     pace = float(np.ptp(force[before])) / way if way > 0 else 0.0  # [mN/um]
@@ -149,7 +139,7 @@ def censor_force(curve: Curve) -> CensoredForce | None:
         top = _turning(path[start:stop], row - start, noise)
         if top <= reached:
             continue  # reloading that stays below what was reached before: elastic, the history does not change
-        value, error = (np.nan, np.nan) if fitted is None else fitted.at(top, noise)
+        value, error = (np.nan, np.nan) if fitted is None else fitted(top)
         if not end <= value < np.inf:
             value, error = end, noise * pace
         new_force[row], new_path[row], sd[row], turning[row] = value, top, error, True
@@ -161,17 +151,21 @@ def censor_force(curve: Curve) -> CensoredForce | None:
 
 
 def censor_displacement(curve: Curve) -> tuple[np.ndarray, Finding] | None:
-    """Which readings of displacement stand at the end of its range, and a note; None if there are none."""
+    """Which readings of displacement are at the end of its range, and that in words; None if there are none."""
     found = plateaus(curve.displacement_um, curve.force_mN, curve.time_s, point_noise(curve.force_mN))
     if not found:
         return None
     path = curve.displacement_um
     # Of the readings within the noise of the end only those that the noise brought below it are left: they lie too low.
-    rows = np.zeros(len(curve), bool)
-    for start, stop in found:
-        rows[start:stop] = True
+    rows = _inside(found, len(curve))
     rows |= path >= float(path.max()) - NEAR_END * point_noise(path[~rows])
     return rows, DISPLACEMENT_RANGE.of(float(path.max()), int(rows.sum()))
+
+
+def _inside(stretches: list[tuple[int, int]], count: int) -> np.ndarray:
+    """Which of so many readings lie in stretches [start, stop)."""
+    rows = np.arange(count)
+    return np.any([(start <= rows) & (rows < stop) for start, stop in stretches], axis=0)
 
 
 def _finding(end: float, count: int, largest: np.ndarray, sds: np.ndarray) -> Finding:
@@ -193,52 +187,43 @@ def _turning(part: np.ndarray, top: int, noise: float) -> float:
     return float(np.mean(close)) if noise > 0 else float(part[top])
 
 
-@dataclass(frozen=True)
-class _Loading:
-    """Loading in the law's form, F = k1 x - k3 x^3 + k5 x^5, x = d / scale - zero, fitted below the range's end."""
-
-    parameters: np.ndarray  # zero, k1, k3, k5
-    covariance: np.ndarray
-    scale_um: float
-
-    def at(self, path: float, noise: float) -> tuple[float, float]:
-        """Force at a displacement, and its standard deviation [mN]."""
-        x = path / self.scale_um - self.parameters[0]
-        powers, slope = _powers(x), _slopes(x) @ self.parameters[1:]
-        gradient = np.array([-slope, *powers])
-        variance = max(gradient @ self.covariance @ gradient, 0.0) + (slope / self.scale_um * noise) ** 2
-        return float(powers @ self.parameters[1:]), float(np.sqrt(variance))
+_POWERS, _SIGNS = np.array([1, 3, 5]), np.array([1, -1, 1])
 
 
-def _powers(x: np.ndarray | float) -> np.ndarray:
-    return np.stack([x, -np.power(x, 3), np.power(x, 5)], -1)
-
-
-def _slopes(x: np.ndarray | float) -> np.ndarray:
-    return np.stack([np.ones_like(x), -3 * np.square(x), 5 * np.power(x, 4)], -1)
-
-
-def _loading(force: np.ndarray, path: np.ndarray, hidden: np.ndarray, start: int, end: float) -> _Loading | None:
-    """The loading curve before the force channel saturates for the first time."""
+def _loading(
+    force: np.ndarray, path: np.ndarray, hidden: np.ndarray, noise: float
+) -> Callable[[float], tuple[float, float]] | None:
+    """Force at a displacement of this noise, and its standard deviation [mN], by the loading curve before the force
+    channel saturates for the first time; None if there is too little of it."""
     from scipy.optimize import least_squares
 
-    before = slice(start)
+    before, end = slice(int(np.argmax(hidden))), float(force.max())
     virgin = (path[before] >= np.maximum.accumulate(path[before])) & (force[before] >= FITTED_FROM * end)
-    rows = np.flatnonzero(virgin & ~hidden[before])
-    if len(rows) < 8:
-        return None
-    f, d = force[rows], path[rows]
-    scale = float(d[-1] - d[0]) / (1 - FITTED_FROM)
+    f, d = force[before][virgin], path[before][virgin]
+    scale = float(d[-1] - d[0]) / (1 - FITTED_FROM) if len(d) >= 8 else 0.0
     if not scale > 0:
         return None
 
-    def misfit(parameters: np.ndarray) -> np.ndarray:  # in displacement, where the noise is
-        x = d / scale - parameters[0]
-        slope = np.maximum(_slopes(x) @ parameters[1:] / scale, 1e-3 * end / scale)
-        return (_powers(x) @ parameters[1:] - f) / slope
+    def terms(x: np.ndarray) -> np.ndarray:
+        return _SIGNS * x[..., None] ** _POWERS
+
+    def slopes(x: np.ndarray) -> np.ndarray:
+        return _SIGNS * _POWERS * x[..., None] ** (_POWERS - 1) / scale
+
+    def misfit(numbers: np.ndarray) -> np.ndarray:  # in displacement, where the noise is
+        x = d / scale - numbers[0]
+        return (terms(x) @ numbers[1:] - f) / np.maximum(slopes(x) @ numbers[1:], 1e-3 * end / scale)
 
     first = d[0] / scale - FITTED_FROM
-    begin = np.concatenate([[first], np.linalg.lstsq(_powers(d / scale - first), f, rcond=None)[0]])
+    begin = np.concatenate([[first], np.linalg.lstsq(terms(d / scale - first), f, rcond=None)[0]])
     found = least_squares(misfit, begin, x_scale=np.maximum(np.abs(begin), 1e-3), max_nfev=100)
-    variance = float(np.sum(found.fun**2) / max(len(d) - 4, 1))
-    return _Loading(found.x, variance * np.linalg.pinv(found.jac.T @ found.jac), scale)
+    covariance = np.sum(found.fun**2) / max(len(d) - 4, 1) * np.linalg.pinv(found.jac.T @ found.jac)
+
+    def at(displacement: float) -> tuple[float, float]:
+        x = np.asarray(displacement / scale - found.x[0])
+        slope = slopes(x) @ found.x[1:]
+        gradient = np.array([-scale * slope, *terms(x)])
+        variance = max(gradient @ covariance @ gradient, 0.0) + (slope * noise) ** 2
+        return float(terms(x) @ found.x[1:]), float(np.sqrt(variance))
+
+    return at

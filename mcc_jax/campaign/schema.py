@@ -57,7 +57,7 @@ class Checked:
 
 @dataclass(frozen=True, repr=False)
 class Curve:
-    """One particle's test, raw as the tester recorded it: nothing shifted, smoothed or sorted.
+    """One particle's test, raw as the instrument recorded it: nothing shifted, smoothed or sorted.
 
     Attributes:
         time_s: time [s], never decreasing, shape (n,), n >= 2.
@@ -67,8 +67,7 @@ class Curve:
 
     Lists, Series and arrays of any kind become numpy arrays that cannot be written to.
 
-    Raises:
-        InputError: if one of them is no 1-D array of numbers, or they differ in length.
+    Anything else, or columns of different lengths, raises `InputError`.
     """
 
     time_s: np.ndarray
@@ -119,8 +118,7 @@ class Metadata:
         corrections: names of corrections that were applied before the data got here.
         other: every further entry of the file, kept as it is.
 
-    Raises:
-        InputError: for a control that does not exist, or a resolution or diameter that is not positive.
+    A control that does not exist, and a resolution or diameter that is not positive, raise `InputError`.
     """
 
     control: Control | None = None
@@ -155,10 +153,7 @@ class Campaign:
         source: the folder or file it was read from, for messages; empty when made in memory.
         raw: of a campaign that `check_tests` made, the one it was made from; None otherwise.
 
-    Lists and Series are converted.
-
-    Raises:
-        InputError: if names, diameters, curves or columns are of the wrong kind, or not as many as each other.
+    Lists and Series are converted; wrong kinds or different lengths raise `InputError`.
     """
 
     particles: tuple[str, ...]
@@ -206,22 +201,14 @@ class Campaign:
         return table(title, rows)
 
     def index(self, particle: str) -> int:
-        """Position of a particle by its name.
-
-        Raises:
-            InputError: if there is no such particle.
-        """
+        """Position of a particle by its name; `InputError` if there is none."""
         if particle in self.particles:
             return self.particles.index(particle)
         known = ", ".join(self.particles)
         raise InputError(f"there is no particle {arguments.shown(particle)}", remedy=f"There are: {known}.")
 
     def select(self, keep: np.ndarray) -> Campaign:
-        """The campaign of those particles where `keep`, booleans of shape (N,), is true.
-
-        Raises:
-            InputError: if `keep` is anything else.
-        """
+        """The campaign of those particles where `keep`, booleans of shape (N,), is true."""
         keep = np.asarray(keep)
         if keep.dtype != bool or keep.shape != (len(self),):
             raise InputError(f"keep must be {len(self)} booleans, one for every particle, got {arguments.shown(keep)}")
@@ -237,12 +224,7 @@ class Campaign:
         )
 
     def without(self, *particles: str) -> Campaign:
-        """The campaign without the named particles.
-
-        Raises:
-            KeyError: if there is no such particle.
-            InputError: if none would be left.
-        """
+        """The campaign without the named particles; `InputError` if there is no such particle, or none is left."""
         gone = {self.index(name) for name in particles}
         if len(gone) == len(self):
             remedy = "Leave at least one particle in"

@@ -1,6 +1,6 @@
 """Cutting a test into approach, load, hold, unload and reload.
 
-The signal that the tester controls (force or displacement) is cut at its turning points, found by hysteresis: a
+The signal that the test machine controls (force or displacement) is cut at its turning points, found by hysteresis: a
 turn counts once the signal has gone back by more than the noise and more than a small share of its range. Around
 and between turning points, a hold is where the signal dwells: it stays within a narrow band for several times
 longer than the neighbouring ramps need to cross that band. What comes before the force begins to rise is the
@@ -64,8 +64,8 @@ def find_segments(curve: Curve, *, control: Control | None = None) -> tuple[Segm
     A reload that goes beyond the greatest force reached before is cut there: what follows is virgin "load". A pause
     that left no samples (a gap in time) is no segment of its own. Where the force stays at its lowest level while
     the platen moves away, that is still "unload". Small cycles that drown in noise are not found: a turn must be
-    deeper than eight times the noise's standard deviation, which is estimated from the curve. A turning
-    point belongs to the segment that starts there.
+    deeper than eight times the noise's standard deviation, which is estimated from the curve. A turning point belongs
+    to the segment that starts there.
 
     Args:
         curve: the test, raw.
@@ -73,11 +73,8 @@ def find_segments(curve: Curve, *, control: Control | None = None) -> tuple[Segm
             while the force relaxes, else force.
 
     Returns:
-        The segments in order; the first starts at 0, each starts where the one before stops, the last stops at
-        the number of samples.
-
-    Raises:
-        InputError: for a curve without a point or with one that is not finite, or a control that does not exist.
+        The segments in order, from 0 to the number of samples. A curve without a point or with one that is not finite,
+        and a control that does not exist, raise `InputError`.
     """
     if control is not None:
         arguments.choice(control, get_args(Control), "control")
@@ -113,25 +110,18 @@ def _found(curve: Curve, control: Control | None) -> tuple[Segment, ...]:
 
 
 def summarise_segments(curve: Curve, segments: tuple[Segment, ...]) -> list[dict[str, Any]]:
-    """One row per segment, as `find_segments` gave them, for printing.
-
-    Returns:
-        Rows with `kind`, `samples`, `start_s`, `stop_s`, `force_from_mN`, `force_to_mN`, `displacement_from_um` and
-        `displacement_to_um`; times, forces and displacements are those of the first and the last sample.
-    """
-    columns = {
-        ("start_s", "stop_s"): curve.time_s,
-        ("force_from_mN", "force_to_mN"): curve.force_mN,
-        ("displacement_from_um", "displacement_to_um"): curve.displacement_um,
-    }
+    """One row per segment for printing: its kind and number of samples, and its first and last time, force and
+    displacement."""
     rows: list[dict[str, Any]] = []
     for part in segments:
-        ends = {
-            name: float(values[at])
-            for names, values in columns.items()
-            for name, at in zip(names, (part.start, part.stop - 1), strict=True)
-        }
-        rows.append({"kind": part.kind, "samples": len(part)} | ends)
+        row: dict[str, Any] = {"kind": part.kind, "samples": len(part)}
+        for first, last, values in (
+            ("start_s", "stop_s", curve.time_s),
+            ("force_from_mN", "force_to_mN", curve.force_mN),
+            ("displacement_from_um", "displacement_to_um", curve.displacement_um),
+        ):
+            row |= {first: float(values[part.start]), last: float(values[part.stop - 1])}
+        rows.append(row)
     return rows
 
 
@@ -211,7 +201,7 @@ def _contact_onset(force: Drive, displacement: np.ndarray, clock: np.ndarray) ->
     while True:
         stop = int(np.flatnonzero(before <= base + rise)[-1]) + 1
         along = _bend(values[:stop], rise, (clock, displacement))
-        # Some samples of the rise must be seen to tell it from what precedes it, also where it is steep.
+        # Some samples of the rise must be seen to distinguish it from what precedes it, also where it is steep.
         stop = min(stop + 8, peak + 1)
         if along is None or stop < 8:
             return onset
@@ -272,7 +262,7 @@ def _assemble(drive: Drive, holds: list[Hold], force: Drive, onset: int) -> tupl
     for hold in holds:
         kinds[hold.start : hold.stop] = "hold"
         if onset > 0 and hold.start < onset < hold.stop:
-            onset = hold.stop  # waiting without force ends where the force rises, which the hold tells better
+            onset = hold.stop  # waiting without force ends where the force rises, which the hold shows better
     kinds[:onset] = "approach"
     cuts = np.flatnonzero(kinds[1:] != kinds[:-1]) + 1
     edges = [0, *cuts.tolist(), count]

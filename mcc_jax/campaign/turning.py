@@ -107,13 +107,13 @@ def _level(
         return largest, 1.0
     near = raw > (1 - share) * largest
     turn = float(time[after.start])
-    before = _run(near, up.start, up.stop, -1, MOST)
-    behind = _run(near, after.start, after.stop, 1, MOST)
-    held = after.kind == "hold"  # a relaxing force: only the ramp tells where it began
-    # The readings beside the turn may be on either side of it: first without them, then each where it belongs.
-    beside = 0 if held else 1
-    rising = _Curve.through(time, raw, before[: len(before) - beside], turn, noise)
-    falling = _Curve.through(time, raw, behind[beside:], turn, noise)
+    before = _run(near, up.start, up.stop, -1)
+    behind = _run(near, after.start, after.stop, 1)
+    held = after.kind == "hold"  # a relaxing force: only the ramp shows where it began
+    # The readings next to the turn may be on either side of it: first without them, then each where it belongs.
+    next_to = 0 if held else 1
+    rising = _Curve.through(time, raw, before[: len(before) - next_to], turn, noise)
+    falling = _Curve.through(time, raw, behind[next_to:], turn, noise)
     if rising is None or falling is None:
         return largest, 1.0
     if held:
@@ -124,9 +124,9 @@ def _level(
     )
     both = np.concatenate([before, behind])
     early = time[both] < turn + _meeting(rising, falling, step)
-    again = [_Curve.through(time, raw, both[side], turn, noise) for side in (early, ~early)]
-    if again[0] is not None and again[1] is not None:
-        rising, falling = again[0], again[1]
+    parts = [_Curve.through(time, raw, both[side], turn, noise) for side in (early, ~early)]
+    if parts[0] is not None and parts[1] is not None:
+        rising, falling = parts[0], parts[1]
     meet = _meeting(rising, falling, step)
     (one, first), (other, second) = rising.at(meet), falling.at(meet)
     steep, down = rising.slope(meet), falling.slope(meet)
@@ -150,23 +150,23 @@ def _meeting(rising: _Curve, falling: _Curve, step: float) -> float:
     return float(instants[int(np.argmin(np.abs(rising.along(instants) - falling.along(instants))))])
 
 
-def _run(near: np.ndarray, start: int, stop: int, direction: int, most: int) -> np.ndarray:
+def _run(near: np.ndarray, start: int, stop: int, direction: int) -> np.ndarray:
     """Rows of the unbroken run of `near` at the end (-1) or the beginning (1) of a segment."""
     order = np.arange(start, stop)[::direction]
     order = order[: int(np.argmin(near[order])) if not near[order].all() else len(order)]
-    return np.sort(order[:most])
+    return np.sort(order[:MOST])
 
 
 def _held(time: np.ndarray, raw: np.ndarray, part: Segment, noise: float) -> np.ndarray | None:
     """Rows of a hold whose readings scatter about one force; None where the force relaxes.
 
-    A hold begins and ends with readings of the ramps beside it that come close to it: they lie apart from the others.
+    A hold begins and ends with readings of the ramps next to it that come close to it: they are far from the others.
     """
     force = raw[part.start : part.stop]
     away = np.abs(force - median(force))
     sd = 1.4826 * median(away)
     rows = part.start + np.flatnonzero(away <= INSIDE * sd)
-    if len(rows) < LEAST:  # too few to tell what they scatter about: those as high as the highest
+    if len(rows) < LEAST:  # too few to show what they scatter about: those as high as the highest
         return part.start + np.flatnonzero(force >= force.max() - INSIDE * noise)
     line = Line.through(time[rows], raw[rows])
     return rows if line.spread == 0 or sd == 0 or abs(line.slope) <= TREND * line.slope_sd else None

@@ -88,7 +88,7 @@ class UnitError(NamedTuple):
         swapped: whether force and displacement are exchanged.
     """
 
-    decades: tuple[float, float, float, float, float, float]
+    decades: tuple[float, ...]
     prior: float = UNIT_ERROR
     swapped: bool = False
 

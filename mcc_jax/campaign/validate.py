@@ -59,14 +59,14 @@ def check_campaign(campaign: Any, name: str = "campaign", *, file: str | Path = 
 def _check(campaign: Campaign, place: str | Path) -> None:
     """Refuse unfit names, shapes and values."""
 
-    def fail(problem: str, remedy: str = "Mend the campaign before it is used") -> InputError:
+    def fail(problem: str, remedy: str = "Correct the campaign before it is used") -> InputError:
         return InputError(problem, file=place, remedy=remedy)
 
     if not len(campaign):
         raise fail("there is no particle")
     name, times = Counter(campaign.particles).most_common(1)[0]
     if times > 1:
-        raise fail(f"the particle {name!r} stands there {times} times")
+        raise fail(f"the particle {name!r} appears {times} times")
     for name, triple in zip(campaign.particles, campaign.diameters_um, strict=True):
         _check_text(name, f"the particle's name {name!r}", fail)
         if not name.strip():
@@ -120,19 +120,12 @@ _COARSEST = ("force_resolution_mN", "displacement_resolution_um")
 
 
 def join_campaigns(first: Campaign, *further: Campaign) -> Campaign:
-    """The tests of several campaigns as one, for instance those that a discovery proposed beside those it had.
+    """The tests of several campaigns as one, for instance those that a discovery proposed in addition to those it had.
 
     Programmes of load may differ. What is read from `campaign.toml` must agree where the law or the search depend on
-    it; of resolutions the coarsest counts, provenances stand one after the other, and of further entries with one name
-    the first campaign's stays.
-
-    Args:
-        first: a campaign; its particles come first.
-        further: other ones, of the same material.
-
-    Raises:
-        InputError: if two particles have the same name, a column is not in all campaigns, or control, punch or
-            corrections differ.
+    it; of resolutions the coarsest counts, provenances are listed, and of further entries with one name the first
+    campaign's stays. The same name twice, a column that is not in all campaigns, and different control, punch or
+    corrections raise `InputError`.
     """
     campaigns = tuple(check_campaign(one, f"campaign {i}") for i, one in enumerate((first, *further), start=1))
     for other in further:
@@ -141,10 +134,8 @@ def join_campaigns(first: Campaign, *further: Campaign) -> Campaign:
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
         at = next(c for c in reversed(campaigns) if twice[0] in c.particles)
-        problem, remedy = (
-            f"the particle {twice[0]!r} is in another of the campaigns, too",
-            "Give every particle a name of its own",
-        )
+        problem = f"the particle {twice[0]!r} is in another of the campaigns, too"
+        remedy = "Give every particle its own name"
         raise InputError(problem, file=at.source or None, column="particle", remedy=remedy)
     joined = {name: tuple(v for c in campaigns for v in c.columns[name]) for name in first.columns}
     return Campaign(
@@ -160,16 +151,14 @@ def join_campaigns(first: Campaign, *further: Campaign) -> Campaign:
 def _check_alike(first: Campaign, other: Campaign) -> None:
     for name in sorted(first.columns.keys() ^ other.columns.keys()):
         lacking = other if name in first.columns else first
-        problem, remedy = (
-            "the column is in another of the campaigns only",
-            "Enter it for all particles, or leave it out everywhere",
-        )
+        problem = "the column is in another of the campaigns only"
+        remedy = "Enter it for all particles, or leave it out everywhere"
         raise InputError(problem, file=lacking.source or None, column=name, remedy=remedy)
     for name in _ALIKE:
         one, another = getattr(first.metadata, name), getattr(other.metadata, name)
         if one != another:
             problem = f"{name} is {another!r} here and {one!r} in the first campaign"
-            remedy = "Such tests are not of one kind; judge them apart, or correct the entry"
+            remedy = "Such tests are not of one kind; evaluate them separately, or correct the entry"
             raise InputError(problem, file=other.source or None, remedy=remedy)
 
 
@@ -178,6 +167,6 @@ def _metadata(each: list[Metadata]) -> Metadata:
     for name in _COARSEST:
         known = [value for m in each if (value := getattr(m, name)) is not None]
         coarsest[name] = max(known, default=None)
-    told = dict.fromkeys(m.provenance for m in each if m.provenance)
+    sources = dict.fromkeys(m.provenance for m in each if m.provenance)
     other = {name: value for m in reversed(each) for name, value in m.other.items()}
-    return replace(each[0], **coarsest, provenance="; ".join(told) or None, other=other)
+    return replace(each[0], **coarsest, provenance="; ".join(sources) or None, other=other)

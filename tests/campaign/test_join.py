@@ -41,12 +41,6 @@ def test_every_test_is_there_once_in_order(tmp_path):
     np.testing.assert_allclose(read_campaign(tmp_path / "joined").diameters_um, joined.diameters_um)
 
 
-def test_one_campaign_is_itself():
-    one = campaign("ab", 1, control="load", provenance="lab")
-    assert join_campaigns(one).metadata == one.metadata
-    assert join_campaigns(one).curves == one.curves
-
-
 def test_what_is_known_of_the_tests_is_kept():
     one = campaign(
         "a", 1, control="load", force_resolution_mN=0.01, provenance="lab", other={"operator": "x", "kept": 1}

@@ -97,14 +97,7 @@ def test_the_zero_of_force_in_the_air_is_taken_off_with_its_error(seed, offset_m
     told = [one for one in campaign_findings(checked) if one.check == "zero of force"]
     assert bool(told) or abs(offset_mN) < 1
     assert worst(told) in (None, "info")
-
-
-def test_an_offset_is_told_in_a_sentence_with_its_size():
-    _, found = only(faulty.in_air(noisy(exact(), 0), offset_mN=20.0), "zero of force")
-    assert found.level == "info"
-    assert found.particles == exact().particles
-    assert "in the air before contact; this was taken off" in found.sentence
-    assert "20" in found.sentence
+    assert all("before contact; this was taken off" in one.sentence for one in told)
 
 
 def test_an_offset_that_no_answer_can_feel_is_taken_off_without_a_word():

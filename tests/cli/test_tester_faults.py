@@ -95,7 +95,7 @@ def test_convert_tells_what_it_finds(run, tmp_path):
         'displacement = { column = "d", unit = "um" }\n'
     )
     for name, rows, words in (
-        ("air", slice(None), "mN in the air"),
+        ("air", slice(None), "mN before contact"),
         ("back", slice(top, None), "its loading is missing"),
     ):
         columns = zip(curve.time_s[rows], curve.force_mN[rows], curve.displacement_um[rows], strict=True)
