@@ -221,44 +221,30 @@ class Mechanism:
 
 
 def row(name: str, equation: str, explanation: str, **own: Any) -> dict[str, Any]:
-    """One formula of a `family`: its name, equation and explanation, and what differs from the others'.
+    """One formula of a `family`, with what differs from the others: fields of `Variant`, settings of the class.
 
-    `own` are fields of `Variant`; all else are settings of the effect's class. Of an `AbstractFormulas` the formula is
-    the one of the row's name unless `formula` is among them.
+    Of an `AbstractFormulas` the formula is the one of the row's name unless `formula` is given.
     """
     return {"name": name, "equation": equation, "explanation": explanation, **own}
 
 
 def family(
-    make: type[AbstractEffect],
-    name: str,
-    explanation: str,
-    *rows: Mapping[str, Any],
-    equivalences: tuple[str, ...] = (),
-    check: str,
-    coordinates: tuple[str, ...],
-    opposite: str = "",
-    sudden: bool = False,
-    **common: Any,
+    make: type[AbstractEffect], name: str, explanation: str, *rows: Mapping[str, Any], **common: Any
 ) -> Mechanism:
     """A mechanism from its rows.
 
-    Args:
-        make: class of the effects; a row may name another.
-        name, explanation: of the mechanism.
-        rows: its formulas.
-        equivalences, check, coordinates, opposite, sudden: of the mechanism.
-        common: fields of `Variant` that rows do not give; without unit and of positive sign if nobody says otherwise.
+    `make` is the class of the effects unless a row names another. `common` has further fields of the mechanism and
+    those of `Variant` that rows do not give; without a unit and of positive sign unless stated.
     """
-    known = {f.name for f in fields(Variant)}
-    variants = []
+    of_mechanism = {f.name: common.pop(f.name) for f in fields(Mechanism) if f.name in common}
+    known, variants = {f.name for f in fields(Variant)}, []
     for own in rows:
         given = {"mechanism": name, "make": make, "unit": "-", "sign": 1, **common, **own}
         fixed = {key: given.pop(key) for key in list(given) if key not in known}
         if issubclass(given["make"], AbstractFormulas):
             fixed.setdefault("formula", given["name"])
         variants.append(Variant(**given, fixed=fixed))
-    return Mechanism(name, explanation, tuple(variants), equivalences, check, coordinates, opposite, sudden)
+    return Mechanism(name, explanation, tuple(variants), **of_mechanism)
 
 
 @dataclass(frozen=True)

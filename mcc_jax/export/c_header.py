@@ -92,15 +92,14 @@ def _origin_lines(law: MccLaw, particle: Particle | None, origin: Origin) -> lis
     lines += [_quoted(line)[1:-1] for line in in_words(law)]
     if origin.calibration is not None:
         c = origin.calibration
-        lines.append(
-            f"From {_quoted(str(c['file']))}, method {_quoted(str(c['method']))}, sha256 {str(c['sha256'])[:16]}..."
-        )
+        file, method = _quoted(str(c["file"])), _quoted(str(c["method"]))
+        lines.append(f"From {file}, method {method}, sha256 {str(c['sha256'])[:16]}...")
         if not c["converged"]:
             lines.append("WARNING: that calibration did not converge.")
     whose = "the population (medians)" if origin.particle is None else f"particle {_quoted(origin.particle)}"
     lines.append(f"Coefficients of {whose}.")
     if particle is not None:
-        sizes = ", ".join(f"{float(d):.6g}" for d in (particle.D1, particle.D2, particle.D3))
+        sizes = ", ".join(f"{float(d):.6g}" for d in jax.tree.leaves(particle))
         lines.append(f"Particle of the golden table: D1, D2, D3 = {sizes} um ({_quoted(origin.geometry)}).")
     if not bool(law.is_monotone):
         lines.append("WARNING: the loading curve is not monotone; a pair of such contacts has several solutions.")
@@ -113,13 +112,9 @@ def _render(name: str, **values: Any) -> str:
         from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
-        loader=PackageLoader("mcc_jax.export"),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-        autoescape=False,  # C and Markdown, not HTML
-    )
+        loader=PackageLoader("mcc_jax.export"), undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+        keep_trailing_newline=True, autoescape=False,  # C and Markdown, not HTML
+    )  # fmt: skip
     return environment.get_template(name).render(**values)
 
 

@@ -89,6 +89,8 @@ def test_equivalences_are_declared():
     for word in ("load-cell gain", "zero of force", "shape parameter a", "frame_compliance"):
         assert word in named
     assert LIBRARY["damage"].equivalences
+    for name, mechanism in LIBRARY.items():
+        assert not mechanism.opposite or LIBRARY[mechanism.opposite].opposite == name
 
 
 def test_names_lead_to_variants():

@@ -60,10 +60,7 @@ print(json.dumps(found))
 """
 
 
-FORMS = [
-    (Unloading.PRINTED, StrainScaling.RAW),
-    pytest.param((Unloading.PUNCH, StrainScaling.MASTER), marks=pytest.mark.extended),
-]
+FORMS = [(Unloading.PRINTED, StrainScaling.RAW), (Unloading.PUNCH, StrainScaling.MASTER)]
 
 
 @pytest.mark.parametrize("form", FORMS, ids=str)
