@@ -311,7 +311,7 @@ def _header(cells: list[str], file: Path) -> tuple[str, ...]:
             raise InputError(f"the name of column {i + 1} is empty", file=file, row=1, remedy="Name or delete it")
     name, count = Counter(header).most_common(1)[0]
     if count > 1:
-        raise InputError(f"stands there {count} times", file=file, row=1, column=name, remedy="Rename or delete one")
+        raise InputError(f"column appears {count} times", file=file, row=1, column=name, remedy="Rename or delete one")
     return header
 
 

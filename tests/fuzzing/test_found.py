@@ -25,10 +25,10 @@ TESTERS = {
     "peak with two points": ("fischer.txt", b"HM  0.020000/", b"HM  0.02.000/", None),
     "digits of a count": ("fischer.txt", b"\r\n2\tn\t", b"\r\n" + b"2" * 5000 + b"\tn\t", None),
     "digits of points": ("hysitron.hld", b"Test Data Points: 12", b"Test Data Points: " + b"1" * 5000, "neither"),
-    "block twice": ("hysitron.hld", b"Sample Approach Data", b"Drift Measurement Data", "stands there twice"),
-    "hld column twice": ("hysitron.hld", b"\tDisp_V", b"\tDisp_nm", "'Disp_nm': stands there 2 times"),
+    "block twice": ("hysitron.hld", b"Sample Approach Data", b"Drift Measurement Data", "appears twice"),
+    "hld column twice": ("hysitron.hld", b"\tDisp_V", b"\tDisp_nm", "'Disp_nm': column appears 2 times"),
     "lc digits": ("hysitron_lc.txt", b"Points = 12", b"Points = " + b"1" * 5000, "the format is not known"),
-    "lc column twice": ("hysitron_lc.txt", b"\tDepth (V)", b"\tTime (s)", "'Time (s)': stands there 2 times"),
+    "lc column twice": ("hysitron_lc.txt", b"\tDepth (V)", b"\tTime (s)", "'Time (s)': column appears 2 times"),
 }
 
 

@@ -37,7 +37,7 @@ def read(lines: list[str], file: Path) -> Tests:
     for start, stop, (block, value) in zip(starts, [*starts[1:], len(lines)], labels, strict=True):
         name = value if single else f"{block}-{value}"
         if name in curves:
-            raise cut_off(f"the test {name!r} stands there twice", file, start + 1)
+            raise cut_off(f"the test {name!r} appears twice", file, start + 1)
         head = next((i for i in range(start, stop) if lines[i].strip() == _COLUMNS), None)
         if head is None:
             raise cut_off(f"the test {name!r} has no samples (the line F h t is missing)", file, start + 1)
@@ -45,8 +45,9 @@ def read(lines: list[str], file: Path) -> Tests:
         last = starts[-1] == start
         if any(line.strip() for line in lines[end:stop]) and last:
             raise cut_off("there is text behind the last test's samples", file, end + 1)
-        numbers = number_block(lines, head + 1, end, ("F", "h", "t"), file, decimal_mark=",")
-        curve = checked_curve(numbers[:, 2], numbers[:, 0], numbers[:, 1], file, head + 2, name)
+        at = range(head + 1, end)
+        block = number_block(lines, at, _COLUMNS.split("\t"), file, decimal_mark=",")
+        curve = checked_curve(block["t"], block["F"], block["h"], file, at, name)
         before = [line for line in lines[max(start - 3, 0) : start] if _PEAK.match(line)]
         peak = _PEAK.match(before[-1]) if before else None
         # A file cut in the middle of a test has not got its greatest force yet.

@@ -8,13 +8,14 @@ approach and drift blocks and the test block's further columns as lists. Nothing
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..schema import Control
-from .text import Tests, checked_curve, cut_off, leading_number, number_block, refuse_twice
+from .text import Tests, checked_curve, cut_off, leading_number, number_block
 
 _BLOCK = re.compile(r"(Sample Approach|Drift Measurement|Test) Data Points: *(\d{1,9})\s*")
 _FORCES = ("Force_µN", "Force_uN", "Force_μN")
@@ -28,7 +29,7 @@ def matches(lines: list[str]) -> bool:
 def read(lines: list[str], file: Path) -> Tests:
     """The one test of the file, named by the file. Raises `InputError` if a block is missing, cut off or damaged."""
     blocks: dict[str, dict[str, np.ndarray]] = {}
-    first_row = 0
+    at: Sequence[int] = ()
     header: list[tuple[str, str]] = []
     i = 0
     while i < len(lines):
@@ -42,16 +43,14 @@ def read(lines: list[str], file: Path) -> Tests:
             i += 1
             continue
         count, names = int(match[2]), lines[i + 1].rstrip().split("\t") if i + 1 < len(lines) else []
-        first, stop = i + 2, i + 2 + count
+        stop = i + 2 + count
         if stop > len(lines) or (count and not lines[stop - 1].strip()):
             raise cut_off(f"{match[1]} announces {count} rows, the file ends before", file, i + 1)
         if match[1] in blocks:
-            raise cut_off(f"the block '{match[1]} Data Points' stands there twice", file, i + 1)
-        refuse_twice(names, file, i + 2)
-        numbers = number_block(lines, first, stop, names, file)
-        blocks[match[1]] = dict(zip(names, numbers.T, strict=True))
+            raise cut_off(f"the block '{match[1]} Data Points' appears twice", file, i + 1)
+        blocks[match[1]] = number_block(lines, range(i + 2, stop), names, file)
         if match[1] == "Test":
-            first_row = first + 1
+            at = range(i + 2, stop)
         i = stop
     if "Test" not in blocks:
         raise cut_off("the block 'Test Data Points' is missing", file)
@@ -59,9 +58,11 @@ def read(lines: list[str], file: Path) -> Tests:
     force_name = next((name for name in _FORCES if name in test), "Force_µN")
     for name in ("Time_s", "Disp_nm", force_name):
         if name not in test:
-            raise cut_off(f"the test block has no column {name!r}; it has {', '.join(test)}", file, first_row - 1)
+            raise cut_off(
+                f"the test block has no column {name!r}; it has {', '.join(test)}", file, at[0] if at else None
+            )
     curve = checked_curve(
-        test.pop("Time_s"), test.pop(force_name) / 1e3, test.pop("Disp_nm") / 1e3, file, first_row, file.stem
+        test.pop("Time_s"), test.pop(force_name) / 1e3, test.pop("Disp_nm") / 1e3, file, at, file.stem
     )
     names = {"Sample Approach": "approach_block", "Drift Measurement": "drift_block"}
     other: dict[str, Any] = _facts(header)

@@ -1,4 +1,4 @@
-"""Hysitron load-control text export: a date, `Number of Points = N`, column names, segments parted by empty lines.
+"""Hysitron load-control text export: a date, `Number of Points = N`, column names, segments separated by empty lines.
 
 The approach is part of the curve, as in the file. The columns in volts and the lengths of the segments are kept
 in `Metadata.other`.
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .text import Tests, checked_curve, cut_off, number_block, refuse_twice
+from .text import Tests, checked_curve, cut_off, number_block
 
 _COUNT = re.compile(r"Number of Points *= *(\d{1,9})\s*")
 _TIME, _DEPTH, _LOAD = "Time (s)", "Depth (nm)", "Load (µN)"
@@ -32,17 +32,13 @@ def read(lines: list[str], file: Path) -> Tests:
     for name in (_TIME, _DEPTH, _LOAD):
         if name not in names:
             raise cut_off(f"the column {name!r} is missing", file, head + 1)
-    refuse_twice(names, file, head + 1)
-    rows = np.array([i for i in range(head + 1, len(lines)) if lines[i].strip()], int)
-    if len(rows) != announced:
-        raise cut_off(f"{announced} points are announced, the file holds {len(rows)}", file, count_row)
-    parts = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
-    blocks = [number_block(lines, int(part[0]), int(part[-1]) + 1, names, file) for part in parts if len(part)]
-    columns = dict(zip(names, np.concatenate([np.empty((0, len(names))), *blocks]).T, strict=True))
+    at = [i for i in range(head + 1, len(lines)) if lines[i].strip()]
+    if len(at) != announced:
+        raise cut_off(f"{announced} points are announced, the file holds {len(at)}", file, count_row)
+    columns = number_block(lines, at, names, file)
     time, depth, load = (columns.pop(name) for name in (_TIME, _DEPTH, _LOAD))
-    back = np.flatnonzero(np.diff(time) < 0)
-    first_row = rows[back[0] + 1] - back[0] if len(back) else rows[0] + 1 if len(rows) else 1
-    curve = checked_curve(time, load / 1e3, depth / 1e3, file, int(first_row), file.stem)
+    curve = checked_curve(time, load / 1e3, depth / 1e3, file, at, file.stem)
+    lengths = [len(part) for part in np.split(at, np.flatnonzero(np.diff(at) > 1) + 1) if len(part)]
     further = {name: values.tolist() for name, values in columns.items()}
-    other = {"date": lines[0].strip(), "block_lengths": [len(block) for block in blocks], "further_columns": further}
+    other = {"date": lines[0].strip(), "block_lengths": lengths, "further_columns": further}
     return Tests({file.stem: curve}, "Hysitron load-control text", "load", other)

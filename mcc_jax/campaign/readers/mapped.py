@@ -438,6 +438,5 @@ def _curve(name: str, rows: list[_Sample], mapping: MappingFile, file: Path, aga
         way = "header" if again else "blank line" if here > before + 1 else "column"
         remedy = f'If another test begins here, write tests = "{way}" in {mapping.file.name} or part the file'
         raise InputError(f"the time of test {name!r} goes back", file=file, row=here, remedy=remedy)
-    # Rows of one test need not follow each other, so the row of the first sample is no guide.
-    first = at[int(back[0]) + 1] - int(back[0]) - 1 if len(back) else at[0]
-    return checked_curve(time, columns["force"], columns["displacement"], file, first, name)
+    lines = [row - 1 for row in at]
+    return checked_curve(time, columns["force"], columns["displacement"], file, lines, name)

@@ -17,7 +17,6 @@ from ..table import filled
 from .text import Tests, checked_curve, decode_lines, number_block
 
 _ROW = re.compile(r"-?\d+\.\d{6}\t-?\d+\.\d{6}\t-?\d+\.\d{6}\s*")
-_NAMES = ("t", "h", "F")
 
 
 def matches(lines: list[str]) -> bool:
@@ -54,9 +53,9 @@ def read_zip(data: bytes, file: Path) -> Tests:
 
 
 def _curve(lines: list[str], file: Path, name: str) -> Curve:
-    end = filled(lines)
-    numbers = number_block(lines, 0, end, _NAMES, file)
-    return checked_curve(numbers[:, 0], numbers[:, 2], numbers[:, 1] / 1e3, file, 1, name)
+    at = range(filled(lines))
+    block = number_block(lines, at, ("t", "h", "F"), file)
+    return checked_curve(block["t"], block["F"], block["h"] / 1e3, file, at, name)
 
 
 def _entries(data: bytes, file: Path) -> list[tuple[str, bytes]]:

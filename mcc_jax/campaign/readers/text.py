@@ -62,51 +62,49 @@ def decode_lines(data: bytes, encoding: str | None = None, file: Path | None = N
 
 
 def number_block(
-    lines: Sequence[str], first: int, stop: int, names: Sequence[str], file: Path, decimal_mark: str = "."
-) -> np.ndarray:
-    """Tab-separated numbers of the lines from `first` to before `stop`, shape (rows, columns).
+    lines: Sequence[str], at: Sequence[int], names: Sequence[str], file: Path, decimal_mark: str = "."
+) -> dict[str, np.ndarray]:
+    """The columns, by name, of tab-separated numbers in the lines at some indices, each of shape (rows,).
 
-    Raises `InputError` at the first row or cell that is damaged.
+    Raises `InputError` if two columns have one name, or a row or cell is damaged.
     """
-    rows = [lines[i].rstrip("\t ").split("\t") for i in range(first, stop)]
-    for i, cells in enumerate(rows, start=first + 1):
+    name, count = Counter(names).most_common(1)[0] if names else ("", 0)
+    if count > 1:
+        problem, remedy = f"column appears {count} times", "Export the file again"
+        raise InputError(problem, file=file, row=at[0] if at else None, column=name, remedy=remedy)
+    rows = [lines[i].rstrip("\t ").split("\t") for i in at]
+    for i, cells in zip(at, rows, strict=True):
         if len(cells) != len(names):
             problem = f"{number_of_cells(len(cells))} where {len(names)} are expected ({', '.join(names)})"
-            raise InputError(problem, file=file, row=i, remedy="The file is damaged or cut off; export it again")
-    block = np.empty((len(rows), len(names)))
-    for j, cells in enumerate(zip(*rows, strict=True)):
+            raise cut_off(problem, file, i + 1)
+    columns = zip(*rows, strict=True) if rows else [()] * len(names)
+    block: dict[str, np.ndarray] = {}
+    for name, cells in zip(names, columns, strict=True):
         try:
-            block[:, j] = numbers(cells, decimal_mark)
+            block[name] = numbers(cells, decimal_mark)
         except NotANumber as error:
-            row, remedy = first + error.index + 1, "Export the file again"
-            raise InputError(str(error), file=file, row=row, column=names[j], remedy=remedy) from None
+            row, remedy = at[error.index] + 1, "Export the file again"
+            raise InputError(str(error), file=file, row=row, column=name, remedy=remedy) from None
     return block
 
 
 def checked_curve(
-    time: np.ndarray, force: np.ndarray, displacement: np.ndarray, file: Path, row: int, name: str
+    time: np.ndarray, force: np.ndarray, displacement: np.ndarray, file: Path, at: Sequence[int], name: str
 ) -> Curve:
-    """A curve whose time never goes back and that has at least two samples, the first in row `row` of the file."""
+    """A curve whose time never goes back and that has at least two samples, in the lines at these indices."""
     if len(time) < 2:
         problem = f"the test {name!r} has fewer than two samples"
-        raise InputError(problem, file=file, row=row, remedy="Export the file again")
+        raise InputError(problem, file=file, row=at[0] + 1 if at else 1, remedy="Export the file again")
     back = np.flatnonzero(np.diff(time) < 0)
     if len(back):
-        problem, at = f"the time of test {name!r} goes back", row + int(back[0]) + 1
-        raise InputError(problem, file=file, row=at, remedy="Each test needs a file or a name of its own")
+        problem, row = f"the time of test {name!r} goes back", at[int(back[0]) + 1] + 1
+        raise InputError(problem, file=file, row=row, remedy="Each test needs a file or a name of its own")
     return Curve(time, force, displacement)
 
 
 def cut_off(problem: str, file: Path, row: int | None = None) -> InputError:
     """The error for a file that ends too early or lacks a part."""
     return InputError(problem, file=file, row=row, remedy="The file is cut off or damaged; export it again")
-
-
-def refuse_twice(names: Sequence[str], file: Path, row: int) -> None:
-    """Refuse a header that names two columns alike: one of them would be lost."""
-    name, count = Counter(names).most_common(1)[0]
-    if count > 1:
-        raise InputError(f"stands there {count} times", file=file, row=row, column=name, remedy="Export the file again")
 
 
 def leading_number(text: str) -> float | None:
