@@ -23,8 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import mcc_jax as mcc
-from mcc_jax.calibrate.forward import Forms, Point
-from mcc_jax.calibrate.linearisation import linear_data, score_of_effects
+from mcc_jax.calibrate.forward import Forms, Point, linearise
+from mcc_jax.calibrate.linearisation import score_of_effects
 from mcc_jax.calibrate.noise import Noise
 from mcc_jax.effects import find_variant
 
@@ -49,7 +49,7 @@ def strength(base: mcc.calibrate.Fit, name: str, strong: str) -> float:
     effect = (find_variant(formula).build(0.0, **further),)
     true = Noise.of((INSTRUMENT.displacement_noise_um, INSTRUMENT.force_noise_mN, 1e-6, 0.2), jnp.ones(PARTICLES))
     point = Point(base.point.latent, base.point.zero, jnp.zeros((PARTICLES, 0)))
-    linear = linear_data(point, base.tests, Forms(base.model.unloading))
+    linear = linearise(point, base.tests, Forms(base.model.unloading))
     model = base.model
     kinds = effect, model.forms, model.zero_prior[1], model.correlation, model.along
     information = float(np.asarray(score_of_effects(point, base.tests, linear, true, *kinds))[:, 0, 1].sum())
@@ -60,7 +60,7 @@ def strength(base: mcc.calibrate.Fit, name: str, strong: str) -> float:
 
 def noise_ratio(fit: mcc.calibrate.Fit) -> float:
     """Median over points of the standard deviation of noise that was found over the true one."""
-    by_force = np.asarray(linear_data(fit.point, fit.tests, fit.model.forms).by_force)
+    by_force = np.asarray(linearise(fit.point, fit.tests, fit.model.forms).by_force)
     true = INSTRUMENT.displacement_noise_um**2 + (INSTRUMENT.force_noise_mN * by_force) ** 2
     found = np.asarray(fit.filters.solver.matrix.diag.d)
     return float(np.median(np.sqrt(found / true)[np.asarray(fit.tests.mask)]))
