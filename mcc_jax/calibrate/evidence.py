@@ -141,7 +141,7 @@ def compare(campaign: Campaign, models: Sequence[Model | Posterior], *, seed: in
 def _refuse_robust(model: Model | None) -> None:
     if model is not None and model.robust:
         raise InputError(
-            "readings are weighed anew in every robust fit, so its likelihood cannot be compared with another's",
+            "readings are weighed again in every robust fit, so its likelihood cannot be compared with another's",
             remedy="Compare models with robust=False.",
         )
 

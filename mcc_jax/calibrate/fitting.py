@@ -33,12 +33,14 @@ from .settings import MOST_POINTS
 from .sharding import Blocks, Parts, block_size, count_of, filled_up, require_same
 
 # Found by trial on simulated campaigns (`benchmarks/study_posterior.py`, `study_noise.py`, `bench_scale.py`).
-FIRST_STEPS = 10  # that all particles of many blocks take before the late ones go on by themselves
+FIRST_STEPS = 10  # that all particles of many blocks take before the unfinished ones go on by themselves
 ALONE = 1.5  # standard deviation of the logarithms that a particle by itself is allowed around the prior's centre
 NARROWEST = 1e-3  # least such standard deviation under the population: any smaller is badly scaled
 NOISE_BLOCKS = 4  # the noise of campaigns of more blocks is estimated from the particles of so many
 ROUNDS, MOST_ROUNDS = 2, 20  # turns of noise, population and particles: at least, and at most, with effects
-STILL = 0.005  # log density still to gain at which effects are not linearised again: a tenth of a standard deviation
+LEAST_GAIN = (
+    0.005  # log density still to gain at which effects are not linearised again: a tenth of a standard deviation
+)
 HALVINGS = 8  # most halvings of a step of a model with effects until it raises the density
 WIDEST = 1.0  # sd of the log of an effect's number over which the bend is taken; beyond, the exact likelihood corrects
 STUDENT_STEPS = 4  # how often weights of readings and noise are taken in turn, in each round
@@ -246,7 +248,7 @@ class _Fitter:
     def particles(
         self, white: Array | np.ndarray, centre: np.ndarray, width: np.ndarray, theta: Any, starts: Parts
     ) -> ParticleFits:
-        """Every particle by itself, all blocks; what is late in many of them goes on in blocks of its own.
+        """Every particle by itself, all blocks; what is unfinished in many of them goes on in blocks of its own.
 
         A block takes as long as its slowest particle, and nearly every block has one that is slow.
         """
@@ -260,14 +262,14 @@ class _Fitter:
         if self.blocks.whole_here:
             return fit(self.blocks, self.own, arrays, starts, STEPS)
         found = fit(self.blocks, self.own, arrays, starts, FIRST_STEPS)
-        late = np.flatnonzero(~np.asarray(found.settled))
-        if not len(late):
+        unfinished = np.flatnonzero(~np.asarray(found.settled))
+        if not len(unfinished):
             return found
-        rows = np.pad(late, (0, -len(late) % self.blocks.size), mode="edge")
+        rows = np.pad(unfinished, (0, -len(unfinished) % self.blocks.size), mode="edge")
         few = Blocks(len(rows), self.blocks.size)
         ends = few.cut(np.moveaxis(np.asarray(found.ends)[rows], 1, 0), axis=1)
         again = fit(few, few.cut(_rows(self.tests, rows)), _rows(arrays, rows), ends, STEPS)
-        return jax.tree.map(lambda x, y: x.at[late].set(y[: len(late)]), found, again)
+        return jax.tree.map(lambda x, y: x.at[unfinished].set(y[: len(unfinished)]), found, again)
 
     def alone(self, white: np.ndarray, theta: Any, starts: np.ndarray | None = None) -> ParticleFits:
         """Every particle on its own, the effects' numbers held."""
@@ -304,7 +306,7 @@ class _Fitter:
     def step(self, target: LogPosterior, before: Array, after: Array) -> Array:
         """A step of Gauss-Newton of population and particles, halved while the density, with the tests linearised where
         it ends, is lower than where it begins; where the population then is."""
-        least, share = _density(before, target) - STILL, 1.0
+        least, share = _density(before, target) - LEAST_GAIN, 1.0
         while True:
             free = before + share * (after - before)
             point = self.together(target, free)
@@ -364,8 +366,8 @@ def fit_tests(
         if effects and not turn:  # amplitudes of zero say nothing about further numbers
             free = jnp.where(jnp.asarray(["." in name for name in target.names]), before, free)
         gain = _density(free, target) - _density(before, target) if effects else 0.0
-        at_rest = turn >= rounds and (not effects or gain < STILL)
-        if last or at_rest:
+        finished = turn >= rounds and (not effects or gain < LEAST_GAIN)
+        if last or finished:
             break
         turn += 1
         if effects and turn > 1:
@@ -391,7 +393,7 @@ def fit_tests(
         target.marginal,
         free,
         covariance,
-        np.asarray([alone, fitter.noise.converged, mode_converged and at_rest]),
+        np.asarray([alone, fitter.noise.converged, mode_converged and finished]),
     )
 
 

@@ -180,10 +180,10 @@ def derivatives(
     kinds = forms.unloading, StrainScaling.RAW
     value, slopes = map(xp.asarray, along(kinds, forms.formulas, tests.particle, record, there, directions))
     slopes = xp.where(mask[None], slopes[:wanted], 0.0)
-    residual = still = xp.zeros((count, points))
+    residual = zeros = xp.zeros((count, points))
     if tests.displacement is not None:
         residual = xp.where(mask, xp.asarray(tests.displacement) - value - zero[:, None], 0.0)
-    by_force, by_peak = slopes[size:] if with_force else (still, still)
+    by_force, by_peak = slopes[size:] if with_force else (zeros, zeros)
     return residual, xp.moveaxis(slopes[:size], 0, -1), by_force, by_peak
 
 

@@ -37,8 +37,8 @@ class Linearisation:
     def __init__(self, own: Parts, count: int, model: Model, blocks: Blocks) -> None:
         """Keep this process's own tests, and the number of all, without padding."""
         self._own, self._count, self._model, self._blocks = own, count, model, blocks
-        still = np.zeros(len(model.forms.names))
-        self.straight = Straight.of(blocks.count, still, still)
+        zeros = np.zeros(len(model.forms.names))
+        self.straight = Straight.of(blocks.count, zeros, zeros)
 
     def at(self, point: Point, sd: np.ndarray | None = None) -> Parts:
         """All tests linearised around a point; with effects and how they bend over a standard deviation of each number.
@@ -57,24 +57,24 @@ class Linearisation:
 
     def _straightened(self, point: Point, sd: np.ndarray) -> Straight:
         """Coordinates in which the prediction bends least (`straightening`), over these standard deviations."""
-        still = np.zeros(point.theta.shape[1])
-        shear, power = still.copy(), still.copy()
+        zeros = np.zeros(point.theta.shape[1])
+        shear, power = zeros.copy(), zeros.copy()
         start, weight = np.asarray(point.theta), np.ones(self._blocks.count)
         weight[self._count :] = 0.0
-        self.straight = Straight.of(self._blocks.count, still, still)
+        self.straight = Straight.of(self._blocks.count, zeros, zeros)
 
         def gram(away: np.ndarray) -> np.ndarray:
             columns = self._moved(point, away).map(lambda linear: linear.columns)
             return np.asarray(self._blocks.all(products, columns))
 
-        here = gram(still)
+        here = gram(zeros)
         for k, owner in self._model.scatter.positive:
             size = weight @ (start[:, owner] ** 2 * here[:, owner, owner])
             shear[k] = start[0, k] * (weight @ (start[:, owner] * here[:, owner, k])) / size if size > 0 else 0.0
         shear = np.clip(shear, -STEEPEST, STEEPEST)
         self.straight = Straight.of(self._blocks.count, shear, power)
         for k, _ in self._model.scatter.positive:
-            step = np.where(np.arange(len(still)) == k, start[0, k] * sd[k], 0.0)
+            step = np.where(np.arange(len(zeros)) == k, start[0, k] * sd[k], 0.0)
             up, down = (weight @ gram(by)[:, k, k] for by in (step, -step))
             power[k] = np.log(up / down) / (4 * sd[k]) if min(up, down) > 0 else 0.0
         return Straight.of(self._blocks.count, shear, np.clip(power, -STEEPEST, STEEPEST))

@@ -139,9 +139,9 @@ class Marginal(eqx.Module):
         xi = start()
         if self.scatter.newton:
             # Found without derivatives; one last step with them carries the derivative of the whole iteration.
-            fixed, still, frozen = jax.lax.stop_gradient((self, population, share))
+            fixed, held, frozen = jax.lax.stop_gradient((self, population, share))
             xi = jax.lax.fori_loop(
-                0, self.scatter.newton, lambda _, x: newton(fixed, still, x, frozen), jax.lax.stop_gradient(xi)
+                0, self.scatter.newton, lambda _, x: newton(fixed, held, x, frozen), jax.lax.stop_gradient(xi)
             )
             xi = newton(self, population, xi, share)
         placed, _, curvature = expand(self, population, xi, share)

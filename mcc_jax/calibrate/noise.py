@@ -231,10 +231,10 @@ def whitening(
     if tests.force_zero_sd is not None:
         directions.append(tests.force_zero_sd * linear.by_offset)
     white = forward_substitution(solver, jnp.stack(directions, 1))
-    still = Whitening(solver, tests.mask, white[:, 0], tests.branch, None, tests.reading_weight)
+    branches = Whitening(solver, tests.mask, white[:, 0], tests.branch, None, tests.reading_weight)
     if tests.force_zero_sd is None:
-        return still
-    return replace(still, common=still(jnp.stack(directions, 1))[:, 1])
+        return branches
+    return replace(branches, common=branches(jnp.stack(directions, 1))[:, 1])
 
 
 def _read_out(noise: Noise, tests: Tests, linear: Linear) -> Array:
