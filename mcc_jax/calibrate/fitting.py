@@ -38,9 +38,7 @@ ALONE = 1.5  # standard deviation of the logarithms that a particle by itself is
 NARROWEST = 1e-3  # least such standard deviation under the population: any smaller is badly scaled
 NOISE_BLOCKS = 4  # the noise of campaigns of more blocks is estimated from the particles of so many
 ROUNDS, MOST_ROUNDS = 2, 20  # turns of noise, population and particles: at least, and at most, with effects
-LEAST_GAIN = (
-    0.005  # log density still to gain at which effects are not linearised again: a tenth of a standard deviation
-)
+LEAST_GAIN = 0.005  # log density to gain below which effects are not linearised again: a tenth of an sd
 HALVINGS = 8  # most halvings of a step of a model with effects until it raises the density
 WIDEST = 1.0  # sd of the log of an effect's number over which the bend is taken; beyond, the exact likelihood corrects
 STUDENT_STEPS = 4  # how often weights of readings and noise are taken in turn, in each round
