@@ -187,7 +187,7 @@ def log_density(numbers: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(numbers[..., 0]) & np.isfinite(numbers[..., 2]), total, -np.inf)
 
 
-def beyond(value: Values, within: Sequence[float], edge: float = EDGE) -> Values:
+def beyond(value: Values, within: Sequence[float] | np.ndarray, edge: float = EDGE) -> Values:
     """Half the squared distance from a range in units of its edge; 0 within, and where there is no value."""
     outside = np.maximum(np.maximum(within[0] - value, value - within[1]), 0) / edge
     return 0.5 * np.nan_to_num(outside) ** 2
