@@ -66,9 +66,9 @@ def convert(values: np.ndarray, factor: Fraction) -> np.ndarray:
 def find_column(
     header: Sequence[str], quantity: str, dimension: str, file: str | Path, *, what: str = "column"
 ) -> tuple[int, Fraction]:
-    """Where `quantity` stands in a header, and the factor that turns its unit into the canonical one.
+    """Where `quantity` is in a header, and the factor that turns its unit into the canonical one.
 
-    Raises `InputError` if the quantity is missing, stands there twice, or has no unit or a wrong one.
+    Raises `InputError` if the quantity is missing, appears twice, or has no unit or a wrong one.
 
     Args:
         header: the names, already stripped of blanks.

@@ -73,7 +73,7 @@ def check_folder(path: str | Path) -> None:
         if not path.exists():
             raise InputError("there is no such folder", file=path, remedy=f"Check the path; {expected}")
         if not path.is_dir():
-            remedy = f"{expected.capitalize()}; mcc-jax convert makes one of a tester's file"
+            remedy = f"{expected.capitalize()}; mcc-jax convert makes one of an instrument file"
             if all((path.parent / name).exists() for name in (PARTICLES, CURVES)):
                 remedy = f"Did you mean the folder it lies in, {path.parent}?"
             raise InputError("is a file, not a campaign folder", file=path, remedy=remedy)
@@ -86,7 +86,7 @@ def check_folder(path: str | Path) -> None:
             lower = {entry.lower(): entry for entry in there}
             close = get_close_matches(name, list(lower), n=1, cutoff=0.8)
             found = ", ".join(there[:8]) + (", ..." if len(there) > 8 else "") if there else "nothing"
-            remedy = f"Expected: {expected} (mcc-jax convert makes one of a tester's file); found: {found}"
+            remedy = f"Expected: {expected} (mcc-jax convert makes one of an instrument file); found: {found}"
             if close:
                 remedy = f"Rename {lower[close[0]]!r} to it"
             elif (inside := next((d for d in there if (path / d / PARTICLES).exists()), None)) is not None:

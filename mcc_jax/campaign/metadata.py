@@ -173,9 +173,9 @@ def format_metadata(metadata: Metadata, file: Path) -> str:
     for key in metadata.other:
         if not isinstance(key, str) or key in known:
             raise InputError(f"{key!r} cannot be a key of its own", file=file, remedy="Rename it in Metadata.other")
-    told = {key: value for key, value in known.items() if value is not None}
+    entries = {key: value for key, value in known.items() if value is not None}
     try:
-        text = _table({**told, **metadata.other})
+        text = _table({**entries, **metadata.other})
         text.encode("utf-8")
     except (TypeError, ValueError) as error:
         problem = f"cannot be written as TOML: {error}"

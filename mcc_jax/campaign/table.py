@@ -56,7 +56,7 @@ def binary_kind(data: bytes) -> str | None:
 
 
 def read_bytes(file: Path) -> bytes:
-    """The bytes of a table or a tester's export.
+    """The bytes of a table or an instrument's export.
 
     Raises `InputError` if it cannot be read, is empty or too large; see `mcc_jax.files`.
     """
@@ -275,7 +275,7 @@ def thousands_for_decimals(cells: Iterable[tuple[int, str]], mark: str) -> tuple
     if grouped is None or whole is None:
         return None
     row, cell = grouped
-    return row, f"{cell!r} beside {whole!r} looks like a mark between thousands, not a decimal mark"
+    return row, f"{cell!r} next to {whole!r} looks like a mark between thousands, not a decimal mark"
 
 
 _WHOLE = re.compile(r"[-+]?[1-9][0-9]{2,}")
@@ -430,7 +430,7 @@ def parse_table(text: str, file: Path, numeric: Numeric | None = None) -> Table:
     Args:
         numeric: columns that hold numbers; they are parsed at once where nothing but a point can be the decimal mark.
     """
-    named = _SEPARATOR.match(text)  # a line by which a spreadsheet program is told the delimiter
+    named = _SEPARATOR.match(text)  # a line by which a spreadsheet program learns the delimiter
     # Else the commonest of those that separate columns, outside of quotes, in the header.
     header = re.sub('"[^"]*"', "", _FIRST_LINE.match(text)[0])  # type: ignore[index]  # it matches every text
     delimiter = named[1] if named is not None else max(",;\t", key=header.count)

@@ -375,7 +375,7 @@ def simple(**changes) -> Campaign:
     ("changes", "piece"),
     [
         ({"particles": (), "diameters_um": np.empty((0, 3)), "curves": ()}, "no particle"),
-        ({"particles": ("A", "A"), "diameters_um": np.ones((2, 3)), "curves": (LINE, LINE)}, "stands there 2 times"),
+        ({"particles": ("A", "A"), "diameters_um": np.ones((2, 3)), "curves": (LINE, LINE)}, "appears 2 times"),
         ({"diameters_um": np.full((1, 3), np.nan)}, "not all positive"),
         ({"particles": ("\0",)}, "NUL"),
         ({"particles": ("\ud800",)}, "Unicode"),

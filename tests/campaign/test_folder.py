@@ -79,7 +79,7 @@ def test_what_is_no_test_is_passed_over_and_counted(tmp_path):
     campaign = read(folder)
     assert len(campaign) == 3
     first, second = findings(campaign)
-    assert first.startswith("5 files passed over")
+    assert first.startswith("5 files ignored because of the name")
     assert ".DS_Store" in first
     assert second == "1 folder in it not entered: old"
     assert first in (campaign.metadata.provenance or "")
@@ -103,8 +103,8 @@ def test_a_file_that_cannot_be_read_is_named_with_the_way_to_leave_it_out(tmp_pa
         assert campaign.particles == ("p1", "P9", "P10")
         assert findings(campaign) == ["2 files skipped as asked: notes.txt, P 2.txt"]
     assert "--leave-out Notes fits no file" in told(folder, skip=["Notes"])
-    assert "there is no tester's file" in told(folder, skip=["*"])
-    assert "So it is with all 2 files" in told(_all_bad(tmp_path))
+    assert "there is no instrument file" in told(folder, skip=["*"])
+    assert "All 2 files fail in the same way" in told(_all_bad(tmp_path))
 
 
 def _all_bad(tmp_path):

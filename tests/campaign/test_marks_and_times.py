@@ -28,7 +28,7 @@ IN_MN = [0, 500, 1000, 1500]
 
 def test_a_decimal_mark_between_thousands_is_refused_and_both_ways_out_work(tmp_path):
     text = told(tmp_path, table(rows=LARGE))
-    for piece in ("row 4", "'F'", "'1.000' beside '500'", 'thousands = "point"', 'decimal_mark = ","', '"none"'):
+    for piece in ("row 4", "'F'", "'1.000' next to '500'", 'thousands = "point"', 'decimal_mark = ","', '"none"'):
         assert piece in text
     semicolons = table("t;F;d", rows=LARGE, mark=";")
     keys = 'delimiter = "semicolon"\ndecimal_mark = ","\nthousands = "point"'
@@ -69,7 +69,7 @@ def test_what_programs_write_is_never_taken_for_thousands(tmp_path_factory, forc
 @pytest.mark.parametrize("mark", [";", "\t", ","])
 def test_thousands_in_a_table_of_particles_are_refused(tmp_path, mark):
     particles = HEAD.replace(",", mark) + mark.join(("A", "980", "1.020", "1.150")) + "\n"
-    with pytest.raises(InputError, match=r"row 2, column 'D2_um': '1.020' beside '980'.*Write numbers without marks"):
+    with pytest.raises(InputError, match=r"row 2, column 'D2_um': '1.020' next to '980'.*Write numbers without marks"):
         campaign(tmp_path, particles)
 
 

@@ -295,7 +295,7 @@ def test_unknown_files(tmp_path, data, piece):
 
 def test_missing_file(tmp_path):
     assert "no such file" in message(tmp_path / "none")
-    assert "no tester's file in the folder" in message(tmp_path)
+    assert "no instrument file in the folder" in message(tmp_path)
 
 
 @pytest.mark.extended

@@ -324,7 +324,7 @@ def test_convert_a_folder_keeps_its_words_short(run, tmp_path):
     for piece in (
         "29 tests, 87 points (folder my tests, 29 files, mapped by map.toml",
         "and 17 more; in all, max force 1000 to 4e+04 mN",
-        "Note: 1 file passed over, by name no tester's: .hidden.",
+        "Note: 1 file ignored because of the name: .hidden.",
         "Note: 11 files skipped as asked: P7.txt, P10.txt,",
         "Note: 29 rows with a missing reading were dropped, in 29 tests.",
     ):

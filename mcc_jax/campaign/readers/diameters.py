@@ -1,4 +1,4 @@
-"""Diameters of the particles, which testers' files do not hold."""
+"""Diameters of the particles, which instrument files do not hold."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def check_triple(triple: Triple, what: str, file: str | Path) -> None:
 def diameters_for(
     keys: Mapping[str, Sequence[str]],
     diameters: Diameters | None,
-    told: Mapping[str, list[float] | InputError],
+    in_files: Mapping[str, list[float] | InputError],
     file: Path,
 ) -> tuple[np.ndarray, int]:
     """Diameters in the order of the tests, and how many entries of a table no test needed.
@@ -74,8 +74,8 @@ def diameters_for(
     Args:
         keys: by the name of each test the names under which a table may hold its diameters; the first that fits
             counts.
-        diameters: one triple for all tests, or a table by name, which counts before what the file tells.
-        told: what the tests' files tell, or why they do not.
+        diameters: one triple for all tests, or a table by name, which counts before what the file holds.
+        in_files: what the tests' files hold, or why they do not.
 
     Returns:
         Diameters [um], shape (N, 3), and the number of entries left over.
@@ -92,7 +92,7 @@ def diameters_for(
         key = next(
             (k if k in table else form[same_text(k)] for k in others if k in table or same_text(k) in form), None
         )
-        own = told.get(name)
+        own = in_files.get(name)
         if key is not None:
             check_triple(table[key], f"particle {name!r}", file)
             used.add(key)
@@ -115,7 +115,7 @@ def _no_diameters(
         more = f" (so it is with {_shown(others)}, too)" if others else ""
         return why.changed(problem=why.problem + more)
     if not table:
-        return InputError("a tester's file knows no particle diameters", file=file, remedy=_HOW)
+        return InputError("instrument exports do not contain particle dimensions", file=file, remedy=_HOW)
     if len(lacking) == len(names):
         there, tests = _shown(list(table)), _shown(names)
         problem = f"none of the diameters is for a test: they are for {there}, the tests are {tests}"

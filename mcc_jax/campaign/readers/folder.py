@@ -1,4 +1,4 @@
-"""A folder of testers' files as one campaign.
+"""A folder of instrument files as one campaign.
 
 Which files are read: all that lie in the folder itself, in the natural order of their names (2 before 10), but for
 those that the rule `passed_over` names and those that the user skips. Every other file must be readable: one that is
@@ -27,11 +27,11 @@ NO_DATA = frozenset(
     f".{ending}"
     for ending in "bmp db doc docx gif ini jpeg jpg lnk md odt pdf png ppt pptx py svg tif tiff toml".split()  # noqa: SIM905
 )
-"""Endings of pictures, documents and settings, in which no tester writes samples."""
+"""Endings of pictures, documents and settings, in which no instrument writes samples."""
 _READ_ME = re.compile(r"(read[-_ ]?me|licen[cs]e)(\..*)?", re.IGNORECASE)
 LONGEST_LIST = 64
-"""Longer lists of numbers beside the curves (blocks of approach and drift) are not kept of many files: as TOML they
-would outgrow the curves, and are still in the files."""
+"""Longer lists of numbers than this (blocks of approach and drift) are not kept of many files: as TOML they would outgrow
+the curves, and are still in the files."""
 _SHOWN = 6
 
 
@@ -87,7 +87,7 @@ def read_folder(
     own = Counter(name for tests in found.values() for name in tests.curves)
     curves: dict[str, Curve] = {}
     keys: dict[str, tuple[str, ...]] = {}
-    told: dict[str, list[float] | InputError] = {}
+    sizes: dict[str, list[float] | InputError] = {}
     missing: dict[str, int] = {}
     origin: dict[str, Path] = {}
     for file, tests in found.items():
@@ -101,12 +101,14 @@ def read_folder(
             curves[full], origin[full] = curve, file
             keys[full] = (full, *names_of(file), *([name] if own[name] == 1 else []))
             if (size := tests.diameters_um.get(name)) is not None:
-                told[full] = size if isinstance(size, list) else _or_skip(size, f"--leave-out {shlex.quote(file.name)}")
+                sizes[full] = (
+                    size if isinstance(size, list) else _or_skip(size, f"--leave-out {shlex.quote(file.name)}")
+                )
             if name in tests.missing:
                 missing[full] = tests.missing[name]
     formats = sorted({tests.format for tests in found.values()})
     form = f"{_count(files)}, {' and '.join(formats)}"
-    return Tests(curves, form, _control(found), _other(found), told, missing), keys, findings
+    return Tests(curves, form, _control(found), _other(found), sizes, missing), keys, findings
 
 
 def _files(folder: Path, skip: Sequence[str]) -> tuple[list[Path], list[Finding]]:
@@ -117,7 +119,7 @@ def _files(folder: Path, skip: Sequence[str]) -> tuple[list[Path], list[Finding]
         problem = f"cannot be read: {error.strerror or error}"
         raise InputError(problem, file=folder, remedy="Check the permissions") from None
     if {"particles.csv", "curves.csv"} <= {entry.name for entry in entries}:
-        raise InputError("is a campaign already", file=folder, remedy="Give the folder with the tester's files")
+        raise InputError("is a campaign already", file=folder, remedy="Give the folder with the instrument files")
     quiet = [entry for entry in entries if entry not in inside and passed_over(entry.name)]
     rest = [entry for entry in entries if entry not in inside and entry not in quiet]
     skipped: list[Path] = []
@@ -130,10 +132,10 @@ def _files(folder: Path, skip: Sequence[str]) -> tuple[list[Path], list[Finding]
     files = [entry for entry in rest if entry not in skipped]
     if not files:
         below = f"; give one of the folders in it: {_listed(inside)}" if inside else ""
-        raise InputError("there is no tester's file in the folder", file=folder, remedy=f"Check the path{below}")
+        raise InputError("there is no instrument file in the folder", file=folder, remedy=f"Check the path{below}")
     findings = []
     if quiet:
-        sentence = f"{_count(quiet)} passed over, by name no tester's: {_listed(quiet)}"
+        sentence = f"{_count(quiet)} ignored because of the name: {_listed(quiet)}"
         findings.append(Finding("files", "info", sentence))
     if inside:
         what = "1 folder" if len(inside) == 1 else f"{len(inside)} folders"
@@ -161,7 +163,7 @@ def _unreadable(failed: dict[Path, InputError], files: int) -> InputError:
     error = next(iter(failed.values()))
     names = [file.name for file in failed]
     if len(failed) == files:
-        more = f". So it is with all {files} files" if files > 1 else ""
+        more = f". All {files} files fail in the same way" if files > 1 else ""
         remedy = (error.remedy or "").rstrip(".") + more
         return error.changed(remedy=remedy)
     shown = " ".join(f"--leave-out {shlex.quote(name)}" for name in names[:_SHOWN])
@@ -188,13 +190,15 @@ def _twice(files: Sequence[Path]) -> Finding:
 
 
 def _control(found: dict[Path, Tests]) -> Control | None:
-    """The controlled quantity, if it is the same for all; where one file does not tell it, it is not known."""
+    """The controlled quantity, if it is the same for all; where one file does not say, it is not known."""
     by: dict[Control | None, Path] = {}
     for file, tests in found.items():
         by.setdefault(tests.control, file)
     if "load" in by and "displacement" in by:
         problem = f"the test is controlled by displacement, that of {by['load'].name} by load"
-        raise InputError(problem, file=by["displacement"], remedy="Convert tests of two kinds apart, with --leave-out")
+        raise InputError(
+            problem, file=by["displacement"], remedy="Convert tests of two kinds separately, with --leave-out"
+        )
     return next(iter(by)) if len(by) == 1 else None
 
 

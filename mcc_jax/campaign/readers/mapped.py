@@ -32,7 +32,7 @@ from .mapping import DIMENSIONS, MappingFile
 from .text import Rows, Tests, checked_curve, read_rows
 
 _FURTHEST = 200
-"""Rows above a header found by `begin`, within which it is looked for again; a tester's preamble has a few dozen."""
+"""Rows above a header found by `begin`, within which it is sought again; an instrument's preamble has a few dozen."""
 _OWN_DIAMETER = "Add it to the file, or give this test's diameters in a table by --diameters"
 
 
@@ -164,7 +164,7 @@ class _Reader:
         return found
 
     def _place(self, column: str | int, head: int) -> int:
-        """The index of a column, told by its name in the header or its number."""
+        """The index of a column, by its name in the header or its number."""
         if isinstance(column, int):
             if self.header is not None and column > len(self.header):
                 raise self.wrong(f"there is no column {column}, only {len(self.header)}", "Count again", head)
@@ -178,7 +178,7 @@ class _Reader:
         file, close = self.mapping.file.name, get_close_matches(column, names, n=1)
         other = [word for word, mark in (("semicolon", ";"), ("tab", "\t"), ("comma", ",")) if mark in "".join(names)]
         if len(names) == 1 and other:
-            remedy = f'If its columns are parted by a {other[0]}, write delimiter = "{other[0]}" in {file}'
+            remedy = f'If its columns are separated by a {other[0]}, write delimiter = "{other[0]}" in {file}'
         elif close:
             remedy = f"Did you mean {close[0]!r}?"
         else:
@@ -313,7 +313,7 @@ class _Reader:
         if mark is not None and not self.mapping.thousands:
             word = {".": "point", ",": "comma"}.get(mark, "apostrophe" if mark in APOSTROPHES else "space")
             other = ' (or decimal_mark = ",")' if mark == "," and cell.count(",") == 1 and "." not in cell else ""
-            return f'If the mark parts thousands, write thousands = "{word}"{other} in {name}'
+            return f'If the mark separates thousands, write thousands = "{word}"{other} in {name}'
         if self._is_footer(i):
             return self._footer_remedy(i)
         word = any(c.isalpha() for c in cell) and not _is_no_reading(cell)
@@ -322,8 +322,8 @@ class _Reader:
         if word and self.between:
             return f"If the rows above this test are not those above the first, name the header with begin in {name}"
         if _is_no_reading(cell):
-            return f"Mend the cell, or write missing = [{_quoted(cell)}] in {name} to drop such readings"
-        return f"Mend the cell, or decimal_mark and unit in {name}"
+            return f"Correct the cell, or write missing = [{_quoted(cell)}] in {name} to drop such readings"
+        return f"Correct the cell, or decimal_mark and unit in {name}"
 
     def _is_footer(self, i: int) -> bool:
         """Whether a row that begins with text has samples above and, in its test, none below."""
@@ -358,7 +358,7 @@ class _Reader:
                 return same_text(self.mapping.test_name or self.file.stem)
 
     def _diameters(self, start: int, stop: int) -> list[float] | InputError | None:
-        """D1, D2, D3 [um] as the rows from `start` to `stop` tell them, or why not: a table may hold them."""
+        """D1, D2, D3 [um] as the rows from `start` to `stop` hold them, or why not: a table may hold them."""
         asked = self.mapping.diameters
         if asked is None:
             return None
@@ -395,7 +395,7 @@ class _Reader:
             if not value > 0:
                 raise self.wrong(f"the diameter {value:g} is not positive", _OWN_DIAMETER, i, name)
             return float(convert(np.array([value]), factor)[0])
-        raise self.wrong(f"no row above the samples begins with {name!r}, which is to tell a diameter", _OWN_DIAMETER)
+        raise self.wrong(f"no row above the samples begins with {name!r}, for the diameter", _OWN_DIAMETER)
 
 
 _CLOCK = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}.*|(?:[0-9]+ days?,? )?[0-9]{1,2}:[0-9]{2}(?::[0-9.]+)?.*")
@@ -410,7 +410,7 @@ def _quoted(text: str) -> str:
 
 
 def _is_no_reading(cell: str) -> bool:
-    """Whether a cell looks like what testers write for "no reading": nothing, dashes, NaN, the largest number."""
+    """Whether a cell looks like what instruments write for "no reading": nothing, dashes, NaN, the largest number."""
     if not any(c.isalnum() for c in cell) or cell.lower().strip("+-#") in ("nan", "inf", "na", "n/a", "null", "none"):
         return True
     try:

@@ -10,7 +10,7 @@ A mapping file has these keys; all but `columns` may be left out, and any other 
                                # no-break, narrow and thin), or the character; never guessed. "none": there is none,
                                # though 1.500 is next to 500, which is refused otherwise
     missing = ["NaN", "", -999]   # cells that mean "no reading"; rows with one are dropped, counted and reported
-    comment_prefix = "#"       # rows that begin so are passed over
+    comment_prefix = "#"       # rows that begin so are skipped
     skip_rows = 0              # rows above the header, whatever they hold
     begin = "Time"             # instead of skip_rows: the header is the first row that begins so
     header_rows = 1            # rows of the header: names in the first, for instance units in the next; 0 for none
@@ -42,7 +42,7 @@ A mapping file has these keys; all but `columns` may be left out, and any other 
     header = "Gage length"     # the row that begins so holds the diameter of a sphere; three names for D1, D2 and D3
     unit = "mm"                # of the number; where left out, it is in the file, behind the number
 
-The header, with up to `skip_rows` rows above it, may come again anywhere and is passed over there; without a header
+The header, with up to `skip_rows` rows above it, may come again anywhere and is skipped there; without a header
 (`header_rows = 0`) so are up to `skip_rows` rows above each test that is separated by an empty row. Empty cells behind
 the last column that has a name, and rows of delimiters only, hold nothing.
 """

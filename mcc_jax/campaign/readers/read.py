@@ -1,4 +1,4 @@
-"""One entry for all testers' files, alone or in a folder."""
+"""One entry for all instrument files, alone or in a folder."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ def read_tester_file(
     mapping: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | None = None,
     skip: Sequence[str] = (),
 ) -> Campaign:
-    """A tester's export, or a folder of exports, as a campaign; the format is told by the content, not by the name.
+    """An instrument's export, or a folder of exports, as a campaign; recognised by the content.
 
     Only units are converted (to mN, um, s) and, where a mapping says so, signs; nothing is shifted, smoothed,
     cut or corrected. What the file says besides the curves is kept in `Metadata.other`; what was left out on the
-    user's word (rows with missing readings, files) stands there under "conversion".
+    user's word (rows with missing readings, files) is there under "conversion".
 
     Args:
         path: the file: Fischer HM, Hysitron hld, Hysitron load-control text, Micro Materials text or zip, or
@@ -84,7 +84,7 @@ def read_tester_file(
         origin = f"{place.name}, {tests.format}"
     for one in described:
         if len(described) > 1 and one.diameters_um is not None:
-            problem = "cannot be told apart by mapping file"
+            problem = "cannot differ between mapping files"
             raise InputError(problem, file=one.file, column="diameters_um", remedy="Give --diameters")
         diameters_um = one.sizes_um if diameters_um is None else diameters_um
     sizes, unused = diameters_for(keys, diameters_um, tests.diameters_um, place)
@@ -112,7 +112,7 @@ def read_tester_file(
 
 
 def _read_known(data: bytes, file: Path) -> Tests:
-    """Read a file of a known format, told by what is in it."""
+    """Read a file of a known format, recognised by its content."""
     if is_workbook(data):
         raise InputError("an Excel workbook has no format of its own", file=file, remedy=EXAMPLE)
     if data.startswith((b"PK\x03\x04", b"PK\x05\x06")):
@@ -120,7 +120,7 @@ def _read_known(data: bytes, file: Path) -> Tests:
     kind = binary_kind(data)
     if kind is not None:
         problem = f"the file is {kind}; no reader knows it"
-        raise InputError(problem, file=file, remedy="Export it from the tester as text")
+        raise InputError(problem, file=file, remedy="Export it from the instrument as text")
     lines = decode_lines(data)
     for reader in FORMATS.values():
         if reader.matches(lines):
@@ -153,7 +153,7 @@ def _read_by_one(data: bytes, file: Path, mappings: Sequence[MappingFile]) -> Te
 
 
 def _same(one: Tests, other: Tests) -> bool:
-    def told(tests: Tests) -> tuple[Any, ...]:
+    def content(tests: Tests) -> tuple[Any, ...]:
         readings = [
             (name, *(values.tobytes() for values in (curve.time_s, curve.force_mN, curve.displacement_um)))
             for name, curve in tests.curves.items()
@@ -161,4 +161,4 @@ def _same(one: Tests, other: Tests) -> bool:
         sizes = {name: size if isinstance(size, list) else None for name, size in tests.diameters_um.items()}
         return readings, sizes, tests.control
 
-    return told(one) == told(other)
+    return content(one) == content(other)

@@ -24,7 +24,7 @@ EXAMPLE = f'{_HOW} decimal_mark = "."; [columns] ' + _COLUMNS.format('"Time"', '
 def suggested_mapping(data: bytes) -> str:
     """What to do about a file of an unknown format: a mapping file after what the file itself shows, in one line.
 
-    Which column is which, and its unit, is not guessed: the names of the columns are told in their order.
+    Which column is which, and its unit, is not guessed: the names of the columns are given in their order.
     """
     lines = decode_lines(data)[:LINES]
     rows = {
@@ -52,8 +52,8 @@ def suggested_mapping(data: bytes) -> str:
         keys.append(f'begin = "{names[0]}"')
     if len(header) > 1:
         keys.append("header_rows = 2")
-    told = ", ".join(f'"{one}"' for one in names)
-    return f"{_HOW} {'; '.join(keys)}; [columns] {_COLUMNS.format(*['"..."'] * 3)}; its columns are {told}"
+    listed = ", ".join(f'"{one}"' for one in names)
+    return f"{_HOW} {'; '.join(keys)}; [columns] {_COLUMNS.format(*['"..."'] * 3)}; its columns are {listed}"
 
 
 def _cells(line: str, mark: str) -> list[str]:

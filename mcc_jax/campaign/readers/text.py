@@ -27,9 +27,9 @@ class Tests:
     Attributes:
         curves: the tests by their names.
         format: what kind of file it is, in words.
-        control: the controlled quantity, where the file or a mapping tells it.
+        control: the controlled quantity, where the file or a mapping says so.
         other: what else the file says, kept as it is.
-        diameters_um: D1, D2, D3 [um] of tests whose file should tell them, or why it does not.
+        diameters_um: D1, D2, D3 [um] of tests whose file should hold them, or why it does not.
         missing: how many rows with a missing reading were dropped, by test.
     """
 
@@ -42,7 +42,7 @@ class Tests:
 
 
 def decode_lines(data: bytes, encoding: str | None = None, file: Path | None = None) -> list[str]:
-    """The lines of a tester's file; by default UTF-8 or, as most testers write, Latin-1.
+    """The lines of an instrument file; by default UTF-8 or, as most instruments write, Latin-1.
 
     Raises `InputError` if the file is not in the encoding given.
     """
