@@ -37,7 +37,7 @@ def read_sheet(
 ) -> tuple[range, list[list[str]]]:
     """The rows of a sheet: their numbers and their cells as text, numbers with all their digits.
 
-    Raises `InputError` if it is damaged or too large, no sheet or none for certain is meant, or calamine is not installed.
+    Raises `InputError` if it is damaged or too large, the sheet is not clear, or calamine is not installed.
 
     Args:
         sheet: the sheet's name, or its number, 1 for the first; None for the only one that holds anything.

@@ -30,8 +30,8 @@ NO_DATA = frozenset(
 """Endings of pictures, documents and settings, in which no instrument writes samples."""
 _READ_ME = re.compile(r"(read[-_ ]?me|licen[cs]e)(\..*)?", re.IGNORECASE)
 LONGEST_LIST = 64
-"""Longer lists of numbers than this (blocks of approach and drift) are not kept of many files: as TOML they would outgrow
-the curves, and are still in the files."""
+"""Longer lists of numbers than this (blocks of approach and drift) are not kept of many files: as TOML they would
+outgrow the curves, and are still in the files."""
 _SHOWN = 6
 
 
