@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from .._types import Scalar, Values, scalar
 from .context import Context, positive
-from .effect import AbstractEffect, AbstractFormulas, further, pick, switch
+from .effect import AbstractEffect, AbstractFormulas, Further, further, pick, switch
 from .variant import Need, Nuisance, family, row
 
 # ---- asperities ------------------------------------------------------------------------------------------------------
@@ -79,7 +79,7 @@ TOE = family(
 class Tilt(AbstractEffect):
     """Platens that are not parallel: the contact begins at one edge, and with `radius_share` the force levels them."""
 
-    radius_share: Scalar | None = further()
+    radius_share: Further = further()
     shrinks: float = switch()
 
     def inside(self, context: Context) -> Values:

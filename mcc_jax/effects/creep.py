@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from .._types import Scalar, Values
 from .context import Context
-from .effect import AbstractEffect, AbstractFormulas, further, pick, switch
+from .effect import AbstractEffect, AbstractFormulas, Further, further, pick, switch
 from .record import HOLD
 from .variant import Need, Nuisance, family, row
 
@@ -33,8 +33,8 @@ class LinearCreep(AbstractFormulas):
     formula gives the rates s_j [1/s], the weights w_j and the instantaneous weight w_0.
     """
 
-    tau_s: Scalar | None = further()
-    exponent: Scalar | None = further()
+    tau_s: Further = further()
+    exponent: Further = further()
 
     formulas: ClassVar = {
         "kelvin_voigt": lambda e: _one_time(e.tau_s),

@@ -6,9 +6,9 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 
-from .._types import Scalar, Values
+from .._types import Values
 from .context import Context
-from .effect import AbstractFormulas, further
+from .effect import AbstractFormulas, Further, further
 from .record import RELOAD, UNLOAD, reload_progress
 from .variant import Need, Nuisance, family, row
 
@@ -79,8 +79,8 @@ def _power(e: Ratcheting, cycles: Values) -> Values:
 class Ratcheting(AbstractFormulas):
     """Permanent displacement with every reload, in proportion to size, to the peak, or to what is recovered."""
 
-    cycles_to_rest: Scalar | None = further()
-    exponent: Scalar | None = further()
+    cycles_to_rest: Further = further()
+    exponent: Further = further()
 
     formulas: ClassVar = {
         "linear": _of_size(lambda e, n: n),

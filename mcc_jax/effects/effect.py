@@ -120,8 +120,12 @@ class AbstractModulusAtPeak(AbstractEffect):
         return self.factor(context.peak_strain, context.peak_stress)
 
 
+Further = Any
+"""A further number that only some of a class's formulas have; None for the others."""
+
+
 def further() -> Any:
-    """A field for a further number that only some of a class's formulas have; None for the others."""
+    """A field of that kind."""
     return eqx.field(converter=lambda x: None if x is None else scalar(x), default=None, kw_only=True)
 
 

@@ -7,11 +7,11 @@ from typing import ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._types import Scalar, Values
+from .._types import Values
 from ..formulas import PUNCH_AREA, Formulas, recovery, tangent_modulus
 from ..geometry import Particle
 from .context import Context, root
-from .effect import MIN_FACTOR, AbstractFormulas, Factors, at_least, further, on_terms, terms
+from .effect import MIN_FACTOR, AbstractFormulas, Factors, Further, at_least, further, on_terms, terms
 from .record import Record
 from .variant import Need, Nuisance, family, row
 
@@ -56,8 +56,8 @@ class RateDependence(AbstractFormulas):
 
     rate_of: str = eqx.field(static=True, default="strain", kw_only=True)
     terms: tuple[float, float, float] = terms(True, True, True)
-    exponent: Scalar | None = further()
-    rate_share: Scalar | None = further()
+    exponent: Further = further()
+    rate_share: Further = further()
 
     formulas: ClassVar = {
         "logarithm": lambda e, rate: 1 + e.amplitude * jnp.log(rate),
@@ -200,7 +200,7 @@ class Hardening(AbstractFormulas):
 
     terms: tuple[float, float, float] = terms(True, True, True)
     every_term: bool = eqx.field(static=True, default=False, kw_only=True)
-    yield_strain: Scalar | None = further()
+    yield_strain: Further = further()
 
     formulas: ClassVar = {
         "power": lambda e, eps: jnp.log(jnp.where(eps > 1e-9, eps, 1e-9) / REFERENCE_STRAIN),

@@ -16,6 +16,7 @@ from .effect import (
     AbstractEffect,
     AbstractFormulas,
     AbstractModulusAtPeak,
+    Further,
     at_least,
     further,
     on_terms,
@@ -164,8 +165,8 @@ class Humidity(Strength):
         threshold_percent: relative humidity where softening begins.
     """
 
-    modulus_share: Scalar | None = further()
-    threshold_percent: Scalar | None = further()
+    modulus_share: Further = further()
+    threshold_percent: Further = further()
 
     formulas: ClassVar = {
         "exponential": lambda e, _, r: jnp.exp(-e.amplitude * _dampness(r)),
@@ -216,8 +217,8 @@ class ModulusAtPeak(AbstractFormulas, AbstractModulusAtPeak):
     """
 
     direction: float = eqx.field(static=True, default=-1.0, kw_only=True)
-    threshold_strain: Scalar | None = further()
-    heckel_stress_MPa: Scalar | None = further()
+    threshold_strain: Further = further()
+    heckel_stress_MPa: Further = further()
 
     formulas: ClassVar = {
         "exponential": lambda e, eps, _: jnp.exp(e.signed * eps),

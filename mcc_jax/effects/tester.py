@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from .._types import Scalar, Values
 from .context import Context, contact_radius
-from .effect import AbstractFormulas, further, pick, switch
+from .effect import AbstractFormulas, Further, further, pick, switch
 from .variant import Need, Nuisance, family, row
 
 REFERENCE_FORCE_MN = 100.0
@@ -39,7 +39,7 @@ def _power(amplitude: Scalar, x: Values, reference: float, power: float) -> Valu
 class FrameCompliance(_Observed):
     """Displacement of the frame under a force; the amplitude is its compliance, at 100 mN where it depends on force."""
 
-    seat_force_mN: Scalar | None = further()
+    seat_force_mN: Further = further()
 
     formulas: ClassVar = {
         "linear": lambda e, c: e.amplitude * c.force,
@@ -89,9 +89,9 @@ def _periodic(e: ThermalDrift, c: Context) -> Values:
 class ThermalDrift(_Observed):
     """Displacement that grows with time; the amplitude is a speed: the first, the largest, or the mean over 100 s."""
 
-    tau_s: Scalar | None = further()
-    period_s: Scalar | None = further()
-    phase_rad: Scalar | None = further()
+    tau_s: Further = further()
+    period_s: Further = further()
+    phase_rad: Further = further()
 
     formulas: ClassVar = {
         "linear": lambda e, c: e.amplitude * c.record.time,
@@ -165,7 +165,7 @@ class PlatenSinkIn(_Observed):
     """
 
     shrinks: float = switch()
-    punch_radius_um: Scalar | None = further()
+    punch_radius_um: Further = further()
 
     formulas: ClassVar = {
         "flat": _flat,

@@ -8,11 +8,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .._types import Scalar, Values
+from .._types import Values
 from ..formulas import PUNCH_AREA, recovery, stress_ratio
 from .context import Context, contact_of, positive
 from .cycles import NORM
-from .effect import AbstractEffect, AbstractFormulas, further, pick, switch
+from .effect import AbstractEffect, AbstractFormulas, Further, further, pick, switch
 from .record import RELOAD, reload_progress
 from .variant import Need, Nuisance, family, row
 
@@ -36,7 +36,7 @@ class Bow(AbstractFormulas):
     A formula is the height of the bow at u = F / F_P, 0 at both ends, 1 at most.
     """
 
-    exponent: Scalar | None = further()
+    exponent: Further = further()
 
     formulas: ClassVar = {
         "symmetric_bow": lambda e, u: 4 * u * (1 - u),
@@ -116,7 +116,7 @@ class Adhesion(AbstractFormulas):
     """
 
     over_section: float = switch()
-    mobilised_share: Scalar | None = further()
+    mobilised_share: Further = further()
 
     formulas: ClassVar = {
         "jkr": lambda e, s: _peeled(s) * s,
@@ -221,8 +221,8 @@ class Reversal(AbstractFormulas):
     of_recovery: float = switch()
     quadratic: float = switch()
     stays: bool = eqx.field(static=True, default=False, kw_only=True)
-    onset_share: Scalar | None = further()
-    decay_share: Scalar | None = further()
+    onset_share: Further = further()
+    decay_share: Further = further()
 
     formulas: ClassVar = {
         "power": _power,
