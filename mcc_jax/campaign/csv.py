@@ -148,7 +148,7 @@ def parse_particles(
     return names, np.stack(diameters, axis=-1), columns
 
 
-def _checked_names(names: list[str], table: Table) -> tuple[str, ...]:
+def _checked_names(names: Sequence[str], table: Table) -> tuple[str, ...]:
     seen: dict[str, int] = {}
     for name, row in zip(names, table.rows, strict=True):
         if not name.strip():

@@ -45,7 +45,7 @@ class CurveRows:
 
     def wrong(self, problem: str, record: int | np.integer, remedy: str, column: str = "particle") -> InputError:
         """The error for a record, which names its row in the file."""
-        row = self.table.rows[record]
+        row = self.table.rows[int(record)]
         return InputError(problem, file=self.table.file, row=row, column=column, remedy=remedy)
 
     def check(self, name: str, curve: Curve) -> None:

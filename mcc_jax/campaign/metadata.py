@@ -83,10 +83,11 @@ def typed[T](entries: Mapping[str, Any], kind: type[T], file: Path, write: Mappi
         problem, remedy = "is missing", remedy if key[-1] in write else f"Add [{'.'.join(key)}]"
     elif field:
         problem = "is not a known key"
+        table: Any = kind
         for name in path:  # to the type of the table that the key is in
-            inside = next(one.type for one in msgspec.structs.fields(kind) if one.name == name)
-            kind = next(one for one in (inside, *get_args(inside)) if hasattr(one, "__struct_fields__"))
-        known = [one.encode_name for one in msgspec.structs.fields(kind) if one.encode_name]
+            inside = next(one.type for one in msgspec.structs.fields(table) if one.name == name)
+            table = next(one for one in (inside, *get_args(inside)) if hasattr(one, "__struct_fields__"))
+        known = [one.encode_name for one in msgspec.structs.fields(table) if one.encode_name]
         close = get_close_matches(field[2], known, n=1)
         remedy = f"Did you mean {'.'.join([*path, *close])!r}?" if close else f"Known keys: {', '.join(known)}"
     elif "matching regex" in problem:

@@ -200,7 +200,7 @@ def _plain_numbers(cells: Sequence[str], decimal_mark: str) -> np.ndarray | None
         return None
     if len(values) != len(cells) or not (np.abs(values) <= _LARGEST_NUMBER).all():
         return None
-    for i in np.flatnonzero(values == 0):  # JSON knows no negative zero without a decimal point
+    for i in np.flatnonzero(values == 0).tolist():  # JSON knows no negative zero without a decimal point
         values[i] = parse_number(cells[i], decimal_mark)
     return values
 

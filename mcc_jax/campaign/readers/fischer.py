@@ -46,8 +46,8 @@ def read(lines: list[str], file: Path) -> Tests:
         if any(line.strip() for line in lines[end:stop]) and last:
             raise cut_off("there is text behind the last test's samples", file, end + 1)
         at = range(head + 1, end)
-        block = number_block(lines, at, _COLUMNS.split("\t"), file, decimal_mark=",")
-        curve = checked_curve(block["t"], block["F"], block["h"], file, at, name)
+        columns = number_block(lines, at, _COLUMNS.split("\t"), file, decimal_mark=",")
+        curve = checked_curve(columns["t"], columns["F"], columns["h"], file, at, name)
         before = [line for line in lines[max(start - 3, 0) : start] if _PEAK.match(line)]
         peak = _PEAK.match(before[-1]) if before else None
         # A file cut in the middle of a test has not got its greatest force yet.
