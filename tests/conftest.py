@@ -87,9 +87,6 @@ def pytest_xdist_make_scheduler(config, log):
     return ByGroup(config, log) if config.getoption("dist") == "loadfile" else None
 
 
-CASES = 2
-"""Of a test with more cases the core runs as many, the first and the last; the others are `extended`."""
-
 EVERY_CASE = (
     *("tests/campaign/test_csv.", "tests/campaign/test_folder", "tests/campaign/test_mapping"),
     *("tests/campaign/test_marks", "tests/campaign/test_readers", "tests/campaign/test_valid"),
@@ -100,17 +97,13 @@ EVERY_CASE = (
 
 
 def mark_further_cases(items):
-    """Mark what the core leaves out of tests with many cases."""
-    several = {}
+    """The core has the first case of a test with several cases."""
+    seen = set()
     for item in items:
-        marked = item.get_closest_marker("extended") or item.get_closest_marker("notebook")
-        if not marked and not item.nodeid.startswith(EVERY_CASE):
-            several.setdefault(item.nodeid.split("[")[0], []).append(item)
-    for cases in several.values():
-        kept = {round(k * (len(cases) - 1) / (CASES - 1)) for k in range(CASES)}
-        for i, item in enumerate(cases):
-            if i not in kept and len(cases) > CASES:
-                item.add_marker(pytest.mark.extended)
+        test = item.nodeid.split("[")[0]
+        if test in seen and not item.nodeid.startswith(EVERY_CASE):
+            item.add_marker(pytest.mark.extended)
+        seen.add(test)
 
 
 @pytest.hookimpl(tryfirst=True)

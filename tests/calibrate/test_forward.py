@@ -93,6 +93,7 @@ def test_derivatives_are_finite_differences(law, theta):
     assert not np.any(linearise(point, tests, law, with_force=False).by_force)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     "names",
     first_in_core(

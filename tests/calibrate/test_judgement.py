@@ -152,6 +152,7 @@ def answer(value=16000.0, sd=40.0, *, converged=True):
     }
 
 
+@pytest.mark.extended
 def test_each_set_of_flagged_particles_is_left_out_once():
     campaign = check_tests(faulty.broken(faulty.clipped(clean(), 0.9, only=("5",)), only=("2",)))
     asked = []

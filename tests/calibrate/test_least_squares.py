@@ -31,6 +31,7 @@ def content(result):
     return json.loads(json.dumps(result.to_json(), allow_nan=False))
 
 
+@pytest.mark.extended
 def test_the_truth_is_within_four_standard_deviations(result, content):
     assert content["converged"], content["reason"]
     truth = {"a": 1.43, "effective_modulus_MPa": 16_000.0}

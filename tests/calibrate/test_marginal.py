@@ -131,6 +131,7 @@ def test_the_likelihood_is_the_integral_over_the_particle(scatter, scale, tolera
     np.testing.assert_allclose(likelihood(*one), integrals(*one), rtol=0, atol=tolerance)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("scatter", first_in_core(SCATTERS.values()), ids=SCATTERS)
 def test_the_likelihood_of_sharp_tests_is_the_dense_normal_one(scatter):
     """Where kappa is as good as the latent vector itself, all is normal; and draws are those of the conditional."""

@@ -255,6 +255,7 @@ def test_at_the_bounds_of_a_and_without_spreads_nothing_is_nan(target, density, 
     assert np.all(np.isfinite(np.asarray(slope)))
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("flat", [[0.0, 0.0], [0.6, 0.2], [-0.3, -0.1], [-0.4, 0.7], [-3.0, 0.99]])
 def test_within_the_bounds_of_a_every_shape_factor_is_positive(flat):
     shapes = Shapes(jnp.asarray(flat))

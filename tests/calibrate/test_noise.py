@@ -94,6 +94,7 @@ def test_the_density_has_a_slope_where_some_peaks_were_worked_out():
         assert slope[k] == pytest.approx((up - down) / 2e-5, rel=1e-4, abs=1e-4)
 
 
+@pytest.mark.extended
 def test_white_noise_of_two_branches_is_dense_too():
     rng = np.random.default_rng(5)
     tests, linear = random_tests(rng, elastic=ELASTIC, zero_sd=0.4, count=3)
@@ -133,6 +134,7 @@ def test_draws_have_the_covariance_of_the_density(kind):
     np.testing.assert_allclose(covariance, dense(FOUR, 1.0, tests, linear, kind=kind)[used][:, used], rtol=1e-6)
 
 
+@pytest.mark.extended
 def test_masked_points_count_for_nothing():
     rng = np.random.default_rng(1)
     tests, linear = random_tests(rng, masked=0.4, zero_sd=0.2)
@@ -157,6 +159,7 @@ def test_white_noise_only_divides_and_a_display_reads_in_steps():
 # ---- numbers integrated out, and the noise estimated -----------------------------------------------------------------
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("scale", [1.0, 0.6])
 def test_restricted_likelihood_is_the_dense_normal_one_with_the_numbers_in_the_covariance(scale):
     rng = np.random.default_rng(0)
@@ -221,6 +224,7 @@ def test_known_noise_is_recovered(estimated):
     np.testing.assert_array_equal(found.noise.scale, start.scale)
 
 
+@pytest.mark.extended
 def test_the_estimate_is_the_maximum_and_its_volume_laplace_s(estimated):
     tests, linear, start, found = estimated
 

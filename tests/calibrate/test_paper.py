@@ -72,6 +72,7 @@ def test_an_unknown_reference_is_told(result):
         calibrate_paper(result.campaign, reference="99")
 
 
+@pytest.mark.extended
 def test_particles_left_out_are_listed_with_the_reason_and_are_no_reference():
     weak = paper_campaign(0, peak_stress_MPa=(0.05, 0.6), instrument=Instrument())
     content = calibrate_paper(weak).to_json()

@@ -52,6 +52,7 @@ def test_spikes_count_for_little(clean, spiked, calibrate):
     assert abs(robust[0] - 16_000) < 3 * robust[1]
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("freedom", [3, 10, 1000])
 def test_weights_say_what_a_mean_is_known_by(freedom):
     """The weighted mean of Student numbers scatters as the corrected weights say."""

@@ -69,6 +69,7 @@ def test_particles_below_the_threshold_are_left_out_with_the_reason():
         assert reason is None or "not the threshold of 0.2 MPa" in reason
 
 
+@pytest.mark.extended
 def test_cycles_give_the_same_loading_curve_as_one_ramp():
     programme = Programme.cycles(levels=(0.3, 0.6, 1.0), unload_to=0.05, points=900)
     ramp, cycles = (

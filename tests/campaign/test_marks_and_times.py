@@ -37,6 +37,7 @@ def test_a_decimal_mark_between_thousands_is_refused_and_both_ways_out_work(tmp_
     assert meant.curves[0].force_mN.tolist() == [0, 500, 1, 1.5]
 
 
+@pytest.mark.extended
 @settings(max_examples=60, deadline=None)
 @given(
     forces=st.lists(st.integers(1, 999_000), min_size=4, max_size=8, unique=True),
@@ -56,6 +57,7 @@ def test_grouped_whole_numbers_never_read_a_thousandth(tmp_path_factory, forces,
         convert(folder, text, f'delimiter = ";"\ndecimal_mark = "{mark}"')
 
 
+@pytest.mark.extended
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.floats(0.001, 5000), min_size=3, max_size=8), st.sampled_from(["%.3f", "%.6g", "%g", "%.3e", "%r"]))
 def test_what_programs_write_is_never_taken_for_thousands(tmp_path_factory, forces, form):

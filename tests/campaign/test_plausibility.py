@@ -206,6 +206,7 @@ def test_radii_show_where_the_platens_would_have_touched(stress):
         assert "twice" in findings[0].remedy
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("unloads", [True, False])
 def test_forces_of_soft_tests_show_where_no_ductile_metal_is_so_strong(unloads):
     """3 to 4 GPa at a strain of 0.3 are beyond every metal that bears such a strain."""
@@ -319,6 +320,7 @@ def test_the_paper_s_material_is_itself_however_often_it_is_unloaded(levels, unl
 NUMBERS = st.one_of(st.floats(-1e15, 1e15), st.sampled_from([0.0, 1e300, -1e300, 1e-300, np.nan, np.inf, -np.inf]))
 
 
+@pytest.mark.extended
 @settings(max_examples=100)
 @given(st.integers(2, 30), st.integers(1, 5), st.data())
 def test_nothing_makes_it_fail(samples, count, data):

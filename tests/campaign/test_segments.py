@@ -241,6 +241,7 @@ ANY = st.tuples(st.floats(0, 1e3), st.floats(-1e15, 1e15), st.floats(-1e15, 1e15
 FEW_LEVELS = st.tuples(st.integers(0, 1), st.integers(-3, 3), st.integers(-3, 3))
 
 
+@pytest.mark.extended
 @settings(max_examples=300, deadline=None)
 @given(
     values=st.one_of(st.lists(kind, min_size=2, max_size=80) for kind in (ANY, FEW_LEVELS)),

@@ -71,6 +71,7 @@ def test_history_follows_the_pair(old, new, seed):
     assert not second.overlap_max[~np.asarray(second.active)].any()
 
 
+@pytest.mark.extended
 @settings(max_examples=15, deadline=None)
 @given(pairs=pairs_strategy, seed=st.integers(0, 1000))
 def test_other_names_for_the_particles(pairs, seed):

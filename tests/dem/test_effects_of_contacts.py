@@ -87,6 +87,7 @@ def test_by_hand():
     assert wall_force(damaged, 0.0, d) == wall_force(plain, 0.0, d)  # it acts on unloading alone
 
 
+@pytest.mark.extended
 def test_an_amplitude_of_zero_changes_nothing():
     law = law_of()
     none = half_contact(law._with(tuple(v.build(0.0) for v in CLOSED)), PARTICLE)
@@ -246,6 +247,7 @@ def test_an_effect_of_ones_own():
         half_contact(law_of().with_effects(Anyhow(0.3)), PARTICLE)
 
 
+@pytest.mark.extended
 def test_a_packing_with_effects_is_saved_with_them(tmp_path):
     packing = spheres(with_all(Unloading.PRINTED), [100.0, 60.0])
     assert packing.sides.effects[0].amplitude.shape == (2,)

@@ -26,6 +26,7 @@ from mcc_jax.geometry import Particle
 ROUNDING = 1e-13
 
 
+@pytest.mark.extended
 @ALL_FORMS
 def test_random_paths_of_unlike_pairs_gain_nothing(unloading, scaling):
     law, particle = energy_paths.draw(5, 1000, unloading, scaling)

@@ -47,6 +47,7 @@ def stirred(state, seed=0):
     )
 
 
+@pytest.mark.extended
 def test_wall_and_body_forces_sum_to_zero():
     """T8: and so do torques about the origin."""
     state = stirred(dense())
@@ -226,6 +227,7 @@ def test_particles_outside_are_named():
             start(packing(), loose().walls, position, SKIN)
 
 
+@pytest.mark.extended
 def test_nan_is_named_and_the_state_is_intact():
     with pytest.raises(InputError, match="particle 5 is not finite"):
         start(packing(), loose().walls, loose().position.at[5, 1].set(jnp.nan), SKIN)
@@ -236,6 +238,7 @@ def test_nan_is_named_and_the_state_is_intact():
     assert eqx.tree_equal(jax.tree.map(np.asarray, state), copy)
 
 
+@pytest.mark.extended
 def test_not_monotone_particles_are_named():
     laws = jax.vmap(lambda p: MccLaw(p, 1.43, 16000.0))(paper_population().sample(jax.random.key(3), 300))
     pack = spheres(laws, jnp.full(300, 100.0))
@@ -258,6 +261,7 @@ def test_particles_that_resist_nothing_are_named():
         die(1e-3, 0.0)
 
 
+@pytest.mark.extended
 def test_beyond_the_tested_range_is_said():
     _, rows = advance(packing(), motion(), dense(), 0 * PRESSING, 1, 1, SKIN)
     assert rows.beyond_tested[0] == 0
@@ -337,6 +341,7 @@ def test_a_run_takes_the_steps_asked_for():
 # ---- packings and walls ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.extended
 def test_scattered_spheres_do_not_touch():
     pack = packing()
     position, height = scattered(jax.random.key(4), pack.radius, DIE_RADIUS)

@@ -138,6 +138,7 @@ def test_beside_a_large_side_the_pair_loads_as_against_the_wall():
     assert np.max(np.abs(driven(on_pair(side, large), overlaps) - alone)) <= 1e-12 * np.max(alone)
 
 
+@pytest.mark.extended
 def test_small_overlaps_add_stiffness_in_series():
     sides = drawn(1, 40)
     i, j = sides_of(sides, np.arange(10)), sides_of(sides, np.arange(10, 20))
@@ -324,6 +325,7 @@ def test_energy_is_the_area_under_the_curve(unloading):
         assert energy.recoverable >= 0
 
 
+@pytest.mark.extended
 def test_a_contact_that_carries_nothing_for_a_while_does_no_work():
     """Where the quintic would pull there is no force, and so no work: 0.08 % of the paper's draws."""
     side = half_contact(law_of(C1=4.0, C3=3.9, C5=2.4), Particle(100.0, 100.0, 100.0))
@@ -347,6 +349,7 @@ def test_forms_do_not_mix():
         pair_force(i, j, jnp.zeros(()), jnp.asarray(1e-6))
 
 
+@pytest.mark.extended
 def test_not_monotone_is_flagged_and_not_nan():
     """Pitfall: 2.4 % of the paper's draws have no unique split."""
     plastic = paper_population().sample(jax.random.key(3), 4000)

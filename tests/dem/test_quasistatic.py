@@ -216,6 +216,7 @@ def posterior(scatter, effect=None):
     return found
 
 
+@pytest.mark.extended
 def test_packing_of_a_population_without_scatter_is_one_law():
     made = population_packing(posterior(0.0), np.asarray(DIAMETERS))
     assert made.draws.shape == (5, len(made.names))
@@ -272,6 +273,7 @@ def test_fit_recovers_the_mean_C1_and_modulus(pressed):
     assert fit.misfit < 1e-6
 
 
+@pytest.mark.extended
 def test_bad_input_is_named(pressed):
     packing, state, heights, _, rows, _ = pressed
     with pytest.raises(InputError, match="height"):

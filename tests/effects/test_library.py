@@ -69,6 +69,7 @@ def test_every_variant_says_what_it_is(variant):
         variant.build(0.5, nonsense=1.0)
 
 
+@pytest.mark.extended
 def test_a_nuisance_has_no_meaning_at_the_null_and_some_beyond():
     for name in ("frame_compliance:stiffening", "creep:kelvin_voigt", "pop_in:sharp"):
         variant = find_variant(name)

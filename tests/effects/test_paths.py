@@ -73,6 +73,7 @@ def test_respond_is_the_path_of_a_virgin_particle():
     )
 
 
+@pytest.mark.extended
 def test_padding_changes_nothing():
     """A batch repeats the last point of a shorter test, time included."""
     padded = jax.tree.map(lambda x: jnp.pad(x, (0, 7), mode="edge") if x.ndim else x, RECORD)
@@ -182,6 +183,7 @@ def test_the_record_is_a_pytree_of_its_points():
     assert {x.shape for x in jax.tree.leaves(RECORD)} == {FORCE.shape, ()}
 
 
+@pytest.mark.extended
 def test_new_numbers_do_not_recompile():
     @eqx.filter_jit
     @eqx.debug.assert_max_traces(max_traces=1)

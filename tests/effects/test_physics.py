@@ -145,6 +145,7 @@ def test_creep_of_a_hold_needs_a_hold_and_begins_again_with_each():
         np.testing.assert_allclose(twice[[10, 20, 40, 50, 60]], once * np.array([0, 1, 1, 2, 2]), atol=1e-9)
 
 
+@pytest.mark.extended
 def test_faster_loading_is_harder():
     """At one force the displacement falls with the rate, or is that of the reference rate."""
     time = jnp.linspace(0.0, 1.0, 60)
@@ -185,6 +186,7 @@ def test_a_constant_pull_depends_on_what_the_load_has_lost():
     assert (np.diff(pull[:35]) > 0).all()
 
 
+@pytest.mark.extended
 @family("adhesion")
 def test_adhesion_holds_the_particle_back(variant):
     """It acts on the elastic branch only, adds displacement there, most close to release."""
@@ -267,6 +269,7 @@ def test_the_whole_of_a_power_law_unloads_by_it():
     assert left[1.5] < 0.05 < min(left[1.2], left[2.0])
 
 
+@pytest.mark.extended
 def test_sizes_and_shapes_that_are_the_reference_feel_nothing():
     for name, particle in (("size_effect", sphere(200.0)), ("shape_second_order", sphere(150.0))):
         for variant in LIBRARY[name]:
@@ -307,6 +310,7 @@ def test_asperities_stay_flat():
         )
 
 
+@pytest.mark.extended
 def test_friction_and_hardening_meet_the_stress_they_say():
     """The solved strain fulfils the equation: stress of the law times the factor is the stress applied."""
     force = jnp.linspace(0.0, 300.0, POINTS)
@@ -332,6 +336,7 @@ def test_friction_and_hardening_meet_the_stress_they_say():
         np.testing.assert_allclose(stress, PARTICLE.stress(force)[1:], rtol=1e-9)
 
 
+@pytest.mark.extended
 def test_dry_air_hardens_and_an_unknown_humidity_does_nothing():
     effects = [LIBRARY["humidity"][name].build(0.0) for name in ("C1", "flow", "flow_and_modulus", "flow_linear")]
 
@@ -369,6 +374,7 @@ def test_a_stiff_platen_does_not_give_way():
     assert added[top] == pytest.approx(0.1 * 300.0 / (2 * radius), rel=2e-3)
 
 
+@pytest.mark.extended
 def test_particles_whose_law_is_not_monotone_stay_finite():
     law = MccLaw(Plastic(4.0, 3.0, 2.4), 1.43, 16e3)
     particle = paper_particle(6)

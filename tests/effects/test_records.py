@@ -40,6 +40,7 @@ def test_a_clean_path_is_cut_at_its_turns():
     np.testing.assert_allclose(record.progress[at[220.0]], 0.5, rtol=1e-9)
 
 
+@pytest.mark.extended
 def test_segments_and_clean_path_tell_the_same():
     for curve in campaign().curves[:3]:
         clean = clean_record(jnp.asarray(curve.force_mN), jnp.asarray(curve.time_s))
@@ -105,6 +106,7 @@ def test_noise_of_force_does_not_change_what_an_effect_adds():
         assert np.sqrt(np.mean((noisy - clean) ** 2)) < 0.06 * np.abs(clean).max(), variant
 
 
+@pytest.mark.extended
 def test_batch_pads_with_the_last_point():
     tests = campaign(points=120)
     batch = record_batch(tests, multiple=16)
@@ -117,6 +119,7 @@ def test_batch_pads_with_the_last_point():
     assert batch.relative_humidity.shape == (20,)
 
 
+@pytest.mark.extended
 def test_humidity_comes_from_its_column():
     tests = campaign(points=60)
     assert humidities(tests) is None

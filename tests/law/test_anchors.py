@@ -99,6 +99,7 @@ def stress_at(strain, strain_max=0.45):
 DELTA = 0.015448848218415247
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("below", "value", "slope", "curvature"),
     [
@@ -215,6 +216,7 @@ def test_03_continuity_at_both_ends_of_the_branch(unloading, scaling):
         assert force(d) == 0
 
 
+@pytest.mark.extended
 def test_04_energy_against_the_trapezoidal_rule():
     law, p = PITFALL
     path = jnp.concatenate([jnp.linspace(0.0, 0.45, 4001), jnp.linspace(0.45, 0.43, 4001)])
@@ -225,6 +227,7 @@ def test_04_energy_against_the_trapezoidal_rule():
     check(closed.work / volume, "0.8939867578890244", rel=1e-14)
 
 
+@pytest.mark.extended
 def test_05_scale():
     """D -> 2D: the same stress-strain curve; displacement x2, force x4, time x4, energy x8."""
     law = paper_law()
@@ -261,6 +264,7 @@ def test_07_sphere_has_unit_shape_factors():
         assert elastic_shape_factor(sphere(size)) == 1
 
 
+@pytest.mark.extended
 @ALL_FORMS
 def test_08_reload_retraces_and_rejoins(unloading, scaling):
     law, p = paper_law(unloading, scaling, modulus=3000.0), paper_particle(9)
@@ -273,6 +277,7 @@ def test_08_reload_retraces_and_rejoins(unloading, scaling):
     np.testing.assert_array_equal(force[120:], force_along(law, p, jnp.concatenate([up, beyond]))[40:])
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 @ALL_FORMS
 def test_09_sum_rule_at_the_onset(unloading, scaling, mode):
@@ -288,6 +293,7 @@ def test_09_sum_rule_at_the_onset(unloading, scaling, mode):
         check(by_peak, "-518.4683")
 
 
+@pytest.mark.extended
 def test_09_jacobian_of_a_whole_test():
     """Load, unload, reload, unload: forward = reverse to 4e-15 and both = finite differences to 4e-9 of the scale."""
     knots = np.array([0.0, 0.42, 0.405, 0.45, 0.43])
@@ -316,6 +322,7 @@ def test_10_onset_of_the_exact_punch_is_the_flat_punch():
     close(slope, 2 * EBAR * np.sqrt(2 * 1.43 * 50 * float(peak)) * 1e-3, rel=1e-12)
 
 
+@pytest.mark.extended
 def test_11_master_collapse_only_in_the_master_way():
     strain = jnp.concatenate([jnp.linspace(0, 0.45, 31), jnp.linspace(0.45, 0.42, 60)])
     for scaling in StrainScaling:

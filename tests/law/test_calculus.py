@@ -221,6 +221,7 @@ def test_a_tie_has_the_loading_tangent(mode):
     close(one, other, rel=1e-11)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("mode", first_in_core([jax.jacfwd, jax.jacrev]))
 @pytest.mark.parametrize("form", Unloading)
 def test_slopes_on_the_two_sides_of_the_peak(form, mode):
@@ -238,6 +239,7 @@ def test_slopes_on_the_two_sides_of_the_peak(form, mode):
     assert onset > 2 * loading
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("mode", first_in_core([jax.jacfwd, jax.jacrev]))
 def test_out_of_contact_nothing_depends_on_the_platen(mode):
     law, p = paper_law(), paper_particle(1)

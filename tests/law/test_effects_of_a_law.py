@@ -24,12 +24,14 @@ def creeping(amplitude=RATE, compliance=COMPLIANCE):
     return LAW.with_effects(creep, LIBRARY["frame_compliance"]["linear"].build(compliance))
 
 
+@pytest.mark.extended
 def test_a_frame_adds_compliance_times_force_and_nothing_else():
     base = drive(LAW, PARTICLE, FORCE, control="load").displacement
     frame = drive(creeping(amplitude=0.0), PARTICLE, FORCE, time=TIME, control="load").displacement
     close(frame - base, COMPLIANCE * FORCE, rel=1e-12, scale=1e-12 * float(base.max()))
 
 
+@pytest.mark.extended
 def test_creep_is_the_solution_of_its_equation_by_hand():
     r"""Kelvin-Voigt: tau y' + y = sigma. On the ramp sigma = r t, in the hold exponentially towards the peak."""
     law = LAW.with_effects(LIBRARY["creep"]["kelvin_voigt"].build(RATE, tau_s=TAU))
@@ -92,6 +94,7 @@ def test_what_belongs_to_the_tester_is_left_out():
     assert [effect.name.split(":")[0] for effect in law.of_particle().effects] == ["damage", "size_effect", "creep"]
 
 
+@pytest.mark.extended
 def test_a_variant_of_ones_own_goes_the_same_way():
     class Glue(AbstractEffect):
         """Displacement lost to a layer of glue."""
@@ -124,6 +127,7 @@ def test_what_is_no_effect_is_refused_by_name(effects, words):
         MccLaw(Plastic(7.0, 3.0, 2.7), 1.4, 16000.0, effects="creep")
 
 
+@pytest.mark.extended
 def test_energy_with_damage_is_the_work_of_the_path():
     """What a damaged particle gives back is the integral of its force over its own unloading."""
     law = LAW.with_effects("damage", "size_effect")

@@ -30,6 +30,7 @@ def along(law, particle, peak, displacements):
     return jax.vmap(lambda d: law.energy(particle, History(peak), d))(displacements)
 
 
+@pytest.mark.extended
 @ALL_FORMS
 @settings(max_examples=8, deadline=None, derandomize=True)
 @given(theta=thetas(), x=between(0.1, 0.7), share=between(0.05, 1.2))
@@ -77,6 +78,7 @@ def test_balance(unloading, scaling, theta, x):
     close(e.recoverable[0], 4 / (3 * np.pi) * F * recovered, rel=1e-13)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("form", Unloading)
 def test_elastic_loop_dissipates_nothing(form):
     law, p = paper_law(form, modulus=2000.0), paper_particle(3)
@@ -140,6 +142,7 @@ def stored_slope(p, peak, d):
     return jax.grad(lambda d: paper_law().energy(p, History(peak), d).recoverable)(d)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("C3", [3.0, 3.29, 3.3, 3.6, 4.2])
 def test_no_work_where_the_quintic_would_pull(C3):
     """The force is zero there; the work is that of the force, and its slope is the force, also in the coefficients."""

@@ -165,6 +165,7 @@ def test_history_is_what_was_reached():
     close(stress, law.loading_stress(p, strain), rel=1e-15)
 
 
+@pytest.mark.extended
 def test_splitting_a_path_changes_nothing():
     law, p = paper_law(), paper_particle(7)
     path = jnp.array([10.0, 40.0, 39.5, 39.0, 39.8, 60.0, 59.0, 62.0])
@@ -177,6 +178,7 @@ def test_splitting_a_path_changes_nothing():
     assert jnp.all(jnp.diff(whole[jnp.array([0, 1, 5, 7])]) > 0)
 
 
+@pytest.mark.extended
 def test_out_of_contact_the_displacement_stays():
     law, p = paper_law(), paper_particle(7)
     state = History(50.0)

@@ -68,6 +68,7 @@ def test_load_control_snaps_through(numbers, softening):
     assert np.all(x[6:] > trough)
 
 
+@pytest.mark.extended
 def test_the_example_under_both_controls():
     """C1 = 4, C3 = 3, C5 = 2.4: peak 0.664820461376 MPa at 0.2905, trough 0.660463146397 at 0.3451."""
     law, p = MccLaw(EXAMPLE, 1.43, 16000.0), paper_particle(1)
@@ -99,6 +100,7 @@ def test_nothing_is_ever_nan(unloading, scaling, theta, x, start):
     assert jnp.all(force >= 0)
 
 
+@pytest.mark.extended
 @settings(max_examples=20, deadline=None, derandomize=True)
 @given(theta=thetas(softening=FALLING), fractions=st.lists(between(0.01, 3), min_size=12, max_size=12))
 def test_forces_are_met_under_load_control(theta, fractions):
@@ -116,6 +118,7 @@ def test_forces_are_met_under_load_control(theta, fractions):
     assert np.all(np.diff(peaks)[grows] > 0)
 
 
+@pytest.mark.extended
 def test_behind_the_peak_there_is_no_way_back():
     """A particle pushed down the falling branch and then loaded by force goes on to the rising branch."""
     law, p = MccLaw(EXAMPLE, 1.43, 16000.0), paper_particle(1)

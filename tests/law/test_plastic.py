@@ -159,6 +159,7 @@ SOFTENING = st.one_of(
 )
 
 
+@pytest.mark.extended
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(
     numbers=PLASTIC_NUMBERS,
@@ -187,6 +188,7 @@ NEAR = 10.0 ** np.arange(-15.0, 0.0)
 SWEPT = np.concatenate([[0.0, 1e-12, 1e-6, 0.1, 0.4, 0.7], 1 - NEAR, [1.0], 1 + NEAR, [1.3, 1.79, 2.0, 3.0]])
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("K5", [1.0, 144.0, 4000.0])
 def test_inverse_over_a_dense_sweep(K5):
     """Every degree of softening, 13 decades of stress, and stresses that close in on bend and peak from both sides."""
@@ -223,6 +225,7 @@ def test_inverse_round_trip_of_strain(x, numbers, ratio):
     close(master_strain(plastic, master_stress(plastic, jnp.array(x))), x, rel=1e-13)
 
 
+@pytest.mark.extended
 def test_inverse_of_paths_and_of_no_stress():
     close(master_strain(MEAN, jnp.array([-1.0, 0.0])), [0.0, 0.0])
     x = jnp.linspace(0.0, 1.0, 11)

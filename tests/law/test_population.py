@@ -124,6 +124,7 @@ def test_probability_against_draws(draws, kept):
     close(np.mean(tensile), p, scale=4 * np.sqrt(p / DRAWS))
 
 
+@pytest.mark.extended
 def test_every_curve_that_falls_does_so_within_the_tested_range(draws, kept):
     """First peak at x = 0.15 to 0.50 and 0.14 to 3.4 MPa, median 0.75 MPa."""
     violators = jax.tree.map(lambda c: c[np.flatnonzero(~kept)], draws)

@@ -94,6 +94,7 @@ def test_energy_ratio_values(s, printed):
     check(energy_ratio(jnp.array(s)), printed)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("s", "printed"),
     [
@@ -149,6 +150,7 @@ def test_recovery_accuracy(shares, dtype):
     close(actual, exact, scale=(4e-16 if dtype == np.float64 else 2e-7))
 
 
+@pytest.mark.extended
 def test_ends_are_exact_and_outside_is_flat():
     outside = jnp.array([-jnp.inf, -1.0, -1e-300, 0.0, 1.0, 1.0 + 2**-52, 2.0, jnp.inf])
     released = np.array([0, 0, 0, 0, 1, 1, 1, 1])

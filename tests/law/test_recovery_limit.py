@@ -45,6 +45,7 @@ def balance(law, particle, strain):
     return jax.vmap(one)(strain)
 
 
+@pytest.mark.extended
 @ALL_FORMS
 @pytest.mark.parametrize("modulus", [1.0, 30.0, 400.0, 16000.0])
 def test_what_is_lost_never_falls_as_the_peak_grows(unloading, scaling, modulus):
@@ -58,6 +59,7 @@ def test_what_is_lost_never_falls_as_the_peak_grows(unloading, scaling, modulus)
         assert jnp.all(residual > -1e-15)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("softening", [0.0, 0.5, 0.98, 1.0, 1.5])
 def test_so_it_is_for_any_softening(softening):
     """9 C3^6 / (20 C1 C5^5) up to the loss of monotony and beyond, where force follows the curve down."""
@@ -82,6 +84,7 @@ def test_random_paths_gain_nothing(unloading, scaling):
     assert between.max() <= ROUNDING
 
 
+@pytest.mark.extended
 def test_the_paths_would_show_a_gain(monkeypatch):
     """Without the limit the printed form gains on them, so the test above can fail."""
     import mcc_jax.formulas.branch as branch
@@ -189,6 +192,7 @@ def test_derivatives_equal_differences_where_the_limit_holds(unloading, scaling)
 # ---- machinery ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("form", Unloading)
 def test_the_inverse_follows_the_limit(form):
     law, p = paper_law(form, modulus=30.0), paper_particle(6)

@@ -265,6 +265,7 @@ def test_virgin_limit_of_the_recovered_strain(form):
 # ---- collapse on one master curve -----------------------------------------------------------------------------------
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("form", Unloading)
 def test_only_the_master_way_collapses_all_particles(form):
     """sigma_i(eps) = sigma(eta eps) through a whole cycle."""
@@ -284,6 +285,7 @@ def test_only_the_master_way_collapses_all_particles(form):
     assert error[2] < 1e-12 * float(jnp.max(cycle(MASTER, p, strain)))
 
 
+@pytest.mark.extended
 def test_collapse_error_as_measured():
     """Particle 1 from a strain of 0.5: raw 2.30, contact 1.55, master 5e-14 MPa."""
     p, peak = paper_particle(1), jnp.array(0.5)

@@ -130,6 +130,7 @@ def test_nothing_is_left_with_pyplot(saved):
         assert not re.search(r"^\s*(import|from)\b.*pyplot", file.read_text(encoding="utf-8"), re.MULTILINE)
 
 
+@pytest.mark.extended
 def test_a_measured_campaign_is_not_called_simulated_and_says_nothing_of_cellulose(paper):
     measured = dataclasses.replace(paper.campaign, metadata=Metadata(provenance="tester file x.tri"))
     for figure in paper_figures(dataclasses.replace(paper, campaign=measured)).values():

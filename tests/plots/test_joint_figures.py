@@ -39,6 +39,8 @@ KINDS = ("paper", *(pytest.param(kind, marks=pytest.mark.extended) for kind in (
 STEMS = ["pairs", "prior_posterior", "forest", "shrinkage", "bands", "new_particle", "whitened", "fits", "estimates"]
 UNIT = re.compile(r"\[(GPa|mN|µm|-)\]$")
 
+pytestmark = pytest.mark.extended
+
 
 class Calibrations(dict):
     """That of one particle compiles anew, so it is made only where it is asked for."""
