@@ -13,6 +13,7 @@ from mcc_jax.calibrate.data import rows_from_contact
 from mcc_jax.calibrate.results import Calibration, PosteriorDraws, read_saved
 from mcc_jax.campaign import Campaign, campaign_segments, file_checksums, write_campaign
 from mcc_jax.discover import Discovery
+from mcc_jax.effects import find_variant
 from mcc_jax.law import MccLaw, Plastic
 from mcc_jax.simulate import Hold, Programme, Ramp, simulate_campaign
 
@@ -178,7 +179,8 @@ class Draws(PosteriorDraws):
 
     @property
     def variants(self):
-        return {}
+        names = [f"{effect['mechanism']}:{effect['variant']}" for effect in self.to_json()["effects"]]
+        return {name: find_variant(name) for name in names}
 
     @property
     def particles(self):
