@@ -65,8 +65,10 @@ def checked(law: Any, particle: Any, origin: Any = None, *, needed: bool = True)
     """The origin, or an empty one, of a law that can be exported and a particle that it carries, if one is `needed`.
 
     Raises:
-        InputError: for one of another kind, a batch of laws, or a law or particle that is not usable.
+        InputError: without a particle that is needed, for a batch of laws, or a law or particle that is not usable.
     """
+    if needed and particle is None:
+        raise InputError("particle must be given", remedy="Make one with mcc_jax.Particle(D1, D2, D3), in um.")
     if law.plastic.C1.ndim or law.a.ndim or (particle is not None and particle.D3.ndim):
         raise InputError("a batch of laws or particles cannot be exported", remedy="Export one law.")
     sphere = Particle(1.0, 1.0, 1.0)  # every law carries it
